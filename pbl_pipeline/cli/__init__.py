@@ -1,0 +1,5 @@
+"""The `pbl` command. Each command is a module found through the entry-point group `pbl.commands`."""
+
+from ._main import main
+
+__all__ = ["main"]

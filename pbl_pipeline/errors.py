@@ -1,0 +1,77 @@
+"""Errors a person can act on: a code, what was expected and found, and the next step.
+
+`CODES` is the whole list; `docs/errors.md` explains each, and a test fails when the two differ.
+"""
+
+from __future__ import annotations
+
+#: code -> one line on what it means. The code is what a lab searches for and what an error row stores.
+CODES: dict[str, str] = {
+    "VIDEO_MISSING": "the video file does not exist or cannot be opened",
+    "VIDEO_EMPTY": "the video file has no bytes",
+    "VIDEO_NOT_A_VIDEO": "no decoder recognises the file, or it holds no video stream",
+    "VIDEO_NO_FRAMES": "the container opens but not one frame decodes",
+    "VIDEO_TRUNCATED": "decoding breaks off before the end the container announces",
+    "VIDEO_CHANGED": "the file's bytes are no longer those that were registered",
+    "TRACK_NO_PERSON": "no person was found in the video",
+    "TRACK_TOO_SHORT": "the person is in view for less than the shortest time that can be fitted",
+    "SUBJECT_NEEDS_CHOICE": "several people, none clearly the subject: a person has to choose",
+    "SUBJECT_UNKNOWN_PERSON": "the chosen person number is not among the tracks of the video",
+    "ASSET_MISSING": "a model or demo file is absent and could not be fetched",
+    "ASSET_CHECKSUM": "a fetched file is not the pinned one (SHA-256 differs)",
+    "FILE_FORMAT": "a file lacks a field, or a field has another shape, unit or type than its format says",
+    "MARKER_SET_UNKNOWN": "the body has no marker set of that name, or the names differ",
+    "CAMERA_INVALID": "the camera matrix or distortion is not usable",
+    "FIT_INPUT": "the keypoints cannot be fitted: too few frames, time stamps out of order, nothing seen",
+    "FIT_DIVERGED": "the optimisation ended in values that are not finite",
+    "SOLVER_UNKNOWN": "no solver or paramset has that name",
+    "GAIT_INPUT": "the trajectories cannot be searched for gait events",
+    "NORM_UNKNOWN": "no normative set has that name",
+    "NORM_INVALID": "the normative data cannot support the index (too few cycles, wrong size)",
+    "DB_NOT_RUNNING": "the database does not answer",
+    "DB_UNAVAILABLE": "no database server can be had on this machine",
+    "DB_REFUSED": "the database answers but refuses the login or the operation",
+    "DB_NOT_FOUND": "a row that was named does not exist",
+    "USAGE": "the command was called in a way that cannot work",
+    "INTERNAL": "an unforeseen error: please report it with the text above",
+}
+
+
+class PblError(Exception):
+    """A coded error.
+
+    Parameters
+    ----------
+    code
+        One of `CODES`.
+    found
+        What is the case, concretely ("the file holds 0 bytes").
+    expected
+        What would have been right ("an MP4, MOV or WebM video").
+    next_step
+        What the reader can do now ("copy the file from the phone again").
+    key
+        What it is about: a path, a table key, a frame.
+    """
+
+    def __init__(self, code: str, *, found: str, expected: str, next_step: str, key: object = None) -> None:
+        if code not in CODES:
+            raise ValueError(f"unknown error code {code!r}: add it to pbl_pipeline.errors.CODES")
+        self.code, self.found, self.expected, self.next_step, self.key = code, found, expected, next_step, key
+        super().__init__(self.text())
+
+    def text(self) -> str:
+        """One line per part; the form stored in error rows and printed on stderr."""
+        lines = [f"{self.code}: {CODES[self.code]}"]
+        if self.key is not None:
+            lines.append(f"  about:    {self.key}")
+        lines += [f"  found:    {self.found}", f"  expected: {self.expected}", f"  next:     {self.next_step}"]
+        return "\n".join(lines)
+
+    def __reduce__(self):
+        parts = (self.code, self.found, self.expected, self.next_step, self.key)
+        return (_rebuild, parts)
+
+
+def _rebuild(code: str, found: str, expected: str, next_step: str, key: object) -> PblError:
+    return PblError(code, found=found, expected=expected, next_step=next_step, key=key)

@@ -1,0 +1,100 @@
+"""Results of a session fit and the file formats `<name>.fit.npz` and `<name>.angles.csv`."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.keypoints import Camera
+from pbl_pipeline.qc import Check
+
+
+@dataclasses.dataclass(frozen=True)
+class TrialFit:
+    """The fitted movement of one trial. World frame: z up, origin at the camera, metres.
+
+    time_s (T,); joint_names (40,); qpos (T, 40) in m and rad, NaN in frames outside the time the person is in view;
+    qpos_sd (T, 40), NaN where the solver gives none; marker_names (J,); markers_world_m (T, J, 3);
+    phone_quat_wxyz (T, 4) camera to world; scale (8,) multipliers of the groups in `body.SCALE_NAMES` (1 = the
+    unscaled body; a group's bodies have this scale, all others that of "overall"); site_offset_m (J, 3) in the
+    marker's body frame; residual_2d_px (T, J) and residual_3d_m (T, J), NaN where nothing was seen.
+    """
+
+    name: str
+    time_s: np.ndarray
+    joint_names: tuple[str, ...]
+    qpos: np.ndarray
+    qpos_sd: np.ndarray
+    marker_set: str
+    marker_names: tuple[str, ...]
+    markers_world_m: np.ndarray
+    phone_quat_wxyz: np.ndarray
+    scale: np.ndarray
+    site_offset_m: np.ndarray
+    residual_2d_px: np.ndarray
+    residual_3d_m: np.ndarray
+    camera: Camera
+    image_size_px: tuple[int, int]
+    camera_motion: str  # "static" or "handheld"
+    solver: str
+    params_hash: str
+    body_sha256: str
+    loss: float
+    seconds: float
+
+    def save(self, path: str | Path) -> None:
+        """Write `<name>.fit.npz`."""
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "camera"}
+        np.savez_compressed(
+            path,
+            **{k: np.asarray(v) for k, v in fields.items()},
+            camera_matrix=self.camera.matrix,
+            distortion=self.camera.distortion,
+            camera_source=np.asarray(self.camera.source),
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> TrialFit:
+        """Read `<name>.fit.npz`. Raises `PblError` FILE_FORMAT. Never unpickles."""
+        try:
+            with np.load(path, allow_pickle=False) as f:
+                data = {k: f[k] for k in f.files}
+        except (OSError, ValueError, EOFError) as error:
+            raise _format_error(f"{path}: {error}", "an .npz file without pickled objects") from error
+        wanted = [f.name for f in dataclasses.fields(cls) if f.name != "camera"]
+        missing = [k for k in [*wanted, "camera_matrix", "distortion", "camera_source"] if k not in data]
+        if missing:
+            raise _format_error(f"{path} lacks {', '.join(missing)}", "a file that `pbl fit` wrote")
+        values = {k: data[k] for k in wanted}
+        for k in ("joint_names", "marker_names"):
+            values[k] = tuple(str(n) for n in values[k])
+        for k in ("name", "marker_set", "camera_motion", "solver", "params_hash", "body_sha256"):
+            values[k] = str(values[k])
+        for k in ("loss", "seconds"):
+            values[k] = float(values[k])
+        values["image_size_px"] = (int(data["image_size_px"][0]), int(data["image_size_px"][1]))
+        camera = Camera(data["camera_matrix"], data["distortion"], str(data["camera_source"]))
+        return cls(**values, camera=camera)
+
+
+@dataclasses.dataclass(frozen=True)
+class SessionFit:
+    """All trials of a session with one body. loss_trace (K, 2): step, total loss."""
+
+    trials: tuple[TrialFit, ...]
+    scale: np.ndarray
+    site_offset_m: np.ndarray
+    loss_trace: np.ndarray
+    solver: str
+    params_hash: str
+    seconds: float
+    compile_seconds: float
+    device: str
+    qc: tuple[Check, ...]
+
+
+def _format_error(found: str, expected: str) -> PblError:
+    return PblError("FILE_FORMAT", found=found, expected=expected, next_step="see docs/files.md, section fit.npz")

@@ -1,0 +1,141 @@
+"""Keypoints of one person in one trial: the data of `keypoints.npz`, validated at the door."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """Intrinsics of the upright frame: `matrix` (3, 3) in px, `distortion` (5,) OpenCV order k1 k2 p1 p2 k3.
+
+    `source` says where they come from, such as "measured: calib.toml" or "guess: 60 deg diagonal field of view".
+    """
+
+    matrix: np.ndarray
+    distortion: np.ndarray
+    source: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Keypoints:
+    """One trial. Missing values are NaN with confidence 0.
+
+    Attributes
+    ----------
+    time_s : (T,) float64
+        The container's time stamps.
+    names : tuple of J str
+    marker_set
+        Name of a marker set of the body.
+    xy_px : (T, J, 2)
+        Pixels of the upright, still distorted image.
+    xyz_cam_m : (T, J, 3)
+        Camera frame (x right, y down, z forward), root-relative if `root_relative`.
+    confidence : (T, J)
+        0..1, as stated by the detector.
+    image_size_px : (width, height)
+    box_px : (T, 4)
+        x0, y0, x1, y1 of the person.
+    phone_time_s, phone_quat_wxyz : (P,), (P, 4) or None
+        Phone orientation, camera to world, at its own stamps.
+    """
+
+    time_s: np.ndarray
+    names: tuple[str, ...]
+    marker_set: str
+    xy_px: np.ndarray
+    xyz_cam_m: np.ndarray
+    root_relative: bool
+    confidence: np.ndarray
+    image_size_px: tuple[int, int]
+    camera: Camera
+    box_px: np.ndarray
+    phone_time_s: np.ndarray | None = None
+    phone_quat_wxyz: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        n, j = len(self.time_s), len(self.names)
+        shapes = {
+            "time_s": (self.time_s, (n,)),
+            "xy_px": (self.xy_px, (n, j, 2)),
+            "xyz_cam_m": (self.xyz_cam_m, (n, j, 3)),
+            "confidence": (self.confidence, (n, j)),
+            "box_px": (self.box_px, (n, 4)),
+            "camera_matrix": (self.camera.matrix, (3, 3)),
+            "distortion": (self.camera.distortion, (5,)),
+        }
+        for name, (array, shape) in shapes.items():
+            if np.shape(array) != shape:
+                raise _format_error(f"{name} has shape {np.shape(array)}", f"shape {shape} for {n} frames, {j} names")
+        if np.any(~np.isfinite(self.confidence)) or np.any(self.confidence < 0) or np.any(self.confidence > 1):
+            raise _format_error("confidence outside 0..1 or not finite", "0 for a missing point, at most 1")
+        matrix = self.camera.matrix
+        if not np.all(np.isfinite(matrix)) or matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or matrix[2, 2] != 1:
+            raise PblError(
+                "CAMERA_INVALID",
+                found=f"camera matrix {np.asarray(matrix).tolist()}",
+                expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels with positive focal lengths",
+                next_step="pass a camera file with --camera, or leave it out to use the stated guess",
+            )
+
+    def save(self, path: str | Path) -> None:
+        """Write `keypoints.npz` (the fields of docs/files.md)."""
+        optional = {}
+        if self.phone_time_s is not None and self.phone_quat_wxyz is not None:
+            optional = {"phone_time_s": self.phone_time_s, "phone_quat_wxyz": self.phone_quat_wxyz}
+        np.savez_compressed(
+            path,
+            time_s=np.asarray(self.time_s, np.float64),
+            names=np.asarray(self.names),
+            marker_set=np.asarray(self.marker_set),
+            xy_px=np.asarray(self.xy_px, np.float32),
+            xyz_cam_m=np.asarray(self.xyz_cam_m, np.float32),
+            root_relative=np.asarray(self.root_relative),
+            confidence=np.asarray(self.confidence, np.float32),
+            image_size_px=np.asarray(self.image_size_px, np.int64),
+            camera_matrix=np.asarray(self.camera.matrix, np.float64),
+            distortion=np.asarray(self.camera.distortion, np.float64),
+            camera_source=np.asarray(self.camera.source),
+            box_px=np.asarray(self.box_px, np.float32),
+            **optional,
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> Keypoints:
+        """Read `keypoints.npz`. Raises `PblError` FILE_FORMAT or CAMERA_INVALID. Never unpickles."""
+        try:
+            with np.load(path, allow_pickle=False) as f:
+                data = {k: f[k] for k in f.files}
+        except (OSError, ValueError, EOFError) as error:
+            raise _format_error(f"{path}: {error}", "an .npz file without pickled objects") from error
+        needed = (
+            "time_s names marker_set xy_px xyz_cam_m root_relative confidence image_size_px camera_matrix "
+            "distortion camera_source box_px"
+        ).split()
+        missing = [k for k in needed if k not in data]
+        if missing:
+            raise _format_error(f"{path} lacks {', '.join(missing)}", f"the fields {', '.join(needed)}")
+        return cls(
+            time_s=data["time_s"].astype(np.float64),
+            names=tuple(str(n) for n in data["names"]),
+            marker_set=str(data["marker_set"]),
+            xy_px=data["xy_px"],
+            xyz_cam_m=data["xyz_cam_m"],
+            root_relative=bool(data["root_relative"]),
+            confidence=data["confidence"],
+            image_size_px=(int(data["image_size_px"][0]), int(data["image_size_px"][1])),
+            camera=Camera(data["camera_matrix"], data["distortion"], str(data["camera_source"])),
+            box_px=data["box_px"],
+            phone_time_s=data.get("phone_time_s"),
+            phone_quat_wxyz=data.get("phone_quat_wxyz"),
+        )
+
+
+def _format_error(found: str, expected: str) -> PblError:
+    return PblError("FILE_FORMAT", found=found, expected=expected, next_step="see docs/files.md, section keypoints.npz")

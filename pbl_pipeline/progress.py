@@ -1,0 +1,42 @@
+"""Progress of long steps. The library stays silent until a command switches it on."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import TypeVar
+
+from tqdm import tqdm
+
+T = TypeVar("T")
+_enabled = False
+
+
+def enable(on: bool = True) -> None:
+    """Switch progress bars on (commands do; libraries, workers and tests do not)."""
+    global _enabled
+    _enabled = on
+
+
+def track(items: Iterable[T], label: str, total: int | None = None, unit: str = "frame") -> Iterator[T]:
+    """Iterate over `items`, drawing a bar on stderr when enabled. `total` may be unknown."""
+    return iter(tqdm(items, desc=label, total=total, unit=unit, disable=not _enabled, **_style()))
+
+
+@contextmanager
+def bar(label: str, total: int | None = None, unit: str = "step") -> Iterator[Callable[..., None]]:
+    """A bar for work that is not an iteration: yields `update(n=1, note="")`."""
+    with tqdm(desc=label, total=total, unit=unit, disable=not _enabled, **_style()) as b:
+
+        def update(n: int = 1, note: str = "") -> None:
+            if note:
+                b.set_postfix_str(note, refresh=False)
+            b.update(n)
+
+        yield update
+
+
+def _style() -> dict:
+    # A terminal is redrawn twice a second; a log file gets a line every ten.
+    return {"mininterval": 0.5 if sys.stderr.isatty() else 10.0, "dynamic_ncols": True, "smoothing": 0.1}

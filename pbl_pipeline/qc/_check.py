@@ -1,0 +1,33 @@
+"""One check and its outcome."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+
+PASS, WARN, EMPTY, NEEDS_CHOICE, FAIL = "PASS", "WARN", "EMPTY", "NEEDS_CHOICE", "FAIL"
+#: From best to worst. EMPTY: ran well, nothing to produce. NEEDS_CHOICE: waits for a person.
+OUTCOMES = (PASS, WARN, EMPTY, NEEDS_CHOICE, FAIL)
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """A named check. `value` and `threshold` are in the unit that `check` names; None where none applies."""
+
+    check: str
+    outcome: str
+    value: float | None
+    threshold: float | None
+    advice: str = ""
+
+    def __post_init__(self) -> None:
+        if self.outcome not in OUTCOMES:
+            raise ValueError(f"outcome {self.outcome!r} is not one of {OUTCOMES}")
+
+    def to_dict(self) -> dict:
+        return dataclasses.asdict(self)
+
+
+def worst(checks: Iterable[Check]) -> str:
+    """The worst outcome; PASS when there is no check."""
+    return max((c.outcome for c in checks), key=OUTCOMES.index, default=PASS)

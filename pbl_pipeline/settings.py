@@ -1,0 +1,40 @@
+"""Where things live on this machine. Environment variables override; nothing is read from the working directory."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import platformdirs
+
+#: Every environment variable the project reads, with its meaning (README lists them; a test compares).
+VARIABLES: dict[str, str] = {
+    "PBL_CACHE": "folder for fetched models, demo files and compiled programs (default: the user's cache folder)",
+    "PBL_HOME": "folder for the embedded database and its object store (default: the user's data folder)",
+    "PBL_OFFLINE": "1: never fetch anything, fail with the remedy instead",
+    "PBL_DB_PREFIX": "prefix of the database schema names (default: pbl)",
+    "PBL_STORE": "folder of the object store that holds arrays (default: store/ in PBL_HOME)",
+}
+
+
+def cache_dir() -> Path:
+    """The user's cache folder for PBL, created when absent."""
+    path = Path(os.environ.get("PBL_CACHE") or platformdirs.user_cache_dir("pbl"))
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def home_dir() -> Path:
+    """Folder of the embedded database and the object store (not created here: its owner decides permissions)."""
+    value = os.environ.get("PBL_HOME")
+    if value:
+        return Path(value).absolute()
+    if hasattr(os, "geteuid") and os.geteuid() == 0:
+        # The database server never runs as root, and the account it drops to cannot look into root's home.
+        return Path("/var/lib/pbl")
+    return Path(platformdirs.user_data_dir("pbl"))
+
+
+def offline() -> bool:
+    """True when nothing may be fetched."""
+    return os.environ.get("PBL_OFFLINE", "") not in ("", "0")
