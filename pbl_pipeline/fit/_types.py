@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.keypoints import Camera
 from pbl_pipeline.qc import Check
+from pbl_pipeline.video import Camera
 
 
 @dataclasses.dataclass(frozen=True)

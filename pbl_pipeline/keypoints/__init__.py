@@ -1,1 +1,5 @@
-from ._types import Camera, Keypoints
+"""Keypoints of the tracked person, behind one protocol for every detector."""
+
+from ._types import Keypoints
+
+__all__ = ["Keypoints"]

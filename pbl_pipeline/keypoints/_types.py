@@ -8,18 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-
-
-@dataclasses.dataclass(frozen=True)
-class Camera:
-    """Intrinsics of the upright frame: `matrix` (3, 3) in px, `distortion` (5,) OpenCV order k1 k2 p1 p2 k3.
-
-    `source` says where they come from, such as "measured: calib.toml" or "guess: 60 deg diagonal field of view".
-    """
-
-    matrix: np.ndarray
-    distortion: np.ndarray
-    source: str
+from pbl_pipeline.video import Camera
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,10 +103,20 @@ class Keypoints:
                 data = {k: f[k] for k in f.files}
         except (OSError, ValueError, EOFError) as error:
             raise _format_error(f"{path}: {error}", "an .npz file without pickled objects") from error
-        needed = (
-            "time_s names marker_set xy_px xyz_cam_m root_relative confidence image_size_px camera_matrix "
-            "distortion camera_source box_px"
-        ).split()
+        needed = [
+            "time_s",
+            "names",
+            "marker_set",
+            "xy_px",
+            "xyz_cam_m",
+            "root_relative",
+            "confidence",
+            "image_size_px",
+            "camera_matrix",
+            "distortion",
+            "camera_source",
+            "box_px",
+        ]
         missing = [k for k in needed if k not in data]
         if missing:
             raise _format_error(f"{path} lacks {', '.join(missing)}", f"the fields {', '.join(needed)}")

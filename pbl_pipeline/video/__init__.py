@@ -1,1 +1,5 @@
-from ._types import VideoInfo, Frame
+"""Video files: probe, frames in order with their own time stamps, camera intrinsics."""
+
+from ._types import Camera, Frame, VideoInfo
+
+__all__ = ["Camera", "Frame", "VideoInfo"]

@@ -48,3 +48,15 @@ class Frame:
     index: int
     time_s: float
     image: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """Intrinsics of the upright frame: `matrix` (3, 3) in px, `distortion` (5,) OpenCV order k1 k2 p1 p2 k3.
+
+    `source` says where they come from, such as "measured: calib.toml" or "guess: 60 deg diagonal field of view".
+    """
+
+    matrix: np.ndarray
+    distortion: np.ndarray
+    source: str
