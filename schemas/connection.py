@@ -1,0 +1,265 @@
+"""One configured DataJoint connection, to the server DJ_HOST names or else to the embedded one.
+
+Pattern for a module of tables. Importing it connects to nothing: the schema is bound later.
+
+    import datajoint as dj
+    from schemas import lab                    # tables that are referred to as lab.Subject
+
+    schema = dj.Schema()                       # not bound yet
+
+    @schema
+    class Session(dj.Manual):
+        definition = '''
+        -> lab.Subject
+        session_id : int32
+        ---
+        recorded   : datetime
+        '''
+
+and, once per process, in the order of dependency (`schemas.activate()` does this for all modules):
+
+    from schemas import connection
+    connection.connect()
+    connection.bind("lab", lab.schema)         # schema `pbl_lab`
+    connection.bind("session", session.schema)
+
+Until then the classes exist and can be imported; using one raises DataJoint's "schema is not activated".
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import warnings
+from pathlib import Path
+from typing import Any
+
+# DataJoint reads its configuration while it is imported. Ours comes from here alone: a datajoint.json that happens to
+# lie in the working directory must not point the tables at another server.
+os.environ.setdefault("DJ_IGNORE_CONFIG_FILE", "true")
+os.environ.setdefault("DJ_LOG_LEVEL", "WARNING")
+
+import datajoint as dj
+import pymysql
+from datajoint import instance as dj_instance
+from datajoint.adapters.mysql import MySQLAdapter
+from pymysql.converters import escape_string
+
+from pbl_pipeline import settings
+from pbl_pipeline.errors import PblError
+
+from . import embedded
+from .embedded._folder import APP_USER, Folder
+from .embedded._server import HOST, not_running
+
+#: How long a server may take to answer before it counts as not running.
+CONNECT_TIMEOUT_S = 4.0
+#: Name of the store that holds the arrays. Write it out, `<npy@arrays>`: DataJoint 2.3.5 does not find a default for `<npy@>`.
+STORE = "arrays"
+
+
+def connect(start: bool = False) -> dj.Connection:
+    """The process's connection, made on first use and again when the server has moved.
+
+    Parameters
+    ----------
+    start
+        Start the embedded server when it is not running (never done when DJ_HOST names a server).
+
+    Raises
+    ------
+    PblError
+        DB_NOT_RUNNING when nothing answers within a few seconds, DB_REFUSED when the login is refused,
+        DB_UNAVAILABLE when `start` fails.
+    """
+    target = _target(start)
+    _check(target)
+    configure(target)
+    current = dj_instance._singleton_connection
+    if current is not None and current.is_connected and _same(current, target):
+        return current
+    with warnings.catch_warnings():
+        # Said once in the documentation, not at every start: MariaDB is supported here, by the two repairs below.
+        warnings.filterwarnings("ignore", message="MariaDB is not officially supported")
+        dj_instance._singleton_connection = None
+        return dj.conn()
+
+
+def prefix() -> str:
+    """What the names of the schemas begin with (PBL_DB_PREFIX, default `pbl`)."""
+    return os.environ.get("PBL_DB_PREFIX") or "pbl"
+
+
+def schema_name(stage: str) -> str:
+    """Name of a stage's schema on the server: `lab` -> `pbl_lab`."""
+    return f"{prefix()}_{stage}"
+
+
+def bind(stage: str, schema: dj.Schema) -> None:
+    """Create the schema of a stage and its tables as far as they are missing, and bind the classes to them.
+
+    Call it in the order of dependency: a table can only refer to tables that are bound.
+    """
+    schema.activate(schema_name(stage), connection=connect())
+
+
+def store_dir() -> Path:
+    """Folder that holds the arrays (PBL_STORE, default `store` in `settings.home_dir()`)."""
+    return Path(os.environ.get("PBL_STORE") or settings.home_dir() / "store").absolute()
+
+
+def configure(target: dict[str, Any] | None = None) -> None:
+    """Set DataJoint's configuration: server, store, job bookkeeping. `connect()` calls it."""
+    install_mariadb_shim()
+    if target is not None:
+        dj.config["database.host"] = target["host"]
+        dj.config["database.port"] = target["port"]
+        dj.config["database.user"] = target["user"]
+        dj.config["database.password"] = target["password"]
+        dj.config["database.use_tls"] = target["use_tls"]
+    dj.config["safemode"] = False  # commands ask before they delete; DataJoint's own prompt hangs without a terminal
+    dj.config["database.reconnect"] = True
+    dj.config["loglevel"] = os.environ["DJ_LOG_LEVEL"]
+    dj.config.stores.clear()
+    dj.config.stores.update({"default": STORE, STORE: _store_spec()})
+    dj.config.jobs.auto_refresh = True
+    dj.config.jobs.keep_completed = True
+    dj.config.jobs.add_job_metadata = True
+    dj.config.jobs.version_method = None  # "git" forks three times a make; the code version is a column of ours
+
+
+def _store_spec() -> dict[str, Any]:
+    # The one place that knows where arrays go. An object store (S3, MinIO) becomes a second case here, chosen by
+    # variables named PBL_STORE_*; the tables name the store only as `arrays`.
+    folder = store_dir()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _store_error(folder, str(error)) from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise _store_error(folder, "it exists, and you may not write to it")
+    return {"protocol": "file", "location": str(folder), "subfolding": [2, 2]}
+
+
+def _store_error(folder: Path, found: str) -> PblError:
+    return PblError(
+        "DB_REFUSED",
+        key=folder,
+        found=f"the folder for arrays cannot be used: {found}",
+        expected="a folder you may write to",
+        next_step="set PBL_STORE (or PBL_HOME) to a folder of your own",
+    )
+
+
+def _target(start: bool) -> dict[str, Any]:
+    """Server and login: DJ_* when DJ_HOST is set, else those of the embedded server."""
+    host = os.environ.get("DJ_HOST")
+    if host:
+        user, password = os.environ.get("DJ_USER"), os.environ.get("DJ_PASS")
+        if not user or password is None:
+            raise PblError(
+                "DB_REFUSED",
+                key=f"DJ_HOST={host}",
+                found="DJ_HOST names a server, but DJ_USER or DJ_PASS is not set",
+                expected="all three",
+                next_step="set DJ_USER and DJ_PASS, or unset DJ_HOST to use the embedded database",
+            )
+        name, _, in_host = host.partition(":")
+        use_tls = os.environ.get("DJ_USE_TLS", "").lower()
+        return {
+            "host": name,
+            "port": int(in_host or os.environ.get("DJ_PORT") or 3306),
+            "user": user,
+            "password": password,
+            # None: encrypted when the server can.
+            "use_tls": None if not use_tls else use_tls in ("1", "true", "yes"),
+            "embedded": False,
+        }
+    if start:
+        embedded.start()
+    folder = Folder.default()
+    login = {"host": HOST, "user": APP_USER, "password": folder.credentials().app_password}
+    return {**login, "port": int(folder.state().get("port") or 0), "use_tls": False, "embedded": True}
+
+
+def _check(target: dict[str, Any]) -> None:
+    """One short login of our own: DataJoint's waits three times as long and gives each failure another class."""
+    address = f"{target['host']}:{target['port']}"
+    try:
+        socket.create_connection((target["host"], target["port"]), timeout=CONNECT_TIMEOUT_S).close()
+        probe = pymysql.connect(
+            host=target["host"],
+            port=target["port"],
+            user=target["user"],
+            password=target["password"],
+            connect_timeout=int(CONNECT_TIMEOUT_S),
+            read_timeout=CONNECT_TIMEOUT_S,
+        )
+        probe.close()
+    except pymysql.err.OperationalError as error:
+        number = error.args[0]
+        if number in (1044, 1045, 1130, 1698, 3118, 4151):
+            raise PblError(
+                "DB_REFUSED",
+                key=f"{target['user']}@{address}",
+                found=str(error.args[-1]),
+                expected="a login the server accepts",
+                next_step="pbl db stop, then pbl db start; if it stays, the credentials file is not this server's"
+                if target["embedded"]
+                else "check DJ_USER and DJ_PASS, and that this user may connect from this machine",
+            ) from error
+        raise _no_answer(target, str(error.args[-1])) from error
+    except OSError as error:
+        raise _no_answer(target, f"nothing answers at {address} ({error.strerror or error})") from error
+    if target["embedded"]:
+        embedded.allow_prefix(prefix())
+
+
+def _no_answer(target: dict[str, Any], found: str) -> PblError:
+    if target["embedded"]:
+        return not_running(Folder.default(), found)
+    return PblError(
+        "DB_NOT_RUNNING",
+        key=f"DJ_HOST={target['host']}, DJ_PORT={target['port']}",
+        found=found,
+        expected="a MySQL or MariaDB server",
+        next_step="start that server, or unset DJ_HOST and run: pbl db start",
+    )
+
+
+def _same(connection: dj.Connection, target: dict[str, Any]) -> bool:
+    info = connection.conn_info
+    return (info["host"], info["port"], info["user"], info["passwd"]) == (
+        target["host"],
+        target["port"],
+        target["user"],
+        target["password"],
+    )
+
+
+def install_mariadb_shim() -> None:
+    """Make every connection DataJoint opens, also a later reconnect, work on MariaDB; MySQL is left as it is.
+
+    Two things differ. MariaDB does not see that a primary key determines the other columns of its table, so that with
+    ONLY_FULL_GROUP_BY `A.aggr(B)` fails with error 1055; and its JSON type is text, for which DataJoint hands a bare
+    dict to the driver when it stores the pointer to an object in the store.
+    """
+    original = MySQLAdapter.connect
+    if getattr(original, "_pbl_shim", False):
+        return
+
+    def connect(self: MySQLAdapter, *args: Any, **kwargs: Any) -> Any:
+        connection = original(self, *args, **kwargs)
+        if "MariaDB" in connection.get_server_info():
+            with connection.cursor() as cursor:
+                cursor.execute("SET SESSION sql_mode = REPLACE(@@SESSION.sql_mode, 'ONLY_FULL_GROUP_BY', '')")
+            connection.encoders = {**connection.encoders, dict: _json_literal}
+        return connection
+
+    connect._pbl_shim = True  # type: ignore[attr-defined]
+    MySQLAdapter.connect = connect
+
+
+def _json_literal(value: dict[str, Any], _mapping: object = None) -> str:
+    return "'" + escape_string(json.dumps(value)) + "'"

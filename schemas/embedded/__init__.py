@@ -1,0 +1,24 @@
+"""The database that comes with the project: a private MariaDB server in a folder of its own, no system service.
+
+`start()` gets the server when it is absent, creates the folder on first use and leaves a process running that
+listens on 127.0.0.1 only; `stop()` ends it; `status()` looks and changes nothing. Only MariaDB is started here: a
+MySQL 8 server is used by naming it in DJ_HOST, DJ_PORT, DJ_USER and DJ_PASS.
+"""
+
+from ._binaries import Binaries, find_server, get_server
+from ._folder import Credentials, Folder
+from ._server import Status, allow_prefix, remove, start, status, stop
+
+__all__ = [
+    "Binaries",
+    "Credentials",
+    "Folder",
+    "Status",
+    "allow_prefix",
+    "find_server",
+    "get_server",
+    "remove",
+    "start",
+    "status",
+    "stop",
+]

@@ -1,0 +1,102 @@
+"""Finding the MariaDB server on this machine, or getting it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pbl_pipeline import settings
+from pbl_pipeline.errors import PblError
+
+from ._apt import install, unpack
+
+#: Where the server lies when it is not on PATH (Debian, Fedora, Homebrew).
+PLACES = ("/usr/sbin", "/usr/local/sbin", "/usr/libexec", "/opt/homebrew/bin", "/usr/local/bin")
+
+Say = Callable[[str], None]
+
+
+def silent(_: str) -> None:
+    """The default of every `say`: the library prints nothing, commands do."""
+
+
+@dataclass(frozen=True)
+class Binaries:
+    """The programs of one MariaDB installation and the environment they need."""
+
+    server: Path
+    install_db: Path
+    basedir: Path
+    env: dict[str, str] = field(default_factory=dict)
+
+
+def find_server() -> Binaries | None:
+    """The MariaDB server of this machine, or the one unpacked into `settings.home_dir()/server`; None when absent."""
+    places = [*os.environ.get("PATH", os.defpath).split(os.pathsep), *PLACES]
+    for place in places:
+        server = Path(place) / "mariadbd"
+        if not os.access(server, os.X_OK):
+            continue
+        basedir = server.parent.parent
+        for script in (basedir / "bin" / "mariadb-install-db", basedir / "scripts" / "mariadb-install-db"):
+            if os.access(script, os.X_OK):
+                return Binaries(server, script, basedir)
+    return _unpacked()
+
+
+def get_server(say: Say = silent) -> Binaries:
+    """The server of this machine, fetched with apt when it is absent.
+
+    Parameters
+    ----------
+    say
+        Told in a sentence what is being installed and why.
+
+    Raises
+    ------
+    PblError
+        DB_UNAVAILABLE with the reason and the remedy.
+    """
+    found = find_server()
+    if found:
+        return found
+    reason = "there is no MariaDB server on this machine"
+    if shutil.which("apt-get") is None or shutil.which("dpkg") is None:
+        raise _unavailable(f"{reason}, and no apt to get it with")
+    if settings.offline():
+        raise _unavailable(f"{reason}, and PBL_OFFLINE forbids to fetch it")
+    say("The tables need a database server and this machine has none: getting MariaDB (8 MB, no service is started).")
+    failure = install(say)
+    if failure is not None:
+        say(f"  not as a system package ({failure}); unpacking it into {_unpack_folder()} instead")
+        failure = unpack(_unpack_folder(), say)
+    found = find_server()
+    if found is None:
+        raise _unavailable(f"{reason}; getting it with apt failed: {failure or 'the package holds no mariadbd'}")
+    return found
+
+
+def _unpack_folder() -> Path:
+    return settings.home_dir() / "server"
+
+
+def _unpacked() -> Binaries | None:
+    base = _unpack_folder() / "usr"
+    server, script = base / "sbin" / "mariadbd", base / "bin" / "mariadb-install-db"
+    if not (os.access(server, os.X_OK) and os.access(script, os.X_OK)):
+        return None
+    libraries = sorted({str(p.parent) for p in (_unpack_folder()).glob("**/lib/**/*.so*")})
+    return Binaries(server, script, base, {"LD_LIBRARY_PATH": os.pathsep.join(libraries)} if libraries else {})
+
+
+def _unavailable(found: str) -> PblError:
+    return PblError(
+        "DB_UNAVAILABLE",
+        found=found,
+        expected="mariadbd 10.6 or newer, or a machine with apt that can reach its archive, or a server named in DJ_HOST",
+        next_step="install it (Debian: apt-get install mariadb-server-core mariadb-client-core), or run a server with "
+        "`docker compose up db` and set DJ_HOST, DJ_PORT, DJ_USER and DJ_PASS",
+    )

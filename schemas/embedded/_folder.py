@@ -1,0 +1,219 @@
+"""What lies in the folder of the embedded server, and who may read it."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import secrets
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pbl_pipeline import settings
+from pbl_pipeline.errors import PblError
+
+from ._account import Account, check_enterable
+
+#: Accounts inside the database.
+APP_USER = "pbl"
+ADMIN_USER = "pbl_admin"
+
+
+@dataclass(frozen=True)
+class Credentials:
+    """The two logins of the server: the application's and the one that stops it and grants rights."""
+
+    app_password: str
+    admin_password: str
+
+    @staticmethod
+    def new() -> Credentials:
+        """Random passwords of 190 bits, in characters that need no quoting."""
+        return Credentials(secrets.token_hex(24), secrets.token_hex(24))
+
+
+@dataclass(frozen=True)
+class Folder:
+    """`<home>/db`: `data/` and `run/` belong to the server's account, the rest to the user.
+
+    data/              the tables (0700)
+    run/server.log     what the server says
+    run/s.sock         its socket
+    credentials.json   passwords (0600)
+    server.json        port, process number, version
+    lock               held while a command starts or stops the server
+    """
+
+    path: Path
+
+    @staticmethod
+    def default() -> Folder:
+        """The folder in `settings.home_dir()`."""
+        return Folder(settings.home_dir() / "db")
+
+    @property
+    def data(self) -> Path:
+        return self.path / "data"
+
+    @property
+    def run(self) -> Path:
+        return self.path / "run"
+
+    @property
+    def tmp(self) -> Path:
+        return self.path / "tmp"
+
+    @property
+    def log(self) -> Path:
+        return self.run / "server.log"
+
+    @property
+    def credentials_file(self) -> Path:
+        return self.path / "credentials.json"
+
+    @property
+    def state_file(self) -> Path:
+        return self.path / "server.json"
+
+    @property
+    def lock_file(self) -> Path:
+        return self.path / "lock"
+
+    def initialised(self) -> bool:
+        """True once the first start has completed its set-up (the credentials are written last)."""
+        return self.credentials_file.exists()
+
+    def create(self, account: Account) -> None:
+        """Make the folders, with the server's two given to its account.
+
+        Raises
+        ------
+        PblError
+            DB_UNAVAILABLE when they cannot be made, or when `account` cannot enter them.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise folder_error(self.path, error) from error
+        check_enterable(self.path, account)
+        try:
+            for folder, mode in ((self.data, 0o700), (self.run, 0o755), (self.tmp, 0o700)):
+                folder.mkdir(exist_ok=True)
+                account.own(folder)
+                folder.chmod(mode)
+        except OSError as error:
+            raise folder_error(self.path, error) from error
+
+    @contextmanager
+    def locked(self, timeout_s: float = 120.0) -> Iterator[None]:
+        """Hold the folder's lock; another command that starts or stops the server waits.
+
+        Raises
+        ------
+        PblError
+            DB_UNAVAILABLE when another command holds it for longer than `timeout_s`.
+        """
+        try:
+            handle = os.open(self.lock_file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise folder_error(self.path, error) from error
+        try:
+            deadline = time.monotonic() + timeout_s
+            while True:
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError as error:
+                    if time.monotonic() > deadline:
+                        raise PblError(
+                            "DB_UNAVAILABLE",
+                            key=self.path,
+                            found=f"another command has been starting or stopping the server for {timeout_s:.0f} s",
+                            expected="one command at a time",
+                            next_step="look for a `pbl db` command that hangs, end it and try again",
+                        ) from error
+                    time.sleep(0.05)
+            yield
+        finally:
+            os.close(handle)
+
+    def credentials(self) -> Credentials:
+        """The stored passwords.
+
+        Raises
+        ------
+        PblError
+            DB_NOT_RUNNING when the database was never set up; DB_REFUSED when the file may not be read.
+        """
+        try:
+            return Credentials(**json.loads(self.credentials_file.read_text()))
+        except FileNotFoundError as error:
+            raise PblError(
+                "DB_NOT_RUNNING",
+                key=self.path,
+                found="there is no database in this folder yet",
+                expected="a database that was started once",
+                next_step="pbl db start",
+            ) from error
+        except PermissionError as error:
+            raise PblError(
+                "DB_REFUSED",
+                key=self.credentials_file,
+                found="the file with the passwords belongs to another user",
+                expected="the user who set up the database",
+                next_step="run the command as that user, or set PBL_HOME to a folder of your own",
+            ) from error
+
+    def write_credentials(self, credentials: Credentials) -> None:
+        """Store the passwords, readable by their owner only from the first byte on."""
+        _write(self.credentials_file, asdict(credentials), 0o600)
+
+    def state(self) -> dict[str, Any]:
+        """`port`, `pid`, `version` and the schema prefixes the application may use; empty before the first start."""
+        try:
+            return json.loads(self.state_file.read_text())
+        except FileNotFoundError:
+            return {}
+
+    def write_state(self, **changes: Any) -> dict[str, Any]:
+        """Change some entries of the state, keeping the others."""
+        state = {**self.state(), **changes}
+        _write(self.state_file, state, 0o644)
+        return state
+
+    def log_tail(self, lines: int = 12) -> str:
+        """The last lines the server wrote."""
+        try:
+            return "\n".join(self.log.read_text(errors="replace").splitlines()[-lines:])
+        except OSError as error:
+            return f"(no log: {error})"
+
+
+def folder_error(path: Path, error: OSError) -> PblError:
+    """The coded error for a folder that cannot be written."""
+    return PblError(
+        "DB_UNAVAILABLE",
+        key=path,
+        found=f"the folder cannot be used: {error.strerror or error} ({error.filename or path})",
+        expected="a folder of your own on a local disk with a few hundred MB free",
+        next_step="free some space, or set PBL_HOME to another folder",
+    )
+
+
+def _write(path: Path, content: dict[str, Any], mode: int) -> None:
+    # Written aside and renamed, so that a reader, or a power cut, never meets half a file.
+    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with os.fdopen(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "w") as out:
+            os.fchmod(out.fileno(), mode)
+            json.dump(content, out, indent=1)
+            out.flush()
+            os.fsync(out.fileno())
+        aside.replace(path)
+    except OSError as error:
+        aside.unlink(missing_ok=True)
+        raise folder_error(path.parent, error) from error
