@@ -12,6 +12,8 @@ CODES: dict[str, str] = {
     "VIDEO_NOT_A_VIDEO": "no decoder recognises the file, or it holds no video stream",
     "VIDEO_NO_FRAMES": "the container opens but not one frame decodes",
     "VIDEO_TRUNCATED": "decoding breaks off before the end the container announces",
+    "VIDEO_DAMAGED": "frames inside the recording do not decode cleanly, or the picture size changes",
+    "VIDEO_TIMESTAMPS": "the frames carry no usable time stamps",
     "VIDEO_CHANGED": "the file's bytes are no longer those that were registered",
     "TRACK_NO_PERSON": "no person was found in the video",
     "TRACK_TOO_SHORT": "the person is in view for less than the shortest time that can be fitted",

@@ -19,6 +19,17 @@ class VideoInfo:
         1 / median frame interval; a description only: no computation may use it instead of `time_s`.
     n_frames_announced
         What the container's header claims (0 when it says nothing). What decodes counts.
+    rotation_deg
+        How far the stored picture is turned clockwise to stand upright: 0, 90, 180 or 270.
+    duration_s
+        From the first frame to the end of the last (its length taken as the median interval); NaN for a single frame
+        whose container announces no rate, as is `fps`.
+    variable_frame_rate
+        True when an interval differs from the median by more than a tenth and more than the stamps' own rounding.
+    recorded_utc
+        "2026-01-31T09:15:00Z", or None when the file does not say.
+    notes
+        What a reader should know and no field says: frames an edit list hides, stamps that repeat, a mirrored picture.
     """
 
     path: str
@@ -39,6 +50,7 @@ class VideoInfo:
     recorded_utc: str | None
     make: str | None
     model: str | None
+    notes: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
