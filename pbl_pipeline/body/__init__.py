@@ -1,0 +1,26 @@
+"""The 40-degree-of-freedom body: model, marker sets, scaling and forward kinematics.
+
+Frames: the body frames are OpenSim's (x forward, y up, z right), the world has z up; at `qpos = 0` the body stands
+upright and looks along world +x, with its right side towards world -y.
+"""
+
+from pbl_pipeline import _jax_setup
+
+# Before anything below makes an array: JAX reads the cache's folder once.
+_jax_setup.configure()
+
+from pbl_pipeline.body._kinematics import body_poses, marker_positions  # noqa: E402
+from pbl_pipeline.body._markers import MARKER_SETS, MarkerSet, load_marker_set, marker_set  # noqa: E402
+from pbl_pipeline.body._model import SCALE_NAMES, Body, load_body  # noqa: E402
+
+__all__ = [
+    "MARKER_SETS",
+    "SCALE_NAMES",
+    "Body",
+    "MarkerSet",
+    "body_poses",
+    "load_body",
+    "load_marker_set",
+    "marker_positions",
+    "marker_set",
+]

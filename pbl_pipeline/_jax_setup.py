@@ -1,0 +1,62 @@
+"""JAX and MJX as this project uses them: compiled programs kept on disk, single precision, no noise on import."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import io
+import os
+import sys
+import warnings
+
+import jax
+
+from pbl_pipeline import settings
+
+#: Programs that compile faster than this are not worth a file.
+MIN_COMPILE_SECONDS = 0.3
+
+
+@functools.cache
+def configure() -> None:
+    """Set JAX's persistent compilation cache and import MJX quietly. Call before the first array; idempotent.
+
+    The cache lies in `jax/` of the user's cache folder. JAX's own environment variables win: what
+    `JAX_COMPILATION_CACHE_DIR` or `JAX_PERSISTENT_CACHE_*` say, or a program set in `jax.config` before, stays.
+    Precision stays JAX's default, float32.
+    """
+    if jax.config.jax_compilation_cache_dir is None:
+        try:
+            folder = settings.cache_dir() / "jax"
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            # A cache only saves time: a read-only home is no reason to refuse the work, but worth a word.
+            warnings.warn(f"compiled programs are not kept, every start compiles anew: {error}", stacklevel=2)
+        else:
+            jax.config.update("jax_compilation_cache_dir", str(folder))
+    _default("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)
+    # -1 keeps small programs too; the limit is meant for file systems on which small files are slow.
+    _default("jax_persistent_cache_min_entry_size_bytes", -1)
+    _import_mjx()
+
+
+def _default(option: str, value: float) -> None:
+    if option.upper() not in os.environ:
+        jax.config.update(option, value)
+
+
+def _import_mjx() -> None:
+    # MJX prints two lines on stdout when NVIDIA's optional warp is absent, which would end up in the output of every
+    # command. Only those lines are dropped; whatever else is printed meanwhile is passed on.
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(printed):
+            import mujoco.mjx  # noqa: F401
+    finally:
+        for line in printed.getvalue().splitlines(keepends=True):
+            if not _is_absent_warp(line):
+                sys.stdout.write(line)
+
+
+def _is_absent_warp(line: str) -> bool:
+    return line.startswith("Failed to import ") and line.rstrip().endswith("No module named 'warp'")

@@ -1,0 +1,135 @@
+"""Marker sets: which points of the body are observed. Data, not code: a table of (name, body, x, y, z)."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pbl_pipeline.body._model import load_body
+from pbl_pipeline.errors import PblError
+
+_DATA = Path(__file__).parent / "data"
+_COLUMNS = ("name", "body", "x", "y", "z")
+
+#: Names of the marker sets that ship with the project.
+MARKER_SETS: tuple[str, ...] = tuple(sorted(p.stem.removeprefix("markers_") for p in _DATA.glob("markers_*.csv")))
+
+
+@dataclasses.dataclass(frozen=True)
+class MarkerSet:
+    """J named points fixed to bodies.
+
+    Attributes
+    ----------
+    name
+        "blazepose_33" and so on; the stem of the file for a lab's own table.
+    names, body_names
+        J marker names (all different) and the body each is fixed to.
+    body_index : (J,) int
+        Index into `Body.body_names`.
+    position_m : (J, 3) float64
+        Position on the unscaled body, in the body's frame (x forward, y up, z right), metres.
+    """
+
+    name: str
+    names: tuple[str, ...]
+    body_names: tuple[str, ...]
+    body_index: np.ndarray
+    position_m: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def check_names(self, names: Sequence[str]) -> None:
+        """Raise `PblError` MARKER_SET_UNKNOWN unless `names` are this set's, in this order."""
+        if tuple(names) == self.names:
+            return
+        missing = [n for n in self.names if n not in set(names)]
+        extra = [n for n in names if n not in set(self.names)]
+        found = f"missing: {', '.join(missing) or 'none'}; unknown: {', '.join(extra) or 'none'}"
+        raise PblError(
+            "MARKER_SET_UNKNOWN",
+            found=found if missing or extra else "the names in another order",
+            expected=f"the {len(self.names)} names of {self.name} in its order",
+            next_step="rename or reorder the markers, or pass the marker set the file was made with",
+            key=self.name,
+        )
+
+
+@functools.cache
+def marker_set(name: str) -> MarkerSet:
+    """A marker set that ships with the project. Raises `PblError` MARKER_SET_UNKNOWN."""
+    if name not in MARKER_SETS:
+        raise PblError(
+            "MARKER_SET_UNKNOWN",
+            found=f"{name!r}",
+            expected=f"one of {', '.join(MARKER_SETS)}",
+            next_step="choose one of these, or load a lab's own table with load_marker_set(path)",
+            key=name,
+        )
+    return load_marker_set(_DATA / f"markers_{name}.csv", name=name)
+
+
+def load_marker_set(path: str | Path, name: str | None = None) -> MarkerSet:
+    """Read a table of markers: CSV with the columns name, body, x, y, z in metres in the body's frame.
+
+    Lines that start with `#` are comments, further columns are ignored. `name` is the file's stem unless given.
+
+    Raises
+    ------
+    PblError
+        FILE_FORMAT: unreadable, a column missing, a number that is none, a name twice, a body the model lacks, no rows.
+    """
+    path = Path(path)
+    known = load_body().body_names
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise _format_error(path, str(error)) from error
+    numbered = [(i, t) for i, t in enumerate(text.splitlines(), 1) if t.strip() and not t.lstrip().startswith("#")]
+    table = csv.DictReader((t for _, t in numbered), skipinitialspace=True)
+    absent = [c for c in _COLUMNS if c not in (table.fieldnames or ())]
+    if absent:
+        raise _format_error(path, f"no column {', '.join(absent)}")
+    names: list[str] = []
+    bodies: list[str] = []
+    positions: list[list[float]] = []
+    for (number, _), row in zip(numbered[1:], table, strict=False):
+        where = f"line {number}"
+        marker, body = (row["name"] or "").strip(), (row["body"] or "").strip()
+        if not marker or marker in names:
+            raise _format_error(path, f"{where}: {'no name' if not marker else f'marker {marker} a second time'}")
+        if body not in known:
+            raise _format_error(path, f"{where}: body {body!r}", f"one of {', '.join(known)}")
+        try:
+            position = [float(row[c]) for c in "xyz"]
+        except (TypeError, ValueError) as error:
+            raise _format_error(path, f"{where}: {error}") from error
+        # Two metres from a body's origin is no place on a person: most often a table in millimetres.
+        if not np.all(np.isfinite(position)) or np.max(np.abs(position)) > 2:
+            raise _format_error(path, f"{where}: position {position}")
+        names.append(marker)
+        bodies.append(body)
+        positions.append(position)
+    if not names:
+        raise _format_error(path, "no markers")
+    index = np.array([known.index(b) for b in bodies], np.int32)
+    position_m = np.array(positions, np.float64)
+    index.setflags(write=False)
+    position_m.setflags(write=False)
+    return MarkerSet(name or path.stem, tuple(names), tuple(bodies), index, position_m)
+
+
+def _format_error(path: Path, found: str, expected: str = "CSV with name, body, x, y, z in metres") -> PblError:
+    return PblError(
+        "FILE_FORMAT",
+        found=found,
+        expected=expected,
+        next_step="compare with pbl_pipeline/body/data/markers_blazepose_33.csv",
+        key=path,
+    )

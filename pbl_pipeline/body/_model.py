@@ -1,0 +1,121 @@
+"""The body as data: the MJCF read by C MuJoCo and put on the JAX device."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+_MJCF = Path(__file__).parent / "data" / "pbl_body_40.xml"
+_GROUP_PREFIX = "scale_group/"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Body:
+    """A body of B = 21 bodies and Q = 40 degrees of freedom. Index 0 is the pelvis: MuJoCo's world is left out.
+
+    Attributes
+    ----------
+    mj_model, mjx_model, mjx_data
+        The model for C MuJoCo and for MJX, and an empty state of the latter to start kinematics from.
+    joint_names : Q names
+        OpenSim's, in the order of `qpos`. The slides are pelvis_tx (forward), pelvis_tz (right), pelvis_ty (up).
+    joint_range_rad : (Q, 2)
+        Limits, radians (metres for slides); -inf, inf where unlimited.
+    body_names : B names
+    parent_index : (B,)
+        Index of the parent in `body_names`; -1 for the pelvis.
+    scale_index : (B,)
+        Which of `SCALE_NAMES` scales the body.
+    sha256, name, version
+        Hash of the MJCF's bytes, and what the MJCF calls itself.
+    """
+
+    mj_model: mujoco.MjModel
+    mjx_model: mjx.Model
+    mjx_data: mjx.Data
+    joint_names: tuple[str, ...]
+    joint_range_rad: np.ndarray
+    body_names: tuple[str, ...]
+    parent_index: np.ndarray
+    scale_names: tuple[str, ...]
+    scale_index: np.ndarray
+    sha256: str
+    name: str
+    version: str
+
+
+@functools.cache
+def load_body() -> Body:
+    """The 40-degree-of-freedom body (cached)."""
+    xml, model = _c_model()
+    texts = _texts(model)
+    # Whoever asks first may be tracing: what is cached must be arrays, not that trace's constants.
+    with jax.ensure_compile_time_eval():
+        mjx_model = mjx.put_model(model, impl="jax")
+        mjx_data = mjx.make_data(model, impl="jax")
+    limited = np.asarray(model.jnt_limited, bool)[:, None]
+    names = tuple(model.body(i).name for i in range(1, model.nbody))
+    return Body(
+        mj_model=model,
+        mjx_model=mjx_model,
+        mjx_data=mjx_data,
+        joint_names=tuple(model.joint(i).name for i in range(model.njnt)),
+        joint_range_rad=_frozen(np.where(limited, model.jnt_range, np.array([-np.inf, np.inf]))),
+        body_names=names,
+        parent_index=_frozen(np.asarray(model.body_parentid[1:], np.int32) - 1),
+        scale_names=SCALE_NAMES,
+        scale_index=_frozen(_scale_index(names, _scale_groups(texts))),
+        sha256=hashlib.sha256(xml).hexdigest(),
+        name=_name(model),
+        version=texts["version"],
+    )
+
+
+@functools.cache
+def _c_model() -> tuple[bytes, mujoco.MjModel]:
+    xml = _MJCF.read_bytes()
+    return xml, mujoco.MjModel.from_xml_string(xml.decode())
+
+
+def _scale_groups(texts: dict[str, str]) -> dict[str, str]:
+    return {k.removeprefix(_GROUP_PREFIX): v for k, v in texts.items() if k.startswith(_GROUP_PREFIX)}
+
+
+def _scale_index(body_names: tuple[str, ...], groups: dict[str, str]) -> np.ndarray:
+    index = np.full(len(body_names), list(groups.values()).index("*"), np.int32)
+    for i, members in enumerate(groups.values()):
+        for member in members.split():
+            if member != "*":
+                index[body_names.index(member)] = i
+    return index
+
+
+def _texts(model: mujoco.MjModel) -> dict[str, str]:
+    # In the order of the MJCF, which is the order of the scale vector.
+    raw = bytes(model.text_data)
+    texts = {}
+    for i in range(model.ntext):
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_TEXT, i)
+        texts[name] = raw[model.text_adr[i] : model.text_adr[i] + model.text_size[i]].rstrip(b"\0").decode()
+    return texts
+
+
+def _name(model: Any) -> str:
+    return bytes(model.names).split(b"\0", 1)[0].decode()
+
+
+def _frozen(array: np.ndarray) -> np.ndarray:
+    array.setflags(write=False)
+    return array
+
+
+#: The entries of `scale`, as the MJCF lists them: overall first, then the groups.
+SCALE_NAMES: tuple[str, ...] = tuple(_scale_groups(_texts(_c_model()[1])))
