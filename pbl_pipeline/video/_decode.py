@@ -1,0 +1,315 @@
+"""One pass over the frames of a video file, shared by `probe` and `read_frames` so that both count the same frames.
+
+What counts as a frame: it decodes without a flaw and its presentation time is later than the one before it. Frames
+that an edit list cuts away do not count (a player does not show them), whatever the header announces. When the pass
+reaches the end, `Decoder` compares what came out with what the container promised; a recording that lost its end, or
+pictures in its middle, raises instead of passing as a shorter one.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+
+import av
+from av.container import InputContainer
+
+from pbl_pipeline.errors import PblError
+
+from ._structure import family, missing_end
+
+#: Containers that phones, cameras and converters write. Pictures, texts and playlists (which could name other files)
+#: are not videos even where FFmpeg would open them.
+_CONTAINERS = "mov,matroska,avi,mpegts,mpeg,asf,flv,ogg,mxf,ivf,h264,hevc"
+_OPTIONS = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"}
+
+#: Share of frames whose stamp may repeat or run backwards and be left out; more means the stamps cannot be trusted.
+_MAX_UNORDERED = 0.01
+
+_EXPECTED = "an MP4, MOV, WebM, MKV or AVI video as the phone recorded it"
+_COPY_AGAIN = "copy the file from the phone or camera again and compare the sizes in bytes"
+
+
+def check_file(path: str | Path) -> Path:
+    """The path, if it is a file with bytes in it.
+
+    Raises
+    ------
+    PblError
+        VIDEO_MISSING, VIDEO_EMPTY.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise PblError(
+            "VIDEO_MISSING",
+            found="a folder of that name" if path.is_dir() else "no file of that name",
+            expected="the path of a video file",
+            next_step="check the spelling and that the disk is mounted",
+            key=path,
+        )
+    try:
+        with path.open("rb") as file:
+            first = file.read(1)
+    except OSError as error:
+        raise PblError(
+            "VIDEO_MISSING",
+            found=f"the file cannot be read ({error.strerror})",
+            expected="a file that this account may read",
+            next_step="change the file's permissions or copy it to a folder of your own",
+            key=path,
+        ) from error
+    if not first:
+        raise PblError("VIDEO_EMPTY", found="0 bytes", expected=_EXPECTED, next_step=_COPY_AGAIN, key=path)
+    return path
+
+
+def decode_threads() -> int:
+    """Threads for decoding: the cores this process may use, at most 8 (more brings nothing and costs memory)."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, 8)
+
+
+class Decoder:
+    """Iterate over `(pts, frame)` once; `time_base` turns a stamp into seconds, `notes` fills up on the way."""
+
+    def __init__(self, path: Path, threads: int | None = None) -> None:
+        self.path = path
+        self.container = _open(path)
+        self.stream = self._pick_stream()
+        self.stream.thread_type = "AUTO"
+        self.stream.codec_context.thread_count = threads or decode_threads()
+        self.time_base: Fraction = self.stream.time_base or Fraction(1, av.time_base)
+        self.notes: list[str] = []
+        self.n_frames = 0
+        self._first_pts: int | None = None
+        self._last_pts: int | None = None
+        self._size: tuple[int, int] | None = None
+        self._n_unordered = self._n_damaged = self._n_damaged_at_start = self._n_without_pts = 0
+        self._n_packets = self._n_hidden = 0
+        self._max_packet_pts: int | None = None
+        self._last_packet_corrupt = False
+        self._end_s = 0.0
+        self._demux_error: str | None = None
+
+    def __enter__(self) -> Decoder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.container.close()
+
+    @property
+    def n_announced(self) -> int:
+        """Frames the header claims; 0 when it says nothing."""
+        return self.stream.frames
+
+    def __iter__(self) -> Iterator[tuple[int, av.VideoFrame]]:
+        for packet in self._packets():
+            try:
+                frames = self.stream.decode(packet)
+            except av.FFmpegError:
+                self._count_damage()
+                continue
+            for frame in frames:
+                pts = self._accept(frame)
+                if pts is not None:
+                    yield pts, frame
+        self._check()
+
+    def _packets(self) -> Iterator[av.Packet]:
+        """Every packet of the video stream; those of the other streams only tell how long the file is."""
+        packets = self.container.demux()
+        while True:
+            try:
+                packet = next(packets, None)
+            except av.FFmpegError as error:
+                self._demux_error = error.strerror
+                packet = None
+            if packet is None:
+                break
+            if packet.size and packet.pts is not None and packet.time_base is not None:
+                self._end_s = max(self._end_s, float((packet.pts + (packet.duration or 0)) * packet.time_base))
+            if packet.stream.index != self.stream.index:
+                continue
+            if packet.size:
+                self._n_packets += 1
+                # A corrupt packet counts as damage when another follows it; the last one is a lost end.
+                if self._last_packet_corrupt:
+                    self._count_damage()
+                self._last_packet_corrupt = packet.is_corrupt
+                if packet.is_discard:
+                    self._n_hidden += 1
+                elif packet.pts is not None:
+                    self._max_packet_pts = max(packet.pts, self._max_packet_pts or packet.pts)
+            yield packet
+        if self._demux_error is not None:
+            # The demuxer's own flush packet never came: ask for the frames the decoder still holds.
+            flush = av.Packet()
+            flush.stream = self.stream
+            yield flush
+
+    def _count_damage(self) -> None:
+        # Before the first whole picture, a broken one is a recording cut at its start by an editor: nothing is lost.
+        if self.n_frames:
+            self._n_damaged += 1
+        else:
+            self._n_damaged_at_start += 1
+
+    def _accept(self, frame: av.VideoFrame) -> int | None:
+        """The frame's stamp when it counts, else None."""
+        if frame.is_corrupt:
+            self._count_damage()
+            return None
+        pts = frame.pts
+        if pts is None:  # AVI has no presentation stamps; its decoding stamps are the frame numbers
+            pts = frame.dts
+            self._n_without_pts += 1
+        if pts is None:
+            raise self._time_stamp_error("a frame without a time stamp")
+        if self._last_pts is not None and pts <= self._last_pts:
+            self._n_unordered += 1
+            return None
+        size = (frame.width, frame.height)
+        if self._size is not None and size != self._size:
+            raise PblError(
+                "VIDEO_DAMAGED",
+                found=f"the picture is {self._size[0]}x{self._size[1]} px, but {size[0]}x{size[1]} at frame {self.n_frames}",
+                expected="one picture size for the whole recording",
+                next_step="cut the recording where the size changes and process the pieces as videos of their own",
+                key=self.path,
+            )
+        self._size = size
+        if self._first_pts is None:
+            self._first_pts = pts
+        self._last_pts = pts
+        self.n_frames += 1
+        return pts
+
+    # --- the end of the pass
+
+    def _check(self) -> None:
+        if self.n_frames == 0:
+            lost = missing_end(self.path)
+            raise PblError(
+                "VIDEO_NO_FRAMES",
+                found=f"0 frames of {self._n_packets} packets decode" + (f"; {lost}" if lost else ""),
+                expected="at least one frame that decodes",
+                next_step=_COPY_AGAIN + "; if it does not play elsewhere either, it has to be recorded again",
+                key=self.path,
+            )
+        lost = self._lost_end()
+        if lost is not None:
+            seconds = float((self._last_pts - self._first_pts) * self.time_base)  # type: ignore[operator]
+            raise PblError(
+                "VIDEO_TRUNCATED",
+                found=f"{self.n_frames} frames ({seconds:.2f} s) decode, but {lost}",
+                expected="a recording that is whole to its end",
+                next_step=_COPY_AGAIN + "; if the original is cut too, save the part that plays as a new file "
+                '("ffmpeg -i cut.mp4 -c:v libx264 part.mp4") and process that',
+                key=self.path,
+            )
+        if self._n_damaged:
+            raise PblError(
+                "VIDEO_DAMAGED",
+                found=f"{self._n_damaged} pictures inside the recording do not decode cleanly ({self.n_frames} do)",
+                expected="a recording without damaged pictures (those after one are drawn from it)",
+                next_step=_COPY_AGAIN + "; if the original is damaged too, cut out an undamaged part",
+                key=self.path,
+            )
+        if self._n_unordered > _MAX_UNORDERED * self.n_frames:
+            raise self._time_stamp_error(
+                f"{self._n_unordered} of {self.n_frames + self._n_unordered} frames whose stamp repeats or runs backwards"
+            )
+        self._note()
+
+    def _lost_end(self) -> str | None:
+        lost = missing_end(self.path)
+        if lost is not None:
+            return lost
+        if self._demux_error is not None:
+            return f"reading stops there: {self._demux_error}"
+        if self._last_packet_corrupt:
+            return "the last packet of the file is incomplete"
+        if self._max_packet_pts is not None and self._max_packet_pts > self._last_pts:  # type: ignore[operator]
+            beyond = float((self._max_packet_pts - self._last_pts) * self.time_base)  # type: ignore[operator]
+            return f"the pictures of the last {beyond:.2f} s do not decode"
+        if self._n_packets < self.n_announced:
+            # An edit list also leaves out packets beyond its end; without it every packet of the file comes.
+            n_stored = _count_packets(self.path, self.stream.index)
+            if n_stored < self.n_announced:
+                return f"the container announces {self.n_announced} frames and holds {n_stored}"
+            self._n_hidden = n_stored - self.n_frames
+        if not self.n_announced and self.container.duration is not None:
+            # Only where no count is announced: the length may be rounded, or that of another stream.
+            start_s = (self.container.start_time or 0) / av.time_base
+            missing_s = self.container.duration / av.time_base - (self._end_s - start_s)
+            if missing_s > 0.5:
+                return f"the container announces {missing_s:.2f} s more"
+        return None
+
+    def _note(self) -> None:
+        if self._n_hidden:
+            self.notes.append(f"{self._n_hidden} frames are hidden by the file's edit list and do not count")
+        if self._n_damaged_at_start:
+            self.notes.append(f"{self._n_damaged_at_start} pictures before the first whole one do not count")
+        if self._n_unordered:
+            self.notes.append(f"{self._n_unordered} frames whose time stamp repeats or runs backwards do not count")
+        if self._n_without_pts:
+            self.notes.append(f"{self._n_without_pts} frames have no presentation stamp: their decoding stamp is used")
+
+    def _time_stamp_error(self, found: str) -> PblError:
+        return PblError(
+            "VIDEO_TIMESTAMPS",
+            found=found,
+            expected="a presentation time for each frame, each later than the one before",
+            next_step="use the file the camera wrote; a converter that keeps time stamps writes MP4 or MKV",
+            key=self.path,
+        )
+
+    def _pick_stream(self) -> av.VideoStream:
+        for stream in self.container.streams.video:
+            cover = stream.disposition & stream.disposition.__class__.attached_pic
+            if not cover and stream.codec_context is not None:
+                return stream
+        kinds = sorted({s.type for s in self.container.streams})
+        unknown = any(s.type == "video" and s.codec_context is None for s in self.container.streams)
+        self.container.close()
+        raise PblError(
+            "VIDEO_NOT_A_VIDEO",
+            found="a video stream that no decoder here reads"
+            if unknown
+            else f"a file with {', '.join(kinds) or 'no'} streams and no video",
+            expected=_EXPECTED,
+            next_step="choose the file that holds the pictures; convert it to MP4 (H.264) if its codec is unusual",
+            key=self.path,
+        )
+
+
+def _open(path: Path) -> InputContainer:
+    try:
+        return av.open(str(path), options=_OPTIONS, metadata_errors="replace")
+    except av.FFmpegError as error:
+        lost = missing_end(path) if family(path) else None
+        if lost is None:
+            raise PblError(
+                "VIDEO_NOT_A_VIDEO",
+                found=f"no decoder recognises the file's {path.stat().st_size} bytes ({error.strerror})",
+                expected=_EXPECTED,
+                next_step="check that it is the video itself, not a link, a preview or a text, and copy it again",
+                key=path,
+            ) from error
+        raise PblError(
+            "VIDEO_TRUNCATED",
+            found=f"{lost}, so nothing of it can be read",
+            expected="a recording that is whole to its end",
+            next_step=_COPY_AGAIN + "; a recording that the phone itself could not finish (battery, storage) has to be "
+            "repaired with a tool for that or recorded again",
+            key=path,
+        ) from error
+
+
+def _count_packets(path: Path, index: int) -> int:
+    """Packets of one stream that are whole, as stored, whatever an edit list says."""
+    with av.open(str(path), options=_OPTIONS | {"ignore_editlist": "1"}) as container:
+        return sum(1 for p in container.demux(container.streams[index]) if p.size and not p.is_corrupt)
