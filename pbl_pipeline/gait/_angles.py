@@ -1,0 +1,110 @@
+"""The angles that gait people look at, per side, in degrees and with their signs."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pbl_pipeline.fit import TrialFit
+
+from ._feet import feet_from_fit
+from .events import RIGHT
+
+#: name -> unit, direction of the positive sign. All are per side.
+ANGLE_NAMES: dict[str, str] = {
+    "hip_flexion": "deg, flexion positive",
+    "hip_adduction": "deg, adduction positive",
+    "hip_rotation": "deg, internal rotation positive",
+    "knee_flexion": "deg, flexion positive (OpenSim's knee_angle with the sign turned)",
+    "ankle_dorsiflexion": "deg, dorsiflexion positive (ankle_angle)",
+    "pelvis_tilt": "deg, anterior tilt positive, against the horizontal in the walking direction",
+    "pelvis_obliquity": "deg, the side in question up positive",
+    "pelvis_rotation": "deg, the side in question ahead positive, against the walking direction",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class AngleSeries:
+    """Angles over a trial: `time_s` (T,), `left` and `right` map `ANGLE_NAMES` to (T,) degrees, NaN where unseen."""
+
+    time_s: np.ndarray
+    left: dict[str, np.ndarray]
+    right: dict[str, np.ndarray]
+
+    def of_side(self, side: str) -> dict[str, np.ndarray]:
+        """The angles of "left" or "right"."""
+        return self.right if side == RIGHT else self.left
+
+
+def angle_series(fit: TrialFit) -> AngleSeries:
+    """Angles of a fit. Hip, knee and ankle are the model's own; the pelvis is decomposed anew (`pelvis_angles`).
+
+    Raises `PblError` GAIT_INPUT (see `feet_from_fit`).
+    """
+    column = {name: i for i, name in enumerate(fit.joint_names)}
+    degrees = np.degrees(np.asarray(fit.qpos, float))
+    feet = feet_from_fit(fit)
+    tilt, obliquity, rotation = pelvis_angles(pelvis_rotation(fit), feet.forward).T
+    sides = {}
+    for side, letter, sign in (("left", "l", -1.0), ("right", "r", 1.0)):
+        sides[side] = {
+            "hip_flexion": degrees[:, column[f"hip_flexion_{letter}"]],
+            "hip_adduction": degrees[:, column[f"hip_adduction_{letter}"]],
+            "hip_rotation": degrees[:, column[f"hip_rotation_{letter}"]],
+            "knee_flexion": -degrees[:, column[f"knee_angle_{letter}"]],
+            "ankle_dorsiflexion": degrees[:, column[f"ankle_angle_{letter}"]],
+            "pelvis_tilt": tilt,
+            "pelvis_obliquity": sign * obliquity,
+            "pelvis_rotation": sign * rotation,
+        }
+    return AngleSeries(np.asarray(fit.time_s, float), sides["left"], sides["right"])
+
+
+def pelvis_rotation(fit: TrialFit) -> np.ndarray:
+    """(T, 3, 3) rotation of the pelvis in the world; columns are its axes forward, up, right. NaN where unseen.
+
+    The pelvis joints turn about z (tilt), x (list) and y (rotation) in this order, in a frame that stands with a
+    fixed 90 deg about x in the z-up world.
+    """
+    column = [fit.joint_names.index(n) for n in ("pelvis_tilt", "pelvis_list", "pelvis_rotation")]
+    angles = np.asarray(fit.qpos, float)[:, column]
+    out = np.full((len(angles), 3, 3), np.nan)
+    seen = np.all(np.isfinite(angles), axis=1)
+    stand = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    if np.any(seen):
+        out[seen] = stand @ Rotation.from_euler("ZXY", angles[seen]).as_matrix()
+    return out
+
+
+def pelvis_angles(R_world_pelvis: np.ndarray, forward: np.ndarray) -> np.ndarray:  # noqa: N803  frames in the name
+    """Tilt, obliquity and rotation of the pelvis against the walking direction, in degrees.
+
+    The model's pelvis_tilt, pelvis_list and pelvis_rotation are turned about the axes of the world and so mean tilt
+    and obliquity only for a person who walks along world x. Here the orientation of the pelvis is taken in the frame of
+    the walking direction (forward, up, right) and decomposed there in the same order (tilt, obliquity, rotation,
+    body-fixed), so that the result does not depend on where the person walks.
+
+    Parameters
+    ----------
+    R_world_pelvis
+        (T, 3, 3), columns forward, up, right of the pelvis in a z-up world.
+    forward
+        (T, 3) unit horizontal heading.
+
+    Returns
+    -------
+    (T, 3)
+        tilt, anterior positive; obliquity, right side up positive; rotation, right side ahead positive.
+    """
+    up = np.broadcast_to([0.0, 0.0, 1.0], forward.shape)
+    heading = np.stack([forward, up, np.cross(forward, up)], axis=-1)
+    out = np.full(forward.shape, np.nan)
+    seen = np.all(np.isfinite(R_world_pelvis), axis=(1, 2)) & np.all(np.isfinite(forward), axis=1)
+    if np.any(seen):
+        local = np.swapaxes(heading[seen], 1, 2) @ R_world_pelvis[seen]
+        about_right, about_forward, about_up = Rotation.from_matrix(local).as_euler("ZXY", degrees=True).T
+        # About +right the front rises (posterior tilt); about +forward the right side sinks; about +up it goes ahead.
+        out[seen] = np.column_stack([-about_right, -about_forward, about_up])
+    return out

@@ -1,0 +1,116 @@
+"""Gait cycles between foot downs of one side, and the joint-angle curves over them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from pbl_pipeline.fit import TrialFit
+
+from ._angles import AngleSeries, angle_series
+from .events import FOOT_DOWN, LEFT, RIGHT, GaitEvent, GaitEvents
+
+#: Phases of the curves in percent of the cycle, both ends included.
+REPORT_PERCENT = np.linspace(0.0, 100.0, 51)
+#: Frames further apart than this inside a cycle leave it without curves.
+MAX_CURVE_GAP_S = 0.15
+
+
+@dataclasses.dataclass(frozen=True)
+class GaitCycle:
+    """One stride: foot down to the next foot down of the same side.
+
+    Times in seconds of the trial. In order: `start_s` (foot down), `opposite_foot_up_s`, `opposite_foot_down_s`,
+    `foot_up_s`, `end_s`. `number` counts the cycles of a trial in order of time, both sides together, from 0.
+    `used` is False for the cycles that touch the first or last step of their walking bout, `excluded` says why.
+    `curves` maps names of `ANGLE_NAMES` to (51,) degrees at 0, 2, ..., 100 % of the cycle; empty where there is
+    no fit or frames are missing (`curves_missing` says which).
+    """
+
+    trial: str
+    number: int
+    bout: int
+    side: str
+    start_s: float
+    opposite_foot_up_s: float
+    opposite_foot_down_s: float
+    foot_up_s: float
+    end_s: float
+    used: bool
+    excluded: str = ""
+    curves: dict[str, np.ndarray] = dataclasses.field(default_factory=dict, compare=False, repr=False)
+    curves_missing: str = ""
+
+    @property
+    def stride_time_s(self) -> float:
+        """Foot down to the next foot down of the same side."""
+        return self.end_s - self.start_s
+
+
+def find_cycles(
+    events: GaitEvents | Sequence[GaitEvent], fit: TrialFit | None = None, trial: str = ""
+) -> tuple[GaitCycle, ...]:
+    """All cycles whose four inner events are there in order, with curves where a fit is given.
+
+    First and last step of each bout are left out of the measures (Cotton et al.: "first and last step of a trial are
+    discarded"). A step is the time from one foot down to the next foot down of the other foot. So of a bout with
+    n foot downs, which has n - 1 steps and n - 2 cycles, the cycle that starts with the first foot down and the cycle
+    that ends with the last one are not used: n - 4 cycles remain, and they consist of exactly the n - 3 inner steps. Eight
+    steps in view leave 5 cycles. Cycles that are not used stay in the result with `used` False, so that both counts
+    can be shown.
+    """
+    found = events.events if isinstance(events, GaitEvents) else tuple(events)
+    name = trial or (fit.name if fit is not None else "")
+    series = angle_series(fit) if fit is not None else None
+    cycles = []
+    for bout in sorted({e.bout for e in found}):
+        inside = sorted((e for e in found if e.bout == bout), key=lambda e: e.time_s)
+        downs = [e for e in inside if e.event == FOOT_DOWN]
+        for k, start in enumerate(downs):
+            end = next((e for e in downs[k + 1 :] if e.side == start.side), None)
+            if end is None:
+                continue
+            inner = [e for e in inside if start.time_s < e.time_s < end.time_s]
+            other = RIGHT if start.side == LEFT else LEFT
+            if [(e.side, e.event) for e in inner] != [(other, "foot_up"), (other, "foot_down"), (start.side, "foot_up")]:
+                continue
+            reasons = []
+            if start is downs[0]:
+                reasons.append("first step of the bout")
+            if end is downs[-1]:
+                reasons.append("last step of the bout")
+            times = (start.time_s, *(e.time_s for e in inner), end.time_s)
+            cycles.append((bout, start.side, times, " and ".join(reasons)))
+    cycles.sort(key=lambda c: c[2][0])
+    out = []
+    for number, (bout, side, times, excluded) in enumerate(cycles):
+        curves, missing = cycle_curves(series, side, times[0], times[-1]) if series is not None else ({}, "no fit")
+        out.append(GaitCycle(name, number, bout, side, *times, not excluded, excluded, curves, missing))
+    return tuple(out)
+
+
+def cycle_curves(
+    series: AngleSeries, side: str, start_s: float, end_s: float, percent: np.ndarray = REPORT_PERCENT
+) -> tuple[dict[str, np.ndarray], str]:
+    """Curves of one side at `percent` of the time from `start_s` to `end_s`, in degrees, and why they are missing.
+
+    Interpolation is monotone cubic (PCHIP) between the frames' own time stamps. Frames missing for longer than
+    `MAX_CURVE_GAP_S` inside the cycle, or at its ends, give no curves.
+    """
+    table = series.of_side(side)
+    values = np.column_stack(list(table.values()))
+    seen = np.all(np.isfinite(values), axis=1)
+    time, values = series.time_s[seen], values[seen]
+    first = np.searchsorted(time, start_s, side="right") - 1
+    last = np.searchsorted(time, end_s, side="left")
+    if first < 0 or last >= len(time):
+        return {}, "the cycle reaches beyond the fitted frames"
+    if np.max(np.diff(time[first : last + 1])) > MAX_CURVE_GAP_S:
+        return {}, f"frames are missing for more than {MAX_CURVE_GAP_S:g} s"
+    part = slice(max(0, first - 2), last + 3)
+    at = start_s + percent / 100.0 * (end_s - start_s)
+    curves = PchipInterpolator(time[part], values[part], axis=0)(at)
+    return dict(zip(table, curves.T, strict=True)), ""

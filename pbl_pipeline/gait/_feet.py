@@ -1,0 +1,206 @@
+"""Where the feet are: heel, toe and pelvis over time, from a fit, from keypoints or from laboratory markers."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.keypoints import Keypoints
+
+from ._heading import heading_agreement, heading_from_hips
+
+#: Points of a marker set that are read: hips for pelvis and heading, heel and toe, each (left, right).
+_POINTS: dict[str, dict[str, tuple[str, str]]] = {
+    "blazepose_33": {
+        "hip": ("left_hip", "right_hip"),
+        "heel": ("left_heel", "right_heel"),
+        "toe": ("left_foot_index", "right_foot_index"),
+    },
+    # MeTRAbs' 17 joints end at the ankles: the ankle stands for heel and toe. What is lost: foot up is then the
+    # rearmost ankle, which comes before toe-off because the heel rises first.
+    "mpi_inf_3dhp_17": {
+        "hip": ("left_hip", "right_hip"),
+        "heel": ("left_ankle", "right_ankle"),
+        "toe": ("left_ankle", "right_ankle"),
+    },
+    "bml_movi_87": {
+        "hip": ("LHip", "RHip"),
+        "heel": ("LHeel", "RHeel"),
+        "toe": ("lfirstmetatarsal", "rfirstmetatarsal"),
+    },
+    # Laboratory markers; the anterior spines give the line of the hips.
+    "plug_in_gait": {"hip": ("LASI", "RASI"), "heel": ("LHEE", "RHEE"), "toe": ("LTOE", "RTOE")},
+}
+#: Marker sets that `feet_from_keypoints` and `feet_from_markers` understand.
+FOOT_MARKER_SETS = tuple(_POINTS)
+
+#: Heel in the frame of the calcaneus (x forward, y up, z right; metres, unscaled): the level of the heel marker of
+#: the body figures, in the middle of the foot. The toe is the origin of the toes body, the joint of the toes, so
+#: that a toe angle that no keypoint supports cannot move it.
+_HEEL_IN_CALCN_M = np.array([-0.01617, -0.00123, 0.0])
+_WORLD_UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclasses.dataclass(frozen=True)
+class FootTrajectories:
+    """Feet and pelvis of one trial. Frames without the person are NaN.
+
+    Attributes
+    ----------
+    time_s : (T,)
+    heel_m, toe_m : (T, 2, 3)
+        [left, right], metres (or any one unit: only ratios to the leg length are used).
+    pelvis_m : (T, 3)
+        Middle between the hips. May stand still (root-relative points): only positions relative to it are used.
+    forward : (T, 3)
+        Unit horizontal heading, the direction the pelvis faces, averaged over about a stride.
+    up : (3,)
+        Unit vertical. World: z. Camera frame without phone orientation: -y, which assumes a level camera.
+    confidence : (T, 2)
+        0..1 of each foot's points; NaN where the source states none (a fit).
+    source
+        "fit", "keypoints <marker set>", "markers <marker set>".
+    heading_agreement
+        Cosine between heading and displacement, weighted by the way covered; 1 = walks where the pelvis faces,
+        -1 = backwards or left and right exchanged; NaN where the pelvis does not travel or its position is relative.
+    """
+
+    time_s: np.ndarray
+    heel_m: np.ndarray
+    toe_m: np.ndarray
+    pelvis_m: np.ndarray
+    forward: np.ndarray
+    up: np.ndarray
+    confidence: np.ndarray
+    source: str
+    heading_agreement: float = float("nan")
+
+    def __post_init__(self) -> None:
+        n = len(self.time_s)
+        wanted = {"heel_m": (n, 2, 3), "toe_m": (n, 2, 3), "pelvis_m": (n, 3), "forward": (n, 3), "confidence": (n, 2)}
+        for name, shape in wanted.items():
+            if np.shape(getattr(self, name)) != shape:
+                raise _input_error(f"{name} has shape {np.shape(getattr(self, name))}", f"shape {shape}")
+        time = np.asarray(self.time_s, float)
+        if not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0):
+            raise _input_error("time stamps that are missing or do not increase", "strictly increasing seconds")
+
+
+def feet_from_fit(fit: TrialFit) -> FootTrajectories:
+    """Heel, toe joint and hip centres of the fitted body, world frame (z up).
+
+    Frames whose qpos is NaN stay NaN. Raises `PblError` GAIT_INPUT (no finite frame, time stamps out of order).
+    """
+    from pbl_pipeline.body import body_poses, load_body  # JAX loads only where a fit is read
+
+    body = load_body()
+    qpos = np.asarray(fit.qpos, float)
+    seen = np.flatnonzero(np.all(np.isfinite(qpos), axis=1))
+    if len(seen) == 0:
+        raise _input_error("a fit without one finite frame", "joint angles in at least some frames")
+    xpos, xmat = body_poses(body, qpos[seen].astype(np.float32), np.asarray(fit.scale, np.float32))
+    xpos, xmat = np.asarray(xpos, float), np.asarray(xmat, float)
+    index = {name: i for i, name in enumerate(body.body_names)}
+    hip, heel, toe = (np.full((len(qpos), 2, 3), np.nan) for _ in range(3))
+    for s, side in enumerate("lr"):
+        calcn = index[f"calcn_{side}"]
+        hip[seen, s] = xpos[:, index[f"femur_{side}"]]
+        toe[seen, s] = xpos[:, index[f"toes_{side}"]]
+        heel[seen, s] = xpos[:, calcn] + xmat[:, calcn] @ (_HEEL_IN_CALCN_M * _foot_scale(fit.scale, s))
+    confidence = np.full((len(qpos), 2), np.nan)
+    travels = fit.camera_motion == "static"
+    return _assemble(fit.time_s, hip, heel, toe, _WORLD_UP, confidence, "fit", travels)
+
+
+def feet_from_keypoints(keypoints: Keypoints) -> FootTrajectories:
+    """Feet from the 3D points of a detector.
+
+    With phone orientation the points are turned into the world frame (z up); without it they stay in the camera
+    frame and gravity is taken as -y of the camera, which assumes a level camera: 10 deg of tilt shorten the forward
+    movement by 2 % and leave the times of its extrema where they are. Root-relative points are as good as absolute
+    ones because the method is relative to the pelvis; only the check of the heading needs absolute ones.
+
+    Raises `PblError` GAIT_INPUT where the marker set has no feet or no 3D point was seen.
+    """
+    xyz = np.asarray(keypoints.xyz_cam_m, float)
+    up = np.array([0.0, -1.0, 0.0])
+    if keypoints.phone_time_s is not None and keypoints.phone_quat_wxyz is not None and len(keypoints.phone_time_s) > 1:
+        turns = Rotation.from_quat(np.asarray(keypoints.phone_quat_wxyz, float), scalar_first=True)
+        phone = np.asarray(keypoints.phone_time_s, float)
+        at = Slerp(phone, turns)(np.clip(keypoints.time_s, phone[0], phone[-1]))
+        xyz = np.einsum("tij,tkj->tki", at.as_matrix(), xyz)
+        up = _WORLD_UP
+    return _from_points(
+        np.asarray(keypoints.time_s, float),
+        keypoints.names,
+        keypoints.marker_set,
+        xyz,
+        np.asarray(keypoints.confidence, float),
+        up,
+        f"keypoints {keypoints.marker_set}",
+        travels=not keypoints.root_relative,
+    )
+
+
+def feet_from_markers(
+    time_s: np.ndarray,
+    names: Sequence[str],
+    marker_set: str,
+    xyz_world_m: np.ndarray,
+    confidence: np.ndarray | None = None,
+) -> FootTrajectories:
+    """Feet from laboratory markers (T, J, 3) in a world frame with z up. `confidence` (T, J) or None for unknown.
+
+    Raises `PblError` GAIT_INPUT as `feet_from_keypoints`.
+    """
+    xyz = np.asarray(xyz_world_m, float)
+    known = np.full(xyz.shape[:2], np.nan) if confidence is None else np.asarray(confidence, float)
+    return _from_points(
+        np.asarray(time_s, float), names, marker_set, xyz, known, _WORLD_UP, f"markers {marker_set}", travels=True
+    )
+
+
+def _from_points(time_s, names, marker_set, xyz, confidence, up, source, *, travels) -> FootTrajectories:
+    if marker_set not in _POINTS:
+        raise _input_error(f"marker set {marker_set!r}", f"one of {', '.join(FOOT_MARKER_SETS)}")
+    index = {name: i for i, name in enumerate(names)}
+    wanted = _POINTS[marker_set]
+    missing = [n for pair in wanted.values() for n in pair if n not in index]
+    if missing:
+        raise _input_error(f"no points named {', '.join(dict.fromkeys(missing))}", f"the names of {marker_set}")
+    columns = {part: [index[n] for n in pair] for part, pair in wanted.items()}
+    hip, heel, toe = (xyz[:, columns[part]] for part in ("hip", "heel", "toe"))
+    if not np.any(np.all(np.isfinite(np.concatenate([hip, heel, toe], axis=1)), axis=(1, 2))):
+        raise _input_error("no frame with hips and feet in 3D", "3D points (xyz) of hips and feet")
+    foot = np.minimum(confidence[:, columns["heel"]], confidence[:, columns["toe"]])
+    return _assemble(time_s, hip, heel, toe, up, foot, source, travels)
+
+
+def _assemble(time_s, hip, heel, toe, up, confidence, source, travels) -> FootTrajectories:
+    time = np.asarray(time_s, float)
+    pelvis = hip.mean(axis=1)
+    if np.any(np.diff(time) <= 0) or not np.all(np.isfinite(time)):
+        raise _input_error("time stamps that are missing or do not increase", "strictly increasing seconds")
+    forward = heading_from_hips(time, hip, up)
+    agreement = heading_agreement(time, pelvis, forward, up) if travels else float("nan")
+    return FootTrajectories(time, heel, toe, pelvis, forward, up, confidence, source, agreement)
+
+
+def _foot_scale(scale: np.ndarray, side: int) -> float:
+    from pbl_pipeline.body import SCALE_NAMES
+
+    return float(np.asarray(scale)[SCALE_NAMES.index(("left", "right")[side] + "_leg_and_foot")])
+
+
+def _input_error(found: str, expected: str) -> PblError:
+    return PblError(
+        "GAIT_INPUT",
+        found=found,
+        expected=expected,
+        next_step="pass a fit.npz of `pbl fit`, or a keypoints.npz with 3D points of hips and feet",
+    )
