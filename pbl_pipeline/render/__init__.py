@@ -1,0 +1,24 @@
+"""The fitted body drawn over the recording."""
+
+from pbl_pipeline.render._draw import capsule_outline, draw_body, draw_keypoints
+from pbl_pipeline.render._overlay import overlay_frames, render_overlay, report_indices
+from pbl_pipeline.render._project import NEAR_M, rotation_matrix, scaled_camera, to_camera, to_pixels
+from pbl_pipeline.render._strip import stance_spans
+from pbl_pipeline.render._style import SIDE_COLOUR, side_of
+
+__all__ = [
+    "NEAR_M",
+    "SIDE_COLOUR",
+    "capsule_outline",
+    "draw_body",
+    "draw_keypoints",
+    "overlay_frames",
+    "render_overlay",
+    "report_indices",
+    "rotation_matrix",
+    "scaled_camera",
+    "side_of",
+    "stance_spans",
+    "to_camera",
+    "to_pixels",
+]

@@ -1,0 +1,51 @@
+"""`<name>.angles.csv`: the fitted joint angles as a table that any program reads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import TrialFit
+
+#: Joints that slide; all others turn.
+TRANSLATIONS = frozenset({"pelvis_tx", "pelvis_ty", "pelvis_tz"})
+
+
+def angles_table(fit: TrialFit) -> pd.DataFrame:
+    """One row per frame: `time_s`, then one column per joint under its OpenSim name, in the order of `qpos`.
+
+    Angles in degrees, `pelvis_tx/ty/tz` in metres (world frame, origin at the camera). OpenSim's knee is negative in
+    flexion; `knee_flexion_r/_l`, positive, stands beside `knee_angle_r/_l`. NaN where the person is out of view.
+
+    Raises
+    ------
+    PblError
+        FILE_FORMAT when times, joint names and `qpos` do not belong together.
+    """
+    qpos = np.asarray(fit.qpos, float)
+    wanted = (len(fit.time_s), len(fit.joint_names))
+    if qpos.shape != wanted:
+        raise PblError(
+            "FILE_FORMAT",
+            found=f"qpos of shape {qpos.shape} for {wanted[0]} frames and {wanted[1]} joint names",
+            expected=f"shape {wanted}",
+            next_step="fit the trial again; this fit is damaged",
+            key=fit.name,
+        )
+    columns: dict[str, np.ndarray] = {"time_s": np.asarray(fit.time_s, float)}
+    for name, values in zip(fit.joint_names, qpos.T, strict=True):
+        columns[name] = values if name in TRANSLATIONS else np.degrees(values)
+        if name.startswith("knee_angle_"):
+            columns[name.replace("angle", "flexion")] = -columns[name]
+    return pd.DataFrame(columns)
+
+
+def write_angles_csv(fit: TrialFit, path: str | Path) -> Path:
+    """Write `angles_table(fit)` as CSV (UTF-8, comma, point, six decimals, empty cells for NaN); returns the path."""
+    path = Path(path)
+    # Adding zero turns the -0.0 of a straight knee into 0.0.
+    (angles_table(fit) + 0.0).to_csv(path, index=False, float_format="%.6f", lineterminator="\n")
+    return path

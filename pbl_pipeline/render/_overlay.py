@@ -1,0 +1,295 @@
+"""The fitted body drawn over the recording: a video that browsers play, and single frames for the report."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from av.video.reformatter import ColorRange, Colorspace
+
+from pbl_pipeline import progress
+from pbl_pipeline.body import capsules, load_body
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.render._draw import capsule_outline, draw_body, draw_keypoints
+from pbl_pipeline.render._project import scaled_camera, to_camera
+from pbl_pipeline.render._strip import Event, Strip
+from pbl_pipeline.video import read_frames
+
+_TICKS_PER_S = 90_000  # time base of the output: every common frame rate is a whole number of ticks
+
+
+class _Painter:
+    """Draws one trial's body and keypoints into its frames, at any size of the picture."""
+
+    def __init__(self, fit: TrialFit, keypoints: Keypoints | None) -> None:
+        if keypoints is not None and len(keypoints.time_s) != len(fit.time_s):
+            raise PblError(
+                "FILE_FORMAT",
+                found=f"{len(keypoints.time_s)} frames of keypoints for {len(fit.time_s)} fitted frames",
+                expected="keypoints and fit of the same video",
+                next_step="pass the keypoints.npz this fit was made from",
+                key=fit.name,
+            )
+        body = load_body()
+        if fit.body_sha256 != body.sha256:
+            raise PblError(
+                "FILE_FORMAT",
+                found=f"a fit made with the body model {fit.body_sha256[:12]}",
+                expected=f"the installed body model {body.sha256[:12]} ({body.name} {body.version})",
+                next_step="fit the trial again with this version, or install the version that made the fit",
+                key=fit.name,
+            )
+        self.fit, self._keypoints = fit, keypoints
+        self._known = np.isfinite(fit.qpos).all(axis=1) & np.isfinite(fit.phone_quat_wxyz).all(axis=1)
+        self._row = np.cumsum(self._known) - 1
+        self._capsules = capsules(body, fit.qpos[self._known], fit.scale) if self._known.any() else None
+
+    def known(self, index: int) -> bool:
+        return index < len(self._known) and bool(self._known[index])
+
+    def box_px(self, index: int) -> np.ndarray | None:
+        """x0, y0, x1, y1 around the drawn body in the full-size frame; None where nothing of it is drawn."""
+        if self._capsules is None or not self.known(index):
+            return None
+        row, quat = self._row[index], self.fit.phone_quat_wxyz[index]
+        start, end = to_camera(self._capsules.start[row], quat), to_camera(self._capsules.end[row], quat)
+        radius = self._capsules.radius_m
+        outlines = [capsule_outline(start[g], end[g], float(radius[g]), self.fit.camera) for g in range(len(radius))]
+        points = [o for o in outlines if o is not None]
+        if not points:
+            return None
+        every = np.concatenate(points)
+        return np.concatenate([every.min(0), every.max(0)])
+
+    def paint(self, image: np.ndarray, index: int) -> None:
+        """Draw the state of frame `index` into `image` (any size, the whole frame), in place."""
+        width, height = self.fit.image_size_px
+        fx, fy = image.shape[1] / width, image.shape[0] / height
+        if self._capsules is not None and self.known(index):
+            row = self._row[index]
+            draw_body(
+                image,
+                self._capsules.names,
+                self._capsules.start[row],
+                self._capsules.end[row],
+                self._capsules.radius_m,
+                self.fit.phone_quat_wxyz[index],
+                scaled_camera(self.fit.camera, fx, fy),
+            )
+        if self._keypoints is not None and index < len(self._keypoints.time_s):
+            xy = (np.asarray(self._keypoints.xy_px[index], float) + 0.5) * [fx, fy] - 0.5
+            draw_keypoints(image, xy, self._keypoints.confidence[index])
+
+
+def render_overlay(
+    video_path: str | Path,
+    fit: TrialFit,
+    out_path: str | Path,
+    keypoints: Keypoints | None = None,
+    *,
+    events: Sequence[Event] = (),
+    max_side_px: int = 1280,
+    crf: int = 23,
+) -> Path:
+    """Write the recording with the fitted body over it as H.264 in MP4, and return its path.
+
+    Every frame of the video is in the output at its own time stamp (variable frame rate is kept); frames in which the
+    fit is unknown show the bare picture. Below the picture runs a strip with the knee flexion of both sides, the foot
+    contacts and the time. Memory does not grow with the length of the video.
+
+    Parameters
+    ----------
+    video_path
+        The recording the fit was made from.
+    fit
+        One trial; its frames are those of the video.
+    out_path
+        An .mp4 file; written beside it first and moved when complete, so that no half file is left under this name.
+    keypoints
+        Detected points, drawn as small dots.
+    events
+        Foot contacts of this trial, `GaitEvents.events`.
+    max_side_px
+        The picture is scaled down until its longer side is at most this.
+    crf
+        x264's quality, 0 (lossless) to 51; 23 is its default.
+
+    Raises
+    ------
+    PblError
+        VIDEO_* when the video cannot be read; VIDEO_CHANGED when its frames are not those of the fit; FILE_FORMAT
+        when the keypoints are of another video.
+    """
+    out_path = Path(out_path)
+    painter = _Painter(fit, keypoints)
+    width, height = _even_size(fit.image_size_px, max_side_px)
+    strip_height = 2 * max(40, round(0.08 * height))
+    strip = Strip(fit, events, width, strip_height)
+    part = out_path.with_name(f"{out_path.stem}.part{os.getpid()}.mp4")
+    count = 0
+
+    def pictures() -> Iterator[tuple[float, np.ndarray]]:
+        nonlocal count
+        frames = read_frames(video_path)
+        for frame in progress.track(frames, f"overlay {fit.name}", total=len(fit.time_s)):
+            _check_frame(frame.image, frame.index, fit, video_path)
+            picture = np.empty((height + strip_height, width, 3), np.uint8)
+            same = frame.image.shape[:2] == (height, width)
+            picture[:height] = frame.image if same else _resized(frame.image, (width, height))
+            painter.paint(picture[:height], frame.index)
+            picture[height:] = strip.frame(frame.time_s)
+            count += 1
+            yield frame.time_s, picture
+
+    try:
+        _encode(part, pictures(), (width, height + strip_height), fit.time_s, crf)
+        if count != len(fit.time_s):
+            raise _changed(video_path, f"{count} frames", f"{len(fit.time_s)} frames, as when it was fitted")
+        part.replace(out_path)
+    finally:
+        part.unlink(missing_ok=True)
+    return out_path
+
+
+def overlay_frames(
+    video_path: str | Path,
+    fit: TrialFit,
+    indices: Sequence[int],
+    keypoints: Keypoints | None = None,
+    *,
+    max_side_px: int = 1280,
+    crop_to_body: bool = False,
+) -> list[np.ndarray]:
+    """Frames `indices` with the fitted body drawn, in the order asked for: BGR pictures (H, W, 3) uint8.
+
+    `crop_to_body` cuts each picture to the drawn person with a margin (4:3 where the frame allows it); a frame whose
+    fit is unknown stays whole. The longer side is then scaled down to at most `max_side_px`.
+
+    Raises
+    ------
+    PblError
+        As `render_overlay`; USAGE when a frame does not exist.
+    """
+    wanted = sorted({int(i) for i in indices})
+    if wanted and (wanted[0] < 0 or wanted[-1] >= len(fit.time_s)):
+        raise PblError(
+            "USAGE",
+            found=f"frames {wanted}",
+            expected=f"frames 0 to {len(fit.time_s) - 1}",
+            next_step="ask for frames of this video",
+            key=fit.name,
+        )
+    painter = _Painter(fit, keypoints)
+    pictures: dict[int, np.ndarray] = {}
+    if wanted:
+        for frame in read_frames(video_path, stop=wanted[-1] + 1):
+            if frame.index not in wanted:
+                continue
+            _check_frame(frame.image, frame.index, fit, video_path)
+            image = frame.image.copy()
+            painter.paint(image, frame.index)
+            if crop_to_body and painter.known(frame.index):
+                image = _crop(image, painter.box_px(frame.index))
+            scale = max_side_px / max(image.shape[:2])
+            if scale < 1:
+                image = _resized(image, (round(image.shape[1] * scale), round(image.shape[0] * scale)))
+            pictures[frame.index] = np.ascontiguousarray(image)
+    missing = [i for i in wanted if i not in pictures]
+    if missing:
+        raise _changed(video_path, f"no frame {missing[0]}", f"{len(fit.time_s)} frames, as when it was fitted")
+    return [pictures[int(i)] for i in indices]
+
+
+def report_indices(fit: TrialFit, n: int = 3) -> list[int]:
+    """Frames for the report: `n` of those with a known fit, evenly spread, not at the very ends. Fewer if there are."""
+    known = np.flatnonzero(np.isfinite(fit.qpos).all(axis=1) & np.isfinite(fit.phone_quat_wxyz).all(axis=1))
+    if not len(known):
+        return []
+    picks = known[np.rint((np.arange(n) + 0.5) / n * (len(known) - 1)).astype(int)]
+    return sorted({int(i) for i in picks})
+
+
+def _encode(
+    path: Path, pictures: Iterator[tuple[float, np.ndarray]], size: tuple[int, int], time_s: np.ndarray, crf: int
+) -> None:
+    """H.264 in MP4 with the given times. The index stands at the front, so that a browser starts at once."""
+    ticks = np.rint(np.asarray(time_s, float) * _TICKS_PER_S).astype(np.int64)
+    step = int(np.median(np.diff(ticks))) if len(ticks) > 1 else _TICKS_PER_S // 30
+    last = {int(a): int(b - a) for a, b in zip(ticks, np.append(ticks[1:], ticks[-1] + step), strict=True)}
+    with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as out:
+        # A key frame every two seconds or so: a viewer that drags the slider does not wait.
+        options = {"crf": str(crf), "preset": "veryfast", "g": str(max(1, 2 * _TICKS_PER_S // step))}
+        stream = out.add_stream("libx264", rate=Fraction(_TICKS_PER_S, step), options=options)
+        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+        context = stream.codec_context
+        context.time_base = Fraction(1, _TICKS_PER_S)
+        # Untagged video is guessed to be BT.601 or BT.709 by its size; with the tag the colours are right everywhere.
+        context.colorspace = context.color_primaries = context.color_trc = 1
+        context.color_range = 1
+        for t, picture in pictures:
+            frame = av.VideoFrame.from_ndarray(picture, format="bgr24").reformat(
+                format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
+            )
+            frame.pts, frame.time_base = round(t * _TICKS_PER_S), Fraction(1, _TICKS_PER_S)
+            out.mux(_timed(stream.encode(frame), last))
+        out.mux(_timed(stream.encode(None), last))
+
+
+def _timed(packets: Sequence[av.Packet], duration: dict[int, int]) -> list[av.Packet]:
+    for packet in packets:
+        if packet.pts is not None:
+            packet.duration = duration.get(packet.pts, packet.duration or 0)
+    return list(packets)
+
+
+def _even_size(size: tuple[int, int], max_side_px: int) -> tuple[int, int]:
+    """Size scaled down to the longest side allowed, both sides even: 4:2:0 colour needs that."""
+    scale = min(1.0, max_side_px / max(size))
+    return max(2, 2 * round(size[0] * scale / 2)), max(2, 2 * round(size[1] * scale / 2))
+
+
+def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    smaller = size[0] < image.shape[1]
+    return cv2.resize(
+        image, (max(1, size[0]), max(1, size[1])), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
+    )
+
+
+def _crop(image: np.ndarray, box_px: np.ndarray | None) -> np.ndarray:
+    """The part of the picture around the box: 4:3, the body four fifths of its height, within the picture."""
+    if box_px is None:
+        return image
+    height, width = image.shape[:2]
+    box = np.clip(box_px, 0, [width, height, width, height])
+    if box[2] - box[0] < 2 or box[3] - box[1] < 2:
+        return image
+    h = min(max((box[3] - box[1]) / 0.8, (box[2] - box[0]) / 0.8 * 0.75), height)
+    w = min(h * 4 / 3, width)
+    x0 = round(float(np.clip((box[0] + box[2] - w) / 2, 0, width - w)))
+    y0 = round(float(np.clip((box[1] + box[3] - h) / 2, 0, height - h)))
+    return image[y0 : y0 + round(h), x0 : x0 + round(w)]
+
+
+def _check_frame(image: np.ndarray, index: int, fit: TrialFit, video_path: str | Path) -> None:
+    size = (image.shape[1], image.shape[0])
+    if size != tuple(fit.image_size_px):
+        raise _changed(video_path, f"a frame of {size} px", f"{tuple(fit.image_size_px)} px, as when it was fitted")
+    if index >= len(fit.time_s):
+        raise _changed(video_path, f"a frame {index}", f"{len(fit.time_s)} frames, as when it was fitted")
+
+
+def _changed(video_path: str | Path, found: str, expected: str) -> PblError:
+    return PblError(
+        "VIDEO_CHANGED",
+        found=found,
+        expected=expected,
+        next_step="use the recording that the fit was made from, or run the chain on this one",
+        key=video_path,
+    )
