@@ -25,7 +25,8 @@ def configure() -> None:
     `JAX_COMPILATION_CACHE_DIR` or `JAX_PERSISTENT_CACHE_*` say, or a program set in `jax.config` before, stays.
     Precision stays JAX's default, float32.
     """
-    if jax.config.jax_compilation_cache_dir is None:
+    # JAX makes its options attributes at run time, which a type checker cannot see.
+    if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
         try:
             folder = settings.cache_dir() / "jax"
             folder.mkdir(parents=True, exist_ok=True)

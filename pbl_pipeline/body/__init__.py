@@ -9,6 +9,7 @@ from pbl_pipeline import _jax_setup
 # Before anything below makes an array: JAX reads the cache's folder once.
 _jax_setup.configure()
 
+from pbl_pipeline.body._capsules import Capsules, capsules  # noqa: E402
 from pbl_pipeline.body._kinematics import body_poses, marker_positions  # noqa: E402
 from pbl_pipeline.body._markers import MARKER_SETS, MarkerSet, load_marker_set, marker_set  # noqa: E402
 from pbl_pipeline.body._model import SCALE_NAMES, Body, load_body  # noqa: E402
@@ -17,8 +18,10 @@ __all__ = [
     "MARKER_SETS",
     "SCALE_NAMES",
     "Body",
+    "Capsules",
     "MarkerSet",
     "body_poses",
+    "capsules",
     "load_body",
     "load_marker_set",
     "marker_positions",

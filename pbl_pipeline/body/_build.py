@@ -70,14 +70,16 @@ def _body(parent: ET.Element, body: dict[str, Any], *, upright: bool) -> ET.Elem
     inertia = [f"{x:.6g}" for x in (across, along, across)]
     ET.SubElement(element, "inertial", pos=_text(body["com"]), mass=f"{body['mass']:g}", diaginertia=" ".join(inertia))
     for joint in body["joints"]:
-        extra = {} if joint["range"] is None else {"range": _text(joint["range"])}
-        ET.SubElement(element, "joint", name=joint["name"], type=joint["type"], axis=_text(joint["axis"]), **extra)
+        attributes = {"name": joint["name"], "type": joint["type"], "axis": _text(joint["axis"])}
+        if joint["range"] is not None:
+            attributes["range"] = _text(joint["range"])
+        ET.SubElement(element, "joint", attributes)
     side = body["name"][-2:] if body["name"][-2:] in ("_r", "_l") else ""
     for shape in SHAPES[body["name"].removesuffix(side)]:
         placed = mirrored(shape) if side == "_l" else shape
         where = {"fromto": _text([*placed.start, *placed.end])} if placed.end else {"pos": _text(placed.start)}
         kind = "capsule" if placed.end else "ellipsoid"
-        ET.SubElement(element, "geom", name=placed.name + side, type=kind, size=_text(placed.size), **where)
+        ET.SubElement(element, "geom", {"name": placed.name + side, "type": kind, "size": _text(placed.size), **where})
     return element
 
 

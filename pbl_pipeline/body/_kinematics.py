@@ -41,7 +41,7 @@ def body_poses(
     parent_scale = jnp.where(body.parent_index >= 0, scale[body.scale_index[body.parent_index]], 1.0)
     # Index 0 of MuJoCo is the world, which has no scale.
     factor = jnp.concatenate([jnp.ones(1, scale.dtype), parent_scale])
-    model = body.mjx_model.tree_replace({"body_pos": body.mjx_model.body_pos * factor[:, None]})
+    model = body.mjx_model.replace(body_pos=body.mjx_model.body_pos * factor[:, None])
 
     def one(q):
         # GPUs round the factors of float32 products to ten bits unless told otherwise: millimetres at the foot.

@@ -1,5 +1,8 @@
 """The body as data: the MJCF read by C MuJoCo and put on the JAX device."""
 
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 import dataclasses

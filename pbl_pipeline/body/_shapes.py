@@ -13,7 +13,7 @@ Vec3 = tuple[float, float, float]
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """A capsule from `start` to `end` of radius `size[0]`, or, without `end`, an ellipsoid at `start` with half axes."""
+    """A capsule from `start` to `end` with its radius in `size`; without `end` an ellipsoid about `start`."""
 
     name: str
     start: Vec3

@@ -1,4 +1,6 @@
-"""Write the body's MJCF and the BML-MoVi marker table from the figures: `python -m pbl_pipeline.body.build FIGURES.json`.
+"""Write the body's MJCF and the BML-MoVi marker table from the figures.
+
+    python -m pbl_pipeline.body.build FIGURES.json
 
 The two files under `data/` are part of the project; this command is needed only when the figures or the shapes change.
 The body's SHA-256 changes with them, and every fit names the SHA-256 it was made with.

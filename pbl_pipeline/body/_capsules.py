@@ -1,0 +1,120 @@
+"""The body as capsules in the world: all that a drawing needs, without JAX."""
+
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+import math
+
+import mujoco
+import numpy as np
+
+from pbl_pipeline.body._model import Body
+
+
+@dataclasses.dataclass(frozen=True)
+class Capsules:
+    """G capsules over T poses: rounded bars from `start` to `end`.
+
+    Attributes
+    ----------
+    names, body_names
+        G names (the shape, numbered where it takes several capsules) and the body each belongs to.
+    start, end : (T, G, 3)
+        World, metres; NaN where qpos is NaN.
+    radius_m : (G,)
+        Metres.
+    """
+
+    names: tuple[str, ...]
+    body_names: tuple[str, ...]
+    start: np.ndarray
+    end: np.ndarray
+    radius_m: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class _Local:
+    """One capsule in its body's frame."""
+
+    name: str
+    body: int
+    start: np.ndarray
+    end: np.ndarray
+    radius: float
+
+
+def capsules(body: Body, qpos: np.ndarray, scale: np.ndarray) -> Capsules:
+    """The body's shapes at the poses `qpos` (T, 40) with scale multipliers (8,), lengths and radii scaled alike.
+
+    Ellipsoids are drawn as capsules side by side (see `_strands`). Kinematics by C MuJoCo, in double precision.
+    """
+    qpos, scale = np.asarray(qpos, np.float64), np.asarray(scale, np.float64)
+    local = _local(body)
+    own = scale[body.scale_index]
+    xpos, xmat = _poses(body, qpos, own)
+    index = np.array([c.body for c in local])
+    factor = own[index, None]
+
+    def world(points: np.ndarray) -> np.ndarray:
+        return xpos[:, index] + np.einsum("tgij,gj->tgi", xmat[:, index], factor * points)
+
+    return Capsules(
+        names=tuple(c.name for c in local),
+        body_names=tuple(body.body_names[c.body] for c in local),
+        start=world(np.stack([c.start for c in local])),
+        end=world(np.stack([c.end for c in local])),
+        radius_m=own[index] * np.array([c.radius for c in local]),
+    )
+
+
+def _poses(body: Body, qpos: np.ndarray, own_scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    model = copy.copy(body.mj_model)
+    model.body_pos[2:] *= own_scale[body.parent_index[1:], None]
+    data = mujoco.MjData(model)
+    xpos = np.full((len(qpos), len(body.body_names), 3), np.nan)
+    xmat = np.full((len(qpos), len(body.body_names), 3, 3), np.nan)
+    for t, pose in enumerate(qpos):
+        if np.all(np.isfinite(pose)):
+            data.qpos[:] = pose
+            mujoco.mj_kinematics(model, data)
+            xpos[t], xmat[t] = data.xpos[1:], data.xmat[1:].reshape(-1, 3, 3)
+    return xpos, xmat
+
+
+@functools.cache
+def _local(body: Body) -> tuple[_Local, ...]:
+    model, found = body.mj_model, []
+    for i in range(model.ngeom):
+        rotation = np.empty(9)
+        mujoco.mju_quat2Mat(rotation, model.geom_quat[i])
+        centre, axes, size = model.geom_pos[i].copy(), rotation.reshape(3, 3).T, model.geom_size[i].copy()
+        if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_CAPSULE:
+            strands = [(-size[1] * axes[2], size[1] * axes[2], float(size[0]))]
+        else:
+            strands = _strands(axes, size)
+        name, owner = model.geom(i).name, int(model.geom_bodyid[i]) - 1
+        for k, (start, end, radius) in enumerate(strands):
+            label = name if len(strands) == 1 else f"{name}_{k + 1}"
+            found.append(_Local(label, owner, centre + start, centre + end, radius))
+    return tuple(found)
+
+
+def _strands(axes: np.ndarray, half: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, float]]:
+    """An ellipsoid with half axes a >= b >= c as parallel capsules along a, side by side along b, of radius c.
+
+    As many as leave no gap; the ends follow the ellipse, so the outline keeps its three half axes.
+    """
+    order = np.argsort(half)[::-1]
+    (a, b, c), (along, across, _) = half[order], axes[order]
+    reach = b - c
+    count = 1 if reach < 0.05 * c else math.ceil(2 * reach / (1.5 * c)) + 1
+    strands = []
+    for offset in np.linspace(-reach, reach, count) if count > 1 else [0.0]:
+        length = max(a * math.sqrt(1 - (offset / b) ** 2) - c, 0.0)
+        strands.append((offset * across - length * along, offset * across + length * along, float(c)))
+    return strands
