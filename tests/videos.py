@@ -26,7 +26,7 @@ def write_video(
     container_options: Mapping[str, str] | None = None,
     metadata: Mapping[str, str] | None = None,
 ) -> Path:
-    """Write `frames_bgr` (H, W, 3 uint8, upright, even sizes) at presentation times `time_s`; both may be long iterables.
+    """Write `frames_bgr` (H, W, 3 uint8, upright, even sizes) at times `time_s`; both may be long iterables.
 
     As a phone does, the pictures are stored turned and the file says so: `rotation_deg` (0, 90, 180, 270) is how far a
     player has to turn the stored picture clockwise; `hflip` mirrors what is shown. The frames read back are therefore

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import av
 from av.container import InputContainer
+from av.error import FFmpegError
 
 from pbl_pipeline.errors import PblError
 
@@ -108,7 +109,7 @@ class Decoder:
         for packet in self._packets():
             try:
                 frames = self.stream.decode(packet)
-            except av.FFmpegError:
+            except FFmpegError:
                 self._count_damage()
                 continue
             for frame in frames:
@@ -123,7 +124,7 @@ class Decoder:
         while True:
             try:
                 packet = next(packets, None)
-            except av.FFmpegError as error:
+            except FFmpegError as error:
                 self._demux_error = error.strerror
                 packet = None
             if packet is None:
@@ -172,9 +173,10 @@ class Decoder:
             return None
         size = (frame.width, frame.height)
         if self._size is not None and size != self._size:
+            (w, h), n = self._size, self.n_frames
             raise PblError(
                 "VIDEO_DAMAGED",
-                found=f"the picture is {self._size[0]}x{self._size[1]} px, but {size[0]}x{size[1]} at frame {self.n_frames}",
+                found=f"the picture is {w}x{h} px, but {size[0]}x{size[1]} px from frame {n} on",
                 expected="one picture size for the whole recording",
                 next_step="cut the recording where the size changes and process the pieces as videos of their own",
                 key=self.path,
@@ -218,9 +220,8 @@ class Decoder:
                 key=self.path,
             )
         if self._n_unordered > _MAX_UNORDERED * self.n_frames:
-            raise self._time_stamp_error(
-                f"{self._n_unordered} of {self.n_frames + self._n_unordered} frames whose stamp repeats or runs backwards"
-            )
+            n_all = self.n_frames + self._n_unordered
+            raise self._time_stamp_error(f"{self._n_unordered} of {n_all} frames repeat a stamp or run backwards")
         self._note()
 
     def _lost_end(self) -> str | None:
@@ -289,7 +290,7 @@ class Decoder:
 def _open(path: Path) -> InputContainer:
     try:
         return av.open(str(path), options=_OPTIONS, metadata_errors="replace")
-    except av.FFmpegError as error:
+    except FFmpegError as error:
         lost = missing_end(path) if family(path) else None
         if lost is None:
             raise PblError(

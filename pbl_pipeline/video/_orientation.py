@@ -7,7 +7,6 @@ import dataclasses
 import av
 import cv2
 import numpy as np
-from av.sidedata.sidedata import Type
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +50,7 @@ def orientation_of(frame: av.VideoFrame) -> Orientation:
     The matrix [[a, b, u], [c, d, v], [x, y, w]] sends the stored point (p, q), p to the right and q down, to
     (a p + c q, b p + d q). Angles that are not multiples of 90 degrees are rounded to one (`exact` is then False).
     """
-    data = frame.side_data.get(Type.DISPLAYMATRIX)
+    data = frame.side_data.get("DISPLAYMATRIX")
     if data is None:
         return Orientation()
     a, b, _, c, d = (np.frombuffer(bytes(data), np.int32)[:5] / 65536.0).tolist()

@@ -1,0 +1,168 @@
+"""Camera intrinsics: from a calibration file, or a stated guess.
+
+Pixel coordinates have (0, 0) at the centre of the top-left pixel, as in OpenCV.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+
+from ._types import Camera, VideoInfo
+
+#: Focal length over the longer side of the picture: median, least and most of the 78 iPhone calibrations (iPhone 6s to
+#: 17, main camera, video at 720p and 2160p, 25 distinct) published with OpenCap (stanfordnmbl/opencap-core, commit
+#: d5a5258, Apache-2.0; Uhlrich et al. 2023, PLoS Comput Biol 19(10):e1011462). Mean 0.728, standard deviation 0.044.
+PHONE_FOCAL_OVER_LONG_SIDE = 0.7169
+PHONE_FOCAL_RANGE = (0.6655, 0.8452)
+
+_NEXT = "correct the file, or leave it out: then a phone's field of view is guessed and the result says so"
+
+
+def guess_camera(video: VideoInfo | tuple[int, int]) -> Camera:
+    """Intrinsics of a typical phone's main camera for a probed video or an upright (width, height) in px.
+
+    Focal length `PHONE_FOCAL_OVER_LONG_SIDE` times the longer side (70 degrees along it), principal point in the
+    middle, no distortion. `source` begins with "guess" and states the spread of the published values. A zoomed or
+    cropped recording (digital zoom, strong stabilisation, a telephoto lens) has a longer focal length than any of them.
+    """
+    width, height = (video.width_px, video.height_px) if isinstance(video, VideoInfo) else video
+    if width <= 0 or height <= 0:
+        raise ValueError(f"a picture of {width}x{height} px")
+    focal = PHONE_FOCAL_OVER_LONG_SIDE * max(width, height)
+    matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+    low, high = (100 * (f / PHONE_FOCAL_OVER_LONG_SIDE - 1) for f in PHONE_FOCAL_RANGE)
+    angle = math.degrees(2 * math.atan(0.5 / PHONE_FOCAL_OVER_LONG_SIDE))
+    source = (
+        f"guess: a phone's main camera, {angle:.0f} deg along the longer side (focal length {focal:.0f} px, median of "
+        f"78 published iPhone calibrations, which lie {low:.0f} to +{high:.0f} % from it; no distortion; "
+        "wrong for zoomed or cropped video)"
+    )
+    return Camera(matrix, np.zeros(5), source)
+
+
+def load_camera(path: str | Path, image_size_px: tuple[int, int], name: str | None = None) -> Camera:
+    """Intrinsics from a calibration file, for the upright picture of `image_size_px` (width, height).
+
+    Two forms are read: the TOML of Pose2Sim and Sports2D, a table per camera with `size` [width, height], `matrix` and
+    `distortions`; and JSON with `camera_matrix`, `distortion` and `image_size_px` [width, height]. Distortion is
+    OpenCV's k1 k2 p1 p2 [k3]. When the recording is larger or smaller than the calibrated picture by one factor for
+    both sides, the matrix is scaled. `name` chooses the camera of a TOML that holds several.
+
+    Raises
+    ------
+    PblError
+        CAMERA_INVALID: the file cannot be read, a field is missing or not usable, the model is a fisheye, several
+        cameras and none chosen, or the shape of the picture differs (a crop or a turn, which no factor describes).
+    """
+    path = Path(path)
+    label, fields = _read(path, name)
+    matrix = _array(path, fields, "matrix", (9,)).reshape(3, 3)
+    distortion = _array(path, fields, "distortion", (4, 5))
+    width, height = _array(path, fields, "size", (2,)).tolist()
+    if fields.get("fisheye"):
+        raise _invalid(path, "a fisheye model", "a pinhole camera with k1 k2 p1 p2 k3 distortion")
+    plain = matrix[0, 1] == matrix[1, 0] == matrix[2, 0] == matrix[2, 1] == 0 and matrix[2, 2] == 1
+    if not plain or min(matrix[0, 0], matrix[1, 1]) <= 0:
+        raise _invalid(path, f"matrix {matrix.tolist()}", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx and fy positive")
+    if min(width, height) <= 0 or not (0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height):
+        raise _invalid(
+            path,
+            f"principal point ({matrix[0, 2]:g}, {matrix[1, 2]:g}) of a {width:g}x{height:g} px picture",
+            "a principal point inside the picture",
+        )
+    distortion = np.concatenate([distortion, np.zeros(5 - len(distortion))])
+    matrix, scaled = _scale(path, matrix, (width, height), image_size_px)
+    _check_distortion(path, matrix, distortion, image_size_px)
+    return Camera(matrix, distortion, f"file: {label}{scaled}")
+
+
+def _read(path: Path, name: str | None) -> tuple[str, Mapping[str, Any]]:
+    """The label of the camera and its fields under the names matrix, distortion, size, fisheye."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        content = tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
+    except OSError as error:
+        raise _invalid(path, f"the file cannot be read ({error.strerror})", "a calibration file") from error
+    except ValueError as error:  # also TOML's, JSON's and the text decoder's errors
+        raise _invalid(path, f"the text cannot be parsed ({error})", "a TOML or JSON calibration") from error
+    if not isinstance(content, dict):
+        raise _invalid(path, "no named fields", "a table of fields")
+    if path.suffix.lower() != ".toml":
+        names = {"camera_matrix": "matrix", "distortion": "distortion", "image_size_px": "size", "fisheye": "fisheye"}
+        return path.name, {new: content[old] for old, new in names.items() if old in content}
+    cameras = {key: value for key, value in content.items() if isinstance(value, dict) and "matrix" in value}
+    if name is None and len(cameras) != 1:
+        found = f"{len(cameras)} cameras" + (f" ({', '.join(cameras)})" if cameras else "")
+        raise _invalid(path, found, "one camera, or the name of one of them")
+    if name is not None and name not in cameras:
+        raise _invalid(path, f"cameras {', '.join(cameras) or '(none)'}", f"a camera named {name}")
+    key = name or next(iter(cameras))
+    camera = cameras[key]
+    fields = {"distortion": camera["distortions"]} if "distortions" in camera else {}
+    return f"{path.name} [{key}]", camera | fields
+
+
+def _array(path: Path, fields: Mapping[str, Any], name: str, lengths: tuple[int, ...]) -> np.ndarray:
+    expected = f"{name}: {' or '.join(map(str, lengths))} finite numbers"
+    if name not in fields:
+        raise _invalid(path, f"no field {name}", expected)
+    try:
+        value = np.asarray(fields[name], dtype=np.float64).ravel()
+    except (TypeError, ValueError) as error:
+        raise _invalid(path, f"{name} = {fields[name]!r}", expected) from error
+    if len(value) not in lengths or not np.isfinite(value).all():
+        raise _invalid(path, f"{name} = {fields[name]!r}", expected)
+    return value
+
+
+def _scale(
+    path: Path, matrix: np.ndarray, calibrated: tuple[float, float], image_size_px: tuple[int, int]
+) -> tuple[np.ndarray, str]:
+    (width, height), (new_width, new_height) = calibrated, image_size_px
+    factor = new_width / width
+    if abs(new_height - factor * height) > 1.0:  # one pixel of rounding
+        turned = abs(new_width - new_height / width * height) <= 1.0
+        raise _invalid(
+            path,
+            f"calibrated for {width:g}x{height:g} px, the recording is {new_width}x{new_height} px"
+            + (" (the picture is turned)" if turned else ""),
+            "a calibration of the upright picture, of the same shape",
+        )
+    if factor == 1.0:
+        return matrix, ""
+    scaled = matrix.copy()
+    scaled[:2] *= factor
+    scaled[:2, 2] += (factor - 1) / 2  # coordinates count from the first pixel's centre, sizes from its edge
+    return scaled, f", scaled by {factor:.4g} from {width:g}x{height:g} px"
+
+
+def _check_distortion(path: Path, matrix: np.ndarray, distortion: np.ndarray, image_size_px: tuple[int, int]) -> None:
+    """The radial model must reach the corners of the picture before it turns back, or undistorting has no answer."""
+    k1, k2, _, _, k3 = distortion
+    width, height = image_size_px
+    x = (np.array([0, width - 1, 0, width - 1]) - matrix[0, 2]) / matrix[0, 0]
+    y = (np.array([0, 0, height - 1, height - 1]) - matrix[1, 2]) / matrix[1, 1]
+    corner = float(np.hypot(x, y).max())
+    r = np.linspace(0.0, 3.0 * max(corner, 1.0), 4000)
+    distorted = r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6)
+    turns = np.flatnonzero(np.diff(distorted) <= 0)
+    reach = float(distorted[turns[0]] if len(turns) else distorted[-1])
+    if reach < corner:
+        raise _invalid(
+            path,
+            f"radial distortion {k1:g}, {k2:g}, {k3:g} folds back before the corner of the picture",
+            "coefficients k1 k2 p1 p2 k3 that hold over the whole picture",
+        )
+
+
+def _invalid(path: Path, found: str, expected: str) -> PblError:
+    return PblError("CAMERA_INVALID", found=found, expected=expected, next_step=_NEXT, key=path)
