@@ -1,0 +1,137 @@
+"""Association of detections over time: who in this frame is who in the last.
+
+Each live track predicts where its body box will be (constant velocity and growth); detections are assigned to
+predictions at least total cost (Hungarian algorithm, Kuhn 1955, scipy's `linear_sum_assignment`). Everything is
+measured in body sizes, so near and far people are treated alike.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ._types import Detection
+
+
+@dataclasses.dataclass(frozen=True)
+class AssociationParams:
+    """gate: largest accepted cost at once, in body heights; gate_per_s: how much it widens per second unseen.
+
+    size_weight: cost of a size ratio of e (the natural logarithm of the ratio times this). turn_weight: cost of a body
+    axis turned by 90 degrees, twice that for one upside down: where two people are close, the network at times puts
+    one's head on the other's legs. sure_score: detections below it continue a track only within the unwidened gate
+    and after the sure ones had their choice, and never begin one. max_gap_s: a person unseen for longer is lost, and
+    starts a new track when seen again. velocity_gain: share of a new velocity measurement in the estimate.
+    """
+
+    gate: float = 0.35
+    gate_per_s: float = 1.0
+    size_weight: float = 0.5
+    turn_weight: float = 0.25
+    sure_score: float = 0.8
+    max_gap_s: float = 1.0
+    velocity_gain: float = 0.5
+
+
+@dataclasses.dataclass
+class Trail:
+    """A track while it grows: the frames in which a detector saw the person."""
+
+    frames: list[int]
+    times: list[float]
+    detections: list[Detection]
+    velocity: np.ndarray  # of (x, y) in body heights per s and of log size per s
+
+    @property
+    def last_time(self) -> float:
+        return self.times[-1]
+
+    def state(self) -> np.ndarray:
+        """Centre x, centre y in px and the natural logarithm of the height in px, when last seen."""
+        return measure(self.detections[-1])
+
+    def predict(self, time_s: float) -> np.ndarray:
+        """The state at `time_s`. The velocity is trusted for a quarter of a second, then fades out."""
+        dt = time_s - self.last_time
+        reach = 0.25 * (1.0 - np.exp(-dt / 0.25))
+        state = self.state()
+        size = np.exp(state[2])
+        return state + self.velocity * [size, size, 1.0] * reach
+
+    def add(self, frame: int, time_s: float, detection: Detection, gain: float) -> None:
+        new, old = measure(detection), self.state()
+        dt = max(time_s - self.last_time, 1e-6)
+        size = np.exp((new[2] + old[2]) / 2)
+        # Sizes jitter by a tenth from frame to frame: their rate is noise, so only the position is extrapolated.
+        seen = np.array([(new[0] - old[0]) / size, (new[1] - old[1]) / size, 0.0]) / dt
+        self.velocity = (1 - gain) * self.velocity + gain * np.clip(seen, -5.0, 5.0)
+        self.frames.append(frame)
+        self.times.append(time_s)
+        self.detections.append(detection)
+
+
+def measure(detection: Detection) -> np.ndarray:
+    """Centre x, centre y (px) and log height of a detection: of its body circle where known, else of its box."""
+    x, y, side, _ = detection.roi_px
+    if np.isfinite(side) and side > 0:
+        return np.array([x, y, np.log(side)])
+    x0, y0, x1, y1 = detection.box_px
+    return np.array([(x0 + x1) / 2, (y0 + y1) / 2, np.log(max(y1 - y0, 1.0))])
+
+
+class Associator:
+    """Feeds on frames in order; `trails()` gives every track, the lost ones included."""
+
+    def __init__(self, params: AssociationParams) -> None:
+        self._params = params
+        self._live: list[Trail] = []
+        self._lost: list[Trail] = []
+
+    @property
+    def live(self) -> list[Trail]:
+        return self._live
+
+    def step(self, frame: int, time_s: float, detections: list[Detection], may_begin: bool) -> None:
+        """Assign the detections of one frame. Where `may_begin`, unassigned sure ones start a track."""
+        p = self._params
+        self._lost += [t for t in self._live if time_s - t.last_time > p.max_gap_s]
+        self._live = [t for t in self._live if time_s - t.last_time <= p.max_gap_s]
+        sure = [d for d in detections if d.score >= p.sure_score]
+        weak = [d for d in detections if d.score < p.sure_score]
+        new = self._assign(self._live, sure, frame, time_s, p.gate_per_s)
+        waiting = [t for t in self._live if t.frames[-1] != frame]
+        self._assign(waiting, weak, frame, time_s, 0.0)
+        if may_begin:
+            self._live += [Trail([frame], [time_s], [d], np.zeros(3)) for d in new]
+
+    def _assign(
+        self, trails: list[Trail], detections: list[Detection], frame: int, time_s: float, gate_per_s: float
+    ) -> list[Detection]:
+        """Add detections to the trails at least total cost; returns those that fit nobody."""
+        if not trails or not detections:
+            return detections
+        cost = np.array([[self._cost(t, time_s, d) for d in detections] for t in trails])
+        gate = np.array([self._params.gate + gate_per_s * (time_s - t.last_time) for t in trails])
+        # An impossible pair costs more than any number of possible ones, so it is chosen only where nothing else is.
+        blocked = np.where(cost > gate[:, None], 1e3, cost)
+        taken = set()
+        for i, j in zip(*linear_sum_assignment(blocked), strict=True):
+            if blocked[i, j] < 1e3:
+                trails[i].add(frame, time_s, detections[j], self._params.velocity_gain)
+                taken.add(int(j))
+        return [d for j, d in enumerate(detections) if j not in taken]
+
+    def trails(self) -> list[Trail]:
+        """All tracks in order of appearance."""
+        return sorted([*self._lost, *self._live], key=lambda t: (t.frames[0], -t.detections[0].score))
+
+    def _cost(self, trail: Trail, time_s: float, detection: Detection) -> float:
+        predicted, seen = trail.predict(time_s), measure(detection)
+        size = np.exp((predicted[2] + seen[2]) / 2)
+        distance = float(np.hypot(*(seen[:2] - predicted[:2]))) / size
+        turn = detection.roi_px[3] - trail.detections[-1].roi_px[3]
+        turned = 1.0 - float(np.cos(turn)) if np.isfinite(turn) else 0.0
+        grown = abs(float(seen[2] - predicted[2]))
+        return distance + self._params.size_weight * grown + self._params.turn_weight * turned

@@ -1,0 +1,46 @@
+"""One place that loads a TensorFlow Lite model: hash checked, thread count fixed."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+from ai_edge_litert.interpreter import Interpreter
+
+from pbl_pipeline.errors import PblError
+
+#: Two threads are the sweet spot of these small models; more only waits. Not a method parameter.
+NUM_THREADS = 2
+
+
+class LiteModel:
+    """A loaded .tflite model with one float32 image input. Not to be shared by threads.
+
+    Raises `PblError` ASSET_CHECKSUM when the file is not the pinned one: results name the model by its hash.
+    """
+
+    def __init__(self, path: str | Path, sha256: str) -> None:
+        with Path(path).open("rb") as f:
+            found = hashlib.file_digest(f, "sha256").hexdigest()
+        if found != sha256:
+            raise PblError(
+                "ASSET_CHECKSUM",
+                found=f"SHA-256 {found}",
+                expected=f"SHA-256 {sha256}",
+                next_step="delete the file and run the command again so that it is fetched anew",
+                key=path,
+            )
+        self.sha256 = found
+        self._interpreter = Interpreter(str(path), num_threads=NUM_THREADS)
+        self._interpreter.allocate_tensors()
+        self._input = self._interpreter.get_input_details()[0]["index"]
+        self._outputs = self._interpreter.get_output_details()
+
+    def __call__(self, image: np.ndarray) -> dict[int, np.ndarray]:
+        """Run on `image` (H, W, 3) float32, channels RGB. Outputs keyed by their number of elements."""
+        self._interpreter.set_tensor(self._input, image[None])
+        self._interpreter.invoke()
+        results = (self._interpreter.get_tensor(o["index"]) for o in self._outputs)
+        # The exported output names are meaningless ("Identity_3"), their sizes are not.
+        return {r.size: r for r in results}

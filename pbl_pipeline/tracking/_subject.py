@@ -1,0 +1,212 @@
+"""Who of the people in a video is to be measured, with a score and a reason in words.
+
+The score of a person is a weighted mean of five shares in 0..1:
+
+- *in view*: share of the video's time in which she is tracked;
+- *walks*: share of the video's time in which she moves over the ground, upright, at a walking speed;
+- *size*: her median height in the picture over that of the tallest candidate;
+- *upright*: share of her frames with the body axis within 30 degrees of the vertical;
+- *central*: 1 in the middle of the picture, 0 at its edge (median over her frames).
+
+Walking is judged without a camera calibration: a person of height h px at (x, y) px stands, in units of her own
+height, at (x, y, f) / h from the camera, f being the focal length in px. Only the ratio of f to the picture size
+enters, and only for walking towards or away from the camera, so a usual value serves.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.paramset import Paramset
+
+from ._associate import measure
+from ._types import Detection, PersonTrack, SubjectChoice, Tracking
+
+
+@dataclasses.dataclass(frozen=True)
+class SubjectParams:
+    """Weights of the shares (they are normalised), and when the automatic choice is trusted.
+
+    margin: the best person is chosen when her score exceeds the second best by this much, else a person must choose.
+    min_time_s: who is in view for less is no candidate while somebody else is.
+    walk_windows_s: movement is judged over these times, the longer one for the slow and for those who walk towards or
+    away from the camera. walk_distance: what counts as walking, in body heights: more than one step within a window.
+    walk_steadiness: share of the variance of the position that a steady movement explains (0.75 for one sudden step).
+    walk_speed_max: in body heights per second (a runner has 1.8). size_slack: natural logarithm of the change of the
+    apparent size that is not taken for approach: bending, sitting and raising the arms change the size by a third.
+    focal_share: focal length over the longer side of the picture.
+    """
+
+    weight_in_view: float = 0.25
+    weight_walks: float = 0.35
+    weight_size: float = 0.20
+    weight_upright: float = 0.10
+    weight_central: float = 0.10
+    margin: float = 0.10
+    min_time_s: float = 1.0
+    walk_windows_s: tuple[float, ...] = (2.0, 5.0)
+    walk_distance: float = 0.4
+    walk_steadiness: float = 0.85
+    walk_speed_max: float = 1.8
+    size_slack: float = 0.3
+    max_lean_rad: float = 0.52
+    focal_share: float = 1.0
+
+
+SUBJECT_DEFAULT = "walker"
+SUBJECT_PARAMSETS: dict[str, Paramset] = {SUBJECT_DEFAULT: Paramset.of("subject", SUBJECT_DEFAULT, 1, SubjectParams())}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Person:
+    person_id: int
+    time_s: float
+    in_view: float
+    walks: float
+    height_px: float
+    upright: float
+    central: float
+
+
+def choose_subject(
+    tracking: Tracking, params: SubjectParams | None = None, override: int | None = None
+) -> SubjectChoice:
+    """Choose the person to measure. `override` is a person's number that a human chose: it wins (status MANUAL).
+
+    Raises `PblError` SUBJECT_UNKNOWN_PERSON when the override is not among the persons.
+    """
+    params = params or SubjectParams()
+    people = [_describe(p, tracking, params) for p in tracking.persons]
+    scores = _scores(people, params)
+    if override is not None:
+        if override not in scores:
+            raise PblError(
+                "SUBJECT_UNKNOWN_PERSON",
+                found=f"person {override}",
+                expected=f"one of the tracked persons: {', '.join(map(str, scores)) or 'none was found'}",
+                next_step="look at the numbers in the list of persons and choose one of them",
+                key=override,
+            )
+        others = {k: v for k, v in scores.items() if k != override}
+        second = max(others, key=others.__getitem__, default=None)
+        second_score = others[second] if second is not None else float("nan")
+        reason = f"Person {override} was chosen by hand."
+        return SubjectChoice("MANUAL", override, scores[override], second, second_score, scores, reason)
+    if not people:
+        return SubjectChoice(
+            "NO_PERSON", None, float("nan"), None, float("nan"), {}, "No person was found in the video."
+        )
+    by_id = {p.person_id: p for p in people}
+    long_enough = [p.person_id for p in people if p.time_s >= params.min_time_s]
+    candidates = sorted(long_enough or scores, key=lambda k: -scores[k])
+    best = candidates[0]
+    words = _words(by_id[best], tracking)
+    if len(candidates) == 1:
+        dropped = len(people) - 1
+        alone = (
+            "the only person found" if not dropped else f"the only person in view for {params.min_time_s:g} s or more"
+        )
+        reason = f"Person {best} is {alone}: {words}."
+        return SubjectChoice("CHOSEN", best, scores[best], None, float("nan"), scores, reason)
+    second = candidates[1]
+    lead = scores[best] - scores[second]
+    if lead < params.margin:
+        close = [k for k in candidates if scores[best] - scores[k] < params.margin]
+        listed = "; ".join(f"person {k} {_words(by_id[k], tracking)} (score {scores[k]:.2f})" for k in close)
+        reason = f"{len(close)} people are too alike to choose between: {listed}. A person has to choose."
+        return SubjectChoice("NEEDS_CHOICE", None, scores[best], second, scores[second], scores, reason)
+    reason = (
+        f"Person {best} {words} (score {scores[best]:.2f}); the next, person {second}, "
+        f"{_words(by_id[second], tracking)} (score {scores[second]:.2f})."
+    )
+    return SubjectChoice("CHOSEN", best, scores[best], second, scores[second], scores, reason)
+
+
+def time_in_view_s(track: PersonTrack, time_s: np.ndarray) -> float:
+    """Seconds in which the person has a box: the number of her frames times the mean frame interval."""
+    return float(np.isfinite(track.box_px[:, 0]).sum()) * _frame_interval(time_s)
+
+
+def _frame_interval(time_s: np.ndarray) -> float:
+    return float(time_s[-1] - time_s[0]) / (len(time_s) - 1) if len(time_s) > 1 else 0.0
+
+
+def _describe(track: PersonTrack, tracking: Tracking, params: SubjectParams) -> _Person:
+    rows = np.flatnonzero(np.isfinite(track.box_px[:, 0]))
+    width, height = tracking.image_size_px
+    state = np.array([measure(Detection(track.box_px[r], 1.0, track.roi_px[r])) for r in rows])
+    time = tracking.time_s[rows]
+    total = _frame_interval(tracking.time_s) * len(tracking.time_s)
+    in_view = time_in_view_s(track, tracking.time_s)
+    lean = np.abs(np.nan_to_num(track.roi_px[rows, 3]))
+    upright = lean <= params.max_lean_rad
+    walking = _walking(state, time, upright, max(width, height) * params.focal_share, params)
+    offset = np.hypot(state[:, 0] / width - 0.5, state[:, 1] / height - 0.5)
+    return _Person(
+        person_id=track.person_id,
+        time_s=in_view,
+        in_view=in_view / total if total > 0 else 1.0,
+        walks=float(walking.mean()) * in_view / total if total > 0 else 0.0,
+        height_px=float(np.exp(np.median(state[:, 2]))),
+        upright=float(upright.mean()),
+        central=float(np.clip(1.0 - 2.0 * np.median(offset), 0.0, 1.0)),
+    )
+
+
+def _walking(
+    state: np.ndarray, time: np.ndarray, upright: np.ndarray, focal: float, params: SubjectParams
+) -> np.ndarray:
+    """(n,) bool: frames around which the person moves steadily over the ground, upright, at a walking speed.
+
+    In each window a straight line is fitted to the position in body heights; what a step in place, a jump or a
+    jitter of the box does has no lasting slope.
+    """
+    size = np.exp(state[:, 2])
+    unit = np.median(size)
+    walking = np.zeros(len(time), bool)
+    for window in params.walk_windows_s:
+        # Near the ends of the track the window moves inwards, so that it keeps its length.
+        middle = np.clip(time, time[0] + window / 2, max(time[-1] - window / 2, time[0] + window / 2))
+        for i, t in enumerate(middle):
+            near = np.abs(time - t) <= window / 2 + 1e-9
+            if near.sum() < 3:
+                continue
+            span = time[near][-1] - time[near][0]
+            tau = time[near] - time[near].mean()
+            across, up, log_size = (tau @ state[near] / (tau @ tau)) * span
+            depth = focal / np.median(size[near]) * max(abs(log_size) - params.size_slack, 0.0)
+            moved = float(np.hypot(across / unit, depth))
+            # The larger part of the movement must be steady.
+            part = state[near, 0] if abs(across / unit) >= depth else state[near, 2]
+            steady = np.corrcoef(tau, part)[0, 1] ** 2 >= params.walk_steadiness if np.ptp(part) > 0 else False
+            # Somebody who jumps off a wall also moves sideways, but more up or down than a walker on any slope.
+            climbs = abs(up / unit) > 0.5 * moved
+            at_speed = params.walk_distance <= moved <= params.walk_speed_max * span
+            walking[i] |= bool(at_speed and steady and not climbs and upright[near].mean() > 0.5)
+    return walking
+
+
+def _scores(people: list[_Person], params: SubjectParams) -> dict[int, float]:
+    tallest = max((p.height_px for p in people), default=1.0)
+    weight = np.array(
+        [
+            params.weight_in_view,
+            params.weight_walks,
+            params.weight_size,
+            params.weight_upright,
+            params.weight_central,
+        ]
+    )
+    shares = {p.person_id: [p.in_view, p.walks, p.height_px / tallest, p.upright, p.central] for p in people}
+    return {k: float(np.clip(weight @ np.array(v) / weight.sum(), 0.0, 1.0)) for k, v in shares.items()}
+
+
+def _words(person: _Person, tracking: Tracking) -> str:
+    share = person.walks / person.in_view if person.in_view > 0 else 0.0
+    walks = "walks" if share > 0.5 else "walks part of the time" if share > 0.2 else "stays in place"
+    posture = "" if person.upright > 0.5 else ", mostly not upright"
+    tall = person.height_px / tracking.image_size_px[1]
+    return f"is in view for {person.time_s:.1f} s, {walks}{posture}, and takes {tall:.0%} of the picture's height"
