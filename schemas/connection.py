@@ -50,12 +50,11 @@ from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
 from . import embedded
-from .embedded._folder import APP_USER, Folder
-from .embedded._server import HOST, not_running
+from .embedded import APP_USER, HOST, Folder, not_running
 
 #: How long a server may take to answer before it counts as not running.
 CONNECT_TIMEOUT_S = 4.0
-#: Name of the store that holds the arrays. Write it out, `<npy@arrays>`: DataJoint 2.3.5 does not find a default for `<npy@>`.
+#: Name of the store that holds the arrays. Write it out, `<npy@arrays>`: DataJoint 2.3.5 finds no default for `<npy@>`.
 STORE = "arrays"
 
 
@@ -74,16 +73,27 @@ def connect(start: bool = False) -> dj.Connection:
         DB_UNAVAILABLE when `start` fails.
     """
     target = _target(start)
-    _check(target)
     configure(target)
     current = dj_instance._singleton_connection
-    if current is not None and current.is_connected and _same(current, target):
+    if current is not None and _same(current, target) and _alive(current):
         return current
-    with warnings.catch_warnings():
-        # Said once in the documentation, not at every start: MariaDB is supported here, by the two repairs below.
-        warnings.filterwarnings("ignore", message="MariaDB is not officially supported")
-        dj_instance._singleton_connection = None
-        return dj.conn()
+    _check_answers(target)
+    try:
+        if current is None:
+            with warnings.catch_warnings():
+                # MariaDB is supported here, by the two repairs below: no need to say the contrary at every start.
+                warnings.filterwarnings("ignore", message="MariaDB is not officially supported")
+                current = dj.conn()
+        else:
+            # The server was started again, perhaps on another port. Tables keep this object, so it moves along.
+            info = {name: target[name] for name in ("host", "port", "user")}
+            current.conn_info.update(info, passwd=target["password"], ssl_input=target["use_tls"])
+            current.connect()
+    except pymysql.err.OperationalError as error:
+        raise _login_error(target, error) from error
+    if target["embedded"]:
+        embedded.allow_prefix(prefix())
+    return current
 
 
 def prefix() -> str:
@@ -183,37 +193,31 @@ def _target(start: bool) -> dict[str, Any]:
     return {**login, "port": int(folder.state().get("port") or 0), "use_tls": False, "embedded": True}
 
 
-def _check(target: dict[str, Any]) -> None:
-    """One short login of our own: DataJoint's waits three times as long and gives each failure another class."""
-    address = f"{target['host']}:{target['port']}"
+def _check_answers(target: dict[str, Any]) -> None:
+    """Fail within seconds when nothing sends a greeting; the driver itself would wait three times ten."""
     try:
-        socket.create_connection((target["host"], target["port"]), timeout=CONNECT_TIMEOUT_S).close()
-        probe = pymysql.connect(
-            host=target["host"],
-            port=target["port"],
-            user=target["user"],
-            password=target["password"],
-            connect_timeout=int(CONNECT_TIMEOUT_S),
-            read_timeout=CONNECT_TIMEOUT_S,
-        )
-        probe.close()
-    except pymysql.err.OperationalError as error:
-        number = error.args[0]
-        if number in (1044, 1045, 1130, 1698, 3118, 4151):
-            raise PblError(
-                "DB_REFUSED",
-                key=f"{target['user']}@{address}",
-                found=str(error.args[-1]),
-                expected="a login the server accepts",
-                next_step="pbl db stop, then pbl db start; if it stays, the credentials file is not this server's"
-                if target["embedded"]
-                else "check DJ_USER and DJ_PASS, and that this user may connect from this machine",
-            ) from error
-        raise _no_answer(target, str(error.args[-1])) from error
+        with socket.create_connection((target["host"], target["port"]), timeout=CONNECT_TIMEOUT_S) as probe:
+            probe.settimeout(CONNECT_TIMEOUT_S)
+            if not probe.recv(4):
+                raise _no_answer(target, "the connection is closed at once, without a greeting")
     except OSError as error:
+        address = f"{target['host']}:{target['port']}"
         raise _no_answer(target, f"nothing answers at {address} ({error.strerror or error})") from error
-    if target["embedded"]:
-        embedded.allow_prefix(prefix())
+
+
+def _login_error(target: dict[str, Any], error: pymysql.err.OperationalError) -> PblError:
+    number, text = error.args[0], str(error.args[-1])
+    # Access denied in its forms: to a schema, wrong password, host not allowed, plugin, account locked.
+    if number not in (1044, 1045, 1130, 1251, 1698, 3118, 4151):
+        return _no_answer(target, text)
+    own = "these passwords are not this server's: pbl db stop, then pbl db start; else restore credentials.json"
+    return PblError(
+        "DB_REFUSED",
+        key=f"{target['user']}@{target['host']}:{target['port']}",
+        found=text,
+        expected="a login the server accepts",
+        next_step=own if target["embedded"] else "check DJ_USER and DJ_PASS, and that this user may come from here",
+    )
 
 
 def _no_answer(target: dict[str, Any], found: str) -> PblError:
@@ -226,6 +230,15 @@ def _no_answer(target: dict[str, Any], found: str) -> PblError:
         expected="a MySQL or MariaDB server",
         next_step="start that server, or unset DJ_HOST and run: pbl db start",
     )
+
+
+def _alive(connection: dj.Connection) -> bool:
+    # Not `connection.is_connected`: in DataJoint 2.3.5 it stays True after the server has gone.
+    try:
+        connection._conn.ping(reconnect=False)
+    except pymysql.err.Error:
+        return False
+    return True
 
 
 def _same(connection: dj.Connection, target: dict[str, Any]) -> bool:

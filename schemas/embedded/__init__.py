@@ -6,10 +6,13 @@ MySQL 8 server is used by naming it in DJ_HOST, DJ_PORT, DJ_USER and DJ_PASS.
 """
 
 from ._binaries import Binaries, find_server, get_server
-from ._folder import Credentials, Folder
-from ._server import Status, allow_prefix, remove, start, status, stop
+from ._folder import APP_USER, Credentials, Folder
+from ._port import HOST
+from ._server import Status, allow_prefix, not_running, remove, start, status, stop
 
 __all__ = [
+    "APP_USER",
+    "HOST",
     "Binaries",
     "Credentials",
     "Folder",
@@ -17,6 +20,7 @@ __all__ = [
     "allow_prefix",
     "find_server",
     "get_server",
+    "not_running",
     "remove",
     "start",
     "status",

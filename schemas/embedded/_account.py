@@ -35,8 +35,13 @@ class Account:
             os.chown(path, self.uid, self.gid)
 
 
-def server_account() -> Account:
+def server_account(data: Path) -> Account:
     """The account for the server process: never root.
+
+    Parameters
+    ----------
+    data
+        The data folder. When root meets one that exists, its owner goes on running it, whoever that is.
 
     Raises
     ------
@@ -45,6 +50,9 @@ def server_account() -> Account:
     """
     if os.geteuid() != 0:
         return Account(_name_of(os.geteuid()), os.geteuid(), os.getegid())
+    if data.exists() and data.stat().st_uid != 0:
+        owner = data.stat()
+        return Account(_name_of(owner.st_uid), owner.st_uid, owner.st_gid)
     for name in UNPRIVILEGED:
         try:
             entry = pwd.getpwnam(name)
@@ -69,18 +77,21 @@ def check_enterable(folder: Path, account: Account) -> None:
     """
     if not account.popen():
         return
-    for step in [*reversed(folder.parents), folder]:
-        entered = subprocess.run(
-            ["/bin/sh", "-c", 'cd "$1"', "sh", str(step)], capture_output=True, cwd="/", check=False, **account.popen()
-        )
-        if entered.returncode != 0:
-            raise PblError(
-                "DB_UNAVAILABLE",
-                key=folder,
-                found=f"the account {account.name!r}, which the database server runs as, cannot enter {step}",
-                expected="a folder whose parents it can enter, because the server never runs as root",
-                next_step=f"set PBL_HOME to another folder (the default for root is /var/lib/pbl), or: chmod a+x {step}",
-            )
+    if _can_enter(folder, account):
+        return
+    closed = next(step for step in [*reversed(folder.parents), folder] if not _can_enter(step, account))
+    raise PblError(
+        "DB_UNAVAILABLE",
+        key=folder,
+        found=f"the account {account.name!r}, which the database server runs as, cannot enter {closed}",
+        expected="a folder whose parents it can enter, because the server never runs as root",
+        next_step=f"set PBL_HOME to another folder (root's default is /var/lib/pbl), or: chmod a+x {closed}",
+    )
+
+
+def _can_enter(folder: Path, account: Account) -> bool:
+    command = ["/bin/sh", "-c", 'cd "$1"', "sh", str(folder)]
+    return subprocess.run(command, capture_output=True, cwd="/", check=False, **account.popen()).returncode == 0
 
 
 def _name_of(uid: int) -> str:

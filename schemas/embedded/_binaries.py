@@ -32,6 +32,12 @@ class Binaries:
     basedir: Path
     env: dict[str, str] = field(default_factory=dict)
 
+    def environment(self) -> dict[str, str]:
+        """The whole environment of a child: small, for the caller's variables may hold passwords."""
+        kept = {name: os.environ[name] for name in ("LANG", "TZ") if name in os.environ}
+        # UMASK is MariaDB's own variable: the files it makes are for its account only.
+        return {"PATH": f"{os.defpath}:/usr/sbin:/sbin", "UMASK": "0600", "UMASK_DIR": "0700", **kept, **self.env}
+
 
 def find_server() -> Binaries | None:
     """The MariaDB server of this machine, or the one unpacked into `settings.home_dir()/server`; None when absent."""
@@ -88,7 +94,7 @@ def _unpacked() -> Binaries | None:
     server, script = base / "sbin" / "mariadbd", base / "bin" / "mariadb-install-db"
     if not (os.access(server, os.X_OK) and os.access(script, os.X_OK)):
         return None
-    libraries = sorted({str(p.parent) for p in (_unpack_folder()).glob("**/lib/**/*.so*")})
+    libraries = sorted({str(p.parent) for p in _unpack_folder().glob("**/lib/**/*.so*")})
     return Binaries(server, script, base, {"LD_LIBRARY_PATH": os.pathsep.join(libraries)} if libraries else {})
 
 
@@ -96,7 +102,7 @@ def _unavailable(found: str) -> PblError:
     return PblError(
         "DB_UNAVAILABLE",
         found=found,
-        expected="mariadbd 10.6 or newer, or a machine with apt that can reach its archive, or a server named in DJ_HOST",
+        expected="mariadbd on this machine, or apt with its archive in reach, or a server named in DJ_HOST",
         next_step="install it (Debian: apt-get install mariadb-server-core mariadb-client-core), or run a server with "
-        "`docker compose up db` and set DJ_HOST, DJ_PORT, DJ_USER and DJ_PASS",
+        "`docker compose up -d db` and set DJ_HOST, DJ_PORT, DJ_USER and DJ_PASS",
     )

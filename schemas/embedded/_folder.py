@@ -217,3 +217,8 @@ def _write(path: Path, content: dict[str, Any], mode: int) -> None:
     except OSError as error:
         aside.unlink(missing_ok=True)
         raise folder_error(path.parent, error) from error
+
+
+def indent(text: str) -> str:
+    """Quoted lines, set in under the line of the error that introduces them."""
+    return "\n".join(f"      {line}" for line in text.splitlines())
