@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from pbl_pipeline.fit import TrialFit
 
 from ._feet import feet_from_fit
+from ._poses import BodyPoses, trial_poses
 from .events import RIGHT
 
 #: name -> unit, direction of the positive sign. All are per side.
@@ -38,15 +39,17 @@ class AngleSeries:
         return self.right if side == RIGHT else self.left
 
 
-def angle_series(fit: TrialFit) -> AngleSeries:
+def angle_series(fit: TrialFit, poses: BodyPoses | None = None) -> AngleSeries:
     """Angles of a fit. Hip, knee and ankle are the model's own; the pelvis is decomposed anew (`pelvis_angles`).
 
     Raises `PblError` GAIT_INPUT (see `feet_from_fit`).
     """
     column = {name: i for i, name in enumerate(fit.joint_names)}
     degrees = np.degrees(np.asarray(fit.qpos, float))
-    feet = feet_from_fit(fit)
-    tilt, obliquity, rotation = pelvis_angles(pelvis_rotation(fit), feet.forward).T
+    poses = poses or trial_poses(fit)
+    forward = feet_from_fit(fit, poses).forward
+    # The pelvis frame of the model is forward, up, right.
+    tilt, obliquity, rotation = pelvis_angles(poses.rotation[:, poses.index("pelvis")], forward).T
     sides = {}
     for side, letter, sign in (("left", "l", -1.0), ("right", "r", 1.0)):
         sides[side] = {
@@ -62,23 +65,7 @@ def angle_series(fit: TrialFit) -> AngleSeries:
     return AngleSeries(np.asarray(fit.time_s, float), sides["left"], sides["right"])
 
 
-def pelvis_rotation(fit: TrialFit) -> np.ndarray:
-    """(T, 3, 3) rotation of the pelvis in the world; columns are its axes forward, up, right. NaN where unseen.
-
-    The pelvis joints turn about z (tilt), x (list) and y (rotation) in this order, in a frame that stands with a
-    fixed 90 deg about x in the z-up world.
-    """
-    column = [fit.joint_names.index(n) for n in ("pelvis_tilt", "pelvis_list", "pelvis_rotation")]
-    angles = np.asarray(fit.qpos, float)[:, column]
-    out = np.full((len(angles), 3, 3), np.nan)
-    seen = np.all(np.isfinite(angles), axis=1)
-    stand = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    if np.any(seen):
-        out[seen] = stand @ Rotation.from_euler("ZXY", angles[seen]).as_matrix()
-    return out
-
-
-def pelvis_angles(R_world_pelvis: np.ndarray, forward: np.ndarray) -> np.ndarray:  # noqa: N803  frames in the name
+def pelvis_angles(R_world_pelvis: np.ndarray, forward: np.ndarray) -> np.ndarray:
     """Tilt, obliquity and rotation of the pelvis against the walking direction, in degrees.
 
     The model's pelvis_tilt, pelvis_list and pelvis_rotation are turned about the axes of the world and so mean tilt

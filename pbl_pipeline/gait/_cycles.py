@@ -11,6 +11,7 @@ from scipy.interpolate import PchipInterpolator
 from pbl_pipeline.fit import TrialFit
 
 from ._angles import AngleSeries, angle_series
+from ._poses import BodyPoses
 from .events import FOOT_DOWN, LEFT, RIGHT, GaitEvent, GaitEvents
 
 #: Phases of the curves in percent of the cycle, both ends included.
@@ -51,7 +52,10 @@ class GaitCycle:
 
 
 def find_cycles(
-    events: GaitEvents | Sequence[GaitEvent], fit: TrialFit | None = None, trial: str = ""
+    events: GaitEvents | Sequence[GaitEvent],
+    fit: TrialFit | None = None,
+    trial: str = "",
+    poses: BodyPoses | None = None,
 ) -> tuple[GaitCycle, ...]:
     """All cycles whose four inner events are there in order, with curves where a fit is given.
 
@@ -64,7 +68,7 @@ def find_cycles(
     """
     found = events.events if isinstance(events, GaitEvents) else tuple(events)
     name = trial or (fit.name if fit is not None else "")
-    series = angle_series(fit) if fit is not None else None
+    series = angle_series(fit, poses) if fit is not None else None
     cycles = []
     for bout in sorted({e.bout for e in found}):
         inside = sorted((e for e in found if e.bout == bout), key=lambda e: e.time_s)
@@ -75,7 +79,11 @@ def find_cycles(
                 continue
             inner = [e for e in inside if start.time_s < e.time_s < end.time_s]
             other = RIGHT if start.side == LEFT else LEFT
-            if [(e.side, e.event) for e in inner] != [(other, "foot_up"), (other, "foot_down"), (start.side, "foot_up")]:
+            if [(e.side, e.event) for e in inner] != [
+                (other, "foot_up"),
+                (other, "foot_down"),
+                (start.side, "foot_up"),
+            ]:
                 continue
             reasons = []
             if start is downs[0]:

@@ -13,6 +13,7 @@ from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.keypoints import Keypoints
 
 from ._heading import heading_agreement, heading_from_hips
+from ._poses import BodyPoses, trial_poses
 
 #: Points of a marker set that are read: hips for pelvis and heading, heel and toe, each (left, right).
 _POINTS: dict[str, dict[str, tuple[str, str]]] = {
@@ -91,30 +92,24 @@ class FootTrajectories:
             raise _input_error("time stamps that are missing or do not increase", "strictly increasing seconds")
 
 
-def feet_from_fit(fit: TrialFit) -> FootTrajectories:
-    """Heel, toe joint and hip centres of the fitted body, world frame (z up).
+def feet_from_fit(fit: TrialFit, poses: BodyPoses | None = None) -> FootTrajectories:
+    """Heel, toe joint and hip centres of the fitted body, world frame (z up); `poses` saves computing them again.
 
     Frames whose qpos is NaN stay NaN. Raises `PblError` GAIT_INPUT (no finite frame, time stamps out of order).
     """
-    from pbl_pipeline.body import body_poses, load_body  # JAX loads only where a fit is read
-
-    body = load_body()
-    qpos = np.asarray(fit.qpos, float)
-    seen = np.flatnonzero(np.all(np.isfinite(qpos), axis=1))
-    if len(seen) == 0:
-        raise _input_error("a fit without one finite frame", "joint angles in at least some frames")
-    xpos, xmat = body_poses(body, qpos[seen].astype(np.float32), np.asarray(fit.scale, np.float32))
-    xpos, xmat = np.asarray(xpos, float), np.asarray(xmat, float)
-    index = {name: i for i, name in enumerate(body.body_names)}
-    hip, heel, toe = (np.full((len(qpos), 2, 3), np.nan) for _ in range(3))
-    for s, side in enumerate("lr"):
-        calcn = index[f"calcn_{side}"]
-        hip[seen, s] = xpos[:, index[f"femur_{side}"]]
-        toe[seen, s] = xpos[:, index[f"toes_{side}"]]
-        heel[seen, s] = xpos[:, calcn] + xmat[:, calcn] @ (_HEEL_IN_CALCN_M * _foot_scale(fit.scale, s))
-    confidence = np.full((len(qpos), 2), np.nan)
+    poses = poses or trial_poses(fit)
+    hip, heel, toe = [], [], []
+    for side in "lr":
+        calcn = poses.index(f"calcn_{side}")
+        hip.append(poses.position_m[:, poses.index(f"femur_{side}")])
+        toe.append(poses.position_m[:, poses.index(f"toes_{side}")])
+        point = _HEEL_IN_CALCN_M * poses.scale_of(f"calcn_{side}", fit.scale)
+        heel.append(poses.position_m[:, calcn] + poses.rotation[:, calcn] @ point)
+    confidence = np.full((len(fit.time_s), 2), np.nan)
+    # A handheld phone moves with the person: the way in its frame is not the way on the ground.
     travels = fit.camera_motion == "static"
-    return _assemble(fit.time_s, hip, heel, toe, _WORLD_UP, confidence, "fit", travels)
+    stacked = (np.stack(part, axis=1) for part in (hip, heel, toe))
+    return _assemble(fit.time_s, *stacked, _WORLD_UP, confidence, "fit", travels)
 
 
 def feet_from_keypoints(keypoints: Keypoints) -> FootTrajectories:
@@ -189,12 +184,6 @@ def _assemble(time_s, hip, heel, toe, up, confidence, source, travels) -> FootTr
     forward = heading_from_hips(time, hip, up)
     agreement = heading_agreement(time, pelvis, forward, up) if travels else float("nan")
     return FootTrajectories(time, heel, toe, pelvis, forward, up, confidence, source, agreement)
-
-
-def _foot_scale(scale: np.ndarray, side: int) -> float:
-    from pbl_pipeline.body import SCALE_NAMES
-
-    return float(np.asarray(scale)[SCALE_NAMES.index(("left", "right")[side] + "_leg_and_foot")])
 
 
 def _input_error(found: str, expected: str) -> PblError:

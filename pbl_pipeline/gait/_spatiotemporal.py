@@ -71,7 +71,7 @@ def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
     Status EMPTY with a reason where no cycle is used.
     """
     used = [c for c in cycles if c.used]
-    reasons = {name: _NO_SCALE for name in MEASURES[-3:]}
+    reasons = dict.fromkeys(MEASURES[-3:], _NO_SCALE)
     measures: dict[str, Measure | None] = dict.fromkeys(MEASURES)
     if not used:
         reason = (
@@ -79,7 +79,7 @@ def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
             if cycles
             else "no complete gait cycle"
         )
-        reasons.update({name: reason for name in MEASURES[:-3]})
+        reasons.update(dict.fromkeys(MEASURES[:-3], reason))
         return Spatiotemporal("EMPTY", reason, measures, reasons, len(cycles), 0, 0)
     by_cycle: dict[str, list[tuple[str, float]]] = {name: [] for name in MEASURES[:-3]}
     steps: dict[tuple[str, str, float], float] = {}

@@ -1,0 +1,180 @@
+"""All gait measures of a session: events, cycles, spatiotemporal measures, GDI, checks."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.qc import EMPTY, PASS, WARN, Check, worst
+
+from ._cycles import GaitCycle, find_cycles
+from ._feet import feet_from_fit
+from ._gdi import Gdi, GdiParams, score_gdi
+from ._poses import trial_poses
+from ._spatiotemporal import MEASURES, Spatiotemporal, spatiotemporal
+from .events import EventParams, GaitEvents, detect_events
+from .normative import NormativeSet, load_norm
+
+
+@dataclasses.dataclass(frozen=True)
+class GaitParams:
+    """Parameters of events and index together."""
+
+    events: EventParams = dataclasses.field(default_factory=EventParams)
+    gdi: GdiParams = dataclasses.field(default_factory=GdiParams)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrialMetrics:
+    """Everything of one trial. `events` is None where the fit could not be searched (`error` holds the text)."""
+
+    name: str
+    status: str
+    reason: str
+    events: GaitEvents | None
+    cycles: tuple[GaitCycle, ...]
+    spatiotemporal: Spatiotemporal
+    gdi: Gdi
+    qc: tuple[Check, ...]
+
+    def to_dict(self) -> dict:
+        return {"name": self.name, **_measures(self)}
+
+
+@dataclasses.dataclass(frozen=True)
+class GaitMetrics:
+    """A session: its trials, and the measures over all their cycles together."""
+
+    trials: tuple[TrialMetrics, ...]
+    status: str
+    reason: str
+    spatiotemporal: Spatiotemporal
+    gdi: Gdi
+    qc: tuple[Check, ...]
+    params_hash: str
+
+    def to_dict(self) -> dict:
+        """The content of metrics.json."""
+        return {
+            "session": _measures(self),
+            "trials": [t.to_dict() for t in self.trials],
+            "gdi_model": self.gdi.model,
+            "params_hash": self.params_hash,
+        }
+
+    def save(self, path: str | Path) -> None:
+        """Write `metrics.json`. Missing values are null with a reason in `reasons`."""
+        Path(path).write_text(json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
+
+
+def gait_metrics(
+    trials: Sequence[TrialFit], norm: NormativeSet | str | None = None, params: GaitParams | None = None
+) -> GaitMetrics:
+    """Measures of the trials of one session and of the session (all used cycles of all trials pooled).
+
+    A trial without walking has status EMPTY and takes no part in the session; the session is EMPTY where no trial
+    has a used cycle. Raises `PblError` NORM_UNKNOWN, NORM_INVALID, GAIT_INPUT (no finite frame in a trial).
+    """
+    if not trials:
+        raise PblError(
+            "GAIT_INPUT", found="no trial", expected="at least one fitted trial", next_step="pass fit.npz files"
+        )
+    params = params or GaitParams()
+    wanted = params.gdi.norm if norm is None else norm
+    basis = load_norm(wanted) if isinstance(wanted, str) else wanted
+    done = tuple(_trial(fit, basis, params) for fit in trials)
+    cycles = [c for t in done for c in t.cycles]
+    # Two trials may carry one name; their cycles are told apart by it.
+    measures, gdi = spatiotemporal(_distinct(done)), score_gdi(cycles, basis, params.gdi)
+    status = PASS if measures.status == PASS else EMPTY
+    reason = "" if status == PASS else "; ".join(dict.fromkeys(f"{t.name}: {t.reason}" for t in done))
+    return GaitMetrics(
+        trials=done,
+        status=status,
+        reason=reason,
+        spatiotemporal=measures,
+        gdi=gdi,
+        qc=(*_cycle_checks(measures), *gdi.qc),
+        params_hash=Paramset.of("gait", "gait-metrics", 1, params).hash,
+    )
+
+
+def _trial(fit: TrialFit, norm: NormativeSet, params: GaitParams) -> TrialMetrics:
+    poses = trial_poses(fit)
+    events = detect_events(feet_from_fit(fit, poses), params.events)
+    cycles = find_cycles(events, fit, poses=poses)
+    measures, gdi = spatiotemporal(cycles), score_gdi(cycles, norm, params.gdi)
+    reason = events.reason or measures.reason
+    return TrialMetrics(
+        name=fit.name,
+        status=EMPTY if reason else PASS,
+        reason=reason,
+        events=events,
+        cycles=cycles,
+        spatiotemporal=measures,
+        gdi=gdi,
+        qc=(*events.qc, *_cycle_checks(measures), *gdi.qc),
+    )
+
+
+def _distinct(trials: Sequence[TrialMetrics]) -> list[GaitCycle]:
+    return [dataclasses.replace(c, trial=f"{i} {c.trial}") for i, t in enumerate(trials) for c in t.cycles]
+
+
+def _cycle_checks(measures: Spatiotemporal) -> tuple[Check, ...]:
+    if measures.status == EMPTY:
+        return (Check("cycles_used", EMPTY, 0.0, 1.0, measures.reason),)
+    few = measures.n_cycles_used < 4
+    checks = [
+        Check(
+            "cycles_used",
+            WARN if few else PASS,
+            float(measures.n_cycles_used),
+            4.0,
+            "few cycles: film a longer stretch, or several passes" if few else "",
+        ),
+        Check(
+            "event_bias",
+            WARN,
+            None,
+            None,
+            "foot down is detected early and foot up late (docs/measures.md): stance and double support are too long "
+            "by a constant; compare sessions with each other",
+        ),
+    ]
+    cadence = measures["cadence_steps_per_min"]
+    if cadence is not None:
+        plausible = 60.0 <= cadence.mean <= 150.0
+        checks.append(
+            Check(
+                "cadence_plausible",
+                PASS if plausible else WARN,
+                round(cadence.mean, 2),
+                60.0 if cadence.mean < 60.0 else 150.0,
+                "" if plausible else "unusual for walking: count the steps in the overlay",
+            )
+        )
+    return tuple(checks)
+
+
+def _measures(part: TrialMetrics | GaitMetrics) -> dict:
+    values = part.spatiotemporal
+    reasons = dict(values.reasons)
+    if part.gdi.mean is None:
+        reasons["gdi"] = part.gdi.reason
+    table = {name: None if (m := values[name]) is None else m.to_dict() for name in MEASURES}
+    return {
+        "status": part.status,
+        "reason": part.reason,
+        **table,
+        "gdi": part.gdi.to_dict(),
+        "reasons": reasons,
+        "cycles": {"found": values.n_cycles_found, "used": values.n_cycles_used},
+        "outcome": worst(part.qc),
+        "qc": [c.to_dict() for c in part.qc],
+    }

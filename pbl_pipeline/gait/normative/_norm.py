@@ -1,0 +1,225 @@
+"""Normative sets: a fitted basis and the mean curves that ship with the project."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.paramset import canonical_json
+
+#: Fewest normative vectors that can carry mean and sd of the log distance.
+MIN_VECTORS = 30
+DEFAULT_NORM = "gillette-166-three-angles"
+_FOLDER = "data"
+
+
+@dataclasses.dataclass(frozen=True)
+class NormativeSet:
+    """What a cycle is compared with.
+
+    Attributes
+    ----------
+    name, version, n, source, licence, convention
+        Identity, number of normative vectors, where they are from, how their angles are defined.
+    variables
+        Names of the angles in the feature vector (`ANGLE_NAMES`), in order, each at `percent` of the cycle.
+    percent : (P,)
+    mean_deg : (V * P,)
+        Mean normative vector.
+    components : (K, V * P)
+        Orthonormal principal components, largest variance first, the largest entry of each positive.
+    explained_variance : (K,)
+        deg^2 (n - 1).
+    explained_share
+        Share of the variance of the normative vectors in the K components.
+    ln_mean, ln_sd
+        Of the natural logarithm of the distance over the normative vectors (n - 1).
+    curves
+        name -> {"percent", "mean_deg", "sd_deg"}: the band of a report, also for angles outside the index.
+    sha256
+        Of the numbers above, checked at loading.
+    source_sha256
+        Of the file the set was built from.
+    """
+
+    name: str
+    version: int
+    n: int
+    source: str
+    licence: str
+    convention: str
+    variables: tuple[str, ...]
+    percent: np.ndarray
+    mean_deg: np.ndarray
+    components: np.ndarray
+    explained_variance: np.ndarray
+    explained_share: float
+    ln_mean: float
+    ln_sd: float
+    curves: dict[str, dict[str, np.ndarray]]
+    source_sha256: str = ""
+    sha256: str = ""
+
+    def log_distance(self, vectors: np.ndarray) -> np.ndarray:
+        """ln of the Euclidean distance of the component scores of (N, V * P) vectors to the normative mean."""
+        scores = (np.atleast_2d(vectors) - self.mean_deg) @ self.components.T
+        return np.log(np.linalg.norm(scores, axis=1))
+
+    def index(self, vectors: np.ndarray) -> np.ndarray:
+        """100 - 10 z of (N, V * P) vectors: 100 is the normative mean, 10 one normative standard deviation."""
+        return 100.0 - 10.0 * (self.log_distance(vectors) - self.ln_mean) / self.ln_sd
+
+    def save(self, path: str | Path) -> None:
+        """Write the set as JSON with 7 significant digits and the checksum of what was written."""
+        text = _to_json(self)
+        text["sha256"] = _checksum(text)
+        Path(path).write_text(json.dumps(text, indent=None, separators=(",", ":")).replace(',"', ',\n"') + "\n")
+
+
+def fit_norm(
+    vectors: np.ndarray,
+    *,
+    name: str,
+    version: int,
+    variables: Sequence[str],
+    percent: np.ndarray,
+    source: str,
+    licence: str,
+    convention: str,
+    curves: dict[str, dict[str, np.ndarray]] | None = None,
+    variance: float = 0.95,
+    source_sha256: str = "",
+) -> NormativeSet:
+    """Principal components that explain `variance` of normative vectors (N, V * P), and their log distances.
+
+    Schwartz & Rozumalski 2008 (Gait & Posture 28:351-357) for the index; components of the covariance matrix of the
+    normative vectors alone. Raises `PblError` NORM_INVALID for too few vectors, another length or values that are
+    not finite.
+    """
+    vectors = np.asarray(vectors, float)
+    length = len(variables) * len(percent)
+    if vectors.ndim != 2 or vectors.shape[1] != length:
+        raise _invalid(f"vectors of shape {vectors.shape}", f"(N, {length}): {len(variables)} angles x {len(percent)}")
+    if len(vectors) < MIN_VECTORS:
+        raise _invalid(f"{len(vectors)} vectors", f"at least {MIN_VECTORS}")
+    if not np.all(np.isfinite(vectors)):
+        raise _invalid("values that are not finite", "complete curves")
+    mean = vectors.mean(axis=0)
+    _, singular, rows = np.linalg.svd(vectors - mean, full_matrices=False)
+    spread = singular**2 / (len(vectors) - 1)
+    if not spread.sum() > 0:
+        raise _invalid("vectors without any variance", "different people")
+    share = np.cumsum(spread) / spread.sum()
+    k = int(np.searchsorted(share, variance - 1e-12) + 1)
+    components = rows[:k]
+    # The sign of a component is arbitrary: fixed so that two machines write the same file.
+    components = components * np.sign(components[np.arange(k), np.abs(components).argmax(axis=1)])[:, None]
+    distance = np.log(np.linalg.norm((vectors - mean) @ components.T, axis=1))
+    return NormativeSet(
+        name=name,
+        version=version,
+        n=len(vectors),
+        source=source,
+        licence=licence,
+        convention=convention,
+        variables=tuple(variables),
+        percent=np.asarray(percent, float),
+        mean_deg=mean,
+        components=components,
+        explained_variance=spread[:k],
+        explained_share=float(share[k - 1]),
+        ln_mean=float(distance.mean()),
+        ln_sd=float(distance.std(ddof=1)),
+        curves=curves or {},
+        source_sha256=source_sha256,
+    )
+
+
+def norm_names() -> tuple[str, ...]:
+    """Names of the sets that ship."""
+    folder = resources.files(__package__).joinpath(_FOLDER)
+    return tuple(sorted(f.name.removesuffix(".json") for f in folder.iterdir() if f.name.endswith(".json")))
+
+
+def load_norm(name: str = DEFAULT_NORM) -> NormativeSet:
+    """A set that ships, by name, or a file of `NormativeSet.save`, by a path that ends in .json.
+
+    Raises `PblError` NORM_UNKNOWN, or NORM_INVALID where the file is damaged.
+    """
+    if name.endswith(".json"):
+        path = Path(name)
+        if not path.is_file():
+            raise _unknown(name)
+        text = path.read_text()
+    elif name in norm_names():
+        text = resources.files(__package__).joinpath(_FOLDER, name + ".json").read_text()
+    else:
+        raise _unknown(name)
+    try:
+        data = json.loads(text)
+        checksum = data.pop("sha256")
+        if _checksum(data) != checksum:
+            raise ValueError("the numbers are not those the checksum was made of")
+        return _from_json(data, checksum)
+    except (ValueError, KeyError, TypeError) as error:
+        raise _invalid(f"{name}: {error}", "a file that build_norm wrote, unchanged") from error
+
+
+def _to_json(norm: NormativeSet) -> dict:
+    out = {}
+    for field in dataclasses.fields(norm):
+        if field.name != "sha256":
+            out[field.name] = _plain(getattr(norm, field.name))
+    return out
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.ndarray):
+        return [_plain(v) for v in value]
+    if isinstance(value, float | np.floating):
+        return float(f"{value:.7g}")
+    if isinstance(value, tuple | list):
+        return [_plain(v) for v in value]
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    return value
+
+
+def _checksum(data: dict) -> str:
+    return hashlib.sha256(canonical_json({k: v for k, v in data.items() if k != "sha256"}).encode()).hexdigest()
+
+
+def _from_json(data: dict, checksum: str) -> NormativeSet:
+    arrays = {k: np.asarray(data[k], float) for k in ("percent", "mean_deg", "components", "explained_variance")}
+    curves = {k: {c: np.asarray(v, float) for c, v in band.items()} for k, band in data["curves"].items()}
+    rest = {k: v for k, v in data.items() if k not in arrays and k not in ("curves", "variables")}
+    norm = NormativeSet(**rest, **arrays, curves=curves, variables=tuple(data["variables"]), sha256=checksum)
+    length = len(norm.variables) * len(norm.percent)
+    if norm.mean_deg.shape != (length,) or norm.components.shape[1:] != (length,) or not norm.ln_sd > 0:
+        raise ValueError("sizes of mean, components and variables do not fit together")
+    return norm
+
+
+def _unknown(name: str) -> PblError:
+    return PblError(
+        "NORM_UNKNOWN",
+        found=f"normative set {name!r}",
+        expected=f"one of {', '.join(norm_names())}, or a .json file of build_norm",
+        next_step="name one of these with --norm",
+    )
+
+
+def _invalid(found: str, expected: str) -> PblError:
+    return PblError(
+        "NORM_INVALID",
+        found=found,
+        expected=expected,
+        next_step="build the set again: python -m pbl_pipeline.gait.build_norm --help",
+    )
