@@ -114,6 +114,14 @@ def bind(stage: str, schema: dj.Schema) -> None:
     schema.activate(schema_name(stage), connection=connect())
 
 
+def external() -> str | None:
+    """`host:port` of the server DJ_HOST names, None when the embedded database is used."""
+    if not os.environ.get("DJ_HOST"):
+        return None
+    target = _target(start=False)
+    return f"{target['host']}:{target['port']}"
+
+
 def store_dir() -> Path:
     """Folder that holds the arrays (PBL_STORE, default `store` in `settings.home_dir()`)."""
     return Path(os.environ.get("PBL_STORE") or settings.home_dir() / "store").absolute()
@@ -234,8 +242,9 @@ def _no_answer(target: dict[str, Any], found: str) -> PblError:
 
 def _alive(connection: dj.Connection) -> bool:
     # Not `connection.is_connected`: in DataJoint 2.3.5 it stays True after the server has gone.
+    driver: Any = connection._conn
     try:
-        connection._conn.ping(reconnect=False)
+        driver.ping(reconnect=False)
     except pymysql.err.Error:
         return False
     return True

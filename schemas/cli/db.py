@@ -1,0 +1,123 @@
+"""`pbl db`: the embedded database."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import click
+
+# Each command imports what it needs: `pbl db --help` should not wait for the table engine.
+
+
+@click.group()
+def db() -> None:
+    """The database: a private server in a folder of its own (PBL_HOME), no system service.
+
+    With DJ_HOST, DJ_PORT, DJ_USER and DJ_PASS set, that server is used and nothing is started here.
+
+    Example: pbl db init && pbl db status
+    """
+
+
+@db.command()
+def start() -> None:
+    """Start the database; get the server and create the folder first where they are missing.
+
+    Safe to repeat. The server goes on running until `pbl db stop`, or until the machine is switched off.
+
+    Example: pbl db start
+    """
+    if _uses_external():
+        return
+    from schemas import embedded
+
+    embedded.start(click.echo)
+
+
+@db.command()
+def stop() -> None:
+    """Stop the embedded database in good order. Safe to repeat.
+
+    Example: pbl db stop
+    """
+    from schemas import embedded
+
+    embedded.stop(click.echo)
+
+
+@db.command()
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of a table.")
+def status(as_json: bool) -> None:
+    """Show whether the database answers, where it is and how large it is. Exit code 1 when it does not.
+
+    Example: pbl db status --json
+    """
+    from schemas import connection, embedded
+
+    address = connection.external()
+    if address is not None:
+        server = connection.connect()
+        version = server.query("SELECT VERSION()").fetchone()[0]
+        _print({"kind": "external", "running": True, "address": address, "version": version}, as_json)
+        return
+    now = embedded.status()
+    _print({"kind": "embedded", **now.to_dict(), "store": str(connection.store_dir())}, as_json)
+    if not now.running:
+        found = "there is no database yet" if not now.initialised else "it is not running"
+        if now.pid is not None:
+            found = f"process {now.pid} runs but does not answer: see run/server.log in the folder"
+        raise embedded.not_running(embedded.Folder.default(), found)
+
+
+@db.command()
+def init() -> None:
+    """Start the database and create all tables. Safe to repeat: what exists is kept.
+
+    Example: pbl db init
+    """
+    import schemas
+    from schemas import connection
+
+    if not _uses_external():
+        from schemas import embedded
+
+        embedded.start(click.echo)
+    click.echo("Creating the tables as far as they are missing, and the method rows of this version")
+    schemas.activate()
+    prefix = connection.prefix()
+    rows = connection.connect().query(
+        "SELECT table_schema, table_name FROM information_schema.tables WHERE table_schema LIKE %s "
+        "ORDER BY table_schema, table_name",
+        args=(f"{prefix}_%".replace("_", r"\_"),),
+    )
+    tables: dict[str, int] = {}
+    for schema, table in rows.fetchall():
+        # Names that begin with ~ are DataJoint's own bookkeeping.
+        tables[schema] = tables.get(schema, 0) + (not table.startswith("~"))
+    for schema, count in tables.items():
+        click.echo(f"  {schema:<24} {count:>3} table{'' if count == 1 else 's'}")
+    click.echo(f"Arrays are kept in {connection.store_dir()}")
+    click.echo("Next: pbl ingest VIDEO --subject NAME, or pbl demo")
+
+
+def _uses_external() -> bool:
+    from schemas import connection
+
+    address = connection.external()
+    if address is None:
+        return False
+    connection.connect()
+    click.echo(f"DJ_HOST names the server {address}, which answers: nothing to start.")
+    return True
+
+
+def _print(values: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        click.echo(json.dumps(values))
+        return
+    units = {"uptime_s": "s", "data_mb": "MB"}
+    for name, value in values.items():
+        if value is not None:
+            shown = {True: "yes", False: "no"}.get(value, value) if isinstance(value, bool) else value
+            click.echo(f"{name.removesuffix('_s').removesuffix('_mb'):<12} {shown} {units.get(name, '')}".rstrip())
