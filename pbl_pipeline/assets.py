@@ -1,0 +1,330 @@
+"""Model and demo files that are too large for the package: fetched once with pip, checked, kept in the user's cache.
+
+Each file travels inside a wheel of a public package. Pip downloads exactly that wheel (pinned version, platform and
+SHA-256) through the package index this machine is configured for; nothing of it is installed or run. Only the named
+files are taken out, and every use checks them against their own SHA-256.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import importlib.util
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from . import progress, settings
+from .errors import PblError
+
+#: Longest that a download may take (s); the largest wheel has 36 MB.
+_TIMEOUT_S = 1200.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Wheel:
+    """A pinned wheel: what to ask pip for, and how to know that it came."""
+
+    requirement: str
+    filename: str
+    sha256: str
+    size_bytes: int
+    pip_options: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Asset:
+    """One file of a wheel, with its licence and where it comes from."""
+
+    name: str
+    what: str
+    wheel: Wheel
+    member: str
+    sha256: str
+    size_bytes: int
+    licence: str
+    source: str
+
+    @property
+    def path(self) -> Path:
+        """Where the file is kept on this machine, present or not."""
+        return folder() / Path(self.member).name
+
+
+@dataclasses.dataclass(frozen=True)
+class AssetStatus:
+    """What is known of an asset without fetching: `state` is "ok", "missing" or "changed" (other bytes than pinned)."""
+
+    asset: Asset
+    path: Path
+    state: str
+
+
+# The wheel of one platform for every machine: its models are plain data, and newer wheels carry none.
+_MEDIAPIPE = Wheel(
+    requirement="mediapipe==0.10.21",
+    filename="mediapipe-0.10.21-cp311-cp311-manylinux_2_28_x86_64.whl",
+    sha256="05dc4a9e593655a79558d05d6227d31018c2537a4bd3362b51e230cf22aecfe3",
+    size_bytes=35_622_638,
+    pip_options=(
+        *("--only-binary=:all:", "--platform", "manylinux_2_28_x86_64"),
+        *("--python-version", "311", "--implementation", "cp", "--abi", "cp311"),
+    ),
+)
+_SPORTS2D = Wheel(
+    requirement="sports2d==0.8.34",
+    filename="sports2d-0.8.34-py3-none-any.whl",
+    sha256="733b6db70742636ae9c35d870c22bd416582f579abd5881bee93a14bb0e2655d",
+    size_bytes=9_050_415,
+    # Named so that pip takes the wheel whatever Python asks; 311 is within the range the package declares.
+    pip_options=("--only-binary=:all:", "--python-version", "311"),
+)
+
+_BLAZEPOSE = ("Apache-2.0", "MediaPipe 0.10.21, Google LLC; Bazarevsky et al. 2020, arXiv:2006.10204")
+_DEMO = ("BSD-3-Clause", "Sports2D 0.8.34, David Pagnon; doi:10.21105/joss.06849")
+
+#: Every asset by name.
+ASSETS: dict[str, Asset] = {
+    asset.name: asset
+    for asset in (
+        Asset(
+            "blazepose_detector",
+            "person detector (BlazePose)",
+            _MEDIAPIPE,
+            "mediapipe/modules/pose_detection/pose_detection.tflite",
+            "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c",
+            2_959_046,
+            *_BLAZEPOSE,
+        ),
+        Asset(
+            "blazepose_landmarks",
+            "33 body landmarks (BlazePose, full)",
+            _MEDIAPIPE,
+            "mediapipe/modules/pose_landmark/pose_landmark_full.tflite",
+            "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f",
+            6_440_512,
+            *_BLAZEPOSE,
+        ),
+        Asset(
+            "demo_video",
+            "demo recording: a woman walks, a man jumps",
+            _SPORTS2D,
+            "Sports2D/Demo/demo.mp4",
+            "d9a66417185647b112304b57093f0c180f37a768e6a14daca75ca541f3b78039",
+            3_968_304,
+            *_DEMO,
+        ),
+        Asset(
+            "demo_camera",
+            "camera of the demo recording",
+            _SPORTS2D,
+            "Sports2D/Demo/Calib_demo.toml",
+            "77a9b2a0e921873ddce4b3b00842500564fd7b2aabe91498a1a3db16304c8b37",
+            369,
+            *_DEMO,
+        ),
+    )
+}
+
+
+def folder() -> Path:
+    """Where assets are kept: `assets` in the user's cache folder (PBL_CACHE), created when absent."""
+    path = settings.cache_dir() / "assets"
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def fetch(name: str) -> Path:
+    """The checked file of an asset, fetched on first use (and again when its bytes have changed).
+
+    Several processes may ask at once. A wheel that lies in `folder()` under its own name is used without network.
+
+    Raises
+    ------
+    PblError
+        ASSET_MISSING: it is not here and cannot be fetched (PBL_OFFLINE, no network, no pip, no space).
+        ASSET_CHECKSUM: what came, or what was put there, is not the pinned file.
+    KeyError
+        No asset has that name.
+    """
+    asset = ASSETS[name]
+    if _is_pinned(asset.path, asset.sha256):
+        return asset.path
+    try:
+        with _one_at_a_time():
+            if not _is_pinned(asset.path, asset.sha256):  # another process may have brought it meanwhile
+                _bring(asset)
+    except OSError as error:
+        raise _missing(asset, f"the cache folder cannot be written ({error})") from error
+    return asset.path
+
+
+def status() -> list[AssetStatus]:
+    """The state of every asset on this machine; fetches nothing."""
+    found = []
+    for asset in ASSETS.values():
+        state = "missing"
+        if asset.path.is_file():
+            state = "ok" if _is_pinned(asset.path, asset.sha256) else "changed"
+        found.append(AssetStatus(asset, asset.path, state))
+    return found
+
+
+def pip_command(wheel: Wheel, into: str | Path) -> list[str]:
+    """The pip call that downloads exactly this wheel into a folder, with the index pip is configured for."""
+    quiet = ("--quiet", "--no-input", "--disable-pip-version-check")
+    return [
+        *(sys.executable, "-m", "pip", "download", "--no-deps", *quiet),
+        *("--dest", str(into), *wheel.pip_options, wheel.requirement),
+    ]
+
+
+def _bring(asset: Asset) -> None:
+    wheel, here = asset.wheel, folder() / asset.wheel.filename
+    if here.is_file():
+        _check_wheel(here, wheel, f"delete {here}, or replace it by the file that this makes: {_remedy(wheel)}")
+        _extract(here, wheel)
+        return
+    if settings.offline():
+        state = "other bytes than pinned, and" if asset.path.is_file() else "not on this machine, and"
+        raise _missing(asset, f"{asset.path} is {state} PBL_OFFLINE forbids fetching")
+    with tempfile.TemporaryDirectory(dir=folder(), prefix="fetch-") as temporary:
+        path = _download(asset, Path(temporary))
+        _check_wheel(path, wheel, "try again; if it stays so, the package index in use does not serve the public file")
+        _extract(path, wheel)
+
+
+def _download(asset: Asset, into: Path) -> Path:
+    wheel = asset.wheel
+    if importlib.util.find_spec("pip") is None:
+        raise _missing(asset, "this Python has no pip; `python -m ensurepip` adds it")
+    # Pip collects the download in its temporary folder: placed here, its growth is the progress.
+    scratch = into / "scratch"
+    scratch.mkdir()
+    command = pip_command(wheel, into)
+    with _watch(into, f"fetching {wheel.requirement}", wheel.size_bytes):
+        try:
+            done = subprocess.run(
+                command,
+                env=os.environ | {"TMPDIR": str(scratch)},
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                timeout=_TIMEOUT_S,
+                check=False,
+            )
+        except subprocess.TimeoutExpired as error:
+            raise _missing(asset, f"no answer from the package index within {_TIMEOUT_S:.0f} s") from error
+    path = into / wheel.filename
+    if done.returncode != 0 or not path.is_file():
+        said = [line.strip() for line in done.stderr.splitlines() if line.strip().startswith("ERROR")]
+        reason = said[-1] if said else f"pip ended with code {done.returncode}"
+        others = sorted(p.name for p in into.glob("*.whl"))
+        raise _missing(asset, f"{wheel.requirement} could not be downloaded: {reason} {' '.join(others)}".strip())
+    return path
+
+
+def _extract(path: Path, wheel: Wheel) -> None:
+    """Take all assets of a checked wheel out of it; each appears complete or not at all."""
+    with zipfile.ZipFile(path) as archive:
+        for asset in ASSETS.values():
+            if asset.wheel is not wheel or _is_pinned(asset.path, asset.sha256):
+                continue
+            data = archive.read(asset.member)
+            found = hashlib.sha256(data).hexdigest()
+            if found != asset.sha256:
+                raise _checksum(f"{asset.member} in {path.name}", found, asset.sha256, "report this: the pins disagree")
+            with tempfile.NamedTemporaryFile(dir=asset.path.parent, prefix="fetch-", delete=False) as file:
+                file.write(data)
+            os.chmod(file.name, 0o644)  # readable for the account a worker runs under
+            os.replace(file.name, asset.path)
+
+
+def _check_wheel(path: Path, wheel: Wheel, next_step: str) -> None:
+    found = _sha256(path)
+    if found != wheel.sha256:
+        raise _checksum(wheel.filename, found, wheel.sha256, next_step)
+
+
+def _is_pinned(path: Path, sha256: str) -> bool:
+    return path.is_file() and _sha256(path) == sha256
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _remedy(wheel: Wheel) -> str:
+    return shlex.join(["python", *pip_command(wheel, ".")[1:]])
+
+
+def _missing(asset: Asset, found: str) -> PblError:
+    return PblError(
+        "ASSET_MISSING",
+        found=found,
+        expected=f"{asset.what}, from the wheel {asset.wheel.requirement} ({asset.licence})",
+        next_step=f"with network, run this again; without, run `{_remedy(asset.wheel)}` on a machine that has it and "
+        f"copy {asset.wheel.filename} into {folder()} (or set PBL_CACHE to a folder whose assets/ holds the files)",
+        key=asset.name,
+    )
+
+
+def _checksum(what: str, found: str, expected: str, next_step: str) -> PblError:
+    return PblError(
+        "ASSET_CHECKSUM", found=f"SHA-256 {found}", expected=f"SHA-256 {expected}", next_step=next_step, key=what
+    )
+
+
+@contextlib.contextmanager
+def _one_at_a_time() -> Iterator[None]:
+    """Let one process fetch while others wait for it. Without file locks both fetch, which is slower but as safe."""
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    with (folder() / ".lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        for left in folder().glob("fetch-*"):  # of a process that was killed: we alone fetch now
+            shutil.rmtree(left) if left.is_dir() else left.unlink()
+        yield
+
+
+@contextlib.contextmanager
+def _watch(path: Path, label: str, size_bytes: int) -> Iterator[None]:
+    """Draw how many bytes of `size_bytes` have come into a folder."""
+    over = threading.Event()
+    with progress.bar(label, total=round(size_bytes / 1e6), unit="MB") as update:
+
+        def look() -> None:
+            drawn = 0
+            while not over.wait(0.3):
+                sizes = (_size(file) for file in path.rglob("*"))
+                come = min(round(max(sizes, default=0) / 1e6), round(size_bytes / 1e6))
+                if come > drawn:
+                    update(come - drawn)
+                    drawn = come
+
+        watcher = threading.Thread(target=look, daemon=True)
+        watcher.start()
+        try:
+            yield
+        finally:
+            over.set()
+            watcher.join()
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:  # pip removes its own files while we look
+        return 0
