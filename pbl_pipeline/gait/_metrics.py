@@ -67,6 +67,22 @@ class GaitMetrics:
             "params_hash": self.params_hash,
         }
 
+    def table(self) -> str:
+        """The session's measures as text for a terminal."""
+        lines = [f"{'measure':<24}{'left':>9}{'right':>9}{'mean':>9}{'sd':>8}{'n':>5}"]
+        for name in MEASURES:
+            m = self.spatiotemporal[name]
+            if m is None:
+                lines.append(f"{name:<24}{'-':>9}{'-':>9}{'-':>9}{'-':>8}{'-':>5}  {self.spatiotemporal.reasons[name]}")
+            else:
+                lines.append(f"{name:<24}{_cell(m.left)}{_cell(m.right)}{_cell(m.mean)}{_cell(m.sd, 8)}{m.n:>5}")
+        g = self.gdi
+        lines.append(
+            f"{'GDI of three angles':<24}{_cell(g.left)}{_cell(g.right)}{_cell(g.mean)}{'':>8}{g.n:>5}  {g.reason}"
+        )
+        lines += [f"{c.outcome} {c.check}: {c.advice}" for c in self.qc if c.advice]
+        return "\n".join(line.rstrip() for line in lines)
+
     def save(self, path: str | Path) -> None:
         """Write `metrics.json`. Missing values are null with a reason in `reasons`."""
         Path(path).write_text(json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
@@ -160,6 +176,10 @@ def _cycle_checks(measures: Spatiotemporal) -> tuple[Check, ...]:
             )
         )
     return tuple(checks)
+
+
+def _cell(value: float | None, width: int = 9) -> str:
+    return f"{'-' if value is None else format(value, '.2f'):>{width}}"
 
 
 def _measures(part: TrialMetrics | GaitMetrics) -> dict:

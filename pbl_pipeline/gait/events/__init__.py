@@ -1,6 +1,6 @@
 """Foot down and foot up of both sides."""
 
-from ._detect import detect_events
+from ._detect import detect_events, resolve_params
 from ._types import (
     DEFAULT_EVENT_PARAMSET,
     EVENT_PARAMSETS,
@@ -30,4 +30,5 @@ __all__ = [
     "GaitEvents",
     "detect_events",
     "load_events",
+    "resolve_params",
 ]

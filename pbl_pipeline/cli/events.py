@@ -1,0 +1,70 @@
+"""`pbl events`: foot down and foot up of one file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+
+_EPILOG = "Example: pbl events walk.fit.npz --out walk.events.csv"
+
+
+@click.command(epilog=_EPILOG)
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="events.csv to write.")
+@click.option("--method", default="zeni-2008", show_default=True, help="Name of the event method.")
+def events(file: Path, out: Path, method: str) -> None:
+    """Find foot down and foot up in FILE and write them as CSV.
+
+    FILE is a fit.npz, or a keypoints.npz with 3D markers: its fields decide. Where nobody walks, the CSV has only its
+    header and the reason is printed.
+    """
+    from pbl_pipeline.gait import detect_events
+
+    found = detect_events(_feet(file), method)
+    found.save(out)
+    if found.status == "EMPTY":
+        click.echo(f"{out}: no events: {found.reason}")
+        return
+    count = {k: sum(e.event == k for e in found.events) for k in ("foot_down", "foot_up")}
+    bouts = ", ".join(f"{a:.2f}-{b:.2f} s" for a, b in found.walking_s)
+    click.echo(f"{out}: {count['foot_down']} foot downs, {count['foot_up']} foot ups; walking {bouts}")
+    for check in found.qc:
+        if check.advice:
+            click.echo(f"  {check.outcome} {check.check}: {check.advice}")
+
+
+def _feet(path: Path):
+    from pbl_pipeline.fit import TrialFit
+    from pbl_pipeline.gait import feet_from_fit, feet_from_keypoints, feet_from_markers
+    from pbl_pipeline.keypoints import Keypoints
+
+    try:
+        with np.load(path, allow_pickle=False) as f:
+            fields = set(f.files)
+            markers = {k: f[k] for k in ("time_s", "names", "marker_set", "xyz_world_m", "confidence") if k in fields}
+    except (OSError, ValueError, EOFError, AttributeError) as error:
+        raise _format_error(path, f"{type(error).__name__}: {error}") from error
+    if "qpos" in fields:
+        return feet_from_fit(TrialFit.load(path))
+    if "xyz_cam_m" in fields:
+        return feet_from_keypoints(Keypoints.load(path))
+    if {"time_s", "names", "marker_set", "xyz_world_m", "confidence"} <= set(markers):
+        names = [str(n) for n in markers["names"]]
+        return feet_from_markers(
+            markers["time_s"], names, str(markers["marker_set"]), markers["xyz_world_m"], markers["confidence"]
+        )
+    raise _format_error(path, f"fields {', '.join(sorted(fields)) or 'none'}")
+
+
+def _format_error(path: Path, found: str) -> PblError:
+    return PblError(
+        "FILE_FORMAT",
+        found=found,
+        expected="a fit.npz (qpos), or a keypoints.npz (xyz_cam_m or xyz_world_m)",
+        next_step="make one with `pbl detect` or `pbl fit`",
+        key=str(path),
+    )
