@@ -12,7 +12,7 @@ from pbl_pipeline.fit import TrialFit
 
 from ._angles import AngleSeries, angle_series
 from ._poses import BodyPoses
-from .events import FOOT_DOWN, LEFT, RIGHT, GaitEvent, GaitEvents
+from .events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents
 
 #: Phases of the curves in percent of the cycle, both ends included.
 REPORT_PERCENT = np.linspace(0.0, 100.0, 51)
@@ -62,8 +62,8 @@ def find_cycles(
     First and last step of each bout are left out of the measures (Cotton et al.: "first and last step of a trial are
     discarded"). A step is the time from one foot down to the next foot down of the other foot. So of a bout with
     n foot downs, which has n - 1 steps and n - 2 cycles, the cycle that starts with the first foot down and the cycle
-    that ends with the last one are not used: n - 4 cycles remain, and they consist of exactly the n - 3 inner steps. Eight
-    steps in view leave 5 cycles. Cycles that are not used stay in the result with `used` False, so that both counts
+    that ends with the last one are not used: n - 4 cycles remain, made of exactly the n - 3 inner steps. Eight steps
+    (nine foot downs) in view leave 5 cycles. Cycles that are not used stay in the result with `used` False, so that both counts
     can be shown.
     """
     found = events.events if isinstance(events, GaitEvents) else tuple(events)
@@ -79,25 +79,35 @@ def find_cycles(
                 continue
             inner = [e for e in inside if start.time_s < e.time_s < end.time_s]
             other = RIGHT if start.side == LEFT else LEFT
-            if [(e.side, e.event) for e in inner] != [
-                (other, "foot_up"),
-                (other, "foot_down"),
-                (start.side, "foot_up"),
-            ]:
+            wanted = [(other, FOOT_UP), (other, FOOT_DOWN), (start.side, FOOT_UP)]
+            if [(e.side, e.event) for e in inner] != wanted:
                 continue
             reasons = []
             if start is downs[0]:
                 reasons.append("first step of the bout")
             if end is downs[-1]:
                 reasons.append("last step of the bout")
-            times = (start.time_s, *(e.time_s for e in inner), end.time_s)
-            cycles.append((bout, start.side, times, " and ".join(reasons)))
-    cycles.sort(key=lambda c: c[2][0])
-    out = []
-    for number, (bout, side, times, excluded) in enumerate(cycles):
-        curves, missing = cycle_curves(series, side, times[0], times[-1]) if series is not None else ({}, "no fit")
-        out.append(GaitCycle(name, number, bout, side, *times, not excluded, excluded, curves, missing))
-    return tuple(out)
+            curves, missing = {}, "no fit"
+            if series is not None:
+                curves, missing = cycle_curves(series, start.side, start.time_s, end.time_s)
+            cycle = GaitCycle(
+                trial=name,
+                number=0,
+                bout=bout,
+                side=start.side,
+                start_s=start.time_s,
+                opposite_foot_up_s=inner[0].time_s,
+                opposite_foot_down_s=inner[1].time_s,
+                foot_up_s=inner[2].time_s,
+                end_s=end.time_s,
+                used=not reasons,
+                excluded=" and ".join(reasons),
+                curves=curves,
+                curves_missing=missing,
+            )
+            cycles.append(cycle)
+    cycles.sort(key=lambda c: c.start_s)
+    return tuple(dataclasses.replace(c, number=number) for number, c in enumerate(cycles))
 
 
 def cycle_curves(

@@ -108,8 +108,8 @@ def feet_from_fit(fit: TrialFit, poses: BodyPoses | None = None) -> FootTrajecto
     confidence = np.full((len(fit.time_s), 2), np.nan)
     # A handheld phone moves with the person: the way in its frame is not the way on the ground.
     travels = fit.camera_motion == "static"
-    stacked = (np.stack(part, axis=1) for part in (hip, heel, toe))
-    return _assemble(fit.time_s, *stacked, _WORLD_UP, confidence, "fit", travels)
+    hips, heels, toes = (np.stack(part, axis=1) for part in (hip, heel, toe))
+    return _assemble(fit.time_s, hips, heels, toes, _WORLD_UP, confidence, "fit", travels)
 
 
 def feet_from_keypoints(keypoints: Keypoints) -> FootTrajectories:

@@ -75,8 +75,8 @@ class Gdi:
 
     def to_dict(self) -> dict:
         """`gdi` of metrics.json."""
-        rounded = {k: None if v is None else round(v, 3) for k, v in zip("lrm", (self.left, self.right, self.mean))}
-        return {"left": rounded["l"], "right": rounded["r"], "mean": rounded["m"], "n": self.n, "norm": self.norm}
+        left, right, mean = (None if v is None else round(v, 3) for v in (self.left, self.right, self.mean))
+        return {"left": left, "right": right, "mean": mean, "n": self.n, "norm": self.norm}
 
 
 def score_gdi(
@@ -169,9 +169,9 @@ def _checks(scored: Sequence[GdiCycle], enough: bool, reason: str, params: GdiPa
             WARN,
             None,
             None,
-            "the normative angles are those of a laboratory marker model; ours are those of the fitted OpenSim body, whose "
-            "pelvis and hip axes differ by constant offsets (hip flexion most). Compare sessions with each other, "
-            "not a single GDI with 100",
+            "the normative angles come from a laboratory marker model, ours from the fitted OpenSim body, whose pelvis "
+            "and hip axes differ by constant offsets (hip flexion most): compare sessions with each other, do not read "
+            "a single value against 100",
         ),
         Check(
             "gdi_cycles",

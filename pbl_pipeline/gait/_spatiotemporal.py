@@ -11,7 +11,7 @@ from ._cycles import GaitCycle
 from .events import LEFT, RIGHT
 
 #: Measures in the order of metrics.json; the unit is in the name.
-MEASURES = (
+MEASURES: tuple[str, ...] = (
     "cadence_steps_per_min",
     "stride_time_s",
     "step_time_s",
@@ -28,7 +28,7 @@ _NO_SCALE = "the absolute scale of a single camera is not validated in this vers
 
 @dataclasses.dataclass(frozen=True)
 class Measure:
-    """Mean and sd (n - 1; None for one value) over all values of both sides, n of them; left, right: means of a side."""
+    """Mean and sd (n - 1; None for one value) over the n values of both sides; `left`, `right` are means of a side."""
 
     left: float | None
     right: float | None
@@ -71,7 +71,7 @@ def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
     Status EMPTY with a reason where no cycle is used.
     """
     used = [c for c in cycles if c.used]
-    reasons = dict.fromkeys(MEASURES[-3:], _NO_SCALE)
+    reasons: dict[str, str] = dict.fromkeys(MEASURES[-3:], _NO_SCALE)
     measures: dict[str, Measure | None] = dict.fromkeys(MEASURES)
     if not used:
         reason = (

@@ -63,7 +63,7 @@ def build_gillette(path: str | Path) -> NormativeSet:
         source="166 control subjects of Gillette Children's Specialty Healthcare, Schwartz & Rozumalski 2008, "
         "Gait & Posture 28:351-357; file GDI_Calc_Fast_Data.mat of github.com/peruvianox/WAAAG",
         licence="MIT (c) 2022 Ricky Pimentel",
-        convention="laboratory model of Plug-in-Gait kind (markers on the skin, angles in degrees); one vector a subject",
+        convention="laboratory model of Plug-in-Gait kind (skin markers), degrees, one vector a subject",
         curves=curves,
         source_sha256=hashlib.sha256(Path(path).read_bytes()).hexdigest(),
     )

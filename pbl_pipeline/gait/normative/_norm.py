@@ -17,7 +17,7 @@ from pbl_pipeline.paramset import canonical_json
 #: Fewest normative vectors that can carry mean and sd of the log distance.
 MIN_VECTORS = 30
 DEFAULT_NORM = "gillette-166-three-angles"
-_FOLDER = "data"
+_FOLDER = resources.files("pbl_pipeline.gait.normative").joinpath("data")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,8 +144,7 @@ def fit_norm(
 
 def norm_names() -> tuple[str, ...]:
     """Names of the sets that ship."""
-    folder = resources.files(__package__).joinpath(_FOLDER)
-    return tuple(sorted(f.name.removesuffix(".json") for f in folder.iterdir() if f.name.endswith(".json")))
+    return tuple(sorted(f.name.removesuffix(".json") for f in _FOLDER.iterdir() if f.name.endswith(".json")))
 
 
 def load_norm(name: str = DEFAULT_NORM) -> NormativeSet:
@@ -159,7 +158,7 @@ def load_norm(name: str = DEFAULT_NORM) -> NormativeSet:
             raise _unknown(name)
         text = path.read_text()
     elif name in norm_names():
-        text = resources.files(__package__).joinpath(_FOLDER, name + ".json").read_text()
+        text = _FOLDER.joinpath(name + ".json").read_text()
     else:
         raise _unknown(name)
     try:
@@ -197,10 +196,13 @@ def _checksum(data: dict) -> str:
 
 
 def _from_json(data: dict, checksum: str) -> NormativeSet:
-    arrays = {k: np.asarray(data[k], float) for k in ("percent", "mean_deg", "components", "explained_variance")}
-    curves = {k: {c: np.asarray(v, float) for c, v in band.items()} for k, band in data["curves"].items()}
-    rest = {k: v for k, v in data.items() if k not in arrays and k not in ("curves", "variables")}
-    norm = NormativeSet(**rest, **arrays, curves=curves, variables=tuple(data["variables"]), sha256=checksum)
+    values = dict(data, sha256=checksum, variables=tuple(data["variables"]))
+    for name in ("percent", "mean_deg", "components", "explained_variance"):
+        values[name] = np.asarray(data[name], float)
+    values["curves"] = {
+        name: {key: np.asarray(v, float) for key, v in band.items()} for name, band in data["curves"].items()
+    }
+    norm = NormativeSet(**values)
     length = len(norm.variables) * len(norm.percent)
     if norm.mean_deg.shape != (length,) or norm.components.shape[1:] != (length,) or not norm.ln_sd > 0:
         raise ValueError("sizes of mean, components and variables do not fit together")
