@@ -136,9 +136,18 @@ ASSETS: dict[str, Asset] = {
 
 
 def folder() -> Path:
-    """Where assets are kept: `assets` in the user's cache folder (PBL_CACHE), created when absent."""
-    path = settings.cache_dir() / "assets"
-    path.mkdir(parents=True, exist_ok=True)
+    """Where assets are kept: `assets` in the user's cache folder (PBL_CACHE), created when absent.
+
+    Raises
+    ------
+    PblError
+        ASSET_MISSING: the folder cannot be made.
+    """
+    try:
+        path = settings.cache_dir() / "assets"
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(error) from error
     return path
 
 
@@ -163,7 +172,7 @@ def fetch(name: str) -> Path:
             if not _is_pinned(asset.path, asset.sha256):  # another process may have brought it meanwhile
                 _bring(asset)
     except OSError as error:
-        raise _missing(asset, f"the cache folder cannot be written ({error})") from error
+        raise _unwritable(error) from error
     return asset.path
 
 
@@ -275,6 +284,15 @@ def _missing(asset: Asset, found: str) -> PblError:
         next_step=f"with network, run this again; without, run `{_remedy(asset.wheel)}` on a machine that has it and "
         f"copy {asset.wheel.filename} into {folder()} (or set PBL_CACHE to a folder whose assets/ holds the files)",
         key=asset.name,
+    )
+
+
+def _unwritable(error: OSError) -> PblError:
+    return PblError(
+        "ASSET_MISSING",
+        found=f"the cache folder cannot be written ({error})",
+        expected="a folder for model and demo files with 60 MB free",
+        next_step="set PBL_CACHE to a folder of your own with free space",
     )
 
 

@@ -1,0 +1,267 @@
+"""`pbl doctor`: what is installed, which device is used, what is missing and how to get it."""
+
+from __future__ import annotations
+
+import ctypes.util
+import dataclasses
+import os
+import platform
+import re
+import shutil
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+
+import click
+
+from pbl_pipeline import __version__, assets, settings
+from pbl_pipeline.errors import PblError
+
+OK, NOTE, MISSING = "ok", "note", "missing"
+
+#: Free space (GB) below which a session of videos will not fit.
+_MIN_FREE_GB = 2.0
+#: Where distributions put the server, which is often not on a user's PATH.
+_SERVER_PLACES = ("/usr/sbin", "/usr/local/sbin", "/usr/libexec", "/opt/homebrew/bin", "/usr/local/bin")
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """One line of the table. `state` is "ok", "note" (works, but read it) or "missing" (needed, with a next step)."""
+
+    what: str
+    state: str
+    detail: str
+    next_step: str = ""
+
+
+@click.command()
+@click.option("--fetch", is_flag=True, help="First fetch the model and demo files that are missing.")
+def doctor(fetch: bool) -> None:
+    """Say what is installed, which device is used, what is missing and how to get it.
+
+    Ends with code 0 when everything the default chain needs is there, else 1. Changes nothing without --fetch.
+
+    Example: pbl doctor --fetch
+    """
+    failed = _fetch_missing() if fetch else {}
+    found = examine(failed)
+    _print(found)
+    missing = [f for f in found if f.state == MISSING]
+    summary = (
+        f"{len(missing)} missing: {', '.join(f.what for f in missing)}" if missing else "All that is needed is here."
+    )
+    click.echo(f"\n{summary}")
+    sys.exit(1 if missing else 0)
+
+
+def examine(fetch_errors: dict[str, PblError] | None = None) -> list[Finding]:
+    """All findings, in the order they are printed. `fetch_errors` says why an asset could not be fetched just now."""
+    found = [_python(), *_packages(), _jax_device(), _jax_cache(), _litert(), _onnx(), _codecs(), _database()]
+    found += list(_assets(fetch_errors or {}))
+    found.append(_folder("cache folder", settings.cache_dir, "PBL_CACHE"))
+    found.append(_folder("home folder", settings.home_dir, "PBL_HOME"))
+    return found
+
+
+def _print(found: list[Finding]) -> None:
+    colours = {OK: "green", NOTE: "yellow", MISSING: "red"}
+    width = max(len(f.what) for f in found)
+    for f in found:
+        click.echo(f"{f.what:<{width}}  {click.style(f'{f.state:<7}', fg=colours[f.state])}  {f.detail}")
+        if f.next_step:
+            click.echo(f"{'':<{width}}           next: {f.next_step}")
+
+
+def _fetch_missing() -> dict[str, PblError]:
+    failed: dict[str, PblError] = {}
+    for name in assets.ASSETS:
+        try:
+            assets.fetch(name)
+        except PblError as error:
+            failed[name] = error
+    return failed
+
+
+# --- what is installed
+
+
+def _python() -> Finding:
+    what = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {os.cpu_count()} cores"
+    return Finding("Python", OK, f"{what}; pbl-pipeline {__version__}")
+
+
+def _packages() -> Iterator[Finding]:
+    """The packages that pyproject.toml names, without the extras."""
+    try:
+        lines = requires("pbl-pipeline") or []
+    except PackageNotFoundError:
+        yield Finding("packages", MISSING, "pbl-pipeline itself is not installed", "pip install -e . in its folder")
+        return
+    there, absent = [], []
+    for line in lines:
+        name = re.match(r"[A-Za-z0-9._-]+", line)
+        if name is None or "extra ==" in line:
+            continue
+        try:
+            there.append(f"{name[0]} {version(name[0])}")
+        except PackageNotFoundError:
+            absent.append(line.split(";")[0].strip())
+    for start in range(0, len(there), 5):
+        yield Finding("packages" if start == 0 else "", OK, ", ".join(there[start : start + 5]))
+    if absent:
+        yield Finding("packages", MISSING, ", ".join(absent), f"pip install {' '.join(repr(a) for a in absent)}")
+
+
+def _loads(what: str, look: Callable[[], Finding], next_step: str) -> Finding:
+    """`look()`, with what a broken or absent installation raises turned into a finding."""
+    try:
+        return look()
+    except PblError as error:
+        return Finding(what, MISSING, error.found, error.next_step)
+    except (ImportError, OSError, RuntimeError, ValueError) as error:
+        return Finding(what, MISSING, f"{type(error).__name__}: {error}".splitlines()[0], next_step)
+
+
+def _jax_device() -> Finding:
+    def look() -> Finding:
+        import jax
+
+        devices = jax.devices()
+        detail = f"{devices[0].platform}: {', '.join(sorted({d.device_kind for d in devices}))} ({len(devices)})"
+        if devices[0].platform == "cpu" and (shutil.which("nvidia-smi") or ctypes.util.find_library("cuda")):
+            note = f"{detail}; an NVIDIA GPU is not used"
+            return Finding("JAX device", NOTE, note, "pip install 'pbl-pipeline[gpu]'")
+        return Finding("JAX device", OK, detail)
+
+    return _loads("JAX device", look, "pip install --upgrade jax jaxlib")
+
+
+def _jax_cache() -> Finding:
+    def look() -> Finding:
+        import jax
+
+        from pbl_pipeline import _jax_setup
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what it would warn of is the finding below
+            _jax_setup.configure()
+        folder = getattr(jax.config, "jax_compilation_cache_dir", None)
+        if not folder:
+            return Finding("compile cache", NOTE, "off: every start compiles anew", "make PBL_CACHE a writable folder")
+        files = list(Path(folder).glob("*")) if Path(folder).is_dir() else []
+        megabytes = sum(f.stat().st_size for f in files if f.is_file()) / 1e6
+        return Finding("compile cache", OK, f"on: {folder} ({len(files)} files, {megabytes:.1f} MB)")
+
+    return _loads("compile cache", look, "pip install --upgrade jax mujoco-mjx")
+
+
+def _litert() -> Finding:
+    def look() -> Finding:
+        from ai_edge_litert.interpreter import Interpreter
+
+        detail = f"ai-edge-litert {version('ai-edge-litert')}"
+        detector = assets.ASSETS["blazepose_detector"].path
+        if not detector.is_file():
+            return Finding("LiteRT", OK, f"{detail}; not tried, no model here yet")
+        model = Interpreter(model_path=str(detector), num_threads=1)
+        model.allocate_tensors()
+        shape = model.get_input_details()[0]["shape"].tolist()
+        return Finding("LiteRT", OK, f"{detail}; loads the person detector, input {shape}")
+
+    return _loads("LiteRT", look, "pip install ai-edge-litert")
+
+
+def _onnx() -> Finding:
+    def look() -> Finding:
+        import onnxruntime
+
+        providers = ", ".join(p.removesuffix("ExecutionProvider") for p in onnxruntime.get_available_providers())
+        return Finding("ONNX runtime", OK, f"{onnxruntime.__version__}: {providers}")
+
+    return _loads("ONNX runtime", look, "pip install onnxruntime")
+
+
+def _codecs() -> Finding:
+    def look() -> Finding:
+        import av
+        from av.codec.codec import Codec, UnknownCodecError
+
+        lacking = []
+        for name in ("h264", "hevc", "vp9", "libx264"):
+            try:
+                Codec(name, "w" if name == "libx264" else "r")
+            except UnknownCodecError:
+                lacking.append(name)
+        detail = f"PyAV {av.__version__}, libavcodec {'.'.join(map(str, av.library_versions['libavcodec']))}"
+        if lacking:
+            remedy = "pip install --force-reinstall --only-binary=av av"
+            return Finding("video codecs", MISSING, f"{detail} lacks {', '.join(lacking)}", remedy)
+        return Finding("video codecs", OK, f"{detail}: reads H.264, HEVC, VP9; writes H.264")
+
+    return _loads("video codecs", look, "pip install av")
+
+
+# --- what lies around it
+
+
+def _database() -> Finding:
+    """A server program, or the server that DJ_HOST names. The tables are not imported: the library stands alone."""
+    host = os.environ.get("DJ_HOST")
+    if host:
+        return Finding("database", NOTE, f"DJ_HOST names {host}; not contacted", "`pbl db status` asks it")
+    unpacked = settings.home_dir() / "server" / "usr" / "sbin"
+    places = os.pathsep.join([os.environ.get("PATH", os.defpath), *_SERVER_PLACES, str(unpacked)])
+    server = shutil.which("mariadbd", path=places)
+    if server:
+        return Finding("database", OK, f"{server} (embedded; `pbl db status` says whether it runs)")
+    other = shutil.which("mysqld", path=places)
+    found = f"{other} is MySQL, the embedded server is MariaDB" if other else "no MariaDB server program"
+    return Finding(
+        "database",
+        MISSING,
+        f"{found} (`pbl run`, `detect`, `fit`, `events` and `gait` work without)",
+        "`pbl db init` gets it (apt), or set DJ_HOST to a server that runs",
+    )
+
+
+def _assets(errors: dict[str, PblError]) -> Iterator[Finding]:
+    try:
+        items = assets.status()
+    except PblError as error:
+        yield Finding("assets", MISSING, error.found, error.next_step)
+        return
+    for item in items:
+        asset, where = item.asset, f"{item.path}"
+        if item.state == "ok":
+            yield Finding(asset.name, OK, f"{where} ({asset.licence})")
+            continue
+        error = errors.get(asset.name)
+        detail = f"{where} has other bytes than pinned" if item.state == "changed" else f"{asset.what}: not fetched yet"
+        if error is not None:
+            yield Finding(asset.name, MISSING, error.found, error.next_step)
+        else:
+            size = asset.wheel.size_bytes / 1e6
+            yield Finding(asset.name, MISSING, detail, f"`pbl doctor --fetch` ({size:.0f} MB from the package index)")
+
+
+def _folder(what: str, where: Callable[[], Path], variable: str) -> Finding:
+    """Whether a folder can be written and has room. The home folder may not exist yet: its parent is asked."""
+    try:
+        path = where()
+        there = path
+        while not there.exists():
+            there = there.parent
+        with tempfile.TemporaryFile(dir=there):
+            pass
+        free_gb = shutil.disk_usage(there).free / 1e9
+    except OSError as error:
+        return Finding(what, MISSING, f"cannot be written: {error}", f"set {variable} to a folder of your own")
+    later = "" if path.exists() else ", made on first use"
+    detail = f"{path} (writable{later}, {free_gb:.0f} GB free)"
+    if free_gb < _MIN_FREE_GB:
+        return Finding(what, NOTE, detail, f"free some space, or set {variable} to a folder on a larger disk")
+    return Finding(what, OK, detail)
