@@ -1,5 +1,20 @@
 """The session fit: keypoints of 1..N trials to joint angles, one body for all."""
 
+from ._params import DEFAULT, PARAMSETS, CostParams, ImplicitAdamParams, ViewParams, params_of
+from ._session import LEVEL_CAMERA_QUAT_WXYZ, LEVEL_CAMERA_R_NC, fit_session, with_steps
 from ._types import SessionFit, TrialFit
 
-__all__ = ["SessionFit", "TrialFit"]
+__all__ = [
+    "DEFAULT",
+    "LEVEL_CAMERA_QUAT_WXYZ",
+    "LEVEL_CAMERA_R_NC",
+    "PARAMSETS",
+    "CostParams",
+    "ImplicitAdamParams",
+    "SessionFit",
+    "TrialFit",
+    "ViewParams",
+    "fit_session",
+    "params_of",
+    "with_steps",
+]

@@ -47,14 +47,11 @@ class TrialFit:
 
     def save(self, path: str | Path) -> None:
         """Write `<name>.fit.npz`."""
-        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "camera"}
-        np.savez_compressed(
-            path,
-            **{k: np.asarray(v) for k, v in fields.items()},
-            camera_matrix=self.camera.matrix,
-            distortion=self.camera.distortion,
-            camera_source=np.asarray(self.camera.source),
-        )
+        arrays = {f.name: np.asarray(getattr(self, f.name)) for f in dataclasses.fields(self) if f.name != "camera"}
+        arrays["camera_matrix"] = np.asarray(self.camera.matrix)
+        arrays["distortion"] = np.asarray(self.camera.distortion)
+        arrays["camera_source"] = np.asarray(self.camera.source)
+        np.savez_compressed(path, allow_pickle=False, **arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> TrialFit:

@@ -1,0 +1,53 @@
+# make demo: the main job on a real video in an embedded database.   make test: the tests.   Both install what they need.
+
+VENV   := .venv
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.installed
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
+            if command -v $$p >/dev/null && $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; \
+            then echo $$p; break; fi; done)
+OUT    ?= pbl_demo
+
+.PHONY: demo test test-slow lint format types lock clean help
+
+help:           ## what can be made
+	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
+
+demo: $(READY)  ## put the demo recording through every table and show the result
+	$(BIN)/pbl demo --out $(OUT)
+
+test: $(READY)  ## all tests but the slow ones
+	$(BIN)/pytest -m "not slow"
+
+test-slow: $(READY) ## the slow tests too
+	$(BIN)/pytest
+
+lint: $(READY)  ## style, formatting and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+format: $(READY) ## rewrite the source in the project's format
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+lock: $(READY)  ## choose the newest allowed version of every dependency and write requirements.lock
+	$(BIN)/pip install --quiet uv
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev --generate-hashes --no-emit-index-url \
+	  --no-emit-find-links --upgrade --custom-compile-command "make lock" --output-file requirements.lock pyproject.toml
+
+# Debian splits `venv` off; without it the environment cannot hold pip, so it is installed once (root or sudo).
+$(READY): pyproject.toml requirements.lock
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: apt-get install python3"; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+	  echo "installing Debian's python3-venv (needed once)"; \
+	  sudo=$$(test "$$(id -u)" = 0 || echo sudo); $$sudo apt-get update -qq && \
+	  $$sudo apt-get install -y -qq --no-install-recommends python3-venv python3-pip; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@echo "installing the locked dependencies into $(VENV) (some minutes the first time)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	@touch $(READY)
+
+clean:          ## remove the virtual environment and the demo's output; the database and the cache stay
+	rm -rf $(VENV) $(OUT) .pytest_cache .ruff_cache

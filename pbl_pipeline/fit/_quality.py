@@ -1,0 +1,114 @@
+"""Checks of a session fit. Thresholds are the project's own unless a source is named."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pbl_pipeline.qc import FAIL, PASS, WARN, Check
+
+from ._problem import Session
+from ._types import TrialFit
+
+#: Median 2D residual as a share of the person's height in the picture: 5 px of a 500 px person is the paper's level.
+RESIDUAL_2D_WARN, RESIDUAL_2D_FAIL = 0.02, 0.06
+RESIDUAL_3D_WARN_CM, RESIDUAL_3D_FAIL_CM = 6.0, 15.0
+IN_VIEW_WARN = 0.5
+SCALE_LOW, SCALE_HIGH = 0.8, 1.25
+LIMIT_MARGIN_RAD, LIMIT_SHARE = np.deg2rad(1.0), 0.2
+CONVERGED_CHANGE = 0.05
+
+
+def check_fit(
+    session: Session, trials: Sequence[TrialFit], scale: np.ndarray, loss_trace: np.ndarray
+) -> tuple[Check, ...]:
+    """All checks of one session fit, worst trial per check."""
+    checks = [_residual_2d(session, trials), _residual_3d(trials), _in_view(session), _scale(scale)]
+    checks += [_limits(session, trials), _converged(loss_trace), _camera(session, trials)]
+    return tuple(checks)
+
+
+def _grade(value: float, warn: float, fail: float) -> str:
+    return FAIL if not value < fail else WARN if value > warn else PASS
+
+
+def _residual_2d(session: Session, trials: Sequence[TrialFit]) -> Check:
+    shares = []
+    for keypoints, trial in zip(session.trials, trials, strict=True):
+        height = np.nanmedian(keypoints.box_px[:, 3] - keypoints.box_px[:, 1])
+        shares.append(np.nanmedian(trial.residual_2d_px) / height)
+    value = float(np.max(shares))
+    return Check(
+        "residual_2d_share_of_body_height",
+        _grade(value, RESIDUAL_2D_WARN, RESIDUAL_2D_FAIL),
+        value,
+        RESIDUAL_2D_WARN,
+        "the fitted body does not lie on the person: look at the overlay; wrong person, occlusion or too few steps",
+    )
+
+
+def _residual_3d(trials: Sequence[TrialFit]) -> Check:
+    value = float(np.max([100 * np.nanmedian(t.residual_3d_m) for t in trials]))
+    return Check(
+        "residual_3d_cm",
+        _grade(value, RESIDUAL_3D_WARN_CM, RESIDUAL_3D_FAIL_CM),
+        value,
+        RESIDUAL_3D_WARN_CM,
+        "the body and the detector's 3D points disagree: angles towards or away from the camera are uncertain",
+    )
+
+
+def _in_view(session: Session) -> Check:
+    value = float(np.min(session.in_view_share))
+    return Check(
+        "share_of_frames_with_whole_person",
+        WARN if value < IN_VIEW_WARN else PASS,
+        value,
+        IN_VIEW_WARN,
+        "keep head and feet in the picture; frames without them are not used",
+    )
+
+
+def _scale(scale: np.ndarray) -> Check:
+    worst = float(scale[np.argmax(np.abs(np.log(scale)))])
+    return Check(
+        "scale_furthest_from_1",
+        PASS if SCALE_LOW <= worst <= SCALE_HIGH else WARN,
+        worst,
+        SCALE_HIGH if worst > 1 else SCALE_LOW,
+        "a body segment is scaled beyond what adults show: a child, or the camera's focal length is wrong",
+    )
+
+
+def _limits(session: Session, trials: Sequence[TrialFit]) -> Check:
+    low, high = np.asarray(session.model.body.joint_range_rad).T
+    qpos = np.concatenate([t.qpos[np.isfinite(t.qpos[:, 0])] for t in trials])
+    share = np.mean((qpos < low + LIMIT_MARGIN_RAD) | (qpos > high - LIMIT_MARGIN_RAD), axis=0)
+    names = [n for n, s in zip(session.model.body.joint_names, share, strict=True) if s > LIMIT_SHARE]
+    return Check(
+        "joints_at_their_limit",
+        WARN if names else PASS,
+        float(len(names)),
+        0.0,
+        f"held at a limit in over {LIMIT_SHARE:.0%} of the frames: {', '.join(names)}" if names else "",
+    )
+
+
+def _converged(loss_trace: np.ndarray) -> Check:
+    tail = loss_trace[int(0.9 * len(loss_trace)) - 1 :, 1]
+    change = float((tail[0] - tail[-1]) / tail[-1])
+    return Check(
+        "loss_change_over_last_tenth",
+        PASS if abs(change) < CONVERGED_CHANGE else WARN,
+        change,
+        CONVERGED_CHANGE,
+        "the optimisation was still moving: use a paramset with more steps",
+    )
+
+
+def _camera(session: Session, trials: Sequence[TrialFit]) -> Check:
+    sources = {t.camera.source for t in session.trials}
+    guessed = any(s.startswith("guess") for s in sources)
+    advice = "the focal length is a guess: pass --camera with a calibration" if guessed else ""
+    return Check("camera_intrinsics_measured", WARN if guessed else PASS, None, None, advice)

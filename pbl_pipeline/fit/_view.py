@@ -1,0 +1,41 @@
+"""Which frames of a trial count: those with the whole person in view (the paper, section Keypoint Detection)."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from pbl_pipeline.keypoints import Keypoints
+
+
+def whole_person_in_view(keypoints: Keypoints, min_confidence: float) -> np.ndarray:
+    """(T,) bool: at least nine tenths of the markers are seen, inside the picture and believed by the detector."""
+    width, height = keypoints.image_size_px
+    xy = np.nan_to_num(keypoints.xy_px, nan=-1.0)
+    inside = (xy[..., 0] >= 0) & (xy[..., 0] <= width) & (xy[..., 1] >= 0) & (xy[..., 1] <= height)
+    seen = inside & (keypoints.confidence >= min_confidence)
+    return seen.mean(axis=1) >= 0.9
+
+
+def bridge_gaps(in_view: np.ndarray, time_s: np.ndarray, max_gap_s: float) -> np.ndarray:
+    """Frames to use: those in view and those inside a gap between two of them that is shorter than `max_gap_s`."""
+    used = in_view.copy()
+    index = np.flatnonzero(in_view)
+    for a, b in itertools.pairwise(index):
+        if b > a + 1 and time_s[b] - time_s[a] < max_gap_s:
+            used[a:b] = True
+    return used
+
+
+def longest_run_s(used: np.ndarray, time_s: np.ndarray) -> float:
+    """Length (s) of the longest unbroken run of used frames."""
+    best, start = 0.0, None
+    for i, u in enumerate(used):
+        if u and start is None:
+            start = i
+        if u and start is not None:
+            best = max(best, float(time_s[i] - time_s[start]))
+        if not u:
+            start = None
+    return best

@@ -1,0 +1,31 @@
+"""The documentation names every code, variable and command there is, and none that is not."""
+
+from __future__ import annotations
+
+import re
+from importlib.metadata import entry_points
+from pathlib import Path
+
+from pbl_pipeline.errors import CODES
+from pbl_pipeline.settings import VARIABLES
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_errors_page_lists_exactly_the_codes():
+    text = (ROOT / "docs" / "errors.md").read_text()
+    listed = re.findall(r"^\| ([A-Z_]+) \|", text, re.MULTILINE)
+    assert sorted(listed) == sorted(CODES)
+
+
+def test_readme_names_every_variable_and_command():
+    text = (ROOT / "README.md").read_text()
+    missing = [v for v in VARIABLES if f"`{v}`" not in text]
+    missing += [c.name for c in entry_points(group="pbl.commands") if f"`pbl {c.name}`" not in text]
+    assert not missing
+
+
+def test_every_command_has_help_with_an_example():
+    for entry in entry_points(group="pbl.commands"):
+        command = entry.load()
+        assert "Example" in (command.help or ""), entry.name

@@ -1,0 +1,226 @@
+"""The fit against the synthetic walker, whose angles are known; the cost terms against hand-worked numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import PARAMSETS, TrialFit, fit_session, params_of, with_steps
+from pbl_pipeline.fit._costs import center, distance_2d_px2, distance_3d_cm2, huber_of_square, project_px, weighted_mean
+from pbl_pipeline.fit._problem import LEVEL_CAMERA_R_NC
+from pbl_pipeline.fit._start import root_positions
+from pbl_pipeline.fit._trajectory import ImplicitTrajectory, fit_ranges, frequencies, pose_of, raw_of
+from pbl_pipeline.fit._view import bridge_gaps, longest_run_s, whole_person_in_view
+from pbl_pipeline.paramset import Paramset
+from tests.walker import CAMERA, observe, walking_qpos
+
+TIME_S = np.arange(0, 2.6, 1 / 30)
+
+
+def quick(steps: int = 1500) -> Paramset:
+    """The demo's paramset with full weight on 3D, because the synthetic points are metric."""
+    params = params_of(PARAMSETS["blazepose-quick"])
+    params = dataclasses.replace(
+        params, steps=steps, samples_per_trial=64, cost=dataclasses.replace(params.cost, weight_3d=1.0)
+    )
+    return Paramset.of("fit", "test", 1, params)
+
+
+@pytest.fixture(scope="module")
+def two_trials():
+    """Two trials of one person of other size, in opposite directions, with noise; and their fit."""
+    scale = np.full(8, 1.06)
+    truth = [
+        walking_qpos(TIME_S, heading_rad=np.pi / 2, start_m=(6.0, -1.5)),
+        walking_qpos(TIME_S, heading_rad=-np.pi / 2, start_m=(6.5, 1.5), stride_s=1.25),
+    ]
+    seen = [observe(q, TIME_S, noise_px=2.0, noise_m=0.01, scale=scale, seed=i) for i, q in enumerate(truth)]
+    return truth, seen, fit_session(seen, ["left", "right"], quick())
+
+
+def test_fit_recovers_angles_position_and_scale(two_trials):
+    truth, _, fit = two_trials
+    joints = ["hip_flexion", "hip_adduction", "knee_angle", "ankle_angle"]
+    names = [f"{j}_{s}" for j in joints for s in "rl"]
+    columns = [fit.trials[0].joint_names.index(n) for n in names]
+    for q, trial in zip(truth, fit.trials, strict=True):
+        error = np.rad2deg(np.abs(trial.qpos[:, columns] - q[:, columns]))
+        assert np.median(error) < 3.0
+        assert np.median(error[:, names.index("knee_angle_r")]) < 3.0
+        assert np.median(np.abs(trial.qpos[:, :3] - q[:, :3])) < 0.10
+    assert np.median(np.abs(fit.scale - 1.06)) < 0.03
+
+
+def test_fit_turns_the_body_to_where_it_walks(two_trials):
+    truth, _, fit = two_trials
+    i = fit.trials[0].joint_names.index("pelvis_rotation")
+    for q, trial in zip(truth, fit.trials, strict=True):
+        off = np.angle(np.exp(1j * (trial.qpos[:, i] - q[:, i])))
+        assert np.rad2deg(np.median(np.abs(off))) < 5.0
+
+
+def test_fit_residuals_are_at_the_noise(two_trials):
+    _, _, fit = two_trials
+    for trial in fit.trials:
+        assert np.nanmedian(trial.residual_2d_px) < 2 * 2.0
+        assert np.nanmedian(trial.residual_3d_m) < 2 * 0.016  # |N(0, 1 cm)| in 3D has its median at 1.5 cm
+    assert {c.check: c.outcome for c in fit.qc}["residual_2d_share_of_body_height"] == "PASS"
+
+
+def test_fit_shares_one_body_and_reports_how_it_was_made(two_trials):
+    _, _, fit = two_trials
+    a, b = fit.trials
+    assert np.array_equal(a.scale, b.scale)
+    assert np.array_equal(a.site_offset_m, b.site_offset_m)
+    assert a.params_hash == quick().hash
+    assert fit.loss_trace[-1, 0] == 1500
+    assert fit.loss_trace[-1, 1] < 0.3 * fit.loss_trace[0, 1]
+
+
+def test_fit_file_round_trip(two_trials, tmp_path):
+    trial = two_trials[2].trials[0]
+    trial.save(tmp_path / "a.fit.npz")
+    back = TrialFit.load(tmp_path / "a.fit.npz")
+    for field in dataclasses.fields(TrialFit):
+        a, b = getattr(trial, field.name), getattr(back, field.name)
+        if isinstance(a, np.ndarray):
+            np.testing.assert_array_equal(a, b)
+        elif field.name != "camera":
+            assert a == b, field.name
+
+
+def test_frames_outside_the_view_are_unknown():
+    q = walking_qpos(TIME_S)
+    k = observe(q, TIME_S)
+    confidence = k.confidence.copy()
+    confidence[:20] = 0
+    xy, xyz = k.xy_px.copy(), k.xyz_cam_m.copy()
+    xy[:20], xyz[:20] = np.nan, np.nan
+    fit = fit_session([dataclasses.replace(k, xy_px=xy, xyz_cam_m=xyz, confidence=confidence)], ["a"], quick(250))
+    assert np.all(np.isnan(fit.trials[0].qpos[:20]))
+    assert np.all(np.isfinite(fit.trials[0].qpos[20:]))
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "text"),
+    [
+        ({"time_s": TIME_S[::-1].copy()}, "FIT_INPUT", "time stamps"),
+        ({"time_s": np.where(TIME_S > 1, 1.0, TIME_S)}, "FIT_INPUT", "time stamps"),
+        ({"confidence": np.zeros((len(TIME_S), 33))}, "FIT_INPUT", "in view"),
+        ({"xyz_cam_m": np.full((len(TIME_S), 33, 3), np.nan)}, "FIT_INPUT", "NaN"),
+        ({"marker_set": "no_such_set"}, "MARKER_SET_UNKNOWN", "no_such_set"),
+        ({"names": tuple(f"m{i}" for i in range(33))}, "MARKER_SET_UNKNOWN", "m0"),
+    ],
+)
+def test_bad_keypoints_are_refused(change, code, text):
+    k = dataclasses.replace(observe(walking_qpos(TIME_S), TIME_S), **change)
+    with pytest.raises(PblError, match=text) as error:
+        fit_session([k], ["a"], quick(250))
+    assert error.value.code == code
+
+
+def test_under_a_second_in_view_is_refused():
+    time_s = TIME_S[:25]
+    with pytest.raises(PblError, match=r"0\.80 s") as error:
+        fit_session([observe(walking_qpos(time_s), time_s)], ["a"], quick(250))
+    assert error.value.code == "FIT_INPUT"
+
+
+def test_huber_is_quadratic_then_linear_with_finite_gradient_at_zero():
+    e = jnp.array([0.0, 1.0, 5.0, 7.0])
+    np.testing.assert_allclose(huber_of_square(e**2, 5.0), [0, 0.5, 12.5, 5 * (7 - 2.5)], rtol=1e-6)
+    gradient = jax.grad(lambda x: huber_of_square(jnp.sum(x**2), 5.0))(jnp.zeros(3))
+    np.testing.assert_array_equal(gradient, 0)
+
+
+def test_weighted_mean_counts_only_weighted_frames():
+    cost, c = jnp.array([[1.0, 3.0], [100.0, 100.0]]), jnp.array([[1.0, 0.5], [1.0, 1.0]])
+    assert float(weighted_mean(cost, c, jnp.array([1.0, 0.0]))) == pytest.approx((1 + 1.5) / 2)
+
+
+def test_projection_by_hand_and_bounded_behind_the_camera():
+    K = jnp.asarray(CAMERA.matrix)
+    np.testing.assert_allclose(project_px(jnp.array([[0.5, -0.25, 5.0]]), K), [[960 + 150, 540 - 75]], rtol=1e-6)
+    x = jnp.array([[0.3, 0.1, -2.0], [0.1, 0.1, 0.0]])
+    assert np.all(np.isfinite(project_px(x, K)))
+    assert np.all(np.isfinite(jax.grad(lambda y: jnp.sum(project_px(y, K)))(x)))
+
+
+def test_distances_by_hand():
+    R = jnp.asarray(LEVEL_CAMERA_R_NC)
+    x_world = jnp.array([[4.0, 0.0, 0.0], [4.0, 1.0, 0.0], [4.0, 0.0, 1.0]])
+    x_cam = x_world @ R + jnp.array([7.0, 0.0, 0.0])  # moved as a whole: the centred distance does not see it
+    c = jnp.ones(3)
+    np.testing.assert_allclose(distance_3d_cm2(x_world, x_cam, R, c), 0, atol=1e-3)
+    # Ahead of a level camera: world +y is to the left, world +z up.
+    xy = jnp.array([[960.0, 540.0], [960.0 - 375, 540.0], [960.0, 540.0 - 375 + 3]])
+    np.testing.assert_allclose(distance_2d_px2(x_world, xy, R, jnp.asarray(CAMERA.matrix)), [0, 0, 9], atol=1e-2)
+    assert float(jnp.abs(jnp.sum(center(x_world, jnp.array([1.0, 1.0, 0.0]))[:2])).max()) < 1e-6
+
+
+def test_root_position_from_pixels():
+    rng = np.random.default_rng(1)
+    x = rng.normal(0, 0.4, (3, 10, 3))
+    root = np.array([[0.2, 0.1, 5.0], [-1.0, 0.3, 8.0], [1.0, 0.0, 3.0]])
+    uv = (x + root[:, None]) @ CAMERA.matrix.T
+    c = np.ones((3, 10))
+    c[2, 4:] = 0
+    c[1, 3:] = 0
+    found = root_positions(x, uv[..., :2] / uv[..., 2:], c, CAMERA.matrix)
+    np.testing.assert_allclose(found[[0, 2]], root[[0, 2]], atol=1e-9)
+    assert np.all(np.isnan(found[1]))  # three points are not enough
+
+
+def test_pose_and_its_inverse():
+    names = ["pelvis_tx", "pelvis_ty", "pelvis_tz", "pelvis_tilt", "pelvis_list", "pelvis_rotation", "knee_angle_r"]
+    limits = np.array([[-np.inf, np.inf]] * 6 + [[-2.8, 0.2]])
+    low, high, is_translation = fit_ranges(names, limits)
+    q = np.array([3.0, -1.0, 0.5, 0.1, -0.2, 3.0, -1.0])
+    back = pose_of(jnp.asarray(raw_of(q, low, high, is_translation)), *map(jnp.asarray, (low, high, is_translation)))
+    np.testing.assert_allclose(back, q, atol=1e-5)
+    far = pose_of(jnp.full(7, 50.0), *map(jnp.asarray, (low, high, is_translation)))
+    assert float(far[-1]) == pytest.approx(0.2, abs=1e-5)
+
+
+def test_time_encoding_covers_the_band():
+    omega = frequencies(6.0, 80.0, 2)
+    assert omega[0] == pytest.approx(np.pi / 6)
+    assert 80 <= omega[-1] < 80 * 2**0.5
+    np.testing.assert_allclose(omega[2:] / omega[:-2], 2.0)
+    network = ImplicitTrajectory(len(omega), (16, 16, 16), 2, 40, 0.1, key=jax.random.key(0))
+    assert network(jnp.asarray(0.5), jnp.asarray(omega, jnp.float32)).shape == (40,)
+
+
+def test_short_gaps_are_bridged_and_long_ones_are_not():
+    time_s = np.arange(100) / 30
+    seen = np.ones(100, bool)
+    seen[10:30] = False  # 0.7 s
+    seen[50:90] = False  # 1.4 s
+    used = bridge_gaps(seen, time_s, 1.0)
+    assert used[:50].all()
+    assert not used[50:90].any()
+    assert longest_run_s(used, time_s) == pytest.approx(49 / 30)
+
+
+def test_person_cut_by_the_border_is_not_in_view():
+    k = observe(walking_qpos(TIME_S), TIME_S)
+    xy = k.xy_px.copy()
+    xy[5, 27:33] += [0, 2000.0]  # feet below the picture
+    assert np.flatnonzero(~whole_person_in_view(dataclasses.replace(k, xy_px=xy), 0.3)).tolist() == [5]
+
+
+def test_paramsets_survive_json_and_name_their_steps():
+    import json
+
+    for p in PARAMSETS.values():
+        stored = Paramset(p.stage, p.name, p.version, json.loads(p.canonical_json))
+        assert params_of(stored) == params_of(p)
+        assert stored.hash == p.hash
+    short = with_steps(PARAMSETS["paper-2025"], 100)
+    assert short.hash != PARAMSETS["paper-2025"].hash
+    assert "100" in short.name
