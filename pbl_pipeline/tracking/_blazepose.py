@@ -137,7 +137,8 @@ class BlazePoseDetector:
         values, scores = decode(raw_boxes, output[N_ANCHORS].reshape(N_ANCHORS), self._min_score)
         values, scores = suppress(values, scores, self._min_iou)
         points = values.reshape(-1, 6, 2) * INPUT_SIZE
-        points = (points - [left, top]) * [width / w, height / h]
+        # Half a pixel less: the network counts from the picture's edge, pixel coordinates from the first centre.
+        points = (points - [left, top]) * [width / w, height / h] - 0.5
         detections = []
         for p, score in zip(points, scores, strict=True):
             roi = circle_roi(p[2], p[3])

@@ -37,7 +37,7 @@ class SubjectParams:
     walk_steadiness: share of the variance of the position that a steady movement explains (0.75 for one sudden step).
     walk_speed_max: in body heights per second (a runner has 1.8). size_slack: natural logarithm of the change of the
     apparent size that is not taken for approach: bending, sitting and raising the arms change the size by a third.
-    focal_share: focal length over the longer side of the picture.
+    focal_share: focal length over the longer side of the picture (the median phone's, as in `video.guess_camera`).
     """
 
     weight_in_view: float = 0.25
@@ -53,7 +53,7 @@ class SubjectParams:
     walk_speed_max: float = 1.8
     size_slack: float = 0.3
     max_lean_rad: float = 0.52
-    focal_share: float = 1.0
+    focal_share: float = 0.72
 
 
 SUBJECT_DEFAULT = "walker"
@@ -96,20 +96,16 @@ def choose_subject(
         reason = f"Person {override} was chosen by hand."
         return SubjectChoice("MANUAL", override, scores[override], second, second_score, scores, reason)
     if not people:
-        return SubjectChoice(
-            "NO_PERSON", None, float("nan"), None, float("nan"), {}, "No person was found in the video."
-        )
+        nobody = "No person was found in the video."
+        return SubjectChoice("NO_PERSON", None, float("nan"), None, float("nan"), {}, nobody)
     by_id = {p.person_id: p for p in people}
     long_enough = [p.person_id for p in people if p.time_s >= params.min_time_s]
     candidates = sorted(long_enough or scores, key=lambda k: -scores[k])
     best = candidates[0]
     words = _words(by_id[best], tracking)
     if len(candidates) == 1:
-        dropped = len(people) - 1
-        alone = (
-            "the only person found" if not dropped else f"the only person in view for {params.min_time_s:g} s or more"
-        )
-        reason = f"Person {best} is {alone}: {words}."
+        others = f" in view for {params.min_time_s:g} s or more" if len(people) > 1 else " found"
+        reason = f"Person {best} {words}, and is the only person{others}."
         return SubjectChoice("CHOSEN", best, scores[best], None, float("nan"), scores, reason)
     second = candidates[1]
     lead = scores[best] - scores[second]

@@ -11,7 +11,7 @@ from ._types import Detection, PersonDetector
 
 
 def tile_starts(length: int, tile: int, overlap: float) -> list[int]:
-    """Where tiles of `tile` pixels start to cover `length`, evenly spread, overlapping at least by the share `overlap`."""
+    """Where tiles of `tile` pixels start to cover `length`: evenly spread, overlapping by `overlap` or more."""
     if tile >= length:
         return [0]
     n = 1 + math.ceil((length - tile) / (tile * (1.0 - overlap)) - 1e-9)
@@ -39,8 +39,8 @@ def detect_in(detector: PersonDetector, image: np.ndarray, windows: list[tuple[i
         if x1 - x0 < 16 or y1 - y0 < 16:
             continue
         for d in detector.detect(image[y0:y1, x0:x1]):
-            box = d.box_px + [x0, y0, x0, y0]
-            roi = d.roi_px + [x0, y0, 0, 0]
+            box = d.box_px + np.array([x0, y0, x0, y0])
+            roi = d.roi_px + np.array([x0, y0, 0, 0])
             whole = _area(np.clip(box, 0, [width, height, width, height]))
             inside = _area(np.clip(box, [x0, y0, x0, y0], [x1, y1, x1, y1]))
             # A person cut by the window's edge is measured worse than in the neighbouring window that holds her whole.

@@ -25,7 +25,7 @@ class TrackingParams:
 
     search_interval_s: every so often the whole frame and all tiles are searched.
     follow_interval_s: in between, one window around each known person is searched this often.
-    tile_fraction, tile_overlap: tiles are squares of this share of the shorter side, overlapping by at least that share.
+    tile_fraction, tile_overlap: tiles are squares of this share of the shorter side, overlapping by that share or more.
     window_sizes: side of the window around a person, in body circles.
     min_score: detections below it are ignored. association: see `AssociationParams`; gaps up to its `max_gap_s` are
     bridged (observed=False), after a longer one a new person begins.
@@ -43,7 +43,7 @@ class TrackingParams:
     min_score: float = 0.5
     min_hits: int = 3
     min_track_s: float = 0.25
-    association: AssociationParams = AssociationParams()
+    association: AssociationParams = dataclasses.field(default_factory=AssociationParams)
 
 
 DEFAULT = "blazepose-tiles"
@@ -84,11 +84,13 @@ def track_people(
     slack = 0.5 * float(np.median(np.diff(info.time_s))) if info.n_frames > 1 else 0.0
     next_search = next_follow = 0.0
     for frame in progress.track(read_frames(video_path), "people", total=info.n_frames):
+        # The last frame too, so that tracks do not end before the video does.
+        last = frame.index == info.n_frames - 1
         if frame.time_s + slack >= next_search:
             found = detect_in(detector, frame.image, windows)
             next_search = frame.time_s + params.search_interval_s
             may_begin = True
-        elif frame.time_s + slack >= next_follow:
+        elif last or frame.time_s + slack >= next_follow:
             around = [_window(t.predict(frame.time_s), params.window_sizes) for t in associator.live]
             found = detect_in(detector, frame.image, around)
             # A lone window cannot tell a new person from a poor view of the known one.
@@ -122,9 +124,7 @@ def _to_track(person_id: int, trail: Trail, time_s: np.ndarray, size: tuple[int,
     score = np.zeros(n)
     observed = np.zeros(n, bool)
     observed[trail.frames] = True
-    score[inside] = _interpolate(time_s[inside], trail.times, np.array([d.score for d in trail.detections])[:, None])[
-        :, 0
-    ]
+    score[inside] = np.interp(time_s[inside], trail.times, [d.score for d in trail.detections])
     seen_roi = np.array([d.roi_px for d in trail.detections])
     if np.all(np.isfinite(seen_roi)):
         seen_roi[:, 3] = np.unwrap(seen_roi[:, 3])

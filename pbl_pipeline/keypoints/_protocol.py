@@ -1,0 +1,41 @@
+"""What every keypoint detector offers; tables and commands know nothing more of one."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Protocol
+
+import numpy as np
+
+from pbl_pipeline.video import Camera
+
+
+@dataclasses.dataclass(frozen=True)
+class PersonKeypoints:
+    """One person in one frame.
+
+    xy_px (J, 2) in the upright, distorted picture; xyz_cam_m (J, 3) camera frame (x right, y down, z forward);
+    confidence (J,) in 0..1; presence: how sure the detector is that the crop shows a person at all, 0..1;
+    roi_px (4,) centre x, centre y, side, rotation of the body circle as these keypoints show it (NaN: not known),
+    a better crop for the same frame than the one they were found in.
+    """
+
+    xy_px: np.ndarray
+    xyz_cam_m: np.ndarray
+    confidence: np.ndarray
+    presence: float
+    roi_px: np.ndarray
+
+
+class KeypointDetector(Protocol):
+    """Finds the keypoints of the person in a region of one upright BGR frame. Not to be shared by threads."""
+
+    name: str
+    model_sha256: str
+    names: tuple[str, ...]
+    marker_set: str
+    root_relative: bool
+
+    def detect(self, image: np.ndarray, roi_px: np.ndarray, camera: Camera) -> PersonKeypoints:
+        """`roi_px` (4,): the body circle as in `tracking.Detection`; the detector adds the margin it needs."""
+        ...
