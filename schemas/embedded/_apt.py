@@ -5,8 +5,12 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import threading
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
+
+from pbl_pipeline.progress import bar
 
 #: The bare programs: no service, no system user, nothing started.
 PACKAGES = ("mariadb-server-core", "mariadb-client-core")
@@ -26,13 +30,15 @@ def install(say: Say) -> str | None:
     prefix = _privilege()
     if prefix is None:
         return "you are not root and sudo asks for a password"
-    command = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get"]
-    add = [*command, "install", "-y", "-q", "--no-install-recommends", *PACKAGES]
-    say(f"  {' '.join(add)}")
-    if _run(add) is None:
+    # A fresh machine may be installing its own updates: wait for the lock.
+    command = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "-q", "-o", "DPkg::Lock::Timeout=120"]
+    add = [*command, "install", "-y", "--no-install-recommends", *PACKAGES]
+    say(f"  {' '.join([*prefix, 'apt-get install --no-install-recommends', *PACKAGES])}")
+    failure = _run(add, label="apt-get install")
+    if failure is None:
         return None
-    say("  the package list is missing or old: apt-get update")
-    return _run([*command, "update", "-q"]) or _run(add)
+    say(f"  the package list may be missing or old ({failure}): apt-get update")
+    return _run([*command, "update"], label="apt-get update") or _run(add, label="apt-get install")
 
 
 def unpack(folder: Path, say: Say, apt_options: Sequence[str] = ()) -> str | None:
@@ -70,16 +76,16 @@ def _download_and_unpack(work: Path, say: Say, apt_options: Sequence[str]) -> st
     # The system's package lists are used as they are; where they are missing, own ones are fetched beside them.
     own_lists = ["-o", f"Dir::State::Lists={work / 'lists'}", "-o", f"Dir::Cache={work}", "-o", "Debug::NoLocking=1"]
     for lists in ([], own_lists):
-        options = [*lists, *apt_options]
+        options = [*apt_options, *lists]
         if lists:
             say("  fetching a package list of our own")
-            failure = _run(["apt-get", *options, "update", "-q"])
+            failure = _run(["apt-get", *options, "-q", "update"], label="apt-get update")
             if failure:
                 return failure
         wanted, failure = _missing(options)
         if failure is None:
             say(f"  downloading {', '.join(wanted)}")
-            failure = _run(["apt-get", *options, "download", "-q", *wanted], cwd=work / "archives")
+            failure = _run(["apt-get", *options, "-q", "download", *wanted], work / "archives", "apt-get download")
         if failure is None:
             break
     else:
@@ -96,7 +102,7 @@ def _missing(options: Sequence[str]) -> tuple[list[str], str | None]:
     simulate = ["apt-get", *options, "-s", "-q", "install", "--no-install-recommends", *PACKAGES]
     done = subprocess.run(simulate, capture_output=True, text=True, timeout=TIMEOUT_S, env=_env(), check=False)
     if done.returncode != 0:
-        return [], _last_line(done.stderr or done.stdout)
+        return [], _reason(done.stderr or done.stdout) or "apt-get failed"
     names = [line.split()[1] for line in done.stdout.splitlines() if line.startswith("Inst ")]
     return sorted({*names, *PACKAGES}), None
 
@@ -109,25 +115,37 @@ def _privilege() -> list[str] | None:
     return None
 
 
-def _run(command: Sequence[str], cwd: Path | None = None) -> str | None:
+def _run(command: Sequence[str], cwd: Path | None = None, label: str = "") -> str | None:
+    """Run to the end, with a bar that moves with each line when `label` is given; None when well, else why not."""
     try:
-        done = subprocess.run(
+        child = subprocess.Popen(
             command,
-            capture_output=True,
-            text=True,
-            timeout=TIMEOUT_S,
             stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
             env=_env(),
             cwd=cwd,
-            check=False,
         )
-    except subprocess.TimeoutExpired:
-        return f"{command[0]} did not end within {TIMEOUT_S:.0f} s"
     except FileNotFoundError:
         return f"{command[0]} is not installed"
-    if done.returncode == 0:
+    watchdog = threading.Timer(TIMEOUT_S, child.kill)
+    watchdog.start()
+    said = ""
+    try:
+        with bar(label, unit="line") if label else nullcontext() as update:
+            for line in child.stdout or ():
+                said += line
+                if update is not None:
+                    update(1, line.strip()[:50])
+        child.wait()
+    finally:
+        watchdog.cancel()
+        child.kill()
+    if child.returncode == 0:
         return None
-    return _last_line(done.stderr or done.stdout) or f"{command[0]} ended with code {done.returncode}"
+    return _reason(said) or f"{command[0]} ended with code {child.returncode}"
 
 
 def _env() -> dict[str, str]:
@@ -135,6 +153,7 @@ def _env() -> dict[str, str]:
     return {**os.environ, "LC_ALL": "C", "DEBIAN_FRONTEND": "noninteractive"}
 
 
-def _last_line(text: str) -> str:
-    lines = [line for line in text.splitlines() if line.strip()]
-    return lines[-1].strip() if lines else ""
+def _reason(text: str) -> str:
+    """The line that says why: apt's first error (E: ...), else the last line."""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return next((line for line in lines if line.startswith("E: ")), lines[-1] if lines else "")
