@@ -1,0 +1,66 @@
+"""Connect, declare the tables in the order of dependency, insert the method rows."""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+from typing import Any
+
+#: Modules of tables, each its own schema on the server, in the order of dependency.
+STAGES = ("lab", "session", "video", "tracking", "keypoints", "fit", "gait", "gdi", "qc")
+
+#: The computed tables of the chain, in the order in which populate visits them: (module, class).
+COMPUTED = (
+    ("video", "VideoInfo"),
+    ("tracking", "Tracking"),
+    ("tracking", "SubjectChoice"),
+    ("keypoints", "Keypoints"),
+    ("fit", "TrialInput"),
+    ("fit", "SessionFit"),
+    ("gait", "GaitEvents"),
+    ("gait", "GaitCycle"),
+    ("gait", "Spatiotemporal"),
+    ("gdi", "GDI"),
+    ("gdi", "SessionGdi"),
+    ("qc", "SessionQc"),
+)
+
+_methods_done: set[str] = set()
+
+
+def modules() -> list[ModuleType]:
+    """The table modules, imported."""
+    return [importlib.import_module(f"schemas.{stage}") for stage in STAGES]
+
+
+def activate(start: bool = False, methods: bool = True) -> None:
+    """Bind all tables to the database; safe to call again.
+
+    Parameters
+    ----------
+    start
+        Start the embedded server when it is not running.
+    methods
+        Insert the method, body and norm rows of this version of the code (loads the numerical libraries, a few
+        seconds). Commands that only look leave it out.
+
+    Raises
+    ------
+    PblError
+        What `schemas.connection.connect` raises.
+    """
+    from . import connection
+
+    connection.connect(start=start)
+    for stage, module in zip(STAGES, modules(), strict=True):
+        connection.bind(stage, module.schema)
+    if methods and connection.prefix() not in _methods_done:
+        from ._methods import insert_all
+
+        insert_all()
+        _methods_done.add(connection.prefix())
+
+
+def computed_tables() -> list[Any]:
+    """The computed tables in the order of the chain."""
+    return [getattr(importlib.import_module(f"schemas.{module}"), name) for module, name in COMPUTED]

@@ -1,0 +1,53 @@
+"""The method, body and norm rows of this version of the code."""
+
+from __future__ import annotations
+
+from . import fit, gait, gdi, keypoints, tracking
+from ._base import insert_methods, library
+
+
+def insert_all() -> None:
+    """Insert what the lookup tables lack; nothing is ever edited. Loads the numerical libraries."""
+    tracks, points, fits, gaits = (library(name) for name in ("tracking", "keypoints", "fit", "gait"))
+    insert_methods(tracking.TrackingMethod, "tracking", tracks.PARAMSETS)
+    insert_methods(tracking.SubjectMethod, "subject", tracks.SUBJECT_PARAMSETS)
+    insert_methods(keypoints.KeypointMethod, "keypoint", points.PARAMSETS)
+    insert_methods(fit.FitMethod, "fit", fits.PARAMSETS)
+    insert_methods(gait.GaitEventMethod, "gait", gaits.EVENT_PARAMSETS)
+    insert_methods(gdi.GdiModel, "gdi", gaits.GDI_PARAMSETS)
+    _body()
+    for name in gaits.norm_names():
+        _norm(name)
+
+
+def _body() -> None:
+    body = library("body").load_body()
+    row = {
+        "body_model": f"{body.name}-{body.version}",
+        "body_name": body.name,
+        "body_version": body.version,
+        "body_sha256": body.sha256,
+        "joint_names": list(body.joint_names),
+        "scale_names": list(library("body").SCALE_NAMES),
+    }
+    if not fit.BodyModel & {"body_sha256": body.sha256}:
+        fit.BodyModel.insert1(row)
+
+
+def _norm(name: str) -> None:
+    norm = library("gait").load_norm(name)
+    if gdi.NormativeSet & {"norm_sha256": norm.sha256}:
+        return
+    gdi.NormativeSet.insert1(
+        {
+            "norm": f"{norm.name}-v{norm.version}",
+            "norm_name": norm.name,
+            "norm_version": norm.version,
+            "norm_sha256": norm.sha256,
+            "norm_n": norm.n,
+            "norm_variables": list(norm.variables),
+            "norm_source": norm.source[:1000],
+            "norm_convention": norm.convention[:1000],
+            "norm_licence": norm.licence[:500],
+        }
+    )

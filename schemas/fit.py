@@ -1,0 +1,266 @@
+"""The session fit: which trials are fitted together, and the movement that comes out."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import keypoints, session, video  # noqa: F401  a definition refers to session
+from ._base import (
+    Origin,
+    computes,
+    dj,
+    file_ref,
+    library,
+    method_arguments,
+    method_columns,
+    new_folder,
+    number,
+    origin_columns,
+    stored_file,
+    stored_paramset,
+)
+
+schema = dj.Schema()
+
+
+@schema
+class BodyModel(dj.Lookup):
+    definition = """
+    # a body to fit, by the hash of its MJCF
+    body_model    : varchar(48)                # name and version
+    ---
+    body_name     : varchar(32)
+    body_version  : varchar(15)
+    body_sha256   : char(64)                   # of the MJCF
+    joint_names   : json                       # order of qpos
+    scale_names   : json                       # order of the scale groups
+    unique index (body_sha256)
+    """
+
+
+@schema
+class FitMethod(dj.Lookup):
+    definition = f"""
+    # frozen parameters of a session fit
+    {method_columns("fit")}
+    """
+
+
+@schema
+class FitPlan(dj.Manual):
+    definition = """
+    # which sessions are fitted by which method
+    -> session.Session
+    -> FitMethod
+    """
+
+
+@schema
+class TrialInput(dj.Computed):
+    definition = f"""
+    # trials whose keypoints can be fitted; one that cannot has an error row here and does not hold up its session
+    -> keypoints.Keypoints
+    -> FitMethod
+    ---
+    in_view_share   : float32                  # (0..1) share of frames with the whole person in view
+    n_used          : int32                    # frames that the fit will use
+    {origin_columns("trial_input")}
+    """
+
+    @property
+    def key_source(self) -> Any:
+        planned = video.Video.proj("session_id") * FitPlan
+        return (keypoints.Keypoints.proj() * FitMethod.proj()) & planned
+
+    def make_fetch(self, key: dict) -> tuple:
+        ref = file_ref((keypoints.Keypoints & key).fetch1("keypoints_file"))
+        return (
+            ref,
+            (video.Video & key).fetch1("video_name"),
+            method_arguments(FitMethod, "fit", "fit", key["fit_method"]),
+        )
+
+    @computes
+    def make_compute(self, key: dict, ref: dict, name: str, method: Mapping[str, Any]) -> tuple:
+        with stored_file(self, ref) as path:
+            found = library("keypoints").Keypoints.load(path)
+        used, share = library("fit").check_trial(found, name, stored_paramset(method))
+        return int(np.sum(used)), float(share), method["sha"]
+
+    def make_insert(self, key: dict, n_used: int, share: float, sha: str, origin: Origin) -> None:
+        row = {"n_used": n_used, "in_view_share": share, **origin.row("trial_input", method_hash=sha)}
+        self.insert1({**key, **row})
+
+
+@schema
+class FitSet(dj.Manual):
+    definition = """
+    # videos of a session that are fitted together; another video or person makes another set
+    fit_set           : char(16)               # hash over session, videos, persons and keypoint method
+    ---
+    -> session.Session
+    fit_set_n         : int16                  # how many videos
+    fit_set_created   : datetime               # when planned, UTC
+    """
+
+    class Video(dj.Part):
+        definition = """
+        -> master
+        -> video.Video
+        ---
+        -> keypoints.Keypoints
+        """
+
+
+@schema
+class FitSelection(dj.Manual):
+    definition = """
+    # which sets are fitted by which method
+    -> FitSet
+    -> FitMethod
+    ---
+    fit_current : bool                         # false once a newer set of the session took its place; old fits stay
+    """
+
+
+@schema
+class SessionFit(dj.Computed):
+    definition = f"""
+    # one body fitted to all trials of a set
+    -> FitSelection
+    ---
+    -> BodyModel
+    solver               : varchar(32)
+    fit_loss             : float32             # (-) total loss at the end
+    fit_residual_2d      : float32             # (px) median distance of body and keypoints in the picture
+    fit_residual_3d      : float32             # (cm) median distance of body and 3D keypoints
+    fit_outcome          : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')  # worst check
+    fit_scale            : json                # multiplier (-) of each scale group, 1 = the unscaled body
+    compile_seconds      : float32             # (s) of the duration, spent compiling
+    compute_device       : varchar(64)         # what JAX computed on
+    session_file         : <object@arrays>     # npz: scale (8), site_offset_m (J,3) m, loss_trace (K,2)
+    {origin_columns("fit")}
+    """
+
+    class Trial(dj.Part):
+        definition = """
+        # the fitted movement of one video
+        -> master
+        -> FitSet.Video
+        ---
+        trial_name        : varchar(255)
+        trial_n_fitted    : int32              # frames with joint angles
+        trial_residual_2d : float32            # (px) median distance of body and keypoints in the picture
+        trial_residual_3d : float32            # (cm) median distance of body and 3D keypoints
+        trial_file        : <object@arrays>    # fit.npz: time_s (T) s, qpos (T,40) m and rad, markers_world_m (T,J,3) m, residual_2d_px (T,J) px, residual_3d_m (T,J) m; docs/files.md
+        """  # noqa: E501
+
+    class Check(dj.Part):
+        definition = """
+        # quality checks of the fit
+        -> master
+        fit_check         : varchar(64)        # name, with its unit
+        ---
+        fit_check_outcome : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')
+        fit_check_value=null     : float64     # in the unit (see fit_check)
+        fit_check_threshold=null : float64     # in the unit (see fit_check)
+        fit_check_advice  : varchar(1000)
+        """
+
+    @property
+    def key_source(self) -> Any:
+        return FitSelection & {"fit_current": True}
+
+    def make_fetch(self, key: dict) -> tuple:
+        rows = (FitSet.Video * keypoints.Keypoints.proj("keypoints_file") * video.Video & key).to_dicts(
+            order_by="video_id"
+        )
+        names = trial_names([(r["video_id"], r["video_name"]) for r in rows])
+        trials = [
+            (r["video_id"], n, r["camera_motion"], file_ref(r["keypoints_file"]))
+            for r, n in zip(rows, names, strict=True)
+        ]
+        return trials, method_arguments(FitMethod, "fit", "fit", key["fit_method"])
+
+    @computes
+    def make_compute(self, key: dict, trials: Sequence[tuple], method: Mapping[str, Any]) -> tuple:
+        ids, names, motions, refs = (list(column) for column in zip(*trials, strict=True))
+        with ExitStack() as stack:
+            paths = [stack.enter_context(stored_file(self, ref)) for ref in refs]
+            loaded = [library("keypoints").Keypoints.load(path) for path in paths]
+        # The library knows one moving camera; "one of several" on stands is a static one for it.
+        motions = ["handheld" if m == "handheld" else "static" for m in motions]
+        result = library("fit").fit_session(loaded, names, stored_paramset(method), camera_motion=motions)
+        return result, ids, method["sha"]
+
+    def make_insert(self, key: dict, result: Any, ids: list[int], sha: str, origin: Origin) -> None:
+        body_sha = result.trials[0].body_sha256
+        residual_2d = np.concatenate([t.residual_2d_px.ravel() for t in result.trials])
+        residual_3d = np.concatenate([t.residual_3d_m.ravel() for t in result.trials])
+        with new_folder() as folder:
+            np.savez_compressed(
+                folder / "session.npz",
+                scale=np.asarray(result.scale, np.float32),
+                site_offset_m=np.asarray(result.site_offset_m, np.float32),
+                loss_trace=np.asarray(result.loss_trace, np.float32),
+            )
+            self.insert1(
+                {
+                    **key,
+                    "body_model": (BodyModel & {"body_sha256": body_sha}).fetch1("body_model"),
+                    "solver": result.solver,
+                    "fit_loss": float(result.trials[0].loss),
+                    "fit_residual_2d": float(np.nanmedian(residual_2d)),
+                    "fit_residual_3d": 100 * float(np.nanmedian(residual_3d)),
+                    "fit_outcome": library("qc").worst(result.qc),
+                    "fit_scale": [round(float(s), 5) for s in result.scale],
+                    "compile_seconds": result.compile_seconds,
+                    "compute_device": result.device[:64],
+                    "session_file": folder / "session.npz",
+                    **origin.row("fit", method_hash=sha, model_sha256=body_sha),
+                }
+            )
+            for video_id, trial in zip(ids, result.trials, strict=True):
+                path = folder / f"{video_id}.fit.npz"
+                float32_trial(trial).save(path)
+                self.Trial.insert1(
+                    {
+                        **key,
+                        "video_id": video_id,
+                        "trial_name": trial.name,
+                        "trial_n_fitted": int(np.isfinite(trial.qpos).all(axis=1).sum()),
+                        "trial_residual_2d": float(np.nanmedian(trial.residual_2d_px)),
+                        "trial_residual_3d": 100 * float(np.nanmedian(trial.residual_3d_m)),
+                        "trial_file": path,
+                    }
+                )
+        self.Check.insert({**key, **check_row("fit", check)} for check in result.qc)
+
+
+def check_row(prefix: str, check: Any) -> dict[str, Any]:
+    """A library `Check` as values of a Check part table."""
+    return {
+        f"{prefix}_check": check.check,
+        f"{prefix}_check_outcome": check.outcome,
+        f"{prefix}_check_value": number(check.value),
+        f"{prefix}_check_threshold": number(check.threshold),
+        f"{prefix}_check_advice": check.advice[:1000],
+    }
+
+
+def trial_names(videos: Sequence[tuple[int, str]]) -> list[str]:
+    """A name for each (video_id, file name): the file's stem, with the number where stems repeat."""
+    stems = [Path(name).stem for _, name in videos]
+    return [s if stems.count(s) == 1 else f"{s}-{i}" for (i, _), s in zip(videos, stems, strict=True)]
+
+
+def float32_trial(trial: Any) -> Any:
+    """The trial with float32 arrays, time stamps excepted: what the store keeps."""
+    wide = [f.name for f in dataclasses.fields(trial) if isinstance(getattr(trial, f.name), np.ndarray)]
+    return dataclasses.replace(trial, **{n: np.asarray(getattr(trial, n), np.float32) for n in wide if n != "time_s"})

@@ -1,0 +1,345 @@
+"""Gait events, cycles and spatiotemporal measures of each fitted trial."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from . import fit, session  # noqa: F401  a definition refers to session
+from ._base import (
+    Origin,
+    computes,
+    dj,
+    file_ref,
+    library,
+    method_arguments,
+    method_columns,
+    new_folder,
+    number,
+    origin_columns,
+    stored_file,
+    stored_paramset,
+)
+
+schema = dj.Schema()
+
+
+@schema
+class GaitEventMethod(dj.Lookup):
+    definition = f"""
+    # frozen parameters of event detection
+    {method_columns("gait")}
+    """
+
+
+@schema
+class GaitPlan(dj.Manual):
+    definition = """
+    # which sessions are searched for gait events by which method
+    -> session.Session
+    -> GaitEventMethod
+    """
+
+
+@schema
+class GaitEvents(dj.Computed):
+    definition = f"""
+    # foot down and foot up of both sides; EMPTY: ran well, nobody walks
+    -> fit.SessionFit.Trial
+    -> GaitEventMethod
+    ---
+    events_status     : enum('PASS', 'EMPTY')
+    events_reason     : varchar(1000)          # why EMPTY
+    events_detector   : varchar(64)            # name of the method in the library
+    events_source     : varchar(64)            # what the feet come from
+    walking_bouts     : json                   # (s) start and end of each walking bout
+    n_events          : int16
+    n_candidates      : int16                  # extrema before the check of their order
+    n_order_breaks    : int16                  # bouts that ended because an event was missing or out of order
+    {origin_columns("events")}
+    """
+
+    class Event(dj.Part):
+        definition = """
+        -> master
+        event_no          : int16              # in order of time, from 1
+        ---
+        event_time        : float64            # (s) time of the trial
+        event_side        : enum('left', 'right')
+        event_kind        : enum('foot_down', 'foot_up')
+        event_probability : float32            # (0..1) how clear the event is, not calibrated
+        event_bout        : int16              # walking bout, from 0
+        """
+
+    class Check(dj.Part):
+        definition = """
+        # quality checks of the events
+        -> master
+        events_check         : varchar(64)     # name, with its unit
+        ---
+        events_check_outcome : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')
+        events_check_value=null     : float64  # in the unit (see events_check)
+        events_check_threshold=null : float64  # in the unit (see events_check)
+        events_check_advice  : varchar(1000)
+        """
+
+    @property
+    def key_source(self) -> Any:
+        planned = fit.FitSet.proj("session_id") * GaitPlan
+        return (fit.SessionFit.Trial.proj() * GaitEventMethod.proj()) & planned
+
+    def make_fetch(self, key: dict) -> tuple:
+        ref = file_ref((fit.SessionFit.Trial & key).fetch1("trial_file"))
+        return ref, method_arguments(GaitEventMethod, "gait", "gait", key["gait_method"])
+
+    @computes
+    def make_compute(self, key: dict, ref: dict, method: Mapping[str, Any]) -> tuple:
+        gait = library("gait")
+        with stored_file(self, ref) as path:
+            trial = library("fit").TrialFit.load(path)
+        return gait.detect_events(gait.feet_from_fit(trial), stored_paramset(method)), method["sha"]
+
+    def make_insert(self, key: dict, found: Any, sha: str, origin: Origin) -> None:
+        self.insert1(
+            {
+                **key,
+                "events_status": found.status,
+                "events_reason": found.reason[:1000],
+                "events_detector": found.method,
+                "events_source": found.source[:64],
+                "walking_bouts": [[float(a), float(b)] for a, b in found.walking_s],
+                "n_events": len(found.events),
+                "n_candidates": found.n_candidates,
+                "n_order_breaks": found.n_order_breaks,
+                **origin.row("events", method_hash=sha),
+            }
+        )
+        self.Event.insert(
+            {
+                **key,
+                "event_no": i,
+                "event_time": e.time_s,
+                "event_side": e.side,
+                "event_kind": e.event,
+                "event_probability": e.probability,
+                "event_bout": e.bout,
+            }
+            for i, e in enumerate(found.events, 1)
+        )
+        self.Check.insert({**key, **fit.check_row("events", check)} for check in found.qc)
+
+
+@schema
+class GaitCycle(dj.Computed):
+    definition = f"""
+    # strides of a trial, foot down to the next foot down of the same side
+    -> GaitEvents
+    ---
+    n_cycles        : int16                    # all complete cycles
+    n_cycles_used   : int16                    # without the first and last step of each bout
+    curves          : <object@arrays>          # npz: cycle_no (N), names (A), percent (P) of the cycle, curve (N,A,P) deg
+    {origin_columns("cycles")}
+    """  # noqa: E501
+
+    class Cycle(dj.Part):
+        definition = """
+        -> master
+        cycle_no           : int16             # in order of time, both sides together, from 0
+        ---
+        cycle_side         : enum('left', 'right')
+        cycle_bout         : int16             # walking bout, from 0
+        cycle_start        : float64           # (s) foot down
+        opposite_foot_up   : float64           # (s)
+        opposite_foot_down : float64           # (s)
+        cycle_foot_up      : float64           # (s)
+        cycle_end          : float64           # (s) next foot down of the same side
+        cycle_used         : bool              # false for the first and last step of a bout
+        cycle_excluded     : varchar(100)      # why it is not used
+        curves_missing     : varchar(100)      # why it has no curves
+        """
+
+    def make_fetch(self, key: dict) -> tuple:
+        events = (GaitEvents.Event & key).to_dicts(order_by="event_no")
+        ref = file_ref((fit.SessionFit.Trial & key).fetch1("trial_file"))
+        return [{k: v for k, v in e.items() if k.startswith("event_")} for e in events], ref
+
+    @computes
+    def make_compute(self, key: dict, events: Sequence[Mapping[str, Any]], ref: dict) -> tuple:
+        with stored_file(self, ref) as path:
+            trial = library("fit").TrialFit.load(path)
+        return (library("gait").find_cycles([event_of_row(e) for e in events], trial),)
+
+    def make_insert(self, key: dict, cycles: Sequence[Any], origin: Origin) -> None:
+        with new_folder() as folder:
+            save_curves(cycles, folder / "curves.npz")
+            self.insert1(
+                {
+                    **key,
+                    "n_cycles": len(cycles),
+                    "n_cycles_used": sum(c.used for c in cycles),
+                    "curves": folder / "curves.npz",
+                    **origin.row("cycles"),
+                }
+            )
+        self.Cycle.insert(
+            {
+                **key,
+                "cycle_no": c.number,
+                "cycle_side": c.side,
+                "cycle_bout": c.bout,
+                "cycle_start": c.start_s,
+                "opposite_foot_up": c.opposite_foot_up_s,
+                "opposite_foot_down": c.opposite_foot_down_s,
+                "cycle_foot_up": c.foot_up_s,
+                "cycle_end": c.end_s,
+                "cycle_used": c.used,
+                "cycle_excluded": c.excluded[:100],
+                "curves_missing": c.curves_missing[:100],
+            }
+            for c in cycles
+        )
+
+
+@schema
+class Spatiotemporal(dj.Computed):
+    definition = f"""
+    # measures of a trial over its used cycles; null where one cannot be trusted (Measure says why)
+    -> GaitCycle
+    ---
+    measures_status          : enum('PASS', 'EMPTY')
+    measures_reason          : varchar(1000)   # why EMPTY
+    n_steps_used             : int16
+    cadence=null             : float32         # (steps/min)
+    stride_time=null         : float32         # (s)
+    step_time=null           : float32         # (s)
+    stance=null              : float32         # (percent) of the cycle
+    swing=null               : float32         # (percent) of the cycle
+    double_support=null      : float32         # (percent) of the cycle
+    double_support_time=null : float32         # (s) both double supports of a cycle
+    speed=null               : float32         # (m/s)
+    stride_length=null       : float32         # (m)
+    step_width=null          : float32         # (m)
+    {origin_columns("measures")}
+    """
+
+    class Measure(dj.Part):
+        definition = """
+        # every measure with both sides and its spread
+        -> master
+        measure             : varchar(32)      # name, with its unit
+        ---
+        measure_mean=null   : float32          # in the unit (see measure): both sides
+        measure_left=null   : float32          # in the unit (see measure)
+        measure_right=null  : float32          # in the unit (see measure)
+        measure_sd=null     : float32          # in the unit (see measure): n - 1, null for one value
+        measure_n           : int16            # values
+        measure_missing     : varchar(255)     # why it is null
+        """
+
+    def make_fetch(self, key: dict) -> tuple:
+        name = (fit.SessionFit.Trial & key).fetch1("trial_name")
+        rows = (GaitCycle.Cycle & key).to_dicts(order_by="cycle_no")
+        return name, [{k: v for k, v in r.items() if k not in key} for r in rows]
+
+    @computes
+    def make_compute(self, key: dict, name: str, rows: Sequence[Mapping[str, Any]]) -> tuple:
+        return (library("gait").spatiotemporal([cycle_of_row(r, name) for r in rows]),)
+
+    def make_insert(self, key: dict, result: Any, origin: Origin) -> None:
+        self.insert1(
+            {
+                **key,
+                "measures_status": result.status,
+                "measures_reason": result.reason[:1000],
+                "n_steps_used": result.n_steps_used,
+                **{column: mean_of(result.measures[name]) for name, column in MEASURE_COLUMNS.items()},
+                **origin.row("measures"),
+            }
+        )
+        self.Measure.insert({**key, **row} for row in measure_rows(result.measures, result.reasons))
+
+
+#: Name of a measure in metrics.json -> column of Spatiotemporal (the unit is in the column's comment).
+MEASURE_COLUMNS = {
+    "cadence_steps_per_min": "cadence",
+    "stride_time_s": "stride_time",
+    "step_time_s": "step_time",
+    "stance_percent": "stance",
+    "swing_percent": "swing",
+    "double_support_percent": "double_support",
+    "double_support_time_s": "double_support_time",
+    "speed_m_per_s": "speed",
+    "stride_length_m": "stride_length",
+    "step_width_m": "step_width",
+}
+
+
+def mean_of(measure: Any) -> float | None:
+    """The mean of a library `Measure`, None where there is none."""
+    return None if measure is None else number(measure.mean)
+
+
+def measure_rows(measures: Mapping[str, Any], reasons: Mapping[str, str], prefix: str = "measure") -> list[dict]:
+    """Rows of a Measure part table whose columns begin with `prefix`."""
+    rows = []
+    for name, m in measures.items():
+        row: dict[str, Any] = {prefix: name, f"{prefix}_missing": reasons.get(name, "")[:255]}
+        row |= {f"{prefix}_{k}": None if m is None else number(getattr(m, k)) for k in ("mean", "left", "right", "sd")}
+        rows.append({**row, f"{prefix}_n": 0 if m is None else m.n})
+    return rows
+
+
+def event_of_row(row: Mapping[str, Any]) -> Any:
+    """The library's `GaitEvent`."""
+    return library("gait").GaitEvent(
+        float(row["event_time"]),
+        row["event_side"],
+        row["event_kind"],
+        float(row["event_probability"]),
+        int(row["event_bout"]),
+    )
+
+
+def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Mapping[str, np.ndarray] | None = None) -> Any:
+    """The library's `GaitCycle`."""
+    return library("gait").GaitCycle(
+        trial=trial,
+        number=int(row["cycle_no"]),
+        bout=int(row["cycle_bout"]),
+        side=row["cycle_side"],
+        start_s=float(row["cycle_start"]),
+        opposite_foot_up_s=float(row["opposite_foot_up"]),
+        opposite_foot_down_s=float(row["opposite_foot_down"]),
+        foot_up_s=float(row["cycle_foot_up"]),
+        end_s=float(row["cycle_end"]),
+        used=bool(row["cycle_used"]),
+        excluded=row["cycle_excluded"],
+        curves=dict(curves or {}),
+        curves_missing=row["curves_missing"],
+    )
+
+
+def save_curves(cycles: Sequence[Any], path: Any) -> None:
+    """Write the curves of all cycles to one npz; a cycle without curves is NaN."""
+    percent = np.asarray(library("gait").REPORT_PERCENT, np.float32)
+    names = sorted({name for c in cycles for name in c.curves})
+    curve = np.full((len(cycles), len(names), len(percent)), np.nan, np.float32)
+    for i, cycle in enumerate(cycles):
+        for j, name in enumerate(names):
+            if name in cycle.curves:
+                curve[i, j] = cycle.curves[name]
+    numbers = np.asarray([c.number for c in cycles], np.int16)
+    np.savez_compressed(path, cycle_no=numbers, names=np.asarray(names, dtype=str), percent=percent, curve=curve)
+
+
+def load_curves(path: Any) -> dict[int, dict[str, np.ndarray]]:
+    """Curves by cycle number and name, (P,) degrees; cycles without curves have none."""
+    with np.load(path, allow_pickle=False) as f:
+        data = {k: f[k] for k in f.files}
+    out: dict[int, dict[str, np.ndarray]] = {}
+    for i, n in enumerate(data["cycle_no"]):
+        named = {str(name): data["curve"][i, j] for j, name in enumerate(data["names"])}
+        out[int(n)] = {name: c for name, c in named.items() if np.isfinite(c).all()}
+    return out

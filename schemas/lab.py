@@ -1,0 +1,78 @@
+"""Who and what is recorded: projects, subjects, populations, devices, camera calibrations."""
+
+from __future__ import annotations
+
+from ._base import dj
+
+schema = dj.Schema()
+
+
+@schema
+class Project(dj.Manual):
+    definition = """
+    # a study or clinic
+    project            : varchar(32)           # short name
+    ---
+    project_title=''   : varchar(200)          # full title
+    """
+
+
+@schema
+class Population(dj.Lookup):
+    definition = """
+    # group that a subject belongs to
+    population              : varchar(32)      # short name
+    ---
+    population_description  : varchar(200)
+    """
+    contents = (
+        ("unknown", "not stated"),
+        ("healthy", "no known disorder that affects walking"),
+        ("patient", "a disorder that affects walking"),
+    )
+
+
+@schema
+class Subject(dj.Manual):
+    definition = """
+    # a person, by pseudonymous code only: never a name, initials or a birth date
+    subject               : varchar(32)        # code of the person
+    ---
+    -> [nullable] Project
+    -> Population
+    subject_height=null   : float32            # (m) measured body height
+    subject_created       : datetime           # when registered, UTC
+    """
+
+
+@schema
+class Device(dj.Manual):
+    definition = """
+    # model of a recording device
+    device           : varchar(64)             # short name, such as pixel-8-rear
+    ---
+    device_make=''   : varchar(64)
+    device_model=''  : varchar(64)
+    """
+
+
+@schema
+class CameraCalibration(dj.Manual):
+    definition = """
+    # intrinsics of an upright frame
+    camera_id                : int32
+    ---
+    -> [nullable] Device
+    camera_origin            : enum('measured', 'exif', 'preset', 'estimated')  # how the figures were had
+    camera_width             : int32           # (px) width of the upright frame they hold for
+    camera_height            : int32           # (px) height of the upright frame they hold for
+    camera_fx                : float64         # (px) focal length, horizontal
+    camera_fy                : float64         # (px) focal length, vertical
+    camera_cx                : float64         # (px) principal point from the left edge
+    camera_cy                : float64         # (px) principal point from the upper edge
+    camera_distortion        : json            # k1 k2 p1 p2 k3 (-), OpenCV's order
+    camera_focal_sd=null     : float32         # (px) standard deviation of the focal length, null when unknown
+    camera_note              : varchar(255)    # file or rule they come from
+    camera_sha256            : char(64)        # over all figures, so that one calibration is stored once
+    unique index (camera_sha256)
+    """

@@ -1,0 +1,84 @@
+"""Every quality check of a visit in one place; the worst outcome wins."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from . import fit, gait, gdi
+from ._base import Origin, computes, dj, library, origin_columns
+
+schema = dj.Schema()
+
+#: The part tables that hold checks: stage, table, prefix of its columns.
+SOURCES = (
+    ("fit", fit.SessionFit.Check, "fit"),
+    ("gait", gait.GaitEvents.Check, "events"),
+    ("gdi", gdi.SessionGdi.Check, "gdi"),
+)
+
+
+@schema
+class SessionQc(dj.Computed):
+    definition = f"""
+    # worst outcome of all checks of a visit
+    -> gdi.SessionGdi
+    ---
+    qc_outcome : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')
+    qc_n       : int16                         # how many checks
+    qc_worst   : varchar(1000)                 # names of the checks with that outcome, empty for PASS
+    {origin_columns("qc")}
+    """
+
+    class Check(dj.Part):
+        definition = """
+        -> master
+        qc_no             : int16              # from 1, in the order of the chain
+        ---
+        qc_stage          : varchar(16)        # part of the chain
+        qc_video_id=null  : int32              # trial it is about, null for the session
+        qc_check          : varchar(64)        # name, with its unit
+        qc_check_outcome  : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')
+        qc_value=null     : float64            # in the unit (see qc_check)
+        qc_threshold=null : float64            # in the unit (see qc_check)
+        qc_advice         : varchar(1000)      # what to do about it
+        """
+
+    def make_fetch(self, key: dict) -> tuple:
+        found = []
+        for stage, table, prefix in SOURCES:
+            for row in (table & key).to_dicts(order_by="KEY"):
+                found.append(
+                    {
+                        "qc_stage": stage,
+                        "qc_video_id": row.get("video_id"),
+                        "qc_check": row[f"{prefix}_check"],
+                        "qc_check_outcome": row[f"{prefix}_check_outcome"],
+                        "qc_value": row[f"{prefix}_check_value"],
+                        "qc_threshold": row[f"{prefix}_check_threshold"],
+                        "qc_advice": row[f"{prefix}_check_advice"],
+                    }
+                )
+        return (found,)
+
+    @computes
+    def make_compute(self, key: dict, rows: Sequence[dict[str, Any]]) -> tuple:
+        qc = library("qc")
+        checks = [
+            qc.Check(r["qc_check"], r["qc_check_outcome"], r["qc_value"], r["qc_threshold"], r["qc_advice"])
+            for r in rows
+        ]
+        return qc.worst(checks), rows
+
+    def make_insert(self, key: dict, outcome: str, rows: Sequence[dict[str, Any]], origin: Origin) -> None:
+        named = [r["qc_check"] for r in rows if r["qc_check_outcome"] == outcome] if outcome != "PASS" else []
+        self.insert1(
+            {
+                **key,
+                "qc_outcome": outcome,
+                "qc_n": len(rows),
+                "qc_worst": ", ".join(dict.fromkeys(named))[:1000],
+                **origin.row("qc"),
+            }
+        )
+        self.Check.insert({**key, "qc_no": i, **row} for i, row in enumerate(rows, 1))

@@ -1,0 +1,25 @@
+"""Visits: the recordings of one subject that share one body."""
+
+from __future__ import annotations
+
+from . import lab  # noqa: F401  the definition refers to it
+from ._base import dj
+
+schema = dj.Schema()
+
+#: Label of the session of videos that were ingested without one.
+UNLABELLED = "unlabelled"
+
+
+@schema
+class Session(dj.Manual):
+    definition = """
+    # a visit: its videos are fitted together with one body
+    session_id          : int32
+    ---
+    -> lab.Subject
+    session_label       : varchar(64)          # date (YYYY-MM-DD) or the lab's own label
+    session_date=null   : date                 # when recorded, null when unknown
+    session_created     : datetime             # when registered, UTC
+    unique index (subject, session_label)
+    """

@@ -1,0 +1,279 @@
+"""People in a video, and which of them is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+
+from . import video
+from ._base import (
+    Origin,
+    computes,
+    dj,
+    file_ref,
+    library,
+    method_arguments,
+    method_columns,
+    new_folder,
+    number,
+    origin_columns,
+    rebuild_params,
+    stored_file,
+    utc_now,
+)
+
+schema = dj.Schema()
+
+#: Statuses of a choice that let the chain go on.
+CHOSEN = ("CHOSEN", "MANUAL")
+
+
+@schema
+class TrackingMethod(dj.Lookup):
+    definition = f"""
+    # frozen parameters of person detection, association and choice
+    {method_columns("tracking")}
+    """
+
+
+@schema
+class SubjectMethod(dj.Lookup):
+    definition = f"""
+    # frozen parameters of the automatic choice of the measured person
+    {method_columns("subject")}
+    """
+
+
+@schema
+class TrackingSelection(dj.Manual):
+    definition = """
+    # which videos are tracked by which method
+    -> video.Video
+    -> TrackingMethod
+    ---
+    -> SubjectMethod
+    """
+
+
+@schema
+class SubjectOverride(dj.Manual):
+    definition = """
+    # a person's decision who is measured; it wins over the automatic choice
+    -> TrackingSelection
+    ---
+    override_person_id : int16                 # number of the person in the tracking
+    override_created   : datetime              # when decided, UTC
+    """
+
+
+@schema
+class Tracking(dj.Computed):
+    definition = f"""
+    # everybody in the video, numbered in order of appearance
+    -> TrackingSelection
+    ---
+    n_persons       : int16
+    detector        : varchar(64)              # name of the person detector
+    tracks          : <object@arrays>         # npz: time_s (T) s, person_id (N), box_px (N,T,4) px, roi_px (N,T,4) px px px rad, score (N,T) 0..1, observed (N,T)
+    {origin_columns("tracking")}
+    """  # noqa: E501
+
+    class Person(dj.Part):
+        definition = """
+        # one person's track in figures
+        -> master
+        person_id       : int16
+        ---
+        first_frame     : int32                # first frame in view
+        last_frame      : int32                # last frame in view
+        first_time      : float32              # (s) time of the first frame in view
+        last_time       : float32              # (s) time of the last frame in view
+        n_observed      : int32                # frames in which the detector saw the person itself
+        detection_score : float32              # (0..1) median score of those frames
+        box_height      : float32              # (px) median height of the box
+        """
+
+    @property
+    def key_source(self) -> Any:
+        """Only what a probe could read: a file that is no video has one error row, in VideoInfo."""
+        return TrackingSelection & video.VideoInfo
+
+    def make_fetch(self, key: dict) -> tuple:
+        method = method_arguments(TrackingMethod, "tracking", "tracking", key["tracking_method"])
+        return (video.Video & key).fetch1("video_path", "video_sha256"), method
+
+    @computes
+    def make_compute(self, key: dict, file: tuple, method: Mapping[str, Any]) -> tuple:
+        path = video.registered_file(*file, key)
+        params = rebuild_params(library("tracking").TrackingParams, **method)
+        return library("tracking").track_people(path, params=params), method["sha"]
+
+    def make_insert(self, key: dict, tracking: Any, sha: str, origin: Origin) -> None:
+        with new_folder() as folder:
+            save_tracking(tracking, folder / "tracks.npz")
+            self.insert1(
+                {
+                    **key,
+                    "n_persons": len(tracking.persons),
+                    "detector": tracking.detector,
+                    "tracks": folder / "tracks.npz",
+                    **origin.row("tracking", method_hash=sha, model_sha256=tracking.model_sha256),
+                }
+            )
+        self.Person.insert({**key, **_person_row(p, tracking.time_s)} for p in tracking.persons)
+
+
+@schema
+class SubjectChoice(dj.Computed):
+    definition = f"""
+    # who is measured: chosen by score with a written reason, or by a person (SubjectOverride)
+    -> Tracking
+    ---
+    choice_status        : enum('CHOSEN', 'MANUAL', 'NEEDS_CHOICE', 'NO_PERSON')
+    chosen_person_id=null: int16               # null unless CHOSEN or MANUAL
+    choice_score=null    : float32             # (0..1) score of the chosen person
+    runner_up_id=null    : int16               # next best person
+    runner_up_score=null : float32             # (0..1) score of the next best person
+    choice_scores        : json                # person number to score (0..1)
+    choice_reason        : varchar(2000)       # why, in a sentence
+    {origin_columns("choice")}
+    """
+
+    def make_fetch(self, key: dict) -> tuple:
+        tracks, detector, model = (Tracking & key).fetch1("tracks", "detector", "tracking_model_sha256")
+        size = (video.VideoInfo & key).fetch1("width", "height")
+        override = (SubjectOverride & key).to_dicts()
+        person = int(override[0]["override_person_id"]) if override else None
+        subject_method = (TrackingSelection & key).fetch1("subject_method")
+        method = method_arguments(SubjectMethod, "subject", "subject", subject_method)
+        return file_ref(tracks), (int(size[0]), int(size[1])), (detector, model), person, method
+
+    @property
+    def key_source(self) -> Any:
+        return Tracking & video.VideoInfo
+
+    @computes
+    def make_compute(
+        self, key: dict, ref: dict, size: tuple, about: tuple, override: int | None, method: Mapping[str, Any]
+    ) -> tuple:
+        params = rebuild_params(library("tracking").SubjectParams, **method)
+        with stored_file(self, ref) as path:
+            tracking = load_tracking(path, size, *about)
+        return library("tracking").choose_subject(tracking, params=params, override=override), method["sha"]
+
+    def make_insert(self, key: dict, choice: Any, sha: str, origin: Origin) -> None:
+        self.insert1(
+            {
+                **key,
+                "choice_status": choice.status,
+                "chosen_person_id": choice.person_id,
+                "choice_score": number(choice.score),
+                "runner_up_id": choice.runner_up_id,
+                "runner_up_score": number(choice.runner_up_score),
+                "choice_scores": {str(k): number(v) for k, v in choice.scores.items()},
+                "choice_reason": choice.reason[:2000],
+                **origin.row("choice", method_hash=sha),
+            }
+        )
+
+
+# ---------------------------------------------------------------------------------------------- override and effects
+def set_override(key: Mapping[str, Any], person_id: int) -> None:
+    """Write a person's decision for one tracking selection. `drop_outdated_choices` then removes what it contradicts.
+
+    Raises
+    ------
+    PblError
+        SUBJECT_UNKNOWN_PERSON when the video is tracked and has no such person.
+    """
+    key = {"video_id": key["video_id"], "tracking_method": key["tracking_method"]}
+    if Tracking & key:
+        persons = sorted(int(p) for p in (Tracking.Person & key).to_arrays("person_id"))
+        if person_id not in persons:
+            raise PblError(
+                "SUBJECT_UNKNOWN_PERSON",
+                found=f"person {person_id}",
+                expected=f"one of {persons}" if persons else "a video in which a person was found",
+                next_step="choose one of the numbers above",
+                key=f"video_id={key['video_id']}",
+            )
+    row = {**key, "override_person_id": person_id, "override_created": utc_now()}
+    if SubjectOverride & key:
+        SubjectOverride.update1(row)
+    else:
+        SubjectOverride.insert1(row)
+
+
+def outdated_choices(restriction: Any = True) -> Any:
+    """Choices that contradict the overrides: another person decided, or the decision was withdrawn."""
+    decided = SubjectChoice.proj("choice_status", "chosen_person_id") * SubjectOverride.proj("override_person_id")
+    differs = decided & "choice_status != 'MANUAL' or chosen_person_id != override_person_id"
+    withdrawn = (SubjectChoice & {"choice_status": "MANUAL"}) - SubjectOverride
+    return SubjectChoice & [differs.proj(), withdrawn.proj()] & restriction
+
+
+def drop_outdated_choices(restriction: Any = True) -> dict[str, int]:
+    """Delete outdated choices and all that was computed from them, in one transaction.
+
+    Returns
+    -------
+    dict
+        Table name to number of deleted rows, empty when nothing was outdated. The next populate computes them anew.
+    """
+    rows = outdated_choices(restriction)
+    if not rows:
+        return {}
+    target = SubjectChoice & rows.proj()
+    counts = {name: n for name, n in dj.Diagram.cascade(target, part_integrity="cascade").counts().items() if n}
+    target.delete(prompt=False, part_integrity="cascade")
+    return counts
+
+
+# ------------------------------------------------------------------------------------------------------- files, rows
+def save_tracking(tracking: Any, path: Path) -> None:
+    """Write all tracks of a video to one npz, float32 but for the time stamps."""
+    t, people = len(tracking.time_s), tracking.persons
+    stack = {
+        "box_px": np.zeros((len(people), t, 4), np.float32),
+        "roi_px": np.zeros((len(people), t, 4), np.float32),
+        "score": np.zeros((len(people), t), np.float32),
+        "observed": np.zeros((len(people), t), bool),
+    }
+    for i, person in enumerate(people):
+        for name, array in stack.items():
+            array[i] = getattr(person, name)
+    ids = np.asarray([p.person_id for p in people], np.int16)
+    np.savez_compressed(path, time_s=np.asarray(tracking.time_s, np.float64), person_id=ids, **stack)
+
+
+def load_tracking(path: Path, size_px: tuple[int, int], detector: str, model_sha256: str) -> Any:
+    """The library's `Tracking` from the npz that `save_tracking` wrote and the row's figures."""
+    types = library("tracking")
+    with np.load(path, allow_pickle=False) as f:
+        data = {k: f[k] for k in f.files}
+    people = tuple(
+        types.PersonTrack(int(p), data["box_px"][i], data["roi_px"][i], data["score"][i], data["observed"][i])
+        for i, p in enumerate(data["person_id"])
+    )
+    return types.Tracking(data["time_s"], size_px, people, detector, model_sha256)
+
+
+def _person_row(person: Any, time_s: np.ndarray) -> dict[str, Any]:
+    frames = np.flatnonzero(np.isfinite(person.box_px).all(axis=1))
+    seen = np.asarray(person.observed, bool)
+    height = person.box_px[frames, 3] - person.box_px[frames, 1]
+    return {
+        "person_id": person.person_id,
+        "first_frame": int(frames[0]),
+        "last_frame": int(frames[-1]),
+        "first_time": float(time_s[frames[0]]),
+        "last_time": float(time_s[frames[-1]]),
+        "n_observed": int(seen.sum()),
+        "detection_score": float(np.median(person.score[seen])) if seen.any() else 0.0,
+        "box_height": float(np.median(height)),
+    }

@@ -1,0 +1,148 @@
+"""Recordings and what a probe finds in them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pbl_pipeline.errors import PblError
+
+from . import lab, session  # noqa: F401  the definitions refer to them
+from ._base import Origin, computes, dj, library, number, origin_columns
+
+schema = dj.Schema()
+
+CAMERA_MOTIONS = ("static", "handheld", "one of several")
+
+
+@schema
+class Video(dj.Manual):
+    definition = """
+    # a video file of one trial
+    video_id        : int32
+    ---
+    -> session.Session
+    -> [nullable] lab.CameraCalibration
+    video_path      : varchar(1000)            # where the file lies, absolute
+    video_name      : varchar(255)             # name of the file
+    video_sha256    : char(64)                 # of its bytes: the same file is never registered twice
+    video_size      : int64                    # (byte) length of the file
+    activity        : varchar(32)              # what the subject does, such as walking
+    camera_motion   : enum('static', 'handheld', 'one of several')
+    video_created   : datetime                 # when registered, UTC
+    unique index (video_sha256)
+    """
+
+
+@schema
+class VideoInfo(dj.Computed):
+    definition = f"""
+    # what the file holds; sizes after the rotation flag is applied
+    -> Video
+    ---
+    container            : varchar(64)
+    codec                : varchar(32)
+    pixel_format         : varchar(32)
+    width                : int32               # (px) of the upright frame
+    height               : int32               # (px) of the upright frame
+    rotation             : int16               # (deg) rotation flag of the file
+    fps=null             : float32             # (1/s) 1 / median frame interval, a description only
+    duration=null        : float32             # (s) from the first frame to the end of the last
+    n_frames             : int32               # frames that decode
+    n_frames_announced   : int32               # frames the header claims, 0 when it says nothing
+    variable_frame_rate  : bool                # whether frame intervals differ
+    recorded_utc=null    : varchar(40)         # recording time as the file states it
+    phone_make=null      : varchar(64)
+    phone_model=null     : varchar(64)
+    video_notes          : json                # remarks on the file, such as a mirrored picture
+    frame_time           : <npy@arrays>       # (s) float64 (T): the container's own time stamps, first frame 0
+    {origin_columns("video_info")}
+    """
+
+    def make_fetch(self, key: dict) -> tuple:
+        return (Video & key).fetch1("video_path", "video_sha256")
+
+    @computes
+    def make_compute(self, key: dict, path: str, sha256: str) -> tuple:
+        return (library("video").probe(registered_file(path, sha256, key)),)
+
+    def make_insert(self, key: dict, info: Any, origin: Origin) -> None:
+        self.insert1(
+            {
+                **key,
+                "container": info.container[:64],
+                "codec": info.codec,
+                "pixel_format": info.pixel_format,
+                "width": info.width_px,
+                "height": info.height_px,
+                "rotation": info.rotation_deg,
+                "fps": number(info.fps),
+                "duration": number(info.duration_s),
+                "n_frames": info.n_frames,
+                "n_frames_announced": info.n_frames_announced,
+                "variable_frame_rate": info.variable_frame_rate,
+                "recorded_utc": info.recorded_utc,
+                "phone_make": info.make,
+                "phone_model": info.model,
+                "video_notes": list(info.notes),
+                "frame_time": info.time_s,
+                **origin.row("video_info"),
+            }
+        )
+
+
+def info_of_row(row: Mapping[str, Any]) -> Any:
+    """The library's `VideoInfo` from a joined row of Video and VideoInfo."""
+    nan = float("nan")
+    return library("video").VideoInfo(
+        path=row["video_path"],
+        sha256=row["video_sha256"],
+        size_bytes=int(row["video_size"]),
+        container=row["container"],
+        codec=row["codec"],
+        pixel_format=row["pixel_format"],
+        width_px=int(row["width"]),
+        height_px=int(row["height"]),
+        rotation_deg=int(row["rotation"]),
+        time_s=row["frame_time"].load(),
+        fps=nan if row["fps"] is None else float(row["fps"]),
+        duration_s=nan if row["duration"] is None else float(row["duration"]),
+        n_frames=int(row["n_frames"]),
+        n_frames_announced=int(row["n_frames_announced"]),
+        variable_frame_rate=bool(row["variable_frame_rate"]),
+        recorded_utc=row["recorded_utc"],
+        make=row["phone_make"],
+        model=row["phone_model"],
+        notes=tuple(row["video_notes"]),
+    )
+
+
+def registered_file(path: str, sha256: str, key: dict) -> Path:
+    """The video file, after checking that it is still the one that was registered.
+
+    Raises
+    ------
+    PblError
+        VIDEO_MISSING, VIDEO_CHANGED.
+    """
+    if not Path(path).is_file():
+        raise PblError(
+            "VIDEO_MISSING",
+            found=f"no file at {path}",
+            expected="the file that was registered",
+            next_step="bring the file or its disk back, then `pbl populate --retry-errors`; "
+            "if it lies elsewhere now, `pbl ingest` the new path and the row takes it over",
+            key=f"video_id={key['video_id']}",
+        )
+    found = library("video").sha256_of(path)
+    if found != sha256:
+        raise PblError(
+            "VIDEO_CHANGED",
+            found=f"{path} has SHA-256 {found}",
+            expected=f"SHA-256 {sha256}, as registered",
+            next_step="restore the original file, then `pbl populate --retry-errors`; "
+            "or `pbl ingest` the changed file as a video of its own",
+            key=f"video_id={key['video_id']}",
+        )
+    return Path(path)
