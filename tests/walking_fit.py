@@ -1,4 +1,4 @@
-"""A walking body with known joint angles, in the form of a fit: for drawing, exporting and reporting, not for accuracy."""
+"""A walking body with known joint angles, in the form of a fit: for drawing, export and report."""
 
 from __future__ import annotations
 

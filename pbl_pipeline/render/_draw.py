@@ -19,7 +19,7 @@ _FAR_PX = 20_000.0  # polygons that reach further than this are cut: OpenCV coun
 
 def draw_body(
     image: np.ndarray,
-    names: Sequence[str],
+    body_names: Sequence[str],
     start_m: np.ndarray,
     end_m: np.ndarray,
     radius_m: np.ndarray,
@@ -31,8 +31,9 @@ def draw_body(
 
     Parameters
     ----------
-    names
-        G names; their side (`_r`, `_l`) chooses the colour.
+    body_names
+        The body of each of the G capsules. Its side (`_r`, `_l`) chooses the colour; the capsules of one body are
+        drawn as one shape with one outline.
     start_m, end_m : (G, 3)
         Ends of the axes, world frame. Capsules with NaN are left out; what lies behind `NEAR_M` is cut off.
     radius_m : (G,)
@@ -42,31 +43,31 @@ def draw_body(
         0..1; the person stays visible through the body.
     """
     start, end = to_camera(start_m, quat_wxyz), to_camera(end_m, quat_wxyz)
-    depth = 0.5 * (start[:, 2] + end[:, 2])
-    if not np.any(np.isfinite(depth)):
-        return
-    middle = float(np.nanmedian(depth))
-    layer: np.ndarray | None = None
-    box = np.array([np.inf, np.inf, -np.inf, -np.inf])
-    # Far ones first, so that the near limb covers the far one.
-    for g in np.argsort(-depth):
+    outlines: dict[str, list[np.ndarray]] = {}
+    depths: dict[str, list[float]] = {}
+    for g, name in enumerate(body_names):
         outline = capsule_outline(start[g], end[g], float(radius_m[g]), camera)
-        if outline is None or not _touches(outline, image.shape):
-            continue
-        if layer is None:
-            layer = image.copy()
-        corners = np.rint(outline * (1 << _SHIFT)).astype(np.int32)
-        fill, edge = _shaded(SIDE_COLOUR[side_of(names[g])], (middle - float(depth[g])) / _SHADE_DEPTH_M)
-        cv2.fillConvexPoly(layer, corners, fill, cv2.LINE_AA, _SHIFT)
-        cv2.polylines(layer, [corners], True, edge, 1, cv2.LINE_AA, _SHIFT)
-        box[:2] = np.minimum(box[:2], outline.min(0) - 2)
-        box[2:] = np.maximum(box[2:], outline.max(0) + 3)
-    if layer is None:
+        if outline is not None and _touches(outline, image.shape):
+            outlines.setdefault(name, []).append(outline)
+            depths.setdefault(name, []).append(0.5 * float(start[g, 2] + end[g, 2]))
+    if not outlines:
         return
+    depth = {name: float(np.mean(d)) for name, d in depths.items()}
+    middle = float(np.median(list(depth.values())))
+    layer = image.copy()
+    # Far ones first, so that the near limb covers the far one.
+    for name in sorted(outlines, key=lambda n: -depth[n]):
+        corners = [np.rint(o * (1 << _SHIFT)).astype(np.int32) for o in outlines[name]]
+        fill, edge = _shaded(SIDE_COLOUR[side_of(name)], (middle - depth[name]) / _SHADE_DEPTH_M)
+        # All outlines before all fills: what remains of them is the outline of the whole.
+        cv2.polylines(layer, corners, True, edge, 2, cv2.LINE_AA, _SHIFT)
+        for c in corners:
+            cv2.fillConvexPoly(layer, c, fill, cv2.LINE_AA, _SHIFT)
     # Only the rectangle around the body is blended: on a large frame that is most of the time saved.
-    h, w = image.shape[:2]
-    x0, y0 = (int(v) for v in np.clip(box[:2], 0, [w, h]))
-    x1, y1 = (int(v) for v in np.clip(box[2:], 0, [w, h]))
+    every = np.concatenate([o for group in outlines.values() for o in group])
+    limit = [image.shape[1], image.shape[0]]
+    x0, y0 = (int(v) for v in np.clip(every.min(0) - 3, 0, limit))
+    x1, y1 = (int(v) for v in np.clip(every.max(0) + 4, 0, limit))
     part = image[y0:y1, x0:x1]
     if part.size:
         image[y0:y1, x0:x1] = cv2.addWeighted(layer[y0:y1, x0:x1], opacity, part, 1 - opacity, 0)

@@ -23,6 +23,7 @@ from pbl_pipeline.render._strip import Event, Strip
 from pbl_pipeline.video import read_frames
 
 _TICKS_PER_S = 90_000  # time base of the output: every common frame rate is a whole number of ticks
+_BLOCK = 64  # frames whose capsules are computed and kept at a time
 
 
 class _Painter:
@@ -47,20 +48,28 @@ class _Painter:
                 key=fit.name,
             )
         self.fit, self._keypoints = fit, keypoints
-        self._known = np.isfinite(fit.qpos).all(axis=1) & np.isfinite(fit.phone_quat_wxyz).all(axis=1)
-        self._row = np.cumsum(self._known) - 1
-        self._capsules = capsules(body, fit.qpos[self._known], fit.scale) if self._known.any() else None
+        self._known = _known(fit)
+        self._body, self._block, self._capsules = body, -1, None
+
+    def _pose(self, index: int) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, np.ndarray]:
+        """Body names, starts, ends and radii of the capsules in one frame; posed in blocks, so that memory stays."""
+        block, row = divmod(index, _BLOCK)
+        if self._capsules is None or block != self._block:
+            part = self.fit.qpos[block * _BLOCK : (block + 1) * _BLOCK]
+            self._capsules, self._block = capsules(self._body, part, self.fit.scale), block
+        c = self._capsules
+        return c.body_names, c.start[row], c.end[row], c.radius_m
 
     def known(self, index: int) -> bool:
         return index < len(self._known) and bool(self._known[index])
 
     def box_px(self, index: int) -> np.ndarray | None:
         """x0, y0, x1, y1 around the drawn body in the full-size frame; None where nothing of it is drawn."""
-        if self._capsules is None or not self.known(index):
+        if not self.known(index):
             return None
-        row, quat = self._row[index], self.fit.phone_quat_wxyz[index]
-        start, end = to_camera(self._capsules.start[row], quat), to_camera(self._capsules.end[row], quat)
-        radius = self._capsules.radius_m
+        _, start_m, end_m, radius = self._pose(index)
+        quat = self.fit.phone_quat_wxyz[index]
+        start, end = to_camera(start_m, quat), to_camera(end_m, quat)
         outlines = [capsule_outline(start[g], end[g], float(radius[g]), self.fit.camera) for g in range(len(radius))]
         points = [o for o in outlines if o is not None]
         if not points:
@@ -72,17 +81,9 @@ class _Painter:
         """Draw the state of frame `index` into `image` (any size, the whole frame), in place."""
         width, height = self.fit.image_size_px
         fx, fy = image.shape[1] / width, image.shape[0] / height
-        if self._capsules is not None and self.known(index):
-            row = self._row[index]
-            draw_body(
-                image,
-                self._capsules.names,
-                self._capsules.start[row],
-                self._capsules.end[row],
-                self._capsules.radius_m,
-                self.fit.phone_quat_wxyz[index],
-                scaled_camera(self.fit.camera, fx, fy),
-            )
+        if self.known(index):
+            camera = scaled_camera(self.fit.camera, fx, fy)
+            draw_body(image, *self._pose(index), self.fit.phone_quat_wxyz[index], camera)
         if self._keypoints is not None and index < len(self._keypoints.time_s):
             xy = (np.asarray(self._keypoints.xy_px[index], float) + 0.5) * [fx, fy] - 0.5
             draw_keypoints(image, xy, self._keypoints.confidence[index])
@@ -209,11 +210,17 @@ def overlay_frames(
 
 def report_indices(fit: TrialFit, n: int = 3) -> list[int]:
     """Frames for the report: `n` of those with a known fit, evenly spread, not at the very ends. Fewer if there are."""
-    known = np.flatnonzero(np.isfinite(fit.qpos).all(axis=1) & np.isfinite(fit.phone_quat_wxyz).all(axis=1))
+    known = np.flatnonzero(_known(fit))
     if not len(known):
         return []
     picks = known[np.rint((np.arange(n) + 0.5) / n * (len(known) - 1)).astype(int)]
     return sorted({int(i) for i in picks})
+
+
+def _known(fit: TrialFit) -> np.ndarray:
+    """(T,) bool: frames whose pose and camera orientation are known."""
+    state = np.concatenate([fit.qpos, fit.phone_quat_wxyz], axis=1)
+    return np.asarray(np.isfinite(state).all(axis=1), bool)
 
 
 def _encode(

@@ -49,7 +49,7 @@ class Strip:
         time = np.asarray(fit.time_s, float)
         self._t0, self._t1 = float(time[0]), float(max(time[-1], time[0] + 1e-3))
         self._plot = (round(height * 0.20), round(height * 0.64))
-        self._rows = {"right": round(height * 0.75), "left": round(height * 0.89)}
+        self._rows = {"left": round(height * 0.75), "right": round(height * 0.89)}
         self._picture = np.full((height, width, 3), _PAPER, np.uint8)
         self._draw_knees(fit, time)
         self._draw_contacts(events)
@@ -59,14 +59,14 @@ class Strip:
         picture = self._picture.copy()
         x = round(float(self._x(time_s)))
         cv2.line(picture, (x, self._plot[0] - 2), (x, self._height - 2), _INK, 1, cv2.LINE_AA)
-        self._text(picture, f"{time_s:.2f} s", (self._right, round(self._height * 0.13)), _INK, right=True, weight=600)
+        self._text(picture, f"{time_s:.2f} s", (self._right, round(self._height * 0.13)), _INK, right=True)
         return picture
 
     def _draw_knees(self, fit: TrialFit, time: np.ndarray) -> None:
         top, bottom = self._plot
         curves = {
             side: -np.degrees(np.asarray(fit.qpos, float)[:, fit.joint_names.index(f"knee_angle_{side[0]}")])
-            for side in ("right", "left")
+            for side in ("left", "right")
             if f"knee_angle_{side[0]}" in fit.joint_names
         }
         seen = np.concatenate([c[np.isfinite(c)] for c in curves.values()] or [np.zeros(0)])
@@ -84,7 +84,7 @@ class Strip:
             )
         title_row = round(self._height * 0.13)
         end = self._text(self._picture, "Knee flexion", (self._left, title_row), _INK)
-        for side in ("right", "left"):
+        for side in ("left", "right"):
             end = self._text(self._picture, side, (end + self._text_px, title_row), bgr(SIDE_COLOUR[side]), weight=600)
         for side, curve in curves.items():
             points = np.stack([self._x(time), y(curve)], axis=-1)

@@ -135,7 +135,6 @@ def cycle_chart(
     cycles: Mapping[str, Sequence[np.ndarray]],
     foot_off_percent: Mapping[str, float],
     norm: tuple[np.ndarray, np.ndarray, np.ndarray] | None,
-    directions: tuple[str, str],
 ) -> Markup:
     """One joint angle over the gait cycle: each cycle thin, the mean of a side thick, the norm as a grey band.
 
@@ -149,20 +148,16 @@ def cycle_chart(
         side -> mean percent of the cycle at which the foot leaves the ground.
     norm
         percent (Q,), mean (Q,), sd (Q,) in degrees; None where there is none.
-    directions
-        What up and down mean, such as ("flexion", "extension").
     """
     values = [np.asarray(c, float) for curves in cycles.values() for c in curves]
     if norm is not None:
         values += [norm[1] - norm[2], norm[1] + norm[2]]
     ticks = nice_ticks(*_extent(values, least=20.0))
-    axes = Axes((340, 230), (0, 100), (ticks[0], ticks[-1]), margin=(38, 8, 10, 24))
+    axes = Axes((280, 200), (0, 100), (ticks[0], ticks[-1]), margin=(36, 8, 8, 22))
     if norm is not None:
         axes.band(norm[0], norm[1] - norm[2], norm[1] + norm[2])
         axes.curve(norm[0], norm[1], "#9aa3ad", 1.2)
-    axes.grid([0, 20, 40, 60, 80, 100], ticks, "\N{NO-BREAK SPACE}%", "\N{DEGREE SIGN}")
-    axes.text((axes.right, axes.top + 9), f"\N{UPWARDS ARROW} {directions[0]}", "end")
-    axes.text((axes.right, axes.bottom - 4), f"\N{DOWNWARDS ARROW} {directions[1]}", "end")
+    axes.grid([0, 25, 50, 75, 100], ticks, "\N{NO-BREAK SPACE}%", "\N{DEGREE SIGN}")
     for side, curves in cycles.items():
         colour = SIDE_COLOUR[side]
         for c in curves:
@@ -190,7 +185,7 @@ def time_chart(
     """
     ticks = nice_ticks(*_extent(list(curves.values()), least=20.0))
     stop = float(time_s[-1]) if len(time_s) else 1.0
-    axes = Axes((340, 170), (0, max(stop, 1e-3)), (ticks[0], ticks[-1]), margin=(38, 8, 10, 24))
+    axes = Axes((280, 150), (0, max(stop, 1e-3)), (ticks[0], ticks[-1]), margin=(36, 8, 8, 22))
     axes.grid(_inside(nice_ticks(0, stop), stop), ticks, "\N{NO-BREAK SPACE}s", "\N{DEGREE SIGN}")
     for row, (side, bars) in enumerate(spans.items()):
         y = axes.bottom - 3 - 5 * row
@@ -236,7 +231,7 @@ def contact_chart(
 def index_chart(label: str, values: Mapping[str, Sequence[float]]) -> Markup:
     """Gait deviation index of single cycles as dots per side; 100 is the norm, each 10 points one sd."""
     every = [v for side in values.values() for v in side if np.isfinite(v)]
-    low, high = min([70.0, *(v - 4 for v in every)]), max([110.0, *(v + 4 for v in every)])
+    low, high = min([70.0, *(v - 4 for v in every)]), max([120.0, *(v + 4 for v in every)])
     ticks = [t for t in nice_ticks(low, high) if t == round(t)]
     axes = Axes((520, 104), (ticks[0], ticks[-1]), (0, 1), margin=(52, 6, 16, 26))
     axes.box(float(axes.x(90)), float(axes.x(min(110, ticks[-1]))), axes.top, axes.bottom, _BAND)
@@ -251,7 +246,7 @@ def index_chart(label: str, values: Mapping[str, Sequence[float]]) -> Markup:
         for v in own:
             axes.dot(float(axes.x(v)), y, colour, hollow=True)
         if own:
-            x = float(axes.x(np.mean(own)))
+            x = float(axes.x(float(np.mean(own))))
             axes.line((x, y - 10), (x, y + 10), colour, 2.4)
     return axes.svg(label)
 

@@ -1,0 +1,155 @@
+"""Charts and pictures of the page, made from results."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from markupsafe import Markup
+
+from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.gait import GaitCycle, GaitEvents, NormativeSet
+from pbl_pipeline.render import SIDE_COLOUR, stance_spans
+from pbl_pipeline.report import _svg
+from pbl_pipeline.report._types import Picture
+from pbl_pipeline.report._words import ANGLES, PELVIS_ANGLES, number, plural
+
+_SIDES = ("left", "right")
+_JPEG_QUALITY = 84
+
+
+def cycle_charts(cycles: Sequence[GaitCycle], norm: NormativeSet | None) -> list[dict]:
+    """One chart per angle over the cycles that count: the joints first, then the pelvis. Empty without curves."""
+    usable = [c for c in cycles if c.used and c.curves]
+    if not usable:
+        return []
+    foot_off = {s: _foot_off([c for c in usable if c.side == s]) for s in _SIDES}
+    names = {k: (title, positive) for k, (title, _, _, positive) in ANGLES.items()} | PELVIS_ANGLES
+    charts = []
+    for key, (title, positive) in names.items():
+        by_side = {s: [c.curves[key] for c in usable if c.side == s and key in c.curves] for s in _SIDES}
+        if not any(by_side.values()):
+            continue
+        band = None
+        if norm is not None and key in norm.curves:
+            curve = norm.curves[key]
+            band = (np.asarray(curve["percent"]), np.asarray(curve["mean_deg"]), np.asarray(curve["sd_deg"]))
+        percent = np.linspace(0.0, 100.0, len(next(c for curves in by_side.values() for c in curves)))
+        ranges = [
+            f"{side} {number(float(np.min(mean)), 0)} to {number(float(np.max(mean)), 0)}\N{DEGREE SIGN}"
+            for side, curves in by_side.items()
+            if curves and np.isfinite(mean := _svg.mean_curve(curves)).all()
+        ]
+        label = f"{title} in degrees over the gait cycle in percent. Mean curves: {', '.join(ranges)}."
+        charts.append(
+            {
+                "name": title,
+                "note": ", ".join(x for x in (positive, "" if band is not None else "no norm") if x),
+                "svg": _svg.cycle_chart(label, percent, by_side, foot_off, band),
+            }
+        )
+    return charts
+
+
+def time_charts(fit: TrialFit, events: GaitEvents | None) -> list[dict]:
+    """The joint angles over the recording. Empty where the body was fitted in no frame."""
+    qpos = np.asarray(fit.qpos, float)
+    if not np.isfinite(qpos).any():
+        return []
+    column = {name: i for i, name in enumerate(fit.joint_names)}
+    spans = {s: stance_spans(events.events, s) for s in _SIDES} if events is not None else {}
+    charts = []
+    for title, joint, sign, positive in ANGLES.values():
+        curves = {
+            side: sign * np.degrees(qpos[:, column[f"{joint}_{side[0]}"]])
+            for side in _SIDES
+            if f"{joint}_{side[0]}" in column
+        }
+        label = f"{title} in degrees over the {fit.time_s[-1]:.1f} seconds of the recording."
+        charts.append({"name": title, "note": positive, "svg": _svg.time_chart(label, fit.time_s, curves, spans)})
+    return charts
+
+
+def contact_chart(fit: TrialFit, events: GaitEvents) -> Markup | None:
+    """Foot contacts over the recording; None without events."""
+    if not events.events:
+        return None
+    counts = ", ".join(
+        f"{side} foot down {len(events.times(side, 'foot_down'))} and up {len(events.times(side, 'foot_up'))} times"
+        for side in _SIDES
+    )
+    return _svg.contact_chart(
+        f"Foot contacts over the recording: {counts}.",
+        float(fit.time_s[-1]),
+        known_spans(fit),
+        {s: stance_spans(events.events, s) for s in _SIDES},
+        [(e.time_s, e.side, e.event) for e in events.events],
+    )
+
+
+def known_spans(fit: TrialFit) -> list[tuple[float, float]]:
+    """Stretches (start, stop) in s in which the body is fitted."""
+    known = np.isfinite(np.asarray(fit.qpos, float)).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
+    return [(float(fit.time_s[a]), float(fit.time_s[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def index_chart(values: dict[str, list[float]]) -> Markup | None:
+    """The index of each cycle; None without any."""
+    if not any(values.values()):
+        return None
+    means = ", ".join(
+        f"{side} mean {np.mean(v):.1f} of {plural(len(v), 'cycle')}" for side, v in values.items() if len(v)
+    )
+    return _svg.index_chart(f"GDI of three angles per cycle: {means}.", values)
+
+
+def picture(trial: str, p: Picture) -> dict:
+    """An overlay frame as a data URI with its texts."""
+    ok, data = cv2.imencode(".jpg", p.image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    if not ok:
+        raise ValueError(f"picture of frame {p.index} cannot be encoded: shape {p.image.shape}, {p.image.dtype}")
+    return {
+        "src": "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode(),
+        "alt": f"Frame {p.index} of {trial} with the fitted body drawn over the person",
+        "width": p.image.shape[1],
+        "height": p.image.shape[0],
+        "caption": f"{number(p.time_s, 2)} s (frame {p.index})",
+    }
+
+
+def legend(*items: str) -> list[tuple[Markup, str]]:
+    """Key of a chart: samples of lines and areas with their words, from the names "left", "norm", ..."""
+    left, right = SIDE_COLOUR["left"], SIDE_COLOUR["right"]
+    samples = {
+        "left": (_line(left, 2.4, "7 3"), "Left"),
+        "right": (_line(right, 2.4), "Right"),
+        "cycles": (_line(right, 0.9, opacity=0.5), "Single cycles"),
+        "norm": (_rect("#dfe3e8"), "Norm, mean and one sd each way"),
+        "foot off": (_line("#5b636c", 1.0, "2 3"), "Foot off"),
+        "stance": (_rect(right, 0.45), "Foot on the ground"),
+        "foot down": (Markup('<polygon points="10,1 20,1 15,10" fill="#5b636c"/>'), "Foot down"),
+        "foot up": (Markup('<polygon points="10,11 20,11 15,2" fill="#5b636c"/>'), "Foot up"),
+        "in view": (_rect("#eceff2"), "Person in view and fitted"),
+    }
+    return [
+        (Markup('<svg viewBox="0 0 30 12" aria-hidden="true">{}</svg>').format(samples[i][0]), samples[i][1])
+        for i in items
+    ]
+
+
+def _foot_off(cycles: Sequence[GaitCycle]) -> float:
+    values = [100 * (c.foot_up_s - c.start_s) / c.stride_time_s for c in cycles]
+    return float(np.mean(values)) if values else float("nan")
+
+
+def _line(colour: str, width: float, dash: str = "none", opacity: float = 1.0) -> Markup:
+    return Markup(
+        '<line x1="0" y1="6" x2="30" y2="6" stroke="{}" stroke-width="{}" stroke-dasharray="{}" stroke-opacity="{}"/>'
+    ).format(colour, width, dash, opacity)
+
+
+def _rect(colour: str, opacity: float = 1.0) -> Markup:
+    return Markup('<rect x="0" y="1" width="30" height="10" fill="{}" fill-opacity="{}"/>').format(colour, opacity)

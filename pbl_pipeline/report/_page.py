@@ -1,0 +1,342 @@
+"""What stands on the page, section by section, as plain values for the template."""
+
+from __future__ import annotations
+
+from pathlib import PurePath
+
+import numpy as np
+
+import pbl_pipeline
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.gait import Gdi, Measure, NormativeSet, TrialMetrics, load_norm, norm_names
+from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, OUTCOMES, PASS, WARN, Check
+from pbl_pipeline.report import _figures
+from pbl_pipeline.report._types import SessionReport, TrialReport
+from pbl_pipeline.report._words import (
+    HEADLINES,
+    MEASURES,
+    OUTCOME_WORDS,
+    VERDICT_WORDS,
+    check_name,
+    number,
+    plural,
+    sentence,
+    significant,
+    size,
+)
+
+GDI_NAME = "GDI of three angles"
+
+
+def page_of(report: SessionReport) -> dict:
+    """Everything the template shows. Raises `PblError` FILE_FORMAT where trials and metrics do not belong together."""
+    pairs = _paired(report)
+    norm = _norm(report)
+    checks = _checks(report)
+    empty = report.metrics is None or report.metrics.status != PASS
+    page: dict = {
+        "title": report.title,
+        "meta": [
+            ("Subject", report.subject_code),
+            ("Date", report.date),
+            ("Recordings", ", ".join(t.name for t in report.trials)),
+        ],
+        "verdict": _verdict(report, checks),
+        "checks": [_check_row(c) for c in checks],
+        "trials": [_trial(t, m) for t, m in pairs],
+        "open_time_charts": empty,
+        "key_cycles": _figures.legend("left", "right", "cycles", "norm", "foot off"),
+        "key_contacts": _figures.legend("stance", "foot down", "foot up", "in view"),
+        "key_time": _figures.legend("left", "right", "stance"),
+        "notes": _notes(norm),
+        "origin": _origin(report, pairs, norm),
+        "footer": f"Made by the PBL pipeline {pbl_pipeline.__version__}. Research software: not a medical device, "
+        "and no diagnosis. Everything on this page is contained in it; nothing is loaded from elsewhere.",
+    }
+    if report.metrics is not None and not empty:
+        metrics = report.metrics
+        values = metrics.spatiotemporal
+        cycles = [c for t in metrics.trials for c in t.cycles]
+        page["tiles"] = [*(_tile(k, values[k], values.reasons.get(k, "")) for k in HEADLINES), _gdi_tile(metrics.gdi)]
+        page["measures"] = [_measure_row(k, values[k], values.reasons.get(k, "")) for k in MEASURES]
+        page["measures"].append(_gdi_row(metrics.gdi))
+        page["measures_note"] = (
+            f"{plural(values.n_cycles_used, 'gait cycle')} used of {values.n_cycles_found} found: the first and the "
+            "last step of each walk are left out. SD over all values of both sides; n counts them."
+        )
+        page["cycle_charts"] = _figures.cycle_charts(cycles, norm)
+        page["cycles_note"] = _cycles_note(norm)
+        page["index"] = _index(metrics.gdi)
+    return page
+
+
+def _paired(report: SessionReport) -> list[tuple[TrialReport, TrialMetrics | None]]:
+    """Each trial with its measures: those with a fit stand in `metrics` in the same order."""
+    measured = list(report.metrics.trials) if report.metrics is not None else []
+    fitted = [t for t in report.trials if t.fit is not None]
+    if measured and [m.name for m in measured] != [t.fit.name for t in fitted if t.fit is not None]:
+        raise PblError(
+            "FILE_FORMAT",
+            found=f"measures of {[m.name for m in measured]} for the fitted trials {[t.name for t in fitted]}",
+            expected="the measures of the same trials in the same order",
+            next_step="compute the measures from these fits",
+            key=report.title,
+        )
+    rest = iter(measured)
+    return [(t, next(rest, None) if t.fit is not None else None) for t in report.trials]
+
+
+def _norm(report: SessionReport) -> NormativeSet | None:
+    if report.norm is not None or report.metrics is None:
+        return report.norm
+    name = report.metrics.gdi.norm
+    return load_norm(name) if name in norm_names() else None
+
+
+def _checks(report: SessionReport) -> list[Check]:
+    """All checks, earlier stages first, each once: what a trial and its session both say is said by the session."""
+    checks = list(report.checks)
+    for t in report.trials:
+        if t.choice is not None and t.choice.status == "NEEDS_CHOICE":
+            checks.append(Check("subject_choice", NEEDS_CHOICE, None, None, f"{t.name}: {t.choice.reason}"))
+        elif t.choice is not None and t.choice.status == "NO_PERSON":
+            checks.append(Check("subject_choice", FAIL, None, None, f"{t.name}: {t.choice.reason}"))
+    if report.session is not None:
+        checks += report.session.qc
+    if report.metrics is not None:
+        for t in report.metrics.trials:
+            checks += t.events.qc if t.events is not None else ()
+        checks += report.metrics.qc
+    return list(dict.fromkeys(checks))
+
+
+def _verdict(report: SessionReport, checks: list[Check]) -> dict:
+    metrics = report.metrics
+    measured = metrics is not None and metrics.status == PASS
+    # One recording without gait, or no index, makes a session with measures one to be read with care, not an empty one.
+    outcomes = [WARN if measured and c.outcome == EMPTY else c.outcome for c in checks]
+    outcome = max(outcomes, key=OUTCOMES.index, default=PASS)
+    if metrics is None and outcome in (PASS, WARN, EMPTY):
+        outcome = FAIL
+    elif metrics is not None and not measured and outcome in (PASS, WARN):
+        outcome = EMPTY
+    notable = [c for c, o in zip(checks, outcomes, strict=True) if o == outcome and outcome not in (PASS, EMPTY)]
+    problems = [f"{t.name}: {t.problem}" for t in report.trials if t.problem]
+    asking = f"{len(notable)} of {plural(len(checks), 'check')} {'asks' if len(notable) == 1 else 'ask'}"
+    texts = {
+        PASS: "All checks passed.",
+        WARN: f"{asking} for attention:",
+        EMPTY: sentence(
+            metrics.reason if metrics is not None and metrics.reason else "nobody walks in these recordings"
+        ),
+        NEEDS_CHOICE: "Several people are in view and none is clearly the subject:",
+        FAIL: "The chain ended before there was anything to measure:"
+        if metrics is None
+        else "A check failed. The figures below show what came out, not how the person walks:",
+    }
+    points = [f"{check_name(c)}: {c.advice}" if c.advice else check_name(c) for c in notable]
+    return {
+        "outcome": outcome,
+        "word": VERDICT_WORDS[outcome],
+        "sentence": texts[outcome],
+        "points": [sentence(p) for p in [*points, *problems]],
+    }
+
+
+def _tile(key: str, m: Measure | None, reason: str) -> dict:
+    name, unit, decimals = MEASURES[key]
+    if m is None:
+        return {"name": name, "value": None, "reason": reason}
+    return {
+        "name": name,
+        "value": number(m.mean, decimals),
+        "unit": unit,
+        "left": None if m.left is None else number(m.left, decimals),
+        "right": None if m.right is None else number(m.right, decimals),
+        "note": f"sd {number(m.sd, _sd_decimals(decimals))}, n {m.n}",
+    }
+
+
+def _gdi_tile(gdi: Gdi) -> dict:
+    if gdi.mean is None:
+        return {"name": GDI_NAME, "value": None, "reason": gdi.reason}
+    return {
+        "name": GDI_NAME,
+        "value": number(gdi.mean, 1),
+        "unit": "",
+        "left": number(gdi.left, 1),
+        "right": number(gdi.right, 1),
+        "note": f"sd {number(_gdi_sd(gdi), 1)}, n {gdi.n}",
+    }
+
+
+def _measure_row(key: str, m: Measure | None, reason: str) -> dict:
+    name, unit, decimals = MEASURES[key]
+    if m is None:
+        return {"name": name, "known": False, "reason": reason or "no reason was recorded"}
+    return {
+        "name": name,
+        "known": True,
+        "left": number(m.left, decimals),
+        "right": number(m.right, decimals),
+        "mean": number(m.mean, decimals),
+        "sd": number(m.sd, _sd_decimals(decimals)),
+        "n": m.n,
+        "unit": unit,
+    }
+
+
+def _gdi_row(gdi: Gdi) -> dict:
+    if gdi.mean is None:
+        return {"name": GDI_NAME, "known": False, "reason": gdi.reason}
+    values = {"left": number(gdi.left, 1), "right": number(gdi.right, 1), "mean": number(gdi.mean, 1)}
+    unit = "100 = norm, 10 = 1 sd"
+    return {"name": GDI_NAME, "known": True, **values, "sd": number(_gdi_sd(gdi), 1), "n": gdi.n, "unit": unit}
+
+
+def _gdi_sd(gdi: Gdi) -> float | None:
+    values = [c.gdi for c in gdi.cycles]
+    return float(np.std(values, ddof=1)) if len(values) > 1 else None
+
+
+def _index(gdi: Gdi) -> dict:
+    values = {side: [c.gdi for c in gdi.cycles if c.side == side] for side in ("left", "right")}
+    if gdi.mean is None:
+        text = f"Not known: {gdi.reason}"
+    else:
+        text = (
+            f"Mean {number(gdi.mean, 1)} over {plural(gdi.n, 'cycle')}: left {number(gdi.left, 1)} "
+            f"(n {gdi.n_left}), right {number(gdi.right, 1)} (n {gdi.n_right})"
+        )
+    return {
+        "svg": _figures.index_chart(values),
+        "sentence": sentence(text),
+        "note": "Each dot is one gait cycle, the bar the mean of its side; the grey area is within one standard "
+        "deviation of the norm. This index uses hip flexion, hip adduction and knee flexion. It is not the "
+        "original Gait Deviation Index of nine angles, and the two must not be compared.",
+    }
+
+
+def _trial(t: TrialReport, m: TrialMetrics | None) -> dict:
+    v = t.video
+    texts = [
+        f"{number(v.duration_s, 1)} s, {v.n_frames} frames of {v.width_px} x {v.height_px} px, "
+        f"{number(v.fps, 1)} frames/s{' (variable)' if v.variable_frame_rate else ''}"
+    ]
+    if t.choice is not None and t.choice.reason:
+        texts.append(t.choice.reason)
+    if t.fit is not None:
+        spans = _figures.known_spans(t.fit)
+        where = ", ".join(f"{number(a, 1)} to {number(b, 1)} s" for a, b in spans[:4])
+        texts.append(f"The body is fitted from {where}" if spans else "The body is fitted in no frame")
+        if np.isfinite(t.fit.residual_2d_px).any():
+            px, cm = float(np.nanmedian(t.fit.residual_2d_px)), 100 * float(np.nanmedian(t.fit.residual_3d_m))
+            texts.append(f"It lies {number(px, 1)} px and {number(cm, 1)} cm (median) from the detected points")
+    if m is not None and m.reason:
+        texts.append(f"No gait measures: {m.reason}")
+    if t.problem:
+        texts.append(t.problem)
+    events = m.events if m is not None else None
+    return {
+        "name": t.name,
+        "sentence": " ".join(sentence(x) for x in texts),
+        "contacts": _figures.contact_chart(t.fit, events) if t.fit is not None and events is not None else None,
+        "time_charts": _figures.time_charts(t.fit, events) if t.fit is not None else [],
+        "pictures": [_figures.picture(t.name, p) for p in t.pictures],
+    }
+
+
+def _check_row(c: Check) -> dict:
+    return {
+        "name": check_name(c),
+        "outcome": c.outcome,
+        "word": OUTCOME_WORDS[c.outcome],
+        "value": significant(c.value),
+        "threshold": significant(c.threshold),
+        "advice": c.advice and sentence(c.advice),
+    }
+
+
+def _cycles_note(norm: NormativeSet | None) -> str:
+    text = (
+        "0 % is foot down, 100 % the next foot down of the same foot. Left is dashed. Thin lines are the single "
+        "cycles that count, thick ones their mean."
+    )
+    return text if norm is None else f"{text} Norm: {norm.source}."
+
+
+def _notes(norm: NormativeSet | None) -> list[str]:
+    notes = [
+        "Angles are those of a model of the body that was fitted to the picture. Flexion, adduction, internal rotation "
+        "and dorsiflexion are positive, on both sides.",
+        "Foot contacts are found from the position of heel and toe relative to the pelvis (Zeni, Richards and "
+        "Higginson 2008, Gait & Posture 27:710-714). The method is known to set foot down some hundredths of a second "
+        "early and foot up late. Stance and double support therefore come out too long and swing too short, by a "
+        "roughly constant amount that is not corrected; cadence, stride time and step time are hardly touched.",
+        "The GDI of three angles follows Schwartz and Rozumalski 2008 (Gait & Posture 28:351-357) with hip flexion, "
+        "hip adduction and knee flexion only: 100 is the mean of the norm, each 10 points one standard deviation, "
+        "lower is further away. It is not the original index of nine angles.",
+        "Speed and lengths are left out: with one camera the absolute size of the person is not measured.",
+    ]
+    if norm is not None:
+        notes.insert(
+            1,
+            f"The norm ({norm.name}, n = {norm.n}) comes from another way of measuring: {norm.convention}. The fitted "
+            "model places pelvis and hip axes differently, which shifts a curve against the band by a constant, at hip "
+            "flexion most. Shapes and changes between visits can be compared; a constant offset from the band alone "
+            "is no finding.",
+        )
+    return notes
+
+
+def _origin(
+    report: SessionReport, pairs: list[tuple[TrialReport, TrialMetrics | None]], norm: NormativeSet | None
+) -> list[dict]:
+    """Groups of (name, value, is code)."""
+    groups = []
+    for t, m in pairs:
+        v = t.video
+        device = " ".join(x for x in (v.make, v.model) if x)
+        rows = [
+            ("File", PurePath(v.path).name, False),
+            ("SHA-256", v.sha256, True),
+            ("Size, coding", f"{size(v.size_bytes)}, {v.codec} in {v.container}", False),
+            ("Recorded", f"{v.recorded_utc or 'time unknown'}{', ' + device if device else ''}", False),
+        ]
+        if t.keypoints is not None:
+            rows.append(("Keypoints", f"{t.keypoints.marker_set}, {plural(len(t.keypoints.names), 'point')}", False))
+        camera = t.fit.camera if t.fit is not None else t.keypoints.camera if t.keypoints is not None else None
+        if camera is not None:
+            rows.append(("Camera", f"{camera.source}; focal length {camera.matrix[0, 0]:.0f} px", False))
+        if m is not None and m.events is not None:
+            rows.append(("Gait events", f"{m.events.method}, parameters {m.events.params_hash}", True))
+        groups.append({"name": f"Recording {t.name}", "rows": rows})
+    s = report.session
+    if s is not None:
+        fit = next((t.fit for t in report.trials if t.fit is not None), None)
+        rows = [
+            ("Solver", f"{s.solver}, parameters {s.params_hash}", True),
+            ("Time", f"{s.seconds:.1f} s, of these {s.compile_seconds:.1f} s compiling, on {s.device}", False),
+        ]
+        if fit is not None:
+            rows.append(("Body model (SHA-256)", fit.body_sha256, True))
+            rows.append(("Camera motion", ", ".join(sorted({t.camera_motion for t in s.trials})), False))
+        groups.append({"name": "Fit", "rows": rows})
+    if report.metrics is not None:
+        gdi = report.metrics.gdi
+        rows = [
+            ("Parameters", report.metrics.params_hash, True),
+            (GDI_NAME, f"{gdi.model}, parameters {gdi.params_hash}", True),
+            ("Normative set", gdi.norm, True),
+        ]
+        if norm is not None:
+            rows += [("Source of the norm", norm.source, False), ("Licence of the norm", norm.licence, False)]
+            rows.append(("Norm (SHA-256)", norm.sha256, True))
+        groups.append({"name": "Gait measures", "rows": rows})
+    for heading, values in report.origin.items():
+        groups.append({"name": heading, "rows": [(k, v, False) for k, v in values.items()]})
+    return groups
+
+
+def _sd_decimals(decimals: int) -> int:
+    return decimals + 1 if decimals >= 2 else decimals
