@@ -2,8 +2,8 @@
 
 Pattern for a module of tables. Importing it connects to nothing: the schema is bound later.
 
-    import datajoint as dj
     from schemas import lab                    # tables that are referred to as lab.Subject
+    from schemas.connection import dj          # DataJoint, imported behind our configuration
 
     schema = dj.Schema()                       # not bound yet
 
@@ -40,7 +40,9 @@ from typing import Any
 os.environ.setdefault("DJ_IGNORE_CONFIG_FILE", "true")
 os.environ.setdefault("DJ_LOG_LEVEL", "WARNING")
 
-import datajoint as dj
+with warnings.catch_warnings():
+    warnings.filterwarnings("ignore", message="No datajoint.json found")  # on purpose
+    import datajoint as dj
 import pymysql
 from datajoint import instance as dj_instance
 from datajoint.adapters.mysql import MySQLAdapter
