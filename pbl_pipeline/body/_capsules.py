@@ -94,7 +94,8 @@ def _local(body: Body) -> tuple[_Local, ...]:
         mujoco.mju_quat2Mat(rotation, model.geom_quat[i])
         centre, axes, size = model.geom_pos[i].copy(), rotation.reshape(3, 3).T, model.geom_size[i].copy()
         if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_CAPSULE:
-            strands = [(-size[1] * axes[2], size[1] * axes[2], float(size[0]))]
+            # MuJoCo turns `fromto` into a z axis that points from "to" to "from".
+            strands = [(size[1] * axes[2], -size[1] * axes[2], float(size[0]))]
         else:
             strands = _strands(axes, size)
         name, owner = model.geom(i).name, int(model.geom_bodyid[i]) - 1

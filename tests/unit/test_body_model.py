@@ -1,0 +1,175 @@
+"""The model against the published figures and against how a body moves."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from pbl_pipeline import body as package
+from pbl_pipeline.body import SCALE_NAMES, body_poses, capsules, load_body
+from pbl_pipeline.body.build import build
+
+DATA = Path(package.__file__).parent / "data"
+
+_JOINTS_TEXT = (
+    "pelvis_tx pelvis_tz pelvis_ty pelvis_tilt pelvis_list pelvis_rotation "
+    "hip_flexion_r hip_adduction_r hip_rotation_r knee_angle_r ankle_angle_r subtalar_angle_r mtp_angle_r "
+    "hip_flexion_l hip_adduction_l hip_rotation_l knee_angle_l ankle_angle_l subtalar_angle_l mtp_angle_l "
+    "lumbar_extension lumbar_bending lumbar_rotation neck_extension neck_bending neck_rotation "
+    "arm_flex_r arm_add_r arm_rot_r elbow_flex_r pro_sup_r wrist_flex_r wrist_dev_r "
+    "arm_flex_l arm_add_l arm_rot_l elbow_flex_l pro_sup_l wrist_flex_l wrist_dev_l"
+)
+JOINTS = _JOINTS_TEXT.split()
+
+
+def pose(**degrees: float) -> np.ndarray:
+    """qpos with the named joints in degrees (slides in metres)."""
+    body = load_body()
+    qpos = np.zeros(40)
+    for name, value in degrees.items():
+        qpos[body.joint_names.index(name)] = (
+            value if name.startswith("pelvis_t") and name != "pelvis_tilt" else (np.deg2rad(value))
+        )
+    return qpos
+
+
+def origins(qpos: np.ndarray, names: list[str]) -> np.ndarray:
+    """World positions of the origins of the named bodies, unscaled."""
+    body = load_body()
+    xpos, _ = body_poses(body, qpos, np.ones(8))
+    return np.asarray(xpos)[[body.body_names.index(n) for n in names]]
+
+
+def test_joints_bodies_and_mass():
+    body = load_body()
+    assert body.joint_names == tuple(JOINTS)
+    assert len(body.body_names) == 21
+    assert body.mj_model.nq == body.mj_model.nv == 40
+    # Summed by hand from the figures.
+    assert body.mj_model.body_mass.sum() == pytest.approx(89.2863, abs=1e-4)
+    assert np.all(body.mj_model.geom_contype == 0)
+    assert np.all(body.mj_model.geom_conaffinity == 0)
+
+
+def test_limits():
+    body = load_body()
+    limits = dict(zip(body.joint_names, np.rad2deg(body.joint_range_rad), strict=True))
+    assert limits["knee_angle_r"] == pytest.approx([-160, 10])
+    assert limits["hip_flexion_l"] == pytest.approx([-45.1, 120])
+    for name in JOINTS[:6]:
+        assert limits[name].tolist() == [-np.inf, np.inf]
+    assert np.all(np.isfinite(body.joint_range_rad[6:]))
+
+
+def test_identity():
+    body = load_body()
+    assert body.name == "pbl_body_40"
+    assert body.version == "1"
+    assert body.sha256 == hashlib.sha256((DATA / "pbl_body_40.xml").read_bytes()).hexdigest()
+    assert load_body() is body
+
+
+def test_figures_are_carried_over(shared_data):
+    figures = json.loads((shared_data / "body_model_figures.json").read_text())
+    body, model = load_body(), load_body().mj_model
+    assert list(body.body_names) == [b["name"] for b in figures["bodies"]]
+    assert list(figures["scale_groups"]) == list(SCALE_NAMES)
+    number = 0
+    for i, wanted in enumerate(figures["bodies"], 1):
+        assert model.body(int(model.body_parentid[i])).name == wanted["parent"]
+        np.testing.assert_allclose(model.body_pos[i], wanted["pos"], atol=1e-12)
+        np.testing.assert_allclose(model.body_ipos[i], wanted["com"], atol=1e-12)
+        assert model.body_mass[i] == pytest.approx(wanted["mass"])
+        for joint in wanted["joints"]:
+            assert body.joint_names[number] == joint["name"]
+            assert model.jnt_type[number] == {"slide": 2, "hinge": 3}[joint["type"]]
+            unit = np.array(joint["axis"]) / np.linalg.norm(joint["axis"])
+            np.testing.assert_allclose(model.jnt_axis[number], unit, atol=1e-9)
+            if joint["range"] is not None:
+                np.testing.assert_allclose(np.rad2deg(body.joint_range_rad[number]), joint["range"], atol=1e-9)
+            number += 1
+        group = SCALE_NAMES[body.scale_index[i - 1]]
+        members = figures["scale_groups"][group]
+        assert wanted["name"] in members or (group == "overall" and wanted["name"] in ("torso", "head"))
+    assert number == 40
+
+
+def test_shipped_files_are_what_the_builder_writes(shared_data, tmp_path):
+    result = CliRunner().invoke(build, [str(shared_data / "body_model_figures.json"), "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    for name in ("pbl_body_40.xml", "markers_bml_movi_87.csv"):
+        assert (tmp_path / name).read_text() == (DATA / name).read_text(), f"run pbl_pipeline.body.build: {name}"
+
+
+def test_stands_upright_and_has_a_plausible_height():
+    body = load_body()
+    shapes = capsules(body, np.zeros((1, 40)), np.ones(8))
+    top = np.max(np.maximum(shapes.start[0, :, 2], shapes.end[0, :, 2]) + shapes.radius_m)
+    bottom = np.min(np.minimum(shapes.start[0, :, 2], shapes.end[0, :, 2]) - shapes.radius_m)
+    assert 1.70 < top - bottom < 1.90
+    # Pelvis height 0.975 m is that of a body standing on z = 0.
+    assert abs(bottom) < 0.03
+    head, toes, heel = origins(np.zeros(40), ["head", "toes_r", "calcn_r"])
+    assert head[2] > 1.5
+    # Looks along world x: the toes are in front of the heel.
+    assert toes[0] - heel[0] > 0.15
+
+
+def test_pelvis_moves_in_the_world():
+    start = origins(np.zeros(40), ["pelvis"])[0]
+    np.testing.assert_allclose(start, [0, 0, 0.975], atol=1e-6)
+    # x forward, y up, z right of the body are x, z and -y of the world.
+    moved = origins(pose(pelvis_tx=0.1, pelvis_ty=0.2, pelvis_tz=0.3), ["pelvis"])[0]
+    np.testing.assert_allclose(moved - start, [0.1, -0.3, 0.2], atol=1e-6)
+
+
+def test_pelvis_rotation_turns_left():
+    toes, heel = origins(pose(pelvis_rotation=90), ["toes_r", "calcn_r"])
+    assert (toes - heel)[1] > 0.15
+
+
+@pytest.mark.parametrize("side", ["r", "l"])
+@pytest.mark.parametrize(
+    ("joint", "degrees", "moving", "direction"),
+    [
+        # direction in the world: x forward, z up, and "medial" towards the other side
+        ("hip_flexion", 30, "tibia", "forward"),
+        ("hip_adduction", 20, "calcn", "medial"),
+        ("hip_rotation", 30, "toes", "medial"),
+        ("knee_angle", -60, "talus", "backward"),
+        ("ankle_angle", 20, "toes", "up"),
+        ("arm_flex", 45, "ulna", "forward"),
+        ("arm_add", -45, "ulna", "lateral"),
+        ("elbow_flex", 60, "hand", "forward"),
+    ],
+)
+def test_equal_sign_is_equal_movement_on_both_sides(side, joint, degrees, moving, direction):
+    name = f"{moving}_{side}"
+    before = origins(np.zeros(40), [name])[0]
+    moved = origins(pose(**{f"{joint}_{side}": degrees}), [name])[0] - before
+    medial = np.array([0, 1.0, 0]) if side == "r" else np.array([0, -1.0, 0])
+    towards = {
+        "forward": np.array([1.0, 0, 0]),
+        "backward": np.array([-1.0, 0, 0]),
+        "up": np.array([0, 0, 1.0]),
+        "medial": medial,
+        "lateral": -medial,
+    }[direction]
+    assert moved @ towards > 0.03
+
+
+@pytest.mark.parametrize(
+    ("joint", "towards"),
+    [
+        ("lumbar_extension", [-1, 0, 0]),  # leans back
+        ("lumbar_bending", [0, -1, 0]),  # to the right
+    ],
+)
+def test_trunk_signs(joint, towards):
+    moved = origins(pose(**{joint: 20}), ["head"])[0] - origins(np.zeros(40), ["head"])[0]
+    assert moved @ np.array(towards) > 0.1
