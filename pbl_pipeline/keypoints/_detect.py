@@ -34,6 +34,8 @@ class KeypointParams:
     min_presence: below it a frame has no person and its keypoints are missing.
     max_drift, max_growth: the first pass is believed where its body circle lies within this share of the side from
     the track's, and differs from it in size by at most this factor.
+    agree_mm, agree_width_mm: how far the answers for the picture and its mirror image may lie apart, see
+    `BlazePoseLandmarks`.
     min_time_s: a person in view for less cannot be measured.
     box_margin: added to the keypoints' box on each side, as a share of its size.
     """
@@ -45,6 +47,8 @@ class KeypointParams:
     min_presence: float = 0.5
     max_drift: float = 0.3
     max_growth: float = 1.5
+    agree_mm: float = 100.0
+    agree_width_mm: float = 20.0
     min_time_s: float = 1.0
     box_margin: float = 0.1
 
@@ -54,7 +58,7 @@ PARAMSETS: dict[str, Paramset] = {DEFAULT: Paramset.of("keypoints", DEFAULT, 1, 
 
 
 def _blazepose(params: KeypointParams) -> KeypointDetector:
-    return BlazePoseLandmarks(assets.fetch("blazepose_landmarks"))
+    return BlazePoseLandmarks(assets.fetch("blazepose_landmarks"), params.agree_mm, params.agree_width_mm)
 
 
 #: Detectors by the name that `KeypointParams.detector` uses. Another detector joins here.
@@ -108,11 +112,10 @@ def detect_keypoints(
         detector = DETECTORS[params.detector](params)
     track_roi = _rois(track.roi_px, track.box_px)
     roi = smooth_rois(track_roi, tracking.time_s, params.smooth_s)
-    found = _run(detector, video_path, roi, camera, "keypoints 1/2" if params.passes > 1 else "keypoints")
     if params.passes > 1:
-        better = refine_rois(roi, found, params)
-        roi = smooth_rois(better, tracking.time_s, params.smooth_s)
-        found = _run(detector, video_path, roi, camera, "keypoints 2/2")
+        first = _run(detector, video_path, roi, camera, "crops", quick=True)
+        roi = smooth_rois(refine_rois(roi, first, params), tracking.time_s, params.smooth_s)
+    found = _run(detector, video_path, roi, camera, "keypoints", quick=False)
     return _assemble(found, detector, tracking, camera, params)
 
 
@@ -162,7 +165,7 @@ def _rois(roi: np.ndarray, box: np.ndarray) -> np.ndarray:
 
 
 def _run(
-    detector: KeypointDetector, video_path: str | Path, roi: np.ndarray, camera: Camera, label: str
+    detector: KeypointDetector, video_path: str | Path, roi: np.ndarray, camera: Camera, label: str, *, quick: bool
 ) -> list[PersonKeypoints | None]:
     rows = np.flatnonzero(np.isfinite(roi).all(axis=1))
     found: list[PersonKeypoints | None] = [None] * len(roi)
@@ -170,7 +173,7 @@ def _run(
     seen = 0
     for frame in progress.track(frames, label, total=int(rows[-1] - rows[0] + 1)):
         if np.isfinite(roi[frame.index]).all():
-            found[frame.index] = detector.detect(frame.image, roi[frame.index], camera)
+            found[frame.index] = detector.detect(frame.image, roi[frame.index], camera, quick=quick)
             seen += 1
     if seen != len(rows):
         raise PblError(

@@ -36,6 +36,9 @@ class KeypointDetector(Protocol):
     marker_set: str
     root_relative: bool
 
-    def detect(self, image: np.ndarray, roi_px: np.ndarray, camera: Camera) -> PersonKeypoints:
-        """`roi_px` (4,): the body circle as in `tracking.Detection`; the detector adds the margin it needs."""
+    def detect(self, image: np.ndarray, roi_px: np.ndarray, camera: Camera, *, quick: bool = False) -> PersonKeypoints:
+        """`roi_px` (4,): the body circle as in `tracking.Detection`; the detector adds the margin it needs.
+
+        `quick`: only the better crop is wanted (`roi_px` and `presence`), so accuracy may be spared.
+        """
         ...
