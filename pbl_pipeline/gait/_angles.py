@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.fit import TrialFit
-
 from ._feet import feet_from_fit
 from ._poses import BodyPoses, trial_poses
 from .events import RIGHT
+
+if TYPE_CHECKING:
+    from pbl_pipeline.fit import TrialFit
 
 #: name -> unit, direction of the positive sign. All are per side.
 ANGLE_NAMES: dict[str, str] = {

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from pbl_pipeline.fit import TrialFit
-
 from ._angles import AngleSeries, angle_series
 from ._poses import BodyPoses
 from .events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents
+
+if TYPE_CHECKING:
+    from pbl_pipeline.fit import TrialFit
 
 #: Phases of the curves in percent of the cycle, both ends included.
 REPORT_PERCENT = np.linspace(0.0, 100.0, 51)
@@ -63,8 +65,8 @@ def find_cycles(
     discarded"). A step is the time from one foot down to the next foot down of the other foot. So of a bout with
     n foot downs, which has n - 1 steps and n - 2 cycles, the cycle that starts with the first foot down and the cycle
     that ends with the last one are not used: n - 4 cycles remain, made of exactly the n - 3 inner steps. Eight steps
-    (nine foot downs) in view leave 5 cycles. Cycles that are not used stay in the result with `used` False, so that both counts
-    can be shown.
+    (nine foot downs) in view leave 5 cycles. Cycles that are not used stay in the result with `used` False, so that
+    both counts can be shown.
     """
     found = events.events if isinstance(events, GaitEvents) else tuple(events)
     name = trial or (fit.name if fit is not None else "")

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import TrialFit
-from pbl_pipeline.keypoints import Keypoints
 
 from ._heading import heading_agreement, heading_from_hips
 from ._poses import BodyPoses, trial_poses
+
+if TYPE_CHECKING:
+    from pbl_pipeline.fit import TrialFit
+    from pbl_pipeline.keypoints import Keypoints
 
 #: Points of a marker set that are read: hips for pelvis and heading, heel and toe, each (left, right).
 _POINTS: dict[str, dict[str, tuple[str, str]]] = {

@@ -6,9 +6,9 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import EMPTY, PASS, WARN, Check, worst
 
@@ -19,6 +19,9 @@ from ._poses import trial_poses
 from ._spatiotemporal import MEASURES, Spatiotemporal, spatiotemporal
 from .events import EventParams, GaitEvents, detect_events
 from .normative import NormativeSet, load_norm
+
+if TYPE_CHECKING:
+    from pbl_pipeline.fit import TrialFit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,12 +34,12 @@ class GaitParams:
 
 @dataclasses.dataclass(frozen=True)
 class TrialMetrics:
-    """Everything of one trial. `events` is None where the fit could not be searched (`error` holds the text)."""
+    """Everything of one trial."""
 
     name: str
     status: str
     reason: str
-    events: GaitEvents | None
+    events: GaitEvents
     cycles: tuple[GaitCycle, ...]
     spatiotemporal: Spatiotemporal
     gdi: Gdi

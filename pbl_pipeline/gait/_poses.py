@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import TrialFit
 
 if TYPE_CHECKING:
     from pbl_pipeline.body import Body
+    from pbl_pipeline.fit import TrialFit
 
 _CHUNK = 128
 

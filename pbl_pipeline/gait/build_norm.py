@@ -12,6 +12,7 @@ from pathlib import Path
 import click
 import numpy as np
 from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
 
 from pbl_pipeline.errors import PblError
 
@@ -37,7 +38,7 @@ def gillette_vectors(path: str | Path) -> np.ndarray:
     """The control vectors (166, 459) in degrees. Raises `PblError` NORM_INVALID where the file holds none."""
     try:
         vectors = np.asarray(loadmat(path)["all_ctrl_gait_vectors"], float).T
-    except (OSError, ValueError, KeyError, NotImplementedError) as error:
+    except (OSError, ValueError, KeyError, NotImplementedError, MatReadError) as error:
         raise _not_gillette(path, f"{type(error).__name__}: {error}") from error
     if vectors.ndim != 2 or vectors.shape[1] != len(GILLETTE_ORDER) * POINTS:
         raise _not_gillette(path, f"vectors of shape {vectors.shape}")

@@ -8,6 +8,7 @@ import json
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -70,7 +71,8 @@ class NormativeSet:
     def log_distance(self, vectors: np.ndarray) -> np.ndarray:
         """ln of the Euclidean distance of the component scores of (N, V * P) vectors to the normative mean."""
         scores = (np.atleast_2d(vectors) - self.mean_deg) @ self.components.T
-        return np.log(np.linalg.norm(scores, axis=1))
+        # A vector equal to the mean has no logarithm; a millionth of a degree is far below any real distance.
+        return np.log(np.maximum(np.linalg.norm(scores, axis=1), 1e-6))
 
     def index(self, vectors: np.ndarray) -> np.ndarray:
         """100 - 10 z of (N, V * P) vectors: 100 is the normative mean, 10 one normative standard deviation."""
@@ -196,7 +198,7 @@ def _checksum(data: dict) -> str:
 
 
 def _from_json(data: dict, checksum: str) -> NormativeSet:
-    values = dict(data, sha256=checksum, variables=tuple(data["variables"]))
+    values: dict[str, Any] = dict(data, sha256=checksum, variables=tuple(data["variables"]))
     for name in ("percent", "mean_deg", "components", "explained_variance"):
         values[name] = np.asarray(data[name], float)
     values["curves"] = {

@@ -1,0 +1,70 @@
+"""Events of 11 laboratory walks against the labels of the laboratory (markers and force plates)."""
+
+from __future__ import annotations
+
+import gzip
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pbl_pipeline.gait import detect_events, feet_from_markers
+
+c3d = pytest.importorskip("c3d", reason="the c3d package (dev extra) reads the laboratory files")
+
+MARKERS = ("LASI", "RASI", "LHEE", "RHEE", "LTOE", "RTOE")
+EVENT = {"Foot Strike": "foot_down", "Foot Off": "foot_up"}
+#: An extremum this close to the end of the recording cannot be seen to be one.
+EDGE_S = 0.15
+
+
+def read_walk(path: Path):
+    """Time (T,), marker positions (T, J, 3) in m, labelled events (side, event, time)."""
+    reader = c3d.Reader(io.BytesIO(gzip.decompress(path.read_bytes())))
+    labels: list[str] = []
+    for key in ("POINT:LABELS", "POINT:LABELS2"):
+        values = reader.get(key)
+        if values is not None:
+            labels += [str(s).strip() for s in np.ravel(values.string_array)]
+    columns = [labels.index(n) for n in MARKERS]
+    rows = np.array([points[columns] for _, points, _ in reader.read_frames()], float)
+    xyz = np.where(rows[..., 3:4] < 0, np.nan, rows[..., :3] / 1000.0)
+    time = (reader.first_frame - 1 + np.arange(len(xyz))) / reader.point_rate
+    table = reader.get("EVENT")
+    words = zip(
+        np.ravel(table.get("CONTEXTS").string_array),
+        np.ravel(table.get("LABELS").string_array),
+        table.get("TIMES").float_array,
+        strict=True,
+    )
+    return time, xyz, [(c.strip().lower(), EVENT[label.strip()], float(t[0] * 60 + t[1])) for c, label, t in words]
+
+
+def compare(folder: Path) -> tuple[list[tuple], int, int]:
+    """(walk, side, event, error in s) of each matched label; labels in all; labels away from the edges unmatched."""
+    matched, n_labels, missed_inside = [], 0, 0
+    for path in sorted(folder.glob("Straight_*.c3d.gz")):
+        time, xyz, labels = read_walk(path)
+        found = detect_events(feet_from_markers(time, MARKERS, "plug_in_gait", xyz))
+        for side, event, true_s in labels:
+            n_labels += 1
+            error = np.array(found.times(side, event)) - true_s
+            if len(error) and np.abs(error).min() < 0.1:
+                matched.append((path.name, side, event, error[np.abs(error).argmin()]))
+            elif time[0] + EDGE_S < true_s < time[-1] - EDGE_S:
+                missed_inside += 1
+    return matched, n_labels, missed_inside
+
+
+def test_events_of_the_laboratory(shared_data):
+    matched, n_labels, missed_inside = compare(shared_data / "real" / "gait_lab_c3d")
+    assert n_labels == 95
+    assert len({m[0] for m in matched}) == 11
+    assert len(matched) >= 0.9 * n_labels
+    assert missed_inside == 0
+    for event, mean_ms, sd_ms in (("foot_down", -39, 12), ("foot_up", 13, 10)):
+        error = 1000 * np.array([m[3] for m in matched if m[2] == event])
+        print(f"{event}: n {len(error)}, {error.mean():+.1f} +- {error.std(ddof=1):.1f} ms")  # noqa: T201
+        assert error.mean() == pytest.approx(mean_ms, abs=5)
+        assert error.std(ddof=1) < sd_ms + 3

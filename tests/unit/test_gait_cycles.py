@@ -1,0 +1,147 @@
+"""Cycles and spatiotemporal measures of a list of events worked by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pbl_pipeline.gait import AngleSeries, Measure, Spatiotemporal, cycle_curves, find_cycles, spatiotemporal
+from pbl_pipeline.gait.events import GaitEvent
+
+
+def walk(downs: list[tuple[float, str]], double_support_s: dict[str, float], bout: int = 0) -> list[GaitEvent]:
+    """Foot downs as given; the other foot leaves the ground `double_support_s[side that landed]` later."""
+    out = []
+    for time, side in downs:
+        other = "right" if side == "left" else "left"
+        out += [
+            GaitEvent(time, side, "foot_down", 1.0, bout),
+            GaitEvent(time + double_support_s[side], other, "foot_up", 1.0, bout),
+        ]
+    return out
+
+
+# Left steps (landing left) last 0.6 s, right steps 0.5 s; stride 1.1 s. After a left foot down the right foot leaves
+# 0.12 s later, after a right one the left 0.10 s later.
+DOWNS = [
+    (1.0, "left"),
+    (1.5, "right"),
+    (2.1, "left"),
+    (2.6, "right"),
+    (3.2, "left"),
+    (3.7, "right"),
+    (4.3, "left"),
+    (4.8, "right"),
+]
+EVENTS = walk(DOWNS, {"left": 0.12, "right": 0.10})
+
+
+def test_first_and_last_step_are_dropped():
+    cycles = find_cycles(EVENTS, trial="a")
+    assert [(c.side, round(c.start_s, 3), round(c.end_s, 3)) for c in cycles] == [
+        ("left", 1.0, 2.1),
+        ("right", 1.5, 2.6),
+        ("left", 2.1, 3.2),
+        ("right", 2.6, 3.7),
+        ("left", 3.2, 4.3),
+        ("right", 3.7, 4.8),
+    ]
+    assert [c.used for c in cycles] == [False, True, True, True, True, False]
+    assert cycles[0].excluded == "first step of the bout"
+    assert cycles[-1].excluded == "last step of the bout"
+    assert [c.number for c in cycles] == list(range(6))
+    c = cycles[2]
+    assert (c.opposite_foot_up_s, c.opposite_foot_down_s, c.foot_up_s) == pytest.approx((2.22, 2.6, 2.7))
+
+
+def of(result: Spatiotemporal, name: str) -> Measure:
+    """A measure that must be there."""
+    measure = result[name]
+    assert measure is not None
+    return measure
+
+
+def test_measures_by_hand():
+    result = spatiotemporal(find_cycles(EVENTS))
+    assert (result.status, result.n_cycles_found, result.n_cycles_used) == ("PASS", 6, 4)
+    # Inner steps: 1.5-2.1 l, 2.1-2.6 r, 2.6-3.2 l, 3.2-3.7 r, 3.7-4.3 l: five of the seven.
+    assert result.n_steps_used == 5
+    step = of(result, "step_time_s")
+    assert (step.left, step.right, step.n) == pytest.approx((0.6, 0.5, 5))
+    assert step.mean == pytest.approx((3 * 0.6 + 2 * 0.5) / 5)
+    assert step.sd == pytest.approx(np.std([0.6, 0.5, 0.6, 0.5, 0.6], ddof=1))
+    stride = of(result, "stride_time_s")
+    assert (stride.left, stride.right, stride.mean, stride.sd, stride.n) == pytest.approx(
+        (1.1, 1.1, 1.1, 0, 4), abs=1e-9
+    )
+    assert of(result, "cadence_steps_per_min").mean == pytest.approx(120 / 1.1)
+    assert of(result, "cadence_steps_per_min").left is None
+    # Left stance: down at 0, left foot up 0.10 s after right foot down at 0.5 -> 0.60 s of 1.1 s.
+    assert of(result, "stance_percent").left == pytest.approx(100 * 0.60 / 1.1)
+    # Right stance: down at 0, right foot up 0.12 s after left foot down at 0.6 -> 0.72 s.
+    assert of(result, "stance_percent").right == pytest.approx(100 * 0.72 / 1.1)
+    assert of(result, "swing_percent").left == pytest.approx(100 * 0.50 / 1.1)
+    assert of(result, "double_support_time_s").mean == pytest.approx(0.22)
+    assert of(result, "double_support_percent").mean == pytest.approx(20.0)
+
+
+def test_what_needs_a_scale_is_none_with_a_reason():
+    result = spatiotemporal(find_cycles(EVENTS))
+    for name in ("speed_m_per_s", "stride_length_m", "step_width_m"):
+        assert result[name] is None
+        assert "scale" in result.reasons[name]
+
+
+@pytest.mark.parametrize(
+    ("n_downs", "found", "used"), [(0, 0, 0), (2, 0, 0), (3, 1, 0), (4, 2, 0), (5, 3, 1), (7, 5, 3)]
+)
+def test_counts_of_short_walks(n_downs, found, used):
+    result = spatiotemporal(find_cycles(walk(DOWNS[:n_downs], {"left": 0.12, "right": 0.10})))
+    assert (result.n_cycles_found, result.n_cycles_used) == (found, used)
+    assert result.status == ("PASS" if used else "EMPTY")
+    if not used:
+        assert result.reason
+        assert all(result[name] is None and result.reasons[name] for name in result.measures)
+    if used == 1:
+        assert of(result, "stride_time_s").sd is None
+
+
+def test_each_bout_loses_its_ends():
+    second = walk([(t + 10, s) for t, s in DOWNS[:5]], {"left": 0.12, "right": 0.10}, bout=1)
+    cycles = find_cycles([*EVENTS, *second])
+    assert [c.used for c in cycles if c.bout == 1] == [False, True, False]
+    assert not [c for c in cycles if c.stride_time_s > 2]
+
+
+def test_a_cycle_without_its_inner_events_is_none():
+    lost = [e for e in EVENTS if not (e.side == "right" and e.event == "foot_up" and 2.1 < e.time_s < 2.6)]
+    starts = [c.start_s for c in find_cycles(lost)]
+    assert 2.1 not in starts
+    assert 1.5 not in starts  # its own foot up is the one that is missing
+    assert 2.6 in starts
+
+
+def series(time: np.ndarray) -> AngleSeries:
+    ramp = {"hip_flexion": 10.0 * time, "knee_flexion": 30 * np.sin(2 * np.pi * time)}
+    return AngleSeries(time, {k: -v for k, v in ramp.items()}, ramp)
+
+
+def test_curves_are_resampled_to_percent_of_the_cycle():
+    rng = np.random.default_rng(0)
+    time = np.cumsum(rng.uniform(0.02, 0.045, 200))
+    curves, missing = cycle_curves(series(time), "right", 1.3, 2.4)
+    assert missing == ""
+    at = np.linspace(1.3, 2.4, 51)
+    np.testing.assert_allclose(curves["hip_flexion"], 10 * at, atol=1e-9)
+    np.testing.assert_allclose(curves["knee_flexion"], 30 * np.sin(2 * np.pi * at), atol=0.35)
+    left, _ = cycle_curves(series(time), "left", 1.3, 2.4)
+    np.testing.assert_allclose(left["hip_flexion"], -10 * at, atol=1e-9)
+
+
+def test_missing_frames_give_no_curves():
+    time = np.arange(100) / 30
+    angles = series(time)
+    angles.right["knee_flexion"][45:52] = np.nan
+    assert cycle_curves(angles, "right", 1.3, 2.4)[1] == "frames are missing for more than 0.15 s"
+    assert cycle_curves(angles, "right", 2.0, 3.0)[1] == ""
+    assert "beyond" in cycle_curves(angles, "right", 2.5, 3.4)[1]

@@ -1,0 +1,356 @@
+"""Feet, pelvis angles, curves and metrics of a body that is moved by formulas."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.spatial.transform import Rotation
+
+from pbl_pipeline.body import load_body
+from pbl_pipeline.cli.events import events as events_command
+from pbl_pipeline.cli.gait import gait as gait_command
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.gait import (
+    MEASURES,
+    angle_series,
+    detect_events,
+    feet_from_fit,
+    feet_from_keypoints,
+    feet_from_markers,
+    find_cycles,
+    gait_metrics,
+    load_events,
+    pelvis_angles,
+)
+from pbl_pipeline.gait.normative import load_norm
+from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.video import Camera
+
+STRIDE_S = 1.1
+CAMERA = Camera(np.array([[1000.0, 0, 500], [0, 1000, 500], [0, 0, 1]]), np.zeros(5), "test")
+
+
+def make_fit(time_s: np.ndarray, values: dict[str, np.ndarray | float], name: str = "walk", **changes) -> TrialFit:
+    body = load_body()
+    qpos = np.zeros((len(time_s), 40))
+    for joint, value in values.items():
+        qpos[:, body.joint_names.index(joint)] = value
+    n = len(time_s)
+    fit = TrialFit(
+        name=name,
+        time_s=time_s,
+        joint_names=body.joint_names,
+        qpos=qpos,
+        qpos_sd=np.full_like(qpos, np.nan),
+        marker_set="blazepose_33",
+        marker_names=(),
+        markers_world_m=np.zeros((n, 0, 3)),
+        phone_quat_wxyz=np.tile([1.0, 0, 0, 0], (n, 1)),
+        scale=np.ones(8),
+        site_offset_m=np.zeros((0, 3)),
+        residual_2d_px=np.zeros((n, 0)),
+        residual_3d_m=np.zeros((n, 0)),
+        camera=CAMERA,
+        image_size_px=(1000, 1000),
+        camera_motion="static",
+        solver="formula",
+        params_hash="0",
+        body_sha256=body.sha256,
+        loss=0.0,
+        seconds=0.0,
+    )
+    return dataclasses.replace(fit, **changes)
+
+
+def walking(time_s: np.ndarray, heading_deg: float = 0.0, start_s: float = 0.0, speed: float = 1.2) -> dict:
+    """Joint values that follow the normative mean curves, right foot down at `start_s`, left half a stride later."""
+    norm = load_norm()
+    values: dict[str, np.ndarray | float] = {}
+    for side, delay in (("r", 0.0), ("l", 0.5)):
+        phase = 100 * (((time_s - start_s) / STRIDE_S - delay) % 1.0)
+        for joint, curve, sign in (
+            ("hip_flexion", "hip_flexion", 1),
+            ("hip_adduction", "hip_adduction", 1),
+            ("knee_angle", "knee_flexion", -1),
+            ("ankle_angle", "ankle_dorsiflexion", 1),
+        ):
+            band = norm.curves[curve]
+            values[f"{joint}_{side}"] = sign * np.radians(np.interp(phase, band["percent"], band["mean_deg"]))
+    angle = np.radians(heading_deg)
+    values["pelvis_tx"] = speed * time_s * np.cos(angle)
+    values["pelvis_tz"] = -speed * time_s * np.sin(angle)  # the slide goes to the right, world -y
+    values["pelvis_rotation"] = angle
+    return values
+
+
+def test_feet_of_the_standing_body_by_hand():
+    """Positions of the figures added up: pelvis, femur, tibia, talus, calcaneus (x forward, y up, z right)."""
+    time = np.arange(40) / 30
+    feet = feet_from_fit(make_fit(time, {}))
+    right = np.array([-0.07219 - 0.00167 - 0.05446, -0.06749 - 0.36555 - 0.48017 - 0.04684, 0.08526 + 0.00884])
+    heel = right + np.array([-0.01617, -0.00123, 0.0])
+    toe = right + np.array([0.19051, -0.00213, 0.00115])
+    hip = np.array([-0.07219, -0.06749, 0.0])
+
+    def world(p):
+        return np.array([p[0], -p[2], p[1]])  # x forward, y to the left, z up
+
+    np.testing.assert_allclose(feet.heel_m[5, 1] - feet.pelvis_m[5], world(heel - hip), atol=1e-5)
+    np.testing.assert_allclose(feet.toe_m[5, 1] - feet.pelvis_m[5], world(toe - hip), atol=1e-5)
+    np.testing.assert_allclose(feet.heel_m[5, 0] * [1, -1, 1], feet.heel_m[5, 1], atol=1e-5)
+    np.testing.assert_allclose(feet.forward, np.tile([1.0, 0, 0], (40, 1)), atol=1e-5)
+
+
+def test_the_foot_grows_with_its_scale():
+    time = np.arange(40) / 30
+    scale = np.ones(8)
+    scale[load_body().scale_names.index("right_leg_and_foot")] = 1.5
+    plain, scaled = feet_from_fit(make_fit(time, {})), feet_from_fit(make_fit(time, {}, scale=scale))
+    length = [np.linalg.norm(f.toe_m - f.heel_m, axis=2)[0] for f in (plain, scaled)]
+    np.testing.assert_allclose(length[1] / length[0], [1.0, 1.5], atol=1e-5)
+
+
+@pytest.mark.parametrize("heading_deg", [0, 70, 180, -135])
+def test_pelvis_angles_do_not_depend_on_the_heading(heading_deg):
+    tilt, side_up, ahead = 12.0, 4.0, 9.0
+    angle = np.radians(heading_deg)
+    forward = np.tile([np.cos(angle), np.sin(angle), 0.0], (60, 1))
+    right = np.cross(forward[0], [0, 0, 1])
+    frame = np.column_stack([forward[0], [0, 0, 1], right])
+    # Front down by `tilt`, right side up by `side_up`, right side ahead by `ahead`, each about the axis as it stands.
+    local = Rotation.from_euler("ZXY", [-tilt, -side_up, ahead], degrees=True).as_matrix()
+    pelvis = np.tile(frame @ local, (60, 1, 1))
+    np.testing.assert_allclose(pelvis_angles(pelvis, forward), np.tile([tilt, side_up, ahead], (60, 1)), atol=1e-9)
+    # What the words mean, without Euler angles: small turns one at a time.
+    for k, (turned, axis, direction) in enumerate(
+        [
+            (Rotation.from_euler("z", -5, degrees=True), 0, (1, -1)),  # the front axis sinks
+            (Rotation.from_euler("x", -5, degrees=True), 2, (1, 1)),  # the right axis rises
+            (Rotation.from_euler("y", 5, degrees=True), 2, (0, 1)),  # the right axis goes ahead
+        ]
+    ):
+        moved = turned.as_matrix()[:, axis]
+        assert np.sign(moved[direction[0]]) == direction[1]
+        one = pelvis_angles((frame @ turned.as_matrix())[None], forward[:1])[0]
+        np.testing.assert_allclose(one, 5.0 * np.eye(3)[k], atol=1e-9)
+
+
+def test_curves_have_the_signs_of_gait():
+    time = np.arange(90) / 30
+    values = {"knee_angle_r": np.radians(-60), "hip_flexion_l": np.radians(20), "pelvis_tilt": np.radians(-10)}
+    angles = angle_series(make_fit(time, values))
+    assert angles.right["knee_flexion"][40] == pytest.approx(60)
+    assert angles.left["knee_flexion"][40] == pytest.approx(0)
+    assert angles.left["hip_flexion"][40] == pytest.approx(20)
+    assert angles.left["pelvis_tilt"][40] == pytest.approx(10, abs=1e-3)  # OpenSim's negative tilt is anterior
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 120.0])
+def test_a_walking_body(heading_deg):
+    time = np.arange(0, 10, 1 / 30)
+    fit = make_fit(time, walking(time, heading_deg))
+    metrics = gait_metrics([fit])
+    assert metrics.status == "PASS"
+    values = metrics.spatiotemporal
+    stride, cadence, stance = (values[n] for n in ("stride_time_s", "cadence_steps_per_min", "stance_percent"))
+    assert stride is not None
+    assert cadence is not None
+    assert stance is not None
+    assert stride.mean == pytest.approx(STRIDE_S, abs=0.004)
+    assert cadence.mean == pytest.approx(120 / STRIDE_S, abs=0.5)
+    assert stance.left == pytest.approx(stance.right, abs=1.0)
+    # The mean curves of normal walking: foot up at 60 % of the cycle; the method finds it a little late.
+    assert 58 < stance.mean < 70
+    # Right foot down at multiples of the stride, by construction of the curves.
+    down = np.array(metrics.trials[0].events.times("right", "foot_down"))
+    assert np.abs((down + STRIDE_S / 2) % STRIDE_S - STRIDE_S / 2).max() < 0.06
+    # Curves of the mean of the norm are closer to it than those of anybody.
+    assert metrics.gdi.mean is not None
+    assert metrics.gdi.mean > 100
+    used = [c for c in metrics.trials[0].cycles if c.used]
+    assert 55 < used[0].curves["knee_flexion"].max() < 65
+    for c in metrics.qc:
+        assert c.outcome in ("PASS", "WARN")
+
+
+def test_a_session_pools_its_trials_and_an_empty_one_takes_no_part():
+    time = np.arange(0, 6, 1 / 30)
+    one = make_fit(time, walking(time))
+    two = make_fit(time, walking(time, 90.0, start_s=0.4), name="back")
+    still = make_fit(time, {}, name="standing")
+    alone, together = gait_metrics([one]), gait_metrics([one, two, still])
+    n = [alone.gdi.n, together.trials[1].gdi.n]
+    assert together.gdi.n == sum(n)
+    assert together.trials[2].status == "EMPTY"
+    assert together.status == "PASS"
+    assert together.trials[2].gdi.mean is None
+    means = [together.trials[i].gdi.mean or 0.0 for i in range(2)]
+    assert together.gdi.mean == pytest.approx(np.average(means, weights=n))
+
+
+def test_standing_gives_nulls_with_reasons(tmp_path):
+    time = np.arange(0, 6, 1 / 30)
+    metrics = gait_metrics([make_fit(time, {"pelvis_tx": 0.01 * np.sin(time)})])
+    metrics.save(tmp_path / "metrics.json")
+    session = json.loads((tmp_path / "metrics.json").read_text())["session"]
+    assert session["status"] == "EMPTY"
+    assert "no walking" in session["reason"]
+    for name in MEASURES:
+        assert session[name] is None
+        assert session["reasons"][name]
+    assert session["gdi"]["mean"] is None
+    assert session["reasons"]["gdi"]
+    assert session["outcome"] == "EMPTY"
+
+
+def test_out_of_view_in_the_middle():
+    time = np.arange(0, 12, 1 / 30)
+    fit = make_fit(time, walking(time))
+    fit.qpos[170:200] = np.nan
+    cycles = find_cycles(detect_events(feet_from_fit(fit)), fit)
+    assert {c.bout for c in cycles} == {0, 1}
+    assert not [c for c in cycles if c.start_s < time[169] and c.end_s > time[200]]
+    assert all(c.curves for c in cycles)
+
+
+def test_input_errors():
+    time = np.arange(0, 2, 1 / 30)
+    fit = make_fit(time, {})
+    with pytest.raises(PblError, match="GAIT_INPUT"):
+        gait_metrics([])
+    with pytest.raises(PblError, match="GAIT_INPUT"):
+        feet_from_fit(dataclasses.replace(fit, qpos=np.full_like(fit.qpos, np.nan)))
+    with pytest.raises(PblError, match="GAIT_INPUT"):
+        feet_from_fit(dataclasses.replace(fit, joint_names=tuple(reversed(fit.joint_names))))
+    with pytest.raises(PblError, match="NORM_UNKNOWN"):
+        gait_metrics([fit], "nobody")
+
+
+def make_keypoints(fit: TrialFit, marker_set: str, root_relative: bool = True, tilt_deg: float = 0.0) -> Keypoints:
+    """Points of the fitted feet in a level (or tilted) camera: x right is world -y, y down world -z, z forward x."""
+    feet = feet_from_fit(fit)
+    names = {
+        "blazepose_33": ("left_hip", "right_hip", "left_heel", "right_heel", "left_foot_index", "right_foot_index"),
+        "mpi_inf_3dhp_17": ("left_hip", "right_hip", "left_ankle", "right_ankle"),
+    }[marker_set]
+    left = np.cross([0.0, 0, 1], feet.forward)
+    points = [feet.pelvis_m + 0.09 * left, feet.pelvis_m - 0.09 * left, feet.heel_m[:, 0], feet.heel_m[:, 1]]
+    points += [feet.toe_m[:, 0], feet.toe_m[:, 1]]
+    world = np.stack(points[: len(names)], axis=1)
+    if root_relative:
+        world = world - feet.pelvis_m[:, None]
+    camera = np.stack([-world[..., 1], -world[..., 2], world[..., 0]], axis=-1)
+    camera = camera @ Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix().T
+    n, j = len(fit.time_s), len(names)
+    return Keypoints(
+        time_s=fit.time_s,
+        names=names,
+        marker_set=marker_set,
+        xy_px=np.zeros((n, j, 2)),
+        xyz_cam_m=camera,
+        root_relative=root_relative,
+        confidence=np.full((n, j), 0.8),
+        image_size_px=(1000, 1000),
+        camera=CAMERA,
+        box_px=np.zeros((n, 4)),
+    )
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 10.0])
+def test_keypoints_give_the_events_of_the_fit(tilt_deg):
+    time = np.arange(0, 8, 1 / 30)
+    fit = make_fit(time, walking(time, 90.0))
+    expected = detect_events(feet_from_fit(fit))
+    found = detect_events(feet_from_keypoints(make_keypoints(fit, "blazepose_33", tilt_deg=tilt_deg)))
+    assert [(e.side, e.event) for e in found.events] == [(e.side, e.event) for e in expected.events]
+    np.testing.assert_allclose(
+        [e.time_s for e in found.events], [e.time_s for e in expected.events], atol=1e-6 if not tilt_deg else 0.01
+    )
+    assert found.source == "keypoints blazepose_33"
+    assert max(e.probability for e in found.events) < 0.8
+
+
+def test_absolute_keypoints_know_the_way():
+    time = np.arange(0, 8, 1 / 30)
+    keypoints = make_keypoints(make_fit(time, walking(time, 90.0)), "blazepose_33", root_relative=False)
+    assert feet_from_keypoints(keypoints).heading_agreement > 0.99
+
+
+def test_a_turned_phone_is_turned_back():
+    time = np.arange(0, 8, 1 / 30)
+    fit = make_fit(time, walking(time, 90.0))
+    plain = make_keypoints(fit, "blazepose_33")
+    # A level camera's orientation: columns are its axes in the world; then rolled by 90 deg as a phone held upright.
+    level = np.column_stack([[0, -1.0, 0], [0, 0, -1.0], [1.0, 0, 0]])
+    roll = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    quat = Rotation.from_matrix(level @ roll).as_quat(scalar_first=True)
+    rolled = dataclasses.replace(
+        plain,
+        xyz_cam_m=plain.xyz_cam_m @ roll,
+        phone_time_s=np.array([0.0, 8.0]),
+        phone_quat_wxyz=np.stack([quat, quat]),
+    )
+    a, b = detect_events(feet_from_keypoints(plain)), detect_events(feet_from_keypoints(rolled))
+    np.testing.assert_allclose([e.time_s for e in a.events], [e.time_s for e in b.events], atol=1e-6)
+
+
+def test_ankles_alone_are_enough_for_events():
+    time = np.arange(0, 8, 1 / 30)
+    fit = make_fit(time, walking(time))
+    found = detect_events(feet_from_keypoints(make_keypoints(fit, "mpi_inf_3dhp_17")))
+    assert found.status == "PASS"
+    assert len(found.events) >= 20
+
+
+def test_keypoints_without_feet_or_depth_are_refused():
+    time = np.arange(0, 3, 1 / 30)
+    keypoints = make_keypoints(make_fit(time, walking(time)), "blazepose_33")
+    flat = dataclasses.replace(keypoints, xyz_cam_m=np.full_like(keypoints.xyz_cam_m, np.nan))
+    for wrong in (flat, dataclasses.replace(keypoints, marker_set="hands"), _renamed(keypoints)):
+        with pytest.raises(PblError, match="GAIT_INPUT"):
+            feet_from_keypoints(wrong)
+    with pytest.raises(PblError, match="GAIT_INPUT"):
+        feet_from_markers(time, ["LHEE"], "plug_in_gait", np.zeros((len(time), 1, 3)))
+
+
+def _renamed(keypoints: Keypoints) -> Keypoints:
+    return dataclasses.replace(keypoints, names=("a", *keypoints.names[1:]))
+
+
+def test_commands(tmp_path):
+    time = np.arange(0, 6, 1 / 30)
+    fit = make_fit(time, walking(time))
+    paths = {"fit": tmp_path / "walk.fit.npz", "keypoints": tmp_path / "keypoints.npz", "still": tmp_path / "s.fit.npz"}
+    fit.save(paths["fit"])
+    make_keypoints(fit, "blazepose_33").save(paths["keypoints"])
+    make_fit(time, {}).save(paths["still"])
+    run = CliRunner()
+    for name in ("fit", "keypoints"):
+        out = tmp_path / f"{name}.csv"
+        result = run.invoke(events_command, [str(paths[name]), "--out", str(out)])
+        assert result.exit_code == 0, result.output
+        assert len(load_events(out)) >= 12
+    result = run.invoke(events_command, [str(paths["still"]), "--out", str(tmp_path / "none.csv")])
+    assert "no walking" in result.output
+    assert load_events(tmp_path / "none.csv") == ()
+    out = tmp_path / "metrics.json"
+    result = run.invoke(gait_command, [str(paths["fit"]), str(paths["still"]), "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    assert "cadence_steps_per_min" in result.output
+    assert [t["status"] for t in json.loads(out.read_text())["trials"]] == ["PASS", "EMPTY"]
+    for command in (events_command, gait_command):
+        assert "Example: pbl" in run.invoke(command, ["--help"]).output
+
+
+@pytest.mark.parametrize("content", [b"", b"not a zip"])
+def test_events_of_a_broken_file(tmp_path, content):
+    path = tmp_path / "x.npz"
+    path.write_bytes(content)
+    result = CliRunner().invoke(events_command, [str(path), "--out", str(tmp_path / "e.csv")])
+    assert isinstance(result.exception, PblError)
+    assert result.exception.code == "FILE_FORMAT"

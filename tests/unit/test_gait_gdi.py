@@ -1,0 +1,207 @@
+"""GDI of three angles against numpy worked another way, and the normative set that ships."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.gait import GaitCycle, GdiParams, fit_norm, load_norm, norm_names, score_gdi
+from pbl_pipeline.gait.build_norm import GILLETTE_ORDER, THREE_ANGLES, build_gillette, gillette_vectors
+
+PERCENT = np.linspace(0, 98, 50)
+ABOUT = {"name": "toy", "version": 1, "source": "made up", "licence": "none", "convention": "none"}
+
+
+def toy_vectors(n: int = 80, seed: int = 3) -> np.ndarray:
+    """Smooth random curves of three angles."""
+    rng = np.random.default_rng(seed)
+    phase = 2 * np.pi * PERCENT / 100
+    basis = np.stack([np.ones(50), np.cos(phase), np.sin(phase), np.cos(2 * phase), np.sin(2 * phase)])
+    weights = rng.standard_normal((n, 3, 5)) * np.array([6, 4, 3, 2, 1.0])
+    return (weights @ basis).reshape(n, 150) + np.repeat([20.0, 0.0, 25.0], 50) + 0.2 * rng.standard_normal((n, 150))
+
+
+def cycle(vector: np.ndarray, side: str = "left", number: int = 0, **changes) -> GaitCycle:
+    curves = {n: np.append(v, v[0]) for n, v in zip(THREE_ANGLES, np.split(vector, 3), strict=True)}
+    made = GaitCycle("t", number, 0, side, 0.0, 0.1, 0.5, 0.6, 1.0, used=True, curves=curves)
+    return dataclasses.replace(made, **changes)
+
+
+def index_another_way(norm_vectors: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Eigenvectors of the covariance matrix, distances in the original space after projection."""
+    mean = norm_vectors.mean(axis=0)
+    values, eigen = np.linalg.eigh(np.cov(norm_vectors.T))
+    order = np.argsort(values)[::-1]
+    share = np.cumsum(values[order]) / values.sum()
+    keep = eigen[:, order[: np.flatnonzero(share >= 0.95)[0] + 1]]
+    projector = keep @ keep.T
+
+    def ln_distance(x):
+        return np.log(np.sqrt((((x - mean) @ projector) ** 2).sum(axis=1)))
+
+    of_norm = ln_distance(norm_vectors)
+    z = (ln_distance(vectors) - of_norm.sum() / len(of_norm)) / np.sqrt(
+        np.var(of_norm) * len(of_norm) / (len(of_norm) - 1)
+    )
+    return 100 - 10 * z
+
+
+@pytest.fixture(scope="module")
+def toy():
+    return fit_norm(toy_vectors(), variables=THREE_ANGLES, percent=PERCENT, **ABOUT)
+
+
+def test_against_plain_numpy(toy):
+    others = toy_vectors(20, seed=9) + 5.0
+    expected = index_another_way(toy_vectors(), others)
+    np.testing.assert_allclose(toy.index(others), expected, rtol=0, atol=1e-8)
+    cycles = [cycle(v, ("left", "right")[i % 2], i) for i, v in enumerate(others)]
+    result = score_gdi(cycles, toy)
+    np.testing.assert_allclose([c.gdi for c in result.cycles], expected, atol=1e-8)
+    assert result.left == pytest.approx(expected[::2].mean())
+    assert result.right == pytest.approx(expected[1::2].mean())
+    assert (result.mean, result.n, result.status) == (pytest.approx(expected.mean()), 20, "PASS")
+    assert [c.z for c in result.cycles] == pytest.approx((100 - expected) / 10)
+
+
+def test_the_normative_vectors_average_100_with_sd_10(toy):
+    scores = toy.index(toy_vectors())
+    assert scores.mean() == pytest.approx(100, abs=1e-9)
+    assert scores.std(ddof=1) == pytest.approx(10, abs=1e-9)
+
+
+def test_components(toy):
+    np.testing.assert_allclose(toy.components @ toy.components.T, np.eye(len(toy.components)), atol=1e-12)
+    assert np.all(np.diff(toy.explained_variance) < 0)
+    assert toy.explained_share >= 0.95
+    largest = np.abs(toy.components).argmax(axis=1)
+    assert np.all(toy.components[np.arange(len(largest)), largest] > 0)
+
+
+def test_a_cycle_further_away_scores_less(toy):
+    away = [toy.mean_deg + k * 10 * toy.components[0] for k in (1, 2, 4, 8)]
+    assert np.all(np.diff(toy.index(np.array(away))) < 0)
+    # Twice the distance adds ln 2 to the log distance.
+    assert np.diff(toy.index(np.array(away))) == pytest.approx([-10 * np.log(2) / toy.ln_sd] * 3)
+
+
+def test_deviation_outside_the_components_is_told(toy):
+    rng = np.random.default_rng(0)
+    odd = rng.standard_normal(150)
+    odd -= toy.components.T @ (toy.components @ odd)
+    inside = cycle(toy.mean_deg + 20 * toy.components[1])
+    outside = cycle(toy.mean_deg + toy.components[1] + 10 * odd, "right")
+    result = score_gdi([inside, outside], toy)
+    assert result.cycles[0].explained == pytest.approx(1.0)
+    assert result.cycles[1].explained < 0.01
+    both = score_gdi([outside, cycle(toy.mean_deg + toy.components[1] + 10 * odd)], toy)
+    assert next(c for c in both.qc if c.check == "gdi_explained").outcome == "WARN"
+
+
+def test_unused_cycles_do_not_count(toy):
+    good, bad = toy.mean_deg + 10 * toy.components[0], toy.mean_deg + 90 * toy.components[0]
+    result = score_gdi([cycle(good), cycle(good, "right", 1), cycle(bad, "right", 2, used=False)], toy)
+    assert result.n == 2
+    assert result.mean == pytest.approx(toy.index(good)[0])
+
+
+@pytest.mark.parametrize("n_left", [0, 2])
+def test_too_few_cycles_give_none_with_a_reason(toy, n_left):
+    result = score_gdi([cycle(toy.mean_deg + 1.0, number=i) for i in range(n_left)], toy)
+    assert (result.status, result.mean, result.left) == ("EMPTY", None, None)
+    assert f"{n_left} left and 0 right" in result.reason
+    assert result.to_dict() == {"left": None, "right": None, "mean": None, "n": n_left, "norm": "toy"}
+
+
+def test_cycles_without_curves_are_named(toy):
+    bare = cycle(toy.mean_deg, curves={}, curves_missing="frames are missing for more than 0.15 s")
+    assert "frames are missing" in score_gdi([bare], toy).reason
+
+
+def test_the_convention_warning_stands_on_every_result(toy):
+    result = score_gdi([cycle(toy.mean_deg + 3), cycle(toy.mean_deg + 3, "right")], toy)
+    checks = {c.check: c for c in result.qc}
+    assert checks["norm_convention"].outcome == "WARN"
+    assert checks["gdi_cycles"].outcome == "WARN"
+    assert score_gdi([], toy, GdiParams(min_cycles_per_side=3)).params_hash != result.params_hash
+
+
+def test_bad_norms(toy):
+    wrong = [
+        toy_vectors(10),
+        toy_vectors()[:, :149],
+        np.ones((40, 150)),
+        np.where(np.eye(80, 150), np.nan, toy_vectors()),
+    ]
+    for vectors in wrong:
+        with pytest.raises(PblError, match="NORM_INVALID"):
+            fit_norm(vectors, variables=THREE_ANGLES, percent=PERCENT, **ABOUT)
+    with pytest.raises(PblError, match="NORM_UNKNOWN"):
+        load_norm("gillette")
+    with pytest.raises(PblError, match="NORM_UNKNOWN"):
+        load_norm("absent.json")
+
+
+def test_a_changed_file_is_refused(toy, tmp_path):
+    path = tmp_path / "toy.json"
+    toy.save(path)
+    again = load_norm(str(path))
+    np.testing.assert_allclose(again.index(toy_vectors()), toy.index(toy_vectors()), atol=1e-4)
+    data = json.loads(path.read_text())
+    data["ln_sd"] *= 1.01
+    path.write_text(json.dumps(data))
+    with pytest.raises(PblError, match="NORM_INVALID"):
+        load_norm(str(path))
+    path.write_text("{}")
+    with pytest.raises(PblError, match="NORM_INVALID"):
+        load_norm(str(path))
+
+
+def test_the_set_that_ships():
+    norm = load_norm()
+    assert norm.name in norm_names()
+    assert (norm.n, norm.variables, norm.components.shape[1]) == (166, THREE_ANGLES, 150)
+    assert set(norm.curves) == set(GILLETTE_ORDER)
+    assert all(band["mean_deg"].shape == (51,) for band in norm.curves.values())
+    # Signs of normal walking: knee bends most in swing, hip extends before foot up, adducts in early stance.
+    knee, hip, adduction = (norm.curves[n]["mean_deg"] for n in ("knee_flexion", "hip_flexion", "hip_adduction"))
+    assert 55 < knee.max() < 65
+    assert 68 <= 2 * knee.argmax() <= 78
+    assert 48 <= 2 * hip.argmin() <= 58
+    assert adduction[5:15].mean() > 3 > adduction[35]
+    np.testing.assert_allclose(np.concatenate([hip[:50], adduction[:50], knee[:50]]), norm.mean_deg, atol=1e-5)
+
+
+def test_the_set_is_what_the_command_builds(shared_data):
+    source = shared_data / "real" / "gdi_gillette" / "GDI_Calc_Fast_Data.mat"
+    shipped, built = load_norm(), build_gillette(source)
+    assert shipped.source_sha256 == built.source_sha256
+    np.testing.assert_allclose(shipped.mean_deg, built.mean_deg, rtol=1e-6)
+    np.testing.assert_allclose(shipped.components, built.components, atol=1e-6)
+    vectors = gillette_vectors(source).reshape(166, 9, 51)[:, [3, 4, 6], :50].reshape(166, 150)
+    scores = shipped.index(vectors)
+    assert scores.mean() == pytest.approx(100, abs=1e-3)
+    assert scores.std(ddof=1) == pytest.approx(10, abs=1e-3)
+    np.testing.assert_allclose(scores, index_another_way(vectors, vectors), atol=1e-3)
+
+
+def test_the_arithmetic_reproduces_the_original_index(shared_data, toy):
+    """With the published 15 features of nine angles in place of our components: the known log distance."""
+    data = loadmat(shared_data / "real" / "gdi_gillette" / "GDI_Calc_Fast_Data.mat")
+    vectors, features = data["all_ctrl_gait_vectors"].T, data["gait_features"].T
+    original = dataclasses.replace(toy, mean_deg=vectors.mean(axis=0), components=features)
+    distance = original.log_distance(vectors)
+    assert distance.mean() == pytest.approx(4.694223, abs=1e-6)
+    assert distance.std(ddof=1) == pytest.approx(0.297627, abs=1e-6)
+
+
+def test_not_a_gillette_file(tmp_path):
+    path = tmp_path / "x.mat"
+    path.write_bytes(b"nothing")
+    with pytest.raises(PblError, match="NORM_INVALID"):
+        build_gillette(path)
