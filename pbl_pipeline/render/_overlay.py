@@ -134,6 +134,7 @@ def render_overlay(
     strip_height = 2 * max(40, round(0.08 * height))
     strip = Strip(fit, events, width, strip_height)
     part = out_path.with_name(f"{out_path.stem}.part{os.getpid()}.mp4")
+    out_path.parent.mkdir(parents=True, exist_ok=True)
     count = 0
 
     def pictures() -> Iterator[tuple[float, np.ndarray]]:

@@ -126,9 +126,7 @@ def _verdict(report: SessionReport, checks: list[Check]) -> dict:
     texts = {
         PASS: "All checks passed.",
         WARN: f"{asking} for attention:",
-        EMPTY: sentence(
-            metrics.reason if metrics is not None and metrics.reason else "nobody walks in these recordings"
-        ),
+        EMPTY: _why_empty(report),
         NEEDS_CHOICE: "Several people are in view and none is clearly the subject:",
         FAIL: "The chain ended before there was anything to measure:"
         if metrics is None
@@ -141,6 +139,15 @@ def _verdict(report: SessionReport, checks: list[Check]) -> dict:
         "sentence": texts[outcome],
         "points": [sentence(p) for p in [*points, *problems]],
     }
+
+
+def _why_empty(report: SessionReport) -> str:
+    metrics = report.metrics
+    if metrics is None or not metrics.reason:
+        return "Nobody walks in these recordings."
+    if len(metrics.trials) == 1:
+        return sentence(metrics.trials[0].reason or metrics.reason)
+    return metrics.reason + "."  # begins with the name of a trial, which keeps its spelling
 
 
 def _tile(key: str, m: Measure | None, reason: str) -> dict:

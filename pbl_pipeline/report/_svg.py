@@ -233,7 +233,7 @@ def index_chart(label: str, values: Mapping[str, Sequence[float]]) -> Markup:
     every = [v for side in values.values() for v in side if np.isfinite(v)]
     low, high = min([70.0, *(v - 4 for v in every)]), max([120.0, *(v + 4 for v in every)])
     ticks = [t for t in nice_ticks(low, high) if t == round(t)]
-    axes = Axes((520, 104), (ticks[0], ticks[-1]), (0, 1), margin=(52, 6, 16, 26))
+    axes = Axes((400, 104), (ticks[0], ticks[-1]), (0, 1), margin=(52, 6, 16, 26))
     axes.box(float(axes.x(90)), float(axes.x(min(110, ticks[-1]))), axes.top, axes.bottom, _BAND)
     for t in ticks:
         axes.line((float(axes.x(t)), axes.top), (float(axes.x(t)), axes.bottom), _GRID, 1)

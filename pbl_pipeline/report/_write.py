@@ -26,6 +26,7 @@ def write_report(path: str | Path, report: SessionReport) -> Path:
         FILE_FORMAT where `report.metrics` is not of the fits in `report.trials`.
     """
     path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     folder = resources.files("pbl_pipeline.report").joinpath("templates")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     template = environment.from_string(folder.joinpath("report.html").read_text(encoding="utf-8"))
