@@ -124,11 +124,6 @@ def external() -> str | None:
     return f"{target['host']}:{target['port']}"
 
 
-def store_dir() -> Path:
-    """Folder that holds the arrays (PBL_STORE, default `store` in `settings.home_dir()`)."""
-    return Path(os.environ.get("PBL_STORE") or settings.home_dir() / "store").absolute()
-
-
 def configure(target: dict[str, Any] | None = None) -> None:
     """Set DataJoint's configuration: server, store, job bookkeeping. `connect()` calls it."""
     install_mariadb_shim()
@@ -152,7 +147,7 @@ def configure(target: dict[str, Any] | None = None) -> None:
 def _store_spec() -> dict[str, Any]:
     # The one place that knows where arrays go. An object store (S3, MinIO) becomes a second case here, chosen by
     # variables named PBL_STORE_*; the tables name the store only as `arrays`.
-    folder = store_dir()
+    folder = settings.store_dir()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import hashlib
-import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,10 +13,12 @@ from typing import Any
 from datajoint.errors import DuplicateError
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.paramset import canonical_json
 
 from . import fit, gait, gdi, keypoints, lab, session, tracking, video
-from ._base import library, resolve_method, utc_now
+from ._base import dj, library, resolve_method, utc_now
 
+_ATTEMPTS = 20
 _SUBJECT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
 
 
@@ -45,19 +46,21 @@ class Ingested:
     error: PblError | None = None
 
 
-def ingest(
-    paths: Sequence[str | Path],
-    *,
-    subject: str,
-    session_label: str = session.UNLABELLED,
-    project: str | None = None,
-    camera_file: str | Path | None = None,
-    camera_motion: str = "static",
-    activity: str = "walking",
-    person: int | None = None,
-    methods: Methods | None = None,
-) -> list[Ingested]:
-    """Register videos of one session with the methods they go through. Nothing is decoded.
+@dataclasses.dataclass(frozen=True)
+class Visit:
+    """What all files of one call share."""
+
+    subject: str
+    session_label: str = session.UNLABELLED
+    project: str | None = None
+    camera_file: str | Path | None = None
+    camera_motion: str = "static"
+    activity: str = "walking"
+    person: int | None = None
+
+
+def ingest(paths: Sequence[str | Path], visit: Visit, methods: Methods | None = None) -> list[Ingested]:
+    """Register videos of one session with the methods they go through. At most one picture of each is decoded.
 
     Files that are not videos are taken as well: their failure then stands in the table of the stage that meets it,
     with a code and a next step. Missing and empty files are refused at once; the other files are still registered.
@@ -65,13 +68,13 @@ def ingest(
     Raises
     ------
     PblError
-        USAGE for a subject code that could be a name; SOLVER_UNKNOWN, NORM_UNKNOWN for unknown methods; the camera
-        file's own errors. Errors of single files are in the result.
+        USAGE for a subject code that could be a name; SOLVER_UNKNOWN, NORM_UNKNOWN for unknown methods. Errors of
+        single files are in the result.
     """
-    if not _SUBJECT.fullmatch(subject):
+    if not _SUBJECT.fullmatch(visit.subject):
         raise PblError(
             "USAGE",
-            found=f"subject code {subject!r}",
+            found=f"subject code {visit.subject!r}",
             expected="a pseudonymous code of letters, digits, '-', '_' and '.', at most 32 long (never a name)",
             next_step="pass such a code with --subject",
         )
@@ -79,9 +82,7 @@ def ingest(
     done = []
     for path in (Path(p).absolute() for p in paths):
         try:
-            done.append(
-                _ingest_one(path, subject, session_label, project, camera_file, camera_motion, activity, person, chosen)
-            )
+            done.append(_ingest_one(path, visit, chosen))
         except PblError as error:
             done.append(Ingested(path, "refused", error=error))
     return done
@@ -101,17 +102,7 @@ def resolve(methods: Methods) -> dict[str, str]:
     }
 
 
-def _ingest_one(
-    path: Path,
-    subject: str,
-    session_label: str,
-    project: str | None,
-    camera_file: str | Path | None,
-    camera_motion: str,
-    activity: str,
-    person: int | None,
-    chosen: dict[str, str],
-) -> Ingested:
+def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str]) -> Ingested:
     if not path.is_file():
         raise PblError(
             "VIDEO_MISSING",
@@ -141,32 +132,34 @@ def _ingest_one(
     known = _with_sha256(sha256)
     if known:
         return _known(path, known)
+    camera = _camera(visit.camera_file, path) if visit.camera_file else None
     row = {
         "video_path": str(path),
         "video_name": path.name[-255:],
         "video_sha256": sha256,
         "video_size": size,
-        "activity": activity,
-        "camera_motion": camera_motion,
+        "activity": visit.activity,
+        "camera_motion": visit.camera_motion,
         "video_created": utc_now(),
     }
-    # Numbers are taken as the highest plus one; another process that takes the same one makes us take the next.
-    for attempt in range(20):
+    # Numbers are taken as the highest plus one; where another process took the same one, we try again.
+    for attempt in range(_ATTEMPTS):
         try:
             with video.schema.connection.transaction:  # type: ignore[union-attr]
-                row["session_id"] = _session(subject, session_label, project)
-                row["camera_id"] = _camera(camera_file, path) if camera_file else None
+                row["session_id"] = _session(visit)
+                row["camera_id"] = _camera_id(camera) if camera else None
                 row["video_id"] = next_id(video.Video, "video_id")
                 video.Video.insert1(row)
-                _select(row["video_id"], row["session_id"], person, chosen)
-            return Ingested(path, "registered", row["video_id"], f"subject {subject}, session {session_label}")
+                _select(row["video_id"], row["session_id"], visit.person, chosen)
         except DuplicateError:
             known = _with_sha256(sha256)
             if known:
                 return _known(path, known)
-            if attempt == 19:
+            if attempt == _ATTEMPTS - 1:
                 raise
-    raise AssertionError("unreachable")
+        else:
+            break
+    return Ingested(path, "registered", row["video_id"], f"subject {visit.subject}, session {visit.session_label}")
 
 
 def _with_sha256(sha256: str) -> dict[str, Any] | None:
@@ -182,25 +175,20 @@ def _known(path: Path, row: dict[str, Any]) -> Ingested:
     return Ingested(path, "known", int(row["video_id"]), f"already {where}; nothing was inserted")
 
 
-def _session(subject: str, label: str, project: str | None) -> int:
-    now = utc_now()
-    if project:
-        lab.Project.insert1({"project": project}, skip_duplicates=True)
-    if not lab.Subject & {"subject": subject}:
-        lab.Subject.insert1({"subject": subject, "project": project, "population": "unknown", "subject_created": now})
-    found = (session.Session & {"subject": subject, "session_label": label}).to_dicts()
+def _session(visit: Visit) -> int:
+    if visit.project:
+        lab.Project.insert1({"project": visit.project}, skip_duplicates=True)
+    subject = {"subject": visit.subject}
+    if not lab.Subject & subject:
+        more = {"project": visit.project, "population": "unknown", "subject_created": utc_now()}
+        lab.Subject.insert1({**subject, **more})
+    label = {**subject, "session_label": visit.session_label}
+    found = (session.Session & label).to_dicts()
     if found:
         return int(found[0]["session_id"])
     number = next_id(session.Session, "session_id")
-    session.Session.insert1(
-        {
-            "session_id": number,
-            "subject": subject,
-            "session_label": label,
-            "session_date": _date(label),
-            "session_created": now,
-        }
-    )
+    day = {"session_date": _date(visit.session_label), "session_created": utc_now()}
+    session.Session.insert1({"session_id": number, **label, **day})
     return number
 
 
@@ -211,34 +199,37 @@ def _date(label: str) -> datetime.date | None:
         return None
 
 
-def _camera(camera_file: str | Path, path: Path) -> int:
-    """Row of the calibration in a file. Intrinsics hold for one picture size, so the video's header is read."""
-    size = library("video").image_size_of(path)
-    camera = library("video").load_camera(camera_file, size)
-    figures = {
-        "camera_width": size[0],
-        "camera_height": size[1],
+def _camera(camera_file: str | Path, path: Path) -> dict[str, Any] | None:
+    """Figures of the calibration in a file, for the size of this video's first picture.
+
+    None when no picture can be decoded: the tables will say why, and there is nothing to calibrate.
+    """
+    frames = library("video").read_frames(path, stop=1)
+    try:
+        height, width = next(iter(frames)).image.shape[:2]
+    except PblError:
+        return None
+    camera = library("video").load_camera(camera_file, (int(width), int(height)))
+    return {
+        "camera_width": int(width),
+        "camera_height": int(height),
         "camera_fx": float(camera.matrix[0, 0]),
         "camera_fy": float(camera.matrix[1, 1]),
         "camera_cx": float(camera.matrix[0, 2]),
         "camera_cy": float(camera.matrix[1, 2]),
         "camera_distortion": [float(d) for d in camera.distortion],
+        "camera_origin": "measured",
+        "camera_note": camera.source.removeprefix("file:").strip()[:255],
     }
-    sha256 = hashlib.sha256(json.dumps(figures, sort_keys=True).encode()).hexdigest()
+
+
+def _camera_id(camera: dict[str, Any]) -> int:
+    sha256 = hashlib.sha256(canonical_json(camera).encode()).hexdigest()
     known = (lab.CameraCalibration & {"camera_sha256": sha256}).keys()
     if known:
         return int(known[0]["camera_id"])
     number = next_id(lab.CameraCalibration, "camera_id")
-    origin, _, note = camera.source.partition(":")
-    lab.CameraCalibration.insert1(
-        {
-            **figures,
-            "camera_id": number,
-            "camera_origin": origin if origin in ("measured", "exif", "preset", "estimated") else "measured",
-            "camera_note": (note.strip() or str(camera_file))[:255],
-            "camera_sha256": sha256,
-        }
-    )
+    lab.CameraCalibration.insert1({**camera, "camera_id": number, "camera_sha256": sha256})
     return number
 
 
@@ -256,7 +247,5 @@ def _select(video_id: int, session_id: int, person: int | None, chosen: dict[str
 
 def next_id(table: Any, attribute: str) -> int:
     """The highest number in use plus one."""
-    from ._base import dj
-
     highest = dj.U().aggr(table, highest=f"max({attribute})").fetch1("highest")
     return 1 if highest is None else int(highest) + 1

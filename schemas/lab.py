@@ -73,6 +73,6 @@ class CameraCalibration(dj.Manual):
     camera_distortion        : json            # k1 k2 p1 p2 k3 (-), OpenCV's order
     camera_focal_sd=null     : float32         # (px) standard deviation of the focal length, null when unknown
     camera_note              : varchar(255)    # file or rule they come from
-    camera_sha256            : char(64)        # over all figures, so that one calibration is stored once
+    camera_sha256            : char(64)        # over all of the above, so that one calibration is stored once
     unique index (camera_sha256)
     """

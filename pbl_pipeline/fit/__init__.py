@@ -2,6 +2,7 @@
 
 from ._params import DEFAULT, PARAMSETS, CostParams, ImplicitAdamParams, ViewParams, params_of
 from ._session import LEVEL_CAMERA_QUAT_WXYZ, LEVEL_CAMERA_R_NC, fit_session, with_steps
+from ._trial import check_trial
 from ._types import SessionFit, TrialFit
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "SessionFit",
     "TrialFit",
     "ViewParams",
+    "check_trial",
     "fit_session",
     "params_of",
     "with_steps",

@@ -1,0 +1,75 @@
+"""`pbl ingest`: register videos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("videos", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--subject", required=True, metavar="CODE", help="Pseudonymous code of the person, never a name.")
+@click.option(
+    "--session",
+    "session_label",
+    default="unlabelled",
+    show_default=True,
+    metavar="LABEL",
+    help="Visit: a date (YYYY-MM-DD) or your own label. Its videos are fitted together with one body.",
+)
+@click.option("--project", metavar="NAME", help="Study or clinic, for a subject that is new.")
+@click.option("--camera", type=click.Path(path_type=Path), metavar="FILE", help="Calibration of the camera.")
+@click.option(
+    "--camera-motion",
+    type=click.Choice(["static", "handheld", "one of several"]),
+    default="static",
+    show_default=True,
+    help="How the camera was held.",
+)
+@click.option("--activity", default="walking", show_default=True, help="What the person does.")
+@click.option("--person", type=click.IntRange(min=1), help="Measure this person of the tracking (else: automatic).")
+@click.option("--tracking-method", metavar="NAME", help="Method of person tracking (else: the default).")
+@click.option("--keypoint-method", metavar="NAME", help="Method of keypoint detection (else: the default).")
+@click.option("--fit-method", metavar="NAME", help="Method of the session fit (else: the default).")
+@click.option("--norm", metavar="NAME", help="Normative set of the Gait Deviation Index (else: the default).")
+def ingest(
+    videos: tuple[Path, ...],
+    subject: str,
+    session_label: str,
+    project: str | None,
+    camera: Path | None,
+    camera_motion: str,
+    activity: str,
+    person: int | None,
+    tracking_method: str | None,
+    keypoint_method: str | None,
+    fit_method: str | None,
+    norm: str | None,
+) -> None:
+    """Register videos of one visit; `pbl populate` then computes them. Nothing is decoded here.
+
+    A file whose bytes are registered already is not registered twice. Exit code 1 when a file was refused; the others
+    are registered all the same.
+
+    \b
+    Example: pbl ingest walk1.mp4 walk2.mp4 --subject P017 --session 2026-03-01
+    Example: pbl ingest walk.mov --subject P018 --camera iphone.toml --person 2
+    """
+    import schemas
+    from schemas.ingest import Methods, Visit
+    from schemas.ingest import ingest as register
+
+    schemas.activate()
+    visit = Visit(subject, session_label, project, camera, camera_motion, activity, person)
+    methods = Methods(tracking=tracking_method, keypoint=keypoint_method, fit=fit_method, norm=norm)
+    results = register(videos, visit, methods)
+    for result in results:
+        if result.error is not None:
+            click.echo(result.error.text(), err=True)
+        else:
+            click.echo(f"video_id {result.video_id}: {result.path.name} {result.status} ({result.note})")
+        if result.status == "known" and person is not None:
+            click.echo(f"  to measure another person of it: pbl choose {result.video_id} {person}")
+    if any(r.error for r in results):
+        raise click.exceptions.Exit(1)
