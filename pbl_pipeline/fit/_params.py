@@ -22,7 +22,8 @@ class CostParams:
 class ViewParams:
     """Which frames count: whole person in view, shorter gaps of partial view bridged (paper, Keypoint Detection)."""
 
-    min_confidence: float = 0.3
+    #: Mean over the markers of a frame.
+    min_confidence: float = 0.5
     max_gap_s: float = 1.0
     min_in_view_s: float = 1.0
 

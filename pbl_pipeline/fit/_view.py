@@ -9,13 +9,21 @@ import numpy as np
 from pbl_pipeline.keypoints import Keypoints
 
 
+#: Share of the markers that must lie inside the picture.
+INSIDE_SHARE = 0.95
+
+
 def whole_person_in_view(keypoints: Keypoints, min_confidence: float) -> np.ndarray:
-    """(T,) bool: at least nine tenths of the markers are seen, inside the picture and believed by the detector."""
+    """(T,) bool: nearly all markers are detected inside the picture, with a mean confidence of `min_confidence`.
+
+    The mean and not each marker: in a view from the side the far arm is hidden in every frame, and the person is in
+    view all the same.
+    """
     width, height = keypoints.image_size_px
     xy = np.nan_to_num(keypoints.xy_px, nan=-1.0)
     inside = (xy[..., 0] >= 0) & (xy[..., 0] <= width) & (xy[..., 1] >= 0) & (xy[..., 1] <= height)
-    seen = inside & (keypoints.confidence >= min_confidence)
-    return seen.mean(axis=1) >= 0.9
+    inside &= keypoints.confidence > 0
+    return (inside.mean(axis=1) >= INSIDE_SHARE) & (keypoints.confidence.mean(axis=1) >= min_confidence)
 
 
 def bridge_gaps(in_view: np.ndarray, time_s: np.ndarray, max_gap_s: float) -> np.ndarray:

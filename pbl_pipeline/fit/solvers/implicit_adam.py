@@ -5,7 +5,9 @@ Every trial has its own network, all share one body. The steps run inside `lax.s
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import math
 import time
 from typing import Any
 
@@ -14,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
@@ -61,8 +63,10 @@ def solve_implicit_adam(session: Session, params: ImplicitAdamParams) -> Solutio
     """
     begin = time.perf_counter()
     unknowns, constants = _initialise(session, params)
-    optimiser = _optimiser(params)
-    state = optimiser.init(eqx.filter(unknowns, eqx.is_array))
+    # The number of steps is data, not part of the compiled program: any number runs without compiling again.
+    steps = jnp.asarray(params.steps, jnp.float32)
+    fixed = dataclasses.replace(params, steps=0, seed=0)
+    state = _optimiser(fixed, steps).init(eqx.filter(unknowns, eqx.is_array))
     key = jax.random.key(params.seed + 1)
 
     n_chunks, trace, compile_seconds = -(-params.steps // CHUNK), [], 0.0
@@ -71,7 +75,7 @@ def solve_implicit_adam(session: Session, params: ImplicitAdamParams) -> Solutio
     with progress.bar("fit", total=params.steps) as update:
         for chunk in range(n_chunks):
             t0 = time.perf_counter()
-            carry, losses = _run_chunk(carry, session.obs, constants, session.model, params)
+            carry, losses = _run_chunk(carry, steps, session.obs, constants, session.model, fixed)
             losses = np.asarray(losses)
             if chunk == 0:
                 compile_seconds = time.perf_counter() - t0
@@ -119,9 +123,11 @@ def _initialise(session: Session, params: ImplicitAdamParams) -> tuple[_Unknowns
     return unknowns, _Constants(f32(omega), f32(raw_start), f32(low), f32(high), jnp.asarray(is_translation))
 
 
-def _optimiser(params: ImplicitAdamParams) -> optax.GradientTransformation:
-    decay = (params.learning_rate_end / params.learning_rate_start) ** (1.0 / params.steps)
-    rate = optax.exponential_decay(params.learning_rate_start, transition_steps=1, decay_rate=decay)
+def _optimiser(params: ImplicitAdamParams, steps: ArrayLike) -> optax.GradientTransformation:
+    log_decay = math.log(params.learning_rate_end / params.learning_rate_start)
+
+    def rate(count: ArrayLike) -> Array:
+        return params.learning_rate_start * jnp.exp(log_decay * count / steps)
 
     def network_only(tree: _Unknowns) -> Any:
         mask = jax.tree.map(lambda _: False, tree)
@@ -179,9 +185,9 @@ def _sample(obs: Observations, n: int, key: Array) -> Observations:
 
 
 @functools.partial(jax.jit, static_argnames=("model", "params"), donate_argnums=0)
-def _run_chunk(carry, obs: Observations, k: _Constants, model: FitModel, params: ImplicitAdamParams):
-    """`CHUNK` steps of Adam; steps beyond `params.steps` change nothing."""
-    optimiser = _optimiser(params)
+def _run_chunk(carry, steps: Array, obs: Observations, k: _Constants, model: FitModel, params: ImplicitAdamParams):
+    """`CHUNK` steps of Adam; those beyond `steps` change nothing."""
+    optimiser = _optimiser(params, steps)
 
     def step(carry, _):
         unknowns, state, key, done = carry
@@ -189,7 +195,7 @@ def _run_chunk(carry, obs: Observations, k: _Constants, model: FitModel, params:
         batch = _sample(obs, params.samples_per_trial, draw)
         loss, gradient = jax.value_and_grad(_loss)(unknowns, batch, k, model, params.cost)
         updates, new_state = optimiser.update(gradient, state, unknowns)
-        active = done < params.steps
+        active = done < steps
         unknowns = jax.tree.map(lambda p, u: p + jnp.where(active, u, 0.0), unknowns, updates)
         state = jax.tree.map(lambda new, old: jnp.where(active, new, old), new_state, state)
         return (unknowns, state, key, done + 1), loss
