@@ -35,6 +35,11 @@ def home_dir() -> Path:
     return Path(platformdirs.user_data_dir("pbl"))
 
 
+def store_dir() -> Path:
+    """Folder of the object store that holds the arrays (not created here)."""
+    return Path(os.environ.get("PBL_STORE") or home_dir() / "store").absolute()
+
+
 def offline() -> bool:
     """True when nothing may be fetched."""
     return os.environ.get("PBL_OFFLINE", "") not in ("", "0")

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 from typing import Any
 
 import click
+
+from pbl_pipeline import settings
 
 # Each command imports what it needs: `pbl db --help` should not wait for the table engine.
 
@@ -53,16 +56,16 @@ def status(as_json: bool) -> None:
 
     Example: pbl db status --json
     """
-    from schemas import connection, embedded
+    if os.environ.get("DJ_HOST"):
+        from schemas import connection
 
-    address = connection.external()
-    if address is not None:
-        server = connection.connect()
-        version = server.query("SELECT VERSION()").fetchone()[0]
-        _print({"kind": "external", "running": True, "address": address, "version": version}, as_json)
+        version = connection.connect().query("SELECT VERSION()").fetchone()[0]
+        _print({"kind": "external", "running": True, "address": connection.external(), "version": version}, as_json)
         return
+    from schemas import embedded
+
     now = embedded.status()
-    _print({"kind": "embedded", **now.to_dict(), "store": str(connection.store_dir())}, as_json)
+    _print({"kind": "embedded", **now.to_dict(), "store": str(settings.store_dir())}, as_json)
     if not now.running:
         found = "there is no database yet" if not now.initialised else "it is not running"
         if now.pid is not None:
@@ -97,18 +100,17 @@ def init() -> None:
         tables[schema] = tables.get(schema, 0) + (not table.startswith("~"))
     for schema, count in tables.items():
         click.echo(f"  {schema:<24} {count:>3} table{'' if count == 1 else 's'}")
-    click.echo(f"Arrays are kept in {connection.store_dir()}")
+    click.echo(f"Arrays are kept in {settings.store_dir()}")
     click.echo("Next: pbl ingest VIDEO --subject NAME, or pbl demo")
 
 
 def _uses_external() -> bool:
+    if not os.environ.get("DJ_HOST"):
+        return False
     from schemas import connection
 
-    address = connection.external()
-    if address is None:
-        return False
     connection.connect()
-    click.echo(f"DJ_HOST names the server {address}, which answers: nothing to start.")
+    click.echo(f"DJ_HOST names the server {connection.external()}, which answers: nothing to start.")
     return True
 
 

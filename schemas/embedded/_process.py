@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import time
@@ -19,6 +20,7 @@ from ._folder import ADMIN_USER, Folder, folder_error, indent
 from ._port import HOST, free_port, port_free
 
 START_TIMEOUT_S = 60.0
+LOG_SIZE = "--innodb-log-file-size=256M"
 
 #: Options of the running server. Without a character set it would use latin1; with a case-insensitive collation the
 #: keys "a" and "A" would collide; packets of the default 16 MB cut arrays off at 8 MB; a worker may be silent for a
@@ -30,7 +32,7 @@ OPTIONS = (
     "--collation-server=utf8mb4_bin",
     "--max-allowed-packet=1G",
     "--innodb-buffer-pool-size=256M",
-    "--innodb-log-file-size=256M",
+    LOG_SIZE,
     "--innodb-flush-log-at-trx-commit=1",
     "--performance-schema=OFF",
     "--wait-timeout=604800",
@@ -173,9 +175,9 @@ def terminate(pid: int) -> None:
 
 def _advice(folder: Folder) -> str:
     tail = folder.log_tail(40)
-    if "No space left" in tail or "Errcode: 28" in tail:
+    if re.search(r"No space left|\berr\w*:? 28\b", tail, re.IGNORECASE):
         return "the disk is full: free some space, then pbl db start"
-    if "Permission denied" in tail or "Errcode: 13" in tail:
+    if re.search(r"Permission denied|\berr\w*:? 13\b", tail, re.IGNORECASE):
         return f"something in {folder.path} belongs to another user: start it as the user who set it up"
     if "Unable to lock" in tail or "Resource temporarily unavailable" in tail:
         return "another server uses these files: end that process named mariadbd, then pbl db start"

@@ -13,8 +13,11 @@ from ._account import Account
 from ._binaries import Binaries
 from ._folder import ADMIN_USER, APP_USER, Credentials, Folder, indent
 from ._port import HOST, free_port
+from ._process import LOG_SIZE
 
 SETUP_TIMEOUT_S = 300.0
+#: An empty database takes 290 MB, nearly all of it the log that is laid out in advance.
+NEEDED_MB = 500
 
 #: The installation leaves up to four root accounts without a password (localhost, the machine's name, 127.0.0.1, ::1).
 #: All go: the only administrator has a random password. mariadb.sys owns system views and is locked, PUBLIC is a role.
@@ -30,12 +33,21 @@ def initialise(folder: Folder, binaries: Binaries, account: Account) -> None:
     Raises
     ------
     PblError
-        DB_UNAVAILABLE with the last lines of the program that failed.
+        DB_UNAVAILABLE when there is too little space, or with what the program that failed said.
     """
+    free_mb = shutil.disk_usage(folder.path).free // 2**20
+    if free_mb < NEEDED_MB:
+        raise PblError(
+            "DB_UNAVAILABLE",
+            key=folder.path,
+            found=f"{free_mb} MB are free on this disk",
+            expected=f"at least {NEEDED_MB} MB for an empty database",
+            next_step="free some space, or set PBL_HOME to a folder on another local disk",
+        )
     # What an interrupted first start left is not a database: nothing was ever stored in it.
     shutil.rmtree(folder.data, ignore_errors=True)
     folder.create(account)
-    where = [f"--datadir={folder.data}", f"--basedir={binaries.basedir}", f"--tmpdir={folder.tmp}"]
+    where = [f"--datadir={folder.data}", f"--basedir={binaries.basedir}", f"--tmpdir={folder.tmp}", LOG_SIZE]
     install = [str(binaries.install_db), "--no-defaults", "--auth-root-authentication-method=normal", "--skip-test-db"]
     _run([*install, *where], "", folder, binaries, account)
     credentials = Credentials.new()
@@ -97,10 +109,12 @@ def _run(command: list[str], stdin: str, folder: Folder, binaries: Binaries, acc
     if code == 0 and "[ERROR]" not in said and not said.startswith("ERROR"):
         return
     shutil.rmtree(folder.data, ignore_errors=True)
+    # The installer ends with a page of general advice; the lines that say why stand before it.
+    lines = [line for line in said.splitlines() if "ERROR" in line] or said.splitlines()
     raise PblError(
         "DB_UNAVAILABLE",
         key=folder.path,
-        found=f"{Path(command[0]).name} failed (code {code}):\n" + indent("\n".join(said.splitlines()[-12:])),
+        found=f"{Path(command[0]).name} failed (code {code}):\n" + indent("\n".join(lines[-8:])),
         expected="an empty database",
         next_step="free some space if the disk is full, see that the folder is on a local disk, then: pbl db start",
     )

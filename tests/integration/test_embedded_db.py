@@ -10,6 +10,7 @@ import stat
 import subprocess
 import sys
 import time
+import types
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from click.testing import CliRunner
 from pbl_pipeline.errors import PblError
 from schemas import embedded
 from schemas.cli.db import db
-from schemas.embedded import _account, _apt, _binaries
+from schemas.embedded import _account, _apt, _binaries, _process, _setup
 
 from .conftest import new_home, remove_home
 
@@ -155,7 +156,7 @@ def test_a_long_path_is_no_obstacle():
         remove_home(home)
 
 
-def test_a_server_that_cannot_start_says_why(tmp_path_factory: pytest.TempPathFactory):
+def test_a_server_that_cannot_start_says_why():
     home = new_home()
     try:
         where = folder(home)
@@ -168,6 +169,35 @@ def test_a_server_that_cannot_start_says_why(tmp_path_factory: pytest.TempPathFa
         assert "server.log" in caught.value.next_step
     finally:
         remove_home(home)
+
+
+def test_too_little_space_is_said_before_anything_is_written(monkeypatch: pytest.MonkeyPatch):
+    home = new_home()
+    try:
+        monkeypatch.setattr(_setup.shutil, "disk_usage", lambda _: types.SimpleNamespace(free=30 * 2**20))
+        with pytest.raises(PblError, match="DB_UNAVAILABLE") as caught:
+            embedded.start(folder=folder(home))
+        assert caught.value.found.startswith("30 MB")
+        assert list(folder(home).data.iterdir()) == []
+    finally:
+        remove_home(home)
+
+
+@pytest.mark.parametrize(
+    ("line", "advice"),
+    [
+        ("[ERROR] InnoDB: preallocating 268435456 bytes for file ./ib_logfile101 failed with error 28", "disk is full"),
+        ('[ERROR] mariadbd: Error writing file (Errcode: 28 "No space left on device")', "disk is full"),
+        ('[ERROR] Can\'t create test file (Errcode: 13 "Permission denied")', "another user"),
+        ("[ERROR] InnoDB: Unable to lock ./ibdata1 error: 11", "another server"),
+        ("[ERROR] InnoDB: Page corrupted", "server.log"),
+    ],
+)
+def test_the_log_is_read_for_advice(tmp_path: Path, line: str, advice: str):
+    where = embedded.Folder(tmp_path)
+    where.run.mkdir()
+    where.log.write_text(f"2026-11-20 [Note] Starting MariaDB as process 128\n{line}\n")
+    assert advice in _process._advice(where)
 
 
 # ---------------------------------------------------------------- who may do what
@@ -191,7 +221,7 @@ def test_no_login_without_a_password(database: Path):
         assert len(by_name[name]["authentication_string"]) > 20
     where_from = [{"host": "127.0.0.1", "port": state["port"]}, {"unix_socket": os.path.relpath(where.run / "s.sock")}]
     for address in where_from:
-        for user in ("root", "pbl", "pbl_admin", "mariadb.sys", ""):
+        for user in ("root", "pbl", "pbl_admin", "mariadb.sys", "somebody"):
             with pytest.raises(pymysql.err.OperationalError) as caught:
                 pymysql.connect(**address, user=user, password="")
             assert caught.value.args[0] in (1045, 1130, 1698, 4151), caught.value  # refused, not unreachable
