@@ -23,7 +23,7 @@ MODEL_SHA256 = "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f
 INPUT_SIZE = 256
 #: The crop is this much larger than the body circle.
 CROP_MARGIN = 1.25
-NAMES = (
+NAMES: tuple[str, ...] = (
     "nose",
     "left_eye_inner",
     "left_eye",

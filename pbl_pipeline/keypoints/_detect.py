@@ -73,7 +73,7 @@ def detect_keypoints(
     params: KeypointParams | None = None,
     detector: KeypointDetector | None = None,
 ) -> Keypoints:
-    """Keypoints of person `person_id` in every frame of the video; NaN with confidence 0 where she is not in view.
+    """Keypoints of person `person_id` in every frame; NaN with confidence 0 where she or the point is not in view.
 
     `detector` replaces the one that `params.detector` names. Frames stream.
 
@@ -196,13 +196,16 @@ def _assemble(
     n, j = len(found), len(detector.names)
     xy, xyz = np.full((n, j, 2), np.nan), np.full((n, j, 3), np.nan)
     confidence, box = np.zeros((n, j)), np.full((n, 4), np.nan)
+    width, height = tracking.image_size_px
     for row, person in enumerate(found):
         if person is None or person.presence < params.min_presence:
             continue
-        xy[row], xyz[row], confidence[row] = person.xy_px, person.xyz_cam_m, person.confidence
+        # What lies beyond the picture was not seen, whatever the detector extrapolates.
+        inside = np.all((person.xy_px >= -0.5) & (person.xy_px <= np.array([width, height]) - 0.5), axis=1)
+        xy[row, inside], xyz[row, inside] = person.xy_px[inside], person.xyz_cam_m[inside]
+        confidence[row, inside] = np.clip(person.confidence[inside], 0.0, 1.0)
         low, high = person.xy_px.min(axis=0), person.xy_px.max(axis=0)
         margin = params.box_margin * (high - low)
-        width, height = tracking.image_size_px
         box[row] = np.clip(np.concatenate([low - margin, high + margin]), 0.0, [width, height, width, height])
     return Keypoints(
         time_s=tracking.time_s,

@@ -2,6 +2,7 @@
 
 from ._associate import AssociationParams
 from ._blazepose import BlazePoseDetector
+from ._sheet import save_contact_sheet
 from ._subject import SUBJECT_DEFAULT, SUBJECT_PARAMSETS, SubjectParams, choose_subject, time_in_view_s
 from ._track import DEFAULT, DETECTORS, PARAMSETS, TrackingParams, track_people
 from ._types import Detection, PersonDetector, PersonTrack, SubjectChoice, Tracking
@@ -22,6 +23,7 @@ __all__ = [
     "Tracking",
     "TrackingParams",
     "choose_subject",
+    "save_contact_sheet",
     "time_in_view_s",
     "track_people",
 ]
