@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from types import SimpleNamespace
 
 import av
 import cv2
@@ -13,6 +12,7 @@ import pytest
 
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.gait import GaitEvent
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.render import (
     NEAR_M,
@@ -90,8 +90,8 @@ def _draw(names: tuple[str, ...], start: list, end: list, radius: float = 0.05, 
     image = _image()
     n = len(names)
     # Written in the camera's frame, handed over in the world's.
-    world = [np.asarray(p, float).reshape(n, 3) @ rotation_matrix(LEVEL_CAMERA_QUAT_WXYZ).T for p in (start, end)]
-    draw_body(image, names, *world, np.full(n, radius), LEVEL_CAMERA_QUAT_WXYZ, CAMERA, opacity)
+    a, b = (np.asarray(p, float).reshape(n, 3) @ rotation_matrix(LEVEL_CAMERA_QUAT_WXYZ).T for p in (start, end))
+    draw_body(image, names, a, b, np.full(n, radius), LEVEL_CAMERA_QUAT_WXYZ, CAMERA, opacity)
     return image
 
 
@@ -165,8 +165,8 @@ def test_keypoints_are_dots_where_they_were_seen() -> None:
     assert image[:20, :20].sum() == 0
 
 
-def _event(time_s: float, side: str, event: str) -> SimpleNamespace:
-    return SimpleNamespace(time_s=time_s, side=side, event=event)
+def _event(time_s: float, side: str, event: str) -> GaitEvent:
+    return GaitEvent(time_s, side, event, 1.0)
 
 
 def test_stance_is_claimed_only_between_a_foot_down_and_the_next_foot_up() -> None:
@@ -263,7 +263,7 @@ def test_body_lies_on_its_projection(walk, clip) -> None:
     q = walk.qpos[10]
     pelvis = np.array([q[column["pelvis_tx"]], -q[column["pelvis_tz"]], 0.975 + q[column["pelvis_ty"]]])
     x, y = to_pixels(to_camera(pelvis, LEVEL_CAMERA_QUAT_WXYZ), walk.camera)
-    changed = (np.abs(image.astype(int) - 200) > 20).any(axis=2)
+    changed = np.abs(image.astype(int) - 200).max(axis=2) > 20
     assert changed[round(y), round(x)]
     rows, columns = np.nonzero(changed)
     assert abs(columns.mean() - x) < 25

@@ -1,0 +1,74 @@
+"""`<name>.angles.csv`, read back as a stranger would."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pbl_pipeline.body import load_body
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.export import angles_table, write_angles_csv
+from tests.walking_fit import joint_angles_deg, walking_fit
+
+
+@pytest.fixture(scope="module")
+def walk():
+    body = load_body()
+    return walking_fit(body.joint_names, body.sha256, n_frames=40, seen=(5, 40))
+
+
+def _read(path: Path) -> tuple[list[str], list[dict[str, str]]]:
+    with path.open(newline="", encoding="utf-8") as f:
+        rows = csv.DictReader(f)
+        return list(rows.fieldnames or ()), list(rows)
+
+
+def test_columns_are_time_and_the_joints_in_their_order(walk, tmp_path: Path) -> None:
+    columns, rows = _read(write_angles_csv(walk, tmp_path / "walk.angles.csv"))
+    assert len(rows) == 40
+    assert columns[0] == "time_s"
+    assert [c for c in columns[1:] if not c.startswith("knee_flexion")] == list(walk.joint_names)
+    for side in "rl":
+        assert columns[columns.index(f"knee_angle_{side}") + 1] == f"knee_flexion_{side}"
+
+
+def test_values_are_degrees_and_metres(walk, tmp_path: Path) -> None:
+    _, rows = _read(write_angles_csv(walk, tmp_path / "walk.angles.csv"))
+    row, column = rows[20], {n: i for i, n in enumerate(walk.joint_names)}
+    assert float(row["time_s"]) == pytest.approx(20 / 30, abs=1e-6)
+    assert float(row["pelvis_tx"]) == pytest.approx(6.0)  # m, not turned into degrees
+    assert float(row["pelvis_rotation"]) == pytest.approx(90.0)
+    assert float(row["elbow_flex_l"]) == pytest.approx(22.0)
+    assert float(row["hip_flexion_r"]) == pytest.approx(57.29578 * walk.qpos[20, column["hip_flexion_r"]], abs=1e-4)
+
+
+def test_knee_flexion_is_positive_and_opposite_to_the_knee_angle(walk, tmp_path: Path) -> None:
+    _, rows = _read(write_angles_csv(walk, tmp_path / "walk.angles.csv"))
+    flexion = np.array([float(r["knee_flexion_r"]) for r in rows[5:]])
+    angle = np.array([float(r["knee_angle_r"]) for r in rows[5:]])
+    np.testing.assert_allclose(flexion, -angle)
+    # One whole cycle of 33 frames: swing bends the knee as far as the curve the walker was made from.
+    assert flexion.max() == pytest.approx(joint_angles_deg(np.linspace(0, 1, 200))["knee_flexion"].max(), abs=4)
+
+
+def test_unknown_frames_are_empty_cells(walk, tmp_path: Path) -> None:
+    _, rows = _read(write_angles_csv(walk, tmp_path / "walk.angles.csv"))
+    assert all(v == "" for k, v in rows[0].items() if k != "time_s")
+    assert rows[0]["time_s"] == "0.000000"
+    assert all(v != "" for v in rows[5].values())
+
+
+def test_a_straight_knee_is_not_minus_zero(walk, tmp_path: Path) -> None:
+    straight = dataclasses.replace(walk, qpos=np.zeros_like(walk.qpos))
+    _, rows = _read(write_angles_csv(straight, tmp_path / "walk.angles.csv"))
+    assert rows[3]["knee_flexion_r"] == "0.000000"
+
+
+def test_damaged_fit_is_refused(walk) -> None:
+    with pytest.raises(PblError) as caught:
+        angles_table(dataclasses.replace(walk, qpos=walk.qpos[:, :39]))
+    assert caught.value.code == "FILE_FORMAT"

@@ -1,0 +1,367 @@
+"""The report page: what stands in it, that it is whole and asks for nothing, and pages of sessions that went wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pbl_pipeline.body import load_body
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import SessionFit, TrialFit
+from pbl_pipeline.gait import GaitMetrics, gait_metrics, load_norm
+from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, PASS, WARN, Check
+from pbl_pipeline.report import Picture, SessionReport, TrialReport, write_report
+from pbl_pipeline.report._svg import cycle_chart, mean_curve, nice_ticks
+from pbl_pipeline.report._words import check_name, number, plural, sentence, significant, size
+from pbl_pipeline.tracking import SubjectChoice
+from pbl_pipeline.video import VideoInfo
+from tests.walking_fit import walking_fit
+
+N, FPS = 200, 30.0
+VOID = {"meta", "br", "img", "link", "input", "hr"}
+EVIL = "<script>alert(1)</script>&\"'"
+
+
+class Page(HTMLParser):
+    """Checks that tags are balanced and gathers texts, tags and attributes."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: list[str] = []
+        self.problems: list[str] = []
+        self.feed(text)
+        self.close()
+        self.problems += [f"<{t}> is never closed" for t in self.open]
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        names = [k for k, _ in attrs]
+        if len(names) != len(set(names)):
+            self.problems.append(f"<{tag}> has an attribute twice")
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        if not self.open or self.open.pop() != tag:
+            self.problems.append(f"</{tag}> closes something else")
+
+    def handle_data(self, data: str) -> None:
+        if not self.open or self.open[-1] not in ("style", "script"):
+            self.texts.append(data)
+
+    @property
+    def text(self) -> str:
+        return re.sub(r"\s+", " ", " ".join(self.texts))
+
+    def all(self, tag: str) -> list[dict[str, str | None]]:
+        return [a for t, a in self.tags if t == tag]
+
+
+def _video(name: str = "walk.mp4") -> VideoInfo:
+    time = np.arange(N) / FPS
+    return VideoInfo(
+        path=f"/somewhere/secret/{name}",
+        sha256="ab" * 32,
+        size_bytes=3_456_789,
+        container="mp4",
+        codec="h264",
+        pixel_format="yuv420p",
+        width_px=640,
+        height_px=360,
+        rotation_deg=0,
+        time_s=time,
+        fps=FPS,
+        duration_s=N / FPS,
+        n_frames=N,
+        n_frames_announced=N,
+        variable_frame_rate=False,
+        recorded_utc="2026-11-20T10:00:00Z",
+        make="Acme",
+        model="Phone 9",
+    )
+
+
+CHOICE = SubjectChoice("CHOSEN", 2, 0.9, 1, 0.2, {1: 0.2, 2: 0.9}, "person 2 walks through the picture")
+
+
+def _session(*fits: TrialFit, qc: tuple[Check, ...] = (Check("residual_3d_cm", PASS, 3.1, 6.0),)) -> SessionFit:
+    f = fits[0]
+    trace = np.array([[0.0, 99.0], [100.0, 9.0]])
+    return SessionFit(fits, f.scale, f.site_offset_m, trace, f.solver, f.params_hash, 31.2, 12.0, "cpu", qc)
+
+
+@pytest.fixture(scope="module")
+def walk() -> TrialFit:
+    body = load_body()
+    return walking_fit(body.joint_names, body.sha256, n_frames=N, seen=(10, 190))
+
+
+@pytest.fixture(scope="module")
+def stand() -> TrialFit:
+    body = load_body()
+    return walking_fit(body.joint_names, body.sha256, n_frames=N, walks=False, name="stand")
+
+
+@pytest.fixture(scope="module")
+def measured(walk: TrialFit) -> GaitMetrics:
+    return gait_metrics([walk])
+
+
+@pytest.fixture(scope="module")
+def report(walk: TrialFit, measured: GaitMetrics) -> SessionReport:
+    pictures = tuple(Picture(i, i / FPS, np.full((90, 120, 3), i, np.uint8)) for i in (30, 90, 150))
+    trial = TrialReport("walk", _video(), CHOICE, walk, None, pictures)
+    return SessionReport(
+        title="Visit 1",
+        subject_code="S-014",
+        date="2026-11-20",
+        trials=(trial,),
+        metrics=measured,
+        session=_session(walk),
+        origin={"Software": {"Version": "0.1.0"}},
+    )
+
+
+def _page(report: SessionReport, folder: Path) -> Page:
+    page = Page(write_report(folder / "report.html", report).read_text(encoding="utf-8"))
+    assert page.problems == []
+    return page
+
+
+def test_page_is_whole_and_asks_for_nothing(report: SessionReport, tmp_path: Path) -> None:
+    path = write_report(tmp_path / "new" / "report.html", report)
+    text = path.read_text(encoding="utf-8")
+    page = Page(text)
+    assert page.problems == []
+    assert text.startswith("<!doctype html>")
+    assert page.all("html")[0]["lang"] == "en"
+    for tag, attributes in page.tags:
+        assert tag not in ("script", "link", "iframe", "object", "embed", "base", "form")
+        for name, value in attributes.items():
+            assert name not in ("href", "srcset", "action", "background", "xlink:href"), tag
+            assert not name.startswith("on"), name
+            if name == "src":
+                assert (value or "").startswith("data:image/")
+    assert not re.search(r"url\(|@import", text)
+    assert path.stat().st_size < 3_000_000
+    assert [p.name for p in path.parent.iterdir()] == ["report.html"]
+
+
+def test_page_shows_the_measures(report: SessionReport, measured: GaitMetrics, tmp_path: Path) -> None:
+    page = _page(report, tmp_path)
+    values = measured.spatiotemporal
+    cadence, stride, stance = (values[k] for k in ("cadence_steps_per_min", "stride_time_s", "stance_percent"))
+    assert cadence is not None
+    assert stride is not None
+    assert stance is not None
+    assert stance.left is not None
+    assert cadence.mean == pytest.approx(120 / 1.1, abs=2)  # the walker's own cadence
+    for words in (
+        "Visit 1",
+        "S-014",
+        "2026-11-20",
+        f"{cadence.mean:.1f} steps/min",
+        f"{stride.mean:.2f} s",
+        f"Left {stance.left:.1f}",
+        f"n {stance.n}",
+        "Double support",
+        "GDI of three angles",
+        "Speed Not known: the absolute scale",
+        "person 2 walks through the picture".capitalize(),
+        "ab" * 32,
+        "walk.mp4",
+        "Acme Phone 9",
+        measured.params_hash,
+        "Version 0.1.0",
+        "not the original",
+        "Zeni",
+    ):
+        assert words in page.text, words
+    assert "/somewhere/secret" not in page.text  # a file's name is provenance, a folder of the laboratory is not
+
+
+def test_gdi_is_always_named_with_its_three_angles(report: SessionReport, tmp_path: Path) -> None:
+    text = _page(report, tmp_path).text
+    for match in re.finditer(r"\bGDI\b", text):
+        follows = text[match.end() : match.end() + 20]
+        # Checks and hashes carry the index in their identifiers.
+        assert follows.startswith((" of three angles", " cycles", " explained", "_Calc", " with 100")), follows
+
+
+def test_charts_and_pictures_have_words(report: SessionReport, tmp_path: Path) -> None:
+    page = _page(report, tmp_path)
+    labels = [a.get("aria-label") or "" for a in page.all("svg") if a.get("role") == "img"]
+    # 8 angles over the cycle, the index, the contacts, 5 angles over time
+    assert len(labels) == 8 + 1 + 1 + 5
+    assert all(len(label) > 20 for label in labels)
+    assert any(re.match(r"Knee flexion .* left \d+ to \d+°, right \d+ to \d+°", label) for label in labels)
+    images = page.all("img")
+    assert len(images) == 3
+    assert all("Frame" in (a["alt"] or "") for a in images)
+    assert all(a.get("scope") in ("col", "row") for a in page.all("th"))
+
+
+def test_names_are_escaped_everywhere(report: SessionReport, walk: TrialFit, tmp_path: Path) -> None:
+    fit = dataclasses.replace(walk, name=EVIL, camera=dataclasses.replace(walk.camera, source=EVIL))
+    choice = dataclasses.replace(CHOICE, reason=EVIL)
+    video = dataclasses.replace(_video(EVIL.replace("/", "")), model=EVIL, recorded_utc=EVIL)
+    trial = dataclasses.replace(report.trials[0], name=EVIL, fit=fit, choice=choice, video=video, problem=EVIL)
+    evil = dataclasses.replace(
+        report,
+        title=EVIL,
+        subject_code=EVIL,
+        date=EVIL,
+        trials=(trial,),
+        metrics=gait_metrics([fit]),
+        session=dataclasses.replace(_session(fit), solver=EVIL, device=EVIL),
+        checks=(Check(EVIL, WARN, None, None, EVIL),),
+        origin={EVIL: {EVIL: EVIL}},
+    )
+    path = write_report(tmp_path / "report.html", evil)
+    text = path.read_text(encoding="utf-8")
+    page = Page(text)
+    assert page.problems == []
+    assert "<script" not in text
+    assert page.text.count(EVIL) > 10
+
+
+def _verdict(page: Page) -> str:
+    (verdict,) = [a for t, a in page.tags if t == "section" and "verdict" in (a.get("class") or "")]
+    return (verdict.get("class") or "").split()[-1]
+
+
+def test_verdict_is_the_worst_check(report: SessionReport, tmp_path: Path) -> None:
+    page = _page(report, tmp_path)
+    assert _verdict(page) == WARN
+    assert "Usable with care" in page.text
+    bad = dataclasses.replace(report, checks=(Check("residual_2d_px", FAIL, 99.0, 9.0, "look at the overlay"),))
+    page = _page(bad, tmp_path)
+    assert _verdict(page) == FAIL
+    assert "Residual 2D (px): look at the overlay." in page.text
+
+
+def test_session_without_gait_says_so_and_draws_the_angles(
+    report: SessionReport, stand: TrialFit, tmp_path: Path
+) -> None:
+    metrics = gait_metrics([stand])
+    assert metrics.status == EMPTY
+    trial = TrialReport("stand", _video(), CHOICE, stand)
+    page = _page(dataclasses.replace(report, trials=(trial,), metrics=metrics, session=_session(stand)), tmp_path)
+    assert _verdict(page) == EMPTY
+    assert "No gait to measure" in page.text
+    assert sentence(metrics.trials[0].reason) in page.text
+    assert not [a for t, a in page.tags if t == "section" and a.get("class") == "tiles"]
+    (details,) = page.all("details")
+    assert "open" in details
+    assert len([a for a in page.all("svg") if a.get("role") == "img"]) == 5
+
+
+def test_one_recording_without_gait_does_not_empty_the_session(
+    report: SessionReport, walk: TrialFit, stand: TrialFit, tmp_path: Path
+) -> None:
+    metrics = gait_metrics([walk, stand])
+    trials = (report.trials[0], TrialReport("stand", _video("stand.mp4"), CHOICE, stand))
+    page = _page(dataclasses.replace(report, trials=trials, metrics=metrics, session=_session(walk, stand)), tmp_path)
+    assert _verdict(page) == WARN
+    assert "steps/min" in page.text
+    assert "No gait measures: " + metrics.trials[1].reason in page.text
+
+
+def test_session_that_waits_for_a_choice(report: SessionReport, tmp_path: Path) -> None:
+    choice = SubjectChoice("NEEDS_CHOICE", None, 0.5, 2, 0.48, {1: 0.5, 2: 0.48}, "two people walk alike")
+    waiting = dataclasses.replace(report, trials=(TrialReport("walk", _video(), choice),), metrics=None, session=None)
+    page = _page(waiting, tmp_path)
+    assert _verdict(page) == NEEDS_CHOICE
+    assert "two people walk alike" in page.text
+
+
+def test_session_whose_chain_broke(report: SessionReport, tmp_path: Path) -> None:
+    trial = TrialReport("walk", _video(), None, problem="TRACK_TOO_SHORT: in view for 0.4 s")
+    page = _page(dataclasses.replace(report, trials=(trial,), metrics=None, session=None), tmp_path)
+    assert _verdict(page) == FAIL
+    assert "in view for 0.4 s" in page.text
+    assert "steps/min" not in page.text
+
+
+def test_fit_without_a_known_frame_is_drawn_without_curves(report: SessionReport, stand: TrialFit, tmp_path) -> None:
+    unknown = dataclasses.replace(
+        stand,
+        qpos=np.full_like(stand.qpos, np.nan),
+        residual_2d_px=np.full_like(stand.residual_2d_px, np.nan),
+        residual_3d_m=np.full_like(stand.residual_3d_m, np.nan),
+    )
+    trial = TrialReport("stand", _video(), CHOICE, unknown, problem="nobody was seen")
+    page = _page(dataclasses.replace(report, trials=(trial,), metrics=None, session=_session(unknown)), tmp_path)
+    assert "The body is fitted in no frame." in page.text
+
+
+def test_measures_of_other_fits_are_refused(report: SessionReport, stand: TrialFit, tmp_path: Path) -> None:
+    with pytest.raises(PblError) as caught:
+        write_report(tmp_path / "r.html", dataclasses.replace(report, metrics=gait_metrics([stand])))
+    assert caught.value.code == "FILE_FORMAT"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_norm_band_is_the_norm() -> None:
+    norm = load_norm()
+    curve = norm.curves["knee_flexion"]
+    percent = np.linspace(0, 100, 51)
+    flat = [np.full(51, 20.0)]
+    svg = cycle_chart(
+        "Knee", percent, {"left": flat, "right": []}, {"left": 60.0}, (percent, curve["mean_deg"], curve["sd_deg"])
+    )
+    band = np.array([p.split(",") for p in re.findall(r'<polygon points="([^"]+)"', svg)[0].split()], float)
+    upper, lower = band[:51], band[51:][::-1]
+    # The curve of 20 deg gives the scale: where the band's centre crosses it, the norm is 20 deg.
+    lines = [np.array([p.split(",") for p in m.split()], float) for m in re.findall(r'<polyline points="([^"]+)"', svg)]
+    y20 = lines[-1][0, 1]
+    y0 = float(re.findall(r'y1="([\d.]+)" x2="[\d.]+" y2="[\d.]+" stroke="#b9bfc5"', svg)[0])
+    per_degree = (y0 - y20) / 20
+    np.testing.assert_allclose((y0 - (upper[:, 1] + lower[:, 1]) / 2) / per_degree, curve["mean_deg"], atol=0.3)
+    np.testing.assert_allclose((lower[:, 1] - upper[:, 1]) / per_degree / 2, curve["sd_deg"], atol=0.3)
+
+
+def test_mean_curve_is_unknown_where_a_cycle_is() -> None:
+    mean = mean_curve([np.array([1.0, 2.0]), np.array([3.0, np.nan])])
+    np.testing.assert_array_equal(mean, [2.0, np.nan])
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "ticks"),
+    [
+        (0, 70, [0, 20, 40, 60, 80]),
+        (-13, 41, [-20, 0, 20, 40, 60]),
+        (0, 7.6, [0, 2, 4, 6, 8]),
+        (-0.3, 0.2, [-0.3, -0.2, -0.1, 0, 0.1, 0.2]),
+    ],
+)
+def test_ticks_are_round_and_enclose(low: float, high: float, ticks: list[float]) -> None:
+    assert nice_ticks(low, high) == pytest.approx(ticks)
+
+
+def test_words() -> None:
+    assert number(-3.456, 1) == "\N{MINUS SIGN}3.5"
+    assert number(-0.01, 1) == "0.0"
+    assert number(None, 1) == number(float("nan"), 2) == "\N{EN DASH}"
+    assert significant(0.01234) == "0.0123"
+    assert significant(1234.5) == "1234"
+    assert significant(230.0) == "230"
+    assert significant(0.5) == "0.5"
+    assert significant(0.0) == "0"
+    assert significant(None) == ""
+    assert check_name(Check("residual_3d_cm", PASS, 1.0, 2.0)) == "Residual 3D (cm)"
+    assert check_name(Check("gdi_cycles", PASS, 1.0, 2.0)) == "GDI cycles"
+    assert plural(1, "cycle") == "1 cycle"
+    assert plural(0, "cycle") == "0 cycles"
+    assert size(999) == "999 bytes"
+    assert size(3_456_789) == "3.5 MB"
