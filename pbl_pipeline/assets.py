@@ -234,11 +234,16 @@ def _download(asset: Asset, into: Path) -> Path:
             raise _missing(asset, f"no answer from the package index within {_TIMEOUT_S:.0f} s") from error
     path = into / wheel.filename
     if done.returncode != 0 or not path.is_file():
-        said = [line.strip() for line in done.stderr.splitlines() if line.strip().startswith("ERROR")]
-        reason = said[-1] if said else f"pip ended with code {done.returncode}"
-        others = sorted(p.name for p in into.glob("*.whl"))
-        raise _missing(asset, f"{wheel.requirement} could not be downloaded: {reason} {' '.join(others)}".strip())
+        raise _missing(asset, f"{wheel.requirement} could not be downloaded: {_pip_reason(done)}")
     return path
+
+
+def _pip_reason(done: subprocess.CompletedProcess[str]) -> str:
+    """Pip's last error; without a connection it only says that nothing matches, so that is said first."""
+    errors = [line.strip() for line in done.stderr.splitlines() if line.strip().startswith("ERROR")]
+    reason = errors[-1] if errors else f"pip ended with code {done.returncode} and brought another file"
+    unreachable = "connection broken" in done.stderr or "ConnectionError" in done.stderr
+    return f"no connection to the package index ({reason})" if unreachable else reason
 
 
 def _extract(path: Path, wheel: Wheel) -> None:

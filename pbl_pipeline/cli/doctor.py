@@ -120,8 +120,6 @@ def _loads(what: str, look: Callable[[], Finding], next_step: str) -> Finding:
     """`look()`, with what a broken or absent installation raises turned into a finding."""
     try:
         return look()
-    except PblError as error:
-        return Finding(what, MISSING, error.found, error.next_step)
     except (ImportError, OSError, RuntimeError, ValueError) as error:
         return Finding(what, MISSING, f"{type(error).__name__}: {error}".splitlines()[0], next_step)
 
@@ -164,8 +162,11 @@ def _litert() -> Finding:
         from ai_edge_litert.interpreter import Interpreter
 
         detail = f"ai-edge-litert {version('ai-edge-litert')}"
-        detector = assets.ASSETS["blazepose_detector"].path
-        if not detector.is_file():
+        try:
+            detector = assets.ASSETS["blazepose_detector"].path
+        except PblError:  # no cache folder: a finding of its own
+            detector = None
+        if detector is None or not detector.is_file():
             return Finding("LiteRT", OK, f"{detail}; not tried, no model here yet")
         model = Interpreter(model_path=str(detector), num_threads=1)
         model.allocate_tensors()

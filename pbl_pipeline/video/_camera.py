@@ -18,9 +18,10 @@ from pbl_pipeline.errors import PblError
 
 from ._types import Camera, VideoInfo
 
-#: Focal length over the longer side of the picture: median, least and most of the 78 iPhone calibrations (iPhone 6s to
-#: 17, main camera, video at 720p and 2160p, 25 distinct) published with OpenCap (stanfordnmbl/opencap-core, commit
-#: d5a5258, Apache-2.0; Uhlrich et al. 2023, PLoS Comput Biol 19(10):e1011462). Mean 0.728, standard deviation 0.044.
+#: Focal length over the longer side of the picture: median, least and most of the 78 iPhone calibrations (38 models,
+#: identifiers iPhone8,1 to iPhone17,5; 25 distinct values; video of 720 and 2160 lines) published with OpenCap
+#: (stanfordnmbl/opencap-core, commit d5a5258, Apache-2.0; Uhlrich et al. 2023, PLoS Comput Biol 19(10):e1011462).
+#: Their mean is 0.728, their standard deviation 0.044.
 PHONE_FOCAL_OVER_LONG_SIDE = 0.7169
 PHONE_FOCAL_RANGE = (0.6655, 0.8452)
 

@@ -44,7 +44,7 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
     sha256 = sha256_of(path)
     stamps: list[int] = []
     turn, pixel_format, width, height = Orientation(), "", 0, 0
-    with Decoder(path, threads) as decoder:
+    with Decoder(path, threads, exact=True) as decoder:
         stream, container = decoder.stream, decoder.container
         for pts, frame in progress.track(decoder, "reading video", total=decoder.n_announced or None):
             if not stamps:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from av.video.reformatter import VideoReformatter
 
 from ._decode import Decoder, check_file
 from ._orientation import Orientation, orientation_of
@@ -38,12 +39,15 @@ def _frames(path: Path, start: int, stop: int | None, step: int, threads: int | 
     if stop is not None and stop <= start:
         return
     with Decoder(path, threads) as decoder:
+        # One converter for the whole file: a new one per frame would set itself up, with threads of its own, each time.
+        to_bgr = VideoReformatter()
         turn, first_pts, last = Orientation(), 0, None if stop is None else range(start, stop, step)[-1]
         for index, (pts, frame) in enumerate(decoder):
             if index == 0:
                 turn, first_pts = orientation_of(frame), pts
             if index >= start and (index - start) % step == 0:
-                image = turn.apply(frame.to_ndarray(format="bgr24"))
+                # Rows of some widths are padded for the converter; users get plain arrays.
+                image = np.ascontiguousarray(turn.apply(to_bgr.reformat(frame, format="bgr24", threads=1).to_ndarray()))
                 # Same arithmetic as probe, so that the stamps are equal to the last bit.
                 yield Frame(index, float(np.int64(pts - first_pts) * float(decoder.time_base)), image)
             if last is not None and index >= last:

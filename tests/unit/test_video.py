@@ -1,0 +1,521 @@
+"""Probe and frames against files whose frames, stamps and damage are known, and against OpenCV as a second decoder."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.video import Frame, VideoInfo, guess_camera, load_camera, probe, read_frames, sha256_of
+from tests.videos import constant_rate, numbered_frames, write_video
+
+VARIABLE_S = np.cumsum(np.r_[0.0, np.random.default_rng(0).uniform(0.01, 0.05, 39)])
+
+
+def grey(frame: Frame) -> int:
+    """The number that `numbered_frames` wrote into the middle of the picture."""
+    h, w = frame.image.shape[:2]
+    return round(float(frame.image[h // 2 - 4 : h // 2 + 4, w // 2 - 4 : w // 2 + 4].mean()) / 8)
+
+
+def noise_frames(n: int) -> Iterator[np.ndarray]:
+    """Pictures that do not compress, so that every part of the file is picture data."""
+    rng = np.random.default_rng(1)
+    for _ in range(n):
+        yield rng.integers(0, 255, (64, 96, 3), np.uint8)
+
+
+def code_of(path: Path) -> str:
+    with pytest.raises(PblError) as error:
+        probe(path)
+    assert error.value.key == path
+    return error.value.code
+
+
+# --- what a whole file says
+
+
+@pytest.mark.parametrize(
+    ("suffix", "codec", "container", "decoder"),
+    [
+        ("mp4", "libx264", "mp4", "h264"),
+        ("mov", "libx264", "mov", "h264"),
+        ("mp4", "libx265", "mp4", "hevc"),
+        ("mkv", "libx264", "matroska", "h264"),
+        ("webm", "libvpx-vp9", "matroska", "vp9"),
+        ("ts", "libx264", "mpegts", "h264"),
+    ],
+)
+def test_variable_frame_rate_stamps_are_the_containers(tmp_path, suffix, codec, container, decoder):
+    b_frames = 2 if "x26" in codec else 0
+    path = write_video(tmp_path / f"v.{suffix}", numbered_frames(40), VARIABLE_S, codec, b_frames=b_frames)
+    info = probe(path)
+    tick = 1e-3 if container == "matroska" else 1 / 90_000
+    assert info.n_frames == 40
+    assert info.time_s[0] == 0.0
+    assert np.abs(info.time_s - VARIABLE_S).max() <= 0.501 * tick
+    assert info.variable_frame_rate
+    assert info.fps == pytest.approx(1 / np.median(np.diff(VARIABLE_S)), rel=0.05)
+    assert info.duration_s == pytest.approx(VARIABLE_S[-1] + 1 / info.fps, abs=2e-3)
+    assert (info.width_px, info.height_px, info.rotation_deg) == (96, 64, 0)
+    assert (info.container, info.codec, info.pixel_format) == (container, decoder, "yuv420p")
+    assert info.size_bytes == path.stat().st_size
+    assert info.sha256 == sha256_of(path) == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert info.notes == ()
+    assert [grey(f) for f in read_frames(path)] == [i % 30 for i in range(40)]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "fps"), [("mp4", 30.0), ("mp4", 59.94), ("mkv", 59.94), ("mkv", 240.0), ("avi", 30.0)]
+)
+def test_constant_rate_is_not_called_variable(tmp_path, suffix, fps):
+    """MKV rounds stamps to 1 ms: at 240 per second they alternate between 4 and 5 ms without the rate varying."""
+    options = {"codec": "mpeg4", "ticks_per_s": 30} if suffix == "avi" else {}
+    info = probe(write_video(tmp_path / f"v.{suffix}", numbered_frames(60), constant_rate(60, fps), **options))
+    assert info.n_frames == 60
+    assert not info.variable_frame_rate
+    assert info.fps == pytest.approx(fps, rel=0.05)
+
+
+def test_one_missing_frame_makes_the_rate_variable(tmp_path):
+    info = probe(write_video(tmp_path / "v.mp4", numbered_frames(29), np.delete(constant_rate(30), 12)))
+    assert info.variable_frame_rate
+    assert info.fps == pytest.approx(30.0)
+
+
+def test_a_single_frame_has_the_announced_rate(tmp_path):
+    info = probe(write_video(tmp_path / "v.mkv", numbered_frames(1), [0.0]))
+    assert info.n_frames == 1
+    assert not info.variable_frame_rate
+    assert info.fps == pytest.approx(30.0)
+
+
+def test_read_frames_selects_by_index_and_keeps_the_stamps_of_probe(tmp_path):
+    path = write_video(tmp_path / "v.mp4", numbered_frames(40), VARIABLE_S, b_frames=2)
+    info = probe(path, threads=1)
+    for start, stop, step in (
+        (0, None, 1),
+        (7, None, 1),
+        (0, 10, 1),
+        (5, 30, 4),
+        (38, 90, 1),
+        (5, 5, 1),
+        (50, None, 1),
+    ):
+        frames = list(read_frames(path, start, stop, step, threads=3))
+        assert [f.index for f in frames] == list(range(40))[start:stop:step]
+        assert [f.time_s for f in frames] == info.time_s[start:stop:step].tolist()
+        assert [grey(f) for f in frames] == [i % 30 for i in range(40)][start:stop:step]
+    with pytest.raises(ValueError, match="step"):
+        read_frames(path, step=0)
+    with pytest.raises(ValueError, match="start"):
+        read_frames(path, start=-1)
+
+
+def test_pictures_are_bgr(tmp_path):
+    image = next(read_frames(write_video(tmp_path / "v.mp4", numbered_frames(2), constant_rate(2)))).image
+    assert image.dtype == np.uint8
+    assert image.flags.c_contiguous
+    np.testing.assert_allclose(image[4, 4], (255, 0, 0), atol=12)  # blue
+    np.testing.assert_allclose(image[-4, -4], (0, 0, 255), atol=12)  # red
+
+
+@pytest.mark.parametrize("rotation", [0, 90, 180, 270])
+def test_rotation_flag_gives_the_upright_picture(tmp_path, rotation):
+    """The picture has a blue block top left and a red one bottom right, and OpenCV turns it the same way."""
+    path = write_video(tmp_path / "v.mp4", numbered_frames(3), constant_rate(3), rotation_deg=rotation)
+    with av.open(str(path)) as container:
+        stored = next(container.decode(video=0))
+        assert (stored.width, stored.height) == ((96, 64) if rotation % 180 == 0 else (64, 96))
+    info = probe(path)
+    assert (info.width_px, info.height_px, info.rotation_deg) == (96, 64, rotation)
+    image = next(read_frames(path)).image
+    assert image.shape == (64, 96, 3)
+    np.testing.assert_allclose(image[4, 4], (255, 0, 0), atol=12)
+    np.testing.assert_allclose(image[-4, -4], (0, 0, 255), atol=12)
+    assert cv2.VideoCapture(str(path)).read()[1].shape == image.shape
+    assert np.abs(image.astype(float) - cv2.VideoCapture(str(path)).read()[1]).mean() < 4
+
+
+@pytest.mark.parametrize("rotation", [0, 90, 180, 270])
+def test_mirrored_picture_is_shown_mirrored_and_said(tmp_path, rotation):
+    path = write_video(tmp_path / "v.mp4", numbered_frames(3), constant_rate(3), rotation_deg=rotation, hflip=True)
+    info = probe(path)
+    image = next(read_frames(path)).image
+    assert image.shape == (64, 96, 3)
+    np.testing.assert_allclose(image[4, -4], (255, 0, 0), atol=12)
+    np.testing.assert_allclose(image[-4, 4], (0, 0, 255), atol=12)
+    assert info.rotation_deg == rotation
+    assert any("mirrored" in note for note in info.notes)
+
+
+def test_metadata_of_a_phone(tmp_path):
+    metadata = {
+        "com.apple.quicktime.creationdate": "2024-05-01T09:30:00+0200",
+        "com.apple.quicktime.make": "Apple",
+        "com.apple.quicktime.model": "iPhone 12",
+    }
+    options = {"movflags": "use_metadata_tags"}
+    info = probe(
+        write_video(tmp_path / "v.mov", numbered_frames(2), [0, 0.1], metadata=metadata, container_options=options)
+    )
+    assert (info.recorded_utc, info.make, info.model) == ("2024-05-01T07:30:00Z", "Apple", "iPhone 12")
+    assert info.container == "mov"
+
+
+@pytest.mark.parametrize("written", [None, "1904-01-01T00:00:00Z", "1970-01-01T00:00:00Z"])
+def test_unknown_recording_time_is_none(tmp_path, written):
+    metadata = {"creation_time": written} if written else {}
+    info = probe(write_video(tmp_path / "v.mp4", numbered_frames(2), [0, 0.1], metadata=metadata))
+    assert (info.recorded_utc, info.make, info.model) == (None, None, None)
+
+
+# --- edit lists, and the recordings that have them
+
+
+def test_frames_that_an_edit_list_hides_do_not_count(tmp_path):
+    """Stamps below zero become an edit list: a player begins at the 21st picture."""
+    path = tmp_path / "v.mp4"
+    with av.open(str(path), "w", options={"avoid_negative_ts": "disabled", "use_editlist": "1"}) as container:
+        stream = container.add_stream("libx264", rate=30)
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        for i, image in enumerate([*numbered_frames(60), None]):
+            frame = None
+            if image is not None:
+                frame = av.VideoFrame.from_ndarray(image, format="bgr24")
+                frame.pts, frame.time_base = i, Fraction(1, 30)
+            for packet in stream.encode(frame):
+                assert packet.pts is not None
+                assert packet.dts is not None
+                packet.pts, packet.dts = packet.pts - 20, packet.dts - 20
+                container.mux(packet)
+    info = probe(path)
+    assert (info.n_frames, info.n_frames_announced) == (40, 60)
+    assert info.notes == ("20 frames are hidden by the file's edit list and do not count",)
+    np.testing.assert_allclose(info.time_s, constant_rate(40), atol=1e-4)
+    assert [grey(f) for f in read_frames(path)] == [(20 + i) % 30 for i in range(40)]
+
+
+@pytest.mark.parametrize(("clip", "n_frames", "n_announced"), [("walk", 75, 271), ("STS", 798, 841)])
+def test_real_clips_with_edit_lists(shared_data, clip, n_frames, n_announced):
+    """OpenCV decodes as many (../shared/data/README.md); the header announces more, and the file is whole."""
+    path = shared_data / "real" / "video_mocap" / clip / "video.mp4"
+    info = probe(path, threads=2)
+    assert (info.n_frames, info.n_frames_announced) == (n_frames, n_announced)
+    assert (info.width_px, info.height_px) == (720, 1280)
+    assert not info.variable_frame_rate
+    assert info.fps == pytest.approx(60.0)
+    assert len(info.notes) == 1
+
+
+@pytest.mark.parametrize("file", ["video_mocap/walk/video.mp4", "multiview/cam01.mp4", "multiview/cam02.mp4"])
+def test_real_clips_decode_as_in_opencv(shared_data, file):
+    path = shared_data / "real" / file
+    capture = cv2.VideoCapture(str(path))
+    for frame in read_frames(path, threads=2):
+        there, theirs = capture.read()
+        assert there
+        if frame.index % 20 == 0:
+            assert np.abs(frame.image.astype(np.int16) - theirs).mean() < 2.0
+            assert frame.time_s * 1000 == pytest.approx(capture.get(cv2.CAP_PROP_POS_MSEC), abs=1.0)
+    assert not capture.read()[0]
+
+
+# --- files that are not whole videos
+
+
+def test_missing_and_empty(tmp_path):
+    assert code_of(tmp_path / "absent.mp4") == "VIDEO_MISSING"
+    assert code_of(tmp_path) == "VIDEO_MISSING"
+    (tmp_path / "empty.mp4").touch()
+    assert code_of(tmp_path / "empty.mp4") == "VIDEO_EMPTY"
+    with pytest.raises(PblError, match="VIDEO_MISSING"):
+        read_frames(tmp_path / "absent.mp4")  # at the call, not at the first frame
+    with pytest.raises(PblError, match="VIDEO_EMPTY"):
+        sha256_of(tmp_path / "empty.mp4")
+
+
+def test_not_a_video(tmp_path):
+    text, picture, noise, sound = (tmp_path / n for n in ("text.mp4", "picture.mp4", "noise.mov", "sound.mp4"))
+    text.write_text("#EXTM3U\n#EXTINF:10,\nother.mp4\n")  # also a playlist, which must not be followed
+    cv2.imwrite(str(tmp_path / "p.png"), np.zeros((64, 64, 3), np.uint8))
+    picture.write_bytes((tmp_path / "p.png").read_bytes())
+    noise.write_bytes(np.random.default_rng(0).bytes(50_000))
+    with av.open(str(sound), "w") as container:
+        stream = container.add_stream("aac", rate=44100)
+        assert isinstance(stream, av.AudioStream)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+        frame.sample_rate = 44100
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    for path in (text, picture, noise, sound):
+        assert code_of(path) == "VIDEO_NOT_A_VIDEO"
+
+
+def test_not_one_frame_decodes(tmp_path):
+    path = write_video(
+        tmp_path / "v.mp4", noise_frames(10), constant_rate(10), container_options={"movflags": "+faststart"}
+    )
+    data = path.read_bytes()
+    start = data.index(b"mdat") + 4
+    path.write_bytes(data[:start] + bytes(len(data) - start))
+    assert code_of(path) == "VIDEO_NO_FRAMES"
+
+
+CONTAINERS = {
+    "index first": ("mp4", "libx264", {"movflags": "+faststart"}),
+    "index first, hevc": ("mov", "libx265", {"movflags": "+faststart"}),
+    "index last": ("mp4", "libx264", {}),
+    "fragments": ("mp4", "libx264", {"movflags": "frag_keyframe+empty_moov"}),
+    "matroska": ("mkv", "libx264", {}),
+    "webm": ("webm", "libvpx-vp9", {}),
+    "avi": ("avi", "mpeg4", {}),
+    "transport stream": ("ts", "libx264", {}),
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("whole")
+    made = {}
+    for name, (suffix, codec, options) in CONTAINERS.items():
+        path = folder / f"{name.replace(' ', '_').replace(',', '')}.{suffix}"
+        b_frames, ticks = (2 if "x26" in codec else 0), (30 if suffix == "avi" else 90_000)
+        made[name] = write_video(
+            path,
+            noise_frames(40),
+            constant_rate(40),
+            codec,
+            b_frames=b_frames,
+            gop=10,
+            ticks_per_s=ticks,
+            container_options=options,
+        )
+    return made
+
+
+@pytest.mark.parametrize("name", CONTAINERS)
+def test_a_file_cut_anywhere_in_its_pictures_is_truncated(whole, tmp_path, name):
+    assert probe(whole[name]).n_frames == 40
+    data = whole[name].read_bytes()
+    for part in (0.15, 0.5, 0.97):
+        path = tmp_path / f"{part}{whole[name].suffix}"
+        path.write_bytes(data[: int(part * len(data))])
+        assert code_of(path) == "VIDEO_TRUNCATED", part
+        with pytest.raises(PblError, match="VIDEO_TRUNCATED"):
+            list(read_frames(path, threads=1))
+
+
+@pytest.mark.parametrize("name", ["index first", "index first, hevc", "matroska", "webm", "fragments"])
+def test_a_file_whose_end_is_zeros_is_truncated(whole, tmp_path, name):
+    """What a copy leaves that reserved the whole length and then broke off."""
+    data = whole[name].read_bytes()
+    path = tmp_path / f"v{whole[name].suffix}"
+    path.write_bytes(data[: int(0.6 * len(data))] + bytes(len(data) - int(0.6 * len(data))))
+    assert code_of(path) == "VIDEO_TRUNCATED"
+
+
+def test_truncation_says_what_is_left_and_what_to_do(whole, tmp_path):
+    path = tmp_path / "v.mp4"
+    data = whole["index first"].read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(PblError) as error:
+        probe(path)
+    assert "frames" in error.value.found
+    assert f"the file at {len(data) // 2}" in error.value.found
+    assert "copy" in error.value.next_step
+    data = whole["index last"].read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(PblError, match="nothing of it can be read"):
+        probe(path)
+
+
+@pytest.mark.parametrize("name", ["index first", "index first, hevc"])
+def test_damage_inside_is_not_passed_over(whole, tmp_path, name):
+    data = bytearray(whole[name].read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 6000] = bytes(6000)
+    path = tmp_path / f"v{whole[name].suffix}"
+    path.write_bytes(data)
+    assert code_of(path) == "VIDEO_DAMAGED"
+
+
+def _with_stamps(path: Path, times_s: list[float]) -> Path:
+    """An MKV whose packets carry these stamps, in any order."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mjpeg", rate=30)
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuvj420p"
+        for image, t in zip(numbered_frames(len(times_s)), times_s, strict=True):
+            for packet in stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")):
+                packet.time_base = Fraction(1, 1000)
+                packet.pts = packet.dts = round(1000 * t)
+                container.mux(packet)
+    return path
+
+
+def test_a_repeated_stamp_is_left_out_and_said(tmp_path):
+    times = constant_rate(200, 25.0)
+    times[50] = times[49]
+    path = _with_stamps(tmp_path / "v.mkv", times.tolist())
+    info = probe(path)
+    np.testing.assert_allclose(info.time_s, np.delete(times, 50), atol=1e-9)
+    assert info.notes == ("1 frames whose time stamp repeats or runs backwards do not count",)
+    assert [grey(f) for f in read_frames(path)] == [i % 30 for i in range(200) if i != 50]
+
+
+def test_stamps_that_cannot_be_trusted(tmp_path):
+    assert (
+        code_of(_with_stamps(tmp_path / "v.mkv", np.repeat(constant_rate(20, 25.0), 2).tolist())) == "VIDEO_TIMESTAMPS"
+    )
+    raw = write_video(tmp_path / "v.h264", numbered_frames(10), constant_rate(10))  # a stream without a container
+    assert code_of(raw) == "VIDEO_TIMESTAMPS"
+
+
+def test_a_changing_picture_size_is_refused(tmp_path):
+    path = tmp_path / "v.ts"
+    parts = [
+        write_video(tmp_path / f"{h}.ts", numbered_frames(10, h, 96), constant_rate(10), gop=5).read_bytes()
+        for h in (64, 128)
+    ]
+    path.write_bytes(b"".join(parts))
+    assert code_of(path) == "VIDEO_DAMAGED"
+
+
+# --- memory
+
+
+def _resident_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * 4096 / 1e6
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs /proc")
+def test_memory_does_not_grow_with_the_length(tmp_path):
+    """3,000 frames of 58 KB are 173 MB; between the first third and the end the process may grow by 12 MB."""
+    pictures = list(numbered_frames(30, 120, 160))
+    path = write_video(tmp_path / "v.mp4", (pictures[i % 30] for i in range(3000)), constant_rate(3000))
+    at_third, n = 0.0, 0
+    for frame in read_frames(path, threads=2):
+        n += 1
+        if frame.index == 1000:
+            at_third = _resident_mb()
+    assert n == 3000
+    assert _resident_mb() - at_third < 12
+    before = _resident_mb()
+    assert probe(path, threads=2).n_frames == 3000
+    assert _resident_mb() - before < 12
+
+
+# --- cameras
+
+
+def _toml(path: Path, **changes: str) -> Path:
+    fields = {
+        "size": "[1920, 1080]",
+        "matrix": "[[1500.0, 0.0, 960.0], [0.0, 1510.0, 540.0], [0.0, 0.0, 1.0]]",
+        "distortions": "[0.1, -0.2, 0.001, 0.002]",
+        "fisheye": "false",
+    } | changes
+    body = "\n".join(f"{key} = {value}" for key, value in fields.items() if value)
+    path.write_text(f'[cam]\nname = "cam"\n{body}\n[metadata]\nerror = 0.0\n')
+    return path
+
+
+def test_camera_from_toml(tmp_path):
+    camera = load_camera(_toml(tmp_path / "c.toml"), (1920, 1080))
+    np.testing.assert_array_equal(camera.matrix, [[1500, 0, 960], [0, 1510, 540], [0, 0, 1]])
+    np.testing.assert_array_equal(camera.distortion, [0.1, -0.2, 0.001, 0.002, 0])
+    assert camera.source == "file: c.toml [cam]"
+
+
+def test_camera_scales_with_the_picture(tmp_path):
+    """Halved: the point at the middle of a pixel block stays it, so cx = (960 + 0.5) / 2 - 0.5 = 479.75."""
+    camera = load_camera(_toml(tmp_path / "c.toml"), (960, 540))
+    np.testing.assert_allclose(camera.matrix, [[750, 0, 479.75], [0, 755, 269.75], [0, 0, 1]])
+    assert "scaled by 0.5 from 1920x1080" in camera.source
+
+
+def test_camera_from_json(tmp_path):
+    path = tmp_path / "c.json"
+    matrix = [[900.0, 0, 360], [0, 901.0, 640], [0, 0, 1]]
+    path.write_text(
+        json.dumps({"camera_matrix": matrix, "distortion": [0.1, 0, 0, 0, 0.3], "image_size_px": [720, 1280]})
+    )
+    camera = load_camera(path, (720, 1280))
+    np.testing.assert_array_equal(camera.matrix, matrix)
+    np.testing.assert_array_equal(camera.distortion, [0.1, 0, 0, 0, 0.3])
+
+
+@pytest.mark.parametrize(
+    ("size", "changes"),
+    [
+        ((1920, 1088), {}),
+        ((1080, 1920), {}),
+        ((1920, 1080), {"matrix": "[[1500.0, 0.0], [0.0, 1510.0]]"}),
+        ((1920, 1080), {"matrix": "[[-1500.0, 0.0, 960.0], [0.0, 1510.0, 540.0], [0.0, 0.0, 1.0]]"}),
+        ((1920, 1080), {"matrix": "[[1500.0, 0.0, 960.0], [0.0, 1510.0, 2540.0], [0.0, 0.0, 1.0]]"}),
+        ((1920, 1080), {"matrix": "[[nan, 0.0, 960.0], [0.0, 1510.0, 540.0], [0.0, 0.0, 1.0]]"}),
+        ((1920, 1080), {"distortions": "[0.1, 0.2]"}),
+        ((1920, 1080), {"distortions": ""}),
+        ((1920, 1080), {"distortions": "[-2.0, 0.0, 0.0, 0.0]"}),
+        ((1920, 1080), {"size": '["a", "b"]'}),
+        ((1920, 1080), {"fisheye": "true"}),
+        ((1920, 1080), {"size": "[1920, 1080"}),
+    ],
+)
+def test_unusable_cameras(tmp_path, size, changes):
+    path = _toml(tmp_path / "c.toml", **changes)
+    with pytest.raises(PblError) as error:
+        load_camera(path, size)
+    assert error.value.code == "CAMERA_INVALID"
+    assert error.value.key == path
+
+
+def test_camera_file_of_several(shared_data, tmp_path):
+    path = shared_data / "real" / "multiview" / "Calib_qualisys.toml"
+    assert load_camera(path, (1088, 1920), "cam_02").matrix[0, 0] == pytest.approx(1673.73, abs=0.01)
+    for name in (None, "cam_9"):
+        with pytest.raises(PblError, match="CAMERA_INVALID"):
+            load_camera(path, (1088, 1920), name)
+    with pytest.raises(PblError, match="CAMERA_INVALID"):
+        load_camera(tmp_path / "absent.toml", (1088, 1920))
+
+
+@pytest.mark.parametrize("size", [(720, 1280), (1280, 720)])
+def test_guess_is_stated(size):
+    camera = guess_camera(size)
+    assert camera.matrix[0, 0] == camera.matrix[1, 1] == pytest.approx(0.7169 * 1280)
+    assert camera.matrix[:2, 2].tolist() == [(size[0] - 1) / 2, (size[1] - 1) / 2]
+    assert not camera.distortion.any()
+    assert camera.source.startswith("guess: ")
+    assert "70 deg" in camera.source
+    assert "-7 to +18 %" in camera.source
+
+
+def test_guess_for_a_probed_video(tmp_path):
+    info = probe(write_video(tmp_path / "v.mp4", numbered_frames(2), [0, 0.1], rotation_deg=90))
+    assert isinstance(info, VideoInfo)
+    np.testing.assert_array_equal(guess_camera(info).matrix, guess_camera((96, 64)).matrix)
+    assert dataclasses.asdict(guess_camera(info))["source"] == guess_camera((96, 64)).source
+
+
+def test_guess_is_the_median_of_the_published_figures(shared_data):
+    published = json.loads((shared_data / "real" / "norms" / "opencap_iphone_intrinsics.json").read_text())
+    ratios = [
+        np.mean([c["intrinsicMat"][0][0], c["intrinsicMat"][1][1]]) / np.max(c["imageSize"]) for c in published.values()
+    ]
+    assert len(ratios) == 78
+    assert guess_camera((1280, 720)).matrix[0, 0] / 1280 == pytest.approx(np.median(ratios), abs=1e-4)
+    assert min(ratios) == pytest.approx(0.6655, abs=3e-4)
+    assert max(ratios) == pytest.approx(0.8452, abs=3e-4)
