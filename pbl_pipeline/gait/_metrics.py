@@ -162,8 +162,8 @@ def _cycle_checks(measures: Spatiotemporal) -> tuple[Check, ...]:
             WARN,
             None,
             None,
-            "foot down is detected early and foot up late (docs/measures.md): stance and double support are too long "
-            "by a constant; compare sessions with each other",
+            "with laboratory markers foot down is found 39 ms early and foot up 13 ms late; on video this is not "
+            "measured yet: stance and double support may be too long by a constant, so compare sessions",
         ),
     ]
     cadence = measures["cadence_steps_per_min"]
