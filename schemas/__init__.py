@@ -3,6 +3,21 @@
 Importing this package connects to nothing and loads no table.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 from ._activate import COMPUTED, STAGES, activate, computed_tables
 
-__all__ = ["COMPUTED", "STAGES", "activate", "computed_tables"]
+if TYPE_CHECKING:
+    from .results import SessionResults
+
+
+def load_session(restriction: Any) -> SessionResults:
+    """Everything the tables hold of one session, as the library's objects: see `schemas.results.load_session`."""
+    from .results import load_session as load
+
+    return load(restriction)
+
+
+__all__ = ["COMPUTED", "STAGES", "activate", "computed_tables", "load_session"]

@@ -90,6 +90,18 @@ class GDI(dj.Computed):
         cycle_explained : float32              # (0..1) share of the deviation that the index sees
         """
 
+    class Check(dj.Part):
+        definition = """
+        # quality checks of the index
+        -> master
+        index_check              : varchar(64)  # name, with its unit
+        ---
+        index_check_outcome      : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')
+        index_check_value=null   : float64     # in the unit (see index_check)
+        index_check_threshold=null: float64    # in the unit (see index_check)
+        index_check_advice       : varchar(1000)
+        """
+
     @property
     def key_source(self) -> Any:
         planned = fit.FitSet.proj("session_id") * GdiPlan
@@ -130,6 +142,7 @@ class GDI(dj.Computed):
             {**key, "cycle_no": c.number, "cycle_gdi": c.gdi, "cycle_z": c.z, "cycle_explained": c.explained}
             for c in result.cycles
         )
+        self.Check.insert({**key, **fit.check_row("index", check)} for check in result.qc)
 
 
 @schema
@@ -149,6 +162,7 @@ class SessionGdi(dj.Computed):
     session_gdi_right=null      : float32      # (-)
     session_gdi_n               : int16        # cycles with an index
     session_cycles              : int16        # used cycles
+    session_params_hash         : char(16)     # hash over the parameters of events and index together
     session_cadence=null        : float32      # (steps/min)
     session_stride_time=null    : float32      # (s)
     session_step_time=null      : float32      # (s)
@@ -225,6 +239,7 @@ class SessionGdi(dj.Computed):
                 "session_gdi_right": number(index.right),
                 "session_gdi_n": index.n,
                 "session_cycles": measures.n_cycles_used,
+                "session_params_hash": result.params_hash,
                 **{f"session_{c}": gait.mean_of(measures.measures[by_column[c]]) for c in columns},
                 **origin.row("session_gdi", method_hash=sha, model_sha256=norm_sha),
             }

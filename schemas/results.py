@@ -1,0 +1,380 @@
+"""Rows back to the library's objects: what a report, a demo or an analyst works with."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+
+from . import fit, gait, gdi, keypoints, session, tracking, video
+from ._base import error_code, error_found, file_ref, library, stored_file
+
+
+@dataclasses.dataclass(frozen=True)
+class TrialResults:
+    """One video of a session. What a stage did not produce is None, with a sentence in `problem`."""
+
+    video_id: int
+    name: str
+    path: Path
+    info: Any = None  # pbl_pipeline.video.VideoInfo
+    tracking: Any = None  # pbl_pipeline.tracking.Tracking
+    choice: Any = None  # pbl_pipeline.tracking.SubjectChoice
+    keypoints: Any = None  # pbl_pipeline.keypoints.Keypoints
+    fit: Any = None  # pbl_pipeline.fit.TrialFit
+    events: Any = None  # pbl_pipeline.gait.GaitEvents
+    cycles: tuple[Any, ...] = ()  # of pbl_pipeline.gait.GaitCycle
+    problem: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class SessionResults:
+    """A visit: its trials in the order of their numbers, the fit and the measures of the current set."""
+
+    session_id: int
+    subject: str
+    session_label: str
+    session_date: datetime.date | None
+    trials: tuple[TrialResults, ...]
+    fit: Any = None  # pbl_pipeline.fit.SessionFit
+    metrics: Any = None  # pbl_pipeline.gait.GaitMetrics
+    key: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def fitted(self) -> tuple[TrialResults, ...]:
+        """The trials that have a fit, in the order of `fit.trials` and `metrics.trials`."""
+        return tuple(t for t in self.trials if t.fit is not None)
+
+
+def load_session(restriction: Any) -> SessionResults:
+    """Everything the tables hold of one session.
+
+    Parameters
+    ----------
+    restriction
+        What picks one session and, where several methods were used, one chain of methods: a dict such as
+        `{"subject": "P017", "session_label": "2026-03-01", "fit_method": "paper-2025-v1"}`.
+
+    Raises
+    ------
+    PblError
+        DB_NOT_FOUND when no session matches, USAGE when several sessions or chains match.
+    """
+    found = (session.Session & restriction).to_dicts()
+    if not found:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no session for {restriction}",
+            expected="a registered session",
+            next_step="`pbl ingest` prints subject and session of each video",
+        )
+    visit = _single(found, "session_id", restriction)
+    chain = {"session_id": int(visit["session_id"])}
+    fits = (
+        fit.SessionFit * (fit.FitSelection & {"fit_current": True}) * fit.FitSet.proj("session_id")
+        & chain
+        & restriction
+    ).keys()
+    key = dict(_single(fits, "fit_set", restriction)) if fits else {}
+    session_fit = load_session_fit(key) if key else None
+    fit_by_video = dict(zip(_videos(key), session_fit.trials, strict=True)) if session_fit else {}
+    measured = (gdi.SessionGdi & key & restriction).keys() if key else []
+    metrics_key = _single(measured, "gait_method", restriction) if measured else {}
+    metrics = load_metrics(metrics_key) if metrics_key else None
+    rows = (video.Video & chain).to_dicts(order_by="video_id")
+    by_name = {t.name: t for t in metrics.trials} if metrics else {}
+    trials = tuple(_trial(row, restriction, fit_by_video.get(int(row["video_id"])), by_name) for row in rows)
+    return SessionResults(
+        session_id=int(visit["session_id"]),
+        subject=visit["subject"],
+        session_label=visit["session_label"],
+        session_date=visit["session_date"],
+        trials=trials,
+        fit=session_fit,
+        metrics=metrics,
+        key={**key, **metrics_key},
+    )
+
+
+def _single(rows: list[dict], attribute: str, restriction: Any) -> dict:
+    if len(rows) > 1:
+        raise PblError(
+            "USAGE",
+            found=f"{len(rows)} rows for {restriction}: " + "; ".join(str(r) for r in rows[:4]),
+            expected="one session and one chain of methods",
+            next_step=f"add {attribute} or the name of a method to the restriction",
+        )
+    return rows[0]
+
+
+def _videos(key: Mapping[str, Any]) -> list[int]:
+    return [int(v) for v in (fit.SessionFit.Trial & key).to_arrays("video_id", order_by="video_id")]
+
+
+def load_keypoints(key: Any) -> Any:
+    """The library's `Keypoints` of one row."""
+    ref = file_ref((keypoints.Keypoints & key).fetch1("keypoints_file"))
+    with stored_file(keypoints.Keypoints(), ref) as path:
+        return library("keypoints").Keypoints.load(path)
+
+
+def load_trial_fit(key: Any) -> Any:
+    """The library's `TrialFit` of one row of SessionFit.Trial."""
+    ref = file_ref((fit.SessionFit.Trial & key).fetch1("trial_file"))
+    with stored_file(fit.SessionFit(), ref) as path:
+        return library("fit").TrialFit.load(path)
+
+
+def load_session_fit(key: Any) -> Any:
+    """The library's `SessionFit` of one row, its trials in the order of their video numbers."""
+    row = (fit.SessionFit & key).fetch1()
+    with stored_file(fit.SessionFit(), file_ref(row["session_file"])) as path, np.load(path, allow_pickle=False) as f:
+        arrays = {k: f[k] for k in f.files}
+    trials = tuple(load_trial_fit({**key, "video_id": v}) for v in _videos(key))
+    return library("fit").SessionFit(
+        trials=trials,
+        scale=arrays["scale"],
+        site_offset_m=arrays["site_offset_m"],
+        loss_trace=arrays["loss_trace"],
+        solver=row["solver"],
+        params_hash=row["fit_method_hash"],
+        seconds=float(row["fit_seconds"]),
+        compile_seconds=float(row["compile_seconds"]),
+        device=row["compute_device"],
+        qc=tuple(_checks(fit.SessionFit.Check & key, "fit")),
+    )
+
+
+def load_info(key: Any) -> Any:
+    """The library's `VideoInfo` of one video."""
+    return video.info_of_row((video.Video * video.VideoInfo & key).fetch1())
+
+
+def load_tracking(key: Any) -> Any:
+    """The library's `Tracking` of one row."""
+    row = (tracking.Tracking & key).fetch1()
+    size = (video.VideoInfo & {"video_id": row["video_id"]}).fetch1("width", "height")
+    with stored_file(tracking.Tracking(), file_ref(row["tracks"])) as path:
+        return tracking.load_tracking(path, (int(size[0]), int(size[1])), row["detector"], row["tracking_model_sha256"])
+
+
+def load_choice(key: Any) -> Any:
+    """The library's `SubjectChoice` of one row."""
+    row = (tracking.SubjectChoice & key).fetch1()
+    nan = float("nan")
+    return library("tracking").SubjectChoice(
+        status=row["choice_status"],
+        person_id=None if row["chosen_person_id"] is None else int(row["chosen_person_id"]),
+        score=nan if row["choice_score"] is None else float(row["choice_score"]),
+        runner_up_id=None if row["runner_up_id"] is None else int(row["runner_up_id"]),
+        runner_up_score=nan if row["runner_up_score"] is None else float(row["runner_up_score"]),
+        scores={int(k): nan if v is None else float(v) for k, v in row["choice_scores"].items()},
+        reason=row["choice_reason"],
+    )
+
+
+def load_events(key: Any) -> Any:
+    """The library's `GaitEvents` of one row."""
+    row = (gait.GaitEvents & key).fetch1()
+    events = (gait.GaitEvents.Event & key).to_dicts(order_by="event_no")
+    return library("gait").GaitEvents(
+        status=row["events_status"],
+        events=tuple(gait.event_of_row(e) for e in events),
+        reason=row["events_reason"],
+        method=row["events_detector"],
+        params_hash=row["events_method_hash"],
+        source=row["events_source"],
+        walking_s=tuple((float(a), float(b)) for a, b in row["walking_bouts"]),
+        n_candidates=int(row["n_candidates"]),
+        n_order_breaks=int(row["n_order_breaks"]),
+        qc=tuple(_checks(gait.GaitEvents.Check & key, "events")),
+    )
+
+
+def load_cycles(key: Any, trial: str) -> tuple[Any, ...]:
+    """The library's `GaitCycle`s of one row, with their curves."""
+    ref = file_ref((gait.GaitCycle & key).fetch1("curves"))
+    with stored_file(gait.GaitCycle(), ref) as path:
+        curves = gait.load_curves(path)
+    rows = (gait.GaitCycle.Cycle & key).to_dicts(order_by="cycle_no")
+    return tuple(gait.cycle_of_row(r, trial, curves.get(int(r["cycle_no"]))) for r in rows)
+
+
+def _checks(rows: Any, prefix: str) -> list[Any]:
+    check = library("qc").Check
+    fields = ("", "_outcome", "_value", "_threshold", "_advice")
+    return [check(*(row[f"{prefix}_check{f}"] for f in fields)) for row in rows.to_dicts(order_by="KEY")]
+
+
+def load_metrics(key: Any) -> Any:
+    """The library's `GaitMetrics` of one row of SessionGdi, from the rows of its trials and its own: nothing is
+    computed anew. A trial's checks are those of its events and index."""
+    lib, row = library("gait"), (gdi.SessionGdi & key).fetch1()
+    row_key = {k: row[k] for k in gdi.SessionGdi.primary_key}
+    trials = tuple(_trial_metrics({**row_key, "video_id": v}) for v in _videos(row_key))
+    norm_name, model = _names(row_key)
+    index = lib.Gdi(
+        status="PASS" if row["session_gdi"] is not None else "EMPTY",
+        reason=row["session_gdi_reason"],
+        left=_float(row["session_gdi_left"]),
+        right=_float(row["session_gdi_right"]),
+        mean=_float(row["session_gdi"]),
+        n=int(row["session_gdi_n"]),
+        n_left=sum(t.gdi.n_left for t in trials),
+        n_right=sum(t.gdi.n_right for t in trials),
+        norm=norm_name,
+        model=model,
+        params_hash=row["session_gdi_method_hash"],
+        cycles=tuple(c for t in trials for c in t.gdi.cycles),
+        qc=tuple(c for c in _checks(gdi.SessionGdi.Check & row_key, "gdi") if c.check in _INDEX_CHECKS),
+    )
+    measures = _spatiotemporal(
+        (gdi.SessionGdi.Measure & row_key).to_dicts(),
+        "session_measure",
+        status=row["session_status"],
+        reason=row["session_reason"],
+        n_cycles_found=sum(t.spatiotemporal.n_cycles_found for t in trials),
+        n_cycles_used=int(row["session_cycles"]),
+        n_steps_used=sum(t.spatiotemporal.n_steps_used for t in trials),
+    )
+    return lib.GaitMetrics(
+        trials=trials,
+        status=row["session_status"],
+        reason=row["session_reason"],
+        spatiotemporal=measures,
+        gdi=index,
+        qc=tuple(_checks(gdi.SessionGdi.Check & row_key, "gdi")),
+        params_hash=row["session_params_hash"],
+    )
+
+
+#: Checks of the index among the checks of a session; the others are of the measures.
+_INDEX_CHECKS = ("gdi_cycles", "gdi_explained", "norm_convention")
+
+
+def _trial_metrics(key: Mapping[str, Any]) -> Any:
+    lib = library("gait")
+    name = (fit.SessionFit.Trial & key).fetch1("trial_name")
+    counts = (gait.GaitCycle & key).fetch1("n_cycles", "n_cycles_used")
+    row = (gait.Spatiotemporal & key).fetch1()
+    events = load_events(key)
+    measures = _spatiotemporal(
+        (gait.Spatiotemporal.Measure & key).to_dicts(),
+        "measure",
+        status=row["measures_status"],
+        reason=row["measures_reason"],
+        n_cycles_found=int(counts[0]),
+        n_cycles_used=int(counts[1]),
+        n_steps_used=int(row["n_steps_used"]),
+    )
+    index = load_gdi(key, name)
+    reason = events.reason or measures.reason
+    return lib.TrialMetrics(
+        name=name,
+        status="EMPTY" if reason else "PASS",
+        reason=reason,
+        events=events,
+        cycles=load_cycles(key, name),
+        spatiotemporal=measures,
+        gdi=index,
+        qc=(*events.qc, *index.qc),
+    )
+
+
+def load_gdi(key: Any, trial: str) -> Any:
+    """The library's `Gdi` of one row of GDI."""
+    lib, row = library("gait"), (gdi.GDI & key).fetch1()
+    norm_name, model = _names(row)
+    rows = (gdi.GDI.Cycle * gait.GaitCycle.Cycle.proj("cycle_side") & key).to_dicts(order_by="cycle_no")
+    cycles = tuple(
+        lib.GdiCycle(
+            trial=trial,
+            number=int(r["cycle_no"]),
+            side=r["cycle_side"],
+            gdi=float(r["cycle_gdi"]),
+            z=float(r["cycle_z"]),
+            explained=float(r["cycle_explained"]),
+        )
+        for r in rows
+    )
+    return lib.Gdi(
+        status=row["gdi_status"],
+        reason=row["gdi_reason"],
+        left=_float(row["gdi_left"]),
+        right=_float(row["gdi_right"]),
+        mean=_float(row["gdi"]),
+        n=int(row["gdi_n"]),
+        n_left=sum(c.side == "left" for c in cycles),
+        n_right=sum(c.side == "right" for c in cycles),
+        norm=norm_name,
+        model=model,
+        params_hash=row["gdi_method_hash"],
+        cycles=cycles,
+        qc=tuple(_checks(gdi.GDI.Check & key, "index")),
+    )
+
+
+def _names(key: Mapping[str, Any]) -> tuple[str, str]:
+    norm = (gdi.NormativeSet & {"norm": key["norm"]}).fetch1("norm_name")
+    return norm, (gdi.GdiModel & {"gdi_method": key["gdi_method"]}).fetch1("gdi_method_name")
+
+
+def _spatiotemporal(rows: list[dict], prefix: str, **fields: Any) -> Any:
+    """The library's `Spatiotemporal` from the rows of a Measure part table, measures in the library's order."""
+    lib = library("gait")
+    by_name = {row[prefix]: row for row in rows}
+    measures, reasons = {}, {}
+    for name in (*lib.MEASURES, *sorted(set(by_name) - set(lib.MEASURES))):
+        if name not in by_name:
+            continue
+        row = by_name[name]
+        mean = _float(row[f"{prefix}_mean"])
+        left, right, sd = (_float(row[f"{prefix}_{k}"]) for k in ("left", "right", "sd"))
+        measures[name] = None if mean is None else lib.Measure(left, right, mean, sd, int(row[f"{prefix}_n"]))
+        if row[f"{prefix}_missing"]:
+            reasons[name] = row[f"{prefix}_missing"]
+    return lib.Spatiotemporal(measures=measures, reasons=reasons, **fields)
+
+
+def _float(value: Any) -> float | None:
+    return None if value is None or not np.isfinite(value) else float(value)
+
+
+def _trial(row: Mapping[str, Any], restriction: Any, fitted: Any, metrics: Mapping[str, Any]) -> TrialResults:
+    key = {"video_id": int(row["video_id"])}
+    name = fitted.name if fitted is not None else Path(row["video_name"]).stem
+    out = TrialResults(key["video_id"], name, Path(row["video_path"]), fit=fitted)
+    found: dict[str, Any] = {}
+    if video.VideoInfo & key:
+        found["info"] = load_info(key)
+    chain = tracking.Tracking & key & restriction
+    if chain:
+        track_key = _single(chain.keys(), "tracking_method", restriction)
+        found["tracking"] = load_tracking(track_key)
+        if tracking.SubjectChoice & track_key:
+            found["choice"] = load_choice(track_key)
+    points = (keypoints.Keypoints & key & restriction).keys()
+    if points:
+        found["keypoints"] = load_keypoints(_single(points, "keypoint_method", restriction))
+    if fitted is not None and name in metrics:
+        found["events"], found["cycles"] = metrics[name].events, metrics[name].cycles
+    return dataclasses.replace(out, **found, problem=_problem(key, found.get("choice"), fitted))
+
+
+def _problem(key: Mapping[str, Any], choice: Any, fitted: Any) -> str:
+    """Why a video has no fit, in a sentence."""
+    if fitted is not None:
+        return ""
+    for table in (video.VideoInfo, tracking.Tracking, tracking.SubjectChoice, keypoints.Keypoints, fit.TrialInput):
+        for row in (table.jobs.errors & key).to_dicts():
+            message = row["error_message"]
+            return f"{table.__name__}: {error_code(message)}, {error_found(message)}"
+    if choice is not None and choice.status not in tracking.CHOSEN:
+        return choice.reason
+    return "not computed yet"

@@ -1,0 +1,77 @@
+"""Joined queries for analysts, as pandas tables. `schemas.activate()` must have been called."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from . import fit, gait, gdi, qc, session, tracking, video
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def current_sets() -> Any:
+    """Sets of videos that are the newest of their session, with subject and session."""
+    current = fit.FitSelection & {"fit_current": True}
+    return (
+        current
+        * fit.FitSet.proj("session_id", "fit_set_n")
+        * session.Session.proj("subject", "session_label", "session_date")
+    )
+
+
+def session_summary(restriction: Any = True) -> pd.DataFrame:
+    """One row per visit and chain of methods: cadence, stride time, index, worst quality check.
+
+    Columns carry the units of their tables (docs/tables.md): cadence steps/min, times s, stance and swing percent,
+    residuals px and cm.
+    """
+    fits = fit.SessionFit.proj("fit_residual_2d", "fit_residual_3d", "fit_outcome")
+    measures = gdi.SessionGdi.proj(
+        "session_status",
+        "session_reason",
+        "session_cycles",
+        "session_cadence",
+        "session_stride_time",
+        "session_step_time",
+        "session_stance",
+        "session_swing",
+        "session_double_support",
+        "session_gdi",
+        "session_gdi_left",
+        "session_gdi_right",
+        "session_gdi_n",
+    )
+    quality = qc.SessionQc.proj("qc_outcome", "qc_worst")
+    return (current_sets() * fits * measures * quality & restriction).to_pandas(order_by="session_id").reset_index()
+
+
+def trial_summary(restriction: Any = True) -> pd.DataFrame:
+    """One row per fitted video: residuals, events, measures and index of the trial."""
+    trials = fit.SessionFit.Trial.proj("trial_name", "trial_n_fitted", "trial_residual_2d", "trial_residual_3d")
+    events = gait.GaitEvents.proj("events_status", "events_reason", "n_events")
+    cycles = gait.GaitCycle.proj("n_cycles", "n_cycles_used")
+    measures = gait.Spatiotemporal.proj("cadence", "stride_time", "step_time", "stance", "swing", "double_support")
+    index = gdi.GDI.proj("gdi", "gdi_left", "gdi_right", "gdi_n")
+    joined = current_sets() * trials * events * cycles * measures * index
+    return (joined & restriction).to_pandas(order_by="video_id").reset_index()
+
+
+def video_summary(restriction: Any = True) -> pd.DataFrame:
+    """One row per video that was tracked: who was chosen, why, and how well she was seen."""
+    probed = video.VideoInfo.proj("duration", "n_frames", "fps")
+    chosen = tracking.SubjectChoice.proj("choice_status", "chosen_person_id", "choice_score", "choice_reason")
+    named = video.Video.proj("session_id", "video_name") * session.Session.proj("subject", "session_label")
+    return (named * probed * chosen & restriction).to_pandas(order_by="video_id").reset_index()
+
+
+def quality_summary(restriction: Any = True) -> pd.DataFrame:
+    """Every check of the current visits that is not PASS, with its value, threshold and advice."""
+    checks = qc.SessionQc.Check & "qc_check_outcome != 'PASS'"
+    return (current_sets() * checks & restriction).to_pandas(order_by="session_id, qc_no").reset_index()
+
+
+def decided_by_hand() -> pd.DataFrame:
+    """Videos whose subject a person chose."""
+    manual = tracking.SubjectOverride * video.Video.proj("video_name", "session_id")
+    return manual.to_pandas(order_by="video_id").reset_index()
