@@ -1,0 +1,306 @@
+"""Tiles, merging, association over time and the choice of the subject, against hand-worked and synthetic truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.tracking import (
+    PARAMSETS,
+    AssociationParams,
+    Detection,
+    PersonTrack,
+    Tracking,
+    TrackingParams,
+    choose_subject,
+    save_contact_sheet,
+    time_in_view_s,
+    track_people,
+)
+from pbl_pipeline.tracking._associate import Associator
+from pbl_pipeline.tracking._blazepose import body_box, box_iou, circle_roi
+from pbl_pipeline.tracking._tiles import detect_in, merge, tile_starts, tiles
+from tests.videos import constant_rate, write_video
+
+HEIGHT = 400.0
+
+
+def person(x: float, y: float, side: float = HEIGHT, score: float = 0.95, turn: float = 0.0) -> Detection:
+    roi = np.array([x, y, side, turn])
+    return Detection(box_px=body_box(roi), score=score, roi_px=roi)
+
+
+# --- geometry ---------------------------------------------------------------------------------------------------
+
+
+def test_box_iou_by_hand():
+    box = np.array([0.0, 0.0, 2.0, 2.0])
+    others = np.array([[0, 0, 2, 2], [1, 0, 3, 2], [2, 2, 3, 3], [1, 1, 1, 1]], float)
+    np.testing.assert_allclose(box_iou(box, others), [1, 2 / 6, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("rim", "turn"), [((0, -5), 0.0), ((5, 0), np.pi / 2), ((-5, 0), -np.pi / 2), ((3, -4), np.arctan2(3, 4))]
+)
+def test_circle_rotation_is_clockwise_and_zero_when_upright(rim, turn):
+    centre = np.array([10.0, 20.0])
+    np.testing.assert_allclose(circle_roi(centre, centre + rim), [10, 20, 10, turn], atol=1e-12)
+
+
+def test_body_box_turns_with_the_body():
+    np.testing.assert_allclose(body_box(np.array([100, 200, 50, 0.0])), [90, 175, 110, 225])
+    np.testing.assert_allclose(body_box(np.array([100, 200, 50, np.pi / 2])), [75, 190, 125, 210])
+
+
+@pytest.mark.parametrize(("width", "height"), [(1768, 994), (1080, 1920), (720, 1280), (64, 64), (4000, 500)])
+@pytest.mark.parametrize("overlap", [0.25, 0.5])
+def test_tiles_cover_the_frame_and_overlap(width, height, overlap):
+    windows = tiles(width, height, 0.7, overlap)
+    assert windows[0] == (0, 0, width, height)
+    covered = np.zeros((height, width), int)
+    side = round(0.7 * min(width, height))
+    for x0, y0, x1, y1 in windows[1:]:
+        assert (x1 - x0, y1 - y0) == (side, side)
+        covered[y0:y1, x0:x1] += 1
+    assert covered.min() >= 1
+    for starts in (tile_starts(width, side, overlap), tile_starts(height, side, overlap)):
+        assert np.all(np.diff(starts) <= side * (1 - overlap) + 1)
+
+
+class Spots:
+    """A detector that finds square spots: a spot of brightness 200 + n is a person n tens of px high."""
+
+    name, model_sha256 = "spots", "0" * 64
+
+    def detect(self, image: np.ndarray) -> list[Detection]:
+        found = []
+        for value in np.unique(image[image[:, :, 1] > 200][:, 1]) if image.size else []:
+            y, x = np.nonzero(image[:, :, 1] == value)
+            found.append(person(x.mean(), y.mean(), 10.0 * (float(value) - 200)))
+        return found
+
+
+def test_detection_in_windows_is_in_frame_pixels_and_counted_once():
+    image = np.zeros((994, 1768, 3), np.uint8)
+    image[600:611, 1000:1011] = 240
+    (found,) = detect_in(Spots(), image, tiles(1768, 994, 0.7, 0.3))
+    np.testing.assert_allclose(found.roi_px, [1005, 605, 400, 0])
+
+
+def test_merge_averages_agreement_and_drops_the_wrong_size():
+    agreeing = [(0.9, person(100, 300)), (0.6, person(110, 300)), (0.1, person(150, 300))]
+    wrong_size = (0.8, person(160, 350, side=800, score=0.8))
+    neighbour = (0.7, person(300, 300, score=0.7))
+    found = merge([*agreeing, wrong_size, neighbour])
+    assert len(found) == 2
+    # 0.9 and 0.6 are averaged; the one trusted less than half as much only confirms.
+    np.testing.assert_allclose(found[0].roi_px, [104, 300, 400, 0])
+    np.testing.assert_allclose(found[1].roi_px, [300, 300, 400, 0])
+
+
+def test_merge_averages_angles_on_the_circle():
+    (found,) = merge([(0.9, person(0, 0, turn=3.1)), (0.9, person(0, 0, turn=-3.1))])
+    assert abs(abs(found.roi_px[3]) - np.pi) < 1e-9
+
+
+# --- association ------------------------------------------------------------------------------------------------
+
+
+def follow(frames: list[list[Detection]], step_s: float = 0.1) -> list:
+    associator = Associator(AssociationParams())
+    for i, detections in enumerate(frames):
+        associator.step(i, i * step_s, detections, True)
+    return associator.trails()
+
+
+def test_two_people_who_pass_each_other_keep_their_identity():
+    # They meet at 500; each moves 40 px per frame, so the nearest old place is often the other's.
+    frames = [[person(100 + 40 * i, 500), person(900 - 40 * i, 520, side=380)] for i in range(21)]
+    rng = np.random.default_rng(0)
+    frames = [[f[k] for k in rng.permutation(2)] for f in frames]
+    trails = follow(frames)
+    assert len(trails) == 2
+    for trail, (start, slope, side) in zip(
+        sorted(trails, key=lambda t: t.state()[0], reverse=True), [(100, 40, 400), (900, -40, 380)], strict=True
+    ):
+        assert [d.roi_px[2] for d in trail.detections] == [side] * 21
+        np.testing.assert_allclose([d.roi_px[0] for d in trail.detections], start + slope * np.arange(21))
+
+
+def test_a_short_gap_is_bridged_and_a_long_one_is_not():
+    here = [person(500, 500)]
+    assert len(follow([here] * 5 + [[]] * 9 + [here] * 5)) == 1
+    assert len(follow([here] * 5 + [[]] * 11 + [here] * 5)) == 2
+
+
+def test_a_weak_or_upside_down_detection_does_not_take_over_a_track():
+    walk = [[person(500 + 10 * i, 500)] for i in range(5)]
+    trails = follow([*walk, [], [], [person(700, 600, score=0.6)], [person(600, 620, score=0.84, turn=np.pi)]])
+    assert [d.roi_px[0] for d in trails[0].detections] == [500, 510, 520, 530, 540]
+    # The weak one begins nothing either.
+    assert len(trails) == 2
+
+
+# --- a whole video ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def spots_video(tmp_path):
+    """4 s at 25 fps, 640x360. Person A (140 px) walks right, hidden for 0.6 s; B (100 px) stands, from 2 s on; C is
+    one frame of glare."""
+
+    def frames():
+        for i in range(100):
+            image = np.zeros((360, 640, 3), np.uint8)
+            if not 40 <= i < 55:
+                image[170:190, 100 + 4 * i : 120 + 4 * i] = 214
+            if i >= 50:
+                image[90:110, 300:320] = 210
+            if i == 20:
+                image[250:270, 50:70] = 206
+            yield image
+
+    return write_video(tmp_path / "spots.mkv", frames(), constant_rate(100, 25), codec="ffv1", pixel_format="bgr0")
+
+
+def test_track_people_numbers_bridges_and_drops(spots_video):
+    tracking = track_people(spots_video, detector=Spots())
+    assert tracking.image_size_px == (640, 360)
+    assert tracking.detector == "spots"
+    assert [p.person_id for p in tracking.persons] == [1, 2]
+    a, b = tracking.persons
+    assert np.isfinite(a.roi_px[:100]).all()
+    np.testing.assert_allclose(a.roi_px[:, 0], 109.5 + 4 * np.arange(100), atol=1.5)
+    assert not a.observed[40:55].any()
+    assert a.observed[:40].sum() >= 10
+    seen = np.flatnonzero(np.isfinite(b.box_px[:, 0]))
+    # A new person is found at the next full search: within 0.2 s, 5 frames.
+    assert 50 <= seen[0] <= 55
+    assert seen[-1] == 99
+    assert np.isnan(b.roi_px[:50]).all()
+    assert (b.score[:50] == 0).all()
+    assert not b.observed[:50].any()
+    assert time_in_view_s(a, tracking.time_s) == pytest.approx(4.0)
+
+
+def test_track_people_finds_nobody_in_noise(tmp_path):
+    video = write_video(tmp_path / "dark.mkv", [np.zeros((64, 64, 3), np.uint8)] * 30, constant_rate(30), "ffv1")
+    tracking = track_people(video, detector=Spots())
+    assert tracking.persons == ()
+    assert choose_subject(tracking).status == "NO_PERSON"
+
+
+def test_unknown_detector_is_refused(spots_video):
+    with pytest.raises(PblError) as error:
+        track_people(spots_video, TrackingParams(detector="none"))
+    assert error.value.code == "SOLVER_UNKNOWN"
+
+
+def test_paramset_names_the_model():
+    paramset = PARAMSETS["blazepose-tiles"]
+    assert (paramset.stage, paramset.version) == ("tracking", 1)
+    assert paramset.params["model_sha256"] == TrackingParams().model_sha256
+    assert len(paramset.hash) == 16
+
+
+def test_contact_sheet_shows_everybody(spots_video, tmp_path):
+    import cv2
+
+    tracking = track_people(spots_video, detector=Spots())
+    sheet = cv2.imread(str(save_contact_sheet(spots_video, tracking, tmp_path / "sheet.png")))
+    assert sheet is not None
+    assert sheet.shape == (360, 1280, 3)
+
+
+# --- the subject ------------------------------------------------------------------------------------------------
+
+SIZE = (1000, 1000)
+FPS = 30.0
+
+
+def track(person_id: int, x, y=500.0, side=HEIGHT, turn=0.0, start: int = 0, n: int = 180, jitter: float = 0.0):
+    """A person in frames start.. of a video of `n` frames; x, y, side may be functions of the seconds since then."""
+    t = np.arange(n - start) / FPS
+    rng = np.random.default_rng(person_id)
+    values = [np.broadcast_to(v(t) if callable(v) else v, t.shape).astype(float) for v in (x, y, side, turn)]
+    values[0] = values[0] + rng.normal(0, jitter * HEIGHT, len(t))
+    values[2] = values[2] * np.exp(rng.normal(0, 2 * jitter, len(t)))
+    roi = np.full((n, 4), np.nan)
+    roi[start:] = np.stack(values, axis=1)
+    seen = np.isfinite(roi[:, 0])
+    box = np.full((n, 4), np.nan)
+    box[seen] = np.clip(body_box(roi[seen]), 0, 1000)
+    return PersonTrack(person_id, box, roi, seen.astype(float), seen)
+
+
+def video_of(*persons: PersonTrack) -> Tracking:
+    n = len(persons[0].score)
+    return Tracking(np.arange(n) / FPS, SIZE, persons, "test", "")
+
+
+def test_the_walker_is_chosen_not_the_one_who_stays():
+    walker = track(2, x=lambda t: 100 + 130 * t, jitter=0.03)
+    stander = track(1, x=500.0, jitter=0.03)
+    choice = choose_subject(video_of(stander, walker))
+    assert (choice.status, choice.person_id, choice.runner_up_id) == ("CHOSEN", 2, 1)
+    assert "walks" in choice.reason
+    assert "stays in place" in choice.reason
+
+
+def test_walking_towards_the_camera_counts_as_walking():
+    # 1.2 m/s from 9 m to 1.8 m away, a person of 1.7 m, focal length 720 px; and somebody sits down and gets up.
+    walker = track(2, x=480.0, side=lambda t: 720 * 1.7 / (9 - 1.2 * t), jitter=0.03)
+    sitter = track(1, x=600.0, side=lambda t: 330 + 60 * np.sin(2 * np.pi * t / 3), jitter=0.03)
+    choice = choose_subject(video_of(sitter, walker))
+    assert choice.person_id == 2
+
+
+def test_jumping_off_a_wall_is_not_walking():
+    jumper = track(1, x=lambda t: 300 + 100 * t, y=lambda t: 200 + 130 * t)
+    walker = track(2, x=lambda t: 900 - 100 * t, y=600.0)
+    choice = choose_subject(video_of(jumper, walker))
+    assert choice.person_id == 2
+
+
+def test_a_patient_who_walks_slowly_wins_over_a_larger_bystander():
+    # 0.25 m/s for a person of 1.7 m: 0.15 body heights per second.
+    patient = track(1, x=lambda t: 300 + 0.15 * HEIGHT * t, jitter=0.02)
+    bystander = track(2, x=900.0, side=500.0, jitter=0.02)
+    assert choose_subject(video_of(patient, bystander)).person_id == 1
+
+
+def test_two_alike_need_a_choice_and_a_human_decides():
+    side_by_side = video_of(track(1, x=lambda t: 100 + 100 * t), track(2, x=lambda t: 300 + 100 * t))
+    choice = choose_subject(side_by_side)
+    assert (choice.status, choice.person_id) == ("NEEDS_CHOICE", None)
+    assert "person 1" in choice.reason
+    assert "person 2" in choice.reason
+    by_hand = choose_subject(side_by_side, override=1)
+    assert (by_hand.status, by_hand.person_id, by_hand.runner_up_id) == ("MANUAL", 1, 2)
+
+
+def test_an_override_wins_over_a_clear_choice_but_must_exist():
+    clear = video_of(track(1, x=500.0), track(2, x=lambda t: 100 + 130 * t))
+    assert choose_subject(clear, override=1).person_id == 1
+    with pytest.raises(PblError) as error:
+        choose_subject(clear, override=3)
+    assert error.value.code == "SUBJECT_UNKNOWN_PERSON"
+
+
+def test_who_is_in_view_for_under_a_second_is_no_candidate_beside_others():
+    stander, passer = track(1, x=500.0), track(2, x=lambda t: 300 + 300 * t, start=155)
+    choice = choose_subject(video_of(stander, passer))
+    assert (choice.person_id, choice.runner_up_id) == (1, None)
+    # Alone he is chosen; that his time is too short is said where keypoints would be computed.
+    assert choose_subject(video_of(track(1, x=500.0, start=160))).person_id == 1
+
+
+def test_scores_do_not_depend_on_the_size_of_the_picture():
+    def scaled(p: PersonTrack, k: float) -> PersonTrack:
+        return PersonTrack(p.person_id, p.box_px * k, p.roi_px * [k, k, k, 1], p.score, p.observed)
+
+    people = (track(1, x=500.0, jitter=0.02), track(2, x=lambda t: 100 + 130 * t, jitter=0.02))
+    small = video_of(*people)
+    large = Tracking(small.time_s, (3000, 3000), tuple(scaled(p, 3.0) for p in people), "test", "")
+    assert choose_subject(small).scores == pytest.approx(choose_subject(large).scores)
