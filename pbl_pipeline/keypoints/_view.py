@@ -28,7 +28,10 @@ def crop_matrix(roi_px: np.ndarray, size: int) -> np.ndarray:
 def viewing_ray(xy_px: np.ndarray, camera: Camera) -> np.ndarray:
     """(N, 3) rays x/z, y/z, 1 of the picture points (N, 2), distortion removed."""
     points = np.asarray(xy_px, np.float64).reshape(-1, 1, 2)
-    flat = cv2.undistortPoints(points, np.asarray(camera.matrix, np.float64), np.asarray(camera.distortion, np.float64))
+    matrix, distortion = np.asarray(camera.matrix, np.float64), np.asarray(camera.distortion, np.float64)
+    # OpenCV's five iterations leave some tenths of a pixel with a wide lens.
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
+    flat = cv2.undistortPoints(points, matrix, distortion, criteria=stop)
     return np.column_stack([flat.reshape(-1, 2), np.ones(len(points))])
 
 

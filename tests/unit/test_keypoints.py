@@ -1,0 +1,237 @@
+"""Crops, the virtual camera of a crop, and the two-pass run, against synthetic geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.keypoints import (
+    PARAMSETS,
+    KeypointParams,
+    Keypoints,
+    PersonKeypoints,
+    detect_keypoints,
+    view_rotation,
+)
+from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES
+from pbl_pipeline.keypoints._detect import refine_rois, smooth_rois
+from pbl_pipeline.keypoints._view import crop_matrix, viewing_ray
+from pbl_pipeline.tracking import PersonTrack, Tracking
+from pbl_pipeline.tracking._blazepose import body_box
+from pbl_pipeline.video import Camera
+from tests.videos import constant_rate, write_video
+
+CAMERA = Camera(np.array([[1300.0, 0, 960], [0, 1300.0, 540], [0, 0, 1]]), np.zeros(5), "test")
+LENS = Camera(CAMERA.matrix, np.array([-0.2, 0.05, 0.001, -0.002, 0.0]), "test with distortion")
+
+
+# --- names ------------------------------------------------------------------------------------------------------
+
+
+def test_the_mirror_swaps_left_and_right_and_nothing_else():
+    assert len(NAMES) == 33
+    assert MIRROR[MIRROR].tolist() == list(range(33))
+    for name, other in zip(NAMES, np.array(NAMES)[MIRROR], strict=True):
+        assert {name.count("left"), other.count("right")} in ({0}, {1})
+    assert NAMES[MIRROR[NAMES.index("left_heel")]] == "right_heel"
+    assert NAMES[MIRROR[0]] == "nose"
+
+
+# --- geometry ---------------------------------------------------------------------------------------------------
+
+
+def test_crop_matrix_by_hand():
+    upright = crop_matrix(np.array([100.0, 200.0, 64.0, 0.0]), 256)
+    np.testing.assert_allclose(upright @ [128, 128, 1], [100, 200])
+    np.testing.assert_allclose(upright @ [0, 0, 1], [68, 168])
+    # Turned clockwise by 90 degrees, the top of the crop lies to the right.
+    lying = crop_matrix(np.array([100.0, 200.0, 64.0, np.pi / 2]), 256)
+    np.testing.assert_allclose(lying @ [128, 0, 1], [132, 200], atol=1e-9)
+
+
+def test_view_rotation_at_the_principal_point_is_the_roll():
+    turn = 0.3
+    rotation = view_rotation(np.array([960.0, 540.0, 400.0, turn]), CAMERA)
+    np.testing.assert_allclose(rotation, Rotation.from_euler("z", turn).as_matrix(), atol=1e-12)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, LENS])
+def test_view_rotation_looks_along_the_ray_and_keeps_the_crops_down(camera):
+    roi = np.array([1700.0, 300.0, 400.0, 0.4])
+    rotation = view_rotation(roi, camera)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    ray = viewing_ray(roi[:2], camera)[0]
+    np.testing.assert_allclose(rotation[:, 2], ray / np.linalg.norm(ray), atol=1e-12)
+    # A point a little down in the virtual camera appears below the centre in the crop's own down direction.
+    import cv2
+
+    below = ray / np.linalg.norm(ray) + 1e-4 * rotation[:, 1]
+    pixel, _ = cv2.projectPoints(below[None], np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)
+    direction = pixel.ravel() - roi[:2]
+    np.testing.assert_allclose(direction / np.linalg.norm(direction), [-np.sin(0.4), np.cos(0.4)], atol=2e-3)
+
+
+@pytest.mark.parametrize("centre_m", [(0.0, 0.0, 5.0), (2.4, 0.3, 5.0), (-2.4, -0.8, 5.0)])
+def test_what_a_crop_shows_is_turned_by_the_viewing_ray(centre_m):
+    """An independent stand-in for the network: it knows the body's shape, sees the crop alone, and finds the pose
+    that explains the crop as a parallel projection. Turned by `view_rotation` that pose must be the true one."""
+    rng = np.random.default_rng(3)
+    shape = rng.normal(0, [0.2, 0.5, 0.15], (33, 3))
+    truth = Rotation.from_euler("yxz", [0.6, 0.1, -0.05])
+    points = truth.apply(shape) + centre_m
+    pixels = points[:, :2] / points[:, 2:] * 1300 + [960, 540]
+    roi = np.array([*(np.array(centre_m[:2]) / centre_m[2] * 1300 + [960, 540]), 520.0, 0.15])
+    to_picture = crop_matrix(roi, 256)
+    seen = np.linalg.solve(to_picture[:, :2], (pixels - to_picture[:, 2]).T).T
+
+    def misfit(p):
+        return (np.exp(p[3]) * Rotation.from_rotvec(p[:3]).apply(shape)[:, :2] + p[4:] - seen).ravel()
+
+    solution = least_squares(misfit, [0, 0.5, 0, np.log(100), 128, 128])
+    in_crop = Rotation.from_rotvec(solution.x[:3])
+    in_camera = Rotation.from_matrix(view_rotation(roi, CAMERA)) * in_crop
+    assert np.degrees((in_camera * truth.inv()).magnitude()) < 4.0
+    if centre_m[0] != 0:
+        rolled_only = Rotation.from_euler("z", 0.15) * in_crop
+        assert np.degrees((rolled_only * truth.inv()).magnitude()) > 15.0
+
+
+# --- crops over time --------------------------------------------------------------------------------------------
+
+
+def test_smoothing_keeps_steady_movement_and_calms_jitter():
+    time = np.arange(60) / 30
+    steady = np.stack([100 + 50 * time, 200 - 10 * time, np.full(60, 300.0), 0.2 + 0 * time], axis=1)
+    np.testing.assert_allclose(smooth_rois(steady, time, 0.1), steady, rtol=1e-6)
+    noise = np.random.default_rng(0).normal(0, 5, (60, 2))
+    shaken = steady.copy()
+    shaken[:, :2] += noise
+    left = smooth_rois(shaken, time, 0.1)[:, :2] - steady[:, :2]
+    assert left.std() < 0.5 * noise.std()
+
+
+def test_smoothing_leaves_gaps_and_turns_through_half_a_circle():
+    time = np.arange(20) / 30
+    roi = np.tile([100.0, 100, 50, np.pi], (20, 1))
+    roi[::2, 3] = -np.pi
+    roi[5:8] = np.nan
+    smooth = smooth_rois(roi, time, 0.1)
+    assert np.isnan(smooth[5:8]).all()
+    np.testing.assert_allclose(np.abs(smooth[np.r_[:5, 8:20], 3]), np.pi, atol=1e-6)
+
+
+def test_the_track_wins_where_the_first_pass_contradicts_it():
+    roi = np.tile([500.0, 500.0, 400.0, 0.0], (4, 1))
+
+    def seen(x, side, presence=1.0):
+        empty = np.zeros((1, 2)), np.zeros((1, 3)), np.zeros(1)
+        return PersonKeypoints(*empty, presence, np.array([x, 500.0, side, 0.1]))
+
+    found = [seen(520, 420), seen(700, 400), seen(500, 700), seen(520, 420, presence=0.2)]
+    better = refine_rois(roi, found, KeypointParams())
+    np.testing.assert_allclose(better[0], [520, 500, 420, 0.1])
+    np.testing.assert_allclose(better[1:], roi[1:])
+
+
+# --- a whole video ----------------------------------------------------------------------------------------------
+
+
+class Cross:
+    """A detector with three points: the region's centre, and two at its sides; nobody where the picture is dark."""
+
+    name, model_sha256, marker_set, root_relative = "cross", "0" * 64, "test", True
+    names: tuple[str, ...] = ("middle", "left", "right")
+
+    def __init__(self):
+        self.calls: list[bool] = []
+
+    def detect(self, image, roi_px, camera, *, quick=False):
+        self.calls.append(quick)
+        x, y, side, _ = roi_px
+        xy = np.array([[x, y], [x - side, y], [x + side, y]])
+        return PersonKeypoints(
+            xy, np.ones((3, 3)), np.full(3, 0.9), float(image.mean() > 50), roi_px + np.eye(4)[0] * 2
+        )
+
+
+@pytest.fixture
+def case(tmp_path):
+    """90 frames at 30 fps, 200x100; the person in frames 10..69 but 30..34; frames 50..54 are dark."""
+    frames = [np.full((100, 200, 3), 0 if 50 <= i < 55 else 128, np.uint8) for i in range(90)]
+    video = write_video(tmp_path / "v.mkv", frames, constant_rate(90), "ffv1", pixel_format="bgr0")
+    roi = np.full((90, 4), np.nan)
+    roi[10:70] = [60.0, 50.0, 70.0, 0.0]
+    roi[30:35] = np.nan
+    seen = np.isfinite(roi[:, 0])
+    person = PersonTrack(1, body_box(roi), roi, seen.astype(float), seen)
+    return video, Tracking(constant_rate(90), (200, 100), (person,), "test", "")
+
+
+def test_two_passes_and_missing_values(case, tmp_path):
+    video, tracking = case
+    detector = Cross()
+    keypoints = detect_keypoints(video, tracking, 1, CAMERA, detector=detector)
+    assert detector.calls == [True] * 55 + [False] * 55
+    there = np.zeros(90, bool)
+    there[10:70] = True
+    there[30:35] = there[50:55] = False
+    assert np.array_equal(np.isfinite(keypoints.xy_px[:, 0, 0]), there)
+    assert np.array_equal(keypoints.confidence[:, 0] > 0, there)
+    # The first pass moved the crop by 2 px; around the dark frames the track's crop has a share.
+    np.testing.assert_allclose(keypoints.xy_px[there, 0, 0], 62, atol=1.5)
+    np.testing.assert_allclose(keypoints.xy_px[12, 0], [62, 50], atol=1e-3)
+    # What lies beyond the picture was not seen.
+    assert np.isnan(keypoints.xy_px[:, 1]).all()
+    assert np.isnan(keypoints.xyz_cam_m[:, 1]).all()
+    assert (keypoints.confidence[:, 1] == 0).all()
+    np.testing.assert_allclose(keypoints.box_px[12], [0, 50, 146, 50], atol=1e-3)
+    assert np.isnan(keypoints.box_px[~there]).all()
+    keypoints.save(tmp_path / "k.npz")
+    again = Keypoints.load(tmp_path / "k.npz")
+    np.testing.assert_array_equal(again.xy_px, keypoints.xy_px)
+    assert again.names == ("middle", "left", "right")
+
+
+def test_one_pass(case):
+    video, tracking = case
+    detector = Cross()
+    keypoints = detect_keypoints(video, tracking, 1, CAMERA, KeypointParams(passes=1), detector)
+    assert detector.calls == [False] * 55
+    np.testing.assert_allclose(keypoints.xy_px[12, 0], [60, 50], atol=1e-3)
+
+
+def test_under_a_second_in_view_is_too_short(case):
+    video, tracking = case
+    roi = tracking.persons[0].roi_px.copy()
+    roi[25:] = np.nan
+    short = PersonTrack(1, body_box(roi), roi, np.zeros(90), np.isfinite(roi[:, 0]))
+    with pytest.raises(PblError) as error:
+        detect_keypoints(video, Tracking(tracking.time_s, (200, 100), (short,), "test", ""), 1, CAMERA, None, Cross())
+    assert error.value.code == "TRACK_TOO_SHORT"
+    assert "0.50 s" in error.value.found
+
+
+def test_unknown_person_detector_and_changed_video(case, tmp_path):
+    video, tracking = case
+    with pytest.raises(PblError) as error:
+        detect_keypoints(video, tracking, 7, CAMERA, None, Cross())
+    assert error.value.code == "SUBJECT_UNKNOWN_PERSON"
+    with pytest.raises(PblError) as error:
+        detect_keypoints(video, tracking, 1, CAMERA, KeypointParams(detector="none"))
+    assert error.value.code == "SOLVER_UNKNOWN"
+    shorter = write_video(
+        tmp_path / "s.mkv", [np.full((100, 200, 3), 128, np.uint8)] * 40, constant_rate(40), "ffv1", pixel_format="bgr0"
+    )
+    with pytest.raises(PblError) as error:
+        detect_keypoints(shorter, tracking, 1, CAMERA, None, Cross())
+    assert error.value.code == "VIDEO_CHANGED"
+
+
+def test_paramset_names_the_model():
+    paramset = PARAMSETS["blazepose-33"]
+    assert (paramset.stage, paramset.version) == ("keypoints", 1)
+    assert paramset.params["model_sha256"] == KeypointParams().model_sha256
