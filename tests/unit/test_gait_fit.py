@@ -150,6 +150,18 @@ def test_curves_have_the_signs_of_gait():
     assert angles.left["pelvis_tilt"][40] == pytest.approx(10, abs=1e-3)  # OpenSim's negative tilt is anterior
 
 
+def test_pelvis_curves_belong_to_a_side():
+    """Right side ahead and right side up are positive for the right, negative for the left."""
+    time = np.arange(0, 12, 1 / 30)
+    turn = np.radians(8.0) * np.sin(2 * np.pi * time)  # about up: the right side ahead; averages out of the heading
+    angles = angle_series(make_fit(time, {"pelvis_rotation": turn, "pelvis_list": np.radians(-5.0)}))
+    peak = np.argmin(np.abs(time - 6.25))
+    assert angles.right["pelvis_rotation"][peak] == pytest.approx(8, abs=0.5)
+    assert angles.left["pelvis_rotation"][peak] == pytest.approx(-8, abs=0.5)
+    assert angles.right["pelvis_obliquity"][peak] == pytest.approx(5, abs=0.1)
+    assert angles.left["pelvis_obliquity"][peak] == pytest.approx(-5, abs=0.1)
+
+
 @pytest.mark.parametrize("heading_deg", [0.0, 120.0])
 def test_a_walking_body(heading_deg):
     time = np.arange(0, 10, 1 / 30)
