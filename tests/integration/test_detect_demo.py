@@ -1,0 +1,195 @@
+"""`pbl detect` on the demo recording and on bad input. Needs the assets; skips where they cannot be had."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from pbl_pipeline import assets
+from pbl_pipeline.cli.detect import detect
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.keypoints import Keypoints, detect_keypoints
+from pbl_pipeline.tracking import Tracking, choose_subject, track_people
+from pbl_pipeline.video import guess_camera, load_camera, read_frames
+from tests.unit.test_blazepose import BY_EYE, asset
+from tests.videos import constant_rate, write_video
+
+SIZE = (1768, 994)
+
+
+@pytest.fixture(scope="module")
+def demo() -> Path:
+    for name in ("blazepose_detector", "blazepose_landmarks", "demo_camera"):
+        asset(name)
+    return asset("demo_video")
+
+
+@pytest.fixture(scope="module")
+def tracking(demo) -> Tracking:
+    return track_people(demo)
+
+
+@pytest.fixture(scope="module")
+def keypoints(demo, tracking) -> Keypoints:
+    camera = load_camera(assets.fetch("demo_camera"), SIZE)
+    chosen = choose_subject(tracking).person_id
+    assert chosen is not None
+    return detect_keypoints(demo, tracking, chosen, camera)
+
+
+def cut(demo: Path, start: int, stop: int, x: slice, y: slice) -> Iterator[np.ndarray]:
+    for frame in read_frames(demo, start=start, stop=stop):
+        yield frame.image[y, x]
+
+
+def run(*args: object):
+    return CliRunner().invoke(detect, [str(a) for a in args])
+
+
+def code_of(result) -> str:
+    assert isinstance(result.exception, PblError), result.output
+    return result.exception.code
+
+
+def hips_at(tracking: Tracking, frame: int) -> dict[int, np.ndarray]:
+    return {p.person_id: p.roi_px[frame, :2] for p in tracking.persons if np.isfinite(p.roi_px[frame, 0])}
+
+
+def test_both_people_are_tracked_and_she_is_one_person(tracking):
+    # By eye: she walks from x = 1525 in frame 45 to x = 199 in frame 180; he stands on the wall, at x = 640 in
+    # frame 60; from about frame 195 on he has landed on the lawn, at x = 1250 in frame 210.
+    ids = {
+        next(k for k, xy in hips_at(tracking, f).items() if np.hypot(xy[0] - x, xy[1] - y) < 60)
+        for f, x, y in [
+            (45, 1525, 750),
+            (75, 1266, 740),
+            (105, 959, 715),
+            (135, 680, 715),
+            (165, 370, 712),
+            (180, 200, 730),
+        ]
+    }
+    assert len(ids) == 1
+    man = {k for k, xy in hips_at(tracking, 60).items() if np.hypot(xy[0] - 635, xy[1] - 270) < 60}
+    landed = {k for k, xy in hips_at(tracking, 210).items() if np.hypot(xy[0] - 1250, xy[1] - 740) < 80}
+    assert man
+    assert landed
+    assert not ids & (man | landed)
+
+
+def test_the_walker_is_chosen_with_a_reason(tracking):
+    choice = choose_subject(tracking)
+    assert choice.status == "CHOSEN"
+    assert choice.person_id is not None
+    assert abs(hips_at(tracking, 105)[choice.person_id][0] - 959) < 60
+    assert choice.score - choice.runner_up_score > 0.15
+    assert "walks" in choice.reason
+
+
+def test_keypoints_lie_where_a_human_sees_them(keypoints):
+    names = keypoints.names
+    for frame, (side, front, rear) in BY_EYE.items():
+        other = "left" if side == "right" else "right"
+        for point, truth in ((f"{side}_ankle", front), (f"{other}_ankle", rear)):
+            assert np.hypot(*(keypoints.xy_px[frame, names.index(point)] - truth)) < 25, (frame, point)
+
+
+def test_feet_alternate_as_she_walks(keypoints):
+    """Right and left foot in front by turns. Counted in the frames by eye: right 60, left 79, right 98, left 116,
+    right 134, left 152, right 171, left 187 (+- 2 frames)."""
+    names = keypoints.names
+    # She walks towards small x.
+    lead = keypoints.xy_px[:, names.index("left_ankle"), 0] - keypoints.xy_px[:, names.index("right_ankle"), 0]
+    for frame, sign in [(60, 1), (79, -1), (98, 1), (116, -1), (134, 1), (152, -1), (171, 1), (187, -1)]:
+        assert sign * lead[frame] > 100, frame
+
+
+def test_her_heading_does_not_turn_with_the_viewing_angle(keypoints):
+    """She walks straight on, through 28 degrees of viewing angle. Without the turn by the viewing ray the axis through
+    her hips turns with it (slope 0.8)."""
+    seen = slice(60, 187)
+    hips = (
+        keypoints.xyz_cam_m[seen, keypoints.names.index("right_hip")]
+        - keypoints.xyz_cam_m[seen, keypoints.names.index("left_hip")]
+    )
+    heading = np.degrees(np.arctan2(hips[:, 0], hips[:, 2]))
+    middle = keypoints.xy_px[seen, keypoints.names.index("left_hip"), 0]
+    view = np.degrees(np.arctan((middle - keypoints.camera.matrix[0, 2]) / keypoints.camera.matrix[0, 0]))
+    assert abs(np.polyfit(view, heading, 1)[0]) < 0.35
+
+
+@pytest.mark.parametrize("name", ["walk", "STS"])
+def test_a_single_person_is_chosen_whatever_she_does(shared_data, demo, tmp_path, name):
+    video = shared_data / "real" / "video_mocap" / name / "video.mp4"
+    # Of the long recording the first 3 s suffice.
+    frames = (f.image for f in read_frames(video, stop=180, step=2))
+    times = constant_rate(38 if name == "walk" else 90)
+    choice = choose_subject(track_people(write_video(tmp_path / "v.mp4", frames, times)))
+    assert (choice.status, choice.person_id, choice.runner_up_id) == ("CHOSEN", 1, None)
+
+
+def test_command_on_a_cut_of_the_demo(demo, tmp_path):
+    video = write_video(tmp_path / "she.mp4", cut(demo, 80, 125, slice(500, 1500), slice(394, 994)), constant_rate(45))
+    result = run(video, "--out", tmp_path / "new" / "she.npz")
+    assert result.exit_code == 0, result.output
+    assert "CHOSEN" in result.output
+    keypoints = Keypoints.load(tmp_path / "new" / "she.npz")
+    assert keypoints.marker_set == "blazepose_33"
+    assert keypoints.camera.source == guess_camera((1000, 600)).source
+    # Frame 100 of the demo is frame 20 here, moved by the cut.
+    ankle = keypoints.xy_px[20, keypoints.names.index("right_ankle")] + [500, 394]
+    assert np.hypot(*(ankle - BY_EYE[100][1])) < 25
+    # A human's choice of somebody who is not there.
+    assert code_of(run(video, "--out", tmp_path / "she.npz", "--person", "9")) == "SUBJECT_UNKNOWN_PERSON"
+
+
+def test_nobody_in_noise(demo, tmp_path):
+    rng = np.random.default_rng(1)
+    coarse = rng.integers(0, 256, (45, 18, 32, 3), np.uint8)
+    video = write_video(
+        tmp_path / "n.mp4", (np.kron(c, np.ones((20, 20, 1), np.uint8)) for c in coarse), constant_rate(45)
+    )
+    result = run(video, "--out", tmp_path / "n.npz")
+    assert code_of(result) == "TRACK_NO_PERSON"
+    assert "NO_PERSON" in result.output
+    assert not (tmp_path / "n.npz").exists()
+
+
+def test_her_and_her_mirror_image_need_a_choice(demo, tmp_path):
+    def frames():
+        for image in cut(demo, 75, 120, slice(700, 1500), slice(394, 994)):
+            yield np.hstack([image, image[:, ::-1]])
+
+    video = write_video(tmp_path / "two.mp4", frames(), constant_rate(45))
+    result = run(video, "--out", tmp_path / "two.npz")
+    assert code_of(result) == "SUBJECT_NEEDS_CHOICE"
+    assert "--person" in str(result.exception)
+    assert (tmp_path / "two.persons.png").stat().st_size > 10_000
+    assert not (tmp_path / "two.npz").exists()
+    by_hand = run(video, "--out", tmp_path / "two.npz", "--person", "2")
+    assert by_hand.exit_code == 0, by_hand.output
+    assert "MANUAL" in by_hand.output
+
+
+def test_under_a_second_in_view(demo, tmp_path):
+    """She is in view for 0.8 s of 2 s; the rest is the empty lawn of the same place, before she comes."""
+
+    def frames():
+        window = slice(500, 1300), slice(394, 994)
+        yield from cut(demo, 90, 114, *window)
+        yield from cut(demo, 0, 36, *window)
+
+    video = write_video(tmp_path / "short.mp4", frames(), constant_rate(60))
+    result = run(video, "--out", tmp_path / "short.npz")
+    assert code_of(result) == "TRACK_TOO_SHORT"
+
+
+def test_usage_errors(tmp_path):
+    assert run(tmp_path / "v.mp4", "--out", tmp_path / "x.csv").exit_code == 2
+    assert run(tmp_path / "v.mp4", "--out", tmp_path / "x.npz", "--person", "her").exit_code == 2
+    assert code_of(run(tmp_path / "missing.mp4", "--out", tmp_path / "x.npz")) == "VIDEO_MISSING"
+    assert "Example" in run("--help").output

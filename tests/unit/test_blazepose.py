@@ -1,0 +1,173 @@
+"""BlazePose's two networks: decoding by hand, and the real models on frames of the demo recording.
+
+The tests with models need the assets and skip where those are absent and cannot be fetched.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pbl_pipeline import assets
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.keypoints import BlazePoseLandmarks
+from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES
+from pbl_pipeline.tracking import BlazePoseDetector
+from pbl_pipeline.tracking._blazepose import N_ANCHORS, anchor_centres, decode, suppress
+from pbl_pipeline.tracking._tiles import detect_in, tiles
+from pbl_pipeline.video import Camera, read_frames
+
+CAMERA = Camera(np.array([[2520.0, 0, 884], [0, 2520.0, 497], [0, 0, 1]]), np.zeros(5), "Calib_demo.toml of Sports2D")
+
+#: Read off the frames by eye on a pixel grid (px, +- 6): front and rear ankle of the woman, and which foot is in
+#: front, told by the near arm, which is the left one, and swings against its leg.
+BY_EYE = {
+    100: ("right", (961, 906), (1133, 906)),
+    116: ("left", (788, 903), (945, 906)),
+    134: ("right", (604, 903), (766, 906)),
+}
+
+
+def asset(name: str) -> Path:
+    try:
+        return assets.fetch(name)
+    except PblError as error:
+        if error.code != "ASSET_MISSING":
+            raise
+        pytest.skip(f"asset {name} is absent: {error.found}")
+
+
+@pytest.fixture(scope="module")
+def frames() -> dict[int, np.ndarray]:
+    video = asset("demo_video")
+    return {f.index: f.image for f in read_frames(video, start=100, stop=135) if f.index in BY_EYE}
+
+
+@pytest.fixture(scope="module")
+def detector() -> BlazePoseDetector:
+    return BlazePoseDetector(asset("blazepose_detector"))
+
+
+@pytest.fixture(scope="module")
+def landmarks() -> BlazePoseLandmarks:
+    return BlazePoseLandmarks(asset("blazepose_landmarks"))
+
+
+# --- by hand ----------------------------------------------------------------------------------------------------
+
+
+def test_anchors():
+    centres = anchor_centres()
+    assert centres.shape == (N_ANCHORS, 2)
+    np.testing.assert_allclose(centres[:3], [[0.5 / 28, 0.5 / 28], [0.5 / 28, 0.5 / 28], [1.5 / 28, 0.5 / 28]])
+    first16 = 28 * 28 * 2
+    np.testing.assert_allclose(centres[first16 + 2 * 14], [0.5 / 14, 1.5 / 14])
+    np.testing.assert_allclose(centres[-6:], np.tile([6.5 / 7, 6.5 / 7], (6, 1)))
+
+
+def test_decode_one_box_by_hand():
+    raw_boxes = np.zeros((N_ANCHORS, 12), np.float32)
+    raw_scores = np.full(N_ANCHORS, -500, np.float32)
+    row = 28 * 28 * 2 + 14 * 14 * 2  # first anchor of stride 32: centre at 16 px
+    raw_boxes[row] = [4, 8, 40, 20, 0, 0, 0, -50, 1, 2, 3, 4]
+    raw_scores[row] = np.log(3)
+    values, scores = decode(raw_boxes, raw_scores, 0.5)
+    np.testing.assert_allclose(scores, [0.75])
+    np.testing.assert_allclose(values[0, :8] * 224, [0, 14, 40, 34, 16, 16, 16, -34], rtol=1e-6, atol=1e-9)
+
+
+def test_weighted_suppression_by_hand():
+    values = np.array([[0, 0, 2, 2, 7], [0, 0, 2, 1.6, 1], [5, 5, 6, 6, 3.0]])
+    kept, scores = suppress(values, np.array([0.9, 0.6, 0.5]), 0.3)
+    np.testing.assert_allclose(scores, [0.9, 0.5])
+    np.testing.assert_allclose(kept[0], [0, 0, 2, (0.9 * 2 + 0.6 * 1.6) / 1.5, (0.9 * 7 + 0.6) / 1.5])
+    np.testing.assert_allclose(kept[1], values[2])
+
+
+def test_another_file_than_the_pinned_model_is_refused(tmp_path):
+    (tmp_path / "model.tflite").write_bytes(b"not the model")
+    with pytest.raises(PblError) as error:
+        BlazePoseDetector(tmp_path / "model.tflite")
+    assert error.value.code == "ASSET_CHECKSUM"
+
+
+# --- with the models --------------------------------------------------------------------------------------------
+
+
+def test_tiles_find_both_people_and_the_whole_frame_does_not(detector, frames):
+    image = frames[100]
+    found = detect_in(detector, image, tiles(1768, 994, 0.7, 0.3))
+    sure = sorted((d.roi_px for d in found if d.score > 0.9), key=lambda r: r[0])
+    assert len(sure) == 2
+    man, woman = sure
+    # Hips by eye: the man's on the wall near (645, 250), the woman's near (1005, 715).
+    assert np.hypot(*(man[:2] - [645, 250])) < 40
+    assert np.hypot(*(woman[:2] - [1005, 715])) < 40
+    assert abs(woman[3]) < 0.3
+    assert not [d for d in detector.detect(image) if d.score > 0.9]
+
+
+def test_no_person_in_noise_or_flat_pictures(detector):
+    rng = np.random.default_rng(0)
+    for image in (rng.integers(0, 256, (480, 640, 3), np.uint8), np.full((480, 640, 3), 127, np.uint8)):
+        assert not [d for d in detector.detect(image) if d.score > 0.8]
+
+
+def region(frame: int) -> np.ndarray:
+    """A body circle around the middle of the two ankles seen by eye, one leg length above."""
+    _, front, rear = BY_EYE[frame]
+    return np.array([(front[0] + rear[0]) / 2, 715.0, 440.0, 0.0])
+
+
+@pytest.mark.parametrize("frame", BY_EYE)
+def test_ankles_where_a_human_sees_them(landmarks, frames, frame):
+    side, front, rear = BY_EYE[frame]
+    other = "left" if side == "right" else "right"
+    person = landmarks.detect(frames[frame], region(frame), CAMERA)
+    assert person.presence > 0.9
+    # 25 px are 9 cm of this person.
+    assert np.hypot(*(person.xy_px[NAMES.index(f"{side}_ankle")] - front)) < 25
+    assert np.hypot(*(person.xy_px[NAMES.index(f"{other}_ankle")] - rear)) < 25
+    # She walks to the left of the picture, so her left side is nearer, and the head is up (y is down).
+    xyz = person.xyz_cam_m
+    assert xyz[NAMES.index("left_hip"), 2] < xyz[NAMES.index("right_hip"), 2]
+    assert xyz[NAMES.index("nose"), 1] < -0.4
+    assert 0.5 < xyz[NAMES.index(f"{side}_ankle"), 1] < 1.0
+    np.testing.assert_allclose(xyz[[23, 24]].mean(axis=0), 0, atol=0.02)
+    assert np.all((person.confidence >= 0) & (person.confidence <= 1))
+    assert person.confidence[NAMES.index(f"{side}_ankle")] > 0.5
+
+
+def test_a_mirrored_picture_gives_the_mirrored_person(landmarks, frames):
+    image, roi = frames[116], region(116)
+    width = image.shape[1]
+    matrix = CAMERA.matrix.copy()
+    matrix[0, 2] = width - 1 - matrix[0, 2]
+    mirrored = np.ascontiguousarray(image[:, ::-1])
+    a = landmarks.detect(image, roi, CAMERA)
+    # Half a pixel: the crop's centre is a place on the picture, counted from pixel centres on both sides.
+    b = landmarks.detect(mirrored, np.array([width - 1 - roi[0], *roi[1:]]), Camera(matrix, np.zeros(5), "mirrored"))
+    np.testing.assert_allclose(b.xy_px[MIRROR] * [-1, 1] + [width - 1, 0], a.xy_px, atol=3)
+    np.testing.assert_allclose(b.xyz_cam_m[MIRROR] * [-1, 1, 1], a.xyz_cam_m, atol=0.02)
+
+
+def test_a_turned_picture_gives_the_turned_person(landmarks, frames):
+    image, roi = frames[100], region(100)
+    turn = 0.5
+    about = (float(CAMERA.matrix[0, 2]), float(CAMERA.matrix[1, 2]))
+    warp = cv2.getRotationMatrix2D(about, -np.degrees(turn), 1.0)
+    turned = cv2.warpAffine(image, warp, (1768, 1400))
+    a = landmarks.detect(image, roi, CAMERA)
+    b = landmarks.detect(turned, np.array([*(warp @ [*roi[:2], 1]), roi[2], turn]), CAMERA)
+    np.testing.assert_allclose(b.xy_px, a.xy_px @ warp[:, :2].T + warp[:, 2], atol=12)
+    roll = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    np.testing.assert_allclose(b.xyz_cam_m, a.xyz_cam_m @ roll.T, atol=0.06)
+
+
+def test_quick_gives_nearly_the_same_circle(landmarks, frames):
+    full = landmarks.detect(frames[100], region(100), CAMERA)
+    quick = landmarks.detect(frames[100], region(100), CAMERA, quick=True)
+    np.testing.assert_allclose(quick.roi_px[:2], full.roi_px[:2], atol=20)
