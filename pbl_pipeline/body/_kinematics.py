@@ -5,16 +5,12 @@ Positions only: `mjx.kinematics`, never `mjx.forward`, which would also compute 
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
-
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
-from mujoco import mjx
 
 from pbl_pipeline.body._markers import MarkerSet
 from pbl_pipeline.body._model import Body
+from pbl_pipeline.body._poses import poses
 
 
 def body_poses(
@@ -42,10 +38,9 @@ def body_poses(
     qpos = jnp.asarray(qpos, jnp.result_type(float))
     scale = jnp.asarray(scale, jnp.result_type(float))
     parent_scale = jnp.where(body.parent_index >= 0, scale[body.scale_index[body.parent_index]], 1.0)
-    # Index 0 of MuJoCo is the world, which has no scale.
-    factor = jnp.concatenate([jnp.ones(1, scale.dtype), parent_scale])
+    body_pos = jnp.asarray(body.mj_model.body_pos[1:], scale.dtype) * parent_scale[:, None]
     batch = qpos.shape[:-1]
-    xpos, xmat = _kinematics(body)(qpos.reshape(-1, qpos.shape[-1]), factor)
+    xpos, xmat = poses(body)(qpos.reshape(-1, qpos.shape[-1]), body_pos)
     return xpos.reshape(*batch, *xpos.shape[1:]), xmat.reshape(*batch, *xmat.shape[1:])
 
 
@@ -80,22 +75,3 @@ def marker_positions(
     rotation = xmat[..., markers.body_index, :, :]
     # A sum of products instead of a matrix product, for the same reason as above.
     return xpos[..., markers.body_index, :] + jnp.sum(rotation * local[:, None, :], axis=-1)
-
-
-@functools.cache
-def _kinematics(body: Body) -> Callable[[Array, Array], tuple[Array, Array]]:
-    """(N, 40) joint values and (22,) multipliers of the body positions -> xpos (N, 21, 3), xmat (N, 21, 3, 3)."""
-
-    def one(model: mjx.Model, qpos: Array) -> tuple[Array, Array]:
-        # GPUs round the factors of float32 products to ten bits unless told otherwise: millimetres at the foot.
-        with jax.default_matmul_precision("highest"):
-            data = mjx.kinematics(model, body.mjx_data.replace(qpos=qpos))
-        return data.xpos[1:], data.xmat[1:]
-
-    # Compiled here so that a call outside any jit is not hundreds of small ones; inside a jit this changes nothing.
-    @jax.jit
-    def all_poses(qpos: Array, factor: Array) -> tuple[Array, Array]:
-        model = body.mjx_model.replace(body_pos=body.mjx_model.body_pos * factor[:, None])
-        return jax.vmap(one, in_axes=(None, 0))(model, qpos)
-
-    return all_poses

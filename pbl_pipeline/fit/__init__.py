@@ -1,8 +1,7 @@
 """The session fit: keypoints of 1..N trials to joint angles, one body for all."""
 
 from ._params import DEFAULT, PARAMSETS, CostParams, ImplicitAdamParams, ViewParams, params_of
-from ._session import LEVEL_CAMERA_QUAT_WXYZ, LEVEL_CAMERA_R_NC, fit_session, with_steps
-from ._trial import check_trial
+from ._session import LEVEL_CAMERA_QUAT_WXYZ, LEVEL_CAMERA_R_NC, SOLVERS, check_trial, fit_session, with_steps
 from ._types import SessionFit, TrialFit
 
 __all__ = [
@@ -10,6 +9,7 @@ __all__ = [
     "LEVEL_CAMERA_QUAT_WXYZ",
     "LEVEL_CAMERA_R_NC",
     "PARAMSETS",
+    "SOLVERS",
     "CostParams",
     "ImplicitAdamParams",
     "SessionFit",

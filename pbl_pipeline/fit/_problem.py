@@ -95,7 +95,7 @@ def make_session(trials: Sequence[Keypoints], names: Sequence[str], view: ViewPa
     body, markers = load_body(), marker_set(trials[0].marker_set)
     used, shares = [], []
     for trial, name in zip(trials, names, strict=True):
-        u, share = _check(trial, name, markers, view)
+        u, share = check_trial(trial, name, view)
         used.append(u)
         shares.append(share)
     n_frames = max(len(t.time_s) for t in trials)
@@ -105,7 +105,12 @@ def make_session(trials: Sequence[Keypoints], names: Sequence[str], view: ViewPa
     return Session(FitModel(body, markers), tuple(names), tuple(trials), tuple(used), tuple(shares), obs)
 
 
-def _check(trial: Keypoints, name: str, markers: MarkerSet, view: ViewParams) -> tuple[np.ndarray, float]:
+def check_trial(trial: Keypoints, name: str, view: ViewParams) -> tuple[np.ndarray, float]:
+    """Which frames (T,) bool of a trial a fit would use, and the share of frames with the whole person in view.
+
+    Raises `PblError` FIT_INPUT or MARKER_SET_UNKNOWN where the trial cannot be fitted.
+    """
+    markers = marker_set(trial.marker_set)
     if tuple(trial.names) != tuple(markers.names):
         raise PblError(
             "MARKER_SET_UNKNOWN",

@@ -16,11 +16,14 @@ from pbl_pipeline.paramset import Paramset
 from ._costs import distance_2d_px2, distance_3d_cm2
 from ._params import DEFAULT, PARAMSETS, params_of
 from ._problem import LEVEL_CAMERA_R_NC, Session, make_session
+from ._problem import check_trial as _check_trial
 from ._quality import check_fit
 from ._types import SessionFit, TrialFit
 from .solvers import Solution, solve_implicit_adam
 
 SOLVER = "implicit-adam"
+#: Every solver there is.
+SOLVERS = (SOLVER,)
 #: `LEVEL_CAMERA_R_NC` as a quaternion (w, x, y, z).
 LEVEL_CAMERA_QUAT_WXYZ = np.array([0.5, -0.5, 0.5, -0.5])
 
@@ -75,6 +78,14 @@ def fit_session(
         device=str(jax.devices()[0].device_kind),
         qc=check_fit(session, fits, solution.scale, solution.loss_trace),
     )
+
+
+def check_trial(keypoints: Keypoints, name: str, paramset: Paramset | None = None) -> tuple[np.ndarray, float]:
+    """Which frames (T,) bool of a trial the fit would use, and the share of frames with the whole person in view.
+
+    Raises `PblError` FIT_INPUT or MARKER_SET_UNKNOWN where the trial cannot be fitted.
+    """
+    return _check_trial(keypoints, name, params_of(paramset or PARAMSETS[DEFAULT]).view)
 
 
 def _trial_fit(

@@ -8,7 +8,6 @@ import numpy as np
 
 from pbl_pipeline.keypoints import Keypoints
 
-
 #: Share of the markers that must lie inside the picture.
 INSIDE_SHARE = 0.95
 

@@ -99,12 +99,12 @@ def capsule_outline(start_cam_m: np.ndarray, end_cam_m: np.ndarray, radius_m: fl
 
 def draw_keypoints(image: np.ndarray, xy_px: np.ndarray, confidence: np.ndarray) -> None:
     """Detected points (J, 2) as small dots, in place: filled from confidence 0.5 on, hollow below; none at 0."""
-    size = max(2, round(max(image.shape[:2]) / 480))
+    size = max(2, round(max(image.shape[:2]) / 640))
     for (x, y), c in zip(np.asarray(xy_px, float), np.asarray(confidence, float), strict=True):
         if not (np.isfinite(x) and np.isfinite(y)) or c <= 0 or abs(x) > _FAR_PX or abs(y) > _FAR_PX:
             continue
         centre = (round(x), round(y))
-        cv2.circle(image, centre, size, (20, 20, 20), 2, cv2.LINE_AA)
+        cv2.circle(image, centre, size + 1, (20, 20, 20), 1, cv2.LINE_AA)
         cv2.circle(image, centre, size, (66, 228, 240), -1 if c >= 0.5 else 1, cv2.LINE_AA)
 
 

@@ -48,8 +48,8 @@ class Strip:
         self._left, self._right = round(width * 0.012) + 3 * self._text_px, width - round(width * 0.012) - 1
         time = np.asarray(fit.time_s, float)
         self._t0, self._t1 = float(time[0]), float(max(time[-1], time[0] + 1e-3))
-        self._plot = (round(height * 0.20), round(height * 0.64))
-        self._rows = {"left": round(height * 0.75), "right": round(height * 0.89)}
+        self._plot = (round(height * 0.20), round(height * 0.61))
+        self._rows = {"left": round(height * 0.75), "right": round(height * 0.91)}
         self._picture = np.full((height, width, 3), _PAPER, np.uint8)
         self._draw_knees(fit, time)
         self._draw_contacts(events)
@@ -104,8 +104,12 @@ class Strip:
                 cv2.rectangle(self._picture, (a, row - half), (b, row + half), pale, -1)
             for e in events:
                 if e.side == side:
-                    x = round(float(self._x(e.time_s)))
-                    cv2.line(self._picture, (x, row - half - 1), (x, row + half + 1), colour, 2)
+                    x, sign = round(float(self._x(e.time_s))), 1 if e.event == "foot_down" else -1
+                    cv2.line(self._picture, (x, row - half), (x, row + half), colour, 2)
+                    # A small triangle that points to the ground line: from above for down, from below for up.
+                    base, tip = row - sign * (2 * half), row - sign * half
+                    corners = np.array([[x - half, base], [x + half, base], [x, tip]], np.int32)
+                    cv2.fillConvexPoly(self._picture, corners, colour, cv2.LINE_AA)
 
     def _x(self, time_s: np.ndarray | float) -> np.ndarray:
         part = (np.asarray(time_s, float) - self._t0) / (self._t1 - self._t0)

@@ -260,7 +260,7 @@ def _check_row(c: Check) -> dict:
         "word": OUTCOME_WORDS[c.outcome],
         "value": significant(c.value),
         "threshold": significant(c.threshold),
-        "advice": c.advice and sentence(c.advice),
+        "advice": "" if c.outcome == PASS else sentence(c.advice),
     }
 
 
@@ -277,9 +277,10 @@ def _notes(norm: NormativeSet | None) -> list[str]:
         "Angles are those of a model of the body that was fitted to the picture. Flexion, adduction, internal rotation "
         "and dorsiflexion are positive, on both sides.",
         "Foot contacts are found from the position of heel and toe relative to the pelvis (Zeni, Richards and "
-        "Higginson 2008, Gait & Posture 27:710-714). The method is known to set foot down some hundredths of a second "
-        "early and foot up late. Stance and double support therefore come out too long and swing too short, by a "
-        "roughly constant amount that is not corrected; cadence, stride time and step time are hardly touched.",
+        "Higginson 2008, Gait & Posture 27:710-714). On laboratory markers this method sets foot down some hundredths "
+        "of a second early and foot up a little late, so stance and double support come out too long and swing too "
+        "short. Nothing is corrected for it. Cadence, stride time and step time are hardly touched, and changes "
+        "between visits less than single values.",
         "The GDI of three angles follows Schwartz and Rozumalski 2008 (Gait & Posture 28:351-357) with hip flexion, "
         "hip adduction and knee flexion only: 100 is the mean of the norm, each 10 points one standard deviation, "
         "lower is further away. It is not the original index of nine angles.",

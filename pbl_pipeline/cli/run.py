@@ -1,0 +1,51 @@
+"""`pbl run`: the whole chain on files, no database."""
+
+from __future__ import annotations
+
+import datetime
+from pathlib import Path
+
+import click
+
+from ._options import Person, fit_paramset
+
+
+@click.command(epilog="Example: pbl run walk1.mp4 walk2.mp4 --out results --camera phone.toml")
+@click.argument("videos", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the results.")
+@click.option("--camera", type=click.Path(path_type=Path), help="Calibration file; without it a phone is guessed.")
+@click.option("--camera-motion", type=click.Choice(["static", "handheld"]), default="static", show_default=True)
+@click.option("--person", type=Person(), default="auto", show_default=True, help="Whom to measure.")
+@click.option("--solver", default="implicit-adam", show_default=True, help="Name of the solver.")
+@click.option("--params", help="Name of a paramset, or a JSON file with changes to the default one.")
+@click.option("--norm", help="Normative set of the GDI.")
+@click.option("--subject", default="-", help="Code of the subject on the report; never a name.")
+def run(
+    videos: tuple[Path, ...],
+    out: Path,
+    camera: Path | None,
+    camera_motion: str,
+    person: int | None,
+    solver: str,
+    params: str | None,
+    norm: str | None,
+    subject: str,
+) -> None:
+    """Put VIDEOS, the trials of one session, through the whole chain.
+
+    Writes report.html, metrics.json, session.json, and per trial the keypoints, the fit, the angles, the events and a
+    video with the body drawn over it. A video that cannot be used is named and left out; the others go on.
+    """
+    paramset = fit_paramset(solver, params)
+    from pbl_pipeline.pipeline import run_session, write_results
+
+    session = run_session(videos, camera, person, paramset, camera_motion, norm)
+    today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
+    paths = write_results(out, session, subject_code=subject, date=f"computed {today}")
+    click.echo(session.metrics.table())
+    for check in session.fit.qc:
+        if check.outcome != "PASS":
+            click.echo(f"{check.outcome} {check.check}: {check.advice}")
+    for name, error in session.problems.items():
+        click.echo(f"left out {name}\n{error.text()}", err=True)
+    click.echo("\n".join(str(p) for p in paths))

@@ -1,0 +1,196 @@
+"""The whole chain on files: videos of one session in, results and report out. The tables do the same row by row."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pbl_pipeline import __version__
+from pbl_pipeline.body import SCALE_NAMES
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.export import write_angles_csv
+from pbl_pipeline.fit import SessionFit, TrialFit, check_trial, fit_session
+from pbl_pipeline.gait import GaitMetrics, gait_metrics
+from pbl_pipeline.keypoints import Keypoints, detect_keypoints
+from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.qc import WARN, Check
+from pbl_pipeline.render import overlay_frames, render_overlay
+from pbl_pipeline.report import Picture, SessionReport, TrialReport, write_report
+from pbl_pipeline.tracking import SubjectChoice, choose_subject, track_people
+from pbl_pipeline.video import VideoInfo, guess_camera, load_camera, probe
+
+#: What `write_results` writes for each trial, after the trial's name and a dot.
+TRIAL_FILES = ("overlay.mp4", "angles.csv", "events.csv", "fit.npz", "keypoints.npz")
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """One recording up to its keypoints."""
+
+    name: str
+    path: Path
+    video: VideoInfo
+    choice: SubjectChoice
+    keypoints: Keypoints
+
+
+@dataclasses.dataclass(frozen=True)
+class Session:
+    """A session: the trials that were fitted, in the order of the fit, and what became of the others."""
+
+    trials: tuple[Trial, ...]
+    fit: SessionFit
+    metrics: GaitMetrics
+    problems: Mapping[str, PblError] = dataclasses.field(default_factory=dict)
+
+
+def detect_trial(path: Path, camera_file: Path | None = None, person: int | None = None) -> Trial:
+    """Video to keypoints of the subject.
+
+    Raises
+    ------
+    PblError
+        The VIDEO_ codes, TRACK_NO_PERSON, TRACK_TOO_SHORT, SUBJECT_NEEDS_CHOICE, SUBJECT_UNKNOWN_PERSON, ASSET_ codes,
+        CAMERA_INVALID.
+    """
+    info = probe(path)
+    camera = load_camera(camera_file, (info.width_px, info.height_px)) if camera_file else guess_camera(info)
+    tracking = track_people(path)
+    choice = choose_subject(tracking, override=person)
+    if choice.person_id is None:
+        raise _no_subject(path, choice)
+    return Trial(path.stem, path, info, choice, detect_keypoints(path, tracking, choice.person_id, camera))
+
+
+def run_session(
+    paths: Sequence[Path],
+    camera_file: Path | None = None,
+    person: int | None = None,
+    paramset: Paramset | None = None,
+    camera_motion: str = "static",
+    norm: str | None = None,
+) -> Session:
+    """Videos of one session to gait measures. A video that fails is left out with its problem; the others go on.
+
+    Raises
+    ------
+    PblError
+        The error of the video where no video of the session can be fitted.
+    """
+    trials, problems = [], {}
+    for path, name in zip(paths, distinct_names(paths), strict=True):
+        try:
+            trial = dataclasses.replace(detect_trial(path, camera_file, person), name=name)
+            check_trial(trial.keypoints, name, paramset)
+        except PblError as error:
+            problems[name] = error
+        else:
+            trials.append(trial)
+    if not trials:
+        raise next(iter(problems.values()))
+    fit = fit_session([t.keypoints for t in trials], [t.name for t in trials], paramset, camera_motion)
+    return Session(tuple(trials), fit, gait_metrics(fit.trials, norm=norm), problems)
+
+
+def write_results(
+    out: Path,
+    session: Session,
+    title: str = "Gait report",
+    subject_code: str = "-",
+    date: str = "",
+    origin: Mapping[str, Mapping[str, str]] | None = None,
+) -> list[Path]:
+    """Write everything a person or program reads of a session into `out` and return the paths, the report first.
+
+    `<name>.keypoints.npz`, `.fit.npz`, `.angles.csv`, `.events.csv` and `.overlay.mp4` per trial; `session.json`,
+    `metrics.json` and `report.html` (docs/files.md).
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    paths, reports = [out / "report.html"], []
+    for trial, fit, metrics in zip(session.trials, session.fit.trials, session.metrics.trials, strict=True):
+        files = {end: out / f"{trial.name}.{end}" for end in TRIAL_FILES}
+        events = metrics.events.events if metrics.events else ()
+        render_overlay(
+            trial.path,
+            fit,
+            files["overlay.mp4"],
+            keypoints=trial.keypoints,
+            events=events,
+        )
+        write_angles_csv(fit, files["angles.csv"])
+        if metrics.events:
+            metrics.events.save(files["events.csv"])
+        fit.save(files["fit.npz"])
+        trial.keypoints.save(files["keypoints.npz"])
+        paths += [p for p in files.values() if p.exists()]
+        pictures = _pictures(trial, fit)
+        reports.append(TrialReport(trial.name, trial.video, trial.choice, fit, trial.keypoints, pictures))
+    write_session_json(session.fit, out / "session.json")
+    session.metrics.save(out / "metrics.json")
+    left_out = (Check(f"trial {n}", WARN, None, None, f"left out: {e.text()}") for n, e in session.problems.items())
+    report = SessionReport(
+        title=title,
+        subject_code=subject_code,
+        date=date,
+        trials=tuple(reports),
+        metrics=session.metrics,
+        session=session.fit,
+        checks=tuple(left_out),
+        origin=dict(origin or {}) | {"Software": {"pbl-pipeline": __version__}},
+    )
+    write_report(out / "report.html", report)
+    return [*paths, out / "session.json", out / "metrics.json"]
+
+
+def write_session_json(fit: SessionFit, path: Path) -> None:
+    """Write `session.json`: how the session was fitted and how well."""
+    content = {
+        "trials": [t.name for t in fit.trials],
+        "solver": fit.solver,
+        "params_hash": fit.params_hash,
+        "scale": dict(zip(SCALE_NAMES, (round(float(s), 5) for s in fit.scale), strict=True)),
+        "loss_trace": [[int(step), round(float(loss), 5)] for step, loss in fit.loss_trace],
+        "seconds": round(fit.seconds, 3),
+        "compile_seconds": round(fit.compile_seconds, 3),
+        "device": fit.device,
+        "qc": [c.to_dict() for c in fit.qc],
+        "code_version": __version__,
+    }
+    path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def distinct_names(paths: Sequence[Path]) -> list[str]:
+    """A name for each path: its stem, numbered where stems repeat."""
+    stems = [p.stem for p in paths]
+    return [s if stems.count(s) == 1 else f"{s}-{i + 1}" for i, s in enumerate(stems)]
+
+
+def _pictures(trial: Trial, fit: TrialFit) -> tuple[Picture, ...]:
+    """Three frames spread over the time in view, cut to the person."""
+    seen = np.flatnonzero(np.isfinite(fit.qpos[:, 0]))
+    index = [int(seen[int(q * (len(seen) - 1))]) for q in (0.2, 0.5, 0.8)]
+    images = overlay_frames(trial.path, fit, index, crop_to_body=True)
+    return tuple(Picture(i, float(fit.time_s[i]), image) for i, image in zip(index, images, strict=True))
+
+
+def _no_subject(path: Path, choice: SubjectChoice) -> PblError:
+    if choice.status == "NO_PERSON":
+        return PblError(
+            "TRACK_NO_PERSON",
+            found="nobody in any frame",
+            expected="a person who takes at least about a fifth of the picture's height",
+            next_step="film from nearer, in light, so that the whole body is in the picture",
+            key=path,
+        )
+    ranked = sorted(choice.scores, key=lambda p: -choice.scores[p])
+    return PblError(
+        "SUBJECT_NEEDS_CHOICE",
+        found=choice.reason,
+        expected="one person who is clearly the subject",
+        next_step=f"run `pbl detect` to see the numbered people, then pass --person N (likeliest: {ranked[0]})",
+        key=path,
+    )
