@@ -138,8 +138,8 @@ class SessionFit(dj.Computed):
     -> BodyModel
     solver               : varchar(32)
     fit_loss             : float32             # (-) total loss at the end
-    fit_residual_2d      : float32             # (px) median distance of body and keypoints in the picture
-    fit_residual_3d      : float32             # (cm) median distance of body and 3D keypoints
+    fit_residual_2d=null : float32             # (px) median distance of body and keypoints in the picture
+    fit_residual_3d=null : float32             # (cm) median distance of body and 3D keypoints
     fit_outcome          : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')  # worst check
     fit_scale            : json                # multiplier (-) of each scale group, 1 = the unscaled body
     compile_seconds      : float32             # (s) of the duration, spent compiling
@@ -156,8 +156,8 @@ class SessionFit(dj.Computed):
         ---
         trial_name        : varchar(255)
         trial_n_fitted    : int32              # frames with joint angles
-        trial_residual_2d : float32            # (px) median distance of body and keypoints in the picture
-        trial_residual_3d : float32            # (cm) median distance of body and 3D keypoints
+        trial_residual_2d=null : float32       # (px) median distance of body and keypoints in the picture
+        trial_residual_3d=null : float32       # (cm) median distance of body and 3D keypoints
         trial_file        : <object@arrays>    # fit.npz: time_s (T) s, qpos (T,40) m and rad, markers_world_m (T,J,3) m, residual_2d_px (T,J) px, residual_3d_m (T,J) m; docs/files.md
         """  # noqa: E501
 
@@ -216,8 +216,8 @@ class SessionFit(dj.Computed):
                     "body_model": (BodyModel & {"body_sha256": body_sha}).fetch1("body_model"),
                     "solver": result.solver,
                     "fit_loss": float(result.trials[0].loss),
-                    "fit_residual_2d": float(np.nanmedian(residual_2d)),
-                    "fit_residual_3d": 100 * float(np.nanmedian(residual_3d)),
+                    "fit_residual_2d": median(residual_2d),
+                    "fit_residual_3d": median(100 * residual_3d),
                     "fit_outcome": library("qc").worst(result.qc),
                     "fit_scale": [round(float(s), 5) for s in result.scale],
                     "compile_seconds": result.compile_seconds,
@@ -235,12 +235,18 @@ class SessionFit(dj.Computed):
                         "video_id": video_id,
                         "trial_name": trial.name,
                         "trial_n_fitted": int(np.isfinite(trial.qpos).all(axis=1).sum()),
-                        "trial_residual_2d": float(np.nanmedian(trial.residual_2d_px)),
-                        "trial_residual_3d": 100 * float(np.nanmedian(trial.residual_3d_m)),
+                        "trial_residual_2d": median(trial.residual_2d_px),
+                        "trial_residual_3d": median(100 * trial.residual_3d_m),
                         "trial_file": path,
                     }
                 )
         self.Check.insert({**key, **check_row("fit", check)} for check in result.qc)
+
+
+def median(values: np.ndarray) -> float | None:
+    """Median of the values that are there; None where none is."""
+    there = values[np.isfinite(values)]
+    return float(np.median(there)) if len(there) else None
 
 
 def check_row(prefix: str, check: Any) -> dict[str, Any]:

@@ -26,9 +26,9 @@ class Population(dj.Lookup):
     population_description  : varchar(200)
     """
     contents = (
-        ("unknown", "not stated"),
-        ("healthy", "no known disorder that affects walking"),
-        ("patient", "a disorder that affects walking"),
+        {"population": "unknown", "population_description": "not stated"},
+        {"population": "healthy", "population_description": "no known disorder that affects walking"},
+        {"population": "patient", "population_description": "a disorder that affects walking"},
     )
 
 

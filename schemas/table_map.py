@@ -1,0 +1,142 @@
+"""The map of all tables, made from their definitions: `python -m schemas.table_map > docs/tables.md`."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import sys
+from typing import Any
+
+from ._activate import STAGES, modules
+from ._base import dj
+
+_ORIGIN = ("code_version", "method_hash", "model_sha256", "host", "seconds", "computed")
+_KINDS = {dj.Manual: "manual", dj.Lookup: "lookup", dj.Computed: "computed", dj.Part: "part"}
+_SHAPES = {"manual": ('["', '"]'), "lookup": ('[/"', '"/]'), "computed": ('(["', '"])')}
+
+
+def tables() -> dict[str, Any]:
+    """Every table class by its name, such as `fit.SessionFit.Trial`, in the order of the modules."""
+    out: dict[str, Any] = {}
+    for stage, module in zip(STAGES, modules(), strict=True):
+        for cls, _ in module.schema.declare_list:
+            out[f"{stage}.{cls.__name__}"] = cls
+            for name, part in vars(cls).items():
+                if inspect.isclass(part) and issubclass(part, dj.Part):
+                    out[f"{stage}.{cls.__name__}.{name}"] = part
+    return out
+
+
+def kind(cls: Any) -> str:
+    """manual, lookup, computed or part."""
+    return next(word for base, word in _KINDS.items() if issubclass(cls, base))
+
+
+def references(name: str, cls: Any) -> list[str]:
+    """Names of the tables that a table refers to."""
+    stage, master = name.split(".")[0], ".".join(name.split(".")[:2])
+    out = []
+    for line in cls.definition.splitlines():
+        match = re.match(r"\s*->\s*(?:\[[^\]]*\]\s*)?([\w.]+)", line)
+        if match:
+            target = match.group(1)
+            known = master if target == "master" else target
+            out.append(known if known.split(".")[0] in STAGES else f"{stage}.{known}")
+    return out
+
+
+def columns(cls: Any) -> list[tuple[str, str, str, bool]]:
+    """(name, type, comment, in the key) of each column a definition states itself."""
+    out, in_key = [], True
+    for line in cls.definition.splitlines():
+        text = line.strip()
+        if text.startswith("---"):
+            in_key = False
+        match = re.match(r"(\w+)\s*(=\s*[^:]+?)?\s*:\s*([^#]+?)\s*(?:#\s*(.*))?$", text)
+        if match and not text.startswith(("#", "->", "unique", "index")):
+            out.append((match.group(1), match.group(3), match.group(4) or "", in_key))
+    return out
+
+
+def comment(cls: Any) -> str:
+    """The first comment of a definition: what a row is."""
+    for line in cls.definition.splitlines():
+        if line.strip().startswith("#"):
+            return line.strip().lstrip("# ")
+    return ""
+
+
+def mermaid() -> str:
+    """The graph of all tables but the parts."""
+    lines = ["flowchart TD"]
+    everything = tables()
+    for stage in STAGES:
+        lines.append(f"  subgraph {stage}")
+        for name, cls in everything.items():
+            if name.startswith(stage + ".") and kind(cls) != "part":
+                left, right = _SHAPES[kind(cls)]
+                lines.append(f"    {name.replace('.', '_')}{left}{name.split('.')[1]}{right}")
+        lines.append("  end")
+    edges = set()
+    for name, cls in everything.items():
+        own = ".".join(name.split(".")[:2])
+        for target in references(name, cls):
+            of = ".".join(target.split(".")[:2])
+            if of != own:
+                edges.add(f"  {of.replace('.', '_')} --> {own.replace('.', '_')}")
+    return "\n".join([*lines, *sorted(edges)])
+
+
+def table_map() -> str:
+    """The whole page."""
+    lines = [
+        "# Tables",
+        "",
+        "Made by `python -m schemas.table_map > docs/tables.md`; do not edit. Each section is a schema of the server,",
+        "`pbl_<section>`. Boxes are filled by people and `pbl ingest`, slanted boxes hold methods, round ones",
+        "`pbl populate` computes.",
+        "",
+        "```mermaid",
+        mermaid(),
+        "```",
+        "",
+        "*origin* stands for the columns that say where a computed row comes from: `<prefix>_code_version`,",
+        "`_method_hash`, `_model_sha256`, `_host`, `_seconds` (s), `_computed` (UTC).",
+    ]
+    stage = ""
+    for name, cls in tables().items():
+        if name.split(".")[0] != stage:
+            stage = name.split(".")[0]
+            lines += ["", f"## {stage}", "", modules()[STAGES.index(stage)].__doc__ or ""]
+        lines += ["", f"### {name} ({kind(cls)})", "", *([comment(cls), ""] if comment(cls) else [])]
+        refers = ", ".join(references(name, cls))
+        lines += ["| column | type | meaning |", "|---|---|---|"]
+        if refers:
+            lines.append(f"| *refers to* | | {refers} |")
+        origin = [c for c in columns(cls) if c[0].endswith(_ORIGIN) and _is_origin(c[0], cls)]
+        for column, type_, text, in_key in columns(cls):
+            if column not in {c[0] for c in origin}:
+                shown = f"**{column}**" if in_key else column
+                lines.append(f"| {shown} | {_cell(type_)} | {_cell(text)} |")
+        if origin:
+            lines.append("| *origin* | | |")
+    return "\n".join(lines) + "\n"
+
+
+def _is_origin(column: str, cls: Any) -> bool:
+    prefix = origin_prefix(cls)
+    return prefix is not None and column.startswith(prefix)
+
+
+def origin_prefix(cls: Any) -> str | None:
+    """Prefix of a table's origin columns, None where it has none."""
+    found = [c[0] for c in columns(cls) if c[0].endswith("_code_version")]
+    return found[0].removesuffix("code_version") if found else None
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("<", "&lt;").replace(">", "&gt;")
+
+
+if __name__ == "__main__":
+    sys.stdout.write(table_map())

@@ -1,0 +1,89 @@
+"""Stand-ins for the slow stages, so that the tables are tested with a whole chain in seconds.
+
+The probe, the choice of the subject, events, cycles, measures and index are the library's own. Detection, keypoints
+and the fit give a synthetic walker; the real ones run in tests/end_to_end.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pbl_pipeline.fit
+import pbl_pipeline.keypoints
+import pbl_pipeline.tracking
+from pbl_pipeline.body import load_body
+from pbl_pipeline.fit import SessionFit
+from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.qc import Check
+from pbl_pipeline.tracking import PersonTrack, Tracking
+from pbl_pipeline.video import probe
+from tests.videos import constant_rate, numbered_frames, write_video
+from tests.walker import observe, walking_qpos
+from tests.walking_fit import walking_fit
+
+N_FRAMES = 240
+
+
+def small_video(folder: Path, name: str, n: int = N_FRAMES, people: str = "walker and bystander") -> Path:
+    """A real video of coloured frames; the stand-in detector reads who is in it from the file's name."""
+    suffix = {"walker and bystander": "", "two alike": "_alike", "nobody": "_nobody"}[people]
+    shift = sum(map(ord, name)) % 7  # other bytes for other names
+    frames = (np.roll(f, shift, axis=1) for f in numbered_frames(n, 72, 128))
+    return write_video(folder / f"{name}{suffix}.mp4", frames, constant_rate(n))
+
+
+def track_people(video_path: Path, params: object = None) -> Tracking:
+    """Two people: one walks across the picture, one stands at its edge (or both walk alike, or nobody is there)."""
+    info = probe(video_path)
+    time, size = info.time_s, (1920, 1080)
+    stem = Path(video_path).stem
+    walks = _person(1, 300 + 1200 * time / time[-1], 500.0)
+    stands = _person(2, np.full_like(time, 1800.0), 250.0)
+    alike = _person(2, 320 + 1200 * time / time[-1], 500.0)
+    people = () if stem.endswith("_nobody") else (walks, alike if stem.endswith("_alike") else stands)
+    return Tracking(time, size, people, "stand-in", "0" * 64)
+
+
+def _person(number: int, x: np.ndarray, height: float) -> PersonTrack:
+    box = np.stack([x - height / 5, np.full_like(x, 300.0), x + height / 5, np.full_like(x, 300.0 + height)], axis=1)
+    roi = np.full((len(x), 4), np.nan)
+    return PersonTrack(number, box, roi, np.full(len(x), 0.9), np.ones(len(x), bool))
+
+
+def detect_keypoints(video_path, tracking, person_id, camera, params=None) -> Keypoints:
+    """The synthetic walker, seen without noise; person 2 is another height in the picture."""
+    time = tracking.time_s
+    found = observe(walking_qpos(time, start_m=(7.0 if person_id == 1 else 9.0, -3.0)), time)
+    return dataclasses.replace(found, camera=camera)
+
+
+def fit_session(trials, names, paramset=None, camera_motion="static") -> SessionFit:
+    """The movement that was put in; as many time stamps as the keypoints have."""
+    body = load_body()
+    fits = tuple(
+        walking_fit(body.joint_names, body.sha256, name=name, n_frames=len(k.time_s))
+        for name, k in zip(names, trials, strict=True)
+    )
+    return SessionFit(
+        trials=fits,
+        scale=np.ones(8),
+        site_offset_m=np.zeros((1, 3)),
+        loss_trace=np.array([[0.0, 20.0], [100.0, 2.0]]),
+        solver="implicit-adam",
+        params_hash=paramset.hash if paramset is not None else "",
+        seconds=0.1,
+        compile_seconds=0.0,
+        device="cpu",
+        qc=(Check("residual_3d_cm", "WARN", 7.0, 6.0, "look at the overlay"), Check("scale", "PASS", None, None)),
+    )
+
+
+def install(patch: pytest.MonkeyPatch) -> None:
+    """Put the stand-ins in place of the library's functions."""
+    patch.setattr(pbl_pipeline.tracking, "track_people", track_people)
+    patch.setattr(pbl_pipeline.keypoints, "detect_keypoints", detect_keypoints)
+    patch.setattr(pbl_pipeline.fit, "fit_session", fit_session)

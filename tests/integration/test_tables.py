@@ -1,0 +1,497 @@
+"""The tables, from a file to a visit's measures, on the embedded database."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import pbl_pipeline.video
+import schemas
+from pbl_pipeline.errors import PblError
+from schemas import fit, gait, gdi, keypoints, lab, qc, session, table_map, tracking, video, views
+from schemas.choose import choose_person
+from schemas.ingest import Methods, Visit, ingest
+from schemas.results import load_session
+from schemas.status import pipeline_status
+from workers.populate import populate
+
+from . import chain
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def declared(database: Path) -> None:
+    schemas.activate()
+
+
+@pytest.fixture
+def tables(declared: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Empty tables with the method rows, and stand-ins for the slow stages."""
+    chain.install(monkeypatch)
+    yield
+    lab.Subject.delete(prompt=False, part_integrity="cascade")
+    lab.CameraCalibration.delete(prompt=False)
+    for table in schemas.computed_tables():
+        assert len(table()) == 0
+        table.jobs.delete_quick()
+
+
+def errors(run) -> dict[str, dict[str, int]]:
+    return {t.table: t.errors for t in run.tables if t.errors}
+
+
+def done(run) -> dict[str, int]:
+    return {t.table: t.done for t in run.tables}
+
+
+def register(*paths: Path, **visit) -> list[int]:
+    results = ingest(paths, Visit(subject=visit.pop("subject", "P001"), **visit))
+    assert [r.status for r in results] == ["registered"] * len(paths)
+    return [r.video_id or 0 for r in results]
+
+
+# ------------------------------------------------------------------------------------------------ the whole chain
+def test_a_bad_file_leaves_one_error_row_while_the_others_finish(tables: None, tmp_path: Path):
+    good = [chain.small_video(tmp_path, "walk1"), chain.small_video(tmp_path, "walk2", n=210)]
+    (tmp_path / "notes.mp4").write_text("not a video")
+    register(*good, tmp_path / "notes.mp4", session_label="2026-03-01")
+    run = populate()
+    assert errors(run) == {"VideoInfo": {"VIDEO_NOT_A_VIDEO": 1}}
+    assert done(run) == {
+        "VideoInfo": 2,
+        "Tracking": 2,
+        "SubjectChoice": 2,
+        "Keypoints": 2,
+        "TrialInput": 2,
+        "SessionFit": 1,
+        "GaitEvents": 2,
+        "GaitCycle": 2,
+        "Spatiotemporal": 2,
+        "GDI": 2,
+        "SessionGdi": 1,
+        "SessionQc": 1,
+    }
+    (row,) = pipeline_status().errors
+    assert (row.table, row.code, row.about) == ("VideoInfo", "VIDEO_NOT_A_VIDEO", "notes.mp4")
+    assert row.next_step
+    assert "Traceback" in row.stack
+    _everything_comes_back(good)
+    # What the synthetic walker does is what the rows say: a stride of 1.1 s.
+    (visit,) = views.session_summary().to_dict("records")
+    assert visit["session_stride_time"] == pytest.approx(1.1, abs=0.01)
+    assert visit["session_cadence"] == pytest.approx(120 / 1.1, abs=1.0)
+    assert np.isfinite(visit["session_gdi"])
+    assert (visit["subject"], visit["session_label"], visit["fit_set_n"]) == ("P001", "2026-03-01", 2)
+    assert visit["qc_outcome"] == "WARN"
+    assert "residual_3d_cm" in visit["qc_worst"]
+    assert len(views.trial_summary()) == 2
+    assert set(views.video_summary()["choice_status"]) == {"CHOSEN"}
+    assert (views.quality_summary()["qc_check_outcome"] != "PASS").all()
+    again = populate()
+    assert not again.did_something
+    assert set(done(again).values()) == {0}
+    assert not errors(again)
+
+
+def _everything_comes_back(paths: list[Path]) -> None:
+    """What was stored is what the library made."""
+    results = load_session({"subject": "P001"})
+    assert [t.problem == "" for t in results.trials] == [True, True, False]
+    assert results.trials[2].problem.startswith("VideoInfo: VIDEO_NOT_A_VIDEO")
+    assert results.fit is not None
+    assert results.metrics is not None
+    for path, trial in zip(paths, results.fitted, strict=True):
+        info = pbl_pipeline.video.probe(path)
+        assert trial.info.time_s.tolist() == info.time_s.tolist()
+        for field in ("sha256", "n_frames", "width_px", "height_px", "codec", "container", "rotation_deg", "notes"):
+            assert getattr(trial.info, field) == getattr(info, field), field
+        tracks = chain.track_people(path)
+        np.testing.assert_allclose(trial.tracking.persons[1].box_px, tracks.persons[1].box_px, rtol=1e-6)
+        assert trial.choice.person_id == 1
+        points = chain.detect_keypoints(path, tracks, 1, trial.keypoints.camera)
+        np.testing.assert_allclose(trial.keypoints.xy_px, points.xy_px, rtol=1e-5)
+        assert trial.keypoints.camera.source.startswith("guess")
+        made = chain.fit_session([points], [path.stem]).trials[0]
+        np.testing.assert_allclose(trial.fit.qpos, made.qpos, atol=1e-6)
+        assert trial.fit.time_s.dtype == np.float64
+        assert trial.fit.qpos.dtype == np.float32
+        assert trial.events.status == "PASS"
+        assert any(c.used and c.curves for c in trial.cycles)
+    lib = pbl_pipeline.gait
+    fresh = lib.gait_metrics(results.fit.trials)
+    assert results.metrics.params_hash == fresh.params_hash
+    assert results.metrics.gdi.mean == pytest.approx(fresh.gdi.mean, abs=1e-3)
+    stored, made = results.metrics.to_dict()["session"], fresh.to_dict()["session"]
+    for name in lib.MEASURES:
+        assert (stored[name] is None) == (made[name] is None)
+        if made[name] is not None:
+            for part, value in made[name].items():
+                expected = None if value is None else pytest.approx(value, rel=1e-3)
+                assert stored[name][part] == expected, (name, part)
+    assert stored["reasons"] == made["reasons"]
+    assert stored["cycles"] == made["cycles"]
+
+
+def test_nobody_walks_and_nobody_there(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def standing(trials, names, paramset=None, camera_motion="static"):
+        result = chain.fit_session(trials, names, paramset)
+        still = tuple(
+            chain.walking_fit(t.joint_names, t.body_sha256, name=t.name, n_frames=len(t.time_s), walks=False)
+            for t in result.trials
+        )
+        return chain.dataclasses.replace(result, trials=still)
+
+    monkeypatch.setattr(chain.pbl_pipeline.fit, "fit_session", standing)
+    register(chain.small_video(tmp_path, "stands"), chain.small_video(tmp_path, "empty", people="nobody"))
+    run = populate()
+    assert not errors(run)
+    empty = {t.table: t.empty for t in run.tables if t.empty}
+    assert empty == {"SubjectChoice": 1, "GaitEvents": 1, "Spatiotemporal": 1, "GDI": 1, "SessionGdi": 1}
+    assert (gait.GaitEvents).fetch1("events_reason")
+    assert gdi.SessionGdi.fetch1("session_gdi", "session_cadence") == (None, None)
+    assert gdi.SessionGdi.fetch1("session_reason")
+    assert qc.SessionQc.fetch1("qc_outcome") == "EMPTY"
+    assert len(keypoints.Keypoints()) == 1
+    assert load_session({"subject": "P001"}).metrics.status == "EMPTY"
+    assert not populate().did_something
+
+
+# ------------------------------------------------------------------------------------------------------- ingest
+def test_the_same_bytes_are_registered_once(tables: None, tmp_path: Path):
+    first = chain.small_video(tmp_path, "walk")
+    copy = tmp_path / "copy.mp4"
+    copy.write_bytes(first.read_bytes())
+    (number,) = register(first)
+    (result,) = ingest([copy], Visit("P002"))
+    assert (result.status, result.video_id) == ("known", number)
+    assert "P001" in result.note
+    assert len(video.Video()) == 1
+    assert len(lab.Subject()) == 1
+    first.unlink()
+    (result,) = ingest([copy], Visit("P001"))
+    assert result.status == "moved"
+    assert video.Video.fetch1("video_path") == str(copy)
+
+
+def test_refused_files_do_not_hold_up_the_others(tables: None, tmp_path: Path):
+    (tmp_path / "empty.mp4").touch()
+    paths = [tmp_path / "absent.mp4", tmp_path / "empty.mp4", tmp_path, chain.small_video(tmp_path, "walk")]
+    results = ingest(paths, Visit("P001"))
+    codes = [r.error.code if r.error else r.status for r in results]
+    assert codes == ["VIDEO_MISSING", "VIDEO_EMPTY", "VIDEO_MISSING", "registered"]
+
+
+@pytest.mark.parametrize("subject", ["Jane Doe", "", "x" * 33, "-p"])
+def test_a_code_that_could_be_a_name_is_refused(tables: None, tmp_path: Path, subject: str):
+    with pytest.raises(PblError, match="USAGE"):
+        ingest([tmp_path / "a.mp4"], Visit(subject))
+
+
+def test_unknown_methods_are_refused_with_the_names_there_are(tables: None, tmp_path: Path):
+    path = chain.small_video(tmp_path, "walk")
+    for methods in (Methods(tracking="x"), Methods(fit="x"), Methods(norm="x")):
+        with pytest.raises(PblError, match=r"expected: one of \w+"):
+            ingest([path], Visit("P001"), methods)
+    assert len(video.Video()) == 0
+
+
+def test_a_calibration_is_stored_once_and_used(tables: None, tmp_path: Path):
+    camera = tmp_path / "phone.json"
+    camera.write_text(
+        '{"camera_matrix": [[900, 0, 64], [0, 900, 36], [0, 0, 1]], "distortion": [0.1, 0, 0, 0, 0],'
+        ' "image_size_px": [128, 72]}'
+    )
+    paths = chain.small_video(tmp_path, "walk1"), chain.small_video(tmp_path, "walk2")
+    register(*paths, camera_file=camera)
+    assert lab.CameraCalibration.fetch1("camera_fx", "camera_origin") == (900.0, "measured")
+    populate(["VideoInfo", "Tracking", "SubjectChoice", "Keypoints"])
+    stored = load_session({"subject": "P001"}).trials[1].keypoints.camera
+    assert stored.matrix[0, 0] == 900
+    assert stored.distortion.tolist() == [0.1, 0, 0, 0, 0]
+    assert stored.source.startswith("measured: ")
+
+
+# ------------------------------------------------------------------------------------------- who is measured
+def test_two_alike_wait_for_a_choice_and_the_rest_goes_on(tables: None, tmp_path: Path):
+    alike, clear = register(
+        chain.small_video(tmp_path, "both", people="two alike"), chain.small_video(tmp_path, "clear")
+    )
+    run = populate()
+    assert not errors(run)
+    assert {t.table: t.waiting for t in run.tables}["SubjectChoice"] == 1
+    assert keypoints.Keypoints.to_arrays("video_id").tolist() == [clear]
+    state = pipeline_status()
+    assert {t.table: (t.pending, t.waiting) for t in state.tables}["Keypoints"] == (0, 0)
+    (waiting,) = state.waiting
+    assert (waiting.video_id, waiting.persons) == (alike, [1, 2])
+    assert not populate().did_something
+    with pytest.raises(PblError, match="SUBJECT_UNKNOWN_PERSON"):
+        choose_person(alike, 7)
+    first_fit = fit.SessionFit.keys()
+    choose_person(alike, 2)
+    run = populate()
+    assert not errors(run)
+    assert keypoints.Keypoints.to_arrays("keypoints_person_id", order_by="video_id").tolist() == [2, 1]
+    # Another video in the session is another set; the old fit stays, but is no longer the current one.
+    assert len(fit.SessionFit()) == 2
+    assert (fit.FitSelection & {"fit_current": True}).keys() != first_fit
+    assert len(fit.FitSelection & {"fit_current": True}) == 1
+    assert len(views.session_summary()) == 1
+    assert views.session_summary()["fit_set_n"].tolist() == [2]
+
+
+def test_a_decision_wins_and_recomputes_what_was_another_persons(tables: None, tmp_path: Path):
+    (number,) = register(chain.small_video(tmp_path, "walk"))
+    populate()
+    old = keypoints.Keypoints.fetch1("focal_length", "keypoints_computed", "keypoints_person_id")
+    assert old[2] == 1
+    deleted = choose_person(number, 2)
+    assert sum(deleted.values()) >= 10
+    assert len(keypoints.Keypoints()) == len(fit.SessionFit()) == len(fit.FitSet()) == len(qc.SessionQc()) == 0
+    assert len(tracking.Tracking()) == 1
+    run = populate()
+    assert done(run)["Tracking"] == 0
+    assert done(run)["SessionQc"] == 1
+    assert tracking.SubjectChoice.fetch1("choice_status", "chosen_person_id") == ("MANUAL", 2)
+    assert keypoints.Keypoints.fetch1("keypoints_person_id") == 2
+    # The same decision again changes nothing; a withdrawn one, by any route, is noticed by populate.
+    assert choose_person(number, 2) == {}
+    tracking.SubjectOverride.delete(prompt=False)
+    run = populate()
+    assert run.dropped
+    assert tracking.SubjectChoice.fetch1("choice_status", "chosen_person_id") == ("CHOSEN", 1)
+
+
+def test_a_decision_given_with_the_video_is_checked_when_the_people_are_known(tables: None, tmp_path: Path):
+    (number,) = register(chain.small_video(tmp_path, "walk"), person=9)
+    assert errors(populate()) == {"SubjectChoice": {"SUBJECT_UNKNOWN_PERSON": 1}}
+    choose_person(number, 2)
+    assert not errors(populate())
+    assert tracking.SubjectChoice.fetch1("choice_status") == "MANUAL"
+    with pytest.raises(PblError, match="DB_NOT_FOUND"):
+        choose_person(12345, 1)
+
+
+def test_a_trial_that_cannot_be_fitted_does_not_hold_up_its_session(
+    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def half_seen(video_path, tracking, person_id, camera, params=None):
+        found = chain.detect_keypoints(video_path, tracking, person_id, camera)
+        if "cut" not in Path(video_path).stem:
+            return found
+        return chain.dataclasses.replace(found, confidence=np.zeros_like(found.confidence))
+
+    monkeypatch.setattr(chain.pbl_pipeline.keypoints, "detect_keypoints", half_seen)
+    _, good = register(chain.small_video(tmp_path, "cut"), chain.small_video(tmp_path, "whole"))
+    run = populate()
+    assert errors(run) == {"TrialInput": {"FIT_INPUT": 1}}
+    assert fit.SessionFit.Trial.to_arrays("video_id").tolist() == [good]
+
+
+def test_a_later_video_makes_a_new_set_and_the_old_fit_stays(tables: None, tmp_path: Path):
+    register(chain.small_video(tmp_path, "walk1"))
+    populate()
+    register(chain.small_video(tmp_path, "walk2"))
+    run = populate()
+    assert (done(run)["SessionFit"], run.planned) == (1, 1)
+    current = {r["fit_set_n"]: r["fit_current"] for r in (fit.FitSet * fit.FitSelection).to_dicts()}
+    assert current == {1: 0, 2: 1}
+    assert len(fit.SessionFit()) == 2
+    # Without the later video the first set is current again; nothing has to be computed.
+    (video.Video & "video_name='walk2.mp4'").delete(prompt=False, part_integrity="cascade")
+    run = populate()
+    assert done(run)["SessionFit"] == 0
+    assert fit.FitSelection.fetch1("fit_current") == 1
+
+
+# ------------------------------------------------------------------------------------------- errors and stuck jobs
+def test_a_missing_or_changed_file_is_an_error_until_it_is_back(tables: None, tmp_path: Path):
+    lost, changed = chain.small_video(tmp_path, "lost"), chain.small_video(tmp_path, "changed")
+    register(lost, changed)
+    kept = lost.read_bytes(), changed.read_bytes()
+    lost.unlink()
+    changed.write_bytes(kept[1] + b"x")
+    assert errors(populate()) == {"VideoInfo": {"VIDEO_MISSING": 1, "VIDEO_CHANGED": 1}}
+    lost.write_bytes(kept[0])
+    changed.write_bytes(kept[1])
+    assert not populate().did_something  # an error row is not tried again by itself
+    run = populate(retry_errors=True)
+    assert run.retried == 2
+    assert done(run)["VideoInfo"] == 2
+    assert not pipeline_status().errors
+
+
+def test_an_error_row_keeps_code_and_next_step_however_long_the_text(
+    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def fails(path):
+        raise PblError(
+            "VIDEO_DAMAGED", found="f" * 9000, expected="e" * 9000, next_step="do " + "n" * 9000, key="k" * 9000
+        )
+
+    register(chain.small_video(tmp_path, "walk"))
+    monkeypatch.setattr(pbl_pipeline.video, "probe", fails)
+    assert errors(populate()) == {"VideoInfo": {"VIDEO_DAMAGED": 1}}
+    (row,) = pipeline_status().errors
+    assert row.next_step.startswith("do nnn")
+    assert "f" * 9000 in row.stack
+
+
+def test_an_unforeseen_error_gets_a_code_too(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def fails(path):
+        raise ZeroDivisionError("somewhere deep")
+
+    register(chain.small_video(tmp_path, "walk"))
+    monkeypatch.setattr(pbl_pipeline.video, "probe", fails)
+    assert errors(populate()) == {"VideoInfo": {"INTERNAL": 1}}
+    (row,) = pipeline_status().errors
+    assert "ZeroDivisionError: somewhere deep" in row.found
+    assert row.next_step
+
+
+@pytest.mark.parametrize("signal", [KeyboardInterrupt, SystemExit])
+def test_an_interrupt_ends_the_loop_and_puts_the_job_back(
+    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, signal: type[BaseException]
+):
+    def interrupted(path):
+        raise signal("now")
+
+    register(chain.small_video(tmp_path, "walk1"), chain.small_video(tmp_path, "walk2"))
+    with monkeypatch.context() as patch:
+        patch.setattr(pbl_pipeline.video, "probe", interrupted)
+        run = populate(["VideoInfo"])
+    assert run.interrupted
+    counts = video.VideoInfo.jobs.progress()
+    assert (counts["pending"], counts["error"], counts["reserved"]) == (2, 0, 0)
+    assert done(populate(["VideoInfo"])) == {"VideoInfo": 2}
+
+
+def test_reservations_of_dead_processes_are_freed_and_others_are_kept(tables: None, tmp_path: Path):
+    register(*(chain.small_video(tmp_path, f"walk{i}") for i in range(4)))
+    jobs = video.VideoInfo.jobs
+    jobs.refresh(delay=-1)
+    dead, own, alive, elsewhere = jobs.keys(order_by="video_id")
+    now = jobs.connection.query("SELECT CURRENT_TIMESTAMP(3)").fetchone()[0]
+    here = platform.node()
+    pids = {"dead": 2**22 - 3, "own": os.getpid(), "alive": os.getppid()}
+    for key, host, pid in (
+        (dead, here, pids["dead"]),
+        (own, here, pids["own"]),
+        (alive, here, pids["alive"]),
+        (elsewhere, "another-host", pids["dead"]),
+    ):
+        jobs.update1({**key, "status": "reserved", "host": host, "pid": pid, "reserved_time": now})
+    run = populate(["VideoInfo"])
+    assert (run.freed, done(run)) == (2, {"VideoInfo": 2})
+    left = jobs.reserved.to_arrays("video_id", order_by="video_id")
+    assert left.tolist() == [alive["video_id"], elsewhere["video_id"]]
+
+
+def test_limit_and_unknown_tables(tables: None, tmp_path: Path):
+    register(*(chain.small_video(tmp_path, f"walk{i}") for i in range(3)))
+    assert done(populate(["videoinfo"], limit=2)) == {"VideoInfo": 2}
+    assert done(populate(["VideoInfo"], limit=2)) == {"VideoInfo": 1}
+    with pytest.raises(PblError, match="USAGE"):
+        populate(["VideoInf"])
+
+
+# -------------------------------------------------------------------------------------------------- definitions
+def test_every_float_column_states_its_unit(declared: None):
+    missing = [
+        f"{name}.{a.name}"
+        for name, cls in table_map.tables().items()
+        for a in cls.heading.attributes.values()
+        if (a.original_type or a.type) in ("float32", "float64") and not re.search(r"\([^)]+\)", a.comment)
+    ]
+    assert not missing
+
+
+def test_every_computed_table_states_its_origin(declared: None):
+    for table in schemas.computed_tables():
+        prefix = table_map.origin_prefix(table)
+        assert prefix, table.__name__
+        columns = {prefix + c for c in ("code_version", "method_hash", "model_sha256", "host", "seconds", "computed")}
+        assert columns <= set(table.heading.names), table.__name__
+
+
+def test_no_two_tables_share_a_secondary_attribute(declared: None):
+    """DataJoint refuses joins of tables that do; foreign keys are shared on purpose."""
+    owner: dict[str, str] = {}
+    for name, cls in table_map.tables().items():
+        own = {c[0] for c in table_map.columns(cls) if not c[3]}
+        for column in own:
+            assert column not in owner, f"{column} of {name} is in {owner.get(column)} too"
+            owner[column] = name
+
+
+def test_the_map_is_what_the_database_holds(declared: None):
+    """The parsed references and columns are DataJoint's own."""
+    everything = table_map.tables()
+    by_full_name = {cls.full_table_name: name for name, cls in everything.items()}
+    for name, cls in everything.items():
+        parents = {by_full_name[p] for p in cls().parents()}
+        assert set(table_map.references(name, cls)) == parents, name
+        declared_columns = {c[0] for c in table_map.columns(cls)}
+        assert declared_columns <= set(cls.heading.names), name
+        inherited = {a for p in parents for a in everything[p].heading.primary_key}
+        assert set(cls.heading.names) - declared_columns <= inherited, name
+
+
+def test_the_page_of_the_tables_is_up_to_date():
+    page = (ROOT / "docs" / "tables.md").read_text()
+    assert page == table_map.table_map(), "run: python -m schemas.table_map > docs/tables.md"
+
+
+def test_methods_are_frozen(declared: None):
+    from schemas import _methods
+    from schemas._base import insert_methods
+
+    before = len(tracking.TrackingMethod()), len(fit.BodyModel()), len(gdi.NormativeSet())
+    _methods.insert_all()
+    assert (len(tracking.TrackingMethod()), len(fit.BodyModel()), len(gdi.NormativeSet())) == before
+    (known,) = list(pbl_pipeline.tracking.PARAMSETS.values())[:1]
+    edited = chain.dataclasses.replace(known, params={**known.params, "min_score": 0.99})
+    with pytest.raises(PblError, match="new version"):
+        insert_methods(tracking.TrackingMethod, "tracking", {known.name: edited})
+
+
+# ----------------------------------------------------------------------------------------------------- commands
+def test_the_commands_from_file_to_summary(tables: None, tmp_path: Path):
+    from schemas.cli.choose import choose
+    from schemas.cli.ingest import ingest as ingest_command
+    from schemas.cli.status import status
+    from workers.cli.populate import populate as populate_command
+
+    runner = CliRunner()
+    path = chain.small_video(tmp_path, "both", people="two alike")
+    (tmp_path / "notes.mp4").write_text("not a video")
+    first = runner.invoke(ingest_command, [str(path), str(tmp_path / "notes.mp4"), "--subject", "P001"])
+    assert first.exit_code == 0, first.output
+    number = int(re.findall(r"video_id (\d+): both_alike.mp4 registered", first.output)[0])
+    again = runner.invoke(ingest_command, [str(path), "--subject", "P001", "--person", "2"])
+    assert (again.exit_code, f"pbl choose {number} 2" in again.output) == (0, True)
+    absent = runner.invoke(ingest_command, [str(tmp_path / "absent.mp4"), "--subject", "P001"])
+    assert absent.exit_code == 1
+    run = runner.invoke(populate_command, [])
+    assert run.exit_code == 0, run.output
+    assert "VIDEO_NOT_A_VIDEO" in run.output
+    assert "pbl choose" in run.output
+    shown = runner.invoke(status, [])
+    assert "VIDEO_NOT_A_VIDEO" in shown.output
+    assert f"pbl choose {number} 1|2" in shown.output
+    chosen = runner.invoke(choose, [str(number), "2"])
+    assert "deleted 1 rows of" in chosen.output
+    run = runner.invoke(populate_command, [])
+    assert re.search(r"SessionQc +1", run.output)
+    assert "nothing to do" in runner.invoke(populate_command, []).output
+    as_json = runner.invoke(status, ["--json"])
+    assert '"code": "VIDEO_NOT_A_VIDEO"' in as_json.output
+    assert len(session.Session()) == 1

@@ -1,0 +1,56 @@
+"""One direction of dependency: pbl_pipeline <- schemas <- workers."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# In a fresh process, so that nothing another test imported counts. `None` in sys.modules makes an import fail.
+BLOCKED = """
+import importlib, pkgutil, sys
+for name in ("datajoint", "schemas", "workers"):
+    sys.modules[name] = None
+import pbl_pipeline
+def fail(name):
+    raise
+names = [m.name for m in pkgutil.walk_packages(pbl_pipeline.__path__, "pbl_pipeline.", onerror=fail)]
+for name in names:
+    if not name.endswith("__main__"):
+        importlib.import_module(name)
+print(len(names))
+"""
+
+
+def test_the_library_imports_with_the_tables_blocked():
+    done = subprocess.run([sys.executable, "-c", BLOCKED], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert int(done.stdout.split()[-1]) > 40
+
+
+@pytest.mark.parametrize(
+    ("package", "forbidden"),
+    [("pbl_pipeline", {"schemas", "workers", "datajoint", "pymysql"}), ("schemas", {"workers"})],
+)
+def test_no_import_against_the_direction(package: str, forbidden: set[str]):
+    files = sorted((ROOT / package).rglob("*.py"))
+    assert len(files) > 5
+    found = [f"{f.relative_to(ROOT)}: {name}" for f in files for name in _imports(f) if name.split(".")[0] in forbidden]
+    assert not found
+
+
+def _imports(file: Path) -> set[str]:
+    names = set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            names.add(node.module)
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "import_module":
+            names |= {a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str)}
+    return names
