@@ -49,7 +49,7 @@ class Strip:
         time = np.asarray(fit.time_s, float)
         self._t0, self._t1 = float(time[0]), float(max(time[-1], time[0] + 1e-3))
         self._plot = (round(height * 0.20), round(height * 0.61))
-        self._rows = {"left": round(height * 0.75), "right": round(height * 0.91)}
+        self._rows = {"left": round(height * 0.73), "right": round(height * 0.885)}
         self._picture = np.full((height, width, 3), _PAPER, np.uint8)
         self._draw_knees(fit, time)
         self._draw_contacts(events)
