@@ -117,6 +117,34 @@ def test_gradients_match_finite_differences_of_c_mujoco(seed):
         np.testing.assert_allclose(np.ravel(gradient), expected, atol=2e-5 * np.abs(expected).max() + 1e-5)
 
 
+def test_forward_mode_and_second_derivatives():
+    """The closed-form derivative can itself be differentiated: its change along a line, against differences."""
+    body, markers = load_body(), marker_set("mpi_inf_3dhp_17")
+    rng = np.random.default_rng(6)
+    qpos, along = random_poses(body, 1, rng)[0], rng.normal(size=40)
+    scale, offset = rng.uniform(0.8, 1.2, 8), np.zeros((17, 3))
+    weight = rng.normal(size=(17, 3))
+
+    def on_line(s):
+        return jnp.sum(weight * marker_positions(body, markers, jnp.asarray(qpos) + s * along, scale, offset))
+
+    def truth(s: float) -> float:
+        return float(np.sum(weight * c_mujoco(body, markers, qpos + s * along, scale, offset)[0]))
+
+    step = 1e-3
+    first = (truth(step) - truth(-step)) / (2 * step)
+    second = (truth(step) - 2 * truth(0.0) + truth(-step)) / step**2
+
+    @jax.jit
+    def both(s):
+        return jax.jvp(on_line, (s,), (1.0,))[1], jax.jvp(jax.grad(on_line), (s,), (1.0,))[1]
+
+    ours = both(0.0)
+    assert abs(second) > 1
+    assert float(ours[0]) == pytest.approx(first, rel=1e-3)
+    assert float(ours[1]) == pytest.approx(second, rel=1e-3)
+
+
 def test_gradient_is_finite_at_zero():
     body, markers = load_body(), marker_set("blazepose_33")
 
