@@ -1,0 +1,23 @@
+"""`pbl report`: what the tables hold of a visit, as files for people."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command(epilog="Example: pbl report --subject P017 --session 2026-03-01 --out P017")
+@click.option("--subject", required=True, help="Code of the subject.")
+@click.option("--session", "label", help="Date or label of the visit; needed where the subject has several.")
+@click.option("--fit-method", help="Name of the fit method; needed where several were used.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the files.")
+def report(subject: str, label: str | None, fit_method: str | None, out: Path) -> None:
+    """Write report.html, overlay videos, angles and events of one visit from the tables."""
+    import schemas
+    from schemas.report import write_session
+
+    schemas.activate(methods=False)
+    wanted = {"subject": subject, "session_label": label, "fit_method": fit_method}
+    for path in write_session({k: v for k, v in wanted.items() if v is not None}, out):
+        click.echo(path)

@@ -1,0 +1,54 @@
+"""Results of a visit from the tables as files for people: report, overlay, angles (what `pbl run` writes)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pbl_pipeline.errors import PblError
+
+from . import fit, gait, keypoints, tracking
+from .results import load_session
+
+
+def write_session(restriction: Any, out: Path) -> list[Path]:
+    """Write the files of `pbl_pipeline.pipeline.write_results` for one session; nothing is computed anew.
+
+    Raises
+    ------
+    PblError
+        DB_NOT_FOUND when the session is unknown or not fitted yet, USAGE when several match, VIDEO_MISSING when a
+        recording is no longer where it was.
+    """
+    # The library's drawing half is heavy; commands that only look at rows do not pay for it.
+    from pbl_pipeline.pipeline import Session, Trial, write_results
+
+    found = load_session(restriction)
+    if found.fit is None or found.metrics is None:
+        problems = "; ".join(f"{t.name}: {t.problem}" for t in found.trials if t.problem)
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no finished fit and measures of session {found.session_label!r}. {problems}".strip(),
+            expected="a session that was populated",
+            next_step="run `pbl populate`, then `pbl status`",
+            key=f"subject {found.subject}",
+        )
+    trials = tuple(Trial(t.name, t.path, t.info, t.choice, t.keypoints) for t in found.fitted)
+    return write_results(
+        out,
+        Session(trials, found.fit, found.metrics),
+        title="Gait report",
+        subject_code=found.subject,
+        date=str(found.session_date or found.session_label),
+        origin={"Methods": _methods(found.key)},
+    )
+
+
+def _methods(key: Any) -> dict[str, str]:
+    """Name and version of the method behind each stage."""
+    chain = fit.FitSet.Video & {"fit_set": key["fit_set"]}
+    rows = (chain.proj(..., "keypoint_method", "tracking_method")).to_dicts(limit=1)
+    points = (keypoints.KeypointMethod & rows[0]).fetch1("keypoint_method")
+    tracks = (tracking.TrackingMethod & rows[0]).fetch1("tracking_method")
+    gaits = (gait.GaitEventMethod & key).fetch1("gait_method")
+    return {"Tracking": tracks, "Keypoints": points, "Fit": key["fit_method"], "Gait events": gaits}
