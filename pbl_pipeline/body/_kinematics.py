@@ -73,5 +73,5 @@ def marker_positions(
     own = jnp.asarray(scale, dtype)[body.scale_index[markers.body_index]]
     local = own[:, None] * (jnp.asarray(markers.position_m, dtype) + jnp.asarray(site_offset_m, dtype))
     rotation = xmat[..., markers.body_index, :, :]
-    # A sum of products instead of a matrix product, for the same reason as above.
+    # A sum of products: a matrix product would be rounded on GPUs, see _poses.py.
     return xpos[..., markers.body_index, :] + jnp.sum(rotation * local[:, None, :], axis=-1)
