@@ -27,12 +27,15 @@ from pbl_pipeline.paramset import Paramset
 
 from . import connection as _connection  # noqa: F401  configures DataJoint before the import below
 
-import datajoint as dj  # isort: skip
+import datajoint  # isort: skip
 from datajoint.hash_registry import get_store_backend  # isort: skip
 
 __all__ = ["Origin", "computes", "dj", "method_columns", "origin_columns", "stored_file"]
 
 P = TypeVar("P")
+
+#: DataJoint without its types: its metaclass lends classes the operators of queries, which no type checker can see.
+dj: Any = datajoint
 
 #: Longest texts that keep a whole coded error within the 2047 characters of a job's error_message.
 _LIMITS = {"found": 600, "expected": 350, "next_step": 600, "key": 250}

@@ -31,7 +31,7 @@ def _body() -> None:
         "scale_names": list(library("body").SCALE_NAMES),
     }
     if not fit.BodyModel & {"body_sha256": body.sha256}:
-        fit.BodyModel.insert1(row)
+        fit.BodyModel.insert1(row, skip_duplicates=True)
 
 
 def _norm(name: str) -> None:
@@ -49,5 +49,6 @@ def _norm(name: str) -> None:
             "norm_source": norm.source[:1000],
             "norm_convention": norm.convention[:1000],
             "norm_licence": norm.licence[:500],
-        }
+        },
+        skip_duplicates=True,
     )

@@ -94,7 +94,7 @@ class Keypoints(dj.Computed):
         camera: Mapping[str, Any] | None,
         method: Mapping[str, Any],
     ) -> tuple:
-        path = video.registered_file(*file, key)
+        path = video.registered_file(file[0], file[1], key)
         params = rebuild_params(library("keypoints").KeypointParams, **method)
         with stored_file(self, tracks[0]) as stored:
             everybody = tracking.load_tracking(stored, size, *tracks[1:])

@@ -85,10 +85,9 @@ def _make_set(group: Mapping[str, Any], rows: list[dict]) -> list[dict[str, Any]
         )
         for older in _older_sets(group, name):
             fit.FitSelection.update1({**older, "fit_current": False})
-        if fit.FitSelection & selection:
-            fit.FitSelection.update1({**selection, "fit_current": True})
-        else:
-            fit.FitSelection.insert1({**selection, "fit_current": True})
+        # Another process may have planned the same set in the meantime.
+        fit.FitSelection.insert1({**selection, "fit_current": True}, skip_duplicates=True)
+        fit.FitSelection.update1({**selection, "fit_current": True})
     return [selection]
 
 

@@ -53,7 +53,7 @@ def columns(cls: Any) -> list[tuple[str, str, str, bool]]:
         if text.startswith("---"):
             in_key = False
         match = re.match(r"(\w+)\s*(=\s*[^:]+?)?\s*:\s*([^#]+?)\s*(?:#\s*(.*))?$", text)
-        if match and not text.startswith(("#", "->", "unique", "index")):
+        if match and not text.startswith(("#", "->")) and not re.match(r"(unique\s+)?index\s*\(", text):
             out.append((match.group(1), match.group(3), match.group(4) or "", in_key))
     return out
 

@@ -109,7 +109,7 @@ class Tracking(dj.Computed):
 
     @computes
     def make_compute(self, key: dict, file: tuple, method: Mapping[str, Any]) -> tuple:
-        path = video.registered_file(*file, key)
+        path = video.registered_file(file[0], file[1], key)
         params = rebuild_params(library("tracking").TrackingParams, **method)
         return library("tracking").track_people(path, params=params), method["sha"]
 
@@ -225,10 +225,11 @@ def drop_outdated_choices(restriction: Any = True) -> dict[str, int]:
     dict
         Table name to number of deleted rows, empty when nothing was outdated. The next populate computes them anew.
     """
-    rows = outdated_choices(restriction)
-    if not rows:
+    keys = outdated_choices(restriction).keys()
+    if not keys:
         return {}
-    target = SubjectChoice & rows.proj()
+    # As plain keys: a cascade from a restriction by subqueries fails in DataJoint 2.3.5 ("attribute not found").
+    target = SubjectChoice & keys
     counts = {name: n for name, n in dj.Diagram.cascade(target, part_integrity="cascade").counts().items() if n}
     target.delete(prompt=False, part_integrity="cascade")
     return counts

@@ -14,10 +14,19 @@ from typing import Any
 from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
 from schemas import computed_tables
-from schemas._base import error_code
+from schemas._base import dj, error_code
 
-#: What an interrupted computation leaves as the beginning of its error message: retried without being asked.
-INTERRUPTED = ("KeyboardInterrupt", "SystemExit", "LostConnectionError")
+#: How the message of an error begins that says nothing about the video: a signal, a lost server, or inputs that
+#: somebody changed during the computation. Such rows are tried again without being asked.
+INTERRUPTED = (
+    "KeyboardInterrupt",
+    "SystemExit",
+    "LostConnectionError",
+    "OperationalError",
+    "InterfaceError",
+    "DataJointError: Referential integrity failed",
+    "DataJointError: fetch1",
+)
 #: Statuses that mean "ran well, nothing to produce": table -> (column, values).
 EMPTY_COLUMNS = {
     "SubjectChoice": ("choice_status", ("NO_PERSON",)),
@@ -123,7 +132,7 @@ def _choose(names: Sequence[str] | None) -> list[Any]:
 
 def _populate_table(table: Any, part: TableRun, limit: int | None) -> None:
     jobs = table.jobs
-    jobs.refresh(delay=-1)
+    fill_queue(table)
     empty_before = _count_empty(table)
     calls = 0
     with progress.bar(table.__name__, total=_ready(jobs, limit), unit="row") as update:
@@ -144,6 +153,24 @@ def _populate_table(table: Any, part: TableRun, limit: int | None) -> None:
             update(done)
     part.empty = max(0, min(_count_empty(table) - empty_before, part.done))
     part.waiting = count_waiting(table)
+
+
+def fill_queue(table: Any) -> int:
+    """Queue every key that has no result and no job, in one statement; returns how many.
+
+    DataJoint's own refresh inserts row by row (66 s for 300,000 keys); it still runs, to clean up.
+    """
+    jobs, quote = table.jobs, table.connection.adapter.quote_identifier
+    todo = (table().key_source - table.proj()).restrict(dj.Not(jobs), semantic_check=False).proj()
+    columns = ",".join(quote(c) for c in todo.heading.primary_key)
+    names = f"{columns},{quote('status')},{quote('priority')}"
+    values = f"{columns},'pending',{int(table.connection._config.jobs.default_priority)}"
+    # IGNORE: another process may queue the same key between the two halves of the statement. Nothing in it comes from
+    # outside: names are DataJoint's own, quoted by its adapter.
+    statement = f"INSERT IGNORE INTO {jobs.full_table_name} ({names}) SELECT {values} FROM ({todo.make_sql()}) AS todo"  # noqa: S608
+    cursor = table.connection.query(statement)
+    jobs.refresh(delay=-1)
+    return int(cursor.rowcount)
 
 
 def _ready(jobs: Any, limit: int | None) -> int:
@@ -176,7 +203,7 @@ def free_dead(table: Any) -> int:
         if row["host"] == platform.node() and not _alive(int(row["pid"]), row["reserved_time"], jobs):
             n += _put_back(jobs, row)
     for word in INTERRUPTED:
-        for row in (jobs.errors & f"error_message like '{word}%%'").to_dicts():
+        for row in (jobs.errors & f"error_message like '{word}%'").to_dicts():
             n += _put_back(jobs, row)
     return n
 
