@@ -37,7 +37,7 @@ def detect(video: Path, out: Path, camera: Path | None, person: int | None) -> N
     Where no one is clearly the subject, nothing is measured: a picture with the numbered people is written beside OUT,
     and the command is to be called again with --person N.
     """
-    from pbl_pipeline.keypoints import detect_keypoints
+    from pbl_pipeline.keypoints import check_keypoints, detect_keypoints
     from pbl_pipeline.tracking import choose_subject, save_contact_sheet, time_in_view_s, track_people
     from pbl_pipeline.video import guess_camera, load_camera, probe
 
@@ -71,6 +71,9 @@ def detect(video: Path, out: Path, camera: Path | None, person: int | None) -> N
         f"{out}: {len(keypoints.names)} points ({keypoints.marker_set}) of person {choice.person_id} "
         f"in {int(seen.sum())} of {len(seen)} frames; camera {lens.source}"
     )
+    for check in check_keypoints(keypoints):
+        if check.advice:
+            click.echo(f"  {check.outcome} {check.check} = {check.value:.3g}: {check.advice}")
 
 
 def _needs_choice(video: Path, tracking: Tracking, choice: SubjectChoice, sheet: Path) -> PblError:

@@ -3,6 +3,7 @@
 from ._blazepose import BlazePoseLandmarks
 from ._detect import DEFAULT, DETECTORS, PARAMSETS, KeypointParams, detect_keypoints
 from ._protocol import KeypointDetector, PersonKeypoints
+from ._quality import check_keypoints, side_changes
 from ._types import Keypoints
 from ._view import view_rotation
 
@@ -15,6 +16,8 @@ __all__ = [
     "KeypointParams",
     "Keypoints",
     "PersonKeypoints",
+    "check_keypoints",
     "detect_keypoints",
+    "side_changes",
     "view_rotation",
 ]

@@ -79,7 +79,7 @@ class BlazePoseLandmarks:
     """
 
     name = "blazepose"
-    names = NAMES
+    names: tuple[str, ...] = NAMES
     marker_set = "blazepose_33"
     root_relative = True
 

@@ -9,7 +9,7 @@ contradicts the track, the track wins.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -144,7 +144,7 @@ def smooth_rois(roi: np.ndarray, time_s: np.ndarray, sigma_s: float) -> np.ndarr
     return out
 
 
-def refine_rois(roi: np.ndarray, found: list[PersonKeypoints | None], params: KeypointParams) -> np.ndarray:
+def refine_rois(roi: np.ndarray, found: Sequence[PersonKeypoints | None], params: KeypointParams) -> np.ndarray:
     """Regions (T, 4) that the keypoints show, and those of `roi` where nobody was found or somebody else."""
     out = roi.copy()
     for row, person in enumerate(found):

@@ -58,6 +58,6 @@ def _cell(image: np.ndarray, tracking: Tracking, person_id: int, frame: int) -> 
         cv2.rectangle(cell, (x0, y0), (x1, y1), colour, 4 if p.person_id == person_id else 1)
         cv2.putText(cell, str(p.person_id), (x0 + 4, y0 + 28), cv2.FONT_HERSHEY_SIMPLEX, 0.9, colour, 2, cv2.LINE_AA)
     label = f"person {person_id} at {tracking.time_s[frame]:.2f} s"
-    cv2.putText(cell, label, (8, cell.shape[0] - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (0, 0, 0), 4, cv2.LINE_AA)
+    cv2.rectangle(cell, (0, cell.shape[0] - 34), (230, cell.shape[0]), (0, 0, 0), -1)
     cv2.putText(cell, label, (8, cell.shape[0] - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (255, 255, 255), 1, cv2.LINE_AA)
     return cell

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from pbl_pipeline import assets
 from pbl_pipeline.cli.detect import detect
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.keypoints import Keypoints, detect_keypoints
+from pbl_pipeline.keypoints import Keypoints, check_keypoints, detect_keypoints
 from pbl_pipeline.tracking import Tracking, choose_subject, track_people
 from pbl_pipeline.video import guess_camera, load_camera, read_frames
 from tests.unit.test_blazepose import BY_EYE, asset
@@ -99,13 +99,22 @@ def test_keypoints_lie_where_a_human_sees_them(keypoints):
 
 
 def test_feet_alternate_as_she_walks(keypoints):
-    """Right and left foot in front by turns. Counted in the frames by eye: right 60, left 79, right 98, left 116,
-    right 134, left 152, right 171, left 187 (+- 2 frames)."""
+    """Right and left foot in front by turns. In these frames of double support the leading leg was told by eye from the
+    near (left) arm, which swings against its leg: right 60, left 79, right 98, left 116, right 134, left 152,
+    right 171, left 187."""
     names = keypoints.names
     # She walks towards small x.
     lead = keypoints.xy_px[:, names.index("left_ankle"), 0] - keypoints.xy_px[:, names.index("right_ankle"), 0]
     for frame, sign in [(60, 1), (79, -1), (98, 1), (116, -1), (134, 1), (152, -1), (171, 1), (187, -1)]:
         assert sign * lead[frame] > 100, frame
+
+
+def test_the_keypoints_pass_their_checks(keypoints):
+    assert {c.check: c.outcome for c in check_keypoints(keypoints)} == {
+        "frames_seen_s": "PASS",
+        "leg_confidence": "PASS",
+        "side_changes": "PASS",
+    }
 
 
 def test_her_heading_does_not_turn_with_the_viewing_angle(keypoints):

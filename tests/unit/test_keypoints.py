@@ -13,7 +13,9 @@ from pbl_pipeline.keypoints import (
     KeypointParams,
     Keypoints,
     PersonKeypoints,
+    check_keypoints,
     detect_keypoints,
+    side_changes,
     view_rotation,
 )
 from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES
@@ -235,3 +237,38 @@ def test_paramset_names_the_model():
     paramset = PARAMSETS["blazepose-33"]
     assert (paramset.stage, paramset.version) == ("keypoints", 1)
     assert paramset.params["model_sha256"] == KeypointParams().model_sha256
+
+
+# --- quality ----------------------------------------------------------------------------------------------------
+
+
+def standing(n: int = 120) -> Keypoints:
+    """Two hips that turn slowly by half a circle."""
+    angle = np.linspace(0, np.pi, n)
+    right = 0.1 * np.stack([np.cos(angle), np.zeros(n), np.sin(angle)], axis=-1)
+    xyz = np.stack([-right, right], axis=1)
+    size = (n, 2, 2), (n, 2), (n, 4)
+    shape = [np.zeros(size[0]), np.full(size[1], 0.9), np.zeros(size[2])]
+    names = ("left_hip", "right_hip")
+    return Keypoints(constant_rate(n), names, "t", shape[0], xyz, True, shape[1], (9, 9), CAMERA, shape[2])
+
+
+def test_turning_round_is_no_change_of_sides_but_an_exchange_is():
+    keypoints = standing()
+    assert side_changes(keypoints).tolist() == []
+    assert {c.outcome for c in check_keypoints(keypoints)} == {"PASS"}
+    xyz = keypoints.xyz_cam_m
+    xyz[40:60] = xyz[40:60, ::-1]
+    # Missing for a while: what happened meanwhile is not known.
+    xyz[80:100] = np.nan
+    xyz[100:] = xyz[100:, ::-1]
+    assert side_changes(keypoints).tolist() == [40, 60]
+    check = {c.check: c for c in check_keypoints(keypoints)}["side_changes"]
+    assert (check.outcome, check.value) == ("WARN", 2.0)
+    assert check.advice
+
+
+def test_checks_without_any_frame():
+    keypoints = standing()
+    keypoints.confidence[:] = 0
+    assert [c.outcome for c in check_keypoints(keypoints)] == ["EMPTY"]

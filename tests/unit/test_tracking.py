@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -219,11 +221,23 @@ SIZE = (1000, 1000)
 FPS = 30.0
 
 
-def track(person_id: int, x, y=500.0, side=HEIGHT, turn=0.0, start: int = 0, n: int = 180, jitter: float = 0.0):
+Course = float | Callable[[np.ndarray], np.ndarray]
+
+
+def track(
+    person_id: int,
+    x: Course,
+    y: Course = 500.0,
+    side: Course = HEIGHT,
+    turn: Course = 0.0,
+    start: int = 0,
+    n: int = 180,
+    jitter: float = 0.0,
+) -> PersonTrack:
     """A person in frames start.. of a video of `n` frames; x, y, side may be functions of the seconds since then."""
     t = np.arange(n - start) / FPS
     rng = np.random.default_rng(person_id)
-    values = [np.broadcast_to(v(t) if callable(v) else v, t.shape).astype(float) for v in (x, y, side, turn)]
+    values = [np.array(v(t) if callable(v) else np.full(t.shape, v), float) for v in (x, y, side, turn)]
     values[0] = values[0] + rng.normal(0, jitter * HEIGHT, len(t))
     values[2] = values[2] * np.exp(rng.normal(0, 2 * jitter, len(t)))
     roi = np.full((n, 4), np.nan)
