@@ -10,13 +10,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from datajoint.errors import DuplicateError
-
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import canonical_json
 
 from . import fit, gait, gdi, keypoints, lab, session, tracking, video
-from ._base import dj, library, resolve_method, utc_now
+from ._base import DuplicateError, dj, library, resolve_method, utc_now
 
 _ATTEMPTS = 20
 _SUBJECT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")

@@ -54,3 +54,11 @@ def _imports(file: Path) -> set[str]:
         elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "import_module":
             names |= {a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str)}
     return names
+
+
+def test_datajoint_is_configured_before_it_is_imported():
+    """A datajoint.json in the working directory must never count, so only these two may import DataJoint themselves."""
+    allowed = {"schemas/connection.py", "schemas/_base.py"}
+    files = [f for package in ("schemas", "workers") for f in (ROOT / package).rglob("*.py")]
+    found = {str(f.relative_to(ROOT)) for f in files if any(n.split(".")[0] == "datajoint" for n in _imports(f))}
+    assert found == allowed
