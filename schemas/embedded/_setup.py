@@ -48,8 +48,10 @@ def initialise(folder: Folder, binaries: Binaries, account: Account) -> None:
     shutil.rmtree(folder.data, ignore_errors=True)
     folder.create(account)
     where = [f"--datadir={folder.data}", f"--basedir={binaries.basedir}", f"--tmpdir={folder.tmp}", LOG_SIZE]
-    install = [str(binaries.install_db), "--no-defaults", "--auth-root-authentication-method=normal", "--skip-test-db"]
-    _run([*install, *where], "", folder, binaries, account)
+    # "--force": a machine whose own name does not resolve (a bare container) is no reason to stop; the accounts that
+    # carry the name are dropped below.
+    install = [str(binaries.install_db), "--no-defaults", "--force", "--auth-root-authentication-method=normal"]
+    _run([*install, "--skip-test-db", *where], "", folder, binaries, account)
     credentials = Credentials.new()
     # One statement a line, read from stdin: passwords appear neither on a command line nor in a file.
     statements = [
