@@ -8,13 +8,23 @@ from typing import Any
 from . import computed_tables, tracking, video
 from ._base import error_code, error_found, error_next_step
 
+#: Columns that say "ran well, nothing to produce": table -> (status, values, reason or None where a table above says).
+EMPTY_COLUMNS: dict[str, tuple[str, tuple[str, ...], str | None]] = {
+    "SubjectChoice": ("choice_status", ("NO_PERSON",), "choice_reason"),
+    "GaitEvents": ("events_status", ("EMPTY",), "events_reason"),
+    "Spatiotemporal": ("measures_status", ("EMPTY",), None),
+    "GDI": ("gdi_status", ("EMPTY",), None),
+    "SessionGdi": ("session_status", ("EMPTY",), None),
+}
+
 
 @dataclasses.dataclass(frozen=True)
 class TableStatus:
-    """One computed table. pending: keys without a result, a reservation or an error."""
+    """One computed table. pending: keys without a result, a reservation or an error; empty is part of done."""
 
     table: str
     done: int
+    empty: int
     pending: int
     reserved: int
     error: int
@@ -35,6 +45,16 @@ class ErrorRow:
 
 
 @dataclasses.dataclass(frozen=True)
+class EmptyRow:
+    """A video for which a stage ran well and found nothing to go on with."""
+
+    table: str
+    video_id: int
+    about: str
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True)
 class Waiting:
     """A video that needs a person's choice, with the command that decides."""
 
@@ -52,6 +72,7 @@ class Status:
     videos: int
     tables: list[TableStatus]
     errors: list[ErrorRow]
+    empty: list[EmptyRow]
     waiting: list[Waiting]
 
     def to_dict(self) -> dict[str, Any]:
@@ -67,9 +88,29 @@ def pipeline_status() -> Status:
         remaining, _ = table().progress()
         waiting = len(table & {"choice_status": "NEEDS_CHOICE"}) if table is tracking.SubjectChoice else 0
         pending = max(0, remaining - counts["reserved"] - counts["error"] - counts["ignore"])
-        tables.append(TableStatus(table.__name__, len(table()), pending, counts["reserved"], counts["error"], waiting))
+        done, empty = len(table()), len(empty_rows(table))
+        tables.append(TableStatus(table.__name__, done, empty, pending, counts["reserved"], counts["error"], waiting))
         errors += _errors(table)
-    return Status(len(video.Video()), tables, errors, _waiting())
+    return Status(len(video.Video()), tables, errors, _empty(), _waiting())
+
+
+def empty_rows(table: Any) -> Any:
+    """Rows of a computed table that say "ran well, nothing to produce"."""
+    if table.__name__ not in EMPTY_COLUMNS:
+        return table & False
+    column, values, _ = EMPTY_COLUMNS[table.__name__]
+    return table & [{column: v} for v in values]
+
+
+def _empty() -> list[EmptyRow]:
+    out = []
+    for table in computed_tables():
+        reason = EMPTY_COLUMNS.get(table.__name__, ("", (), None))[2]
+        if reason is None:
+            continue
+        for row in (empty_rows(table) * video.Video.proj("video_name")).to_dicts(order_by="video_id"):
+            out.append(EmptyRow(table.__name__, int(row["video_id"]), row["video_name"], row[reason]))
+    return out
 
 
 def _errors(table: Any) -> list[ErrorRow]:

@@ -15,6 +15,7 @@ from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
 from schemas import computed_tables
 from schemas._base import dj, error_code
+from schemas.status import empty_rows
 
 #: How the message of an error begins that says nothing about the video: a signal, a lost server, or inputs that
 #: somebody changed during the computation. Such rows are tried again without being asked.
@@ -27,14 +28,6 @@ INTERRUPTED = (
     "DataJointError: Referential integrity failed",
     "DataJointError: fetch1",
 )
-#: Statuses that mean "ran well, nothing to produce": table -> (column, values).
-EMPTY_COLUMNS = {
-    "SubjectChoice": ("choice_status", ("NO_PERSON",)),
-    "GaitEvents": ("events_status", ("EMPTY",)),
-    "Spatiotemporal": ("measures_status", ("EMPTY",)),
-    "GDI": ("gdi_status", ("EMPTY",)),
-    "SessionGdi": ("session_status", ("EMPTY",)),
-}
 
 
 @dataclasses.dataclass
@@ -133,7 +126,7 @@ def _choose(names: Sequence[str] | None) -> list[Any]:
 def _populate_table(table: Any, part: TableRun, limit: int | None) -> None:
     jobs = table.jobs
     fill_queue(table)
-    empty_before = _count_empty(table)
+    empty_before = len(empty_rows(table))
     calls = 0
     with progress.bar(table.__name__, total=_ready(jobs, limit), unit="row") as update:
         # One key a call: an interrupt must end the loop (populate itself would go on to the next key), and other
@@ -151,7 +144,7 @@ def _populate_table(table: Any, part: TableRun, limit: int | None) -> None:
             done = result["success_count"] + len(result["error_list"])
             calls += done
             update(done)
-    part.empty = max(0, min(_count_empty(table) - empty_before, part.done))
+    part.empty = max(0, min(len(empty_rows(table)) - empty_before, part.done))
     part.waiting = count_waiting(table)
 
 
@@ -177,13 +170,6 @@ def _ready(jobs: Any, limit: int | None) -> int:
     """How many jobs can be taken now, at most `limit`."""
     n = len(jobs.pending & "scheduled_time <= CURRENT_TIMESTAMP(3)")
     return n if limit is None else min(n, limit)
-
-
-def _count_empty(table: Any) -> int:
-    if table.__name__ not in EMPTY_COLUMNS:
-        return 0
-    column, values = EMPTY_COLUMNS[table.__name__]
-    return len(table & [{column: v} for v in values])
 
 
 def count_waiting(table: Any) -> int:

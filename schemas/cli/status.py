@@ -35,9 +35,9 @@ def status(as_json: bool) -> None:
 def lines(state: Status) -> list[str]:
     """The printed form."""
     out = [f"{state.videos} videos", ""]
-    out.append(f"{'table':<16}{'done':>7}{'pending':>9}{'reserved':>10}{'error':>7}{'waiting':>9}")
+    out.append(f"{'table':<16}{'done':>7}{'empty':>7}{'pending':>9}{'reserved':>10}{'error':>7}{'waiting':>9}")
     for t in state.tables:
-        out.append(f"{t.table:<16}{t.done:>7}{t.pending:>9}{t.reserved:>10}{t.error:>7}{t.waiting:>9}")
+        out.append(f"{t.table:<16}{t.done:>7}{t.empty:>7}{t.pending:>9}{t.reserved:>10}{t.error:>7}{t.waiting:>9}")
     if state.errors:
         out += ["", "errors (tried again with: pbl populate --retry-errors)"]
     for e in state.errors:
@@ -47,6 +47,9 @@ def lines(state: Status) -> list[str]:
             f"    found: {e.found}",
             f"    next:  {e.next_step}",
         ]
+    if state.empty:
+        out += ["", "ran well, nothing to produce"]
+    out += [f"  video_id={e.video_id}  {e.about}  {e.table}: {e.reason}" for e in state.empty]
     if state.waiting:
         out += ["", "waiting for a choice"]
     for w in state.waiting:

@@ -157,7 +157,11 @@ def test_nobody_walks_and_nobody_there(tables: None, tmp_path: Path, monkeypatch
     assert not errors(run)
     empty = {t.table: t.empty for t in run.tables if t.empty}
     assert empty == {"SubjectChoice": 1, "GaitEvents": 1, "Spatiotemporal": 1, "GDI": 1, "SessionGdi": 1}
-    assert (gait.GaitEvents).fetch1("events_reason")
+    shown = {(e.table, e.about): e.reason for e in pipeline_status().empty}
+    assert shown == {
+        ("SubjectChoice", "empty_nobody.mp4"): "No person was found in the video.",
+        ("GaitEvents", "stands.mp4"): gait.GaitEvents.fetch1("events_reason"),
+    }
     assert gdi.SessionGdi.fetch1("session_gdi", "session_cadence") == (None, None)
     assert gdi.SessionGdi.fetch1("session_reason")
     assert qc.SessionQc.fetch1("qc_outcome") == "EMPTY"
