@@ -7,18 +7,16 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from pbl_pipeline import __version__
 from pbl_pipeline.body import SCALE_NAMES
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import write_angles_csv
 from pbl_pipeline.fit import SessionFit, TrialFit, check_trial, fit_session
 from pbl_pipeline.gait import GaitMetrics, gait_metrics
-from pbl_pipeline.keypoints import Keypoints, detect_keypoints
+from pbl_pipeline.keypoints import Keypoints, check_keypoints, detect_keypoints
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import WARN, Check
-from pbl_pipeline.render import overlay_frames, render_overlay
+from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
 from pbl_pipeline.report import Picture, SessionReport, TrialReport, write_report
 from pbl_pipeline.tracking import SubjectChoice, choose_subject, track_people
 from pbl_pipeline.video import VideoInfo, guess_camera, load_camera, probe
@@ -131,7 +129,8 @@ def write_results(
         reports.append(TrialReport(trial.name, trial.video, trial.choice, fit, trial.keypoints, pictures))
     write_session_json(session.fit, out / "session.json")
     session.metrics.save(out / "metrics.json")
-    left_out = (Check(f"trial {n}", WARN, None, None, f"left out: {e.text()}") for n, e in session.problems.items())
+    checks = [c for t in session.trials for c in _named(check_keypoints(t.keypoints), t.name, len(session.trials))]
+    checks += (Check(f"trial {n}", WARN, None, None, f"left out: {e.text()}") for n, e in session.problems.items())
     report = SessionReport(
         title=title,
         subject_code=subject_code,
@@ -139,7 +138,7 @@ def write_results(
         trials=tuple(reports),
         metrics=session.metrics,
         session=session.fit,
-        checks=tuple(left_out),
+        checks=tuple(checks),
         origin=dict(origin or {}) | {"Software": {"pbl-pipeline": __version__}},
     )
     write_report(out / "report.html", report)
@@ -169,11 +168,17 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
     return [s if stems.count(s) == 1 else f"{s}-{i + 1}" for i, s in enumerate(stems)]
 
 
+def _named(checks: Sequence[Check], trial: str, n_trials: int) -> list[Check]:
+    """The checks, with the trial's name where there are several."""
+    if n_trials == 1:
+        return list(checks)
+    return [dataclasses.replace(c, check=f"{c.check} ({trial})") for c in checks]
+
+
 def _pictures(trial: Trial, fit: TrialFit) -> tuple[Picture, ...]:
-    """Three frames spread over the time in view, cut to the person."""
-    seen = np.flatnonzero(np.isfinite(fit.qpos[:, 0]))
-    index = [int(seen[int(q * (len(seen) - 1))]) for q in (0.2, 0.5, 0.8)]
-    images = overlay_frames(trial.path, fit, index, crop_to_body=True)
+    """Frames for the report, cut to the person."""
+    index = report_indices(fit)
+    images = overlay_frames(trial.path, fit, index, crop_to_body=True, max_side_px=760)
     return tuple(Picture(i, float(fit.time_s[i]), image) for i, image in zip(index, images, strict=True))
 
 

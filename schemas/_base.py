@@ -58,6 +58,30 @@ def origin_columns(prefix: str) -> str:
     """
 
 
+def check_columns(prefix: str) -> str:
+    """Definition lines of a part table of quality checks; the names carry the prefix for the same reason."""
+    return f"""
+    -> master
+    {prefix}_check           : varchar(64)       # name, with its unit
+    ---
+    {prefix}_check_outcome   : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')
+    {prefix}_check_value=null     : float64      # in the unit (see {prefix}_check)
+    {prefix}_check_threshold=null : float64      # in the unit (see {prefix}_check)
+    {prefix}_check_advice    : varchar(1000)     # what to do about it
+    """
+
+
+def check_row(prefix: str, check: Any) -> dict[str, Any]:
+    """A library `Check` as values of `check_columns(prefix)`."""
+    return {
+        f"{prefix}_check": check.check,
+        f"{prefix}_check_outcome": check.outcome,
+        f"{prefix}_check_value": number(check.value),
+        f"{prefix}_check_threshold": number(check.threshold),
+        f"{prefix}_check_advice": check.advice[:1000],
+    }
+
+
 @dataclasses.dataclass(frozen=True)
 class Origin:
     """Version, host, duration and time of one computation."""

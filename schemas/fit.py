@@ -13,6 +13,8 @@ import numpy as np
 from . import keypoints, session, video  # noqa: F401  a definition refers to session
 from ._base import (
     Origin,
+    check_columns,
+    check_row,
     computes,
     dj,
     file_ref,
@@ -20,7 +22,6 @@ from ._base import (
     method_arguments,
     method_columns,
     new_folder,
-    number,
     origin_columns,
     stored_file,
     stored_paramset,
@@ -162,15 +163,9 @@ class SessionFit(dj.Computed):
         """  # noqa: E501
 
     class Check(dj.Part):
-        definition = """
+        definition = f"""
         # quality checks of the fit
-        -> master
-        fit_check         : varchar(64)        # name, with its unit
-        ---
-        fit_check_outcome : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')
-        fit_check_value=null     : float64     # in the unit (see fit_check)
-        fit_check_threshold=null : float64     # in the unit (see fit_check)
-        fit_check_advice  : varchar(1000)
+        {check_columns("fit")}
         """
 
     @property
@@ -247,17 +242,6 @@ def median(values: np.ndarray) -> float | None:
     """Median of the values that are there; None where none is."""
     there = values[np.isfinite(values)]
     return float(np.median(there)) if len(there) else None
-
-
-def check_row(prefix: str, check: Any) -> dict[str, Any]:
-    """A library `Check` as values of a Check part table."""
-    return {
-        f"{prefix}_check": check.check,
-        f"{prefix}_check_outcome": check.outcome,
-        f"{prefix}_check_value": number(check.value),
-        f"{prefix}_check_threshold": number(check.threshold),
-        f"{prefix}_check_advice": check.advice[:1000],
-    }
 
 
 def trial_names(videos: Sequence[tuple[int, str]]) -> list[str]:

@@ -10,6 +10,8 @@ import numpy as np
 from . import fit, session  # noqa: F401  a definition refers to session
 from ._base import (
     Origin,
+    check_columns,
+    check_row,
     computes,
     dj,
     file_ref,
@@ -74,15 +76,9 @@ class GaitEvents(dj.Computed):
         """
 
     class Check(dj.Part):
-        definition = """
+        definition = f"""
         # quality checks of the events
-        -> master
-        events_check         : varchar(64)     # name, with its unit
-        ---
-        events_check_outcome : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')
-        events_check_value=null     : float64  # in the unit (see events_check)
-        events_check_threshold=null : float64  # in the unit (see events_check)
-        events_check_advice  : varchar(1000)
+        {check_columns("events")}
         """
 
     @property
@@ -128,7 +124,7 @@ class GaitEvents(dj.Computed):
             }
             for i, e in enumerate(found.events, 1)
         )
-        self.Check.insert({**key, **fit.check_row("events", check)} for check in found.qc)
+        self.Check.insert({**key, **check_row("events", check)} for check in found.qc)
 
 
 @schema

@@ -11,6 +11,8 @@ from pbl_pipeline.errors import PblError
 from . import fit, gait, session  # noqa: F401  a definition refers to session
 from ._base import (
     Origin,
+    check_columns,
+    check_row,
     computes,
     dj,
     file_ref,
@@ -91,15 +93,9 @@ class GDI(dj.Computed):
         """
 
     class Check(dj.Part):
-        definition = """
+        definition = f"""
         # quality checks of the index
-        -> master
-        index_check              : varchar(64)  # name, with its unit
-        ---
-        index_check_outcome      : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')
-        index_check_value=null   : float64     # in the unit (see index_check)
-        index_check_threshold=null: float64    # in the unit (see index_check)
-        index_check_advice       : varchar(1000)
+        {check_columns("index")}
         """
 
     @property
@@ -142,7 +138,7 @@ class GDI(dj.Computed):
             {**key, "cycle_no": c.number, "cycle_gdi": c.gdi, "cycle_z": c.z, "cycle_explained": c.explained}
             for c in result.cycles
         )
-        self.Check.insert({**key, **fit.check_row("index", check)} for check in result.qc)
+        self.Check.insert({**key, **check_row("index", check)} for check in result.qc)
 
 
 @schema
@@ -187,15 +183,9 @@ class SessionGdi(dj.Computed):
         """
 
     class Check(dj.Part):
-        definition = """
+        definition = f"""
         # quality checks of measures and index
-        -> master
-        gdi_check               : varchar(64)  # name, with its unit
-        ---
-        gdi_check_outcome       : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')
-        gdi_check_value=null    : float64      # in the unit (see gdi_check)
-        gdi_check_threshold=null: float64      # in the unit (see gdi_check)
-        gdi_check_advice        : varchar(1000)
+        {check_columns("gdi")}
         """
 
     @property
@@ -246,7 +236,7 @@ class SessionGdi(dj.Computed):
         )
         rows = gait.measure_rows(measures.measures, measures.reasons, prefix="session_measure")
         self.Measure.insert({**key, **row} for row in rows)
-        self.Check.insert({**key, **fit.check_row("gdi", check)} for check in result.qc)
+        self.Check.insert({**key, **check_row("gdi", check)} for check in result.qc)
 
 
 def norm_of_row(name: str, sha256: str) -> Any:

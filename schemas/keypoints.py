@@ -10,6 +10,8 @@ import numpy as np
 from . import lab, tracking, video
 from ._base import (
     Origin,
+    check_columns,
+    check_row,
     computes,
     dj,
     file_ref,
@@ -61,6 +63,12 @@ class Keypoints(dj.Computed):
     keypoints_file        : <object@arrays>   # keypoints.npz: time_s (T) s, xy_px (T,J,2) px, xyz_cam_m (T,J,3) m, confidence (T,J) 0..1, box_px (T,4) px, camera; docs/files.md
     {origin_columns("keypoints")}
     """  # noqa: E501
+
+    class Check(dj.Part):
+        definition = f"""
+        # quality checks of what was seen
+        {check_columns("keypoints")}
+        """
 
     @property
     def key_source(self) -> Any:
@@ -121,6 +129,8 @@ class Keypoints(dj.Computed):
                     **origin.row("keypoints", method_hash=sha, model_sha256=model),
                 }
             )
+        checks = library("keypoints").check_keypoints(found)
+        self.Check.insert({**key, **check_row("keypoints", check)} for check in checks)
 
 
 def camera_of_row(row: Mapping[str, Any]) -> Any:

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from . import fit, gait, gdi
+from . import fit, gait, gdi, keypoints
 from ._base import Origin, computes, dj, library, origin_columns
 
 schema = dj.Schema()
 
 #: The part tables that hold checks: stage, table, prefix of its columns.
 SOURCES = (
+    ("keypoints", keypoints.Keypoints.Check, "keypoints"),
     ("fit", fit.SessionFit.Check, "fit"),
     ("gait", gait.GaitEvents.Check, "events"),
     ("gdi", gdi.SessionGdi.Check, "gdi"),
@@ -47,7 +48,7 @@ class SessionQc(dj.Computed):
     def make_fetch(self, key: dict) -> tuple:
         found = []
         for stage, table, prefix in SOURCES:
-            for row in (table & key).to_dicts(order_by="KEY"):
+            for row in (table & _of_set(table, key)).to_dicts(order_by="KEY"):
                 found.append(
                     {
                         "qc_stage": stage,
@@ -82,3 +83,10 @@ class SessionQc(dj.Computed):
             }
         )
         self.Check.insert({**key, "qc_no": i, **row} for i, row in enumerate(rows, 1))
+
+
+def _of_set(table: Any, key: dict) -> Any:
+    """What restricts a table of checks to one set of videos. Keypoints do not know the set: they are its members."""
+    if table is not keypoints.Keypoints.Check:
+        return key
+    return [{k: row[k] for k in keypoints.Keypoints.primary_key} for row in (fit.FitSet.Video & key).to_dicts()]

@@ -7,7 +7,7 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 
-from . import fit, gait, keypoints, tracking
+from . import fit
 from .results import load_session
 
 
@@ -46,9 +46,11 @@ def write_session(restriction: Any, out: Path) -> list[Path]:
 
 def _methods(key: Any) -> dict[str, str]:
     """Name and version of the method behind each stage."""
-    chain = fit.FitSet.Video & {"fit_set": key["fit_set"]}
-    rows = (chain.proj(..., "keypoint_method", "tracking_method")).to_dicts(limit=1)
-    points = (keypoints.KeypointMethod & rows[0]).fetch1("keypoint_method")
-    tracks = (tracking.TrackingMethod & rows[0]).fetch1("tracking_method")
-    gaits = (gait.GaitEventMethod & key).fetch1("gait_method")
-    return {"Tracking": tracks, "Keypoints": points, "Fit": key["fit_method"], "Gait events": gaits}
+    member = (fit.FitSet.Video & {"fit_set": key["fit_set"]}).to_dicts(limit=1)[0]
+    return {
+        "Tracking": member["tracking_method"],
+        "Keypoints": member["keypoint_method"],
+        "Fit": key["fit_method"],
+        "Gait events": key["gait_method"],
+        "Index": f"{key['gdi_method']}, norm {key['norm']}",
+    }

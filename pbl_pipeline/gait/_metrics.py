@@ -157,14 +157,6 @@ def _cycle_checks(measures: Spatiotemporal) -> tuple[Check, ...]:
             4.0,
             "few cycles: film a longer stretch, or several passes" if few else "",
         ),
-        Check(
-            "event_bias",
-            WARN,
-            None,
-            None,
-            "with laboratory markers foot down is found 39 ms early and foot up 13 ms late; on video this is not "
-            "measured yet: stance and double support may be too long by a constant, so compare sessions",
-        ),
     ]
     cadence = measures["cadence_steps_per_min"]
     if cadence is not None:
