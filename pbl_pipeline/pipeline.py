@@ -18,7 +18,7 @@ from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import WARN, Check
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
 from pbl_pipeline.report import Picture, SessionReport, TrialReport, write_report
-from pbl_pipeline.tracking import SubjectChoice, choose_subject, track_people
+from pbl_pipeline.tracking import SubjectChoice, choose_subject, require_subject, track_people
 from pbl_pipeline.video import VideoInfo, guess_camera, load_camera, probe
 
 #: What `write_results` writes for each trial, after the trial's name and a dot.
@@ -46,8 +46,8 @@ class Session:
     problems: Mapping[str, PblError] = dataclasses.field(default_factory=dict)
 
 
-def detect_trial(path: Path, camera_file: Path | None = None, person: int | None = None) -> Trial:
-    """Video to keypoints of the subject.
+def detect_trial(path: Path, sheet: Path, camera_file: Path | None = None, person: int | None = None) -> Trial:
+    """Video to keypoints of the subject. `sheet` is the picture of the people that is written when one must be chosen.
 
     Raises
     ------
@@ -59,13 +59,13 @@ def detect_trial(path: Path, camera_file: Path | None = None, person: int | None
     camera = load_camera(camera_file, (info.width_px, info.height_px)) if camera_file else guess_camera(info)
     tracking = track_people(path)
     choice = choose_subject(tracking, override=person)
-    if choice.person_id is None:
-        raise _no_subject(path, choice)
-    return Trial(path.stem, path, info, choice, detect_keypoints(path, tracking, choice.person_id, camera))
+    subject = require_subject(choice, tracking, path, sheet)
+    return Trial(path.stem, path, info, choice, detect_keypoints(path, tracking, subject, camera))
 
 
 def run_session(
     paths: Sequence[Path],
+    out: Path,
     camera_file: Path | None = None,
     person: int | None = None,
     paramset: Paramset | None = None,
@@ -73,6 +73,7 @@ def run_session(
     norm: str | None = None,
 ) -> Session:
     """Videos of one session to gait measures. A video that fails is left out with its problem; the others go on.
+    Into `out` goes only a picture of the people of a video in which one must be chosen.
 
     Raises
     ------
@@ -82,7 +83,7 @@ def run_session(
     trials, problems = [], {}
     for path, name in zip(paths, distinct_names(paths), strict=True):
         try:
-            trial = dataclasses.replace(detect_trial(path, camera_file, person), name=name)
+            trial = dataclasses.replace(detect_trial(path, out / f"{name}.persons.png", camera_file, person), name=name)
             check_trial(trial.keypoints, name, paramset)
         except PblError as error:
             problems[name] = error
@@ -180,22 +181,3 @@ def _pictures(trial: Trial, fit: TrialFit) -> tuple[Picture, ...]:
     index = report_indices(fit)
     images = overlay_frames(trial.path, fit, index, crop_to_body=True, max_side_px=760)
     return tuple(Picture(i, float(fit.time_s[i]), image) for i, image in zip(index, images, strict=True))
-
-
-def _no_subject(path: Path, choice: SubjectChoice) -> PblError:
-    if choice.status == "NO_PERSON":
-        return PblError(
-            "TRACK_NO_PERSON",
-            found="nobody in any frame",
-            expected="a person who takes at least about a fifth of the picture's height",
-            next_step="film from nearer, in light, so that the whole body is in the picture",
-            key=path,
-        )
-    ranked = sorted(choice.scores, key=lambda p: -choice.scores[p])
-    return PblError(
-        "SUBJECT_NEEDS_CHOICE",
-        found=choice.reason,
-        expected="one person who is clearly the subject",
-        next_step=f"run `pbl detect` to see the numbered people, then pass --person N (likeliest: {ranked[0]})",
-        key=path,
-    )

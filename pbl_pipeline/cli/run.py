@@ -39,7 +39,7 @@ def run(
     paramset = fit_paramset(solver, params)
     from pbl_pipeline.pipeline import run_session, write_results
 
-    session = run_session(videos, camera, person, paramset, camera_motion, norm)
+    session = run_session(videos, out, camera, person, paramset, camera_motion, norm)
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
     paths = write_results(out, session, subject_code=subject, date=f"computed {today}")
     click.echo(session.metrics.table())

@@ -2,6 +2,7 @@
 
 from ._associate import AssociationParams
 from ._blazepose import BlazePoseDetector
+from ._require import require_subject
 from ._sheet import save_contact_sheet
 from ._subject import SUBJECT_DEFAULT, SUBJECT_PARAMSETS, SubjectParams, choose_subject, time_in_view_s
 from ._track import DEFAULT, DETECTORS, PARAMSETS, TrackingParams, track_people
@@ -23,6 +24,7 @@ __all__ = [
     "Tracking",
     "TrackingParams",
     "choose_subject",
+    "require_subject",
     "save_contact_sheet",
     "time_in_view_s",
     "track_people",

@@ -1,0 +1,38 @@
+"""The one person to measure, or the coded error that says why there is none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pbl_pipeline.errors import PblError
+
+from ._sheet import save_contact_sheet
+from ._types import SubjectChoice, Tracking
+
+
+def require_subject(choice: SubjectChoice, tracking: Tracking, video_path: str | Path, sheet: Path) -> int:
+    """The chosen person's number. Where a person has to choose, the numbered people are drawn into `sheet` (PNG).
+
+    Raises `PblError` TRACK_NO_PERSON or SUBJECT_NEEDS_CHOICE.
+    """
+    if choice.person_id is not None:
+        return choice.person_id
+    if choice.status == "NO_PERSON":
+        raise PblError(
+            "TRACK_NO_PERSON",
+            found="no person in any frame",
+            expected="a person who takes at least about a fifth of the picture's height",
+            next_step="film from nearer, in light, so that the whole body is in the picture",
+            key=str(video_path),
+        )
+    sheet.parent.mkdir(parents=True, exist_ok=True)
+    save_contact_sheet(video_path, tracking, sheet)
+    ranked = sorted(choice.scores, key=lambda k: -choice.scores[k])
+    named = ", ".join(f"{k} (score {choice.scores[k]:.2f})" for k in ranked)
+    raise PblError(
+        "SUBJECT_NEEDS_CHOICE",
+        found=f"{len(tracking.persons)} people, none clearly the subject: person {named}",
+        expected="one person who walks, is in view longer, or is larger than the others",
+        next_step=f"look at {sheet} and call again with --person N, for example --person {ranked[0]}",
+        key=str(video_path),
+    )
