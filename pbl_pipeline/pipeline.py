@@ -8,18 +8,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pbl_pipeline import __version__
+from pbl_pipeline._names import distinct
 from pbl_pipeline.body import SCALE_NAMES
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import write_angles_csv
 from pbl_pipeline.fit import SessionFit, TrialFit, check_trial, fit_session
-from pbl_pipeline.gait import GaitMetrics, gait_metrics
+from pbl_pipeline.gait import DEFAULT_NORM, GaitMetrics, gait_metrics, load_norm
 from pbl_pipeline.keypoints import Keypoints, check_keypoints, detect_keypoints
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import WARN, Check
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
 from pbl_pipeline.report import Picture, SessionReport, TrialReport, write_report
 from pbl_pipeline.tracking import SubjectChoice, choose_subject, require_subject, track_people
-from pbl_pipeline.video import VideoInfo, guess_camera, load_camera, probe
+from pbl_pipeline.video import VideoInfo, guess_camera, load_camera, probe, sha256_of
 
 #: What `write_results` writes for each trial, after the trial's name and a dot.
 TRIAL_FILES = ("overlay.mp4", "angles.csv", "events.csv", "fit.npz", "keypoints.npz")
@@ -38,12 +39,14 @@ class Trial:
 
 @dataclasses.dataclass(frozen=True)
 class Session:
-    """A session: the trials that were fitted, in the order of the fit, and what became of the others."""
+    """A session: the trials that were fitted, in the order of the fit, and what became of the others: `problems` where
+    this run met them, `left_out` (name to sentence) where the tables hold them."""
 
     trials: tuple[Trial, ...]
     fit: SessionFit
     metrics: GaitMetrics
     problems: Mapping[str, PblError] = dataclasses.field(default_factory=dict)
+    left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 def detect_trial(path: Path, sheet: Path, camera_file: Path | None = None, person: int | None = None) -> Trial:
@@ -72,17 +75,22 @@ def run_session(
     camera_motion: str = "static",
     norm: str | None = None,
 ) -> Session:
-    """Videos of one session to gait measures. A video that fails is left out with its problem; the others go on.
-    Into `out` goes only a picture of the people of a video in which one must be chosen.
+    """Videos of one session to gait measures. A video that fails is left out with its problem, and so is one whose
+    bytes were named before, because its steps would count twice; the others go on. Into `out` goes only a picture of
+    the people of a video in which one must be chosen.
 
     Raises
     ------
     PblError
-        The error of the video where no video of the session can be fitted.
+        The error of the video where no video of the session can be fitted; NORM_UNKNOWN, NORM_INVALID.
     """
-    trials, problems = [], {}
+    basis = load_norm(norm or DEFAULT_NORM)  # a wrong name must not cost a fit
+    trials, problems, seen = [], {}, {}
     for path, name in zip(paths, distinct_names(paths), strict=True):
         try:
+            first = seen.setdefault(sha256_of(path), name)
+            if first != name:
+                raise _named_twice(path, first)
             trial = dataclasses.replace(detect_trial(path, out / f"{name}.persons.png", camera_file, person), name=name)
             check_trial(trial.keypoints, name, paramset)
         except PblError as error:
@@ -92,7 +100,7 @@ def run_session(
     if not trials:
         raise next(iter(problems.values()))
     fit = fit_session([t.keypoints for t in trials], [t.name for t in trials], paramset, camera_motion)
-    return Session(tuple(trials), fit, gait_metrics(fit.trials, norm=norm), problems)
+    return Session(tuple(trials), fit, gait_metrics(fit.trials, norm=basis), problems)
 
 
 def write_results(
@@ -131,7 +139,8 @@ def write_results(
     write_session_json(session.fit, out / "session.json")
     session.metrics.save(out / "metrics.json")
     checks = [c for t in session.trials for c in _named(check_keypoints(t.keypoints), t.name, len(session.trials))]
-    checks += (Check(f"trial {n}", WARN, None, None, f"left out: {e.text()}") for n, e in session.problems.items())
+    missing = {n: e.text() for n, e in session.problems.items()} | dict(session.left_out)
+    checks += (Check(f"trial {n}", WARN, None, None, f"left out: {why}") for n, why in missing.items())
     report = SessionReport(
         title=title,
         subject_code=subject_code,
@@ -165,8 +174,17 @@ def write_session_json(fit: SessionFit, path: Path) -> None:
 
 def distinct_names(paths: Sequence[Path]) -> list[str]:
     """A name for each path: its stem, numbered where stems repeat."""
-    stems = [p.stem for p in paths]
-    return [s if stems.count(s) == 1 else f"{s}-{i + 1}" for i, s in enumerate(stems)]
+    return distinct([p.stem for p in paths], range(1, len(paths) + 1))
+
+
+def _named_twice(path: Path, first: str) -> PblError:
+    return PblError(
+        "USAGE",
+        found=f"the same bytes as {first}",
+        expected="every recording once",
+        next_step="name it once; if these should be two recordings, copy them from the phone again",
+        key=path,
+    )
 
 
 def _named(checks: Sequence[Check], trial: str, n_trials: int) -> list[Check]:

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from pbl_pipeline._names import distinct
+
 from . import keypoints, session, video  # noqa: F401  a definition refers to session
 from ._base import (
     Origin,
@@ -246,8 +248,7 @@ def median(values: np.ndarray) -> float | None:
 
 def trial_names(videos: Sequence[tuple[int, str]]) -> list[str]:
     """A name for each (video_id, file name): the file's stem, with the number where stems repeat."""
-    stems = [Path(name).stem for _, name in videos]
-    return [s if stems.count(s) == 1 else f"{s}-{i}" for (i, _), s in zip(videos, stems, strict=True)]
+    return distinct([Path(name).stem for _, name in videos], [number for number, _ in videos])
 
 
 def float32_trial(trial: Any) -> Any:

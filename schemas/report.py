@@ -36,7 +36,7 @@ def write_session(restriction: Any, out: Path) -> list[Path]:
     trials = tuple(Trial(t.name, t.path, t.info, t.choice, t.keypoints) for t in found.fitted)
     return write_results(
         out,
-        Session(trials, found.fit, found.metrics),
+        Session(trials, found.fit, found.metrics, left_out={t.name: t.problem for t in found.trials if t.fit is None}),
         title="Gait report",
         subject_code=found.subject,
         date=str(found.session_date or found.session_label),

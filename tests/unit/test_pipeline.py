@@ -1,0 +1,73 @@
+"""The chain on files, with the slow stages replaced: what is named, left out and checked first."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from pbl_pipeline import pipeline
+from pbl_pipeline.errors import PblError
+from tests.integration import chain
+
+
+def test_names_are_distinct_whatever_the_files_are_called():
+    names = pipeline.distinct_names([Path(p) for p in ("a/walk.mp4", "b/walk.mp4", "walk-2.mp4", "stand.mov")])
+    assert names == ["walk-1", "walk-2-2", "walk-2", "stand"]
+
+
+@pytest.fixture
+def fitted(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """Names of the trials of each fit; detection and fit are stand-ins."""
+    calls: list[list[str]] = []
+
+    def detect(path, sheet, camera_file=None, person=None):
+        info = pipeline.probe(path)
+        points = chain.detect_keypoints(path, chain.track_people(path), 1, pipeline.guess_camera(info))
+        points = dataclasses.replace(points, image_size_px=(1920, 1080))
+        return pipeline.Trial(path.stem, path, info, pipeline.choose_subject(chain.track_people(path)), points)
+
+    def fit(trials, names, paramset=None, camera_motion="static"):
+        calls.append(list(names))
+        return chain.fit_session(trials, names, paramset, camera_motion)
+
+    monkeypatch.setattr(pipeline, "detect_trial", detect)
+    monkeypatch.setattr(pipeline, "check_trial", lambda *_: None)
+    monkeypatch.setattr(pipeline, "fit_session", fit)
+    return calls
+
+
+def test_a_video_named_twice_counts_once(fitted: list[list[str]], tmp_path: Path):
+    first = chain.small_video(tmp_path, "walk", n=120)
+    copy = tmp_path / "copy.mp4"
+    copy.write_bytes(first.read_bytes())
+    session = pipeline.run_session([first, copy], tmp_path / "out")
+    assert fitted == [["walk"]]
+    assert session.problems["copy"].code == "USAGE"
+    assert "same bytes as walk" in session.problems["copy"].found
+
+
+def test_an_unknown_norm_is_refused_before_the_fit(fitted: list[list[str]], tmp_path: Path):
+    with pytest.raises(PblError) as error:
+        pipeline.run_session([chain.small_video(tmp_path, "walk", n=120)], tmp_path / "out", norm="no-such-norm")
+    assert error.value.code == "NORM_UNKNOWN"
+    assert not fitted
+
+
+def test_the_report_of_a_visit_names_the_recordings_it_lacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    import schemas.report
+    from schemas.results import SessionResults, TrialResults
+
+    trials = (
+        TrialResults(1, "walk", tmp_path / "walk.mp4", fit=object()),
+        TrialResults(2, "dark", tmp_path / "dark.mp4", problem="SubjectChoice: nobody was found"),
+    )
+    found = SessionResults(1, "P1", "visit", None, trials, fit=object(), metrics=object())
+    monkeypatch.setattr(schemas.report, "load_session", lambda _: found)
+    monkeypatch.setattr(schemas.report, "_methods", lambda _: {})
+    written = []
+    monkeypatch.setattr(pipeline, "write_results", lambda out, session, **_: written.append(session) or [])
+    schemas.report.write_session({}, tmp_path)
+    assert [t.name for t in written[0].trials] == ["walk"]
+    assert written[0].left_out == {"dark": "SubjectChoice: nobody was found"}
