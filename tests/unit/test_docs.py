@@ -6,6 +6,8 @@ import re
 from importlib.metadata import entry_points
 from pathlib import Path
 
+import click
+
 from pbl_pipeline.errors import CODES
 from pbl_pipeline.settings import VARIABLES
 
@@ -28,4 +30,4 @@ def test_readme_names_every_variable_and_command():
 def test_every_command_has_help_with_an_example():
     for entry in entry_points(group="pbl.commands"):
         command = entry.load()
-        assert "Example" in (command.help or ""), entry.name
+        assert "Example:" in command.get_help(click.Context(command)), entry.name
