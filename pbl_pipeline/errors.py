@@ -21,6 +21,8 @@ CODES: dict[str, str] = {
     "SUBJECT_UNKNOWN_PERSON": "the chosen person number is not among the tracks of the video",
     "ASSET_MISSING": "a model or demo file is absent and could not be fetched",
     "ASSET_CHECKSUM": "a fetched file is not the pinned one (SHA-256 differs)",
+    "FILE_MISSING": "a file that was named does not exist or cannot be read",
+    "FILE_UNWRITABLE": "a result cannot be written where it was asked for",
     "FILE_FORMAT": "a file lacks a field, or a field has another shape, unit or type than its format says",
     "MARKER_SET_UNKNOWN": "the body has no marker set of that name, or the names differ",
     "CAMERA_INVALID": "the camera matrix or distortion is not usable",
@@ -35,7 +37,7 @@ CODES: dict[str, str] = {
     "DB_REFUSED": "the database answers but refuses the login or the operation",
     "DB_NOT_FOUND": "a row that was named does not exist",
     "USAGE": "the command was called in a way that cannot work",
-    "INTERNAL": "an unforeseen error: please report it with the text above",
+    "INTERNAL": "an unforeseen error: please report it with the whole text",
 }
 
 

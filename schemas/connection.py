@@ -35,6 +35,8 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+from pbl_pipeline.errors import PblError
+
 # DataJoint reads its configuration while it is imported. Ours comes from here alone: a datajoint.json that happens to
 # lie in the working directory must not point the tables at another server.
 os.environ.setdefault("DJ_IGNORE_CONFIG_FILE", "true")
@@ -42,14 +44,21 @@ os.environ.setdefault("DJ_LOG_LEVEL", "WARNING")
 
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", message="No datajoint.json found")  # on purpose
-    import datajoint as dj
+    try:
+        import datajoint as dj
+    except ValueError as error:  # it reads the DJ_ variables while it is imported
+        raise PblError(
+            "USAGE",
+            found=str(error).split("For further information")[0].strip(),
+            expected="values of the DJ_ variables as DataJoint knows them (DJ_PORT: a number)",
+            next_step="correct the variable, or unset it",
+        ) from error
 import pymysql
 from datajoint import instance as dj_instance
 from datajoint.adapters.mysql import MySQLAdapter
 from pymysql.converters import escape_string
 
 from pbl_pipeline import settings
-from pbl_pipeline.errors import PblError
 
 from . import embedded
 from .embedded import APP_USER, HOST, Folder, not_running
@@ -181,6 +190,10 @@ def _target(start: bool) -> dict[str, Any]:
                 next_step="set DJ_USER and DJ_PASS, or unset DJ_HOST to use the embedded database",
             )
         name, _, in_host = host.partition(":")
+        if in_host and not in_host.isdecimal():
+            raise PblError(
+                "USAGE", found=f"DJ_HOST={host}", expected="HOST or HOST:PORT", next_step="correct the variable"
+            )
         use_tls = os.environ.get("DJ_USE_TLS", "").lower()
         return {
             "host": name,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import hashlib
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -101,10 +102,10 @@ def resolve(methods: Methods) -> dict[str, str]:
 
 
 def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str]) -> Ingested:
-    if not path.is_file():
+    if not os.path.isfile(path):  # not Path.is_file: that raises where a folder on the way may not be entered
         raise PblError(
             "VIDEO_MISSING",
-            found="no such file" if not path.exists() else "it is not a file",
+            found="no such file" if not os.path.exists(path) else "it is not a file",
             expected="a video file",
             next_step="check the path",
             key=path,

@@ -1,9 +1,12 @@
-"""Finds commands by name, loads only the one called, and turns a `PblError` into exit code and stderr text."""
+"""Finds commands by name, loads only the one called, and turns every error into an exit code and a text on stderr."""
 
 from __future__ import annotations
 
+import errno
 import sys
+import traceback
 from importlib.metadata import entry_points
+from pathlib import Path
 
 import click
 
@@ -11,7 +14,7 @@ from pbl_pipeline import __version__, progress
 from pbl_pipeline.errors import PblError
 
 #: Exit codes: 0 done, 1 a coded error, 2 wrong usage (click's own), 130 interrupted.
-EXIT_ERROR = 1
+EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
 
 
 class _Commands(click.Group):
@@ -28,7 +31,8 @@ class _Commands(click.Group):
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="pbl")
 @click.option("--quiet", is_flag=True, help="No progress bars.")
-def cli(quiet: bool) -> None:
+@click.option("--debug", is_flag=True, help="Print the traceback of an error, too.")
+def cli(quiet: bool, debug: bool) -> None:
     """Gait analysis from phone video: joint angles, gait events and a Gait Deviation Index.
 
     Example: pbl run walk.mp4 --out results
@@ -39,7 +43,44 @@ def cli(quiet: bool) -> None:
 def main() -> None:
     """Entry point of the `pbl` script."""
     try:
-        cli(prog_name="pbl")
+        # Not standalone: click would turn Ctrl-C into "Aborted!" and code 1, as if there had been an error.
+        sys.exit(cli.main(prog_name="pbl", standalone_mode=False) or 0)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("interrupted", err=True)
+        sys.exit(EXIT_INTERRUPTED)
     except PblError as error:
-        click.echo(error.text(), err=True)
-        sys.exit(EXIT_ERROR)
+        _explain(error)
+    except Exception as error:  # noqa: BLE001 - the last place that can turn a traceback into advice
+        _explain(error)
+
+
+def _explain(error: Exception) -> None:
+    # The option is read from the words of the call: the error may have come before any option was.
+    if "--debug" in sys.argv[1:]:
+        traceback.print_exception(error)
+    coded = error if isinstance(error, PblError) else _unforeseen(error)
+    click.echo(coded.text(), err=True)
+    sys.exit(EXIT_ERROR)
+
+
+def _unforeseen(error: Exception) -> PblError:
+    """What is said of an error that no stage gave a code: a full disk by its name, all else as INTERNAL."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+        return PblError(
+            "FILE_UNWRITABLE",
+            found=error.strerror or str(error),
+            expected="room for the results",
+            next_step="free space on this disk, or write to another one",
+            key=error.filename,
+        )
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f", at {Path(frames[-1].filename).name}:{frames[-1].lineno} in {frames[-1].name}" if frames else ""
+    return PblError(
+        "INTERNAL",
+        found=f"{type(error).__name__}: {error}{where}",
+        expected="a result or a coded error",
+        next_step="run the same with `pbl --debug ...` and report the whole text",
+    )

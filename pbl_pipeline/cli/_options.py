@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,9 +49,11 @@ def fit_paramset(solver: str, params: str | None) -> Paramset:
     base = PARAMSETS[DEFAULT]
     try:
         changes = json.loads(path.read_text())
+        if not isinstance(changes, dict):
+            raise TypeError("not an object")
         merged = _merge(dataclasses.asdict(params_of(base)), changes)
         return Paramset.of("fit", path.stem, 1, params_of(Paramset("fit", path.stem, 1, merged)))
-    except (ValueError, TypeError, KeyError) as error:
+    except (OSError, ValueError, TypeError, KeyError) as error:
         raise PblError(
             "FILE_FORMAT",
             found=f"{type(error).__name__}: {error}",
@@ -64,8 +67,26 @@ def _merge(base: dict, changes: dict) -> dict:
     unknown = set(changes) - set(base)
     if unknown:
         raise KeyError(f"unknown parameters {sorted(unknown)}; known: {sorted(base)}")
+    for name, value in changes.items():
+        _check_kind(name, value, base[name])
     nested = {k: _merge(base[k], v) for k, v in changes.items() if isinstance(base[k], dict)}
     return {**base, **changes, **nested}
+
+
+def _check_kind(name: str, value: object, default: object) -> None:
+    """A value must be of its default's kind; numbers are finite and not negative, counts at least 1."""
+    if isinstance(default, (dict, str, bool)):
+        fits = isinstance(value, type(default))
+    elif isinstance(default, (list, tuple)):
+        fits = isinstance(value, list)
+    elif isinstance(default, int):
+        fits = (
+            isinstance(value, int) and not isinstance(value, bool) and value >= (name in ("steps", "samples_per_trial"))
+        )
+    else:
+        fits = isinstance(value, (int, float)) and not isinstance(value, bool) and 0 <= value < math.inf
+    if not fits:
+        raise ValueError(f"{name} = {json.dumps(value)}; the default is {json.dumps(default)}")
 
 
 def _unknown(found: str, known: tuple[str, ...]) -> PblError:

@@ -10,7 +10,7 @@ from ._options import Person
 
 
 @click.command(epilog="Example: pbl detect walk.mp4 --out walk.keypoints.npz --person auto")
-@click.argument("video", type=click.Path(path_type=Path))
+@click.argument("video", type=click.Path(path_type=Path, readable=False))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="keypoints.npz to write.")
 @click.option("--camera", type=click.Path(path_type=Path), help="Calibration file; without it a phone is guessed.")
 @click.option("--person", type=Person(), default="auto", show_default=True, help="Whom to measure.")
@@ -20,6 +20,7 @@ def detect(video: Path, out: Path, camera: Path | None, person: int | None) -> N
     Where no one is clearly the subject, nothing is measured: a picture with the numbered people is written beside OUT,
     and the command is to be called again with --person N.
     """
+    from pbl_pipeline.files import check_out_file
     from pbl_pipeline.keypoints import check_keypoints, detect_keypoints
     from pbl_pipeline.tracking import choose_subject, require_subject, time_in_view_s, track_people
     from pbl_pipeline.video import guess_camera, load_camera, probe
@@ -29,8 +30,8 @@ def detect(video: Path, out: Path, camera: Path | None, person: int | None) -> N
     info = probe(video)
     size = (info.width_px, info.height_px)
     lens = load_camera(camera, size) if camera else guess_camera(info)
+    check_out_file(out)
     tracking = track_people(video)
-    out.parent.mkdir(parents=True, exist_ok=True)
     choice = choose_subject(tracking, override=person)
     for p in tracking.persons:
         seconds = time_in_view_s(p, tracking.time_s)

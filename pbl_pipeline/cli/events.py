@@ -5,15 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
-import numpy as np
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import check_numbers, check_out_file, load_npz
 
 _EPILOG = "Example: pbl events walk.fit.npz --out walk.events.csv"
 
 
 @click.command(epilog=_EPILOG)
-@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("file", type=click.Path(path_type=Path, readable=False))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="events.csv to write.")
 @click.option("--method", default="zeni-2008", show_default=True, help="Name of the event method.")
 def events(file: Path, out: Path, method: str) -> None:
@@ -24,6 +24,7 @@ def events(file: Path, out: Path, method: str) -> None:
     """
     from pbl_pipeline.gait import detect_events
 
+    check_out_file(out)
     found = detect_events(_feet(file), method)
     found.save(out)
     if found.status == "EMPTY":
@@ -42,20 +43,18 @@ def _feet(path: Path):
     from pbl_pipeline.gait import feet_from_fit, feet_from_keypoints, feet_from_markers
     from pbl_pipeline.keypoints import Keypoints
 
-    try:
-        with np.load(path, allow_pickle=False) as f:
-            fields = set(f.files)
-            markers = {k: f[k] for k in ("time_s", "names", "marker_set", "xyz_world_m", "confidence") if k in fields}
-    except (OSError, ValueError, EOFError, AttributeError) as error:
-        raise _format_error(path, f"{type(error).__name__}: {error}") from error
+    data = load_npz(path)
+    fields = set(data)
     if "qpos" in fields:
         return feet_from_fit(TrialFit.load(path))
     if "xyz_cam_m" in fields:
         return feet_from_keypoints(Keypoints.load(path))
-    if {"time_s", "names", "marker_set", "xyz_world_m", "confidence"} <= set(markers):
-        names = [str(n) for n in markers["names"]]
+    if {"time_s", "names", "marker_set", "xyz_world_m", "confidence"} <= fields:
+        n, j = data["time_s"].size, data["names"].size
+        check_numbers(path, data, {"time_s": (n,), "xyz_world_m": (n, j, 3), "confidence": (n, j)})
+        names = [str(name) for name in data["names"]]
         return feet_from_markers(
-            markers["time_s"], names, str(markers["marker_set"]), markers["xyz_world_m"], markers["confidence"]
+            data["time_s"], names, str(data["marker_set"]), data["xyz_world_m"], data["confidence"]
         )
     raise _format_error(path, f"fields {', '.join(sorted(fields)) or 'none'}")
 

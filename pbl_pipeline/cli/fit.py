@@ -10,7 +10,7 @@ from ._options import fit_paramset
 
 
 @click.command(epilog="Example: pbl fit walk1.keypoints.npz walk2.keypoints.npz --out results")
-@click.argument("keypoints", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("keypoints", nargs=-1, required=True, type=click.Path(path_type=Path, readable=False))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the results.")
 @click.option("--solver", default="implicit-adam", show_default=True, help="Name of the solver.")
 @click.option("--params", help="Name of a paramset, or a JSON file with changes to the default one.")
@@ -21,10 +21,12 @@ def fit(keypoints: tuple[Path, ...], out: Path, solver: str, params: str | None,
     Writes <name>.fit.npz and <name>.angles.csv for each trial, and session.json.
     """
     from pbl_pipeline.export import write_angles_csv
+    from pbl_pipeline.files import check_out_folder
     from pbl_pipeline.fit import fit_session
     from pbl_pipeline.keypoints import Keypoints
     from pbl_pipeline.pipeline import distinct_names, write_session_json
 
+    check_out_folder(out)
     paramset = fit_paramset(solver, params)
     trials = [Keypoints.load(path) for path in keypoints]
     names = distinct_names([Path(p.name.removesuffix(".npz").removesuffix(".keypoints")) for p in keypoints])

@@ -11,7 +11,7 @@ from ._options import Person, fit_paramset
 
 
 @click.command(epilog="Example: pbl run walk1.mp4 walk2.mp4 --out results --camera phone.toml")
-@click.argument("videos", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("videos", nargs=-1, required=True, type=click.Path(path_type=Path, readable=False))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the results.")
 @click.option("--camera", type=click.Path(path_type=Path), help="Calibration file; without it a phone is guessed.")
 @click.option("--camera-motion", type=click.Choice(["static", "handheld"]), default="static", show_default=True)
@@ -36,9 +36,15 @@ def run(
     Writes report.html, metrics.json, session.json, and per trial the keypoints, the fit, the angles, the events and a
     video with the body drawn over it. A video that cannot be used is named and left out; the others go on.
     """
-    paramset = fit_paramset(solver, params)
+    from pbl_pipeline.files import check_out_folder
+    from pbl_pipeline.gait import load_norm
     from pbl_pipeline.pipeline import run_session, write_results
 
+    # What can be wrong with the call is found before minutes of work.
+    check_out_folder(out)
+    paramset = fit_paramset(solver, params)
+    if norm is not None:
+        load_norm(norm)
     session = run_session(videos, out, camera, person, paramset, camera_motion, norm)
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
     paths = write_results(out, session, subject_code=subject, date=f"computed {today}")

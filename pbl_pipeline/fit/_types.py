@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import check_numbers, load_npz
 from pbl_pipeline.qc import Check
 from pbl_pipeline.video import Camera
 
@@ -55,16 +56,13 @@ class TrialFit:
 
     @classmethod
     def load(cls, path: str | Path) -> TrialFit:
-        """Read `<name>.fit.npz`. Raises `PblError` FILE_FORMAT. Never unpickles."""
-        try:
-            with np.load(path, allow_pickle=False) as f:
-                data = {k: f[k] for k in f.files}
-        except (OSError, ValueError, EOFError) as error:
-            raise _format_error(f"{path}: {error}", "an .npz file without pickled objects") from error
+        """Read `<name>.fit.npz`. Raises `PblError` FILE_MISSING, FILE_FORMAT. Never unpickles."""
+        data = load_npz(path)
         wanted = [f.name for f in dataclasses.fields(cls) if f.name != "camera"]
         missing = [k for k in [*wanted, "camera_matrix", "distortion", "camera_source"] if k not in data]
         if missing:
             raise _format_error(f"{path} lacks {', '.join(missing)}", "a file that `pbl fit` wrote")
+        check_numbers(path, data, _shapes(data["time_s"].size, data["joint_names"].size, data["marker_names"].size))
         values = {k: data[k] for k in wanted}
         for k in ("joint_names", "marker_names"):
             values[k] = tuple(str(n) for n in values[k])
@@ -91,6 +89,15 @@ class SessionFit:
     compile_seconds: float
     device: str
     qc: tuple[Check, ...]
+
+
+def _shapes(n: int, q: int, j: int) -> dict[str, tuple[int | None, ...]]:
+    """Shapes of the fields of a fit of `n` frames, `q` joints and `j` markers."""
+    shapes: dict[str, tuple[int | None, ...]] = dict.fromkeys(("qpos", "qpos_sd"), (n, q))
+    shapes |= dict.fromkeys(("residual_2d_px", "residual_3d_m"), (n, j))
+    shapes |= {"time_s": (n,), "markers_world_m": (n, j, 3), "phone_quat_wxyz": (n, 4), "site_offset_m": (j, 3)}
+    shapes |= {"scale": (None,), "image_size_px": (2,), "camera_matrix": (3, 3), "distortion": (5,)}
+    return shapes | {"loss": (), "seconds": ()}
 
 
 def _format_error(found: str, expected: str) -> PblError:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import check_numbers, load_npz
 from pbl_pipeline.video import Camera
 
 
@@ -75,7 +77,7 @@ class Keypoints:
 
     def save(self, path: str | Path) -> None:
         """Write `keypoints.npz` (the fields of docs/files.md)."""
-        optional = {}
+        optional: dict[str, Any] = {}
         if self.phone_time_s is not None and self.phone_quat_wxyz is not None:
             optional = {"phone_time_s": self.phone_time_s, "phone_quat_wxyz": self.phone_quat_wxyz}
         np.savez_compressed(
@@ -97,12 +99,8 @@ class Keypoints:
 
     @classmethod
     def load(cls, path: str | Path) -> Keypoints:
-        """Read `keypoints.npz`. Raises `PblError` FILE_FORMAT or CAMERA_INVALID. Never unpickles."""
-        try:
-            with np.load(path, allow_pickle=False) as f:
-                data = {k: f[k] for k in f.files}
-        except (OSError, ValueError, EOFError) as error:
-            raise _format_error(f"{path}: {error}", "an .npz file without pickled objects") from error
+        """Read `keypoints.npz`. Raises `PblError` FILE_MISSING, FILE_FORMAT, CAMERA_INVALID. Never unpickles."""
+        data = load_npz(path)
         needed = [
             "time_s",
             "names",
@@ -120,6 +118,10 @@ class Keypoints:
         missing = [k for k in needed if k not in data]
         if missing:
             raise _format_error(f"{path} lacks {', '.join(missing)}", f"the fields {', '.join(needed)}")
+        n, j = data["time_s"].size, data["names"].size
+        arrays = {"time_s": (n,), "xy_px": (n, j, 2), "xyz_cam_m": (n, j, 3), "confidence": (n, j), "box_px": (n, 4)}
+        arrays |= {"image_size_px": (2,), "camera_matrix": (3, 3), "distortion": (5,), "root_relative": ()}
+        check_numbers(path, data, arrays)
         return cls(
             time_s=data["time_s"].astype(np.float64),
             names=tuple(str(n) for n in data["names"]),

@@ -42,10 +42,10 @@ def check_file(path: str | Path) -> Path:
         VIDEO_MISSING, VIDEO_EMPTY.
     """
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):  # not Path.is_file: that raises where a folder on the way may not be entered
         raise PblError(
             "VIDEO_MISSING",
-            found="a folder of that name" if path.is_dir() else "no file of that name",
+            found="a folder of that name" if os.path.isdir(path) else "no file of that name",
             expected="the path of a video file",
             next_step="check the spelling and that the disk is mounted",
             key=path,

@@ -8,7 +8,7 @@ import click
 
 
 @click.command()
-@click.argument("videos", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("videos", nargs=-1, required=True, type=click.Path(path_type=Path, readable=False))
 @click.option("--subject", required=True, metavar="CODE", help="Pseudonymous code of the person, never a name.")
 @click.option(
     "--session",

@@ -15,8 +15,10 @@ import click
 def report(subject: str, label: str | None, fit_method: str | None, out: Path) -> None:
     """Write report.html, overlay videos, angles and events of one visit from the tables."""
     import schemas
+    from pbl_pipeline.files import check_out_folder
     from schemas.report import write_session
 
+    check_out_folder(out)
     schemas.activate(methods=False)
     wanted = {"subject": subject, "session_label": label, "fit_method": fit_method}
     for path in write_session({k: v for k, v in wanted.items() if v is not None}, out):

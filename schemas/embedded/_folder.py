@@ -159,6 +159,8 @@ class Folder:
                 expected="a database that was started once",
                 next_step="pbl db start",
             ) from error
+        except NotADirectoryError as error:
+            raise folder_error(self.path, error) from error
         except PermissionError as error:
             raise PblError(
                 "DB_REFUSED",

@@ -28,8 +28,10 @@ def demo(out: Path) -> None:
             expected="no DJ_HOST: the demo works in the embedded database and leaves a lab's server alone",
             next_step="unset DJ_HOST, or use `pbl ingest` and `pbl populate` on your server",
         )
+    from pbl_pipeline.files import check_out_folder
     from schemas import embedded
 
+    check_out_folder(out)
     begin = time.monotonic()
     was_running = embedded.status().running
     try:
