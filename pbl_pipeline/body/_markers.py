@@ -34,6 +34,9 @@ class MarkerSet:
         Index into `Body.body_names`.
     position_m : (J, 3) float64
         Position on the unscaled body, in the body's frame (x forward, y up, z right), metres.
+    weight_3d : (J,) float64
+        How far the detector's 3D position of the point may be taken for the place on the body, 0 (not at all: only its
+        pixels count) to 1. A property of the detector; 1 unless the table has a column `weight_3d`.
     """
 
     name: str
@@ -41,6 +44,7 @@ class MarkerSet:
     body_names: tuple[str, ...]
     body_index: np.ndarray
     position_m: np.ndarray
+    weight_3d: np.ndarray
 
     def __len__(self) -> int:
         return len(self.names)
@@ -78,7 +82,8 @@ def marker_set(name: str) -> MarkerSet:
 def load_marker_set(path: str | Path, name: str | None = None) -> MarkerSet:
     """Read a table of markers: CSV with the columns name, body, x, y, z in metres in the body's frame.
 
-    Lines that start with `#` are comments, further columns are ignored. `name` is the file's stem unless given.
+    The column `weight_3d` may be there too (`MarkerSet`); an empty cell means 1. Lines that start with `#` are
+    comments, further columns are ignored. `name` is the file's stem unless given.
 
     Raises
     ------
@@ -99,6 +104,7 @@ def load_marker_set(path: str | Path, name: str | None = None) -> MarkerSet:
     names: list[str] = []
     bodies: list[str] = []
     positions: list[list[float]] = []
+    weights: list[float] = []
     for (number, _), row in zip(numbered[1:], table, strict=False):
         where = f"line {number}"
         marker, body = (row["name"] or "").strip(), (row["body"] or "").strip()
@@ -108,21 +114,27 @@ def load_marker_set(path: str | Path, name: str | None = None) -> MarkerSet:
             raise _format_error(path, f"{where}: body {body!r}", f"one of {', '.join(known)}")
         try:
             position = [float(row[c]) for c in "xyz"]
+            weight = float(row.get("weight_3d") or 1)
         except (TypeError, ValueError) as error:
             raise _format_error(path, f"{where}: {error}") from error
         # Two metres from a body's origin is no place on a person: most often a table in millimetres.
         if not np.all(np.isfinite(position)) or np.max(np.abs(position)) > 2:
             raise _format_error(path, f"{where}: position {position}")
+        if not 0 <= weight <= 1:
+            raise _format_error(path, f"{where}: weight_3d {weight}", "a number from 0 to 1")
         names.append(marker)
         bodies.append(body)
         positions.append(position)
+        weights.append(weight)
     if not names:
         raise _format_error(path, "no markers")
     index = np.array([known.index(b) for b in bodies], np.int32)
     position_m = np.array(positions, np.float64)
     index.setflags(write=False)
-    position_m.setflags(write=False)
-    return MarkerSet(name or path.stem, tuple(names), tuple(bodies), index, position_m)
+    weight_3d = np.array(weights, np.float64)
+    for array in (position_m, weight_3d):
+        array.setflags(write=False)
+    return MarkerSet(name or path.stem, tuple(names), tuple(bodies), index, position_m, weight_3d)
 
 
 def _format_error(path: Path, found: str, expected: str = "CSV with name, body, x, y, z in metres") -> PblError:

@@ -9,10 +9,17 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from pbl_pipeline.body import SCALE_NAMES
 
 #: Depth below which a point is treated as if it were this far away: keeps projections and gradients finite.
 NEAR_M = 0.1
+
+#: Places in `SCALE_NAMES` of the segments that the body has on both sides, in the same order.
+LEFT_SCALES = np.array([i for i, n in enumerate(SCALE_NAMES) if n.startswith("left_")])
+RIGHT_SCALES = np.array([SCALE_NAMES.index(SCALE_NAMES[i].replace("left_", "right_")) for i in LEFT_SCALES])
 
 
 def huber_of_square(e2: Float[Array, ...], width: float) -> Float[Array, ...]:
@@ -32,10 +39,10 @@ def weighted_mean(cost: Float[Array, "*n J"], c: Float[Array, "*n J"], frame_wei
     return total / (jnp.maximum(jnp.sum(frame_weight), 1.0) * cost.shape[-1])
 
 
-def center(x: Float[Array, "*n J 3"], seen: Float[Array, "*n J"]) -> Float[Array, "*n J 3"]:
-    """Subtract the mean over the markers that are seen (0 or 1) in each frame."""
-    n = jnp.maximum(jnp.sum(seen, axis=-1), 1.0)[..., None, None]
-    return x - jnp.sum(x * seen[..., None], axis=-2, keepdims=True) / n
+def center(x: Float[Array, "*n J 3"], weight: Float[Array, "*n J"]) -> Float[Array, "*n J 3"]:
+    """Subtract the weighted mean over the markers in each frame; nothing where all weights are 0."""
+    n = jnp.sum(weight, axis=-1)[..., None, None]
+    return x - jnp.sum(x * weight[..., None], axis=-2, keepdims=True) / jnp.where(n > 0, n, 1.0)
 
 
 def distance_3d_cm2(
@@ -43,11 +50,15 @@ def distance_3d_cm2(
     x_cam: Float[Array, "*n J 3"],
     R_nc: Float[Array, "*#n 3 3"],
     c: Float[Array, "*n J"],
+    marker_weight: Float[Array, " J"] | float = 1.0,
 ) -> Float[Array, "*n J"]:
-    """Squared distance (cm^2) of model and detected 3D points, both with their mean over the seen markers removed."""
-    seen = (c > 0).astype(x_world.dtype)
+    """Squared distance (cm^2) of model and detected 3D points, both with their mean over the seen markers removed.
+
+    `marker_weight` says how much each marker counts in that mean; the distances themselves are not weighted.
+    """
+    weight = jnp.where(c > 0, marker_weight, 0.0).astype(x_world.dtype)
     detected = jnp.einsum("...ij,...kj->...ki", R_nc, x_cam)
-    delta = center(x_world, seen) - center(detected, seen)
+    delta = center(x_world, weight) - center(detected, weight)
     return 1e4 * jnp.sum(delta**2, axis=-1)
 
 
@@ -74,3 +85,26 @@ def distance_2d_px2(
 def offset_m2(site_offset_m: Float[Array, "J 3"]) -> Array:
     """Sum of squared marker offsets (m^2)."""
     return jnp.sum(site_offset_m**2)
+
+
+def pose_prior(
+    qpos: Float[Array, "*n Q"],
+    neutral: Float[Array, " Q"],
+    inverse_sd: Float[Array, " Q"],
+    frame_weight: Float[Array, "*n"],
+) -> Array:
+    """Half the squared distance from the neutral pose in standard deviations, summed over joints, mean over frames.
+
+    The negative logarithm of independent normal distributions. `inverse_sd` is 0 where a joint has no prior.
+    """
+    z2 = jnp.sum(((qpos - neutral) * inverse_sd) ** 2, axis=-1)
+    return 0.5 * jnp.sum(z2 * frame_weight) / jnp.maximum(jnp.sum(frame_weight), 1.0)
+
+
+def scale_prior(s: Float[Array, " 8"], sd: float, sd_sides: float) -> Array:
+    """Half the squared segment scales relative to the whole body's, and of left against right, in standard deviations.
+
+    `s[0]`, the size of the whole body, is free.
+    """
+    sides = s[LEFT_SCALES] - s[RIGHT_SCALES]
+    return 0.5 * (jnp.sum((s[1:] / sd) ** 2) + jnp.sum((sides / sd_sides) ** 2))

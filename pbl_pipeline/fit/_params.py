@@ -9,13 +9,26 @@ from pbl_pipeline.paramset import Paramset
 
 @dataclasses.dataclass(frozen=True)
 class CostParams:
-    """Weights and Huber widths of the cost terms (defaults: the paper, section Model Fitting)."""
+    """Weights and Huber widths of the cost terms (defaults: the paper, section Model Fitting, which has no priors).
+
+    `weight_3d` and `weight_2d` count costs that are means over markers, in cm^2 and px^2; the priors are half sums of
+    squares in standard deviations. The 2D cost of 33 independent markers with 5 px noise is about 10 times less than
+    its negative log-likelihood, so a prior of weight 0.1 counts as its standard deviations say.
+    """
 
     weight_3d: float = 1.0
     weight_2d: float = 0.1
+    #: On the marker set's places. 100 is a standard deviation of about 2 cm per axis, by the same count; 25 of 4 cm.
     weight_offset_per_m2: float = 100.0
     huber_3d_cm: float = 10.0
     huber_2d_px: float = 5.0
+    weight_pose: float = 0.0
+    #: (joint, without its side where it has one; neutral angle in deg; standard deviation in deg) of each with a prior.
+    pose_prior_deg: tuple[tuple[str, float, float], ...] = ()
+    weight_scale: float = 0.0
+    #: Of a segment's scale against the whole body's, and of a left segment's against the right one's.
+    scale_sd: float = 0.1
+    scale_sides_sd: float = 0.02
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,32 +65,65 @@ class ImplicitAdamParams:
     view: ViewParams = ViewParams()
 
 
+#: What 33 points with two on the pelvis, three on each hand and two on each foot hardly tell: turns of the trunk against
+#: the pelvis, turns of a limb about its own axis, sideways joints. Without a prior these take up whatever the detector
+#: gets wrong (a pelvis tipped back by 25 deg in sitting). Standard deviations are round numbers of the project's own,
+#: set by anatomy and not by fitting: about how far a joint moves in walking and standing up, together with how people
+#: differ in their standing pose. Hip and knee flexion, ankle, shoulders and elbows are seen well and have none, but for
+#: the turn of the upper arm, which a straight elbow hides. Forearm: 90 deg turns the palms to the body, as they hang.
+POSE_PRIOR_DEG = (
+    ("lumbar_extension", 0.0, 15.0),
+    ("lumbar_bending", 0.0, 10.0),
+    ("lumbar_rotation", 0.0, 10.0),
+    ("neck_extension", 0.0, 20.0),
+    ("neck_bending", 0.0, 15.0),
+    ("neck_rotation", 0.0, 20.0),
+    ("hip_adduction", 0.0, 10.0),
+    ("hip_rotation", 0.0, 10.0),
+    ("subtalar_angle", 0.0, 10.0),
+    ("mtp_angle", 0.0, 15.0),
+    ("arm_rot", 0.0, 40.0),
+    ("pro_sup", 90.0, 30.0),
+    ("wrist_flex", 0.0, 20.0),
+    ("wrist_dev", 0.0, 10.0),
+)
+
 PAPER_2025 = ImplicitAdamParams()
-#: For BlazePose on two CPU cores: fewer steps from a start near the answer. The detector's depth is much less certain
-#: than its pixels, so its 3D counts less than MeTRAbs's in the paper (shared notes: full weight 13 deg, 0.1-0.3 8-9 deg
-#: mean joint error on a phone clip with mocap).
-DEMO = ImplicitAdamParams(
+#: For BlazePose on two CPU cores: fewer steps from a start near the answer, and priors (tests/benchmarks/real_clips.py
+#: measures them on two phone clips with marker mocap). Its depth is much less certain than its pixels, so 3D counts
+#: less than MeTRAbs's in the paper; at 0.05 one of the clips ended in a wrong pose. Its points were marked by eye in
+#: pictures and not felt on bone, so they may lie twice as far from the marker set's places.
+BLAZEPOSE = ImplicitAdamParams(
     steps=4_000,
     samples_per_trial=160,
     start="keypoints",
-    cost=CostParams(weight_3d=0.2),
+    cost=CostParams(
+        weight_3d=0.2,
+        weight_offset_per_m2=25.0,
+        weight_pose=0.1,
+        pose_prior_deg=POSE_PRIOR_DEG,
+        weight_scale=0.1,
+    ),
 )
 
 PARAMSETS: dict[str, Paramset] = {
     "paper-2025": Paramset.of("fit", "paper-2025", 1, PAPER_2025),
-    "blazepose-quick": Paramset.of("fit", "blazepose-quick", 1, DEMO),
+    "blazepose": Paramset.of("fit", "blazepose", 1, BLAZEPOSE),
 }
-DEFAULT = "blazepose-quick"
+DEFAULT = "blazepose"
 
 
 def params_of(paramset: Paramset) -> ImplicitAdamParams:
     """The parameter object of a stored paramset (the inverse of `Paramset.of`)."""
     values = dict(paramset.params)
+    cost = values["cost"]
     return ImplicitAdamParams(
         **{
             **values,
             "hidden": tuple(values["hidden"]),
-            "cost": CostParams(**values["cost"]),
+            "cost": CostParams(
+                **{**cost, "pose_prior_deg": tuple((str(n), float(m), float(s)) for n, m, s in cost["pose_prior_deg"])}
+            ),
             "view": ViewParams(**values["view"]),
         }
     )

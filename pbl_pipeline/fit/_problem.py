@@ -45,7 +45,8 @@ class FitModel:
 
     def __init__(self, body: Body, markers: MarkerSet) -> None:
         self.body, self.markers = body, markers
-        self._key = (body.sha256, tuple(markers.names), np.asarray(markers.position_m).tobytes())
+        tables = np.asarray(markers.position_m).tobytes(), np.asarray(markers.weight_3d).tobytes()
+        self._key = (body.sha256, tuple(markers.names), *tables)
 
     def __hash__(self) -> int:
         return hash(self._key)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -26,7 +27,8 @@ def check_fit(
     """All checks of one session fit, worst trial per check."""
     checks = [_residual_2d(session, trials), _residual_3d(trials), _in_view(session), _scale(scale)]
     checks += [_limits(session, trials), _converged(loss_trace), _camera(session, trials)]
-    return tuple(checks)
+    # Advice is for whom a check asks to act.
+    return tuple(dataclasses.replace(c, advice="") if c.outcome == PASS else c for c in checks)
 
 
 def _grade(value: float, warn: float, fail: float) -> str:
@@ -91,7 +93,7 @@ def _limits(session: Session, trials: Sequence[TrialFit]) -> Check:
         WARN if names else PASS,
         float(len(names)),
         0.0,
-        f"held at a limit in over {LIMIT_SHARE:.0%} of the frames: {', '.join(names)}" if names else "",
+        f"held at a limit in over {LIMIT_SHARE:.0%} of the frames: {', '.join(names)}",
     )
 
 
@@ -110,5 +112,5 @@ def _converged(loss_trace: np.ndarray) -> Check:
 def _camera(session: Session, trials: Sequence[TrialFit]) -> Check:
     sources = {t.camera.source for t in session.trials}
     guessed = any(s.startswith("guess") for s in sources)
-    advice = "the focal length is a guess: pass --camera with a calibration" if guessed else ""
+    advice = "the focal length is a guess: pass --camera with a calibration"
     return Check("camera_intrinsics_measured", WARN if guessed else PASS, None, None, advice)

@@ -11,7 +11,17 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import PARAMSETS, TrialFit, fit_session, params_of, with_steps
-from pbl_pipeline.fit._costs import center, distance_2d_px2, distance_3d_cm2, huber_of_square, project_px, weighted_mean
+from pbl_pipeline.fit._costs import (
+    center,
+    distance_2d_px2,
+    distance_3d_cm2,
+    huber_of_square,
+    pose_prior,
+    project_px,
+    scale_prior,
+    weighted_mean,
+)
+from pbl_pipeline.fit._prior import prior_of
 from pbl_pipeline.fit._problem import LEVEL_CAMERA_R_NC
 from pbl_pipeline.fit._start import root_positions
 from pbl_pipeline.fit._trajectory import ImplicitTrajectory, fit_ranges, frequencies, pose_of, raw_of
@@ -24,7 +34,7 @@ TIME_S = np.arange(0, 2.6, 1 / 30)
 
 def quick(steps: int = 1500) -> Paramset:
     """The demo's paramset with full weight on 3D, because the synthetic points are metric."""
-    params = params_of(PARAMSETS["blazepose-quick"])
+    params = params_of(PARAMSETS["blazepose"])
     params = dataclasses.replace(
         params, steps=steps, samples_per_trial=64, cost=dataclasses.replace(params.cost, weight_3d=1.0)
     )
@@ -94,16 +104,18 @@ def test_fit_file_round_trip(two_trials, tmp_path):
             assert a == b, field.name
 
 
-def test_frames_outside_the_view_are_unknown():
-    q = walking_qpos(TIME_S)
-    k = observe(q, TIME_S)
+def test_frames_outside_the_view_are_unknown(two_trials):
+    # Two trials again, of the same length: the compiled program of the fixture serves.
+    k = two_trials[1][0]
     confidence = k.confidence.copy()
     confidence[:20] = 0
     xy, xyz = k.xy_px.copy(), k.xyz_cam_m.copy()
     xy[:20], xyz[:20] = np.nan, np.nan
-    fit = fit_session([dataclasses.replace(k, xy_px=xy, xyz_cam_m=xyz, confidence=confidence)], ["a"], quick(250))
+    cut = dataclasses.replace(k, xy_px=xy, xyz_cam_m=xyz, confidence=confidence)
+    fit = fit_session([cut, two_trials[1][1]], ["a", "b"], quick(250))
     assert np.all(np.isnan(fit.trials[0].qpos[:20]))
     assert np.all(np.isfinite(fit.trials[0].qpos[20:]))
+    assert np.all(np.isfinite(fit.trials[1].qpos))
 
 
 @pytest.mark.parametrize(
@@ -125,9 +137,10 @@ def test_bad_keypoints_are_refused(change, code, text):
 
 
 def test_under_a_second_in_view_is_refused():
-    time_s = TIME_S[:25]
+    k = observe(walking_qpos(TIME_S), TIME_S)
+    confidence = np.where(np.arange(len(TIME_S)) < 25, 0.9, 0.0)[:, None].repeat(33, axis=1)
     with pytest.raises(PblError, match=r"0\.80 s") as error:
-        fit_session([observe(walking_qpos(time_s), time_s)], ["a"], quick(250))
+        fit_session([dataclasses.replace(k, confidence=confidence)], ["a"], quick(250))
     assert error.value.code == "FIT_INPUT"
 
 
@@ -161,6 +174,46 @@ def test_distances_by_hand():
     xy = jnp.array([[960.0, 540.0], [960.0 - 375, 540.0], [960.0, 540.0 - 375 + 3]])
     np.testing.assert_allclose(distance_2d_px2(x_world, xy, R, jnp.asarray(CAMERA.matrix)), [0, 0, 9], atol=1e-2)
     assert float(jnp.abs(jnp.sum(center(x_world, jnp.array([1.0, 1.0, 0.0]))[:2])).max()) < 1e-6
+
+
+def test_markers_without_weight_do_not_move_the_centre_of_the_others():
+    R, c = jnp.eye(3), jnp.ones(3)
+    model = jnp.array([[0.0, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.9]])
+    detected = model.at[2, 2].add(0.3)  # one point is 30 cm off
+    np.testing.assert_allclose(distance_3d_cm2(model, detected, R, c), [100, 100, 400], rtol=1e-4)
+    weight = jnp.array([1.0, 1.0, 0.0])
+    np.testing.assert_allclose(distance_3d_cm2(model, detected, R, c, weight), [0, 0, 900], rtol=1e-4)
+    assert np.all(np.isfinite(distance_3d_cm2(model, detected, R, jnp.array([0.0, 0.0, 1.0]), weight)))  # none left
+
+
+def test_pose_prior_by_hand():
+    names = ["hip_rotation_r", "knee_angle_r", "hip_rotation_l", "pro_sup_r", "lumbar_bending"]
+    neutral, inverse_sd = prior_of(names, [("hip_rotation", 0, 10), ("pro_sup", 90, 30), ("lumbar_bending", 0, 5)])
+    np.testing.assert_allclose(np.rad2deg(neutral), [0, 0, 0, 90, 0])
+    np.testing.assert_allclose(inverse_sd * np.deg2rad(1), [1 / 10, 0, 1 / 10, 1 / 30, 1 / 5])
+    # 2 sd, free, 1 sd, 1 sd, 0: half of 4 + 1 + 1. The second frame is at the neutral pose, the third does not count.
+    q = jnp.deg2rad(jnp.array([[20.0, 77, -10, 60, 0], [0, 0, 0, 90, 0], [90, 90, 90, 90, 90]]))
+    value = pose_prior(q, jnp.asarray(neutral), jnp.asarray(inverse_sd), jnp.array([1.0, 1.0, 0.0]))
+    assert float(value) == pytest.approx((3.0 + 0.0) / 2, rel=1e-5)
+
+
+@pytest.mark.parametrize("entry", [("hip_rotatoin", 0, 10), ("hip_rotation", 0, 0)])
+def test_pose_prior_of_no_joint_or_without_width_is_refused(entry):
+    with pytest.raises(PblError, match=entry[0]):
+        prior_of(["hip_rotation_r"], [entry])
+
+
+def test_scale_prior_by_hand_leaves_the_whole_body_free():
+    # Overall, pelvis, left thigh, left leg, right thigh, right leg, left arm, right arm.
+    s = jnp.array([0.3, 0.1, 0, 0, -0.05, 0, 0.2, 0.2])
+    each, thighs = 1 + 0.25 + 4 + 4, (0.05 / 0.02) ** 2
+    assert float(scale_prior(s, 0.1, 0.02)) == pytest.approx(0.5 * (each + thighs), rel=1e-5)
+
+
+def test_the_papers_cost_has_neither_prior():
+    cost = params_of(PARAMSETS["paper-2025"]).cost
+    assert (cost.weight_pose, cost.weight_scale) == (0.0, 0.0)
+    assert (cost.weight_3d, cost.weight_2d, cost.weight_offset_per_m2) == (1.0, 0.1, 100.0)
 
 
 def test_root_position_from_pixels():

@@ -23,6 +23,7 @@ from pbl_pipeline.errors import PblError
 
 from .. import _costs as costs
 from .._params import CostParams, ImplicitAdamParams
+from .._prior import prior_of
 from .._problem import FitModel, Observations, Session
 from .._start import keypoint_start, paper_start
 from .._trajectory import ImplicitTrajectory, fit_ranges, frequencies, pose_of, raw_of
@@ -46,6 +47,9 @@ class _Constants(eqx.Module):
     low: Float[Array, " 40"]
     high: Float[Array, " 40"]
     is_translation: Array
+    neutral: Float[Array, " 40"]
+    inverse_sd: Float[Array, " 40"]
+    marker_weight_3d: Float[Array, " J"]
 
 
 def scale_multipliers(s: Float[Array, " 8"]) -> Float[Array, " 8"]:
@@ -120,7 +124,18 @@ def _initialise(session: Session, params: ImplicitAdamParams) -> tuple[_Unknowns
     )(keys)
     unknowns = _Unknowns(networks, jnp.zeros(8), jnp.zeros((len(session.model.markers.names), 3)))
     f32 = functools.partial(jnp.asarray, dtype=jnp.float32)
-    return unknowns, _Constants(f32(omega), f32(raw_start), f32(low), f32(high), jnp.asarray(is_translation))
+    neutral, inverse_sd = prior_of(body.joint_names, params.cost.pose_prior_deg)
+    constants = _Constants(
+        omega_rad_s=f32(omega),
+        raw_start=f32(raw_start),
+        low=f32(low),
+        high=f32(high),
+        is_translation=jnp.asarray(is_translation),
+        neutral=f32(neutral),
+        inverse_sd=f32(inverse_sd),
+        marker_weight_3d=f32(session.model.markers.weight_3d),
+    )
+    return unknowns, constants
 
 
 def _optimiser(params: ImplicitAdamParams, steps: ArrayLike) -> optax.GradientTransformation:
@@ -156,12 +171,15 @@ def _loss(unknowns: _Unknowns, obs: Observations, k: _Constants, model: FitModel
     qpos = _qpos(unknowns.networks, obs.time_s, k)
     x = model.positions(qpos, scale_multipliers(unknowns.s), unknowns.site_offset_m)
     R_nc, matrix = obs.R_nc[:, None], obs.camera_matrix[:, None]
-    e3 = costs.huber_of_square(costs.distance_3d_cm2(x, obs.x_cam, R_nc, obs.c), cost.huber_3d_cm)
+    d3 = costs.distance_3d_cm2(x, obs.x_cam, R_nc, obs.c, k.marker_weight_3d)
+    e3 = costs.huber_of_square(d3, cost.huber_3d_cm)
     e2 = costs.huber_of_square(costs.distance_2d_px2(x, obs.xy_px, R_nc, matrix), cost.huber_2d_px)
     return (
-        cost.weight_3d * costs.weighted_mean(e3, obs.c, obs.frame_weight)
+        cost.weight_3d * costs.weighted_mean(e3, obs.c * k.marker_weight_3d, obs.frame_weight)
         + cost.weight_2d * costs.weighted_mean(e2, obs.c, obs.frame_weight)
         + cost.weight_offset_per_m2 * costs.offset_m2(unknowns.site_offset_m)
+        + cost.weight_pose * costs.pose_prior(qpos, k.neutral, k.inverse_sd, obs.frame_weight)
+        + cost.weight_scale * costs.scale_prior(unknowns.s, cost.scale_sd, cost.scale_sides_sd)
     )
 
 

@@ -1,0 +1,180 @@
+"""Joint angles of the whole chain on two phone clips against marker motion capture of the same motion.
+
+    python -m tests.benchmarks.real_clips                                  # the default paramset
+    python -m tests.benchmarks.real_clips --params paper-2025 --clip walk
+    python -m tests.benchmarks.real_clips --set steps=12000 --set cost.weight_3d=0.1
+
+Reads `../shared/data/real/video_mocap/{walk,STS}`; see the README there for its source, licence and conventions. Key
+points are detected once and kept in the temporary folder (`--fresh` detects anew). The camera is not calibrated, so its
+intrinsics are a guess, as they are for most users. Prints one table per clip: mean absolute error in degrees per angle
+and side, and the same for what two published systems made of the clip (they see the same pixels).
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import gzip
+import json
+import sys
+import tempfile
+from pathlib import Path
+
+import click
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pbl_pipeline.fit import DEFAULT, PARAMSETS, TrialFit, fit_session, params_of
+from pbl_pipeline.gait._poses import trial_poses
+from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.pipeline import detect_trial
+from tests.conftest import SHARED
+
+CLIPS = ("walk", "STS")
+ANGLES = ("hip_flexion", "hip_adduction", "hip_rotation", "knee_flexion", "ankle_angle")
+MAX_LAG_S = 0.1
+
+
+def angles_of(rotation: dict[str, Rotation]) -> dict[str, np.ndarray]:
+    """(T,) degrees per angle and side from body rotations whose axes are OpenSim's (forward, up, right).
+
+    Every system goes through here, so that model conventions (axes of ankle and knee) count the same way.
+    """
+    out = {}
+    for side, sign in (("r", 1.0), ("l", -1.0)):
+        hip = _relative(rotation, "pelvis", f"femur_{side}")
+        out[f"hip_flexion_{side}"] = hip[:, 0]
+        out[f"hip_adduction_{side}"] = sign * hip[:, 1]
+        out[f"hip_rotation_{side}"] = sign * hip[:, 2]
+        out[f"knee_flexion_{side}"] = -_relative(rotation, f"femur_{side}", f"tibia_{side}")[:, 0]
+        out[f"ankle_angle_{side}"] = _relative(rotation, f"tibia_{side}", f"talus_{side}")[:, 0]
+    return out
+
+
+def _relative(rotation: dict[str, Rotation], parent: str, child: str) -> np.ndarray:
+    return (rotation[parent].inv() * rotation[child]).as_euler("ZXY", degrees=True)
+
+
+def recorded_angles(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Time stamps (s) and angles of one of the recording's `sample_*.json.gz`."""
+    with gzip.open(path, "rt") as file:
+        data = json.load(file)
+    turned = {n: Rotation.from_euler("XYZ", np.asarray(b["rotation"])) for n, b in data["bodies"].items()}
+    return np.asarray(data["time"], float), angles_of(turned)
+
+
+def fitted_angles(fit: TrialFit) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Time stamps (s) and angles of our fit, frames in view only."""
+    poses = trial_poses(fit)
+    seen = np.flatnonzero(np.isfinite(fit.qpos[:, 0]))
+    turned = {n: Rotation.from_matrix(poses.rotation[seen, i]) for i, n in enumerate(poses.body.body_names)}
+    return np.asarray(fit.time_s)[seen], angles_of(turned)
+
+
+@dataclasses.dataclass(frozen=True)
+class Score:
+    """`error_deg` and `bias_deg` per angle and side, `lag_s` of the video behind the mocap, knee correlation."""
+
+    error_deg: dict[str, float]
+    bias_deg: dict[str, float]
+    lag_s: float
+    knee_correlation: float
+
+    @property
+    def mean_deg(self) -> float:
+        return float(np.mean(list(self.error_deg.values())))
+
+
+def score(ours: tuple[np.ndarray, dict], truth: tuple[np.ndarray, dict]) -> Score:
+    """Errors at the lag within `MAX_LAG_S` at which the knees correlate best. Times outside the truth do not count.
+
+    The correlation and not the error: a constant error of one angle would pull the lag away from the motion's.
+    """
+    lags = np.arange(-MAX_LAG_S, MAX_LAG_S + 0.001, 0.005)
+    return max((_score_at(ours, truth, lag) for lag in lags), key=lambda s: s.knee_correlation)
+
+
+def _score_at(ours: tuple[np.ndarray, dict], truth: tuple[np.ndarray, dict], lag: float) -> Score:
+    time = ours[0] - lag
+    inside = (time >= truth[0][0]) & (time <= truth[0][-1])
+    error, bias, knees = {}, {}, []
+    for name, values in ours[1].items():
+        true = np.interp(time[inside], truth[0], truth[1][name])
+        difference = values[inside] - true
+        error[name], bias[name] = float(np.mean(np.abs(difference))), float(np.mean(difference))
+        if name.startswith("knee"):
+            knees.append(np.corrcoef(values[inside], true)[0, 1])
+    return Score(error, bias, float(lag), float(np.mean(knees)))
+
+
+def table(rows: dict[str, Score]) -> str:
+    """The errors as text, right / left per angle."""
+    head = f"{'mean absolute error, deg (right / left)':44}" + "".join(f"{a:>15}" for a in ANGLES)
+    lines = [f"{head}{'mean':>8}{'knee r':>8}{'lag ms':>8}"]
+    for name, s in rows.items():
+        cells = "".join(f"{s.error_deg[a + '_r']:8.1f} /{s.error_deg[a + '_l']:5.1f}" for a in ANGLES)
+        lines.append(f"{name:44}{cells}{s.mean_deg:8.2f}{s.knee_correlation:8.2f}{1000 * s.lag_s:8.0f}")
+        if name.startswith("ours"):
+            biases = "".join(f"{s.bias_deg[a + '_r']:8.1f} /{s.bias_deg[a + '_l']:5.1f}" for a in ANGLES)
+            lines.append(f"{'  of which constant':44}{biases}")
+    return "\n".join(lines)
+
+
+def keypoints_of(clip: str, fresh: bool = False) -> Keypoints:
+    """Key points of a clip, from the temporary folder where they were detected before."""
+    cached = Path(tempfile.gettempdir()) / "pbl_real_clips" / f"{clip}.keypoints.npz"
+    if fresh or not cached.exists():
+        cached.parent.mkdir(exist_ok=True)
+        video, people = SHARED / "real" / "video_mocap" / clip / "video.mp4", cached.with_suffix(".png")
+        detect_trial(video, people).keypoints.save(cached)
+    return Keypoints.load(cached)
+
+
+def changed(paramset: Paramset, changes: tuple[str, ...]) -> Paramset:
+    """The paramset with `name=value` changes; a dot reaches into a group, as in `cost.weight_3d=0.1`."""
+    params = params_of(paramset)
+    for change in changes:
+        name, value = change.split("=", 1)
+        *groups, field = name.split(".")
+        inner = getattr(params, groups[0]) if groups else params
+        inner = dataclasses.replace(inner, **{field: ast.literal_eval(value)})
+        params = dataclasses.replace(params, **{groups[0]: inner}) if groups else inner
+    return Paramset.of(paramset.stage, " ".join([paramset.name, *changes]), paramset.version, params)
+
+
+@click.command()
+@click.option("--params", default=DEFAULT, show_default=True, help="Name of a paramset.")
+@click.option("--set", "changes", multiple=True, help="A change to it, such as cost.weight_3d=0.1.")
+@click.option("--clip", "clips", multiple=True, type=click.Choice(CLIPS), default=CLIPS, show_default=True)
+@click.option("--fresh", is_flag=True, help="Detect the key points anew.")
+@click.option("--save", type=click.Path(path_type=Path, file_okay=False), help="Folder for the fits.")
+def main(params: str, changes: tuple[str, ...], clips: tuple[str, ...], fresh: bool, save: Path | None) -> None:
+    """Print the errors of the chain on the clips."""
+    paramset = changed(PARAMSETS[params], changes)
+    for clip in clips:
+        folder = SHARED / "real" / "video_mocap" / clip
+        if not folder.is_dir():
+            sys.exit(f"the recording is absent: {folder}")
+        truth = recorded_angles(folder / "sample_mocap.json.gz")
+        session = fit_session([keypoints_of(clip, fresh)], [clip], paramset)
+        trial = session.trials[0]
+        if save:
+            save.mkdir(parents=True, exist_ok=True)
+            trial.save(save / f"{clip}.fit.npz")
+        rows = {"ours": score(fitted_angles(trial), truth)}
+        for name, file in (("OpenCap Monocular", "sample_mono"), ("WHAM", "sample_wham")):
+            rows[name] = score(recorded_angles(folder / f"{file}.json.gz"), truth)
+        click.echo(f"\n{clip}: {paramset.name}, {session.seconds:.0f} s")
+        click.echo(table(rows))
+        pixels, cm = np.nanmedian(trial.residual_2d_px), 100 * np.nanmedian(trial.residual_3d_m)
+        click.echo(
+            f"residual 2D {pixels:.1f} px, 3D {cm:.1f} cm, loss {trial.loss:.2f}, scale {session.scale.round(2)}"
+        )
+        for check in session.qc:
+            if check.outcome != "PASS":
+                click.echo(f"{check.outcome} {check.check}: {check.advice}")
+
+
+if __name__ == "__main__":
+    main()
