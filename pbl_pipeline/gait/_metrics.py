@@ -72,7 +72,8 @@ class GaitMetrics:
 
     def table(self) -> str:
         """The session's measures as text for a terminal."""
-        lines = [f"{'measure':<24}{'left':>9}{'right':>9}{'mean':>9}{'sd':>8}{'n':>5}"]
+        lines = [f"{self.status}: {self.reason}"] if self.reason else []
+        lines.append(f"{'measure':<24}{'left':>9}{'right':>9}{'mean':>9}{'sd':>8}{'n':>5}")
         for name in MEASURES:
             m = self.spatiotemporal[name]
             if m is None:
