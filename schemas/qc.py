@@ -22,7 +22,7 @@ SOURCES = (
 @schema
 class SessionQc(dj.Computed):
     definition = f"""
-    # worst outcome of all checks of a visit
+    # worst outcome of all checks of a visit; a recording without gait beside others with gait counts as WARN
     -> gdi.SessionGdi
     ---
     qc_outcome : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')
@@ -60,19 +60,19 @@ class SessionQc(dj.Computed):
                         "qc_advice": row[f"{prefix}_check_advice"],
                     }
                 )
-        return (found,)
+        return found, (gdi.SessionGdi & key).fetch1("session_status")
 
     @computes
-    def make_compute(self, key: dict, rows: Sequence[dict[str, Any]]) -> tuple:
+    def make_compute(self, key: dict, rows: Sequence[dict[str, Any]], session_status: str) -> tuple:
         qc = library("qc")
-        checks = [
-            qc.Check(r["qc_check"], r["qc_check_outcome"], r["qc_value"], r["qc_threshold"], r["qc_advice"])
-            for r in rows
-        ]
-        return qc.worst(checks), rows
+        outcomes = [qc.in_session(r["qc_check_outcome"], session_status == qc.PASS) for r in rows]
+        outcome = max(outcomes, key=qc.OUTCOMES.index, default=qc.PASS)
+        named = [r["qc_check"] for r, o in zip(rows, outcomes, strict=True) if o == outcome != qc.PASS]
+        return outcome, named, rows
 
-    def make_insert(self, key: dict, outcome: str, rows: Sequence[dict[str, Any]], origin: Origin) -> None:
-        named = [r["qc_check"] for r in rows if r["qc_check_outcome"] == outcome] if outcome != "PASS" else []
+    def make_insert(
+        self, key: dict, outcome: str, named: Sequence[str], rows: Sequence[dict[str, Any]], origin: Origin
+    ) -> None:
         self.insert1(
             {
                 **key,

@@ -1,5 +1,5 @@
 """Quality checks: every verdict carries its value, its threshold and advice."""
 
-from ._check import EMPTY, FAIL, NEEDS_CHOICE, OUTCOMES, PASS, WARN, Check, worst
+from ._check import EMPTY, FAIL, NEEDS_CHOICE, OUTCOMES, PASS, WARN, Check, in_session, worst
 
-__all__ = ["EMPTY", "FAIL", "NEEDS_CHOICE", "OUTCOMES", "PASS", "WARN", "Check", "worst"]
+__all__ = ["EMPTY", "FAIL", "NEEDS_CHOICE", "OUTCOMES", "PASS", "WARN", "Check", "in_session", "worst"]

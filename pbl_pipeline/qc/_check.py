@@ -31,3 +31,9 @@ class Check:
 def worst(checks: Iterable[Check]) -> str:
     """The worst outcome; PASS when there is no check."""
     return max((c.outcome for c in checks), key=OUTCOMES.index, default=PASS)
+
+
+def in_session(outcome: str, measured: bool) -> str:
+    """What an outcome means for a session: where the session has measures, one recording without gait, or no index,
+    makes it one to be read with care (WARN), not an empty one."""
+    return WARN if measured and outcome == EMPTY else outcome

@@ -9,7 +9,7 @@ import numpy as np
 import pbl_pipeline
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import Gdi, Measure, NormativeSet, TrialMetrics, load_norm, norm_names
-from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, OUTCOMES, PASS, WARN, Check
+from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, OUTCOMES, PASS, WARN, Check, in_session
 from pbl_pipeline.report import _figures
 from pbl_pipeline.report._types import SessionReport, TrialReport
 from pbl_pipeline.report._words import (
@@ -113,8 +113,7 @@ def _checks(report: SessionReport) -> list[Check]:
 def _verdict(report: SessionReport, checks: list[Check]) -> dict:
     metrics = report.metrics
     measured = metrics is not None and metrics.status == PASS
-    # One recording without gait, or no index, makes a session with measures one to be read with care, not an empty one.
-    outcomes = [WARN if measured and c.outcome == EMPTY else c.outcome for c in checks]
+    outcomes = [in_session(c.outcome, measured) for c in checks]
     outcome = max(outcomes, key=OUTCOMES.index, default=PASS)
     if metrics is None and outcome in (PASS, WARN, EMPTY):
         outcome = FAIL

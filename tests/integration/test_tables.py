@@ -170,6 +170,26 @@ def test_nobody_walks_and_nobody_there(tables: None, tmp_path: Path, monkeypatch
     assert not populate().did_something
 
 
+def test_one_recording_without_gait_does_not_empty_the_visit(
+    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def one_stands(trials, names, paramset=None, camera_motion="static"):
+        result = chain.fit_session(trials, names, paramset)
+        walks, other = result.trials
+        still = chain.walking_fit(
+            other.joint_names, other.body_sha256, name=other.name, n_frames=len(other.time_s), walks=False
+        )
+        return chain.dataclasses.replace(result, trials=(walks, still))
+
+    monkeypatch.setattr(chain.pbl_pipeline.fit, "fit_session", one_stands)
+    register(chain.small_video(tmp_path, "walk1"), chain.small_video(tmp_path, "stands", n=210))
+    populate()
+    assert gdi.SessionGdi.fetch1("session_status") == "PASS"
+    outcome, names = qc.SessionQc.fetch1("qc_outcome", "qc_worst")
+    assert outcome == "WARN"
+    assert "walking" in names.split(", ")
+
+
 # ------------------------------------------------------------------------------------------------------- ingest
 def test_the_same_bytes_are_registered_once(tables: None, tmp_path: Path):
     first = chain.small_video(tmp_path, "walk")
