@@ -1,10 +1,22 @@
-"""Shared fixtures: where the development data is, and a cache that no test shares with the user."""
+"""Shared fixtures: the development data, a private database, and no trace of the developer's own.
+
+Tests use the user's cache (PBL_CACHE) like every command does: assets are checked against their SHA-256 at each use and
+compiled programs are found by what was compiled, so neither can carry a result from one run to the next, and fetching
+45 MB and compiling for a minute in every run would test nothing new (tests/integration/test_assets_real.py fetches
+into an empty cache on purpose). Set PBL_CACHE to try a cold start. The database, its store and all results are private.
+"""
 
 from __future__ import annotations
 
+import atexit
+import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from schemas import embedded
+from tests.database import new_home, remove_home
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -15,3 +27,30 @@ def shared_data() -> Path:
     if not SHARED.is_dir():
         pytest.skip("the development data (../shared/data) is absent")
     return SHARED
+
+
+@pytest.fixture(scope="session", autouse=True)
+def nothing_of_the_developer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Without DJ_* and the database's PBL_* variables: no test can reach a real server or the user's tables."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in [n for n in os.environ if n.startswith("DJ_") or n in ("PBL_STORE", "PBL_DB_PREFIX")]:
+            if name not in ("DJ_LOG_LEVEL", "DJ_IGNORE_CONFIG_FILE"):
+                patch.delenv(name)
+        # Where no test asks for a database, a command that wants one finds none running.
+        patch.setenv("PBL_HOME", str(tmp_path_factory.mktemp("home")))
+        yield
+
+
+@pytest.fixture(scope="session")
+def database(nothing_of_the_developer: None) -> Iterator[Path]:
+    """The embedded server, running, with PBL_HOME set to its folder for the whole session; yields that folder."""
+    home = new_home()
+    atexit.register(remove_home, home)  # also when pytest itself breaks off
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PBL_HOME", str(home))
+        try:
+            embedded.start(folder=embedded.Folder(home / "db"))
+            yield home
+        finally:
+            remove_home(home)
+            atexit.unregister(remove_home)

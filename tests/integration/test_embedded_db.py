@@ -23,7 +23,7 @@ from schemas import embedded
 from schemas.cli.db import db
 from schemas.embedded import _account, _apt, _binaries, _process, _setup
 
-from .conftest import new_home, remove_home
+from tests.database import new_home, remove_home
 
 PBL = [sys.executable, "-c", "from pbl_pipeline.cli import main; main()"]
 

@@ -1,0 +1,43 @@
+"""Calling `pbl` as its script does, but in this process: exit code and what was printed."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import sys
+from unittest import mock
+
+from pbl_pipeline.cli import main
+
+
+@dataclasses.dataclass(frozen=True)
+class Done:
+    """What a call of `pbl` left."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def error_code(self) -> str:
+        """The code of the error on stderr, "" where there is none."""
+        coded = [line for line in self.err.splitlines() if line.split(":")[0].replace("_", "").isupper()]
+        return coded[-1].split(":")[0] if coded else ""
+
+
+def pbl(*arguments: object) -> Done:
+    """Run `pbl --quiet ARGUMENTS` through the entry point of the script, with its treatment of errors."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        mock.patch.object(sys, "argv", ["pbl", "--quiet", *map(str, arguments)]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else int(end.code is not None)
+        else:
+            code = 0
+    return Done(code, out.getvalue(), err.getvalue())

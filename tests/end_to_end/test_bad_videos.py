@@ -1,0 +1,209 @@
+"""A folder of bad videos and one good one, through the tables and through files: the real detector, the real fit.
+
+One populate for all of them. The fits take few steps (`conftest.FEW_STEPS`): whether she walks shows after seconds.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import schemas
+from pbl_pipeline.fit import DEFAULT, PARAMSETS, TrialFit, params_of
+from pbl_pipeline.gait.events import load_events
+from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.video import probe
+from schemas import fit, gait, gdi, keypoints, lab, qc, tracking, video, views
+from schemas._base import insert_methods
+from tests.command import Done, pbl
+
+from .conftest import FEW_STEPS
+
+EMPTY = "niemand ist da, früh.mp4"
+METHOD = "test-few-steps"
+
+
+def clean() -> None:
+    lab.Subject.delete(prompt=False, part_integrity="cascade")
+    for table in schemas.computed_tables():
+        table.jobs.delete_quick()
+
+
+@pytest.fixture(scope="module")
+def tables(database: Path) -> Iterator[None]:
+    schemas.activate()
+    params = {**PARAMSETS[DEFAULT].params, **FEW_STEPS}
+    few = Paramset.of("fit", METHOD, 1, params_of(Paramset("fit", METHOD, 1, params)))
+    insert_methods(fit.FitMethod, "fit", {METHOD: few})
+    clean()
+    yield
+    clean()
+
+
+@pytest.fixture(scope="module")
+def ingested(tables: None, folder: Path) -> dict[str, Done]:
+    """Three visits: she walks, she stands, and everything that cannot work, with the walking video once more."""
+    more = ("--subject", "P001", "--fit-method", METHOD)
+    gone = folder.parent / "gone.mp4"
+    gone.write_bytes((folder / "walking.mp4").read_bytes() + b"\0")
+    bad = [*(folder / n for n in ("notes.mp4", "nothing.mp4", "truncated.mp4", EMPTY, "two.mp4", "short.mp4")), gone]
+    done = {
+        "walks": pbl("ingest", folder / "walking.mp4", "--session", "walks", *more),
+        "stands": pbl("ingest", folder / "standing.mp4", "--session", "stands", *more),
+        "bad": pbl("ingest", *bad, "--session", "bad", *more),
+        "again": pbl("ingest", folder / "copy of walking.mp4", folder / "walking.mp4", "--session", "again", *more),
+    }
+    gone.unlink()
+    return done
+
+
+@pytest.fixture(scope="module")
+def populated(ingested: dict[str, Done]) -> Done:
+    return pbl("populate")
+
+
+@pytest.fixture(scope="module")
+def status(populated: Done) -> dict:
+    assert populated.code == 0, populated.err
+    return json.loads(pbl("status", "--json").out)
+
+
+# --------------------------------------------------------------------------------------------------- the tables
+def test_ingest_takes_each_file_once_and_refuses_an_empty_one(ingested):
+    assert ingested["walks"].code == ingested["stands"].code == 0
+    assert ingested["bad"].code == 1
+    assert ingested["bad"].error_code == "VIDEO_EMPTY"
+    assert ingested["bad"].out.count("registered") == 6
+    assert ingested["again"].code == 0
+    assert ingested["again"].out.count("known") == 2
+    names = sorted(video.Video.to_arrays("video_name").tolist())
+    assert names == sorted(
+        ["walking.mp4", "standing.mp4", "notes.mp4", "truncated.mp4", EMPTY, "two.mp4", "short.mp4", "gone.mp4"]
+    )
+
+
+def test_each_failure_is_a_row_with_a_code_and_a_next_step(status, populated):
+    found = {(e["about"], e["table"], e["code"]) for e in status["errors"]}
+    assert found == {
+        ("notes.mp4", "VideoInfo", "VIDEO_NOT_A_VIDEO"),
+        ("truncated.mp4", "VideoInfo", "VIDEO_TRUNCATED"),
+        ("gone.mp4", "VideoInfo", "VIDEO_MISSING"),
+        ("short.mp4", "Keypoints", "TRACK_TOO_SHORT"),
+    }
+    printed = pbl("status")
+    assert printed.code == 0
+    for error in status["errors"]:
+        assert error["code"] in populated.out
+        assert error["code"] in printed.out
+        assert len(error["next_step"]) > 10
+        assert error["next_step"].splitlines()[0] in printed.out
+
+
+def test_two_people_wait_for_a_choice(status):
+    (waiting,) = status["waiting"]
+    assert (waiting["about"], waiting["persons"]) == ("two.mp4", [1, 2])
+    assert waiting["next_step"] == f"pbl choose {waiting['video_id']} 1|2"
+    assert waiting["next_step"] in pbl("status").out
+
+
+def test_nobody_is_no_error(status):
+    key = {"video_name": EMPTY}
+    choice = (tracking.SubjectChoice * video.Video.proj("video_name") & key).fetch1()
+    assert choice["choice_status"] == "NO_PERSON"
+    assert choice["choice_reason"]
+    assert ("SubjectChoice", EMPTY) in {(e["table"], e["about"]) for e in status["empty"]}
+    assert len(keypoints.Keypoints * video.Video.proj("video_name") & key) == 0
+
+
+def test_the_good_video_is_finished_all_the_same(status):
+    events = gait.GaitEvents * video.Video.proj("video_name") & {"video_name": "walking.mp4"}
+    assert events.fetch1("events_status") == "PASS"
+    assert len(gait.GaitCycle()) >= 1
+    assert len(gdi.SessionGdi()) == len(qc.SessionQc()) == 2
+    # Five contacts in 3 s; by eye in frames 4, 23, 41, 60 and 78 of this clip.
+    contacts = (gait.GaitEvents.Event * video.Video.proj("video_name") & {"video_name": "walking.mp4"}).to_dicts()
+    times = sorted(float(r["event_time"]) for r in contacts if r["event_kind"] == "foot_down")
+    np.testing.assert_allclose(times, np.array([4, 23, 41, 60, 78]) / 30, atol=0.1)
+
+
+def test_standing_is_fitted_and_has_no_gait(status):
+    name = video.Video.proj("video_name") & {"video_name": "standing.mp4"}
+    assert len(fit.SessionFit.Trial * name) == 1
+    row = (gait.GaitEvents * name).fetch1()
+    assert row["events_status"] == "EMPTY"
+    assert "no walking" in row["events_reason"]
+    (visit,) = views.session_summary({"session_label": "stands"}).to_dict("records")
+    assert visit["session_status"] == "EMPTY"
+    assert "no walking" in visit["session_reason"]
+    assert visit["qc_outcome"] == "EMPTY"
+    assert np.isnan(visit["session_cadence"])
+    assert visit["fit_residual_2d"] < 10
+    assert ("GaitEvents", "standing.mp4") in {(e["table"], e["about"]) for e in status["empty"]}
+
+
+def test_a_second_populate_does_nothing(status):
+    again = pbl("populate")
+    assert again.code == 0
+    assert "nothing to do" in again.out
+
+
+def test_the_report_of_a_visit_without_walking(status, tmp_path):
+    done = pbl("report", "--subject", "P001", "--session", "stands", "--out", tmp_path / "report")
+    assert done.code == 0, done.err
+    _no_gait(tmp_path / "report")
+
+
+def _no_gait(out: Path) -> None:
+    """The files of a fit that stands, without gait, with the reason."""
+    metrics = json.loads((out / "metrics.json").read_text())["session"]
+    assert metrics["status"] == "EMPTY"
+    assert "no walking" in metrics["reason"]
+    assert metrics["cadence_steps_per_min"] is None
+    assert metrics["gdi"]["mean"] is None
+    assert {"cadence_steps_per_min", "gdi"} <= set(metrics["reasons"])
+    assert load_events(out / "standing.events.csv") == ()
+    assert "no walking" in (out / "report.html").read_text()
+    assert probe(out / "standing.overlay.mp4").n_frames == 90
+    body = TrialFit.load(out / "standing.fit.npz")
+    assert np.nanmedian(body.residual_2d_px) < 10
+    knees = body.qpos[:, [body.joint_names.index(f"knee_angle_{s}") for s in "rl"]]
+    assert np.all(np.nanmax(knees, axis=0) - np.nanmin(knees, axis=0) < np.radians(15))
+
+
+# ------------------------------------------------------------------------------------------------------ the files
+@pytest.mark.parametrize(
+    ("name", "code"),
+    [
+        ("notes.mp4", "VIDEO_NOT_A_VIDEO"),
+        ("nothing.mp4", "VIDEO_EMPTY"),
+        ("truncated.mp4", "VIDEO_TRUNCATED"),
+        ("not there.mp4", "VIDEO_MISSING"),
+        (EMPTY, "TRACK_NO_PERSON"),
+        ("short.mp4", "TRACK_TOO_SHORT"),
+        ("two.mp4", "SUBJECT_NEEDS_CHOICE"),
+    ],
+)
+def test_run_on_a_bad_video_ends_with_its_code(folder, tmp_path, few_steps, name, code):
+    done = pbl("run", folder / name, "--out", tmp_path / "out", "--params", few_steps)
+    assert (done.code, done.error_code) == (1, code), done.err
+    assert "next:" in done.err
+    assert not list(tmp_path.rglob("report.html"))
+    assert bool(list(tmp_path.rglob("two.persons.png"))) == (code == "SUBJECT_NEEDS_CHOICE")
+
+
+def test_run_stands_and_names_what_it_left_out(folder, tmp_path, few_steps):
+    """Standing, with two videos that cannot be used: they are named, and the rest is done."""
+    videos = [folder / n for n in ("notes.mp4", "standing.mp4", "short.mp4")]
+    done = pbl("run", *videos, "--out", tmp_path, "--params", few_steps)
+    assert done.code == 0, done.err
+    assert "VIDEO_NOT_A_VIDEO" in done.err
+    assert "TRACK_TOO_SHORT" in done.err
+    assert "EMPTY: standing: no walking" in done.out
+    _no_gait(tmp_path)
+    report = (tmp_path / "report.html").read_text()
+    assert "VIDEO_NOT_A_VIDEO" in report
+    assert "TRACK_TOO_SHORT" in report
