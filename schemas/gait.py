@@ -134,7 +134,7 @@ class GaitCycle(dj.Computed):
     -> GaitEvents
     ---
     n_cycles        : int16                    # all complete cycles
-    n_cycles_used   : int16                    # without the first and last step of each bout
+    n_cycles_used   : int16                    # without first and last steps and odd lengths
     curves          : <object@arrays>          # npz: cycle_no (N), names (A), percent (P) of the cycle, curve (N,A,P) deg
     {origin_columns("cycles")}
     """  # noqa: E501
@@ -151,7 +151,7 @@ class GaitCycle(dj.Computed):
         opposite_foot_down : float64           # (s)
         cycle_foot_up      : float64           # (s)
         cycle_end          : float64           # (s) next foot down of the same side
-        cycle_used         : bool              # false for the first and last step of a bout
+        cycle_used         : bool              # false: first or last step of a bout, odd length
         cycle_excluded     : varchar(100)      # why it is not used
         curves_missing     : varchar(100)      # why it has no curves
         """

@@ -214,7 +214,7 @@ def _checks(rows: Any, prefix: str) -> list[Any]:
 
 def load_metrics(key: Any) -> Any:
     """The library's `GaitMetrics` of one row of SessionGdi, from the rows of its trials and its own: nothing is
-    computed anew. A trial's checks are those of its events and index."""
+    computed anew but the checks of a trial's cycles."""
     lib, row = library("gait"), (gdi.SessionGdi & key).fetch1()
     row_key = {k: row[k] for k in gdi.SessionGdi.primary_key}
     trials = tuple(_trial_metrics({**row_key, "video_id": v}) for v in _videos(row_key))
@@ -273,17 +273,17 @@ def _trial_metrics(key: Mapping[str, Any]) -> Any:
         n_cycles_used=int(counts[1]),
         n_steps_used=int(row["n_steps_used"]),
     )
-    index = load_gdi(key, name)
+    index, cycles = load_gdi(key, name), load_cycles(key, name)
     reason = events.reason or measures.reason
     return lib.TrialMetrics(
         name=name,
         status="EMPTY" if reason else "PASS",
         reason=reason,
         events=events,
-        cycles=load_cycles(key, name),
+        cycles=cycles,
         spatiotemporal=measures,
         gdi=index,
-        qc=(*events.qc, *index.qc),
+        qc=(*events.qc, *lib.cycle_checks(measures, cycles), *index.qc),
     )
 
 

@@ -8,7 +8,7 @@ from ._angles import ANGLE_NAMES, AngleSeries, angle_series, pelvis_angles
 from ._cycles import REPORT_PERCENT, GaitCycle, cycle_curves, find_cycles
 from ._feet import FOOT_MARKER_SETS, FootTrajectories, feet_from_fit, feet_from_keypoints, feet_from_markers
 from ._gdi import GDI_MODEL, GDI_PARAMSETS, Gdi, GdiCycle, GdiParams, gdi_vector, score_gdi
-from ._metrics import GaitMetrics, GaitParams, TrialMetrics, gait_metrics
+from ._metrics import GaitMetrics, GaitParams, TrialMetrics, cycle_checks, gait_metrics
 from ._poses import BodyPoses, trial_poses
 from ._spatiotemporal import MEASURES, Measure, Spatiotemporal, spatiotemporal
 from .events import (
@@ -49,6 +49,7 @@ __all__ = [
     "Spatiotemporal",
     "TrialMetrics",
     "angle_series",
+    "cycle_checks",
     "cycle_curves",
     "detect_events",
     "feet_from_fit",

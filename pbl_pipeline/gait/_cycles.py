@@ -20,6 +20,14 @@ if TYPE_CHECKING:
 REPORT_PERCENT = np.linspace(0.0, 100.0, 51)
 #: Frames further apart than this inside a cycle leave it without curves.
 MAX_CURVE_GAP_S = 0.15
+#: A stride longer than this times the typical one holds a step that was missed (at least half a stride more) or a
+#: pause; one shorter than its inverse an event that is none. Strides of one walk vary by a few percent, in ataxia ten.
+STRIDE_RATIO = 1.35
+#: Fewest cycles of a bout for a typical stride of its own; shorter bouts are compared with the whole trial.
+_OWN_MEDIAN = 5
+
+
+_ODD = "times the typical stride"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +36,8 @@ class GaitCycle:
 
     Times in seconds of the trial. In order: `start_s` (foot down), `opposite_foot_up_s`, `opposite_foot_down_s`,
     `foot_up_s`, `end_s`. `number` counts the cycles of a trial in order of time, both sides together, from 0.
-    `used` is False for the cycles that touch the first or last step of their walking bout, `excluded` says why.
+    `used` is False for the cycles that touch the first or last step of their walking bout and for those that are far
+    longer or shorter than the others (`odd_length`); `excluded` says why.
     `curves` maps names of `ANGLE_NAMES` to (51,) degrees at 0, 2, ..., 100 % of the cycle; empty where there is
     no fit or frames are missing (`curves_missing` says which).
     """
@@ -46,6 +55,11 @@ class GaitCycle:
     excluded: str = ""
     curves: dict[str, np.ndarray] = dataclasses.field(default_factory=dict, compare=False, repr=False)
     curves_missing: str = ""
+
+    @property
+    def odd_length(self) -> bool:
+        """Whether the cycle is left out because of its length."""
+        return _ODD in self.excluded
 
     @property
     def stride_time_s(self) -> float:
@@ -67,6 +81,9 @@ def find_cycles(
     that ends with the last one are not used: n - 4 cycles remain, made of exactly the n - 3 inner steps. Eight steps
     (nine foot downs) in view leave 5 cycles. Cycles that are not used stay in the result with `used` False, so that
     both counts can be shown.
+
+    A cycle longer than `STRIDE_RATIO` times the median stride of its bout, or shorter than its inverse, is not used
+    either: a step that was not detected makes one long cycle of each side, which would pass as a slow stride.
     """
     found = events.events if isinstance(events, GaitEvents) else tuple(events)
     name = trial or (fit.name if fit is not None else "")
@@ -108,8 +125,23 @@ def find_cycles(
                 curves_missing=missing,
             )
             cycles.append(cycle)
+    cycles = _without_odd_lengths(cycles)
     cycles.sort(key=lambda c: c.start_s)
     return tuple(dataclasses.replace(c, number=number) for number, c in enumerate(cycles))
+
+
+def _without_odd_lengths(cycles: list[GaitCycle]) -> list[GaitCycle]:
+    out = []
+    for c in cycles:
+        own = [o.stride_time_s for o in cycles if o.bout == c.bout]
+        typical = np.median(own if len(own) >= _OWN_MEDIAN else [o.stride_time_s for o in cycles])
+        ratio = float(c.stride_time_s / typical)
+        if 1 / STRIDE_RATIO <= ratio <= STRIDE_RATIO:
+            out.append(c)
+            continue
+        reason = f"{ratio:.2f} {_ODD}"
+        out.append(dataclasses.replace(c, used=False, excluded=f"{c.excluded} and {reason}" if c.excluded else reason))
+    return out
 
 
 def cycle_curves(

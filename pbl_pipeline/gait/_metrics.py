@@ -119,7 +119,7 @@ def gait_metrics(
         reason=reason,
         spatiotemporal=measures,
         gdi=gdi,
-        qc=(*_cycle_checks(measures), *gdi.qc),
+        qc=(*cycle_checks(measures, cycles), *gdi.qc),
         params_hash=Paramset.of("gait", "gait-metrics", 1, params).hash,
     )
 
@@ -138,7 +138,7 @@ def _trial(fit: TrialFit, norm: NormativeSet, params: GaitParams) -> TrialMetric
         cycles=cycles,
         spatiotemporal=measures,
         gdi=gdi,
-        qc=(*events.qc, *_cycle_checks(measures), *gdi.qc),
+        qc=(*events.qc, *cycle_checks(measures, cycles), *gdi.qc),
     )
 
 
@@ -146,9 +146,18 @@ def _distinct(trials: Sequence[TrialMetrics]) -> list[GaitCycle]:
     return [dataclasses.replace(c, trial=f"{i} {c.trial}") for i, t in enumerate(trials) for c in t.cycles]
 
 
-def _cycle_checks(measures: Spatiotemporal) -> tuple[Check, ...]:
+def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple[Check, ...]:
+    """Checks of the cycles that `measures` were made of: `cycles_used`, `cycles_of_odd_length`, `cadence_plausible`."""
+    odd = sum(c.odd_length for c in cycles)
+    lengths = Check(
+        "cycles_of_odd_length",
+        WARN if odd else PASS,
+        float(odd),
+        0.0,
+        "a step was missed or invented, or the person paused: left out of the measures, see the overlay" if odd else "",
+    )
     if measures.status == EMPTY:
-        return (Check("cycles_used", EMPTY, 0.0, 1.0, measures.reason),)
+        return (Check("cycles_used", EMPTY, 0.0, 1.0, measures.reason), *((lengths,) if odd else ()))
     few = measures.n_cycles_used < 4
     checks = [
         Check(
@@ -158,6 +167,7 @@ def _cycle_checks(measures: Spatiotemporal) -> tuple[Check, ...]:
             4.0,
             "few cycles: film a longer stretch, or several passes" if few else "",
         ),
+        lengths,
     ]
     cadence = measures["cadence_steps_per_min"]
     if cadence is not None:

@@ -44,7 +44,7 @@ class Measure:
 class Spatiotemporal:
     """Measures by name (`MEASURES`); None where one cannot be trusted, with the reason in `reasons`.
 
-    `n_cycles_found` and `n_cycles_used` count before and after the first and last step of each bout are dropped.
+    `n_cycles_found` and `n_cycles_used` count before and after the exclusions of `find_cycles`.
     """
 
     status: str
@@ -74,11 +74,7 @@ def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
     reasons: dict[str, str] = dict.fromkeys(MEASURES[-3:], _NO_SCALE)
     measures: dict[str, Measure | None] = dict.fromkeys(MEASURES)
     if not used:
-        reason = (
-            f"{len(cycles)} gait cycles, none left without the first and last step"
-            if cycles
-            else "no complete gait cycle"
-        )
+        reason = _none_used(cycles)
         reasons.update(dict.fromkeys(MEASURES[:-3], reason))
         return Spatiotemporal("EMPTY", reason, measures, reasons, len(cycles), 0, 0)
     by_cycle: dict[str, list[tuple[str, float]]] = {name: [] for name in MEASURES[:-3]}
@@ -99,6 +95,13 @@ def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
     by_cycle["step_time_s"] = [(side, value) for (_, side, _), value in steps.items()]
     measures.update({name: _measure(values) for name, values in by_cycle.items()})
     return Spatiotemporal("PASS", "", measures, reasons, len(cycles), len(used), len(steps))
+
+
+def _none_used(cycles: Sequence[GaitCycle]) -> str:
+    if not cycles:
+        return "no complete gait cycle"
+    odd = " and strides of odd length" if any(c.odd_length for c in cycles) else ""
+    return f"{len(cycles)} gait cycles, none left without the first and last step{odd}"
 
 
 def _measure(values: Sequence[tuple[str, float]]) -> Measure:

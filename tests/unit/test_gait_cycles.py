@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pbl_pipeline.gait import AngleSeries, Measure, Spatiotemporal, cycle_curves, find_cycles, spatiotemporal
+from pbl_pipeline.gait import (
+    AngleSeries,
+    Measure,
+    Spatiotemporal,
+    cycle_checks,
+    cycle_curves,
+    find_cycles,
+    spatiotemporal,
+)
 from pbl_pipeline.gait.events import GaitEvent
 
 
@@ -119,6 +127,41 @@ def test_a_cycle_without_its_inner_events_is_none():
     assert 2.1 not in starts
     assert 1.5 not in starts  # its own foot up is the one that is missing
     assert 2.6 in starts
+
+
+def steps(times: list[float]) -> list[GaitEvent]:
+    """A walk with foot downs of alternate sides at these times."""
+    return walk([(t, "left" if k % 2 == 0 else "right") for k, t in enumerate(times)], {"left": 0.11, "right": 0.11})
+
+
+def test_a_missed_step_does_not_pass_as_a_long_stride():
+    # Twelve steps of 0.55 s (stride 1.10 s); between the sixth and the seventh foot down one step more goes by unseen.
+    times = [0.55 * k + (0.55 if k >= 6 else 0.0) for k in range(13)]
+    cycles = find_cycles(steps(times))
+    assert [round(c.stride_time_s, 2) for c in cycles if c.odd_length] == [1.65, 1.65]
+    assert {c.excluded for c in cycles if c.odd_length} == {"1.50 times the typical stride"}
+    result = spatiotemporal(cycles)
+    assert (result.n_cycles_found, result.n_cycles_used) == (11, 7)
+    stride = of(result, "stride_time_s")
+    assert stride.mean == pytest.approx(1.10)
+    assert stride.sd == pytest.approx(0.0, abs=1e-9)
+    assert of(result, "cadence_steps_per_min").mean == pytest.approx(60 / 0.55)
+    assert of(result, "step_time_s").mean == pytest.approx(0.55)
+    (check,) = (c for c in cycle_checks(result, cycles) if c.check == "cycles_of_odd_length")
+    assert (check.outcome, check.value) == ("WARN", 2.0)
+    assert check.advice
+
+
+def test_strides_that_vary_as_in_disease_are_all_used():
+    rng = np.random.default_rng(4)
+    times = np.cumsum(0.55 * (1 + 0.10 * rng.standard_normal(30)))
+    cycles = find_cycles(steps(times.tolist()))
+    assert not any(c.odd_length for c in cycles)
+
+
+def test_a_slow_bout_is_compared_with_itself():
+    slow = [GaitEvent(e.time_s * 2 + 20, e.side, e.event, 1.0, 1) for e in EVENTS]
+    assert [c.used for c in find_cycles([*EVENTS, *slow]) if c.bout == 1] == [False, True, True, True, True, False]
 
 
 def series(time: np.ndarray) -> AngleSeries:
