@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pbl_pipeline.body import load_body, marker_positions, marker_set
+from pbl_pipeline.body import load_body, marker_set
 from pbl_pipeline.fit import LEVEL_CAMERA_R_NC
+from pbl_pipeline.fit._problem import FRAME_BUCKET, FitModel
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.video import Camera
 
@@ -56,13 +57,13 @@ def observe(
     confidence: float = 0.9,
 ) -> Keypoints:
     """Project the walker into the camera and add noise."""
-    body, markers = load_body(), marker_set(marker_set_name)
+    markers = marker_set(marker_set_name)
     rng = np.random.default_rng(seed)
     scale = np.ones(8) if scale is None else scale
     offset = np.zeros((len(markers.names), 3), np.float32)
-    x_world = np.asarray(
-        marker_positions(body, markers, qpos.astype(np.float32), scale.astype(np.float32), offset), np.float64
-    )
+    # Padded as the fit pads its frames, so that one compiled program serves both.
+    padded = np.pad(qpos, [(0, -len(qpos) % FRAME_BUCKET), (0, 0)], mode="edge")
+    x_world = np.asarray(FitModel(load_body(), markers).positions(padded, scale, offset), np.float64)[: len(qpos)]
     x_cam = x_world @ LEVEL_CAMERA_R_NC
     uv = x_cam @ CAMERA.matrix.T
     xy = uv[..., :2] / uv[..., 2:] + rng.normal(0, noise_px, (*x_cam.shape[:2], 2))

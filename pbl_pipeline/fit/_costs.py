@@ -10,7 +10,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from pbl_pipeline.body import SCALE_NAMES
 
@@ -50,7 +50,7 @@ def distance_3d_cm2(
     x_cam: Float[Array, "*n J 3"],
     R_nc: Float[Array, "*#n 3 3"],
     c: Float[Array, "*n J"],
-    marker_weight: Float[Array, " J"] | float = 1.0,
+    marker_weight: ArrayLike = 1.0,
 ) -> Float[Array, "*n J"]:
     """Squared distance (cm^2) of model and detected 3D points, both with their mean over the seen markers removed.
 

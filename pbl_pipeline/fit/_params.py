@@ -33,11 +33,15 @@ class CostParams:
 
 @dataclasses.dataclass(frozen=True)
 class ViewParams:
-    """Which frames count: whole person in view, shorter gaps of partial view bridged (paper, Keypoint Detection)."""
+    """Which frames count: whole person in view, shorter gaps of partial view bridged (paper, Keypoint Detection).
+
+    `max_blind_s` is our own addition: longer runs in which nothing was detected are left unknown.
+    """
 
     #: Mean over the markers of a frame.
     min_confidence: float = 0.5
     max_gap_s: float = 1.0
+    max_blind_s: float = 0.15
     min_in_view_s: float = 1.0
 
 
@@ -65,7 +69,7 @@ class ImplicitAdamParams:
     view: ViewParams = ViewParams()
 
 
-#: What 33 points with two on the pelvis, three on each hand and two on each foot hardly tell: turns of the trunk against
+#: What 33 points with two on the pelvis, three on a hand and two on a foot hardly tell: turns of the trunk against
 #: the pelvis, turns of a limb about its own axis, sideways joints. Without a prior these take up whatever the detector
 #: gets wrong (a pelvis tipped back by 25 deg in sitting). Standard deviations are round numbers of the project's own,
 #: set by anatomy and not by fitting: about how far a joint moves in walking and standing up, together with how people

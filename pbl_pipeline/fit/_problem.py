@@ -6,7 +6,6 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,9 +14,10 @@ from jaxtyping import Array, ArrayLike, Float
 from pbl_pipeline.body import Body, MarkerSet, load_body, marker_positions, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.video import Camera, viewing_ray
 
 from ._params import ViewParams
-from ._view import bridge_gaps, longest_run_s, whole_person_in_view
+from ._view import SEEN_SHARE, blind_runs, bridge_gaps, longest_run_s, whole_person_in_view
 
 #: R_nc of a level camera that looks along world +x: columns are the camera's x (right), y (down), z (forward).
 LEVEL_CAMERA_R_NC = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -133,6 +133,7 @@ def check_trial(trial: Keypoints, name: str, view: ViewParams) -> tuple[np.ndarr
         raise _input_error(f"trial {name}: NaN or infinite points with confidence above 0", "confidence 0 there", name)
     in_view = whole_person_in_view(trial, view.min_confidence)
     used = bridge_gaps(in_view, trial.time_s, view.max_gap_s)
+    used &= ~blind_runs(np.mean(seen, axis=1) >= SEEN_SHARE, trial.time_s, view.max_blind_s)
     longest = longest_run_s(used, trial.time_s)
     if longest < view.min_in_view_s:
         raise _input_error(
@@ -147,7 +148,7 @@ def check_trial(trial: Keypoints, name: str, view: ViewParams) -> tuple[np.ndarr
 def _pack(trial: Keypoints, used: np.ndarray, n_frames: int) -> Observations:
     c = np.where(used[:, None], trial.confidence, 0.0)
     seen = c > 0
-    xy = undistort_px(np.where(seen[..., None], trial.xy_px, 0.0), trial)
+    xy = undistort_px(np.where(seen[..., None], trial.xy_px, 0.0), trial.camera)
     x_cam = np.where(seen[..., None], trial.xyz_cam_m, 0.0)
     pad = n_frames - len(used)
 
@@ -165,13 +166,12 @@ def _pack(trial: Keypoints, used: np.ndarray, n_frames: int) -> Observations:
     )
 
 
-def undistort_px(xy_px: np.ndarray, trial: Keypoints) -> np.ndarray:
+def undistort_px(xy_px: np.ndarray, camera: Camera) -> np.ndarray:
     """(T, J, 2) pixels of an ideal pinhole camera with the same matrix."""
-    if not np.any(trial.camera.distortion):
+    if not np.any(camera.distortion):
         return xy_px
-    flat = np.ascontiguousarray(xy_px.reshape(-1, 1, 2), np.float64)
-    matrix = trial.camera.matrix
-    return cv2.undistortPoints(flat, matrix, trial.camera.distortion, P=matrix).reshape(xy_px.shape)
+    pinhole = viewing_ray(xy_px.reshape(-1, 2), camera) @ np.asarray(camera.matrix, np.float64).T
+    return pinhole[:, :2].reshape(xy_px.shape)
 
 
 def _input_error(found: str, expected: str, key: str | None = None, next_step: str = "") -> PblError:

@@ -25,8 +25,8 @@ def check_fit(
     session: Session, trials: Sequence[TrialFit], scale: np.ndarray, loss_trace: np.ndarray
 ) -> tuple[Check, ...]:
     """All checks of one session fit, worst trial per check."""
-    checks = [_residual_2d(session, trials), _residual_3d(trials), _in_view(session), _scale(scale)]
-    checks += [_limits(session, trials), _converged(loss_trace), _camera(session, trials)]
+    checks = [_residual_2d(session, trials), _residual_3d(session, trials), _in_view(session), _scale(scale)]
+    checks += [_limits(session, trials), _converged(loss_trace), _intrinsics(trials), _orientation()]
     # Advice is for whom a check asks to act.
     return tuple(dataclasses.replace(c, advice="") if c.outcome == PASS else c for c in checks)
 
@@ -38,7 +38,9 @@ def _grade(value: float, warn: float, fail: float) -> str:
 def _residual_2d(session: Session, trials: Sequence[TrialFit]) -> Check:
     shares = []
     for keypoints, trial in zip(session.trials, trials, strict=True):
-        height = np.nanmedian(keypoints.box_px[:, 3] - keypoints.box_px[:, 1])
+        y = np.where(np.isfinite(trial.residual_2d_px), keypoints.xy_px[..., 1], np.nan)
+        y = y[np.isfinite(y).any(axis=1)]
+        height = np.median(np.nanmax(y, axis=1) - np.nanmin(y, axis=1))
         shares.append(np.nanmedian(trial.residual_2d_px) / height)
     value = float(np.max(shares))
     return Check(
@@ -50,8 +52,9 @@ def _residual_2d(session: Session, trials: Sequence[TrialFit]) -> Check:
     )
 
 
-def _residual_3d(trials: Sequence[TrialFit]) -> Check:
-    value = float(np.max([100 * np.nanmedian(t.residual_3d_m) for t in trials]))
+def _residual_3d(session: Session, trials: Sequence[TrialFit]) -> Check:
+    counts = np.asarray(session.model.markers.weight_3d) > 0
+    value = float(np.max([100 * np.nanmedian(t.residual_3d_m[:, counts]) for t in trials]))
     return Check(
         "residual_3d_cm",
         _grade(value, RESIDUAL_3D_WARN_CM, RESIDUAL_3D_FAIL_CM),
@@ -109,8 +112,23 @@ def _converged(loss_trace: np.ndarray) -> Check:
     )
 
 
-def _camera(session: Session, trials: Sequence[TrialFit]) -> Check:
-    sources = {t.camera.source for t in session.trials}
-    guessed = any(s.startswith("guess") for s in sources)
-    advice = "the focal length is a guess: pass --camera with a calibration"
-    return Check("camera_intrinsics_measured", WARN if guessed else PASS, None, None, advice)
+def _intrinsics(trials: Sequence[TrialFit]) -> Check:
+    sources = sorted({t.camera.source for t in trials if not t.camera.source.startswith(("measured", "file"))})
+    return Check(
+        "camera_intrinsics_measured",
+        WARN if sources else PASS,
+        None,
+        None,
+        f"the focal length is not measured ({'; '.join(sources)}): pass --camera with a calibration",
+    )
+
+
+def _orientation() -> Check:
+    return Check(
+        "camera_orientation_known",
+        WARN,
+        None,
+        None,
+        "the camera is taken as level and still: its own tilt adds to the pelvis angles and to positions, not to the "
+        "angles between segments (hip, knee, ankle)",
+    )

@@ -97,7 +97,8 @@ def _trial_fit(
     body, markers = session.model.body, session.model.markers
     x = session.model.positions(qpos, solution.scale, solution.site_offset_m)
     R_nc, matrix = obs.R_nc[i][None], obs.camera_matrix[i][None]
-    residual_3d = 0.01 * np.sqrt(np.asarray(distance_3d_cm2(x, obs.x_cam[i], R_nc, obs.c[i])))[:n]
+    weight_3d = np.asarray(markers.weight_3d, np.float32)
+    residual_3d = 0.01 * np.sqrt(np.asarray(distance_3d_cm2(x, obs.x_cam[i], R_nc, obs.c[i], weight_3d)))[:n]
     residual_2d = np.sqrt(np.asarray(distance_2d_px2(x, obs.xy_px[i], R_nc, matrix)))[:n]
     seen = np.asarray(obs.c[i])[:n] > 0
     hide = ~used[:, None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import Body
 
@@ -41,8 +42,9 @@ def headings(session: Session, trial: int) -> np.ndarray:
     """
     model = session.model
     trunk = np.array([b in _TRUNK for b in model.markers.body_names])
-    standing = np.zeros(len(model.body.joint_names))
-    template = np.asarray(model.positions(standing, np.ones(8), np.zeros((len(trunk), 3))))[trunk]
+    # As many frames as the trial has, though one would do: the same compiled program serves the residuals later.
+    standing = np.zeros((session.obs.time_s.shape[1], len(model.body.joint_names)))
+    template = np.asarray(model.positions(standing, np.ones(8), np.zeros((len(trunk), 3))))[0, trunk]
     x_world = np.asarray(session.obs.x_cam[trial])[:, trunk] @ LEVEL_CAMERA_R_NC.T
     c = np.asarray(session.obs.c[trial])[:, trunk]
     out = np.full(len(x_world), np.nan)
@@ -64,7 +66,7 @@ def start_pose(body: Body, position_world_m: np.ndarray, heading_rad: float) -> 
     qpos = np.zeros(model.nq)
     i = {n: k for k, n in enumerate(body.joint_names)}
     pelvis = model.body("pelvis")
-    rotation = _matrix(pelvis.quat)
+    rotation = Rotation.from_quat(pelvis.quat, scalar_first=True).as_matrix()
     tx, ty, tz = rotation.T @ (np.asarray(position_world_m) - pelvis.pos)
     qpos[i["pelvis_tx"]], qpos[i["pelvis_ty"]], qpos[i["pelvis_tz"]] = tx, ty, tz
     qpos[i["pelvis_rotation"]] = heading_rad
@@ -94,14 +96,3 @@ def paper_start(session: Session, distance_m: float, middle: np.ndarray) -> np.n
     qpos = start_pose(session.model.body, np.array([distance_m, 0.0, 0.0]), 0.0)
     translation = [n in ("pelvis_tx", "pelvis_ty", "pelvis_tz") for n in session.model.body.joint_names]
     return np.where(translation, qpos, middle)
-
-
-def _matrix(quat_wxyz: np.ndarray) -> np.ndarray:
-    w, x, y, z = quat_wxyz / np.linalg.norm(quat_wxyz)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

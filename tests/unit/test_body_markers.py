@@ -187,3 +187,22 @@ def test_a_bad_table_is_refused(tmp_path, text, found):
 def test_a_missing_table_is_refused(tmp_path):
     with pytest.raises(PblError, match="FILE_FORMAT"):
         load_marker_set(tmp_path / "none.csv")
+
+
+def test_only_the_large_joints_of_blazepose_count_in_3d():
+    markers = marker_set("blazepose_33")
+    large = ["shoulder", "elbow", "wrist", "hip", "knee", "ankle"]
+    counted = {n for n, w in zip(markers.names, markers.weight_3d, strict=True) if w == 1}
+    assert counted == {f"{s}_{j}" for s in ("left", "right") for j in large}
+    assert set(markers.weight_3d) == {0.0, 1.0}
+    assert np.all(marker_set("bml_movi_87").weight_3d == 1)
+
+
+def test_a_table_may_weight_its_markers(tmp_path):
+    path = tmp_path / "mine.csv"
+    path.write_text("name,body,x,y,z,weight_3d\na,pelvis,0,0,0,0.5\nb,pelvis,0,0,0.1,\n")
+    np.testing.assert_array_equal(load_marker_set(path).weight_3d, [0.5, 1])
+    path.write_text("name,body,x,y,z,weight_3d\na,pelvis,0,0,0,2\n")
+    with pytest.raises(PblError, match="weight_3d") as error:
+        load_marker_set(path)
+    assert error.value.code == "FILE_FORMAT"

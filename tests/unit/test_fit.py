@@ -80,6 +80,7 @@ def test_fit_residuals_are_at_the_noise(two_trials):
         assert np.nanmedian(trial.residual_2d_px) < 2 * 2.0
         assert np.nanmedian(trial.residual_3d_m) < 2 * 0.016  # |N(0, 1 cm)| in 3D has its median at 1.5 cm
     assert {c.check: c.outcome for c in fit.qc}["residual_2d_share_of_body_height"] == "PASS"
+    assert all(bool(c.advice) == (c.outcome != "PASS") for c in fit.qc)
 
 
 def test_fit_shares_one_body_and_reports_how_it_was_made(two_trials):
