@@ -20,6 +20,7 @@ from pbl_pipeline.video import probe
 from schemas import fit, gait, gdi, keypoints, lab, qc, tracking, video, views
 from schemas._base import insert_methods
 from tests.command import Done, pbl
+from tests.videos import constant_rate, numbered_frames, write_video
 
 from .conftest import FEW_STEPS
 
@@ -155,6 +156,23 @@ def test_the_report_of_a_visit_without_walking(status, tmp_path):
     done = pbl("report", "--subject", "P001", "--session", "stands", "--out", tmp_path / "report")
     assert done.code == 0, done.err
     _no_gait(tmp_path / "report")
+
+
+def test_without_the_models_an_error_waits_until_they_are_there(status, tmp_path, monkeypatch):
+    path = write_video(tmp_path / "later.mp4", numbered_frames(40), constant_rate(40))
+    assert pbl("ingest", path, "--subject", "P001", "--session", "later").code == 0
+    with monkeypatch.context() as patch:
+        patch.setenv("PBL_CACHE", str(tmp_path / "cache"))
+        patch.setenv("PBL_OFFLINE", "1")
+        done = pbl("populate", "--table", "VideoInfo", "--table", "Tracking")
+        assert done.code == 0, done.err
+        assert "ASSET_MISSING" in done.out
+    (error,) = (e for e in json.loads(pbl("status", "--json").out)["errors"] if e["about"] == "later.mp4")
+    assert (error["table"], error["code"]) == ("Tracking", "ASSET_MISSING")
+    assert "pip download" in error["next_step"]
+    assert "nothing to do" in pbl("populate").out
+    assert pbl("populate", "--retry-errors", "--table", "Tracking").code == 0
+    assert len(tracking.Tracking * video.Video.proj("video_name") & {"video_name": "later.mp4"}) == 1
 
 
 def _no_gait(out: Path) -> None:
