@@ -14,7 +14,7 @@ import tempfile
 import time
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -359,6 +359,21 @@ def _lost(ref: Mapping[str, Any]) -> PblError:
         expected="every file that a row of the database names",
         next_step="restore the object store from the backup, or delete the row so that it is computed again",
     )
+
+
+# ---------------------------------------------------------------------------------------------- what is out of date
+def delete_below(table: Any, keys: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    """Delete the rows with these keys and all that was computed from them, in one transaction.
+
+    Returns table name to number of deleted rows, empty when there was nothing.
+    """
+    if not keys:
+        return {}
+    # As plain keys: a cascade from a restriction by subqueries fails in DataJoint 2.3.5 ("attribute not found").
+    target = table & list(keys)
+    counts = {name: n for name, n in dj.Diagram.cascade(target, part_integrity="cascade").counts().items() if n}
+    target.delete(prompt=False, part_integrity="cascade")
+    return counts
 
 
 def utc_now() -> datetime.datetime:

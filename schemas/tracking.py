@@ -14,6 +14,7 @@ from . import video
 from ._base import (
     Origin,
     computes,
+    delete_below,
     dj,
     file_ref,
     library,
@@ -211,8 +212,8 @@ def set_override(key: Mapping[str, Any], person_id: int) -> None:
 
 def outdated_choices(restriction: Any = True) -> Any:
     """Choices that contradict the overrides: another person decided, or the decision was withdrawn."""
-    decided = SubjectChoice.proj("choice_status", "chosen_person_id") * SubjectOverride.proj("override_person_id")
-    differs = decided & "choice_status != 'MANUAL' or chosen_person_id != override_person_id"
+    decided = SubjectChoice.proj("chosen_person_id") * SubjectOverride.proj("override_person_id")
+    differs = decided & "chosen_person_id is null or chosen_person_id != override_person_id"
     withdrawn = (SubjectChoice & {"choice_status": "MANUAL"}) - SubjectOverride
     return SubjectChoice & [differs.proj(), withdrawn.proj()] & restriction
 
@@ -220,19 +221,21 @@ def outdated_choices(restriction: Any = True) -> Any:
 def drop_outdated_choices(restriction: Any = True) -> dict[str, int]:
     """Delete outdated choices and all that was computed from them, in one transaction.
 
+    Where a person decided for whom the automatic choice had chosen already, nothing that was computed changes: the
+    choice becomes MANUAL and stays.
+
     Returns
     -------
     dict
         Table name to number of deleted rows, empty when nothing was outdated. The next populate computes them anew.
     """
-    keys = outdated_choices(restriction).keys()
-    if not keys:
-        return {}
-    # As plain keys: a cascade from a restriction by subqueries fails in DataJoint 2.3.5 ("attribute not found").
-    target = SubjectChoice & keys
-    counts = {name: n for name, n in dj.Diagram.cascade(target, part_integrity="cascade").counts().items() if n}
-    target.delete(prompt=False, part_integrity="cascade")
-    return counts
+    confirmed = SubjectChoice.proj("choice_status", "chosen_person_id") * SubjectOverride.proj("override_person_id")
+    confirmed = confirmed & "choice_status != 'MANUAL' and chosen_person_id = override_person_id" & restriction
+    for row in confirmed.to_dicts():
+        key = {k: row[k] for k in SubjectChoice.primary_key}
+        reason = f"Person {row['override_person_id']} was chosen by hand, as automatically before."
+        SubjectChoice.update1({**key, "choice_status": "MANUAL", "choice_reason": reason})
+    return delete_below(SubjectChoice, outdated_choices(restriction).keys())
 
 
 # ------------------------------------------------------------------------------------------------------- files, rows

@@ -296,6 +296,24 @@ def test_a_decision_wins_and_recomputes_what_was_another_persons(tables: None, t
     assert tracking.SubjectChoice.fetch1("choice_status", "chosen_person_id") == ("CHOSEN", 1)
 
 
+def test_confirming_the_automatic_choice_deletes_nothing(tables: None, tmp_path: Path):
+    (number,) = register(chain.small_video(tmp_path, "walk"))
+    populate()
+    assert tracking.SubjectChoice.fetch1("choice_status", "chosen_person_id") == ("CHOSEN", 1)
+    computed = qc.SessionQc.fetch1("qc_computed")
+    assert choose_person(number, 1) == {}
+    assert tracking.SubjectChoice.fetch1("choice_status", "chosen_person_id") == ("MANUAL", 1)
+    assert "by hand" in tracking.SubjectChoice.fetch1("choice_reason")
+    assert qc.SessionQc.fetch1("qc_computed") == computed
+    assert not populate().did_something
+    # By another route than the command it is the same.
+    other = register(chain.small_video(tmp_path, "other"))[0]
+    populate()
+    tracking.set_override({"video_id": other, "tracking_method": tracking.Tracking.to_arrays("tracking_method")[0]}, 1)
+    assert not populate().did_something
+    assert set(tracking.SubjectChoice.to_arrays("choice_status")) == {"MANUAL"}
+
+
 def test_a_decision_given_with_the_video_is_checked_when_the_people_are_known(tables: None, tmp_path: Path):
     (number,) = register(chain.small_video(tmp_path, "walk"), person=9)
     assert errors(populate()) == {"SubjectChoice": {"SUBJECT_UNKNOWN_PERSON": 1}}
