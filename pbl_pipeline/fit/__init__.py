@@ -1,7 +1,8 @@
 """The session fit: keypoints of 1..N trials to joint angles, one body for all."""
 
 from ._params import DEFAULT, PARAMSETS, CostParams, ImplicitAdamParams, ViewParams, params_of
-from ._session import LEVEL_CAMERA_QUAT_WXYZ, LEVEL_CAMERA_R_NC, SOLVERS, check_trial, fit_session, with_steps
+from ._problem import LEVEL_CAMERA_R_NC
+from ._session import LEVEL_CAMERA_QUAT_WXYZ, SOLVERS, check_trial, fit_session
 from ._types import SessionFit, TrialFit
 
 __all__ = [
@@ -18,5 +19,4 @@ __all__ = [
     "check_trial",
     "fit_session",
     "params_of",
-    "with_steps",
 ]

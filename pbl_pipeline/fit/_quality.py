@@ -18,7 +18,10 @@ RESIDUAL_3D_WARN_CM, RESIDUAL_3D_FAIL_CM = 6.0, 15.0
 IN_VIEW_WARN = 0.5
 SCALE_LOW, SCALE_HIGH = 0.8, 1.25
 LIMIT_MARGIN_RAD, LIMIT_SHARE = np.deg2rad(1.0), 0.2
-CONVERGED_CHANGE = 0.05
+#: Fall of the loss over the second half of the steps, as a share of its end. The learning rate decays, so the very end
+#: is flat whatever happens; this fall is not. On the demo and on a synthetic walker, joint angles after a fall of 0.07
+#: to 0.14 were within 1 deg (median) of those after three times the steps, after 0.16 to 0.28 within 2 deg.
+FALL_WARN, TRACE_NEEDED = 0.2, 8
 
 
 def check_fit(
@@ -101,13 +104,14 @@ def _limits(session: Session, trials: Sequence[TrialFit]) -> Check:
 
 
 def _converged(loss_trace: np.ndarray) -> Check:
-    tail = loss_trace[int(0.9 * len(loss_trace)) - 1 :, 1]
-    change = float((tail[0] - tail[-1]) / tail[-1])
+    loss = loss_trace[:, 1]
+    enough = len(loss) >= TRACE_NEEDED
+    fall = float(loss[len(loss) // 2 - 1] / loss[-1] - 1) if enough else None
     return Check(
-        "loss_change_over_last_tenth",
-        PASS if abs(change) < CONVERGED_CHANGE else WARN,
-        change,
-        CONVERGED_CHANGE,
+        "loss_fall_over_second_half",
+        PASS if fall is not None and fall < FALL_WARN else WARN,
+        fall,
+        FALL_WARN,
         "the optimisation was still moving: use a paramset with more steps",
     )
 

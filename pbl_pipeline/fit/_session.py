@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Sequence
 
@@ -15,7 +14,7 @@ from pbl_pipeline.paramset import Paramset
 
 from ._costs import distance_2d_px2, distance_3d_cm2
 from ._params import DEFAULT, PARAMSETS, params_of
-from ._problem import LEVEL_CAMERA_R_NC, Session, make_session
+from ._problem import Session, make_session
 from ._problem import check_trial as _check_trial
 from ._quality import check_fit
 from ._types import SessionFit, TrialFit
@@ -125,12 +124,3 @@ def _trial_fit(
         loss=float(solution.loss_trace[-1, 1]),
         seconds=seconds,
     )
-
-
-def with_steps(paramset: Paramset, steps: int) -> Paramset:
-    """The same method with another number of steps, under a name that says so."""
-    params = dataclasses.replace(params_of(paramset), steps=steps)
-    return Paramset.of(paramset.stage, f"{paramset.name}-{steps}-steps", paramset.version, params)
-
-
-__all__ = ["LEVEL_CAMERA_QUAT_WXYZ", "LEVEL_CAMERA_R_NC", "fit_session", "with_steps"]

@@ -8,10 +8,9 @@ and without this rotation would seem to turn while she walks straight on.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
-from pbl_pipeline.video import Camera
+from pbl_pipeline.video import Camera, viewing_ray
 
 
 def crop_matrix(roi_px: np.ndarray, size: int) -> np.ndarray:
@@ -23,16 +22,6 @@ def crop_matrix(roi_px: np.ndarray, size: int) -> np.ndarray:
     cosine, sine = np.cos(rotation), np.sin(rotation)
     turn = np.array([[cosine, -sine], [sine, cosine]]) * (side / size)
     return np.column_stack([turn, np.array([x, y]) - turn @ [size / 2, size / 2]])
-
-
-def viewing_ray(xy_px: np.ndarray, camera: Camera) -> np.ndarray:
-    """(N, 3) rays x/z, y/z, 1 of the picture points (N, 2), distortion removed."""
-    points = np.asarray(xy_px, np.float64).reshape(-1, 1, 2)
-    matrix, distortion = np.asarray(camera.matrix, np.float64), np.asarray(camera.distortion, np.float64)
-    # OpenCV's five iterations leave some tenths of a pixel with a wide lens.
-    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
-    flat = cv2.undistortPoints(points, matrix, distortion, criteria=stop)
-    return np.column_stack([flat.reshape(-1, 2), np.ones(len(points))])
 
 
 def view_rotation(roi_px: np.ndarray, camera: Camera) -> np.ndarray:

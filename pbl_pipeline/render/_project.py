@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.video import Camera
 
@@ -16,13 +17,7 @@ def rotation_matrix(quat_wxyz: np.ndarray) -> np.ndarray:
     For `phone_quat_wxyz` this is R_nc: it takes camera vectors to the world.
     """
     q = np.asarray(quat_wxyz, float)
-    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return Rotation.from_quat(q.reshape(-1, 4), scalar_first=True).as_matrix().reshape(*q.shape[:-1], 3, 3)
 
 
 def to_camera(points_world_m: np.ndarray, quat_wxyz: np.ndarray) -> np.ndarray:

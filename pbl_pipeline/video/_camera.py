@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from pbl_pipeline.errors import PblError
@@ -167,3 +168,13 @@ def _check_distortion(path: Path, matrix: np.ndarray, distortion: np.ndarray, im
 
 def _invalid(path: Path, found: str, expected: str) -> PblError:
     return PblError("CAMERA_INVALID", found=found, expected=expected, next_step=_NEXT, key=path)
+
+
+def viewing_ray(xy_px: np.ndarray, camera: Camera) -> np.ndarray:
+    """(N, 3) rays x/z, y/z, 1 of the picture points (N, 2), distortion removed."""
+    points = np.asarray(xy_px, np.float64).reshape(-1, 1, 2)
+    matrix, distortion = np.asarray(camera.matrix, np.float64), np.asarray(camera.distortion, np.float64)
+    # OpenCV's five iterations leave some tenths of a pixel with a wide lens.
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
+    flat = cv2.undistortPoints(points, matrix, distortion, criteria=stop)
+    return np.column_stack([flat.reshape(-1, 2), np.ones(len(points))])

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import PARAMSETS, TrialFit, fit_session, params_of, with_steps
+from pbl_pipeline.fit import PARAMSETS, TrialFit, check_trial, fit_session, params_of
 from pbl_pipeline.fit._costs import (
     center,
     distance_2d_px2,
@@ -22,7 +23,8 @@ from pbl_pipeline.fit._costs import (
     weighted_mean,
 )
 from pbl_pipeline.fit._prior import prior_of
-from pbl_pipeline.fit._problem import LEVEL_CAMERA_R_NC
+from pbl_pipeline.fit._problem import LEVEL_CAMERA_R_NC, undistort_px
+from pbl_pipeline.fit._quality import _converged
 from pbl_pipeline.fit._start import root_positions
 from pbl_pipeline.fit._trajectory import ImplicitTrajectory, fit_ranges, frequencies, pose_of, raw_of
 from pbl_pipeline.fit._view import bridge_gaps, longest_run_s, whole_person_in_view
@@ -275,6 +277,41 @@ def test_paramsets_survive_json_and_name_their_steps():
         stored = Paramset(p.stage, p.name, p.version, json.loads(p.canonical_json))
         assert params_of(stored) == params_of(p)
         assert stored.hash == p.hash
-    short = with_steps(PARAMSETS["paper-2025"], 100)
-    assert short.hash != PARAMSETS["paper-2025"].hash
-    assert "100" in short.name
+
+
+def test_where_nothing_was_seen_nothing_is_known():
+    k = observe(walking_qpos(TIME_S), TIME_S)
+    confidence = k.confidence.copy()
+    confidence[20:23] = 0  # 0.1 s: bridged
+    confidence[40:62] = 0  # 0.7 s: left unknown
+    confidence[65:70, :11] = 0  # the face alone
+    xy = np.where(confidence[..., None] > 0, k.xy_px, np.nan)
+    xyz = np.where(confidence[..., None] > 0, k.xyz_cam_m, np.nan)
+    used, _ = check_trial(dataclasses.replace(k, xy_px=xy, xyz_cam_m=xyz, confidence=confidence), "a")
+    assert np.flatnonzero(~used).tolist() == list(range(40, 62))
+
+
+def test_convergence_is_judged_by_the_second_half_and_needs_a_trace():
+    def outcome(loss):
+        return _converged(np.column_stack([np.arange(len(loss)), loss])).outcome
+
+    assert outcome([9.0, 3.0, 1.5, 1.1, 1.05, 1.02, 1.01, 1.0]) == "PASS"
+    assert outcome([9.0, 6.0, 4.0, 3.0, 2.0, 1.5, 1.2, 1.0]) == "WARN"
+    assert outcome([1.0]) == "WARN"
+
+
+def test_an_unmeasured_camera_is_told():
+    k = observe(walking_qpos(TIME_S), TIME_S)
+    guessed = dataclasses.replace(k, camera=dataclasses.replace(k.camera, source="estimated: by somebody"))
+    checks = {c.check: c for c in fit_session([guessed], ["a"], quick(250)).qc}
+    assert checks["camera_intrinsics_measured"].outcome == "WARN"
+    assert "by somebody" in checks["camera_intrinsics_measured"].advice
+    assert checks["camera_orientation_known"].outcome == "WARN"
+
+
+def test_lens_distortion_is_undone():
+    camera = dataclasses.replace(CAMERA, distortion=np.array([-0.25, 0.08, 0.001, -0.0005, 0.0]))
+    x = np.random.default_rng(3).uniform([-1.5, -0.8, 3.0], [1.5, 0.8, 5.0], (40, 3))
+    seen = cv2.projectPoints(x, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)[0].reshape(1, 40, 2)
+    straight = x @ camera.matrix.T
+    np.testing.assert_allclose(undistort_px(seen, camera)[0], straight[:, :2] / straight[:, 2:], atol=0.01)

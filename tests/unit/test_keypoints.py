@@ -20,10 +20,10 @@ from pbl_pipeline.keypoints import (
 )
 from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES
 from pbl_pipeline.keypoints._detect import refine_rois, smooth_rois
-from pbl_pipeline.keypoints._view import crop_matrix, viewing_ray
+from pbl_pipeline.keypoints._view import crop_matrix
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.tracking._blazepose import body_box
-from pbl_pipeline.video import Camera
+from pbl_pipeline.video import Camera, viewing_ray
 from tests.videos import constant_rate, write_video
 
 CAMERA = Camera(np.array([[1300.0, 0, 960], [0, 1300.0, 540], [0, 0, 1]]), np.zeros(5), "test")
