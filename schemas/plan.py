@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
-from . import fit, keypoints, tracking, video
+from . import fit, keypoints, session, tracking, video
 from ._base import dj, utc_now
 
 #: What one fit is for: a session, seen through one chain of methods.
 GROUP = ("session_id", "tracking_method", "keypoint_method", "fit_method")
+
+
+#: The tables in which an error row decides that a trial does not take part.
+UNDECIDED = (video.VideoInfo, tracking.Tracking, tracking.SubjectChoice, keypoints.Keypoints, fit.TrialInput)
 
 
 def plan_fit_sets() -> list[dict[str, Any]]:
@@ -20,24 +25,60 @@ def plan_fit_sets() -> list[dict[str, Any]]:
     A trial is decided when it can be fitted (TrialInput), failed, shows nobody, or waits for a person's choice. While
     another trial of the session is still being computed, nothing is planned: otherwise every single video of a visit
     would trigger a fit of its own. A later video (or choice) makes a new set; the old set and its fit stay, no longer
-    current.
+    current. Workers take turns at a session, and where several sets of it are current all but one cease to be.
 
     Returns
     -------
     list of dict
         fit_set and fit_method of the sets that became current now.
     """
-    fitted = (fit.FitSet.Video * (fit.FitSelection & {"fit_current": True})).proj("tracking_method", "keypoint_method")
+    current = fit.FitSelection & {"fit_current": True}
+    fitted = (fit.FitSet.Video * current).proj("tracking_method", "keypoint_method")
     in_a_set = dj.U("video_id", "tracking_method", "keypoint_method", "fit_method") & fitted
     new = fit.TrialInput.proj() * video.Video.proj("session_id") - in_a_set
-    sessions = sorted({int(s) for s in new.to_arrays("session_id")})
+    by_method = dj.U("session_id", "fit_method").aggr(current * fit.FitSet.proj("session_id"), n_current="count(*)")
+    several = (by_method & "n_current > 1").proj()
+    sessions = sorted({int(s) for found in (new, several) for s in found.to_arrays("session_id")})
+    failed = [table.jobs for table in UNDECIDED]  # declares the job tables, which would end a transaction
     made = []
     for session_id in sessions:
-        made += _plan_session(session_id)
+        with _locked(session_id):
+            _keep_one_current(session_id)
+            made += _plan_session(session_id, failed)
     return made
 
 
-def _plan_session(session_id: int) -> list[dict[str, Any]]:
+@contextmanager
+def _locked(session_id: int) -> Iterator[None]:
+    """A transaction in which nobody else plans this session and every query sees what others have committed.
+
+    Two workers that see different trials ready would otherwise both make their set the current one.
+    """
+    connection = fit.schema.connection
+    assert connection is not None
+    # For this transaction only: the snapshot of the default level would be from before the lock.
+    connection.query("SET TRANSACTION ISOLATION LEVEL READ COMMITTED")
+    with connection.transaction:
+        table = session.Session.full_table_name  # DataJoint's own name, quoted; the number is an argument
+        connection.query(f"SELECT session_id FROM {table} WHERE session_id = %s FOR UPDATE", args=(session_id,))  # noqa: S608
+        yield
+
+
+def _keep_one_current(session_id: int) -> None:
+    """Of several current sets of one group the largest stays current, of equally large ones the newest."""
+    member = fit.FitSet.Video.proj("tracking_method", "keypoint_method")
+    sets = fit.FitSet.proj("session_id", "fit_set_n", "fit_set_created") & {"session_id": session_id}
+    rows = ((fit.FitSelection & {"fit_current": True}) * sets).to_dicts(order_by="fit_set_n DESC, fit_set_created DESC")
+    kept = set()
+    for row in rows:
+        methods = (member & {"fit_set": row["fit_set"]}).to_dicts(limit=1)[0]
+        group = tuple({**methods, **row}[k] for k in GROUP)
+        if group in kept:
+            fit.FitSelection.update1({k: row[k] for k in fit.FitSelection.primary_key} | {"fit_current": False})
+        kept.add(group)
+
+
+def _plan_session(session_id: int, failed: Sequence[Any]) -> list[dict[str, Any]]:
     videos = video.Video & {"session_id": session_id}
     selected = (keypoints.KeypointSelection.proj() * videos.proj("session_id")) * fit.FitPlan.proj()
     ready = (
@@ -48,7 +89,7 @@ def _plan_session(session_id: int) -> list[dict[str, Any]]:
     ready_by_group: dict[tuple, list[dict]] = defaultdict(list)
     for row in ready.to_dicts(order_by="video_id"):
         ready_by_group[tuple(row[k] for k in GROUP)].append(row)
-    decided = _decided(videos)
+    decided = _decided(videos, failed)
     waiting = set()
     for row in selected.to_dicts():
         group = tuple(row[k] for k in GROUP)
@@ -67,27 +108,16 @@ def _make_set(group: Mapping[str, Any], rows: list[dict]) -> list[dict[str, Any]
     selection = {"fit_set": name, "fit_method": group["fit_method"]}
     if fit.FitSelection & selection & {"fit_current": True}:
         return []
-    connection = fit.schema.connection
-    assert connection is not None
-    with connection.transaction:
-        fit.FitSet.insert1(
-            {
-                "fit_set": name,
-                "session_id": group["session_id"],
-                "fit_set_n": len(rows),
-                "fit_set_created": utc_now(),
-            },
-            skip_duplicates=True,
-        )
-        member = ("video_id", "tracking_method", "keypoint_method")
-        fit.FitSet.Video.insert(
-            ({"fit_set": name, **{k: row[k] for k in member}} for row in rows), skip_duplicates=True
-        )
-        for older in _older_sets(group, name):
-            fit.FitSelection.update1({**older, "fit_current": False})
-        # Another process may have planned the same set in the meantime.
-        fit.FitSelection.insert1({**selection, "fit_current": True}, skip_duplicates=True)
-        fit.FitSelection.update1({**selection, "fit_current": True})
+    fit.FitSet.insert1(
+        {"fit_set": name, "session_id": group["session_id"], "fit_set_n": len(rows), "fit_set_created": utc_now()},
+        skip_duplicates=True,
+    )
+    member = ("video_id", "tracking_method", "keypoint_method")
+    fit.FitSet.Video.insert(({"fit_set": name, **{k: row[k] for k in member}} for row in rows), skip_duplicates=True)
+    for older in _older_sets(group, name):
+        fit.FitSelection.update1({**older, "fit_current": False})
+    fit.FitSelection.insert1({**selection, "fit_current": True}, skip_duplicates=True)
+    fit.FitSelection.update1({**selection, "fit_current": True})
     return [selection]
 
 
@@ -107,13 +137,12 @@ def fit_set_hash(group: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) ->
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
 
 
-def _decided(videos: Any) -> Any:
+def _decided(videos: Any, failed: Sequence[Any]) -> Any:
     """A test of a selection row: True when it will not give keypoints by itself (failed, nobody, must be chosen)."""
     ids = {int(v) for v in videos.to_arrays("video_id")}
     stopped: list[dict] = []
-    for table in (video.VideoInfo, tracking.Tracking, tracking.SubjectChoice, keypoints.Keypoints, fit.TrialInput):
-        failed = table.jobs.errors.keys()
-        stopped += [k for k in failed if int(k["video_id"]) in ids]
+    for jobs in failed:
+        stopped += [k for k in list(jobs.errors.keys()) if int(k["video_id"]) in ids]
     unchosen = (tracking.SubjectChoice & videos) - [{"choice_status": s} for s in tracking.CHOSEN]
     stopped += list(unchosen.keys())
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import platform
 import re
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pymysql
 import pytest
 from click.testing import CliRunner
 
@@ -20,6 +23,7 @@ from pbl_pipeline.errors import PblError
 from schemas import fit, gait, gdi, keypoints, lab, qc, session, table_map, tracking, video, views
 from schemas.choose import choose_person
 from schemas.ingest import Methods, Visit, ingest
+from schemas.plan import plan_fit_sets
 from schemas.results import load_session
 from schemas.status import pipeline_status
 from workers.populate import populate
@@ -354,6 +358,53 @@ def test_a_later_video_makes_a_new_set_and_the_old_fit_stays(tables: None, tmp_p
     run = populate()
     assert done(run)["SessionFit"] == 0
     assert fit.FitSelection.fetch1("fit_current") == 1
+
+
+def test_two_planners_take_turns_and_the_second_sees_what_the_first_left(tables: None, tmp_path: Path):
+    """The planner waits for another that holds the session, and then counts the trials that there are by then."""
+    first, second = register(chain.small_video(tmp_path, "walk1"), chain.small_video(tmp_path, "walk2"))
+    populate(["VideoInfo", "Tracking", "SubjectChoice", "Keypoints", "TrialInput"])
+    fit.FitSet.delete(prompt=False, part_integrity="cascade")  # that run planned them both
+    assert len(fit.FitSelection()) == 0
+    about = fit.schema.connection.conn_info
+    other = pymysql.connect(host=about["host"], port=about["port"], user=about["user"], password=about["passwd"])
+    order = []
+
+    def release() -> None:
+        time.sleep(1.0)
+        with other.cursor() as cursor:
+            cursor.execute(f"DELETE FROM {fit.TrialInput.full_table_name} WHERE video_id = {second}")
+            cursor.execute(f"DELETE FROM {fit.FitPlan.full_table_name}")
+        order.append("other planner done")
+        other.commit()
+
+    with other.cursor() as cursor:
+        cursor.execute(f"SELECT * FROM {session.Session.full_table_name} FOR UPDATE")
+    holder = threading.Thread(target=release)
+    holder.start()
+    (made,) = plan_fit_sets()
+    order.append("planned")
+    holder.join()
+    other.close()
+    assert order == ["other planner done", "planned"]
+    assert (fit.FitSet.Video & made).to_arrays("video_id").tolist() == [first]
+
+
+@pytest.mark.parametrize("waits", [False, True])
+def test_several_current_sets_are_repaired(tables: None, tmp_path: Path, waits: bool):
+    register(chain.small_video(tmp_path, "walk1"))
+    populate()
+    register(chain.small_video(tmp_path, "walk2"))
+    populate()
+    for key in list(fit.FitSelection.keys()):
+        fit.FitSelection.update1({**key, "fit_current": True})
+    with pytest.raises(PblError, match="USAGE"):
+        load_session({"subject": "P001"})
+    if waits:  # a third recording that is not computed yet must not leave the visit without results
+        register(chain.small_video(tmp_path, "walk3"))
+    assert plan_fit_sets() == []
+    assert (fit.FitSet & (fit.FitSelection & {"fit_current": True})).to_arrays("fit_set_n").tolist() == [2]
+    assert len(load_session({"subject": "P001"}).fitted) == 2
 
 
 # ------------------------------------------------------------------------------------------- errors and stuck jobs
