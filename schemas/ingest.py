@@ -7,7 +7,7 @@ import datetime
 import hashlib
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import canonical_json
 
 from . import fit, gait, gdi, keypoints, lab, session, tracking, video
-from ._base import DuplicateError, dj, library, resolve_method, utc_now
+from ._activate import computed_tables
+from ._base import DuplicateError, delete_below, dj, error_code, library, resolve_method, utc_now
 
 _ATTEMPTS = 20
 _SUBJECT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
@@ -36,7 +37,8 @@ class Methods:
 
 @dataclasses.dataclass(frozen=True)
 class Ingested:
-    """What became of one path: "registered", "known" (nothing inserted), "moved" (path updated) or "refused"."""
+    """What became of one path: "registered", "known" (nothing changed), "moved" (path updated), "updated" (camera or
+    methods added) or "refused"; `note` says it in words."""
 
     path: Path
     status: str
@@ -47,15 +49,28 @@ class Ingested:
 
 @dataclasses.dataclass(frozen=True)
 class Visit:
-    """What all files of one call share."""
+    """What all files of one call share. `camera_motion` and `activity` None: static, walking."""
 
     subject: str
     session_label: str = session.UNLABELLED
     project: str | None = None
     camera_file: str | Path | None = None
-    camera_motion: str = "static"
-    activity: str = "walking"
+    camera_motion: str | None = None
+    activity: str | None = None
     person: int | None = None
+
+
+#: Key of a selection or plan -> field of `Methods` that names it.
+METHOD_FIELDS = {
+    "tracking_method": "tracking",
+    "keypoint_method": "keypoint",
+    "fit_method": "fit",
+    "gait_method": "gait",
+    "gdi_method": "gdi",
+    "norm": "norm",
+}
+#: Errors that say that the file was not where, or what, it should be.
+_FILE_ERRORS = ("VIDEO_MISSING", "VIDEO_CHANGED")
 
 
 def ingest(paths: Sequence[str | Path], visit: Visit, methods: Methods | None = None) -> list[Ingested]:
@@ -63,6 +78,9 @@ def ingest(paths: Sequence[str | Path], visit: Visit, methods: Methods | None = 
 
     Files that are not videos are taken as well: their failure then stands in the table of the stage that meets it,
     with a code and a next step. Missing and empty files are refused at once; the other files are still registered.
+
+    A file that is registered already takes what is given with it: a camera replaces its own, and what was computed with
+    that is deleted (keypoints and after); methods that are named are added to its selections and its session's plans.
 
     Raises
     ------
@@ -77,11 +95,13 @@ def ingest(paths: Sequence[str | Path], visit: Visit, methods: Methods | None = 
             expected="a pseudonymous code of letters, digits, '-', '_' and '.', at most 32 long (never a name)",
             next_step="pass such a code with --subject",
         )
-    chosen = resolve(methods or Methods())
+    methods = methods or Methods()
+    chosen = resolve(methods)
+    more = {key for key, field in METHOD_FIELDS.items() if getattr(methods, field) is not None}
     done = []
     for path in (Path(p).absolute() for p in paths):
         try:
-            done.append(_ingest_one(path, visit, chosen))
+            done.append(_ingest_one(path, visit, chosen, more))
         except PblError as error:
             done.append(Ingested(path, "refused", error=error))
     return done
@@ -101,7 +121,7 @@ def resolve(methods: Methods) -> dict[str, str]:
     }
 
 
-def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str]) -> Ingested:
+def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]) -> Ingested:
     if not os.path.isfile(path):  # not Path.is_file: that raises where a folder on the way may not be entered
         raise PblError(
             "VIDEO_MISSING",
@@ -130,34 +150,32 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str]) -> Ingested:
     sha256 = library("video").sha256_of(path)
     known = _with_sha256(sha256)
     if known:
-        return _known(path, known)
+        return _known(path, known, visit, chosen, more)
     camera = _camera(visit.camera_file, path) if visit.camera_file else None
     row = {
         "video_path": str(path),
         "video_name": path.name[-255:],
         "video_sha256": sha256,
         "video_size": size,
-        "activity": visit.activity,
-        "camera_motion": visit.camera_motion,
+        "activity": visit.activity or "walking",
+        "camera_motion": visit.camera_motion or "static",
         "video_created": utc_now(),
     }
-    # Numbers are taken as the highest plus one; where another process took the same one, we try again.
-    for attempt in range(_ATTEMPTS):
-        try:
-            with video.schema.connection.transaction:  # type: ignore[union-attr]
-                row["session_id"] = _session(visit)
-                row["camera_id"] = _camera_id(camera) if camera else None
-                row["video_id"] = next_id(video.Video, "video_id")
-                video.Video.insert1(row)
-                _select(row["video_id"], row["session_id"], visit.person, chosen)
-        except DuplicateError:
-            known = _with_sha256(sha256)
-            if known:
-                return _known(path, known)
-            if attempt == _ATTEMPTS - 1:
-                raise
-        else:
-            break
+
+    def insert() -> None:
+        row["session_id"] = _session(visit)
+        row["camera_id"] = _camera_id(camera) if camera else None
+        row["video_id"] = next_id(video.Video, "video_id")
+        video.Video.insert1(row)
+        _select(row["video_id"], row["session_id"], visit.person, chosen)
+
+    try:
+        _in_transaction(insert, until=lambda: bool(_with_sha256(sha256)))
+    except DuplicateError:
+        known = _with_sha256(sha256)
+        if not known:
+            raise
+        return _known(path, known, visit, chosen, more)
     return Ingested(path, "registered", row["video_id"], f"subject {visit.subject}, session {visit.session_label}")
 
 
@@ -166,12 +184,100 @@ def _with_sha256(sha256: str) -> dict[str, Any] | None:
     return rows[0] if rows else None
 
 
-def _known(path: Path, row: dict[str, Any]) -> Ingested:
-    where = f"video_id {row['video_id']} of subject {row['subject']}, session {row['session_label']}"
+def _in_transaction(work: Callable[[], None], until: Callable[[], bool] = lambda: False) -> None:
+    """Numbers are taken as the highest plus one; where another process took the same one, we try again."""
+    for attempt in range(_ATTEMPTS):
+        try:
+            with video.schema.connection.transaction:  # type: ignore[union-attr]
+                work()
+        except DuplicateError:
+            if until() or attempt == _ATTEMPTS - 1:
+                raise
+        else:
+            return
+
+
+def _known(path: Path, row: dict[str, Any], visit: Visit, chosen: dict[str, str], more: set[str]) -> Ingested:
+    """Take over the path where the old one is gone, the camera and the methods that were named; say the rest."""
+    number = int(row["video_id"])
+    status, notes = "known", [f"already video_id {number} of subject {row['subject']}, session {row['session_label']}"]
     if str(path) != row["video_path"] and not Path(row["video_path"]).is_file():
-        video.Video.update1({"video_id": row["video_id"], "video_path": str(path), "video_name": path.name[-255:]})
-        return Ingested(path, "moved", int(row["video_id"]), f"{where}; it was {row['video_path']}, which is gone")
-    return Ingested(path, "known", int(row["video_id"]), f"already {where}; nothing was inserted")
+        video.Video.update1({"video_id": number, "video_path": str(path), "video_name": path.name[-255:]})
+        _forget_errors(number, _FILE_ERRORS)
+        status = "moved"
+        notes.append(f"it was {row['video_path']}, which is gone")
+    changes = _new_camera(path, row, visit.camera_file) if visit.camera_file else []
+    changes += _new_methods(row, chosen, more)
+    if changes and status == "known":
+        status = "updated"
+    for what, given in (("activity", visit.activity), ("camera_motion", visit.camera_motion)):
+        if given is not None and given != row[what]:
+            changes.append(f"{what.replace('_', ' ')} {given} was ignored, it stays {row[what]}")
+    if status == "known" and not changes:
+        changes = ["nothing was inserted"]
+    return Ingested(path, status, number, "; ".join(notes + changes))
+
+
+def _new_camera(path: Path, row: dict[str, Any], camera_file: str | Path) -> list[str]:
+    """Give a registered video this camera and delete what was computed with another; what was done, in words."""
+    number = int(row["video_id"])
+    camera = _camera(camera_file, path)
+    if camera is None:
+        return ["the camera was not attached, because no picture of the video can be decoded"]
+    if row["camera_id"] is not None and int(row["camera_id"]) == _known_camera(camera):
+        return []
+    deleted: dict[str, int] = {}
+
+    def attach() -> None:
+        deleted.clear()
+        video.Video.update1({"video_id": number, "camera_id": _camera_id(camera)})
+        deleted.update(delete_below(keypoints.Keypoints, (keypoints.Keypoints & {"video_id": number}).keys()))
+
+    _in_transaction(attach)
+    # What failed with the other camera may do with this one.
+    _forget_errors(number)
+    rows = ", ".join(f"{n} of {name}" for name, n in deleted.items())
+    return ["the camera was attached" + (f", and what depends on it was deleted: {rows}" if rows else "")]
+
+
+def _new_methods(row: dict[str, Any], chosen: dict[str, str], more: set[str]) -> list[str]:
+    """Add the selections and plans of the methods that were named; those that are new, in words."""
+    of_video, of_session = {"video_id": int(row["video_id"])}, {"session_id": int(row["session_id"])}
+    tracked = {**of_video, "tracking_method": chosen["tracking_method"]}
+    new: list[tuple[Any, dict[str, Any]]] = []
+    if "tracking_method" in more:
+        new.append((tracking.TrackingSelection, {**tracked, "subject_method": chosen["subject_method"]}))
+    if more & {"tracking_method", "keypoint_method"}:
+        known = (tracking.TrackingSelection & of_video).keys()
+        trackings = [tracked] if "tracking_method" in more else known
+        points = {"keypoint_method": chosen["keypoint_method"]}
+        new += [(keypoints.KeypointSelection, {**t, **points}) for t in trackings]
+    if "fit_method" in more:
+        new.append((fit.FitPlan, {**of_session, "fit_method": chosen["fit_method"]}))
+    if "gait_method" in more:
+        new.append((gait.GaitPlan, {**of_session, "gait_method": chosen["gait_method"]}))
+    if more & {"gdi_method", "norm"}:
+        new.append((gdi.GdiPlan, {**of_session, "gdi_method": chosen["gdi_method"], "norm": chosen["norm"]}))
+    added = []
+    with video.schema.connection.transaction:  # type: ignore[union-attr]
+        for table, values in new:
+            key = {k: v for k, v in values.items() if k in table.primary_key}
+            if not table & key:
+                table.insert1(values)
+                names = [str(v) for k, v in key.items() if k not in ("video_id", "session_id")]
+                added.append(f"{table.__name__} {', '.join(names)} was added")
+    return added
+
+
+def _forget_errors(video_id: int, codes: Sequence[str] | None = None) -> None:
+    """Delete the error rows of a video (with these codes), so that the next populate tries again without being told."""
+    for table in computed_tables():
+        if "video_id" not in table.primary_key:
+            continue
+        jobs = table.jobs
+        for row in (jobs.errors & {"video_id": video_id}).to_dicts():
+            if codes is None or error_code(row["error_message"]) in codes:
+                (jobs & {k: row[k] for k in jobs.primary_key}).delete_quick()
 
 
 def _session(visit: Visit) -> int:
@@ -223,13 +329,21 @@ def _camera(camera_file: str | Path, path: Path) -> dict[str, Any] | None:
 
 
 def _camera_id(camera: dict[str, Any]) -> int:
-    sha256 = hashlib.sha256(canonical_json(camera).encode()).hexdigest()
-    known = (lab.CameraCalibration & {"camera_sha256": sha256}).keys()
-    if known:
-        return int(known[0]["camera_id"])
+    known = _known_camera(camera)
+    if known is not None:
+        return known
     number = next_id(lab.CameraCalibration, "camera_id")
-    lab.CameraCalibration.insert1({**camera, "camera_id": number, "camera_sha256": sha256})
+    lab.CameraCalibration.insert1({**camera, "camera_id": number, "camera_sha256": _camera_sha256(camera)})
     return number
+
+
+def _known_camera(camera: dict[str, Any]) -> int | None:
+    known = (lab.CameraCalibration & {"camera_sha256": _camera_sha256(camera)}).keys()
+    return int(known[0]["camera_id"]) if known else None
+
+
+def _camera_sha256(camera: dict[str, Any]) -> str:
+    return hashlib.sha256(canonical_json(camera).encode()).hexdigest()
 
 
 def _select(video_id: int, session_id: int, person: int | None, chosen: dict[str, str]) -> None:

@@ -23,11 +23,9 @@ import click
 @click.option(
     "--camera-motion",
     type=click.Choice(["static", "handheld", "one of several"]),
-    default="static",
-    show_default=True,
-    help="How the camera was held.",
+    help="How the camera was held (else: static).",
 )
-@click.option("--activity", default="walking", show_default=True, help="What the person does.")
+@click.option("--activity", help="What the person does (else: walking).")
 @click.option("--person", type=click.IntRange(min=1), help="Measure this person of the tracking (else: automatic).")
 @click.option("--tracking-method", metavar="NAME", help="Method of person tracking (else: the default).")
 @click.option("--keypoint-method", metavar="NAME", help="Method of keypoint detection (else: the default).")
@@ -39,8 +37,8 @@ def ingest(
     session_label: str,
     project: str | None,
     camera: Path | None,
-    camera_motion: str,
-    activity: str,
+    camera_motion: str | None,
+    activity: str | None,
     person: int | None,
     tracking_method: str | None,
     keypoint_method: str | None,
@@ -49,7 +47,8 @@ def ingest(
 ) -> None:
     """Register videos of one visit; `pbl populate` then computes them. Nothing is decoded here.
 
-    A file whose bytes are registered already is not registered twice. Exit code 1 when a file was refused; the others
+    A file whose bytes are registered already is not registered twice, but takes a new camera (what was computed with
+    another is deleted, and said) and further methods. Exit code 1 when a file was refused; the others
     are registered all the same.
 
     \b
@@ -69,7 +68,7 @@ def ingest(
             click.echo(result.error.text(), err=True)
         else:
             click.echo(f"video_id {result.video_id}: {result.path.name} {result.status} ({result.note})")
-        if result.status == "known" and person is not None:
+        if result.status in ("known", "moved", "updated") and person is not None:
             click.echo(f"  to measure another person of it: pbl choose {result.video_id} {person}")
     if any(r.error for r in results):
         raise click.exceptions.Exit(1)

@@ -211,6 +211,52 @@ def test_the_same_bytes_are_registered_once(tables: None, tmp_path: Path):
     assert video.Video.fetch1("video_path") == str(copy)
 
 
+def test_a_moved_file_is_computed_without_being_told(tables: None, tmp_path: Path):
+    first = chain.small_video(tmp_path, "walk")
+    register(first)
+    populate(["VideoInfo"])
+    moved = first.rename(tmp_path / "moved.mp4")
+    assert errors(populate(["Tracking"])) == {"Tracking": {"VIDEO_MISSING": 1}}
+    (result,) = ingest([moved], Visit("P001"))
+    assert result.status == "moved"
+    assert not pipeline_status().errors
+    assert done(populate(["Tracking"])) == {"Tracking": 1}
+
+
+def test_a_registered_video_takes_a_camera_and_further_methods(tables: None, tmp_path: Path):
+    path = chain.small_video(tmp_path, "walk")
+    (number,) = register(path)
+    populate()
+    assert load_session({"subject": "P001"}).trials[0].keypoints.camera.source.startswith("guess")
+    tracked = tracking.Tracking.fetch1("tracking_computed")
+    camera = tmp_path / "phone.json"
+    camera.write_text(
+        '{"camera_matrix": [[900, 0, 64], [0, 900, 36], [0, 0, 1]], "distortion": [0, 0, 0, 0, 0],'
+        ' "image_size_px": [128, 72]}'
+    )
+    (result,) = ingest([path], Visit("P001", camera_file=camera, activity="running"))
+    assert (result.status, result.video_id) == ("updated", number)
+    assert "1 of" in result.note
+    assert "keypoints" in result.note.lower()
+    assert "activity running was ignored, it stays walking" in result.note
+    assert len(keypoints.Keypoints()) == len(fit.SessionFit()) == len(fit.FitSet()) == len(qc.SessionQc()) == 0
+    assert tracking.Tracking.fetch1("tracking_computed") == tracked
+    assert not errors(populate())
+    assert load_session({"subject": "P001"}).trials[0].keypoints.camera.matrix[0, 0] == 900
+    assert len(qc.SessionQc()) == 1
+    # The same camera again changes nothing.
+    (result,) = ingest([path], Visit("P001", camera_file=camera))
+    assert (result.status, result.note.endswith("nothing was inserted")) == ("known", True)
+    names = {r["fit_method_name"] for r in fit.FitMethod.to_dicts()}
+    other = sorted(names - {(fit.FitPlan * fit.FitMethod).fetch1("fit_method_name")})[0]
+    (result,) = ingest([path], Visit("P001"), Methods(fit=other))
+    assert result.status == "updated"
+    assert f"FitPlan {other}" in result.note
+    assert len(fit.FitPlan()) == 2
+    assert done(populate())["SessionFit"] == 1
+    assert len(fit.SessionFit()) == 2
+
+
 def test_refused_files_do_not_hold_up_the_others(tables: None, tmp_path: Path):
     (tmp_path / "empty.mp4").touch()
     paths = [tmp_path / "absent.mp4", tmp_path / "empty.mp4", tmp_path, chain.small_video(tmp_path, "walk")]
