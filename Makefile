@@ -8,7 +8,7 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
             then echo $$p; break; fi; done)
 OUT    ?= pbl_demo
 
-.PHONY: demo test test-slow lint format types lock clean help
+.PHONY: demo test lint format lock clean help
 
 help:           ## what can be made
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -16,10 +16,7 @@ help:           ## what can be made
 demo: $(READY)  ## put the demo recording through every table and show the result
 	$(BIN)/pbl demo --out $(OUT)
 
-test: $(READY)  ## all tests but the slow ones
-	$(BIN)/pytest -m "not slow"
-
-test-slow: $(READY) ## the slow tests too
+test: $(READY)  ## the tests
 	$(BIN)/pytest
 
 lint: $(READY)  ## style, formatting and types

@@ -27,6 +27,15 @@ def test_readme_names_every_variable_and_command():
     assert not missing
 
 
+def test_readme_has_no_placeholder_and_no_dead_link():
+    text = (ROOT / "README.md").read_text()
+    assert not re.findall(r"@[A-Z]+@", text)
+    links = [x for x in re.findall(r"\]\(([^)#]+)", text) if "://" not in x]
+    assert [x for x in links if not (ROOT / x).exists()] == []
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    assert [t for t in re.findall(r"`make ([a-z-]+)`", text) if t not in targets] == []
+
+
 def test_every_command_has_help_with_an_example():
     for entry in entry_points(group="pbl.commands"):
         command = entry.load()
