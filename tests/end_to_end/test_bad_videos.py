@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import schemas
@@ -141,7 +142,7 @@ def test_standing_is_fitted_and_has_no_gait(status):
     assert visit["session_status"] == "EMPTY"
     assert "no walking" in visit["session_reason"]
     assert visit["qc_outcome"] == "EMPTY"
-    assert np.isnan(visit["session_cadence"])
+    assert pd.isna(visit["session_cadence"])
     assert visit["fit_residual_2d"] < 10
     assert ("GaitEvents", "standing.mp4") in {(e["table"], e["about"]) for e in status["empty"]}
 

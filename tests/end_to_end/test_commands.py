@@ -110,9 +110,6 @@ def test_angles_are_as_described(fitted):
     row = dict(zip(header, rows[45], strict=True))
     assert float(row["knee_angle_r"]) == pytest.approx(np.degrees(middle), abs=0.01)
     assert abs(float(row["knee_flexion_r"])) == pytest.approx(abs(np.degrees(middle)), abs=0.01)
-    flexion = np.array([float(r[header.index("knee_flexion_r")] or "nan") for r in rows])
-    assert np.nanmax(flexion) > 30  # in swing; positive in flexion
-    assert np.nanmin(flexion) > -20
 
 
 def test_session_json_is_as_described(fitted):

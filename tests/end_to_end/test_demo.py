@@ -138,6 +138,10 @@ def test_angles_and_video_cover_the_recording(out, demo_files):
     assert header[0] == "time_s"
     assert {*fit.joint_names, "knee_flexion_r", "knee_flexion_l"} <= set(header)
     assert len(rows) == source.n_frames
+    for side in "rl":  # positive in flexion: nearly straight at contact, well bent in swing
+        flexion = np.array([float(r[header.index(f"knee_flexion_{side}")] or "nan") for r in rows])
+        assert np.nanmax(flexion) > 40
+        assert -20 < np.nanmin(flexion) < 25
     middle = 110
     assert float(rows[middle][0]) == pytest.approx(source.time_s[middle], abs=1e-3)
     angle = fit.qpos[middle, fit.joint_names.index("hip_flexion_l")]
