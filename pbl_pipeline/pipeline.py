@@ -48,6 +48,19 @@ class Session:
     problems: Mapping[str, PblError] = dataclasses.field(default_factory=dict)
     left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
+    @property
+    def checks(self) -> tuple[Check, ...]:
+        """What was seen in each trial, and which recordings are missing."""
+        found = [c for t in self.trials for c in _named(check_keypoints(t.keypoints), t.name, len(self.trials))]
+        missing = {n: e.text() for n, e in self.problems.items()} | dict(self.left_out)
+        found += (Check(f"trial {n}", WARN, None, None, f"left out: {why}") for n, why in missing.items())
+        return tuple(found)
+
+    @property
+    def judged(self) -> GaitMetrics:
+        """The measures with every check of the session: what metrics.json, the terminal and the report judge by."""
+        return self.metrics.with_checks([*self.checks, *self.fit.qc])
+
 
 def detect_trial(path: Path, sheet: Path, camera_file: Path | None = None, person: int | None = None) -> Trial:
     """Video to keypoints of the subject. `sheet` is the picture of the people that is written when one must be chosen.
@@ -100,7 +113,7 @@ def run_session(
     if not trials:
         raise next(iter(problems.values()))
     fit = fit_session([t.keypoints for t in trials], [t.name for t in trials], paramset, camera_motion)
-    return Session(tuple(trials), fit, gait_metrics(fit.trials, norm=basis), problems)
+    return Session(tuple(trials), fit, gait_metrics(fit.trials, norm=basis, fit_checks=fit.qc), problems)
 
 
 def write_results(
@@ -118,9 +131,9 @@ def write_results(
     """
     out.mkdir(parents=True, exist_ok=True)
     paths, reports = [out / "report.html"], []
-    for trial, fit, metrics in zip(session.trials, session.fit.trials, session.metrics.trials, strict=True):
+    for trial, fit, measured in zip(session.trials, session.fit.trials, session.metrics.trials, strict=True):
         files = {end: out / f"{trial.name}.{end}" for end in TRIAL_FILES}
-        events = metrics.events.events if metrics.events else ()
+        events = measured.events.events if measured.events else ()
         render_overlay(
             trial.path,
             fit,
@@ -129,26 +142,24 @@ def write_results(
             events=events,
         )
         write_angles_csv(fit, files["angles.csv"])
-        if metrics.events:
-            metrics.events.save(files["events.csv"])
+        if measured.events:
+            measured.events.save(files["events.csv"])
         fit.save(files["fit.npz"])
         trial.keypoints.save(files["keypoints.npz"])
         paths += [p for p in files.values() if p.exists()]
         pictures = _pictures(trial, fit)
         reports.append(TrialReport(trial.name, trial.video, trial.choice, fit, trial.keypoints, pictures))
     write_session_json(session.fit, out / "session.json")
-    session.metrics.save(out / "metrics.json")
-    checks = [c for t in session.trials for c in _named(check_keypoints(t.keypoints), t.name, len(session.trials))]
-    missing = {n: e.text() for n, e in session.problems.items()} | dict(session.left_out)
-    checks += (Check(f"trial {n}", WARN, None, None, f"left out: {why}") for n, why in missing.items())
+    metrics = session.judged
+    metrics.save(out / "metrics.json")
     report = SessionReport(
         title=title,
         subject_code=subject_code,
         date=date,
         trials=tuple(reports),
-        metrics=session.metrics,
+        metrics=metrics,
         session=session.fit,
-        checks=tuple(checks),
+        checks=session.checks,
         origin=dict(origin or {}) | {"Software": {"pbl-pipeline": __version__}},
     )
     write_report(out / "report.html", report)

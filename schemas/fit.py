@@ -240,6 +240,12 @@ class SessionFit(dj.Computed):
         self.Check.insert({**key, **check_row("fit", check)} for check in result.qc)
 
 
+def fit_checks(key: Mapping[str, Any]) -> list[tuple]:
+    """The checks of one session fit as arguments of the library's `Check`: what `make_fetch` may hand on."""
+    rows = (SessionFit.Check & {k: key[k] for k in SessionFit.primary_key}).to_dicts(order_by="fit_check")
+    return [tuple(row[f"fit_check{f}"] for f in ("", "_outcome", "_value", "_threshold", "_advice")) for row in rows]
+
+
 def median(values: np.ndarray) -> float | None:
     """Median of the values that are there; None where none is."""
     there = values[np.isfinite(values)]

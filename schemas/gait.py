@@ -151,7 +151,7 @@ class GaitCycle(dj.Computed):
         opposite_foot_down : float64           # (s)
         cycle_foot_up      : float64           # (s)
         cycle_end          : float64           # (s) next foot down of the same side
-        cycle_used         : bool              # false: first or last step of a bout, odd length
+        cycle_used         : bool              # false: first or last step, odd length, failed fit
         cycle_excluded     : varchar(100)      # why it is not used
         curves_missing     : varchar(100)      # why it has no curves
         """
@@ -159,13 +159,14 @@ class GaitCycle(dj.Computed):
     def make_fetch(self, key: dict) -> tuple:
         events = (GaitEvents.Event & key).to_dicts(order_by="event_no")
         ref = file_ref((fit.SessionFit.Trial & key).fetch1("trial_file"))
-        return [{k: v for k, v in e.items() if k.startswith("event_")} for e in events], ref
+        return [{k: v for k, v in e.items() if k.startswith("event_")} for e in events], ref, fit.fit_checks(key)
 
     @computes
-    def make_compute(self, key: dict, events: Sequence[Mapping[str, Any]], ref: dict) -> tuple:
+    def make_compute(self, key: dict, events: Sequence[Mapping[str, Any]], ref: dict, checks: Sequence[tuple]) -> tuple:
         with stored_file(self, ref) as path:
             trial = library("fit").TrialFit.load(path)
-        return (library("gait").find_cycles([event_of_row(e) for e in events], trial),)
+        about_fit = [library("qc").Check(*check) for check in checks]
+        return (library("gait").find_cycles([event_of_row(e) for e in events], trial, fit_checks=about_fit),)
 
     def make_insert(self, key: dict, cycles: Sequence[Any], origin: Origin) -> None:
         with new_folder() as folder:

@@ -201,18 +201,26 @@ class SessionGdi(dj.Computed):
             (NormativeSet & key).fetch1("norm_name", "norm_sha256"),
             method_arguments(gait.GaitEventMethod, "gait", "gait", key["gait_method"]),
             method_arguments(GdiModel, "gdi", "gdi", key["gdi_method"]),
+            fit.fit_checks(key),
         )
 
     @computes
     def make_compute(
-        self, key: dict, refs: Sequence[dict], norm: tuple, events: Mapping[str, Any], index: Mapping[str, Any]
+        self,
+        key: dict,
+        refs: Sequence[dict],
+        norm: tuple,
+        events: Mapping[str, Any],
+        index: Mapping[str, Any],
+        checks: Sequence[tuple],
     ) -> tuple:
         lib = library("gait")
         params = lib.GaitParams(rebuild_params(lib.EventParams, **events), rebuild_params(lib.GdiParams, **index))
         with ExitStack() as stack:
             paths = [stack.enter_context(stored_file(self, ref)) for ref in refs]
             trials = [library("fit").TrialFit.load(path) for path in paths]
-        return lib.gait_metrics(trials, norm_of_row(*norm), params), index["sha"], norm[1]
+        about_fit = [library("qc").Check(*check) for check in checks]
+        return lib.gait_metrics(trials, norm_of_row(*norm), params, about_fit), index["sha"], norm[1]
 
     def make_insert(self, key: dict, result: Any, sha: str, norm_sha: str, origin: Origin) -> None:
         measures, index = result.spatiotemporal, result.gdi

@@ -85,7 +85,7 @@ def ingest(paths: Sequence[str | Path], visit: Visit, methods: Methods | None = 
     Raises
     ------
     PblError
-        USAGE for a subject code that could be a name; SOLVER_UNKNOWN, NORM_UNKNOWN for unknown methods. Errors of
+        USAGE for a subject code that could be a name, or one person's number for several videos; SOLVER_UNKNOWN, NORM_UNKNOWN for unknown methods. Errors of
         single files are in the result.
     """
     if not _SUBJECT.fullmatch(visit.subject):
@@ -94,6 +94,13 @@ def ingest(paths: Sequence[str | Path], visit: Visit, methods: Methods | None = 
             found=f"subject code {visit.subject!r}",
             expected="a pseudonymous code of letters, digits, '-', '_' and '.', at most 32 long (never a name)",
             next_step="pass such a code with --subject",
+        )
+    if visit.person is not None and len(paths) > 1:
+        raise PblError(
+            "USAGE",
+            found=f"person {visit.person} for {len(paths)} videos",
+            expected="a person's number with one video: people are numbered anew in each",
+            next_step="ingest them without --person, then `pbl choose VIDEO_ID PERSON` where needed",
         )
     methods = methods or Methods()
     chosen = resolve(methods)

@@ -15,7 +15,7 @@ from ._options import Person, fit_paramset
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the results.")
 @click.option("--camera", type=click.Path(path_type=Path), help="Calibration file; without it a phone is guessed.")
 @click.option("--camera-motion", type=click.Choice(["static", "handheld"]), default="static", show_default=True)
-@click.option("--person", type=Person(), default="auto", show_default=True, help="Whom to measure.")
+@click.option("--person", type=Person(), default="auto", show_default=True, help="Whom to measure, of one video.")
 @click.option("--solver", default="implicit-adam", show_default=True, help="Name of the solver.")
 @click.option("--params", help="Name of a paramset, or a JSON file with changes to the default one.")
 @click.option("--norm", help="Normative set of the GDI.")
@@ -36,11 +36,20 @@ def run(
     Writes report.html, metrics.json, session.json, and per trial the keypoints, the fit, the angles, the events and a
     video with the body drawn over it. A video that cannot be used is named and left out; the others go on.
     """
+    from pbl_pipeline.errors import PblError
     from pbl_pipeline.files import check_out_folder
     from pbl_pipeline.gait import load_norm
     from pbl_pipeline.pipeline import run_session, write_results
 
     # What can be wrong with the call is found before minutes of work.
+    if person is not None and len(videos) > 1:
+        raise PblError(
+            "USAGE",
+            found=f"person {person} for {len(videos)} videos",
+            expected="a person's number with one video: people are numbered anew in each",
+            next_step="leave out --person; where the automatic choice is wrong, run that video alone with --person, "
+            "or use `pbl ingest` and `pbl choose`, which keep a choice for each video of a visit",
+        )
     check_out_folder(out)
     paramset = fit_paramset(solver, params)
     if norm is not None:
@@ -48,10 +57,7 @@ def run(
     session = run_session(videos, out, camera, person, paramset, camera_motion, norm)
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
     paths = write_results(out, session, subject_code=subject, date=f"computed {today}")
-    click.echo(session.metrics.table())
-    for check in session.fit.qc:
-        if check.outcome != "PASS":
-            click.echo(f"{check.outcome} {check.check}: {check.advice}")
+    click.echo(session.judged.table())
     for name, error in session.problems.items():
         click.echo(f"left out {name}\n{error.text()}", err=True)
     click.echo("\n".join(str(p) for p in paths))

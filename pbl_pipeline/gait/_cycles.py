@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from pbl_pipeline.qc import FIT_FAILED, Check, withheld
+
 from ._angles import AngleSeries, angle_series
 from ._poses import BodyPoses
 from .events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents
@@ -37,7 +39,7 @@ class GaitCycle:
     Times in seconds of the trial. In order: `start_s` (foot down), `opposite_foot_up_s`, `opposite_foot_down_s`,
     `foot_up_s`, `end_s`. `number` counts the cycles of a trial in order of time, both sides together, from 0.
     `used` is False for the cycles that touch the first or last step of their walking bout and for those that are far
-    longer or shorter than the others (`odd_length`); `excluded` says why.
+    longer or shorter than the others (`odd_length`), and for all of a fit that failed; `excluded` says why.
     `curves` maps names of `ANGLE_NAMES` to (51,) degrees at 0, 2, ..., 100 % of the cycle; empty where there is
     no fit or frames are missing (`curves_missing` says which).
     """
@@ -62,6 +64,11 @@ class GaitCycle:
         return _ODD in self.excluded
 
     @property
+    def fit_failed(self) -> bool:
+        """Whether the cycle is left out because the fit failed."""
+        return self.excluded.startswith(FIT_FAILED)
+
+    @property
     def stride_time_s(self) -> float:
         """Foot down to the next foot down of the same side."""
         return self.end_s - self.start_s
@@ -72,6 +79,7 @@ def find_cycles(
     fit: TrialFit | None = None,
     trial: str = "",
     poses: BodyPoses | None = None,
+    fit_checks: Sequence[Check] = (),
 ) -> tuple[GaitCycle, ...]:
     """All cycles whose four inner events are there in order, with curves where a fit is given.
 
@@ -84,6 +92,8 @@ def find_cycles(
 
     A cycle longer than `STRIDE_RATIO` times the median stride of its bout, or shorter than its inverse, is not used
     either: a step that was not detected makes one long cycle of each side, which would pass as a slow stride.
+
+    Where one of `fit_checks`, the checks of the session fit, FAILs, no cycle is used (`pbl_pipeline.qc.withheld`).
     """
     found = events.events if isinstance(events, GaitEvents) else tuple(events)
     name = trial or (fit.name if fit is not None else "")
@@ -126,6 +136,8 @@ def find_cycles(
             )
             cycles.append(cycle)
     cycles = _without_odd_lengths(cycles)
+    if reason := withheld(fit_checks):
+        cycles = [dataclasses.replace(c, used=False, excluded=reason) for c in cycles]
     cycles.sort(key=lambda c: c.start_s)
     return tuple(dataclasses.replace(c, number=number) for number, c in enumerate(cycles))
 

@@ -150,6 +150,8 @@ def _score(cycle: GaitCycle, norm: NormativeSet) -> GdiCycle:
 
 
 def _too_few(cycles: Sequence[GaitCycle], n_left: int, n_right: int, params: GdiParams) -> str:
+    if failed := next((c.excluded for c in cycles if c.fit_failed), ""):
+        return failed
     text = (
         f"{n_left} left and {n_right} right cycles with curves are left of {len(cycles)}, "
         f"the index needs {params.min_cycles_per_side} of each side"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import Paramset
-from pbl_pipeline.qc import EMPTY, PASS, WARN, Check, worst
+from pbl_pipeline.qc import EMPTY, OUTCOMES, PASS, WARN, Check, in_session, worst
 
 from ._cycles import GaitCycle, find_cycles
 from ._feet import feet_from_fit
@@ -51,7 +51,10 @@ class TrialMetrics:
 
 @dataclasses.dataclass(frozen=True)
 class GaitMetrics:
-    """A session: its trials, and the measures over all their cycles together."""
+    """A session: its trials, and the measures over all their cycles together.
+
+    `qc` are the checks of its measures and index, `before` those of the stages before (`with_checks`).
+    """
 
     trials: tuple[TrialMetrics, ...]
     status: str
@@ -60,11 +63,28 @@ class GaitMetrics:
     gdi: Gdi
     qc: tuple[Check, ...]
     params_hash: str
+    before: tuple[Check, ...] = ()
+
+    def with_checks(self, checks: Sequence[Check]) -> GaitMetrics:
+        """The same measures, judged together with the checks of keypoints and fit."""
+        return dataclasses.replace(self, before=tuple(checks))
+
+    @property
+    def checks(self) -> tuple[Check, ...]:
+        """Every check of the session in the order of the chain, each once: `before`, the trials' events, `qc`."""
+        events = [c for t in self.trials for c in t.events.qc]
+        return tuple(dict.fromkeys([*self.before, *events, *self.qc]))
+
+    @property
+    def outcome(self) -> str:
+        """The worst of `checks`, as report and tables judge it."""
+        return max((in_session(c.outcome, self.status == PASS) for c in self.checks), key=OUTCOMES.index, default=PASS)
 
     def to_dict(self) -> dict:
         """The content of metrics.json."""
+        judged = {"outcome": self.outcome, "qc": [c.to_dict() for c in self.checks]}
         return {
-            "session": _measures(self),
+            "session": {**_measures(self), **judged},
             "trials": [t.to_dict() for t in self.trials],
             "gdi_model": self.gdi.model,
             "params_hash": self.params_hash,
@@ -84,7 +104,8 @@ class GaitMetrics:
         lines.append(
             f"{'GDI of three angles':<24}{_cell(g.left)}{_cell(g.right)}{_cell(g.mean)}{'':>8}{g.n:>5}  {g.reason}"
         )
-        lines += [f"{c.outcome} {c.check}: {c.advice}" for c in self.qc if c.advice]
+        lines.append(f"quality checks: {self.outcome}")
+        lines += [f"{c.outcome} {c.check}: {c.advice}" for c in self.checks if c.advice]
         return "\n".join(line.rstrip() for line in lines)
 
     def save(self, path: str | Path) -> None:
@@ -93,12 +114,16 @@ class GaitMetrics:
 
 
 def gait_metrics(
-    trials: Sequence[TrialFit], norm: NormativeSet | str | None = None, params: GaitParams | None = None
+    trials: Sequence[TrialFit],
+    norm: NormativeSet | str | None = None,
+    params: GaitParams | None = None,
+    fit_checks: Sequence[Check] = (),
 ) -> GaitMetrics:
     """Measures of the trials of one session and of the session (all used cycles of all trials pooled).
 
     A trial without walking has status EMPTY and takes no part in the session; the session is EMPTY where no trial
-    has a used cycle. Raises `PblError` NORM_UNKNOWN, NORM_INVALID, GAIT_INPUT (no finite frame in a trial).
+    has a used cycle. Where one of `fit_checks`, the checks of the session fit, FAILs, there is none: measures and index
+    are None with that reason. Raises `PblError` NORM_UNKNOWN, NORM_INVALID, GAIT_INPUT (no finite frame in a trial).
     """
     if not trials:
         raise PblError(
@@ -107,7 +132,7 @@ def gait_metrics(
     params = params or GaitParams()
     wanted = params.gdi.norm if norm is None else norm
     basis = load_norm(wanted) if isinstance(wanted, str) else wanted
-    done = tuple(_trial(fit, basis, params) for fit in trials)
+    done = tuple(_trial(fit, basis, params, fit_checks) for fit in trials)
     cycles = [c for t in done for c in t.cycles]
     # Two trials may carry one name; their cycles are told apart by it.
     measures, gdi = spatiotemporal(_distinct(done)), score_gdi(cycles, basis, params.gdi)
@@ -124,10 +149,10 @@ def gait_metrics(
     )
 
 
-def _trial(fit: TrialFit, norm: NormativeSet, params: GaitParams) -> TrialMetrics:
+def _trial(fit: TrialFit, norm: NormativeSet, params: GaitParams, fit_checks: Sequence[Check]) -> TrialMetrics:
     poses = trial_poses(fit)
     events = detect_events(feet_from_fit(fit, poses), params.events)
-    cycles = find_cycles(events, fit, poses=poses)
+    cycles = find_cycles(events, fit, poses=poses, fit_checks=fit_checks)
     measures, gdi = spatiotemporal(cycles), score_gdi(cycles, norm, params.gdi)
     reason = events.reason or measures.reason
     return TrialMetrics(

@@ -100,6 +100,8 @@ def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
 def _none_used(cycles: Sequence[GaitCycle]) -> str:
     if not cycles:
         return "no complete gait cycle"
+    if failed := next((c.excluded for c in cycles if c.fit_failed), ""):
+        return failed
     odd = " and strides of odd length" if any(c.odd_length for c in cycles) else ""
     return f"{len(cycles)} gait cycles, none left without the first and last step{odd}"
 

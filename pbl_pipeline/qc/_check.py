@@ -9,6 +9,9 @@ PASS, WARN, EMPTY, NEEDS_CHOICE, FAIL = "PASS", "WARN", "EMPTY", "NEEDS_CHOICE",
 #: From best to worst. EMPTY: ran well, nothing to produce. NEEDS_CHOICE: waits for a person.
 OUTCOMES = (PASS, WARN, EMPTY, NEEDS_CHOICE, FAIL)
 
+#: How the reason of `withheld` begins.
+FIT_FAILED = "the fit failed its check"
+
 
 @dataclasses.dataclass(frozen=True)
 class Check:
@@ -37,3 +40,13 @@ def in_session(outcome: str, measured: bool) -> str:
     """What an outcome means for a session: where the session has measures, one recording without gait, or no index,
     makes it one to be read with care (WARN), not an empty one."""
     return WARN if measured and outcome == EMPTY else outcome
+
+
+def withheld(fit_checks: Iterable[Check]) -> str:
+    """Why nothing is measured on a fit with these checks: the ones that FAIL. Empty where none does.
+
+    The one rule for files and tables: a body that does not lie on the person says nothing of how she walks, so the
+    gait cycles of such a fit are not used.
+    """
+    failed = [c.check for c in fit_checks if c.outcome == FAIL]
+    return f"{FIT_FAILED} {', '.join(failed)}" if failed else ""

@@ -20,6 +20,8 @@ import pbl_pipeline.tracking
 import pbl_pipeline.video
 import schemas
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.pipeline import Session, Trial
+from pbl_pipeline.qc import Check
 from schemas import fit, gait, gdi, keypoints, lab, qc, session, table_map, tracking, video, views
 from schemas.choose import choose_person
 from schemas.ingest import Methods, Visit, ingest
@@ -194,6 +196,33 @@ def test_one_recording_without_gait_does_not_empty_the_visit(
     assert "walking" in names.split(", ")
 
 
+def test_a_failed_fit_gives_no_measures_in_tables_and_files(
+    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def fails(trials, names, paramset=None, camera_motion="static"):
+        bad = Check("residual_3d_cm", "FAIL", 21.0, 6.0, "the body and the 3D points disagree")
+        return chain.dataclasses.replace(chain.fit_session(trials, names, paramset), qc=(bad,))
+
+    monkeypatch.setattr(chain.pbl_pipeline.fit, "fit_session", fails)
+    register(chain.small_video(tmp_path, "walk1"), chain.small_video(tmp_path, "walk2", n=210))
+    assert not errors(populate())
+    why = "the fit failed its check residual_3d_cm"
+    assert gdi.SessionGdi.fetch1("session_gdi", "session_cadence") == (None, None)
+    assert gdi.SessionGdi.fetch1("session_gdi_reason") == why
+    assert set(gait.Spatiotemporal.to_arrays("measures_reason")) == {why}
+    assert set(gdi.GDI.to_arrays("gdi_reason")) == {why}
+    assert set(gait.GaitCycle.Cycle.to_arrays("cycle_excluded")) == {why}
+    assert qc.SessionQc.fetch1("qc_outcome") == "FAIL"
+    found = load_session({"subject": "P001"})
+    trials = tuple(Trial(t.name, t.path, t.info, t.choice, t.keypoints) for t in found.fitted)
+    judged = Session(trials, found.fit, found.metrics).judged
+    fresh = pbl_pipeline.gait.gait_metrics(found.fit.trials, fit_checks=found.fit.qc)
+    assert judged.to_dict()["session"]["outcome"] == "FAIL"
+    assert {k: v for k, v in judged.to_dict()["session"].items() if k not in ("outcome", "qc")} == {
+        k: v for k, v in fresh.to_dict()["session"].items() if k not in ("outcome", "qc")
+    }
+
+
 # ------------------------------------------------------------------------------------------------------- ingest
 def test_the_same_bytes_are_registered_once(tables: None, tmp_path: Path):
     first = chain.small_video(tmp_path, "walk")
@@ -269,6 +298,11 @@ def test_refused_files_do_not_hold_up_the_others(tables: None, tmp_path: Path):
 def test_a_code_that_could_be_a_name_is_refused(tables: None, tmp_path: Path, subject: str):
     with pytest.raises(PblError, match="USAGE"):
         ingest([tmp_path / "a.mp4"], Visit(subject))
+
+
+def test_one_persons_number_for_several_videos_is_refused(tables: None, tmp_path: Path):
+    with pytest.raises(PblError, match="USAGE"):
+        ingest([tmp_path / "a.mp4", tmp_path / "b.mp4"], Visit("P001", person=2))
 
 
 def test_unknown_methods_are_refused_with_the_names_there_are(tables: None, tmp_path: Path):

@@ -29,6 +29,7 @@ from pbl_pipeline.gait import (
 )
 from pbl_pipeline.gait.normative import load_norm
 from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.qc import Check
 from pbl_pipeline.video import Camera
 
 STRIDE_S = 1.1
@@ -218,6 +219,41 @@ def test_standing_gives_nulls_with_reasons(tmp_path):
     assert session["gdi"]["mean"] is None
     assert session["reasons"]["gdi"]
     assert session["outcome"] == "EMPTY"
+
+
+def test_nothing_is_measured_on_a_fit_that_failed():
+    time = np.arange(0, 6, 1 / 30)
+    fit = make_fit(time, walking(time))
+    fine = Check("residual_2d_share_of_body_height", "WARN", 0.03, 0.02, "look")
+    failed = Check("residual_3d_cm", "FAIL", 21.0, 6.0, "the body and the detector's 3D points disagree")
+    assert gait_metrics([fit], fit_checks=[fine]).status == "PASS"
+    metrics = gait_metrics([fit], fit_checks=[fine, failed]).with_checks([fine, failed])
+    content = metrics.to_dict()
+    for part in (content["session"], *content["trials"]):
+        assert part["status"] == "EMPTY"
+        assert "the fit failed its check residual_3d_cm" in part["reason"]
+        for name in MEASURES[:-3]:
+            assert part[name] is None
+            assert part["reasons"][name] == "the fit failed its check residual_3d_cm"
+        assert part["gdi"]["mean"] is None
+        assert part["reasons"]["gdi"] == "the fit failed its check residual_3d_cm"
+        assert part["cycles"]["found"] > 0
+    assert content["session"]["outcome"] == metrics.outcome == "FAIL"
+    assert "residual_3d_cm" in {c["check"] for c in content["session"]["qc"]}
+    assert metrics.trials[0].events.events
+
+
+def test_the_outcome_counts_what_came_before():
+    time = np.arange(0, 6, 1 / 30)
+    metrics = gait_metrics([make_fit(time, walking(time))])
+    assert metrics.outcome == "WARN"
+    seen = Check("leg_confidence", "FAIL", 0.1, 0.5, "the legs are hidden")
+    judged = metrics.with_checks([seen])
+    assert judged.outcome == "FAIL"
+    assert judged.to_dict()["session"]["outcome"] == "FAIL"
+    assert "FAIL leg_confidence: the legs are hidden" in judged.table()
+    still = gait_metrics([make_fit(time, walking(time)), make_fit(time, {}, name="standing")])
+    assert still.outcome == "WARN"
 
 
 def test_out_of_view_in_the_middle():

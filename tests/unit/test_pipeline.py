@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
 from pbl_pipeline import pipeline
+from pbl_pipeline.cli.run import run
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.qc import Check
 from tests.integration import chain
 
 
@@ -53,6 +57,37 @@ def test_an_unknown_norm_is_refused_before_the_fit(fitted: list[list[str]], tmp_
         pipeline.run_session([chain.small_video(tmp_path, "walk", n=120)], tmp_path / "out", norm="no-such-norm")
     assert error.value.code == "NORM_UNKNOWN"
     assert not fitted
+
+
+@pytest.mark.parametrize("outcome", ["PASS", "FAIL"])
+def test_report_and_metrics_agree_on_the_outcome(
+    fitted: list[list[str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, outcome: str
+):
+    from pbl_pipeline.report._page import page_of
+
+    written = []
+    seen = Check("leg_confidence", outcome, 0.1, 0.5, "the legs are hidden" if outcome == "FAIL" else "")
+    monkeypatch.setattr(pipeline, "check_keypoints", lambda _: (seen,))
+    monkeypatch.setattr(pipeline, "render_overlay", lambda *_, **__: None)
+    monkeypatch.setattr(pipeline, "_pictures", lambda *_: ())
+    monkeypatch.setattr(pipeline, "write_report", lambda path, report: written.append(report))
+    session = pipeline.run_session([chain.small_video(tmp_path, "walk")], tmp_path / "out")
+    pipeline.write_results(tmp_path / "out", session)
+    content = json.loads((tmp_path / "out" / "metrics.json").read_text())["session"]
+    page = page_of(written[0])
+    assert content["outcome"] == page["verdict"]["outcome"] == session.judged.outcome
+    assert content["outcome"] == ("FAIL" if outcome == "FAIL" else "WARN")
+    assert {c["check"] for c in content["qc"]} >= {"leg_confidence", "residual_3d_cm", "walking", "cycles_used"}
+    assert len(page["checks"]) == len(content["qc"])
+
+
+def test_a_persons_number_belongs_to_one_video(tmp_path: Path):
+    paths = [str(chain.small_video(tmp_path, name, n=10)) for name in ("a", "b")]
+    result = CliRunner().invoke(run, [*paths, "--out", str(tmp_path / "out"), "--person", "2"])
+    assert isinstance(result.exception, PblError)
+    assert result.exception.code == "USAGE"
+    assert "--person" in result.exception.next_step
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_report_of_a_visit_names_the_recordings_it_lacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
