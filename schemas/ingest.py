@@ -85,8 +85,8 @@ def ingest(paths: Sequence[str | Path], visit: Visit, methods: Methods | None = 
     Raises
     ------
     PblError
-        USAGE for a subject code that could be a name, or one person's number for several videos; SOLVER_UNKNOWN, NORM_UNKNOWN for unknown methods. Errors of
-        single files are in the result.
+        USAGE for a subject code that could be a name, a label too long, or one person's number for several videos;
+        SOLVER_UNKNOWN, NORM_UNKNOWN for unknown methods. Errors of single files are in the result.
     """
     if not _SUBJECT.fullmatch(visit.subject):
         raise PblError(
@@ -95,6 +95,18 @@ def ingest(paths: Sequence[str | Path], visit: Visit, methods: Methods | None = 
             expected="a pseudonymous code of letters, digits, '-', '_' and '.', at most 32 long (never a name)",
             next_step="pass such a code with --subject",
         )
+    for what, text, longest in (
+        ("session", visit.session_label, 64),
+        ("project", visit.project or "", 32),
+        ("activity", visit.activity or "", 32),
+    ):
+        if len(text) > longest:
+            raise PblError(
+                "USAGE",
+                found=f"--{what} of {len(text)} characters",
+                expected=f"at most {longest}",
+                next_step="choose a shorter one",
+            )
     if visit.person is not None and len(paths) > 1:
         raise PblError(
             "USAGE",

@@ -72,8 +72,8 @@ class VideoInfo(dj.Computed):
             {
                 **key,
                 "container": info.container[:64],
-                "codec": info.codec,
-                "pixel_format": info.pixel_format,
+                "codec": info.codec[:32],
+                "pixel_format": info.pixel_format[:32],
                 "width": info.width_px,
                 "height": info.height_px,
                 "rotation": info.rotation_deg,
@@ -82,14 +82,19 @@ class VideoInfo(dj.Computed):
                 "n_frames": info.n_frames,
                 "n_frames_announced": info.n_frames_announced,
                 "variable_frame_rate": info.variable_frame_rate,
-                "recorded_utc": info.recorded_utc,
-                "phone_make": info.make,
-                "phone_model": info.model,
+                # Tags of the file: anything may stand there.
+                "recorded_utc": _cut(info.recorded_utc, 40),
+                "phone_make": _cut(info.make, 64),
+                "phone_model": _cut(info.model, 64),
                 "video_notes": list(info.notes),
                 "frame_time": info.time_s,
                 **origin.row("video_info"),
             }
         )
+
+
+def _cut(text: str | None, limit: int) -> str | None:
+    return None if text is None else text[:limit]
 
 
 def info_of_row(row: Mapping[str, Any]) -> Any:

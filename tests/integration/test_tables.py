@@ -19,6 +19,7 @@ import pbl_pipeline.gait
 import pbl_pipeline.tracking
 import pbl_pipeline.video
 import schemas
+import workers.populate
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.pipeline import Session, Trial
 from pbl_pipeline.qc import Check
@@ -298,6 +299,27 @@ def test_refused_files_do_not_hold_up_the_others(tables: None, tmp_path: Path):
 def test_a_code_that_could_be_a_name_is_refused(tables: None, tmp_path: Path, subject: str):
     with pytest.raises(PblError, match="USAGE"):
         ingest([tmp_path / "a.mp4"], Visit(subject))
+
+
+@pytest.mark.parametrize("label", [{"session_label": "s" * 65}, {"project": "p" * 33}, {"activity": "a" * 33}])
+def test_labels_that_do_not_fit_are_refused(tables: None, tmp_path: Path, label: dict):
+    path = chain.small_video(tmp_path, "walk")
+    with pytest.raises(PblError, match="USAGE"):
+        ingest([path], Visit("P001", **label))
+
+
+def test_odd_tags_of_a_file_are_cut_not_an_error(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    original = pbl_pipeline.video.probe
+
+    def odd(path):
+        fields = ("container", "codec", "pixel_format", "recorded_utc", "make", "model")
+        return chain.dataclasses.replace(original(path), **dict.fromkeys(fields, "\U0001f4f1" * 300))
+
+    monkeypatch.setattr(pbl_pipeline.video, "probe", odd)
+    register(chain.small_video(tmp_path, "walk"))
+    run = populate(["VideoInfo"])
+    assert not errors(run)
+    assert video.VideoInfo.fetch1("phone_model", "codec") == ("\U0001f4f1" * 64, "\U0001f4f1" * 32)
 
 
 def test_one_persons_number_for_several_videos_is_refused(tables: None, tmp_path: Path):
@@ -651,6 +673,24 @@ def test_methods_are_frozen(declared: None):
 
 
 # ----------------------------------------------------------------------------------------------------- commands
+def test_the_demo_stops_when_it_is_interrupted(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from pbl_pipeline import assets
+    from workers.cli.demo import demo
+
+    path = chain.small_video(tmp_path, "walk")
+    camera = tmp_path / "phone.json"
+    camera.write_text(
+        '{"camera_matrix": [[900, 0, 64], [0, 900, 36], [0, 0, 1]], "distortion": [0, 0, 0, 0, 0],'
+        ' "image_size_px": [128, 72]}'
+    )
+    monkeypatch.setattr(assets, "fetch", lambda name: camera if name == "demo_camera" else path)
+    monkeypatch.setattr(workers.populate, "populate", lambda: workers.populate.Run([], interrupted=True))
+    result = CliRunner().invoke(demo, ["--out", str(tmp_path / "out")])
+    assert result.exit_code == 130, result.output
+    assert "[5/5]" not in result.output
+    assert "interrupted" in result.output
+
+
 def test_the_commands_from_file_to_summary(tables: None, tmp_path: Path):
     from schemas.cli.choose import choose
     from schemas.cli.ingest import ingest as ingest_command

@@ -66,7 +66,10 @@ def _run(out: Path) -> None:
             raise result.error
         click.echo(f"{result.status}: video_id {result.video_id}; {result.note}")
     _step(4, "populate")
-    click.echo("\n".join(summary(populate())))
+    run = populate()
+    click.echo("\n".join(summary(run)))
+    if run.interrupted:
+        raise click.exceptions.Exit(130)
     _step(5, "result")
     here = {"subject": SUBJECT, "session_label": SESSION}
     paths = write_session(here, out)
