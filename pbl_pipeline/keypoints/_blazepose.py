@@ -68,9 +68,8 @@ MIRROR = np.array([NAMES.index(n.replace("left", "~").replace("right", "left").r
 class BlazePoseLandmarks:
     """`KeypointDetector` with BlazePose's 33 points, root-relative (origin between the hips).
 
-    The crop is shown twice, the second time mirrored, and the answers are averaged: on the walking trial of
-    `../shared/data/real/video_mocap` that took the 3D error against markers from 51 to 43 mm and the jitter from 28 to
-    21 mm (second difference at 60 Hz), more than four further crops did.
+    The crop is shown twice, the second time mirrored, and the answers are averaged: the network's errors in the two are
+    partly independent, and where it prefers one side of the body the mirrored answer prefers the other.
 
     confidence = sigmoid(visibility logit) * sigmoid(presence logit), the mean of both answers, times
     1 / (1 + exp((sigma - agree_mm) / agree_width_mm)); sigma is half the 3D distance in mm between the answers. The

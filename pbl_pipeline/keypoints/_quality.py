@@ -1,10 +1,9 @@
 """Checks of the keypoints of one trial: how much was seen, how sure, and whether left and right stayed where they were.
 
 A body from the front and the same from behind, with the sides exchanged, give nearly one outline. Where the face tells
-nothing (pixelated for privacy, against the light) a network may answer with either. Measured on the four views of
-`../shared/data/real/multiview` against OpenPose: no frame of 299 from three sides, 30 of 100 from the front with a
-pixelated face. Which of the two is right cannot be told from the movement alone (tried: choosing the sequence that
-moves least turned up to 70 right frames wrong), so such a trial is reported, not repaired.
+nothing (pixelated for privacy, against the light) a network may answer with either, and change its mind within a trial.
+Which of the two is right cannot be told from the movement alone: the sequence that moves least may be the wrong one
+throughout. So such a trial is reported, not repaired.
 """
 
 from __future__ import annotations
