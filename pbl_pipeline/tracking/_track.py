@@ -15,6 +15,7 @@ from pbl_pipeline.video import probe, read_frames
 
 from ._associate import AssociationParams, Associator, Trail
 from ._blazepose import MODEL_SHA256, BlazePoseDetector, body_box
+from ._join import JoinParams, join_trails
 from ._tiles import detect_in, tiles
 from ._types import PersonDetector, PersonTrack, Tracking
 
@@ -28,7 +29,8 @@ class TrackingParams:
     tile_fraction, tile_overlap: tiles are squares of this share of the shorter side, overlapping by that share or more.
     window_sizes: side of the window around a person, in body circles.
     min_score: detections below it are ignored. association: see `AssociationParams`; gaps up to its `max_gap_s` are
-    bridged (observed=False), after a longer one a new person begins.
+    bridged (observed=False), after a longer one a new person begins, unless `join` finds that it is the same one; such
+    a gap stays without boxes.
     min_hits: a person must be seen surely (`sure_score` of the association) this often, and over `min_track_s`, or
     the track is dropped as false.
     """
@@ -44,10 +46,11 @@ class TrackingParams:
     min_hits: int = 3
     min_track_s: float = 0.25
     association: AssociationParams = dataclasses.field(default_factory=AssociationParams)
+    join: JoinParams = dataclasses.field(default_factory=JoinParams)
 
 
 DEFAULT = "blazepose-tiles"
-PARAMSETS: dict[str, Paramset] = {DEFAULT: Paramset.of("tracking", DEFAULT, 1, TrackingParams())}
+PARAMSETS: dict[str, Paramset] = {DEFAULT: Paramset.of("tracking", DEFAULT, 2, TrackingParams())}
 
 
 def _blazepose(params: TrackingParams) -> PersonDetector:
@@ -99,8 +102,9 @@ def track_people(
             continue
         next_follow = frame.time_s + params.follow_interval_s
         associator.step(frame.index, frame.time_s, found, may_begin)
-    people = [t for t in associator.trails() if _is_real(t, params)]
-    persons = tuple(_to_track(i + 1, t, info.time_s, size) for i, t in enumerate(people))
+    people = join_trails([t for t in associator.trails() if _is_real(t, params)], size, params.join)
+    longest = params.association.max_gap_s
+    persons = tuple(_to_track(i + 1, t, info.time_s, size, longest) for i, t in enumerate(people))
     return Tracking(info.time_s, size, persons, detector.name, detector.model_sha256)
 
 
@@ -114,8 +118,9 @@ def _is_real(trail: Trail, params: TrackingParams) -> bool:
     return sure >= params.min_hits and trail.times[-1] - trail.times[0] >= params.min_track_s
 
 
-def _to_track(person_id: int, trail: Trail, time_s: np.ndarray, size: tuple[int, int]) -> PersonTrack:
-    """Rows for every frame; between sightings, centre, size and score are interpolated linearly in time."""
+def _to_track(person_id: int, trail: Trail, time_s: np.ndarray, size: tuple[int, int], max_gap_s: float) -> PersonTrack:
+    """Rows for every frame; between sightings up to `max_gap_s` apart, centre, size and score are interpolated linearly
+    in time."""
     n = len(time_s)
     first, last = trail.frames[0], trail.frames[-1]
     inside = slice(first, last + 1)
@@ -133,6 +138,9 @@ def _to_track(person_id: int, trail: Trail, time_s: np.ndarray, size: tuple[int,
         box[inside] = body_box(roi[inside])
     else:
         box[inside] = _interpolate(time_s[inside], trail.times, np.array([d.box_px for d in trail.detections]))
+    for a, b in zip(trail.frames, trail.frames[1:], strict=False):
+        if time_s[b] - time_s[a] > max_gap_s + 1e-9:
+            roi[a + 1 : b], box[a + 1 : b], score[a + 1 : b] = np.nan, np.nan, 0.0
     width, height = size
     box = np.clip(box, 0.0, [width, height, width, height])
     return PersonTrack(person_id, box, roi, score, observed)

@@ -22,6 +22,7 @@ from pbl_pipeline.tracking import (
 )
 from pbl_pipeline.tracking._associate import Associator
 from pbl_pipeline.tracking._blazepose import body_box, box_iou, circle_roi
+from pbl_pipeline.tracking._join import JoinParams, join_trails
 from pbl_pipeline.tracking._tiles import detect_in, merge, tile_starts, tiles
 from tests.videos import constant_rate, write_video
 
@@ -144,6 +145,54 @@ def test_a_weak_or_upside_down_detection_does_not_take_over_a_track():
     assert len(trails) == 2
 
 
+PICTURE = (1920, 1080)
+
+
+def joined(frames: list[list[Detection]]) -> list[list[int]]:
+    """The frames in which each person was seen, after joining."""
+    return [t.frames for t in join_trails(follow(frames), PICTURE, JoinParams())]
+
+
+def walker(i: int, hidden: range, x: float = 300.0, speed: float = 25.0, side: float = HEIGHT) -> list[Detection]:
+    return [] if i in hidden else [person(x + speed * i, 500 + 3 * (i % 2), side)]
+
+
+def test_a_walker_hidden_for_two_seconds_stays_one_person():
+    # 250 px/s of a body of 400 px: 1.1 m/s. Behind a pillar from 1.5 to 3.4 s.
+    hidden = range(15, 34)
+    frames = [walker(i, hidden) for i in range(50)]
+    assert len(follow(frames)) == 2
+    assert joined(frames) == [[i for i in range(50) if i not in hidden]]
+    # Longer out of sight than the limit: nobody knows.
+    assert len(joined([walker(i, range(12, 40), speed=20) for i in range(60)])) == 2
+
+
+def test_somebody_else_is_not_joined():
+    def then(first: Callable[[int], list[Detection]], second: Callable[[int], list[Detection]]) -> int:
+        return len(joined([first(i) if i < 15 else second(i) if i >= 34 else [] for i in range(50)]))
+
+    nobody = range(0)
+    assert then(lambda i: walker(i, nobody), lambda i: walker(i, nobody)) == 1
+    # A child, somebody coming back the way the other went, somebody elsewhere, somebody who stands there.
+    assert then(lambda i: walker(i, nobody), lambda i: walker(i, nobody, side=280)) == 2
+    assert then(lambda i: walker(i, nobody), lambda i: walker(i, nobody, x=2000, speed=-25)) == 2
+    assert then(lambda i: walker(i, nobody), lambda i: walker(i, nobody, x=800)) == 2
+    assert then(lambda i: walker(i, nobody), lambda i: [person(1150, 500)]) == 2
+
+
+def test_who_leaves_the_picture_is_not_who_comes_in():
+    frames = [[person(1700 + 12 * i, 500)] if i < 15 else [person(1860, 500)] if i >= 30 else [] for i in range(45)]
+    assert len(joined(frames)) == 2
+
+
+def test_two_who_could_both_be_the_hidden_one_are_not_joined():
+    frames = [
+        walker(i, range(50)) if 15 <= i < 34 else [person(300 + 25 * i + d, 500) for d in ((0, 60) if i > 33 else (0,))]
+        for i in range(50)
+    ]
+    assert len(joined(frames)) == 3
+
+
 # --- a whole video ----------------------------------------------------------------------------------------------
 
 
@@ -186,6 +235,24 @@ def test_track_people_numbers_bridges_and_drops(spots_video):
     assert time_in_view_s(a, tracking.time_s) == pytest.approx(4.0)
 
 
+def test_a_long_time_out_of_sight_has_no_boxes(tmp_path):
+    def frames():
+        for i in range(120):
+            image = np.zeros((360, 640, 3), np.uint8)
+            if not 40 <= i < 80:  # 1.6 s
+                image[170:190, 100 + 3 * i : 120 + 3 * i] = 214
+            yield image
+
+    path = write_video(tmp_path / "hidden.mkv", frames(), constant_rate(120, 25), codec="ffv1", pixel_format="bgr0")
+    tracking = track_people(path, detector=Spots())
+    (only,) = tracking.persons
+    assert np.isnan(only.box_px[40:80]).all()
+    assert np.isnan(only.roi_px[40:80]).all()
+    assert not only.score[40:80].any()
+    assert np.isfinite(only.box_px[:38]).all()
+    assert np.isfinite(only.box_px[86:]).all()
+
+
 def test_track_people_finds_nobody_in_noise(tmp_path):
     video = write_video(tmp_path / "dark.mkv", [np.zeros((64, 64, 3), np.uint8)] * 30, constant_rate(30), "ffv1")
     tracking = track_people(video, detector=Spots())
@@ -201,7 +268,7 @@ def test_unknown_detector_is_refused(spots_video):
 
 def test_paramset_names_the_model():
     paramset = PARAMSETS["blazepose-tiles"]
-    assert (paramset.stage, paramset.version) == ("tracking", 1)
+    assert (paramset.stage, paramset.version) == ("tracking", 2)
     assert paramset.params["model_sha256"] == TrackingParams().model_sha256
     assert len(paramset.hash) == 16
 
