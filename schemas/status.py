@@ -12,7 +12,7 @@ from ._base import error_code, error_found, error_next_step
 EMPTY_COLUMNS: dict[str, tuple[str, tuple[str, ...], str | None]] = {
     "SubjectChoice": ("choice_status", ("NO_PERSON",), "choice_reason"),
     "GaitEvents": ("events_status", ("EMPTY",), "events_reason"),
-    "Spatiotemporal": ("measures_status", ("EMPTY",), None),
+    "Spatiotemporal": ("measures_status", ("EMPTY",), "measures_reason"),
     "GDI": ("gdi_status", ("EMPTY",), None),
     "SessionGdi": ("session_status", ("EMPTY",), None),
 }
@@ -103,12 +103,15 @@ def empty_rows(table: Any) -> Any:
 
 
 def _empty() -> list[EmptyRow]:
-    out = []
+    out: list[EmptyRow] = []
     for table in computed_tables():
         reason = EMPTY_COLUMNS.get(table.__name__, ("", (), None))[2]
         if reason is None:
             continue
+        said = {e.video_id for e in out}  # the first table that has nothing knows why
         for row in (empty_rows(table) * video.Video.proj("video_name")).to_dicts(order_by="video_id"):
+            if int(row["video_id"]) in said:
+                continue
             out.append(EmptyRow(table.__name__, int(row["video_id"]), row["video_name"], row[reason]))
     return out
 

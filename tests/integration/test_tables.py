@@ -214,6 +214,10 @@ def test_a_failed_fit_gives_no_measures_in_tables_and_files(
     assert set(gdi.GDI.to_arrays("gdi_reason")) == {why}
     assert set(gait.GaitCycle.Cycle.to_arrays("cycle_excluded")) == {why}
     assert qc.SessionQc.fetch1("qc_outcome") == "FAIL"
+    assert {(e.table, e.about): e.reason for e in pipeline_status().empty} == {
+        ("Spatiotemporal", "walk1.mp4"): why,
+        ("Spatiotemporal", "walk2.mp4"): why,
+    }
     found = load_session({"subject": "P001"})
     trials = tuple(Trial(t.name, t.path, t.info, t.choice, t.keypoints) for t in found.fitted)
     judged = Session(trials, found.fit, found.metrics).judged
