@@ -73,7 +73,7 @@ def marker_set(name: str) -> MarkerSet:
             "MARKER_SET_UNKNOWN",
             found=f"{name!r}",
             expected=f"one of {', '.join(MARKER_SETS)}",
-            next_step="choose one of these, or load a lab's own table with load_marker_set(path)",
+            next_step="write the keypoints in one of these sets",
             key=name,
         )
     return load_marker_set(_DATA / f"markers_{name}.csv", name=name)

@@ -28,7 +28,7 @@ from pbl_pipeline.body._build import body_xml, marker_csv
 def build(figures: Path, out: Path) -> None:
     """Write pbl_body_40.xml and markers_bml_movi_87.csv from FIGURES (body_model_figures.json).
 
-    Example: python -m pbl_pipeline.body.build ../shared/data/body_model_figures.json
+    Example: python -m pbl_pipeline.body.build body_model_figures.json
     """
     data = json.loads(figures.read_text(encoding="utf-8"))
     out.mkdir(parents=True, exist_ok=True)

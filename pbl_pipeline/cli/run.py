@@ -34,7 +34,8 @@ def run(
     """Put VIDEOS, the trials of one session, through the whole chain.
 
     Writes report.html, metrics.json, session.json, and per trial the keypoints, the fit, the angles, the events and a
-    video with the body drawn over it. A video that cannot be used is named and left out; the others go on.
+    video with the body drawn over it. A video that cannot be used is named and left out; the others go on, and the exit
+    code is 1.
     """
     from pbl_pipeline.errors import PblError
     from pbl_pipeline.files import check_out_folder
@@ -61,3 +62,5 @@ def run(
     for name, error in session.problems.items():
         click.echo(f"left out {name}\n{error.text()}", err=True)
     click.echo("\n".join(str(p) for p in paths))
+    if session.problems:
+        raise click.exceptions.Exit(1)

@@ -112,14 +112,7 @@ def check_trial(trial: Keypoints, name: str, view: ViewParams) -> tuple[np.ndarr
     Raises `PblError` FIT_INPUT or MARKER_SET_UNKNOWN where the trial cannot be fitted.
     """
     markers = marker_set(trial.marker_set)
-    if tuple(trial.names) != tuple(markers.names):
-        raise PblError(
-            "MARKER_SET_UNKNOWN",
-            found=f"trial {name}: names {', '.join(trial.names[:4])}, ...",
-            expected=f"the {len(markers.names)} names of {markers.name} in their order",
-            next_step="write the keypoints in the order of the marker set",
-            key=name,
-        )
+    markers.check_names(trial.names)
     step = np.diff(trial.time_s)
     if len(trial.time_s) < 2 or not np.all(np.isfinite(trial.time_s)) or np.any(step <= 0):
         bad = int(np.sum(~(step > 0)))

@@ -62,7 +62,8 @@ def page_of(report: SessionReport) -> dict:
         page["measures"].append(_gdi_row(metrics.gdi))
         page["measures_note"] = (
             f"{plural(values.n_cycles_used, 'gait cycle')} used of {values.n_cycles_found} found: the first and the "
-            "last step of each walk are left out. SD over all values of both sides; n counts them."
+            "last step of each walk are left out, and strides of odd length. SD over all values of both sides; n "
+            "counts them."
         )
         page["cycle_charts"] = _figures.cycle_charts(cycles, norm)
         page["cycles_note"] = _cycles_note(norm)
@@ -129,7 +130,7 @@ def _verdict(report: SessionReport, checks: list[Check]) -> dict:
         NEEDS_CHOICE: "Several people are in view and none is clearly the subject:",
         FAIL: "The chain ended before there was anything to measure:"
         if metrics is None
-        else "A check failed. The figures below show what came out, not how the person walks:",
+        else "A check failed. What is shown below is what came out, not how the person moves:",
     }
     points = [f"{check_name(c)}: {c.advice}" if c.advice else check_name(c) for c in notable]
     return {

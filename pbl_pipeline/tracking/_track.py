@@ -50,7 +50,7 @@ class TrackingParams:
 
 
 DEFAULT = "blazepose-tiles"
-PARAMSETS: dict[str, Paramset] = {DEFAULT: Paramset.of("tracking", DEFAULT, 2, TrackingParams())}
+PARAMSETS: dict[str, Paramset] = {DEFAULT: Paramset.of("tracking", DEFAULT, 1, TrackingParams())}
 
 
 def _blazepose(params: TrackingParams) -> PersonDetector:

@@ -22,7 +22,6 @@ from pbl_pipeline.errors import PblError
 from schemas import embedded
 from schemas.cli.db import db
 from schemas.embedded import _account, _apt, _binaries, _process, _setup
-
 from tests.database import new_home, remove_home
 
 PBL = [sys.executable, "-c", "from pbl_pipeline.cli import main; main()"]
