@@ -268,7 +268,7 @@ def test_unknown_detector_is_refused(spots_video):
 
 def test_paramset_names_the_model():
     paramset = PARAMSETS["blazepose-tiles"]
-    assert (paramset.stage, paramset.version) == ("tracking", 2)
+    assert (paramset.stage, paramset.version) == ("tracking", 1)
     assert paramset.params["model_sha256"] == TrackingParams().model_sha256
     assert len(paramset.hash) == 16
 
