@@ -38,7 +38,7 @@ def page_of(report: SessionReport) -> dict:
         "title": report.title,
         "meta": [
             ("Subject", report.subject_code),
-            ("Date", report.date),
+            ("Visit", report.date),
             ("Recordings", ", ".join(t.name for t in report.trials)),
         ],
         "verdict": _verdict(report, checks),
