@@ -101,7 +101,7 @@ def init() -> None:
     for schema, count in tables.items():
         click.echo(f"  {schema:<24} {count:>3} table{'' if count == 1 else 's'}")
     click.echo(f"Arrays are kept in {settings.store_dir()}")
-    click.echo("Next: pbl ingest VIDEO --subject NAME, or pbl demo")
+    click.echo("Next: pbl ingest VIDEO --subject CODE, or pbl demo")
 
 
 def _uses_external() -> bool:
