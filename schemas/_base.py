@@ -12,8 +12,6 @@ import importlib
 import platform
 import tempfile
 import time
-import types
-import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -80,6 +78,11 @@ def check_row(prefix: str, check: Any) -> dict[str, Any]:
         f"{prefix}_check_threshold": number(check.threshold),
         f"{prefix}_check_advice": check.advice[:1000],
     }
+
+
+def check_values(prefix: str, row: Mapping[str, Any]) -> tuple:
+    """The arguments of the library's `Check` from a row of `check_columns(prefix)`."""
+    return tuple(row[f"{prefix}_check{end}"] for end in ("", "_outcome", "_value", "_threshold", "_advice"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -269,7 +272,7 @@ def rebuild_params(cls: type[P], params: Mapping[str, Any], stage: str, name: st
         SOLVER_UNKNOWN when this version of the code no longer has these parameters.
     """
     try:
-        value = _from_plain(cls, params)
+        value = Paramset(stage, name, version, params).to(cls)
         same = Paramset.of(stage, name, version, value).hash == sha
     except (TypeError, KeyError):
         same, value = False, None
@@ -293,28 +296,6 @@ def plain(value: Any) -> Any:
         return plain(value.tolist())
     if isinstance(value, np.generic):
         return value.item()
-    return value
-
-
-def _from_plain(target: Any, value: Any) -> Any:
-    """Undo what JSON does to a frozen dataclass: lists back to tuples, dicts back to nested dataclasses."""
-    origin = typing.get_origin(target)
-    if origin in (typing.Union, types.UnionType):
-        if value is None:
-            return None
-        return _from_plain(next(a for a in typing.get_args(target) if a is not type(None)), value)
-    if dataclasses.is_dataclass(target) and isinstance(target, type):
-        hints = typing.get_type_hints(target)
-        unknown = set(value) - {f.name for f in dataclasses.fields(target)}
-        if unknown:
-            raise TypeError(f"unknown parameters {sorted(unknown)}")
-        return target(**{k: _from_plain(hints[k], v) for k, v in value.items()})
-    if origin is tuple or target is tuple:
-        args = typing.get_args(target)
-        inner = args[0] if len(args) == 2 and args[1] is Ellipsis else Any
-        return tuple(_from_plain(inner, v) for v in value)
-    if target is Any and isinstance(value, list):
-        return tuple(_from_plain(Any, v) for v in value)
     return value
 
 

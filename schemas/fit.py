@@ -17,6 +17,7 @@ from ._base import (
     Origin,
     check_columns,
     check_row,
+    check_values,
     computes,
     dj,
     file_ref,
@@ -243,7 +244,7 @@ class SessionFit(dj.Computed):
 def fit_checks(key: Mapping[str, Any]) -> list[tuple]:
     """The checks of one session fit as arguments of the library's `Check`: what `make_fetch` may hand on."""
     rows = (SessionFit.Check & {k: key[k] for k in SessionFit.primary_key}).to_dicts(order_by="fit_check")
-    return [tuple(row[f"fit_check{f}"] for f in ("", "_outcome", "_value", "_threshold", "_advice")) for row in rows]
+    return [check_values("fit", row) for row in rows]
 
 
 def median(values: np.ndarray) -> float | None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from . import fit, gait, gdi, keypoints
-from ._base import Origin, computes, dj, library, origin_columns
+from ._base import Origin, check_values, computes, dj, library, origin_columns
 
 schema = dj.Schema()
 
@@ -17,6 +17,9 @@ SOURCES = (
     ("gait", gait.GaitEvents.Check, "events"),
     ("gdi", gdi.SessionGdi.Check, "gdi"),
 )
+
+#: Where the values of a check stand in `SessionQc.Check`.
+COLUMNS = ("qc_check", "qc_check_outcome", "qc_value", "qc_threshold", "qc_advice")
 
 
 @schema
@@ -49,17 +52,8 @@ class SessionQc(dj.Computed):
         found = []
         for stage, table, prefix in SOURCES:
             for row in (table & _of_set(table, key)).to_dicts(order_by="KEY"):
-                found.append(
-                    {
-                        "qc_stage": stage,
-                        "qc_video_id": row.get("video_id"),
-                        "qc_check": row[f"{prefix}_check"],
-                        "qc_check_outcome": row[f"{prefix}_check_outcome"],
-                        "qc_value": row[f"{prefix}_check_value"],
-                        "qc_threshold": row[f"{prefix}_check_threshold"],
-                        "qc_advice": row[f"{prefix}_check_advice"],
-                    }
-                )
+                values = dict(zip(COLUMNS, check_values(prefix, row), strict=True))
+                found.append({"qc_stage": stage, "qc_video_id": row.get("video_id"), **values})
         return found, (gdi.SessionGdi & key).fetch1("session_status")
 
     @computes

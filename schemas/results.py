@@ -13,7 +13,7 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 
 from . import fit, gait, gdi, keypoints, session, tracking, video
-from ._base import error_code, error_found, file_ref, library, stored_file
+from ._base import check_values, error_code, error_found, file_ref, library, number, stored_file
 
 
 @dataclasses.dataclass(frozen=True)
@@ -208,8 +208,7 @@ def load_cycles(key: Any, trial: str) -> tuple[Any, ...]:
 
 def _checks(rows: Any, prefix: str) -> list[Any]:
     check = library("qc").Check
-    fields = ("", "_outcome", "_value", "_threshold", "_advice")
-    return [check(*(row[f"{prefix}_check{f}"] for f in fields)) for row in rows.to_dicts(order_by="KEY")]
+    return [check(*check_values(prefix, row)) for row in rows.to_dicts(order_by="KEY")]
 
 
 def load_metrics(key: Any) -> Any:
@@ -222,9 +221,9 @@ def load_metrics(key: Any) -> Any:
     index = lib.Gdi(
         status="PASS" if row["session_gdi"] is not None else "EMPTY",
         reason=row["session_gdi_reason"],
-        left=_float(row["session_gdi_left"]),
-        right=_float(row["session_gdi_right"]),
-        mean=_float(row["session_gdi"]),
+        left=number(row["session_gdi_left"]),
+        right=number(row["session_gdi_right"]),
+        mean=number(row["session_gdi"]),
         n=int(row["session_gdi_n"]),
         n_left=sum(t.gdi.n_left for t in trials),
         n_right=sum(t.gdi.n_right for t in trials),
@@ -306,9 +305,9 @@ def load_gdi(key: Any, trial: str) -> Any:
     return lib.Gdi(
         status=row["gdi_status"],
         reason=row["gdi_reason"],
-        left=_float(row["gdi_left"]),
-        right=_float(row["gdi_right"]),
-        mean=_float(row["gdi"]),
+        left=number(row["gdi_left"]),
+        right=number(row["gdi_right"]),
+        mean=number(row["gdi"]),
         n=int(row["gdi_n"]),
         n_left=sum(c.side == "left" for c in cycles),
         n_right=sum(c.side == "right" for c in cycles),
@@ -334,16 +333,12 @@ def _spatiotemporal(rows: list[dict], prefix: str, **fields: Any) -> Any:
         if name not in by_name:
             continue
         row = by_name[name]
-        mean = _float(row[f"{prefix}_mean"])
-        left, right, sd = (_float(row[f"{prefix}_{k}"]) for k in ("left", "right", "sd"))
+        mean = number(row[f"{prefix}_mean"])
+        left, right, sd = (number(row[f"{prefix}_{k}"]) for k in ("left", "right", "sd"))
         measures[name] = None if mean is None else lib.Measure(left, right, mean, sd, int(row[f"{prefix}_n"]))
         if row[f"{prefix}_missing"]:
             reasons[name] = row[f"{prefix}_missing"]
     return lib.Spatiotemporal(measures=measures, reasons=reasons, **fields)
-
-
-def _float(value: Any) -> float | None:
-    return None if value is None or not np.isfinite(value) else float(value)
 
 
 def _trial(row: Mapping[str, Any], restriction: Any, fitted: Any, metrics: Mapping[str, Any]) -> TrialResults:

@@ -118,16 +118,5 @@ DEFAULT = "blazepose"
 
 
 def params_of(paramset: Paramset) -> ImplicitAdamParams:
-    """The parameter object of a stored paramset (the inverse of `Paramset.of`)."""
-    values = dict(paramset.params)
-    cost = values["cost"]
-    return ImplicitAdamParams(
-        **{
-            **values,
-            "hidden": tuple(values["hidden"]),
-            "cost": CostParams(
-                **{**cost, "pose_prior_deg": tuple((str(n), float(m), float(s)) for n, m, s in cost["pose_prior_deg"])}
-            ),
-            "view": ViewParams(**values["view"]),
-        }
-    )
+    """The parameter object of a stored paramset."""
+    return paramset.to(ImplicitAdamParams)
