@@ -28,6 +28,21 @@ from ._base import (
 schema = dj.Schema()
 
 
+def measure_columns(prefix: str) -> str:
+    """Definition lines of a part table of measures; `measure_rows` gives its rows."""
+    return f"""
+    -> master
+    {prefix}             : varchar(32)         # name, with its unit
+    ---
+    {prefix}_mean=null   : float32             # in the unit (see {prefix}): both sides
+    {prefix}_left=null   : float32             # in the unit (see {prefix})
+    {prefix}_right=null  : float32             # in the unit (see {prefix})
+    {prefix}_sd=null     : float32             # in the unit (see {prefix}): n - 1, null for one value
+    {prefix}_n           : int16               # values
+    {prefix}_missing     : varchar(255)        # why it is null
+    """
+
+
 @schema
 class GaitEventMethod(dj.Lookup):
     definition = f"""
@@ -222,17 +237,9 @@ class Spatiotemporal(dj.Computed):
     """
 
     class Measure(dj.Part):
-        definition = """
+        definition = f"""
         # every measure with both sides and its spread
-        -> master
-        measure             : varchar(32)      # name, with its unit
-        ---
-        measure_mean=null   : float32          # in the unit (see measure): both sides
-        measure_left=null   : float32          # in the unit (see measure)
-        measure_right=null  : float32          # in the unit (see measure)
-        measure_sd=null     : float32          # in the unit (see measure): n - 1, null for one value
-        measure_n           : int16            # values
-        measure_missing     : varchar(255)     # why it is null
+        {measure_columns("measure")}
         """
 
     def make_fetch(self, key: dict) -> tuple:
@@ -279,7 +286,7 @@ def mean_of(measure: Any) -> float | None:
 
 
 def measure_rows(measures: Mapping[str, Any], reasons: Mapping[str, str], prefix: str = "measure") -> list[dict]:
-    """Rows of a Measure part table whose columns begin with `prefix`."""
+    """Rows of a part table with `measure_columns(prefix)`."""
     rows = []
     for name, m in measures.items():
         row: dict[str, Any] = {prefix: name, f"{prefix}_missing": reasons.get(name, "")[:255]}

@@ -169,17 +169,9 @@ class SessionGdi(dj.Computed):
     """
 
     class Measure(dj.Part):
-        definition = """
+        definition = f"""
         # every measure with both sides and its spread
-        -> master
-        session_measure             : varchar(32)  # name, with its unit
-        ---
-        session_measure_mean=null   : float32  # in the unit (see session_measure): both sides
-        session_measure_left=null   : float32  # in the unit (see session_measure)
-        session_measure_right=null  : float32  # in the unit (see session_measure)
-        session_measure_sd=null     : float32  # in the unit (see session_measure): n - 1, null for one value
-        session_measure_n           : int16    # values
-        session_measure_missing     : varchar(255)  # why it is null
+        {gait.measure_columns("session_measure")}
         """
 
     class Check(dj.Part):

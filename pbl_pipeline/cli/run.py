@@ -39,7 +39,6 @@ def run(
     """
     from pbl_pipeline.errors import PblError
     from pbl_pipeline.files import check_out_folder
-    from pbl_pipeline.gait import load_norm
     from pbl_pipeline.pipeline import run_session, write_results
 
     # What can be wrong with the call is found before minutes of work.
@@ -53,8 +52,6 @@ def run(
         )
     check_out_folder(out)
     paramset = fit_paramset(solver, params)
-    if norm is not None:
-        load_norm(norm)
     session = run_session(videos, out, camera, person, paramset, camera_motion, norm)
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
     paths = write_results(out, session, subject_code=subject, date=f"computed {today}")

@@ -43,7 +43,8 @@ def fit_session(
         One of `PARAMSETS` or one of the same form (default: `DEFAULT`).
     camera_motion
         "static" or "handheld", for all trials or each. Without phone orientation both are fitted with a level camera
-        that does not turn: joint angles do not depend on it, positions in the world do, and a check says so.
+        that does not turn: angles between segments do not depend on it, pelvis angles and positions in the world do,
+        and a check says so.
 
     Raises
     ------
