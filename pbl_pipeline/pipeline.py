@@ -73,7 +73,7 @@ def detect_trial(path: Path, sheet: Path, camera_file: Path | None = None, perso
     """
     info = probe(path)
     camera = load_camera(camera_file, (info.width_px, info.height_px)) if camera_file else guess_camera(info)
-    tracking = track_people(path)
+    tracking = track_people(path, info=info)
     choice = choose_subject(tracking, override=person)
     subject = require_subject(choice, tracking, path, sheet)
     return Trial(path.stem, path, info, choice, detect_keypoints(path, tracking, subject, camera))

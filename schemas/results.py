@@ -153,7 +153,8 @@ def load_session_fit(key: Any) -> Any:
 
 def load_info(key: Any) -> Any:
     """The library's `VideoInfo` of one video."""
-    return video.info_of_row((video.Video * video.VideoInfo & key).fetch1())
+    row = (video.Video * video.VideoInfo & key).fetch1()
+    return video.info_of_row(row, row["frame_time"].load())
 
 
 def load_tracking(key: Any) -> Any:

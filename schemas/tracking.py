@@ -106,13 +106,16 @@ class Tracking(dj.Computed):
 
     def make_fetch(self, key: dict) -> tuple:
         method = method_arguments(TrackingMethod, "tracking", "tracking", key["tracking_method"])
-        return (video.Video & key).fetch1("video_path", "video_sha256"), method
+        probed = (video.Video * video.VideoInfo & key).fetch1()
+        return probed, file_ref(probed.pop("frame_time")), method
 
     @computes
-    def make_compute(self, key: dict, file: tuple, method: Mapping[str, Any]) -> tuple:
-        path = video.registered_file(file[0], file[1], key)
+    def make_compute(self, key: dict, probed: Mapping[str, Any], times: dict, method: Mapping[str, Any]) -> tuple:
+        path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
         params = rebuild_params(library("tracking").TrackingParams, **method)
-        return library("tracking").track_people(path, params=params), method["sha"]
+        with stored_file(self, times) as stored:
+            info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
+        return library("tracking").track_people(path, params=params, info=info), method["sha"]
 
     def make_insert(self, key: dict, tracking: Any, sha: str, origin: Origin) -> None:
         with new_folder() as folder:

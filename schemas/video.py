@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pbl_pipeline.errors import PblError
 
 from . import lab, session  # noqa: F401  the definitions refer to them
@@ -97,8 +99,8 @@ def _cut(text: str | None, limit: int) -> str | None:
     return None if text is None else text[:limit]
 
 
-def info_of_row(row: Mapping[str, Any]) -> Any:
-    """The library's `VideoInfo` from a joined row of Video and VideoInfo."""
+def info_of_row(row: Mapping[str, Any], time_s: np.ndarray) -> Any:
+    """The library's `VideoInfo` from a joined row of Video and VideoInfo and the array in `frame_time`."""
     nan = float("nan")
     return library("video").VideoInfo(
         path=row["video_path"],
@@ -110,7 +112,7 @@ def info_of_row(row: Mapping[str, Any]) -> Any:
         width_px=int(row["width"]),
         height_px=int(row["height"]),
         rotation_deg=int(row["rotation"]),
-        time_s=row["frame_time"].load(),
+        time_s=time_s,
         fps=nan if row["fps"] is None else float(row["fps"]),
         duration_s=nan if row["duration"] is None else float(row["duration"]),
         n_frames=int(row["n_frames"]),

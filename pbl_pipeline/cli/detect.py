@@ -31,7 +31,7 @@ def detect(video: Path, out: Path, camera: Path | None, person: int | None) -> N
     size = (info.width_px, info.height_px)
     lens = load_camera(camera, size) if camera else guess_camera(info)
     check_out_file(out)
-    tracking = track_people(video)
+    tracking = track_people(video, info=info)
     choice = choose_subject(tracking, override=person)
     for p in tracking.persons:
         seconds = time_in_view_s(p, tracking.time_s)

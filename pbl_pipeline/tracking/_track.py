@@ -11,7 +11,7 @@ import numpy as np
 from pbl_pipeline import assets, progress
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import Paramset
-from pbl_pipeline.video import probe, read_frames
+from pbl_pipeline.video import VideoInfo, probe, read_frames
 
 from ._associate import AssociationParams, Associator, Trail
 from ._blazepose import MODEL_SHA256, BlazePoseDetector, body_box
@@ -62,12 +62,17 @@ DETECTORS: dict[str, Callable[[TrackingParams], PersonDetector]] = {"blazepose":
 
 
 def track_people(
-    video_path: str | Path, params: TrackingParams | None = None, detector: PersonDetector | None = None
+    video_path: str | Path,
+    params: TrackingParams | None = None,
+    detector: PersonDetector | None = None,
+    info: VideoInfo | None = None,
 ) -> Tracking:
     """Find everybody in a video and follow them. Frames stream: memory does not grow with the video.
 
-    `detector` replaces the one that `params.detector` names. No person found gives a `Tracking` without persons.
-    Raises the `PblError`s of `video.probe` and `assets.fetch`, and SOLVER_UNKNOWN for an unknown detector name.
+    `detector` replaces the one that `params.detector` names. `info` is what `video.probe` said of this file; without
+    it the video is probed, which decodes it once more. No person found gives a `Tracking` without persons.
+    Raises the `PblError`s of `video.probe` and `assets.fetch`, SOLVER_UNKNOWN for an unknown detector name, and
+    VIDEO_CHANGED when `info` is of another number of frames.
     """
     params = params or TrackingParams()
     if detector is None:
@@ -79,14 +84,16 @@ def track_people(
                 next_step="choose one of these names in the tracking parameters",
             )
         detector = DETECTORS[params.detector](params)
-    info = probe(video_path)
+    info = info or probe(video_path)
     associator = Associator(params.association)
     size = (info.width_px, info.height_px)
     windows = tiles(*size, params.tile_fraction, params.tile_overlap)
     # A frame is due when the nearest multiple of the interval falls to it; half a frame of slack avoids beating.
     slack = 0.5 * float(np.median(np.diff(info.time_s))) if info.n_frames > 1 else 0.0
     next_search = next_follow = 0.0
+    n_frames = 0
     for frame in progress.track(read_frames(video_path), "people", total=info.n_frames):
+        n_frames += 1
         # The last frame too, so that tracks do not end before the video does.
         last = frame.index == info.n_frames - 1
         if frame.time_s + slack >= next_search:
@@ -102,6 +109,14 @@ def track_people(
             continue
         next_follow = frame.time_s + params.follow_interval_s
         associator.step(frame.index, frame.time_s, found, may_begin)
+    if n_frames != info.n_frames:
+        raise PblError(
+            "VIDEO_CHANGED",
+            found=f"{n_frames} frames",
+            expected=f"the {info.n_frames} frames that were probed",
+            next_step="probe the video again",
+            key=str(video_path),
+        )
     people = join_trails([t for t in associator.trails() if _is_real(t, params)], size, params.join)
     longest = params.association.max_gap_s
     persons = tuple(_to_track(i + 1, t, info.time_s, size, longest) for i, t in enumerate(people))

@@ -20,7 +20,7 @@ from pbl_pipeline.fit import SessionFit
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.qc import Check
 from pbl_pipeline.tracking import PersonTrack, Tracking
-from pbl_pipeline.video import probe
+from pbl_pipeline.video import VideoInfo, probe
 from tests.videos import constant_rate, numbered_frames, write_video
 from tests.walker import observe, walking_qpos
 from tests.walking_fit import walking_fit
@@ -36,9 +36,9 @@ def small_video(folder: Path, name: str, n: int = N_FRAMES, people: str = "walke
     return write_video(folder / f"{name}{suffix}.mp4", frames, constant_rate(n))
 
 
-def track_people(video_path: Path, params: object = None) -> Tracking:
+def track_people(video_path: Path, params: object = None, info: VideoInfo | None = None) -> Tracking:
     """Two people: one walks across the picture, one stands at its edge (or both walk alike, or nobody is there)."""
-    info = probe(video_path)
+    info = info or probe(video_path)
     time, size = info.time_s, (1920, 1080)
     stem = Path(video_path).stem
     walks = _person(1, 300 + 1200 * time / time[-1], 500.0)

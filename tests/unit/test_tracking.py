@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -24,6 +25,7 @@ from pbl_pipeline.tracking._associate import Associator
 from pbl_pipeline.tracking._blazepose import body_box, box_iou, circle_roi
 from pbl_pipeline.tracking._join import JoinParams, join_trails
 from pbl_pipeline.tracking._tiles import detect_in, merge, tile_starts, tiles
+from pbl_pipeline.video import probe
 from tests.videos import constant_rate, write_video
 
 HEIGHT = 400.0
@@ -385,3 +387,12 @@ def test_scores_do_not_depend_on_the_size_of_the_picture():
     small = video_of(*people)
     large = Tracking(small.time_s, (3000, 3000), tuple(scaled(p, 3.0) for p in people), "test", "")
     assert choose_subject(small).scores == pytest.approx(choose_subject(large).scores)
+
+
+def test_a_probe_of_another_video_is_refused(spots_video):
+    info = probe(spots_video)
+    known = track_people(spots_video, detector=Spots(), info=info)
+    assert len(known.persons) == len(track_people(spots_video, detector=Spots()).persons)
+    with pytest.raises(PblError) as error:
+        track_people(spots_video, detector=Spots(), info=dataclasses.replace(info, n_frames=info.n_frames - 1))
+    assert error.value.code == "VIDEO_CHANGED"
