@@ -37,11 +37,15 @@ def body_poses(
     """
     qpos = jnp.asarray(qpos, jnp.result_type(float))
     scale = jnp.asarray(scale, jnp.result_type(float))
-    parent_scale = jnp.where(body.parent_index >= 0, scale[body.scale_index[body.parent_index]], 1.0)
-    body_pos = jnp.asarray(body.mj_model.body_pos[1:], scale.dtype) * parent_scale[:, None]
     batch = qpos.shape[:-1]
-    xpos, xmat = poses(body)(qpos.reshape(-1, qpos.shape[-1]), body_pos)
+    xpos, xmat, _ = poses(body)(qpos.reshape(-1, qpos.shape[-1]), scaled_body_pos(body, scale))
     return xpos.reshape(*batch, *xpos.shape[1:]), xmat.reshape(*batch, *xmat.shape[1:])
+
+
+def scaled_body_pos(body: Body, scale: Float[Array, " 8"]) -> Float[Array, "21 3"]:
+    """Where each body hangs on its parent (m, parent's frame) when the parent is scaled."""
+    parent_scale = jnp.where(body.parent_index >= 0, scale[body.scale_index[body.parent_index]], 1.0)
+    return jnp.asarray(body.mj_model.body_pos[1:], scale.dtype) * parent_scale[:, None]
 
 
 def marker_positions(

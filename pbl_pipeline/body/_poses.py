@@ -26,12 +26,14 @@ from pbl_pipeline.body._model import Body
 
 
 @functools.cache
-def poses(body: Body) -> Callable[[Array, Array], tuple[Array, Array]]:
-    """The compiled function (N, 40) joint values, (21, 3) body positions -> xpos (N, 21, 3), xmat (N, 21, 3, 3).
+def poses(body: Body) -> Callable[[Array, Array], tuple[Array, Array, Array]]:
+    """The compiled function (N, 40) joint values, (21, 3) body positions -> xpos (N, 21, 3), xmat (N, 21, 3, 3),
+    xaxis (N, 40, 3).
 
-    Body positions are in the parent's frame, metres. Differentiable in both, forward and reverse.
+    Body positions are in the parent's frame, metres; `xaxis` are the joints' axes in the world. Differentiable in both
+    arguments, forward and reverse.
     """
-    tree = _Tree.of(body)
+    tree = tree_of(body)
 
     @jax.custom_jvp
     def one(qpos: Array, body_pos: Array) -> tuple[Array, Array, Array]:
@@ -48,15 +50,20 @@ def poses(body: Body) -> Callable[[Array, Array], tuple[Array, Array]]:
 
     # Compiled here so that a call outside any jit is not hundreds of small ones; inside a jit this changes nothing.
     @jax.jit
-    def all_poses(qpos: Array, body_pos: Array) -> tuple[Array, Array]:
-        xpos, xmat, _ = jax.vmap(one, in_axes=(0, None))(qpos, body_pos)
-        return xpos, xmat
+    def all_poses(qpos: Array, body_pos: Array) -> tuple[Array, Array, Array]:
+        return jax.vmap(one, in_axes=(0, None))(qpos, body_pos)
 
     return all_poses
 
 
+@functools.cache
+def tree_of(body: Body) -> Tree:
+    """Who moves whom in a body (cached)."""
+    return Tree.of(body)
+
+
 @dataclasses.dataclass(frozen=True)
-class _Tree:
+class Tree:
     """Who moves whom, as 0/1 matrices over B bodies and Q joints."""
 
     parent: np.ndarray  # (B,), -1: the world
@@ -66,7 +73,7 @@ class _Tree:
     slides_body: np.ndarray  # (B, Q): the slides of body b itself
 
     @classmethod
-    def of(cls, body: Body) -> _Tree:
+    def of(cls, body: Body) -> Tree:
         model, parent = body.mj_model, body.parent_index
         hinge, slide = model.jnt_type == 3, model.jnt_type == 2  # mjJNT_HINGE, mjJNT_SLIDE
         if not np.all(hinge | slide) or np.any(model.jnt_pos):
@@ -89,7 +96,7 @@ class _Tree:
 
 
 def _tangents(
-    tree: _Tree, xpos: Array, xmat: Array, xaxis: Array, dqpos: Array, dbody_pos: Array
+    tree: Tree, xpos: Array, xmat: Array, xaxis: Array, dqpos: Array, dbody_pos: Array
 ) -> tuple[Array, Array, Array]:
     """Derivatives of xpos (B, 3), xmat (B, 3, 3), xaxis (Q, 3) along dqpos (Q,) and dbody_pos (B, 3)."""
 
