@@ -26,6 +26,7 @@ CODES: dict[str, str] = {
     "FILE_FORMAT": "a file lacks a field, or a field has another shape, unit or type than its format says",
     "MARKER_SET_UNKNOWN": "the body has no marker set of that name, or the names differ",
     "CAMERA_INVALID": "the camera matrix or distortion is not usable",
+    "PHONE_LOG": "the orientation log of the phone is not usable",
     "FIT_INPUT": "the keypoints cannot be fitted: too few frames, time stamps out of order, nothing seen",
     "FIT_DIVERGED": "the optimisation ended in values that are not finite",
     "SOLVER_UNKNOWN": "no solver or paramset has that name",

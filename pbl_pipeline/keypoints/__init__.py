@@ -1,21 +1,27 @@
-"""Keypoints of the tracked person, behind one protocol for every detector."""
+"""Keypoints of the tracked person from any detector, views of several cameras, markers of a laboratory."""
 
 from ._blazepose import BlazePoseLandmarks
 from ._detect import DEFAULT, DETECTORS, PARAMSETS, KeypointParams, detect_keypoints
+from ._multi_view import SAME_TIME_S, MultiView, cameras_of_files
 from ._protocol import KeypointDetector, PersonKeypoints
 from ._quality import check_keypoints, side_changes
 from ._types import Keypoints
 from ._view import view_rotation
+from ._world_markers import WorldMarkers
 
 __all__ = [
     "DEFAULT",
     "DETECTORS",
     "PARAMSETS",
+    "SAME_TIME_S",
     "BlazePoseLandmarks",
     "KeypointDetector",
     "KeypointParams",
     "Keypoints",
+    "MultiView",
     "PersonKeypoints",
+    "WorldMarkers",
+    "cameras_of_files",
     "check_keypoints",
     "detect_keypoints",
     "side_changes",

@@ -10,7 +10,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_numbers, load_npz
-from pbl_pipeline.video import Camera
+from pbl_pipeline.video import Attitude, Camera, check_attitude
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +34,13 @@ class Keypoints:
     box_px : (T, 4)
         x0, y0, x1, y1 of the person.
     phone_time_s, phone_quat_wxyz : (P,), (P, 4) or None
-        Phone orientation, camera to world, at its own stamps.
+        Phone orientation, camera to world, at its own stamps: both or neither. Brought to unit length, without jumps
+        of sign, when made (`check_attitude`); how much of the recording it covers is for the fit to judge.
+
+    Raises
+    ------
+    PblError
+        FILE_FORMAT (shapes, confidence), CAMERA_INVALID, PHONE_LOG.
     """
 
     time_s: np.ndarray
@@ -74,6 +80,25 @@ class Keypoints:
                 expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels with positive focal lengths",
                 next_step="pass a camera file with --camera, or leave it out to use the stated guess",
             )
+        self._check_phone()
+
+    def _check_phone(self) -> None:
+        if self.phone_time_s is None and self.phone_quat_wxyz is None:
+            return
+        if self.phone_time_s is None or self.phone_quat_wxyz is None:
+            raise PblError(
+                "PHONE_LOG",
+                found=f"phone_time_s {_there(self.phone_time_s)}, phone_quat_wxyz {_there(self.phone_quat_wxyz)}",
+                expected="both or neither",
+                next_step="see docs/files.md, section keypoints.npz",
+            )
+        time_s, quat_wxyz = check_attitude(self.phone_time_s, self.phone_quat_wxyz)
+        object.__setattr__(self, "phone_time_s", time_s)
+        object.__setattr__(self, "phone_quat_wxyz", quat_wxyz)
+
+    def with_attitude(self, attitude: Attitude) -> Keypoints:
+        """The same keypoints with the phone's orientation."""
+        return dataclasses.replace(self, phone_time_s=attitude.time_s, phone_quat_wxyz=attitude.quat_wxyz)
 
     def save(self, path: str | Path) -> None:
         """Write `keypoints.npz` (the fields of docs/files.md)."""
@@ -99,7 +124,10 @@ class Keypoints:
 
     @classmethod
     def load(cls, path: str | Path) -> Keypoints:
-        """Read `keypoints.npz`. Raises `PblError` FILE_MISSING, FILE_FORMAT, CAMERA_INVALID. Never unpickles."""
+        """Read `keypoints.npz`; never unpickles.
+
+        Raises `PblError` FILE_MISSING, FILE_FORMAT, CAMERA_INVALID, PHONE_LOG.
+        """
         data = load_npz(path)
         needed = [
             "time_s",
@@ -136,6 +164,10 @@ class Keypoints:
             phone_time_s=data.get("phone_time_s"),
             phone_quat_wxyz=data.get("phone_quat_wxyz"),
         )
+
+
+def _there(value: object) -> str:
+    return "missing" if value is None else "there"
 
 
 def _format_error(found: str, expected: str) -> PblError:

@@ -1,16 +1,24 @@
-"""Video files: probe, frames in order with their own time stamps, camera intrinsics."""
+"""Video files: probe, frames in order with their own time stamps, intrinsics, pose and orientation of the camera."""
 
+from ._attitude import Attitude, camera_in_device, check_attitude, load_attitude
 from ._camera import guess_camera, load_camera, viewing_ray
+from ._camera_pose import CameraPose, load_camera_poses
 from ._probe import probe, sha256_of
 from ._read import read_frames
 from ._types import Camera, Frame, VideoInfo
 
 __all__ = [
+    "Attitude",
     "Camera",
+    "CameraPose",
     "Frame",
     "VideoInfo",
+    "camera_in_device",
+    "check_attitude",
     "guess_camera",
+    "load_attitude",
     "load_camera",
+    "load_camera_poses",
     "probe",
     "read_frames",
     "sha256_of",

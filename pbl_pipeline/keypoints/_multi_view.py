@@ -1,0 +1,149 @@
+"""One trial seen by several calibrated cameras."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.video import CameraPose, load_camera, load_camera_poses
+
+from ._types import Keypoints
+
+#: Cameras started by one trigger differ by less; a frame of 60 Hz is 17 ms.
+SAME_TIME_S = 1e-3
+
+
+@dataclasses.dataclass(frozen=True)
+class MultiView:
+    """Keypoints of the same moments from at least two cameras that stand still.
+
+    Attributes
+    ----------
+    views
+        Keypoints of each camera: equal time stamps (within 1 ms), names and marker set. `xyz_cam_m` may be all NaN.
+    poses
+        Where each camera stands, in the same order; one world for all.
+
+    Raises
+    ------
+    PblError
+        FIT_INPUT: fewer than two views, or views that differ in names or times. CAMERA_INVALID: another number of
+        poses.
+    """
+
+    views: tuple[Keypoints, ...]
+    poses: tuple[CameraPose, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "views", tuple(self.views))
+        object.__setattr__(self, "poses", tuple(self.poses))
+        if len(self.views) < 2:
+            raise _view_error(f"{len(self.views)} views", "at least two cameras; fit one alone without --cameras")
+        if len(self.poses) != len(self.views):
+            raise PblError(
+                "CAMERA_INVALID",
+                found=f"{len(self.poses)} camera poses for {len(self.views)} views",
+                expected="one for each",
+                next_step="pass the keypoints of each camera of the calibration, or take out cameras",
+            )
+        first = self.views[0]
+        for number, view in enumerate(self.views[1:], 2):
+            if (view.marker_set, view.names) != (first.marker_set, first.names):
+                found = f"{view.marker_set} with {len(view.names)} names in view {number}, other than in the first"
+                raise _view_error(found, f"{first.marker_set} and the same names in the same order")
+            if len(view.time_s) != len(first.time_s):
+                found = f"{len(view.time_s)} frames in view {number}, {len(first.time_s)} in the first"
+                raise _view_error(found, "the same frames in all")
+            apart = float(np.max(np.abs(np.asarray(view.time_s) - first.time_s), initial=0.0))
+            if not apart <= SAME_TIME_S:
+                found = f"time stamps of view {number} up to {1000 * apart:.3g} ms from the first's"
+                raise _view_error(found, f"at most {1000 * SAME_TIME_S:g} ms: cameras that were started together")
+
+    @property
+    def time_s(self) -> np.ndarray:
+        """(T,) time stamps, of the first view."""
+        return self.views[0].time_s
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The J markers of each view."""
+        return self.views[0].names
+
+    @property
+    def marker_set(self) -> str:
+        """The marker set of each view."""
+        return self.views[0].marker_set
+
+    @classmethod
+    def from_calibration(
+        cls, views: Sequence[Keypoints], calibration: str | Path, cameras: Sequence[str] | None = None
+    ) -> MultiView:
+        """Views with lens and pose from a calibration file of several cameras (Pose2Sim's TOML).
+
+        `cameras` names each view's camera in the file; None: the views are in the file's order and number. The lens of
+        the calibration replaces that of the keypoints.
+
+        Raises
+        ------
+        PblError
+            FIT_INPUT, CAMERA_INVALID (see `load_camera` and `load_camera_poses`).
+        """
+        poses = load_camera_poses(calibration)
+        names = list(poses if cameras is None else cameras)
+        unknown = [n for n in names if n not in poses]
+        if unknown or len(names) != len(views):
+            raise _calibration_error(calibration, list(poses), [str(n) for n in unknown or names], len(views))
+        lenses = [load_camera(calibration, v.image_size_px, n) for v, n in zip(views, names, strict=True)]
+        seen = [dataclasses.replace(v, camera=lens) for v, lens in zip(views, lenses, strict=True)]
+        return cls(tuple(seen), tuple(poses[n] for n in names))
+
+
+def cameras_of_files(stems: Sequence[str], calibration: str | Path) -> tuple[str, list[str]]:
+    """A name for the trial and the camera of each file.
+
+    A file belongs to the camera that its stem names, alone or after the trial's name and a dot ("cam_01",
+    "walk.cam_01"; case, `_` and `-` do not count). Where no stem names one, the files are in the order of the cameras.
+    The trial is called "trial" where the stems have no common name for it.
+
+    Raises `PblError` CAMERA_INVALID where some files are of a camera and some are not, or the counts differ.
+    """
+    cameras = list(load_camera_poses(calibration))
+    plain = {_plain(name): name for name in cameras}
+    parts = [stem.rsplit(".", 1) for stem in stems]
+    found = [plain.get(_plain(p[-1])) for p in parts]
+    named = [c for c in found if c is not None]
+    if not named and len(stems) == len(cameras):
+        return "trial", cameras
+    if len(named) != len(stems) or len(set(named)) != len(named):
+        raise _calibration_error(calibration, cameras, list(stems), len(stems))
+    titles = {p[0] for p in parts if len(p) > 1}
+    same = len(titles) == 1 and all(len(p) > 1 for p in parts)
+    return (titles.pop() if same else "trial"), named
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[_\-\s]", "", name).casefold()
+
+
+def _view_error(found: str, expected: str) -> PblError:
+    return PblError(
+        "FIT_INPUT",
+        found=found,
+        expected=expected,
+        next_step="synchronise and cut the recordings to the same frames, and detect each with the same method",
+    )
+
+
+def _calibration_error(path: str | Path, cameras: list[str], views: list[str], n_views: int) -> PblError:
+    return PblError(
+        "CAMERA_INVALID",
+        found=f"cameras {', '.join(cameras)} for {n_views} views ({', '.join(views)})",
+        expected="a camera for each view",
+        next_step="name the keypoints files like their cameras, or pass one for each camera in the file's order",
+        key=str(path),
+    )

@@ -1,0 +1,171 @@
+"""Markers of a laboratory: points in the world, without a camera."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import check_numbers, load_npz
+
+from ._trc import read_trc
+
+_FIELDS = ("time_s", "names", "marker_set", "xyz_world_m", "confidence")
+
+
+@dataclasses.dataclass(frozen=True)
+class WorldMarkers:
+    """One trial of optical markers. A marker that was not seen is NaN with confidence 0.
+
+    Attributes
+    ----------
+    time_s : (T,) float64
+        Time stamps, finite.
+    names : tuple of J str
+        All different.
+    marker_set
+        Name of the marker set; for a laboratory's own, the stem of its table.
+    xyz_world_m : (T, J, 3) float64
+        World: right-handed, z up, metres; origin and heading are the laboratory's.
+    confidence : (T, J) float64
+        0..1.
+
+    Raises
+    ------
+    PblError
+        FILE_FORMAT: shapes, types, names that repeat, confidence outside 0..1, infinite values, NaN with a confidence
+        above 0. The order of the stamps is checked where they are used (FIT_INPUT, GAIT_INPUT).
+    """
+
+    time_s: np.ndarray
+    names: tuple[str, ...]
+    marker_set: str
+    xyz_world_m: np.ndarray
+    confidence: np.ndarray
+
+    def __post_init__(self) -> None:
+        for field in ("time_s", "xyz_world_m", "confidence"):
+            try:
+                object.__setattr__(self, field, np.asarray(getattr(self, field), np.float64))
+            except (TypeError, ValueError) as error:
+                raise _format_error(f"{field}: {error}", "numbers") from error
+        names = tuple(str(n) for n in self.names)
+        object.__setattr__(self, "names", names)
+        n, j = self.time_s.size, len(names)
+        if not n or not j:
+            raise _format_error(f"{n} frames, {j} markers", "at least one of each")
+        for field, shape in {"time_s": (n,), "xyz_world_m": (n, j, 3), "confidence": (n, j)}.items():
+            if getattr(self, field).shape != shape:
+                found = f"{field} has shape {getattr(self, field).shape}"
+                raise _format_error(found, f"shape {shape} for {n} frames, {j} names")
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice or "" in names:
+            raise _format_error(
+                f"names that repeat: {', '.join(twice) or '(empty)'}", "a name of its own for each marker"
+            )
+        if not np.isfinite(self.time_s).all():
+            raise _format_error("time stamps that are not finite", "seconds")
+        if np.isinf(self.xyz_world_m).any():
+            raise _format_error("infinite positions", "metres, NaN where a marker was not seen")
+        c = self.confidence
+        if not np.all((c >= 0) & (c <= 1)):
+            raise _format_error("confidence outside 0..1 or not finite", "0 for a missing marker, at most 1")
+        lost = int(np.sum(np.isnan(self.xyz_world_m).any(axis=2) & (c > 0)))
+        if lost:
+            raise _format_error(f"{lost} markers that are NaN with a confidence above 0", "confidence 0 there")
+
+    def save(self, path: str | Path) -> None:
+        """Write the .npz of docs/files.md (markers as float32)."""
+        np.savez_compressed(
+            path,
+            time_s=self.time_s,
+            names=np.asarray(self.names),
+            marker_set=np.asarray(self.marker_set),
+            xyz_world_m=self.xyz_world_m.astype(np.float32),
+            confidence=self.confidence.astype(np.float32),
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> WorldMarkers:
+        """Read the .npz of docs/files.md. Raises `PblError` FILE_MISSING, FILE_FORMAT. Never unpickles."""
+        data = load_npz(path)
+        missing = [k for k in _FIELDS if k not in data]
+        if missing:
+            raise _format_error(f"no {', '.join(missing)}", f"the fields {', '.join(_FIELDS)}", path)
+        n, j = data["time_s"].size, data["names"].size
+        check_numbers(path, data, {"time_s": (n,), "xyz_world_m": (n, j, 3), "confidence": (n, j)})
+        names = tuple(str(name) for name in np.ravel(data["names"]))
+        values = (data["time_s"], names, str(data["marker_set"]), data["xyz_world_m"], data["confidence"])
+        return _about(path, *values)
+
+    @classmethod
+    def from_trc(cls, path: str | Path, marker_set: str, up: str = "y") -> WorldMarkers:
+        """Read a TRC file (OpenSim's and most motion capture programs' text format).
+
+        `up` is the file's vertical axis. "y": turned by 90 degrees about x into the world, (x, y, z) to (x, -z, y), so
+        x stays (OpenSim's forward) and the frame stays right-handed. "z": taken as it is. Empty cells, NaN and three
+        zeros, which some programs write into gaps, are missing: NaN with confidence 0; all else has confidence 1.
+
+        Raises
+        ------
+        PblError
+            FILE_MISSING, FILE_FORMAT (also for units that cannot be), USAGE for another `up`.
+        """
+        if up not in ("y", "z"):
+            raise PblError(
+                "USAGE",
+                found=f"up {up!r}",
+                expected="y or z, the vertical axis of the file",
+                next_step="look at the file: the heads' markers are highest along this axis",
+                key=str(path),
+            )
+        trc = read_trc(path)
+        xyz = trc.xyz_m
+        if up == "y":
+            xyz = np.stack([xyz[..., 0], -xyz[..., 2], xyz[..., 1]], axis=-1)
+        seen = np.asarray(np.isfinite(xyz).all(axis=2))
+        return _about(
+            path, trc.time_s, trc.names, marker_set, np.where(seen[..., None], xyz, np.nan), seen.astype(float)
+        )
+
+    def select(self, names: Sequence[str], marker_set: str | None = None) -> WorldMarkers:
+        """The markers of `names` in that order, as a marker set wants them; one that the trial lacks was never seen.
+
+        `marker_set` renames the set. Raises `PblError` MARKER_SET_UNKNOWN where the trial has none of them.
+        """
+        column = {name: i for i, name in enumerate(self.names)}
+        there = [i for i, name in enumerate(names) if name in column]
+        if not there:
+            raise PblError(
+                "MARKER_SET_UNKNOWN",
+                found=f"markers {', '.join(self.names)}",
+                expected=f"some of {', '.join(names)}",
+                next_step="name the markers in the table of --marker-set as the recording does",
+                key=marker_set or self.marker_set,
+            )
+        xyz = np.full((len(self.time_s), len(names), 3), np.nan)
+        confidence = np.zeros(xyz.shape[:2])
+        source = [column[names[i]] for i in there]
+        xyz[:, there], confidence[:, there] = self.xyz_world_m[:, source], self.confidence[:, source]
+        return WorldMarkers(self.time_s, tuple(names), marker_set or self.marker_set, xyz, confidence)
+
+
+def _about(path: str | Path, *values) -> WorldMarkers:
+    """Markers from a file; an error names the file."""
+    try:
+        return WorldMarkers(*values)
+    except PblError as error:
+        raise _format_error(error.found, error.expected, path) from error
+
+
+def _format_error(found: str, expected: str, path: str | Path | None = None) -> PblError:
+    return PblError(
+        "FILE_FORMAT",
+        found=found,
+        expected=expected,
+        next_step="see docs/files.md, section markers of a laboratory",
+        key=None if path is None else str(path),
+    )
