@@ -20,7 +20,7 @@ from pbl_pipeline.qc import WARN, Check
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
 from pbl_pipeline.report import Picture, SessionReport, TrialReport, write_report
 from pbl_pipeline.tracking import SubjectChoice, choose_subject, require_subject, track_people
-from pbl_pipeline.video import VideoInfo, guess_camera, load_camera, probe, sha256_of
+from pbl_pipeline.video import VideoInfo, guess_camera, load_attitude, load_camera, probe, sha256_of
 
 #: What `write_results` writes for each trial, after the trial's name and a dot.
 TRIAL_FILES = ("overlay.mp4", "angles.csv", "events.csv", "fit.npz", "keypoints.npz")
@@ -85,26 +85,36 @@ def run_session(
     camera_file: Path | None = None,
     person: int | None = None,
     paramset: Paramset | None = None,
-    camera_motion: str = "static",
+    camera_motion: str | None = None,
     norm: str | None = None,
+    attitude_files: Sequence[Path] = (),
 ) -> Session:
     """Videos of one session to gait measures. A video that fails is left out with its problem, and so is one whose
     bytes were named before, because its steps would count twice; the others go on. Into `out` goes only a picture of
     the people of a video in which one must be chosen.
 
+    `attitude_files` holds an orientation log of the phone for each path, or nothing. `camera_motion` None stands for
+    "handheld" where there are logs, else "static".
+
     Raises
     ------
     PblError
-        The error of the video where no video of the session can be fitted; NORM_UNKNOWN, NORM_INVALID.
+        The error of the video where no video of the session can be fitted; NORM_UNKNOWN, NORM_INVALID; FILE_MISSING,
+        PHONE_LOG for a log.
     """
-    basis = load_norm(norm or DEFAULT_NORM)  # a wrong name must not cost a fit
+    # A wrong name or log must not cost a fit.
+    basis = load_norm(norm or DEFAULT_NORM)
+    logs = [load_attitude(file) for file in attitude_files] or [None] * len(paths)
+    camera_motion = camera_motion or ("handheld" if attitude_files else "static")
     trials, problems, seen = [], {}, {}
-    for path, name in zip(paths, distinct_names(paths), strict=True):
+    for path, name, log in zip(paths, distinct_names(paths), logs, strict=True):
         try:
             first = seen.setdefault(sha256_of(path), name)
             if first != name:
                 raise _named_twice(path, first)
             trial = dataclasses.replace(detect_trial(path, out / f"{name}.persons.png", camera_file, person), name=name)
+            if log is not None:
+                trial = dataclasses.replace(trial, keypoints=trial.keypoints.with_attitude(log))
             check_trial(trial.keypoints, name, paramset)
         except PblError as error:
             problems[name] = error

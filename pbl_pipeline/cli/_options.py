@@ -16,6 +16,11 @@ if TYPE_CHECKING:
     from pbl_pipeline.paramset import Paramset
 
 
+#: Commands that fit: how the camera was held, and what is meant where nobody says.
+CAMERA_MOTIONS = ("static", "handheld")
+CAMERA_MOTION_HELP = "Default: handheld where the phone's orientation is known, else static."
+
+
 class Person(click.ParamType):
     """`auto` (None) or the number of a person."""
 
@@ -29,38 +34,69 @@ class Person(click.ParamType):
         return self.fail(f"{value!r} is neither 'auto' nor the number of a person", param, ctx)
 
 
-def fit_paramset(solver: str, params: str | None) -> Paramset:
-    """The paramset that `--solver` and `--params` (a name, or a JSON file of changes to the default) ask for.
+def fit_paramset(solver: str | None, params: str | None, default: str | None = None) -> Paramset:
+    """The paramset that `--solver` and `--params` ask for; `default` stands in for the project's default paramset.
 
-    Raises `PblError` SOLVER_UNKNOWN, FILE_FORMAT.
+    `--params` is a name, or a JSON file of changes to the paramset that its key "base" names. Without either, and
+    without "base", it is the default paramset; with `--solver` alone the default one of that solver.
+
+    Raises `PblError` SOLVER_UNKNOWN (also where the paramset is of another solver than `--solver`), FILE_FORMAT.
     """
-    from pbl_pipeline.fit import DEFAULT, PARAMSETS, SOLVERS, params_of
+    from pbl_pipeline.fit import PARAMSETS, SOLVERS, params_of
     from pbl_pipeline.paramset import Paramset
 
-    if solver not in SOLVERS:
-        raise _unknown(f"solver {solver!r}", SOLVERS)
+    if solver is not None and solver not in SOLVERS:
+        raise _unknown(f"solver {solver!r}", tuple(SOLVERS))
     if params is None:
-        return PARAMSETS[DEFAULT]
+        return PARAMSETS[_default_of(solver, default)]
     if params in PARAMSETS:
-        return PARAMSETS[params]
+        return _of_solver(PARAMSETS[params], solver)
     path = Path(params)
     if not path.is_file():
         raise _unknown(f"paramset {params!r}, and no such file", tuple(PARAMSETS))
-    base = PARAMSETS[DEFAULT]
+    base = _default_of(solver, default)
     try:
         changes = json.loads(path.read_text())
         if not isinstance(changes, dict):
             raise TypeError("not an object")
-        merged = _merge(dataclasses.asdict(params_of(base)), changes)
+        base = changes.pop("base", base)
+        if base not in PARAMSETS:
+            raise KeyError(f"base {base!r}; known: {sorted(PARAMSETS)}")
+        before = _of_solver(PARAMSETS[base], solver)
+        merged = _merge(dataclasses.asdict(params_of(before)), changes)
+        if merged["solver"] != before.params["solver"]:
+            raise ValueError(
+                f"solver {merged['solver']!r}, but {base} is of {before.params['solver']}: name another base"
+            )
         return Paramset.of("fit", path.stem, 1, params_of(Paramset("fit", path.stem, 1, merged)))
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise PblError(
             "FILE_FORMAT",
             found=f"{type(error).__name__}: {error}",
-            expected=f'a JSON object with some of the parameters of {DEFAULT}, such as {{"steps": 8000}}',
-            next_step="correct the file",
+            expected=f'a JSON object with some of the parameters of {base}, such as {{"cost": {{"weight_2d": 0.05}}}}',
+            next_step='correct the file; the key "base" names the paramset that it changes',
             key=path,
         ) from error
+
+
+def _default_of(solver: str | None, default: str | None = None) -> str:
+    """Name of the default paramset, where it is of another solver of the first of that solver."""
+    from pbl_pipeline.fit import DEFAULT, PARAMSETS
+
+    names = [default or DEFAULT, DEFAULT, *PARAMSETS]
+    return next(n for n in names if solver in (None, PARAMSETS[n].params["solver"]))
+
+
+def _of_solver(paramset: Paramset, solver: str | None) -> Paramset:
+    its_own = paramset.params["solver"]
+    if solver not in (None, its_own):
+        raise PblError(
+            "SOLVER_UNKNOWN",
+            found=f"solver {solver} with paramset {paramset.name}",
+            expected=f"{its_own}, the solver of {paramset.name}",
+            next_step="leave out --solver, or name a paramset of that solver",
+        )
+    return paramset
 
 
 def _merge(base: dict, changes: dict) -> dict:

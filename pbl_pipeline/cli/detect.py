@@ -13,23 +13,26 @@ from ._options import Person
 @click.argument("video", type=click.Path(path_type=Path, readable=False))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="keypoints.npz to write.")
 @click.option("--camera", type=click.Path(path_type=Path), help="Calibration file; without it a phone is guessed.")
+@click.option("--attitude", type=click.Path(path_type=Path), help="Orientation log of the phone (docs/files.md).")
 @click.option("--person", type=Person(), default="auto", show_default=True, help="Whom to measure.")
-def detect(video: Path, out: Path, camera: Path | None, person: int | None) -> None:
+def detect(video: Path, out: Path, camera: Path | None, attitude: Path | None, person: int | None) -> None:
     """Find the people in VIDEO, choose the one to measure, and write that person's keypoints.
 
     Where no one is clearly the subject, nothing is measured: a picture with the numbered people is written beside OUT,
-    and the command is to be called again with --person N.
+    and the command is to be called again with --person N. With --attitude the keypoints carry the phone's orientation,
+    and the fit then knows where gravity points and how the camera moved.
     """
     from pbl_pipeline.files import check_out_file
     from pbl_pipeline.keypoints import check_keypoints, detect_keypoints
     from pbl_pipeline.tracking import choose_subject, require_subject, time_in_view_s, track_people
-    from pbl_pipeline.video import guess_camera, load_camera, probe
+    from pbl_pipeline.video import guess_camera, load_attitude, load_camera, probe
 
     if out.suffix != ".npz":
         raise click.BadParameter(f"{out} does not end in .npz", param_hint="--out")
     info = probe(video)
     size = (info.width_px, info.height_px)
     lens = load_camera(camera, size) if camera else guess_camera(info)
+    log = load_attitude(attitude) if attitude else None
     check_out_file(out)
     tracking = track_people(video, info=info)
     choice = choose_subject(tracking, override=person)
@@ -40,12 +43,16 @@ def detect(video: Path, out: Path, camera: Path | None, person: int | None) -> N
     sheet = out.with_name(out.name.removesuffix(".npz") + ".persons.png")
     subject = require_subject(choice, tracking, video, sheet)
     keypoints = detect_keypoints(video, tracking, subject, lens)
+    if log is not None:
+        keypoints = keypoints.with_attitude(log)
     keypoints.save(out)
     seen = keypoints.confidence.max(axis=1) > 0
     click.echo(
         f"{out}: {len(keypoints.names)} points ({keypoints.marker_set}) of person {subject} "
         f"in {int(seen.sum())} of {len(seen)} frames; camera {lens.source}"
     )
+    if log is not None:
+        click.echo(f"  orientation of the phone: {len(log.time_s)} samples over {log.time_s[-1] - log.time_s[0]:.1f} s")
     for check in check_keypoints(keypoints):
         if check.advice:
             click.echo(f"  {check.outcome} {check.check} = {check.value:.3g}: {check.advice}")

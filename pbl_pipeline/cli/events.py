@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import check_numbers, check_out_file, load_npz
+from pbl_pipeline.files import check_out_file, load_npz
 
 _EPILOG = "Example: pbl events walk.fit.npz --out walk.events.csv"
 
@@ -41,21 +41,16 @@ def events(file: Path, out: Path, method: str) -> None:
 def _feet(path: Path):
     from pbl_pipeline.fit import TrialFit
     from pbl_pipeline.gait import feet_from_fit, feet_from_keypoints, feet_from_markers
-    from pbl_pipeline.keypoints import Keypoints
+    from pbl_pipeline.keypoints import Keypoints, WorldMarkers
 
-    data = load_npz(path)
-    fields = set(data)
+    fields = set(load_npz(path))
     if "qpos" in fields:
         return feet_from_fit(TrialFit.load(path))
     if "xyz_cam_m" in fields:
         return feet_from_keypoints(Keypoints.load(path))
-    if {"time_s", "names", "marker_set", "xyz_world_m", "confidence"} <= fields:
-        n, j = data["time_s"].size, data["names"].size
-        check_numbers(path, data, {"time_s": (n,), "xyz_world_m": (n, j, 3), "confidence": (n, j)})
-        names = [str(name) for name in data["names"]]
-        return feet_from_markers(
-            data["time_s"], names, str(data["marker_set"]), data["xyz_world_m"], data["confidence"]
-        )
+    if "xyz_world_m" in fields:
+        seen = WorldMarkers.load(path)
+        return feet_from_markers(seen.time_s, seen.names, seen.marker_set, seen.xyz_world_m, seen.confidence)
     raise _format_error(path, f"fields {', '.join(sorted(fields)) or 'none'}")
 
 

@@ -1,36 +1,72 @@
-"""`pbl fit`: keypoints of one session to joint angles."""
+"""`pbl fit`: keypoints or markers of one session to joint angles."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from ._options import fit_paramset
+from pbl_pipeline.errors import PblError
+
+from ._options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, fit_paramset
+
+if TYPE_CHECKING:
+    from pbl_pipeline.body import MarkerSet
+    from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
+
+_ENDS = (".npz", ".keypoints", ".markers")
 
 
 @click.command(epilog="Example: pbl fit walk1.keypoints.npz walk2.keypoints.npz --out results")
-@click.argument("keypoints", nargs=-1, required=True, type=click.Path(path_type=Path, readable=False))
+@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path, readable=False))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the results.")
-@click.option("--solver", default="implicit-adam", show_default=True, help="Name of the solver.")
-@click.option("--params", help="Name of a paramset, or a JSON file with changes to the default one.")
-@click.option("--camera-motion", type=click.Choice(["static", "handheld"]), default="static", show_default=True)
-def fit(keypoints: tuple[Path, ...], out: Path, solver: str, params: str | None, camera_motion: str) -> None:
-    """Fit one body to the KEYPOINTS files, the trials of one session.
+@click.option("--solver", help="gauss-newton or implicit-adam; without it the solver of the paramset.")
+@click.option("--params", help="Name of a paramset, or a JSON file with changes to one (docs/files.md).")
+@click.option("--camera-motion", type=click.Choice(CAMERA_MOTIONS), help=CAMERA_MOTION_HELP)
+@click.option("--cameras", type=click.Path(path_type=Path), help="Calibration (TOML): FILES are views of one trial.")
+@click.option("--marker-set", help="Name of a marker set, or a table (CSV) of your own; needed for .trc files.")
+@click.option(
+    "--up", type=click.Choice(["y", "z"]), default="y", show_default=True, help="Vertical axis of .trc files."
+)
+def fit(
+    files: tuple[Path, ...],
+    out: Path,
+    solver: str | None,
+    params: str | None,
+    camera_motion: str | None,
+    cameras: Path | None,
+    marker_set: str | None,
+    up: str,
+) -> None:
+    """Fit one body to FILES, the trials of one session.
 
-    Writes <name>.fit.npz and <name>.angles.csv for each trial, and session.json.
+    FILES are keypoints.npz, or markers of a laboratory as .npz or .trc. With --cameras they are the views of one trial,
+    named like the cameras of the calibration or in its order. Writes <name>.fit.npz and <name>.angles.csv for each
+    trial, and session.json.
     """
     from pbl_pipeline.export import write_angles_csv
     from pbl_pipeline.files import check_out_folder
-    from pbl_pipeline.fit import fit_session
-    from pbl_pipeline.keypoints import Keypoints
+    from pbl_pipeline.fit import PARAMSETS, fit_session
+    from pbl_pipeline.keypoints import WorldMarkers
     from pbl_pipeline.pipeline import distinct_names, write_session_json
 
     check_out_folder(out)
-    paramset = fit_paramset(solver, params)
-    trials = [Keypoints.load(path) for path in keypoints]
-    names = distinct_names([Path(p.name.removesuffix(".npz").removesuffix(".keypoints")) for p in keypoints])
-    session = fit_session(trials, names, paramset, camera_motion)
+    paramset = fit_paramset(solver, params)  # a wrong name is said before anything is read
+    table = _marker_set(marker_set)
+    trials: Sequence[Any] = [_load(path, table, up) for path in files]
+    if all(isinstance(trial, WorldMarkers) for trial in trials) and "markers" in PARAMSETS:
+        paramset = fit_paramset(solver, params, default="markers")
+    stems = [_stem(path) for path in files]
+    if cameras:
+        trial, name = _views_of_one(trials, stems, cameras)
+        trials, names = [trial], [name]
+    else:
+        names = distinct_names([Path(stem + ".npz") for stem in stems])
+    motions = [camera_motion or _motion(trial) for trial in trials]
+    markers = {} if table is None else {"markers": table}
+    session = fit_session(trials, names, paramset, motions[0] if len(set(motions)) == 1 else motions, **markers)
     out.mkdir(parents=True, exist_ok=True)
     for trial in session.trials:
         trial.save(out / f"{trial.name}.fit.npz")
@@ -41,3 +77,78 @@ def fit(keypoints: tuple[Path, ...], out: Path, solver: str, params: str | None,
     for check in session.qc:
         if check.outcome != "PASS":
             click.echo(f"{check.outcome} {check.check}: {check.advice}")
+
+
+def _marker_set(given: str | None) -> MarkerSet | None:
+    """The table of `--marker-set`: a file where it ends in .csv, else the name of a shipped set."""
+    from pbl_pipeline.body import load_marker_set, marker_set
+
+    if given is None:
+        return None
+    return load_marker_set(Path(given)) if given.lower().endswith(".csv") else marker_set(given)
+
+
+def _load(path: Path, table: MarkerSet | None, up: str) -> Keypoints | WorldMarkers:
+    """One file as a trial; markers of a laboratory are put into the order of their marker set."""
+    import dataclasses
+
+    from pbl_pipeline.body import marker_set
+    from pbl_pipeline.files import load_npz
+    from pbl_pipeline.keypoints import Keypoints, WorldMarkers
+
+    if path.suffix.lower() == ".trc":
+        if table is None:
+            raise PblError(
+                "USAGE",
+                found=f"{path.name} without --marker-set",
+                expected="the marker set that says where on the body each marker sits",
+                next_step="pass --marker-set with a name or a table (CSV: name, body, x, y, z); see docs/files.md",
+                key=str(path),
+            )
+        seen = WorldMarkers.from_trc(path, table.name, up)
+    elif "xyz_world_m" in load_npz(path):
+        seen = WorldMarkers.load(path)
+    else:
+        keypoints = Keypoints.load(path)
+        return keypoints if table is None else dataclasses.replace(keypoints, marker_set=table.name)
+    wanted = table or marker_set(seen.marker_set)
+    chosen = seen.select(wanted.names, wanted.name)
+    absent, unused = set(wanted.names) - set(seen.names), set(seen.names) - set(wanted.names)
+    click.echo(f"{path.name}: {len(wanted) - len(absent)} of {len(wanted)} markers of {wanted.name}")
+    for what, names in (("  not in the file", absent), ("  not in the marker set", unused)):
+        if names:
+            click.echo(f"{what}: {', '.join(sorted(names))}")
+    return chosen
+
+
+def _views_of_one(
+    views: Sequence[Keypoints | WorldMarkers], stems: Sequence[str], calibration: Path
+) -> tuple[MultiView, str]:
+    """The files as views of one trial, and the trial's name."""
+    from pbl_pipeline.keypoints import Keypoints, MultiView, cameras_of_files
+
+    seen = [view for view in views if isinstance(view, Keypoints)]
+    if len(seen) < len(views):
+        raise PblError(
+            "USAGE",
+            found="markers of a laboratory with --cameras",
+            expected="the keypoints of each camera",
+            next_step="leave out --cameras: such markers are in the world already",
+        )
+    name, cameras = cameras_of_files(stems, calibration)
+    for stem, camera in zip(stems, cameras, strict=True):
+        click.echo(f"{stem}: camera {camera}")
+    return MultiView.from_calibration(seen, calibration, cameras), name
+
+
+def _motion(trial: object) -> str:
+    return "handheld" if getattr(trial, "phone_time_s", None) is not None else "static"
+
+
+def _stem(path: Path) -> str:
+    stem = path.name
+    if path.suffix.lower() == ".trc":
+        return path.stem
+    for end in _ENDS:
+        stem = stem.removesuffix(end)
+    return stem

@@ -7,26 +7,33 @@ from pathlib import Path
 
 import click
 
-from ._options import Person, fit_paramset
+from ._options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, Person, fit_paramset
 
 
 @click.command(epilog="Example: pbl run walk1.mp4 walk2.mp4 --out results --camera phone.toml")
 @click.argument("videos", nargs=-1, required=True, type=click.Path(path_type=Path, readable=False))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the results.")
 @click.option("--camera", type=click.Path(path_type=Path), help="Calibration file; without it a phone is guessed.")
-@click.option("--camera-motion", type=click.Choice(["static", "handheld"]), default="static", show_default=True)
+@click.option(
+    "--attitude",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    help="Orientation log of the phone (docs/files.md), once for each VIDEO, in their order.",
+)
+@click.option("--camera-motion", type=click.Choice(CAMERA_MOTIONS), help=CAMERA_MOTION_HELP)
 @click.option("--person", type=Person(), default="auto", show_default=True, help="Whom to measure, of one video.")
-@click.option("--solver", default="implicit-adam", show_default=True, help="Name of the solver.")
-@click.option("--params", help="Name of a paramset, or a JSON file with changes to the default one.")
+@click.option("--solver", help="gauss-newton or implicit-adam; without it the solver of the paramset.")
+@click.option("--params", help="Name of a paramset, or a JSON file with changes to one (docs/files.md).")
 @click.option("--norm", help="Normative set of the GDI.")
 @click.option("--subject", default="-", help="Code of the subject on the report; never a name.")
 def run(
     videos: tuple[Path, ...],
     out: Path,
     camera: Path | None,
-    camera_motion: str,
+    attitude: tuple[Path, ...],
+    camera_motion: str | None,
     person: int | None,
-    solver: str,
+    solver: str | None,
     params: str | None,
     norm: str | None,
     subject: str,
@@ -50,9 +57,16 @@ def run(
             next_step="leave out --person; where the automatic choice is wrong, run that video alone with --person, "
             "or use `pbl ingest` and `pbl choose`, which keep a choice for each video of a visit",
         )
+    if attitude and len(attitude) != len(videos):
+        raise PblError(
+            "USAGE",
+            found=f"{len(attitude)} times --attitude for {len(videos)} videos",
+            expected="none, or one for each video, in the same order",
+            next_step="name a log for each video; run videos without a log in another call",
+        )
     check_out_folder(out)
     paramset = fit_paramset(solver, params)
-    session = run_session(videos, out, camera, person, paramset, camera_motion, norm)
+    session = run_session(videos, out, camera, person, paramset, camera_motion, norm, attitude)
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
     paths = write_results(out, session, subject_code=subject, date=f"computed {today}")
     click.echo(session.judged.table())
