@@ -64,10 +64,8 @@ def fit_paramset(solver: str | None, params: str | None, default: str | None = N
             raise KeyError(f"base {base!r}; known: {sorted(PARAMSETS)}")
         before = _of_solver(PARAMSETS[base], solver)
         merged = _merge(dataclasses.asdict(params_of(before)), changes)
-        if merged["solver"] != before.params["solver"]:
-            raise ValueError(
-                f"solver {merged['solver']!r}, but {base} is of {before.params['solver']}: name another base"
-            )
+        if "solver" in changes and changes["solver"] != _solver_of(before):
+            raise ValueError(f"solver {changes['solver']!r}, but {base} is of {_solver_of(before)}: name another base")
         return Paramset.of("fit", path.stem, 1, params_of(Paramset("fit", path.stem, 1, merged)))
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise PblError(
@@ -80,23 +78,28 @@ def fit_paramset(solver: str | None, params: str | None, default: str | None = N
 
 
 def _default_of(solver: str | None, default: str | None = None) -> str:
-    """Name of the default paramset, where it is of another solver of the first of that solver."""
+    """Name of the default paramset, or where that is of another solver, of the first that is of this one."""
     from pbl_pipeline.fit import DEFAULT, PARAMSETS
 
+    if solver is None:
+        return default or DEFAULT
     names = [default or DEFAULT, DEFAULT, *PARAMSETS]
-    return next(n for n in names if solver in (None, PARAMSETS[n].params["solver"]))
+    return next(n for n in names if _solver_of(PARAMSETS[n]) == solver)
 
 
 def _of_solver(paramset: Paramset, solver: str | None) -> Paramset:
-    its_own = paramset.params["solver"]
-    if solver not in (None, its_own):
+    if solver is not None and solver != _solver_of(paramset):
         raise PblError(
             "SOLVER_UNKNOWN",
             found=f"solver {solver} with paramset {paramset.name}",
-            expected=f"{its_own}, the solver of {paramset.name}",
+            expected=f"{_solver_of(paramset)}, the solver of {paramset.name}",
             next_step="leave out --solver, or name a paramset of that solver",
         )
     return paramset
+
+
+def _solver_of(paramset: Paramset) -> str:
+    return paramset.params["solver"]
 
 
 def _merge(base: dict, changes: dict) -> dict:
