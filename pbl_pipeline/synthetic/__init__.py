@@ -1,0 +1,34 @@
+"""A walker with known truth: joint angles, body, camera and clock, seen by phones, cameras or markers.
+
+For tests, for `pbl bench fit` and for the calibration of the fit's uncertainties. Everything is a function of a seed.
+World frame: z up, metres, the phone at the origin and 1.2 m above the floor, the walk ahead of it along x.
+"""
+
+from ._camera import LEVEL_R_NC, PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor, picture_px
+from ._noise import NO_NOISE, Noise
+from ._observe import Seen, observe, pelvis_positions
+from ._path import PATHS
+from ._person import person, true_markers
+from ._views import VIEW_CAMERA, VIEW_SIZE_PX, observe_markers, observe_views
+from ._walk import walk_qpos
+
+__all__ = [
+    "LEVEL_R_NC",
+    "NO_NOISE",
+    "PATHS",
+    "PHONE_CAMERA",
+    "PHONE_SIZE_PX",
+    "VIEW_CAMERA",
+    "VIEW_SIZE_PX",
+    "Noise",
+    "PhoneSensor",
+    "Seen",
+    "observe",
+    "observe_markers",
+    "observe_views",
+    "pelvis_positions",
+    "person",
+    "picture_px",
+    "true_markers",
+    "walk_qpos",
+]
