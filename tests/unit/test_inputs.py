@@ -1,0 +1,335 @@
+"""Laboratory markers, TRC files, and one trial seen by several cameras."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.keypoints import MultiView, WorldMarkers, cameras_of_files
+from pbl_pipeline.video import CameraPose, load_camera, load_camera_poses
+from tests.conftest import SHARED
+from tests.inputs import CALIBRATION, NAMES, POSE, ROWS, J, T, changed, keypoints, markers, trc_text
+
+
+def code_of(error: pytest.ExceptionInfo[PblError]) -> str:
+    return error.value.code
+
+
+@pytest.fixture
+def calibration(tmp_path: Path) -> Path:
+    (tmp_path / "Calib.toml").write_text(CALIBRATION)
+    return tmp_path / "Calib.toml"
+
+
+# --- markers of a laboratory ------------------------------------------------------------------------------------
+
+
+def test_markers_go_through_a_file(tmp_path):
+    xyz, confidence = markers().xyz_world_m.copy(), np.ones((T, J))
+    xyz[2, 1], confidence[2, 1] = np.nan, 0
+    seen = markers(xyz_world_m=xyz, confidence=confidence)
+    seen.save(tmp_path / "m.npz")
+    again = WorldMarkers.load(tmp_path / "m.npz")
+    np.testing.assert_allclose(again.xyz_world_m, xyz, rtol=1e-6)
+    np.testing.assert_array_equal(again.confidence, confidence)
+    np.testing.assert_array_equal(again.time_s, seen.time_s)
+    assert (again.names, again.marker_set) == (NAMES, "lab")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"xyz_world_m": np.zeros((T, J, 2))},
+        {"xyz_world_m": changed(np.zeros((T, J, 3)), np.inf)},
+        {"xyz_world_m": changed(np.zeros((T, J, 3)), np.nan)},  # with confidence 1
+        {"xyz_world_m": np.full((T, J, 3), "x")},
+        {"confidence": np.ones(T)},
+        {"confidence": changed(np.ones((T, J)), 1.1)},
+        {"confidence": changed(np.ones((T, J)), -0.1)},
+        {"confidence": changed(np.ones((T, J)), np.nan)},
+        {"time_s": changed(np.arange(T), np.nan)},
+        {"names": ("A", "B", "A")},
+        {"names": ("A", "B")},
+        {"names": (), "xyz_world_m": np.zeros((T, 0, 3)), "confidence": np.zeros((T, 0))},
+        {"time_s": np.zeros(0), "xyz_world_m": np.zeros((0, J, 3)), "confidence": np.zeros((0, J))},
+    ],
+)
+def test_markers_that_cannot_be(changes):
+    with pytest.raises(PblError) as error:
+        markers(**changes)
+    assert code_of(error) == "FILE_FORMAT"
+
+
+@pytest.mark.parametrize("lost", ["time_s", "names", "marker_set", "xyz_world_m", "confidence"])
+def test_a_file_of_markers_needs_all_its_fields(tmp_path, lost):
+    markers().save(tmp_path / "m.npz")
+    with np.load(tmp_path / "m.npz") as f:
+        np.savez(tmp_path / "less.npz", **{k: f[k] for k in f.files if k != lost})
+    with pytest.raises(PblError) as error:
+        WorldMarkers.load(tmp_path / "less.npz")
+    assert code_of(error) == "FILE_FORMAT"
+    assert lost in error.value.found
+    assert "less.npz" in str(error.value.key)
+
+
+def test_markers_are_put_into_the_order_of_a_set():
+    chosen = markers().select(("C", "X", "A"), "mine")
+    assert (chosen.names, chosen.marker_set) == (("C", "X", "A"), "mine")
+    np.testing.assert_array_equal(chosen.xyz_world_m[:, 0], markers().xyz_world_m[:, 2])
+    np.testing.assert_array_equal(chosen.xyz_world_m[:, 2], markers().xyz_world_m[:, 0])
+    assert np.isnan(chosen.xyz_world_m[:, 1]).all()
+    assert chosen.confidence.tolist() == [[1, 0, 1]] * T
+    with pytest.raises(PblError) as error:
+        markers().select(("X", "Y"))
+    assert code_of(error) == "MARKER_SET_UNKNOWN"
+
+
+# --- TRC --------------------------------------------------------------------------------------------------------
+
+
+def trc(tmp_path: Path, *args, up: str = "y", **more) -> WorldMarkers:
+    (tmp_path / "walk.trc").write_text(trc_text(*args, **more))
+    return WorldMarkers.from_trc(tmp_path / "walk.trc", "lab", up)
+
+
+def test_a_trc_file_by_hand(tmp_path):
+    seen = trc(tmp_path, ROWS)
+    assert (seen.names, seen.marker_set) == (("Hip", "Head"), "lab")
+    np.testing.assert_allclose(seen.time_s, [0, 0.01, 0.02])
+    # x stays forward, up (y) becomes z, right (z) becomes -y: right-handed.
+    np.testing.assert_allclose(seen.xyz_world_m[0], [[0.1, -0.2, 0.9], [0.11, -0.21, 1.6]])
+    # Empty cells and three zeros are gaps.
+    assert seen.confidence.tolist() == [[1, 1], [1, 0], [1, 0]]
+    assert np.isnan(seen.xyz_world_m[1:, 1]).all()
+
+
+@pytest.mark.parametrize(("units", "factor"), [("mm", 1e-3), ("cm", 1e-2), ("m", 1.0), ("M", 1.0)])
+def test_units_and_upright_axis_of_a_trc_file(tmp_path, units, factor):
+    seen = trc(tmp_path, ["1\t0\t1\t2\t3\t4\t5\t6"], units, up="z")
+    np.testing.assert_allclose(seen.xyz_world_m[0], factor * np.array([[1.0, 2, 3], [4, 5, 6]]))
+
+
+@pytest.mark.parametrize(
+    ("rows", "more"),
+    [
+        (ROWS, {"units": "ft"}),
+        (ROWS, {"units": ""}),
+        (ROWS, {"n_frames": 4}),
+        (ROWS, {"names": "Hip\t\t\t\t\t"}),
+        (ROWS, {"names": "Hip\t\t\tHip\t\t"}),
+        ([], {}),
+        ([ROWS[0][:-4]], {}),  # cut off: a number shorter is not seen, a cell less is
+        (["1\t0.00\t100\t900\t200\t110\t1600"], {}),
+        ([ROWS[0] + "\t5"], {}),
+        ([ROWS[0].replace("900", "9o0")], {}),
+        ([ROWS[0].replace("900", "inf")], {}),
+        ([ROWS[0], ROWS[0]], {}),
+        ([ROWS[1], ROWS[0]], {}),
+        ([ROWS[0].replace("0.00", "")], {}),
+    ],
+)
+def test_damaged_trc_files(tmp_path, rows, more):
+    with pytest.raises(PblError) as error:
+        trc(tmp_path, rows, **more)
+    assert code_of(error) == "FILE_FORMAT"
+    assert "walk.trc" in str(error.value.key)
+
+
+def test_files_that_are_no_trc(tmp_path):
+    (tmp_path / "text.trc").write_text("hello\n" * 9)
+    (tmp_path / "bytes.trc").write_bytes(bytes(range(256)) * 20)
+    (tmp_path / "empty.trc").touch()
+    for name, code in {
+        "text": "FILE_FORMAT",
+        "bytes": "FILE_FORMAT",
+        "empty": "FILE_FORMAT",
+        "no": "FILE_MISSING",
+    }.items():
+        with pytest.raises(PblError) as error:
+            WorldMarkers.from_trc(tmp_path / f"{name}.trc", "lab")
+        assert code_of(error) == code
+    with pytest.raises(PblError) as error:
+        trc(tmp_path, ROWS, up="x")
+    assert code_of(error) == "USAGE"
+
+
+@pytest.mark.parametrize("units", ["m", "mm"])
+def test_a_wrong_unit_is_noticed(tmp_path, units):
+    """Three markers over 1.7 m, once written in mm and called m, once the other way round."""
+    size = 1.7 if units == "mm" else 1700.0
+    row = "\t".join(f"{v:g}" for v in (1, 0, 0, 0, 1, 0, size / 2, 0, 0, size, 0.1))
+    text = trc_text([row], units, names="A\t\t\tB\t\t\tC\t\t").replace("\t2\t" + units, "\t3\t" + units)
+    (tmp_path / "w.trc").write_text(text)
+    with pytest.raises(PblError) as error:
+        WorldMarkers.from_trc(tmp_path / "w.trc", "lab")
+    assert "m apart if Units" in error.value.found
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the development data (../shared/data) is absent")
+def test_real_trc_files():
+    walk = WorldMarkers.from_trc(SHARED / "real" / "marker_ik" / "walking1.trc", "lab")
+    assert walk.xyz_world_m.shape == (131, 51, 3)
+    np.testing.assert_allclose(walk.xyz_world_m[0, 0], [-0.297591, 0.264781, 1.41067])  # C7, first row of the file
+    at = {n: np.nanmean(walk.xyz_world_m[:, i], axis=0) for i, n in enumerate(walk.names)}
+    # She walks along +x, so her right is -y; her neck is above her hips, these above her heels.
+    assert np.diff(walk.xyz_world_m[[0, -1], 0, 0])[0] > 1
+    assert at["L.ASIS"][1] > at["R_HJC"][1]
+    assert at["C7"][2] > at["L.ASIS"][2] > at["L_calc"][2] > 0
+    files = sorted((SHARED / "real").glob("m*/*.trc"))
+    assert len(files) == 8
+    for path in files:
+        seen = WorldMarkers.from_trc(path, "lab")
+        assert seen.confidence.mean() > 0.95, path.name
+        assert 1.3 < np.nanmax(seen.xyz_world_m[..., 2]) < 1.9, path.name
+
+
+# --- several cameras --------------------------------------------------------------------------------------------
+
+
+def test_views_of_one_trial():
+    views = MultiView((keypoints(), keypoints(time_s=np.arange(T) / 30 + 0.0009)), (POSE, POSE))
+    assert (views.names, views.marker_set, len(views.time_s)) == (NAMES, "lab", T)
+
+
+@pytest.mark.parametrize(
+    ("other", "code"),
+    [
+        ({"time_s": np.arange(T) / 30 + 0.0011}, "FIT_INPUT"),
+        ({"time_s": changed(np.arange(T) / 30, np.nan)}, "FIT_INPUT"),
+        ({"names": ("A", "C", "B")}, "FIT_INPUT"),
+        ({"marker_set": "other"}, "FIT_INPUT"),
+    ],
+)
+def test_views_that_do_not_belong_together(other, code):
+    with pytest.raises(PblError) as error:
+        MultiView((keypoints(), keypoints(**other)), (POSE, POSE))
+    assert code_of(error) == code
+
+
+def test_too_few_views_or_poses():
+    with pytest.raises(PblError) as error:
+        MultiView((keypoints(),), (POSE,))
+    assert code_of(error) == "FIT_INPUT"
+    with pytest.raises(PblError) as error:
+        MultiView((keypoints(), keypoints()), (POSE,))
+    assert code_of(error) == "CAMERA_INVALID"
+    shorter = {k: getattr(keypoints(), k)[:-1] for k in ("time_s", "xy_px", "xyz_cam_m", "confidence", "box_px")}
+    with pytest.raises(PblError) as error:
+        MultiView((keypoints(), keypoints(**shorter)), (POSE, POSE))
+    assert code_of(error) == "FIT_INPUT"
+    assert "4 frames" in error.value.found
+
+
+@pytest.mark.parametrize(
+    ("R", "p"),
+    [
+        (1.01 * np.eye(3), np.zeros(3)),
+        (np.diag([1.0, 1, -1]), np.zeros(3)),
+        (np.zeros((3, 3)), np.zeros(3)),
+        (changed(np.eye(3), np.nan), np.zeros(3)),
+        (np.eye(3), np.array([0, np.inf, 0])),
+        (np.eye(3), np.zeros(2)),
+        (np.eye(4), np.zeros(3)),
+        (np.full((3, 3), "x"), np.zeros(3)),
+    ],
+)
+def test_poses_that_cannot_be(R, p):
+    with pytest.raises(PblError) as error:
+        CameraPose(R, p)
+    assert code_of(error) == "CAMERA_INVALID"
+
+
+def test_poses_by_hand(calibration):
+    poses = load_camera_poses(calibration)
+    assert list(poses) == ["cam_01", "cam_02"]
+    # x_cam = Rx(90) x_world + (0, 1.5, 4): the camera looks along world +y from 4 m behind and 1.5 m above the origin.
+    np.testing.assert_allclose(poses["cam_01"].R_nc[:, 2], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(poses["cam_01"].R_nc[:, 1], [0, 0, -1], atol=1e-12)
+    np.testing.assert_allclose(poses["cam_01"].p_nc, [0, -4, 1.5], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("rotation = [0, 0, 0]", ""),
+        ("rotation = [0, 0, 0]", "rotation = [0, 0]"),
+        ("rotation = [0, 0, 0]", "rotation = 3"),
+        ("translation = [0, 0, 2]", "translation = [0, 0, nan]"),
+        ("translation = [0, 0, 2]", "translation = 'far'"),
+        ("[cam_01]", "[cam_01"),
+        ("matrix", "other"),
+    ],
+)
+def test_calibrations_that_cannot_be(calibration, old, new):
+    calibration.write_text(CALIBRATION.replace(old, new))
+    with pytest.raises(PblError) as error:
+        load_camera_poses(calibration)
+    assert code_of(error) == "CAMERA_INVALID"
+
+
+def test_files_find_their_cameras(calibration):
+    assert cameras_of_files(["cam_02", "Cam01"], calibration) == ("trial", ["cam_02", "cam_01"])
+    assert cameras_of_files(["walk.cam_01", "walk.cam_02"], calibration) == ("walk", ["cam_01", "cam_02"])
+    assert cameras_of_files(["left", "right"], calibration) == ("trial", ["cam_01", "cam_02"])
+    for stems in (["cam_01", "right"], ["cam_01", "cam_01"], ["a", "b", "c"], ["a"]):
+        with pytest.raises(PblError) as error:
+            cameras_of_files(stems, calibration)
+        assert code_of(error) == "CAMERA_INVALID"
+
+
+def test_lenses_come_from_the_calibration(calibration):
+    views = MultiView.from_calibration(
+        [keypoints(image_size_px=(500, 500)), keypoints()], calibration, ["cam_02", "cam_01"]
+    )
+    assert [v.camera.matrix[0, 2] for v in views.views] == [250, 500]
+    assert views.poses[0].p_nc.tolist() == [0, 0, -2]
+    with pytest.raises(PblError) as error:
+        MultiView.from_calibration([keypoints(), keypoints()], calibration, ["cam_01", "cam_09"])
+    assert code_of(error) == "CAMERA_INVALID"
+
+
+#: Column of each marker of the TRC file (hips and legs right, left; neck, head, nose; arms right, left) in OpenPose's
+#: BODY_25B.
+IN_BODY_25B = [12, 14, 16, 22, 23, 24, 11, 13, 15, 19, 20, 21, 17, 18, 0, 6, 8, 10, 5, 7, 9]
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the development data (../shared/data) is absent")
+def test_poses_of_a_real_calibration_triangulate_to_its_markers():
+    """The 2D points of four cameras meet where the TRC of the same recording has its markers."""
+    folder = SHARED / "real" / "multiview"
+    truth = WorldMarkers.from_trc(folder / "S00_P00_T01_BalancingTrial_0-100.trc", "body_25b")
+    assert [truth.names[i] for i in (0, 5, 6, 14, 17)] == ["RHip", "RHeel", "LHip", "Nose", "RWrist"]
+    poses = load_camera_poses(folder / "Calib_qualisys.toml")
+    # from_trc keeps the file's x; the cameras' world is turned by 90 degrees about the vertical.
+    in_world = np.stack([-truth.xyz_world_m[..., 1], truth.xyz_world_m[..., 0], truth.xyz_world_m[..., 2]], axis=-1)
+    seen = np.load(folder / "openpose_body25b_2d.npz")
+    lines, weights, median_px = [], [], []
+    for number, (name, pose) in enumerate(poses.items(), 1):
+        camera = load_camera(folder / "Calib_qualisys.toml", (1088, 1920), name)
+        x_cam = (in_world - pose.p_nc) @ pose.R_nc
+        uv = cv2.projectPoints(x_cam.reshape(-1, 3), np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)[0]
+        people = seen[f"cam{number:02d}"][:, :, IN_BODY_25B]
+        away = np.linalg.norm(people[..., :2] - uv.reshape(len(people), 1, -1, 2), axis=-1)
+        away = np.where(people[..., 2] > 0.3, away, np.nan)
+        enough = np.sum(np.isfinite(away), axis=2, keepdims=True) > 5
+        chosen = np.nanmedian(np.where(enough, away, np.inf), axis=2).argmin(axis=1)
+        frames = np.arange(len(people))
+        median_px.append(np.nanmedian(away[frames, chosen]))
+        points = people[frames, chosen]
+        flat = cv2.undistortPoints(points[..., :2].reshape(-1, 1, 2).astype(float), camera.matrix, camera.distortion)
+        R_cn = pose.R_nc.T
+        projection = np.column_stack([R_cn, -R_cn @ pose.p_nc])
+        xy = flat.reshape(*points.shape[:2], 2)
+        lines.append(xy[..., None] * projection[2] - projection[:2])
+        weights.append(np.where(points[..., 2] > 0.3, points[..., 2], 0.0))
+    assert max(median_px) < 20  # the other direction of the poses is off by 2000 px and more
+    used = np.sum(np.array(weights) > 0, axis=0) >= 3
+    equations = np.concatenate([w[..., None, None] * line for w, line in zip(weights, lines, strict=True)], axis=2)
+    points = np.linalg.svd(equations)[2][..., -1, :]
+    met = points[..., :3] / points[..., 3:]
+    assert used.mean() > 0.9
+    assert np.median(np.linalg.norm(met - in_world, axis=-1)[used]) < 1e-3
