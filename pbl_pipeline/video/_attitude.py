@@ -41,7 +41,7 @@ class Attitude:
     Attributes
     ----------
     time_s : (P,) float64
-        Seconds on the video's clock, up to a constant offset that the fit finds; strictly increasing.
+        Seconds, 0 at about the video's first frame (the fit finds the small offset left); strictly increasing.
     quat_wxyz : (P, 4) float64
         R_nc, camera to world, as unit quaternions (w, x, y, z); neighbours have the same sign.
     source
