@@ -22,6 +22,11 @@ _MPI_INF_3DHP_TEXT = (
     "right_ankle left_hip left_knee left_ankle pelvis spine head"
 )
 MPI_INF_3DHP = _MPI_INF_3DHP_TEXT.split()
+_BODY_25B_TEXT = (
+    "Nose LEye REye LEar REar LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee RKnee LAnkle RAnkle Neck "
+    "Head LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel"
+)
+BODY_25B = _BODY_25B_TEXT.split()
 #: No left or right: on the midline but for the figures' own scatter.
 BML_MIDLINE = {"backneck", "upperback", "clavicle", "sternum", "umbilicus", "Head", "mhip", "CHip", "Neck"}
 
@@ -37,15 +42,18 @@ def other_side(set_name: str, name: str) -> str | None:
         if name in BML_MIDLINE:
             return None
         return {"l": "r", "r": "l", "L": "R", "R": "L"}[name[0]] + name[1:]
+    if set_name == "body25b":
+        return {"L": "R", "R": "L"}[name[0]] + name[1:] if name[0] in "LR" else None
     if "left" in name:
         return name.replace("left", "right")
     return name.replace("right", "left") if "right" in name else None
 
 
 def test_names():
-    assert set(MARKER_SETS) == {"bml_movi_87", "blazepose_33", "mpi_inf_3dhp_17"}
+    assert set(MARKER_SETS) == {"bml_movi_87", "blazepose_33", "body25b", "mpi_inf_3dhp_17"}
     assert list(marker_set("blazepose_33").names) == BLAZEPOSE
     assert list(marker_set("mpi_inf_3dhp_17").names) == MPI_INF_3DHP
+    assert list(marker_set("body25b").names) == BODY_25B
     assert len(marker_set("bml_movi_87")) == 87
 
 
