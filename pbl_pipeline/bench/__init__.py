@@ -1,0 +1,24 @@
+"""Benchmarks that `pbl bench` runs: each case in processes of its own, so that memory and cold times are honest.
+
+Importing this package imports no JAX: the process that only starts others must not take the accelerator.
+"""
+
+from ._plan import MOTIONS, SOLVERS, Case, Data, long_cases, quick_cases, robust_cases, speed_cases
+from ._run import Row, label, run_cases
+from ._table import ratios, text
+
+__all__ = [
+    "MOTIONS",
+    "SOLVERS",
+    "Case",
+    "Data",
+    "Row",
+    "label",
+    "long_cases",
+    "quick_cases",
+    "ratios",
+    "robust_cases",
+    "run_cases",
+    "speed_cases",
+    "text",
+]
