@@ -1,0 +1,176 @@
+"""Linear systems of a session: one small block per frame, coupled to the two frames on either side, and a border.
+
+    | A  B | |x|   |g|      A (F Q, F Q): block (t, t) full, blocks (t, t+1) and (t, t+2) diagonal (second differences)
+    | B' C | |y| = |h|      B (F Q, K), C (K, K): what all frames share (scale, marker offsets, clocks)
+
+Solved by block cyclic reduction over pairs of frames (e.g. Golub & Van Loan, Matrix Computations, 4th ed., 4.5.4) and the
+Schur complement of A: work and memory grow linearly with F, and the number of steps one after the other with log F,
+which is what a GPU needs. All matrices are symmetric positive definite.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax.lax.linalg import triangular_solve
+from jaxtyping import Array, Float
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Arrow:
+    """The matrix. F must be even; `next_1[t]` couples t with t + 1, `next_2[t]` t with t + 2 (0 beyond the end)."""
+
+    diagonal: Float[Array, "F Q Q"]
+    next_1: Float[Array, "F Q"]
+    next_2: Float[Array, "F Q"]
+    border: Float[Array, "F Q K"]
+    corner: Float[Array, "K K"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class _Level:
+    """What one level of the reduction leaves: with block = L L', the inverse of L and its products with the links."""
+
+    inverse: Float[Array, "M n n"]
+    left: Float[Array, "M n n"]
+    right: Float[Array, "M n n"]
+
+
+def solve(matrix: Arrow, g: Float[Array, "F Q"], h: Float[Array, " K"]) -> tuple[Array, Array]:
+    """x (F, Q) and y (K,) of the system above."""
+    with jax.default_matmul_precision("highest"):
+        levels, schur, reduced = _eliminate(matrix, g)
+        y = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix.corner - schur), True), h - reduced)
+        x = _substitute(levels, (g - matrix.border @ y)[..., None])[..., 0]
+    return x, y
+
+
+def marginal_variance(matrix: Arrow) -> tuple[Float[Array, "F Q"], Float[Array, " K"]]:
+    """Diagonal of the inverse of the whole matrix: that of x and that of y."""
+    with jax.default_matmul_precision("highest"):
+        levels, schur, _ = _eliminate(matrix, jnp.zeros(matrix.border.shape[:2], matrix.border.dtype))
+        inverse = _inverse_of_factor(matrix.corner - schur)
+        shared = jnp.sum((_substitute(levels, matrix.border) @ inverse.T) ** 2, axis=-1)
+        return _inverse_diagonal(levels, shared.shape) + shared, jnp.sum(inverse**2, axis=0)
+
+
+def _inverse_of_factor(matrix: Float[Array, "*m n n"]) -> Float[Array, "*m n n"]:
+    """Inverse of the lower Cholesky factor. Products with it are faster than many triangular solutions."""
+    lower = jnp.linalg.cholesky(matrix)
+    eye = jnp.broadcast_to(jnp.eye(matrix.shape[-1], dtype=matrix.dtype), matrix.shape)
+    return triangular_solve(lower, eye, left_side=True, lower=True)
+
+
+def _eliminate(matrix: Arrow, g: Array) -> tuple[list[_Level], Array, Array]:
+    """Factors of A, B' A^-1 B and B' A^-1 g."""
+    blocks, links = _pairs(matrix)
+    rhs = _in_pairs(jnp.concatenate([matrix.border, g[..., None]], axis=-1))
+    k = matrix.border.shape[-1]
+    total = jnp.zeros((k, k + 1), rhs.dtype)
+    levels: list[_Level] = []
+    while True:
+        last = blocks.shape[0] == 1
+        level, blocks, links, rhs, y = _reduce(blocks, links, rhs)
+        levels.append(level)
+        total += jnp.einsum("mnk,mnl->kl", y[..., :k], y)
+        if last:
+            return levels, total[:, :k], total[:, k]
+
+
+def _pairs(matrix: Arrow) -> tuple[Array, Array]:
+    """Blocks (F/2, 2Q, 2Q) of pairs of frames and the links (F/2, 2Q, 2Q) of each pair with the next one."""
+    f, q = matrix.next_1.shape
+    eye = jnp.eye(q, dtype=matrix.next_1.dtype)
+    own = matrix.diagonal.reshape(f // 2, 2, q, q)
+    next_1 = matrix.next_1.reshape(f // 2, 2, q, 1) * eye
+    next_2 = matrix.next_2.reshape(f // 2, 2, q, 1) * eye
+    blocks = jnp.block([[own[:, 0], next_1[:, 0]], [next_1[:, 0], own[:, 1]]])
+    links = jnp.block([[next_2[:, 0], jnp.zeros_like(next_1[:, 1])], [next_1[:, 1], next_2[:, 1]]])
+    return blocks, links
+
+
+def _in_pairs(rows: Float[Array, "F Q R"]) -> Float[Array, "M n R"]:
+    return rows.reshape(rows.shape[0] // 2, 2 * rows.shape[1], rows.shape[2])
+
+
+def _split(rows: Array) -> tuple[Array, Array]:
+    """Rows 0, 2, 4 ... and rows 1, 3, 5 ... of an even number of them, without the cost of strided copies."""
+    both = rows.reshape(rows.shape[0] // 2, 2, *rows.shape[1:])
+    return both[:, 0], both[:, 1]
+
+
+def _join(even: Array, odd: Array) -> Array:
+    return jnp.stack([even, odd], axis=1).reshape(2 * even.shape[0], *even.shape[1:])
+
+
+def _even(rows: Array, fill: Array) -> Array:
+    return jnp.concatenate([rows, fill[None]]) if rows.shape[0] % 2 else rows
+
+
+def _earlier(rows: Array) -> Array:
+    """Each row's predecessor, zeros before the first."""
+    return jnp.concatenate([jnp.zeros_like(rows[:1]), rows[:-1]])
+
+
+def _later(rows: Array) -> Array:
+    """Each row's successor, zeros after the last."""
+    return jnp.concatenate([rows[1:], jnp.zeros_like(rows[:1])])
+
+
+def _reduce(blocks: Array, links: Array, rhs: Array) -> tuple[_Level, Array, Array, Array, Array]:
+    """Eliminate every other block (0, 2, 4 ...); the rest stays, linked anew. Block i stays right of eliminated i."""
+    n = blocks.shape[-1]
+    gone, stay = _split(_even(blocks, jnp.eye(n, dtype=blocks.dtype)))
+    after, before = _split(_even(links, jnp.zeros((n, n), links.dtype)))
+    rhs_gone, rhs_stay = _split(_even(rhs, jnp.zeros_like(rhs[0])))
+    inverse = _inverse_of_factor(gone)
+    left = inverse @ jnp.swapaxes(_earlier(before), -1, -2)
+    right = inverse @ after
+    y = inverse @ rhs_gone
+    stay = stay - _gram(right, right) - _later(_gram(left, left))
+    rhs_stay = rhs_stay - _gram(right, y) - _later(_gram(left, y))
+    return _Level(inverse, left, right), stay, -_later(_gram(left, right)), rhs_stay, y
+
+
+def _gram(a: Array, b: Array) -> Array:
+    return jnp.einsum("mkn,mkr->mnr", a, b)
+
+
+def _substitute(levels: list[_Level], rhs: Float[Array, "F Q R"]) -> Float[Array, "F Q R"]:
+    """A^-1 rhs with the factors of A."""
+    part, solved, counts = _in_pairs(rhs), [], []
+    for level in levels:
+        counts.append(part.shape[0])
+        gone, stay = _split(_even(part, jnp.zeros_like(part[0])))
+        y = level.inverse @ gone
+        part = stay - _gram(level.right, y) - _later(_gram(level.left, y))
+        solved.append(y)
+    x = jnp.zeros_like(part)
+    for level, y, count in zip(reversed(levels), reversed(solved), reversed(counts), strict=True):
+        gone = _gram(level.inverse, y - level.left @ _earlier(x) - level.right @ x)
+        x = _join(gone, x)[:count]
+    return x.reshape(rhs.shape)
+
+
+def _inverse_diagonal(levels: list[_Level], shape: tuple[int, ...]) -> Float[Array, "F Q"]:
+    """Diagonal of A^-1 by the same recursion backwards, which needs only the blocks between neighbours."""
+    n = levels[0].inverse.shape[-1]
+    own = jnp.zeros((1, n, n), levels[0].inverse.dtype)
+    link = own  # link[i]: covariance of block i with block i + 1
+    for level in reversed(levels):
+        count = level.inverse.shape[0]
+        own, link = own[:count], link[:count]
+        left, between = _earlier(own), _earlier(link)
+        to_left, to_right = -_gram(level.inverse, level.left), -_gram(level.inverse, level.right)
+        # Covariance of an eliminated block with its neighbours, then its own.
+        with_left = to_left @ left + to_right @ jnp.swapaxes(between, -1, -2)
+        with_right = to_left @ between + to_right @ own
+        gone = _gram(level.inverse, level.inverse)
+        gone += with_left @ jnp.swapaxes(to_left, -1, -2) + with_right @ jnp.swapaxes(to_right, -1, -2)
+        own, link = _join(gone, own), _join(with_right, _later(jnp.swapaxes(with_left, -1, -2)))
+    frames = shape[0] // 2
+    return jnp.diagonal(own[:frames], axis1=-2, axis2=-1).reshape(shape)
