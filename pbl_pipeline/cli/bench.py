@@ -36,10 +36,22 @@ def bench() -> None:
 
 @bench.command(epilog="Example: pbl bench fit --solver gauss-newton --trials 1 --motion static --batch 1,64")
 @click.option("--quick", is_flag=True, help="About a minute on two cores: few rows, few steps of implicit-adam.")
-@click.option("--solver", type=click.Choice(["all", "gauss-newton", "implicit-adam"]), default="all", show_default=True)
+@click.option(
+    "--solver",
+    type=click.Choice(["all", "gauss-newton", "implicit-adam"]),
+    default="all",
+    show_default=True,
+    help="--long and --robust take gauss-newton for all: ask for the other one by name.",
+)
 @click.option("--trials", type=_Numbers(), default="1,10", show_default=True, help="Trials of a session.")
 @click.option("--batch", type=_Numbers(), default="1,16,64", show_default=True, help="Sessions at once (gauss-newton).")
-@click.option("--motion", type=click.Choice(["all", "static", "handheld"]), default="all", show_default=True)
+@click.option(
+    "--motion",
+    type=click.Choice(["all", "static", "handheld"]),
+    default="all",
+    show_default=True,
+    help="Of the camera; --long and --robust take static for all.",
+)
 @click.option("--seeds", type=click.IntRange(1), default=3, show_default=True, help="People; errors are means of them.")
 @click.option("--repeat", type=click.IntRange(1), default=3, show_default=True, help="Warm runs; the best counts.")
 @click.option("--adam-steps", type=click.IntRange(1), help="Steps of implicit-adam instead of the paper's 25,000.")
