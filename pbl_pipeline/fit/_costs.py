@@ -82,6 +82,31 @@ def distance_2d_px2(
     return jnp.sum((project_px(x_cam, matrix) - xy_px) ** 2, axis=-1)
 
 
+def project_jacobian(x_cam: Float[Array, "*n J 3"], matrix: Float[Array, "*#n 3 3"]) -> Float[Array, "*n J 2 3"]:
+    """Derivative of `project_px` (px per m)."""
+    soft = 0.5 * NEAR_M
+    bent = (x_cam[..., 2] - NEAR_M) / soft
+    z = NEAR_M + soft * jax.nn.softplus(bent)
+    focal = jnp.stack([matrix[..., 0, 0], matrix[..., 1, 1]], axis=-1)[..., None, :]
+    across = (focal / z[..., None])[..., None] * jnp.eye(2, dtype=x_cam.dtype)
+    along = -focal * x_cam[..., :2] * (jax.nn.sigmoid(bent) / z**2)[..., None]
+    return jnp.concatenate([across, along[..., None]], axis=-1)
+
+
+def beyond_limit_deg(
+    qpos: Float[Array, "*n Q"], low: Float[Array, " Q"], high: Float[Array, " Q"]
+) -> Float[Array, "*n Q"]:
+    """How far a joint is beyond its limit (deg, negative below the lower one), 0 inside."""
+    return jnp.rad2deg(jnp.maximum(qpos - high, 0.0) + jnp.minimum(qpos - low, 0.0))
+
+
+def second_difference(qpos: Float[Array, "F Q"], bend: Float[Array, "F 3"]) -> Float[Array, "F Q"]:
+    """Second difference of each joint over frames, with the weights `bend` of the frames before, at and after."""
+    none = jnp.zeros_like(qpos[:1])
+    before, after = jnp.concatenate([none, qpos[:-1]]), jnp.concatenate([qpos[1:], none])
+    return bend[:, :1] * before + bend[:, 1:2] * qpos + bend[:, 2:] * after
+
+
 def offset_m2(site_offset_m: Float[Array, "J 3"]) -> Array:
     """Sum of squared marker offsets (m^2)."""
     return jnp.sum(site_offset_m**2)

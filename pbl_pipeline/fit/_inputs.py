@@ -1,0 +1,266 @@
+"""A session to fit: trials of every kind, validated at the door and packed into arrays."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from pbl_pipeline.body import Body, MarkerSet, load_body, marker_set
+from pbl_pipeline.body._jacobian import MarkerTable
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
+from pbl_pipeline.video import Camera, viewing_ray
+
+from ._observations import CLOCK_RANGE_S, Observations, TrialArrays, pack, pad_markers
+from ._params import ViewParams
+from ._rotation import mean_rotation, rotation_matrices
+from ._view import SEEN_SHARE, blind_runs, bridge_gaps, longest_run_s, whole_person_in_view
+
+#: R_nc of a level camera that looks along world +x: columns are the camera's x (right), y (down), z (forward).
+LEVEL_CAMERA_R_NC = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+#: What a trial may be.
+Trial = Keypoints | MultiView | WorldMarkers
+
+#: Where the camera's orientation comes from (`TrialFit.orientation_source`).
+MEASURED, CALIBRATED, LEVEL, GAIT = "measured: phone", "measured: calibration", "assumed: level", "estimated: gait"
+
+#: Share of a trial's used time that the phone's log must cover.
+PHONE_COVERAGE = 0.9
+
+
+@dataclasses.dataclass(frozen=True)
+class Session:
+    """One session. `used` (T_i,) bool: frames that count, unpadded; `orientation`: source of each camera's."""
+
+    body: Body
+    markers: MarkerSet
+    table: MarkerTable
+    names: tuple[str, ...]
+    trials: tuple[Trial, ...]
+    arrays: tuple[TrialArrays, ...]
+    in_view_share: tuple[float, ...]
+    orientation: tuple[str, ...]
+    obs: Observations
+
+    @property
+    def moving(self) -> bool:
+        """Whether a camera turns and its orientation was measured."""
+        return any(a.phone_time_s is not None for a in self.arrays)
+
+    def frames(self, i: int) -> slice:
+        """Where trial `i` lies in the packed frames."""
+        start = sum(len(a.time_s) for a in self.arrays[:i])
+        return slice(start, start + len(self.arrays[i].time_s))
+
+
+def make_session(
+    trials: Sequence[Trial],
+    names: Sequence[str],
+    view: ViewParams,
+    camera_motion: Sequence[str] = (),
+    markers: MarkerSet | None = None,
+) -> Session:
+    """Validate the trials of one session and pack them.
+
+    Raises
+    ------
+    PblError
+        FIT_INPUT (no trial, too few frames in view, time stamps out of order, nothing seen, values not finite where
+        confidence is positive, trials of different kinds), MARKER_SET_UNKNOWN, PHONE_LOG.
+    """
+    if not trials or len(trials) != len(names):
+        raise _input_error(f"{len(trials)} trials and {len(names)} names", "at least one trial and a name for each")
+    kinds = {type(t) for t in trials}
+    sets = {t.marker_set for t in trials}
+    if len(kinds) > 1 or len(sets) > 1:
+        what = ", ".join(sorted([k.__name__ for k in kinds] + list(sets)))
+        raise _input_error(what, "one kind of trial and one marker set in a session")
+    if len({len(t.views) for t in trials if isinstance(t, MultiView)}) > 1:
+        raise _input_error("trials with different numbers of cameras", "the same cameras in all trials of a session")
+    table = markers or marker_set(trials[0].marker_set)
+    motions = list(camera_motion) or ["static"] * len(trials)
+    checked = [check_trial(t, n, view, table) for t, n in zip(trials, names, strict=True)]
+    arrays, orientation = [], []
+    for trial, name, motion, (used, _) in zip(trials, names, motions, checked, strict=True):
+        packed, source = _arrays(trial, name, motion, used)
+        arrays.append(packed)
+        orientation.append(source)
+    return Session(
+        body=load_body(),
+        markers=table,
+        table=MarkerTable.of(table, pad_markers(len(table))),
+        names=tuple(names),
+        trials=tuple(trials),
+        arrays=tuple(arrays),
+        in_view_share=tuple(share for _, share in checked),
+        orientation=tuple(orientation),
+        obs=pack(arrays),
+    )
+
+
+def check_trial(
+    trial: Trial, name: str, view: ViewParams, markers: MarkerSet | None = None
+) -> tuple[np.ndarray, float]:
+    """Which frames (T,) bool of a trial a fit would use, and the share of frames with the whole person in view.
+
+    Raises `PblError` FIT_INPUT or MARKER_SET_UNKNOWN where the trial cannot be fitted.
+    """
+    (markers or marker_set(trial.marker_set)).check_names(trial.names)
+    step = np.diff(trial.time_s)
+    if len(trial.time_s) < 2 or not np.all(np.isfinite(trial.time_s)) or np.any(step <= 0):
+        bad = int(np.sum(~(step > 0)))
+        raise _input_error(
+            f"trial {name}: {len(trial.time_s)} time stamps, {bad} of the steps not positive",
+            "at least two, finite and strictly increasing",
+            name,
+        )
+    if isinstance(trial, WorldMarkers):
+        _check_finite(name, trial.confidence > 0, trial.xyz_world_m)
+        seen = trial.confidence > 0
+        in_view = (np.mean(seen, axis=1) >= SEEN_SHARE) & (_mean_seen(trial.confidence) >= view.min_confidence)
+    elif isinstance(trial, MultiView):
+        for k in trial.views:
+            _check_points(name, k, need_3d=False)
+        confidence = np.max([k.confidence for k in trial.views], axis=0)
+        seen = confidence > 0
+        in_view = (np.mean(seen, axis=1) >= SEEN_SHARE) & (_mean_seen(confidence) >= view.min_confidence)
+    else:
+        _check_points(name, trial, need_3d=has_3d(trial))
+        seen = trial.confidence > 0
+        in_view = whole_person_in_view(trial, view.min_confidence)
+    used = bridge_gaps(in_view, trial.time_s, view.max_gap_s)
+    used &= ~blind_runs(np.mean(seen, axis=1) >= SEEN_SHARE, trial.time_s, view.max_blind_s)
+    longest = longest_run_s(used, trial.time_s)
+    if longest < view.min_in_view_s:
+        raise _input_error(
+            f"trial {name}: the whole person is in view for {longest:.2f} s at a stretch",
+            f"at least {view.min_in_view_s:.1f} s",
+            name,
+            "film so that head and feet stay in the picture for a few steps, or pick another person with --person",
+        )
+    return used, float(np.mean(in_view))
+
+
+def _mean_seen(confidence: np.ndarray) -> np.ndarray:
+    """Mean confidence of the markers seen in each frame: a laboratory's missing marker says nothing of the others."""
+    count = np.maximum(np.sum(confidence > 0, axis=1), 1)
+    return np.sum(confidence, axis=1) / count
+
+
+def has_3d(trial: Keypoints) -> bool:
+    """Whether the detector gave 3D points at all."""
+    return bool(np.any(np.isfinite(trial.xyz_cam_m[trial.confidence > 0])))
+
+
+def _check_points(name: str, trial: Keypoints, need_3d: bool) -> None:
+    seen = trial.confidence > 0
+    _check_finite(name, seen, trial.xy_px)
+    if need_3d:
+        _check_finite(name, seen, trial.xyz_cam_m)
+
+
+def _check_finite(name: str, seen: np.ndarray, points: np.ndarray) -> None:
+    if not np.all(np.isfinite(points[seen])):
+        raise _input_error(f"trial {name}: NaN or infinite points with confidence above 0", "confidence 0 there", name)
+
+
+def _arrays(trial: Trial, name: str, motion: str, used: np.ndarray) -> tuple[TrialArrays, str]:
+    """The arrays of a trial and where its camera's orientation comes from."""
+    t, j = len(trial.time_s), len(trial.names)
+    if isinstance(trial, WorldMarkers):
+        seen = trial.confidence > 0
+        none = np.zeros((t, 0, j))
+        return TrialArrays(
+            time_s=np.asarray(trial.time_s, float),
+            used=used,
+            x_cam=np.zeros((t, 0, j, 3)),
+            c_3d=none,
+            xy_px=np.zeros((t, 0, j, 2)),
+            c_2d=none,
+            x_world=np.where(seen[..., None], trial.xyz_world_m, 0.0),
+            c_world=np.asarray(trial.confidence, float),
+            R_nc=np.zeros((t, 0, 3, 3)),
+            p_nc=np.zeros((t, 0, 3)),
+            camera_matrix=np.zeros((t, 0, 3, 3)),
+        ), CALIBRATED
+    phone = None
+    if isinstance(trial, MultiView):
+        views = trial.views
+        R = np.tile(np.stack([p.R_nc for p in trial.poses]), (t, 1, 1, 1))
+        p = np.tile(np.stack([p.p_nc for p in trial.poses]), (t, 1, 1))
+        source = CALIBRATED
+    else:
+        views = (trial,)
+        p = np.zeros((t, 1, 3))
+        R, phone, source = _orientation(trial, name, motion, used)
+        R = R[:, None]
+    per_view = [_view(k) for k in views]
+    xy, c_2d, x_cam, c_3d = (np.stack(a, axis=1) for a in zip(*per_view, strict=True))
+    return TrialArrays(
+        time_s=np.asarray(trial.time_s, float),
+        used=used,
+        x_cam=x_cam,
+        c_3d=c_3d,
+        xy_px=xy,
+        c_2d=c_2d,
+        x_world=np.zeros((t, j, 3)),
+        c_world=np.zeros((t, j)),
+        R_nc=R,
+        p_nc=p,
+        camera_matrix=np.tile(np.stack([k.camera.matrix for k in views]), (t, 1, 1, 1)),
+        phone_time_s=None if phone is None else phone[0],
+        phone_quat_wxyz=None if phone is None else phone[1],
+    ), source
+
+
+def _view(trial: Keypoints) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Undistorted pixels, their confidence, 3D points, theirs."""
+    c = np.asarray(trial.confidence, float)
+    seen = c > 0
+    xy = undistort_px(np.where(seen[..., None], trial.xy_px, 0.0), trial.camera)
+    known = seen & np.all(np.isfinite(trial.xyz_cam_m), axis=-1)
+    return xy, c, np.where(known[..., None], trial.xyz_cam_m, 0.0), np.where(known, c, 0.0)
+
+
+def _orientation(
+    trial: Keypoints, name: str, motion: str, used: np.ndarray
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray] | None, str]:
+    """R_nc (T, 3, 3) to start from, the phone's log where the camera moves, and the source."""
+    t = len(trial.time_s)
+    if trial.phone_time_s is None or trial.phone_quat_wxyz is None:
+        return np.tile(LEVEL_CAMERA_R_NC, (t, 1, 1)), None, LEVEL
+    first, last = trial.time_s[np.flatnonzero(used)[[0, -1]]]
+    covered = min(last, trial.phone_time_s[-1]) - max(first, trial.phone_time_s[0])
+    if covered < PHONE_COVERAGE * (last - first) - CLOCK_RANGE_S:
+        raise PblError(
+            "PHONE_LOG",
+            found=f"trial {name}: orientation from {trial.phone_time_s[0]:.2f} to {trial.phone_time_s[-1]:.2f} s",
+            expected=f"the time in which the person is in view, {first:.2f} to {last:.2f} s of the video",
+            next_step="pass the log of this video, on its clock (docs/files.md), or leave it out",
+            key=name,
+        )
+    turned = rotation_matrices(trial.phone_time_s, trial.phone_quat_wxyz, trial.time_s)
+    if motion == "static":
+        return np.tile(mean_rotation(turned[used]), (t, 1, 1)), None, MEASURED
+    return turned, (np.asarray(trial.phone_time_s), np.asarray(trial.phone_quat_wxyz)), MEASURED
+
+
+def undistort_px(xy_px: np.ndarray, camera: Camera) -> np.ndarray:
+    """(T, J, 2) pixels of an ideal pinhole camera with the same matrix."""
+    if not np.any(camera.distortion):
+        return np.asarray(xy_px, float)
+    pinhole = viewing_ray(xy_px.reshape(-1, 2), camera) @ np.asarray(camera.matrix, np.float64).T
+    return pinhole[:, :2].reshape(xy_px.shape)
+
+
+def _input_error(found: str, expected: str, key: str | None = None, next_step: str = "") -> PblError:
+    return PblError(
+        "FIT_INPUT",
+        found=found,
+        expected=expected,
+        next_step=next_step or "look at the keypoints file (docs/files.md) and detect again",
+        key=key,
+    )

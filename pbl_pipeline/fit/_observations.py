@@ -1,0 +1,188 @@
+"""What was seen in a session, as arrays on the device: the frames of all trials one after another.
+
+Frames, markers and trials are padded to a few sizes, so that a worker compiles a handful of programs. Padding has
+weight 0 everywhere and never changes a result.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy.spatial.transform import Rotation, Slerp
+
+#: Sizes to which markers are padded; larger sets are padded to a multiple of 64.
+MARKER_SIZES = (24, 40, 64, 96, 128)
+#: Fewest frames of a program, in all trials together.
+MIN_FRAMES = 64
+#: Frame interval (s) for which second differences are stated: 30 Hz.
+FRAME_S = 1 / 30
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Observations:
+    """F frames of all trials, V views, J markers, N trials; P samples of the phone's orientation per trial.
+
+    time_s counts from each trial's first frame; `trial` is the number of a frame's trial; `weight` is 1 for a frame that
+    counts and 0 for others. Confidences are 0 where nothing was seen; values there are finite and do not count. `xy_px`
+    are pixels of an ideal pinhole camera (undistorted). `bend` holds the weights of the frames before, at and after a
+    frame in the second difference there (per 1/30 s squared), 0 where it is not formed. `sample_*`: the phone's
+    orientation R_nc as quaternions at a fixed interval, from `sample_start_s` on; there where `has_phone` is 1.
+    """
+
+    time_s: Float[Array, " F"]
+    trial: Int[Array, " F"]
+    weight: Float[Array, " F"]
+    x_cam: Float[Array, "F V J 3"]
+    c_3d: Float[Array, "F V J"]
+    xy_px: Float[Array, "F V J 2"]
+    c_2d: Float[Array, "F V J"]
+    x_world: Float[Array, "F J 3"]
+    c_world: Float[Array, "F J"]
+    R_nc: Float[Array, "F V 3 3"]
+    p_nc: Float[Array, "F V 3"]
+    camera_matrix: Float[Array, "F V 3 3"]
+    bend: Float[Array, "F 3"]
+    n_markers: Float[Array, ""]
+    n_views: Float[Array, ""]
+    has_phone: Float[Array, " N"]
+    sample_quat_wxyz: Float[Array, "N P 4"]
+    sample_start_s: Float[Array, " N"]
+    sample_step_s: Float[Array, ""]
+
+
+@dataclasses.dataclass(frozen=True)
+class TrialArrays:
+    """One trial before padding (NumPy, float64): T frames, V views, J markers. Fields as in `Observations`.
+
+    `used` (T,) bool: frames that count. phone_time_s (P,) on the video's clock, phone_quat_wxyz (P, 4): orientation of
+    the one camera where it moves, else None.
+    """
+
+    time_s: np.ndarray
+    used: np.ndarray
+    x_cam: np.ndarray
+    c_3d: np.ndarray
+    xy_px: np.ndarray
+    c_2d: np.ndarray
+    x_world: np.ndarray
+    c_world: np.ndarray
+    R_nc: np.ndarray
+    p_nc: np.ndarray
+    camera_matrix: np.ndarray
+    phone_time_s: np.ndarray | None = None
+    phone_quat_wxyz: np.ndarray | None = None
+
+
+#: Interval (s) of the phone's orientation as the solvers see it, and how far beyond the trial it is kept (s): the
+#: largest offset between the two clocks.
+SAMPLE_S, CLOCK_RANGE_S = 0.01, 0.5
+
+
+def pad_frames(n: int) -> int:
+    """The size to which `n` frames are padded: 64, 96, 128, 192, 256, 384 ..."""
+    size = MIN_FRAMES
+    while size < n:
+        size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
+    return size
+
+
+def pad_markers(n: int) -> int:
+    """The size to which `n` markers are padded."""
+    return next((s for s in MARKER_SIZES if s >= n), -(-n // 64) * 64)
+
+
+def pad_trials(n: int) -> int:
+    """The size to which `n` trials are padded: a power of 2."""
+    return 1 << (n - 1).bit_length()
+
+
+def bend_weights(time_s: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """(T, 3): weights of the frames before, at and after each in the second difference, per (1/30 s)^2.
+
+    The second derivative of the parabola through three frames at any spacing. Formed between the first and the last
+    frame that counts; frames in a gap between are carried by it.
+    """
+    out = np.zeros((len(time_s), 3))
+    index = np.flatnonzero(used)
+    if index.size == 0:
+        return out
+    t = np.arange(max(index[0], 0) + 1, index[-1])
+    before, after = time_s[t] - time_s[t - 1], time_s[t + 1] - time_s[t]
+    scale = 2 * FRAME_S**2 / (before + after)
+    out[t] = np.stack([scale / before, -scale * (1 / before + 1 / after), scale / after], axis=1)
+    return out
+
+
+def pack(trials: Sequence[TrialArrays]) -> Observations:
+    """All trials of a session as one `Observations`."""
+    total = sum(len(t.time_s) for t in trials)
+    frames, markers = pad_frames(total) - total, pad_markers(trials[0].c_world.shape[1])
+    n_markers = trials[0].c_world.shape[1]
+    n = pad_trials(len(trials))
+
+    def joined(field: str, marker_axis: int | None = None) -> np.ndarray:
+        a = np.concatenate([getattr(t, field) for t in trials])
+        widths = [(0, 0)] * a.ndim
+        widths[0] = (0, frames)
+        if marker_axis is not None:
+            widths[marker_axis] = (0, markers - n_markers)
+        return np.pad(a, widths, mode="constant" if marker_axis is not None else "edge")
+
+    used = np.concatenate([t.used for t in trials])
+    quats, starts = _phone_samples(trials, n)
+    bend = np.concatenate([bend_weights(t.time_s, t.used) for t in trials])
+    arrays = {
+        "time_s": np.concatenate([t.time_s - t.time_s[0] for t in trials] + [np.zeros(frames)]),
+        "weight": np.pad(used.astype(float), (0, frames)),
+        "x_cam": joined("x_cam", 2),
+        "c_3d": joined("c_3d", 2) * _padded(used, frames)[:, None, None],
+        "xy_px": joined("xy_px", 2),
+        "c_2d": joined("c_2d", 2) * _padded(used, frames)[:, None, None],
+        "x_world": joined("x_world", 1),
+        "c_world": joined("c_world", 1) * _padded(used, frames)[:, None],
+        "R_nc": joined("R_nc"),
+        "p_nc": joined("p_nc"),
+        "camera_matrix": joined("camera_matrix"),
+        "bend": np.pad(bend, [(0, frames), (0, 0)]),
+        "n_markers": np.asarray(n_markers),
+        "n_views": np.asarray(max(trials[0].c_3d.shape[1], 1)),
+        "has_phone": np.pad([float(t.phone_time_s is not None) for t in trials], (0, n - len(trials))),
+        "sample_quat_wxyz": quats,
+        "sample_start_s": starts,
+        "sample_step_s": np.asarray(SAMPLE_S),
+    }
+    number = np.concatenate([np.full(len(t.time_s), i) for i, t in enumerate(trials)])
+    f32 = {k: jnp.asarray(v, jnp.float32) for k, v in arrays.items()}
+    return Observations(trial=jnp.asarray(np.pad(number, (0, frames), mode="edge"), jnp.int32), **f32)
+
+
+def _padded(used: np.ndarray, frames: int) -> np.ndarray:
+    return np.pad(used.astype(float), (0, frames))
+
+
+def _phone_samples(trials: Sequence[TrialArrays], n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Orientations (n, P, 4) every `SAMPLE_S` and the time (n,) of the first, on each trial's own clock."""
+    moving = [i for i, t in enumerate(trials) if t.phone_time_s is not None]
+    if not moving:
+        return np.tile([1.0, 0, 0, 0], (n, 2, 1)), np.zeros(n)
+    from scipy.spatial.transform import Rotation, Slerp
+
+    longest = max(t.time_s[-1] - t.time_s[0] for t in trials) + 2 * CLOCK_RANGE_S
+    count = pad_frames(int(np.ceil(longest / SAMPLE_S)) + 2)
+    out = np.tile([1.0, 0, 0, 0], (n, count, 1))
+    for i in moving:
+        trial = trials[i]
+        assert trial.phone_time_s is not None and trial.phone_quat_wxyz is not None
+        turn = Slerp(trial.phone_time_s, Rotation.from_quat(trial.phone_quat_wxyz, scalar_first=True))
+        at = trial.time_s[0] - CLOCK_RANGE_S + SAMPLE_S * np.arange(count)
+        quat = turn(np.clip(at, trial.phone_time_s[0], trial.phone_time_s[-1])).as_quat(scalar_first=True)
+        same = np.sign(np.sum(quat[1:] * quat[:-1], axis=1))
+        quat[1:] *= np.cumprod(np.where(same == 0, 1.0, same))[:, None]
+        out[i] = quat
+    return out, np.full(n, -CLOCK_RANGE_S)

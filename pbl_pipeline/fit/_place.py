@@ -1,0 +1,139 @@
+"""Where a Gauss-Newton fit starts: the standing body, placed and turned in each frame by the points of the trunk."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pbl_pipeline.body import Body, MarkerSet
+
+from ._inputs import Session
+from ._observations import TrialArrays
+
+#: Bodies whose markers turn with the trunk; limbs would pull the heading towards where they swing.
+TRUNK = ("pelvis", "torso", "head", "humerus_r", "humerus_l")
+#: Joint angles (deg) of the start beside the standing pose: bent a little, away from limits and from straight limbs.
+BENT_DEG = {"knee_angle": -10.0, "elbow_flex": 20.0, "pro_sup": 45.0, "hip_flexion": 5.0}
+
+
+def placed_poses(session: Session, trial: int, flip: bool = False) -> np.ndarray:
+    """qpos (T, 40) of one trial; `flip`: facing the other way."""
+    arrays = session.arrays[trial]
+    points, c = world_points(arrays)
+    body, markers = session.body, session.markers
+    template = standing_markers(body, markers)
+    trunk = np.array([b in TRUNK for b in markers.body_names])
+    if trunk.sum() < 3:
+        trunk[:] = True
+    weight = np.where(trunk, c, 0.0)
+    R, x = align(template, points, weight)
+    known = (np.count_nonzero(weight, axis=1) >= 3) & np.isfinite(x).all(axis=1) & arrays.used
+    if not known.any():
+        # Nothing to turn it by: straight ahead of the first camera, facing it.
+        R, x = np.tile(np.diag([-1.0, -1.0, 1.0]), (len(x), 1, 1)), np.tile([4.0, 0.0, 0.0], (len(x), 1))
+        known = arrays.used.copy()
+    if flip:
+        about = np.einsum("tij,j->ti", R, np.average(template[trunk], axis=0)) + x
+        R = R @ np.diag([-1.0, -1.0, 1.0])  # half a turn about the standing body's vertical
+        x = about - np.einsum("tij,j->ti", R, np.average(template[trunk], axis=0))
+    return _poses(body, R, x, known)
+
+
+def world_points(arrays: TrialArrays) -> tuple[np.ndarray, np.ndarray]:
+    """World positions (T, J, 3) in m and confidences (T, J) of what was seen, from whatever the trial holds."""
+    if np.any(arrays.c_world > 0):
+        return arrays.x_world, arrays.c_world
+    v = int(np.argmax(np.sum(arrays.c_3d, axis=(0, 2))))
+    if np.any(arrays.c_3d[:, v] > 0):
+        c = arrays.c_3d[:, v]
+        root = root_positions(arrays.x_cam[:, v], arrays.xy_px[:, v], np.minimum(c, arrays.c_2d[:, v]), arrays.camera_matrix[:, v])
+        x = arrays.x_cam[:, v] + root[:, None]
+        return np.einsum("tij,tmj->tmi", arrays.R_nc[:, v], x) + arrays.p_nc[:, v, None], c
+    return triangulate(arrays)
+
+
+def root_positions(x_cam: np.ndarray, xy_px: np.ndarray, c: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Camera-frame position (T, 3) in m of the origin of root-relative points (T, J, 3), from their pixels.
+
+    Weighted least squares on ``fx (x + tx) = (u - cx) (z + tz)`` and the like for v, linear in the unknown
+    (tx, ty, tz). NaN in frames with fewer than four points seen.
+    """
+    focal, centre = np.stack([matrix[:, 0, 0], matrix[:, 1, 1]], -1), matrix[:, :2, 2]
+    d = (xy_px - centre[:, None]) / focal[:, None]  # (T, J, 2)
+    # Rows a . t = b with a = (1, 0, -du) and (0, 1, -dv), b = d z - x.
+    b = d * x_cam[..., 2:] - x_cam[..., :2]
+    normal = np.zeros((len(c), 3, 3))
+    total = np.sum(c, axis=1)
+    normal[:, 0, 0] = normal[:, 1, 1] = total
+    normal[:, :2, 2] = normal[:, 2, :2] = -np.einsum("tj,tjk->tk", c, d)
+    normal[:, 2, 2] = np.einsum("tj,tjk->t", c, d**2)
+    right = np.concatenate([np.einsum("tj,tjk->tk", c, b), -np.einsum("tj,tjk->t", c, d * b)[:, None]], axis=1)
+    enough = np.count_nonzero(c > 0, axis=1) >= 4
+    out = np.full((len(c), 3), np.nan)
+    out[enough] = np.linalg.solve(normal[enough] + 1e-9 * np.eye(3), right[enough][..., None])[..., 0]
+    return out
+
+
+def triangulate(arrays: TrialArrays) -> tuple[np.ndarray, np.ndarray]:
+    """World points (T, J, 3) of several cameras: the point nearest to all viewing rays; confidence 0 under 2 views."""
+    matrix, R = arrays.camera_matrix, arrays.R_nc
+    focal = np.stack([matrix[..., 0, 0], matrix[..., 1, 1]], -1)[:, :, None]
+    d = (arrays.xy_px - matrix[..., None, :2, 2]) / focal
+    ray = np.concatenate([d, np.ones((*d.shape[:-1], 1))], axis=-1)
+    ray = np.einsum("tvij,tvmj->tvmi", R, ray / np.linalg.norm(ray, axis=-1, keepdims=True))
+    across = arrays.c_2d[..., None, None] * (np.eye(3) - ray[..., :, None] * ray[..., None, :])
+    normal = np.sum(across, axis=1)
+    right = np.einsum("tvmij,tvj->tmi", across, arrays.p_nc)
+    seen = np.count_nonzero(arrays.c_2d > 0, axis=1) >= 2
+    out = np.zeros(right.shape)
+    out[seen] = np.linalg.solve(normal[seen] + 1e-9 * np.eye(3), right[seen][..., None])[..., 0]
+    return out, np.where(seen, np.max(arrays.c_2d, axis=1), 0.0)
+
+
+def standing_markers(body: Body, markers: MarkerSet) -> np.ndarray:
+    """(J, 3) of the unscaled standing body with its pelvis at the origin and unturned, by C MuJoCo."""
+    import mujoco
+
+    model = body.mj_model
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    R, x = data.xmat[1:].reshape(-1, 3, 3), data.xpos[1:]
+    pelvis = R[0]
+    points = x[markers.body_index] + np.einsum("mij,mj->mi", R[markers.body_index], markers.position_m)
+    del pelvis
+    return points - x[0]
+
+
+def align(template: np.ndarray, points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations (T, 3, 3) and positions (T, 3) with points = R template + x in the weighted least-squares sense (Kabsch)."""
+    total = np.maximum(weight.sum(axis=1), 1e-9)[:, None]
+    a = weight @ template / total
+    b = np.einsum("tj,tji->ti", weight, points) / total
+    H = np.einsum("tj,tji,tjk->tik", weight, points - b[:, None], template[None] - a[:, None])
+    U, _, Vt = np.linalg.svd(np.nan_to_num(H))
+    mirror = np.sign(np.linalg.det(U @ Vt))
+    U[:, :, 2] *= np.where(mirror == 0, 1.0, mirror)[:, None]
+    R = U @ Vt
+    return R, b - np.einsum("tij,tj->ti", R, a)
+
+
+def _poses(body: Body, R: np.ndarray, x: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Poses with the pelvis of the standing template turned by R and moved to x; frames not known in between."""
+    model = body.mj_model
+    column = {n: k for k, n in enumerate(body.joint_names)}
+    qpos = np.zeros((len(x), len(body.joint_names)))
+    for joint, degrees in BENT_DEG.items():
+        for name in (joint, f"{joint}_r", f"{joint}_l"):
+            if name in column:
+                qpos[:, column[name]] = np.deg2rad(degrees)
+    pelvis = model.body("pelvis")
+    stands = Rotation.from_quat(pelvis.quat, scalar_first=True).as_matrix()
+    local = np.einsum("ji,tj->ti", stands, x - pelvis.pos)
+    turned = Rotation.from_matrix(np.einsum("ji,tjk,kl->til", stands, R, stands)[known])
+    tilt, lean, heading = turned.as_euler("ZXY").T
+    index, at = np.flatnonzero(known), np.arange(len(x))
+    values = dict(zip(("pelvis_tx", "pelvis_ty", "pelvis_tz"), local[known].T, strict=True))
+    values |= {"pelvis_tilt": tilt, "pelvis_list": lean, "pelvis_rotation": np.unwrap(heading)}
+    for name, value in values.items():
+        qpos[:, column[name]] = np.interp(at, index, value)
+    return qpos
