@@ -92,8 +92,16 @@ def marker_jacobian(
     owner = np.asarray(body.mj_model.jnt_bodyid) - 1
     turns = jnp.asarray(tree.turns_body, x.dtype)[table.body_index]
     slides = jnp.asarray(tree.path @ tree.slides_body, x.dtype)[table.body_index]
-    lever = x[:, :, None, :] - xpos[:, owner][:, None]
-    per_qpos = jnp.cross(xaxis[:, None], lever) * turns[..., None] + xaxis[:, None] * slides[..., None]
+    # One coordinate after the other, joints last: the loops then run over neighbouring numbers.
+    axis = [xaxis[:, None, :, k] for k in range(3)]
+    lever = [x[:, :, None, k] - xpos[:, None, owner, k] for k in range(3)]
+    per_qpos = jnp.stack(
+        [
+            turns * (axis[(k + 1) % 3] * lever[(k + 2) % 3] - axis[(k + 2) % 3] * lever[(k + 1) % 3]) + slides * axis[k]
+            for k in range(3)
+        ],
+        axis=-2,
+    )
 
     # A scaled parent moves its children's origins; everything further out follows.
     parent = tree.parent
@@ -105,7 +113,7 @@ def marker_jacobian(
     per_scale = origin[:, table.body_index] + arm[..., None] * mine[:, None, :]
     return MarkerJacobian(
         x_world_m=x,
-        per_qpos=jnp.swapaxes(per_qpos, -1, -2),
+        per_qpos=per_qpos,
         per_scale=per_scale,
         per_offset=rotation * own[:, None, None],
     )

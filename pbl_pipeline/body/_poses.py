@@ -1,9 +1,12 @@
-"""Where the bodies are, compiled: MJX's kinematics, with the derivative written out.
+"""Where the bodies are, compiled: the chain of the tree, level by level, with the derivative written out.
 
-Differentiating through `mjx.kinematics` gives the right numbers, but a program of some 18,000 operations that takes
-longer to compile than a short trial takes to fit. The derivative of a tree of rigid bodies is known in closed form
-(the geometric Jacobian, e.g. Featherstone, Rigid Body Dynamics Algorithms, 2008, ch. 4), needs only the positions,
-rotations and joint axes that MJX returns, and is one small matrix product per step:
+MuJoCo's own kinematics in JAX (`mjx.kinematics`) gives the same numbers, which a test holds, but a program of some
+9,000 operations, 18,000 with its derivative, that takes longer to compile than a short trial takes to fit. Here all
+hinges turn at once, the turns of each body are multiplied at once, and the tree is then walked level by level: a
+dozen batched products of 3x3 matrices.
+
+The derivative of a tree of rigid bodies is known in closed form (the geometric Jacobian, e.g. Featherstone, Rigid Body
+Dynamics Algorithms, 2008, ch. 4) and needs only positions, rotations and joint axes:
 
 - a body turns with all hinges between the world and itself: omega_b = sum of axis_j * dq_j;
 - its origin moves as its parent's does, plus omega_parent x (x_b - x_parent), plus its own slides, plus the turned
@@ -20,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from mujoco import mjx
+from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body._model import Body
 
@@ -35,13 +38,11 @@ def poses(body: Body) -> Callable[[Array, Array], tuple[Array, Array, Array]]:
     """
     tree = tree_of(body)
 
+    chain = _Chain.of(body)
+
     @jax.custom_jvp
     def one(qpos: Array, body_pos: Array) -> tuple[Array, Array, Array]:
-        model = body.mjx_model.replace(body_pos=jnp.concatenate([jnp.zeros((1, 3), body_pos.dtype), body_pos]))
-        # GPUs round the factors of float32 products to ten bits unless told otherwise: millimetres at the foot.
-        with jax.default_matmul_precision("highest"):
-            data = mjx.kinematics(model, body.mjx_data.replace(qpos=qpos))
-        return data.xpos[1:], data.xmat[1:], data.xaxis
+        return _forward(chain, tree, qpos, body_pos)
 
     @one.defjvp
     def one_jvp(primals, tangents):
@@ -93,6 +94,88 @@ class Tree:
             turns_axis=on_path[owner] * earlier * hinge,
             slides_body=(owner[None, :] == np.arange(len(parent))[:, None]) * slide,
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Chain:
+    """The joints of each body in the order in which they act, padded to the most a body has; Q stands for none."""
+
+    stands: np.ndarray  # (B, 3, 3): the body against its parent at qpos 0
+    axis: np.ndarray  # (Q, 3) in the body's frame
+    hinges: np.ndarray  # (B, H): joints that turn the body
+    levels: tuple[np.ndarray, ...]  # bodies by their distance from the world
+    owner: np.ndarray  # (Q,)
+    turn: np.ndarray  # (Q,): which hinge of its body, the number of hinges before it (slides: 0)
+
+    @classmethod
+    def of(cls, body: Body) -> _Chain:
+        model, parent = body.mj_model, body.parent_index
+        owner = np.asarray(model.jnt_bodyid) - 1
+        hinge = model.jnt_type == 3
+        lists = [np.flatnonzero((owner == b) & hinge) for b in range(len(parent))]
+        hinges = np.full((len(parent), max(map(len, lists))), model.njnt)
+        turn = np.zeros(model.njnt, int)
+        for b, joints in enumerate(lists):
+            hinges[b, : len(joints)] = joints
+            turn[joints] = np.arange(len(joints))
+            slides = np.flatnonzero((owner == b) & ~hinge)
+            if len(slides) and len(joints) and slides.max() > joints.min():
+                raise ValueError("the body's slides must act before its hinges")
+        depth = np.zeros(len(parent), int)
+        for b, p in enumerate(parent):
+            depth[b] = depth[p] + 1 if p >= 0 else 0
+        return cls(
+            stands=Rotation.from_quat(model.body_quat[1:], scalar_first=True).as_matrix(),
+            axis=np.asarray(model.jnt_axis),
+            hinges=hinges,
+            levels=tuple(np.flatnonzero(depth == d) for d in range(depth.max() + 1)),
+            owner=owner,
+            turn=turn,
+        )
+
+
+def _forward(chain: _Chain, tree: Tree, qpos: Array, body_pos: Array) -> tuple[Array, Array, Array]:
+    """xpos (B, 3), xmat (B, 3, 3), xaxis (Q, 3) of one pose."""
+    dtype = qpos.dtype
+    axis = jnp.asarray(chain.axis, dtype)
+    turned = jax.lax.optimization_barrier(jnp.concatenate([_rodrigues(axis, qpos), jnp.eye(3, dtype=dtype)[None]]))
+    partial = [jnp.asarray(chain.stands, dtype)]
+    for h in range(chain.hinges.shape[1]):
+        partial.append(_product(partial[-1], turned[chain.hinges[:, h]]))
+    local, before = partial[-1], jnp.stack(partial)[chain.turn, chain.owner]
+    xmat: list[Array] = [jnp.zeros((3, 3), dtype)] * len(tree.parent)
+    for bodies in chain.levels:
+        here = local[bodies]
+        if tree.parent[bodies[0]] >= 0:
+            here = _product(jnp.stack([xmat[p] for p in tree.parent[bodies]]), here)
+        for b, matrix in zip(bodies, here, strict=True):
+            xmat[b] = matrix
+    matrices = jnp.stack(xmat)
+    world = jnp.concatenate([matrices, jnp.eye(3, dtype=dtype)[None]])  # parent -1: the world
+    xaxis = _turned(world[tree.parent[chain.owner]], _turned(before, axis))
+    slides = jnp.matmul(jnp.asarray(tree.slides_body, dtype), xaxis * qpos[:, None], precision="highest")
+    step = _turned(world[tree.parent], body_pos) + slides
+    return jnp.matmul(jnp.asarray(tree.path, dtype), step, precision="highest"), matrices, xaxis
+
+
+# Sums of products and not matrix products: those are rounded to ten bits on GPUs, and called one by one on CPUs.
+# The barrier keeps the compiler from computing a product anew in each of the products that use it.
+def _product(a: Array, b: Array) -> Array:
+    return jax.lax.optimization_barrier(sum(a[..., :, k : k + 1] * b[..., k : k + 1, :] for k in range(3)))
+
+
+def _turned(matrix: Array, vector: Array) -> Array:
+    return sum(matrix[..., :, k] * vector[..., k : k + 1] for k in range(3))
+
+
+def _rodrigues(axis: Array, angle: Array) -> Array:
+    """Rotations (Q, 3, 3) about unit axes (Q, 3)."""
+    x, y, z = axis[:, 0], axis[:, 1], axis[:, 2]
+    zero = jnp.zeros_like(x)
+    cross = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
+    outer = axis[:, :, None] * axis[:, None, :]
+    sin, cos = jnp.sin(angle)[:, None, None], jnp.cos(angle)[:, None, None]
+    return cos * jnp.eye(3, dtype=axis.dtype) + sin * cross + (1 - cos) * outer
 
 
 def _tangents(
