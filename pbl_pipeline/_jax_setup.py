@@ -39,6 +39,20 @@ def configure() -> None:
     # -1 keeps small programs too; the limit is meant for file systems on which small files are slow.
     _default("jax_persistent_cache_min_entry_size_bytes", -1)
     _import_mjx()
+    jax.monitoring.register_event_duration_secs_listener(_count_compilation)
+
+
+_COMPILED = {"seconds": 0.0}
+
+
+def _count_compilation(event: str, seconds: float, **_: object) -> None:
+    if event.startswith("/jax/core/compile/"):
+        _COMPILED["seconds"] += seconds
+
+
+def compile_seconds() -> float:
+    """Seconds this process has spent so far on tracing programs and on compiling or loading them."""
+    return _COMPILED["seconds"]
 
 
 def _default(option: str, value: float) -> None:

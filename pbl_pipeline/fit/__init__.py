@@ -1,8 +1,25 @@
 """The session fit: keypoints of 1..N trials to joint angles, one body for all."""
 
-from ._params import DEFAULT, PARAMSETS, CostParams, ImplicitAdamParams, ViewParams, params_of
-from ._problem import LEVEL_CAMERA_R_NC
-from ._session import LEVEL_CAMERA_QUAT_WXYZ, SOLVERS, check_trial, fit_session
+from ._inputs import LEVEL_CAMERA_R_NC, Trial
+from ._params import (
+    DEFAULT,
+    PARAMSETS,
+    SOLVERS,
+    CostParams,
+    GaussNewtonParams,
+    ImplicitAdamParams,
+    Params,
+    ViewParams,
+    params_of,
+)
+from ._session import (
+    LEVEL_CAMERA_QUAT_WXYZ,
+    SessionInput,
+    check_trial,
+    fit_session,
+    fit_sessions,
+    paper_objective,
+)
 from ._types import SessionFit, TrialFit
 
 __all__ = [
@@ -12,11 +29,17 @@ __all__ = [
     "PARAMSETS",
     "SOLVERS",
     "CostParams",
+    "GaussNewtonParams",
     "ImplicitAdamParams",
+    "Params",
     "SessionFit",
+    "SessionInput",
+    "Trial",
     "TrialFit",
     "ViewParams",
     "check_trial",
     "fit_session",
+    "fit_sessions",
+    "paper_objective",
     "params_of",
 ]

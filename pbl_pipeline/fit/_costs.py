@@ -51,15 +51,17 @@ def distance_3d_cm2(
     R_nc: Float[Array, "*#n 3 3"],
     c: Float[Array, "*n J"],
     marker_weight: ArrayLike = 1.0,
+    depth_ratio: ArrayLike = 1.0,
 ) -> Float[Array, "*n J"]:
     """Squared distance (cm^2) of model and detected 3D points, both with their mean over the seen markers removed.
 
     `marker_weight` says how much each marker counts in that mean; the distances themselves are not weighted.
+    `depth_ratio`: what a distance along the camera's axis counts against one across it (1: the paper's).
     """
     weight = jnp.where(c > 0, marker_weight, 0.0).astype(x_world.dtype)
-    detected = jnp.einsum("...ij,...kj->...ki", R_nc, x_cam)
-    delta = center(x_world, weight) - center(detected, weight)
-    return 1e4 * jnp.sum(delta**2, axis=-1)
+    delta = jnp.einsum("...ji,...kj->...ki", R_nc, center(x_world, weight)) - center(x_cam, weight)
+    across, along = jnp.sum(delta[..., :2] ** 2, axis=-1), delta[..., 2] * depth_ratio
+    return 1e4 * (across + along**2)
 
 
 def project_px(x_cam: Float[Array, "*n J 3"], matrix: Float[Array, "*#n 3 3"]) -> Float[Array, "*n J 2"]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import Paramset
 
 
@@ -20,6 +21,9 @@ class CostParams:
     weight_2d: float = 0.1
     #: On the marker set's places. 100 is a standard deviation of about 2 cm per axis, by the same count; 25 of 4 cm.
     weight_offset_per_m2: float = 100.0
+    weight_phone: float = 1.0
+    #: What a 3D distance along the camera's axis counts against one across it.
+    depth_ratio: float = 1.0
     huber_3d_cm: float = 10.0
     huber_2d_px: float = 5.0
     weight_pose: float = 0.0
@@ -49,6 +53,7 @@ class ViewParams:
 class ImplicitAdamParams:
     """Solver `implicit-adam`: one network per trial, one body per session, Adam (defaults: the paper)."""
 
+    solver: str = "implicit-adam"
     steps: int = 25_000
     samples_per_trial: int = 300
     learning_rate_start: float = 1e-3
@@ -92,15 +97,42 @@ POSE_PRIOR_DEG = (
     ("wrist_dev", 0.0, 10.0),
 )
 
+#: What `qpos_sd` is multiplied by, per group of joints, so that 90 % intervals hold the truth in 90 % of the samples of
+#: the synthetic walker (`python -m tests.benchmarks.uncertainty` prints them and checks them on other walks).
+SD_FACTOR: tuple[tuple[str, float], ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class GaussNewtonParams:
+    """Solver `gauss-newton`: per-frame poses with a prior on their second differences; the same costs as the paper's."""
+
+    solver: str = "gauss-newton"
+    max_iterations: int = 60
+    #: It ends after a step in which no joint moved further (rad; m for the pelvis) ...
+    tolerance_rad: float = 1e-3
+    #: ... or two in a row whose gain was below this share of the cost.
+    tolerance_cost: float = 1e-5
+    #: Weight of half the squared second difference of each joint over frames at 30 Hz, per rad^2 and m^2.
+    smooth_per_rad2: float = 200.0
+    smooth_per_m2: float = 20_000.0
+    #: Weight of half the squared angle beyond a joint's limit, per deg^2.
+    weight_limit_per_deg2: float = 0.1
+    #: The angle between fitted and measured camera counts linearly beyond this, as in the paper, and smoothly below.
+    huber_phone_deg: float = 0.5
+    #: Standard deviation (s) of the offset between the phone's clock and the video's.
+    clock_sd_s: float = 0.2
+    sd_factor: tuple[tuple[str, float], ...] = SD_FACTOR
+    cost: CostParams = CostParams()
+    view: ViewParams = ViewParams()
+
+
 PAPER_2025 = ImplicitAdamParams()
-#: For BlazePose on two CPU cores: fewer steps from a start near the answer, and priors (tests/benchmarks/real_clips.py
-#: measures them on two phone clips with marker mocap). Its depth is much less certain than its pixels, so 3D counts
-#: less than MeTRAbs's in the paper; at 0.05 one of the clips ended in a wrong pose. Its points were marked by eye in
+#: For 87 points of MeTRAbs: the paper's costs, but pixels count more, because they err less than depth.
+GAUSS_NEWTON = GaussNewtonParams(cost=CostParams(weight_2d=0.5))
+#: For BlazePose: priors (tests/benchmarks/real_clips.py measures them on two phone clips with marker mocap). Its depth is
+#: much less certain than its pixels, so 3D counts less than MeTRAbs's in the paper. Its points were marked by eye in
 #: pictures and not felt on bone, so they may lie twice as far from the marker set's places.
-BLAZEPOSE = ImplicitAdamParams(
-    steps=4_000,
-    samples_per_trial=160,
-    start="keypoints",
+BLAZEPOSE = GaussNewtonParams(
     cost=CostParams(
         weight_3d=0.2,
         weight_offset_per_m2=25.0,
@@ -109,14 +141,47 @@ BLAZEPOSE = ImplicitAdamParams(
         weight_scale=0.1,
     ),
 )
+#: For markers of a laboratory, known to millimetres but placed by hand; a marker that jumped counts little.
+MARKERS = GaussNewtonParams(
+    smooth_per_rad2=20.0,
+    smooth_per_m2=2_000.0,
+    cost=CostParams(
+        huber_3d_cm=3.0, weight_offset_per_m2=300.0, weight_pose=0.01, pose_prior_deg=POSE_PRIOR_DEG, weight_scale=0.01
+    ),
+)
+
+Params = GaussNewtonParams | ImplicitAdamParams
+_CLASSES: dict[str, type[GaussNewtonParams] | type[ImplicitAdamParams]] = {
+    "gauss-newton": GaussNewtonParams,
+    "implicit-adam": ImplicitAdamParams,
+}
+#: Every solver there is.
+SOLVERS = tuple(_CLASSES)
 
 PARAMSETS: dict[str, Paramset] = {
     "paper-2025": Paramset.of("fit", "paper-2025", 1, PAPER_2025),
+    "gauss-newton": Paramset.of("fit", "gauss-newton", 1, GAUSS_NEWTON),
     "blazepose": Paramset.of("fit", "blazepose", 1, BLAZEPOSE),
+    "markers": Paramset.of("fit", "markers", 1, MARKERS),
 }
 DEFAULT = "blazepose"
 
 
-def params_of(paramset: Paramset) -> ImplicitAdamParams:
-    """The parameter object of a stored paramset."""
-    return paramset.to(ImplicitAdamParams)
+def params_of(paramset: Paramset) -> Params:
+    """The parameter object of a stored paramset.
+
+    Raises
+    ------
+    PblError
+        SOLVER_UNKNOWN: the paramset names no solver of this version.
+    """
+    solver = paramset.params.get("solver")
+    if solver not in _CLASSES:
+        raise PblError(
+            "SOLVER_UNKNOWN",
+            found=f"solver {solver!r} in paramset {paramset.name}",
+            expected=f"one of {', '.join(SOLVERS)}",
+            next_step="correct the paramset, or install the version of this software that it was made with",
+            key=paramset.name,
+        )
+    return paramset.to(_CLASSES[solver])

@@ -9,7 +9,10 @@ import numpy as np
 
 from pbl_pipeline.qc import FAIL, PASS, WARN, Check
 
-from ._problem import Session
+from pbl_pipeline.keypoints import WorldMarkers
+
+from ._inputs import GAIT, LEVEL, Session
+from .solvers import Solution
 from ._types import TrialFit
 
 #: Median 2D residual as a share of the person's height in the picture: 5 px of a 500 px person is the paper's level.
@@ -22,14 +25,21 @@ LIMIT_MARGIN_RAD, LIMIT_SHARE = np.deg2rad(1.0), 0.2
 #: is flat whatever happens; this fall is not. On the demo and on a synthetic walker, joint angles after a fall of 0.07
 #: to 0.14 were within 1 deg (median) of those after three times the steps, after 0.16 to 0.28 within 2 deg.
 FALL_WARN, TRACE_NEEDED = 0.2, 8
+#: Median standard deviation of a joint angle from which on the joint counts as not observed.
+SD_WARN_DEG = 15.0
+CLOCK_WARN_S = 0.3
 
 
-def check_fit(
-    session: Session, trials: Sequence[TrialFit], scale: np.ndarray, loss_trace: np.ndarray
-) -> tuple[Check, ...]:
+def check_fit(session: Session, trials: Sequence[TrialFit], solution: Solution) -> tuple[Check, ...]:
     """All checks of one session fit, worst trial per check."""
-    checks = [_residual_2d(session, trials), _residual_3d(session, trials), _in_view(session), _scale(scale)]
-    checks += [_limits(session, trials), _converged(loss_trace), _intrinsics(trials), _orientation()]
+    checks = [_residual_3d(session, trials), _in_view(session), _scale(solution.scale), _limits(session, trials)]
+    checks += [_converged(solution)]
+    if not isinstance(session.trials[0], WorldMarkers):
+        checks = [_residual_2d(session, trials), *checks, _intrinsics(trials), _orientation(trials)]
+    if solution.qpos_sd is not None:
+        checks += [_observed(trials)]
+    if np.any(np.isfinite([t.phone_clock_offset_s for t in trials])):
+        checks += [_clock(trials)]
     # Advice is for whom a check asks to act.
     return tuple(dataclasses.replace(c, advice="") if c.outcome == PASS else c for c in checks)
 
@@ -40,10 +50,11 @@ def _grade(value: float, warn: float, fail: float) -> str:
 
 def _residual_2d(session: Session, trials: Sequence[TrialFit]) -> Check:
     shares = []
-    for keypoints, trial in zip(session.trials, trials, strict=True):
-        y = np.where(np.isfinite(trial.residual_2d_px), keypoints.xy_px[..., 1], np.nan)
-        y = y[np.isfinite(y).any(axis=1)]
-        height = np.median(np.nanmax(y, axis=1) - np.nanmin(y, axis=1))
+    for arrays, trial in zip(session.arrays, trials, strict=True):
+        seen = (arrays.c_2d > 0) & arrays.used[:, None, None]
+        y = np.where(seen, arrays.xy_px[..., 1], np.nan)
+        y = y[np.isfinite(y).any(axis=-1)]
+        height = np.median(np.nanmax(y, axis=-1) - np.nanmin(y, axis=-1))
         shares.append(np.nanmedian(trial.residual_2d_px) / height)
     value = float(np.max(shares))
     return Check(
@@ -56,8 +67,12 @@ def _residual_2d(session: Session, trials: Sequence[TrialFit]) -> Check:
 
 
 def _residual_3d(session: Session, trials: Sequence[TrialFit]) -> Check:
-    counts = np.asarray(session.model.markers.weight_3d) > 0
-    value = float(np.max([100 * np.nanmedian(t.residual_3d_m[:, counts]) for t in trials]))
+    counts = np.asarray(session.markers.weight_3d) > 0
+    medians = [100 * np.median(r[np.isfinite(r)]) for t in trials if np.isfinite(r := t.residual_3d_m[:, counts]).any()]
+    if not medians:
+        # Pixels alone: nothing to compare with.
+        return Check("residual_3d_cm", PASS, None, RESIDUAL_3D_WARN_CM, "")
+    value = float(np.max(medians))
     return Check(
         "residual_3d_cm",
         _grade(value, RESIDUAL_3D_WARN_CM, RESIDUAL_3D_FAIL_CM),
@@ -90,10 +105,10 @@ def _scale(scale: np.ndarray) -> Check:
 
 
 def _limits(session: Session, trials: Sequence[TrialFit]) -> Check:
-    low, high = np.asarray(session.model.body.joint_range_rad).T
+    low, high = np.asarray(session.body.joint_range_rad).T
     qpos = np.concatenate([t.qpos[np.isfinite(t.qpos[:, 0])] for t in trials])
     share = np.mean((qpos < low + LIMIT_MARGIN_RAD) | (qpos > high - LIMIT_MARGIN_RAD), axis=0)
-    names = [n for n, s in zip(session.model.body.joint_names, share, strict=True) if s > LIMIT_SHARE]
+    names = [n for n, s in zip(session.body.joint_names, share, strict=True) if s > LIMIT_SHARE]
     return Check(
         "joints_at_their_limit",
         WARN if names else PASS,
@@ -103,8 +118,16 @@ def _limits(session: Session, trials: Sequence[TrialFit]) -> Check:
     )
 
 
-def _converged(loss_trace: np.ndarray) -> Check:
-    loss = loss_trace[:, 1]
+def _converged(solution: Solution) -> Check:
+    if solution.qpos_sd is not None:
+        return Check(
+            "iterations",
+            PASS if solution.converged else WARN,
+            float(solution.iterations),
+            None,
+            "the solver stopped at its bound on iterations, not at a minimum: look at the overlay; raise max_iterations",
+        )
+    loss = solution.loss_trace[:, 1]
     enough = len(loss) >= TRACE_NEEDED
     fall = float(loss[len(loss) // 2 - 1] / loss[-1] - 1) if enough else None
     return Check(
@@ -127,12 +150,42 @@ def _intrinsics(trials: Sequence[TrialFit]) -> Check:
     )
 
 
-def _orientation() -> Check:
+def _orientation(trials: Sequence[TrialFit]) -> Check:
+    sources = {t.orientation_source for t in trials}
+    if LEVEL in sources:
+        advice = (
+            "the camera is taken as level and still: its own tilt adds to the pelvis angles and to positions, not to the "
+            "angles between segments (hip, knee, ankle)"
+        )
+    else:
+        advice = (
+            "the vertical is taken from the walk, on a level floor by a person who does not lean to a side: a lean of the "
+            "trunk to a side is lost; pass the phone's log with --attitude"
+        )
+    return Check("camera_orientation_known", WARN if sources & {LEVEL, GAIT} else PASS, None, None, advice)
+
+
+def _observed(trials: Sequence[TrialFit]) -> Check:
+    names = trials[0].joint_names
+    turns = np.array([n not in ("pelvis_tx", "pelvis_ty", "pelvis_tz") for n in names])
+    sd = np.rad2deg(np.max([np.nanmedian(t.qpos_sd, axis=0) for t in trials], axis=0))
+    unseen = [n for n, d, turn in zip(names, sd, turns, strict=True) if turn and not d < SD_WARN_DEG]
     return Check(
-        "camera_orientation_known",
-        WARN,
-        None,
-        None,
-        "the camera is taken as level and still: its own tilt adds to the pelvis angles and to positions, not to the "
-        "angles between segments (hip, knee, ankle)",
+        "joints_not_observed",
+        WARN if unseen else PASS,
+        float(len(unseen)),
+        0.0,
+        f"standard deviation of {SD_WARN_DEG:.0f} deg and more: {', '.join(unseen)}",
+    )
+
+
+def _clock(trials: Sequence[TrialFit]) -> Check:
+    offsets = np.array([t.phone_clock_offset_s for t in trials])
+    worst = float(offsets[np.nanargmax(np.abs(offsets))])
+    return Check(
+        "phone_clock_offset_s",
+        WARN if abs(worst) > CLOCK_WARN_S else PASS,
+        worst,
+        CLOCK_WARN_S,
+        "the phone's clock and the video's are far apart: the log may belong to another recording",
     )

@@ -1,127 +1,285 @@
-"""`fit_session`: the one function that tables and commands call."""
+"""`fit_session` and `fit_sessions`: the functions that tables and commands call."""
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from pbl_pipeline.body import MarkerSet
+from pbl_pipeline.body._jacobian import table_positions
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.video import Camera
 
 from ._costs import distance_2d_px2, distance_3d_cm2
-from ._params import DEFAULT, PARAMSETS, params_of
-from ._problem import Session, make_session
-from ._problem import check_trial as _check_trial
+from ._gravity import upright
+from ._inputs import Session, Trial, make_session
+from ._inputs import check_trial as _check_trial
+from ._paper_objective import paper_objective as _paper_objective
+from ._params import DEFAULT, PARAMSETS, GaussNewtonParams, Params, params_of
 from ._quality import check_fit
+from ._rotation import matrices_of, quat_wxyz
 from ._types import SessionFit, TrialFit
-from .solvers import Solution, solve_implicit_adam
+from .solvers import Solution, solve_gauss_newton, solve_implicit_adam
 
-SOLVER = "implicit-adam"
-#: Every solver there is.
-SOLVERS = (SOLVER,)
 #: `LEVEL_CAMERA_R_NC` as a quaternion (w, x, y, z).
 LEVEL_CAMERA_QUAT_WXYZ = np.array([0.5, -0.5, 0.5, -0.5])
 
+#: Sessions solved at once on a GPU.
+BATCH = 64
+
+
+@dataclasses.dataclass(frozen=True)
+class SessionInput:
+    """One session for `fit_sessions`; fields as the arguments of `fit_session`."""
+
+    trials: Sequence[Trial]
+    names: Sequence[str]
+    camera_motion: str | Sequence[str] = "static"
+    markers: MarkerSet | None = None
+
 
 def fit_session(
-    trials: Sequence[Keypoints],
+    trials: Sequence[Trial],
     names: Sequence[str],
     paramset: Paramset | None = None,
     camera_motion: str | Sequence[str] = "static",
+    markers: MarkerSet | None = None,
 ) -> SessionFit:
     """Fit the body to all trials of one session; scale and marker offsets are shared.
 
     Parameters
     ----------
     trials, names
-        Keypoints of each trial and a name for each.
+        Trials of one kind and a name for each: `Keypoints` of one camera, `MultiView` of several calibrated cameras, or
+        `WorldMarkers` of a laboratory.
     paramset
         One of `PARAMSETS` or one of the same form (default: `DEFAULT`).
     camera_motion
-        "static" or "handheld", for all trials or each. Without phone orientation both are fitted with a level camera
-        that does not turn: angles between segments do not depend on it, pelvis angles and positions in the world do,
-        and a check says so.
+        "static" or "handheld", for all trials or each. The orientation of a handheld phone that was logged
+        (`Keypoints.phone_quat_wxyz`) is part of the fit, together with the offset between its clock and the video's;
+        that of a static one gives its tilt. Without a log the camera counts as one that does not turn, and level
+        unless the walk tells its tilt; a check says which.
+    markers
+        Where the markers sit on the body, for a set of the laboratory's own (`body.load_marker_set`).
 
     Raises
     ------
     PblError
-        FIT_INPUT, MARKER_SET_UNKNOWN, FIT_DIVERGED.
+        FIT_INPUT, MARKER_SET_UNKNOWN, PHONE_LOG, SOLVER_UNKNOWN, FIT_DIVERGED.
     """
-    begin = time.perf_counter()
+    result = fit_sessions([SessionInput(trials, names, camera_motion, markers)], paramset)[0]
+    if isinstance(result, PblError):
+        raise result
+    return result
+
+
+def fit_sessions(
+    sessions: Sequence[SessionInput], paramset: Paramset | None = None, batch: int | None = None
+) -> list[SessionFit | PblError]:
+    """Fit many sessions; those packed to the same sizes go through the device together, with the same results.
+
+    A session that cannot be fitted gives its `PblError` in its place. `batch`: most sessions at once (default: `BATCH`
+    on a GPU, 1 on a CPU, which gains nothing by it); `implicit-adam` takes one at a time.
+
+    Raises
+    ------
+    PblError
+        SOLVER_UNKNOWN.
+    """
     paramset = paramset or PARAMSETS[DEFAULT]
     params = params_of(paramset)
-    motions = [camera_motion] * len(trials) if isinstance(camera_motion, str) else list(camera_motion)
-    session = make_session(trials, names, params.view)
-    solution = solve_implicit_adam(session, params)
-    if not np.all(np.isfinite(solution.qpos)):
+    out: list[SessionFit | PblError | None] = [None] * len(sessions)
+    groups: dict[tuple, list[tuple[int, Session, float]]] = {}
+    for i, given in enumerate(sessions):
+        begin = time.perf_counter()
+        try:
+            session = make_session(given.trials, given.names, params.view, _motions(given), given.markers)
+        except PblError as error:
+            out[i] = error
+            continue
+        shapes = tuple(a.shape for a in jax.tree.leaves(session.obs))
+        key = (shapes, session.moving, type(session.trials[0]))
+        groups.setdefault(key, []).append((i, session, time.perf_counter() - begin))
+    if batch is None:
+        batch = 1 if jax.default_backend() == "cpu" else BATCH
+    for members in groups.values():
+        for k in range(0, len(members), batch):
+            part = members[k : k + batch]
+            solutions = _solve([s for _, s, _ in part], params)
+            for (i, session, packing), solution in zip(part, solutions, strict=True):
+                try:
+                    out[i] = _session_fit(session, solution, paramset, _motions(sessions[i]), packing)
+                except PblError as error:
+                    out[i] = error
+    return [r for r in out if r is not None]
+
+
+def _motions(given: SessionInput) -> list[str]:
+    motion = given.camera_motion
+    return [motion] * len(given.trials) if isinstance(motion, str) else list(motion)
+
+
+def _solve(sessions: Sequence[Session], params: Params) -> list[Solution]:
+    if isinstance(params, GaussNewtonParams):
+        return solve_gauss_newton(sessions, params)
+    return [solve_implicit_adam(s, params) for s in sessions]
+
+
+def check_trial(
+    trial: Trial, name: str, paramset: Paramset | None = None, markers: MarkerSet | None = None
+) -> tuple[np.ndarray, float]:
+    """Which frames (T,) bool of a trial the fit would use, and the share of frames with the whole person in view.
+
+    Raises `PblError` FIT_INPUT or MARKER_SET_UNKNOWN where the trial cannot be fitted.
+    """
+    return _check_trial(trial, name, params_of(paramset or PARAMSETS[DEFAULT]).view, markers)
+
+
+def paper_objective(fit: SessionFit, trials: Sequence[Trial], markers: MarkerSet | None = None) -> float:
+    """The paper's own total (section Model Fitting) of a session fit, whatever the fit itself minimised."""
+    view = params_of(PARAMSETS["paper-2025"]).view
+    motions = [t.camera_motion for t in fit.trials]
+    session = make_session(trials, [t.name for t in fit.trials], view, motions, markers)
+    qpos = np.zeros((session.obs.weight.shape[0], len(session.body.joint_names)))
+    R_nc = np.array(session.obs.R_nc, np.float64)
+    for i, trial in enumerate(fit.trials):
+        qpos[session.frames(i)] = trial.qpos
+        if isinstance(trials[i], Keypoints):
+            R_nc[session.frames(i), 0] = matrices_of(trial.phone_quat_wxyz)
+    overall = fit.scale[0] - 1
+    s = np.concatenate([[overall], fit.scale[1:] - 1 - overall])
+    return _paper_objective(session, qpos, R_nc, s, fit.site_offset_m)
+
+
+def _session_fit(
+    session: Session, solution: Solution, paramset: Paramset, motions: Sequence[str], packing: float
+) -> SessionFit:
+    begin = time.perf_counter()
+    used = np.asarray(session.obs.weight) > 0
+    if not np.all(np.isfinite(solution.qpos[used])) or not np.all(np.isfinite(solution.scale)):
         raise PblError(
             "FIT_DIVERGED",
             found="joint angles that are not finite",
             expected="finite angles",
             next_step="check the keypoints and the camera matrix",
+            key=", ".join(session.names),
         )
-    seconds = time.perf_counter() - begin
-    fits = tuple(_trial_fit(session, i, solution, paramset, motions[i], seconds) for i in range(len(trials)))
+    solution, sources = upright(session, solution)
+    seconds = packing + solution.seconds + time.perf_counter() - begin
+    residuals = _residuals(session, solution)
+    fits = tuple(
+        _trial_fit(session, i, solution, residuals, sources[i], paramset, motions[i], seconds)
+        for i in range(len(session.trials))
+    )
     return SessionFit(
         trials=fits,
         scale=solution.scale,
         site_offset_m=solution.site_offset_m,
         loss_trace=solution.loss_trace,
-        solver=SOLVER,
+        iterations=solution.iterations,
+        converged=solution.converged,
+        solver=str(paramset.params["solver"]),
         params_hash=paramset.hash,
         seconds=seconds,
         compile_seconds=solution.compile_seconds,
         device=str(jax.devices()[0].device_kind),
-        qc=check_fit(session, fits, solution.scale, solution.loss_trace),
+        qc=check_fit(session, fits, solution),
     )
 
 
-def check_trial(keypoints: Keypoints, name: str, paramset: Paramset | None = None) -> tuple[np.ndarray, float]:
-    """Which frames (T,) bool of a trial the fit would use, and the share of frames with the whole person in view.
+@dataclasses.dataclass(frozen=True)
+class _Residuals:
+    """On the packed frames, without padded markers: x_world_m (F, J, 3); px (F, J) mean over views; m (F, J)."""
 
-    Raises `PblError` FIT_INPUT or MARKER_SET_UNKNOWN where the trial cannot be fitted.
-    """
-    return _check_trial(keypoints, name, params_of(paramset or PARAMSETS[DEFAULT]).view)
+    x_world_m: np.ndarray
+    px: np.ndarray
+    m: np.ndarray
+
+
+def _residuals(session: Session, solution: Solution) -> _Residuals:
+    obs, j = session.obs, len(session.markers)
+    f32 = lambda a: jnp.asarray(a, jnp.float32)  # noqa: E731
+    offset = np.zeros((session.table.weight.shape[0], 3))
+    offset[:j] = solution.site_offset_m
+    x = _positions(session.body, session.table, f32(solution.qpos), f32(solution.scale), f32(offset))
+    c_2d, c_3d, c_world = (np.asarray(c) for c in (obs.c_2d, obs.c_3d, obs.c_world))
+    px = m = np.full((len(x), j), np.nan)
+    if np.any(c_2d > 0):
+        R = f32(solution.R_nc)
+        e = np.sqrt(np.asarray(distance_2d_px2(x[:, None] - obs.p_nc[:, :, None], obs.xy_px, R, obs.camera_matrix)))
+        px = _mean_seen(e, c_2d)[:, :j]
+    if np.any(c_3d > 0):
+        e2 = distance_3d_cm2(x[:, None], obs.x_cam, f32(solution.R_nc), obs.c_3d, session.table.weight_3d)
+        m = 0.01 * _mean_seen(np.sqrt(np.asarray(e2)), c_3d)[:, :j]
+    if np.any(c_world > 0):
+        e = np.linalg.norm(np.asarray(x) - np.asarray(obs.x_world), axis=-1)
+        m = np.where(c_world > 0, e, np.nan)[:, :j]
+    return _Residuals(np.asarray(x, np.float64)[:, :j], px, m)
+
+
+_positions = jax.jit(table_positions, static_argnames="body")
+
+
+def _mean_seen(e: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Mean over views (axis 1) of those that saw a marker, NaN where none did."""
+    seen = c > 0
+    count = seen.sum(axis=1)
+    return np.where(count > 0, np.sum(np.where(seen, e, 0.0), axis=1) / np.maximum(count, 1), np.nan)
 
 
 def _trial_fit(
-    session: Session, i: int, solution: Solution, paramset: Paramset, camera_motion: str, seconds: float
+    session: Session,
+    i: int,
+    solution: Solution,
+    residuals: _Residuals,
+    source: str,
+    paramset: Paramset,
+    camera_motion: str,
+    seconds: float,
 ) -> TrialFit:
-    keypoints, used, obs = session.trials[i], session.used[i], session.obs
-    n = len(keypoints.time_s)
-    qpos = solution.qpos[i]
-    body, markers = session.model.body, session.model.markers
-    x = session.model.positions(qpos, solution.scale, solution.site_offset_m)
-    R_nc, matrix = obs.R_nc[i][None], obs.camera_matrix[i][None]
-    weight_3d = np.asarray(markers.weight_3d, np.float32)
-    residual_3d = 0.01 * np.sqrt(np.asarray(distance_3d_cm2(x, obs.x_cam[i], R_nc, obs.c[i], weight_3d)))[:n]
-    residual_2d = np.sqrt(np.asarray(distance_2d_px2(x, obs.xy_px[i], R_nc, matrix)))[:n]
-    seen = np.asarray(obs.c[i])[:n] > 0
-    hide = ~used[:, None]
+    trial, arrays, at = session.trials[i], session.arrays[i], session.frames(i)
+    hide = ~arrays.used[:, None]
+    n, q = len(arrays.time_s), solution.qpos.shape[1]
+    sd = np.full((n, q), np.nan) if solution.qpos_sd is None else solution.qpos_sd[at]
+    view = trial.views[0] if isinstance(trial, MultiView) else trial
+    camera = view.camera if isinstance(view, Keypoints) else NO_CAMERA
+    size = view.image_size_px if isinstance(view, Keypoints) else (0, 0)
+    has_camera = not isinstance(trial, WorldMarkers)
+    moves = arrays.phone_time_s is not None and solution.qpos_sd is not None
     return TrialFit(
         name=session.names[i],
-        time_s=keypoints.time_s,
-        joint_names=tuple(body.joint_names),
-        qpos=np.where(hide, np.nan, qpos[:n]),
-        qpos_sd=np.full((n, qpos.shape[1]), np.nan),
-        marker_set=markers.name,
-        marker_names=tuple(markers.names),
-        markers_world_m=np.where(hide[..., None], np.nan, np.asarray(x)[:n]),
-        phone_quat_wxyz=np.tile(LEVEL_CAMERA_QUAT_WXYZ, (n, 1)),
+        time_s=trial.time_s,
+        joint_names=tuple(session.body.joint_names),
+        qpos=np.where(hide, np.nan, solution.qpos[at]),
+        qpos_sd=np.where(hide, np.nan, sd),
+        marker_set=session.markers.name,
+        marker_names=tuple(session.markers.names),
+        markers_world_m=np.where(hide[..., None], np.nan, residuals.x_world_m[at]),
+        phone_quat_wxyz=quat_wxyz(solution.R_nc[at, 0]) if has_camera else np.full((n, 4), np.nan),
         scale=solution.scale,
         site_offset_m=solution.site_offset_m,
-        residual_2d_px=np.where(seen, residual_2d, np.nan),
-        residual_3d_m=np.where(seen, residual_3d, np.nan),
-        camera=keypoints.camera,
-        image_size_px=keypoints.image_size_px,
+        residual_2d_px=np.where(hide, np.nan, residuals.px[at]),
+        residual_3d_m=np.where(hide, np.nan, residuals.m[at]),
+        camera=camera,
+        image_size_px=size,
         camera_motion=camera_motion,
-        solver=SOLVER,
+        camera_position_m=arrays.p_nc[0, 0] if has_camera else np.full(3, np.nan),
+        orientation_source=source,
+        phone_clock_offset_s=float(solution.clock_s[i]) if moves else float("nan"),
+        solver=str(paramset.params["solver"]),
         params_hash=paramset.hash,
-        body_sha256=body.sha256,
+        body_sha256=session.body.sha256,
         loss=float(solution.loss_trace[-1, 1]),
         seconds=seconds,
     )
+
+
+#: Stands for the camera of a trial that has none.
+NO_CAMERA = Camera(np.full((3, 3), np.nan), np.full(5, np.nan), "none: laboratory markers")

@@ -1,15 +1,22 @@
-"""The implicit trajectory: a network from time to pose (the paper, section Implicit Representation)."""
+"""The implicit trajectory: a network from time to pose and camera (the paper, section Implicit Representation)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
+
+#: The time encoding is padded to a multiple of this many frequencies: trials of like duration share a program.
+FREQUENCY_BUCKET = 8
+#: Small output weights: the trajectory starts nearly constant at its bias, the start pose.
+FINAL_SCALE = 0.1
+
+#: One network per trial: for each layer weights (N, inputs, outputs) and biases (N, outputs).
+Networks = list[tuple[Array, Array]]
 
 
 def frequencies(duration_s: float, max_frequency_rad_s: float, pairs_per_octave: int) -> np.ndarray:
@@ -20,39 +27,49 @@ def frequencies(duration_s: float, max_frequency_rad_s: float, pairs_per_octave:
     return lowest * 2.0 ** (k / pairs_per_octave)
 
 
-class ImplicitTrajectory(eqx.Module):
-    """Multi-layer perceptron on a sinusoidal encoding of time; the encoding also enters the first `n_skip` layers.
+def encode(time_s: np.ndarray, omega_rad_s: np.ndarray) -> np.ndarray:
+    """(..., 2 K) sines and cosines of times (...); K is the number of frequencies, padded with columns of 0."""
+    phase = np.asarray(time_s)[..., None] * omega_rad_s
+    pad = [(0, 0)] * (phase.ndim - 1) + [(0, -len(omega_rad_s) % FREQUENCY_BUCKET)]
+    return np.concatenate([np.pad(np.sin(phase), pad), np.pad(np.cos(phase), pad)], axis=-1)
 
-    Output: 40 numbers per time, before the joint limits are applied (`pose_of`).
+
+def initial_networks(
+    seed: int, n_trials: int, n_frequency: int, hidden: Sequence[int], n_skip: int, n_out: int
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Random networks, one per trial; a trial's does not depend on how many there are.
+
+    Weights and biases are uniform within 1 / sqrt(inputs), as usual for such layers; the last layer's weights are
+    small and its biases 0. The encoding enters the first layer and, beside its output, the next `n_skip`.
     """
+    n_code = 2 * n_frequency
+    n_padded = 2 * (n_frequency + -n_frequency % FREQUENCY_BUCKET)
+    networks = []
+    for trial in range(n_trials):
+        rng = np.random.default_rng([seed, trial])
+        layers, width = [], 0
+        for i, out in enumerate([*hidden, n_out]):
+            coded = i <= n_skip and i < len(hidden)
+            bound = 1 / math.sqrt(width + n_code * coded)
+            weight = rng.uniform(-bound, bound, (width + n_padded * coded, out)).astype(np.float32)
+            bias = rng.uniform(-bound, bound, out).astype(np.float32)
+            last = i == len(hidden)
+            layers.append((weight * (FINAL_SCALE if last else 1), bias * (not last)))
+            width = out
+        networks.append(layers)
+    return [tuple(np.stack([net[i][k] for net in networks]) for k in (0, 1)) for i in range(len(hidden) + 1)]
 
-    layers: list[eqx.nn.Linear]
-    n_skip: int = eqx.field(static=True)
 
-    def __init__(
-        self, n_frequency: int, hidden: Sequence[int], n_skip: int, n_out: int, final_scale: float, *, key: PRNGKeyArray
-    ) -> None:
-        n_code = 2 * n_frequency
-        keys = jax.random.split(key, len(hidden) + 1)
-        layers, width = [], n_code
-        for i, (n, k) in enumerate(zip(hidden, keys[:-1], strict=True)):
-            extra = n_code if 0 < i <= n_skip else 0
-            layers.append(eqx.nn.Linear(width + extra, n, key=k))
-            width = n
-        last = eqx.nn.Linear(width, n_out, key=keys[-1])
-        # Small output weights: the trajectory starts nearly constant at its bias, the start pose.
-        last = eqx.tree_at(lambda m: (m.weight, m.bias), last, (last.weight * final_scale, jnp.zeros(n_out)))
-        self.layers, self.n_skip = [*layers, last], n_skip
-
-    def __call__(self, time_s: Float[Array, ""], omega_rad_s: Float[Array, " F"]) -> Float[Array, " 40"]:
-        phase = omega_rad_s * time_s
-        code = jnp.concatenate([jnp.sin(phase), jnp.cos(phase)])
-        x = code
-        for i, layer in enumerate(self.layers[:-1]):
-            if 0 < i <= self.n_skip:
-                x = jnp.concatenate([x, code])
-            x = jax.nn.relu(layer(x))
-        return self.layers[-1](x)
+def evaluate(networks: Networks, code: Float[Array, "N B C"]) -> Float[Array, "N B O"]:
+    """Outputs of each trial's network at its own encoded times, before the joint limits are applied (`pose_of`)."""
+    x = code[..., :0]
+    for i, (weight, bias) in enumerate(networks):
+        if weight.shape[1] > x.shape[-1]:
+            x = jnp.concatenate([x, code], axis=-1)
+        x = jnp.einsum("nbi,nio->nbo", x, weight, precision="highest") + bias[:, None]
+        if i < len(networks) - 1:
+            x = jax.nn.relu(x)
+    return x
 
 
 #: The pelvis angles have no limit in the body; the tanh needs one. Rotation gets a full turn either way so that no

@@ -21,7 +21,10 @@ class TrialFit:
     qpos_sd (T, 40), NaN where the solver gives none; marker_names (J,); markers_world_m (T, J, 3);
     phone_quat_wxyz (T, 4) camera to world; scale (8,) multipliers of the groups in `body.SCALE_NAMES` (1 = the
     unscaled body; a group's bodies have this scale, all others that of "overall"); site_offset_m (J, 3) in the
-    marker's body frame; residual_2d_px (T, J) and residual_3d_m (T, J), NaN where nothing was seen.
+    marker's body frame; residual_2d_px (T, J) and residual_3d_m (T, J), NaN where nothing was seen. Of several cameras
+    residual_2d_px is the mean over them, and camera, phone_quat_wxyz and camera_position_m (3,) are the first one's;
+    laboratory markers have none (NaN). phone_clock_offset_s: the sensor's clock minus the video's, NaN where not
+    estimated. orientation_source: where the world's vertical comes from.
     """
 
     name: str
@@ -40,6 +43,9 @@ class TrialFit:
     camera: Camera
     image_size_px: tuple[int, int]
     camera_motion: str  # "static" or "handheld"
+    camera_position_m: np.ndarray
+    orientation_source: str
+    phone_clock_offset_s: float
     solver: str
     params_hash: str
     body_sha256: str
@@ -66,9 +72,9 @@ class TrialFit:
         values = {k: data[k] for k in wanted}
         for k in ("joint_names", "marker_names"):
             values[k] = tuple(str(n) for n in values[k])
-        for k in ("name", "marker_set", "camera_motion", "solver", "params_hash", "body_sha256"):
+        for k in ("name", "marker_set", "camera_motion", "orientation_source", "solver", "params_hash", "body_sha256"):
             values[k] = str(values[k])
-        for k in ("loss", "seconds"):
+        for k in ("loss", "seconds", "phone_clock_offset_s"):
             values[k] = float(values[k])
         values["image_size_px"] = (int(data["image_size_px"][0]), int(data["image_size_px"][1]))
         camera = Camera(data["camera_matrix"], data["distortion"], str(data["camera_source"]))
@@ -83,6 +89,8 @@ class SessionFit:
     scale: np.ndarray
     site_offset_m: np.ndarray
     loss_trace: np.ndarray
+    iterations: int
+    converged: bool
     solver: str
     params_hash: str
     seconds: float
@@ -97,7 +105,7 @@ def _shapes(n: int, q: int, j: int) -> dict[str, tuple[int | None, ...]]:
     shapes |= dict.fromkeys(("residual_2d_px", "residual_3d_m"), (n, j))
     shapes |= {"time_s": (n,), "markers_world_m": (n, j, 3), "phone_quat_wxyz": (n, 4), "site_offset_m": (j, 3)}
     shapes |= {"scale": (None,), "image_size_px": (2,), "camera_matrix": (3, 3), "distortion": (5,)}
-    return shapes | {"loss": (), "seconds": ()}
+    return shapes | {"loss": (), "seconds": (), "camera_position_m": (3,), "phone_clock_offset_s": ()}
 
 
 def _format_error(found: str, expected: str) -> PblError:

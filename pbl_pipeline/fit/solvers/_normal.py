@@ -2,7 +2,7 @@
 
 The derivatives are written out (`body/_jacobian.py`): a frame's Hessian is a sum over its markers of small products, the
 3D term's centring adds three-dimensional corrections, and what all frames share borders the frames' blocks. Robust
-costs enter with their own curvature, which is that of Huber's function and never negative.
+costs enter as weighted squares (iteratively reweighted least squares).
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ class Weights:
     weight_2d: Float[Array, ""]
     weight_phone: Float[Array, ""]
     weight_offset_per_m2: Float[Array, ""]
+    depth_ratio: Float[Array, ""]
     huber_3d_cm: Float[Array, ""]
     huber_2d_px: Float[Array, ""]
     huber_phone_deg: Float[Array, ""]
@@ -85,20 +86,8 @@ _MIXER[:, 0] = 1.0
 
 def cost(body: Body, table: MarkerTable, obs: Observations, w: Weights, kinds: Kinds, state: State) -> Array:
     """The cost of a session: means over frames and markers, as the paper's, plus priors."""
-    x = table_positions(body, table, state.qpos, scale_multipliers(state.s), state.site_offset_m)
-    total = jnp.zeros(obs.weight.shape, x.dtype)
-    views = 1 / (obs.n_markers * obs.n_views)
-    if kinds.camera_2d:
-        e2 = costs.distance_2d_px2(_from_camera(x, obs), obs.xy_px, state.R_nc, obs.camera_matrix)
-        total += w.weight_2d * views * jnp.sum(costs.huber_of_square(e2, w.huber_2d_px) * obs.c_2d, axis=(-2, -1))
-    if kinds.camera_3d:
-        e2 = costs.distance_3d_cm2(x[:, None], obs.x_cam, state.R_nc, obs.c_3d, table.weight_3d)
-        c = obs.c_3d * table.weight_3d
-        total += w.weight_3d * views * jnp.sum(costs.huber_of_square(e2, w.huber_3d_cm) * c, axis=(-2, -1))
-    if kinds.world:
-        e2 = 1e4 * jnp.sum((x - obs.x_world) ** 2, axis=-1)
-        one = costs.huber_of_square(e2, w.huber_3d_cm) * obs.c_world * table.weight_3d
-        total += w.weight_3d * jnp.sum(one, axis=-1) / obs.n_markers
+    n = jnp.maximum(jnp.sum(obs.weight), 1.0)
+    total = marker_cost(body, table, obs, w, kinds, state)
     if kinds.moving:
         error, _ = _phone_error_deg(obs, state)
         total += w.weight_phone * costs.huber_of_square(jnp.sum(error**2, -1), w.huber_phone_deg) / w.huber_phone_deg
@@ -106,12 +95,43 @@ def cost(body: Body, table: MarkerTable, obs: Observations, w: Weights, kinds: K
     z2 = jnp.sum(((state.qpos - w.neutral) * w.inverse_sd) ** 2, axis=-1)
     total += 0.5 * w.weight_pose * z2
     bent = 0.5 * jnp.sum(costs.second_difference(state.qpos, obs.bend) ** 2 * w.smooth)
-    n = jnp.maximum(jnp.sum(obs.weight), 1.0)
     shared = w.weight_offset_per_m2 * costs.offset_m2(state.site_offset_m)
     shared += w.weight_scale * costs.scale_prior(state.s, w.scale_sd, w.scale_sides_sd)
     if kinds.moving:
         shared += 0.5 * jnp.sum((state.clock_s / w.clock_sd_s) ** 2) / n
     return (jnp.sum(total * obs.weight) + bent) / n + shared
+
+
+def marker_cost(
+    body: Body, table: MarkerTable, obs: Observations, w: Weights, kinds: Kinds, state: State
+) -> Float[Array, " F"]:
+    """Cost of the keypoints in each frame: means over markers and views."""
+    x = table_positions(body, table, state.qpos, scale_multipliers(state.s), state.site_offset_m)
+    total = jnp.zeros(obs.weight.shape, x.dtype)
+    views = 1 / (obs.n_markers * obs.n_views)
+    if kinds.camera_2d:
+        e2 = costs.distance_2d_px2(_from_camera(x, obs), obs.xy_px, state.R_nc, obs.camera_matrix)
+        total += w.weight_2d * views * jnp.sum(costs.huber_of_square(e2, w.huber_2d_px) * obs.c_2d, axis=(-2, -1))
+    if kinds.camera_3d:
+        e2 = costs.distance_3d_cm2(x[:, None], obs.x_cam, state.R_nc, obs.c_3d, table.weight_3d, w.depth_ratio)
+        c = obs.c_3d * table.weight_3d
+        total += w.weight_3d * views * jnp.sum(costs.huber_of_square(e2, w.huber_3d_cm) * c, axis=(-2, -1))
+    if kinds.world:
+        e2 = 1e4 * jnp.sum((x - obs.x_world) ** 2, axis=-1)
+        one = costs.huber_of_square(e2, w.huber_3d_cm) * obs.c_world * table.weight_3d
+        total += w.weight_3d * jnp.sum(one, axis=-1) / obs.n_markers
+    return total
+
+
+def dispersion(
+    body: Body, table: MarkerTable, obs: Observations, w: Weights, kinds: Kinds, state: State
+) -> Float[Array, ""]:
+    """Twice the keypoints' cost per observed number: what turns the cost's curvature into that of a log-likelihood."""
+    seen = lambda c: jnp.sum((c > 0) * obs.weight.reshape(-1, *[1] * (c.ndim - 1)))  # noqa: E731
+    numbers = 3 * seen(obs.c_3d) * kinds.camera_3d + 2 * seen(obs.c_2d) * kinds.camera_2d
+    numbers += 3 * seen(obs.c_world) * kinds.world
+    total = jnp.sum(marker_cost(body, table, obs, w, kinds, state) * obs.weight)
+    return 2 * total / jnp.maximum(numbers, 1.0)
 
 
 def _from_camera(x: Float[Array, "F J 3"], obs: Observations) -> Float[Array, "F V J 3"]:
@@ -188,15 +208,11 @@ def _cross_matrix(x: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
     return jnp.stack([zero, -c, b, c, zero, -a, -b, a, zero], axis=-1).reshape(*x.shape, 3)
 
 
-def _robust(e: Float[Array, "*n D"], width: Array) -> tuple[Float[Array, "*n"], Float[Array, "*n D D"]]:
-    """Weight w of the gradient w e of Huber's cost of a vector, and its curvature: flat along e beyond the width."""
+def _robust(e: Float[Array, "*n D"], width: Array) -> Float[Array, "*n"]:
+    """Weight w of the gradient w e of Huber's cost of a vector."""
     e2 = jnp.sum(e**2, axis=-1)
     far = e2 > width**2
-    length = jnp.sqrt(jnp.where(far, e2, 1.0))
-    weight = jnp.where(far, width / length, 1.0)
-    along = jnp.where(far[..., None], e / length[..., None], 0.0)
-    eye = jnp.eye(e.shape[-1], dtype=e.dtype)
-    return weight, weight[..., None, None] * (eye - along[..., :, None] * along[..., None, :])
+    return jnp.where(far, width / jnp.sqrt(jnp.where(far, e2, 1.0)), 1.0)
 
 
 def _marker_terms(body, table, obs, w, kinds, qpos, R_nc, state):
@@ -212,30 +228,30 @@ def _marker_terms(body, table, obs, w, kinds, qpos, R_nc, state):
     f = jnp.zeros_like(x)
     if kinds.world:
         e = 100 * (x - obs.x_world)
-        weight, curve = _robust(e, w.huber_3d_cm)
-        c = w.weight_3d * obs.c_world * table.weight_3d * count
-        f += 100 * (c * weight)[..., None] * e
-        M += 1e4 * c[..., None, None] * curve
+        c = w.weight_3d * obs.c_world * table.weight_3d * count * _robust(e, w.huber_3d_cm)
+        f += 100 * c[..., None] * e
+        M += 1e4 * c[..., None, None] * jnp.eye(3, dtype=x.dtype)
     if kinds.camera_2d:
         x_cam = jnp.einsum("fvji,fvmj->fvmi", R_nc, _from_camera(x, obs))
         e = costs.project_px(x_cam, obs.camera_matrix) - obs.xy_px
         D = jnp.einsum("fvmik,fvjk->fvmij", costs.project_jacobian(x_cam, obs.camera_matrix), R_nc)
-        weight, curve = _robust(e, w.huber_2d_px)
-        c = w.weight_2d * obs.c_2d * count[:, None] / obs.n_views
-        f += jnp.einsum("fvm,fvmij,fvmi->fmj", c * weight, D, e)
-        M += jnp.einsum("fvm,fvmik,fvmij,fvmjl->fmkl", c, D, curve, D)
+        c = w.weight_2d * obs.c_2d * count[:, None] / obs.n_views * _robust(e, w.huber_2d_px)
+        f += jnp.einsum("fvm,fvmij,fvmi->fmj", c, D, e)
+        M += jnp.einsum("fvm,fvmik,fvmil->fmkl", c, D, D)
     centred = []
     if kinds.camera_3d:
+        per_m = 100 * jnp.array([1.0, 1.0, 0.0]) + 100 * w.depth_ratio * jnp.array([0.0, 0.0, 1.0])
         for v in range(obs.c_3d.shape[1]):
             seen = jnp.where(obs.c_3d[:, v] > 0, table.weight_3d, 0.0)
             b = seen / jnp.maximum(jnp.sum(seen, axis=-1, keepdims=True), 1e-6)
-            detected = jnp.einsum("fij,fmj->fmi", R_nc[:, v], obs.x_cam[:, v])
-            e = 100 * (costs.center(x, seen) - costs.center(detected, seen))
-            weight, curve = _robust(e, w.huber_3d_cm)
-            c = w.weight_3d * obs.c_3d[:, v] * table.weight_3d * count / obs.n_views
-            force = 100 * (c * weight)[..., None] * e
+            # To the camera's axes, in cm, depth at its own weight.
+            T = jnp.swapaxes(R_nc[:, v], -1, -2) * per_m[:, None]
+            e = jnp.einsum("fij,fmj->fmi", T, costs.center(x, seen))
+            e -= costs.center(obs.x_cam[:, v], seen) * per_m
+            c = w.weight_3d * obs.c_3d[:, v] * table.weight_3d * count / obs.n_views * _robust(e, w.huber_3d_cm)
+            force = jnp.einsum("fm,fij,fmi->fmj", c, T, e)
             f += force - b[..., None] * jnp.sum(force, axis=1, keepdims=True)
-            W = 1e4 * c[..., None, None] * curve
+            W = c[..., None, None] * jnp.einsum("fik,fil->fkl", T, T)[:, None]
             M += W
             centred.append((b, W))
 
@@ -309,11 +325,10 @@ def _shared_terms(w, state, n, C, h):
 def _phone_terms(obs, w, state, H, g, B, C, h):
     """The phone's orientation: rotations of the camera (the last 3 unknowns of a frame) and the clocks."""
     error, rate = _phone_error_deg(obs, state)
-    weight, curve = _robust(error, w.huber_phone_deg)
-    c = w.weight_phone / w.huber_phone_deg * obs.weight * obs.has_phone[obs.trial]
+    c = w.weight_phone / w.huber_phone_deg * obs.weight * obs.has_phone[obs.trial] * _robust(error, w.huber_phone_deg)
     deg = 180 / jnp.pi
-    K = c[:, None, None] * curve * deg**2
-    force = (c * weight)[:, None] * error * deg
+    K = c[:, None, None] * deg**2 * jnp.eye(3, dtype=error.dtype)
+    force = c[:, None] * error * deg
     # A frame without orientation keeps its camera: one unit of curvature is enough to hold it.
     hold = 1e6 * (1 - obs.has_phone[obs.trial])[:, None, None] * jnp.eye(3)
     H = H.at[:, -3:, -3:].add(K + hold + 1e-3 * jnp.eye(3))

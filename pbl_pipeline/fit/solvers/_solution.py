@@ -5,15 +5,27 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from jaxtyping import Float
 
 
 @dataclasses.dataclass(frozen=True)
 class Solution:
-    """qpos (N, T, 40) on the padded frames; scale (8,) multipliers; site_offset_m (J, 3); loss_trace (K, 2)."""
+    """A fitted session: F packed frames (padding included), V views, J markers (without padding), N trials.
 
-    qpos: np.ndarray
-    scale: np.ndarray
-    site_offset_m: np.ndarray
-    loss_trace: np.ndarray
+    qpos in m and rad; R_nc: camera to world; s: the paper's scale parameters; scale: their multipliers; clock_s: sensor
+    time minus video time of each trial, 0 where not estimated; loss_trace: (step, loss) of K steps; qpos_sd: standard
+    deviations, None where the solver gives none.
+    """
+
+    qpos: Float[np.ndarray, "F 40"]
+    R_nc: Float[np.ndarray, "F V 3 3"]
+    s: Float[np.ndarray, " 8"]
+    scale: Float[np.ndarray, " 8"]
+    site_offset_m: Float[np.ndarray, "J 3"]
+    clock_s: Float[np.ndarray, " N"]
+    loss_trace: Float[np.ndarray, "K 2"]
     compile_seconds: float
     seconds: float
+    iterations: int
+    converged: bool
+    qpos_sd: Float[np.ndarray, "F 40"] | None = None

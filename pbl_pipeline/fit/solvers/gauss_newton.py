@@ -8,18 +8,29 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import time
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array
 
+from pbl_pipeline._jax_setup import compile_seconds
 from pbl_pipeline.body import Body
 from pbl_pipeline.body._jacobian import MarkerTable
 
+from .._inputs import Session
 from .._observations import Observations
-from ._arrow import Arrow, solve
-from ._normal import Kinds, State, Weights, cost, normal_equations
+from .._params import GaussNewtonParams
+from .._place import placed_poses
+from .._prior import prior_of
+from .._threads import one_blas_thread
+from ._arrow import Arrow, marginal_variance, solve
+from .._paper_objective import kinds_of
+from ._normal import Kinds, State, Weights, cost, dispersion, normal_equations, scale_multipliers
+from ._solution import Solution
 
 #: A step of a joint or camera is cut to this (rad; m for slides).
 LONGEST_STEP = 0.5
@@ -36,22 +47,30 @@ class Progress:
     damping: Array
     iteration: Array
     largest_step: Array
+    #: Steps in a row that gained next to nothing.
+    idle: Array
     converged: Array
     trace: Array
 
 
-@functools.partial(jax.jit, static_argnames=("body", "kinds", "max_iterations"))
-def iterate(
-    body: Body,
-    table: MarkerTable,
-    obs: Observations,
-    w: Weights,
-    kinds: Kinds,
-    start: State,
-    tolerance: Array,
-    max_iterations: int,
+#: Space for the cost of each iteration: the bound on their number.
+MOST_ITERATIONS = 200
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """When the iteration ends (`GaussNewtonParams`), as data."""
+
+    tolerance_rad: Array
+    tolerance_cost: Array
+    max_iterations: Array
+
+
+def minimise(
+    body: Body, kinds: Kinds, table: MarkerTable, obs: Observations, w: Weights, start: State, limits: Limits
 ) -> Progress:
-    """Minimise `cost` from `start`; at most `max_iterations` steps, fewer once a step is below `tolerance`."""
+    """Minimise `cost` from `start`."""
     arguments = (body, table, obs, w, kinds)
 
     def step(p: Progress) -> Progress:
@@ -65,13 +84,15 @@ def iterate(
         keep = lambda new, old: jnp.where(accepted, new, old)  # noqa: E731
         size = jnp.max(jnp.abs(dx) * obs.weight[:, None])
         damping = jnp.where(accepted, p.damping / 10, p.damping * 10)
+        idle = jnp.where(accepted & (p.cost - value > limits.tolerance_cost * p.cost), 0, p.idle + 1)
         return Progress(
             state=jax.tree.map(keep, state, p.state),
             cost=keep(value, p.cost),
             damping=jnp.clip(damping, DAMPING_LEAST, DAMPING_MOST),
             iteration=p.iteration + 1,
             largest_step=keep(size, p.largest_step),
-            converged=(accepted & (size < tolerance)) | (p.damping >= DAMPING_MOST),
+            idle=idle,
+            converged=(accepted & (size < limits.tolerance_rad)) | (idle >= 2),
             trace=p.trace.at[p.iteration].set(keep(value, p.cost)),
         )
 
@@ -81,10 +102,42 @@ def iterate(
         damping=jnp.asarray(DAMPING_START),
         iteration=jnp.asarray(0),
         largest_step=jnp.asarray(jnp.inf),
+        idle=jnp.asarray(0),
         converged=jnp.asarray(False),
-        trace=jnp.full(max_iterations, jnp.nan),
+        trace=jnp.full(MOST_ITERATIONS, jnp.nan),
     )
-    return jax.lax.while_loop(lambda p: ~p.converged & (p.iteration < max_iterations), step, first)
+    most = jnp.minimum(limits.max_iterations, MOST_ITERATIONS)
+    return jax.lax.while_loop(lambda p: ~p.converged & (p.iteration < most), step, first)
+
+
+def _variance(
+    body: Body, kinds: Kinds, table: MarkerTable, obs: Observations, w: Weights, state: State
+) -> Array:
+    """Variances (F, 40) of qpos as far as the residuals tell: dispersion times the inverse curvature's diagonal."""
+    matrix, _, _ = normal_equations(body, table, obs, w, kinds, state)
+    own = jnp.diagonal(matrix.diagonal, axis1=-2, axis2=-1)
+    # What nothing holds gets a variance that is large, not infinite.
+    least = 1e-6 * jnp.max(own)
+    held = matrix.diagonal + least * jnp.eye(own.shape[-1], dtype=own.dtype)
+    corner = matrix.corner + 1e-6 * jnp.max(jnp.diagonal(matrix.corner)) * jnp.eye(matrix.corner.shape[0])
+    variance, _ = marginal_variance(dataclasses.replace(matrix, diagonal=held, corner=corner))
+    return variance[:, :40] * dispersion(body, table, obs, w, kinds, state)
+
+
+_minimise_one = jax.jit(minimise, static_argnames=("body", "kinds"))
+_variance_one = jax.jit(_variance, static_argnames=("body", "kinds"))
+
+
+@functools.partial(jax.jit, static_argnames=("body", "kinds"))
+def _minimise_many(body, kinds, table, obs, w, start, limits):
+    return jax.vmap(functools.partial(minimise, body, kinds), in_axes=(0, 0, None, 0, None))(
+        table, obs, w, start, limits
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("body", "kinds"))
+def _variance_many(body, kinds, table, obs, w, state):
+    return jax.vmap(functools.partial(_variance, body, kinds), in_axes=(0, 0, None, 0))(table, obs, w, state)
 
 
 def _damped(matrix: Arrow, damping: Array) -> Arrow:
@@ -113,3 +166,139 @@ def _moved(state: State, dx: Array, dy: Array, kinds: Kinds) -> State:
         site_offset_m=state.site_offset_m + dy[8:k].reshape(-1, 3),
         clock_s=clock,
     )
+
+
+def solve_gauss_newton(sessions: Sequence[Session], params: GaussNewtonParams) -> list[Solution]:
+    """Fit sessions that are packed to the same sizes: one as it is, several at once on the device.
+
+    The result does not depend on which sessions are fitted together. A session whose result is suspicious is solved
+    again from a start that faces the other way, and the better one of the two is kept.
+    """
+    begin, compiled = time.perf_counter(), compile_seconds()
+    found = _solve(sessions, params, flip=False)
+    again = [i for i, s in enumerate(found) if suspicious(sessions[i], s)]
+    if again:
+        for i, other in zip(again, _solve([sessions[i] for i in again], params, flip=True), strict=True):
+            if other.loss_trace[-1, 1] < found[i].loss_trace[-1, 1]:
+                found[i] = other
+    seconds = (time.perf_counter() - begin) / len(sessions)
+    compiled = (compile_seconds() - compiled) / len(sessions)
+    return [dataclasses.replace(s, seconds=seconds, compile_seconds=compiled) for s in found]
+
+
+def _solve(sessions: Sequence[Session], params: GaussNewtonParams, flip: bool) -> list[Solution]:
+    body, kinds = sessions[0].body, kinds_of(sessions[0])
+    w, limits = weights_of(sessions[0], params), limits_of(params)
+    starts = [start_of(s, flip) for s in sessions]
+    with one_blas_thread():
+        if len(sessions) == 1:
+            one = (sessions[0].table, sessions[0].obs, w)
+            progress = _minimise_one(body, kinds, *one, starts[0], limits)
+            variance = _variance_one(body, kinds, *one, progress.state)
+            results = [(jax.device_get(progress), np.asarray(variance))]
+        else:
+            stack = lambda *a: jnp.stack(a)  # noqa: E731
+            table = jax.tree.map(stack, *[s.table for s in sessions])
+            obs = jax.tree.map(stack, *[s.obs for s in sessions])
+            start = jax.tree.map(stack, *starts)
+            progress = _minimise_many(body, kinds, table, obs, w, start, limits)
+            variance = np.asarray(_variance_many(body, kinds, table, obs, w, progress.state))
+            host = jax.device_get(progress)
+            results = [(jax.tree.map(lambda a, i=i: a[i], host), variance[i]) for i in range(len(sessions))]
+    factors = sd_factors(sessions[0].body.joint_names, params.sd_factor)
+    return [_solution(s, p, v, factors) for s, (p, v) in zip(sessions, results, strict=True)]
+
+
+def _solution(session: Session, p: Progress, variance: np.ndarray, factors: np.ndarray) -> Solution:
+    n = int(p.iteration)
+    trace = np.stack([np.arange(1, n + 1), np.asarray(p.trace)[:n]], axis=1).astype(np.float64)
+    return Solution(
+        qpos=np.asarray(p.state.qpos, np.float64),
+        R_nc=np.asarray(p.state.R_nc, np.float64),
+        s=np.asarray(p.state.s, np.float64),
+        scale=np.asarray(scale_multipliers(jnp.asarray(p.state.s)), np.float64),
+        site_offset_m=np.asarray(p.state.site_offset_m, np.float64)[: len(session.markers)],
+        clock_s=np.asarray(p.state.clock_s, np.float64)[: len(session.arrays)],
+        loss_trace=trace,
+        compile_seconds=0.0,
+        seconds=0.0,
+        iterations=n,
+        converged=bool(p.converged),
+        qpos_sd=np.sqrt(np.maximum(variance, 0.0)) * factors,
+    )
+
+
+def limits_of(params: GaussNewtonParams) -> Limits:
+    """When to end, on the device."""
+    return Limits(
+        jnp.asarray(params.tolerance_rad, jnp.float32),
+        jnp.asarray(params.tolerance_cost, jnp.float32),
+        jnp.asarray(params.max_iterations, jnp.int32),
+    )
+
+
+def weights_of(session: Session, params: GaussNewtonParams) -> Weights:
+    """The paramset's numbers on the device."""
+    names, c = session.body.joint_names, params.cost
+    low, high = np.asarray(session.body.joint_range_rad).T
+    slide = np.array([n in ("pelvis_tx", "pelvis_ty", "pelvis_tz") for n in names])
+    neutral, inverse_sd = prior_of(names, c.pose_prior_deg)
+    values = {
+        "weight_3d": c.weight_3d,
+        "weight_2d": c.weight_2d,
+        "weight_phone": c.weight_phone,
+        "weight_offset_per_m2": c.weight_offset_per_m2,
+        "depth_ratio": c.depth_ratio,
+        "huber_3d_cm": c.huber_3d_cm,
+        "huber_2d_px": c.huber_2d_px,
+        "huber_phone_deg": params.huber_phone_deg,
+        "weight_limit": params.weight_limit_per_deg2,
+        "weight_pose": c.weight_pose,
+        "weight_scale": c.weight_scale,
+        "scale_sd": c.scale_sd,
+        "scale_sides_sd": c.scale_sides_sd,
+        "clock_sd_s": params.clock_sd_s,
+        "neutral": neutral,
+        "inverse_sd": inverse_sd,
+        "smooth": np.where(slide, params.smooth_per_m2, params.smooth_per_rad2),
+        "low": low,
+        "high": high,
+    }
+    return Weights(**{k: jnp.asarray(v, jnp.float32) for k, v in values.items()})
+
+
+def start_of(session: Session, flip: bool = False) -> State:
+    """The standing body placed by the keypoints, unscaled."""
+    obs = session.obs
+    qpos = np.concatenate([placed_poses(session, i, flip) for i in range(len(session.arrays))])
+    qpos = np.pad(qpos, [(0, obs.weight.shape[0] - len(qpos)), (0, 0)], mode="edge")
+    return State(
+        qpos=jnp.asarray(qpos, jnp.float32),
+        R_nc=obs.R_nc,
+        s=jnp.zeros(8),
+        site_offset_m=jnp.zeros((obs.c_world.shape[1], 3)),
+        clock_s=jnp.zeros(obs.has_phone.shape[0]),
+    )
+
+
+def sd_factors(joint_names: Sequence[str], sd_factor: Sequence[tuple[str, float]]) -> np.ndarray:
+    """(40,) factors of `qpos_sd`; a name stands for every joint that begins with it, 1 where none does."""
+    out = np.ones(len(joint_names))
+    for prefix, factor in sd_factor:
+        out[[n.startswith(prefix) for n in joint_names]] = factor
+    return out
+
+
+#: A knee or elbow that bends backwards in more than this share of the frames faces the wrong way.
+BACKWARDS_SHARE = 0.2
+
+
+def suspicious(session: Session, solution: Solution) -> bool:
+    """Whether a hinge with one direction stays at its straight end: what a body turned the wrong way round does."""
+    used = np.asarray(session.obs.weight) > 0
+    low, high = np.asarray(session.body.joint_range_rad).T
+    share = []
+    for name in ("knee_angle_r", "knee_angle_l"):
+        i = session.body.joint_names.index(name)
+        share.append(np.mean(solution.qpos[used, i] > high[i] - np.deg2rad(1.0)))
+    return bool(np.mean(share) > BACKWARDS_SHARE)
