@@ -37,6 +37,7 @@ class MarkerWeights:
     weight_2d: Float[ArrayLike, ""]
     huber_3d_cm: Float[ArrayLike, ""]
     huber_2d_px: Float[ArrayLike, ""]
+    depth_ratio: Float[ArrayLike, ""]
 
     @classmethod
     def of(cls, cost: CostParams) -> MarkerWeights:
@@ -45,7 +46,7 @@ class MarkerWeights:
 
 
 #: The paper's own (section Total loss and optimization), whatever the defaults of `CostParams` are.
-PAPER_WEIGHTS = MarkerWeights(*np.float32([1.0, 0.1, 10.0, 5.0]))
+PAPER_WEIGHTS = MarkerWeights(*np.float32([1.0, 0.1, 10.0, 5.0, 1.0]))
 PAPER_WEIGHT_PHONE, PAPER_WEIGHT_OFFSET_PER_M2 = 1.0, 100.0
 
 
@@ -70,20 +71,29 @@ def marker_cost(
     """
     total = jnp.zeros(x_world.shape[0], x_world.dtype)
     each = 1 / (obs.n_markers * obs.n_views)
-    if kinds.camera_3d:
-        e2 = costs.distance_3d_cm2(x_world[:, None], obs.x_cam, R_nc, obs.c_3d, table.weight_3d)
-        e = costs.huber_of_square(e2, w.huber_3d_cm) * obs.c_3d * table.weight_3d
-        total += w.weight_3d * each * jnp.sum(e, axis=(-2, -1))
-    if kinds.camera_2d:
-        from_camera = x_world[:, None] - obs.p_nc[:, :, None]
-        e2 = costs.distance_2d_px2(from_camera, obs.xy_px, R_nc, obs.camera_matrix)
-        e = costs.huber_of_square(e2, w.huber_2d_px) * obs.c_2d
-        total += w.weight_2d * each * jnp.sum(e, axis=(-2, -1))
+    if kinds.camera_3d or kinds.camera_2d:
+        x_cam = _to_camera(R_nc, x_world[:, None] - obs.p_nc[:, :, None])
+        if kinds.camera_3d:
+            # Both are compared in the camera's axes: a distance is the same in all, and one turn serves both terms.
+            weight = jnp.where(obs.c_3d > 0, table.weight_3d, 0.0)
+            delta = costs.center(x_cam, weight) - costs.center(obs.x_cam, weight)
+            e2 = 1e4 * jnp.sum((delta * jnp.stack([1.0, 1.0, w.depth_ratio])) ** 2, axis=-1)
+            e = costs.huber_of_square(e2, w.huber_3d_cm) * obs.c_3d * table.weight_3d
+            total += w.weight_3d * each * jnp.sum(e, axis=(-2, -1))
+        if kinds.camera_2d:
+            e2 = jnp.sum((costs.project_px(x_cam, obs.camera_matrix) - obs.xy_px) ** 2, axis=-1)
+            e = costs.huber_of_square(e2, w.huber_2d_px) * obs.c_2d
+            total += w.weight_2d * each * jnp.sum(e, axis=(-2, -1))
     if kinds.world:
         e2 = 1e4 * jnp.sum((x_world - obs.x_world) ** 2, axis=-1)
         e = costs.huber_of_square(e2, w.huber_3d_cm) * obs.c_world * table.weight_3d
         total += w.weight_3d * jnp.sum(e, axis=-1) / obs.n_markers
     return total
+
+
+def _to_camera(R_nc: Float[Array, "M V 3 3"], x: Float[Array, "M V J 3"]) -> Float[Array, "M V J 3"]:
+    """Inverse rotation, written out: a matrix product of this size is slow and, on GPUs, rounded to ten bits."""
+    return sum(R_nc[:, :, None, k] * x[..., k, None] for k in range(3))  # type: ignore[return-value]
 
 
 def angle_between_deg(a: Float[Array, "*n 4"], b: Float[Array, "*n 4"]) -> Float[Array, "*n"]:

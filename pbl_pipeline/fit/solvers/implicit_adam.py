@@ -106,6 +106,7 @@ class _Static(NamedTuple):
     body: Body
     kinds: Kinds
     samples: int
+    priors: bool
     #: The unknowns' leaves are slices of one vector: where each begins and its shape, networks first.
     shapes: tuple[tuple[int, ...], ...]
 
@@ -121,7 +122,8 @@ def solve_implicit_adam(session: Session, params: ImplicitAdamParams) -> Solutio
     begin = time.perf_counter()
     data, unknowns = _initialise(session, params)
     numbers = _numbers(session.body, params)
-    static = _Static(session.body, kinds_of(session), params.samples_per_trial, _shapes(unknowns))
+    priors = params.cost.weight_pose > 0 or params.cost.weight_scale > 0
+    static = _Static(session.body, kinds_of(session), params.samples_per_trial, priors, _shapes(unknowns))
     flat = jnp.concatenate([jnp.ravel(a) for a in jax.tree.leaves(unknowns)])
     carry = (flat, jnp.zeros_like(flat), jnp.zeros_like(flat))
     key = jax.random.key(params.seed + 1)
@@ -285,7 +287,8 @@ def _loss(
     R_nc = seen.R_nc
     per_sample = jnp.repeat(d.share / b, b, total_repeat_length=n * b)
     shared = w.weight_offset_per_m2 * costs.offset_m2(unknowns.site_offset_m)
-    shared += w.weight_scale * costs.scale_prior(unknowns.s, w.scale_sd, w.scale_sides_sd)
+    if static.priors:
+        shared += w.weight_scale * costs.scale_prior(unknowns.s, w.scale_sd, w.scale_sides_sd)
     if kinds.moving:
         turn = jaxlie.SO3.exp(raw[..., 40:])
         own = jaxlie.SO3(turn.wxyz[:, :b]).as_matrix().reshape(n * b, 1, 3, 3)
@@ -294,9 +297,10 @@ def _loss(
         off = angle_between_deg(turn.wxyz[:, b:], d.phone_quat_wxyz.at[phone_rows].get(mode="promise_in_bounds"))
         shared += w.weight_phone * jnp.sum(off * (d.share * (d.phone_count > 0) / b)[:, None])
     scale = scale_multipliers(unknowns.s)
-    x = chained_markers(static.body, d.table, qpos, scale, unknowns.site_offset_m)
+    x = jnp.moveaxis(chained_markers(static.body, d.table, qpos, scale, unknowns.site_offset_m), -1, 0)
     total = marker_cost(x, seen, R_nc, d.table, w.markers, kinds)
-    total += 0.5 * w.weight_pose * jnp.sum(((qpos - w.neutral) * w.inverse_sd) ** 2, axis=-1)
+    if static.priors:
+        total += 0.5 * w.weight_pose * jnp.sum(((qpos - w.neutral) * w.inverse_sd) ** 2, axis=-1)
     return jnp.sum(total * per_sample) + shared
 
 
