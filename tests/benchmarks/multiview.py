@@ -39,8 +39,8 @@ CALIBRATION = FOLDER / "Calib_scene.toml"
 #: Key in the .npz, stem of the video, and the camera in the calibration.
 CAMERAS = {f"cam0{i}": f"int_cam0{i}_img" for i in (1, 2, 3, 4)}
 REFERENCES = {
-    "OpenSim, 43 augmented markers": "S00_P00_T01_BalancingTrial_filt_butterworth_0-100_LSTM.mot",
-    "OpenSim, the 21 points": "S00_P00_T01_BalancingTrial_filt_butterworth_0-100_body25b.mot",
+    "43 augmented markers": "S00_P00_T01_BalancingTrial_filt_butterworth_0-100_LSTM.mot",
+    "the 21 points": "S00_P00_T01_BalancingTrial_filt_butterworth_0-100_body25b.mot",
 }
 #: As calibrated; the first two videos are 8 px narrower, cut at the right or by an encoder.
 IMAGE_SIZE_PX = (1088, 1920)
@@ -123,7 +123,7 @@ def _angles_relative(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 def _print_agreement(title: str, ours, theirs) -> None:
     found = agreement(ours, theirs)
     cells = "".join(f"{a.r:8.2f}{a.offset_deg:7.1f}{a.sd_deg:6.1f}" for a in (found[n] for n in JUDGED))
-    click.echo(f"  {title:32}{cells}")
+    click.echo(f"    {title:32}{cells}")
 
 
 @click.command()
@@ -144,20 +144,20 @@ def main(params: str, changes: tuple[str, ...], out: Path | None, frames: tuple[
     median = float(np.nanmedian(np.stack(list(every.values()))))
     good = median <= MAX_MEDIAN_PX
     click.echo(f"four cameras together, {paramset.name}: {together.seconds:.1f} s")
-    click.echo(
-        f"  reprojection median {median:.1f} px (bar {MAX_MEDIAN_PX:g}) {'PASS' if good else 'FAIL'}; by camera "
-    )
-    click.echo("  by camera " + ", ".join(f"{c} {np.nanmedian(e):.1f}" for c, e in every.items()))
+    click.echo(f"  reprojection median {median:.1f} px (bar {MAX_MEDIAN_PX:g}) {'PASS' if good else 'FAIL'}")
+    click.echo("  by camera: " + ", ".join(f"{c} {np.nanmedian(e):.1f}" for c, e in every.items()))
     click.echo(f"  scale {' '.join(f'{s:.2f}' for s in together.scale)}")
     alone = {c: fit_session([views[c]], [c], paramset).trials[0] for c in CAMERAS}
     head = "".join(f"{n.replace('_flexion', ''):>21}" for n in JUDGED)
-    click.echo(f"\n  {'flexion: r, offset, sd (deg)':32}{head}")
+    click.echo(f"\n  {'flexion: r, offset, sd (deg)':34}{head}")
+    click.echo("  against the four together")
     for camera, fit in alone.items():
         own = np.nanmedian(reprojection_px(fit, views[camera], pose_alone(fit)))
-        title = f"{camera} alone ({own:.1f} px) - four"
+        title = f"{camera} alone ({own:.1f} px, size {fit.scale[0]:.2f})"
         _print_agreement(title, fitted_angles(fit), fitted_angles(together))
+    click.echo("  the four together against")
     for name, file in REFERENCES.items():
-        _print_agreement(f"four - {name}"[:32], fitted_angles(together), _angles_relative(FOLDER / file))
+        _print_agreement(f"OpenSim, {name}", fitted_angles(together), _angles_relative(FOLDER / file))
     if out:
         out.mkdir(parents=True, exist_ok=True)
         rows = {
