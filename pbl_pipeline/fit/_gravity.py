@@ -1,11 +1,87 @@
-"""The vertical of a camera whose tilt was not measured."""
+"""The vertical of a camera that does not turn and whose tilt was not measured.
+
+The pelvis of a person who walks on a level floor keeps its height, and its bobbing averages out: over a path of some
+metres this tells the tilt along the path. Across it, a person's head is above the feet on average. The two together as
+one least-squares problem: the vertical is the direction along which the path varies least and the body points.
+"""
 
 from __future__ import annotations
 
-from ._inputs import Session
+import dataclasses
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pbl_pipeline.body import body_poses
+
+from ._inputs import GAIT, LEVEL, Session
+from ._place import pelvis_rest, pelvis_values
 from .solvers import Solution
+
+#: Least length (m) of a path that tells: from the farthest point to the start of the frames that count.
+MIN_PATH_M = 2.0
+#: What the pelvis' height varies by in walking (m), and how far a body leans on average (rad). The project's own.
+BOB_SD_M, LEAN_SD_RAD = 0.03, np.deg2rad(3.0)
+#: Beyond this tilt (rad) the estimate is not believed, and the camera counts as level.
+MOST_TILT_RAD = np.deg2rad(30.0)
 
 
 def upright(session: Session, solution: Solution) -> tuple[Solution, tuple[str, ...]]:
     """The solution in a world whose z is up, and where each trial's vertical comes from."""
-    return solution, session.orientation
+    sources = list(session.orientation)
+    qpos, R_nc = solution.qpos.copy(), solution.R_nc.copy()
+    for i, source in enumerate(sources):
+        if source != LEVEL:
+            continue
+        frames, used = session.frames(i), session.arrays[i].used
+        x, R = pelvis_path(session, qpos[frames])
+        up = vertical(x[used], body_axis(session, qpos[frames][used], solution.scale))
+        if up is None:
+            continue
+        turn = _turn_to_z(up)
+        values = pelvis_values(session.body, turn @ R, x @ turn.T)
+        for name, value in values.items():
+            qpos[frames, session.body.joint_names.index(name)] = value
+        R_nc[frames] = turn @ R_nc[frames]
+        sources[i] = GAIT
+    return dataclasses.replace(solution, qpos=qpos, R_nc=R_nc), tuple(sources)
+
+
+def pelvis_path(session: Session, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (T, 3) and rotations (T, 3, 3) of the pelvis in the world."""
+    column = {n: k for k, n in enumerate(session.body.joint_names)}
+    stands, rest = pelvis_rest(session.body)
+    slides = qpos[:, [column[n] for n in ("pelvis_tx", "pelvis_ty", "pelvis_tz")]]
+    turns = qpos[:, [column[n] for n in ("pelvis_tilt", "pelvis_list", "pelvis_rotation")]]
+    return slides @ stands.T + rest, stands @ Rotation.from_euler("ZXY", turns).as_matrix()
+
+
+def body_axis(session: Session, qpos: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Unit vector (3,) from between the heels to the head, mean over the frames."""
+    names = session.body.body_names
+    # One shape of program: the packed frames'.
+    padded = np.resize(qpos, (session.obs.weight.shape[0], qpos.shape[1]))
+    x = np.asarray(body_poses(session.body, padded, scale)[0], np.float64)[: len(qpos)]
+    feet = 0.5 * (x[:, names.index("calcn_r")] + x[:, names.index("calcn_l")])
+    axis = (x[:, names.index("head")] - feet).mean(axis=0)
+    return axis / np.linalg.norm(axis)
+
+
+def vertical(x: np.ndarray, axis: np.ndarray) -> np.ndarray | None:
+    """Unit vector up (3,) from the pelvis' path (T, 3) and the body's axis (3,); None where the path does not tell."""
+    if np.max(np.linalg.norm(x - x[0], axis=1), initial=0.0) < MIN_PATH_M:
+        return None
+    off = x - x.mean(axis=0)
+    path = off.T @ off / len(x) / BOB_SD_M**2
+    _, axes = np.linalg.eigh(path + (np.eye(3) - np.outer(axis, axis)) / LEAN_SD_RAD**2)
+    up = axes[:, 0] * np.sign(axes[:, 0] @ axis)
+    return None if np.arccos(np.clip(up[2], -1, 1)) > MOST_TILT_RAD else up
+
+
+def _turn_to_z(up: np.ndarray) -> np.ndarray:
+    """The smallest rotation (3, 3) that takes a unit vector to z."""
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    sin = np.linalg.norm(axis)
+    if sin < 1e-9:
+        return np.eye(3)
+    return Rotation.from_rotvec(axis / sin * np.arctan2(sin, up[2])).as_matrix()

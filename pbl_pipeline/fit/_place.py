@@ -98,10 +98,7 @@ def standing_markers(body: Body, markers: MarkerSet) -> np.ndarray:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     R, x = data.xmat[1:].reshape(-1, 3, 3), data.xpos[1:]
-    pelvis = R[0]
-    points = x[markers.body_index] + np.einsum("mij,mj->mi", R[markers.body_index], markers.position_m)
-    del pelvis
-    return points - x[0]
+    return x[markers.body_index] + np.einsum("mij,mj->mi", R[markers.body_index], markers.position_m) - x[0]
 
 
 def align(template: np.ndarray, points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -119,21 +116,31 @@ def align(template: np.ndarray, points: np.ndarray, weight: np.ndarray) -> tuple
 
 def _poses(body: Body, R: np.ndarray, x: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Poses with the pelvis of the standing template turned by R and moved to x; frames not known in between."""
-    model = body.mj_model
     column = {n: k for k, n in enumerate(body.joint_names)}
     qpos = np.zeros((len(x), len(body.joint_names)))
     for joint, degrees in BENT_DEG.items():
         for name in (joint, f"{joint}_r", f"{joint}_l"):
             if name in column:
                 qpos[:, column[name]] = np.deg2rad(degrees)
-    pelvis = model.body("pelvis")
-    stands = Rotation.from_quat(pelvis.quat, scalar_first=True).as_matrix()
-    local = np.einsum("ji,tj->ti", stands, x - pelvis.pos)
-    turned = Rotation.from_matrix(np.einsum("ji,tjk,kl->til", stands, R, stands)[known])
-    tilt, lean, heading = turned.as_euler("ZXY").T
+    stands = pelvis_rest(body)[0]
+    values = pelvis_values(body, R[known] @ stands, x[known])
     index, at = np.flatnonzero(known), np.arange(len(x))
-    values = dict(zip(("pelvis_tx", "pelvis_ty", "pelvis_tz"), local[known].T, strict=True))
-    values |= {"pelvis_tilt": tilt, "pelvis_list": lean, "pelvis_rotation": np.unwrap(heading)}
     for name, value in values.items():
         qpos[:, column[name]] = np.interp(at, index, value)
     return qpos
+
+
+def pelvis_rest(body: Body) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and position (3,) of the pelvis in the world at qpos 0."""
+    pelvis = body.mj_model.body("pelvis")
+    return Rotation.from_quat(pelvis.quat, scalar_first=True).as_matrix(), np.asarray(pelvis.pos)
+
+
+def pelvis_values(body: Body, R: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray]:
+    """The pelvis' six joint values (T,) where its frame is turned by R (T, 3, 3) and lies at x (T, 3), in the world."""
+    stands, rest = pelvis_rest(body)
+    tilt, lean, heading = Rotation.from_matrix(np.einsum("ji,tjk->tik", stands, R)).as_euler("ZXY").T
+    slides = np.einsum("ji,tj->ti", stands, x - rest).T
+    turns = {"pelvis_tilt": tilt, "pelvis_list": lean, "pelvis_rotation": np.unwrap(heading)}
+    # The first three slides of the body lie along the pelvis' axes x, y, z at qpos 0.
+    return dict(zip(("pelvis_tx", "pelvis_ty", "pelvis_tz"), slides, strict=True)) | turns
