@@ -135,3 +135,9 @@ def scale_prior(s: Float[Array, " 8"], sd: float, sd_sides: float) -> Array:
     """
     sides = s[LEFT_SCALES] - s[RIGHT_SCALES]
     return 0.5 * (jnp.sum((s[1:] / sd) ** 2) + jnp.sum((sides / sd_sides) ** 2))
+
+
+def soft_depth_m(z: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Depth bent smoothly to stay above `NEAR_M`, as in `project_px`."""
+    soft = 0.5 * NEAR_M
+    return NEAR_M + soft * jax.nn.softplus((z - NEAR_M) / soft)
