@@ -1,11 +1,11 @@
 """Markers of a table at many poses with the reverse derivative written out: what a gradient method calls at each step.
 
-The numbers are those of `table_positions`. Made for few and large operations, which is what a step of a thousandth of a
-second is made of: the poses lie along the last axis; a body's place in the world is the product of all transforms on its
-way from the root, found by doubling (each body takes over its parent's product, then that of the one twice as far);
-all markers come from the bodies' places by one matrix product. Backwards, the pull on the markers becomes a force and a
-torque on each body, these add up along the tree, and a joint feels what its axis feels (the transposed geometric
-Jacobian, Featherstone, Rigid Body Dynamics Algorithms, 2008, ch. 4).
+The numbers are those of `table_positions`. Made for few and large operations, because a step has thousandths of a
+second: the poses lie along the last axis; a body's place in the world is the product of all transforms on its way from
+the root, found by doubling (each body takes over its parent's product, then that of the one twice as far); all markers
+come from the bodies' places by one matrix product. Backwards, the pull on the markers becomes a force and a torque on
+each body, these add up along the tree, and a joint feels what its axis feels (the transposed geometric Jacobian,
+Featherstone, Rigid Body Dynamics Algorithms, 2008, ch. 4).
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body._jacobian import MarkerTable
-from pbl_pipeline.body._kinematics import scaled_body_pos
 from pbl_pipeline.body._model import Body
 from pbl_pipeline.body._poses import tree_of
 
@@ -103,9 +102,11 @@ def _frames(body: Body) -> Callable[[Array, Array], Array]:
     slides = np.setdiff1d(np.arange(joints), hinges)
     back = np.argsort(np.concatenate([hinges, slides]))
 
+    def const(a: np.ndarray) -> Array:
+        return jnp.asarray(a, jnp.result_type(float))[..., None]
+
     def values(q: Array, body_pos: Array) -> tuple[Array, Array, Array]:
         """Places in the world, the hinges' axes in the frame of the parent (H, B, 3, M), the parents' rotations."""
-        const = lambda a: jnp.asarray(a, q.dtype)[..., None]  # noqa: E731
         cos, sin = (jnp.concatenate([f(q), jnp.full_like(q[:1], f(0.0))]) for f in (jnp.cos, jnp.sin))
         local, axes = None, []
         for h, joint in enumerate(slots.hinge):
@@ -145,10 +146,12 @@ def _frames(body: Body) -> Callable[[Array, Array], Array]:
         force = carried[:, :3]
         about_joint = carried[:, 3:] - _cross(placed[:, 0], force)
         # In the frame of the parent: (B, 3, M).
-        force, about_joint = (_along(parents, jnp.broadcast_to(a[:, None], parents.shape), 2) for a in (force, about_joint))
+        force, about_joint = (
+            _along(parents, jnp.broadcast_to(a[:, None], parents.shape), 2) for a in (force, about_joint)
+        )
         by_turn = _along(axes, jnp.broadcast_to(about_joint, axes.shape), 2).reshape(-1, placed.shape[-1])[by_hinge]
-        by_slide = [jnp.sum(jnp.asarray(slots.slide[..., j], force.dtype)[..., None] * force, axis=(0, 1)) for j in slides]
-        return jnp.concatenate([by_turn, jnp.stack(by_slide)])[back], jnp.sum(force, axis=-1)
+        slid = [jnp.sum(const(slots.slide[..., j]) * force, axis=(0, 1)) for j in slides]
+        return jnp.concatenate([by_turn, jnp.stack(slid)])[back], jnp.sum(force, axis=-1)
 
     frames.defvjp(forward, backward)
     return frames

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Iterable
 
 import jax
 import jax.numpy as jnp
@@ -33,21 +34,22 @@ CHUNK = 1024
 class MarkerWeights:
     """Weights and Huber widths of the keypoint terms as arrays, so that others run the same compiled program."""
 
-    weight_3d: Float[ArrayLike, ""]
-    weight_2d: Float[ArrayLike, ""]
-    huber_3d_cm: Float[ArrayLike, ""]
-    huber_2d_px: Float[ArrayLike, ""]
-    depth_ratio: Float[ArrayLike, ""]
+    weight_3d: Float[Array, ""]
+    weight_2d: Float[Array, ""]
+    huber_3d_cm: Float[Array, ""]
+    huber_2d_px: Float[Array, ""]
+    depth_ratio: Float[Array, ""]
 
     @classmethod
     def of(cls, cost: CostParams) -> MarkerWeights:
         """Those of a paramset."""
-        return cls(*(np.float32(getattr(cost, f.name)) for f in dataclasses.fields(cls)))
+        return cls(*(jnp.asarray(getattr(cost, f.name), jnp.float32) for f in dataclasses.fields(cls)))
 
 
-#: The paper's own (section Total loss and optimization), whatever the defaults of `CostParams` are.
-PAPER_WEIGHTS = MarkerWeights(*np.float32([1.0, 0.1, 10.0, 5.0, 1.0]))
-PAPER_WEIGHT_PHONE, PAPER_WEIGHT_OFFSET_PER_M2 = 1.0, 100.0
+#: The paper's own (section Total loss and optimization), whatever the defaults of `CostParams` become.
+PAPER_COST = CostParams(
+    weight_3d=1.0, weight_2d=0.1, weight_phone=1.0, weight_offset_per_m2=100.0, huber_3d_cm=10.0, huber_2d_px=5.0
+)
 
 
 def kinds_of(session: Session) -> Kinds:
@@ -72,28 +74,33 @@ def marker_cost(
     total = jnp.zeros(x_world.shape[0], x_world.dtype)
     each = 1 / (obs.n_markers * obs.n_views)
     if kinds.camera_3d or kinds.camera_2d:
-        x_cam = _to_camera(R_nc, x_world[:, None] - obs.p_nc[:, :, None])
+        # Coordinate by coordinate: sums over a last axis of three are slow. A turn and a shift of everything changes no
+        # distance, so the camera's own axes serve both terms.
+        away = [x_world[:, None, :, k] - obs.p_nc[:, :, None, k] for k in range(3)]
+        x, y, z = (_sum(R_nc[:, :, k, i, None] * away[k] for k in range(3)) for i in range(3))
         if kinds.camera_3d:
-            # Both are compared in the camera's axes: a distance is the same in all, and one turn serves both terms.
-            weight = jnp.where(obs.c_3d > 0, table.weight_3d, 0.0)
-            delta = costs.center(x_cam, weight) - costs.center(obs.x_cam, weight)
-            e2 = 1e4 * jnp.sum((delta * jnp.stack([1.0, 1.0, w.depth_ratio])) ** 2, axis=-1)
+            seen = jnp.where(obs.c_3d > 0, table.weight_3d, 0.0)
+            share = seen / jnp.maximum(jnp.sum(seen, axis=-1, keepdims=True), 1e-6)
+            off = [a - obs.x_cam[..., i] for i, a in enumerate((x, y, z))]
+            dx, dy, dz = (a - jnp.sum(a * share, axis=-1, keepdims=True) for a in off)
+            e2 = 1e4 * (dx**2 + dy**2 + (dz * w.depth_ratio) ** 2)
             e = costs.huber_of_square(e2, w.huber_3d_cm) * obs.c_3d * table.weight_3d
             total += w.weight_3d * each * jnp.sum(e, axis=(-2, -1))
         if kinds.camera_2d:
-            e2 = jnp.sum((costs.project_px(x_cam, obs.camera_matrix) - obs.xy_px) ** 2, axis=-1)
-            e = costs.huber_of_square(e2, w.huber_2d_px) * obs.c_2d
+            per_depth, camera = 1 / costs.soft_depth_m(z), obs.camera_matrix[..., None]
+            u = camera[..., 0, 0, :] * x * per_depth + camera[..., 0, 2, :] - obs.xy_px[..., 0]
+            v = camera[..., 1, 1, :] * y * per_depth + camera[..., 1, 2, :] - obs.xy_px[..., 1]
+            e = costs.huber_of_square(u**2 + v**2, w.huber_2d_px) * obs.c_2d
             total += w.weight_2d * each * jnp.sum(e, axis=(-2, -1))
     if kinds.world:
-        e2 = 1e4 * jnp.sum((x_world - obs.x_world) ** 2, axis=-1)
+        e2 = 1e4 * _sum((x_world[..., k] - obs.x_world[..., k]) ** 2 for k in range(3))
         e = costs.huber_of_square(e2, w.huber_3d_cm) * obs.c_world * table.weight_3d
         total += w.weight_3d * jnp.sum(e, axis=-1) / obs.n_markers
     return total
 
 
-def _to_camera(R_nc: Float[Array, "M V 3 3"], x: Float[Array, "M V J 3"]) -> Float[Array, "M V J 3"]:
-    """Inverse rotation, written out: a matrix product of this size is slow and, on GPUs, rounded to ten bits."""
-    return sum(R_nc[:, :, None, k] * x[..., k, None] for k in range(3))  # type: ignore[return-value]
+def _sum(parts: Iterable[Array]) -> Array:
+    return functools.reduce(jnp.add, parts)
 
 
 def angle_between_deg(a: Float[Array, "*n 4"], b: Float[Array, "*n 4"]) -> Float[Array, "*n"]:
@@ -133,15 +140,23 @@ def paper_objective(
     q = np.where(counts[:, None], qpos, 0.0).astype(np.float32)
     R = np.where(counts[:, None, None, None], R_nc, np.eye(3)).astype(np.float32)
     per_frame = _marker_costs(
-        session.body, kinds_of(session), session.table, obs, PAPER_WEIGHTS, q, R, np.asarray(s, np.float32), padded
+        session.body,
+        kinds_of(session),
+        session.table,
+        obs,
+        MarkerWeights.of(PAPER_COST),
+        q,
+        R,
+        np.asarray(s, np.float32),
+        padded,
     )
     total = float(np.sum(np.asarray(per_frame, np.float64) * share))
     if session.moving:
         measured = Rotation.from_matrix(np.asarray(obs.R_nc, np.float64)[counts, 0])
         off = np.zeros(len(share))
         off[counts] = np.rad2deg((Rotation.from_matrix(np.asarray(R_nc)[counts, 0]) * measured.inv()).magnitude())
-        total += PAPER_WEIGHT_PHONE * float(np.sum(off * share * np.asarray(obs.has_phone)[np.asarray(obs.trial)]))
-    return total + PAPER_WEIGHT_OFFSET_PER_M2 * float(np.sum(np.asarray(site_offset_m, np.float64) ** 2))
+        total += PAPER_COST.weight_phone * float(np.sum(off * share * np.asarray(obs.has_phone)[np.asarray(obs.trial)]))
+    return total + PAPER_COST.weight_offset_per_m2 * float(np.sum(np.asarray(site_offset_m, np.float64) ** 2))
 
 
 @functools.partial(jax.jit, static_argnames=("body", "kinds"))

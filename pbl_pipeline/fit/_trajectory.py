@@ -57,7 +57,9 @@ def initial_networks(
             layers.append((weight * (FINAL_SCALE if last else 1), bias * (not last)))
             width = out
         networks.append(layers)
-    return [tuple(np.stack([net[i][k] for net in networks]) for k in (0, 1)) for i in range(len(hidden) + 1)]
+    weights = [np.stack(w) for w in zip(*([w for w, _ in net] for net in networks), strict=True)]
+    biases = [np.stack(b) for b in zip(*([b for _, b in net] for net in networks), strict=True)]
+    return list(zip(weights, biases, strict=True))
 
 
 def evaluate(networks: Networks, code: Float[Array, "N B C"]) -> Float[Array, "N B O"]:

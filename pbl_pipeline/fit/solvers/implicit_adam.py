@@ -59,20 +59,20 @@ class _Numbers:
     """The numbers of a paramset as arrays, so that another paramset runs the same compiled program."""
 
     markers: MarkerWeights
-    weight_phone: np.ndarray
-    weight_offset_per_m2: np.ndarray
-    weight_pose: np.ndarray
-    weight_scale: np.ndarray
-    scale_sd: np.ndarray
-    scale_sides_sd: np.ndarray
-    neutral: np.ndarray
-    inverse_sd: np.ndarray
-    steps: np.ndarray
-    rate_start: np.ndarray
-    log_decay: np.ndarray
-    adam_b1: np.ndarray
-    weight_decay: np.ndarray
-    clip_norm: np.ndarray
+    weight_phone: Array
+    weight_offset_per_m2: Array
+    weight_pose: Array
+    weight_scale: Array
+    scale_sd: Array
+    scale_sides_sd: Array
+    neutral: Array
+    inverse_sd: Array
+    steps: Array
+    rate_start: Array
+    log_decay: Array
+    adam_b1: Array
+    weight_decay: Array
+    clip_norm: Array
 
 
 @jax.tree_util.register_dataclass
@@ -157,12 +157,11 @@ def solve_implicit_adam(session: Session, params: ImplicitAdamParams) -> Solutio
             record(*pending)
     solved = _split(carry[0], static.shapes)
     qpos, R_nc = _on_all_frames(session, solved.networks, data, static)
-    s = np.asarray(solved.s, np.float64)
     return Solution(
         qpos=qpos,
         R_nc=R_nc,
-        s=s,
-        scale=np.asarray(scale_multipliers(s), np.float64),
+        s=np.asarray(solved.s, np.float64),
+        scale=np.asarray(scale_multipliers(solved.s), np.float64),
         site_offset_m=np.asarray(solved.site_offset_m, np.float64)[: len(session.markers)],
         clock_s=np.zeros(len(session.trials)),
         loss_trace=np.asarray(trace, np.float64).reshape(-1, 2),
@@ -236,11 +235,11 @@ def _phone_samples(session: Session, n_padded: int) -> tuple[np.ndarray, np.ndar
 
 
 def _numbers(body: Body, params: ImplicitAdamParams) -> _Numbers:
-    cost, f32 = params.cost, np.float32
+    cost, f32 = params.cost, functools.partial(jnp.asarray, dtype=jnp.float32)
     neutral, inverse_sd = prior_of(body.joint_names, cost.pose_prior_deg)
     return _Numbers(
         markers=MarkerWeights.of(cost),
-        weight_phone=f32(getattr(cost, "weight_phone", 1.0)),
+        weight_phone=f32(cost.weight_phone),
         weight_offset_per_m2=f32(cost.weight_offset_per_m2),
         weight_pose=f32(cost.weight_pose),
         weight_scale=f32(cost.weight_scale),
@@ -326,9 +325,33 @@ def _draw(key: Array, d: _Data, static: _Static) -> tuple[Int[Array, "K N B"], I
     return rows, jnp.swapaxes(phone, 0, 1)
 
 
+def adam_step(
+    flat: Float[Array, " P"],
+    mean: Float[Array, " P"],
+    square: Float[Array, " P"],
+    g: Float[Array, " P"],
+    done: Array,
+    n_decayed: int,
+    w: _Numbers,
+) -> tuple[Array, Array, Array]:
+    """Adam (Kingma and Ba 2015) with the gradient's norm clipped and decoupled weight decay of the first unknowns.
+
+    The rate falls exponentially with the steps `done`; from the last step on nothing moves.
+    """
+    g = g * (w.clip_norm / jnp.maximum(jnp.sqrt(jnp.sum(g**2)), w.clip_norm))
+    mean = w.adam_b1 * mean + (1 - w.adam_b1) * g
+    square = ADAM_B2 * square + (1 - ADAM_B2) * g**2
+    count = (done + 1).astype(jnp.float32)
+    unbiased = mean / (1 - w.adam_b1**count)
+    spread = jnp.sqrt(square / (1 - ADAM_B2**count)) + ADAM_EPS
+    decay = jnp.where(jnp.arange(flat.shape[0]) < n_decayed, w.weight_decay, 0.0) * flat
+    rate = jnp.where(done < w.steps, w.rate_start * jnp.exp(w.log_decay * done / w.steps), 0.0)
+    return flat - rate * (unbiased / spread + decay), mean, square
+
+
 @functools.partial(jax.jit, static_argnames="static", donate_argnums=0)
 def _run_chunk(carry, chunk: Array, key: Array, d: _Data, w: _Numbers, static: _Static):
-    """`CHUNK` steps of Adam with weight decay on the networks; those beyond `steps` change nothing."""
+    """`CHUNK` steps of Adam with weight decay on the networks; those beyond `steps` change no unknown."""
     size = sum(math.prod(shape) for shape in static.shapes)
     n_network = size - math.prod(static.shapes[-1]) - 8
     rows, phone_rows = _draw(jax.random.fold_in(key, chunk), d, static)
@@ -338,16 +361,7 @@ def _run_chunk(carry, chunk: Array, key: Array, d: _Data, w: _Numbers, static: _
         done, rows, phone_rows = drawn
         loss, slope = jax.value_and_grad(_loss)(_split(flat, static.shapes), rows, phone_rows, d, w, static)
         g, _ = ravel_pytree(slope)
-        norm = jnp.sqrt(jnp.sum(g**2))
-        g = g * (w.clip_norm / jnp.maximum(norm, w.clip_norm))
-        mean = w.adam_b1 * mean + (1 - w.adam_b1) * g
-        square = ADAM_B2 * square + (1 - ADAM_B2) * g**2
-        count = (done + 1).astype(jnp.float32)
-        unbiased = mean / (1 - w.adam_b1**count)
-        spread = jnp.sqrt(square / (1 - ADAM_B2**count)) + ADAM_EPS
-        decay = jnp.where(jnp.arange(size) < n_network, w.weight_decay, 0.0) * flat
-        rate = jnp.where(done < w.steps, w.rate_start * jnp.exp(w.log_decay * done / w.steps), 0.0)
-        return (flat - rate * (unbiased / spread + decay), mean, square), loss
+        return adam_step(flat, mean, square, g, done, n_network, w), loss
 
     done = chunk * CHUNK + jnp.arange(CHUNK)
     return jax.lax.scan(step, carry, (done, rows, phone_rows))
