@@ -6,7 +6,6 @@ import hashlib
 from pathlib import Path
 
 import numpy as np
-from ai_edge_litert.interpreter import Interpreter
 
 from pbl_pipeline.errors import PblError
 
@@ -32,6 +31,9 @@ class LiteModel:
                 key=path,
             )
         self.sha256 = found
+        # Here and not above: whoever only fits or reads results does not wait for the runtime.
+        from ai_edge_litert.interpreter import Interpreter
+
         self._interpreter = Interpreter(str(path), num_threads=NUM_THREADS)
         self._interpreter.allocate_tensors()
         self._input = self._interpreter.get_input_details()[0]["index"]
