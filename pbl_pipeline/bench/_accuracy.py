@@ -66,13 +66,12 @@ def trial_accuracy(fit: TrialFit, truth: Truth) -> dict[str, Any]:
     sd = np.rad2deg(fit.qpos_sd[:, [fit.joint_names.index(n) for n in PAPER_JOINTS]])
     hidden = ~np.all(np.isfinite(fit.qpos), axis=1)
     span = (fit.time_s >= UNSEEN_S[0]) & (fit.time_s < UNSEEN_S[1])
-    clock = getattr(fit, "phone_clock_offset_s", float("nan"))
     return {
         "joints_deg": joints,
         "all_deg": mean_over(joints, PAPER_JOINTS),
         "main_deg": mean_over(joints, MAIN_JOINTS),
         "camera_deg": camera_error_deg(fit.phone_quat_wxyz, truth.R_nc),
-        "clock_ms": 1e3 * abs(float(clock) - truth.clock_offset_s),
+        "clock_ms": 1e3 * abs(fit.phone_clock_offset_s - truth.clock_offset_s),
         "sd_all_deg": _median(sd),
         "sd_span_deg": _median(sd[span]),
         "sd_outside_deg": _median(sd[~span]),

@@ -154,10 +154,8 @@ def _runner(case: Case, paramset: Paramset) -> Callable[[list[list[Keypoints]]],
         return out
 
     def together(sessions: list[list[Keypoints]]) -> Sessions:
-        # Not in every version of the library; a plain attribute error is what the row then shows.
-        make: Any = fit.SessionInput  # pyright: ignore[reportAttributeAccessIssue]
-        inputs = [make(trials=t, names=names, camera_motion=case.data.motion) for t in sessions]
-        return fit.fit_sessions(inputs, paramset)  # pyright: ignore[reportAttributeAccessIssue]
+        inputs = [fit.SessionInput(trials=t, names=names, camera_motion=case.data.motion) for t in sessions]
+        return fit.fit_sessions(inputs, paramset)
 
     return together if case.batch > 1 else one_by_one
 
@@ -171,6 +169,8 @@ def _failures(done: dict[int, SessionFit | PblError]) -> dict[str, Any]:
 
 
 def _accuracy(done: dict[int, SessionFit | PblError], loaded: dict[int, Any]) -> dict[str, Any]:
+    from pbl_pipeline.fit import paper_objective
+
     from ._accuracy import summary, trial_accuracy
 
     trials, losses, checks = [], [], {}
@@ -179,23 +179,14 @@ def _accuracy(done: dict[int, SessionFit | PblError], loaded: dict[int, Any]) ->
             continue
         keypoints, truth = loaded[i]
         trials += [trial_accuracy(t, x) for t, x in zip(fit.trials, truth, strict=True)]
-        losses.append(_paper_loss(fit, keypoints))
+        losses.append(paper_objective(fit, keypoints))
         for check in fit.qc:
             if check.outcome not in ("PASS", "EMPTY"):
                 checks[check.check] = check.outcome
     if not trials:
         return {}
-    known = [x for x in losses if x is not None]
-    loss = sum(known) / len(known) if known else None
+    loss = sum(losses) / len(losses)
     return {"accuracy": summary(trials), "n_sessions": len(done), "paper_loss": loss, "checks": checks}
-
-
-def _paper_loss(fit: SessionFit, keypoints: list[Keypoints]) -> float | None:
-    """The paper's objective at the fit; None while the library has no such function."""
-    from pbl_pipeline import fit as library
-
-    objective: Any = getattr(library, "paper_objective", None)
-    return None if objective is None else float(objective(fit, keypoints))
 
 
 def _against_one(case: Case, paramset: Paramset, done: dict[int, Any], loaded: dict[int, Any]) -> dict[str, Any]:

@@ -119,8 +119,8 @@ def _percent(value: float | None) -> str:
 def ratios(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Pairs of rows that a bar compares: the solvers, held against still, a batch against one, twice the frames.
 
-    Each is {"what", "seconds", "error", "main_error", "loss", "memory"}: the first named over the second; None where
-    one of them is missing.
+    Each is {"what", "seconds", "all_error", "main_error", "loss", "memory"}: the first named over the second, None
+    where one of them is missing.
     """
     found = []
     good = [r for r in rows if r.get("warm_seconds")]
@@ -134,7 +134,7 @@ def ratios(rows: Sequence[Row]) -> list[dict[str, Any]]:
                 elif a["section"] == "long" and a["solver"] == b["solver"]:
                     pair["memory"] = _over(a["host_bytes"], b["host_bytes"])
                 else:
-                    pair["error"] = _over(accuracy(a, "all_deg"), accuracy(b, "all_deg"))
+                    pair["all_error"] = _over(accuracy(a, "all_deg"), accuracy(b, "all_deg"))
                     pair["main_error"] = _over(accuracy(a, "main_deg"), accuracy(b, "main_deg"))
                     pair["loss"] = _over(a.get("paper_loss"), b.get("paper_loss"))
                 found.append(pair)
@@ -180,7 +180,7 @@ def text(rows: Sequence[Row]) -> str:
     if pairs:
         columns: list[Column] = [("ratio of", lambda r: r["what"])]
         keys = {"seconds": "warm s", "sessions_per_s": "sessions/s", "memory": "memory"}
-        keys |= {"error": "all deg", "main_error": "main deg", "loss": "loss"}
+        keys |= {"all_error": "all deg", "main_error": "main deg", "loss": "loss"}
         for key, title in keys.items():
             if any(p.get(key) is not None for p in pairs):
                 columns.append((title, lambda r, key=key: number(r.get(key), 3)))

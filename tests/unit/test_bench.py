@@ -162,7 +162,10 @@ def test_ratios_compare_what_the_bars_compare():
     assert solvers["main_error"] == pytest.approx(1.1)
     assert solvers["loss"] == pytest.approx(0.99)
     held = found["handheld / static, gauss-newton, 1 trial"]
-    assert held["error"] == pytest.approx(1.05)
+    assert held["all_error"] == pytest.approx(1.05)
+    # A figure of the ratio must not be taken for an error code.
+    text = bench.text(rows)
+    assert sum(line.startswith("handheld / static") and line.endswith("1.000") for line in text.splitlines()) == 1
     batch = found["batch 64 / one by one, gauss-newton, 1 trial, static"]
     assert batch["sessions_per_s"] == pytest.approx((64 / 6.4) / (1 / 2.0))
 
@@ -195,18 +198,36 @@ def test_a_case_is_measured(tmp_path):
     """In this process and with its cache, so what is tested is that every figure is there, not how fast it was."""
     data = Data(n_frames=64, n_sessions=2)
     _data.write(tmp_path, data)
-    case = Case("speed", "implicit-adam", data, repeat=2, adam_steps=20)
+    case = Case("speed", "gauss-newton", data, repeat=2)
     begin = time.time()
     got = _case.measure(case, tmp_path, "warm", begin - 100.0)
     assert 100 < got["first_seconds"] < 100 + time.time() - begin
     assert len(got["warm_seconds_each"]) == 2
     assert got["warm_seconds"] == min(got["warm_seconds_each"])
-    assert got["paramset"] == "paper-2025, 20 steps"
+    assert got["paramset"] == "gauss-newton"
     assert got["host_bytes"] > 1e8
     assert got["n_sessions"] == 2
-    assert 0 < got["accuracy"]["main_deg"] < 90
+    assert 0 < got["accuracy"]["main_deg"] < 6
+    assert got["accuracy"]["sd_all_deg"] > 0
+    assert 1 < got["paper_loss"] < 100
     assert "error" not in got
     assert _case.machine()["cores"] >= 1
+
+
+def test_a_batch_is_measured_and_compared_with_the_sessions_alone(tmp_path):
+    data = Data(n_frames=64, n_sessions=2, motion="handheld")
+    _data.write(tmp_path, data)
+    got = _case.measure(Case("speed", "gauss-newton", data, batch=2, repeat=1), tmp_path, "warm", time.time())
+    assert got["n_sessions"] == 2
+    assert got["batch_difference_rad"] < 1e-3
+    assert got["accuracy"]["camera_deg"] < 5
+    assert got["accuracy"]["clock_ms"] < 40
+
+
+def test_fewer_steps_are_another_paramset():
+    assert _case.paramset_of("implicit-adam", 20).name == "paper-2025, 20 steps"
+    assert _case.paramset_of("implicit-adam", None).name == "paper-2025"
+    assert _case.paramset_of("implicit-adam", 25_000).name == "paper-2025"
 
 
 def test_a_case_in_its_own_process_that_fails_is_a_row_with_its_code(tmp_path):
