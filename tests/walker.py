@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pbl_pipeline.body import load_body, marker_set
-from pbl_pipeline.fit import LEVEL_CAMERA_R_NC
-from pbl_pipeline.fit._problem import FRAME_BUCKET, FitModel
 from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.synthetic import LEVEL_R_NC, true_markers
 from pbl_pipeline.video import Camera
 
 CAMERA = Camera(np.array([[1500.0, 0, 960], [0, 1500.0, 540], [0, 0, 1]]), np.zeros(5), "measured: synthetic")
@@ -59,12 +58,7 @@ def observe(
     """Project the walker into the camera and add noise."""
     markers = marker_set(marker_set_name)
     rng = np.random.default_rng(seed)
-    scale = np.ones(8) if scale is None else scale
-    offset = np.zeros((len(markers.names), 3), np.float32)
-    # Padded as the fit pads its frames, so that one compiled program serves both.
-    padded = np.pad(qpos, [(0, -len(qpos) % FRAME_BUCKET), (0, 0)], mode="edge")
-    x_world = np.asarray(FitModel(load_body(), markers).positions(padded, scale, offset), np.float64)[: len(qpos)]
-    x_cam = x_world @ LEVEL_CAMERA_R_NC
+    x_cam = true_markers(qpos, markers, scale) @ LEVEL_R_NC
     uv = x_cam @ CAMERA.matrix.T
     xy = uv[..., :2] / uv[..., 2:] + rng.normal(0, noise_px, (*x_cam.shape[:2], 2))
     relative = x_cam - x_cam.mean(axis=1, keepdims=True) + rng.normal(0, noise_m, x_cam.shape)

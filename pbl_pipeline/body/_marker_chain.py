@@ -115,7 +115,7 @@ def _frames(body: Body) -> Callable[[Array, Array], Array]:
             local = turn if local is None else _product(local, turn)
             axes.append(_along(local, jnp.broadcast_to(const(slots.axis[h])[:, None], local.shape), 2))
         assert local is not None
-        move = sum(const(slots.slide[..., j]) * q[j] for j in slides)
+        move = functools.reduce(jnp.add, [const(slots.slide[..., j]) * q[j] for j in slides])
         hangs = body_pos[..., None] + move
         # Rows: origin, then columns of the rotation. The last body is the world.
         placed = jnp.concatenate([hangs[:, None], jnp.swapaxes(local, 1, 2)], axis=1)
