@@ -143,10 +143,10 @@ BLAZEPOSE = GaussNewtonParams(
 )
 #: For markers of a laboratory, known to millimetres but placed by hand; a marker that jumped counts little.
 MARKERS = GaussNewtonParams(
-    smooth_per_rad2=20.0,
-    smooth_per_m2=2_000.0,
+    smooth_per_rad2=2.0,
+    smooth_per_m2=200.0,
     cost=CostParams(
-        huber_3d_cm=3.0, weight_offset_per_m2=300.0, weight_pose=0.01, pose_prior_deg=POSE_PRIOR_DEG, weight_scale=0.01
+        huber_3d_cm=3.0, weight_offset_per_m2=100.0, weight_pose=0.01, pose_prior_deg=POSE_PRIOR_DEG, weight_scale=0.01
     ),
 )
 

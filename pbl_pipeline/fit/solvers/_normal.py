@@ -54,6 +54,8 @@ class Weights:
     weight_scale: Float[Array, ""]
     scale_sd: Float[Array, ""]
     scale_sides_sd: Float[Array, ""]
+    #: Half of it times the squared overall scale parameter; 0 where the keypoints tell the size.
+    weight_size: Float[Array, ""]
     clock_sd_s: Float[Array, ""]
     neutral: Float[Array, " 40"]
     inverse_sd: Float[Array, " 40"]
@@ -97,6 +99,7 @@ def cost(body: Body, table: MarkerTable, obs: Observations, w: Weights, kinds: K
     bent = 0.5 * jnp.sum(costs.second_difference(state.qpos, obs.bend) ** 2 * w.smooth)
     shared = w.weight_offset_per_m2 * costs.offset_m2(state.site_offset_m)
     shared += w.weight_scale * costs.scale_prior(state.s, w.scale_sd, w.scale_sides_sd)
+    shared += 0.5 * w.weight_size * state.s[0] ** 2
     if kinds.moving:
         shared += 0.5 * jnp.sum((state.clock_s / w.clock_sd_s) ** 2) / n
     return (jnp.sum(total * obs.weight) + bent) / n + shared
@@ -317,8 +320,9 @@ def _shared_terms(w, state, n, C, h):
     slope = curve @ state.s
     offset = 2 * n * w.weight_offset_per_m2
     C = C + jnp.diag(jnp.concatenate([jnp.zeros(8, C.dtype), jnp.full(state.site_offset_m.size, 1.0) * offset]))
-    C = C.at[:8, :8].add(n * w.weight_scale * curve)
-    force = jnp.concatenate([n * w.weight_scale * slope, offset * state.site_offset_m.reshape(-1)])
+    C = C.at[:8, :8].add(n * w.weight_scale * curve).at[0, 0].add(n * w.weight_size)
+    slope = (w.weight_scale * slope).at[0].add(w.weight_size * state.s[0])
+    force = jnp.concatenate([n * slope, offset * state.site_offset_m.reshape(-1)])
     return C, h - force
 
 

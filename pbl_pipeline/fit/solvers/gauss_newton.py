@@ -257,6 +257,7 @@ def weights_of(session: Session, params: GaussNewtonParams) -> Weights:
         "weight_scale": c.weight_scale,
         "scale_sd": c.scale_sd,
         "scale_sides_sd": c.scale_sides_sd,
+        "weight_size": PIXELS_WEIGHT_SIZE if _pixels_alone(session) else 0.0,
         "clock_sd_s": params.clock_sd_s,
         "neutral": neutral,
         "inverse_sd": inverse_sd,
@@ -265,6 +266,16 @@ def weights_of(session: Session, params: GaussNewtonParams) -> Weights:
         "high": high,
     }
     return Weights(**{k: jnp.asarray(v, jnp.float32) for k, v in values.items()})
+
+
+#: One camera without 3D points cannot tell a small person from a far one: half this times the squared overall scale
+#: parameter, an adult's standard deviation of 0.05 counted as the other priors are.
+PIXELS_WEIGHT_SIZE = 0.1 / 0.05**2
+
+
+def _pixels_alone(session: Session) -> bool:
+    kinds = kinds_of(session)
+    return not (kinds.camera_3d or kinds.world) and session.obs.c_2d.shape[1] == 1
 
 
 def start_of(session: Session, flip: bool = False) -> State:
@@ -289,12 +300,14 @@ def sd_factors(joint_names: Sequence[str], sd_factor: Sequence[tuple[str, float]
     return out
 
 
-#: A knee or elbow that bends backwards in more than this share of the frames faces the wrong way.
+#: Knees at their straight end in more than this share of the frames may belong to a body that faces the wrong way.
 BACKWARDS_SHARE = 0.2
 
 
 def suspicious(session: Session, solution: Solution) -> bool:
-    """Whether a hinge with one direction stays at its straight end: what a body turned the wrong way round does."""
+    """Whether the body may face the wrong way: pixels alone do not tell, and knees then stay at their straight end."""
+    if _pixels_alone(session):
+        return True
     used = np.asarray(session.obs.weight) > 0
     low, high = np.asarray(session.body.joint_range_rad).T
     share = []
