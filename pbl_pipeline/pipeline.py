@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -180,8 +181,12 @@ def write_session_json(fit: SessionFit, path: Path) -> None:
     """Write `session.json`: how the session was fitted and how well."""
     content = {
         "trials": [t.name for t in fit.trials],
+        "orientation_source": {t.name: t.orientation_source for t in fit.trials},
+        "phone_clock_offset_s": {t.name: _known(t.phone_clock_offset_s) for t in fit.trials},
         "solver": fit.solver,
         "params_hash": fit.params_hash,
+        "iterations": int(fit.iterations),
+        "converged": bool(fit.converged),
         "scale": dict(zip(SCALE_NAMES, (round(float(s), 5) for s in fit.scale), strict=True)),
         "loss_trace": [[int(step), round(float(loss), 5)] for step, loss in fit.loss_trace],
         "seconds": round(fit.seconds, 3),
@@ -191,6 +196,11 @@ def write_session_json(fit: SessionFit, path: Path) -> None:
         "code_version": __version__,
     }
     path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def _known(value: float) -> float | None:
+    """The number for JSON; None where it is NaN."""
+    return round(float(value), 4) if math.isfinite(value) else None
 
 
 def distinct_names(paths: Sequence[Path]) -> list[str]:

@@ -25,6 +25,7 @@ from ._base import (
     method_arguments,
     method_columns,
     new_folder,
+    number,
     origin_columns,
     stored_file,
     stored_paramset,
@@ -145,6 +146,8 @@ class SessionFit(dj.Computed):
     fit_residual_2d=null : float32             # (px) median distance of body and keypoints in the picture
     fit_residual_3d=null : float32             # (cm) median distance of body and 3D keypoints
     fit_outcome          : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')  # worst check
+    fit_iterations       : int32               # steps of the solver
+    fit_converged        : bool                # ended at a minimum, not at its bound on iterations or steps
     fit_scale            : json                # multiplier (-) of each scale group, 1 = the unscaled body
     compile_seconds      : float32             # (s) of the duration, spent compiling
     compute_device       : varchar(64)         # what JAX computed on
@@ -162,7 +165,9 @@ class SessionFit(dj.Computed):
         trial_n_fitted    : int32              # frames with joint angles
         trial_residual_2d=null : float32       # (px) median distance of body and keypoints in the picture
         trial_residual_3d=null : float32       # (cm) median distance of body and 3D keypoints
-        trial_file        : <object@arrays>    # fit.npz: time_s (T) s, qpos (T,40) m and rad, markers_world_m (T,J,3) m, residual_2d_px (T,J) px, residual_3d_m (T,J) m; docs/files.md
+        trial_orientation : enum('measured: phone', 'measured: calibration', 'assumed: level', 'estimated: gait')  # where the vertical comes from
+        trial_clock_offset=null : float32      # (s) the phone sensor's clock minus the video's, null where not estimated
+        trial_file        : <object@arrays>    # fit.npz: time_s (T) s, qpos and qpos_sd (T,40) m and rad, markers_world_m (T,J,3) m, residual_2d_px (T,J) px, residual_3d_m (T,J) m; docs/files.md
         """  # noqa: E501
 
     class Check(dj.Part):
@@ -217,6 +222,8 @@ class SessionFit(dj.Computed):
                     "fit_residual_2d": median(residual_2d),
                     "fit_residual_3d": median(100 * residual_3d),
                     "fit_outcome": library("qc").worst(result.qc),
+                    "fit_iterations": int(result.iterations),
+                    "fit_converged": bool(result.converged),
                     "fit_scale": [round(float(s), 5) for s in result.scale],
                     "compile_seconds": result.compile_seconds,
                     "compute_device": result.device[:64],
@@ -235,6 +242,8 @@ class SessionFit(dj.Computed):
                         "trial_n_fitted": int(np.isfinite(trial.qpos).all(axis=1).sum()),
                         "trial_residual_2d": median(trial.residual_2d_px),
                         "trial_residual_3d": median(100 * trial.residual_3d_m),
+                        "trial_orientation": trial.orientation_source,
+                        "trial_clock_offset": number(trial.phone_clock_offset_s),
                         "trial_file": path,
                     }
                 )

@@ -142,6 +142,8 @@ def load_session_fit(key: Any) -> Any:
         scale=arrays["scale"],
         site_offset_m=arrays["site_offset_m"],
         loss_trace=arrays["loss_trace"],
+        iterations=int(row["fit_iterations"]),
+        converged=bool(row["fit_converged"]),
         solver=row["solver"],
         params_hash=row["fit_method_hash"],
         seconds=float(row["fit_seconds"]),

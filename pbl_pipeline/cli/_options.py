@@ -119,9 +119,8 @@ def _check_kind(name: str, value: object, default: object) -> None:
     elif isinstance(default, (list, tuple)):
         fits = isinstance(value, list)
     elif isinstance(default, int):
-        fits = (
-            isinstance(value, int) and not isinstance(value, bool) and value >= (name in ("steps", "samples_per_trial"))
-        )
+        least = 1 if name in ("steps", "samples_per_trial", "max_iterations") else 0
+        fits = isinstance(value, int) and not isinstance(value, bool) and value >= least
     else:
         fits = isinstance(value, (int, float)) and not isinstance(value, bool) and 0 <= value < math.inf
     if not fits:

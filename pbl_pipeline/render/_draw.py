@@ -24,6 +24,7 @@ def draw_body(
     end_m: np.ndarray,
     radius_m: np.ndarray,
     quat_wxyz: np.ndarray,
+    position_m: np.ndarray,
     camera: Camera,
     opacity: float = 0.62,
 ) -> None:
@@ -39,10 +40,12 @@ def draw_body(
     radius_m : (G,)
     quat_wxyz : (4,)
         Camera to world.
+    position_m : (3,)
+        Of the camera in the world.
     opacity
         0..1; the person stays visible through the body.
     """
-    start, end = to_camera(start_m, quat_wxyz), to_camera(end_m, quat_wxyz)
+    start, end = (to_camera(points, quat_wxyz, position_m) for points in (start_m, end_m))
     outlines: dict[str, list[np.ndarray]] = {}
     depths: dict[str, list[float]] = {}
     for g, name in enumerate(body_names):

@@ -68,8 +68,8 @@ class _Painter:
         if not self.known(index):
             return None
         _, start_m, end_m, radius = self._pose(index)
-        quat = self.fit.phone_quat_wxyz[index]
-        start, end = to_camera(start_m, quat), to_camera(end_m, quat)
+        quat, position = self.fit.phone_quat_wxyz[index], self.fit.camera_position_m
+        start, end = to_camera(start_m, quat, position), to_camera(end_m, quat, position)
         outlines = [capsule_outline(start[g], end[g], float(radius[g]), self.fit.camera) for g in range(len(radius))]
         points = [o for o in outlines if o is not None]
         if not points:
@@ -83,7 +83,8 @@ class _Painter:
         fx, fy = image.shape[1] / width, image.shape[0] / height
         if self.known(index):
             camera = scaled_camera(self.fit.camera, fx, fy)
-            draw_body(image, *self._pose(index), self.fit.phone_quat_wxyz[index], camera)
+            quat, position = self.fit.phone_quat_wxyz[index], self.fit.camera_position_m
+            draw_body(image, *self._pose(index), quat, position, camera)
         if self._keypoints is not None and index < len(self._keypoints.time_s):
             xy = (np.asarray(self._keypoints.xy_px[index], float) + 0.5) * [fx, fy] - 0.5
             draw_keypoints(image, xy, self._keypoints.confidence[index])

@@ -20,10 +20,10 @@ def rotation_matrix(quat_wxyz: np.ndarray) -> np.ndarray:
     return Rotation.from_quat(q.reshape(-1, 4), scalar_first=True).as_matrix().reshape(*q.shape[:-1], 3, 3)
 
 
-def to_camera(points_world_m: np.ndarray, quat_wxyz: np.ndarray) -> np.ndarray:
-    """Points (..., 3) of the world (origin at the camera) in the camera frame: x right, y down, z forward (m)."""
-    # x_cam = R_nc^T x_world; with row vectors that is a product from the right by R_nc.
-    return np.asarray(points_world_m, float) @ rotation_matrix(quat_wxyz)
+def to_camera(points_world_m: np.ndarray, quat_wxyz: np.ndarray, position_m: np.ndarray) -> np.ndarray:
+    """Points (..., 3) of the world in the frame of the camera at `position_m` (3,): x right, y down, z forward (m)."""
+    # x_cam = R_nc^T (x_world - p_nc); with row vectors that is a product from the right by R_nc.
+    return (np.asarray(points_world_m, float) - np.asarray(position_m, float)) @ rotation_matrix(quat_wxyz)
 
 
 def to_pixels(points_cam_m: np.ndarray, camera: Camera) -> np.ndarray:

@@ -1,8 +1,7 @@
-"""What the end-to-end tests share: the demo recording, short clips of it, a paramset of few steps."""
+"""What the end-to-end tests share: the demo recording and short clips of it."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -38,15 +37,3 @@ def folder(demo_files: dict[str, Path], tmp_path_factory: pytest.TempPathFactory
     (folder / "notes.mp4").write_text("not a video")
     (folder / "nothing.mp4").touch()
     return folder
-
-
-#: So few steps that the fit takes seconds; enough for events, not for angles anybody should read.
-FEW_STEPS = {"steps": 400, "samples_per_trial": 80}
-
-
-@pytest.fixture(scope="session")
-def few_steps(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A JSON file for `--params`."""
-    path = tmp_path_factory.mktemp("params") / "few-steps.json"
-    path.write_text(json.dumps(FEW_STEPS))
-    return path

@@ -1,6 +1,6 @@
 """A folder of bad videos and one good one, through the tables and through files: the real detector, the real fit.
 
-One populate for all of them. The fits take few steps (`conftest.FEW_STEPS`): whether she walks shows after seconds.
+One populate for all of them.
 """
 
 from __future__ import annotations
@@ -14,19 +14,14 @@ import pandas as pd
 import pytest
 
 import schemas
-from pbl_pipeline.fit import DEFAULT, PARAMSETS, TrialFit, params_of
+from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait.events import load_events
-from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.video import probe
 from schemas import fit, gait, gdi, keypoints, lab, qc, tracking, video, views
-from schemas._base import insert_methods
 from tests.command import Done, pbl
 from tests.videos import constant_rate, numbered_frames, write_video
 
-from .conftest import FEW_STEPS
-
 EMPTY = "niemand ist da, früh.mp4"
-METHOD = "test-few-steps"
 
 
 def clean() -> None:
@@ -38,9 +33,6 @@ def clean() -> None:
 @pytest.fixture(scope="module")
 def tables(database: Path) -> Iterator[None]:
     schemas.activate()
-    params = {**PARAMSETS[DEFAULT].params, **FEW_STEPS}
-    few = Paramset.of("fit", METHOD, 1, params_of(Paramset("fit", METHOD, 1, params)))
-    insert_methods(fit.FitMethod, "fit", {METHOD: few})
     clean()
     yield
     clean()
@@ -49,7 +41,7 @@ def tables(database: Path) -> Iterator[None]:
 @pytest.fixture(scope="module")
 def ingested(tables: None, folder: Path) -> dict[str, Done]:
     """Three visits: she walks, she stands, and everything that cannot work, with the walking video once more."""
-    more = ("--subject", "P001", "--fit-method", METHOD)
+    more = ("--subject", "P001")
     gone = folder.parent / "gone.mp4"
     gone.write_bytes((folder / "walking.mp4").read_bytes() + b"\0")
     bad = [*(folder / n for n in ("notes.mp4", "nothing.mp4", "truncated.mp4", EMPTY, "two.mp4", "short.mp4")), gone]
@@ -206,18 +198,18 @@ def _no_gait(out: Path) -> None:
         ("two.mp4", "SUBJECT_NEEDS_CHOICE"),
     ],
 )
-def test_run_on_a_bad_video_ends_with_its_code(folder, tmp_path, few_steps, name, code):
-    done = pbl("run", folder / name, "--out", tmp_path / "out", "--params", few_steps)
+def test_run_on_a_bad_video_ends_with_its_code(folder, tmp_path, name, code):
+    done = pbl("run", folder / name, "--out", tmp_path / "out")
     assert (done.code, done.error_code) == (1, code), done.err
     assert "next:" in done.err
     assert not list(tmp_path.rglob("report.html"))
     assert bool(list(tmp_path.rglob("two.persons.png"))) == (code == "SUBJECT_NEEDS_CHOICE")
 
 
-def test_run_stands_and_names_what_it_left_out(folder, tmp_path, few_steps):
+def test_run_stands_and_names_what_it_left_out(folder, tmp_path):
     """Standing, with two videos that cannot be used: they are named, and the rest is done."""
     videos = [folder / n for n in ("notes.mp4", "standing.mp4", "short.mp4")]
-    done = pbl("run", *videos, "--out", tmp_path, "--params", few_steps)
+    done = pbl("run", *videos, "--out", tmp_path)
     assert done.code == 1, done.err  # two of the three were left out
     assert "VIDEO_NOT_A_VIDEO" in done.err
     assert "TRACK_TOO_SHORT" in done.err

@@ -34,11 +34,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     walking_fit(body.joint_names, body.sha256, name="walk", n_frames=120).save(folder / "walk.fit.npz")
     _damaged(folder)
     for name, text in {
-        "broken.json": '{"steps": 3',
+        "broken.json": '{"max_iterations": 3',
         "list.json": "[1]",
-        "unknown.json": '{"step": 3}',
-        "typed.json": '{"steps": "many"}',
-        "negative.json": '{"steps": -3}',
+        "unknown.json": '{"steps": 3}',
+        "typed.json": '{"max_iterations": "many"}',
+        "negative.json": '{"max_iterations": -3}',
+        "none.json": '{"max_iterations": 0}',
+        "none-of-paper.json": '{"base": "paper-2025", "steps": 0}',
         "nested.json": '{"cost": 3}',
         "other.toml": "[a]\n",
         "bad.toml": "a = [",
@@ -117,7 +119,7 @@ def test_cameras_that_are_none(folder, tmp_path, camera):
     [
         *(
             ("--params", f"{n}.json", "FILE_FORMAT")
-            for n in ("broken", "list", "unknown", "typed", "negative", "nested")
+            for n in ("broken", "list", "unknown", "typed", "negative", "none", "none-of-paper", "nested")
         ),
         ("--params", "folder.mp4", "SOLVER_UNKNOWN"),
         ("--params", "no such paramset", "SOLVER_UNKNOWN"),

@@ -132,8 +132,12 @@ def _everything_comes_back(paths: list[Path]) -> None:
         np.testing.assert_allclose(trial.fit.qpos, made.qpos, atol=1e-6)
         assert trial.fit.time_s.dtype == np.float64
         assert trial.fit.qpos.dtype == np.float32
+        assert trial.fit.orientation_source == made.orientation_source
+        assert np.isnan(trial.fit.phone_clock_offset_s)
         assert trial.events.status == "PASS"
         assert any(c.used and c.curves for c in trial.cycles)
+    whole = chain.fit_session([points], [path.stem])
+    assert (results.fit.iterations, results.fit.converged) == (whole.iterations, whole.converged)
     lib = pbl_pipeline.gait
     fresh = lib.gait_metrics(results.fit.trials)
     assert results.metrics.params_hash == fresh.params_hash

@@ -91,7 +91,7 @@ def _draw(names: tuple[str, ...], start: list, end: list, radius: float = 0.05, 
     n = len(names)
     # Written in the camera's frame, handed over in the world's.
     a, b = (np.asarray(p, float).reshape(n, 3) @ rotation_matrix(LEVEL_CAMERA_QUAT_WXYZ).T for p in (start, end))
-    draw_body(image, names, a, b, np.full(n, radius), LEVEL_CAMERA_QUAT_WXYZ, CAMERA, opacity)
+    draw_body(image, names, a, b, np.full(n, radius), LEVEL_CAMERA_QUAT_WXYZ, np.zeros(3), CAMERA, opacity)
     return image
 
 
@@ -262,7 +262,7 @@ def test_body_lies_on_its_projection(walk, clip) -> None:
     column = {n: i for i, n in enumerate(walk.joint_names)}
     q = walk.qpos[10]
     pelvis = np.array([q[column["pelvis_tx"]], -q[column["pelvis_tz"]], 0.975 + q[column["pelvis_ty"]]])
-    x, y = to_pixels(to_camera(pelvis, LEVEL_CAMERA_QUAT_WXYZ), walk.camera)
+    x, y = to_pixels(to_camera(pelvis, LEVEL_CAMERA_QUAT_WXYZ, np.zeros(3)), walk.camera)
     changed = np.abs(image.astype(int) - 200).max(axis=2) > 20
     assert changed[round(y), round(x)]
     rows, columns = np.nonzero(changed)

@@ -97,7 +97,7 @@ CHOICE = SubjectChoice("CHOSEN", 2, 0.9, 1, 0.2, {1: 0.2, 2: 0.9}, "person 2 wal
 def _session(*fits: TrialFit, qc: tuple[Check, ...] = (Check("residual_3d_cm", PASS, 3.1, 6.0),)) -> SessionFit:
     f = fits[0]
     trace = np.array([[0.0, 99.0], [100.0, 9.0]])
-    return SessionFit(fits, f.scale, f.site_offset_m, trace, f.solver, f.params_hash, 31.2, 12.0, "cpu", qc)
+    return SessionFit(fits, f.scale, f.site_offset_m, trace, 7, True, f.solver, f.params_hash, 31.2, 12.0, "cpu", qc)
 
 
 @pytest.fixture(scope="module")
