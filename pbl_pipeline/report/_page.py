@@ -237,8 +237,10 @@ def _trial(t: TrialReport, m: TrialMetrics | None) -> dict:
         where = ", ".join(f"{number(a, 1)} to {number(b, 1)} s" for a, b in spans[:4])
         texts.append(f"The body is fitted from {where}" if spans else "The body is fitted in no frame")
         if np.isfinite(t.fit.residual_2d_px).any():
-            px, cm = float(np.nanmedian(t.fit.residual_2d_px)), 100 * float(np.nanmedian(t.fit.residual_3d_m))
-            texts.append(f"It lies {number(px, 1)} px and {number(cm, 1)} cm (median) from the detected points")
+            away = [f"{number(float(np.nanmedian(t.fit.residual_2d_px)), 1)} px"]
+            if np.isfinite(t.fit.residual_3d_m).any():
+                away.append(f"{number(100 * float(np.nanmedian(t.fit.residual_3d_m)), 1)} cm")
+            texts.append(f"It lies {' and '.join(away)} (median) from the detected points")
     if m is not None and m.reason:
         texts.append(f"No gait measures: {m.reason}")
     if t.problem:
@@ -324,11 +326,13 @@ def _origin(
         fit = next((t.fit for t in report.trials if t.fit is not None), None)
         rows = [
             ("Solver", f"{s.solver}, parameters {s.params_hash}", True),
+            ("Steps", f"{s.iterations}, {'converged' if s.converged else 'not converged'}", False),
             ("Time", f"{s.seconds:.1f} s, of these {s.compile_seconds:.1f} s compiling, on {s.device}", False),
         ]
         if fit is not None:
             rows.append(("Body model (SHA-256)", fit.body_sha256, True))
             rows.append(("Camera motion", ", ".join(sorted({t.camera_motion for t in s.trials})), False))
+            rows.append(("Vertical", ", ".join(sorted({t.orientation_source for t in s.trials})), False))
         groups.append({"name": "Fit", "rows": rows})
     if report.metrics is not None:
         gdi = report.metrics.gdi

@@ -12,7 +12,8 @@ import pytest
 
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.gait import GaitEvent
+from pbl_pipeline.fit import fit_session
+from pbl_pipeline.gait import GaitEvent, angle_series
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.render import (
     NEAR_M,
@@ -30,8 +31,10 @@ from pbl_pipeline.render import (
     to_camera,
     to_pixels,
 )
+from pbl_pipeline.synthetic import NO_NOISE, observe
 from pbl_pipeline.video import Camera, probe, read_frames
 from tests.videos import write_video
+from tests.walker import walking_qpos
 from tests.walking_fit import LEVEL_CAMERA_QUAT_WXYZ, walking_fit
 
 CAMERA = Camera(np.array([[500.0, 0, 320], [0, 500, 180], [0, 0, 1]]), np.zeros(5), "test")
@@ -269,6 +272,42 @@ def test_body_lies_on_its_projection(walk, clip) -> None:
     assert abs(columns.mean() - x) < 25
     # 1.75 m or so of a person at 4 m, in a picture of 600 px focal length
     assert 225 < np.ptp(rows) < 300
+
+
+def test_a_camera_that_stands_elsewhere_sees_the_same_body(walk, clip) -> None:
+    """Camera and body moved together by 2 m along world x and 1 m up: the same picture."""
+    column = {n: i for i, n in enumerate(walk.joint_names)}
+    qpos = walk.qpos.copy()
+    qpos[:, column["pelvis_tx"]] += 2
+    qpos[:, column["pelvis_ty"]] += 1
+    moved = dataclasses.replace(walk, qpos=qpos, camera_position_m=np.array([2.0, 0, 1]))
+    (here,), (there,) = (overlay_frames(clip[0], fit, [10], crop_to_body=True) for fit in (walk, moved))
+    assert here.shape == there.shape
+    assert np.mean(np.abs(here.astype(int) - there) > 8) < 0.002  # single precision of the poses
+    (left,) = overlay_frames(clip[0], dataclasses.replace(moved, camera_position_m=np.zeros(3)), [10])
+    assert np.mean(left != overlay_frames(clip[0], walk, [10])[0]) > 0.01
+
+
+@pytest.mark.parametrize("tilt_deg", [(12.0, 5.0), (-8.0, -4.0)])
+def test_the_fit_of_a_tilted_camera_lies_on_the_person(tilt_deg: tuple[float, float]) -> None:
+    """The vertical is estimated from the walk, and the body stays where it is seen, upright in the world."""
+    time_s = np.arange(120) / 30
+    # A camera 1.2 m above the ground sees her walk from right to left.
+    qpos = walking_qpos(time_s, start_m=(5.0, -2.4))
+    seen = observe(qpos, time_s, noise=NO_NOISE, tilt_deg=tilt_deg)
+    fit = fit_session([seen.keypoints], ["walk"]).trials[0]
+    assert fit.orientation_source == "estimated: gait"
+    np.testing.assert_allclose(
+        rotation_matrix(fit.phone_quat_wxyz[0])[2], seen.R_nc[0][2], atol=np.radians(2)
+    )  # third row: the world's vertical as the camera sees it
+    middle = 60
+    points = to_camera(fit.markers_world_m[middle], fit.phone_quat_wxyz[middle], fit.camera_position_m)
+    away = np.linalg.norm(to_pixels(points, fit.camera) - seen.keypoints.xy_px[middle], axis=-1)
+    assert np.median(away) < 5
+    # The pelvis' tilt against the walking direction is that of the walker, whatever the camera's tilt.
+    level = dataclasses.replace(fit, qpos=qpos, phone_quat_wxyz=np.tile(LEVEL_CAMERA_QUAT_WXYZ, (120, 1)))
+    got, wanted = (angle_series(f).left["pelvis_tilt"] for f in (fit, level))
+    assert abs(np.nanmean(got - wanted)) < 4
 
 
 def test_frames_come_in_the_order_asked_for(walk, clip) -> None:
