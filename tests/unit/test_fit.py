@@ -11,7 +11,15 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import PARAMSETS, TrialFit, check_trial, fit_session, params_of
+from pbl_pipeline.fit import (
+    LEVEL_CAMERA_R_NC,
+    PARAMSETS,
+    ImplicitAdamParams,
+    TrialFit,
+    check_trial,
+    fit_session,
+    params_of,
+)
 from pbl_pipeline.fit._costs import (
     center,
     distance_2d_px2,
@@ -22,12 +30,13 @@ from pbl_pipeline.fit._costs import (
     scale_prior,
     weighted_mean,
 )
+from pbl_pipeline.fit._inputs import undistort_px
+from pbl_pipeline.fit._place import root_positions
 from pbl_pipeline.fit._prior import prior_of
-from pbl_pipeline.fit._problem import LEVEL_CAMERA_R_NC, undistort_px
 from pbl_pipeline.fit._quality import _converged
-from pbl_pipeline.fit._start import root_positions
-from pbl_pipeline.fit._trajectory import ImplicitTrajectory, fit_ranges, frequencies, pose_of, raw_of
+from pbl_pipeline.fit._trajectory import fit_ranges, pose_of, raw_of
 from pbl_pipeline.fit._view import bridge_gaps, longest_run_s, whole_person_in_view
+from pbl_pipeline.fit.solvers import Solution
 from pbl_pipeline.paramset import Paramset
 from tests.walker import CAMERA, observe, walking_qpos
 
@@ -35,11 +44,9 @@ TIME_S = np.arange(0, 2.6, 1 / 30)
 
 
 def quick(steps: int = 1500) -> Paramset:
-    """The demo's paramset with full weight on 3D, because the synthetic points are metric."""
-    params = params_of(PARAMSETS["blazepose"])
-    params = dataclasses.replace(
-        params, steps=steps, samples_per_trial=64, cost=dataclasses.replace(params.cost, weight_3d=1.0)
-    )
+    """`implicit-adam` with the demo's priors and full weight on 3D, because the synthetic points are metric."""
+    cost = dataclasses.replace(params_of(PARAMSETS["blazepose"]).cost, weight_3d=1.0)
+    params = ImplicitAdamParams(steps=steps, samples_per_trial=64, start="keypoints", cost=cost)
     return Paramset.of("fit", "test", 1, params)
 
 
@@ -104,7 +111,7 @@ def test_fit_file_round_trip(two_trials, tmp_path):
         if isinstance(a, np.ndarray):
             np.testing.assert_array_equal(a, b)
         elif field.name != "camera":
-            assert a == b, field.name
+            assert a == b or (a != a and b != b), field.name  # NaN: not estimated
 
 
 def test_frames_outside_the_view_are_unknown(two_trials):
@@ -127,7 +134,11 @@ def test_frames_outside_the_view_are_unknown(two_trials):
         ({"time_s": TIME_S[::-1].copy()}, "FIT_INPUT", "time stamps"),
         ({"time_s": np.where(TIME_S > 1, 1.0, TIME_S)}, "FIT_INPUT", "time stamps"),
         ({"confidence": np.zeros((len(TIME_S), 33))}, "FIT_INPUT", "in view"),
-        ({"xyz_cam_m": np.full((len(TIME_S), 33, 3), np.nan)}, "FIT_INPUT", "NaN"),
+        (
+            {"xyz_cam_m": np.where(np.arange(33)[:, None] == 5, np.nan, np.ones((len(TIME_S), 33, 3)))},
+            "FIT_INPUT",
+            "NaN",
+        ),
         ({"marker_set": "no_such_set"}, "MARKER_SET_UNKNOWN", "no_such_set"),
         ({"names": tuple(f"m{i}" for i in range(33))}, "MARKER_SET_UNKNOWN", "m0"),
     ],
@@ -227,8 +238,8 @@ def test_root_position_from_pixels():
     c = np.ones((3, 10))
     c[2, 4:] = 0
     c[1, 3:] = 0
-    found = root_positions(x, uv[..., :2] / uv[..., 2:], c, CAMERA.matrix)
-    np.testing.assert_allclose(found[[0, 2]], root[[0, 2]], atol=1e-9)
+    found = root_positions(x, uv[..., :2] / uv[..., 2:], c, np.tile(CAMERA.matrix, (3, 1, 1)))
+    np.testing.assert_allclose(found[[0, 2]], root[[0, 2]], atol=1e-7)
     assert np.all(np.isnan(found[1]))  # three points are not enough
 
 
@@ -241,15 +252,6 @@ def test_pose_and_its_inverse():
     np.testing.assert_allclose(back, q, atol=1e-5)
     far = pose_of(jnp.full(7, 50.0), *map(jnp.asarray, (low, high, is_translation)))
     assert float(far[-1]) == pytest.approx(0.2, abs=1e-5)
-
-
-def test_time_encoding_covers_the_band():
-    omega = frequencies(6.0, 80.0, 2)
-    assert omega[0] == pytest.approx(np.pi / 6)
-    assert 80 <= omega[-1] < 80 * 2**0.5
-    np.testing.assert_allclose(omega[2:] / omega[:-2], 2.0)
-    network = ImplicitTrajectory(len(omega), (16, 16, 16), 2, 40, 0.1, key=jax.random.key(0))
-    assert network(jnp.asarray(0.5), jnp.asarray(omega, jnp.float32)).shape == (40,)
 
 
 def test_short_gaps_are_bridged_and_long_ones_are_not():
@@ -293,7 +295,21 @@ def test_where_nothing_was_seen_nothing_is_known():
 
 def test_convergence_is_judged_by_the_second_half_and_needs_a_trace():
     def outcome(loss):
-        return _converged(np.column_stack([np.arange(len(loss)), loss])).outcome
+        trace = np.column_stack([np.arange(len(loss)), loss])
+        solution = Solution(
+            qpos=np.zeros((1, 40)),
+            R_nc=np.zeros((1, 1, 3, 3)),
+            s=np.zeros(8),
+            scale=np.ones(8),
+            site_offset_m=np.zeros((33, 3)),
+            clock_s=np.zeros(1),
+            loss_trace=trace,
+            compile_seconds=0.0,
+            seconds=0.0,
+            iterations=len(loss),
+            converged=True,
+        )
+        return _converged(solution).outcome
 
     assert outcome([9.0, 3.0, 1.5, 1.1, 1.05, 1.02, 1.01, 1.0]) == "PASS"
     assert outcome([9.0, 6.0, 4.0, 3.0, 2.0, 1.5, 1.2, 1.0]) == "WARN"
