@@ -82,6 +82,8 @@ def make_session(
         raise _input_error("trials with different numbers of cameras", "the same cameras in all trials of a session")
     table = markers or marker_set(trials[0].marker_set)
     motions = list(camera_motion) or ["static"] * len(trials)
+    if len(motions) != len(trials) or not set(motions) <= {"static", "handheld"}:
+        raise _input_error(f"camera motions {', '.join(motions)}", "'static' or 'handheld' for each trial")
     checked = [check_trial(t, n, view, table) for t, n in zip(trials, names, strict=True)]
     arrays, orientation = [], []
     for trial, name, motion, (used, _) in zip(trials, names, motions, checked, strict=True):

@@ -21,6 +21,7 @@ from ._costs import distance_2d_px2, distance_3d_cm2
 from ._gravity import upright
 from ._inputs import Session, Trial, make_session
 from ._inputs import check_trial as _check_trial
+from ._paper_objective import kinds_of
 from ._paper_objective import paper_objective as _paper_objective
 from ._params import DEFAULT, PARAMSETS, GaussNewtonParams, Params, params_of
 from ._quality import check_fit
@@ -105,7 +106,7 @@ def fit_sessions(
             out[i] = error
             continue
         shapes = tuple(a.shape for a in jax.tree.leaves(session.obs))
-        key = (shapes, session.moving, type(session.trials[0]))
+        key = (shapes, kinds_of(session), type(session.trials[0]))
         groups.setdefault(key, []).append((i, session, time.perf_counter() - begin))
     if batch is None:
         batch = 1 if jax.default_backend() == "cpu" else BATCH
@@ -163,10 +164,11 @@ def _session_fit(
 ) -> SessionFit:
     begin = time.perf_counter()
     used = np.asarray(session.obs.weight) > 0
-    if not np.all(np.isfinite(solution.qpos[used])) or not np.all(np.isfinite(solution.scale)):
+    finite = np.all(np.isfinite(solution.qpos[used])) and np.all(np.isfinite(solution.scale))
+    if not finite or not np.isfinite(solution.loss_trace[-1, 1]):
         raise PblError(
             "FIT_DIVERGED",
-            found="joint angles that are not finite",
+            found="joint angles or a cost that are not finite",
             expected="finite angles",
             next_step="check the keypoints and the camera matrix",
             key=", ".join(session.names),
