@@ -34,11 +34,11 @@ class MarkerTable:
 
     @classmethod
     def of(cls, markers: MarkerSet, size: int | None = None) -> MarkerTable:
-        """The table of a marker set, padded to `size` rows."""
+        """The table of a marker set, padded to `size` rows, on the host."""
         pad = (size or len(markers)) - len(markers)
-        f32 = functools.partial(jnp.asarray, dtype=jnp.float32)
+        f32 = functools.partial(np.asarray, dtype=np.float32)
         return cls(
-            body_index=jnp.asarray(np.pad(markers.body_index, (0, pad)), jnp.int32),
+            body_index=np.pad(markers.body_index, (0, pad)).astype(np.int32),
             position_m=f32(np.pad(markers.position_m, [(0, pad), (0, 0)])),
             weight_3d=f32(np.pad(markers.weight_3d, (0, pad))),
             weight=f32(np.pad(np.ones(len(markers)), (0, pad))),

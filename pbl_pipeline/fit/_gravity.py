@@ -12,9 +12,8 @@ import dataclasses
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import body_poses
-
 from ._inputs import GAIT, LEVEL, Session
+from ._outcome import Outcome
 from ._place import pelvis_rest, pelvis_values
 from .solvers import Solution
 
@@ -26,16 +25,16 @@ BOB_SD_M, LEAN_SD_RAD = 0.03, np.deg2rad(3.0)
 MOST_TILT_RAD = np.deg2rad(30.0)
 
 
-def upright(session: Session, solution: Solution) -> tuple[Solution, tuple[str, ...]]:
-    """The solution in a world whose z is up, and where each trial's vertical comes from."""
+def upright(session: Session, solution: Solution, seen: Outcome) -> tuple[Solution, Outcome, tuple[str, ...]]:
+    """The solution and what it shows in a world whose z is up, and where each trial's vertical comes from."""
     sources = list(session.orientation)
-    qpos, R_nc = solution.qpos.copy(), solution.R_nc.copy()
+    qpos, R_nc, points = solution.qpos.copy(), solution.R_nc.copy(), np.array(seen.x_world_m)
     for i, source in enumerate(sources):
         if source != LEVEL:
             continue
         frames, used = session.frames(i), session.arrays[i].used
         x, R = pelvis_path(session, qpos[frames])
-        up = vertical(x[used], body_axis(session, qpos[frames][used], solution.scale))
+        up = vertical(x[used], unit(np.asarray(seen.body_axis_m)[frames][used].mean(axis=0)))
         if up is None:
             continue
         turn = _turn_to_z(up)
@@ -43,8 +42,10 @@ def upright(session: Session, solution: Solution) -> tuple[Solution, tuple[str, 
         for name, value in values.items():
             qpos[frames, session.body.joint_names.index(name)] = value
         R_nc[frames] = turn @ R_nc[frames]
+        points[frames] = points[frames] @ turn.T
         sources[i] = GAIT
-    return dataclasses.replace(solution, qpos=qpos, R_nc=R_nc), tuple(sources)
+    solution = dataclasses.replace(solution, qpos=qpos, R_nc=R_nc)
+    return solution, dataclasses.replace(seen, x_world_m=points), tuple(sources)
 
 
 def pelvis_path(session: Session, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -56,15 +57,9 @@ def pelvis_path(session: Session, qpos: np.ndarray) -> tuple[np.ndarray, np.ndar
     return slides @ stands.T + rest, stands @ Rotation.from_euler("ZXY", turns).as_matrix()
 
 
-def body_axis(session: Session, qpos: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Unit vector (3,) from between the heels to the head, mean over the frames."""
-    names = session.body.body_names
-    # One shape of program: the packed frames'.
-    padded = np.resize(qpos, (session.obs.weight.shape[0], qpos.shape[1]))
-    x = np.asarray(body_poses(session.body, padded, scale)[0], np.float64)[: len(qpos)]
-    feet = 0.5 * (x[:, names.index("calcn_r")] + x[:, names.index("calcn_l")])
-    axis = (x[:, names.index("head")] - feet).mean(axis=0)
-    return axis / np.linalg.norm(axis)
+def unit(vector: np.ndarray) -> np.ndarray:
+    """The vector at length 1."""
+    return vector / np.linalg.norm(vector)
 
 
 def vertical(x: np.ndarray, axis: np.ndarray) -> np.ndarray | None:

@@ -10,7 +10,6 @@ import dataclasses
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.ndimage import gaussian_filter1d
@@ -29,9 +28,9 @@ FRAME_S = 1 / 30
 class Observations:
     """F frames of all trials, V views, J markers, N trials; P samples of the phone's orientation per trial.
 
-    time_s counts from each trial's first frame; `trial` is the number of a frame's trial; `weight` is 1 for a frame that
-    counts and 0 for others. Confidences are 0 where nothing was seen; values there are finite and do not count. `xy_px`
-    are pixels of an ideal pinhole camera (undistorted). `bend` holds the weights of the frames before, at and after a
+    time_s counts from each trial's first frame; `trial` is the number of a frame's trial; `weight` is 1 for a frame
+    that counts and 0 for others. Confidences are 0 where nothing was seen; values there are finite and do not count.
+    `xy_px` are pixels of an ideal pinhole camera (undistorted). `bend` holds the weights of the frames before, at and after a
     frame in the second difference there (per 1/30 s squared), 0 where it is not formed. `sample_*`: the phone's
     orientation R_nc as quaternions at a fixed interval, from `sample_start_s` on; there where `has_phone` is 1.
     """
@@ -83,8 +82,8 @@ class TrialArrays:
 #: Interval (s) of the phone's orientation as the solvers see it, and how far beyond the trial it is kept (s): the
 #: largest offset between the two clocks.
 SAMPLE_S, CLOCK_RANGE_S = 0.01, 0.5
-#: Width (s, standard deviation) over which the phone's orientation is averaged. Interpolated as it is, its noise is least
-#: half way between two samples, and the clock's offset would lock to those places. A hand's 3 Hz lose 7 %.
+#: Width (s, standard deviation) over which the phone's orientation is averaged. Interpolated as it is, its noise is
+#: least half way between two samples, and the clock's offset would lock to those places. A hand's 3 Hz lose 7 %.
 SMOOTH_S = 0.02
 
 
@@ -124,7 +123,7 @@ def bend_weights(time_s: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 
 def pack(trials: Sequence[TrialArrays]) -> Observations:
-    """All trials of a session as one `Observations`."""
+    """All trials of a session as one `Observations`, still on the host."""
     total = sum(len(t.time_s) for t in trials)
     frames, markers = pad_frames(total) - total, pad_markers(trials[0].c_world.shape[1])
     n_markers = trials[0].c_world.shape[1]
@@ -162,8 +161,8 @@ def pack(trials: Sequence[TrialArrays]) -> Observations:
         "sample_step_s": np.asarray(SAMPLE_S),
     }
     number = np.concatenate([np.full(len(t.time_s), i) for i, t in enumerate(trials)])
-    f32 = {k: jnp.asarray(v, jnp.float32) for k, v in arrays.items()}
-    return Observations(trial=jnp.asarray(np.pad(number, (0, frames), mode="edge"), jnp.int32), **f32)
+    f32 = {k: np.asarray(v, np.float32) for k, v in arrays.items()}
+    return Observations(trial=np.pad(number, (0, frames), mode="edge").astype(np.int32), **f32)
 
 
 def _padded(used: np.ndarray, frames: int) -> np.ndarray:
@@ -180,7 +179,8 @@ def _phone_samples(trials: Sequence[TrialArrays], n: int) -> tuple[np.ndarray, n
     out = np.tile([1.0, 0, 0, 0], (n, count, 1))
     for i in moving:
         trial = trials[i]
-        assert trial.phone_time_s is not None and trial.phone_quat_wxyz is not None
+        assert trial.phone_time_s is not None
+        assert trial.phone_quat_wxyz is not None
         turn = Slerp(trial.phone_time_s, Rotation.from_quat(trial.phone_quat_wxyz, scalar_first=True))
         at = trial.time_s[0] - CLOCK_RANGE_S + SAMPLE_S * np.arange(count)
         quat = turn(np.clip(at, trial.phone_time_s[0], trial.phone_time_s[-1])).as_quat(scalar_first=True)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+
+import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -46,7 +49,9 @@ def world_points(arrays: TrialArrays) -> tuple[np.ndarray, np.ndarray]:
     v = int(np.argmax(np.sum(arrays.c_3d, axis=(0, 2))))
     if np.any(arrays.c_3d[:, v] > 0):
         c = arrays.c_3d[:, v]
-        root = root_positions(arrays.x_cam[:, v], arrays.xy_px[:, v], np.minimum(c, arrays.c_2d[:, v]), arrays.camera_matrix[:, v])
+        root = root_positions(
+            arrays.x_cam[:, v], arrays.xy_px[:, v], np.minimum(c, arrays.c_2d[:, v]), arrays.camera_matrix[:, v]
+        )
         x = arrays.x_cam[:, v] + root[:, None]
         return np.einsum("tij,tmj->tmi", arrays.R_nc[:, v], x) + arrays.p_nc[:, v, None], c
     return triangulate(arrays)
@@ -92,17 +97,19 @@ def triangulate(arrays: TrialArrays) -> tuple[np.ndarray, np.ndarray]:
 
 def standing_markers(body: Body, markers: MarkerSet) -> np.ndarray:
     """(J, 3) of the unscaled standing body with its pelvis at the origin and unturned, by C MuJoCo."""
-    import mujoco
-
-    model = body.mj_model
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    R, x = data.xmat[1:].reshape(-1, 3, 3), data.xpos[1:]
+    x, R = _standing(body)
     return x[markers.body_index] + np.einsum("mij,mj->mi", R[markers.body_index], markers.position_m) - x[0]
 
 
+@functools.cache
+def _standing(body: Body) -> tuple[np.ndarray, np.ndarray]:
+    data = mujoco.MjData(body.mj_model)
+    mujoco.mj_kinematics(body.mj_model, data)
+    return data.xpos[1:].copy(), data.xmat[1:].reshape(-1, 3, 3).copy()
+
+
 def align(template: np.ndarray, points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations (T, 3, 3) and positions (T, 3) with points = R template + x in the weighted least-squares sense (Kabsch)."""
+    """Rotations (T, 3, 3) and positions (T, 3) with points = R template + x, weighted least squares (Kabsch)."""
     total = np.maximum(weight.sum(axis=1), 1e-9)[:, None]
     a = weight @ template / total
     b = np.einsum("tj,tji->ti", weight, points) / total

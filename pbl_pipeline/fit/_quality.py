@@ -7,13 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.qc import FAIL, PASS, WARN, Check
 
-from pbl_pipeline.keypoints import WorldMarkers
-
 from ._inputs import GAIT, LEVEL, Session
-from .solvers import Solution
 from ._types import TrialFit
+from .solvers import Solution
 
 #: Median 2D residual as a share of the person's height in the picture: 5 px of a 500 px person is the paper's level.
 RESIDUAL_2D_WARN, RESIDUAL_2D_FAIL = 0.02, 0.06
@@ -125,7 +124,7 @@ def _converged(solution: Solution) -> Check:
             PASS if solution.converged else WARN,
             float(solution.iterations),
             None,
-            "the solver stopped at its bound on iterations, not at a minimum: look at the overlay; raise max_iterations",
+            "the solver stopped at its bound on steps, not at a minimum: look at the overlay, raise max_iterations",
         )
     loss = solution.loss_trace[:, 1]
     enough = len(loss) >= TRACE_NEEDED
@@ -154,13 +153,13 @@ def _orientation(trials: Sequence[TrialFit]) -> Check:
     sources = {t.orientation_source for t in trials}
     if LEVEL in sources:
         advice = (
-            "the camera is taken as level and still: its own tilt adds to the pelvis angles and to positions, not to the "
-            "angles between segments (hip, knee, ankle)"
+            "the camera is taken as level and still: its own tilt adds to the pelvis angles and to positions, not to "
+            "the angles between segments (hip, knee, ankle)"
         )
     else:
         advice = (
-            "the vertical is taken from the walk, on a level floor by a person who does not lean to a side: a lean of the "
-            "trunk to a side is lost; pass the phone's log with --attitude"
+            "the vertical is taken from the walk, on a level floor by a person who does not lean to a side: a lean of "
+            "the trunk to a side is lost; pass the phone's log with --attitude"
         )
     return Check("camera_orientation_known", WARN if sources & {LEVEL, GAIT} else PASS, None, None, advice)
 

@@ -7,20 +7,18 @@ import time
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from pbl_pipeline.body import MarkerSet
-from pbl_pipeline.body._jacobian import table_positions
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.video import Camera
 
-from ._costs import distance_2d_px2, distance_3d_cm2
 from ._gravity import upright
 from ._inputs import Session, Trial, make_session
 from ._inputs import check_trial as _check_trial
+from ._outcome import Outcome, outcome_one
 from ._paper_objective import kinds_of
 from ._paper_objective import paper_objective as _paper_objective
 from ._params import DEFAULT, PARAMSETS, GaussNewtonParams, Params, params_of
@@ -173,11 +171,11 @@ def _session_fit(
             next_step="check the keypoints and the camera matrix",
             key=", ".join(session.names),
         )
-    solution, sources = upright(session, solution)
+    seen = jax.device_get(solution.outcome or _outcome(session, solution))
+    solution, seen, sources = upright(session, solution, seen)
     seconds = packing + solution.seconds + time.perf_counter() - begin
-    residuals = _residuals(session, solution)
     fits = tuple(
-        _trial_fit(session, i, solution, residuals, sources[i], paramset, motions[i], seconds)
+        _trial_fit(session, i, solution, seen, sources[i], paramset, motions[i], seconds)
         for i in range(len(session.trials))
     )
     return SessionFit(
@@ -196,51 +194,18 @@ def _session_fit(
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class _Residuals:
-    """On the packed frames, without padded markers: x_world_m (F, J, 3); px (F, J) mean over views; m (F, J)."""
-
-    x_world_m: np.ndarray
-    px: np.ndarray
-    m: np.ndarray
-
-
-def _residuals(session: Session, solution: Solution) -> _Residuals:
-    obs, j = session.obs, len(session.markers)
-    f32 = lambda a: jnp.asarray(a, jnp.float32)  # noqa: E731
+def _outcome(session: Session, solution: Solution) -> Outcome:
     offset = np.zeros((session.table.weight.shape[0], 3))
-    offset[:j] = solution.site_offset_m
-    x = _positions(session.body, session.table, f32(solution.qpos), f32(solution.scale), f32(offset))
-    c_2d, c_3d, c_world = (np.asarray(c) for c in (obs.c_2d, obs.c_3d, obs.c_world))
-    px = m = np.full((len(x), j), np.nan)
-    if np.any(c_2d > 0):
-        R = f32(solution.R_nc)
-        e = np.sqrt(np.asarray(distance_2d_px2(x[:, None] - obs.p_nc[:, :, None], obs.xy_px, R, obs.camera_matrix)))
-        px = _mean_seen(e, c_2d)[:, :j]
-    if np.any(c_3d > 0):
-        e2 = distance_3d_cm2(x[:, None], obs.x_cam, f32(solution.R_nc), obs.c_3d, session.table.weight_3d)
-        m = 0.01 * _mean_seen(np.sqrt(np.asarray(e2)), c_3d)[:, :j]
-    if np.any(c_world > 0):
-        e = np.linalg.norm(np.asarray(x) - np.asarray(obs.x_world), axis=-1)
-        m = np.where(c_world > 0, e, np.nan)[:, :j]
-    return _Residuals(np.asarray(x, np.float64)[:, :j], px, m)
-
-
-_positions = jax.jit(table_positions, static_argnames="body")
-
-
-def _mean_seen(e: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Mean over views (axis 1) of those that saw a marker, NaN where none did."""
-    seen = c > 0
-    count = seen.sum(axis=1)
-    return np.where(count > 0, np.sum(np.where(seen, e, 0.0), axis=1) / np.maximum(count, 1), np.nan)
+    offset[: len(session.markers)] = solution.site_offset_m
+    given = (solution.qpos, solution.R_nc, solution.scale, offset)
+    return outcome_one(session.body, session.table, session.obs, *(np.asarray(a, np.float32) for a in given))
 
 
 def _trial_fit(
     session: Session,
     i: int,
     solution: Solution,
-    residuals: _Residuals,
+    seen: Outcome,
     source: str,
     paramset: Paramset,
     camera_motion: str,
@@ -248,7 +213,7 @@ def _trial_fit(
 ) -> TrialFit:
     trial, arrays, at = session.trials[i], session.arrays[i], session.frames(i)
     hide = ~arrays.used[:, None]
-    n, q = len(arrays.time_s), solution.qpos.shape[1]
+    n, q, j = len(arrays.time_s), solution.qpos.shape[1], len(session.markers)
     sd = np.full((n, q), np.nan) if solution.qpos_sd is None else solution.qpos_sd[at]
     view = trial.views[0] if isinstance(trial, MultiView) else trial
     camera = view.camera if isinstance(view, Keypoints) else NO_CAMERA
@@ -263,12 +228,12 @@ def _trial_fit(
         qpos_sd=np.where(hide, np.nan, sd),
         marker_set=session.markers.name,
         marker_names=tuple(session.markers.names),
-        markers_world_m=np.where(hide[..., None], np.nan, residuals.x_world_m[at]),
+        markers_world_m=np.where(hide[..., None], np.nan, seen.x_world_m[at, :j]),
         phone_quat_wxyz=quat_wxyz(solution.R_nc[at, 0]) if has_camera else np.full((n, 4), np.nan),
         scale=solution.scale,
         site_offset_m=solution.site_offset_m,
-        residual_2d_px=np.where(hide, np.nan, residuals.px[at]),
-        residual_3d_m=np.where(hide, np.nan, residuals.m[at]),
+        residual_2d_px=np.where(hide, np.nan, seen.residual_2d_px[at, :j]),
+        residual_3d_m=np.where(hide, np.nan, seen.residual_3d_m[at, :j]),
         camera=camera,
         image_size_px=size,
         camera_motion=camera_motion,

@@ -3,8 +3,8 @@
     | A  B | |x|   |g|      A (F Q, F Q): block (t, t) full, blocks (t, t+1) and (t, t+2) diagonal (second differences)
     | B' C | |y| = |h|      B (F Q, K), C (K, K): what all frames share (scale, marker offsets, clocks)
 
-Solved by block cyclic reduction over pairs of frames (e.g. Golub & Van Loan, Matrix Computations, 4th ed., 4.5.4) and the
-Schur complement of A: work and memory grow linearly with F, and the number of steps one after the other with log F,
+Solved by block cyclic reduction over pairs of frames (e.g. Golub & Van Loan, Matrix Computations, 4th ed., 4.5.4) and
+the Schur complement of A: work and memory grow linearly with F, and the number of steps one after the other with log F,
 which is what a GPU needs. All matrices are symmetric positive definite.
 """
 

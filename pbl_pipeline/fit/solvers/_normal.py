@@ -1,7 +1,7 @@
 """The cost of a session over per-frame poses, and its normal equations at one point.
 
-The derivatives are written out (`body/_jacobian.py`): a frame's Hessian is a sum over its markers of small products, the
-3D term's centring adds three-dimensional corrections, and what all frames share borders the frames' blocks. Robust
+The derivatives are written out (`body/_jacobian.py`): a frame's Hessian is a sum over its markers of small products,
+the 3D term's centring adds three-dimensional corrections, and what all frames share borders the frames' blocks. Robust
 costs enter as weighted squares (iteratively reweighted least squares).
 """
 
@@ -142,7 +142,7 @@ def _from_camera(x: Float[Array, "F J 3"], obs: Observations) -> Float[Array, "F
 
 
 def _phone_error_deg(obs: Observations, state: State) -> tuple[Float[Array, "F 3"], Float[Array, "F 3"]]:
-    """Rotation vector (deg, world) from the measured to the fitted orientation, and d/d clock of the measured (rad/s)."""
+    """Rotation vector (deg, world) from measured to fitted orientation, and d/d clock of the measured (rad/s)."""
     quats = obs.sample_quat_wxyz[obs.trial]
     at = (obs.time_s + state.clock_s[obs.trial] - obs.sample_start_s[obs.trial]) / obs.sample_step_s
     at = jnp.clip(at, 0.0, quats.shape[1] - 1.001)
@@ -305,9 +305,7 @@ def _pose_terms(obs, w, state, H, g):
     next_2 = (later[:, 0] * later[:, 2])[:, None] * smooth
     weight = obs.weight[:, None]
     diagonal = weight * (w.weight_limit * (beyond != 0) * per_deg**2 + w.weight_pose * w.inverse_sd**2) + own
-    force = weight * (
-        w.weight_limit * beyond * per_deg + w.weight_pose * (state.qpos - w.neutral) * w.inverse_sd**2
-    )
+    force = weight * (w.weight_limit * beyond * per_deg + w.weight_pose * (state.qpos - w.neutral) * w.inverse_sd**2)
     force += smooth * pull
     extra = H.shape[-1] - diagonal.shape[-1]
     diagonal, force = (jnp.pad(a, [(0, 0), (0, extra)]) for a in (diagonal, force))

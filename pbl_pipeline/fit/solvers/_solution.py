@@ -7,6 +7,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from .._outcome import Outcome
+
 
 @dataclasses.dataclass(frozen=True)
 class Solution:
@@ -14,7 +16,7 @@ class Solution:
 
     qpos in m and rad; R_nc: camera to world; s: the paper's scale parameters; scale: their multipliers; clock_s: sensor
     time minus video time of each trial, 0 where not estimated; loss_trace: (step, loss) of K steps; qpos_sd: standard
-    deviations, None where the solver gives none.
+    deviations, None where the solver gives none; outcome: `_outcome.py`, None where it is yet to be computed.
     """
 
     qpos: Float[np.ndarray, "F 40"]
@@ -29,3 +31,4 @@ class Solution:
     iterations: int
     converged: bool
     qpos_sd: Float[np.ndarray, "F 40"] | None = None
+    outcome: Outcome | None = None

@@ -23,12 +23,13 @@ from pbl_pipeline.body._jacobian import MarkerTable
 
 from .._inputs import Session
 from .._observations import Observations
+from .._outcome import Outcome, outcome
+from .._paper_objective import kinds_of
 from .._params import GaussNewtonParams
 from .._place import placed_poses
 from .._prior import prior_of
 from .._threads import one_blas_thread
 from ._arrow import Arrow, marginal_variance, solve
-from .._paper_objective import kinds_of
 from ._normal import Kinds, State, Weights, cost, dispersion, normal_equations, scale_multipliers
 from ._solution import Solution
 
@@ -110,36 +111,6 @@ def minimise(
     return jax.lax.while_loop(lambda p: ~p.converged & (p.iteration < most), step, first)
 
 
-def _variance(
-    body: Body, kinds: Kinds, table: MarkerTable, obs: Observations, w: Weights, state: State
-) -> Array:
-    """Variances (F, 40) of qpos as far as the residuals tell: dispersion times the inverse curvature's diagonal."""
-    matrix, _, _ = normal_equations(body, table, obs, w, kinds, state)
-    own = jnp.diagonal(matrix.diagonal, axis1=-2, axis2=-1)
-    # What nothing holds gets a variance that is large, not infinite.
-    least = 1e-6 * jnp.max(own)
-    held = matrix.diagonal + least * jnp.eye(own.shape[-1], dtype=own.dtype)
-    corner = matrix.corner + 1e-6 * jnp.max(jnp.diagonal(matrix.corner)) * jnp.eye(matrix.corner.shape[0])
-    variance, _ = marginal_variance(dataclasses.replace(matrix, diagonal=held, corner=corner))
-    return variance[:, :40] * dispersion(body, table, obs, w, kinds, state)
-
-
-_minimise_one = jax.jit(minimise, static_argnames=("body", "kinds"))
-_variance_one = jax.jit(_variance, static_argnames=("body", "kinds"))
-
-
-@functools.partial(jax.jit, static_argnames=("body", "kinds"))
-def _minimise_many(body, kinds, table, obs, w, start, limits):
-    return jax.vmap(functools.partial(minimise, body, kinds), in_axes=(0, 0, None, 0, None))(
-        table, obs, w, start, limits
-    )
-
-
-@functools.partial(jax.jit, static_argnames=("body", "kinds"))
-def _variance_many(body, kinds, table, obs, w, state):
-    return jax.vmap(functools.partial(_variance, body, kinds), in_axes=(0, 0, None, 0))(table, obs, w, state)
-
-
 def _damped(matrix: Arrow, damping: Array) -> Arrow:
     """Marquardt's damping of the frames' unknowns: in units of their own curvature, with a floor for what is unseen."""
     own = jnp.diagonal(matrix.diagonal, axis1=-2, axis2=-1)
@@ -147,9 +118,7 @@ def _damped(matrix: Arrow, damping: Array) -> Arrow:
     extra = (damping * own + (1e-4 + damping) * floor)[..., None] * jnp.eye(own.shape[-1], dtype=own.dtype)
     corner = jnp.diagonal(matrix.corner)
     more = damping * corner + 1e-6 * jnp.max(corner)
-    return dataclasses.replace(
-        matrix, diagonal=matrix.diagonal + extra, corner=matrix.corner + jnp.diag(more)
-    )
+    return dataclasses.replace(matrix, diagonal=matrix.diagonal + extra, corner=matrix.corner + jnp.diag(more))
 
 
 def _moved(state: State, dx: Array, dy: Array, kinds: Kinds) -> State:
@@ -166,6 +135,36 @@ def _moved(state: State, dx: Array, dy: Array, kinds: Kinds) -> State:
         site_offset_m=state.site_offset_m + dy[8:k].reshape(-1, 3),
         clock_s=clock,
     )
+
+
+def finish(
+    body: Body, kinds: Kinds, table: MarkerTable, obs: Observations, w: Weights, state: State
+) -> tuple[Array, Outcome]:
+    """Variances (F, 40) of qpos as far as the residuals tell (dispersion times the inverse curvature's diagonal)."""
+    matrix, _, _ = normal_equations(body, table, obs, w, kinds, state)
+    own = jnp.diagonal(matrix.diagonal, axis1=-2, axis2=-1)
+    # What nothing holds gets a variance that is large, not infinite.
+    least = 1e-6 * jnp.max(own)
+    held = matrix.diagonal + least * jnp.eye(own.shape[-1], dtype=own.dtype)
+    corner = matrix.corner + 1e-6 * jnp.max(jnp.diagonal(matrix.corner)) * jnp.eye(matrix.corner.shape[0])
+    variance, _ = marginal_variance(dataclasses.replace(matrix, diagonal=held, corner=corner))
+    seen = outcome(body, table, obs, state.qpos, state.R_nc, scale_multipliers(state.s), state.site_offset_m)
+    return variance[:, :40] * dispersion(body, table, obs, w, kinds, state), seen
+
+
+_minimise_one = jax.jit(minimise, static_argnames=("body", "kinds"))
+_finish_one = jax.jit(finish, static_argnames=("body", "kinds"))
+
+
+@functools.partial(jax.jit, static_argnames=("body", "kinds"))
+def _minimise_many(body, kinds, table, obs, w, start, limits):
+    one = functools.partial(minimise, body, kinds)
+    return jax.vmap(one, in_axes=(0, 0, None, 0, None))(table, obs, w, start, limits)
+
+
+@functools.partial(jax.jit, static_argnames=("body", "kinds"))
+def _finish_many(body, kinds, table, obs, w, state):
+    return jax.vmap(functools.partial(finish, body, kinds), in_axes=(0, 0, None, 0))(table, obs, w, state)
 
 
 def solve_gauss_newton(sessions: Sequence[Session], params: GaussNewtonParams) -> list[Solution]:
@@ -190,33 +189,29 @@ def _solve(sessions: Sequence[Session], params: GaussNewtonParams, flip: bool) -
     body, kinds = sessions[0].body, kinds_of(sessions[0])
     w, limits = weights_of(sessions[0], params), limits_of(params)
     starts = [start_of(s, flip) for s in sessions]
+    # Stacked on the host, so that each array goes to the device once.
+    stack = (lambda a: a) if len(sessions) == 1 else (lambda *a: np.stack(a))
+    table, obs, start = (
+        jax.tree.map(stack, *trees) for trees in ([s.table for s in sessions], [s.obs for s in sessions], starts)
+    )
+    table, obs, start = jax.device_put((table, obs, start))
+    minimise_, finish_ = (_minimise_one, _finish_one) if len(sessions) == 1 else (_minimise_many, _finish_many)
     with one_blas_thread():
-        if len(sessions) == 1:
-            one = (sessions[0].table, sessions[0].obs, w)
-            progress = _minimise_one(body, kinds, *one, starts[0], limits)
-            variance = _variance_one(body, kinds, *one, progress.state)
-            results = [(jax.device_get(progress), np.asarray(variance))]
-        else:
-            stack = lambda *a: jnp.stack(a)  # noqa: E731
-            table = jax.tree.map(stack, *[s.table for s in sessions])
-            obs = jax.tree.map(stack, *[s.obs for s in sessions])
-            start = jax.tree.map(stack, *starts)
-            progress = _minimise_many(body, kinds, table, obs, w, start, limits)
-            variance = np.asarray(_variance_many(body, kinds, table, obs, w, progress.state))
-            host = jax.device_get(progress)
-            results = [(jax.tree.map(lambda a, i=i: a[i], host), variance[i]) for i in range(len(sessions))]
+        progress = minimise_(body, kinds, table, obs, w, start, limits)
+        found = jax.device_get((progress, *finish_(body, kinds, table, obs, w, progress.state)))
+    each = [found] if len(sessions) == 1 else [jax.tree.map(lambda a, i=i: a[i], found) for i in range(len(sessions))]
     factors = sd_factors(sessions[0].body.joint_names, params.sd_factor)
-    return [_solution(s, p, v, factors) for s, (p, v) in zip(sessions, results, strict=True)]
+    return [_solution(s, factors, *one) for s, one in zip(sessions, each, strict=True)]
 
 
-def _solution(session: Session, p: Progress, variance: np.ndarray, factors: np.ndarray) -> Solution:
+def _solution(session: Session, factors: np.ndarray, p: Progress, variance: np.ndarray, seen: Outcome) -> Solution:
     n = int(p.iteration)
     trace = np.stack([np.arange(1, n + 1), np.asarray(p.trace)[:n]], axis=1).astype(np.float64)
     return Solution(
         qpos=np.asarray(p.state.qpos, np.float64),
         R_nc=np.asarray(p.state.R_nc, np.float64),
         s=np.asarray(p.state.s, np.float64),
-        scale=np.asarray(scale_multipliers(jnp.asarray(p.state.s)), np.float64),
+        scale=1.0 + p.state.s[0] + np.concatenate([[0.0], np.asarray(p.state.s[1:], np.float64)]),
         site_offset_m=np.asarray(p.state.site_offset_m, np.float64)[: len(session.markers)],
         clock_s=np.asarray(p.state.clock_s, np.float64)[: len(session.arrays)],
         loss_trace=trace,
@@ -225,6 +220,7 @@ def _solution(session: Session, p: Progress, variance: np.ndarray, factors: np.n
         iterations=n,
         converged=bool(p.converged),
         qpos_sd=np.sqrt(np.maximum(variance, 0.0)) * factors,
+        outcome=seen,
     )
 
 
@@ -284,11 +280,11 @@ def start_of(session: Session, flip: bool = False) -> State:
     qpos = np.concatenate([placed_poses(session, i, flip) for i in range(len(session.arrays))])
     qpos = np.pad(qpos, [(0, obs.weight.shape[0] - len(qpos)), (0, 0)], mode="edge")
     return State(
-        qpos=jnp.asarray(qpos, jnp.float32),
+        qpos=np.asarray(qpos, np.float32),
         R_nc=obs.R_nc,
-        s=jnp.zeros(8),
-        site_offset_m=jnp.zeros((obs.c_world.shape[1], 3)),
-        clock_s=jnp.zeros(obs.has_phone.shape[0]),
+        s=np.zeros(8, np.float32),
+        site_offset_m=np.zeros((obs.c_world.shape[1], 3), np.float32),
+        clock_s=np.zeros(obs.has_phone.shape[0], np.float32),
     )
 
 
@@ -309,7 +305,7 @@ def suspicious(session: Session, solution: Solution) -> bool:
     if _pixels_alone(session):
         return True
     used = np.asarray(session.obs.weight) > 0
-    low, high = np.asarray(session.body.joint_range_rad).T
+    high = np.asarray(session.body.joint_range_rad)[:, 1]
     share = []
     for name in ("knee_angle_r", "knee_angle_l"):
         i = session.body.joint_names.index(name)
