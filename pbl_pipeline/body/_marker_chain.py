@@ -123,7 +123,7 @@ def _frames(body: Body) -> Callable[[Array, Array], Array]:
         placed = jnp.concatenate([placed, world])
         for ancestor in slots.jumps:
             before = placed[ancestor]
-            turned = sum(before[:, None, 1 + k] * placed[:, :, k, None] for k in range(3))
+            turned = functools.reduce(jnp.add, [before[:, None, 1 + k] * placed[:, :, k, None] for k in range(3)])
             placed = jnp.concatenate([turned[:, :1] + before[:, :1], turned[:, 1:]], axis=1)
         return placed[:-1], jnp.stack(axes), placed[up][:, 1:]
 
