@@ -47,8 +47,15 @@ def session_summary(restriction: Any = True) -> pd.DataFrame:
 
 
 def trial_summary(restriction: Any = True) -> pd.DataFrame:
-    """One row per fitted video: residuals, events, measures and index of the trial."""
-    trials = fit.SessionFit.Trial.proj("trial_name", "trial_n_fitted", "trial_residual_2d", "trial_residual_3d")
+    """One row per fitted video: residuals, where the vertical comes from, events, measures and index of the trial."""
+    trials = fit.SessionFit.Trial.proj(
+        "trial_name",
+        "trial_n_fitted",
+        "trial_residual_2d",
+        "trial_residual_3d",
+        "trial_orientation",
+        "trial_clock_offset",
+    )
     events = gait.GaitEvents.proj("events_status", "events_reason", "n_events")
     cycles = gait.GaitCycle.proj("n_cycles", "n_cycles_used")
     measures = gait.Spatiotemporal.proj("cadence", "stride_time", "step_time", "stance", "swing", "double_support")

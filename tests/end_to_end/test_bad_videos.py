@@ -116,6 +116,13 @@ def test_nobody_is_no_error(status):
 def test_the_good_video_is_finished_all_the_same(status):
     events = gait.GaitEvents * video.Video.proj("video_name") & {"video_name": "walking.mp4"}
     assert events.fetch1("events_status") == "PASS"
+    # She crosses the picture: the walk tells the vertical. Standing does not.
+    trials = (fit.SessionFit.Trial * video.Video.proj("video_name")).to_dicts()
+    assert {t["video_name"]: t["trial_orientation"] for t in trials} == {
+        "walking.mp4": "estimated: gait",
+        "standing.mp4": "assumed: level",
+    }
+    assert all(fit.SessionFit.to_arrays("fit_converged"))
     assert len(gait.GaitCycle()) >= 1
     assert len(gdi.SessionGdi()) == len(qc.SessionQc()) == 2
     # Five contacts in 3 s; by eye in frames 4, 23, 41, 60 and 78 of this clip.

@@ -88,6 +88,9 @@ def test_a_bad_file_leaves_one_error_row_while_the_others_finish(tables: None, t
         "SessionGdi": 1,
         "SessionQc": 1,
     }
+    assert fit.SessionFit.fetch1("fit_iterations", "fit_converged") == (7, True)
+    assert set(fit.SessionFit.Trial.to_arrays("trial_orientation")) == {"assumed: level"}
+    assert [r["trial_clock_offset"] for r in fit.SessionFit.Trial.to_dicts()] == [None, None]
     (row,) = pipeline_status().errors
     assert (row.table, row.code, row.about) == ("VideoInfo", "VIDEO_NOT_A_VIDEO", "notes.mp4")
     assert row.next_step
@@ -101,6 +104,7 @@ def test_a_bad_file_leaves_one_error_row_while_the_others_finish(tables: None, t
     assert (visit["subject"], visit["session_label"], visit["fit_set_n"]) == ("P001", "2026-03-01", 2)
     assert visit["qc_outcome"] == "WARN"
     assert "residual_3d_cm" in visit["qc_worst"]
+    assert set(views.trial_summary()["trial_orientation"]) == {"assumed: level"}
     assert len(views.trial_summary()) == 2
     assert set(views.video_summary()["choice_status"]) == {"CHOSEN"}
     assert "PASS" not in set(views.quality_summary()["qc_check_outcome"])
