@@ -140,8 +140,7 @@ def _everything_comes_back(paths: list[Path]) -> None:
         assert np.isnan(trial.fit.phone_clock_offset_s)
         assert trial.events.status == "PASS"
         assert any(c.used and c.curves for c in trial.cycles)
-    whole = chain.fit_session([points], [path.stem])
-    assert (results.fit.iterations, results.fit.converged) == (whole.iterations, whole.converged)
+    assert (results.fit.iterations, results.fit.converged) == (7, True)
     lib = pbl_pipeline.gait
     fresh = lib.gait_metrics(results.fit.trials)
     assert results.metrics.params_hash == fresh.params_hash
