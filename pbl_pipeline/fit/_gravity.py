@@ -19,8 +19,9 @@ from .solvers import Solution
 
 #: Least length (m) of a path that tells: from the farthest point to the start of the frames that count.
 MIN_PATH_M = 2.0
-#: What the pelvis' height varies by in walking (m), and how far a body leans on average (rad). The project's own.
-BOB_SD_M, LEAN_SD_RAD = 0.03, np.deg2rad(3.0)
+#: What the pelvis' height varies by in walking (m), and how far a body leans on average (rad): to a side of its path,
+#: and along it, where people stoop. The project's own.
+BOB_SD_M, LEAN_SD_RAD, STOOP_SD_RAD = 0.03, np.deg2rad(3.0), np.deg2rad(10.0)
 #: Beyond this tilt (rad) the estimate is not believed, and the camera counts as level.
 MOST_TILT_RAD = np.deg2rad(30.0)
 
@@ -67,8 +68,13 @@ def vertical(x: np.ndarray, axis: np.ndarray) -> np.ndarray | None:
     if np.max(np.linalg.norm(x - x[0], axis=1), initial=0.0) < MIN_PATH_M:
         return None
     off = x - x.mean(axis=0)
-    path = off.T @ off / len(x) / BOB_SD_M**2
-    _, axes = np.linalg.eigh(path + (np.eye(3) - np.outer(axis, axis)) / LEAN_SD_RAD**2)
+    spread = off.T @ off / len(x)
+    # A stoop must not count as a tilted camera: across the path the body tells the vertical, along it the path does.
+    across = np.cross(np.linalg.eigh(spread)[1][:, -1], axis)
+    across /= np.linalg.norm(across)
+    along = np.cross(axis, across)
+    lean = np.outer(across, across) / LEAN_SD_RAD**2 + np.outer(along, along) / STOOP_SD_RAD**2
+    _, axes = np.linalg.eigh(spread / BOB_SD_M**2 + lean)
     up = axes[:, 0] * np.sign(axes[:, 0] @ axis)
     return None if np.arccos(np.clip(up[2], -1, 1)) > MOST_TILT_RAD else up
 
