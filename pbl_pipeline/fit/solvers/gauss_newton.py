@@ -143,9 +143,9 @@ def finish(
     """Variances (F, 40) of qpos as far as the residuals tell (dispersion times the inverse curvature's diagonal)."""
     matrix, _, _ = normal_equations(body, table, obs, w, kinds, state)
     own = jnp.diagonal(matrix.diagonal, axis1=-2, axis2=-1)
-    # What nothing holds gets a variance that is large, not infinite.
-    least = 1e-6 * jnp.max(own)
-    held = matrix.diagonal + least * jnp.eye(own.shape[-1], dtype=own.dtype)
+    # What nothing holds gets a variance that is large, not infinite: each joint on its own scale, so that the pelvis'
+    # curvature does not make the toes look sure.
+    held = matrix.diagonal + jnp.diag(1e-6 * jnp.max(own, axis=0))
     corner = matrix.corner + 1e-6 * jnp.max(jnp.diagonal(matrix.corner)) * jnp.eye(matrix.corner.shape[0])
     variance, _ = marginal_variance(dataclasses.replace(matrix, diagonal=held, corner=corner))
     seen = outcome(body, table, obs, state.qpos, state.R_nc, scale_multipliers(state.s), state.site_offset_m)
