@@ -38,6 +38,11 @@ def configure() -> None:
     _default("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)
     # -1 keeps small programs too; the limit is meant for file systems on which small files are slow.
     _default("jax_persistent_cache_min_entry_size_bytes", -1)
+    # XLA tries many forms of each matrix product on a GPU: a minute of compiling (H200: 80 s against 15 s) that the
+    # small products here win back only over hours. Read when the first device is asked for.
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "xla_gpu_autotune_level" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_gpu_autotune_level=0".strip()
     _import_mjx()
     jax.monitoring.register_event_duration_secs_listener(_count_compilation)
 

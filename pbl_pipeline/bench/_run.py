@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,8 @@ from ._plan import Case, Data
 Row = dict[str, Any]
 
 
-def run_cases(cases: Sequence[Case], timeout_s: float, note: Callable[[str], None] = lambda _: None) -> list[Row]:
-    """One row per case: the case itself and the figures of both stages; `error` where it failed.
+def run_cases(cases: Sequence[Case], timeout_s: float, note: Callable[[str], None] = lambda _: None) -> Iterator[Row]:
+    """One row per case, as soon as it is done: the case itself and the figures of both stages; `error` where it failed.
 
     Each case starts with an empty folder for compiled programs: stage "cold" fills it, stage "warm" finds it. `note` is
     told what is done next.
@@ -31,7 +31,6 @@ def run_cases(cases: Sequence[Case], timeout_s: float, note: Callable[[str], Non
     PblError
         INTERNAL: the data could not be made.
     """
-    rows = []
     with tempfile.TemporaryDirectory(prefix="pbl-bench-") as name:
         root = Path(name)
         for number, case in enumerate(cases):
@@ -40,8 +39,7 @@ def run_cases(cases: Sequence[Case], timeout_s: float, note: Callable[[str], Non
             cache = root / f"cache{number}"
             cold = _stage(case, "cold", folder, cache, root, timeout_s)
             warm = {} if "error" in cold else _stage(case, "warm", folder, cache, root, timeout_s)
-            rows.append(_row(case, cold, warm))
-    return rows
+            yield _row(case, cold, warm)
 
 
 def label(case: Case) -> str:

@@ -113,7 +113,7 @@ TITLES = {
 
 
 def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.0f} %"
+    return "-" if value is None else f"{100 * value:.3g} %"
 
 
 def ratios(rows: Sequence[Row]) -> list[dict[str, Any]]:

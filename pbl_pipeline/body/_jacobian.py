@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -37,12 +38,13 @@ class MarkerTable:
         """The table of a marker set, padded to `size` rows, on the host."""
         pad = (size or len(markers)) - len(markers)
         f32 = functools.partial(np.asarray, dtype=np.float32)
-        return cls(
-            body_index=np.pad(markers.body_index, (0, pad)).astype(np.int32),
-            position_m=f32(np.pad(markers.position_m, [(0, pad), (0, 0)])),
-            weight_3d=f32(np.pad(markers.weight_3d, (0, pad))),
-            weight=f32(np.pad(np.ones(len(markers)), (0, pad))),
-        )
+        arrays: dict[str, Any] = {
+            "body_index": np.pad(markers.body_index, (0, pad)).astype(np.int32),
+            "position_m": f32(np.pad(markers.position_m, [(0, pad), (0, 0)])),
+            "weight_3d": f32(np.pad(markers.weight_3d, (0, pad))),
+            "weight": f32(np.pad(np.ones(len(markers)), (0, pad))),
+        }
+        return cls(**arrays)
 
 
 @jax.tree_util.register_dataclass

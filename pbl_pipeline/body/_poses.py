@@ -165,7 +165,8 @@ def _product(a: Array, b: Array) -> Array:
 
 
 def _turned(matrix: Array, vector: Array) -> Array:
-    return sum(matrix[..., :, k] * vector[..., k : k + 1] for k in range(3))
+    x, y, z = (matrix[..., :, k] * vector[..., k : k + 1] for k in range(3))
+    return x + y + z
 
 
 def _rodrigues(axis: Array, angle: Array) -> Array:

@@ -58,7 +58,9 @@ def bench() -> None:
 @click.option("--long", "long_", is_flag=True, help="Only: one walk of 5,400 and of 10,800 frames.")
 @click.option("--robust", is_flag=True, help="Only: outliers, a marker never seen, a second with nothing seen.")
 @click.option("--timeout-s", type=click.FloatRange(1), default=3600.0, show_default=True, help="Of one process.")
-@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write all figures to this file, too.")
+@click.option(
+    "--json", "json_path", type=click.Path(path_type=Path), help="Write all figures to this file, after each row."
+)
 def fit(
     quick: bool,
     solver: str,
@@ -99,9 +101,11 @@ def fit(
     if not cases:
         raise click.UsageError("nothing to run: batches of more than one are fitted by gauss-newton only")
 
-    rows = b.run_cases(cases, timeout_s, note=lambda what: click.echo(what, err=True))
+    rows: list[b.Row] = []
+    begun = datetime.now(UTC).isoformat(timespec="seconds")
+    for row in b.run_cases(cases, timeout_s, note=lambda what: click.echo(what, err=True)):
+        rows.append(row)
+        if json_path is not None:  # after each row: a run of hours may be interrupted
+            content = {"benchmark": "fit", "version": __version__, "time_utc": begun, "rows": rows}
+            json_path.write_text(json.dumps(content | {"ratios": b.ratios(rows)}, indent=1) + "\n")
     click.echo(b.text(rows))
-    if json_path is not None:
-        now = datetime.now(UTC).isoformat(timespec="seconds")
-        content = {"benchmark": "fit", "version": __version__, "time_utc": now, "rows": rows, "ratios": b.ratios(rows)}
-        json_path.write_text(json.dumps(content, indent=1) + "\n")

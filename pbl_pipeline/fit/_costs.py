@@ -22,7 +22,7 @@ LEFT_SCALES = np.array([i for i, n in enumerate(SCALE_NAMES) if n.startswith("le
 RIGHT_SCALES = np.array([SCALE_NAMES.index(SCALE_NAMES[i].replace("left_", "right_")) for i in LEFT_SCALES])
 
 
-def huber_of_square(e2: Float[Array, ...], width: float) -> Float[Array, ...]:
+def huber_of_square(e2: Float[Array, ...], width: ArrayLike) -> Float[Array, ...]:
     """Huber cost of a distance given its square: `e2 / 2` up to `width`, then linear.
 
     Takes the square so that the gradient at distance zero is zero and not 0/0: the root is only taken of values that
@@ -128,7 +128,7 @@ def pose_prior(
     return 0.5 * jnp.sum(z2 * frame_weight) / jnp.maximum(jnp.sum(frame_weight), 1.0)
 
 
-def scale_prior(s: Float[Array, " 8"], sd: float, sd_sides: float) -> Array:
+def scale_prior(s: Float[Array, " 8"], sd: ArrayLike, sd_sides: ArrayLike) -> Array:
     """Half the squared segment scales relative to the whole body's, and of left against right, in standard deviations.
 
     `s[0]`, the size of the whole body, is free.

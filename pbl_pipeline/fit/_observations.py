@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -30,8 +31,8 @@ class Observations:
 
     time_s counts from each trial's first frame; `trial` is the number of a frame's trial; `weight` is 1 for a frame
     that counts and 0 for others. Confidences are 0 where nothing was seen; values there are finite and do not count.
-    `xy_px` are pixels of an ideal pinhole camera (undistorted). `bend` holds the weights of the frames before, at and after a
-    frame in the second difference there (per 1/30 s squared), 0 where it is not formed. `sample_*`: the phone's
+    `xy_px` are pixels of an ideal pinhole camera (undistorted). `bend` holds the weights of the frames before, at and
+    after a frame in the second difference there (per 1/30 s squared), 0 where it is not formed. `sample_*`: the phone's
     orientation R_nc as quaternions at a fixed interval, from `sample_start_s` on; there where `has_phone` is 1.
     """
 
@@ -161,8 +162,9 @@ def pack(trials: Sequence[TrialArrays]) -> Observations:
         "sample_step_s": np.asarray(SAMPLE_S),
     }
     number = np.concatenate([np.full(len(t.time_s), i) for i, t in enumerate(trials)])
-    f32 = {k: np.asarray(v, np.float32) for k, v in arrays.items()}
-    return Observations(trial=np.pad(number, (0, frames), mode="edge").astype(np.int32), **f32)
+    f32: dict[str, Any] = {k: np.asarray(v, np.float32) for k, v in arrays.items()}
+    f32["trial"] = np.pad(number, (0, frames), mode="edge").astype(np.int32)
+    return Observations(**f32)
 
 
 def _padded(used: np.ndarray, frames: int) -> np.ndarray:

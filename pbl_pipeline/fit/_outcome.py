@@ -41,6 +41,12 @@ def outcome(
     site_offset_m: Float[Array, "J 3"],
 ) -> Outcome:
     """The outcome of poses, camera orientations and a body."""
+    # GPUs round the factors of float32 products to ten bits unless told otherwise: pixels at the edge.
+    with jax.default_matmul_precision("highest"):
+        return _outcome(body, table, obs, qpos, R_nc, scale, site_offset_m)
+
+
+def _outcome(body, table, obs, qpos, R_nc, scale, site_offset_m) -> Outcome:
     x = table_positions(body, table, qpos, scale, site_offset_m)
     xpos, _ = body_poses(body, qpos, scale)
     head, right, left = (xpos[:, body.body_names.index(n)] for n in ("head", "calcn_r", "calcn_l"))

@@ -1,5 +1,8 @@
 """Where a Gauss-Newton fit starts: the standing body, placed and turned in each frame by the points of the trunk."""
 
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 import functools
@@ -144,10 +147,16 @@ def pelvis_rest(body: Body) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pelvis_values(body: Body, R: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray]:
-    """The pelvis' six joint values (T,) where its frame is turned by R (T, 3, 3) and lies at x (T, 3), in the world."""
+    """The pelvis' six joint values (T,) where its frame is turned by R (T, 3, 3) and lies at x (T, 3), in the world.
+
+    The hinges turn about z, x and y in this order, so R = Rz(tilt) Rx(list) Ry(rotation).
+    """
     stands, rest = pelvis_rest(body)
-    tilt, lean, heading = Rotation.from_matrix(np.einsum("ji,tjk->tik", stands, R)).as_euler("ZXY").T
-    slides = np.einsum("ji,tj->ti", stands, x - rest).T
+    turned = stands.T @ R
+    tilt = np.arctan2(-turned[:, 0, 1], turned[:, 1, 1])
+    lean = np.arcsin(np.clip(turned[:, 2, 1], -1.0, 1.0))
+    heading = np.arctan2(-turned[:, 2, 0], turned[:, 2, 2])
+    slides = stands.T @ (x - rest).T
     turns = {"pelvis_tilt": tilt, "pelvis_list": lean, "pelvis_rotation": np.unwrap(heading)}
     # The first three slides of the body lie along the pelvis' axes x, y, z at qpos 0.
     return dict(zip(("pelvis_tx", "pelvis_ty", "pelvis_tz"), slides, strict=True)) | turns

@@ -82,8 +82,9 @@ def scale_multipliers(s: Float[Array, " 8"]) -> Float[Array, " 8"]:
     return 1.0 + s[0] + jnp.concatenate([jnp.zeros(1, s.dtype), s[1:]])
 
 
-_MIXER = np.eye(8)
-_MIXER[:, 0] = 1.0
+#: Multipliers are 1 + MIXER @ s (`scale_multipliers`).
+MIXER = np.eye(8)
+MIXER[:, 0] = 1.0
 
 
 def cost(body: Body, table: MarkerTable, obs: Observations, w: Weights, kinds: Kinds, state: State) -> Array:
@@ -109,6 +110,12 @@ def marker_cost(
     body: Body, table: MarkerTable, obs: Observations, w: Weights, kinds: Kinds, state: State
 ) -> Float[Array, " F"]:
     """Cost of the keypoints in each frame: means over markers and views."""
+    # GPUs round the factors of float32 products to ten bits unless told otherwise, and costs are compared.
+    with jax.default_matmul_precision("highest"):
+        return _marker_cost(body, table, obs, w, kinds, state)
+
+
+def _marker_cost(body, table, obs, w, kinds, state):
     x = table_positions(body, table, state.qpos, scale_multipliers(state.s), state.site_offset_m)
     total = jnp.zeros(obs.weight.shape, x.dtype)
     views = 1 / (obs.n_markers * obs.n_views)
@@ -222,7 +229,7 @@ def _marker_terms(body, table, obs, w, kinds, qpos, R_nc, state):
     """Blocks of the keypoint terms: H (F, Q, Q), g (F, Q), B (F, Q, K), C (K, K), h (K,)."""
     jac = marker_jacobian(body, table, qpos, scale_multipliers(state.s), state.site_offset_m)
     x, U = jac.x_world_m, jac.per_offset
-    by_s = jac.per_scale @ jnp.asarray(_MIXER, x.dtype)
+    by_s = jac.per_scale @ jnp.asarray(MIXER, x.dtype)
     parts = [jac.per_qpos, by_s] if not kinds.moving else [jac.per_qpos, _cross_matrix(x), by_s]
     A = jnp.concatenate(parts, axis=-1)
     q = A.shape[-1] - 8

@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +31,7 @@ from .._place import placed_poses
 from .._prior import prior_of
 from .._threads import one_blas_thread
 from ._arrow import Arrow, marginal_variance, solve
-from ._normal import Kinds, State, Weights, cost, dispersion, normal_equations, scale_multipliers
+from ._normal import MIXER, Kinds, State, Weights, cost, dispersion, normal_equations, scale_multipliers
 from ._solution import Solution
 
 #: A step of a joint or camera is cut to this (rad; m for slides).
@@ -211,7 +212,7 @@ def _solution(session: Session, factors: np.ndarray, p: Progress, variance: np.n
         qpos=np.asarray(p.state.qpos, np.float64),
         R_nc=np.asarray(p.state.R_nc, np.float64),
         s=np.asarray(p.state.s, np.float64),
-        scale=1.0 + p.state.s[0] + np.concatenate([[0.0], np.asarray(p.state.s[1:], np.float64)]),
+        scale=1.0 + MIXER @ np.asarray(p.state.s, np.float64),
         site_offset_m=np.asarray(p.state.site_offset_m, np.float64)[: len(session.markers)],
         clock_s=np.asarray(p.state.clock_s, np.float64)[: len(session.arrays)],
         loss_trace=trace,
@@ -279,13 +280,15 @@ def start_of(session: Session, flip: bool = False) -> State:
     obs = session.obs
     qpos = np.concatenate([placed_poses(session, i, flip) for i in range(len(session.arrays))])
     qpos = np.pad(qpos, [(0, obs.weight.shape[0] - len(qpos)), (0, 0)], mode="edge")
-    return State(
-        qpos=np.asarray(qpos, np.float32),
-        R_nc=obs.R_nc,
-        s=np.zeros(8, np.float32),
-        site_offset_m=np.zeros((obs.c_world.shape[1], 3), np.float32),
-        clock_s=np.zeros(obs.has_phone.shape[0], np.float32),
-    )
+    zeros = functools.partial(np.zeros, dtype=np.float32)
+    values: dict[str, Any] = {
+        "qpos": np.asarray(qpos, np.float32),
+        "R_nc": obs.R_nc,
+        "s": zeros(8),
+        "site_offset_m": zeros((obs.c_world.shape[1], 3)),
+        "clock_s": zeros(obs.has_phone.shape[0]),
+    }
+    return State(**values)
 
 
 def sd_factors(joint_names: Sequence[str], sd_factor: Sequence[tuple[str, float]]) -> np.ndarray:
