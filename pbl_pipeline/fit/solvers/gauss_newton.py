@@ -49,7 +49,7 @@ class Progress:
     damping: Array
     iteration: Array
     largest_step: Array
-    #: Steps in a row that gained next to nothing.
+    #: Accepted steps in a row that gained next to nothing.
     idle: Array
     converged: Array
     trace: Array
@@ -86,7 +86,9 @@ def minimise(
         keep = lambda new, old: jnp.where(accepted, new, old)  # noqa: E731
         size = jnp.max(jnp.abs(dx) * obs.weight[:, None])
         damping = jnp.where(accepted, p.damping / 10, p.damping * 10)
-        idle = jnp.where(accepted & (p.cost - value > limits.tolerance_cost * p.cost), 0, p.idle + 1)
+        gained = p.cost - value > limits.tolerance_cost * p.cost
+        # A step that was refused says nothing of the minimum: the next one is damped more.
+        idle = jnp.where(accepted, jnp.where(gained, 0, p.idle + 1), p.idle)
         return Progress(
             state=jax.tree.map(keep, state, p.state),
             cost=keep(value, p.cost),
