@@ -54,11 +54,17 @@ def test_the_cases_are_solver_by_trials_by_camera_by_batch():
         (["--long", "--robust", "--solver", "all", "--motion", "handheld"], {"long", "robust"}, 7),
     ],
 )
-def test_options_choose_the_cases(options, sections, n, monkeypatch):
+def test_options_choose_the_cases(options, sections, n, monkeypatch, tmp_path):
     asked = []
-    monkeypatch.setattr(bench, "run_cases", lambda cases, timeout_s, note: asked.extend(cases) or [])
-    done = CliRunner().invoke(command, ["fit", *options])
+
+    def run_cases(cases, timeout_s, note):
+        asked.extend(cases)
+        return [row()]
+
+    monkeypatch.setattr(bench, "run_cases", run_cases)
+    done = CliRunner().invoke(command, ["fit", *options, "--json", str(tmp_path / "a.json")])
     assert done.exit_code == 0, done.output
+    assert json.loads((tmp_path / "a.json").read_text())["rows"][0]["warm_seconds"] == 2.0
     assert {c.section for c in asked} == sections
     assert len(asked) == n
 
