@@ -114,6 +114,19 @@ def test_a_walk_is_recovered(one_by_one):
         assert np.max(np.abs(fit.scale / person(seed)[0] - 1)) < 0.08
 
 
+def test_intervals_of_90_percent_hold_the_truth(one_by_one):
+    """360 frames of three people, all angles but the pelvis', which the vertical from the walk moves."""
+    inside = []
+    for seed, fit in zip(SEEDS, one_by_one, strict=True):
+        trial = fit.trials[0]
+        known = np.isfinite(trial.qpos).all(axis=1)
+        error = np.angle(np.exp(1j * (trial.qpos - walk(seed))[known]))
+        inside.append(np.abs(error) < 1.645 * trial.qpos_sd[known])
+    share = np.concatenate(inside)[:, 6:]
+    assert 0.83 < share.mean() < 0.96
+    assert np.min(share.mean(axis=0)) > 0.3  # no joint is sure of what it is not
+
+
 def test_two_trials_share_one_body():
     scale, offset = person(4)
     truths = [walk_qpos(HALF_S, seed, path="straight") for seed in (14, 15)]
@@ -271,6 +284,24 @@ def test_a_start_that_faces_the_other_way_ends_the_right_way(one_by_one, monkeyp
     assert_near(fit.trials[0], walk(5), deg=2.8, m=0.025)
     e = fit.trials[0].qpos - one_by_one[0].trials[0].qpos
     assert np.nanmedian(np.abs(np.angle(np.exp(1j * e[:, 3:])))) < np.deg2rad(0.3)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_start_far_off_reaches_the_same_fit_or_says_that_it_did_not(one_by_one, monkeypatch, seed):
+    """Joints off by 60 deg in every frame: many steps are refused on the way, and none of them is an end."""
+
+    def far(session, trial: int, flip: bool = False) -> np.ndarray:
+        qpos = placed_poses(session, trial, flip)
+        qpos[:, 3:] += np.random.default_rng(seed).normal(0, 1.0, 37)
+        return qpos
+
+    monkeypatch.setattr(gauss_newton, "placed_poses", far)
+    fit = fit_session([look(5).keypoints], ["a"], PARAMSET)
+    best = one_by_one[0].loss_trace[-1, 1]
+    assert fit.converged == (fit.loss_trace[-1, 1] < 1.01 * best)
+    if seed == 0:
+        assert fit.converged
+        assert_near(fit.trials[0], walk(5), deg=2.8, m=0.025)
 
 
 # --- how it ends ---

@@ -1,0 +1,105 @@
+"""What cannot be fitted is refused with a code before anything is computed, never fitted to nonsense."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import PARAMSETS, SessionInput, fit_sessions
+from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.synthetic import observe, observe_markers, walk_qpos
+
+TIME_S = np.arange(60) / 30
+
+
+@pytest.fixture(scope="module")
+def trial() -> Keypoints:
+    return observe(walk_qpos(TIME_S, 1), TIME_S, seed=1, camera_motion="handheld").keypoints
+
+
+def put(a: np.ndarray, at: tuple[int, ...], value: float) -> np.ndarray:
+    out = np.array(a, float)
+    out[at] = value
+    return out
+
+
+def seen(k: Keypoints) -> tuple[int, ...]:
+    """A place where something was seen."""
+    return tuple(np.argwhere(k.confidence > 0)[50])
+
+
+def with_matrix(k: Keypoints, matrix: np.ndarray) -> Keypoints:
+    return dataclasses.replace(k, camera=dataclasses.replace(k.camera, matrix=matrix))
+
+
+def first(k: Keypoints, n: int) -> Keypoints:
+    names = ("time_s", "xy_px", "xyz_cam_m", "confidence", "box_px")
+    return dataclasses.replace(k, **{name: getattr(k, name)[:n] for name in names})
+
+
+BAD: dict[str, tuple[str, Callable[[Keypoints], dict]]] = {
+    "NaN pixel": ("FIT_INPUT", lambda k: {"xy_px": put(k.xy_px, seen(k), np.nan)}),
+    "infinite 3D point": ("FIT_INPUT", lambda k: {"xyz_cam_m": put(k.xyz_cam_m, seen(k), np.inf)}),
+    "NaN confidence": ("FILE_FORMAT", lambda k: {"confidence": put(k.confidence, (3, 4), np.nan)}),
+    "negative confidence": ("FILE_FORMAT", lambda k: {"confidence": put(k.confidence, (3, 4), -1)}),
+    "nothing seen": ("FIT_INPUT", lambda k: {"confidence": np.zeros_like(k.confidence)}),
+    "repeated stamp": ("FIT_INPUT", lambda k: {"time_s": put(k.time_s, (5,), k.time_s[4])}),
+    "backward stamps": ("FIT_INPUT", lambda k: {"time_s": k.time_s[::-1]}),
+    "NaN stamp": ("FIT_INPUT", lambda k: {"time_s": put(k.time_s, (5,), np.nan)}),
+    "unknown marker set": ("MARKER_SET_UNKNOWN", lambda k: {"marker_set": "unheard_of"}),
+    "names in another order": ("MARKER_SET_UNKNOWN", lambda k: {"names": k.names[::-1]}),
+    "one zero quaternion": ("PHONE_LOG", lambda k: {"phone_quat_wxyz": put(k.phone_quat_wxyz, (5,), 0)}),
+    "zero quaternions": ("PHONE_LOG", lambda k: {"phone_quat_wxyz": np.zeros_like(k.phone_quat_wxyz)}),
+    "backward phone": ("PHONE_LOG", lambda k: {"phone_time_s": k.phone_time_s[::-1]}),
+    "phone of another time": ("PHONE_LOG", lambda k: {"phone_time_s": k.phone_time_s + 30}),
+    "phone without turns": ("PHONE_LOG", lambda k: {"phone_quat_wxyz": None}),
+}
+
+
+def code_of(make: Callable[[], SessionInput]) -> str:
+    """The code with which a session is refused: at its construction or as the result of the fit."""
+    try:
+        result = fit_sessions([make()], PARAMSETS["gauss-newton"])[0]
+    except PblError as error:
+        return error.code
+    assert isinstance(result, PblError)
+    return result.code
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_keypoints_have_a_code(trial, name):
+    code, change = BAD[name]
+    assert code_of(lambda: SessionInput([dataclasses.replace(trial, **change(trial))], ["a"], "handheld")) == code
+
+
+@pytest.mark.parametrize("n", [0, 1, 20])
+def test_too_few_frames(trial, n):
+    assert code_of(lambda: SessionInput([first(trial, n)], ["a"], "handheld")) == "FIT_INPUT"
+
+
+@pytest.mark.parametrize("matrix", [np.zeros((3, 3)), np.full((3, 3), np.nan), -np.eye(3)])
+def test_a_camera_that_cannot_be(trial, matrix):
+    assert code_of(lambda: SessionInput([with_matrix(trial, matrix)], ["a"], "handheld")) == "CAMERA_INVALID"
+
+
+def test_sessions_that_do_not_fit_together(trial):
+    markers = observe_markers(walk_qpos(TIME_S, 1), TIME_S)
+    assert code_of(lambda: SessionInput([trial, markers], ["a", "b"])) == "FIT_INPUT"
+    assert code_of(lambda: SessionInput([trial], ["a", "b"])) == "FIT_INPUT"
+    assert code_of(lambda: SessionInput([], [])) == "FIT_INPUT"
+    assert code_of(lambda: SessionInput([trial], ["a"], ["static", "static"])) == "FIT_INPUT"
+    assert code_of(lambda: SessionInput([trial], ["a"], "shaky")) == "FIT_INPUT"
+
+
+def test_each_bad_session_has_its_own_error(trial):
+    bad = [
+        dataclasses.replace(trial, **change(trial))
+        for n, (c, change) in BAD.items()
+        if n in ("NaN pixel", "nothing seen")
+    ]
+    found = fit_sessions([SessionInput([k], [n], "handheld") for k, n in zip(bad, "ab", strict=True)], batch=3)
+    assert [e.key for e in found if isinstance(e, PblError)] == ["a", "b"]
