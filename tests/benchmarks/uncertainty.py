@@ -23,6 +23,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import PARAMSETS, SessionInput, fit_sessions, params_of
+from pbl_pipeline.fit._params import GaussNewtonParams
 from pbl_pipeline.fit.solvers.gauss_newton import sd_factors
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.synthetic import observe, person, walk_qpos
@@ -132,12 +133,13 @@ def coverage(ratios: np.ndarray, names: Sequence[str], factors: Sequence[tuple[s
 def main(seeds: int, params: str, marker_set: str) -> None:
     """Print factors and coverage; exit code 1 where a group's coverage on other walks is outside the band."""
     given = PARAMSETS[params]
-    if params_of(given).solver != "gauss-newton":
+    now = params_of(given)
+    if not isinstance(now, GaussNewtonParams):
         sys.exit(f"paramset {params} gives no standard deviations")
     known, _, names = standardised(range(seeds), bare(given), marker_set)
     other, errors, _ = standardised(range(HELD_OUT, HELD_OUT + seeds), bare(given), marker_set)
     factors = factors_of(known, names)
-    new, old = coverage(other, names, factors), coverage(other, names, params_of(given).sd_factor)
+    new, old = coverage(other, names, factors), coverage(other, names, now.sd_factor)
     click.echo(f"{params}: {seeds} walks to calibrate on ({len(known)} frames), {seeds} others ({len(other)} frames)")
     click.echo(f"  {'group':16}{'factor':>8}{'held out':>10}{'now':>8}   median |error| held out")
     bad = []

@@ -149,10 +149,10 @@ def test_bodies_are_where_mujoco_and_mjx_have_them():
 
     model = body.mj_model.__copy__()
     model.body_pos[1:] = positions
-    data = mujoco.MjData(model)
+    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
     for t in range(len(qpos)):
         data.qpos[:] = np.asarray(qpos[t], np.float64)
-        mujoco.mj_kinematics(model, data)
+        mujoco.mj_kinematics(model, data)  # pyright: ignore[reportAttributeAccessIssue]
         np.testing.assert_allclose(xpos[t], data.xpos[1:], atol=1e-5)
         np.testing.assert_allclose(xmat[t].reshape(-1, 9), data.xmat[1:], atol=1e-5)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,7 +42,7 @@ def first(k: Keypoints, n: int) -> Keypoints:
     return dataclasses.replace(k, **{name: getattr(k, name)[:n] for name in names})
 
 
-BAD: dict[str, tuple[str, Callable[[Keypoints], dict]]] = {
+BAD: dict[str, tuple[str, Callable[[Any], dict]]] = {
     "NaN pixel": ("FIT_INPUT", lambda k: {"xy_px": put(k.xy_px, seen(k), np.nan)}),
     "infinite 3D point": ("FIT_INPUT", lambda k: {"xyz_cam_m": put(k.xyz_cam_m, seen(k), np.inf)}),
     "NaN confidence": ("FILE_FORMAT", lambda k: {"confidence": put(k.confidence, (3, 4), np.nan)}),
