@@ -49,13 +49,23 @@ def solve(matrix: Arrow, g: Float[Array, "F Q"], h: Float[Array, " K"]) -> tuple
     return x, y
 
 
+#: Columns of the border that are solved for at once for the variances: bounds the memory of long sessions.
+COLUMNS = 32
+
+
 def marginal_variance(matrix: Arrow) -> tuple[Float[Array, "F Q"], Float[Array, " K"]]:
     """Diagonal of the inverse of the whole matrix: that of x and that of y."""
     with jax.default_matmul_precision("highest"):
-        levels, schur, _ = _eliminate(matrix, jnp.zeros(matrix.border.shape[:2], matrix.border.dtype))
+        shape, k = matrix.border.shape[:2], matrix.border.shape[-1]
+        levels, schur, _ = _eliminate(matrix, jnp.zeros(shape, matrix.border.dtype))
         inverse = _inverse_of_factor(matrix.corner - schur)
-        shared = jnp.sum((_substitute(levels, matrix.border) @ inverse.T) ** 2, axis=-1)
-        return _inverse_diagonal(levels, shared.shape) + shared, jnp.sum(inverse**2, axis=0)
+        rows = jnp.pad(inverse, [(0, -k % COLUMNS), (0, 0)]).reshape(-1, COLUMNS, k)
+
+        def add(total: Array, some: Array) -> tuple[Array, None]:
+            return total + jnp.sum(_substitute(levels, matrix.border @ some.T) ** 2, axis=-1), None
+
+        shared, _ = jax.lax.scan(add, jnp.zeros(shape, inverse.dtype), rows)
+        return _inverse_diagonal(levels, shape) + shared, jnp.sum(inverse**2, axis=0)
 
 
 def _inverse_of_factor(matrix: Float[Array, "*m n n"]) -> Float[Array, "*m n n"]:
@@ -68,17 +78,20 @@ def _inverse_of_factor(matrix: Float[Array, "*m n n"]) -> Float[Array, "*m n n"]
 def _eliminate(matrix: Arrow, g: Array) -> tuple[list[_Level], Array, Array]:
     """Factors of A, B' A^-1 B and B' A^-1 g."""
     blocks, links = _pairs(matrix)
-    rhs = _in_pairs(jnp.concatenate([matrix.border, g[..., None]], axis=-1))
+    border, right = _in_pairs(matrix.border), _in_pairs(g[..., None])
     k = matrix.border.shape[-1]
-    total = jnp.zeros((k, k + 1), rhs.dtype)
+    schur, reduced = jnp.zeros((k, k), border.dtype), jnp.zeros(k, border.dtype)
     levels: list[_Level] = []
     while True:
         last = blocks.shape[0] == 1
-        level, blocks, links, rhs, y = _reduce(blocks, links, rhs)
+        level, blocks, links = _reduce(blocks, links)
         levels.append(level)
-        total += jnp.einsum("mnk,mnl->kl", y[..., :k], y)
+        y, border = _forward(level, border)
+        z, right = _forward(level, right)
+        schur += jnp.einsum("mnk,mnl->kl", y, y)
+        reduced += jnp.einsum("mnk,mn->k", y, z[..., 0])
         if last:
-            return levels, total[:, :k], total[:, k]
+            return levels, schur, reduced
 
 
 def _pairs(matrix: Arrow) -> tuple[Array, Array]:
@@ -121,19 +134,23 @@ def _later(rows: Array) -> Array:
     return jnp.concatenate([rows[1:], jnp.zeros_like(rows[:1])])
 
 
-def _reduce(blocks: Array, links: Array, rhs: Array) -> tuple[_Level, Array, Array, Array, Array]:
+def _reduce(blocks: Array, links: Array) -> tuple[_Level, Array, Array]:
     """Eliminate every other block (0, 2, 4 ...); the rest stays, linked anew. Block i stays right of eliminated i."""
     n = blocks.shape[-1]
     gone, stay = _split(_even(blocks, jnp.eye(n, dtype=blocks.dtype)))
     after, before = _split(_even(links, jnp.zeros((n, n), links.dtype)))
-    rhs_gone, rhs_stay = _split(_even(rhs, jnp.zeros_like(rhs[0])))
     inverse = _inverse_of_factor(gone)
     left = inverse @ jnp.swapaxes(_earlier(before), -1, -2)
     right = inverse @ after
-    y = inverse @ rhs_gone
     stay = stay - _gram(right, right) - _later(_gram(left, left))
-    rhs_stay = rhs_stay - _gram(right, y) - _later(_gram(left, y))
-    return _Level(inverse, left, right), stay, -_later(_gram(left, right)), rhs_stay, y
+    return _Level(inverse, left, right), stay, -_later(_gram(left, right))
+
+
+def _forward(level: _Level, rhs: Float[Array, "M n R"]) -> tuple[Array, Array]:
+    """What a level's eliminated rows of the right-hand side become, and the rows that stay."""
+    gone, stay = _split(_even(rhs, jnp.zeros_like(rhs[0])))
+    y = level.inverse @ gone
+    return y, stay - _gram(level.right, y) - _later(_gram(level.left, y))
 
 
 def _gram(a: Array, b: Array) -> Array:
@@ -145,9 +162,7 @@ def _substitute(levels: list[_Level], rhs: Float[Array, "F Q R"]) -> Float[Array
     part, solved, counts = _in_pairs(rhs), [], []
     for level in levels:
         counts.append(part.shape[0])
-        gone, stay = _split(_even(part, jnp.zeros_like(part[0])))
-        y = level.inverse @ gone
-        part = stay - _gram(level.right, y) - _later(_gram(level.left, y))
+        y, part = _forward(level, part)
         solved.append(y)
     x = jnp.zeros_like(part)
     for level, y, count in zip(reversed(levels), reversed(solved), reversed(counts), strict=True):

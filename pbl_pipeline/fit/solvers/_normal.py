@@ -23,7 +23,7 @@ from .._observations import Observations
 from ._arrow import Arrow
 
 #: Frames whose markers are differentiated at once: bounds the memory of long sessions.
-CHUNK = 1024
+CHUNK = 512
 
 
 @dataclasses.dataclass(frozen=True)
