@@ -8,6 +8,7 @@ costs enter as weighted squares (iteratively reweighted least squares).
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -225,6 +226,11 @@ def _robust(e: Float[Array, "*n D"], width: Array) -> Float[Array, "*n"]:
     return jnp.where(far, width / jnp.sqrt(jnp.where(far, e2, 1.0)), 1.0)
 
 
+def _times(a: Float[Array, "*m 3 3"], b: Float[Array, "*m 3 R"]) -> Float[Array, "*m 3 R"]:
+    """Products of many small matrices, written out: a library would be called once for each."""
+    return functools.reduce(jnp.add, [a[..., :, k : k + 1] * b[..., k : k + 1, :] for k in range(3)])
+
+
 def _marker_terms(body, table, obs, w, kinds, qpos, R_nc, state):
     """Blocks of the keypoint terms: H (F, Q, Q), g (F, Q), B (F, Q, K), C (K, K), h (K,)."""
     jac = marker_jacobian(body, table, qpos, scale_multipliers(state.s), state.site_offset_m)
@@ -267,25 +273,25 @@ def _marker_terms(body, table, obs, w, kinds, qpos, R_nc, state):
 
     frames, markers = x.shape[:2]
     flat = lambda a: a.reshape(frames, markers * 3, -1)  # noqa: E731
-    MA = jnp.einsum("fmij,fmjq->fmiq", M, A)
+    MA = _times(M, A)
     G = jnp.einsum("fkq,fkr->fqr", flat(A), flat(MA))
     cross = MA
-    MU = jnp.einsum("fmij,fmjk->fmik", M, U)
-    own = jnp.einsum("fmki,fmkj->mij", U, MU)
+    own = jnp.sum(_times(jnp.swapaxes(U, -1, -2), _times(M, U)), axis=0)
     C_oo = jnp.einsum("mij,mn->minj", own, jnp.eye(markers, dtype=x.dtype)).reshape(3 * markers, 3 * markers)
     for b, W in centred:
         mean = jnp.einsum("fm,fmiq->fiq", b, A)
-        pull = jnp.einsum("fmij,fmjq->fiq", W, A)
+        pull = jnp.sum(_times(W, A), axis=1)
         total = jnp.sum(W, axis=1)
         both = jnp.einsum("fiq,fir->fqr", pull, mean)
         G += jnp.einsum("fiq,fij,fjr->fqr", mean, total, mean) - both - jnp.swapaxes(both, -1, -2)
         loose = pull - total @ mean
-        cross = cross - jnp.einsum("fmij,fjq->fmiq", W, mean) - b[..., None, None] * loose[:, None]
-        X = jnp.swapaxes(jnp.einsum("fmij,fmjk->fmik", W, U), 1, 2).reshape(frames, 3, 3 * markers)
+        cross = cross - _times(W, mean[:, None]) - b[..., None, None] * loose[:, None]
+        X = jnp.swapaxes(_times(W, U), 1, 2).reshape(frames, 3, 3 * markers)
         Y = jnp.swapaxes(b[..., None, None] * U, 1, 2).reshape(frames, 3, 3 * markers)
         one = jnp.einsum("fik,fil->kl", X - 0.5 * total @ Y, Y)
         C_oo -= one + one.T
-    by_offset = jnp.einsum("fmiq,fmik->fqmk", cross, U).reshape(frames, q + 8, 3 * markers)
+    by_offset = _times(jnp.swapaxes(U, -1, -2), cross)
+    by_offset = by_offset.reshape(frames, 3 * markers, q + 8).swapaxes(1, 2)
     C_so = jnp.sum(by_offset[:, q:], axis=0)
     C = jnp.block([[jnp.sum(G[:, q:, q:], axis=0), C_so], [C_so.T, C_oo]])
     B = jnp.concatenate([G[:, :q, q:], by_offset[:, :q]], axis=-1)
