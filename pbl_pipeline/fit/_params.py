@@ -119,6 +119,26 @@ SD_FACTOR: tuple[tuple[str, float], ...] = (
     ("pro_sup", 1.26),
     ("wrist", 1.47),
 )
+#: The same for `blazepose`, whose priors and few points err in ways that the curvature does not show.
+SD_FACTOR_BLAZEPOSE: tuple[tuple[str, float], ...] = (
+    ("pelvis_t", 10.88),
+    ("pelvis_ty", 4.78),
+    ("pelvis_tilt", 3.26),
+    ("pelvis_list", 2.81),
+    ("pelvis_rotation", 1.84),
+    ("hip", 2.7),
+    ("knee", 3.17),
+    ("ankle", 3.25),
+    ("subtalar", 1.83),
+    ("mtp", 4.2),
+    ("lumbar", 2.81),
+    ("neck", 1.86),
+    ("arm", 2.64),
+    ("arm_rot", 2.19),
+    ("elbow", 4.87),
+    ("pro_sup", 2.19),
+    ("wrist", 2.18),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,6 +177,7 @@ GAUSS_NEWTON = GaussNewtonParams(smooth_per_rad2=400.0, cost=CostParams(weight_2
 #: Its 33 points weigh less than MeTRAbs's 87, and so does what smooths them.
 BLAZEPOSE = GaussNewtonParams(
     smooth_per_rad2=20.0,
+    sd_factor=SD_FACTOR_BLAZEPOSE,
     cost=CostParams(
         weight_3d=0.2,
         weight_offset_per_m2=25.0,
