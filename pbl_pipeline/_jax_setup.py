@@ -50,9 +50,9 @@ def configure() -> None:
 _COMPILED = {"seconds": 0.0}
 
 
-def _count_compilation(event: str, seconds: float, **_: object) -> None:
+def _count_compilation(event: str, duration_secs: float, **_: object) -> None:
     if event.startswith("/jax/core/compile/"):
-        _COMPILED["seconds"] += seconds
+        _COMPILED["seconds"] += duration_secs
 
 
 def compile_seconds() -> float:

@@ -91,9 +91,9 @@ def draw(image: np.ndarray, fit: TrialFit, frame: int, view: Keypoints, pose: Ca
     """The fitted body and the detected points over one frame, in place."""
     if np.isfinite(fit.qpos[frame]).all():
         shape = capsules(load_body(), fit.qpos[frame : frame + 1], fit.scale)
-        start, end = shape.start[0] - pose.p_nc, shape.end[0] - pose.p_nc
         quat = Rotation.from_matrix(pose.R_nc).as_quat(scalar_first=True)
-        draw_body(image, shape.body_names, start, end, shape.radius_m, quat, view.camera, opacity=0.5)
+        ends = shape.start[0], shape.end[0]
+        draw_body(image, shape.body_names, *ends, shape.radius_m, quat, pose.p_nc, view.camera, opacity=0.5)
     draw_keypoints(image, view.xy_px[frame], view.confidence[frame])
 
 

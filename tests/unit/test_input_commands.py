@@ -189,10 +189,12 @@ def test_markers_have_a_paramset_of_their_own(fits, tmp_path):
 
 
 def test_changes_to_a_named_paramset(tmp_path):
-    from pbl_pipeline.fit import PARAMSETS, params_of
+    from pbl_pipeline.fit import PARAMSETS, ImplicitAdamParams, params_of
 
     (tmp_path / "mine.json").write_text('{"base": "paper-2025", "steps": 8000, "cost": {"weight_2d": 0.05}}')
     mine, paper = params_of(fit_paramset(None, str(tmp_path / "mine.json"))), params_of(PARAMSETS["paper-2025"])
+    assert isinstance(mine, ImplicitAdamParams)
+    assert isinstance(paper, ImplicitAdamParams)
     assert (mine.steps, mine.cost.weight_2d) == (8000, 0.05)
     assert (mine.samples_per_trial, mine.cost.huber_2d_px) == (paper.samples_per_trial, paper.cost.huber_2d_px)
     for text in ('{"base": "nobody"}', '{"base": ["paper-2025"]}', '{"base": "paper-2025", "step": 3}'):
