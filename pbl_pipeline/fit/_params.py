@@ -146,6 +146,7 @@ class GaussNewtonParams:
     """Solver `gauss-newton`: per-frame poses with a prior on their second differences; the paper's costs otherwise."""
 
     solver: str = "gauss-newton"
+    #: At most 200, the space that the solver keeps for its trace.
     max_iterations: int = 60
     #: It ends after a step in which no joint moved further (rad; m for the pelvis) ...
     tolerance_rad: float = 1e-3

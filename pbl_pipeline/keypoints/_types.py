@@ -80,6 +80,13 @@ class Keypoints:
                 expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels with positive focal lengths",
                 next_step="pass a camera file with --camera, or leave it out to use the stated guess",
             )
+        if not np.all(np.isfinite(self.camera.distortion)):
+            raise PblError(
+                "CAMERA_INVALID",
+                found=f"distortion {np.asarray(self.camera.distortion).tolist()}",
+                expected="k1, k2, p1, p2, k3, finite; zeros for a lens without distortion",
+                next_step="pass a camera file with --camera, or leave it out to use the stated guess",
+            )
         self._check_phone()
 
     def _check_phone(self) -> None:
