@@ -16,6 +16,8 @@ from pbl_pipeline.body import SCALE_NAMES
 
 #: Depth below which a point is treated as if it were this far away: keeps projections and gradients finite.
 NEAR_M = 0.1
+#: How gradually depth is bent there (m).
+SOFT_M = 0.5 * NEAR_M
 
 #: Places in `SCALE_NAMES` of the segments that the body has on both sides, in the same order.
 LEFT_SCALES = np.array([i for i, n in enumerate(SCALE_NAMES) if n.startswith("left_")])
@@ -64,10 +66,14 @@ def distance_3d_cm2(
     return 1e4 * (across + along**2)
 
 
+def soft_depth_m(z: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Depth bent smoothly to stay above `NEAR_M`."""
+    return NEAR_M + SOFT_M * jax.nn.softplus((z - NEAR_M) / SOFT_M)
+
+
 def project_px(x_cam: Float[Array, "*n J 3"], matrix: Float[Array, "*#n 3 3"]) -> Float[Array, "*n J 2"]:
     """Pinhole projection. Depth is bent smoothly to stay above `NEAR_M`, so nothing is huge behind the camera."""
-    soft = 0.5 * NEAR_M
-    z = NEAR_M + soft * jax.nn.softplus((x_cam[..., 2:] - NEAR_M) / soft)
+    z = soft_depth_m(x_cam[..., 2:])
     focal = jnp.stack([matrix[..., 0, 0], matrix[..., 1, 1]], axis=-1)[..., None, :]
     principal = matrix[..., :2, 2][..., None, :]
     return focal * x_cam[..., :2] / z + principal
@@ -86,12 +92,10 @@ def distance_2d_px2(
 
 def project_jacobian(x_cam: Float[Array, "*n J 3"], matrix: Float[Array, "*#n 3 3"]) -> Float[Array, "*n J 2 3"]:
     """Derivative of `project_px` (px per m)."""
-    soft = 0.5 * NEAR_M
-    bent = (x_cam[..., 2] - NEAR_M) / soft
-    z = NEAR_M + soft * jax.nn.softplus(bent)
+    z = soft_depth_m(x_cam[..., 2])
     focal = jnp.stack([matrix[..., 0, 0], matrix[..., 1, 1]], axis=-1)[..., None, :]
     across = (focal / z[..., None])[..., None] * jnp.eye(2, dtype=x_cam.dtype)
-    along = -focal * x_cam[..., :2] * (jax.nn.sigmoid(bent) / z**2)[..., None]
+    along = -focal * x_cam[..., :2] * (jax.nn.sigmoid((x_cam[..., 2] - NEAR_M) / SOFT_M) / z**2)[..., None]
     return jnp.concatenate([across, along[..., None]], axis=-1)
 
 
@@ -135,9 +139,3 @@ def scale_prior(s: Float[Array, " 8"], sd: ArrayLike, sd_sides: ArrayLike) -> Ar
     """
     sides = s[LEFT_SCALES] - s[RIGHT_SCALES]
     return 0.5 * (jnp.sum((s[1:] / sd) ** 2) + jnp.sum((sides / sd_sides) ** 2))
-
-
-def soft_depth_m(z: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Depth bent smoothly to stay above `NEAR_M`, as in `project_px`."""
-    soft = 0.5 * NEAR_M
-    return NEAR_M + soft * jax.nn.softplus((z - NEAR_M) / soft)

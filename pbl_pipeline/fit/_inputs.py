@@ -154,7 +154,7 @@ def _mean_seen(confidence: np.ndarray) -> np.ndarray:
 
 def has_3d(trial: Keypoints) -> bool:
     """Whether the detector gave 3D points at all."""
-    return bool(np.any(np.isfinite(trial.xyz_cam_m[trial.confidence > 0])))
+    return bool(np.any(np.isfinite(trial.xyz_cam_m) & (trial.confidence > 0)[..., None]))
 
 
 def _check_points(name: str, trial: Keypoints, need_3d: bool) -> None:
@@ -165,7 +165,7 @@ def _check_points(name: str, trial: Keypoints, need_3d: bool) -> None:
 
 
 def _check_finite(name: str, seen: np.ndarray, points: np.ndarray) -> None:
-    if not np.all(np.isfinite(points[seen])):
+    if np.any(seen & ~np.isfinite(np.sum(points, axis=-1))):
         raise _input_error(f"trial {name}: NaN or infinite points with confidence above 0", "confidence 0 there", name)
 
 
@@ -223,7 +223,7 @@ def _view(trial: Keypoints) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
     c = np.asarray(trial.confidence, float)
     seen = c > 0
     xy = undistort_px(np.where(seen[..., None], trial.xy_px, 0.0), trial.camera)
-    known = seen & np.all(np.isfinite(trial.xyz_cam_m), axis=-1)
+    known = seen & np.isfinite(np.sum(trial.xyz_cam_m, axis=-1))
     return xy, c, np.where(known[..., None], trial.xyz_cam_m, 0.0), np.where(known, c, 0.0)
 
 

@@ -14,7 +14,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.transform import Rotation, Slerp
+
+from ._rotation import quat_wxyz, rotation_matrices
 
 #: Sizes to which markers are padded; larger sets are padded to a multiple of 64.
 MARKER_SIZES = (24, 40, 64, 96, 128)
@@ -183,11 +184,8 @@ def _phone_samples(trials: Sequence[TrialArrays], n: int) -> tuple[np.ndarray, n
         trial = trials[i]
         assert trial.phone_time_s is not None
         assert trial.phone_quat_wxyz is not None
-        turn = Slerp(trial.phone_time_s, Rotation.from_quat(trial.phone_quat_wxyz, scalar_first=True))
         at = trial.time_s[0] - CLOCK_RANGE_S + SAMPLE_S * np.arange(count)
-        quat = turn(np.clip(at, trial.phone_time_s[0], trial.phone_time_s[-1])).as_quat(scalar_first=True)
-        same = np.sign(np.sum(quat[1:] * quat[:-1], axis=1))
-        quat[1:] *= np.cumprod(np.where(same == 0, 1.0, same))[:, None]
+        quat = quat_wxyz(rotation_matrices(trial.phone_time_s, trial.phone_quat_wxyz, at))
         smooth = gaussian_filter1d(quat, SMOOTH_S / SAMPLE_S, axis=0, mode="nearest")
         out[i] = smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
     return out, np.full(n, -CLOCK_RANGE_S)

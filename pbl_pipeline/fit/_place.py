@@ -39,9 +39,10 @@ def placed_poses(session: Session, trial: int, flip: bool = False) -> np.ndarray
         R, x = np.tile(np.diag([-1.0, -1.0, 1.0]), (len(x), 1, 1)), np.tile([4.0, 0.0, 0.0], (len(x), 1))
         known = arrays.used.copy()
     if flip:
-        about = np.einsum("tij,j->ti", R, np.average(template[trunk], axis=0)) + x
+        middle = np.average(template[trunk], axis=0)
+        about = R @ middle + x
         R = R @ np.diag([-1.0, -1.0, 1.0])  # half a turn about the standing body's vertical
-        x = about - np.einsum("tij,j->ti", R, np.average(template[trunk], axis=0))
+        x = about - R @ middle
     return _poses(body, R, x, known)
 
 
@@ -56,7 +57,7 @@ def world_points(arrays: TrialArrays) -> tuple[np.ndarray, np.ndarray]:
             arrays.x_cam[:, v], arrays.xy_px[:, v], np.minimum(c, arrays.c_2d[:, v]), arrays.camera_matrix[:, v]
         )
         x = arrays.x_cam[:, v] + root[:, None]
-        return np.einsum("tij,tmj->tmi", arrays.R_nc[:, v], x) + arrays.p_nc[:, v, None], c
+        return x @ np.swapaxes(arrays.R_nc[:, v], -1, -2) + arrays.p_nc[:, v, None], c
     return triangulate(arrays)
 
 
@@ -73,9 +74,10 @@ def root_positions(x_cam: np.ndarray, xy_px: np.ndarray, c: np.ndarray, matrix: 
     normal = np.zeros((len(c), 3, 3))
     total = np.sum(c, axis=1)
     normal[:, 0, 0] = normal[:, 1, 1] = total
-    normal[:, :2, 2] = normal[:, 2, :2] = -np.einsum("tj,tjk->tk", c, d)
-    normal[:, 2, 2] = np.einsum("tj,tjk->t", c, d**2)
-    right = np.concatenate([np.einsum("tj,tjk->tk", c, b), -np.einsum("tj,tjk->t", c, d * b)[:, None]], axis=1)
+    weighted = c[..., None] * d
+    normal[:, :2, 2] = normal[:, 2, :2] = -np.sum(weighted, axis=1)
+    normal[:, 2, 2] = np.sum(weighted * d, axis=(1, 2))
+    right = np.concatenate([(c[:, None] @ b)[:, 0], -np.sum(weighted * b, axis=(1, 2))[:, None]], axis=1)
     enough = np.count_nonzero(c > 0, axis=1) >= 4
     out = np.full((len(c), 3), np.nan)
     out[enough] = np.linalg.solve(normal[enough] + 1e-9 * np.eye(3), right[enough][..., None])[..., 0]
@@ -115,13 +117,14 @@ def align(template: np.ndarray, points: np.ndarray, weight: np.ndarray) -> tuple
     """Rotations (T, 3, 3) and positions (T, 3) with points = R template + x, weighted least squares (Kabsch)."""
     total = np.maximum(weight.sum(axis=1), 1e-9)[:, None]
     a = weight @ template / total
-    b = np.einsum("tj,tji->ti", weight, points) / total
-    H = np.einsum("tj,tji,tjk->tik", weight, points - b[:, None], template[None] - a[:, None])
+    b = (weight[:, None] @ points)[:, 0] / total
+    # The weighted points have mean b, so the template needs no centring.
+    H = np.swapaxes(weight[..., None] * (points - b[:, None]), 1, 2) @ template
     U, _, Vt = np.linalg.svd(np.nan_to_num(H))
     mirror = np.sign(np.linalg.det(U @ Vt))
     U[:, :, 2] *= np.where(mirror == 0, 1.0, mirror)[:, None]
     R = U @ Vt
-    return R, b - np.einsum("tij,tj->ti", R, a)
+    return R, b - (R @ a[..., None])[..., 0]
 
 
 def _poses(body: Body, R: np.ndarray, x: np.ndarray, known: np.ndarray) -> np.ndarray:

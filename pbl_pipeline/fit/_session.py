@@ -18,8 +18,8 @@ from pbl_pipeline.video import Camera
 from ._gravity import upright
 from ._inputs import Session, Trial, make_session
 from ._inputs import check_trial as _check_trial
+from ._marker_cost import kinds_of
 from ._outcome import Outcome, outcome_one
-from ._paper_objective import kinds_of
 from ._paper_objective import paper_objective as _paper_objective
 from ._params import DEFAULT, PARAMSETS, GaussNewtonParams, Params, params_of
 from ._quality import check_fit

@@ -20,21 +20,12 @@ from pbl_pipeline.body import Body
 from pbl_pipeline.body._jacobian import MarkerTable, marker_jacobian, table_positions
 
 from .. import _costs as costs
+from .._marker_cost import Kinds, marker_cost
 from .._observations import Observations
 from ._arrow import Arrow
 
 #: Frames whose markers are differentiated at once: bounds the memory of long sessions.
 CHUNK = 512
-
-
-@dataclasses.dataclass(frozen=True)
-class Kinds:
-    """Which terms a session has (static: part of the compiled program)."""
-
-    camera_3d: bool
-    camera_2d: bool
-    world: bool
-    moving: bool
 
 
 @jax.tree_util.register_dataclass
@@ -91,15 +82,14 @@ MIXER[:, 0] = 1.0
 def cost(body: Body, table: MarkerTable, obs: Observations, w: Weights, kinds: Kinds, state: State) -> Array:
     """The cost of a session: means over frames and markers, as the paper's, plus priors."""
     n = jnp.maximum(jnp.sum(obs.weight), 1.0)
-    total = marker_cost(body, table, obs, w, kinds, state)
+    total = keypoint_cost(body, table, obs, w, kinds, state)
     if kinds.moving:
         error, _ = _phone_error_deg(obs, state)
         total += w.weight_phone * costs.huber_of_square(jnp.sum(error**2, -1), w.huber_phone_deg) / w.huber_phone_deg
     total += 0.5 * w.weight_limit * jnp.sum(costs.beyond_limit_deg(state.qpos, w.low, w.high) ** 2, axis=-1)
-    z2 = jnp.sum(((state.qpos - w.neutral) * w.inverse_sd) ** 2, axis=-1)
-    total += 0.5 * w.weight_pose * z2
     bent = 0.5 * jnp.sum(costs.second_difference(state.qpos, obs.bend) ** 2 * w.smooth)
     shared = w.weight_offset_per_m2 * costs.offset_m2(state.site_offset_m)
+    shared += w.weight_pose * costs.pose_prior(state.qpos, w.neutral, w.inverse_sd, obs.weight)
     shared += w.weight_scale * costs.scale_prior(state.s, w.scale_sd, w.scale_sides_sd)
     shared += 0.5 * w.weight_size * state.s[0] ** 2
     if kinds.moving:
@@ -107,31 +97,12 @@ def cost(body: Body, table: MarkerTable, obs: Observations, w: Weights, kinds: K
     return (jnp.sum(total * obs.weight) + bent) / n + shared
 
 
-def marker_cost(
+def keypoint_cost(
     body: Body, table: MarkerTable, obs: Observations, w: Weights, kinds: Kinds, state: State
 ) -> Float[Array, " F"]:
-    """Cost of the keypoints in each frame: means over markers and views."""
-    # GPUs round the factors of float32 products to ten bits unless told otherwise, and costs are compared.
-    with jax.default_matmul_precision("highest"):
-        return _marker_cost(body, table, obs, w, kinds, state)
-
-
-def _marker_cost(body, table, obs, w, kinds, state):
+    """`marker_cost` of a state, in each frame."""
     x = table_positions(body, table, state.qpos, scale_multipliers(state.s), state.site_offset_m)
-    total = jnp.zeros(obs.weight.shape, x.dtype)
-    views = 1 / (obs.n_markers * obs.n_views)
-    if kinds.camera_2d:
-        e2 = costs.distance_2d_px2(_from_camera(x, obs), obs.xy_px, state.R_nc, obs.camera_matrix)
-        total += w.weight_2d * views * jnp.sum(costs.huber_of_square(e2, w.huber_2d_px) * obs.c_2d, axis=(-2, -1))
-    if kinds.camera_3d:
-        e2 = costs.distance_3d_cm2(x[:, None], obs.x_cam, state.R_nc, obs.c_3d, table.weight_3d, w.depth_ratio)
-        c = obs.c_3d * table.weight_3d
-        total += w.weight_3d * views * jnp.sum(costs.huber_of_square(e2, w.huber_3d_cm) * c, axis=(-2, -1))
-    if kinds.world:
-        e2 = 1e4 * jnp.sum((x - obs.x_world) ** 2, axis=-1)
-        one = costs.huber_of_square(e2, w.huber_3d_cm) * obs.c_world * table.weight_3d
-        total += w.weight_3d * jnp.sum(one, axis=-1) / obs.n_markers
-    return total
+    return marker_cost(x, obs, state.R_nc, table, w, kinds)
 
 
 def dispersion(
@@ -141,7 +112,7 @@ def dispersion(
     seen = lambda c: jnp.sum((c > 0) * obs.weight.reshape(-1, *[1] * (c.ndim - 1)))  # noqa: E731
     numbers = 3 * seen(obs.c_3d) * kinds.camera_3d + 2 * seen(obs.c_2d) * kinds.camera_2d
     numbers += 3 * seen(obs.c_world) * kinds.world
-    total = jnp.sum(marker_cost(body, table, obs, w, kinds, state) * obs.weight)
+    total = jnp.sum(keypoint_cost(body, table, obs, w, kinds, state) * obs.weight)
     return 2 * total / jnp.maximum(numbers, 1.0)
 
 

@@ -23,15 +23,15 @@ from pbl_pipeline.body import Body
 from pbl_pipeline.body._jacobian import MarkerTable
 
 from .._inputs import Session
+from .._marker_cost import Kinds, kinds_of
 from .._observations import Observations
 from .._outcome import Outcome, outcome
-from .._paper_objective import kinds_of
 from .._params import GaussNewtonParams
 from .._place import placed_poses
 from .._prior import prior_of
 from .._threads import one_blas_thread
 from ._arrow import Arrow, marginal_variance, solve
-from ._normal import MIXER, Kinds, State, Weights, cost, dispersion, normal_equations, scale_multipliers
+from ._normal import MIXER, State, Weights, cost, dispersion, normal_equations, scale_multipliers
 from ._solution import Solution
 
 #: A step of a joint or camera is cut to this (rad; m for slides).

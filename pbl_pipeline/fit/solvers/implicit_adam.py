@@ -28,13 +28,14 @@ from pbl_pipeline.errors import PblError
 
 from .. import _costs as costs
 from .._inputs import Session
+from .._marker_cost import Kinds, MarkerWeights, frames_at, kinds_of, marker_cost
 from .._network_start import camera_start, keypoint_start, paper_start
 from .._observations import Observations, pad_frames
-from .._paper_objective import MarkerWeights, angle_between_deg, frames_at, kinds_of, marker_cost
+from .._paper_objective import angle_between_deg
 from .._params import ImplicitAdamParams
 from .._prior import prior_of
 from .._trajectory import Networks, encode, evaluate, fit_ranges, frequencies, initial_networks, pose_of, raw_of
-from ._normal import Kinds, scale_multipliers
+from ._normal import scale_multipliers
 from ._solution import Solution
 
 #: Steps per compiled call: the granularity of the progress bar and of the loss trace.
