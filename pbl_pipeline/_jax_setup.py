@@ -38,11 +38,13 @@ def configure() -> None:
     _default("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)
     # -1 keeps small programs too; the limit is meant for file systems on which small files are slow.
     _default("jax_persistent_cache_min_entry_size_bytes", -1)
-    # XLA tries many forms of each matrix product on a GPU: a minute of compiling (H200: 80 s against 15 s) that the
-    # small products here win back only over hours. Read when the first device is asked for.
-    flags = os.environ.get("XLA_FLAGS", "")
-    if "xla_gpu_autotune_level" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} --xla_gpu_autotune_level=0".strip()
+    # On a GPU, XLA tries many forms of each matrix product. Handed to NVIDIA's library instead, the many small products
+    # here are as fast without any trial (H200, a batch of 64: 0.52 s and 6 s of compiling; tried: 0.52 s and 33 s;
+    # neither: 0.98 s and 14 s). Read when the first device is asked for.
+    for flag in ("--xla_gpu_autotune_level=0", "--xla_gpu_enable_triton_gemm=false"):
+        flags = os.environ.get("XLA_FLAGS", "")
+        if flag.partition("=")[0] not in flags:
+            os.environ["XLA_FLAGS"] = f"{flags} {flag}".strip()
     _import_mjx()
     jax.monitoring.register_event_duration_secs_listener(_count_compilation)
 

@@ -12,11 +12,12 @@ _jax_setup.configure()
 from pbl_pipeline.body._capsules import Capsules, capsules  # noqa: E402
 from pbl_pipeline.body._kinematics import body_poses, marker_positions  # noqa: E402
 from pbl_pipeline.body._markers import MARKER_SETS, MarkerSet, load_marker_set, marker_set  # noqa: E402
-from pbl_pipeline.body._model import SCALE_NAMES, Body, load_body  # noqa: E402
+from pbl_pipeline.body._model import SCALE_NAMES, SLIDES, Body, load_body  # noqa: E402
 
 __all__ = [
     "MARKER_SETS",
     "SCALE_NAMES",
+    "SLIDES",
     "Body",
     "Capsules",
     "MarkerSet",

@@ -19,6 +19,9 @@ from mujoco import mjx
 _MJCF = Path(__file__).parent / "data" / "pbl_body_40.xml"
 _GROUP_PREFIX = "scale_group/"
 
+#: Joints that slide, along the pelvis' axes x, y and z at `qpos = 0` (m); all others turn (rad).
+SLIDES = ("pelvis_tx", "pelvis_ty", "pelvis_tz")
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Body:

@@ -1,5 +1,5 @@
 """Results in the formats of other programs."""
 
-from pbl_pipeline.export._angles import TRANSLATIONS, angles_table, write_angles_csv
+from pbl_pipeline.export._angles import angles_table, write_angles_csv
 
-__all__ = ["TRANSLATIONS", "angles_table", "write_angles_csv"]
+__all__ = ["angles_table", "write_angles_csv"]

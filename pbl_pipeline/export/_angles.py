@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from pbl_pipeline.body import SLIDES
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 
 #: Joints that slide; all others turn.
-TRANSLATIONS = frozenset({"pelvis_tx", "pelvis_ty", "pelvis_tz"})
 
 
 def angles_table(fit: TrialFit) -> pd.DataFrame:
@@ -37,7 +37,7 @@ def angles_table(fit: TrialFit) -> pd.DataFrame:
         )
     columns: dict[str, np.ndarray] = {"time_s": np.asarray(fit.time_s, float)}
     for name, values in zip(fit.joint_names, qpos.T, strict=True):
-        columns[name] = values if name in TRANSLATIONS else np.degrees(values)
+        columns[name] = values if name in SLIDES else np.degrees(values)
         if name.startswith("knee_angle_"):
             columns[name.replace("angle", "flexion")] = -columns[name]
     return pd.DataFrame(columns)

@@ -35,12 +35,6 @@ def huber_of_square(e2: Float[Array, ...], width: ArrayLike) -> Float[Array, ...
     return jnp.where(far, width * (distance - 0.5 * width), 0.5 * e2)
 
 
-def weighted_mean(cost: Float[Array, "*n J"], c: Float[Array, "*n J"], frame_weight: Float[Array, "*n"]) -> Array:
-    """Mean of `c * cost` over the frames that count and all markers."""
-    total = jnp.sum(cost * c * frame_weight[..., None])
-    return total / (jnp.maximum(jnp.sum(frame_weight), 1.0) * cost.shape[-1])
-
-
 def center(x: Float[Array, "*n J 3"], weight: Float[Array, "*n J"]) -> Float[Array, "*n J 3"]:
     """Subtract the weighted mean over the markers in each frame; nothing where all weights are 0."""
     n = jnp.sum(weight, axis=-1)[..., None, None]

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ._inputs import GAIT, LEVEL, Session
 from ._outcome import Outcome
-from ._place import pelvis_rest, pelvis_values
+from ._place import pelvis_path, pelvis_values
 from .solvers import Solution
 
 #: Least length (m) of a path that tells: from the farthest point to the start of the frames that count.
@@ -34,7 +34,7 @@ def upright(session: Session, solution: Solution, seen: Outcome) -> tuple[Soluti
         if source != LEVEL:
             continue
         frames, used = session.frames(i), session.arrays[i].used
-        x, R = pelvis_path(session, qpos[frames])
+        x, R = pelvis_path(session.body, qpos[frames])
         up = vertical(x[used], unit(np.asarray(seen.body_axis_m)[frames][used].mean(axis=0)))
         if up is None:
             continue
@@ -47,15 +47,6 @@ def upright(session: Session, solution: Solution, seen: Outcome) -> tuple[Soluti
         sources[i] = GAIT
     solution = dataclasses.replace(solution, qpos=qpos, R_nc=R_nc)
     return solution, dataclasses.replace(seen, x_world_m=points), tuple(sources)
-
-
-def pelvis_path(session: Session, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (T, 3) and rotations (T, 3, 3) of the pelvis in the world."""
-    column = {n: k for k, n in enumerate(session.body.joint_names)}
-    stands, rest = pelvis_rest(session.body)
-    slides = qpos[:, [column[n] for n in ("pelvis_tx", "pelvis_ty", "pelvis_tz")]]
-    turns = qpos[:, [column[n] for n in ("pelvis_tilt", "pelvis_list", "pelvis_rotation")]]
-    return slides @ stands.T + rest, stands @ Rotation.from_euler("ZXY", turns).as_matrix()
 
 
 def unit(vector: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import Body
+from pbl_pipeline.body import SLIDES, Body
 
 from ._inputs import Session
 from ._place import placed_poses
@@ -65,4 +65,4 @@ def camera_start(session: Session, trial: int) -> np.ndarray:
 
 
 def _is_slide(body: Body) -> np.ndarray:
-    return np.array([n in ("pelvis_tx", "pelvis_ty", "pelvis_tz") for n in body.joint_names])
+    return np.array([n in SLIDES for n in body.joint_names])

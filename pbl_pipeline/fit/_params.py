@@ -98,14 +98,13 @@ POSE_PRIOR_DEG = (
 )
 
 #: What `qpos_sd` is multiplied by, per group of joints, so that 90 % intervals hold the truth in 90 % of the samples of
-#: the synthetic walker (`python -m tests.benchmarks.uncertainty` prints them and checks them on other walks). The
-#: pelvis' place errs most with the phone's orientation, which the residuals do not tell: 0.5 deg at 5 m are 44 mm.
+#: the synthetic walker (`python -m tests.benchmarks.uncertainty` prints them and checks them on other walks).
 SD_FACTOR: tuple[tuple[str, float], ...] = (
-    ("pelvis_t", 5.44),
-    ("pelvis_ty", 2.77),
-    ("pelvis_tilt", 1.25),
-    ("pelvis_list", 1.22),
-    ("pelvis_rotation", 1.39),
+    ("pelvis_t", 1.32),
+    ("pelvis_ty", 0.92),
+    ("pelvis_tilt", 1.24),
+    ("pelvis_list", 1.21),
+    ("pelvis_rotation", 1.26),
     ("hip", 1.23),
     ("knee", 1.27),
     ("ankle", 1.56),
@@ -121,23 +120,23 @@ SD_FACTOR: tuple[tuple[str, float], ...] = (
 )
 #: The same for `blazepose`, whose priors and few points err in ways that the curvature does not show.
 SD_FACTOR_BLAZEPOSE: tuple[tuple[str, float], ...] = (
-    ("pelvis_t", 10.88),
-    ("pelvis_ty", 4.78),
-    ("pelvis_tilt", 3.26),
-    ("pelvis_list", 2.81),
-    ("pelvis_rotation", 1.84),
-    ("hip", 2.7),
-    ("knee", 3.17),
-    ("ankle", 3.25),
-    ("subtalar", 1.83),
-    ("mtp", 4.2),
-    ("lumbar", 2.81),
-    ("neck", 1.86),
-    ("arm", 2.64),
-    ("arm_rot", 2.19),
-    ("elbow", 4.87),
-    ("pro_sup", 2.19),
-    ("wrist", 2.18),
+    ("pelvis_t", 2.88),
+    ("pelvis_ty", 1.77),
+    ("pelvis_tilt", 3.42),
+    ("pelvis_list", 2.94),
+    ("pelvis_rotation", 1.85),
+    ("hip", 2.75),
+    ("knee", 3.0),
+    ("ankle", 2.99),
+    ("subtalar", 2.08),
+    ("mtp", 4.13),
+    ("lumbar", 2.87),
+    ("neck", 1.71),
+    ("arm", 2.52),
+    ("arm_rot", 2.03),
+    ("elbow", 4.0),
+    ("pro_sup", 2.76),
+    ("wrist", 2.31),
 )
 
 

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import Body, MarkerSet
+from pbl_pipeline.body import SLIDES, Body, MarkerSet
 
 from ._inputs import Session
 from ._observations import TrialArrays
@@ -149,6 +149,15 @@ def pelvis_rest(body: Body) -> tuple[np.ndarray, np.ndarray]:
     return Rotation.from_quat(pelvis.quat, scalar_first=True).as_matrix(), np.asarray(pelvis.pos)
 
 
+def pelvis_path(body: Body, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (T, 3) and rotations (T, 3, 3) of the pelvis in the world."""
+    column = {n: k for k, n in enumerate(body.joint_names)}
+    stands, rest = pelvis_rest(body)
+    slides = qpos[:, [column[n] for n in SLIDES]]
+    turns = qpos[:, [column[n] for n in ("pelvis_tilt", "pelvis_list", "pelvis_rotation")]]
+    return slides @ stands.T + rest, stands @ Rotation.from_euler("ZXY", turns).as_matrix()
+
+
 def pelvis_values(body: Body, R: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray]:
     """The pelvis' six joint values (T,) where its frame is turned by R (T, 3, 3) and lies at x (T, 3), in the world.
 
@@ -161,5 +170,4 @@ def pelvis_values(body: Body, R: np.ndarray, x: np.ndarray) -> dict[str, np.ndar
     heading = np.arctan2(-turned[:, 2, 0], turned[:, 2, 2])
     slides = stands.T @ (x - rest).T
     turns = {"pelvis_tilt": tilt, "pelvis_list": lean, "pelvis_rotation": np.unwrap(heading)}
-    # The first three slides of the body lie along the pelvis' axes x, y, z at qpos 0.
-    return dict(zip(("pelvis_tx", "pelvis_ty", "pelvis_tz"), slides, strict=True)) | turns
+    return dict(zip(SLIDES, slides, strict=True)) | turns

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pbl_pipeline.body import SLIDES
 from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.qc import FAIL, PASS, WARN, Check
 
@@ -54,7 +55,8 @@ def _residual_2d(session: Session, trials: Sequence[TrialFit]) -> Check:
         y = np.where(seen, arrays.xy_px[..., 1], np.nan)
         y = y[np.isfinite(y).any(axis=-1)]
         height = np.median(np.nanmax(y, axis=-1) - np.nanmin(y, axis=-1))
-        shares.append(np.nanmedian(trial.residual_2d_px) / height)
+        residual = trial.residual_2d_px
+        shares.append(np.median(residual[np.isfinite(residual)]) / height)
     value = float(np.max(shares))
     return Check(
         "residual_2d_share_of_body_height",
@@ -166,8 +168,9 @@ def _orientation(trials: Sequence[TrialFit]) -> Check:
 
 def _observed(trials: Sequence[TrialFit]) -> Check:
     names = trials[0].joint_names
-    turns = np.array([n not in ("pelvis_tx", "pelvis_ty", "pelvis_tz") for n in names])
-    sd = np.rad2deg(np.max([np.nanmedian(t.qpos_sd, axis=0) for t in trials], axis=0))
+    turns = np.array([n not in SLIDES for n in names])
+    known = [np.isfinite(t.qpos_sd).all(axis=1) for t in trials]
+    sd = np.rad2deg(np.max([np.median(t.qpos_sd[k], axis=0) for t, k in zip(trials, known, strict=True)], axis=0))
     unseen = [n for n, d, turn in zip(names, sd, turns, strict=True) if turn and not d < SD_WARN_DEG]
     return Check(
         "joints_not_observed",

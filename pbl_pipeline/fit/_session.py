@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
@@ -25,13 +26,14 @@ from ._params import DEFAULT, PARAMSETS, GaussNewtonParams, Params, params_of
 from ._quality import check_fit
 from ._rotation import matrices_of, quat_wxyz
 from ._types import SessionFit, TrialFit
-from .solvers import Solution, solve_gauss_newton, solve_implicit_adam
+from .solvers import Solution, solve_gauss_newton, solve_implicit_adam, start_of
+from .solvers._normal import State
 
 #: `LEVEL_CAMERA_R_NC` as a quaternion (w, x, y, z).
 LEVEL_CAMERA_QUAT_WXYZ = np.array([0.5, -0.5, 0.5, -0.5])
 
-#: Sessions solved at once on a GPU.
-BATCH = 64
+#: Sessions solved at once on a GPU: enough to fill it, few enough that the next ones are packed meanwhile.
+BATCH = 32
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,8 +96,34 @@ def fit_sessions(
     """
     paramset = paramset or PARAMSETS[DEFAULT]
     params = params_of(paramset)
+    if batch is None:
+        batch = 1 if jax.default_backend() == "cpu" else BATCH
     out: list[SessionFit | PblError | None] = [None] * len(sessions)
-    groups: dict[tuple, list[tuple[int, Session, float]]] = {}
+    for part in _made_ahead(_batches(sessions, params, batch, out)):
+        for packed, solution in zip(part, _solve(part, params), strict=True):
+            motions = _motions(sessions[packed.index])
+            try:
+                out[packed.index] = _session_fit(packed.session, solution, paramset, motions, packed.seconds)
+            except PblError as error:
+                out[packed.index] = error
+    return [r for r in out if r is not None]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Packed:
+    """A session ready for a solver. `start`: of `gauss-newton`, else None; `seconds`: what it took to get here."""
+
+    index: int
+    session: Session
+    start: State | None
+    seconds: float
+
+
+def _batches(
+    sessions: Sequence[SessionInput], params: Params, batch: int, out: list[SessionFit | PblError | None]
+) -> Iterator[list[_Packed]]:
+    """Up to `batch` sessions of the same sizes and terms at a time; errors of the others go to `out`."""
+    waiting: dict[tuple, list[_Packed]] = {}
     for i, given in enumerate(sessions):
         begin = time.perf_counter()
         try:
@@ -103,21 +131,22 @@ def fit_sessions(
         except PblError as error:
             out[i] = error
             continue
+        start = start_of(session) if isinstance(params, GaussNewtonParams) else None
         shapes = tuple(a.shape for a in jax.tree.leaves(session.obs))
         key = (shapes, kinds_of(session), type(session.trials[0]))
-        groups.setdefault(key, []).append((i, session, time.perf_counter() - begin))
-    if batch is None:
-        batch = 1 if jax.default_backend() == "cpu" else BATCH
-    for members in groups.values():
-        for k in range(0, len(members), batch):
-            part = members[k : k + batch]
-            solutions = _solve([s for _, s, _ in part], params)
-            for (i, session, packing), solution in zip(part, solutions, strict=True):
-                try:
-                    out[i] = _session_fit(session, solution, paramset, _motions(sessions[i]), packing)
-                except PblError as error:
-                    out[i] = error
-    return [r for r in out if r is not None]
+        waiting.setdefault(key, []).append(_Packed(i, session, start, time.perf_counter() - begin))
+        if len(waiting[key]) == batch:
+            yield waiting.pop(key)
+    yield from waiting.values()
+
+
+def _made_ahead(parts: Iterator[list[_Packed]]) -> Iterator[list[_Packed]]:
+    """The same, each packed in a thread of its own while the caller is busy with the one before."""
+    with ThreadPoolExecutor(1) as thread:
+        following = thread.submit(next, parts, None)
+        while (part := following.result()) is not None:
+            following = thread.submit(next, parts, None)
+            yield part
 
 
 def _motions(given: SessionInput) -> list[str]:
@@ -125,10 +154,10 @@ def _motions(given: SessionInput) -> list[str]:
     return [motion] * len(given.trials) if isinstance(motion, str) else list(motion)
 
 
-def _solve(sessions: Sequence[Session], params: Params) -> list[Solution]:
+def _solve(part: Sequence[_Packed], params: Params) -> list[Solution]:
     if isinstance(params, GaussNewtonParams):
-        return solve_gauss_newton(sessions, params)
-    return [solve_implicit_adam(s, params) for s in sessions]
+        return solve_gauss_newton([p.session for p in part], params, [p.start for p in part if p.start])
+    return [solve_implicit_adam(p.session, params) for p in part]
 
 
 def check_trial(

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from pbl_pipeline.body import SLIDES
+
 #: The time encoding is padded to a multiple of this many frequencies: trials of like duration share a program.
 FREQUENCY_BUCKET = 8
 #: Small output weights: the trajectory starts nearly constant at its bias, the start pose.
@@ -82,7 +84,7 @@ PELVIS_RANGE_RAD = {"pelvis_tilt": math.pi, "pelvis_list": math.pi, "pelvis_rota
 def fit_ranges(joint_names: Sequence[str], joint_range_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Lower and upper bound (40,) of each coordinate in the fit and which are translations (40,) bool."""
     low, high = np.array(joint_range_rad[:, 0]), np.array(joint_range_rad[:, 1])
-    is_translation = np.array([n in ("pelvis_tx", "pelvis_ty", "pelvis_tz") for n in joint_names])
+    is_translation = np.array([n in SLIDES for n in joint_names])
     for name, bound in PELVIS_RANGE_RAD.items():
         i = list(joint_names).index(name)
         low[i], high[i] = -bound, bound

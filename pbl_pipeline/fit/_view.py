@@ -8,6 +8,8 @@ import numpy as np
 
 from pbl_pipeline.keypoints import Keypoints
 
+#: Share of the markers that must have been detected for a frame to say anything about the pose.
+SEEN_SHARE = 0.5
 #: Share of the markers that must lie inside the picture.
 INSIDE_SHARE = 0.95
 
@@ -16,13 +18,18 @@ def whole_person_in_view(keypoints: Keypoints, min_confidence: float) -> np.ndar
     """(T,) bool: nearly all markers are detected inside the picture, with a mean confidence of `min_confidence`.
 
     The mean and not each marker: in a view from the side the far arm is hidden in every frame, and the person is in
-    view all the same.
+    view all the same. Markers that the detector never gives in this trial say nothing of a single frame and do not
+    count, unless they are most of them.
     """
+    given = np.any(keypoints.confidence > 0, axis=0)
+    if given.mean() < SEEN_SHARE:
+        return np.zeros(len(keypoints.time_s), bool)
     width, height = keypoints.image_size_px
     xy = np.nan_to_num(keypoints.xy_px, nan=-1.0)
     inside = (xy[..., 0] >= 0) & (xy[..., 0] <= width) & (xy[..., 1] >= 0) & (xy[..., 1] <= height)
     inside &= keypoints.confidence > 0
-    return (inside.mean(axis=1) >= INSIDE_SHARE) & (keypoints.confidence.mean(axis=1) >= min_confidence)
+    confidence = keypoints.confidence[:, given]
+    return (inside[:, given].mean(axis=1) >= INSIDE_SHARE) & (confidence.mean(axis=1) >= min_confidence)
 
 
 def bridge_gaps(in_view: np.ndarray, time_s: np.ndarray, max_gap_s: float) -> np.ndarray:
@@ -33,10 +40,6 @@ def bridge_gaps(in_view: np.ndarray, time_s: np.ndarray, max_gap_s: float) -> np
         if b > a + 1 and time_s[b] - time_s[a] < max_gap_s:
             used[a:b] = True
     return used
-
-
-#: Share of the markers that must have been detected for a frame to say anything about the pose.
-SEEN_SHARE = 0.5
 
 
 def blind_runs(seen: np.ndarray, time_s: np.ndarray, max_blind_s: float) -> np.ndarray:

@@ -21,6 +21,7 @@ from collections.abc import Iterable, Sequence
 import click
 import numpy as np
 
+from pbl_pipeline.body import SLIDES
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import PARAMSETS, SessionInput, fit_sessions, params_of
 from pbl_pipeline.fit._params import GaussNewtonParams
@@ -102,7 +103,7 @@ def standardised(
         names = trial.joint_names
         known = np.isfinite(trial.qpos).all(axis=1)
         error = trial.qpos[known] - truth[known]
-        turns = np.array([n not in ("pelvis_tx", "pelvis_ty", "pelvis_tz") for n in names])
+        turns = np.array([n not in SLIDES for n in names])
         error = np.where(turns, np.angle(np.exp(1j * error)), error)
         errors.append(np.abs(error))
         ratios.append(np.abs(error) / trial.qpos_sd[known])

@@ -28,7 +28,6 @@ from pbl_pipeline.fit._costs import (
     pose_prior,
     project_px,
     scale_prior,
-    weighted_mean,
 )
 from pbl_pipeline.fit._inputs import undistort_px
 from pbl_pipeline.fit._place import root_positions
@@ -165,11 +164,6 @@ def test_huber_is_quadratic_then_linear_with_finite_gradient_at_zero():
     np.testing.assert_array_equal(gradient, 0)
 
 
-def test_weighted_mean_counts_only_weighted_frames():
-    cost, c = jnp.array([[1.0, 3.0], [100.0, 100.0]]), jnp.array([[1.0, 0.5], [1.0, 1.0]])
-    assert float(weighted_mean(cost, c, jnp.array([1.0, 0.0]))) == pytest.approx((1 + 1.5) / 2)
-
-
 def test_projection_by_hand_and_bounded_behind_the_camera():
     K = jnp.asarray(CAMERA.matrix)
     np.testing.assert_allclose(project_px(jnp.array([[0.5, -0.25, 5.0]]), K), [[960 + 150, 540 - 75]], rtol=1e-6)
@@ -270,6 +264,15 @@ def test_person_cut_by_the_border_is_not_in_view():
     xy = k.xy_px.copy()
     xy[5, 27:33] += [0, 2000.0]  # feet below the picture
     assert np.flatnonzero(~whole_person_in_view(dataclasses.replace(k, xy_px=xy), 0.3)).tolist() == [5]
+
+
+def test_markers_that_the_detector_never_gives_do_not_hide_the_person():
+    k = observe(walking_qpos(TIME_S), TIME_S)
+    c = k.confidence.copy()
+    c[:, :6] = 0.0
+    assert whole_person_in_view(dataclasses.replace(k, confidence=c), 0.3).all()
+    c[:, :60] = 0.0
+    assert not whole_person_in_view(dataclasses.replace(k, confidence=c), 0.3).any()
 
 
 def test_paramsets_survive_json_and_name_their_steps():

@@ -25,6 +25,7 @@ from pbl_pipeline.fit._costs import (
 from pbl_pipeline.fit._inputs import Session, make_session
 from pbl_pipeline.fit._observations import SAMPLE_S, bend_weights
 from pbl_pipeline.fit._params import CostParams, GaussNewtonParams, ViewParams
+from pbl_pipeline.fit.solvers import _arrow
 from pbl_pipeline.fit.solvers._arrow import Arrow, marginal_variance, solve
 from pbl_pipeline.fit.solvers._normal import State, _phone_error_deg, cost, normal_equations
 from pbl_pipeline.fit.solvers.gauss_newton import kinds_of, start_of, weights_of
@@ -93,6 +94,19 @@ def test_the_arrow_is_solved_as_the_full_matrix(frames):
     np.testing.assert_allclose(np.concatenate([np.ravel(x), y]), want, atol=2e-5 * np.abs(want).max())
     variance = np.diag(np.linalg.inv(full))
     np.testing.assert_allclose(np.concatenate([np.ravel(by_frame), shared]), variance, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("k", "columns"), [(4, 3), (4, 32), (6, 3)])
+def test_a_large_border_by_columns_gives_the_same(k, columns, monkeypatch):
+    rng = np.random.default_rng(k)
+    arrow, full = random_arrow(10, rng, k=k)
+    g, h = rng.normal(size=(10, 5)), rng.normal(size=k)
+    monkeypatch.setattr(_arrow, "LARGE_BORDER", 0)
+    monkeypatch.setattr(_arrow, "COLUMNS", columns)
+    (x, y), (by_frame, shared) = solution_and_variance(arrow, jnp.asarray(g, jnp.float32), jnp.asarray(h, jnp.float32))
+    want = np.linalg.solve(full, np.concatenate([g.ravel(), h]))
+    np.testing.assert_allclose(np.concatenate([np.ravel(x), y]), want, atol=2e-5 * np.abs(want).max())
+    np.testing.assert_allclose(np.concatenate([np.ravel(by_frame), shared]), np.diag(np.linalg.inv(full)), rtol=1e-4)
 
 
 def test_many_arrows_at_once():

@@ -223,7 +223,8 @@ def test_sessions_with_other_terms_are_not_solved_together(walkers, monkeypatch)
     pixels = SessionInput([dataclasses.replace(trial, xyz_cam_m=np.full_like(trial.xyz_cam_m, np.nan))], ["pixels"])
     asked: list[list[str]] = []
 
-    def nothing(sessions, params) -> list[Solution]:
+    def nothing(part, params) -> list[Solution]:
+        sessions = [p.session for p in part]
         asked.append([s.names[0] for s in sessions])
         f, j = len(sessions[0].obs.weight), len(sessions[0].markers)
         names = {"qpos": (f, 40), "R_nc": (f, 1, 3, 3), "s": (8,), "scale": (8,), "site_offset_m": (j, 3)}

@@ -11,11 +11,18 @@ which is what a GPU needs. All matrices are symmetric positive definite.
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.lax.linalg import triangular_solve
 from jaxtyping import Array, Float
+
+#: Columns of the border that are worked on at once where memory counts: for the variances, and in long sessions.
+COLUMNS = 32
+#: Numbers of a border above which it is eliminated some columns at a time, which takes less than half of the memory.
+LARGE_BORDER = 2**26
 
 
 @jax.tree_util.register_dataclass
@@ -49,10 +56,6 @@ def solve(matrix: Arrow, g: Float[Array, "F Q"], h: Float[Array, " K"]) -> tuple
     return x, y
 
 
-#: Columns of the border that are solved for at once for the variances: bounds the memory of long sessions.
-COLUMNS = 32
-
-
 def marginal_variance(matrix: Arrow) -> tuple[Float[Array, "F Q"], Float[Array, " K"]]:
     """Diagonal of the inverse of the whole matrix: that of x and that of y."""
     with jax.default_matmul_precision("highest"):
@@ -78,20 +81,43 @@ def _inverse_of_factor(matrix: Float[Array, "*m n n"]) -> Float[Array, "*m n n"]
 def _eliminate(matrix: Arrow, g: Array) -> tuple[list[_Level], Array, Array]:
     """Factors of A, B' A^-1 B and B' A^-1 g."""
     blocks, links = _pairs(matrix)
-    border, right = _in_pairs(matrix.border), _in_pairs(g[..., None])
-    k = matrix.border.shape[-1]
-    schur, reduced = jnp.zeros((k, k), border.dtype), jnp.zeros(k, border.dtype)
     levels: list[_Level] = []
     while True:
         last = blocks.shape[0] == 1
         level, blocks, links = _reduce(blocks, links)
         levels.append(level)
-        y, border = _forward(level, border)
-        z, right = _forward(level, right)
-        schur += jnp.einsum("mnk,mnl->kl", y, y)
-        reduced += jnp.einsum("mnk,mn->k", y, z[..., 0])
         if last:
-            return levels, schur, reduced
+            break
+    if matrix.border.size > LARGE_BORDER:
+        reduced = _substitute(levels, g[..., None]).reshape(1, -1) @ matrix.border.reshape(g.size, -1)
+        return levels, _by_columns(levels, matrix.border), reduced[0]
+    border, right = _eliminated(levels, matrix.border), _eliminated(levels, g[..., None])
+    schur = functools.reduce(jnp.add, [jnp.einsum("mnk,mnl->kl", y, y) for y in border])
+    reduced = functools.reduce(jnp.add, [jnp.einsum("mnk,mnr->k", y, z) for y, z in zip(border, right, strict=True)])
+    return levels, schur, reduced
+
+
+def _by_columns(levels: list[_Level], border: Float[Array, "F Q K"]) -> Float[Array, "K K"]:
+    """B' A^-1 B."""
+    k = border.shape[-1]
+    width = min(COLUMNS, k)
+    starts = np.minimum(np.arange(0, k, width), k - width)  # the last ones overlap
+
+    def some(start: Array) -> Array:
+        x = _substitute(levels, jax.lax.dynamic_slice_in_dim(border, start, width, axis=2))
+        return x.reshape(-1, width).T @ border.reshape(-1, k)
+
+    rows = jax.lax.map(some, jnp.asarray(starts)).reshape(-1, k)
+    return rows[np.unique(starts[:, None] + np.arange(width), return_index=True)[1]]
+
+
+def _eliminated(levels: list[_Level], rhs: Float[Array, "F Q R"]) -> list[Float[Array, "M n R"]]:
+    """The eliminated rows of a right-hand side, level by level."""
+    part, out = _in_pairs(rhs), []
+    for level in levels:
+        y, part = _forward(level, part)
+        out.append(y)
+    return out
 
 
 def _pairs(matrix: Arrow) -> tuple[Array, Array]:
@@ -159,12 +185,10 @@ def _gram(a: Array, b: Array) -> Array:
 
 def _substitute(levels: list[_Level], rhs: Float[Array, "F Q R"]) -> Float[Array, "F Q R"]:
     """A^-1 rhs with the factors of A."""
-    part, solved, counts = _in_pairs(rhs), [], []
-    for level in levels:
-        counts.append(part.shape[0])
-        y, part = _forward(level, part)
-        solved.append(y)
-    x = jnp.zeros_like(part)
+    solved = _eliminated(levels, rhs)
+    # How many rows each level began with.
+    counts = [rhs.shape[0] // 2, *(level.inverse.shape[0] for level in levels[:-1])]
+    x = jnp.zeros_like(solved[-1])
     for level, y, count in zip(reversed(levels), reversed(solved), reversed(counts), strict=True):
         gone = _gram(level.inverse, y - level.left @ _earlier(x) - level.right @ x)
         x = _join(gone, x)[:count]

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array
 
 from pbl_pipeline._jax_setup import compile_seconds
-from pbl_pipeline.body import Body
+from pbl_pipeline.body import SLIDES, Body
 from pbl_pipeline.body._jacobian import MarkerTable
 
 from .._inputs import Session
@@ -27,6 +27,7 @@ from .._marker_cost import Kinds, kinds_of
 from .._observations import Observations
 from .._outcome import Outcome, outcome
 from .._params import GaussNewtonParams
+from .._phone_error import phone_variance
 from .._place import placed_poses
 from .._prior import prior_of
 from .._threads import one_blas_thread
@@ -170,17 +171,20 @@ def _finish_many(body, kinds, table, obs, w, state):
     return jax.vmap(functools.partial(finish, body, kinds), in_axes=(0, 0, None, 0))(table, obs, w, state)
 
 
-def solve_gauss_newton(sessions: Sequence[Session], params: GaussNewtonParams) -> list[Solution]:
-    """Fit sessions that are packed to the same sizes: one as it is, several at once on the device.
+def solve_gauss_newton(
+    sessions: Sequence[Session], params: GaussNewtonParams, starts: Sequence[State]
+) -> list[Solution]:
+    """Fit sessions that are packed to the same sizes from `start_of` each: one as it is, several at once on the device.
 
     The result does not depend on which sessions are fitted together. A session whose result is suspicious is solved
     again from a start that faces the other way, and the better one of the two is kept.
     """
     begin, compiled = time.perf_counter(), compile_seconds()
-    found = _solve(sessions, params, flip=False)
+    found = _solve(sessions, params, starts)
     again = [i for i, s in enumerate(found) if suspicious(sessions[i], s)]
     if again:
-        for i, other in zip(again, _solve([sessions[i] for i in again], params, flip=True), strict=True):
+        part = [sessions[i] for i in again]
+        for i, other in zip(again, _solve(part, params, [start_of(s, flip=True) for s in part]), strict=True):
             if other.loss_trace[-1, 1] < found[i].loss_trace[-1, 1]:
                 found[i] = other
     seconds = (time.perf_counter() - begin) / len(sessions)
@@ -188,30 +192,36 @@ def solve_gauss_newton(sessions: Sequence[Session], params: GaussNewtonParams) -
     return [dataclasses.replace(s, seconds=seconds, compile_seconds=compiled) for s in found]
 
 
-def _solve(sessions: Sequence[Session], params: GaussNewtonParams, flip: bool) -> list[Solution]:
+def _solve(sessions: Sequence[Session], params: GaussNewtonParams, starts: Sequence[State]) -> list[Solution]:
     body, kinds = sessions[0].body, kinds_of(sessions[0])
     w, limits = weights_of(sessions[0], params), limits_of(params)
-    starts = [start_of(s, flip) for s in sessions]
+    given = [(s.table, s.obs, start) for s, start in zip(sessions, starts, strict=True)]
+    alone = len(given) == 1
+    if not alone:
+        # The last one stands in for those that are missing, so that a worker compiles a program for few sizes.
+        given += [given[-1]] * (pad_batch(len(given)) - len(given))
     # Stacked on the host, so that each array goes to the device once.
-    stack = (lambda a: a) if len(sessions) == 1 else (lambda *a: np.stack(a))
-    table, obs, start = (
-        jax.tree.map(stack, *trees) for trees in ([s.table for s in sessions], [s.obs for s in sessions], starts)
-    )
-    table, obs, start = jax.device_put((table, obs, start))
-    minimise_, finish_ = (_minimise_one, _finish_one) if len(sessions) == 1 else (_minimise_many, _finish_many)
+    table, obs, start = jax.device_put(given[0] if alone else jax.tree.map(lambda *a: np.stack(a), *given))
+    minimise_, finish_ = (_minimise_one, _finish_one) if alone else (_minimise_many, _finish_many)
     with one_blas_thread():
         progress = minimise_(body, kinds, table, obs, w, start, limits)
         found = jax.device_get((progress, *finish_(body, kinds, table, obs, w, progress.state)))
-    each = [found] if len(sessions) == 1 else [jax.tree.map(lambda a, i=i: a[i], found) for i in range(len(sessions))]
+    each = [found] if alone else [jax.tree.map(lambda a, i=i: a[i], found) for i in range(len(sessions))]
     factors = sd_factors(sessions[0].body.joint_names, params.sd_factor)
     return [_solution(s, factors, *one) for s, one in zip(sessions, each, strict=True)]
+
+
+def pad_batch(n: int) -> int:
+    """The size to which a batch of `n` sessions is padded: a power of 2."""
+    return 1 << (n - 1).bit_length()
 
 
 def _solution(session: Session, factors: np.ndarray, p: Progress, variance: np.ndarray, seen: Outcome) -> Solution:
     n = int(p.iteration)
     trace = np.stack([np.arange(1, n + 1), np.asarray(p.trace)[:n]], axis=1).astype(np.float64)
+    qpos = np.asarray(p.state.qpos, np.float64)
     return Solution(
-        qpos=np.asarray(p.state.qpos, np.float64),
+        qpos=qpos,
         R_nc=np.asarray(p.state.R_nc, np.float64),
         s=np.asarray(p.state.s, np.float64),
         scale=1.0 + MIXER @ np.asarray(p.state.s, np.float64),
@@ -222,7 +232,7 @@ def _solution(session: Session, factors: np.ndarray, p: Progress, variance: np.n
         seconds=0.0,
         iterations=n,
         converged=bool(p.converged),
-        qpos_sd=np.sqrt(np.maximum(variance, 0.0)) * factors,
+        qpos_sd=np.sqrt(np.maximum(variance, 0.0) + phone_variance(session, qpos)) * factors,
         outcome=seen,
     )
 
@@ -240,7 +250,7 @@ def weights_of(session: Session, params: GaussNewtonParams) -> Weights:
     """The paramset's numbers on the device."""
     names, c = session.body.joint_names, params.cost
     low, high = np.asarray(session.body.joint_range_rad).T
-    slide = np.array([n in ("pelvis_tx", "pelvis_ty", "pelvis_tz") for n in names])
+    slide = np.array([n in SLIDES for n in names])
     neutral, inverse_sd = prior_of(names, c.pose_prior_deg)
     values = {
         "weight_3d": c.weight_3d,
