@@ -1,0 +1,144 @@
+"""Reference movements of videos, and the error of every fit against them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from . import fit, video  # noqa: F401  a definition refers to video
+from ._base import Origin, computes, dj, file_ref, library, number, origin_columns, stored_file
+
+schema = dj.Schema()
+
+#: Classes of the view of one side of the body.
+VIEWS = ("front", "back", "ipsilateral", "contralateral", "mixed")
+
+
+@schema
+class ReferenceKinematics(dj.Manual):
+    definition = """
+    # movement of a video as another instrument measured it; another file of the same source is another row
+    -> video.Video
+    reference             : char(16)           # hash over source, convention and file
+    ---
+    dataset               : varchar(32)        # collection of recordings that is reported together
+    reference_source      : varchar(64)        # instrument, such as optical markers or several cameras
+    reference_convention  : enum('qpos', 'body_rotations')  # what its angles are: joints of our body, or rotations between bodies
+    reference_name        : varchar(255)       # name of the file
+    reference_sha256      : char(64)           # of the file's bytes
+    reference_origin      : varchar(1000)      # where the file comes from
+    reference_n           : int32              # samples
+    reference_start       : float64            # (s) first sample, in the time of the video
+    reference_end         : float64            # (s) last sample
+    reference_joints      : json               # names of its angles
+    reference_current     : bool               # false once a newer file of the same source took its place; old errors stay
+    reference_created     : datetime           # when registered, UTC
+    reference_file        : <object@arrays>    # npz: time_s (T) s, names (A), angles_deg (T,A) deg, pelvis_m (T,3) m; docs/files.md
+    """  # noqa: E501
+
+
+@schema
+class KinematicError(dj.Computed):
+    definition = f"""
+    # error of a fitted trial against a reference
+    -> fit.SessionFit.Trial
+    -> ReferenceKinematics
+    ---
+    error_lag             : float32            # (s) found by comparison; positive: the video is later than the reference
+    error_n               : int32              # frames compared
+    rte=null              : float32            # (m) mean distance of the pelvis paths after rigid alignment, null where unknown
+    error_view_left       : enum({", ".join(repr(v) for v in VIEWS)})  # from where the left side was seen
+    error_view_right      : enum({", ".join(repr(v) for v in VIEWS)})
+    error_residual_2d=null: float32            # (px) median distance of body and keypoints in the picture
+    error_residual_3d=null: float32            # (cm) median distance of body and 3D keypoints
+    {origin_columns("error")}
+    """  # noqa: E501
+
+    class Joint(dj.Part):
+        definition = """
+        -> master
+        error_joint           : varchar(32)    # OpenSim's name; the knee as knee_flexion, positive in flexion
+        ---
+        joint_n               : int32          # frames compared
+        joint_median_abs      : float32        # (deg) median absolute error
+        joint_mean_abs        : float32        # (deg) mean absolute error
+        joint_bias            : float32        # (deg) mean of ours minus the reference
+        joint_sd              : float32        # (deg) standard deviation of the difference, without its constant part
+        joint_rms             : float32        # (deg) root of the mean squared difference
+        joint_correlation=null: float32        # (-1..1) null where one of the two does not move
+        joint_within_90=null  : float32        # (0..1) share of frames inside the fit's 90 % interval, null without one
+        """
+
+    @property
+    def key_source(self) -> Any:
+        trials = fit.SessionFit.Trial.proj() & (fit.FitSelection & {"fit_current": True})
+        return trials * (ReferenceKinematics & {"reference_current": True}).proj()
+
+    def make_fetch(self, key: dict) -> tuple:
+        return (
+            file_ref((fit.SessionFit.Trial & key).fetch1("trial_file")),
+            file_ref((ReferenceKinematics & key).fetch1("reference_file")),
+        )
+
+    @computes
+    def make_compute(self, key: dict, fitted: Mapping[str, Any], reference: Mapping[str, Any]) -> tuple:
+        lib = library("validation")
+        with stored_file(self, fitted) as path:
+            trial = library("fit").TrialFit.load(path)
+        with stored_file(self, reference) as path:
+            truth = lib.Reference.load(path)
+        return (lib.compare(trial, truth),)
+
+    def make_insert(self, key: dict, errors: Any, origin: Origin) -> None:
+        self.insert1(
+            {
+                **key,
+                "error_lag": errors.lag_s,
+                "error_n": errors.n,
+                "rte": number(errors.rte_m),
+                "error_view_left": errors.view["left"],
+                "error_view_right": errors.view["right"],
+                "error_residual_2d": number(errors.residual_2d_px),
+                "error_residual_3d": number(errors.residual_3d_cm),
+                **origin.row("error"),
+            }
+        )
+        self.Joint.insert({**key, **joint_row(j)} for j in errors.joints)
+
+
+#: Field of the library's `JointError` -> column of KinematicError.Joint.
+JOINT_COLUMNS = {
+    "joint": "error_joint",
+    "n": "joint_n",
+    "median_abs_deg": "joint_median_abs",
+    "mean_abs_deg": "joint_mean_abs",
+    "bias_deg": "joint_bias",
+    "sd_deg": "joint_sd",
+    "rms_deg": "joint_rms",
+    "correlation": "joint_correlation",
+    "within_90": "joint_within_90",
+}
+
+
+def joint_row(error: Any) -> dict[str, Any]:
+    """A library `JointError` as columns of KinematicError.Joint."""
+    row = {column: getattr(error, field) for field, column in JOINT_COLUMNS.items()}
+    return {c: v if c in ("error_joint", "joint_n") else number(v) for c, v in row.items()}
+
+
+def errors_of_rows(row: Mapping[str, Any], joints: list[Mapping[str, Any]]) -> Any:
+    """The library's `KinematicErrors` from a row of KinematicError and its rows of joints."""
+    lib = library("validation")
+    return lib.KinematicErrors(
+        lag_s=float(row["error_lag"]),
+        n=int(row["error_n"]),
+        joints=tuple(lib.JointError(**{f: _value(j[c]) for f, c in JOINT_COLUMNS.items()}) for j in joints),
+        rte_m=_value(row["rte"]),
+        view={"left": row["error_view_left"], "right": row["error_view_right"]},
+        residual_2d_px=_value(row["error_residual_2d"]),
+        residual_3d_cm=_value(row["error_residual_3d"]),
+    )
+
+
+def _value(value: Any) -> Any:
+    return float("nan") if value is None else value
