@@ -1,0 +1,45 @@
+"""How far a fit is from a reference: errors per joint, the paper's tables, paired curves (docs/validation.md)."""
+
+from ._align import align_path, best_lag
+from ._compare import JointError, KinematicErrors, compare, compare_angles, compare_references
+from ._frame import COLUMNS, TrialErrors, error_frame
+from ._joints import JOINTS_CLIP, JOINTS_OPENCAP, JOINTS_PAPER
+from ._reference import BODY_ROTATIONS, CONVENTIONS, QPOS, Reference
+from ._rotations import body_rotation_angles
+from ._sources import (
+    fit_angles,
+    fit_angles_sd,
+    reference_of_bodies,
+    reference_of_fit,
+    reference_of_mot,
+    reference_of_qpos,
+)
+from ._view import view_classes
+
+__all__ = [
+    "BODY_ROTATIONS",
+    "COLUMNS",
+    "CONVENTIONS",
+    "JOINTS_CLIP",
+    "JOINTS_OPENCAP",
+    "JOINTS_PAPER",
+    "QPOS",
+    "JointError",
+    "KinematicErrors",
+    "Reference",
+    "TrialErrors",
+    "align_path",
+    "best_lag",
+    "body_rotation_angles",
+    "compare",
+    "compare_angles",
+    "compare_references",
+    "error_frame",
+    "fit_angles",
+    "fit_angles_sd",
+    "reference_of_bodies",
+    "reference_of_fit",
+    "reference_of_mot",
+    "reference_of_qpos",
+    "view_classes",
+]
