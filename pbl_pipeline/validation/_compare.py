@@ -16,7 +16,7 @@ from ._joints import JOINTS_OPENCAP, JOINTS_PAPER, PELVIS
 from ._reference import Reference
 from ._rotations import pelvis_angles_deg, pelvis_rotations
 from ._sources import fit_angles, fit_angles_sd
-from ._view import NO_VIEW, view_of_fit
+from ._view import MIXED, view_of_fit
 
 #: Half width of a 90 % interval in standard deviations.
 Z_90 = 1.645
@@ -50,8 +50,6 @@ class KinematicErrors:
     ----------
     lag_s
         Of the video behind the reference (positive: the video is later).
-    max_lag_s
-        The search went this far to both sides; a lag at its end is suspicious (`lag_at_limit`).
     n
         Frames in which at least one joint could be compared.
     joints
@@ -61,17 +59,16 @@ class KinematicErrors:
     rte_m
         Mean distance of the pelvis path to the reference's, NaN where one is not known.
     view
-        Side (`r`, `l`) -> "front", "back", "ipsilateral", "contralateral", "mixed", or ``""`` without a camera.
+        "right" and "left" -> "front", "back", "ipsilateral", "contralateral" or "mixed" (`view_classes`).
     residual_2d_px, residual_3d_cm
         Medians of the fit's residuals over frames and markers.
+    trial, reference, source, convention
+        Names of fit and reference, and of what kind the reference is.
+    max_lag_s
+        The search went this far to both sides; a lag at its end is suspicious (`lag_at_limit`).
     """
 
-    trial: str
-    reference: str
-    source: str
-    convention: str
     lag_s: float
-    max_lag_s: float
     n: int
     joints: tuple[JointError, ...]
     median_abs_deg: float
@@ -79,6 +76,11 @@ class KinematicErrors:
     view: Mapping[str, str]
     residual_2d_px: float
     residual_3d_cm: float
+    trial: str = ""
+    reference: str = ""
+    source: str = ""
+    convention: str = ""
+    max_lag_s: float = float("nan")
 
     @property
     def lag_at_limit(self) -> bool:
@@ -196,7 +198,7 @@ def compare_angles(
         joints=joints,
         median_abs_deg=_median(np.abs(paper)),
         rte_m=_rte(time_s - lag, pelvis_m, reference, same_world),
-        view={"r": NO_VIEW, "l": NO_VIEW},
+        view={"right": MIXED, "left": MIXED},
         residual_2d_px=float("nan"),
         residual_3d_cm=float("nan"),
     )

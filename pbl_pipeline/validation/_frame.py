@@ -65,5 +65,5 @@ def error_frame(rows: Iterable[TrialErrors]) -> pd.DataFrame:
 def _view(row: TrialErrors, side: str) -> str:
     if row.camera == SEVERAL:
         return ""
-    view = row.errors.view.get(side or "r", "")
+    view = row.errors.view["left" if side == "l" else "right"]
     return "lateral" if not side and view in (IPSILATERAL, CONTRALATERAL) else view
