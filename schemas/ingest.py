@@ -49,7 +49,7 @@ class Ingested:
 
 @dataclasses.dataclass(frozen=True)
 class Visit:
-    """What all files of one call share. `camera_motion` and `activity` None: static, walking."""
+    """What all files of one call share. None: camera motion static, activity walking, population unchanged."""
 
     subject: str
     session_label: str = session.UNLABELLED
@@ -58,6 +58,7 @@ class Visit:
     camera_motion: str | None = None
     activity: str | None = None
     person: int | None = None
+    population: str | None = None
 
 
 #: Key of a selection or plan -> field of `Methods` that names it.
@@ -99,6 +100,7 @@ def ingest(paths: Sequence[str | Path], visit: Visit, methods: Methods | None = 
         ("session", visit.session_label, 64),
         ("project", visit.project or "", 32),
         ("activity", visit.activity or "", 32),
+        ("population", visit.population or "", 32),
     ):
         if len(text) > longest:
             raise PblError(
@@ -227,6 +229,7 @@ def _known(path: Path, row: dict[str, Any], visit: Visit, chosen: dict[str, str]
         notes.append(f"it was {row['video_path']}, which is gone")
     changes = _new_camera(path, row, visit.camera_file) if visit.camera_file else []
     changes += _new_methods(row, chosen, more)
+    changes += _new_population(row["subject"], visit.population)
     if changes and status == "known":
         status = "updated"
     for what, given in (("activity", visit.activity), ("camera_motion", visit.camera_motion)):
@@ -257,6 +260,16 @@ def _new_camera(path: Path, row: dict[str, Any], camera_file: str | Path) -> lis
     _forget_errors(number)
     rows = ", ".join(f"{n} of {name}" for name, n in deleted.items())
     return ["the camera was attached" + (f", and what depends on it was deleted: {rows}" if rows else "")]
+
+
+def _new_population(subject: str, population: str | None) -> list[str]:
+    """Put a subject into the population that was named; what was done, in words."""
+    key = {"subject": subject}
+    if not population or (lab.Subject & key).fetch1("population") == population:
+        return []
+    lab.Population.insert1({"population": population, "population_description": ""}, skip_duplicates=True)
+    lab.Subject.update1({**key, "population": population})
+    return [f"population of {subject} is {population} now"]
 
 
 def _new_methods(row: dict[str, Any], chosen: dict[str, str], more: set[str]) -> list[str]:
@@ -306,6 +319,7 @@ def _session(visit: Visit) -> int:
     if not lab.Subject & subject:
         more = {"project": visit.project, "population": "unknown", "subject_created": utc_now()}
         lab.Subject.insert1({**subject, **more})
+    _new_population(visit.subject, visit.population)
     label = {**subject, "session_label": visit.session_label}
     found = (session.Session & label).to_dicts()
     if found:

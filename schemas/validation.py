@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from . import fit, video  # noqa: F401  a definition refers to video
 from ._base import Origin, computes, dj, file_ref, library, number, origin_columns, stored_file
 
 schema = dj.Schema()
-
-#: Classes of the view of one side of the body.
-VIEWS = ("front", "back", "ipsilateral", "contralateral", "mixed")
 
 
 @schema
@@ -45,12 +42,12 @@ class KinematicError(dj.Computed):
     -> ReferenceKinematics
     ---
     error_lag             : float32            # (s) found by comparison; positive: the video is later than the reference
+    error_max_lag         : float32            # (s) how far it was searched to both sides
     error_n               : int32              # frames compared
-    rte=null              : float32            # (m) mean distance of the pelvis paths after rigid alignment, null where unknown
-    error_view_left       : enum({", ".join(repr(v) for v in VIEWS)})  # from where the left side was seen
-    error_view_right      : enum({", ".join(repr(v) for v in VIEWS)})
-    error_residual_2d=null: float32            # (px) median distance of body and keypoints in the picture
-    error_residual_3d=null: float32            # (cm) median distance of body and 3D keypoints
+    error_median_abs=null : float32            # (deg) median absolute error over all frames and the paper's joints
+    rte=null              : float32            # (m) mean distance of the pelvis paths after alignment, null where unknown
+    error_view_left       : varchar(16)        # joints of the left side seen from: front, back, ipsilateral, contralateral, mixed (also without a camera)
+    error_view_right      : varchar(16)        # the same for the right side
     {origin_columns("error")}
     """  # noqa: E501
 
@@ -59,14 +56,14 @@ class KinematicError(dj.Computed):
         -> master
         error_joint           : varchar(32)    # OpenSim's name; the knee as knee_flexion, positive in flexion
         ---
-        joint_n               : int32          # frames compared
-        joint_median_abs      : float32        # (deg) median absolute error
-        joint_mean_abs        : float32        # (deg) mean absolute error
-        joint_bias            : float32        # (deg) mean of ours minus the reference
-        joint_sd              : float32        # (deg) standard deviation of the difference, without its constant part
-        joint_rms             : float32        # (deg) root of the mean squared difference
+        joint_n               : int32          # frames compared; where there is none, all below are null
+        joint_median_abs=null : float32        # (deg) median absolute error
+        joint_mean_abs=null   : float32        # (deg) mean absolute error
+        joint_bias=null       : float32        # (deg) mean of fit minus reference
+        joint_sd=null         : float32        # (deg) standard deviation of fit minus reference
+        joint_rms=null        : float32        # (deg) root of its mean square
         joint_correlation=null: float32        # (-1..1) null where one of the two does not move
-        joint_within_90=null  : float32        # (0..1) share of frames inside the fit's 90 % interval, null without one
+        joint_within_90=null  : float32        # (0..1) share of frames inside the fit's interval of 90 percent, null without one
         """
 
     @property
@@ -94,12 +91,12 @@ class KinematicError(dj.Computed):
             {
                 **key,
                 "error_lag": errors.lag_s,
+                "error_max_lag": errors.max_lag_s,
                 "error_n": errors.n,
+                "error_median_abs": number(errors.median_abs_deg),
                 "rte": number(errors.rte_m),
                 "error_view_left": errors.view["left"],
                 "error_view_right": errors.view["right"],
-                "error_residual_2d": number(errors.residual_2d_px),
-                "error_residual_3d": number(errors.residual_3d_cm),
                 **origin.row("error"),
             }
         )
@@ -126,17 +123,26 @@ def joint_row(error: Any) -> dict[str, Any]:
     return {c: v if c in ("error_joint", "joint_n") else number(v) for c, v in row.items()}
 
 
-def errors_of_rows(row: Mapping[str, Any], joints: list[Mapping[str, Any]]) -> Any:
-    """The library's `KinematicErrors` from a row of KinematicError and its rows of joints."""
+def errors_of_rows(row: Mapping[str, Any], joints: Sequence[Mapping[str, Any]]) -> Any:
+    """The library's `KinematicErrors` from a row of KinematicError joined with its trial and reference, and its joints.
+
+    The residuals are those of the trial, which are not stored again here.
+    """
     lib = library("validation")
     return lib.KinematicErrors(
+        trial=row["trial_name"],
+        reference=row["reference_name"],
+        source=row["reference_source"],
+        convention=row["reference_convention"],
         lag_s=float(row["error_lag"]),
+        max_lag_s=float(row["error_max_lag"]),
         n=int(row["error_n"]),
         joints=tuple(lib.JointError(**{f: _value(j[c]) for f, c in JOINT_COLUMNS.items()}) for j in joints),
+        median_abs_deg=_value(row["error_median_abs"]),
         rte_m=_value(row["rte"]),
         view={"left": row["error_view_left"], "right": row["error_view_right"]},
-        residual_2d_px=_value(row["error_residual_2d"]),
-        residual_3d_cm=_value(row["error_residual_3d"]),
+        residual_2d_px=_value(row["trial_residual_2d"]),
+        residual_3d_cm=_value(row["trial_residual_3d"]),
     )
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
-from . import fit, gait, gdi, qc, session, tracking, video
+from . import fit, gait, gdi, lab, qc, session, tracking, validation, video
+from ._base import library
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -82,3 +84,47 @@ def decided_by_hand() -> pd.DataFrame:
     """Videos whose subject a person chose."""
     manual = tracking.SubjectOverride * video.Video.proj("video_name", "session_id")
     return manual.to_pandas(order_by="video_id").reset_index()
+
+
+def validation_frame(restriction: Any = True) -> pd.DataFrame:
+    """Errors of the current fits against the current references, one row per trial, reference and joint.
+
+    The frame of `pbl_pipeline.validation.error_frame`: errors in degrees, lag in s, RTE in m, residuals in px and cm.
+    Dataset, population, activity and camera are those of the reference, the subject and the video.
+    """
+    references = validation.ReferenceKinematics & {"reference_current": True}
+    compared = (
+        validation.KinematicError
+        * references.proj("dataset", "reference_name", "reference_source", "reference_convention")
+        * (fit.FitSelection & {"fit_current": True}).proj()
+        * fit.SessionFit.Trial.proj("trial_name", "trial_residual_2d", "trial_residual_3d")
+        * fit.FitSet.Video.proj("keypoint_method")
+        * video.Video.proj("session_id", "activity", "camera_motion")
+        * session.Session.proj("subject")
+        * lab.Subject.proj("population")
+    ) & restriction
+    key = validation.KinematicError.primary_key
+    joints: dict[tuple, list[dict[str, Any]]] = {}
+    for row in (validation.KinematicError.Joint & compared.proj()).to_dicts(order_by="KEY"):
+        joints.setdefault(tuple(row[k] for k in key), []).append(row)
+    lib = library("validation")
+    found = compared.to_dicts(order_by="video_id, fit_set, fit_method, reference")
+    n_references = Counter((row["fit_set"], row["fit_method"], row["video_id"]) for row in found)
+    rows = []
+    for row in found:
+        # The number, because files of several visits may have one name.
+        trial = f"{row['video_id']} {row['trial_name']}"
+        if n_references[row["fit_set"], row["fit_method"], row["video_id"]] > 1:
+            trial += f" against {row['reference_source']}"
+        rows.append(
+            lib.TrialErrors(
+                errors=validation.errors_of_rows(row, joints.get(tuple(row[k] for k in key), [])),
+                # A camera that is one of several is fitted alone here: it stands still.
+                camera="handheld" if row["camera_motion"] == "handheld" else "static",
+                trial=trial,
+                detector=row["keypoint_method"],
+                solver=row["fit_method"],
+                **{k: row[k] for k in ("dataset", "subject", "population", "activity")},
+            )
+        )
+    return lib.error_frame(rows)

@@ -26,6 +26,7 @@ import click
     help="How the camera was held (else: static).",
 )
 @click.option("--activity", help="What the person does (else: walking).")
+@click.option("--population", metavar="NAME", help="Group of the subject, such as healthy (else: as it was).")
 @click.option("--person", type=click.IntRange(min=1), help="Measure this person of the tracking (else: automatic).")
 @click.option("--tracking-method", metavar="NAME", help="Method of person tracking (else: the default).")
 @click.option("--keypoint-method", metavar="NAME", help="Method of keypoint detection (else: the default).")
@@ -39,6 +40,7 @@ def ingest(
     camera: Path | None,
     camera_motion: str | None,
     activity: str | None,
+    population: str | None,
     person: int | None,
     tracking_method: str | None,
     keypoint_method: str | None,
@@ -60,7 +62,7 @@ def ingest(
     from schemas.ingest import ingest as register
 
     schemas.activate()
-    visit = Visit(subject, session_label, project, camera, camera_motion, activity, person)
+    visit = Visit(subject, session_label, project, camera, camera_motion, activity, person, population)
     methods = Methods(tracking=tracking_method, keypoint=keypoint_method, fit=fit_method, norm=norm)
     results = register(videos, visit, methods)
     for result in results:

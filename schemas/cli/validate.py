@@ -1,0 +1,179 @@
+"""`pbl validate`: how far the fits are from reference movements."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from pbl_pipeline.errors import PblError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+#: Printed where no error was computed yet.
+NOTHING = """\
+No error of a fit against a reference is in the database yet. What to do:
+  pbl validate add VIDEO --reference FILE    for each video that another instrument recorded as well
+  pbl populate                               computes the errors of its fits
+  pbl validate                               prints the tables
+Without a database: pbl validate FIT.npz --reference FILE"""
+
+
+class _WithDefault(click.Group):
+    """A group whose command `tables` runs where none is named."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if not args or args[0] not in (*self.commands, *ctx.help_option_names):
+            args = ["tables", *args]
+        return super().parse_args(ctx, args)
+
+
+@click.group(cls=_WithDefault)
+def validate() -> None:
+    """Compare fits with reference movements and print the paper's tables, the paper's own figures beside.
+
+    Without a command it is `tables`: everything in the database, or the FITS that are named.
+
+    \b
+    Example: pbl validate add walk1.mp4 --reference walk1.mot --dataset OURLAB
+    Example: pbl populate && pbl validate --out accuracy
+    Example: pbl validate walk1.fit.npz --reference walk1.mot
+    """
+
+
+@validate.command(epilog="Example: pbl validate --dataset OURLAB --where population=healthy --out accuracy")
+@click.argument("fits", nargs=-1, type=click.Path(path_type=Path, readable=False))
+@click.option(
+    "--reference",
+    "references",
+    multiple=True,
+    type=click.Path(path_type=Path, readable=False),
+    metavar="FILE",
+    help="Reference of the FITS: once for all of them, or once for each, in their order.",
+)
+@click.option("--out", type=click.Path(path_type=Path), help="Write the tables as CSV, LaTeX and HTML to this folder.")
+@click.option("--dataset", metavar="NAME", help="Only this dataset; with FITS the name to report them under.")
+@click.option(
+    "--where", multiple=True, metavar="COLUMN=VALUE", help="Only these rows, such as population=healthy; repeatable."
+)
+@click.option("--source", help="Instrument of the references (with FITS), where the file does not say it.")
+def tables(
+    fits: tuple[Path, ...],
+    references: tuple[Path, ...],
+    out: Path | None,
+    dataset: str | None,
+    where: tuple[str, ...],
+    source: str | None,
+) -> None:
+    """Print the tables of errors: by dataset and camera, joint, population, activity and view.
+
+    Without FITS: of all rows in the database whose fit and reference are current. With FITS (`fit.npz`): of these
+    files, no database needed; references as in docs/files.md.
+    """
+    from pbl_pipeline.files import check_out_folder
+    from pbl_pipeline.validation import paper_tables, print_tables, write_tables
+
+    if out is not None:
+        check_out_folder(out)
+    frame = _of_files(fits, references, dataset or "files", source) if fits else _of_database(references, source)
+    if frame.empty:
+        click.echo(NOTHING)
+        return
+    chosen = select(frame, [*where, *([f"dataset={dataset}"] if dataset else [])])
+    if chosen.empty:
+        click.echo(f"none of {len(frame)} rows is left by --dataset and --where")
+        return
+    made = paper_tables(chosen)
+    print_tables(made)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        write_tables(made, out)
+        chosen.to_csv(out / "errors.csv", index=False)
+        click.echo(f"written to {out}")
+
+
+@validate.command()
+@click.argument("video")
+@click.option(
+    "--reference",
+    required=True,
+    type=click.Path(path_type=Path, readable=False),
+    metavar="FILE",
+    help="Reference movement: .npz, fit.npz, .json.gz or .mot.",
+)
+@click.option("--dataset", metavar="NAME", help="Collection of recordings to report it with (else: unnamed).")
+@click.option("--source", metavar="TEXT", help="Instrument, such as 'optical markers' (else: what the file says).")
+@click.option("--origin", metavar="TEXT", help="Where the file comes from (else: its path).")
+def add(video: str, reference: Path, dataset: str | None, source: str | None, origin: str | None) -> None:
+    """Register the reference movement of VIDEO (number, path or file name of a registered video).
+
+    `pbl populate` then computes the errors of its fits. The same file is registered once; another file of the same
+    source takes its place. Population, activity and camera are those of the video (`pbl ingest`).
+
+    Example: pbl validate add 3 --reference walk1_mocap.mot --dataset OURLAB
+    """
+    import schemas
+    from schemas.references import add_reference
+
+    schemas.activate()
+    done = add_reference(video, reference, dataset, source, origin)
+    click.echo(f"video_id {done.video_id}: reference {done.reference} {done.status} ({done.note})")
+    if done.status in ("registered", "replaced"):
+        click.echo("next: pbl populate")
+
+
+def _of_database(references: Sequence[Path], source: str | None) -> pd.DataFrame:
+    if references or source:
+        raise click.UsageError("--reference and --source go with FITS; for a registered video: pbl validate add")
+    import schemas
+    from schemas.views import validation_frame
+
+    schemas.activate(methods=False)
+    return validation_frame()
+
+
+def _of_files(fits: Sequence[Path], references: Sequence[Path], dataset: str, source: str | None) -> pd.DataFrame:
+    """Errors of fits in files, by the library alone."""
+    from pbl_pipeline.fit import TrialFit
+    from pbl_pipeline.validation import TrialErrors, compare, error_frame
+    from schemas.references import read_reference
+
+    if len(references) not in (1, len(fits)):
+        raise click.UsageError(f"{len(references)} of --reference for {len(fits)} FITS: one for all, or one for each")
+    truths = [read_reference(path, source) for path in references]
+    truths = truths * len(fits) if len(truths) == 1 else truths
+    rows = []
+    for path, truth in zip(fits, truths, strict=True):
+        fit = TrialFit.load(path)
+        rows.append(
+            TrialErrors(
+                errors=compare(fit, truth),
+                dataset=dataset,
+                subject="",
+                population="unknown",
+                activity="unknown",
+                camera=fit.camera_motion,
+                trial=fit.name,
+                detector=fit.marker_set,
+                solver=fit.solver,
+            )
+        )
+    return error_frame(rows)
+
+
+def select(frame: pd.DataFrame, where: Sequence[str]) -> pd.DataFrame:
+    """Rows of the frame in which every `COLUMN=VALUE` holds. Raises USAGE for an unknown column or another form."""
+    for condition in where:
+        column, equals, value = condition.partition("=")
+        if not equals or column not in frame.columns:
+            raise PblError(
+                "USAGE",
+                found=f"--where {condition}",
+                expected="COLUMN=VALUE with one of " + ", ".join(map(str, frame.columns)),
+                next_step="name one of these columns",
+            )
+        frame = frame.loc[frame[column].astype(str) == value]
+    return frame

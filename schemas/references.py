@@ -1,0 +1,217 @@
+"""Registering reference movements: what `pbl validate add` does."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import load_npz
+from pbl_pipeline.paramset import canonical_json
+
+from . import validation, video
+from ._base import library, new_folder, utc_now
+
+#: Dataset of references that were registered without one.
+UNNAMED = "unnamed"
+
+#: Longest texts that the columns hold.
+_LONGEST = {"dataset": 32, "source": 64, "origin": 1000}
+
+
+@dataclasses.dataclass(frozen=True)
+class Added:
+    """What became of a reference: "registered", "replaced" (an older one of this source is no longer current),
+    "updated" (dataset or origin changed, or current again) or "known"."""
+
+    video_id: int
+    reference: str
+    status: str
+    note: str
+
+
+def read_reference(path: str | Path, source: str | None = None) -> Any:
+    """The library's `Reference` from a file, by what the file is.
+
+    Accepted: the library's own npz, a `fit.npz` of ours (from markers or several cameras), rotations of bodies
+    (`.json.gz`), OpenSim `.mot`.
+
+    Parameters
+    ----------
+    source
+        Instrument; None takes what the file says. A fit without a camera comes from markers, one with from several.
+
+    Raises
+    ------
+    PblError
+        FILE_MISSING, FILE_FORMAT (also what the readers raise).
+    """
+    lib, path = library("validation"), Path(path)
+    name = path.name.lower()
+    if not path.is_file():
+        raise PblError(
+            "FILE_MISSING",
+            found="no such file",
+            expected="a reference: .npz, fit.npz, .json.gz or .mot",
+            next_step="check the path",
+            key=str(path),
+        )
+    if name.endswith(".npz"):
+        found = _read_npz(path)
+    elif name.endswith((".json", ".json.gz")):
+        found = lib.reference_of_bodies(path)
+    elif name.endswith(".mot"):
+        found = lib.reference_of_mot(path)
+    else:
+        raise PblError(
+            "FILE_FORMAT",
+            found=f"a file that ends in {path.suffix or 'nothing'}",
+            expected="a reference: .npz, fit.npz, .json.gz or .mot",
+            next_step="see docs/files.md, section on references; markers (.trc) go through `pbl fit` first",
+            key=str(path),
+        )
+    if not len(found.time_s) or not found.angles_deg:
+        raise PblError(
+            "REFERENCE_INPUT",
+            found=f"{len(found.time_s)} samples of {len(found.angles_deg)} angles",
+            expected="joint angles over time",
+            next_step="export the reference again",
+            key=str(path),
+        )
+    return found if source is None else dataclasses.replace(found, source=source)
+
+
+def _read_npz(path: Path) -> Any:
+    lib = library("validation")
+    if "qpos" not in load_npz(path):
+        return lib.Reference.load(path)
+    fitted = library("fit").TrialFit.load(path)
+    by_markers = bool(np.isnan(fitted.camera_position_m).all())
+    return lib.reference_of_fit(fitted, "optical markers" if by_markers else "several cameras")
+
+
+def add_reference(
+    about: int | str | Path,
+    path: str | Path,
+    dataset: str | None = None,
+    source: str | None = None,
+    origin: str | None = None,
+) -> Added:
+    """Register the reference movement of a video. `pbl populate` then computes the errors of its fits.
+
+    The same file is registered once; another file of the same source takes its place, and the older row with its
+    errors stays, no longer current.
+
+    Parameters
+    ----------
+    about
+        The video: its number, its path, or the name of its file where that is unique.
+    path
+        The reference, see `read_reference`.
+    dataset, source, origin
+        Collection it is reported with (None: as it was, else "unnamed"), instrument (None: what the file says), where
+        it comes from (None: the path).
+
+    Raises
+    ------
+    PblError
+        DB_NOT_FOUND for an unknown video, USAGE for a name that several videos have or a text too long, and what
+        `read_reference` raises.
+    """
+    for what, text in (("dataset", dataset), ("source", source), ("origin", origin)):
+        if text is not None and not 0 < len(text) <= _LONGEST[what]:
+            raise PblError(
+                "USAGE",
+                found=f"--{what} of {len(text)} characters",
+                expected=f"1 to {_LONGEST[what]}",
+                next_step="choose another one",
+            )
+    video_id = find_video(about)
+    path = Path(path).absolute()
+    truth = read_reference(path, source)
+    sha256 = library("video").sha256_of(path)
+    key = {"video_id": video_id, "reference": _hash(truth, sha256)}
+    of_source = {"video_id": video_id, "reference_source": truth.source[:64]}
+    table = validation.ReferenceKinematics
+    with table.connection.transaction:
+        current = (table & of_source & {"reference_current": True}).to_dicts(order_by="reference_created")
+        older = [row for row in current if row["reference"] != key["reference"]]
+        for row in older:
+            table.update1({k: row[k] for k in table.primary_key} | {"reference_current": False})
+        known = (table & key).to_dicts()
+        given: dict[str, Any] = {k: v for k, v in (("dataset", dataset), ("reference_origin", origin)) if v is not None}
+        if known:
+            given["reference_current"] = True
+            changed = {k: v for k, v in given.items() if known[0][k] != v}
+            if changed:
+                table.update1({**key, **changed})
+            status = "updated" if changed else "known"
+            note = ", ".join(f"{k} is now {v}" for k, v in changed.items()) or "nothing was inserted"
+            return Added(video_id, key["reference"], status, note)
+        kept = older[-1]["dataset"] if older else UNNAMED
+        _insert({**key, **of_source, "dataset": dataset or kept}, truth, path, sha256, origin)
+    note = f"{len(truth.time_s)} samples, {len(truth.angles_deg)} angles, source {truth.source}"
+    if older:
+        note += f"; the older reference {', '.join(r['reference'] for r in older)} is no longer current"
+    return Added(video_id, key["reference"], "replaced" if older else "registered", note)
+
+
+def _insert(row: dict[str, Any], truth: Any, path: Path, sha256: str, origin: str | None) -> None:
+    with new_folder() as folder:
+        truth.save(folder / "reference.npz")
+        validation.ReferenceKinematics.insert1(
+            {
+                **row,
+                "reference_convention": truth.convention,
+                "reference_name": path.name[-255:],
+                "reference_sha256": sha256,
+                "reference_origin": origin or str(path)[-1000:],
+                "reference_n": len(truth.time_s),
+                "reference_start": float(truth.time_s[0]),
+                "reference_end": float(truth.time_s[-1]),
+                "reference_joints": list(truth.angles_deg),
+                "reference_current": True,
+                "reference_created": utc_now(),
+                "reference_file": folder / "reference.npz",
+            }
+        )
+
+
+def _hash(truth: Any, sha256: str) -> str:
+    what = {"source": truth.source, "convention": truth.convention, "sha256": sha256}
+    return hashlib.sha256(canonical_json(what).encode()).hexdigest()[:16]
+
+
+def find_video(about: int | str | Path) -> int:
+    """Number of a registered video, from its number, its path, or its file's name. Raises DB_NOT_FOUND, USAGE."""
+    text = str(about)
+    if text.isdecimal():
+        found = (video.Video & {"video_id": int(text)}).to_arrays("video_id")
+    else:
+        path = Path(text).absolute()
+        found = (video.Video & {"video_path": str(path)}).to_arrays("video_id")
+        if not len(found) and path.is_file():
+            found = (video.Video & {"video_sha256": library("video").sha256_of(path)}).to_arrays("video_id")
+        if not len(found):
+            found = (video.Video & {"video_name": Path(text).name}).to_arrays("video_id")
+    if len(found) == 1:
+        return int(found[0])
+    if len(found):
+        raise PblError(
+            "USAGE",
+            found=f"{len(found)} videos of that name: video_id {', '.join(str(v) for v in sorted(found))}",
+            expected="one video",
+            next_step="name it by its number",
+            key=text,
+        )
+    raise PblError(
+        "DB_NOT_FOUND",
+        found="no such video",
+        expected="number, path or file name of a registered video",
+        next_step="register it first: `pbl ingest`, which prints the number",
+        key=text,
+    )

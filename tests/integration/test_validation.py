@@ -1,0 +1,263 @@
+"""References and errors in the tables, from `pbl validate add` to the printed tables."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+import schemas
+from pbl_pipeline.body import load_body
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.validation import Reference, compare, reference_of_fit
+from schemas import lab, validation, video, views
+from schemas.cli.validate import validate
+from schemas.ingest import Visit, ingest
+from schemas.references import add_reference, find_video, read_reference
+from schemas.status import pipeline_status
+from tests.conftest import SHARED
+from tests.walking_fit import walking_fit
+from workers.populate import populate
+
+from . import chain
+
+#: What the reference differs from the fit by: two frames later, the right knee bent 5 degrees more.
+LAG_S, KNEE_DEG = 2 / 30, 5.0
+
+
+@pytest.fixture(scope="module")
+def declared(database: Path) -> None:
+    schemas.activate()
+
+
+@pytest.fixture
+def tables(declared: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Empty tables with the method rows, and stand-ins for the slow stages."""
+    chain.install(monkeypatch)
+    yield
+    lab.Subject.delete(prompt=False, part_integrity="cascade")
+    for table in schemas.computed_tables():
+        assert len(table()) == 0
+        table.jobs.delete_quick()
+
+
+def fitted(n_frames: int = chain.N_FRAMES) -> TrialFit:
+    """What the stand-in of the fit makes of a video."""
+    body = load_body()
+    return walking_fit(body.joint_names, body.sha256, n_frames=n_frames)
+
+
+def reference(n_frames: int = chain.N_FRAMES, knee_deg: float = KNEE_DEG, lag_s: float = LAG_S) -> Reference:
+    """The movement of the stand-in, earlier by `lag_s` and with a right knee bent `knee_deg` more."""
+    truth = reference_of_fit(fitted(n_frames), "optical markers")
+    angles = {**truth.angles_deg, "knee_flexion_r": truth.angles_deg["knee_flexion_r"] + knee_deg}
+    return dataclasses.replace(truth, time_s=truth.time_s - lag_s, angles_deg=angles)
+
+
+def saved(folder: Path, name: str, truth: Reference) -> Path:
+    truth.save(folder / name)
+    return folder / name
+
+
+def register(path: Path, **visit) -> int:
+    (result,) = ingest([path], Visit(visit.pop("subject", "P001"), **visit))
+    assert result.status == "registered"
+    assert result.video_id is not None
+    return result.video_id
+
+
+def call(*words: object) -> Result:
+    return CliRunner().invoke(validate, [str(w) for w in words], prog_name="pbl validate")
+
+
+def done(run) -> int:
+    return {t.table: t.done for t in run.tables}["KinematicError"]
+
+
+# ------------------------------------------------------------------------------------------------------ the tables
+def test_a_reference_that_is_added_later_gives_the_errors_that_were_put_in(tables: None, tmp_path: Path):
+    first, second = (chain.small_video(tmp_path, n) for n in ("walk1", "walk2"))
+    number = register(first, population="healthy", camera_motion="handheld")
+    register(second)
+    assert done(populate()) == 0
+    assert views.validation_frame().empty
+    added = add_reference(number, saved(tmp_path, "truth.npz", reference()), dataset="LAB")
+    assert (added.status, added.video_id) == ("registered", number)
+    run = populate()
+    assert done(run) == 1
+    row = validation.KinematicError.fetch1()
+    assert row["error_lag"] == pytest.approx(LAG_S, abs=1e-3)
+    assert row["rte"] == pytest.approx(0.0, abs=0.01)
+    # She walks across the picture from right to left, the camera on her left.
+    assert (row["error_view_left"], row["error_view_right"]) == ("ipsilateral", "contralateral")
+    joints = {r["error_joint"]: r for r in validation.KinematicError.Joint.to_dicts()}
+    assert joints["knee_flexion_r"]["joint_bias"] == pytest.approx(-KNEE_DEG, abs=0.05)
+    assert joints["knee_flexion_r"]["joint_median_abs"] == pytest.approx(KNEE_DEG, abs=0.05)
+    assert joints["knee_flexion_r"]["joint_sd"] < 0.2
+    assert joints["knee_flexion_l"]["joint_median_abs"] < 0.1
+    assert joints["knee_flexion_l"]["joint_correlation"] > 0.999
+    assert joints["knee_flexion_l"]["joint_within_90"] is None  # the stand-in states no standard deviation
+    frame = views.validation_frame()
+    assert set(frame["dataset"]) == {"LAB"}
+    assert set(frame["population"]) == {"healthy"}
+    assert set(frame["activity"]) == {"walking"}
+    assert set(frame["camera"]) == {"handheld"}
+    assert set(frame["trial"]) == {f"{number} walk1"}
+    knee = frame[(frame["joint"] == "knee_flexion") & (frame["side"] == "r")].iloc[0]
+    assert knee["bias_deg"] == pytest.approx(-KNEE_DEG, abs=0.05)
+    assert knee["view"] == "contralateral"
+    # The rows are what the library says of the same arrays.
+    direct = compare(fitted(), reference())
+    stored = {j["error_joint"]: j["joint_rms"] for j in joints.values()}
+    assert stored == pytest.approx({j.joint: j.rms_deg for j in direct.joints}, abs=1e-3)
+    assert not populate().did_something
+
+
+def test_another_file_of_a_source_is_another_row_and_takes_the_place(tables: None, tmp_path: Path):
+    number = register(chain.small_video(tmp_path, "walk"))
+    old, new = saved(tmp_path, "old.npz", reference()), saved(tmp_path, "new.npz", reference(knee_deg=9.0))
+    add_reference(number, old, dataset="LAB")
+    populate()
+    assert add_reference(number, old).status == "known"
+    replaced = add_reference(number, new)
+    assert replaced.status == "replaced"
+    assert "no longer current" in replaced.note
+    assert done(populate()) == 1
+    assert len(validation.ReferenceKinematics()) == len(validation.KinematicError()) == 2
+    assert set(validation.ReferenceKinematics.to_arrays("dataset")) == {"LAB"}
+    assert _knee_bias() == pytest.approx(-9.0, abs=0.05)
+    assert add_reference(number, old, dataset="OTHER").status == "updated"
+    assert not populate().did_something
+    assert _knee_bias() == pytest.approx(-KNEE_DEG, abs=0.05)
+    assert set(views.validation_frame()["dataset"]) == {"OTHER"}
+    # Another instrument does not take the place of the first.
+    assert add_reference(number, new, source="several cameras").status == "registered"
+    assert done(populate()) == 1
+    assert set(views.validation_frame()["trial"]) == {
+        f"{number} walk against optical markers",
+        f"{number} walk against several cameras",
+    }
+
+
+def _knee_bias() -> float:
+    frame = views.validation_frame()
+    rows = frame[(frame["joint"] == "knee_flexion") & (frame["side"] == "r")]
+    assert len(rows) == 1
+    return float(rows["bias_deg"].to_numpy()[0])
+
+
+def test_a_reference_of_another_time_is_one_error_row(tables: None, tmp_path: Path):
+    paths = [chain.small_video(tmp_path, n) for n in ("walk1", "walk2")]
+    numbers = [register(p) for p in paths]
+    add_reference(numbers[0], saved(tmp_path, "elsewhere.npz", reference(lag_s=-900.0)))
+    add_reference(numbers[1], saved(tmp_path, "truth.npz", reference()))
+    run = populate()
+    assert {t.table: t.errors for t in run.tables if t.errors} == {"KinematicError": {"REFERENCE_INPUT": 1}}
+    assert done(run) == 1
+    (error,) = pipeline_status().errors
+    assert (error.table, error.code, error.about) == ("KinematicError", "REFERENCE_INPUT", "walk1.mp4")
+    assert "no common time" in error.found
+    # The right file takes the wrong one's place; its error row goes with the next populate.
+    add_reference(numbers[0], saved(tmp_path, "right.npz", reference(knee_deg=1.0)))
+    assert done(populate()) == 1
+    assert not pipeline_status().errors
+
+
+# ------------------------------------------------------------------------------------------------------- the files
+def test_a_video_by_number_path_copy_or_name(tables: None, tmp_path: Path):
+    path = chain.small_video(tmp_path, "walk")
+    number = register(path)
+    copy = tmp_path / "elsewhere" / "copy.mp4"
+    copy.parent.mkdir()
+    shutil.copy(path, copy)
+    for about in (number, str(number), path, copy, path.name):
+        assert find_video(about) == number
+    for unknown in (number + 1, "nobody.mp4"):
+        with pytest.raises(PblError, match="DB_NOT_FOUND"):
+            find_video(unknown)
+    other = tmp_path / "other"
+    other.mkdir()
+    register(chain.small_video(other, "walk", n=200))
+    with pytest.raises(PblError, match="USAGE"):
+        find_video(path.name)
+    assert len(video.Video()) == 2
+
+
+def test_files_of_every_kind_are_references(tmp_path: Path):
+    truth = reference()
+    assert read_reference(saved(tmp_path, "a.npz", truth)).source == "optical markers"
+    assert read_reference(tmp_path / "a.npz", source="inertial sensors").source == "inertial sensors"
+    fitted().save(tmp_path / "b.fit.npz")
+    assert read_reference(tmp_path / "b.fit.npz").source == "several cameras"
+    dataclasses.replace(fitted(), camera_position_m=np.full(3, np.nan)).save(tmp_path / "c.fit.npz")
+    assert read_reference(tmp_path / "c.fit.npz").source == "optical markers"
+    lines = ["nRows=3", "nColumns=2", "inDegrees=yes", "endheader", "time\tknee_angle_r"]
+    lines += [f"{0.1 * i}\t{20 + i}" for i in range(3)]
+    (tmp_path / "d.mot").write_text("\n".join(lines))
+    np.testing.assert_allclose(read_reference(tmp_path / "d.mot").angles_deg["knee_flexion_r"], [20, 21, 22])
+    for name, content, code in (("absent.npz", None, "FILE_MISSING"), ("walk.trc", "x", "FILE_FORMAT")):
+        if content:
+            (tmp_path / name).write_text(content)
+        with pytest.raises(PblError, match=code):
+            read_reference(tmp_path / name)
+    nothing = Reference("none", "optical markers", "qpos", np.zeros(0), {})
+    with pytest.raises(PblError, match="REFERENCE_INPUT"):
+        read_reference(saved(tmp_path, "none.npz", nothing))
+
+
+def test_rotations_of_bodies_are_a_reference(shared_data: Path):
+    found = read_reference(SHARED / "real" / "video_mocap" / "walk" / "sample_mocap.json.gz")
+    assert found.convention == "body_rotations"
+    assert np.nanmax(found.angles_deg["knee_flexion_r"]) > 40
+
+
+@pytest.mark.parametrize("texts", [{"dataset": "d" * 33}, {"source": ""}, {"origin": "o" * 1001}])
+def test_texts_that_do_not_fit_are_refused(tables: None, tmp_path: Path, texts: dict):
+    number = register(chain.small_video(tmp_path, "walk"))
+    with pytest.raises(PblError, match="USAGE"):
+        add_reference(number, saved(tmp_path, "truth.npz", reference()), **texts)
+
+
+# ----------------------------------------------------------------------------------------------------- the command
+def test_the_command_says_what_to_do_where_there_is_nothing(tables: None):
+    result = call()
+    assert result.exit_code == 0, result.output
+    assert "pbl validate add VIDEO --reference FILE" in result.output
+
+
+def test_the_command_from_reference_to_tables(tables: None, tmp_path: Path):
+    path = chain.small_video(tmp_path, "walk")
+    number = register(path, population="healthy")
+    truth = saved(tmp_path, "truth.npz", reference())
+    result = call("add", path, "--reference", truth, "--dataset", "LAB")
+    assert result.exit_code == 0, result.output
+    assert f"video_id {number}: reference" in result.output
+    assert "next: pbl populate" in result.output
+    populate()
+    result = call("--out", tmp_path / "out", "--dataset", "LAB", "--where", "population=healthy")
+    assert result.exit_code == 0, result.output
+    for word in ("LAB", "healthy", "Knee Flexion"):
+        assert word in result.output
+    assert {p.suffix for p in (tmp_path / "out").iterdir()} >= {".csv", ".tex", ".html"}
+    assert "none of" in call("--where", "population=patient").output
+    assert call("--where", "shoe=red").exit_code != 0
+    assert call("--reference", truth).exit_code == 2
+
+
+def test_the_command_on_files_needs_no_database(tmp_path: Path):
+    fitted().save(tmp_path / "walk.fit.npz")
+    truth = saved(tmp_path, "truth.npz", reference())
+    result = call(tmp_path / "walk.fit.npz", "--reference", truth, "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "Knee Flexion" in result.output
+    assert list((tmp_path / "out").glob("*.html"))
+    assert call(tmp_path / "walk.fit.npz").exit_code == 2
+    absent = call(tmp_path / "absent.fit.npz", "--reference", truth)
+    assert isinstance(absent.exception, PblError)
+    assert absent.exception.code == "FILE_MISSING"
