@@ -63,7 +63,7 @@ class KinematicError(dj.Computed):
         joint_sd=null         : float32        # (deg) standard deviation of fit minus reference
         joint_rms=null        : float32        # (deg) root of its mean square
         joint_correlation=null: float32        # (-1..1) null where one of the two does not move
-        joint_within_90=null  : float32        # (0..1) share of frames inside the fit's interval of 90 percent, null without one
+        joint_within_90=null  : float32        # (0..1) share of frames inside the fit's 90 percent interval, or null
         """
 
     @property
