@@ -4,6 +4,8 @@ from ._align import align_path, best_lag
 from ._compare import JointError, KinematicErrors, compare, compare_angles, compare_references
 from ._frame import COLUMNS, TrialErrors, error_frame
 from ._joints import JOINTS_CLIP, JOINTS_OPENCAP, JOINTS_PAPER
+from ._paper import paper_figures
+from ._paper_tables import paper_tables
 from ._reference import BODY_ROTATIONS, CONVENTIONS, QPOS, Reference
 from ._rotations import body_rotation_angles
 from ._sources import (
@@ -14,7 +16,10 @@ from ._sources import (
     reference_of_mot,
     reference_of_qpos,
 )
+from ._statistics import NIQR_FACTOR, median_niqr, niqr
+from ._table import Cell, Table
 from ._view import view_classes
+from ._write import html, latex, print_tables, write_tables
 
 __all__ = [
     "BODY_ROTATIONS",
@@ -23,10 +28,13 @@ __all__ = [
     "JOINTS_CLIP",
     "JOINTS_OPENCAP",
     "JOINTS_PAPER",
+    "NIQR_FACTOR",
     "QPOS",
+    "Cell",
     "JointError",
     "KinematicErrors",
     "Reference",
+    "Table",
     "TrialErrors",
     "align_path",
     "best_lag",
@@ -37,9 +45,17 @@ __all__ = [
     "error_frame",
     "fit_angles",
     "fit_angles_sd",
+    "html",
+    "latex",
+    "median_niqr",
+    "niqr",
+    "paper_figures",
+    "paper_tables",
+    "print_tables",
     "reference_of_bodies",
     "reference_of_fit",
     "reference_of_mot",
     "reference_of_qpos",
     "view_classes",
+    "write_tables",
 ]
