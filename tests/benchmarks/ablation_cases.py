@@ -41,6 +41,9 @@ class Setup:
     constant_px, slow_px
         Added to the pixels: one error per marker and trial that does not change; noise with the memory of the 3D noise.
         The walker's own pixel noise has neither. Standard deviations per axis (px).
+    doubted_share
+        Share of the points (marker and frame) whose confidence is 0.001: as good as not found, but in the picture, so
+        that the frame counts as one with the whole person in view.
     site, size
         What the person's marker offsets and deviations of the eight scales from 1 are multiplied by.
     squash, lean_deg
@@ -63,6 +66,7 @@ class Setup:
     noise: Noise = NOISE
     constant_px: float = 0.0
     slow_px: float = 0.0
+    doubted_share: float = 0.0
     site: float = 1.0
     size: float = 1.0
     squash: float = 1.0
@@ -115,10 +119,12 @@ def factors() -> tuple[Factor, ...]:
         add("detector", f"pixel noise x{k:g}", noise=noise(xy_px=k * base.xy_px))
     add("detector", "pixels also err slowly, 3 px", slow_px=3.0)
     add("detector", "pixels also err constantly, 3 px", constant_px=3.0)
+    add("detector", "pixels also err both ways, 3 px each", slow_px=3.0, constant_px=3.0)
     for share in (0.0, 0.10, 0.30):
         add("detector", f"outliers {share:.0%}", noise=noise(outlier_share=share))
     for share in (0.0, 0.30):
         add("detector", f"points missing {share:.0%}", noise=noise(drop_share=share))
+    add("detector", "points of confidence 0.001, 30 %", doubted_share=0.30)
     add("detector", "3D depth x0.8", squash=0.8)
     add("detector", "3D leans to the camera by 10 deg", lean_deg=10.0)
     for k in (0.0, 2.0):
@@ -224,12 +230,16 @@ def worsened(setup: Setup, seen: Seen, rng: np.random.Generator) -> Keypoints:
         xy = xy + setup.constant_px * rng.standard_normal((1, *xy.shape[1:]))
     if setup.slow_px:
         xy = xy + setup.slow_px * slow(rng, points.time_s, xy.shape)
+    confidence = points.confidence
+    if setup.doubted_share:
+        doubted = rng.random(confidence.shape) < setup.doubted_share
+        confidence = np.where(doubted & (confidence > 0), 0.001, confidence)
     camera = points.camera
     if setup.focal != 1:
         matrix = np.array(camera.matrix, np.float64)
         matrix[[0, 1], [0, 1]] *= setup.focal
         camera = dataclasses.replace(camera, matrix=matrix)
-    return dataclasses.replace(points, xyz_cam_m=xyz, xy_px=xy, camera=camera)
+    return dataclasses.replace(points, xyz_cam_m=xyz, xy_px=xy, confidence=confidence, camera=camera)
 
 
 def squashed(xyz_m: np.ndarray, ray: np.ndarray, factor: float) -> np.ndarray:
