@@ -14,21 +14,18 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import gzip
-import json
 import sys
 import tempfile
 from pathlib import Path
 
 import click
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.fit import DEFAULT, PARAMSETS, TrialFit, fit_session, params_of
-from pbl_pipeline.gait._poses import trial_poses
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.pipeline import detect_trial
+from pbl_pipeline.validation import BODY_ROTATIONS, fit_angles, reference_of_bodies
 from tests.conftest import SHARED
 
 CLIPS = ("walk", "STS")
@@ -36,40 +33,16 @@ ANGLES = ("hip_flexion", "hip_adduction", "hip_rotation", "knee_flexion", "ankle
 MAX_LAG_S = 0.1
 
 
-def angles_of(rotation: dict[str, Rotation]) -> dict[str, np.ndarray]:
-    """(T,) degrees per angle and side from body rotations whose axes are OpenSim's (forward, up, right).
-
-    Every system goes through here, so that model conventions (axes of ankle and knee) count the same way.
-    """
-    out = {}
-    for side, sign in (("r", 1.0), ("l", -1.0)):
-        hip = _relative(rotation, "pelvis", f"femur_{side}")
-        out[f"hip_flexion_{side}"] = hip[:, 0]
-        out[f"hip_adduction_{side}"] = sign * hip[:, 1]
-        out[f"hip_rotation_{side}"] = sign * hip[:, 2]
-        out[f"knee_flexion_{side}"] = -_relative(rotation, f"femur_{side}", f"tibia_{side}")[:, 0]
-        out[f"ankle_angle_{side}"] = _relative(rotation, f"tibia_{side}", f"talus_{side}")[:, 0]
-    return out
-
-
-def _relative(rotation: dict[str, Rotation], parent: str, child: str) -> np.ndarray:
-    return (rotation[parent].inv() * rotation[child]).as_euler("ZXY", degrees=True)
-
-
 def recorded_angles(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Time stamps (s) and angles of one of the recording's `sample_*.json.gz`."""
-    with gzip.open(path, "rt") as file:
-        data = json.load(file)
-    turned = {n: Rotation.from_euler("XYZ", np.asarray(b["rotation"])) for n, b in data["bodies"].items()}
-    return np.asarray(data["time"], float), angles_of(turned)
+    reference = reference_of_bodies(path)
+    return reference.time_s, dict(reference.angles_deg)
 
 
 def fitted_angles(fit: TrialFit) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Time stamps (s) and angles of our fit, frames in view only."""
-    poses = trial_poses(fit)
     seen = np.flatnonzero(np.isfinite(fit.qpos[:, 0]))
-    turned = {n: Rotation.from_matrix(poses.rotation[seen, i]) for i, n in enumerate(poses.body.body_names)}
-    return np.asarray(fit.time_s)[seen], angles_of(turned)
+    return np.asarray(fit.time_s)[seen], {n: v[seen] for n, v in fit_angles(fit, BODY_ROTATIONS).items()}
 
 
 @dataclasses.dataclass(frozen=True)
