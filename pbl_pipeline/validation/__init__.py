@@ -2,6 +2,7 @@
 
 from ._align import align_path, best_lag
 from ._compare import JointError, KinematicErrors, compare, compare_angles, compare_references
+from ._curves import CURVE_COLUMNS, cycle_curves, save_curves
 from ._frame import COLUMNS, TrialErrors, error_frame
 from ._joints import JOINTS_CLIP, JOINTS_OPENCAP, JOINTS_PAPER
 from ._paper import paper_figures
@@ -25,6 +26,7 @@ __all__ = [
     "BODY_ROTATIONS",
     "COLUMNS",
     "CONVENTIONS",
+    "CURVE_COLUMNS",
     "JOINTS_CLIP",
     "JOINTS_OPENCAP",
     "JOINTS_PAPER",
@@ -42,6 +44,7 @@ __all__ = [
     "compare",
     "compare_angles",
     "compare_references",
+    "cycle_curves",
     "error_frame",
     "fit_angles",
     "fit_angles_sd",
@@ -56,6 +59,7 @@ __all__ = [
     "reference_of_fit",
     "reference_of_mot",
     "reference_of_qpos",
+    "save_curves",
     "view_classes",
     "write_tables",
 ]
