@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from . import fit, gait, gdi, lab, qc, session, tracking, validation, video
-from ._base import library
+from ._base import file_ref, library, stored_file
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -92,6 +93,41 @@ def validation_frame(restriction: Any = True) -> pd.DataFrame:
     The frame of `pbl_pipeline.validation.error_frame`: errors in degrees, lag in s, RTE in m, residuals in px and cm.
     Dataset, population, activity and camera are those of the reference, the subject and the video.
     """
+    return library("validation").error_frame(row for _, row in _compared(restriction))
+
+
+def validation_curves(frame: pd.DataFrame) -> pd.DataFrame:
+    """Joint angles of fit and reference over the same gait cycles, for the trials in a `validation_frame`.
+
+    The frame of `pbl_pipeline.validation.cycle_curves` (degrees at 0, 1, ..., 100 % of each used cycle), with the
+    methods in `trial`. Reads the stored fits and references of these trials.
+    """
+    import pandas as pd
+
+    lib = library("validation")
+    wanted = set(zip(frame["trial"], frame["detector"], frame["solver"], strict=True))
+    parts = [pd.DataFrame(columns=list(lib.CURVE_COLUMNS))]
+    for key, row in _compared():
+        if (row.trial, row.detector, row.solver) not in wanted:
+            continue
+        with stored_file(fit.SessionFit, file_ref((fit.SessionFit.Trial & key).fetch1("trial_file"))) as path:
+            trial = library("fit").TrialFit.load(path)
+        references = validation.ReferenceKinematics
+        with stored_file(references, file_ref((references & key).fetch1("reference_file"))) as path:
+            truth = lib.Reference.load(path)
+        for method in dict.fromkeys(r["gait_method"] for r in (gait.GaitCycle & key).proj().to_dicts()):
+            of_method = {**key, "gait_method": method}
+            cycles = [
+                gait.cycle_of_row(r, trial.name)
+                for r in (gait.GaitCycle.Cycle & of_method).to_dicts(order_by="cycle_no")
+            ]
+            curves = lib.cycle_curves(trial, truth, cycles, row.errors)
+            parts.append(curves.assign(trial=", ".join((row.trial, row.detector, row.solver, method))))
+    return pd.concat([p for p in parts if len(p)] or parts, ignore_index=True)
+
+
+def _compared(restriction: Any = True) -> Iterator[tuple[dict[str, Any], Any]]:
+    """Key and `TrialErrors` of each current fit against each current reference of its video."""
     references = validation.ReferenceKinematics & {"reference_current": True}
     compared = (
         validation.KinematicError
@@ -103,28 +139,25 @@ def validation_frame(restriction: Any = True) -> pd.DataFrame:
         * session.Session.proj("subject")
         * lab.Subject.proj("population")
     ) & restriction
-    key = validation.KinematicError.primary_key
+    names = validation.KinematicError.primary_key
     joints: dict[tuple, list[dict[str, Any]]] = {}
     for row in (validation.KinematicError.Joint & compared.proj()).to_dicts(order_by="KEY"):
-        joints.setdefault(tuple(row[k] for k in key), []).append(row)
-    lib = library("validation")
+        joints.setdefault(tuple(row[k] for k in names), []).append(row)
     found = compared.to_dicts(order_by="video_id, fit_set, fit_method, reference")
     n_references = Counter((row["fit_set"], row["fit_method"], row["video_id"]) for row in found)
-    rows = []
     for row in found:
         # The number, because files of several visits may have one name.
         trial = f"{row['video_id']} {row['trial_name']}"
         if n_references[row["fit_set"], row["fit_method"], row["video_id"]] > 1:
             trial += f" against {row['reference_source']}"
-        rows.append(
-            lib.TrialErrors(
-                errors=validation.errors_of_rows(row, joints.get(tuple(row[k] for k in key), [])),
-                # A camera that is one of several is fitted alone here: it stands still.
-                camera="handheld" if row["camera_motion"] == "handheld" else "static",
-                trial=trial,
-                detector=row["keypoint_method"],
-                solver=row["fit_method"],
-                **{k: row[k] for k in ("dataset", "subject", "population", "activity")},
-            )
+        key = {k: row[k] for k in names}
+        about = library("validation").TrialErrors(
+            errors=validation.errors_of_rows(row, joints.get(tuple(key.values()), [])),
+            # A camera that is one of several is fitted alone here: it stands still.
+            camera="handheld" if row["camera_motion"] == "handheld" else "static",
+            trial=trial,
+            detector=row["keypoint_method"],
+            solver=row["fit_method"],
+            **{k: row[k] for k in ("dataset", "subject", "population", "activity")},
         )
-    return lib.error_frame(rows)
+        yield key, about

@@ -54,7 +54,7 @@ def validate() -> None:
     metavar="FILE",
     help="Reference of the FITS: once for all of them, or once for each, in their order.",
 )
-@click.option("--out", type=click.Path(path_type=Path), help="Write the tables as CSV, LaTeX and HTML to this folder.")
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write CSV, LaTeX, HTML and curves there.")
 @click.option("--dataset", metavar="NAME", help="Only this dataset; with FITS the name to report them under.")
 @click.option(
     "--where", multiple=True, metavar="COLUMN=VALUE", help="Only these rows, such as population=healthy; repeatable."
@@ -74,7 +74,7 @@ def tables(
     files, no database needed; references as in docs/files.md.
     """
     from pbl_pipeline.files import check_out_folder
-    from pbl_pipeline.validation import paper_tables, print_tables, write_tables
+    from pbl_pipeline.validation import paper_tables, print_tables, save_curves, write_tables
 
     if out is not None:
         check_out_folder(out)
@@ -84,15 +84,23 @@ def tables(
         return
     chosen = select(frame, [*where, *([f"dataset={dataset}"] if dataset else [])])
     if chosen.empty:
-        click.echo(f"none of {len(frame)} rows is left by --dataset and --where")
+        click.echo(f"None of {len(frame)} errors is left by --dataset and --where.")
         return
     made = paper_tables(chosen)
     print_tables(made)
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        write_tables(made, out)
-        chosen.to_csv(out / "errors.csv", index=False)
-        click.echo(f"written to {out}")
+    if out is None:
+        return
+    write_tables(made, out)
+    chosen.to_csv(out / "errors.csv", index=False)
+    click.echo(f"tables, and the errors they are made from (errors.csv): {out}")
+    if not fits:
+        from schemas.views import validation_curves
+
+        curves = validation_curves(chosen)
+        n = len(curves[["trial", "cycle"]].drop_duplicates())
+        if n:
+            save_curves(curves, out / "curves.npz")
+        click.echo(f"{n} gait cycles of fit and reference in pairs" + (f": {out / 'curves.npz'}" if n else ""))
 
 
 @validate.command()

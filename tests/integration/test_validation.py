@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from click.testing import CliRunner, Result
 
@@ -109,7 +110,7 @@ def test_a_reference_that_is_added_later_gives_the_errors_that_were_put_in(table
     assert set(frame["activity"]) == {"walking"}
     assert set(frame["camera"]) == {"handheld"}
     assert set(frame["trial"]) == {f"{number} walk1"}
-    knee = frame[(frame["joint"] == "knee_flexion") & (frame["side"] == "r")].iloc[0]
+    (knee,) = frame.query("joint == 'knee_flexion' and side == 'r'").to_dict("records")
     assert knee["bias_deg"] == pytest.approx(-KNEE_DEG, abs=0.05)
     assert knee["view"] == "contralateral"
     # The rows are what the library says of the same arrays.
@@ -147,9 +148,8 @@ def test_another_file_of_a_source_is_another_row_and_takes_the_place(tables: Non
 
 def _knee_bias() -> float:
     frame = views.validation_frame()
-    rows = frame[(frame["joint"] == "knee_flexion") & (frame["side"] == "r")]
-    assert len(rows) == 1
-    return float(rows["bias_deg"].to_numpy()[0])
+    (row,) = frame.query("joint == 'knee_flexion' and side == 'r'").to_dict("records")
+    return float(row["bias_deg"])
 
 
 def test_a_reference_of_another_time_is_one_error_row(tables: None, tmp_path: Path):
@@ -242,10 +242,22 @@ def test_the_command_from_reference_to_tables(tables: None, tmp_path: Path):
     populate()
     result = call("--out", tmp_path / "out", "--dataset", "LAB", "--where", "population=healthy")
     assert result.exit_code == 0, result.output
-    for word in ("LAB", "healthy", "Knee Flexion"):
+    for word in ("LAB", "control", "Knee Flexion"):
         assert word in result.output
     assert {p.suffix for p in (tmp_path / "out").iterdir()} >= {".csv", ".tex", ".html"}
-    assert "none of" in call("--where", "population=patient").output
+    errors = pd.read_csv(tmp_path / "out" / "errors.csv").fillna({"side": ""})
+    pd.testing.assert_frame_equal(errors, views.validation_frame(), check_dtype=False)
+    cells = pd.read_csv(tmp_path / "out" / "summary.csv").to_dict("records")
+    rte = {c["column"]: c for c in cells if c["row"] == "RTE (cm)"}
+    assert (rte["LAB static"]["n"], rte["MMMC handheld"]["n"]) == (1, 0)
+    assert "6.44" in rte["MMMC handheld"]["paper"]
+    with np.load(tmp_path / "out" / "curves.npz") as curves:
+        knee = curves["knee_flexion_reference"] - curves["knee_flexion_fit"]
+        right = np.char.find(curves["knee_flexion_cycle"], "right") >= 0
+        assert 0 < right.sum() < len(right)
+        np.testing.assert_allclose(knee[right], KNEE_DEG, atol=0.3)
+        np.testing.assert_allclose(knee[~right], 0.0, atol=0.3)
+    assert "None of" in call("--where", "population=patient").output
     assert call("--where", "shoe=red").exit_code != 0
     assert call("--reference", truth).exit_code == 2
 
