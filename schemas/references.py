@@ -34,7 +34,7 @@ class Added:
     note: str
 
 
-def read_reference(path: str | Path, source: str | None = None) -> Any:
+def read_reference(path: str | Path, source: str | None = None, shift_s: float = 0.0) -> Any:
     """The library's `Reference` from a file, by what the file is.
 
     Accepted: the library's own npz, a `fit.npz` of ours (from markers or several cameras), rotations of bodies
@@ -44,6 +44,8 @@ def read_reference(path: str | Path, source: str | None = None) -> Any:
     ----------
     source
         Instrument; None takes what the file says. A fit without a camera comes from markers, one with from several.
+    shift_s
+        Added to its time stamps (s), so that they are on the clock of the video.
 
     Raises
     ------
@@ -82,7 +84,7 @@ def read_reference(path: str | Path, source: str | None = None) -> Any:
             next_step="export the reference again",
             key=str(path),
         )
-    return found if source is None else dataclasses.replace(found, source=source)
+    return dataclasses.replace(found, source=source or found.source, time_s=found.time_s + shift_s)
 
 
 def _read_npz(path: Path) -> Any:
@@ -100,6 +102,7 @@ def add_reference(
     dataset: str | None = None,
     source: str | None = None,
     origin: str | None = None,
+    shift_s: float = 0.0,
 ) -> Added:
     """Register the reference movement of a video. `pbl populate` then computes the errors of its fits.
 
@@ -115,6 +118,8 @@ def add_reference(
     dataset, source, origin
         Collection it is reported with (None: as it was, else "unnamed"), instrument (None: what the file says), where
         it comes from (None: the path).
+    shift_s
+        As in `read_reference`.
 
     Raises
     ------
@@ -132,9 +137,9 @@ def add_reference(
             )
     video_id = find_video(about)
     path = Path(path).absolute()
-    truth = read_reference(path, source)
+    truth = read_reference(path, source, shift_s)
     sha256 = library("video").sha256_of(path)
-    key = {"video_id": video_id, "reference": _hash(truth, sha256)}
+    key = {"video_id": video_id, "reference": _hash(truth, sha256, shift_s)}
     of_source = {"video_id": video_id, "reference_source": truth.source[:64]}
     table = validation.ReferenceKinematics
     with table.connection.transaction:
@@ -153,7 +158,8 @@ def add_reference(
             note = ", ".join(f"{k} is now {v}" for k, v in changed.items()) or "nothing was inserted"
             return Added(video_id, key["reference"], status, note)
         kept = older[-1]["dataset"] if older else UNNAMED
-        _insert({**key, **of_source, "dataset": dataset or kept}, truth, path, sha256, origin)
+        row = {**key, **of_source, "dataset": dataset or kept, "reference_shift": shift_s}
+        _insert(row, truth, path, sha256, origin)
     note = f"{len(truth.time_s)} samples, {len(truth.angles_deg)} angles, source {truth.source}"
     if older:
         note += f"; the older reference {', '.join(r['reference'] for r in older)} is no longer current"
@@ -181,8 +187,8 @@ def _insert(row: dict[str, Any], truth: Any, path: Path, sha256: str, origin: st
         )
 
 
-def _hash(truth: Any, sha256: str) -> str:
-    what = {"source": truth.source, "convention": truth.convention, "sha256": sha256}
+def _hash(truth: Any, sha256: str, shift_s: float) -> str:
+    what = {"source": truth.source, "convention": truth.convention, "sha256": sha256, "shift_s": float(shift_s)}
     return hashlib.sha256(canonical_json(what).encode()).hexdigest()[:16]
 
 

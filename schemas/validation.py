@@ -16,7 +16,7 @@ class ReferenceKinematics(dj.Manual):
     definition = """
     # movement of a video as another instrument measured it; another file of the same source is another row
     -> video.Video
-    reference             : char(16)           # hash over source, convention and file
+    reference             : char(16)           # hash over source, convention, shift and file
     ---
     dataset               : varchar(32)        # collection of recordings that is reported together
     reference_source      : varchar(64)        # instrument, such as optical markers or several cameras
@@ -24,6 +24,7 @@ class ReferenceKinematics(dj.Manual):
     reference_name        : varchar(255)       # name of the file
     reference_sha256      : char(64)           # of the file's bytes
     reference_origin      : varchar(1000)      # where the file comes from
+    reference_shift       : float64            # (s) added to the file's time stamps to be on the clock of the video
     reference_n           : int32              # samples
     reference_start       : float64            # (s) first sample, in the time of the video
     reference_end         : float64            # (s) last sample

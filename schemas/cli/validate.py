@@ -19,7 +19,18 @@ No error of a fit against a reference is in the database yet. What to do:
   pbl validate add VIDEO --reference FILE    for each video that another instrument recorded as well
   pbl populate                               computes the errors of its fits
   pbl validate                               prints the tables
+References are there and populate has run? Then pbl status says what failed.
 Without a database: pbl validate FIT.npz --reference FILE"""
+
+_SHIFT = click.option(
+    "--shift",
+    "shift_s",
+    type=float,
+    default=0.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="Added to the reference's time stamps. They must be the video's within 0.1 s; that lag is found.",
+)
 
 
 class _WithDefault(click.Group):
@@ -60,6 +71,7 @@ def validate() -> None:
     "--where", multiple=True, metavar="COLUMN=VALUE", help="Only these rows, such as population=healthy; repeatable."
 )
 @click.option("--source", help="Instrument of the references (with FITS), where the file does not say it.")
+@_SHIFT
 def tables(
     fits: tuple[Path, ...],
     references: tuple[Path, ...],
@@ -67,6 +79,7 @@ def tables(
     dataset: str | None,
     where: tuple[str, ...],
     source: str | None,
+    shift_s: float,
 ) -> None:
     """Print the tables of errors: by dataset and camera, joint, population, activity and view.
 
@@ -78,7 +91,12 @@ def tables(
 
     if out is not None:
         check_out_folder(out)
-    frame = _of_files(fits, references, dataset or "files", source) if fits else _of_database(references, source)
+    if fits:
+        frame = _of_files(fits, references, dataset or "files", source, shift_s)
+    elif references or source or shift_s:
+        raise click.UsageError("--reference, --source and --shift go with FITS; in the database: pbl validate add")
+    else:
+        frame = _of_database()
     if frame.empty:
         click.echo(NOTHING)
         return
@@ -115,7 +133,10 @@ def tables(
 @click.option("--dataset", metavar="NAME", help="Collection of recordings to report it with (else: unnamed).")
 @click.option("--source", metavar="TEXT", help="Instrument, such as 'optical markers' (else: what the file says).")
 @click.option("--origin", metavar="TEXT", help="Where the file comes from (else: its path).")
-def add(video: str, reference: Path, dataset: str | None, source: str | None, origin: str | None) -> None:
+@_SHIFT
+def add(
+    video: str, reference: Path, dataset: str | None, source: str | None, origin: str | None, shift_s: float
+) -> None:
     """Register the reference movement of VIDEO (number, path or file name of a registered video).
 
     `pbl populate` then computes the errors of its fits. The same file is registered once; another file of the same
@@ -127,15 +148,13 @@ def add(video: str, reference: Path, dataset: str | None, source: str | None, or
     from schemas.references import add_reference
 
     schemas.activate()
-    done = add_reference(video, reference, dataset, source, origin)
+    done = add_reference(video, reference, dataset, source, origin, shift_s)
     click.echo(f"video_id {done.video_id}: reference {done.reference} {done.status} ({done.note})")
     if done.status in ("registered", "replaced"):
         click.echo("next: pbl populate")
 
 
-def _of_database(references: Sequence[Path], source: str | None) -> pd.DataFrame:
-    if references or source:
-        raise click.UsageError("--reference and --source go with FITS; for a registered video: pbl validate add")
+def _of_database() -> pd.DataFrame:
     import schemas
     from schemas.views import validation_frame
 
@@ -143,7 +162,9 @@ def _of_database(references: Sequence[Path], source: str | None) -> pd.DataFrame
     return validation_frame()
 
 
-def _of_files(fits: Sequence[Path], references: Sequence[Path], dataset: str, source: str | None) -> pd.DataFrame:
+def _of_files(
+    fits: Sequence[Path], references: Sequence[Path], dataset: str, source: str | None, shift_s: float
+) -> pd.DataFrame:
     """Errors of fits in files, by the library alone."""
     from pbl_pipeline.fit import TrialFit
     from pbl_pipeline.validation import TrialErrors, compare, error_frame
@@ -151,7 +172,7 @@ def _of_files(fits: Sequence[Path], references: Sequence[Path], dataset: str, so
 
     if len(references) not in (1, len(fits)):
         raise click.UsageError(f"{len(references)} of --reference for {len(fits)} FITS: one for all, or one for each")
-    truths = [read_reference(path, source) for path in references]
+    truths = [read_reference(path, source, shift_s) for path in references]
     truths = truths * len(fits) if len(truths) == 1 else truths
     rows = []
     for path, truth in zip(fits, truths, strict=True):

@@ -163,10 +163,12 @@ def test_a_reference_of_another_time_is_one_error_row(tables: None, tmp_path: Pa
     (error,) = pipeline_status().errors
     assert (error.table, error.code, error.about) == ("KinematicError", "REFERENCE_INPUT", "walk1.mp4")
     assert "no common time" in error.found
-    # The right file takes the wrong one's place; its error row goes with the next populate.
-    add_reference(numbers[0], saved(tmp_path, "right.npz", reference(knee_deg=1.0)))
+    # On the clock of the video it takes the other's place, and the error row goes with the next populate.
+    assert add_reference(numbers[0], tmp_path / "elsewhere.npz", shift_s=-900.0).status == "replaced"
     assert done(populate()) == 1
     assert not pipeline_status().errors
+    lags = sorted(validation.KinematicError.to_arrays("error_lag"))
+    assert lags == pytest.approx([0.0, LAG_S], abs=1e-3)
 
 
 # ------------------------------------------------------------------------------------------------------- the files
@@ -257,7 +259,9 @@ def test_the_command_from_reference_to_tables(tables: None, tmp_path: Path):
         assert 0 < right.sum() < len(right)
         np.testing.assert_allclose(knee[right], KNEE_DEG, atol=0.3)
         np.testing.assert_allclose(knee[~right], 0.0, atol=0.3)
-    assert "None of" in call("--where", "population=patient").output
+    (known,) = ingest([path], Visit("P001", population="patient"))
+    assert (known.status, set(views.validation_frame()["population"])) == ("updated", {"patient"})
+    assert "None of" in call("--where", "population=healthy").output
     assert call("--where", "shoe=red").exit_code != 0
     assert call("--reference", truth).exit_code == 2
 
