@@ -113,8 +113,8 @@ def reference_of_bodies(path: str | Path, source: str = "optical markers") -> Re
 def reference_of_mot(path: str | Path, source: str = "optical markers", convention: str = QPOS) -> Reference:
     """Read an OpenSim motion (.mot): columns by OpenSim's names, degrees or radians as its header says (`inDegrees`).
 
-    `knee_angle_r/_l` is positive in flexion in some models and negative in others; it is turned so that its mean is
-    positive, which every gait and every chair rise has. pelvis_tx, ty, tz are metres in a y-up ground.
+    `knee_angle_r/_l` is positive in flexion in some models and negative in others, and the file does not say which:
+    the larger excursion over both knees counts as flexion. pelvis_tx, ty, tz are metres in a y-up ground.
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT.
     """
@@ -132,18 +132,24 @@ def reference_of_mot(path: str | Path, source: str = "optical markers", conventi
         raise _unreadable(
             path, error, "an OpenSim motion with `inDegrees=yes` or `no`, `endheader` and `time`"
         ) from error
-    angles = {}
+    angles, knee_sign = {}, _knee_sign([v for n, v in column.items() if n in ("knee_angle_r", "knee_angle_l")])
     for name, series in column.items():
         if name.endswith(("_tx", "_ty", "_tz", "_beta")):
             continue
         degrees = series if in_degrees else np.degrees(series)
         if name.startswith("knee_angle_"):
-            name, degrees = name.replace("angle", "flexion"), degrees * (np.sign(np.nanmean(degrees)) or 1.0)
+            name, degrees = name.replace("angle", "flexion"), knee_sign * degrees
         angles[name] = degrees
     pelvis = None
     if all(n in column for n in _PELVIS_PATH):
         pelvis = np.column_stack([column[n] for n in _PELVIS_PATH]) @ Y_UP_TO_Z_UP.T
     return Reference(path.stem, source, convention, time, angles, pelvis)
+
+
+def _knee_sign(knees: Sequence[np.ndarray]) -> float:
+    """+1 where flexion is positive, -1 where it is negative: knees bend further than they overextend."""
+    known = [v[np.isfinite(v)] for v in knees if np.any(np.isfinite(v))]
+    return -1.0 if known and min(v.min() for v in known) < -max(v.max() for v in known) else 1.0
 
 
 def _check_convention(convention: str) -> None:

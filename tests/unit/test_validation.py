@@ -295,6 +295,15 @@ def test_a_motion_file_in_degrees_or_radians(tmp_path: Path, unit: str, factor: 
     np.testing.assert_allclose(read.pelvis_m[0], [1.0, -3.0, 2.0])  # y up becomes z up
 
 
+def test_an_overextended_knee_keeps_its_sign(tmp_path: Path):
+    """The left knee is overextended by 8 deg throughout; flexion is negative in this model, as the right knee shows."""
+    rows = "".join(f"{t:.2f} {-60 * t:.4f} 8.0\n" for t in (0, 0.5, 1.0))
+    (tmp_path / "a.mot").write_text(f"Coordinates\ninDegrees=yes\nendheader\ntime knee_angle_r knee_angle_l\n{rows}")
+    read = reference_of_mot(tmp_path / "a.mot")
+    np.testing.assert_allclose(read.angles_deg[KNEE], [0, 30, 60])
+    np.testing.assert_allclose(read.angles_deg["knee_flexion_l"], -8)
+
+
 # --- fits
 
 
