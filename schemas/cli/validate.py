@@ -84,23 +84,35 @@ def tables(
     """Print the tables of errors: by dataset and camera, joint, population, activity and view.
 
     Without FITS: of all rows in the database whose fit and reference are current. With FITS (`fit.npz`): of these
-    files, no database needed; references as in docs/files.md.
+    files, no database needed; references as in docs/files.md. A fit that cannot be compared is said on stderr, the
+    others are shown, and the exit code is 1.
     """
     from pbl_pipeline.files import check_out_folder
-    from pbl_pipeline.validation import paper_tables, print_tables, save_curves, write_tables
 
     if out is not None:
         check_out_folder(out)
+    refused: list[PblError] = []
     if fits:
-        frame = _of_files(fits, references, dataset or "files", source, shift_s)
+        frame, refused = _of_files(fits, references, dataset or "files", source, shift_s)
     elif references or source or shift_s:
         raise click.UsageError("--reference, --source and --shift go with FITS; in the database: pbl validate add")
     else:
         frame = _of_database()
-    if frame.empty:
+    for error in refused:
+        click.echo(error.text(), err=True)
+    if not frame.empty:
+        _show(frame, [*where, *([f"dataset={dataset}"] if dataset else [])], out, in_database=not fits)
+    elif not fits:
         click.echo(NOTHING)
-        return
-    chosen = select(frame, [*where, *([f"dataset={dataset}"] if dataset else [])])
+    if refused:
+        raise click.exceptions.Exit(1)
+
+
+def _show(frame: pd.DataFrame, where: Sequence[str], out: Path | None, in_database: bool) -> None:
+    """Print the tables of the rows that `where` leaves, and write them where a folder is given."""
+    from pbl_pipeline.validation import paper_tables, print_tables, save_curves, write_tables
+
+    chosen = select(frame, where)
     if chosen.empty:
         click.echo(f"None of {len(frame)} errors is left by --dataset and --where.")
         return
@@ -111,7 +123,7 @@ def tables(
     write_tables(made, out)
     chosen.to_csv(out / "errors.csv", index=False)
     click.echo(f"tables, and the errors they are made from (errors.csv): {out}")
-    if not fits:
+    if in_database:
         from schemas.views import validation_curves
 
         curves = validation_curves(chosen)
@@ -164,22 +176,26 @@ def _of_database() -> pd.DataFrame:
 
 def _of_files(
     fits: Sequence[Path], references: Sequence[Path], dataset: str, source: str | None, shift_s: float
-) -> pd.DataFrame:
-    """Errors of fits in files, by the library alone."""
+) -> tuple[pd.DataFrame, list[PblError]]:
+    """Errors of fits in files, by the library alone; what was refused beside."""
     from pbl_pipeline.fit import TrialFit
     from pbl_pipeline.validation import TrialErrors, compare, error_frame
     from schemas.references import read_reference
 
     if len(references) not in (1, len(fits)):
         raise click.UsageError(f"{len(references)} of --reference for {len(fits)} FITS: one for all, or one for each")
-    truths = [read_reference(path, source, shift_s) for path in references]
-    truths = truths * len(fits) if len(truths) == 1 else truths
-    rows = []
-    for path, truth in zip(fits, truths, strict=True):
-        fit = TrialFit.load(path)
+    rows, refused = [], []
+    of_each = [references[0]] * len(fits) if len(references) == 1 else references
+    for path, truth in zip(fits, of_each, strict=True):
+        try:
+            fit = TrialFit.load(path)
+            errors = compare(fit, read_reference(truth, source, shift_s))
+        except PblError as error:
+            refused.append(error)
+            continue
         rows.append(
             TrialErrors(
-                errors=compare(fit, truth),
+                errors=errors,
                 dataset=dataset,
                 subject="",
                 population="unknown",
@@ -190,7 +206,7 @@ def _of_files(
                 solver=fit.solver,
             )
         )
-    return error_frame(rows)
+    return error_frame(rows), refused
 
 
 def select(frame: pd.DataFrame, where: Sequence[str]) -> pd.DataFrame:

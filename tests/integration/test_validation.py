@@ -274,6 +274,9 @@ def test_the_command_on_files_needs_no_database(tmp_path: Path):
     assert "Knee Flexion" in result.output
     assert list((tmp_path / "out").glob("*.html"))
     assert call(tmp_path / "walk.fit.npz").exit_code == 2
-    absent = call(tmp_path / "absent.fit.npz", "--reference", truth)
-    assert isinstance(absent.exception, PblError)
-    assert absent.exception.code == "FILE_MISSING"
+    some = call(tmp_path / "absent.fit.npz", tmp_path / "walk.fit.npz", "--reference", truth)
+    assert some.exit_code == 1
+    assert "FILE_MISSING" in some.output
+    assert "Knee Flexion" in some.output
+    late = call(tmp_path / "walk.fit.npz", "--reference", truth, "--shift", 60)
+    assert (late.exit_code, "REFERENCE_INPUT" in late.output) == (1, True)
