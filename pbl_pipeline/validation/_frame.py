@@ -9,7 +9,7 @@ import pandas as pd
 
 from ._compare import JointError, KinematicErrors
 from ._joints import split_side
-from ._view import CONTRALATERAL, IPSILATERAL
+from ._view import CONTRALATERAL, IPSILATERAL, LATERAL
 
 STATIC, HANDHELD, SEVERAL = "static", "handheld", "several"
 _JOINT_FIELDS = tuple(f.name for f in dataclasses.fields(JointError))
@@ -66,4 +66,4 @@ def _view(row: TrialErrors, side: str) -> str:
     if row.camera == SEVERAL:
         return ""
     view = row.errors.view["left" if side == "l" else "right"]
-    return "lateral" if not side and view in (IPSILATERAL, CONTRALATERAL) else view
+    return LATERAL if not side and view in (IPSILATERAL, CONTRALATERAL) else view

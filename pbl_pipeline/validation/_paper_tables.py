@@ -16,7 +16,7 @@ from ._joints import JOINTS_OPENCAP, JOINTS_PAPER, ROWS_PAPER, split_side
 from ._paper import paper_cells, paper_where
 from ._statistics import median_niqr, niqr, pearson, smaller
 from ._table import Cell, Table
-from ._view import BACK, CONTRALATERAL, FRONT, IPSILATERAL, MIXED
+from ._view import BACK, CONTRALATERAL, FRONT, IPSILATERAL, LATERAL, MIXED
 
 MEDIAN, MEAN, RTE = "Median Absolute Error (deg)", "Mean Absolute Error (deg)", "RTE (cm)"
 KNOWN, TRIALS = "Joints compared", "All"
@@ -182,7 +182,7 @@ def _groups(name: str, by: str, trials: pd.DataFrame, column: str, paper_columns
 
 
 def _by_view(rows: pd.DataFrame) -> Table:
-    columns = _columns((FRONT, BACK, IPSILATERAL, CONTRALATERAL, MIXED), rows.loc[rows["view"] != "", "view"])
+    columns = _columns((FRONT, BACK, IPSILATERAL, CONTRALATERAL, LATERAL, MIXED), rows.loc[rows["view"] != "", "view"])
     cells = {}
     for c in columns:
         part = _pick(rows, (rows["view"] == c) & (rows["n"] > 0))
@@ -194,7 +194,7 @@ def _by_view(rows: pd.DataFrame) -> Table:
         tuple(ROWS_PAPER),
         columns,
         cells,
-        "Ipsilateral: the camera is on the side of the joint. lateral: a joint of the middle seen from a side. The "
+        "ipsilateral: the camera is on the side of the joint. lateral: a joint of the middle seen from a side. The "
         "paper shows these errors only as a figure (Fig. 4 C).",
     )
 

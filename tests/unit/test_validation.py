@@ -153,11 +153,17 @@ def test_only_joints_that_both_know_are_compared():
 
 
 def test_the_trials_error_pools_frames_and_joints():
-    """1 deg in one joint, 2 in the second, 9 in the third of which a third of the frames is missing: median 2, and
-    the pelvis does not count among the paper's joints."""
+    """1 deg in one joint, 2 in the second, 9 in the third of which a third of the frames is missing: median 2. The
+    other two are not among the paper's joints: with them it would be 9."""
     third = WAVE + 9
     third[::3] = np.nan
-    ours = {"hip_flexion_r": WAVE + 1, KNEE: WAVE + 2, "neck_bending": third, "subtalar_angle_r": WAVE + 50}
+    ours = {
+        "hip_flexion_r": WAVE + 1,
+        KNEE: WAVE + 2,
+        "neck_bending": third,
+        "subtalar_angle_r": WAVE + 50,
+        "pro_sup_r": WAVE + 70,
+    }
     reference = _reference(**dict.fromkeys(ours, WAVE))
     result = compare_angles(TIME, ours, reference, max_lag_s=0.0)
     assert result.median_abs_deg == pytest.approx(2.0)
@@ -321,7 +327,9 @@ def test_knee_flexion_is_positive_and_its_sd_too(fit: TrialFit):
     assert np.nanmax(angles[KNEE]) > 50
     assert "knee_angle_r" not in angles
     assert "pelvis_tx" not in angles
-    np.testing.assert_allclose(fit_angles(fit, BODY_ROTATIONS)[KNEE], angles[KNEE], atol=2.0)
+    turned = fit_angles(fit, BODY_ROTATIONS)
+    for joint in JOINTS_CLIP:  # the hips' axes are the same in both conventions, knee and ankle nearly so
+        np.testing.assert_allclose(turned[joint], angles[joint], atol=1e-3 if "hip" in joint else 3.0)
     with_sd = dataclasses.replace(fit, qpos_sd=np.full_like(fit.qpos, np.radians(3.0)))
     np.testing.assert_allclose(fit_angles_sd(with_sd)[KNEE], 3.0)
     assert list(fit_angles_sd(with_sd, BODY_ROTATIONS)) == list(JOINTS_CLIP)

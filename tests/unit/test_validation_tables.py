@@ -305,7 +305,10 @@ def test_latex_is_escaped_and_its_columns_count():
     tables = paper_tables(error_frame([_trial("a", {"knee_flexion_r": 2.0}, dataset=EVIL)]))
     for table in tables.values():
         text = latex(table)
-        assert EVIL not in text
+        assert not re.search(
+            r"(?<!\\)[%#_$~^]",
+            text.replace(f"pbl_{table.name}", "").replace("$<$", "").replace("$>$", "").replace("$|$", ""),
+        )
         columns = re.findall(r"\\begin\{tabular\}\{(l r*|lr*)\}", text)[0]
         for line in text.split(r"\midrule")[1].split(r"\bottomrule")[0].strip().splitlines():
             assert line.endswith(r" \\")
