@@ -6,8 +6,10 @@ import numpy as np
 
 #: Times of the reference further apart than this are a hole: nothing is interpolated across it.
 MAX_GAP_S = 0.1
-#: Step of the search for the lag.
-LAG_STEP_S = 0.001
+#: Fewest common frames for a lag or an error.
+MIN_COMMON = 10
+#: Steps of the first search for the lag; the second goes by 1 ms.
+_COARSE_MS = 10
 
 
 def at_times(at_s: np.ndarray, time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -34,34 +36,47 @@ def best_lag(
     """The lag (s) of `ours` (N, K) behind `theirs` (T, K) that minimises the offset-free rms over all K joints.
 
     The mean difference of each joint is taken out first: a constant error must not pull the lag away from the
-    movement's. Searched in steps of `LAG_STEP_S` within +- `max_lag_s`, on the same frames for every lag (those that
-    the reference covers at all of them) where there are enough, so that the lag cannot choose its frames. Of equally
-    good lags the smallest counts. NaN where nothing overlaps at any lag.
+    movement's. Searched within +- `max_lag_s` in steps of 10 ms, then of 1 ms around the best, on the same frames for
+    every lag (those that the reference covers at all of them) where there are enough, so that the lag cannot choose its
+    frames. Of equally good lags the smallest counts. NaN where nothing overlaps at any lag.
     """
-    steps = round(max_lag_s / LAG_STEP_S)
-    lags = np.array(sorted(np.arange(-steps, steps + 1), key=abs)) * LAG_STEP_S
+    seen = np.any(np.isfinite(ours), axis=1)
+    time_s, ours = time_s[seen], ours[seen]
     common = (time_s - max_lag_s >= reference_s[0]) & (time_s + max_lag_s <= reference_s[-1])
     if np.count_nonzero(common) < max(MIN_COMMON, 0.5 * len(time_s)):
         common[:] = True
-    cost = np.full(len(lags), np.inf)
-    for i, lag in enumerate(lags):
-        difference = wrapped(ours[common] - at_times(time_s[common] - lag, reference_s, theirs))
-        known = np.isfinite(difference)
-        count = known.sum(axis=0)
-        if not np.any(count >= MIN_COMMON):
-            continue
-        used = np.where(known, difference, 0.0)[:, count >= MIN_COMMON]
-        count = count[count >= MIN_COMMON]
-        squares = (used**2).sum(axis=0) - used.sum(axis=0) ** 2 / count
-        cost[i] = squares.sum() / count.sum()
-    if not np.isfinite(cost).any():
+    time_s, ours = time_s[common], ours[common]
+
+    def cost(lag_ms: int) -> float:
+        return _free_of_offset(ours - at_times(time_s - lag_ms / 1000, reference_s, theirs))
+
+    limit = round(1000 * max_lag_s)
+    coarse = _cheapest({m: cost(m) for m in (*range(0, limit, _COARSE_MS), limit, *range(-limit, 0, _COARSE_MS))})
+    if coarse is None:
         return float("nan")
-    # Differences below rounding do not count as better.
-    return float(lags[np.argmax(cost <= cost.min() + 1e-12)])
+    around = range(max(-limit, coarse - _COARSE_MS), min(limit, coarse + _COARSE_MS) + 1)
+    fine = _cheapest({m: cost(m) for m in around})
+    return float("nan") if fine is None else fine / 1000
 
 
-#: Fewest common frames for a lag or an error.
-MIN_COMMON = 10
+def _free_of_offset(difference_deg: np.ndarray) -> float:
+    """Mean square of (N, K) differences of angles, each joint less its mean; infinite with too few frames."""
+    difference = wrapped(difference_deg)
+    known = np.isfinite(difference)
+    count = known.sum(axis=0)
+    enough = count >= MIN_COMMON
+    if not enough.any():
+        return float("inf")
+    used, count = np.where(known, difference, 0.0)[:, enough], count[enough]
+    return float(((used**2).sum(axis=0) - used.sum(axis=0) ** 2 / count).sum() / count.sum())
+
+
+def _cheapest(costs: dict[int, float]) -> int | None:
+    """The lag of least cost, of equals (but for rounding) the smallest; None where all are infinite."""
+    least = min(costs.values())
+    if not np.isfinite(least):
+        return None
+    return min((lag for lag, c in costs.items() if c <= least + 1e-12), key=abs)
 
 
 def wrapped(difference_deg: np.ndarray) -> np.ndarray:

@@ -206,8 +206,13 @@ def test_a_person_at_rest_has_no_lag():
 def test_the_lag_cannot_choose_its_frames():
     """Noise at the end of the recording must not tempt the search to shift it out of the reference."""
     ours = WAVE.copy()
-    ours[-8:] += 60
+    ours[-8:] += 150
     assert compare_angles(TIME, {KNEE: ours}, _reference(knee_flexion_r=WAVE)).lag_s == 0
+    # Nor where the person is in view for a small part of the video.
+    time = np.arange(-500, 700) / 100.0
+    part = np.full(1200, np.nan)
+    part[500:700] = ours
+    assert compare_angles(time, {KNEE: part}, _reference(knee_flexion_r=WAVE)).lag_s == pytest.approx(0, abs=1e-9)
 
 
 def test_left_and_right_exchanged_shows():
