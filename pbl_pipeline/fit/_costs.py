@@ -35,6 +35,12 @@ def huber_of_square(e2: Float[Array, ...], width: ArrayLike) -> Float[Array, ...
     return jnp.where(far, width * (distance - 0.5 * width), 0.5 * e2)
 
 
+def huber_weight(e2: Float[Array, ...], width: ArrayLike) -> Float[Array, ...]:
+    """Weight w of the gradient `w e` of the Huber cost of a distance given its square."""
+    far = e2 > width**2
+    return jnp.where(far, width / jnp.sqrt(jnp.where(far, e2, 1.0)), 1.0)
+
+
 def center(x: Float[Array, "*n J 3"], weight: Float[Array, "*n J"]) -> Float[Array, "*n J 3"]:
     """Subtract the weighted mean over the markers in each frame; nothing where all weights are 0."""
     n = jnp.sum(weight, axis=-1)[..., None, None]

@@ -31,6 +31,7 @@ class Kinds:
     camera_2d: bool
     world: bool
     moving: bool
+    contact: bool
 
 
 @jax.tree_util.register_dataclass
@@ -69,7 +70,13 @@ def kinds_of(session: Session) -> Kinds:
     """Which terms a session has."""
     obs = session.obs
     has = lambda c: bool(np.any(np.asarray(c) > 0))  # noqa: E731
-    return Kinds(camera_3d=has(obs.c_3d), camera_2d=has(obs.c_2d), world=has(obs.c_world), moving=session.moving)
+    return Kinds(
+        camera_3d=has(obs.c_3d),
+        camera_2d=has(obs.c_2d),
+        world=has(obs.c_world),
+        moving=session.moving,
+        contact=has(obs.contact),
+    )
 
 
 def marker_cost(

@@ -21,6 +21,8 @@ from ._rotation import quat_wxyz, rotation_matrices
 MARKER_SIZES = (24, 40, 64, 96, 128)
 #: Fewest frames of a program, in all trials together.
 MIN_FRAMES = 64
+#: Points of the soles (`solvers/_contact.py`).
+SOLE_POINTS = 4
 #: Frame interval (s) for which second differences are stated: 30 Hz.
 FRAME_S = 1 / 30
 
@@ -33,8 +35,9 @@ class Observations:
     time_s counts from each trial's first frame; `trial` is the number of a frame's trial; `weight` is 1 for a frame
     that counts and 0 for others. Confidences are 0 where nothing was seen; values there are finite and do not count.
     `xy_px` are pixels of an ideal pinhole camera (undistorted). `bend` holds the weights of the frames before, at and
-    after a frame in the second difference there (per 1/30 s squared), 0 where it is not formed. `sample_*`: the phone's
-    orientation R_nc as quaternions at a fixed interval, from `sample_start_s` on; there where `has_phone` is 1.
+    after a frame in the second difference there (per 1/30 s squared), 0 where it is not formed. `contact`: how surely
+    each of S points of the soles stands (0 to 1), 0 until a first solution tells. `sample_*`: the phone's orientation
+    R_nc as quaternions at a fixed interval, from `sample_start_s` on; there where `has_phone` is 1.
     """
 
     time_s: Float[Array, " F"]
@@ -52,6 +55,7 @@ class Observations:
     bend: Float[Array, "F 3"]
     n_markers: Float[Array, ""]
     n_views: Float[Array, ""]
+    contact: Float[Array, "F S"]
     has_phone: Float[Array, " N"]
     sample_quat_wxyz: Float[Array, "N P 4"]
     sample_start_s: Float[Array, " N"]
@@ -155,6 +159,7 @@ def pack(trials: Sequence[TrialArrays]) -> Observations:
         "p_nc": joined("p_nc"),
         "camera_matrix": joined("camera_matrix"),
         "bend": np.pad(bend, [(0, frames), (0, 0)]),
+        "contact": np.zeros((total + frames, SOLE_POINTS)),
         "n_markers": np.asarray(n_markers),
         "n_views": np.asarray(max(trials[0].c_3d.shape[1], 1)),
         "has_phone": np.pad([float(t.phone_time_s is not None) for t in trials], (0, n - len(trials))),

@@ -80,8 +80,9 @@ class ImplicitAdamParams:
 #: set by anatomy and not by fitting: about how far a joint moves in walking and standing up, together with how people
 #: differ in their standing pose. Hip and knee flexion, ankle, shoulders and elbows are seen well and have none, but for
 #: the turn of the upper arm, which a straight elbow hides. Forearm: 90 deg turns the palms to the body, as they hang.
+#: Lumbar spine: the mean of two walks fitted from a laboratory's markers (-7 and -5 deg; nimblephysics' OpenSim data).
 POSE_PRIOR_DEG = (
-    ("lumbar_extension", 0.0, 15.0),
+    ("lumbar_extension", -7.0, 15.0),
     ("lumbar_bending", 0.0, 10.0),
     ("lumbar_rotation", 0.0, 10.0),
     ("neck_extension", 0.0, 20.0),
@@ -160,6 +161,12 @@ class GaussNewtonParams:
     huber_phone_deg: float = 0.5
     #: Standard deviation (s) of the offset between the phone's clock and the video's.
     clock_sd_s: float = 0.2
+    #: Feet on the floor (`solvers/_contact.py`): height over it, and way of a sole that stands, per cm^2. 0: none.
+    weight_floor: float = 0.0
+    weight_slide: float = 0.0
+    huber_floor_cm: float = 2.0
+    huber_slide_cm: float = 1.0
+    slope_sd_deg: float = 5.0
     sd_factor: tuple[tuple[str, float], ...] = SD_FACTOR
     cost: CostParams = CostParams()
     view: ViewParams = ViewParams()
@@ -177,9 +184,12 @@ GAUSS_NEWTON = GaussNewtonParams(smooth_per_rad2=400.0, cost=CostParams(weight_2
 #: Its 33 points weigh less than MeTRAbs's 87, and so does what smooths them.
 BLAZEPOSE = GaussNewtonParams(
     smooth_per_rad2=20.0,
+    weight_floor=0.03,
+    weight_slide=0.03,
     sd_factor=SD_FACTOR_BLAZEPOSE,
     cost=CostParams(
         weight_3d=0.2,
+        depth_ratio=0.5,
         weight_offset_per_m2=25.0,
         weight_pose=0.1,
         pose_prior_deg=POSE_PRIOR_DEG,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +28,8 @@ from pbl_pipeline.fit._observations import SAMPLE_S, bend_weights
 from pbl_pipeline.fit._params import CostParams, GaussNewtonParams, ViewParams
 from pbl_pipeline.fit.solvers import _arrow
 from pbl_pipeline.fit.solvers._arrow import Arrow, marginal_variance, solve
-from pbl_pipeline.fit.solvers._normal import State, _phone_error_deg, cost, normal_equations
+from pbl_pipeline.fit.solvers._contact import _height_cm, _way_cm, sole_positions, standing
+from pbl_pipeline.fit.solvers._normal import State, _phone_error_deg, cost, normal_equations, scale_multipliers
 from pbl_pipeline.fit.solvers.gauss_newton import kinds_of, start_of, weights_of
 from pbl_pipeline.synthetic import observe, observe_markers, observe_views, walk_qpos
 
@@ -185,6 +187,9 @@ PARAMS = GaussNewtonParams(
     smooth_per_rad2=300.0,
     weight_limit_per_deg2=0.2,
     clock_sd_s=0.05,
+    weight_floor=0.05,
+    weight_slide=0.2,
+    slope_sd_deg=4.0,
     view=ViewParams(min_in_view_s=0.5, min_confidence=0.1),
     cost=CostParams(
         weight_3d=0.7,
@@ -200,7 +205,7 @@ PARAMS = GaussNewtonParams(
 
 def small_session(kind: str) -> Session:
     """Two trials of 24 frames each."""
-    few, trials, motion = few_markers(), [], "handheld" if kind == "moving" else "static"
+    few, trials, motion = few_markers(), [], "handheld" if "moving" in kind else "static"
     for seed in (0, 1):
         qpos = walk_qpos(TIME_S, seed)
         if kind == "world":
@@ -209,7 +214,11 @@ def small_session(kind: str) -> Session:
             trials.append(observe_views(qpos, TIME_S, n_views=2, marker_set=few, seed=seed, with_3d=True))
         else:
             trials.append(observe(qpos, TIME_S, marker_set=few, seed=seed, camera_motion=motion).keypoints)
-    return make_session(trials, ["a", "b"], PARAMS.view, [motion] * 2, few)
+    session = make_session(trials, ["a", "b"], PARAMS.view, [motion] * 2, few)
+    if "floor" in kind:
+        seen = np.random.default_rng(5).random(session.obs.contact.shape) * session.obs.weight[:, None]
+        session = dataclasses.replace(session, obs=dataclasses.replace(session.obs, contact=jnp.asarray(seen)))
+    return session
 
 
 def away(session: Session, seed: int = 3) -> State:
@@ -224,15 +233,17 @@ def away(session: Session, seed: int = 3) -> State:
         s=noise(state.s, 0.05),
         site_offset_m=noise(state.site_offset_m, 0.01) * session.table.weight[:, None],
         clock_s=noise(state.clock_s, 0.02) + 0.003,
+        floor=noise(state.floor - np.array([1.2, 0.0, 0.0]), 0.03),
     )
 
 
-@pytest.mark.parametrize("kind", ["static", "moving", "views", "world"])
+@pytest.mark.parametrize("kind", ["static", "moving", "views", "world", "floor", "moving floor"])
 def test_normal_equations_hold_the_gradient_of_the_cost(kind):
     session = small_session(kind)
     w, state, kinds = weights_of(session, PARAMS), away(session), kinds_of(session)
     obs, fixed = session.obs, (session.body, session.table, session.obs, w, kinds)
-    assert kinds.moving == (kind == "moving")
+    assert kinds.moving == ("moving" in kind)
+    assert kinds.contact == ("floor" in kind)
     n = float(jnp.sum(obs.weight))
     assert 30 < n < len(obs.weight)  # and padding
 
@@ -244,6 +255,7 @@ def test_normal_equations_hold_the_gradient_of_the_cost(kind):
             s=state.s + change["s"],
             site_offset_m=state.site_offset_m + change["offset"],
             clock_s=state.clock_s + change["clock"],
+            floor=state.floor + change["floor"],
         )
         return n * cost(*fixed, moved)
 
@@ -253,19 +265,66 @@ def test_normal_equations_hold_the_gradient_of_the_cost(kind):
         "s": jnp.zeros(8),
         "offset": jnp.zeros_like(state.site_offset_m),
         "clock": jnp.zeros_like(state.clock_s),
+        "floor": jnp.zeros_like(state.floor),
     }
     want = jax.jit(jax.grad(total))(none)
     matrix, g, h = jax.jit(lambda s: normal_equations(*fixed, s))(state)
     k = 8 + state.site_offset_m.size
     ours = {"qpos": g[:, :40], "s": h[:8], "offset": h[8:k].reshape(-1, 3)}
     if kinds.moving:
-        ours |= {"turn": g[:, 40:], "clock": h[k:]}
+        ours |= {"turn": g[:, 40:], "clock": h[k : k + 2]}
+    if kinds.contact:
+        ours["floor"] = h[-6:].reshape(-1, 3)
     for name, value in ours.items():
         w_ = np.asarray(want[name])
         assert np.abs(w_).max() > 0.1, name
         np.testing.assert_allclose(-np.asarray(value), w_, atol=1e-3 * np.abs(w_).max(), rtol=1e-3, err_msg=name)
     assert np.all(np.linalg.eigvalsh(np.asarray(matrix.corner, np.float64)) > -1e-3 * np.abs(matrix.corner).max())
     np.testing.assert_allclose(matrix.diagonal, np.swapaxes(matrix.diagonal, 1, 2), atol=1e-3 * np.abs(g).max())
+
+
+def test_curvature_of_the_soles_is_that_of_their_residuals():
+    """v' H v of what they add to the matrix against the residuals' change along v (Gauss-Newton, no robust weights)."""
+    session = small_session("floor")
+    params = dataclasses.replace(PARAMS, huber_floor_cm=1e6, huber_slide_cm=1e6)
+    w, state, obs = weights_of(session, params), away(session), session.obs
+    matrix, nothing = {}, jnp.zeros(())
+    without = dataclasses.replace(w, weight_floor=nothing, weight_slide=nothing)
+    for name, weights in (("all", w), ("none", without)):
+        equations = functools.partial(normal_equations, session.body, session.table, obs, weights, kinds_of(session))
+        matrix[name] = jax.jit(equations)(state)[0]
+    own = jax.tree.map(lambda a, b: np.asarray(a - b, np.float64), matrix["all"], matrix["none"])
+
+    def residuals(qpos, s, floor):
+        x = sole_positions(session.body, qpos, scale_multipliers(s))
+        height, (way, _, share) = _height_cm(x, obs, floor)[0], _way_cm(x, obs)
+        return (
+            jnp.sqrt(obs.weight[:, None] * obs.contact * w.weight_floor) * height,
+            jnp.sqrt(share * w.weight_slide)[..., None] * way,
+        )
+
+    rng = np.random.default_rng(6)
+    v = [rng.normal(size=np.shape(a)).astype(np.float32) for a in (state.qpos, state.s, state.floor)]
+    _, change = jax.jvp(residuals, (state.qpos, state.s, state.floor), tuple(v))
+    want = sum(float(jnp.sum(c**2)) for c in change)
+    q, y = v[0].astype(float), np.zeros(own.corner.shape[0])
+    y[:8], y[-6:] = v[1], v[2].ravel()
+    got = np.einsum("fa,fab,fb", q, own.diagonal, q) + 2 * np.einsum("fa,fab,fb", q[:-1], own.next_1[:-1], q[1:])
+    got += 2 * np.einsum("fa,fak,k", q, own.border, y) + y @ own.corner @ y
+    assert got == pytest.approx(want, rel=1e-4)
+
+
+def test_soles_that_stand():
+    """Still for half a second, then swung at 3 m/s; another never moves, a third moves all the time."""
+    time_s = np.arange(60) / 60
+    x = np.zeros((60, 3, 3))
+    x[30:, 0, 0] = 3 * (time_s[30:] - time_s[30])
+    x[:, 2, 0] = 3 * time_s
+    stands = standing(time_s, x)
+    assert stands[:25, 0].min() > 0.9
+    assert stands[35:, 0].max() < 0.1
+    assert stands[:, 1].min() > 0.9
+    assert stands[5:-5, 2].max() < 0.1
 
 
 # --- the terms by hand ---

@@ -1,6 +1,6 @@
 """Linear systems of a session: one small block per frame, coupled to the two frames on either side, and a border.
 
-    | A  B | |x|   |g|      A (F Q, F Q): block (t, t) full, blocks (t, t+1) and (t, t+2) diagonal (second differences)
+    | A  B | |x|   |g|      A (F Q, F Q): block (t, t) full, (t, t+1) full or diagonal, (t, t+2) diagonal
     | B' C | |y| = |h|      B (F Q, K), C (K, K): what all frames share (scale, marker offsets, clocks)
 
 Solved by block cyclic reduction over pairs of frames (e.g. Golub & Van Loan, Matrix Computations, 4th ed., 4.5.4) and
@@ -28,10 +28,13 @@ LARGE_BORDER = 2**26
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Arrow:
-    """The matrix. F must be even; `next_1[t]` couples t with t + 1, `next_2[t]` t with t + 2 (0 beyond the end)."""
+    """The matrix. F must be even; `next_1[t]` couples t with t + 1, `next_2[t]` t with t + 2 (0 beyond the end).
+
+    `next_1` may be the diagonals of its blocks (F, Q) or the blocks (F, Q, Q), rows of t and columns of t + 1.
+    """
 
     diagonal: Float[Array, "F Q Q"]
-    next_1: Float[Array, "F Q"]
+    next_1: Float[Array, "F Q *Q"]
     next_2: Float[Array, "F Q"]
     border: Float[Array, "F Q K"]
     corner: Float[Array, "K K"]
@@ -122,12 +125,13 @@ def _eliminated(levels: list[_Level], rhs: Float[Array, "F Q R"]) -> list[Float[
 
 def _pairs(matrix: Arrow) -> tuple[Array, Array]:
     """Blocks (F/2, 2Q, 2Q) of pairs of frames and the links (F/2, 2Q, 2Q) of each pair with the next one."""
-    f, q = matrix.next_1.shape
+    f, q = matrix.next_2.shape
     eye = jnp.eye(q, dtype=matrix.next_1.dtype)
     own = matrix.diagonal.reshape(f // 2, 2, q, q)
-    next_1 = matrix.next_1.reshape(f // 2, 2, q, 1) * eye
+    next_1 = matrix.next_1 if matrix.next_1.ndim == 3 else matrix.next_1[..., None] * eye
+    next_1 = next_1.reshape(f // 2, 2, q, q)
     next_2 = matrix.next_2.reshape(f // 2, 2, q, 1) * eye
-    blocks = jnp.block([[own[:, 0], next_1[:, 0]], [next_1[:, 0], own[:, 1]]])
+    blocks = jnp.block([[own[:, 0], next_1[:, 0]], [jnp.swapaxes(next_1[:, 0], -1, -2), own[:, 1]]])
     links = jnp.block([[next_2[:, 0], jnp.zeros_like(next_1[:, 1])], [next_1[:, 1], next_2[:, 1]]])
     return blocks, links
 

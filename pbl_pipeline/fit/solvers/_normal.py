@@ -23,6 +23,7 @@ from .. import _costs as costs
 from .._marker_cost import Kinds, marker_cost
 from .._observations import Observations
 from ._arrow import Arrow
+from ._contact import contact_cost, contact_terms, floor_cost
 
 #: Frames whose markers are differentiated at once: bounds the memory of long sessions.
 CHUNK = 512
@@ -49,6 +50,12 @@ class Weights:
     #: Half of it times the squared overall scale parameter; 0 where the keypoints tell the size.
     weight_size: Float[Array, ""]
     clock_sd_s: Float[Array, ""]
+    #: Feet on the floor (`_contact.py`).
+    weight_floor: Float[Array, ""]
+    weight_slide: Float[Array, ""]
+    huber_floor_cm: Float[Array, ""]
+    huber_slide_cm: Float[Array, ""]
+    slope_sd: Float[Array, ""]
     neutral: Float[Array, " 40"]
     inverse_sd: Float[Array, " 40"]
     #: Per (rad per frame^2 at 30 Hz)^2, of slides per (m per frame^2)^2.
@@ -60,13 +67,15 @@ class Weights:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class State:
-    """The unknowns. `s`: the paper's scale parameters; `clock_s`: sensor time minus video time of each trial."""
+    """The unknowns. `s`: the paper's scale parameters; `clock_s`: sensor time minus video time of each trial; `floor`:
+    its height (m) and slopes along the world's x and y, of each trial."""
 
     qpos: Float[Array, "F 40"]
     R_nc: Float[Array, "F V 3 3"]
     s: Float[Array, " 8"]
     site_offset_m: Float[Array, "J 3"]
     clock_s: Float[Array, " N"]
+    floor: Float[Array, "N 3"]
 
 
 def scale_multipliers(s: Float[Array, " 8"]) -> Float[Array, " 8"]:
@@ -87,6 +96,8 @@ def cost(body: Body, table: MarkerTable, obs: Observations, w: Weights, kinds: K
         error, _ = _phone_error_deg(obs, state)
         total += w.weight_phone * costs.huber_of_square(jnp.sum(error**2, -1), w.huber_phone_deg) / w.huber_phone_deg
     total += 0.5 * w.weight_limit * jnp.sum(costs.beyond_limit_deg(state.qpos, w.low, w.high) ** 2, axis=-1)
+    if kinds.contact:
+        total += contact_cost(body, obs, w, scale_multipliers(state.s), state)
     bent = 0.5 * jnp.sum(costs.second_difference(state.qpos, obs.bend) ** 2 * w.smooth)
     shared = w.weight_offset_per_m2 * costs.offset_m2(state.site_offset_m)
     shared += w.weight_pose * costs.pose_prior(state.qpos, w.neutral, w.inverse_sd, obs.weight)
@@ -94,6 +105,8 @@ def cost(body: Body, table: MarkerTable, obs: Observations, w: Weights, kinds: K
     shared += 0.5 * w.weight_size * state.s[0] ** 2
     if kinds.moving:
         shared += 0.5 * jnp.sum((state.clock_s / w.clock_sd_s) ** 2) / n
+    if kinds.contact:
+        shared += floor_cost(state.floor, w.slope_sd) / n
     return (jnp.sum(total * obs.weight) + bent) / n + shared
 
 
@@ -140,7 +153,7 @@ def normal_equations(
     """Curvature of `cost` times the number of frames, and its negative gradient.
 
     Unknowns of a frame: qpos (40) and, where the camera moves, a small rotation of it (3, world axes, from the left).
-    Shared: s (8), marker offsets (3 J), clocks (N, where the camera moves).
+    Shared: s (8), marker offsets (3 J), clocks (N, where the camera moves), floors (3 N, where feet stand on them).
     """
     with jax.default_matmul_precision("highest"):
         n = jnp.maximum(jnp.sum(obs.weight), 1.0)
@@ -169,12 +182,13 @@ def normal_equations(
         C, h = _shared_terms(w, state, n, C, h)
         if kinds.moving:
             H, g, B, C, h = _phone_terms(obs, w, state, H, g, B, C, h)
+        if kinds.contact:
+            H, g, next_1, B, C, h = _contact_terms(body, obs, w, state, H, g, next_1, B, C, h)
         # Frames that count for nothing stay where they are.
         empty = (obs.weight == 0) & jnp.all(_neighbourhood(obs.bend) == 0, axis=-1)
         H = H + empty[:, None, None] * jnp.eye(H.shape[-1])
-        pad = H.shape[-1] - next_1.shape[-1]
-        widen = lambda a: jnp.pad(a, [(0, 0), (0, pad)])  # noqa: E731
-    return Arrow(H, widen(next_1), widen(next_2), B, C), g, h
+        widen = lambda a: jnp.pad(a, [(0, 0), (0, H.shape[-1] - a.shape[-1])])  # noqa: E731
+    return Arrow(H, next_1 if kinds.contact else widen(next_1), widen(next_2), B, C), g, h
 
 
 def _neighbourhood(bend: Float[Array, "F 3"]) -> Float[Array, "F 3"]:
@@ -191,10 +205,8 @@ def _cross_matrix(x: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
 
 
 def _robust(e: Float[Array, "*n D"], width: Array) -> Float[Array, "*n"]:
-    """Weight w of the gradient w e of Huber's cost of a vector."""
-    e2 = jnp.sum(e**2, axis=-1)
-    far = e2 > width**2
-    return jnp.where(far, width / jnp.sqrt(jnp.where(far, e2, 1.0)), 1.0)
+    """`huber_weight` of a vector."""
+    return costs.huber_weight(jnp.sum(e**2, axis=-1), width)
 
 
 def _times(a: Float[Array, "*m 3 3"], b: Float[Array, "*m 3 R"]) -> Float[Array, "*m 3 R"]:
@@ -327,3 +339,19 @@ def _phone_terms(obs, w, state, H, g, B, C, h):
     k = C.shape[0]
     C = jnp.pad(C, [(0, corner.size), (0, corner.size)]).at[k:, k:].add(jnp.diag(corner))
     return H, g, B, C, jnp.concatenate([h, slope])
+
+
+def _contact_terms(body, obs, w, state, H, g, next_1, B, C, h):
+    """Feet on the floor: also couples a frame's joints with the next one's, and adds the floors to what is shared."""
+    dH, link, dB, dC, dg, dh = contact_terms(
+        body, obs, w, scale_multipliers(state.s), jnp.asarray(MIXER, H.dtype), state
+    )
+    q, k, n = H.shape[-1], C.shape[0], state.floor.size
+    wide = lambda a, *axes: jnp.pad(a, [(0, q - 40 if i in axes else 0) for i in range(a.ndim)])  # noqa: E731
+    next_1 = wide(next_1, 1)[..., None] * jnp.eye(q, dtype=H.dtype) + wide(link, 1, 2)
+    dB = wide(dB, 1)
+    B = jnp.concatenate([B.at[..., :8].add(dB[..., :8]), dB[..., 8:]], axis=-1)
+    C = jnp.pad(C, [(0, n), (0, n)]).at[:8, :8].add(dC[:8, :8]).at[k:, k:].set(dC[8:, 8:])
+    C = C.at[:8, k:].set(dC[:8, 8:]).at[k:, :8].set(dC[8:, :8])
+    h = jnp.concatenate([h.at[:8].add(-dh[:8]), -dh[8:]])
+    return H + wide(dH, 1, 2), g - wide(dg, 1), next_1, B, C, h

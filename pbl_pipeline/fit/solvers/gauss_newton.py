@@ -32,6 +32,7 @@ from .._place import placed_poses
 from .._prior import prior_of
 from .._threads import one_blas_thread
 from ._arrow import Arrow, marginal_variance, solve
+from ._contact import sole_positions, standing
 from ._normal import MIXER, State, Weights, cost, dispersion, normal_equations, scale_multipliers
 from ._solution import Solution
 
@@ -131,13 +132,15 @@ def _moved(state: State, dx: Array, dy: Array, kinds: Kinds) -> State:
     if kinds.moving:
         turn = jaxlie.SO3.exp(dx[:, 40:]).as_matrix()
         R_nc = jnp.einsum("fij,fvjk->fvik", turn, R_nc, precision="highest")
-        clock = clock + dy[k:]
+        clock = clock + dy[k : k + clock.size]
+        k += clock.size
     return State(
         qpos=state.qpos + dx[:, :40],
         R_nc=R_nc,
         s=state.s + dy[:8],
-        site_offset_m=state.site_offset_m + dy[8:k].reshape(-1, 3),
+        site_offset_m=state.site_offset_m + dy[8 : 8 + state.site_offset_m.size].reshape(-1, 3),
         clock_s=clock,
+        floor=state.floor + dy[k:].reshape(-1, 3) if kinds.contact else state.floor,
     )
 
 
@@ -187,6 +190,9 @@ def solve_gauss_newton(
         for i, other in zip(again, _solve(part, params, [start_of(s, flip=True) for s in part]), strict=True):
             if other.loss_trace[-1, 1] < found[i].loss_trace[-1, 1]:
                 found[i] = other
+    if params.weight_floor > 0 or params.weight_slide > 0:
+        sessions, starts = zip(*map(_on_floor, sessions, found), strict=True)
+        found = _solve(sessions, params, starts)
     seconds = (time.perf_counter() - begin) / len(sessions)
     compiled = (compile_seconds() - compiled) / len(sessions)
     return [dataclasses.replace(s, seconds=seconds, compile_seconds=compiled) for s in found]
@@ -209,6 +215,31 @@ def _solve(sessions: Sequence[Session], params: GaussNewtonParams, starts: Seque
     each = [found] if alone else [jax.tree.map(lambda a, i=i: a[i], found) for i in range(len(sessions))]
     factors = sd_factors(sessions[0].body.joint_names, params.sd_factor)
     return [_solution(s, factors, *one) for s, one in zip(sessions, each, strict=True)]
+
+
+def _on_floor(session: Session, found: Solution) -> tuple[Session, State]:
+    """The session with the frames in which feet stand, as a solution shows them, and that solution to start from."""
+    obs, f32 = session.obs, functools.partial(np.asarray, dtype=np.float32)
+    x = np.asarray(sole_positions(session.body, f32(found.qpos), f32(found.scale)))
+    contact, floor = np.zeros(obs.contact.shape, np.float32), np.zeros((obs.has_phone.shape[0], 3), np.float32)
+    for i, arrays in enumerate(session.arrays):
+        at = session.frames(i)
+        contact[at] = standing(arrays.time_s, x[at]) * arrays.used[:, None]
+        floor[i, 0] = np.average(x[at][..., 2], weights=contact[at] + 1e-9)
+    values: dict[str, Any] = {
+        "qpos": f32(found.qpos),
+        "R_nc": f32(found.R_nc),
+        "s": f32(found.s),
+        "site_offset_m": f32(_padded(found.site_offset_m, obs.c_world.shape[1])),
+        "clock_s": f32(_padded(found.clock_s, len(floor))),
+        "floor": floor,
+    }
+    seen: Any = contact
+    return dataclasses.replace(session, obs=dataclasses.replace(obs, contact=seen)), State(**values)
+
+
+def _padded(a: np.ndarray, n: int) -> np.ndarray:
+    return np.pad(a, [(0, n - len(a)), *[(0, 0)] * (a.ndim - 1)])
 
 
 def pad_batch(n: int) -> int:
@@ -268,6 +299,11 @@ def weights_of(session: Session, params: GaussNewtonParams) -> Weights:
         "scale_sides_sd": c.scale_sides_sd,
         "weight_size": PIXELS_WEIGHT_SIZE if _pixels_alone(session) else 0.0,
         "clock_sd_s": params.clock_sd_s,
+        "weight_floor": params.weight_floor,
+        "weight_slide": params.weight_slide,
+        "huber_floor_cm": params.huber_floor_cm,
+        "huber_slide_cm": params.huber_slide_cm,
+        "slope_sd": np.deg2rad(params.slope_sd_deg),
         "neutral": neutral,
         "inverse_sd": inverse_sd,
         "smooth": np.where(slide, params.smooth_per_m2, params.smooth_per_rad2),
@@ -299,6 +335,7 @@ def start_of(session: Session, flip: bool = False) -> State:
         "s": zeros(8),
         "site_offset_m": zeros((obs.c_world.shape[1], 3)),
         "clock_s": zeros(obs.has_phone.shape[0]),
+        "floor": zeros((obs.has_phone.shape[0], 3)),
     }
     return State(**values)
 
