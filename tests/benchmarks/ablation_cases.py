@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from pbl_pipeline.body import SCALE_NAMES
 from pbl_pipeline.fit import PARAMSETS, SessionInput, params_of
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
@@ -32,6 +33,12 @@ WALKS: dict[str, WalkSource] = {"walker": walker}
 NOISE = Noise()
 
 
+#: Places of the segments on both sides in the scales.
+LEFT_SCALES, RIGHT_SCALES = (
+    [i for i, n in enumerate(SCALE_NAMES) if n.startswith(side)] for side in ("left_", "right_")
+)
+
+
 @dataclasses.dataclass(frozen=True)
 class Setup:
     """How a session is observed and fitted.
@@ -46,6 +53,8 @@ class Setup:
         that the frame counts as one with the whole person in view.
     site, size
         What the person's marker offsets and deviations of the eight scales from 1 are multiplied by.
+    sides_alike
+        A left segment's scale is that of the right one. The walker draws the two apart, each with its own 5 %.
     squash, lean_deg
         What the detector gets wrong in 3D at all times: depth along the line of sight multiplied by this, and all
         points turned so that the head comes towards the camera by this angle. Pixels are as they were.
@@ -69,6 +78,7 @@ class Setup:
     doubted_share: float = 0.0
     site: float = 1.0
     size: float = 1.0
+    sides_alike: bool = False
     squash: float = 1.0
     lean_deg: float = 0.0
     focal: float = 1.0
@@ -131,6 +141,7 @@ def factors() -> tuple[Factor, ...]:
         add("body", f"marker offsets x{k:g}", site=k)
     for k in (0.0, 2.0):
         add("body", f"spread of the scales x{k:g}", size=k)
+    add("body", "left and right scales alike", sides_alike=True)
     add("body", "offsets and scales 0", site=0.0, size=0.0)
     add("camera", "focal length told 5 % too long", focal=1.05)
     add("camera", "focal length told 5 % too short", focal=0.95)
@@ -142,6 +153,12 @@ def factors() -> tuple[Factor, ...]:
     for name, path in (("2D", "weight_2d"), ("3D", "weight_3d"), ("offset", "weight_offset_per_m2")):
         for k in (0.1, 10.0):
             add("fit", f"{name} weight x{k:g}", times={f"cost.{path}": k})
+    # A detector whose 3D leans and that is not believed.
+    for k in (0.3, 0.1, 0.03):
+        add("fit", f"3D leans 10 deg, 3D weight x{k:g}", lean_deg=10.0, times={"cost.weight_3d": k})
+    both = {"slow_px": 3.0, "constant_px": 3.0}
+    for k in (0.3, 0.1):
+        add("fit", f"pixels err both ways, 2D weight x{k:g}", times={"cost.weight_2d": k}, **both)
     add("fit", "depth counts 0.3", values={"cost.depth_ratio": 0.3})
     add("fit", "pixels only", with_3d=False)
     for n in (3, 10):
@@ -158,6 +175,9 @@ def factors() -> tuple[Factor, ...]:
     for name in ("blazepose_33", "mpi_inf_3dhp_17", "body25b"):
         add("markers", name, marker_set=name, params="blazepose")
     add("markers", "blazepose_33, paramset gauss-newton", marker_set="blazepose_33")
+    add("markers", "blazepose_33, sides alike", marker_set="blazepose_33", params="blazepose", sides_alike=True)
+    add("markers", "blazepose_33, offsets 0", marker_set="blazepose_33", params="blazepose", site=0.0)
+    add("markers", "blazepose_33, leans 10 deg", marker_set="blazepose_33", params="blazepose", lean_deg=10.0)
     for fps in (15.0, 60.0):
         add("frames", f"{fps:g} Hz", fps=fps)
     add("alone", "no noise, offsets and scales 0", noise=NO_NOISE, site=0.0, size=0.0)
@@ -193,6 +213,8 @@ def session(
     time_s = np.arange(round(duration_s * setup.fps)) / setup.fps
     scale, offset = person(seed, setup.marker_set)
     scale, offset = 1 + setup.size * (scale - 1), setup.site * offset
+    if setup.sides_alike:
+        scale[LEFT_SCALES] = scale[RIGHT_SCALES]
     trials, truth = [], []
     for trial in range(setup.n_trials):
         qpos = source(time_s, seed, trial)
