@@ -2,33 +2,49 @@
 
 For tests, for `pbl bench fit` and for the calibration of the fit's uncertainties. Everything is a function of a seed.
 World frame: z up, metres, the phone at the origin and 1.2 m above the floor, the walk ahead of it along x.
+
+Two walkers: `walk_qpos` (textbook curves; what the benchmark's figures were measured with) and `synthesise` (published
+curves, feet that stand still, impairments, other tasks; `pbl synth`).
 """
 
 from ._camera import LEVEL_R_NC, PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor, picture_px
+from ._impair import IMPAIRMENTS, Impairment
 from ._noise import NO_NOISE, Noise
+from ._norms import GaitNorm, gait_norm
 from ._observe import Seen, observe, pelvis_positions
 from ._path import PATHS
 from ._person import person, true_markers
+from ._synth import TASKS, Synthetic, SynthSpec, Truth, speed_of_group, synthesise
 from ._views import VIEW_CAMERA, VIEW_SIZE_PX, observe_markers, observe_views
 from ._walk import walk_qpos
 
 __all__ = [
+    "IMPAIRMENTS",
     "LEVEL_R_NC",
     "NO_NOISE",
     "PATHS",
     "PHONE_CAMERA",
     "PHONE_SIZE_PX",
+    "TASKS",
     "VIEW_CAMERA",
     "VIEW_SIZE_PX",
+    "GaitNorm",
+    "Impairment",
     "Noise",
     "PhoneSensor",
     "Seen",
+    "SynthSpec",
+    "Synthetic",
+    "Truth",
+    "gait_norm",
     "observe",
     "observe_markers",
     "observe_views",
     "pelvis_positions",
     "person",
     "picture_px",
+    "speed_of_group",
+    "synthesise",
     "true_markers",
     "walk_qpos",
 ]

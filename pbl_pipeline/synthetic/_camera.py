@@ -53,9 +53,14 @@ def camera_turn(yaw_rad: np.ndarray, pitch_rad: np.ndarray, roll_rad: np.ndarray
 
 
 class HeldPhone:
-    """A phone held at the origin that follows a walker: its orientation at any time around the trial."""
+    """A phone held at the origin that follows a walker: its orientation at any time around the trial.
 
-    def __init__(self, rng: np.random.Generator, time_s: np.ndarray, pelvis_m: Float[np.ndarray, "T 3"]) -> None:
+    `tremor` multiplies the hand's (0: turned on a tripod).
+    """
+
+    def __init__(
+        self, rng: np.random.Generator, time_s: np.ndarray, pelvis_m: Float[np.ndarray, "T 3"], *, tremor: float = 1.0
+    ) -> None:
         step = 0.005
         self._grid = np.arange(time_s[0] - 1.5, time_s[-1] + 1.5, step)
         azimuth = np.unwrap(np.arctan2(pelvis_m[:, 1], pelvis_m[:, 0]))
@@ -64,12 +69,12 @@ class HeldPhone:
         seen = CubicSpline(time_s, azimuth)(at) if len(time_s) > 3 else np.interp(at, time_s, azimuth)
         self._yaw = CubicSpline(self._grid, gaussian_filter1d(seen, FOLLOW_SMOOTH_S / step, mode="nearest"))
         self._pitch = float(np.mean(np.arctan2(pelvis_m[:, 2], np.linalg.norm(pelvis_m[:, :2], axis=1))))
-        self._tremor = rng.integers(2**63, size=3)
+        self._tremor, self._share = rng.integers(2**63, size=3), tremor
 
     def R_nc(self, time_s: np.ndarray) -> Float[np.ndarray, "T 3 3"]:
         """Camera to world (T, 3, 3) at video times."""
         yaw, pitch, roll = (
-            np.radians(wander(np.random.default_rng(key), time_s, deg, *TREMOR_HZ, n=16))
+            np.radians(wander(np.random.default_rng(key), time_s, self._share * deg, *TREMOR_HZ, n=16))
             for key, deg in zip(self._tremor, TREMOR_DEG, strict=True)
         )
         return camera_turn(self._yaw(time_s) + yaw, self._pitch + pitch, roll)
