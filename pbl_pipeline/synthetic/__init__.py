@@ -9,7 +9,7 @@ curves, feet that stand still, impairments, other tasks; `pbl synth`).
 
 from ._camera import LEVEL_R_NC, PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor, picture_px
 from ._impair import IMPAIRMENTS, Impairment
-from ._noise import NO_NOISE, Noise
+from ._noise import BLAZEPOSE_NOISE, NO_NOISE, Noise
 from ._norms import GaitNorm, gait_norm
 from ._observe import Seen, observe, pelvis_positions
 from ._path import PATHS
@@ -19,6 +19,7 @@ from ._views import VIEW_CAMERA, VIEW_SIZE_PX, observe_markers, observe_views
 from ._walk import walk_qpos
 
 __all__ = [
+    "BLAZEPOSE_NOISE",
     "IMPAIRMENTS",
     "LEVEL_R_NC",
     "NO_NOISE",

@@ -48,7 +48,7 @@ SD_DEG = {
     "knee_angle": 4.0,
     "ankle_angle": 4.0,
     "subtalar_angle": 6.0,
-    "mtp_angle": 12.0,
+    "mtp_angle": 6.0,
 }
 PATH_SD_M, HEIGHT_SD_M = 0.025, 0.05
 #: The difference from the reference is smooth over about this time (s).
@@ -59,6 +59,7 @@ CLEARANCE_M, KNEE_BACK_DEG, EDGE_DEG = 0.012, 3.0, 0.7
 RAMP_S = 0.03
 #: First the held points are weak, then they are held in full.
 _LOOSE = (16.0, 8.0, 4.0, 2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+_HALVINGS = 6
 _LEG = ("hip_flexion", "hip_adduction", "hip_rotation", "knee_angle", "ankle_angle", "subtalar_angle", "mtp_angle")
 
 
@@ -100,14 +101,49 @@ def solve(
     sd = np.array([_sd(n) for n in names])
     low, high = _ranges(names)
     target = q.copy()
+    problem = _Problem(soles, contacts, target[:, free], free, sd, low, high)
     for loose in _LOOSE:
-        q[:, free] += _step(soles, contacts, q, target[:, free], free, sd, low, high, loose)
+        move = _step(problem, q, loose)
+        before = problem.cost(q, loose)
+        for _ in range(_HALVINGS):
+            tried = q.copy()
+            tried[:, free] += move
+            if problem.cost(tried, loose) <= before:
+                break
+            move = 0.5 * move
+        else:
+            tried = q
+        q = tried
     return q
 
 
-def _step(soles, contacts, q, target, free, sd, low, high, loose) -> np.ndarray:
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Problem:
+    soles: _Soles
+    contacts: Contacts
+    target: np.ndarray
+    free: np.ndarray
+    sd: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def cost(self, q: np.ndarray, loose: float) -> float:
+        """Half of the sum of squares."""
+        x = self.soles.points(q)
+        off = (self.contacts.weight / loose) * (self.contacts.target_m - x)
+        deep = np.clip(self.contacts.floor_m - x[..., 2], 0, None) / (DEPTH_M * loose)
+        now = q[:, self.free]
+        beyond = (np.clip(self.low - now, 0, None) + np.clip(now - self.high, 0, None)) / np.radians(EDGE_DEG)
+        r = (now - self.target) / self.sd
+        bend = np.diff(r, 2, axis=0) * (SMOOTH_S / GRID_STEP_S) ** 2
+        return 0.5 * float(sum(np.sum(part**2) for part in (off, deep, beyond, r, bend)))
+
+
+def _step(problem: _Problem, q: np.ndarray, loose: float) -> np.ndarray:
+    contacts, target, free, sd = problem.contacts, problem.target, problem.free, problem.sd
+    low, high = problem.low, problem.high
     n_t, n = len(q), len(free)
-    x, jac = soles.points(q, free)
+    x, jac = problem.soles.with_jacobian(q, free)
     weight = contacts.weight / loose
     off = contacts.target_m - x
     grad = np.einsum("npi,npi,npij->nj", weight**2, off, jac)
@@ -195,13 +231,23 @@ class _Soles:
             at = toes + place
             self._flat[i] = [at[0], -at[2], at[1] + SOLE_M * size[i]]
 
-    def points(self, q: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def points(self, q: np.ndarray) -> np.ndarray:
+        """Points (N, P, 3)."""
+        x = np.empty((len(q), len(self._ids), 3))
+        for t, values in enumerate(q):
+            self._place(values)
+            turn = self._data.xmat[self._ids].reshape(-1, 3, 3)
+            x[t] = self._data.xpos[self._ids] + np.einsum("pij,pj->pi", turn, self._local)
+        return x
+
+    def with_jacobian(self, q: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points (N, P, 3) and their derivatives (N, P, 3, n) by the free joints."""
         n_p = len(self._ids)
         x, jac = np.empty((len(q), n_p, 3)), np.empty((len(q), n_p, 3, len(free)))
         full = np.empty((3, self._model.nv))
         for t, values in enumerate(q):
             self._place(values)
+            mujoco.mj_comPos(self._model, self._data)
             for p in range(n_p):
                 x[t, p] = self._at(p)
                 mujoco.mj_jac(self._model, self._data, full, None, x[t, p], self._ids[p])
@@ -244,7 +290,6 @@ class _Soles:
     def _place(self, values: np.ndarray) -> None:
         self._data.qpos[:] = values
         mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_comPos(self._model, self._data)
 
     def _at(self, p: int) -> np.ndarray:
         body = self._ids[p]

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
 
 from pbl_pipeline.body import load_body, marker_set
@@ -131,6 +131,8 @@ class Truth:
         Against the phone, as `qpos`.
     floor_height_m : (T,)
         Of the floor against the phone.
+    heel_on_floor, ball_on_floor : (T, 2)
+        Whether heel and ball of the foot are on the floor, [left, right].
     belt_m_per_s
         (2,) velocity of the floor, zeros but on a treadmill: feet in stance move with it.
     clock_offset_s
@@ -152,6 +154,8 @@ class Truth:
     pelvis_m: Float[np.ndarray, "T 3"]
     markers_world_m: Float[np.ndarray, "T J 3"]
     floor_height_m: Float[np.ndarray, " T"]
+    heel_on_floor: Bool[np.ndarray, "T 2"]
+    ball_on_floor: Bool[np.ndarray, "T 2"]
     belt_m_per_s: Float[np.ndarray, " 2"]
     clock_offset_s: float
     outlier: np.ndarray
@@ -201,7 +205,7 @@ class Truth:
 
 _ARRAYS = (
     *("time_s", "qpos", "scale", "site_offset_m", "R_nc", "phone_position_m", "pelvis_m", "markers_world_m"),
-    *("floor_height_m", "belt_m_per_s", "outlier"),
+    *("floor_height_m", "heel_on_floor", "ball_on_floor", "belt_m_per_s", "outlier"),
 )
 
 
@@ -293,6 +297,8 @@ def synthesise(spec: SynthSpec) -> Synthetic:
         pelvis_m=pelvis,
         markers_world_m=x_world,
         floor_height_m=-scene.height_m - phone_m[:, 2],
+        heel_on_floor=_on_floor(scene.plan, time_s, "heel_s"),
+        ball_on_floor=_on_floor(scene.plan, time_s, "ball_s"),
         belt_m_per_s=belt,
         clock_offset_s=sensor.clock_offset_s if sensor is not None else float("nan"),
         outlier=outlier & ~outside,
@@ -329,6 +335,14 @@ def _check_in_view(outside: np.ndarray, spec: SynthSpec) -> None:
         f"at most {100 * OUTSIDE_SHARE:.0f} %: the person stays in front of the {spec.camera} camera",
         "take fewer --seconds, --camera panned or handheld, --view follow, or --ground treadmill",
     )
+
+
+def _on_floor(plan: Plan, time_s: np.ndarray, part: str) -> np.ndarray:
+    out = np.zeros((len(time_s), 2), bool)
+    for step in plan.steps:
+        start, stop = getattr(step, part)
+        out[:, "lr".index(step.side)] |= (time_s >= start) & (time_s <= stop)
+    return out
 
 
 def _events(plan: Plan, until_s: float) -> tuple[GaitEvent, ...]:
