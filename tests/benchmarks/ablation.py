@@ -121,11 +121,11 @@ def measured(factor: Factor, seeds: Sequence[int], duration_s: float, source: Wa
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """The rows as text, the costliest first; the default stands where its change of 0 puts it."""
-    head = f"{'group':9}{'factor':41}{'all':>7}{'change':>8}{'+-':>6}{'main':>7}{'bias':>7}{'sd':>7}"
+    head = f"{'group':9}{'factor':52}{'all':>7}{'change':>8}{'+-':>6}{'main':>7}{'bias':>7}{'sd':>7}"
     lines = [head + f"{'bias share':>12}{'RTE cm':>8}{'in 90 %':>9}{'people':>8}"]
     for r in sorted(rows, key=lambda r: -np.nan_to_num(r["change_all_deg"], nan=-99)):
         lines.append(
-            f"{r['group']:9}{r['factor']:41}{r['all_deg']:7.2f}{r['change_all_deg']:+8.2f}{r['change_all_deg_se']:6.2f}"
+            f"{r['group']:9}{r['factor']:52}{r['all_deg']:7.2f}{r['change_all_deg']:+8.2f}{r['change_all_deg_se']:6.2f}"
             f"{r['main_deg']:7.2f}{r['bias_deg']:7.2f}{r['sd_deg']:7.2f}{r['bias_share']:12.0%}{r['rte_cm']:8.2f}"
             f"{r['within_90']:9.0%}{r['people']:8d}"
         )

@@ -14,6 +14,7 @@ import numpy as np
 
 from pbl_pipeline.body import SCALE_NAMES
 from pbl_pipeline.fit import PARAMSETS, SessionInput, params_of
+from pbl_pipeline.fit._params import POSE_PRIOR_DEG
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.synthetic import NO_NOISE, Noise, Seen, observe, person, walk_qpos
@@ -159,6 +160,12 @@ def factors() -> tuple[Factor, ...]:
     both = {"slow_px": 3.0, "constant_px": 3.0}
     for k in (0.3, 0.1):
         add("fit", f"pixels err both ways, 2D weight x{k:g}", times={"cost.weight_2d": k}, **both)
+    hard = {**both, "lean_deg": 5.0, "noise": noise(along_m=2 * base.along_m)}
+    add("detector", "hard: pixels both ways, lean 5 deg, depth noise x2", **hard)
+    prior = {"cost.weight_pose": 0.1, "cost.pose_prior_deg": POSE_PRIOR_DEG}
+    for name, seen in (("", {}), ("pixels err both ways, ", both), ("hard, ", hard)):
+        add("fit", f"{name}pose prior 0.1", values=prior, **seen)
+        add("fit", f"{name}pose prior 0.1, 2D x0.3", values=prior, times={"cost.weight_2d": 0.3}, **seen)
     add("fit", "depth counts 0.3", values={"cost.depth_ratio": 0.3})
     add("fit", "pixels only", with_3d=False)
     for n in (3, 10):
