@@ -47,7 +47,7 @@ class Step:
 
 
 #: Roll of the foot in shares of the stance: flat after the heel's contact, heel and ball off before the toes.
-FLAT_AFTER, HEEL_OFF_BEFORE, BALL_OFF_BEFORE = 0.13, 0.42, 0.02
+FLAT_AFTER, HEEL_OFF_BEFORE, BALL_OFF_BEFORE = 0.13, 0.42, 0.08
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

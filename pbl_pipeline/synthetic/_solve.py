@@ -304,7 +304,8 @@ def _holds(point: str, step: Step) -> list[tuple[tuple[float, float, float], tup
     if point == "ball":
         return [((HELD_M, HELD_M, HELD_M), step.ball_s)]
     if point == "toe":
-        return [((TOE_M, TOE_M, HELD_M), step.toe_s)]
+        last = (step.ball_s[1] - RAMP_S, step.up_s)
+        return [((TOE_M, TOE_M, HELD_M), step.toe_s), ((HELD_M, HELD_M, HELD_M), last)]
     return [((never, never, ROLL_M), step.ball_s)]
 
 
