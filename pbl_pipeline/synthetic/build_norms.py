@@ -1,7 +1,7 @@
 """Build the normal gait that ships: `python -m pbl_pipeline.synthetic.build_norms Schwartz2008_original.xls`.
 
 The file is the electronic addendum of Schwartz, Rozumalski and Trost 2008 (J Biomech 41:1639-1650): mean and standard
-deviation of joint angles over the gait cycle of 83 typically developing children and adolescents at five speeds. Its
+deviation of joint angles over the gait cycle of typically developing children at five speeds. Its
 figures are written as harmonics of the cycle. Reading it needs the package `xlrd`, which nothing else needs.
 """
 
