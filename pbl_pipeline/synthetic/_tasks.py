@@ -17,8 +17,8 @@ from ._impair import Style
 from ._norms import GRAVITY, gait_norm
 from ._plan import GRID_STEP_S, Plan, Step, ease, grid
 
-#: How strides differ within a walk: step time (share), footprint along and across (m). The project's own numbers, of the
-#: size that is usual in healthy adults (a few percent).
+#: How strides differ within a walk: step time (share), footprint along and across (m). The project's own numbers, of
+#: the size that is usual in healthy adults (a few percent).
 STEP_TIME_SD, ALONG_SD_M, ACROSS_SD_M = 0.018, 0.008, 0.008
 #: Distance between the heels' lines, and by how much the feet point outwards, of a person (mean, sd).
 WIDTH_M, TOE_OUT_DEG = (0.11, 0.015), (6.0, 2.0)
