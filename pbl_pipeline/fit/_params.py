@@ -168,6 +168,9 @@ class GaussNewtonParams:
     huber_slide_cm: float = 1.0
     slope_sd_deg: float = 5.0
     sd_factor: tuple[tuple[str, float], ...] = SD_FACTOR
+    #: Least standard deviation in deg (slides: cm), added in squares: what a detector gets wrong in the same way in
+    #: many frames, which no number of frames mends.
+    sd_floor: tuple[tuple[str, float], ...] = ()
     cost: CostParams = CostParams()
     view: ViewParams = ViewParams()
 
@@ -186,7 +189,7 @@ BLAZEPOSE = GaussNewtonParams(
     smooth_per_rad2=20.0,
     weight_floor=0.03,
     weight_slide=0.03,
-    sd_factor=SD_FACTOR_BLAZEPOSE,
+    sd_factor=(),
     cost=CostParams(
         weight_3d=0.2,
         depth_ratio=0.5,

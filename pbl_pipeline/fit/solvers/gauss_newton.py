@@ -213,8 +213,9 @@ def _solve(sessions: Sequence[Session], params: GaussNewtonParams, starts: Seque
         progress = minimise_(body, kinds, table, obs, w, start, limits)
         found = jax.device_get((progress, *finish_(body, kinds, table, obs, w, progress.state)))
     each = [found] if alone else [jax.tree.map(lambda a, i=i: a[i], found) for i in range(len(sessions))]
-    factors = sd_factors(sessions[0].body.joint_names, params.sd_factor)
-    return [_solution(s, factors, *one) for s, one in zip(sessions, each, strict=True)]
+    names = sessions[0].body.joint_names
+    sd = by_joint(names, params.sd_factor, 1.0), floors_of(names, params.sd_floor)
+    return [_solution(s, *sd, *one) for s, one in zip(sessions, each, strict=True)]
 
 
 def _on_floor(session: Session, found: Solution) -> tuple[Session, State]:
@@ -247,7 +248,9 @@ def pad_batch(n: int) -> int:
     return 1 << (n - 1).bit_length()
 
 
-def _solution(session: Session, factors: np.ndarray, p: Progress, variance: np.ndarray, seen: Outcome) -> Solution:
+def _solution(
+    session: Session, factor: np.ndarray, floor: np.ndarray, p: Progress, variance: np.ndarray, seen: Outcome
+) -> Solution:
     n = int(p.iteration)
     trace = np.stack([np.arange(1, n + 1), np.asarray(p.trace)[:n]], axis=1).astype(np.float64)
     qpos = np.asarray(p.state.qpos, np.float64)
@@ -263,7 +266,7 @@ def _solution(session: Session, factors: np.ndarray, p: Progress, variance: np.n
         seconds=0.0,
         iterations=n,
         converged=bool(p.converged),
-        qpos_sd=np.sqrt(np.maximum(variance, 0.0) + phone_variance(session, qpos)) * factors,
+        qpos_sd=np.sqrt((np.maximum(variance, 0.0) + phone_variance(session, qpos)) * factor**2 + floor**2),
         outcome=seen,
     )
 
@@ -340,12 +343,18 @@ def start_of(session: Session, flip: bool = False) -> State:
     return State(**values)
 
 
-def sd_factors(joint_names: Sequence[str], sd_factor: Sequence[tuple[str, float]]) -> np.ndarray:
-    """(40,) factors of `qpos_sd`; a name stands for every joint that begins with it, 1 where none does."""
-    out = np.ones(len(joint_names))
-    for prefix, factor in sd_factor:
-        out[[n.startswith(prefix) for n in joint_names]] = factor
+def by_joint(joint_names: Sequence[str], values: Sequence[tuple[str, float]], other: float) -> np.ndarray:
+    """(40,) values; a name stands for every joint that begins with it, later ones win, `other` where none does."""
+    out = np.full(len(joint_names), other)
+    for prefix, value in values:
+        out[[n.startswith(prefix) for n in joint_names]] = value
     return out
+
+
+def floors_of(joint_names: Sequence[str], sd_floor: Sequence[tuple[str, float]]) -> np.ndarray:
+    """(40,) least standard deviations in rad and m, from degrees and (slides) centimetres."""
+    slides = np.array([n in SLIDES for n in joint_names])
+    return by_joint(joint_names, sd_floor, 0.0) * np.where(slides, 0.01, np.deg2rad(1.0))
 
 
 #: Knees at their straight end in more than this share of the frames may belong to a body that faces the wrong way.
