@@ -12,6 +12,8 @@ import dataclasses
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pbl_pipeline.body import Body
+
 from ._inputs import GAIT, LEVEL, Session
 from ._outcome import Outcome
 from ._place import pelvis_path, pelvis_values
@@ -22,6 +24,8 @@ MIN_PATH_M = 2.0
 #: What the pelvis' height varies by in walking (m), and how far a body leans on average (rad): to a side of its path,
 #: and along it, where people stoop. The project's own.
 BOB_SD_M, LEAN_SD_RAD, STOOP_SD_RAD = 0.03, np.deg2rad(3.0), np.deg2rad(10.0)
+#: Knees both bent by this much more than in most frames (rad): no frame of a walk.
+SITTING_RAD = np.deg2rad(30.0)
 #: Beyond this tilt (rad) the estimate is not believed, and the camera counts as level.
 MOST_TILT_RAD = np.deg2rad(30.0)
 
@@ -33,7 +37,8 @@ def upright(session: Session, solution: Solution, seen: Outcome) -> tuple[Soluti
     for i, source in enumerate(sources):
         if source != LEVEL:
             continue
-        frames, used = session.frames(i), session.arrays[i].used
+        frames = session.frames(i)
+        used = session.arrays[i].used & on_their_feet(session.body, qpos[frames], session.arrays[i].used)
         x, R = pelvis_path(session.body, qpos[frames])
         up = vertical(x[used], unit(np.asarray(seen.body_axis_m)[frames][used].mean(axis=0)))
         if up is None:
@@ -47,6 +52,13 @@ def upright(session: Session, solution: Solution, seen: Outcome) -> tuple[Soluti
         sources[i] = GAIT
     solution = dataclasses.replace(solution, qpos=qpos, R_nc=R_nc)
     return solution, dataclasses.replace(seen, x_world_m=points), tuple(sources)
+
+
+def on_their_feet(body: Body, qpos: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """(T,) bool: frames (T, 40) without those in which both knees are much more bent than usual: somebody who sits down
+    is lower, and on no slope."""
+    knees = -qpos[:, [body.joint_names.index(n) for n in ("knee_angle_r", "knee_angle_l")]].max(axis=1)
+    return knees < np.median(knees[used]) + SITTING_RAD
 
 
 def unit(vector: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import (
     PARAMSETS,
@@ -27,7 +28,7 @@ from pbl_pipeline.fit import (
     fit_sessions,
     params_of,
 )
-from pbl_pipeline.fit._gravity import vertical
+from pbl_pipeline.fit._gravity import on_their_feet, vertical
 from pbl_pipeline.fit._place import placed_poses
 from pbl_pipeline.fit.solvers import Solution, gauss_newton
 from pbl_pipeline.keypoints import Keypoints
@@ -158,6 +159,18 @@ def test_a_short_path_tells_the_vertical_of_somebody_who_stoops(stoop_deg, side_
     ahead, aside = np.rad2deg(np.arctan2(up[:2], up[2]))
     assert abs(ahead) < 1.5
     assert aside == pytest.approx(-side_deg, abs=1.0)
+
+
+def test_somebody_who_sits_down_is_on_no_slope():
+    """Two thirds of the frames on the feet, with a knee that bends to 60 deg; the last third on a chair."""
+    body = load_body()
+    qpos, right, left = np.zeros((90, 40)), *(body.joint_names.index(f"knee_angle_{s}") for s in "rl")
+    qpos[:60, right] = -np.deg2rad(30 - 30 * np.cos(np.arange(60) / 5))
+    qpos[:60, left] = -np.deg2rad(30 + 30 * np.cos(np.arange(60) / 5))
+    qpos[60:, [right, left]] = -np.deg2rad(85)
+    on_feet = on_their_feet(body, qpos, np.ones(90, bool))
+    assert on_feet[:60].all()
+    assert not on_feet[60:].any()
 
 
 @pytest.mark.parametrize("seed", SEEDS[:2])

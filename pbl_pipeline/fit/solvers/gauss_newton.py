@@ -191,8 +191,8 @@ def solve_gauss_newton(
             if other.loss_trace[-1, 1] < found[i].loss_trace[-1, 1]:
                 found[i] = other
     if params.weight_floor > 0 or params.weight_slide > 0:
-        sessions, starts = zip(*map(_on_floor, sessions, found), strict=True)
-        found = _solve(sessions, params, starts)
+        standing_sessions, starts = zip(*map(_on_floor, sessions, found), strict=True)
+        found = list(map(_after, found, _solve(standing_sessions, params, starts)))
     seconds = (time.perf_counter() - begin) / len(sessions)
     compiled = (compile_seconds() - compiled) / len(sessions)
     return [dataclasses.replace(s, seconds=seconds, compile_seconds=compiled) for s in found]
@@ -216,6 +216,13 @@ def _solve(sessions: Sequence[Session], params: GaussNewtonParams, starts: Seque
     names = sessions[0].body.joint_names
     sd = by_joint(names, params.sd_factor, 1.0), floors_of(names, params.sd_floor)
     return [_solution(s, *sd, *one) for s, one in zip(sessions, each, strict=True)]
+
+
+def _after(first: Solution, second: Solution) -> Solution:
+    """The second solution with the iterations of both."""
+    steps = second.loss_trace + np.array([first.iterations, 0.0])
+    trace = np.concatenate([first.loss_trace, steps])
+    return dataclasses.replace(second, loss_trace=trace, iterations=first.iterations + second.iterations)
 
 
 def _on_floor(session: Session, found: Solution) -> tuple[Session, State]:
