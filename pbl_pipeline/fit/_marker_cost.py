@@ -123,7 +123,7 @@ def _sum(parts: Iterable[Array]) -> Array:
     return functools.reduce(jnp.add, parts)
 
 
-#: Fields of `Observations` with one row per frame.
+#: Fields of `Observations` with one row per frame that `marker_cost` reads.
 PER_FRAME = ("x_cam", "c_3d", "xy_px", "c_2d", "x_world", "c_world", "R_nc", "p_nc", "camera_matrix")
 
 

@@ -22,7 +22,7 @@ from ._inputs import check_trial as _check_trial
 from ._marker_cost import kinds_of
 from ._outcome import Outcome, outcome_one
 from ._paper_objective import paper_objective as _paper_objective
-from ._params import DEFAULT, PARAMSETS, GaussNewtonParams, Params, params_of
+from ._params import DEFAULT, PARAMSETS, GaussNewtonParams, ImplicitAdamParams, Params, params_of
 from ._quality import check_fit
 from ._rotation import matrices_of, quat_wxyz
 from ._types import SessionFit, TrialFit
@@ -86,8 +86,8 @@ def fit_sessions(
 ) -> list[SessionFit | PblError]:
     """Fit many sessions; those packed to the same sizes go through the device together, with the same results.
 
-    A session that cannot be fitted gives its `PblError` in its place. `batch`: most sessions at once (default: `BATCH`
-    on a GPU, 1 on a CPU, which gains nothing by it); `implicit-adam` takes one at a time.
+    A session that cannot be fitted gives its `PblError` in its place. `batch`: most sessions at once, padded to a
+    power of 2 (default: `BATCH` on a GPU, 1 on a CPU, which gains nothing by it); `implicit-adam` takes one at a time.
 
     Raises
     ------
@@ -103,6 +103,8 @@ def fit_sessions(
         for packed, solution in zip(part, _solve(part, params), strict=True):
             motions = _motions(sessions[packed.index])
             try:
+                if isinstance(solution, PblError):
+                    raise solution
                 out[packed.index] = _session_fit(packed.session, solution, paramset, motions, packed.seconds)
             except PblError as error:
                 out[packed.index] = error
@@ -154,10 +156,17 @@ def _motions(given: SessionInput) -> list[str]:
     return [motion] * len(given.trials) if isinstance(motion, str) else list(motion)
 
 
-def _solve(part: Sequence[_Packed], params: Params) -> list[Solution]:
+def _solve(part: Sequence[_Packed], params: Params) -> Sequence[Solution | PblError]:
     if isinstance(params, GaussNewtonParams):
         return solve_gauss_newton([p.session for p in part], params, [p.start for p in part if p.start])
-    return [solve_implicit_adam(p.session, params) for p in part]
+    return [_alone(p.session, params) for p in part]
+
+
+def _alone(session: Session, params: ImplicitAdamParams) -> Solution | PblError:
+    try:
+        return solve_implicit_adam(session, params)
+    except PblError as error:
+        return error
 
 
 def check_trial(

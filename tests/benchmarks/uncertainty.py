@@ -9,9 +9,10 @@ recordings; then it counts what the intervals hold on others, of other people.
 
 `gauss-newton`: walks of 6 s with the benchmark's noise, half of them by a static phone and half by one in the hand,
 both with the phone's log. The residuals tell these errors, so a factor is found (`SD_FACTOR`).
-`blazepose`: walks, standing up and squats at 30 and 60 Hz with BlazePose's own errors (`BLAZEPOSE_NOISE`, points 25 mm
-from the marker set's places), half by a phone that stands tilted by some degrees without a log. Most of these errors
-are the same in many frames and in no residual, so a least standard deviation is found (`SD_FLOOR_BLAZEPOSE`).
+`blazepose`: 5 s of walking, standing up or squats at 30 and 60 Hz with BlazePose's own errors (`BLAZEPOSE_NOISE`,
+points 25 mm from the marker set's places), half by a phone that stands tilted by some degrees without a log. Most of
+these errors are the same in many frames and in no residual, so a least standard deviation is found
+(`SD_FLOOR_BLAZEPOSE`).
 
 Prints them as they stand in pbl_pipeline/fit/_params.py. Exit code 1 where a group holds less than 85 % or more than
 95 % of the other recordings' samples.
@@ -41,7 +42,9 @@ GROUPS = (
     "pelvis_tilt",
     "pelvis_list",
     "pelvis_rotation",
-    "hip",
+    "hip_flexion",
+    "hip_adduction",
+    "hip_rotation",
     "knee",
     "ankle",
     "subtalar",
@@ -108,7 +111,9 @@ def clip(seed: int) -> tuple[SessionInput, np.ndarray]:
     task, view = SCENES[seed % len(SCENES)]
     fps, held = (30.0, 60.0)[seed // 6 % 2], bool(seed // 12 % 2)
     ground = "treadmill" if view == "sagittal" else "overground"  # nobody walks out of a phone's upright picture
-    truth = synthesise(SynthSpec(task, seed, view=view, fps=fps, marker_set="blazepose_33", ground=ground)).truth
+    truth = synthesise(
+        SynthSpec(task, seed, view=view, fps=fps, marker_set="blazepose_33", ground=ground, seconds=5.0)
+    ).truth
     rng = np.random.default_rng([seed, 9])
     seen = observe(
         truth.qpos,

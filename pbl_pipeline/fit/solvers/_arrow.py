@@ -1,7 +1,7 @@
 """Linear systems of a session: one small block per frame, coupled to the two frames on either side, and a border.
 
     | A  B | |x|   |g|      A (F Q, F Q): block (t, t) full, (t, t+1) full or diagonal, (t, t+2) diagonal
-    | B' C | |y| = |h|      B (F Q, K), C (K, K): what all frames share (scale, marker offsets, clocks)
+    | B' C | |y| = |h|      B (F Q, K), C (K, K): what all frames share (scale, marker offsets, clocks, floors)
 
 Solved by block cyclic reduction over pairs of frames (e.g. Golub & Van Loan, Matrix Computations, 4th ed., 4.5.4) and
 the Schur complement of A: work and memory grow linearly with F, and the number of steps one after the other with log F,

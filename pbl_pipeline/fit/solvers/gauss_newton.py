@@ -183,23 +183,28 @@ def solve_gauss_newton(
     again from a start that faces the other way, and the better one of the two is kept.
     """
     begin, compiled = time.perf_counter(), compile_seconds()
-    found = _solve(sessions, params, starts)
+    on_floor = params.weight_floor > 0 or params.weight_slide > 0
+    found = _solve(sessions, params, starts, last=not on_floor)
     again = [i for i, s in enumerate(found) if suspicious(sessions[i], s)]
     if again:
         part = [sessions[i] for i in again]
-        for i, other in zip(again, _solve(part, params, [start_of(s, flip=True) for s in part]), strict=True):
+        turned = _solve(part, params, [start_of(s, flip=True) for s in part], last=not on_floor)
+        for i, other in zip(again, turned, strict=True):
             if other.loss_trace[-1, 1] < found[i].loss_trace[-1, 1]:
                 found[i] = other
-    if params.weight_floor > 0 or params.weight_slide > 0:
+    if on_floor:
         standing_sessions, starts = zip(*map(_on_floor, sessions, found), strict=True)
-        found = list(map(_after, found, _solve(standing_sessions, params, starts)))
+        found = list(map(_after, found, _solve(standing_sessions, params, starts, last=True, contact=True)))
     seconds = (time.perf_counter() - begin) / len(sessions)
     compiled = (compile_seconds() - compiled) / len(sessions)
     return [dataclasses.replace(s, seconds=seconds, compile_seconds=compiled) for s in found]
 
 
-def _solve(sessions: Sequence[Session], params: GaussNewtonParams, starts: Sequence[State]) -> list[Solution]:
-    body, kinds = sessions[0].body, kinds_of(sessions[0])
+def _solve(
+    sessions: Sequence[Session], params: GaussNewtonParams, starts: Sequence[State], last: bool, contact: bool = False
+) -> list[Solution]:
+    """Solutions from given starts; standard deviations and outcome only of the `last` ones."""
+    body, kinds = sessions[0].body, dataclasses.replace(kinds_of(sessions[0]), contact=contact)
     w, limits = weights_of(sessions[0], params), limits_of(params)
     given = [(s.table, s.obs, start) for s, start in zip(sessions, starts, strict=True)]
     alone = len(given) == 1
@@ -211,7 +216,8 @@ def _solve(sessions: Sequence[Session], params: GaussNewtonParams, starts: Seque
     minimise_, finish_ = (_minimise_one, _finish_one) if alone else (_minimise_many, _finish_many)
     with one_blas_thread():
         progress = minimise_(body, kinds, table, obs, w, start, limits)
-        found = jax.device_get((progress, *finish_(body, kinds, table, obs, w, progress.state)))
+        ends = finish_(body, kinds, table, obs, w, progress.state) if last else ()
+        found = jax.device_get((progress, *ends))
     each = [found] if alone else [jax.tree.map(lambda a, i=i: a[i], found) for i in range(len(sessions))]
     names = sessions[0].body.joint_names
     sd = by_joint(names, params.sd_factor, 1.0), floors_of(names, params.sd_floor)
@@ -219,7 +225,7 @@ def _solve(sessions: Sequence[Session], params: GaussNewtonParams, starts: Seque
 
 
 def _after(first: Solution, second: Solution) -> Solution:
-    """The second solution with the iterations of both."""
+    """The second solution with the iterations of both; the cost of the second has a term more."""
     steps = second.loss_trace + np.array([first.iterations, 0.0])
     trace = np.concatenate([first.loss_trace, steps])
     return dataclasses.replace(second, loss_trace=trace, iterations=first.iterations + second.iterations)
@@ -231,8 +237,9 @@ def _on_floor(session: Session, found: Solution) -> tuple[Session, State]:
     x = np.asarray(sole_positions(session.body, f32(found.qpos), f32(found.scale)))
     contact, floor = np.zeros(obs.contact.shape, np.float32), np.zeros((obs.has_phone.shape[0], 3), np.float32)
     for i, arrays in enumerate(session.arrays):
-        at = session.frames(i)
-        contact[at] = standing(arrays.time_s, x[at]) * arrays.used[:, None]
+        first, last = np.flatnonzero(arrays.used)[[0, -1]]  # frames beside them stay where they started
+        at = slice(session.frames(i).start + first, session.frames(i).start + last + 1)
+        contact[at] = standing(arrays.time_s[first : last + 1], x[at]) * arrays.used[first : last + 1, None]
         floor[i, 0] = np.average(x[at][..., 2], weights=contact[at] + 1e-9)
     values: dict[str, Any] = {
         "qpos": f32(found.qpos),
@@ -256,11 +263,19 @@ def pad_batch(n: int) -> int:
 
 
 def _solution(
-    session: Session, factor: np.ndarray, floor: np.ndarray, p: Progress, variance: np.ndarray, seen: Outcome
+    session: Session,
+    factor: np.ndarray,
+    floor: np.ndarray,
+    p: Progress,
+    variance: np.ndarray | None = None,
+    seen: Outcome | None = None,
 ) -> Solution:
     n = int(p.iteration)
     trace = np.stack([np.arange(1, n + 1), np.asarray(p.trace)[:n]], axis=1).astype(np.float64)
-    qpos = np.asarray(p.state.qpos, np.float64)
+    qpos, sd = np.asarray(p.state.qpos, np.float64), None
+    if variance is not None:
+        # The phone's share was in the recordings on which the factors were found, so they are of both.
+        sd = np.sqrt((np.maximum(variance, 0.0) + phone_variance(session, qpos)) * factor**2 + floor**2)
     return Solution(
         qpos=qpos,
         R_nc=np.asarray(p.state.R_nc, np.float64),
@@ -273,7 +288,7 @@ def _solution(
         seconds=0.0,
         iterations=n,
         converged=bool(p.converged),
-        qpos_sd=np.sqrt((np.maximum(variance, 0.0) + phone_variance(session, qpos)) * factor**2 + floor**2),
+        qpos_sd=sd,
         outcome=seen,
     )
 
