@@ -29,8 +29,10 @@ from pbl_pipeline.fit import (
     params_of,
 )
 from pbl_pipeline.fit._gravity import on_their_feet, vertical
+from pbl_pipeline.fit._params import GaussNewtonParams
 from pbl_pipeline.fit._place import placed_poses
 from pbl_pipeline.fit.solvers import Solution, gauss_newton
+from pbl_pipeline.fit.solvers.gauss_newton import by_joint, floors_of
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.synthetic import Noise, Seen, observe, observe_markers, observe_views, person, walk_qpos
@@ -199,6 +201,26 @@ def test_laboratory_markers():
     fit = fit_session([trial], ["a"], PARAMSETS["markers"])
     assert_near(fit.trials[0], walk(9), deg=1.4, m=0.012)
     assert np.isnan(fit.trials[0].phone_quat_wxyz).all()
+
+
+@pytest.mark.parametrize("name", ["gauss-newton", "blazepose"])
+def test_standard_deviations_of_every_joint_are_calibrated(name):
+    names, params = load_body().joint_names, params_of(PARAMSETS[name])
+    assert isinstance(params, GaussNewtonParams)
+    floors, factors = floors_of(names, params.sd_floor), by_joint(names, params.sd_factor, 1.0)
+    assert np.all((floors > 0) | (factors != 1.0))
+    # Degrees for turns, centimetres for slides.
+    assert np.all(floors < np.deg2rad(30))
+
+
+def test_a_least_standard_deviation_is_added_in_squares(one_by_one):
+    params = dataclasses.replace(params_of(PARAMSET), sd_floor=(("knee", 10.0), ("pelvis_tx", 3.0)))
+    given = Paramset.of("fit", "with floors", 1, params)
+    fit = fit_session([look(5).keypoints], ["a"], given).trials[0]
+    plain = one_by_one[0].trials[0]
+    for name, floor in (("knee_angle_r", np.deg2rad(10)), ("pelvis_tx", 0.03), ("hip_flexion_l", 0.0)):
+        want = np.hypot(plain.qpos_sd[:, joint(plain, name)], floor)
+        np.testing.assert_allclose(fit.qpos_sd[:, joint(fit, name)], want, rtol=1e-2)
 
 
 # --- what must not change a result ---
