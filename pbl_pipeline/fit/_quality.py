@@ -26,7 +26,7 @@ LIMIT_MARGIN_RAD, LIMIT_SHARE = np.deg2rad(1.0), 0.2
 #: to 0.14 were within 1 deg (median) of those after three times the steps, after 0.16 to 0.28 within 2 deg.
 FALL_WARN, TRACE_NEEDED = 0.2, 8
 #: Median standard deviation of a joint angle from which on the joint counts as not observed.
-SD_WARN_DEG = 15.0
+SD_WARN_DEG = 20.0
 CLOCK_WARN_S = 0.3
 
 
