@@ -37,8 +37,8 @@ class Added:
 def read_reference(path: str | Path, source: str | None = None, shift_s: float = 0.0) -> Any:
     """The library's `Reference` from a file, by what the file is.
 
-    Accepted: the library's own npz, a `fit.npz` of ours (from markers or several cameras), rotations of bodies
-    (`.json.gz`), OpenSim `.mot`.
+    Accepted: the library's own npz, a `fit.npz` of ours (from markers or several cameras), the `truth.npz` of
+    `pbl synth`, rotations of bodies (`.json.gz`), OpenSim `.mot`.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def read_reference(path: str | Path, source: str | None = None, shift_s: float =
         raise PblError(
             "FILE_MISSING",
             found="no such file",
-            expected="a reference: .npz, fit.npz, .json.gz or .mot",
+            expected="a reference: .npz, fit.npz, truth.npz, .json.gz or .mot",
             next_step="check the path",
             key=str(path),
         )
@@ -72,7 +72,7 @@ def read_reference(path: str | Path, source: str | None = None, shift_s: float =
         raise PblError(
             "FILE_FORMAT",
             found=f"a file that ends in {path.suffix or 'nothing'}",
-            expected="a reference: .npz, fit.npz, .json.gz or .mot",
+            expected="a reference: .npz, fit.npz, truth.npz, .json.gz or .mot",
             next_step="see docs/files.md, section on references; markers (.trc) go through `pbl fit` first",
             key=str(path),
         )
@@ -89,8 +89,14 @@ def read_reference(path: str | Path, source: str | None = None, shift_s: float =
 
 def _read_npz(path: Path) -> Any:
     lib = library("validation")
-    if "qpos" not in load_npz(path):
+    fields = load_npz(path)
+    if "qpos" not in fields:
         return lib.Reference.load(path)
+    if "event_time_s" in fields:
+        truth = library("synthetic").Truth.load(path)
+        return lib.reference_of_qpos(
+            path.stem, "synthetic", truth.time_s, truth.joint_names, truth.qpos, truth.pelvis_m
+        )
     fitted = library("fit").TrialFit.load(path)
     by_markers = bool(np.isnan(fitted.camera_position_m).all())
     return lib.reference_of_fit(fitted, "optical markers" if by_markers else "several cameras")

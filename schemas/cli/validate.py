@@ -140,7 +140,7 @@ def _show(frame: pd.DataFrame, where: Sequence[str], out: Path | None, in_databa
     required=True,
     type=click.Path(path_type=Path, readable=False),
     metavar="FILE",
-    help="Reference movement: .npz, fit.npz, .json.gz or .mot.",
+    help="Reference movement: .npz, fit.npz, truth.npz, .json.gz or .mot.",
 )
 @click.option("--dataset", metavar="NAME", help="Collection of recordings to report it with (else: unnamed).")
 @click.option("--source", metavar="TEXT", help="Instrument, such as 'optical markers' (else: what the file says).")

@@ -16,6 +16,7 @@ import schemas
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.synthetic import SynthSpec, synthesise
 from pbl_pipeline.validation import Reference, compare, reference_of_fit
 from schemas import lab, validation, video, views
 from schemas.cli.validate import validate
@@ -199,6 +200,13 @@ def test_files_of_every_kind_are_references(tmp_path: Path):
     assert read_reference(tmp_path / "b.fit.npz").source == "several cameras"
     dataclasses.replace(fitted(), camera_position_m=np.full(3, np.nan)).save(tmp_path / "c.fit.npz")
     assert read_reference(tmp_path / "c.fit.npz").source == "optical markers"
+    walker = synthesise(SynthSpec(duration_s=1.0, noise="none"))
+    walker.truth.save(tmp_path / "e.truth.npz")
+    known = read_reference(tmp_path / "e.truth.npz")
+    knee = list(walker.truth.joint_names).index("knee_angle_r")
+    np.testing.assert_allclose(known.angles_deg["knee_flexion_r"], -np.degrees(walker.truth.qpos[:, knee]))
+    np.testing.assert_allclose(known.pelvis_m, walker.truth.pelvis_m)
+    assert known.source == "synthetic"
     lines = ["nRows=3", "nColumns=2", "inDegrees=yes", "endheader", "time\tknee_angle_r"]
     lines += [f"{0.1 * i}\t{20 + i}" for i in range(3)]
     (tmp_path / "d.mot").write_text("\n".join(lines))
