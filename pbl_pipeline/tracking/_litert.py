@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
 
 from pbl_pipeline.errors import PblError
+
+from ._prune import keep_outputs
 
 #: Two threads are the sweet spot of these small models; more only waits. Not a method parameter.
 NUM_THREADS = 2
@@ -16,12 +19,21 @@ NUM_THREADS = 2
 class LiteModel:
     """A loaded .tflite model with one float32 image input. Not to be shared by threads.
 
+    `outputs`: numbers of elements of the outputs that are wanted; the others are not computed (`keep_outputs`). None:
+    all of them. `num_threads`: of one call; where several models work side by side, one each is fastest.
+
     Raises `PblError` ASSET_CHECKSUM when the file is not the pinned one: results name the model by its hash.
     """
 
-    def __init__(self, path: str | Path, sha256: str) -> None:
-        with Path(path).open("rb") as f:
-            found = hashlib.file_digest(f, "sha256").hexdigest()
+    def __init__(
+        self,
+        path: str | Path,
+        sha256: str,
+        outputs: Collection[int] | None = None,
+        num_threads: int = NUM_THREADS,
+    ) -> None:
+        content = Path(path).read_bytes()
+        found = hashlib.sha256(content).hexdigest()
         if found != sha256:
             raise PblError(
                 "ASSET_CHECKSUM",
@@ -34,7 +46,9 @@ class LiteModel:
         # Here and not above: whoever only fits or reads results does not wait for the runtime.
         from ai_edge_litert.interpreter import Interpreter
 
-        self._interpreter = Interpreter(str(path), num_threads=NUM_THREADS)
+        if outputs is not None:
+            content = keep_outputs(content, outputs)
+        self._interpreter = Interpreter(model_content=content, num_threads=num_threads)
         self._interpreter.allocate_tensors()
         self._input = self._interpreter.get_input_details()[0]["index"]
         self._outputs = self._interpreter.get_output_details()

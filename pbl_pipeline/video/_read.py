@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import av
 import numpy as np
 from av.video.reformatter import VideoReformatter
 
@@ -20,7 +23,8 @@ def read_frames(
 
     Frame `index` has `time_s` equal to `probe(path).time_s[index]`, whatever `start` is. Decoding begins at the start
     of the file (frames count from there) and ends after the last frame asked for; only the frames asked for are
-    converted to `image` (H, W, 3) uint8 BGR. At most a few frames are in memory.
+    converted to `image` (H, W, 3) uint8 BGR, each when its `image` is first read, in whichever thread does so. At most a
+    few frames are in memory beside those that the caller keeps.
 
     Raises
     ------
@@ -35,20 +39,33 @@ def read_frames(
     return _frames(check_file(path), start, stop, step, threads)
 
 
+class _ToBgr:
+    """Decoded picture to upright BGR. One converter per thread for the whole file: a new one per frame would set itself
+    up, with threads of its own, each time."""
+
+    def __init__(self) -> None:
+        self._local = threading.local()
+
+    def __call__(self, frame: av.VideoFrame, turn: Orientation) -> np.ndarray:
+        if not hasattr(self._local, "converter"):
+            self._local.converter = VideoReformatter()
+        picture = self._local.converter.reformat(frame, format="bgr24", threads=1).to_ndarray()
+        # Rows of some widths are padded for the converter; users get plain arrays.
+        return np.ascontiguousarray(turn.apply(picture))
+
+
 def _frames(path: Path, start: int, stop: int | None, step: int, threads: int | None) -> Iterator[Frame]:
     if stop is not None and stop <= start:
         return
     with Decoder(path, threads) as decoder:
-        # One converter for the whole file: a new one per frame would set itself up, with threads of its own, each time.
-        to_bgr = VideoReformatter()
+        to_bgr = _ToBgr()
         turn, first_pts, last = Orientation(), 0, None if stop is None else range(start, stop, step)[-1]
         for index, (pts, frame) in enumerate(decoder):
             if index == 0:
                 turn, first_pts = orientation_of(frame), pts
             if index >= start and (index - start) % step == 0:
-                # Rows of some widths are padded for the converter; users get plain arrays.
-                image = np.ascontiguousarray(turn.apply(to_bgr.reformat(frame, format="bgr24", threads=1).to_ndarray()))
                 # Same arithmetic as probe, so that the stamps are equal to the last bit.
-                yield Frame(index, float(np.int64(pts - first_pts) * float(decoder.time_base)), image)
+                time_s = float(np.int64(pts - first_pts) * float(decoder.time_base))
+                yield Frame(index, time_s, functools.partial(to_bgr, frame, turn))
             if last is not None and index >= last:
                 return

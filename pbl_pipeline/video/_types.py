@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import numpy as np
 
@@ -53,13 +55,23 @@ class VideoInfo:
     notes: tuple[str, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True)
 class Frame:
-    """One decoded frame: `image` (H, W, 3) uint8, channels BGR (OpenCV's order), upright."""
+    """One decoded frame. `image` (H, W, 3) uint8, channels BGR (OpenCV's order), upright.
 
-    index: int
-    time_s: float
-    image: np.ndarray
+    The picture is converted when it is first asked for: who looks at every tenth frame pays for every tenth. Not to be
+    asked by two threads at once.
+    """
+
+    def __init__(self, index: int, time_s: float, convert: Callable[[], np.ndarray]) -> None:
+        self.index, self.time_s = index, time_s
+        self._convert: Callable[[], np.ndarray] | None = convert
+
+    @functools.cached_property
+    def image(self) -> np.ndarray:
+        assert self._convert is not None
+        image = self._convert()
+        self._convert = None  # lets go of the decoder's own picture
+        return image
 
 
 @dataclasses.dataclass(frozen=True)
