@@ -200,7 +200,7 @@ def test_files_of_every_kind_are_references(tmp_path: Path):
     assert read_reference(tmp_path / "b.fit.npz").source == "several cameras"
     dataclasses.replace(fitted(), camera_position_m=np.full(3, np.nan)).save(tmp_path / "c.fit.npz")
     assert read_reference(tmp_path / "c.fit.npz").source == "optical markers"
-    walker = synthesise(SynthSpec(duration_s=1.0, noise="none"))
+    walker = synthesise(SynthSpec(seconds=1.0, noise="none"))
     walker.truth.save(tmp_path / "e.truth.npz")
     known = read_reference(tmp_path / "e.truth.npz")
     knee = list(walker.truth.joint_names).index("knee_angle_r")
