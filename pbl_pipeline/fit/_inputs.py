@@ -11,12 +11,12 @@ from pbl_pipeline.body import Body, MarkerSet, load_body, marker_set
 from pbl_pipeline.body._jacobian import MarkerTable
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
+from pbl_pipeline.keypoints._in_view import SEEN_SHARE, blind_runs, bridge_gaps, longest_run_s, visibility
 from pbl_pipeline.video import Camera, viewing_ray
 
 from ._observations import CLOCK_RANGE_S, Observations, TrialArrays, pack, pad_markers
 from ._params import ViewParams
 from ._rotation import mean_rotation, rotation_matrices
-from ._view import SEEN_SHARE, blind_runs, bridge_gaps, longest_run_s, whole_person_in_view
 
 #: R_nc of a level camera that looks along world +x: columns are the camera's x (right), y (down), z (forward).
 LEVEL_CAMERA_R_NC = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -131,11 +131,16 @@ def check_trial(
         in_view = (np.mean(seen, axis=1) >= SEEN_SHARE) & (_mean_seen(confidence) >= view.min_confidence)
     else:
         _check_points(name, trial, need_3d=has_3d(trial))
-        seen = trial.confidence > 0
-        in_view = whole_person_in_view(trial, view.min_confidence)
+        shown = visibility(trial, view.min_confidence, view.max_gap_s, view.max_blind_s)
+        return _long_enough(shown.counts, trial.time_s, name, view), shown.whole_share
     used = bridge_gaps(in_view, trial.time_s, view.max_gap_s)
     used &= ~blind_runs(np.mean(seen, axis=1) >= SEEN_SHARE, trial.time_s, view.max_blind_s)
-    longest = longest_run_s(used, trial.time_s)
+    return _long_enough(used, trial.time_s, name, view), float(np.mean(in_view))
+
+
+def _long_enough(used: np.ndarray, time_s: np.ndarray, name: str, view: ViewParams) -> np.ndarray:
+    """`used` (T,), where it has a run that can be fitted. Raises `PblError` FIT_INPUT."""
+    longest = longest_run_s(used, time_s)
     if longest < view.min_in_view_s:
         raise _input_error(
             f"trial {name}: the whole person is in view for {longest:.2f} s at a stretch",
@@ -143,7 +148,7 @@ def check_trial(
             name,
             "film so that head and feet stay in the picture for a few steps, or pick another person with --person",
         )
-    return used, float(np.mean(in_view))
+    return used
 
 
 def _mean_seen(confidence: np.ndarray) -> np.ndarray:

@@ -1,0 +1,167 @@
+"""When the whole person is in view, and which frames of a recording count (the paper, section Keypoint Detection)."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+
+from ._types import Keypoints
+
+#: Share of the markers that must have been detected for a frame to say anything about the pose.
+SEEN_SHARE = 0.5
+#: Share of the markers that must lie inside the picture.
+INSIDE_SHARE = 0.95
+#: Mean confidence over the markers of a frame; a gap of partial view that is bridged is shorter than this; longer runs
+#: without sight of the person are left unknown (`fit.ViewParams` has the same, frozen in its paramsets).
+MIN_CONFIDENCE, MAX_GAP_S, MAX_BLIND_S = 0.5, 1.0, 0.15
+
+
+@dataclasses.dataclass(frozen=True)
+class Gap:
+    """Frames between two with the whole person in view, from the last before to the first after it (s); `bridged`:
+    short enough to count all the same."""
+
+    start_s: float
+    stop_s: float
+    bridged: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Visibility:
+    """Who was in view when.
+
+    Attributes
+    ----------
+    time_s : (T,)
+    seen : (T,) bool
+        Most points of the person were found.
+    whole : (T,) bool
+        The whole person is in view (`whole_person_in_view`).
+    counts : (T,) bool
+        The frames that a fit uses: whole, or in a bridged gap.
+    gaps
+        Between the first and the last frame with the whole person.
+    """
+
+    time_s: np.ndarray
+    seen: np.ndarray
+    whole: np.ndarray
+    counts: np.ndarray
+    gaps: tuple[Gap, ...]
+
+    @property
+    def whole_share(self) -> float:
+        """Share of all frames with the whole person in view."""
+        return float(np.mean(self.whole)) if len(self.whole) else 0.0
+
+    @property
+    def first_s(self) -> float:
+        """Time of the first frame with the whole person, NaN where there is none."""
+        return float(self.time_s[self.whole][0]) if self.whole.any() else math.nan
+
+    @property
+    def last_s(self) -> float:
+        """Time of the last frame with the whole person, NaN where there is none."""
+        return float(self.time_s[self.whole][-1]) if self.whole.any() else math.nan
+
+    @property
+    def counts_s(self) -> float:
+        """Seconds of frames that count."""
+        return float(np.sum(self.counts)) * step_s(self.time_s)
+
+    def text(self) -> str:
+        """One sentence for people."""
+        if not self.whole.any():
+            return "the whole person is never in view"
+        words = f"the whole person is in view in {self.whole_share:.0%} of the frames, from {self.first_s:.1f} to "
+        words += f"{self.last_s:.1f} s"
+        if not self.gaps:
+            return words + ", without a gap"
+        spans = ", ".join(f"{g.start_s:.1f} to {g.stop_s:.1f} s" for g in self.gaps if not g.bridged)
+        short = sum(g.bridged for g in self.gaps)
+        parts = [f"not used: {spans}"] if spans else []
+        if short:
+            parts.append(f"{short} {'gap' if short == 1 else 'gaps'} of partial view under {MAX_GAP_S:g} s bridged")
+        return f"{words}; {'; '.join(parts)}"
+
+
+def visibility(
+    keypoints: Keypoints,
+    min_confidence: float = MIN_CONFIDENCE,
+    max_gap_s: float = MAX_GAP_S,
+    max_blind_s: float = MAX_BLIND_S,
+) -> Visibility:
+    """Which frames of a trial of one camera show the whole person, and which count."""
+    time = np.asarray(keypoints.time_s, float)
+    whole = whole_person_in_view(keypoints, min_confidence)
+    seen = np.mean(keypoints.confidence > 0, axis=1) >= SEEN_SHARE
+    counts = bridge_gaps(whole, time, max_gap_s) & ~blind_runs(seen, time, max_blind_s)
+    gaps = [
+        Gap(float(time[a]), float(time[b]), bool(counts[a : b + 1].all()))
+        for a, b in itertools.pairwise(np.flatnonzero(whole))
+        if b > a + 1
+    ]
+    return Visibility(time, seen, whole, counts, tuple(gaps))
+
+
+def whole_person_in_view(keypoints: Keypoints, min_confidence: float) -> np.ndarray:
+    """(T,) bool: nearly all markers are detected inside the picture, with a mean confidence of `min_confidence`.
+
+    The mean and not each marker: in a view from the side the far arm is hidden in every frame, and the person is in
+    view all the same. Markers that the detector never gives in this trial say nothing of a single frame and do not
+    count, unless they are most of them.
+    """
+    given = np.any(keypoints.confidence > 0, axis=0)
+    if given.mean() < SEEN_SHARE:
+        return np.zeros(len(keypoints.time_s), bool)
+    width, height = keypoints.image_size_px
+    xy = np.nan_to_num(keypoints.xy_px, nan=-1.0)
+    inside = (xy[..., 0] >= 0) & (xy[..., 0] <= width) & (xy[..., 1] >= 0) & (xy[..., 1] <= height)
+    inside &= keypoints.confidence > 0
+    confidence = keypoints.confidence[:, given]
+    return (inside[:, given].mean(axis=1) >= INSIDE_SHARE) & (confidence.mean(axis=1) >= min_confidence)
+
+
+def bridge_gaps(in_view: np.ndarray, time_s: np.ndarray, max_gap_s: float) -> np.ndarray:
+    """Frames to use: those in view and those inside a gap between two of them that is shorter than `max_gap_s`."""
+    used = in_view.copy()
+    index = np.flatnonzero(in_view)
+    for a, b in itertools.pairwise(index):
+        if b > a + 1 and time_s[b] - time_s[a] < max_gap_s:
+            used[a:b] = True
+    return used
+
+
+def blind_runs(seen: np.ndarray, time_s: np.ndarray, max_blind_s: float) -> np.ndarray:
+    """(T,) bool: frames in unbroken runs without sight of the person, longer than `max_blind_s`.
+
+    Partial view may be bridged; where nothing was seen there is nothing to fit, and a trajectory that swings freely
+    through such a hole invents movement (on a synthetic walker up to 50 deg at the knee within 0.9 s).
+    """
+    blind = np.zeros(len(seen), bool)
+    index = np.flatnonzero(seen)
+    for a, b in itertools.pairwise(index):
+        if b > a + 1 and time_s[b] - time_s[a] > max_blind_s:
+            blind[a + 1 : b] = True
+    return blind
+
+
+def longest_run_s(used: np.ndarray, time_s: np.ndarray) -> float:
+    """Length (s) of the longest unbroken run of used frames."""
+    best, start = 0.0, None
+    for i, u in enumerate(used):
+        if u and start is None:
+            start = i
+        if u and start is not None:
+            best = max(best, float(time_s[i] - time_s[start]))
+        if not u:
+            start = None
+    return best
+
+
+def step_s(time_s: np.ndarray) -> float:
+    """Mean time (s) between frames; 0 for a single one."""
+    return float(time_s[-1] - time_s[0]) / (len(time_s) - 1) if len(time_s) > 1 else 0.0
