@@ -7,10 +7,11 @@ Two walkers: `walk_qpos` (textbook curves; what the benchmark's figures were mea
 curves, feet that stand still, impairments, other tasks; `pbl synth`).
 """
 
+from pbl_pipeline.gait.normative import GaitNorm, gait_norm
+
 from ._camera import LEVEL_R_NC, PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor, picture_px
 from ._impair import IMPAIRMENTS, Impairment
 from ._noise import BLAZEPOSE_NOISE, NO_NOISE, Noise
-from ._norms import GaitNorm, gait_norm
 from ._observe import Seen, observe, pelvis_positions
 from ._path import PATHS
 from ._person import person, true_markers

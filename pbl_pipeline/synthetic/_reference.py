@@ -10,10 +10,10 @@ from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 
 from pbl_pipeline.body import load_body
+from pbl_pipeline.gait.normative import GRAVITY, gait_norm, harmonic_sum
 
 from ._gait import MIDDLE_CURVES_DEG, OFFSET_SD_DEG, SIDE_CURVES_DEG, harmonics, wander, within
 from ._impair import Style
-from ._norms import GRAVITY, gait_norm, harmonic_sum
 from ._plan import GRID_STEP_S, Plan
 
 #: Curves of the norm that drive the legs, and the joints they drive (sign, joint).

@@ -16,6 +16,7 @@ from pbl_pipeline.body import load_body, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_out_folder, load_npz
 from pbl_pipeline.gait.events import GaitEvent, GaitEvents
+from pbl_pipeline.gait.normative import gait_norm
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.video import Camera
 
@@ -23,7 +24,6 @@ from . import _tasks
 from ._camera import PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor, phone_log, picture_px
 from ._impair import Impairment, style_of
 from ._noise import NO_NOISE, Noise
-from ._norms import gait_norm
 from ._observe import hide, look, pelvis_positions
 from ._person import true_markers
 from ._physique import leg_length_m, physique

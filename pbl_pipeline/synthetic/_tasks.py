@@ -11,10 +11,10 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.gait.normative import GRAVITY, gait_norm
 
 from ._gait import wander, within
 from ._impair import Style
-from ._norms import GRAVITY, gait_norm
 from ._plan import GRID_STEP_S, Plan, Step, ease, grid
 
 #: How strides differ within a walk: step time (share), footprint along and across (m). The project's own numbers, of

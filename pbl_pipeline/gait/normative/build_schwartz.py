@@ -1,4 +1,4 @@
-"""Build the normal gait that ships: `python -m pbl_pipeline.synthetic.build_norms Schwartz2008_original.xls`.
+"""Build the normal gait that ships: `python -m pbl_pipeline.gait.normative.build_schwartz Schwartz2008_original.xls`.
 
 The file is the electronic addendum of Schwartz, Rozumalski and Trost 2008 (J Biomech 41:1639-1650): mean and standard
 deviation of joint angles over the gait cycle of typically developing children at five speeds. Its
@@ -94,10 +94,10 @@ def _at(coefficients: np.ndarray, points: int) -> np.ndarray:
 def main(xls: Path, out: Path | None) -> None:
     """Write the normal gait of XLS as harmonics.
 
-    Example: python -m pbl_pipeline.synthetic.build_norms Schwartz2008_original.xls --out norm.json
+    Example: python -m pbl_pipeline.gait.normative.build_schwartz Schwartz2008_original.xls --out norm.json
     """
     norm, worst = build(xls)
-    target = out or Path(__file__).parent / "data" / "schwartz_2008.json"
+    target = out or Path(__file__).parent / "curves" / "schwartz_2008.json"
     lines = json.dumps(norm, indent=1)
     # One list a line: readable, and a change shows as one line.
     for inner in ("      ", "     ", "    "):

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 
-_FILE = Path(__file__).parent / "data" / "schwartz_2008.json"
+_FILE = Path(__file__).parent / "curves" / "schwartz_2008.json"
 #: Acceleration of gravity (m/s^2), which makes speeds comparable between people: v / sqrt(g * leg length).
 GRAVITY = 9.81
 
@@ -93,7 +93,7 @@ def harmonic_sum(coefficients: np.ndarray, phase_rad: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def gait_norm() -> GaitNorm:
-    """The norm that ships with the package (`data/schwartz_2008.json`, written by `build_norms.py`)."""
+    """The norm that ships with the package (`curves/schwartz_2008.json`, written by `build_schwartz.py`)."""
     raw = json.loads(_FILE.read_text())
     return GaitNorm(
         groups=tuple(raw["groups"]),
