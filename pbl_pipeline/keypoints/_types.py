@@ -12,6 +12,8 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_numbers, load_npz
 from pbl_pipeline.video import Attitude, Camera, check_attitude
 
+from ._picture import Picture
+
 
 @dataclasses.dataclass(frozen=True)
 class Keypoints:
@@ -30,12 +32,16 @@ class Keypoints:
         Camera frame (x right, y down, z forward), root-relative if `root_relative`.
     confidence : (T, J)
         0..1, as stated by the detector.
+    confidence_curve
+        Name of the curve (`confidence_curve`) that says what this is worth; empty where none is known.
     image_size_px : (width, height)
     box_px : (T, 4)
         x0, y0, x1, y1 of the person.
     phone_time_s, phone_quat_wxyz : (P,), (P, 4) or None
         Phone orientation, camera to world, at its own stamps: both or neither. Brought to unit length, without jumps
         of sign, when made (`check_attitude`); how much of the recording it covers is for the fit to judge.
+    picture
+        How light and sharp the picture of the person is, or None where no video was seen.
 
     Raises
     ------
@@ -55,6 +61,8 @@ class Keypoints:
     box_px: np.ndarray
     phone_time_s: np.ndarray | None = None
     phone_quat_wxyz: np.ndarray | None = None
+    confidence_curve: str = ""
+    picture: Picture | None = None
 
     def __post_init__(self) -> None:
         n, j = len(self.time_s), len(self.names)
@@ -112,6 +120,10 @@ class Keypoints:
         optional: dict[str, Any] = {}
         if self.phone_time_s is not None and self.phone_quat_wxyz is not None:
             optional = {"phone_time_s": self.phone_time_s, "phone_quat_wxyz": self.phone_quat_wxyz}
+        if self.confidence_curve:
+            optional["confidence_curve"] = np.asarray(self.confidence_curve)
+        if self.picture is not None:
+            optional |= self.picture.arrays()
         np.savez_compressed(
             path,
             time_s=np.asarray(self.time_s, np.float64),
@@ -170,6 +182,8 @@ class Keypoints:
             box_px=data["box_px"],
             phone_time_s=data.get("phone_time_s"),
             phone_quat_wxyz=data.get("phone_quat_wxyz"),
+            confidence_curve=str(data.get("confidence_curve", "")),
+            picture=Picture.from_arrays(path, data),
         )
 
 

@@ -1,0 +1,100 @@
+"""What a detector's confidence is worth: curves from what it states to how often the point is where it says.
+
+A stated confidence is a number between 0 and 1 in a scale of the detector's own. A curve turns it into the probability
+that the point lies within a stated bound of the true one in the picture. Curves are data with a name and a version
+(`data/confidence_curves.json`, made by `python -m pbl_pipeline.validation.build_confidence`) and never change: another
+fit is another version, and its name stands in the parameters of the keypoint method.
+
+The stated confidence stays what the fit weighs with (docs/confidence.md says why); the probability is what people are
+shown.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+from importlib import resources
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+
+from ._types import Keypoints
+
+#: The bound of all curves: a share of the length of the trunk (middle of the shoulders to middle of the hips) in the
+#: picture, as it would be seen from the side. The "percentage of correct points" of pose estimation at 0.2.
+BOUND_TRUNK = 0.2
+_DATA = "data/confidence_curves.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class ConfidenceCurve:
+    """A monotone map from stated confidence to probability.
+
+    Attributes
+    ----------
+    name
+        "blazepose-v1": detector and version.
+    detector
+        Name of the detector.
+    bound_trunk
+        The point counts as right within this share of the trunk's length.
+    stated, probability : (K,)
+        Knots; linear between them, constant outside.
+    n : int
+        Points that it was fitted to.
+    source
+        What it was fitted to, in words.
+    params
+        The parameters of the detection that gave these confidences (`KeypointParams` less `confidence_curve`).
+    """
+
+    name: str
+    detector: str
+    bound_trunk: float
+    stated: np.ndarray
+    probability: np.ndarray
+    n: int
+    source: str
+    params: dict
+
+    def __call__(self, confidence: np.ndarray) -> np.ndarray:
+        """Probabilities for stated confidences of any shape; 0 for 0, which says that there is no point."""
+        confidence = np.asarray(confidence, float)
+        return np.where(confidence > 0, np.interp(confidence, self.stated, self.probability), 0.0)
+
+
+@functools.cache
+def confidence_curves() -> dict[str, ConfidenceCurve]:
+    """All curves by name."""
+    text = resources.files("pbl_pipeline.keypoints").joinpath(_DATA).read_text(encoding="utf-8")
+    curves = {}
+    for name, c in json.loads(text)["curves"].items():
+        stated, probability = np.asarray(c["stated"], float), np.asarray(c["probability"], float)
+        if np.any(np.diff(stated) <= 0) or np.any(np.diff(probability) < 0) or not 0 <= probability[0] <= 1:
+            raise ValueError(f"{_DATA}: {name} is not a monotone curve")
+        curves[name] = ConfidenceCurve(
+            name, c["detector"], c["bound_trunk"], stated, probability, c["n"], c["source"], c["params"]
+        )
+    return curves
+
+
+def confidence_curve(name: str) -> ConfidenceCurve:
+    """The curve of that name. Raises `PblError` SOLVER_UNKNOWN."""
+    curves = confidence_curves()
+    if name not in curves:
+        raise PblError(
+            "SOLVER_UNKNOWN",
+            found=f"confidence curve {name!r}",
+            expected=f"one of {', '.join(curves)}, or none",
+            next_step="choose one of these names in the keypoint parameters, or update the program that reads the file",
+        )
+    return curves[name]
+
+
+def probability_within(keypoints: Keypoints) -> np.ndarray | None:
+    """(T, J) probability that a point lies within the curve's bound of the true one; None without a curve."""
+    if not keypoints.confidence_curve:
+        return None
+    return confidence_curve(keypoints.confidence_curve)(keypoints.confidence)

@@ -1,0 +1,156 @@
+"""How good the picture of the person is: light, contrast and blur, measured in a few frames while they pass by.
+
+A detector answers in the dark and out of focus as well, only worse, and its confidence falls late. What is measured
+here is measured where the person is, and at the person's own scale: the middle strip of the crop, made `SIDE` pixels
+high. The figures behind the thresholds of the checks are in docs/confidence.md.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import check_numbers
+from pbl_pipeline.video import Frame
+
+#: Height (px) of the crop in which the picture is measured: about what the landmark networks see.
+SIDE = 256
+#: Share of the crop's width that is looked at: the body and not what is beside it.
+STRIP = 0.4
+#: Of the Gaussian (px of the crop) that takes out the sensor's noise before the blur is measured.
+_CALM_SD = 1.0
+_LEAST_PX = 8
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """Measures of P frames.
+
+    Attributes
+    ----------
+    time_s : (P,)
+        The frames' time stamps.
+    luma : (P, 3)
+        5th, 50th and 95th percentile of the brightness (0..255) where the person is.
+    detail : (P,)
+        Length of the finest detail as a share of the person's size, `detail_of`. Blur makes it longer.
+    """
+
+    time_s: np.ndarray
+    luma: np.ndarray
+    detail: np.ndarray
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The fields of `keypoints.npz`."""
+        return {
+            "picture_time_s": np.asarray(self.time_s, np.float64),
+            "picture_luma": np.asarray(self.luma, np.float32),
+            "picture_detail": np.asarray(self.detail, np.float32),
+        }
+
+    @classmethod
+    def from_arrays(cls, path: str | Path, data: Mapping[str, np.ndarray]) -> Picture | None:
+        """From the fields of a file; None where it has none. Raises `PblError` FILE_FORMAT."""
+        if "picture_time_s" not in data:
+            return None
+        n = data["picture_time_s"].size
+        missing = [name for name in ("picture_luma", "picture_detail") if name not in data]
+        if missing:
+            raise PblError(
+                "FILE_FORMAT",
+                found=f"picture_time_s without {', '.join(missing)}",
+                expected="all fields of the picture or none",
+                next_step="see docs/files.md, section keypoints.npz",
+                key=str(path),
+            )
+        check_numbers(path, data, {"picture_time_s": (n,), "picture_luma": (n, 3), "picture_detail": (n,)})
+        return cls(data["picture_time_s"], data["picture_luma"], data["picture_detail"])
+
+    @property
+    def contrast(self) -> float:
+        """Median over the frames of the 95th less the 5th percentile of the brightness, NaN without a frame."""
+        return _median(self.luma[:, 2] - self.luma[:, 0])
+
+    @property
+    def brightness(self) -> float:
+        """Median brightness, NaN without a frame."""
+        return _median(self.luma[:, 1])
+
+    @property
+    def detail_share(self) -> float:
+        """Median of `detail`, NaN without a frame."""
+        return _median(self.detail)
+
+
+class PictureMeter:
+    """Measures one frame in each `every_s` seconds.
+
+    `watch` stands between the video and whoever looks at its frames: it hands every frame on and converts only those
+    that it measures.
+    """
+
+    def __init__(self, every_s: float = 0.5) -> None:
+        self._every_s = every_s
+        self._next_s = -math.inf
+        self._rows: list[tuple[float, np.ndarray, float]] = []
+
+    def watch(self, frames: Iterable[Frame], roi_px: np.ndarray) -> Iterator[Frame]:
+        """The frames as they come; `roi_px` (T, 4) the body circle of each frame of the video, NaN where none is."""
+        for frame in frames:
+            # A clock that was set back (`time_s` from another video) only measures more.
+            if frame.time_s >= self._next_s and np.isfinite(roi_px[frame.index]).all():
+                self.add(frame.time_s, frame.image, roi_px[frame.index])
+            yield frame
+
+    def add(self, time_s: float, image: np.ndarray, roi_px: np.ndarray) -> None:
+        """Measure `image` (H, W, 3) uint8 BGR around the body circle `roi_px` (4,) centre x, y, side, rotation."""
+        strip = _strip(image, roi_px)
+        if strip is None:
+            return
+        self._next_s = time_s + self._every_s
+        self._rows.append((time_s, np.percentile(strip, (5, 50, 95)), detail_of(strip)))
+
+    def result(self) -> Picture:
+        """What was measured so far."""
+        if not self._rows:
+            return Picture(np.zeros(0), np.zeros((0, 3)), np.zeros(0))
+        time, luma, detail = zip(*self._rows, strict=True)
+        return Picture(np.array(time), np.array(luma), np.array(detail))
+
+
+def detail_of(strip: np.ndarray) -> float:
+    """Length of the finest detail of a grey picture (H, W) whose height is the person's size, as a share of it.
+
+    sqrt(variance / variance of the step between neighbouring pixels), along the axis where it is longer: a picture
+    that is blurred along one axis, as by movement, is a blurred one. Brightness and contrast do not count. NaN for a
+    flat picture.
+    """
+    calm = cv2.GaussianBlur(strip.astype(np.float32), (0, 0), _CALM_SD)
+    steps = min(float(np.var(np.diff(calm, axis=0))), float(np.var(np.diff(calm, axis=1))))
+    variance = float(np.var(calm))
+    return math.sqrt(variance / steps) / len(strip) if steps > 0 else math.nan
+
+
+def _strip(image: np.ndarray, roi_px: np.ndarray) -> np.ndarray | None:
+    """The grey strip (<= SIDE, W) uint8 of the person; None where hardly anything of it is in the picture."""
+    x, y, side, _ = (float(v) for v in roi_px)
+    height, width = image.shape[:2]
+    x0, x1 = max(0, round(x - STRIP * side / 2)), min(width, round(x + STRIP * side / 2))
+    y0, y1 = max(0, round(y - side / 2)), min(height, round(y + side / 2))
+    if x1 - x0 < max(_LEAST_PX, 0.5 * STRIP * side) or y1 - y0 < max(_LEAST_PX, 0.5 * side):
+        return None
+    scale = SIDE / side
+    size = max(2, round((x1 - x0) * scale)), max(2, round((y1 - y0) * scale))
+    small = cv2.resize(image[y0:y1, x0:x1], size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+    return cv2.cvtColor(small, cv2.COLOR_BGR2GRAY)
+
+
+def _median(values: np.ndarray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else math.nan
