@@ -13,6 +13,8 @@ VARIABLES: dict[str, str] = {
     "PBL_HOME": "folder for the embedded database and its object store (default: the user's data folder)",
     "PBL_OFFLINE": "1: never fetch anything, fail with the remedy instead",
     "PBL_DB_PREFIX": "prefix of the database schema names (default: pbl)",
+    "PBL_MODELS": "folder of the registered keypoint models (default: models/ in PBL_HOME)",
+    "PBL_ONNX_DEVICE": "where ONNX models run: auto, cpu or cuda (default: auto, CUDA where it works)",
     "PBL_STORE": "folder of the object store that holds arrays (default: store/ in PBL_HOME)",
 }
 
@@ -38,6 +40,11 @@ def home_dir() -> Path:
 def store_dir() -> Path:
     """Folder of the object store that holds the arrays (not created here)."""
     return Path(os.environ.get("PBL_STORE") or home_dir() / "store").absolute()
+
+
+def models_dir() -> Path:
+    """Folder of the registered keypoint models (not created here). Not the cache: a lab's own model is nowhere else."""
+    return Path(os.environ.get("PBL_MODELS") or home_dir() / "models").absolute()
 
 
 def offline() -> bool:

@@ -1,0 +1,65 @@
+"""Where ONNX models run: CPU or CUDA. What was asked for and is not there is an error or is said, never silent."""
+
+from __future__ import annotations
+
+import os
+
+from pbl_pipeline.errors import PblError
+
+#: What may be asked for. "auto": CUDA where it works, else the CPU, and the model says which.
+DEVICES = ("auto", "cpu", "cuda")
+_PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
+
+
+def asked_device(device: str | None = None) -> str:
+    """`device`, or PBL_ONNX_DEVICE, or "auto". Raises `PblError` USAGE for another word."""
+    asked = (device or os.environ.get("PBL_ONNX_DEVICE") or "auto").lower()
+    if asked not in DEVICES:
+        raise PblError(
+            "USAGE",
+            found=f"device {asked!r}",
+            expected=f"one of {', '.join(DEVICES)}",
+            next_step="correct --device or PBL_ONNX_DEVICE",
+        )
+    return asked
+
+
+def available_devices() -> tuple[str, ...]:
+    """Devices of the installed onnxruntime, the fastest first. That a driver answers is only known by loading."""
+    import onnxruntime
+
+    there = set(onnxruntime.get_available_providers())
+    return tuple(d for d in ("cuda", "cpu") if _PROVIDERS[d] in there)
+
+
+def providers_for(device: str | None = None) -> list[str]:
+    """Execution providers to ask a session for.
+
+    Raises
+    ------
+    PblError
+        DEVICE_UNAVAILABLE: CUDA was asked for and the installed onnxruntime has none. USAGE: an unknown device.
+    """
+    asked, there = asked_device(device), available_devices()
+    if asked == "auto":
+        return [_PROVIDERS[d] for d in there]
+    if asked not in there:
+        raise unavailable(f"onnxruntime with {', '.join(there)} only")
+    return [_PROVIDERS[asked]]
+
+
+def device_of(providers: list[str]) -> str:
+    """The device that a session with these providers computes on."""
+    return next((d for d, p in _PROVIDERS.items() if providers and providers[0] == p), "cpu")
+
+
+def unavailable(found: str) -> PblError:
+    """DEVICE_UNAVAILABLE about CUDA."""
+    return PblError(
+        "DEVICE_UNAVAILABLE",
+        found=found,
+        expected="onnxruntime with a CUDA execution provider that starts, because cuda was asked for",
+        next_step="replace onnxruntime by onnxruntime-gpu and install the CUDA and cuDNN that it names, or ask for "
+        "cpu or auto (--device, PBL_ONNX_DEVICE)",
+        key="cuda",
+    )

@@ -1,0 +1,267 @@
+"""`model.json`: what a keypoint model takes and gives, validated at the door (docs/models.md)."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.paramset import canonical_json
+
+SPEC_FILE, GRAPH_FILE = "model.json", "model.onnx"
+#: Kind -> the outputs that it must have.
+KINDS: dict[str, tuple[str, ...]] = {
+    "crop3d": ("coords2d", "coords3d"),
+    "simcc": ("simcc_x", "simcc_y"),
+    "heatmap": ("heatmap",),
+}
+_NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,39}")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+#: What the text of a licence or a source may take.
+_LONGEST = 500
+_REQUIRED = ("name", "kind", "sha256", "licence", "source", "input", "outputs", "marker_set", "joint_names")
+_OPTIONAL = ("mirror_pairs", "pixel_origin", "box_margin", "simcc_split", "comment")
+_INPUT = ("name", "width", "height", "layout", "colour", "mean", "std")
+#: Fields that change no number of the result; the others are hashed into the method's parameters.
+_WORDS = ("name", "licence", "source", "comment")
+#: Ways in which names tell the sides apart: (left, right) at the beginning or the end of a name.
+_SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("l", "r"), ("L", "R"))
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelInput:
+    """The picture that a model takes: `name` of the graph's input, `width` and `height` in px, `layout` NCHW or NHWC,
+    `colour` RGB or BGR; value = (v - mean) / std with v in 0..255, a mean and std for each channel in that order."""
+
+    name: str
+    width: int
+    height: int
+    layout: str
+    colour: str
+    mean: tuple[float, float, float]
+    std: tuple[float, float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelSpec:
+    """One model.
+
+    Attributes
+    ----------
+    kind
+        "crop3d": `coords2d` (N, J, 2) px of the crop and `coords3d` (N, J, 3) mm in the axes of the crop's camera (x right,
+        y down, z forward), up to one common shift. "simcc": `simcc_x` (N, J, width * split), `simcc_y` likewise.
+        "heatmap": `heatmap` (N, J, h, w).
+    sha256
+        Of `model.onnx`.
+    outputs
+        Role (above) -> name in the graph.
+    mirror : (J,) ints
+        For each point of a mirrored picture, whose it is.
+    pixel_origin
+        Where coordinates of the crop count from: "centre" of the first pixel, or its "edge".
+    box_margin
+        How much larger than the person's box (the body circle) the crop is to be.
+    spec_sha256
+        Over all that changes a result, without names and licences.
+    """
+
+    name: str
+    kind: str
+    sha256: str
+    licence: str
+    source: str
+    input: ModelInput
+    outputs: Mapping[str, str]
+    marker_set: str
+    joint_names: tuple[str, ...]
+    mirror: tuple[int, ...]
+    pixel_origin: str
+    box_margin: float
+    simcc_split: float
+    spec_sha256: str
+
+
+def load_spec(folder: str | Path) -> ModelSpec:
+    """Read `model.json` of a model's folder. Whether `model.onnx` fits it, `OnnxModel` checks.
+
+    Raises
+    ------
+    PblError
+        MODEL_MISSING: no such folder or file. MODEL_INVALID: not JSON, a field missing, unknown or of a wrong kind.
+        MARKER_SET_UNKNOWN: the joint names are not those of the marker set of the body that is named.
+    """
+    path = Path(folder) / SPEC_FILE
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise PblError(
+            "MODEL_MISSING",
+            found=error.strerror or str(error),
+            expected=f"a folder with {GRAPH_FILE} and {SPEC_FILE}",
+            next_step="see docs/models.md for what a model's folder holds",
+            key=str(path),
+        ) from error
+    except ValueError as error:
+        raise invalid(path, f"no JSON text ({error})", "a JSON object") from error
+    if not isinstance(content, dict):
+        raise invalid(path, "no named fields", "a JSON object")
+    return parse_spec(content, path)
+
+
+def parse_spec(content: Mapping[str, Any], path: str | Path) -> ModelSpec:
+    """The spec from the fields of `model.json`; `path` is named in errors. Raises as `load_spec`."""
+    _fields(path, "", content, _REQUIRED, _OPTIONAL)
+    name = _text(path, content, "name")
+    if not _NAME.fullmatch(name):
+        raise invalid(path, f"name {name!r}", "small letters, digits, '.', '_' and '-', at most 40")
+    kind = _text(path, content, "kind")
+    if kind not in KINDS:
+        raise invalid(path, f"kind {kind!r}", f"one of {', '.join(KINDS)}")
+    sha256 = _text(path, content, "sha256").lower()
+    if not _SHA256.fullmatch(sha256):
+        raise invalid(path, f"sha256 {sha256[:80]!r}", f"the 64 hex digits of the SHA-256 of {GRAPH_FILE}")
+    outputs = content["outputs"]
+    if not isinstance(outputs, dict) or set(outputs) != set(KINDS[kind]) or not _all_text(outputs.values()):
+        raise invalid(path, f"outputs {outputs!r}", f"the graph's names of {', '.join(KINDS[kind])}")
+    names = content["joint_names"]
+    if not isinstance(names, list) or not names or not _all_text(names) or len(set(names)) != len(names):
+        raise invalid(path, "joint_names: not a list of names, all different", "a name for each point, in order")
+    markers = _text(path, content, "marker_set")
+    _check_marker_set(markers, names)
+    origin = content.get("pixel_origin", "centre")
+    if origin not in ("centre", "edge"):
+        raise invalid(path, f"pixel_origin {origin!r}", "'centre' or 'edge'")
+    hashed = {k: v for k, v in content.items() if k not in _WORDS}
+    return ModelSpec(
+        name=name,
+        kind=kind,
+        sha256=sha256,
+        licence=_text(path, content, "licence"),
+        source=_text(path, content, "source"),
+        input=_input(path, content["input"]),
+        outputs=dict(outputs),
+        marker_set=markers,
+        joint_names=tuple(names),
+        mirror=_mirror(path, names, content.get("mirror_pairs")),
+        pixel_origin=origin,
+        box_margin=_number(path, content, "box_margin", 1.0, 0.5, 4.0),
+        simcc_split=_number(path, content, "simcc_split", 2.0, 0.25, 16.0),
+        spec_sha256=hashlib.sha256(canonical_json(hashed).encode()).hexdigest(),
+    )
+
+
+def mirror_pairs(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Pairs (left, right) that the names tell: equal but for left/right or l/r, in either case, at one end."""
+    known, pairs = set(names), []
+    for name in names:
+        for left, right in _SIDES:
+            others = []
+            if name.startswith(left):
+                others.append(right + name[len(left) :])
+            if len(left) > 1 and name.endswith(left):
+                others.append(name[: -len(left)] + right)
+            found = next((o for o in others if o in known), None)
+            if found:
+                pairs.append((name, found))
+                break
+    return pairs
+
+
+def invalid(path: str | Path, found: str, expected: str) -> PblError:
+    """MODEL_INVALID about a file of a model."""
+    return PblError(
+        "MODEL_INVALID",
+        found=found,
+        expected=expected,
+        next_step="correct the model's folder as docs/models.md describes it, and add it again",
+        key=str(path),
+    )
+
+
+def _mirror(path: str | Path, names: list[str], stated: Any) -> tuple[int, ...]:
+    if stated is None:
+        pairs = mirror_pairs(names)
+    elif isinstance(stated, list) and all(isinstance(p, list) and len(p) == 2 and _all_text(p) for p in stated):
+        pairs = [(a, b) for a, b in stated]
+    else:
+        raise invalid(path, "mirror_pairs: not a list of pairs of names", "[[left, right], ...]")
+    flat = [n for pair in pairs for n in pair]
+    wrong = sorted({n for n in flat if n not in names or flat.count(n) > 1})
+    if wrong:
+        raise invalid(path, f"mirror_pairs with {', '.join(wrong)}", "names of joint_names, each once at most")
+    out = list(range(len(names)))
+    for left, right in pairs:
+        i, j = names.index(left), names.index(right)
+        out[i], out[j] = j, i
+    lone = [n for i, n in enumerate(names) if out[i] == i and re.search("left|right", n.lower())]
+    if lone:
+        raise invalid(path, f"no other side of {', '.join(lone)}", "a pair for each, by name or in mirror_pairs")
+    return tuple(out)
+
+
+def _check_marker_set(markers: str, names: Sequence[str]) -> None:
+    """A set of the body must be given in its order; another set is the lab's own, and the fit asks for its table."""
+    from pbl_pipeline.body import MARKER_SETS, marker_set
+
+    if markers in MARKER_SETS:
+        marker_set(markers).check_names(names)
+
+
+def _input(path: str | Path, value: Any) -> ModelInput:
+    if not isinstance(value, dict):
+        raise invalid(path, "input: no named fields", f"an object with {', '.join(_INPUT)}")
+    _fields(path, "input.", value, _INPUT, ())
+    layout, colour = _text(path, value, "layout"), _text(path, value, "colour")
+    if layout not in ("NCHW", "NHWC") or colour not in ("RGB", "BGR"):
+        raise invalid(path, f"input layout {layout!r}, colour {colour!r}", "NCHW or NHWC, RGB or BGR")
+    for side in ("width", "height"):
+        size = value[side]
+        if not isinstance(size, int) or isinstance(size, bool) or not 16 <= size <= 4096:
+            raise invalid(path, f"input {side} {size!r}", "a whole number of pixels, 16 to 4096")
+    for field in ("mean", "std"):
+        numbers = value[field]
+        three = isinstance(numbers, list) and len(numbers) == 3 and all(_is_number(n) for n in numbers)
+        if not three or (field == "std" and min(numbers) <= 0):
+            raise invalid(path, f"input {field} {numbers!r}", "three numbers on the scale 0..255, std positive")
+    mean, std = tuple(map(float, value["mean"])), tuple(map(float, value["std"]))
+    name = _text(path, value, "name")
+    return ModelInput(name, value["width"], value["height"], layout, colour, mean, std)  # type: ignore[arg-type]
+
+
+def _fields(
+    path: str | Path, where: str, content: Mapping[str, Any], required: Sequence[str], optional: Sequence[str]
+) -> None:
+    missing = [where + f for f in required if f not in content]
+    unknown = [where + f for f in content if f not in (*required, *optional)]
+    if missing or unknown:
+        found = [f"no {', '.join(missing)}"] * bool(missing) + [f"unknown {', '.join(unknown)}"] * bool(unknown)
+        known = f"the fields {', '.join(required)}" + (f"; optional {', '.join(optional)}" if optional else "")
+        raise invalid(path, "; ".join(found), known)
+
+
+def _text(path: str | Path, content: Mapping[str, Any], field: str) -> str:
+    value = content[field]
+    if not isinstance(value, str) or not value.strip() or len(value) > _LONGEST:
+        raise invalid(path, f"{field} {str(value)[:80]!r}", f"a text of 1 to {_LONGEST} characters")
+    return value.strip()
+
+
+def _all_text(values: Any) -> bool:
+    return all(isinstance(v, str) and v for v in values)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e6
+
+
+def _number(path: str | Path, content: Mapping[str, Any], field: str, default: float, low: float, high: float) -> float:
+    value = content.get(field, default)
+    if not _is_number(value) or not low <= value <= high:
+        raise invalid(path, f"{field} {value!r}", f"a number from {low:g} to {high:g}")
+    return float(value)
