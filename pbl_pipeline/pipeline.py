@@ -21,7 +21,7 @@ from pbl_pipeline.qc import WARN, Check
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
 from pbl_pipeline.report import Picture, SessionReport, TrialReport, write_report
 from pbl_pipeline.tracking import SubjectChoice, choose_subject, require_subject, track_people
-from pbl_pipeline.video import VideoInfo, guess_camera, load_attitude, load_camera, probe, sha256_of
+from pbl_pipeline.video import VideoInfo, check_timing, find_camera, load_attitude, probe, sha256_of
 
 #: What `write_results` writes for each trial, after the trial's name and a dot.
 TRIAL_FILES = ("overlay.mp4", "angles.csv", "events.csv", "fit.npz", "keypoints.npz")
@@ -52,7 +52,11 @@ class Session:
     @property
     def checks(self) -> tuple[Check, ...]:
         """What was seen in each trial, and which recordings are missing."""
-        found = [c for t in self.trials for c in _named(check_keypoints(t.keypoints), t.name, len(self.trials))]
+        found = [
+            c
+            for t in self.trials
+            for c in _named([*check_timing(t.video), *check_keypoints(t.keypoints)], t.name, len(self.trials))
+        ]
         missing = {n: e.text() for n, e in self.problems.items()} | dict(self.left_out)
         found += (Check(f"trial {n}", WARN, None, None, f"left out: {why}") for n, why in missing.items())
         return tuple(found)
@@ -73,7 +77,7 @@ def detect_trial(path: Path, sheet: Path, camera_file: Path | None = None, perso
         CAMERA_INVALID.
     """
     info = probe(path)
-    camera = load_camera(camera_file, (info.width_px, info.height_px)) if camera_file else guess_camera(info)
+    camera = find_camera(info, camera_file)
     tracking = track_people(path, info=info)
     choice = choose_subject(tracking, override=person)
     subject = require_subject(choice, tracking, path, sheet)

@@ -25,13 +25,12 @@ def detect(video: Path, out: Path, camera: Path | None, attitude: Path | None, p
     from pbl_pipeline.files import check_out_file
     from pbl_pipeline.keypoints import check_keypoints, detect_keypoints
     from pbl_pipeline.tracking import choose_subject, require_subject, time_in_view_s, track_people
-    from pbl_pipeline.video import guess_camera, load_attitude, load_camera, probe
+    from pbl_pipeline.video import check_timing, find_camera, load_attitude, probe
 
     if out.suffix != ".npz":
         raise click.BadParameter(f"{out} does not end in .npz", param_hint="--out")
     info = probe(video)
-    size = (info.width_px, info.height_px)
-    lens = load_camera(camera, size) if camera else guess_camera(info)
+    lens = find_camera(info, camera)
     log = load_attitude(attitude) if attitude else None
     check_out_file(out)
     tracking = track_people(video, info=info)
@@ -53,6 +52,8 @@ def detect(video: Path, out: Path, camera: Path | None, attitude: Path | None, p
     )
     if log is not None:
         click.echo(f"  orientation of the phone: {len(log.time_s)} samples over {log.time_s[-1] - log.time_s[0]:.1f} s")
-    for check in check_keypoints(keypoints):
+    for note in info.notes:
+        click.echo(f"  {note}")
+    for check in (*check_timing(info), *check_keypoints(keypoints)):
         if check.advice:
             click.echo(f"  {check.outcome} {check.check} = {check.value:.3g}: {check.advice}")

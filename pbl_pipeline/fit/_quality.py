@@ -28,6 +28,8 @@ FALL_WARN, TRACE_NEEDED = 0.2, 8
 #: Median standard deviation of a joint angle from which on the joint counts as not observed.
 SD_WARN_DEG = 20.0
 CLOCK_WARN_S = 0.3
+#: Standard deviation of the focal length as a share of it. By so much depth and the person's size are off.
+FOCAL_SD_WARN = 0.02
 
 
 def check_fit(session: Session, trials: Sequence[TrialFit], solution: Solution) -> tuple[Check, ...]:
@@ -142,13 +144,16 @@ def _converged(solution: Solution) -> Check:
 
 def _intrinsics(trials: Sequence[TrialFit]) -> Check:
     sources = sorted({t.camera.source for t in trials if not t.camera.source.startswith(("measured", "file"))})
-    return Check(
-        "camera_intrinsics_measured",
-        WARN if sources else PASS,
-        None,
-        None,
-        f"the focal length is not measured ({'; '.join(sources)}): pass --camera with a calibration",
+    spread = np.array([t.camera.focal_rel_sd for t in trials])
+    worst = float(np.nanmax(spread)) if np.isfinite(spread).any() else None
+    unsure = worst is not None and worst > FOCAL_SD_WARN
+    advice = (
+        f"the focal length is not measured ({'; '.join(sources)}): pass --camera with a calibration (`pbl calibrate`)"
+        if sources
+        else "the calibration of the camera leaves the focal length uncertain: calibrate again (docs/camera.md)"
     )
+    # The value is the standard deviation of the focal length as a share of it.
+    return Check("camera_intrinsics_measured", WARN if sources or unsure else PASS, worst, FOCAL_SD_WARN, advice)
 
 
 def _orientation(trials: Sequence[TrialFit]) -> Check:

@@ -120,6 +120,8 @@ class Keypoints:
         optional: dict[str, Any] = {}
         if self.phone_time_s is not None and self.phone_quat_wxyz is not None:
             optional = {"phone_time_s": self.phone_time_s, "phone_quat_wxyz": self.phone_quat_wxyz}
+        if np.isfinite(self.camera.focal_rel_sd):
+            optional["focal_rel_sd"] = np.asarray(self.camera.focal_rel_sd, np.float64)
         if self.confidence_curve:
             optional["confidence_curve"] = np.asarray(self.confidence_curve)
         if self.picture is not None:
@@ -168,7 +170,10 @@ class Keypoints:
         n, j = data["time_s"].size, data["names"].size
         arrays = {"time_s": (n,), "xy_px": (n, j, 2), "xyz_cam_m": (n, j, 3), "confidence": (n, j), "box_px": (n, 4)}
         arrays |= {"image_size_px": (2,), "camera_matrix": (3, 3), "distortion": (5,), "root_relative": ()}
+        if "focal_rel_sd" in data:
+            arrays["focal_rel_sd"] = ()
         check_numbers(path, data, arrays)
+        rel_sd = float(data.get("focal_rel_sd", np.nan))
         return cls(
             time_s=data["time_s"].astype(np.float64),
             names=tuple(str(n) for n in data["names"]),
@@ -178,7 +183,7 @@ class Keypoints:
             root_relative=bool(data["root_relative"]),
             confidence=data["confidence"],
             image_size_px=(int(data["image_size_px"][0]), int(data["image_size_px"][1])),
-            camera=Camera(data["camera_matrix"], data["distortion"], str(data["camera_source"])),
+            camera=Camera(data["camera_matrix"], data["distortion"], str(data["camera_source"]), rel_sd),
             box_px=data["box_px"],
             phone_time_s=data.get("phone_time_s"),
             phone_quat_wxyz=data.get("phone_quat_wxyz"),

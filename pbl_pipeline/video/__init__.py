@@ -3,8 +3,10 @@
 from ._attitude import Attitude, camera_in_device, check_attitude, load_attitude
 from ._camera import guess_camera, load_camera, viewing_ray
 from ._camera_pose import CameraPose, load_camera_poses
+from ._find_camera import find_camera
 from ._probe import probe, sha256_of
 from ._read import read_frames
+from ._timing import check_timing
 from ._types import Camera, Frame, VideoInfo
 
 __all__ = [
@@ -15,6 +17,8 @@ __all__ = [
     "VideoInfo",
     "camera_in_device",
     "check_attitude",
+    "check_timing",
+    "find_camera",
     "guess_camera",
     "load_attitude",
     "load_camera",

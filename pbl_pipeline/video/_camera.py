@@ -25,6 +25,9 @@ from ._types import Camera, VideoInfo
 #: Their mean is 0.728, their standard deviation 0.044.
 PHONE_FOCAL_OVER_LONG_SIDE = 0.7169
 PHONE_FOCAL_RANGE = (0.6655, 0.8452)
+#: Root mean square distance of the 25 distinct values from that median, as a share of it (0.067). Other phones, lenses
+#: and zooms may lie further off; nothing measured says how far.
+PHONE_FOCAL_REL_SD = 0.07
 
 _NEXT = "correct the file, or leave it out: then a phone's field of view is guessed and the result says so"
 
@@ -35,6 +38,7 @@ def guess_camera(video: VideoInfo | tuple[int, int]) -> Camera:
     Focal length `PHONE_FOCAL_OVER_LONG_SIDE` times the longer side (70 degrees along it), principal point in the
     middle, no distortion. `source` begins with "guess" and states the spread of the published values. A zoomed or
     cropped recording (digital zoom, strong stabilisation, a telephoto lens) has a longer focal length than any of them.
+    `find_camera` asks the file first.
     """
     width, height = (video.width_px, video.height_px) if isinstance(video, VideoInfo) else video
     if width <= 0 or height <= 0:
@@ -48,7 +52,7 @@ def guess_camera(video: VideoInfo | tuple[int, int]) -> Camera:
         f"78 published iPhone calibrations, which lie {low:.0f} to +{high:.0f} % from it; no distortion; "
         "wrong for zoomed or cropped video)"
     )
-    return Camera(matrix, np.zeros(5), source)
+    return Camera(matrix, np.zeros(5), source, PHONE_FOCAL_REL_SD)
 
 
 def load_camera(path: str | Path, image_size_px: tuple[int, int], name: str | None = None) -> Camera:
@@ -57,7 +61,8 @@ def load_camera(path: str | Path, image_size_px: tuple[int, int], name: str | No
     Two forms are read: the TOML of Pose2Sim and Sports2D, a table per camera with `size` [width, height], `matrix` and
     `distortions`; and JSON with `camera_matrix`, `distortion` and `image_size_px` [width, height]. Distortion is
     OpenCV's k1 k2 p1 p2 [k3]. When the recording is larger or smaller than the calibrated picture by one factor for
-    both sides, the matrix is scaled. `name` chooses the camera of a TOML that holds several.
+    both sides, the matrix is scaled. `name` chooses the camera of a TOML that holds several. The JSON may state the
+    standard deviation of the focal length, `focal_sd_px` (`pbl calibrate` does).
 
     Raises
     ------
@@ -82,9 +87,15 @@ def load_camera(path: str | Path, image_size_px: tuple[int, int], name: str | No
             "a principal point inside the picture",
         )
     distortion = np.concatenate([distortion, np.zeros(5 - len(distortion))])
+    rel_sd, spread = math.nan, ""
+    if fields.get("focal_sd") is not None:
+        rel_sd = float(_array(path, fields, "focal_sd", (1,))[0]) * 2 / (matrix[0, 0] + matrix[1, 1])
+        if rel_sd < 0:
+            raise _invalid(path, f"focal_sd_px = {fields['focal_sd']!r}", "a standard deviation in px, 0 or more")
+        spread = f", focal length within {100 * rel_sd:.2g} % (sd)"
     matrix, scaled = _scale(path, matrix, (width, height), image_size_px)
-    _check_distortion(path, matrix, distortion, image_size_px)
-    return Camera(matrix, distortion, f"file: {label}{scaled}")
+    check_distortion(path, matrix, distortion, image_size_px)
+    return Camera(matrix, distortion, f"file: {label}{scaled}{spread}", rel_sd)
 
 
 def _read(path: Path, name: str | None) -> tuple[str, Mapping[str, Any]]:
@@ -100,6 +111,7 @@ def _read(path: Path, name: str | None) -> tuple[str, Mapping[str, Any]]:
         raise _invalid(path, "no named fields", "a table of fields")
     if path.suffix.lower() != ".toml":
         names = {"camera_matrix": "matrix", "distortion": "distortion", "image_size_px": "size", "fisheye": "fisheye"}
+        names["focal_sd_px"] = "focal_sd"
         return path.name, {new: content[old] for old, new in names.items() if old in content}
     cameras = {key: value for key, value in content.items() if isinstance(value, dict) and "matrix" in value}
     if name is None and len(cameras) != 1:
@@ -147,8 +159,19 @@ def _scale(
     return scaled, f", scaled by {factor:.4g} from {width:g}x{height:g} px"
 
 
-def _check_distortion(path: Path, matrix: np.ndarray, distortion: np.ndarray, image_size_px: tuple[int, int]) -> None:
-    """The radial model must reach the corners of the picture before it turns back, or undistorting has no answer."""
+def check_distortion(path: Path, matrix: np.ndarray, distortion: np.ndarray, image_size_px: tuple[int, int]) -> None:
+    """Refuse a lens whose radial model turns back before the corners of the picture (`reaches_corners`)."""
+    if not reaches_corners(matrix, distortion, image_size_px):
+        k1, k2, _, _, k3 = distortion
+        raise _invalid(
+            path,
+            f"radial distortion {k1:g}, {k2:g}, {k3:g} folds back before the corner of the picture",
+            "coefficients k1 k2 p1 p2 k3 that hold over the whole picture",
+        )
+
+
+def reaches_corners(matrix: np.ndarray, distortion: np.ndarray, image_size_px: tuple[int, int]) -> bool:
+    """Whether the radial model reaches the corners before it turns back: beyond that, undistorting has no answer."""
     k1, k2, _, _, k3 = distortion
     width, height = image_size_px
     x = (np.array([0, width - 1, 0, width - 1]) - matrix[0, 2]) / matrix[0, 0]
@@ -157,13 +180,7 @@ def _check_distortion(path: Path, matrix: np.ndarray, distortion: np.ndarray, im
     r = np.linspace(0.0, 3.0 * max(corner, 1.0), 4000)
     distorted = r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6)
     turns = np.flatnonzero(np.diff(distorted) <= 0)
-    reach = float(distorted[turns[0]] if len(turns) else distorted[-1])
-    if reach < corner:
-        raise _invalid(
-            path,
-            f"radial distortion {k1:g}, {k2:g}, {k3:g} folds back before the corner of the picture",
-            "coefficients k1 k2 p1 p2 k3 that hold over the whole picture",
-        )
+    return float(distorted[turns[0]] if len(turns) else distorted[-1]) >= corner
 
 
 def _invalid(path: Path, found: str, expected: str) -> PblError:

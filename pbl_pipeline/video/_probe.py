@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import hashlib
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from pbl_pipeline import progress
 
 from ._decode import Decoder, check_file
 from ._orientation import Orientation, orientation_of
+from ._tags import read_tags
+from ._timing import speed_notes
 from ._types import VideoInfo
 
 
@@ -56,8 +59,11 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
         tick_s = float(decoder.time_base)
         time_s = ticks * tick_s
         interval_s, varies = _rate(time_s, tick_s, float(stream.average_rate) if stream.average_rate else None)
-        metadata = dict(stream.metadata) | dict(container.metadata)
+        tags = read_tags(path)
+        metadata = dict(stream.metadata) | dict(container.metadata) | tags.items
+        capture_fps = _number(metadata, "com.android.capture.fps", "com.apple.quicktime.capture.fps")
         notes = decoder.notes + _picture_notes(turn, stream.sample_aspect_ratio)
+        notes += speed_notes(1.0 / interval_s, capture_fps, tags.speeds)
         return VideoInfo(
             path=str(path),
             sha256=sha256,
@@ -78,6 +84,9 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
             make=_first(metadata, "com.apple.quicktime.make", "com.android.manufacturer", "make"),
             model=_first(metadata, "com.apple.quicktime.model", "com.android.model", "model"),
             notes=tuple(notes),
+            lens=_first(metadata, "com.apple.quicktime.camera.lens_model"),
+            focal_35mm=_number(metadata, "com.apple.quicktime.camera.focal_length.35mm_equivalent"),
+            capture_fps=capture_fps,
         )
 
 
@@ -128,3 +137,10 @@ def _recorded_utc(metadata: Mapping[str, str]) -> str | None:
 def _first(metadata: Mapping[str, str], *names: str) -> str | None:
     lower = {key.lower(): value.strip() for key, value in metadata.items()}
     return next((lower[name] for name in names if lower.get(name)), None)
+
+
+def _number(metadata: Mapping[str, str], *names: str) -> float | None:
+    """The positive number that a tag begins with ("27", "27.00mm"); None where there is none."""
+    digits = re.match(r"\d+(\.\d+)?", _first(metadata, *names) or "")
+    value = float(digits[0]) if digits else 0.0
+    return value if value > 0 else None

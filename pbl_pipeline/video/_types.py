@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -30,6 +31,13 @@ class VideoInfo:
         True when an interval differs from the median by more than a tenth and more than the stamps' own rounding.
     recorded_utc
         "2026-01-31T09:15:00Z", or None when the file does not say.
+    make, model, lens
+        As the phone wrote them, or None: "Apple", "iPhone 13", "iPhone 13 back dual wide camera 5.1mm f/1.6".
+    focal_35mm
+        Focal length (mm) of the same view on 35 mm film, or None.
+    capture_fps
+        Frames per second at which the phone says it recorded, or None. Where it is above `fps`, playing is slower than
+        the movement was, and so are the stamps.
     notes
         What a reader should know and no field says: frames an edit list hides, stamps that repeat, a mirrored picture.
     """
@@ -53,6 +61,9 @@ class VideoInfo:
     make: str | None
     model: str | None
     notes: tuple[str, ...] = ()
+    lens: str | None = None
+    focal_35mm: float | None = None
+    capture_fps: float | None = None
 
 
 class Frame:
@@ -78,9 +89,17 @@ class Frame:
 class Camera:
     """Intrinsics of the upright frame: `matrix` (3, 3) in px, `distortion` (5,) OpenCV order k1 k2 p1 p2 k3.
 
-    `source` says where they come from, such as "measured: calib.toml" or "guess: 60 deg diagonal field of view".
+    `source` says where they come from. Its first word is the kind: "file" and "measured" (a calibration), "metadata"
+    (what the phone wrote into the video), "preset" (a phone of that model), "guess". `focal_rel_sd`: standard deviation
+    of the focal length as a share of it, NaN where nothing is known of it.
     """
 
     matrix: np.ndarray
     distortion: np.ndarray
     source: str
+    focal_rel_sd: float = math.nan
+
+    @property
+    def focal_px(self) -> float:
+        """Mean of the two focal lengths, px."""
+        return float(self.matrix[0, 0] + self.matrix[1, 1]) / 2

@@ -28,7 +28,7 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 
     def detect(path, sheet, camera_file=None, person=None):
         info = pipeline.probe(path)
-        points = chain.detect_keypoints(path, chain.track_people(path), 1, pipeline.guess_camera(info))
+        points = chain.detect_keypoints(path, chain.track_people(path), 1, pipeline.find_camera(info))
         points = dataclasses.replace(points, image_size_px=(1920, 1080))
         return pipeline.Trial(path.stem, path, info, pipeline.choose_subject(chain.track_people(path)), points)
 

@@ -1,0 +1,154 @@
+"""What a phone wrote into a MOV or MP4 beside the pictures, read from the boxes themselves.
+
+FFmpeg hands on the metadata of the whole file. The lens stands in the metadata of the video track, which it leaves out,
+and of an edit list it applies the cuts and ignores the speed. Layout: ISO/IEC 14496-12 (boxes, edit list 8.6.6) and
+Apple's QuickTime File Format (`meta` with `keys` and `ilst`, well-known types of `data`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+from ._structure import family
+
+#: An index larger than this is not read: hours of video have some MB.
+_LARGEST_MOOV = 64 << 20
+_CONTAINERS = (b"moov", b"trak", b"udta", b"edts", b"mdia")
+
+
+@dataclasses.dataclass(frozen=True)
+class Tags:
+    """`items`: names in lower case and texts of the file and of its video track (whose own go first). `speeds`: those
+    of the video track's edits, 1 where they play as stored; empty edits do not count."""
+
+    items: dict[str, str] = dataclasses.field(default_factory=dict)
+    speeds: tuple[float, ...] = ()
+
+
+def read_tags(path: Path) -> Tags:
+    """The tags of a file; nothing where it is no MOV or MP4, or its boxes make no sense from some place on."""
+    if family(path) != "mp4":
+        return Tags()
+    moov = _moov(path)
+    items: dict[str, str] = {}
+    tracks: dict[str, str] = {}
+    speeds: tuple[float, ...] = ()
+    for name, box in _boxes(moov):
+        if name == b"trak":
+            if not speeds and not tracks and _is_video(box):
+                tracks, speeds = _items(box), _speeds(box)
+        elif name == b"meta":
+            items |= _meta(box)
+        elif name == b"udta":
+            items |= _items(box)
+    return Tags(items | tracks, speeds)
+
+
+def _moov(path: Path) -> bytes:
+    size = path.stat().st_size
+    at = 0
+    with path.open("rb") as file:
+        while at + 8 <= size:
+            file.seek(at)
+            length, name = struct.unpack(">I4s", file.read(8))
+            head = 8
+            if length == 1:
+                wide = file.read(8)
+                length, head = (int.from_bytes(wide, "big"), 16) if len(wide) == 8 else (0, 16)
+            elif length == 0:
+                length = size - at
+            if length < head:
+                break
+            if name == b"moov":
+                return file.read(length - head) if length <= _LARGEST_MOOV else b""
+            at += length
+    return b""
+
+
+def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Names and contents of the boxes in `data`; ends where a length makes no sense."""
+    at = 0
+    while at + 8 <= len(data):
+        length, name = struct.unpack_from(">I4s", data, at)
+        head = 8
+        if length == 1 and at + 16 <= len(data):
+            (length,), head = struct.unpack_from(">Q", data, at + 8), 16
+        elif length == 0:
+            length = len(data) - at
+        if length < head or at + length > len(data):
+            return
+        yield name, data[at + head : at + length]
+        at += length
+
+
+def _find(data: bytes, *names: bytes) -> bytes:
+    """Content of the first box at this path; empty where there is none."""
+    for wanted in names:
+        data = next((box for name, box in _boxes(data) if name == wanted), b"")
+    return data
+
+
+def _is_video(trak: bytes) -> bool:
+    return _find(trak, b"mdia", b"hdlr")[8:12] == b"vide"
+
+
+def _items(data: bytes) -> dict[str, str]:
+    """The items of all `meta` boxes directly in these containers."""
+    found: dict[str, str] = {}
+    for name, box in _boxes(data):
+        if name == b"meta":
+            found |= _meta(box)
+        elif name in _CONTAINERS:
+            found |= _items(box)
+    return found
+
+
+def _meta(box: bytes) -> dict[str, str]:
+    # ISO writes version and flags before the boxes, QuickTime does not.
+    if box[4:8] != b"hdlr" and box[8:12] == b"hdlr":
+        box = box[4:]
+    keys, listed = _find(box, b"keys"), _find(box, b"ilst")
+    names, at = [], 8
+    while at + 8 <= len(keys):
+        (length,) = struct.unpack_from(">I", keys, at)
+        if length < 8 or at + length > len(keys):
+            break
+        names.append(keys[at + 8 : at + length].decode("utf-8", "replace"))
+        at += length
+    found = {}
+    for number, item in _boxes(listed):
+        index = int.from_bytes(number, "big")
+        data = _find(item, b"data")
+        if 1 <= index <= len(names) and len(data) > 8:
+            value = _value(int.from_bytes(data[1:4], "big"), data[8:])
+            if value is not None:
+                found[names[index - 1].lower()] = value
+    return found
+
+
+def _value(kind: int, raw: bytes) -> str | None:
+    """Text of a value by its well-known type; None for the others (pictures, binary)."""
+    if kind == 1:
+        return raw.decode("utf-8", "replace").strip("\0").strip()
+    if kind in (23, 24) and len(raw) == (4 if kind == 23 else 8):
+        return f"{struct.unpack('>f' if kind == 23 else '>d', raw)[0]:.9g}"
+    if kind in (21, 22, 65, 66, 67, 74, 75, 76, 77, 78) and len(raw) <= 8:
+        return str(int.from_bytes(raw, "big", signed=kind in (21, 65, 66, 67, 74)))
+    return None
+
+
+def _speeds(trak: bytes) -> tuple[float, ...]:
+    table = _find(trak, b"edts", b"elst")
+    if len(table) < 8:
+        return ()
+    layout = ">QqhH" if table[0] == 1 else ">IihH"
+    size = struct.calcsize(layout)
+    speeds = []
+    for i in range(min(int.from_bytes(table[4:8], "big"), (len(table) - 8) // size)):
+        _, start, whole, part = struct.unpack_from(layout, table, 8 + i * size)
+        if start >= 0:
+            speeds.append(whole + part / 65536)
+    return tuple(speeds)

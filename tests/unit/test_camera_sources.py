@@ -1,0 +1,261 @@
+"""Whose intrinsics a video gets, and what its file says of lens and time; on files made with known content."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.video import Camera, VideoInfo, check_timing, find_camera, probe, read_frames
+from pbl_pipeline.video._camera import reaches_corners
+from pbl_pipeline.video._presets import preset_camera, presets, quarter_turn
+from pbl_pipeline.video._tags import read_tags
+from pbl_pipeline.video.build_presets import build
+from tests.inputs import keypoints
+from tests.quicktime import edit_list, insert, meta
+from tests.videos import constant_rate, numbered_frames, write_video
+
+APPLE = {
+    "com.apple.quicktime.make": "Apple",
+    "com.apple.quicktime.model": "iPhone 13",
+    "com.apple.quicktime.creationdate": "2026-03-01T10:15:30+0100",
+}
+LENS = "com.apple.quicktime.camera.lens_model"
+FOCAL = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
+
+
+def video(**changes) -> VideoInfo:
+    values: dict = {
+        "path": "v.mov",
+        "sha256": "0" * 64,
+        "size_bytes": 1,
+        "container": "mov",
+        "codec": "h264",
+        "pixel_format": "yuv420p",
+        "width_px": 720,
+        "height_px": 1280,
+        "rotation_deg": 90,
+        "time_s": constant_rate(3),
+        "fps": 30.0,
+        "duration_s": 0.1,
+        "n_frames": 3,
+        "n_frames_announced": 3,
+        "variable_frame_rate": False,
+        "recorded_utc": None,
+        "make": None,
+        "model": None,
+    }
+    return VideoInfo(**{**values, **changes})
+
+
+def small(path, **options):
+    return write_video(path, numbered_frames(6), constant_rate(6), **options)
+
+
+# --- what the file says
+
+
+@pytest.mark.parametrize("iso", [False, True])
+@pytest.mark.parametrize("value", [27, "27", 27.0, "27.00mm"])
+def test_the_lens_stands_with_the_track(tmp_path, value, iso):
+    path = small(tmp_path / "a.mov")
+    lens = "iPhone 13 back dual wide camera 5.1mm f/1.6"
+    insert(path, of_track=meta({LENS: lens, FOCAL: value}, iso), of_file=meta(APPLE, iso))
+    info = probe(path)
+    assert (info.make, info.model, info.lens, info.focal_35mm) == ("Apple", "iPhone 13", lens, 27.0)
+    assert info.recorded_utc == "2026-03-01T09:15:30Z"
+    assert info.n_frames == 6
+    camera = find_camera(info)
+    assert camera.source.startswith("metadata: 27 mm on 35 mm film, iPhone 13 back")
+
+
+def test_a_file_without_tags(tmp_path):
+    info = probe(small(tmp_path / "a.mp4"))
+    assert (info.lens, info.focal_35mm, info.capture_fps) == (None, None, None)
+    assert check_timing(info) == ()
+    assert find_camera(info).source.startswith("guess: ")
+
+
+def test_boxes_that_make_no_sense_end_the_reading(tmp_path):
+    path = small(tmp_path / "a.mov")
+    whole = insert(path, of_track=meta({LENS: "x", FOCAL: 27}), of_file=meta(APPLE)).read_bytes()
+    assert read_tags(path).items == {k.lower(): v for k, v in APPLE.items()} | {LENS: "x", FOCAL: "27"}
+    rng = np.random.default_rng(1)
+    for at in rng.integers(whole.index(b"moov"), len(whole) - 4, 300):
+        path.write_bytes(whole[:at] + rng.bytes(4) + whole[at + 4 :])
+        tags = read_tags(path)
+        assert all(isinstance(v, str) for v in tags.items.values())
+    for at in range(8, len(whole), 97):
+        path.write_bytes(whole[:at])
+        assert read_tags(path).items == {}
+
+
+# --- time
+
+
+def test_android_slow_motion_is_said_and_fails(tmp_path):
+    path = insert(small(tmp_path / "a.mp4"), of_file=meta({"com.android.capture.fps": 240.0}))
+    info = probe(path)
+    assert info.capture_fps == 240
+    assert any("240 and stored at 30" in n and "8 times too slow" in n for n in info.notes)
+    (check,) = check_timing(info)
+    assert (check.outcome, check.value) == ("FAIL", pytest.approx(8, rel=1e-3))
+    assert "original" in check.advice
+
+
+def test_android_at_the_rate_it_says_passes(tmp_path):
+    info = probe(insert(small(tmp_path / "a.mp4"), of_file=meta({"com.android.capture.fps": 30.0})))
+    assert [c.outcome for c in check_timing(info)] == ["PASS"]
+    assert not any("slow" in n for n in info.notes)
+
+
+def test_slow_motion_with_an_edit_list(tmp_path):
+    """240 frames a second of real time; the edit list plays the second half at an eighth and hides nothing."""
+    path = write_video(tmp_path / "slow.mov", numbered_frames(48), constant_rate(48, 240), ticks_per_s=2400)
+    insert(path, of_track=edit_list([(100, 0, 1.0), (800, 240, 0.125)]))
+    info = probe(path)
+    np.testing.assert_allclose(np.diff(info.time_s), 1 / 240, atol=1e-3)
+    assert any("edit list asks players for other speeds (0.125)" in n for n in info.notes)
+    assert any("slow motion of 240 frames a second" in n for n in info.notes)
+
+
+def test_hevc_portrait_with_its_rotation_flag(tmp_path):
+    path = tmp_path / "a.mov"
+    write_video(path, numbered_frames(6, 96, 64), constant_rate(6), codec="libx265", rotation_deg=90)
+    info = probe(insert(path, of_file=meta(APPLE)))
+    assert (info.codec, info.width_px, info.height_px, info.rotation_deg) == ("hevc", 64, 96, 90)
+    assert next(iter(read_frames(path))).image[2, 2].tolist() == pytest.approx([255, 0, 0], abs=40)
+    assert info.n_frames == 6
+
+
+# --- intrinsics
+
+
+def test_the_order_of_sources(tmp_path):
+    file = tmp_path / "camera.json"
+    content = {"camera_matrix": [[940, 0, 360], [0, 942, 640], [0, 0, 1]], "distortion": [0] * 5}
+    file.write_text(json.dumps(content | {"image_size_px": [720, 1280], "focal_sd_px": 4.705}))
+    full = video(model="iPhone 13", focal_35mm=27.0)
+    given = find_camera(full, file)
+    assert given.source.startswith("file: camera.json, focal length within 0.5 % (sd)")
+    assert given.focal_rel_sd == pytest.approx(0.005)
+    assert find_camera(full).source.startswith("metadata: ")
+    assert find_camera(dataclasses.replace(full, focal_35mm=None)).source.startswith(
+        "preset: main camera of the iPhone"
+    )
+    assert find_camera(video()).source.startswith("guess: ")
+    spread = [find_camera(v).focal_rel_sd for v in (full, video(model="iPhone 13"), video())]
+    assert sorted(spread) == spread
+    assert spread[0] > given.focal_rel_sd
+
+
+def test_focal_length_from_film():
+    camera = find_camera(video(focal_35mm=36.0, width_px=1600, height_px=1200))
+    # 36 mm along 36 mm of film is as long as the picture; along the diagonals (43.267 mm, 2000 px) it is 1664 px.
+    assert camera.focal_px == pytest.approx(np.sqrt(1600 * 2000 * 36 / 43.2666), rel=1e-4)
+    assert not camera.distortion.any()
+    assert find_camera(video(focal_35mm=3000.0)).source.startswith("guess")
+
+
+def test_film_and_published_calibration_agree_on_one_phone():
+    film, known = find_camera(video(focal_35mm=27.0)), find_camera(video(model="iPhone 13"))
+    assert film.focal_px == pytest.approx(known.focal_px, rel=film.focal_rel_sd)
+
+
+def test_presets_are_those_published(shared_data):
+    published = json.loads((shared_data / "real/norms/opencap_iphone_intrinsics.json").read_text())
+    assert build(published) == presets()
+    for key, entry in published.items():
+        height, width = (int(row[0]) for row in entry["imageSize"])
+        camera = preset_camera(video(model=key.split("/")[0], width_px=width, height_px=height))
+        assert camera is not None
+        np.testing.assert_allclose(camera.matrix, entry["intrinsicMat"], atol=1e-3)
+        np.testing.assert_allclose(camera.distortion, entry["distortion"][0], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["iPhone 11", "iphone12,1", " iPhone  11 "])
+def test_a_preset_by_name_or_identifier(name):
+    small_one, large = preset_camera(video(model=name)), preset_camera(video(model=name, width_px=2160, height_px=3840))
+    assert small_one is not None
+    assert large is not None
+    # Of this phone both formats are published, and differ.
+    assert (small_one.matrix[0, 0], large.matrix[0, 0]) == (
+        pytest.approx(912.2, abs=0.1),
+        pytest.approx(2702.8, abs=0.1),
+    )
+
+
+@pytest.mark.parametrize(
+    ("model", "lens"),
+    [
+        ("iPhone 3G", None),
+        (None, None),
+        ("iPhone 13", "iPhone 13 front camera 2.71mm f/2.2"),
+        ("iPhone 13", "1.54mm f/2.4"),
+    ],
+)
+def test_no_preset(model, lens):
+    assert preset_camera(video(model=model, lens=lens)) is None
+    assert find_camera(video(model=model, lens=lens)).source.startswith("guess")
+
+
+def test_a_preset_scales_and_turns_with_the_recording():
+    portrait = preset_camera(video(model="iPhone 11"))
+    assert portrait is not None
+    points = np.array([[0.3, -0.2, 2.0], [-0.4, 0.6, 2.5], [0.1, 0.9, 3.0]])
+    seen = _project(points, portrait)
+    # 1080p portrait: the same view, 1.5 times as many pixels.
+    larger = preset_camera(video(model="iPhone 11", width_px=1080, height_px=1920))
+    assert larger is not None
+    np.testing.assert_allclose(_project(points, larger) + 0.5, 1.5 * (seen + 0.5), atol=1e-6)
+    # The phone turned counter-clockwise (flag 0): what was right in the portrait picture is up, so (x, y) -> (y, W-1-x).
+    level = preset_camera(video(model="iPhone 11", width_px=1280, height_px=720, rotation_deg=0))
+    assert level is not None
+    np.testing.assert_allclose(
+        _project(points @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), level),
+        np.stack([seen[:, 1], 719 - seen[:, 0]], 1),
+        atol=1e-6,
+    )
+    on_its_head = preset_camera(video(model="iPhone 11", width_px=1280, height_px=720, rotation_deg=180))
+    assert on_its_head is not None
+    np.testing.assert_allclose(
+        _project(points @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]]), on_its_head),
+        np.stack([1279 - seen[:, 1], seen[:, 0]], 1),
+        atol=1e-6,
+    )
+
+
+def test_four_quarter_turns_are_none():
+    matrix, distortion = np.array([[900.0, 0, 300], [0, 910, 600], [0, 0, 1]]), np.array([0.1, -0.2, 0.01, -0.02, 0.3])
+    turned, bent = matrix, distortion
+    for width in (720, 1280, 720, 1280):
+        turned, bent = quarter_turn(turned, bent, width)
+    np.testing.assert_allclose(turned, matrix)
+    np.testing.assert_allclose(bent, distortion)
+
+
+def test_every_preset_holds_over_the_whole_picture():
+    for model in presets()["names"]:
+        for width, height, turned in ((720, 1280, 90), (1920, 1080, 0), (1440, 1080, 180)):
+            camera = preset_camera(video(model=model, width_px=width, height_px=height, rotation_deg=turned))
+            assert camera is not None
+            assert reaches_corners(camera.matrix, camera.distortion, (width, height))
+
+
+def test_the_uncertainty_is_kept_with_the_keypoints(tmp_path):
+    lens = Camera(np.array([[900.0, 0, 500], [0, 900, 500], [0, 0, 1]]), np.zeros(5), "preset: x", 0.04)
+    keypoints(camera=lens).save(tmp_path / "k.npz")
+    assert Keypoints.load(tmp_path / "k.npz").camera.focal_rel_sd == 0.04
+    keypoints().save(tmp_path / "without.npz")
+    assert np.isnan(Keypoints.load(tmp_path / "without.npz").camera.focal_rel_sd)
+    with np.load(tmp_path / "without.npz") as f:
+        assert "focal_rel_sd" not in f.files
+
+
+def _project(points: np.ndarray, camera: Camera) -> np.ndarray:
+    flat, _ = cv2.projectPoints(points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)
+    return flat.reshape(-1, 2)
