@@ -212,7 +212,7 @@ def test_a_preset_scales_and_turns_with_the_recording():
     larger = preset_camera(video(model="iPhone 11", width_px=1080, height_px=1920))
     assert larger is not None
     np.testing.assert_allclose(_project(points, larger) + 0.5, 1.5 * (seen + 0.5), atol=1e-6)
-    # The phone turned counter-clockwise (flag 0): what was right in the portrait picture is up, so (x, y) -> (y, W-1-x).
+    # The phone turned counter-clockwise (flag 0): right in the portrait picture is up, so (x, y) -> (y, W - 1 - x).
     level = preset_camera(video(model="iPhone 11", width_px=1280, height_px=720, rotation_deg=0))
     assert level is not None
     np.testing.assert_allclose(
