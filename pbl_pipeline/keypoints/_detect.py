@@ -1,15 +1,15 @@
 """Keypoints of one tracked person over a video.
 
-Two passes, because the crop decides the quality: the first cuts along the person's track, and its keypoints say where
-the body circle really is; the second cuts there, smoothed over time in both directions (nothing is live here). The
-crop never feeds on itself from frame to frame, so it cannot wander off to somebody else: where the first pass
-contradicts the track, the track wins.
+Two looks, because the crop decides the quality: the first, at some of the frames, cuts along the person's track, and
+its keypoints say where the body circle really is; the second, at every frame, cuts there, smoothed over time in both
+directions (nothing is live here). The crop never feeds on itself from frame to frame, so it cannot wander off to
+somebody else: where the first look contradicts the track, the track wins.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +18,12 @@ from pbl_pipeline import assets, progress
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.tracking import Tracking, time_in_view_s
-from pbl_pipeline.video import Camera, read_frames
+from pbl_pipeline.video import Camera, Frame, read_frames
 
+from ._batched import BatchDetector, BatchedLooks
 from ._blazepose import MODEL_SHA256, BlazePoseLandmarks
+from ._crops import REACH_SD, corrected, first_looks, smooth_at, smooth_rois
+from ._passes import Looks, look_twice, n_workers
 from ._protocol import KeypointDetector, PersonKeypoints
 from ._types import Keypoints
 
@@ -29,10 +32,11 @@ from ._types import Keypoints
 class KeypointParams:
     """Parameters of `detect_keypoints`.
 
-    passes: 1 cuts along the track only, 2 cuts again where the first pass saw the body.
+    passes: 1 cuts along the track only, 2 cuts again where the first look saw the body.
+    first_look_s: the first look is taken once in so many seconds, 0: at every frame.
     smooth_s: standard deviation of the Gaussian that smooths the crops over time.
     min_presence: below it a frame has no person and its keypoints are missing.
-    max_drift, max_growth: the first pass is believed where its body circle lies within this share of the side from
+    max_drift, max_growth: the first look is believed where its body circle lies within this share of the side from
     the track's, and differs from it in size by at most this factor.
     agree_mm, agree_width_mm: how far the answers for the picture and its mirror image may lie apart, see
     `BlazePoseLandmarks`.
@@ -43,6 +47,7 @@ class KeypointParams:
     detector: str = "blazepose"
     model_sha256: str = MODEL_SHA256
     passes: int = 2
+    first_look_s: float = 0.1
     smooth_s: float = 0.1
     min_presence: float = 0.5
     max_drift: float = 0.3
@@ -61,8 +66,21 @@ def _blazepose(params: KeypointParams) -> KeypointDetector:
     return BlazePoseLandmarks(assets.fetch("blazepose_landmarks"), params.agree_mm, params.agree_width_mm)
 
 
+def _onnx(params: KeypointParams) -> KeypointDetector:
+    from ._onnx_keypoints import ModelKeypointParams, OnnxKeypoints  # not above: its parameters extend these
+
+    if not isinstance(params, ModelKeypointParams):
+        raise PblError(
+            "SOLVER_UNKNOWN",
+            found="detector 'onnx' without the model that it is to run",
+            expected="the parameters of a registered model (`method_of_model`)",
+            next_step="name a registered model (`pbl models list`)",
+        )
+    return OnnxKeypoints(params.model)
+
+
 #: Detectors by the name that `KeypointParams.detector` uses. Another detector joins here.
-DETECTORS: dict[str, Callable[[KeypointParams], KeypointDetector]] = {"blazepose": _blazepose}
+DETECTORS: dict[str, Callable[[KeypointParams], KeypointDetector]] = {"blazepose": _blazepose, "onnx": _onnx}
 
 
 def detect_keypoints(
@@ -75,7 +93,8 @@ def detect_keypoints(
 ) -> Keypoints:
     """Keypoints of person `person_id` in every frame; NaN with confidence 0 where she or the point is not in view.
 
-    `detector` replaces the one that `params.detector` names. Frames stream.
+    `detector` replaces the one that `params.detector` names. The video is decoded once, and frames of about half a
+    second are in memory.
 
     Raises `PblError`: SUBJECT_UNKNOWN_PERSON; TRACK_TOO_SHORT when she is in view for less than `min_time_s`;
     VIDEO_CHANGED when the video has other frames than the tracking; SOLVER_UNKNOWN for an unknown detector name;
@@ -101,60 +120,10 @@ def detect_keypoints(
             "person",
             key=str(video_path),
         )
-    if detector is None:
-        if params.detector not in DETECTORS:
-            raise PblError(
-                "SOLVER_UNKNOWN",
-                found=f"keypoint detector {params.detector!r}",
-                expected=f"one of {', '.join(DETECTORS)}",
-                next_step="choose one of these names in the keypoint parameters",
-            )
-        detector = DETECTORS[params.detector](params)
-    track_roi = _rois(track.roi_px, track.box_px)
-    roi = smooth_rois(track_roi, tracking.time_s, params.smooth_s)
-    if params.passes > 1:
-        first = _run(detector, video_path, roi, camera, "crops", quick=True)
-        roi = smooth_rois(refine_rois(roi, first, params), tracking.time_s, params.smooth_s)
-    found = _run(detector, video_path, roi, camera, "keypoints", quick=False)
-    return _assemble(found, detector, tracking, camera, params)
-
-
-def smooth_rois(roi: np.ndarray, time_s: np.ndarray, sigma_s: float) -> np.ndarray:
-    """Regions (T, 4) smoothed over time by a Gaussian kernel; size as logarithm, rotation on the circle.
-
-    Frames without a region (NaN) stay so, and take no part.
-    """
-    good = np.flatnonzero(np.isfinite(roi).all(axis=1))
-    out = np.full(roi.shape, np.nan)
-    if sigma_s <= 0:
-        out[good] = roi[good]
-        return out
-    x, y, side, turn = roi[good].T
-    values = np.stack([x, y, np.log(side), np.sin(turn), np.cos(turn)], axis=1)
-    time = time_s[good]
-    for row, t in zip(good, time, strict=True):
-        near = slice(np.searchsorted(time, t - 4 * sigma_s), np.searchsorted(time, t + 4 * sigma_s, side="right"))
-        # A straight line is fitted under the kernel: at the ends of a track a mean would lag behind the person.
-        tau = time[near] - t
-        weight = np.exp(-0.5 * (tau / sigma_s) ** 2)
-        design = np.stack([np.ones(len(tau)), tau / sigma_s], axis=1)
-        normal = design.T @ (weight[:, None] * design) + np.diag([0.0, 1e-9])
-        value = np.linalg.solve(normal, design.T @ (weight[:, None] * values[near]))[0]
-        out[row] = [value[0], value[1], np.exp(value[2]), np.arctan2(value[3], value[4])]
-    return out
-
-
-def refine_rois(roi: np.ndarray, found: Sequence[PersonKeypoints | None], params: KeypointParams) -> np.ndarray:
-    """Regions (T, 4) that the keypoints show, and those of `roi` where nobody was found or somebody else."""
-    out = roi.copy()
-    for row, person in enumerate(found):
-        if person is None or person.presence < params.min_presence or not np.all(np.isfinite(person.roi_px)):
-            continue
-        drift = float(np.hypot(*(person.roi_px[:2] - roi[row, :2]))) / roi[row, 2]
-        growth = abs(float(np.log(person.roi_px[2] / roi[row, 2])))
-        if drift <= params.max_drift and growth <= np.log(params.max_growth):
-            out[row] = person.roi_px
-    return out
+    detectors = [detector] if detector is not None else _detectors(params)
+    roi = smooth_rois(_rois(track.roi_px, track.box_px), tracking.time_s, params.smooth_s)
+    found = _look(detectors, video_path, roi, tracking.time_s, camera, params)
+    return _assemble(found, detectors[0], tracking, camera, params)
 
 
 def _rois(roi: np.ndarray, box: np.ndarray) -> np.ndarray:
@@ -164,26 +133,69 @@ def _rois(roi: np.ndarray, box: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(roi).all(axis=1, keepdims=True), roi, around)
 
 
-def _run(
-    detector: KeypointDetector, video_path: str | Path, roi: np.ndarray, camera: Camera, label: str, *, quick: bool
+def _detectors(params: KeypointParams) -> list[KeypointDetector]:
+    """The detector that the parameters name; one for each core where it says that this is the fastest."""
+    if params.detector not in DETECTORS:
+        raise PblError(
+            "SOLVER_UNKNOWN",
+            found=f"keypoint detector {params.detector!r}",
+            expected=f"one of {', '.join(DETECTORS)}",
+            next_step="choose one of these names in the keypoint parameters",
+        )
+    first = DETECTORS[params.detector](params)
+    more = n_workers() - 1 if getattr(first, "per_core", False) else 0
+    return [first, *(DETECTORS[params.detector](params) for _ in range(more))]
+
+
+def _look(
+    detectors: list[KeypointDetector],
+    video_path: str | Path,
+    roi: np.ndarray,
+    time_s: np.ndarray,
+    camera: Camera,
+    params: KeypointParams,
 ) -> list[PersonKeypoints | None]:
+    """What is seen in each frame, of the person whose body circle is `roi` (T, 4), NaN where she is not in view."""
     rows = np.flatnonzero(np.isfinite(roi).all(axis=1))
+    firsts = first_looks(rows, time_s, params.first_look_s) if params.passes > 1 else rows[:0]
+    better, n_better = np.empty((len(firsts), 4)), 0
+
+    def correct(row: int, person: PersonKeypoints) -> None:
+        nonlocal n_better
+        better[n_better] = corrected(roi[row], person, params.min_presence, params.max_drift, params.max_growth)
+        n_better += 1
+
+    def region(row: int) -> np.ndarray:
+        if params.passes < 2:
+            return roi[row]
+        return smooth_at(better[:n_better], time_s[firsts[:n_better]], float(time_s[row]), params.smooth_s)
+
     found: list[PersonKeypoints | None] = [None] * len(roi)
-    frames = read_frames(video_path, start=int(rows[0]), stop=int(rows[-1]) + 1)
-    seen = 0
-    for frame in progress.track(frames, label, total=int(rows[-1] - rows[0] + 1)):
-        if np.isfinite(roi[frame.index]).all():
-            found[frame.index] = detector.detect(frame.image, roi[frame.index], camera, quick=quick)
-            seen += 1
-    if seen != len(rows):
+    frames = _in_view(video_path, rows)
+    reach_s = REACH_SD * params.smooth_s if params.passes > 1 else 0.0
+    first = detectors[0]
+    with BatchedLooks(first, camera) if isinstance(first, BatchDetector) else Looks(detectors, camera) as looks:
+        seen = look_twice(frames, looks, time_s, reach_s, {int(r): roi[r] for r in firsts}, correct, region)
+        for row, person in progress.track(seen, "keypoints", total=len(rows)):
+            found[row] = person
+    n_seen = sum(person is not None for person in found)
+    if n_seen != len(rows):
         raise PblError(
             "VIDEO_CHANGED",
-            found=f"{seen} of the {len(rows)} frames in which the person was tracked",
+            found=f"{n_seen} of the {len(rows)} frames in which the person was tracked",
             expected="the video that was tracked",
             next_step="track the people again in this file",
             key=str(video_path),
         )
     return found
+
+
+def _in_view(video_path: str | Path, rows: np.ndarray) -> Iterator[Frame]:
+    """The frames `rows` of the video, in order."""
+    wanted = set(rows.tolist())
+    for frame in read_frames(video_path, start=int(rows[0]), stop=int(rows[-1]) + 1):
+        if frame.index in wanted:
+            yield frame
 
 
 def _assemble(

@@ -1,9 +1,9 @@
 """A TensorFlow Lite model without the branches that nobody asks for.
 
-BlazePose's landmark network also draws a silhouette of 256 x 256 and a heatmap for every point. Those two branches are a
-seventh of its multiplications and, because they work on large maps, half of its time. The runtime computes every output
-that the file names, so the file is rewritten with fewer; what is left is computed from the same weights in the same
-order, bit for bit.
+BlazePose's landmark network also draws a silhouette of 256 x 256 and a heatmap for every point. Those two branches are
+a seventh of its multiplications and, because they work on large maps, half of its time. The runtime computes every
+output that the file names, so the file is rewritten with fewer; what is left is computed from the same weights in the
+same order, bit for bit.
 """
 
 from __future__ import annotations

@@ -23,8 +23,8 @@ def read_frames(
 
     Frame `index` has `time_s` equal to `probe(path).time_s[index]`, whatever `start` is. Decoding begins at the start
     of the file (frames count from there) and ends after the last frame asked for; only the frames asked for are
-    converted to `image` (H, W, 3) uint8 BGR, each when its `image` is first read, in whichever thread does so. At most a
-    few frames are in memory beside those that the caller keeps.
+    converted to `image` (H, W, 3) uint8 BGR, each when its `image` is first read, in whichever thread does so. At most
+    a few frames are in memory beside those that the caller keeps.
 
     Raises
     ------

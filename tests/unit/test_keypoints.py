@@ -19,11 +19,12 @@ from pbl_pipeline.keypoints import (
     view_rotation,
 )
 from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES
-from pbl_pipeline.keypoints._detect import refine_rois, smooth_rois
+from pbl_pipeline.keypoints._crops import corrected, first_looks, smooth_at, smooth_rois
+from pbl_pipeline.keypoints._detect import _look
 from pbl_pipeline.keypoints._view import crop_matrix
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.tracking._blazepose import body_box
-from pbl_pipeline.video import Camera, viewing_ray
+from pbl_pipeline.video import Camera, read_frames, viewing_ray
 from tests.videos import constant_rate, write_video
 
 CAMERA = Camera(np.array([[1300.0, 0, 960], [0, 1300.0, 540], [0, 0, 1]]), np.zeros(5), "test")
@@ -126,17 +127,27 @@ def test_smoothing_leaves_gaps_and_turns_through_half_a_circle():
     np.testing.assert_allclose(np.abs(smooth[np.r_[:5, 8:20], 3]), np.pi, atol=1e-6)
 
 
-def test_the_track_wins_where_the_first_pass_contradicts_it():
-    roi = np.tile([500.0, 500.0, 400.0, 0.0], (4, 1))
+def test_first_looks_are_spread_evenly_and_begin_and_end_each_run():
+    time = np.arange(60) / 30
+    rows = np.concatenate([np.arange(0, 20), np.arange(31, 60)])
+    np.testing.assert_array_equal(
+        first_looks(rows, time, 0.1), [0, 3, 6, 9, 12, 15, 18, 19, 31, 34, 37, 40, 43, 46, 49, 52, 55, 58, 59]
+    )
+    np.testing.assert_array_equal(first_looks(rows, time, 0.0), rows)
+    np.testing.assert_array_equal(first_looks(rows[:1], time, 0.1), rows[:1])
+
+
+def test_the_track_wins_where_the_first_look_contradicts_it():
+    roi = np.array([500.0, 500.0, 400.0, 0.0])
 
     def seen(x, side, presence=1.0):
         empty = np.zeros((1, 2)), np.zeros((1, 3)), np.zeros(1)
         return PersonKeypoints(*empty, presence, np.array([x, 500.0, side, 0.1]))
 
     found = [seen(520, 420), seen(700, 400), seen(500, 700), seen(520, 420, presence=0.2)]
-    better = refine_rois(roi, found, KeypointParams())
+    better = [corrected(roi, one, min_presence=0.5, max_drift=0.3, max_growth=1.5) for one in found]
     np.testing.assert_allclose(better[0], [520, 500, 420, 0.1])
-    np.testing.assert_allclose(better[1:], roi[1:])
+    np.testing.assert_allclose(better[1:], np.tile(roi, (3, 1)))
 
 
 # --- a whole video ----------------------------------------------------------------------------------------------
@@ -177,13 +188,14 @@ def test_two_passes_and_missing_values(case, tmp_path):
     video, tracking = case
     detector = Cross()
     keypoints = detect_keypoints(video, tracking, 1, CAMERA, detector=detector)
-    assert detector.calls == [True] * 55 + [False] * 55
+    # Once in 0.1 s, and at the ends of both runs: frames 10..29 and 35..69.
+    assert (detector.calls.count(True), detector.calls.count(False)) == (8 + 13, 55)
     there = np.zeros(90, bool)
     there[10:70] = True
     there[30:35] = there[50:55] = False
     assert np.array_equal(np.isfinite(keypoints.xy_px[:, 0, 0]), there)
     assert np.array_equal(keypoints.confidence[:, 0] > 0, there)
-    # The first pass moved the crop by 2 px; around the dark frames the track's crop has a share.
+    # The first look moved the crop by 2 px; around the dark frames the track's crop has a share.
     np.testing.assert_allclose(keypoints.xy_px[there, 0, 0], 62, atol=1.5)
     np.testing.assert_allclose(keypoints.xy_px[12, 0], [62, 50], atol=1e-3)
     # What lies beyond the picture was not seen.
@@ -196,6 +208,40 @@ def test_two_passes_and_missing_values(case, tmp_path):
     again = Keypoints.load(tmp_path / "k.npz")
     np.testing.assert_array_equal(again.xy_px, keypoints.xy_px)
     assert again.names == ("middle", "left", "right")
+
+
+def test_one_reading_sees_what_two_readings_of_the_video_see(case):
+    """The plain way: all first looks, then all crops, then all second looks. Detectors in threads change nothing."""
+    video, tracking = case
+    params = KeypointParams(first_look_s=0.05)
+    images = {frame.index: frame.image for frame in read_frames(video)}
+    time, roi = tracking.time_s, smooth_rois(tracking.persons[0].roi_px, tracking.time_s, params.smooth_s)
+    rows = np.flatnonzero(np.isfinite(roi[:, 0]))
+    better = np.full_like(roi, np.nan)
+    limits = params.min_presence, params.max_drift, params.max_growth
+    for row in first_looks(rows, time, params.first_look_s):
+        better[row] = corrected(roi[row], Cross().detect(images[row], roi[row], CAMERA), *limits)
+    known = np.flatnonzero(np.isfinite(better[:, 0]))
+    plain = {row: smooth_at(better[known], time[known], time[row], params.smooth_s) for row in rows}
+
+    for n_detectors in (1, 3):
+        found = _look([Cross() for _ in range(n_detectors)], video, roi, time, CAMERA, params)
+        assert [row for row, person in enumerate(found) if person is not None] == rows.tolist()
+        for row in rows:
+            np.testing.assert_array_equal(found[row].xy_px[0], plain[row][:2])
+
+
+def test_an_error_in_a_thread_is_raised(case):
+    video, tracking = case
+
+    class Broken(Cross):
+        def detect(self, image, roi_px, camera, *, quick=False):
+            if len(self.calls) == 9:
+                raise ValueError("broken")
+            return super().detect(image, roi_px, camera, quick=quick)
+
+    with pytest.raises(ValueError, match="broken"):
+        detect_keypoints(video, tracking, 1, CAMERA, detector=Broken())
 
 
 def test_one_pass(case):
