@@ -40,6 +40,8 @@ class Keypoints:
     phone_time_s, phone_quat_wxyz : (P,), (P, 4) or None
         Phone orientation, camera to world, at its own stamps: both or neither. Brought to unit length, without jumps
         of sign, when made (`check_attitude`); how much of the recording it covers is for the fit to judge.
+    origin
+        Which detector and model made them, under which licence and on what; empty where nobody said.
     picture
         How light and sharp the picture of the person is, or None where no video was seen.
 
@@ -63,6 +65,7 @@ class Keypoints:
     phone_quat_wxyz: np.ndarray | None = None
     confidence_curve: str = ""
     picture: Picture | None = None
+    origin: str = ""
 
     def __post_init__(self) -> None:
         n, j = len(self.time_s), len(self.names)
@@ -124,6 +127,8 @@ class Keypoints:
             optional["focal_rel_sd"] = np.asarray(self.camera.focal_rel_sd, np.float64)
         if self.confidence_curve:
             optional["confidence_curve"] = np.asarray(self.confidence_curve)
+        if self.origin:
+            optional["origin"] = np.asarray(self.origin)
         if self.picture is not None:
             optional |= self.picture.arrays()
         np.savez_compressed(
@@ -189,6 +194,7 @@ class Keypoints:
             phone_quat_wxyz=data.get("phone_quat_wxyz"),
             confidence_curve=str(data.get("confidence_curve", "")),
             picture=Picture.from_arrays(path, data),
+            origin=str(data.get("origin", "")),
         )
 
 
