@@ -230,4 +230,5 @@ def _assemble(
         image_size_px=tracking.image_size_px,
         camera=camera,
         box_px=box.astype(np.float32),
+        origin=getattr(detector, "origin", ""),
     )
