@@ -36,6 +36,7 @@ CODES: dict[str, str] = {
     "SOLVER_UNKNOWN": "no solver or paramset has that name",
     "GAIT_INPUT": "the trajectories cannot be searched for gait events",
     "REFERENCE_INPUT": "fit and reference cannot be compared: no common time, joint or frames",
+    "ANGLE_UNITS": "joint angles are not in degrees",
     "NORM_UNKNOWN": "no normative set has that name",
     "NORM_INVALID": "the normative data cannot support the index (too few cycles, wrong size)",
     "DB_NOT_RUNNING": "the database does not answer",
