@@ -8,6 +8,7 @@ measured in body sizes, so near and far people are treated alike.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -32,10 +33,12 @@ class AssociationParams:
     turn_weight: float = 0.25
     sure_score: float = 0.8
     max_gap_s: float = 1.0
+    min_hits: int = 3
+    doubt_gap_s: float = 0.35
     velocity_gain: float = 0.5
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(eq=False)
 class Trail:
     """A track while it grows: the frames in which a detector saw the person."""
 
@@ -43,6 +46,13 @@ class Trail:
     times: list[float]
     detections: list[Detection]
     velocity: np.ndarray  # of (x, y) in body heights per s and of log size per s
+    surprise: float = 0.0  # how far the last sighting lay from where it was expected, in body heights
+    due_s: float = 0.0  # when to look at the person again
+
+    @classmethod
+    def of(cls, frame: int, time_s: float, detection: Detection) -> Trail:
+        """A trail that begins, at rest."""
+        return cls([frame], [time_s], [detection], np.zeros(3))
 
     @property
     def last_time(self) -> float:
@@ -61,9 +71,10 @@ class Trail:
         return state + self.velocity * [size, size, 1.0] * reach
 
     def add(self, frame: int, time_s: float, detection: Detection, gain: float) -> None:
-        new, old = measure(detection), self.state()
+        new, old, expected = measure(detection), self.state(), self.predict(time_s)
         dt = max(time_s - self.last_time, 1e-6)
         size = np.exp((new[2] + old[2]) / 2)
+        self.surprise = float(np.hypot(*(new[:2] - expected[:2]))) / size
         # Sizes jitter by a tenth from frame to frame: their rate is noise, so only the position is extrapolated.
         seen = np.array([(new[0] - old[0]) / size, (new[1] - old[1]) / size, 0.0]) / dt
         self.velocity = (1 - gain) * self.velocity + gain * np.clip(seen, -5.0, 5.0)
@@ -93,18 +104,32 @@ class Associator:
     def live(self) -> list[Trail]:
         return self._live
 
-    def step(self, frame: int, time_s: float, detections: list[Detection], may_begin: bool) -> None:
-        """Assign the detections of one frame. Where `may_begin`, unassigned sure ones start a track."""
+    def forget(self, time_s: float) -> None:
+        """Give up those who have been unseen for too long at `time_s`."""
         p = self._params
-        self._lost += [t for t in self._live if time_s - t.last_time > p.max_gap_s]
-        self._live = [t for t in self._live if time_s - t.last_time <= p.max_gap_s]
+        gone = [
+            time_s - t.last_time > (p.max_gap_s if len(t.frames) >= p.min_hits else p.doubt_gap_s) for t in self._live
+        ]
+        self._lost += [t for t, g in zip(self._live, gone, strict=True) if g]
+        self._live = [t for t, g in zip(self._live, gone, strict=True) if not g]
+
+    def begin(self, trail: Trail) -> None:
+        """Take up a trail that was not known."""
+        self._live.append(trail)
+
+    def step(
+        self, frame: int, time_s: float, detections: list[Detection], among: Sequence[Trail] | None = None
+    ) -> list[Detection]:
+        """Assign the detections of one frame to the live tracks (of `among`); returns the sure ones that fit none."""
+        p = self._params
+        self.forget(time_s)
+        live = [t for t in self._live if among is None or t in among]
         sure = [d for d in detections if d.score >= p.sure_score]
         weak = [d for d in detections if d.score < p.sure_score]
-        new = self._assign(self._live, sure, frame, time_s, p.gate_per_s)
-        waiting = [t for t in self._live if t.frames[-1] != frame]
+        new = self._assign(live, sure, frame, time_s, p.gate_per_s)
+        waiting = [t for t in live if t.frames[-1] != frame]
         self._assign(waiting, weak, frame, time_s, 0.0)
-        if may_begin:
-            self._live += [Trail([frame], [time_s], [d], np.zeros(3)) for d in new]
+        return new
 
     def _assign(
         self, trails: list[Trail], detections: list[Detection], frame: int, time_s: float, gate_per_s: float
@@ -112,7 +137,7 @@ class Associator:
         """Add detections to the trails at least total cost; returns those that fit nobody."""
         if not trails or not detections:
             return detections
-        cost = np.array([[self._cost(t, time_s, d) for d in detections] for t in trails])
+        cost = np.array([[pair_cost(t, time_s, d, self._params) for d in detections] for t in trails])
         gate = np.array([self._params.gate + gate_per_s * (time_s - t.last_time) for t in trails])
         # An impossible pair costs more than any number of possible ones, so it is chosen only where nothing else is.
         blocked = np.where(cost > gate[:, None], 1e3, cost)
@@ -127,11 +152,13 @@ class Associator:
         """All tracks in order of appearance."""
         return sorted([*self._lost, *self._live], key=lambda t: (t.frames[0], -t.detections[0].score))
 
-    def _cost(self, trail: Trail, time_s: float, detection: Detection) -> float:
-        predicted, seen = trail.predict(time_s), measure(detection)
-        size = np.exp((predicted[2] + seen[2]) / 2)
-        distance = float(np.hypot(*(seen[:2] - predicted[:2]))) / size
-        turn = detection.roi_px[3] - trail.detections[-1].roi_px[3]
-        turned = 1.0 - float(np.cos(turn)) if np.isfinite(turn) else 0.0
-        grown = abs(float(seen[2] - predicted[2]))
-        return distance + self._params.size_weight * grown + self._params.turn_weight * turned
+
+def pair_cost(trail: Trail, time_s: float, detection: Detection, params: AssociationParams) -> float:
+    """How badly a detection at `time_s` continues a trail, in body heights."""
+    predicted, seen = trail.predict(time_s), measure(detection)
+    size = np.exp((predicted[2] + seen[2]) / 2)
+    distance = float(np.hypot(*(seen[:2] - predicted[:2]))) / size
+    turn = detection.roi_px[3] - trail.detections[-1].roi_px[3]
+    turned = 1.0 - float(np.cos(turn)) if np.isfinite(turn) else 0.0
+    grown = abs(float(seen[2] - predicted[2]))
+    return distance + params.size_weight * grown + params.turn_weight * turned

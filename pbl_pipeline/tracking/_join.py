@@ -1,4 +1,9 @@
-"""Joining what became two tracks because somebody was hidden for longer than the association waits."""
+"""Joining what became two tracks because somebody was hidden, or left the picture and came back.
+
+Behind a pillar a walker goes on walking: the movement before and after tells that it is one person. Who leaves the
+picture may come back from anywhere, and so may anybody else: there only the clothes tell, and only where they are the
+same and nobody else's are alike. Not to join costs a choice by hand; to join wrongly measures somebody else.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +12,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ._associate import Trail, measure
+from ._appearance import likeness, mean_look
+from ._associate import Trail
+from ._line import line_near
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,6 +22,12 @@ class JoinParams:
     """max_gap_s: longest time out of sight. velocity_s: the straight line through this much of a track before and after
     the gap says where the person was going to and coming from. gate, gate_per_s: how far these two may miss the other
     track's end, in body heights at once and per second of the gap. max_growth: largest ratio of sizes across the gap.
+    other_clothes: likeness (`likeness`) below which two are never joined.
+    same_clothes, clothes_lead: likeness from which somebody who was out of sight for up to `return_gap_s` is the same,
+    and by how much it must exceed that to everybody else. min_looks: sightings that a likeness needs on either side.
+    return_growth: largest ratio of sizes, who comes back may be nearer.
+    Likeness on seven recordings of four people: the same person in two halves of a recording 0.96 to 0.998, but 0.88 of
+    a man who jumps on a wall; two people 0.39 to 0.90.
     """
 
     max_gap_s: float = 2.5
@@ -22,15 +35,25 @@ class JoinParams:
     gate: float = 0.3
     gate_per_s: float = 0.2
     max_growth: float = 1.25
+    other_clothes: float = 0.5
+    same_clothes: float = 0.92
+    clothes_lead: float = 0.03
+    min_looks: int = 5
+    return_gap_s: float = 120.0
+    return_growth: float = 2.5
 
 
 def join_trails(trails: Sequence[Trail], size_px: tuple[int, int], params: JoinParams) -> list[Trail]:
     """The trails in order of appearance, those of one person put together.
 
     Two are one person where the first ends before the second begins, at most `max_gap_s` apart, with like sizes, where
-    each, going on at its velocity, meets the other, and the way between lies in the picture (who leaves it may be
-    anybody when somebody comes in). Where more than one would fit, none is joined: a person must then choose.
+    each, going on at its velocity, meets the other, and the way between lies in the picture. Where more than one would
+    fit, none is joined. After that, two are one where the clothes say so.
     """
+    return _join_by_clothes(_join_by_movement(trails, size_px, params), params)
+
+
+def _join_by_movement(trails: Sequence[Trail], size_px: tuple[int, int], params: JoinParams) -> list[Trail]:
     rest = sorted(trails, key=lambda t: (t.frames[0], -t.detections[0].score))
     while True:
         fits = [(a, b) for a in rest for b in rest if a is not b and _one_person(a, b, size_px, params)]
@@ -38,16 +61,59 @@ def join_trails(trails: Sequence[Trail], size_px: tuple[int, int], params: JoinP
         if not sole:
             return rest
         a, b = sole[0]
-        whole = Trail([*a.frames, *b.frames], [*a.times, *b.times], [*a.detections, *b.detections], b.velocity)
-        rest = [whole if t is a else t for t in rest if t is not b]
+        rest = [_whole(a, b) if t is a else t for t in rest if t is not b]
+
+
+def _join_by_clothes(trails: Sequence[Trail], params: JoinParams) -> list[Trail]:
+    """In order of time each trail becomes part of a person who was seen before, or a new person."""
+    people: list[Trail] = []
+    for trail in sorted(trails, key=lambda t: t.times[0]):
+        gone = [p for p in people if 0 < trail.times[0] - p.times[-1] <= params.return_gap_s]
+        alike = {id(p): _likeness(p, trail, params) for p in gone}
+        known = sorted((p for p in gone if np.isfinite(alike[id(p)])), key=lambda p: -alike[id(p)])
+        best = known[0] if known else None
+        if best is None or alike[id(best)] < params.same_clothes or not _alike_in_size(best, trail, params):
+            people.append(trail)
+            continue
+        # Others who left before, and those who are surely somebody else, being there at the same time.
+        others = [*known[1:], *(t for t in trails if t is not trail and (_together(t, trail) or _together(t, best)))]
+        rivals = [r for r in (_likeness(t, trail, params) for t in others) if np.isfinite(r)]
+        if alike[id(best)] - max(rivals, default=0.0) < params.clothes_lead:
+            people.append(trail)
+        else:
+            people[people.index(best)] = _whole(best, trail)
+    return people
+
+
+def _together(a: Trail, b: Trail) -> bool:
+    return a.times[0] <= b.times[-1] and b.times[0] <= a.times[-1]
+
+
+def _likeness(a: Trail, b: Trail, params: JoinParams) -> float:
+    """Of the clothes; NaN where too few sightings of one of them know it."""
+    looks = [[d.look for d in t.detections if d.look is not None and np.isfinite(d.look).all()] for t in (a, b)]
+    if min(map(len, looks)) < params.min_looks:
+        return float("nan")
+    return likeness(mean_look(looks[0]), mean_look(looks[1]))
+
+
+def _alike_in_size(a: Trail, b: Trail, params: JoinParams) -> bool:
+    before, after = line_near(a, a.times[-1], params.velocity_s), line_near(b, b.times[0], params.velocity_s)
+    if before is None or after is None:
+        return False
+    return abs(float(np.log(before[2] / after[2]))) <= np.log(params.return_growth)
+
+
+def _whole(a: Trail, b: Trail) -> Trail:
+    return Trail([*a.frames, *b.frames], [*a.times, *b.times], [*a.detections, *b.detections], b.velocity)
 
 
 def _one_person(a: Trail, b: Trail, size_px: tuple[int, int], p: JoinParams) -> bool:
     gap = b.times[0] - a.times[-1]
     if not 0 < gap <= p.max_gap_s:
         return False
-    before, after = _line(a, a.times[-1], p.velocity_s), _line(b, b.times[0], p.velocity_s)
-    if before is None or after is None:
+    before, after = line_near(a, a.times[-1], p.velocity_s), line_near(b, b.times[0], p.velocity_s)
+    if before is None or after is None or _likeness(a, b, p) < p.other_clothes:
         return False
     (end, going, height), (begin, coming, next_height) = before, after
     if not 1 / p.max_growth <= next_height / height <= p.max_growth:
@@ -58,14 +124,3 @@ def _one_person(a: Trail, b: Trail, size_px: tuple[int, int], p: JoinParams) -> 
     # Both ends lie in the picture; so must half a body around them, or the person may just have left it.
     room = min(end[0], begin[0], size_px[0] - end[0], size_px[0] - begin[0]) > 0.2 * unit
     return bool(inside and room and max(miss) / unit <= p.gate + p.gate_per_s * gap)
-
-
-def _line(trail: Trail, at_s: float, length_s: float) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Place (2,) px at `at_s`, velocity (2,) px/s and height in px, of the sightings within `length_s` of it."""
-    near = [i for i, t in enumerate(trail.times) if abs(t - at_s) <= length_s]
-    if len(near) < 3:
-        return None
-    states = np.array([measure(trail.detections[i]) for i in near])
-    tau = np.array([trail.times[i] for i in near]) - at_s
-    slope, place = np.polyfit(tau, states[:, :2], 1)
-    return place, slope, float(np.exp(np.median(states[:, 2])))

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from ._blazepose import box_iou
 from ._types import Detection, PersonDetector
+
+#: x0, y0, x1, y1 in px; it may reach beyond the picture.
+Window = tuple[int, int, int, int]
 
 
 def tile_starts(length: int, tile: int, overlap: float) -> list[int]:
@@ -18,7 +22,7 @@ def tile_starts(length: int, tile: int, overlap: float) -> list[int]:
     return [round(i * (length - tile) / (n - 1)) for i in range(n)]
 
 
-def tiles(width: int, height: int, fraction: float, overlap: float) -> list[tuple[int, int, int, int]]:
+def tiles(width: int, height: int, fraction: float, overlap: float) -> list[Window]:
     """Windows x0, y0, x1, y1: the whole frame first, then squares of `fraction` of the shorter side."""
     side = max(round(min(width, height) * fraction), 1)
     grid = [
@@ -30,11 +34,17 @@ def tiles(width: int, height: int, fraction: float, overlap: float) -> list[tupl
     return [whole, *(t for t in grid if t != whole)]
 
 
-def detect_in(detector: PersonDetector, image: np.ndarray, windows: list[tuple[int, int, int, int]]) -> list[Detection]:
-    """Run the detector in each window (clipped to the image) and merge what it found, in pixels of `image`."""
+def detect_in(
+    detector: PersonDetector, image: np.ndarray, windows: Sequence[Window], passing: Sequence[Window] = ()
+) -> list[Detection]:
+    """Run the detector in each window (clipped to the image) and merge what it found, in pixels of `image`.
+
+    `windows` are laid around people and see them in the right size; `passing` are laid anywhere, are trusted half as
+    much, and so only confirm whom another window saw.
+    """
     height, width = image.shape[:2]
     found: list[tuple[float, Detection]] = []
-    for window in windows:
+    for window, weight in [*((w, 1.0) for w in windows), *((w, 0.5 if windows else 1.0) for w in passing)]:
         x0, y0, x1, y1 = max(window[0], 0), max(window[1], 0), min(window[2], width), min(window[3], height)
         if x1 - x0 < 16 or y1 - y0 < 16:
             continue
@@ -44,7 +54,7 @@ def detect_in(detector: PersonDetector, image: np.ndarray, windows: list[tuple[i
             whole = _area(np.clip(box, 0, [width, height, width, height]))
             inside = _area(np.clip(box, [x0, y0, x0, y0], [x1, y1, x1, y1]))
             # A person cut by the window's edge is measured worse than in the neighbouring window that holds her whole.
-            trust = d.score * (inside / whole if whole > 0 else 0.0)
+            trust = weight * d.score * (inside / whole if whole > 0 else 0.0)
             found.append((trust, Detection(box_px=box, score=d.score, roi_px=roi)))
     return merge(found)
 

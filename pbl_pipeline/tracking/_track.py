@@ -1,9 +1,10 @@
-"""People over a whole video: tiled detection at intervals, cheap detection around known people in between."""
+"""People over a whole video: detection where `Watch` says, association, and what both directions of time tell."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,44 +14,48 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.video import VideoInfo, probe, read_frames
 
-from ._associate import AssociationParams, Associator, Trail
-from ._blazepose import MODEL_SHA256, BlazePoseDetector, body_box
+from ._appearance import look_of
+from ._associate import AssociationParams, Associator, Trail, measure
+from ._blazepose import MODEL_SHA256, BlazePoseDetector, body_box, box_iou
 from ._join import JoinParams, join_trails
-from ._tiles import detect_in, tiles
-from ._types import PersonDetector, PersonTrack, Tracking
+from ._rewind import rewind
+from ._tiles import detect_in
+from ._types import Detection, PersonDetector, PersonTrack, Tracking
+from ._uncross import UncrossParams, uncross
+from ._watch import Watch, WatchParams, window_around
+
+#: A second look must find a new person with at least this overlap of the boxes; nearer to where somebody known is
+#: expected than so many body heights, it is a poor view of that one.
+CONFIRM_IOU, SAME_BODY = 0.3, 0.25
 
 
 @dataclasses.dataclass(frozen=True)
 class TrackingParams:
     """Parameters of `track_people`.
 
-    search_interval_s: every so often the whole frame and all tiles are searched.
-    follow_interval_s: in between, one window around each known person is searched this often.
-    tile_fraction, tile_overlap: tiles are squares of this share of the shorter side, overlapping by that share or more.
-    window_sizes: side of the window around a person, in body circles.
-    min_score: detections below it are ignored. association: see `AssociationParams`; gaps up to its `max_gap_s` are
-    bridged (observed=False), after a longer one a new person begins, unless `join` finds that it is the same one; such
-    a gap stays without boxes.
+    detector, model_sha256: the person detector and its model file. model: name of the registered model folder, empty
+    for an embedded one. min_score: detections below it are ignored.
+    watch, association, uncross, join: see `WatchParams`, `AssociationParams`, `UncrossParams`, `JoinParams`. Gaps up to
+    the association's `max_gap_s` are bridged (observed=False), after a longer one a new person begins, unless `join`
+    finds that it is the same one; such a gap stays without boxes.
     min_hits: a person must be seen surely (`sure_score` of the association) this often, and over `min_track_s`, or
     the track is dropped as false.
     """
 
     detector: str = "blazepose"
+    model: str = ""
     model_sha256: str = MODEL_SHA256
-    search_interval_s: float = 0.2
-    follow_interval_s: float = 0.1
-    tile_fraction: float = 0.7
-    tile_overlap: float = 0.3
-    window_sizes: float = 1.6
     min_score: float = 0.5
     min_hits: int = 3
     min_track_s: float = 0.25
+    watch: WatchParams = dataclasses.field(default_factory=WatchParams)
     association: AssociationParams = dataclasses.field(default_factory=AssociationParams)
+    uncross: UncrossParams = dataclasses.field(default_factory=UncrossParams)
     join: JoinParams = dataclasses.field(default_factory=JoinParams)
 
 
 DEFAULT = "blazepose-tiles"
-PARAMSETS: dict[str, Paramset] = {DEFAULT: Paramset.of("tracking", DEFAULT, 1, TrackingParams())}
+PARAMSETS: dict[str, Paramset] = {DEFAULT: Paramset.of("tracking", DEFAULT, 2, TrackingParams())}
 
 
 def _blazepose(params: TrackingParams) -> PersonDetector:
@@ -85,30 +90,41 @@ def track_people(
             )
         detector = DETECTORS[params.detector](params)
     info = info or probe(video_path)
-    associator = Associator(params.association)
     size = (info.width_px, info.height_px)
-    windows = tiles(*size, params.tile_fraction, params.tile_overlap)
-    # A frame is due when the nearest multiple of the interval falls to it; half a frame of slack avoids beating.
+    trails = _follow(video_path, params, detector, info)
+    people = join_trails(uncross([t for t in trails if _is_real(t, params)], params.uncross), size, params.join)
+    longest = params.association.max_gap_s
+    persons = tuple(_to_track(i + 1, t, info.time_s, size, longest) for i, t in enumerate(people))
+    return Tracking(info.time_s, size, persons, detector.name, detector.model_sha256)
+
+
+def _follow(video_path: str | Path, params: TrackingParams, detector: PersonDetector, info: VideoInfo) -> list[Trail]:
+    """One pass over the frames: every trail, the false ones included."""
+    associator = Associator(params.association)
     slack = 0.5 * float(np.median(np.diff(info.time_s))) if info.n_frames > 1 else 0.0
-    next_search = next_follow = 0.0
+    watch = Watch((info.width_px, info.height_px), params.watch, slack)
+    # The frames of the last searches, to follow new people back in: as long as a turn of all windows takes.
+    kept: deque[tuple[int, float, np.ndarray]] = deque(maxlen=watch.n_turn)
     n_frames = 0
     for frame in progress.track(read_frames(video_path), "people", total=info.n_frames):
-        n_frames += 1
+        n_frames, now = n_frames + 1, frame.time_s
+        associator.forget(now)
         # The last frame too, so that tracks do not end before the video does.
-        last = frame.index == info.n_frames - 1
-        if frame.time_s + slack >= next_search:
-            found = detect_in(detector, frame.image, windows)
-            next_search = frame.time_s + params.search_interval_s
-            may_begin = True
-        elif last or frame.time_s + slack >= next_follow:
-            around = [_window(t.predict(frame.time_s), params.window_sizes) for t in associator.live]
-            found = detect_in(detector, frame.image, around)
-            # A lone window cannot tell a new person from a poor view of the known one.
-            may_begin = False
-        else:
+        due = watch.due(now, associator.live, last=frame.index == info.n_frames - 1)
+        elsewhere = watch.elsewhere(now, associator.live)
+        if not (due or elsewhere):
             continue
-        next_follow = frame.time_s + params.follow_interval_s
-        associator.step(frame.index, frame.time_s, found, may_begin)
+        found = detect_in(detector, frame.image, watch.around(now, due), elsewhere)
+        found = [_with_look(d, frame.image) for d in found]
+        for new in associator.step(frame.index, now, found, due):
+            sure = _confirmed(new, detector, frame.image, now, associator.live, params)
+            if sure is not None:
+                trail = Trail.of(frame.index, now, sure)
+                sizes = params.watch.window_sizes
+                associator.begin(rewind(trail, kept, associator.trails(), detector, sizes, params.association))
+        watch.looked(now, due, associator.live)
+        if elsewhere:
+            kept.append((frame.index, now, frame.image))
     if n_frames != info.n_frames:
         raise PblError(
             "VIDEO_CHANGED",
@@ -117,15 +133,44 @@ def track_people(
             next_step="probe the video again",
             key=str(video_path),
         )
-    people = join_trails([t for t in associator.trails() if _is_real(t, params)], size, params.join)
-    longest = params.association.max_gap_s
-    persons = tuple(_to_track(i + 1, t, info.time_s, size, longest) for i, t in enumerate(people))
-    return Tracking(info.time_s, size, persons, detector.name, detector.model_sha256)
+    return associator.trails()
 
 
-def _window(state: np.ndarray, sizes: float) -> tuple[int, int, int, int]:
-    half = 0.5 * sizes * float(np.exp(state[2]))
-    return round(state[0] - half), round(state[1] - half), round(state[0] + half), round(state[1] + half)
+def _confirmed(
+    new: Detection,
+    detector: PersonDetector,
+    image: np.ndarray,
+    time_s: float,
+    live: Sequence[Trail],
+    params: TrackingParams,
+) -> Detection | None:
+    """Who is seen in a window around a detection that fits nobody known, or None.
+
+    A lone window that was laid anywhere cannot tell a new person from a poor view of a known one: it may cut her or
+    show her too small. Laid around her, it must find her again, in about the same place, where nobody known is.
+    """
+    known = [t.predict(time_s) for t in live]
+    if any(_near(measure(new), k) for k in known):
+        return None
+    window = window_around(measure(new), params.watch.window_sizes)
+    again = [d for d in detect_in(detector, image, [window]) if d.score >= params.association.sure_score]
+    if not again:
+        return None
+    overlap = box_iou(new.box_px, np.array([d.box_px for d in again]))
+    best = again[int(np.argmax(overlap))]
+    if overlap.max() < CONFIRM_IOU or any(_near(measure(best), k) for k in known):
+        return None
+    return _with_look(best, image)
+
+
+def _near(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two body circles lie so close, and are so alike in size, that both are of one person."""
+    apart = np.hypot(*(a[:2] - b[:2])) / np.exp((a[2] + b[2]) / 2)
+    return bool(apart < SAME_BODY)
+
+
+def _with_look(detection: Detection, image: np.ndarray) -> Detection:
+    return dataclasses.replace(detection, look=look_of(image, measure(detection), detection.roi_px[3]))
 
 
 def _is_real(trail: Trail, params: TrackingParams) -> bool:

@@ -21,7 +21,7 @@ from pbl_pipeline.tracking import (
     time_in_view_s,
     track_people,
 )
-from pbl_pipeline.tracking._associate import Associator
+from pbl_pipeline.tracking._associate import Associator, Trail
 from pbl_pipeline.tracking._blazepose import body_box, box_iou, circle_roi
 from pbl_pipeline.tracking._join import JoinParams, join_trails
 from pbl_pipeline.tracking._tiles import detect_in, merge, tile_starts, tiles
@@ -115,7 +115,8 @@ def test_merge_averages_angles_on_the_circle():
 def follow(frames: list[list[Detection]], step_s: float = 0.1) -> list:
     associator = Associator(AssociationParams())
     for i, detections in enumerate(frames):
-        associator.step(i, i * step_s, detections, True)
+        for new in associator.step(i, i * step_s, detections):
+            associator.begin(Trail.of(i, i * step_s, new))
     return associator.trails()
 
 
@@ -270,7 +271,7 @@ def test_unknown_detector_is_refused(spots_video):
 
 def test_paramset_names_the_model():
     paramset = PARAMSETS["blazepose-tiles"]
-    assert (paramset.stage, paramset.version) == ("tracking", 1)
+    assert (paramset.stage, paramset.version) == ("tracking", 2)
     assert paramset.params["model_sha256"] == TrackingParams().model_sha256
     assert len(paramset.hash) == 16
 

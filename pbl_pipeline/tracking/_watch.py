@@ -1,0 +1,129 @@
+"""Where to look in which frame: around known people as often as their movement asks for, elsewhere in turn.
+
+One call of a detector costs as much as decoding three frames, so pictures are not searched throughout. A person who
+moves evenly is looked at every fifth of a second and interpolated between, one who keeps still more rarely; one who
+surprises, was missed or comes close to another is looked at more often. The whole frame and its tiles are visited by
+turns: nobody new is overlooked for longer than a turn, and `rewind` then finds the frames between.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from ._associate import Trail
+from ._tiles import Window, tiles
+
+
+@dataclasses.dataclass(frozen=True)
+class WatchParams:
+    """tile_fraction, tile_overlap: tiles are squares of this share of the shorter side, overlapping by that share or
+    more. search_interval_s: how often one of the whole frame and the tiles is searched, by turns.
+    follow_interval_s: how often a window around each known person is searched. rest_interval_s: the same for one who
+    keeps still (slower than `still` body heights per second). close_interval_s: the same where the person was seen
+    fewer than `known_hits` times, was missed, surprised by more than `surprise` body heights, or is nearer to another
+    than `near` body heights.
+    window_sizes: side of the window, in body circles. covered: tiles of which such windows cover this share are left
+    out.
+    """
+
+    tile_fraction: float = 0.7
+    tile_overlap: float = 0.3
+    search_interval_s: float = 0.2
+    follow_interval_s: float = 0.2
+    rest_interval_s: float = 0.4
+    close_interval_s: float = 0.06
+    still: float = 0.1
+    surprise: float = 0.15
+    known_hits: int = 4
+    near: float = 0.6
+    window_sizes: float = 1.6
+    covered: float = 0.8
+
+
+class Watch:
+    """The windows of each frame in order. `slack_s` is half a frame: it avoids beating between frames and intervals."""
+
+    def __init__(self, size_px: tuple[int, int], params: WatchParams, slack_s: float) -> None:
+        self._params, self._slack = params, slack_s
+        self._ring = tiles(*size_px, params.tile_fraction, params.tile_overlap)
+        self._at = 0
+        self._next_search = 0.0
+        self._first = True
+
+    @property
+    def n_turn(self) -> int:
+        """Searches until every place was searched."""
+        return len(self._ring)
+
+    def due(self, time_s: float, live: Sequence[Trail], last: bool) -> list[Trail]:
+        """Who is to be looked at in this frame, and who is so close to one of them that her window shows both."""
+        now = time_s + self._slack
+        due = [t for t in live if last or now >= t.due_s]
+        windows = [window_around(t.predict(time_s), self._params.window_sizes) for t in due]
+        return [t for t in live if t in due or any(_inside(t.predict(time_s), w) for w in windows)]
+
+    def around(self, time_s: float, due: Sequence[Trail]) -> list[Window]:
+        """A window around each of these people."""
+        return [window_around(t.predict(time_s), self._params.window_sizes) for t in due]
+
+    def elsewhere(self, time_s: float, live: Sequence[Trail]) -> list[Window]:
+        """Windows in which somebody new is searched in this frame; the first time all of them."""
+        if time_s + self._slack < self._next_search:
+            return []
+        self._next_search = time_s + self._params.search_interval_s
+        if self._first:
+            self._first = False
+            return list(self._ring)
+        around = self.around(time_s, live)
+        for _ in range(len(self._ring)):
+            window = self._ring[self._at]
+            self._at = (self._at + 1) % len(self._ring)
+            if not any(_share(window, a) >= self._params.covered for a in around):
+                return [window]
+        return []
+
+    def looked(self, time_s: float, due: Sequence[Trail], live: Sequence[Trail]) -> None:
+        """After a look at those who were due, or were found: says when they are due again."""
+        p = self._params
+        for trail in live:
+            if trail not in due and trail.due_s > time_s:
+                continue
+            interval = p.follow_interval_s
+            if _close(trail, time_s, live, p):
+                interval = p.close_interval_s
+            elif np.hypot(*trail.velocity[:2]) < p.still:
+                interval = p.rest_interval_s
+            trail.due_s = time_s + interval
+
+
+def window_around(state: np.ndarray, sizes: float) -> Window:
+    """The square of `sizes` body circles around a body with this state (`measure`)."""
+    half = 0.5 * sizes * float(np.exp(state[2]))
+    return round(state[0] - half), round(state[1] - half), round(state[0] + half), round(state[1] + half)
+
+
+def _close(trail: Trail, time_s: float, live: Sequence[Trail], params: WatchParams) -> bool:
+    if len(trail.frames) < params.known_hits or trail.last_time < time_s or trail.surprise > params.surprise:
+        return True
+    here = trail.predict(time_s + params.follow_interval_s)
+    for other in live:
+        if other is trail:
+            continue
+        there = other.predict(time_s + params.follow_interval_s)
+        if np.hypot(*(here[:2] - there[:2])) < params.near * np.exp((here[2] + there[2]) / 2):
+            return True
+    return False
+
+
+def _inside(state: np.ndarray, window: Window) -> bool:
+    return bool(window[0] <= state[0] <= window[2] and window[1] <= state[1] <= window[3])
+
+
+def _share(window: Window, cover: Window) -> float:
+    """Share of `window` that `cover` covers."""
+    width = min(window[2], cover[2]) - max(window[0], cover[0])
+    height = min(window[3], cover[3]) - max(window[1], cover[1])
+    return max(width, 0) * max(height, 0) / ((window[2] - window[0]) * (window[3] - window[1]))
