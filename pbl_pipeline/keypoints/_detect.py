@@ -24,6 +24,7 @@ from ._batched import BatchDetector, BatchedLooks
 from ._blazepose import MODEL_SHA256, BlazePoseLandmarks
 from ._crops import REACH_SD, corrected, first_looks, smooth_at, smooth_rois
 from ._passes import Looks, look_twice, n_workers
+from ._picture import Picture, PictureMeter
 from ._protocol import KeypointDetector, PersonKeypoints
 from ._types import Keypoints
 
@@ -122,8 +123,9 @@ def detect_keypoints(
         )
     detectors = [detector] if detector is not None else _detectors(params)
     roi = smooth_rois(_rois(track.roi_px, track.box_px), tracking.time_s, params.smooth_s)
-    found = _look(detectors, video_path, roi, tracking.time_s, camera, params)
-    return _assemble(found, detectors[0], tracking, camera, params)
+    meter = PictureMeter()
+    found = _look(detectors, video_path, roi, tracking.time_s, camera, params, meter)
+    return _assemble(found, detectors[0], tracking, camera, params, meter.result())
 
 
 def _rois(roi: np.ndarray, box: np.ndarray) -> np.ndarray:
@@ -154,6 +156,7 @@ def _look(
     time_s: np.ndarray,
     camera: Camera,
     params: KeypointParams,
+    meter: PictureMeter,
 ) -> list[PersonKeypoints | None]:
     """What is seen in each frame, of the person whose body circle is `roi` (T, 4), NaN where she is not in view."""
     rows = np.flatnonzero(np.isfinite(roi).all(axis=1))
@@ -171,7 +174,7 @@ def _look(
         return smooth_at(better[:n_better], time_s[firsts[:n_better]], float(time_s[row]), params.smooth_s)
 
     found: list[PersonKeypoints | None] = [None] * len(roi)
-    frames = _in_view(video_path, rows)
+    frames = meter.watch(_in_view(video_path, rows), roi)
     reach_s = REACH_SD * params.smooth_s if params.passes > 1 else 0.0
     first = detectors[0]
     with BatchedLooks(first, camera) if isinstance(first, BatchDetector) else Looks(detectors, camera) as looks:
@@ -204,6 +207,7 @@ def _assemble(
     tracking: Tracking,
     camera: Camera,
     params: KeypointParams,
+    picture: Picture,
 ) -> Keypoints:
     n, j = len(found), len(detector.names)
     xy, xyz = np.full((n, j, 2), np.nan), np.full((n, j, 3), np.nan)
@@ -231,4 +235,5 @@ def _assemble(
         camera=camera,
         box_px=box.astype(np.float32),
         origin=getattr(detector, "origin", ""),
+        picture=picture,
     )
