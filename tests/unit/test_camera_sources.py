@@ -83,7 +83,8 @@ def test_a_file_without_tags(tmp_path):
 def test_boxes_that_make_no_sense_end_the_reading(tmp_path):
     path = small(tmp_path / "a.mov")
     whole = insert(path, of_track=meta({LENS: "x", FOCAL: 27}), of_file=meta(APPLE)).read_bytes()
-    assert read_tags(path).items == {k.lower(): v for k, v in APPLE.items()} | {LENS: "x", FOCAL: "27"}
+    there = {k.lower(): v for k, v in APPLE.items()} | {LENS: "x", FOCAL: "27"}
+    assert read_tags(path).items == there
     rng = np.random.default_rng(1)
     for at in rng.integers(whole.index(b"moov"), len(whole) - 4, 300):
         path.write_bytes(whole[:at] + rng.bytes(4) + whole[at + 4 :])
@@ -91,7 +92,7 @@ def test_boxes_that_make_no_sense_end_the_reading(tmp_path):
         assert all(isinstance(v, str) for v in tags.items.values())
     for at in range(8, len(whole), 97):
         path.write_bytes(whole[:at])
-        assert read_tags(path).items == {}
+        assert read_tags(path).items.items() <= there.items()
 
 
 # --- time
