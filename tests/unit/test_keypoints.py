@@ -21,6 +21,7 @@ from pbl_pipeline.keypoints import (
 from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES
 from pbl_pipeline.keypoints._crops import corrected, first_looks, smooth_at, smooth_rois
 from pbl_pipeline.keypoints._detect import _look
+from pbl_pipeline.keypoints._picture import PictureMeter
 from pbl_pipeline.keypoints._view import crop_matrix
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.tracking._blazepose import body_box
@@ -225,7 +226,7 @@ def test_one_reading_sees_what_two_readings_of_the_video_see(case):
     plain = {row: smooth_at(better[known], time[known], time[row], params.smooth_s) for row in rows}
 
     for n_detectors in (1, 3):
-        found = _look([Cross() for _ in range(n_detectors)], video, roi, time, CAMERA, params)
+        found = _look([Cross() for _ in range(n_detectors)], video, roi, time, CAMERA, params, PictureMeter())
         assert [row for row, person in enumerate(found) if person is not None] == rows.tolist()
         for row in rows:
             np.testing.assert_array_equal(found[row].xy_px[0], plain[row][:2])
