@@ -19,13 +19,18 @@ KINDS: dict[str, tuple[str, ...]] = {
     "crop3d": ("coords2d", "coords3d"),
     "simcc": ("simcc_x", "simcc_y"),
     "heatmap": ("heatmap",),
+    "person_detector": ("boxes",),
 }
+#: Kinds that find people, not points: they have no marker set.
+WITHOUT_POINTS = ("person_detector",)
 _NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,39}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 #: What the text of a licence or a source may take.
 _LONGEST = 500
-_REQUIRED = ("name", "kind", "sha256", "licence", "source", "input", "outputs", "marker_set", "joint_names")
-_OPTIONAL = ("mirror_pairs", "pixel_origin", "box_margin", "simcc_split", "comment")
+_REQUIRED = ("name", "kind", "sha256", "licence", "source", "input", "outputs")
+_POINTS = ("marker_set", "joint_names")
+_OPTIONAL_POINTS = ("mirror_pairs", "pixel_origin", "box_margin", "simcc_split")
+_OPTIONAL = ("comment",)
 _INPUT = ("name", "width", "height", "layout", "colour", "mean", "std")
 #: Fields that change no number of the result; the others are hashed into the method's parameters.
 _WORDS = ("name", "licence", "source", "comment")
@@ -56,7 +61,8 @@ class ModelSpec:
     kind
         "crop3d": `coords2d` (N, J, 2) px of the crop and `coords3d` (N, J, 3) mm in the axes of the crop's camera (x right,
         y down, z forward), up to one common shift. "simcc": `simcc_x` (N, J, width * split), `simcc_y` likewise.
-        "heatmap": `heatmap` (N, J, h, w).
+        "heatmap": `heatmap` (N, J, h, w). "person_detector": `boxes` (N, cells, 5 + classes), YOLOX's rows; it has
+        no marker set and no joint names.
     sha256
         Of `model.onnx`.
     outputs
@@ -116,7 +122,9 @@ def load_spec(folder: str | Path) -> ModelSpec:
 
 def parse_spec(content: Mapping[str, Any], path: str | Path) -> ModelSpec:
     """The spec from the fields of `model.json`; `path` is named in errors. Raises as `load_spec`."""
-    _fields(path, "", content, _REQUIRED, _OPTIONAL)
+    points = content.get("kind") not in WITHOUT_POINTS
+    required = (*_REQUIRED, *(_POINTS if points else ()))
+    _fields(path, "", content, required, (*(_OPTIONAL_POINTS if points else ()), *_OPTIONAL))
     name = _text(path, content, "name")
     if not _NAME.fullmatch(name):
         raise invalid(path, f"name {name!r}", "small letters, digits, '.', '_' and '-', at most 40")
@@ -129,11 +137,12 @@ def parse_spec(content: Mapping[str, Any], path: str | Path) -> ModelSpec:
     outputs = content["outputs"]
     if not isinstance(outputs, dict) or set(outputs) != set(KINDS[kind]) or not _all_text(outputs.values()):
         raise invalid(path, f"outputs {outputs!r}", f"the graph's names of {', '.join(KINDS[kind])}")
-    names = content["joint_names"]
-    if not isinstance(names, list) or not names or not _all_text(names) or len(set(names)) != len(names):
+    names = content.get("joint_names", [])
+    if not isinstance(names, list) or bool(names) != points or not _all_text(names) or len(set(names)) != len(names):
         raise invalid(path, "joint_names: not a list of names, all different", "a name for each point, in order")
-    markers = _text(path, content, "marker_set")
-    _check_marker_set(markers, names)
+    markers = _text(path, content, "marker_set") if points else ""
+    if points:
+        _check_marker_set(markers, names)
     origin = content.get("pixel_origin", "centre")
     if origin not in ("centre", "edge"):
         raise invalid(path, f"pixel_origin {origin!r}", "'centre' or 'edge'")
