@@ -43,6 +43,9 @@ CODES: dict[str, str] = {
     "DB_UNAVAILABLE": "no database server can be had on this machine",
     "DB_REFUSED": "the database answers but refuses the login or the operation",
     "DB_NOT_FOUND": "a row that was named does not exist",
+    "DB_MIGRATION": "the tables on the server are not as this version of the code declares them",
+    "STORE_UNAVAILABLE": "the object store of the arrays cannot be reached, or refuses",
+    "BACKUP_INVALID": "a backup is incomplete or was changed",
     "USAGE": "the command was called in a way that cannot work",
     "INTERNAL": "an unforeseen error: please report it with the whole text",
 }

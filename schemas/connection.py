@@ -32,7 +32,6 @@ import json
 import os
 import socket
 import warnings
-from pathlib import Path
 from typing import Any
 
 from pbl_pipeline.errors import PblError
@@ -56,11 +55,12 @@ with warnings.catch_warnings():
 import pymysql
 from datajoint import instance as dj_instance
 from datajoint.adapters.mysql import MySQLAdapter
+from datajoint.hash_registry import get_store_backend
 from pymysql.converters import escape_string
 
-from pbl_pipeline import settings
-
 from . import embedded
+from ._secrets import secret
+from ._store import store_spec
 from .embedded import APP_USER, HOST, Folder, not_running
 
 #: How long a server may take to answer before it counts as not running.
@@ -94,17 +94,30 @@ def connect(start: bool = False) -> dj.Connection:
             with warnings.catch_warnings():
                 # MariaDB is supported here, by the two repairs below: no need to say the contrary at every start.
                 warnings.filterwarnings("ignore", message="MariaDB is not officially supported")
-                current = dj.conn()
+                current = dj.conn(use_tls=target["use_tls"])
         else:
             # The server was started again, perhaps on another port. Tables keep this object, so it moves along.
             info = {name: target[name] for name in ("host", "port", "user")}
-            current.conn_info.update(info, passwd=target["password"], ssl_input=target["use_tls"])
+            tls = {"ssl": True if target["use_tls"] is None else target["use_tls"], "ssl_input": target["use_tls"]}
+            current.conn_info.update(info, passwd=target["password"], **tls)
             current.connect()
     except pymysql.err.OperationalError as error:
         raise _login_error(target, error) from error
+    except RuntimeError as error:  # the driver's, where it cannot do the server's way of logging in
+        raise _no_answer(target, str(error)) from error
     if target["embedded"]:
         embedded.allow_prefix(prefix())
     return current
+
+
+def another() -> dj.Connection:
+    """A connection beside the process's own, to the same server: for a thread, since DataJoint's serves one only."""
+    target = _target(start=False)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="MariaDB is not officially supported")
+        return dj.Connection(
+            target["host"], target["user"], target["password"], port=target["port"], use_tls=target["use_tls"]
+        )
 
 
 def prefix() -> str:
@@ -141,52 +154,29 @@ def configure(target: dict[str, Any] | None = None) -> None:
         dj.config["database.port"] = target["port"]
         dj.config["database.user"] = target["user"]
         dj.config["database.password"] = target["password"]
-        dj.config["database.use_tls"] = target["use_tls"]
+        dj.config["database.use_tls"] = None if target["use_tls"] is None else bool(target["use_tls"])
     dj.config["safemode"] = False  # commands ask before they delete; DataJoint's own prompt hangs without a terminal
     dj.config["database.reconnect"] = True
     dj.config["loglevel"] = os.environ["DJ_LOG_LEVEL"]
     dj.config.stores.clear()
-    dj.config.stores.update({"default": STORE, STORE: _store_spec()})
+    dj.config.stores.update({"default": STORE, STORE: store_spec()})
     dj.config.jobs.auto_refresh = True
-    dj.config.jobs.keep_completed = True
+    dj.config.jobs.keep_completed = False  # a result row says that a job is done; queues stay as small as their work
     dj.config.jobs.add_job_metadata = True
     dj.config.jobs.version_method = None  # "git" forks three times a make; the code version is a column of ours
-
-
-def _store_spec() -> dict[str, Any]:
-    # The one place that knows where arrays go. An object store (S3, MinIO) becomes a second case here, chosen by
-    # variables named PBL_STORE_*; the tables name the store only as `arrays`.
-    folder = settings.store_dir()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _store_error(folder, str(error)) from error
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise _store_error(folder, "it exists, and you may not write to it")
-    return {"protocol": "file", "location": str(folder), "subfolding": [2, 2]}
-
-
-def _store_error(folder: Path, found: str) -> PblError:
-    return PblError(
-        "DB_REFUSED",
-        key=folder,
-        found=f"the folder for arrays cannot be used: {found}",
-        expected="a folder you may write to",
-        next_step="set PBL_STORE (or PBL_HOME) to a folder of your own",
-    )
 
 
 def _target(start: bool) -> dict[str, Any]:
     """Server and login: DJ_* when DJ_HOST is set, else those of the embedded server."""
     host = os.environ.get("DJ_HOST")
     if host:
-        user, password = os.environ.get("DJ_USER"), os.environ.get("DJ_PASS")
+        user, password = os.environ.get("DJ_USER"), secret("DJ_PASS")
         if not user or password is None:
             raise PblError(
                 "DB_REFUSED",
                 key=f"DJ_HOST={host}",
                 found="DJ_HOST names a server, but DJ_USER or DJ_PASS is not set",
-                expected="all three",
+                expected="all three (the password in DJ_PASS, or in the file that DJ_PASS_FILE names)",
                 next_step="set DJ_USER and DJ_PASS, or unset DJ_HOST to use the embedded database",
             )
         name, _, in_host = host.partition(":")
@@ -194,14 +184,12 @@ def _target(start: bool) -> dict[str, Any]:
             raise PblError(
                 "USAGE", found=f"DJ_HOST={host}", expected="HOST or HOST:PORT", next_step="correct the variable"
             )
-        use_tls = os.environ.get("DJ_USE_TLS", "").lower()
         return {
             "host": name,
             "port": int(in_host or os.environ.get("DJ_PORT") or 3306),
             "user": user,
             "password": password,
-            # None: encrypted when the server can.
-            "use_tls": None if not use_tls else use_tls in ("1", "true", "yes"),
+            "use_tls": _tls(),
             "embedded": False,
         }
     if start:
@@ -209,6 +197,34 @@ def _target(start: bool) -> dict[str, Any]:
     folder = Folder.default()
     login = {"host": HOST, "user": APP_USER, "password": folder.credentials().app_password}
     return {**login, "port": int(folder.state().get("port") or 0), "use_tls": False, "embedded": True}
+
+
+def _tls() -> bool | dict[str, Any] | None:
+    """How the connection is encrypted: None where the server can, False never, a dict of the driver's always.
+
+    DJ_TLS_CA names the file of the authority that signed the server's certificate: name and certificate are checked
+    then. Without it DJ_USE_TLS=1 encrypts, but would not notice another server in between. A bare True is no choice:
+    DataJoint hands it on as "encrypted where possible", and a server without TLS is then spoken to in the clear.
+    """
+    wanted, authority = os.environ.get("DJ_USE_TLS", "").lower(), os.environ.get("DJ_TLS_CA")
+    if wanted and wanted not in ("1", "true", "yes"):
+        return False
+    if not authority:
+        return {"verify_mode": "none"} if wanted else None
+    if not os.access(authority, os.R_OK):
+        raise PblError(
+            "FILE_MISSING",
+            key=f"DJ_TLS_CA={authority}",
+            found="no such file, or it cannot be read",
+            expected="the certificate (PEM) of the authority that signed the server's",
+            next_step="correct the variable, or mount the file there",
+        )
+    return {"ca": authority, "check_hostname": True}
+
+
+def store_backend() -> Any:
+    """DataJoint's access to the store of arrays, whatever it is. `connect()` or `configure()` must have been called."""
+    return get_store_backend(STORE, config=dj.config)
 
 
 def _check_answers(target: dict[str, Any]) -> None:

@@ -1,0 +1,138 @@
+"""Where arrays go: a folder, or a bucket of an object store (S3, MinIO)."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import secrets
+from pathlib import Path
+from typing import Any
+
+from pbl_pipeline import settings
+from pbl_pipeline.errors import PblError
+
+from ._secrets import secret
+
+#: Folder of the bucket under which everything of ours lies; the phones' uploads may have another one beside it.
+LOCATION = "arrays"
+
+
+def is_remote() -> bool:
+    """True when PBL_S3_ENDPOINT names an object store."""
+    return bool(os.environ.get("PBL_S3_ENDPOINT"))
+
+
+def describe() -> str:
+    """Where arrays go, in words, without any secret."""
+    if is_remote():
+        return f"{os.environ['PBL_S3_ENDPOINT']}, bucket {bucket()}"
+    return str(settings.store_dir())
+
+
+def bucket() -> str:
+    """Name of the bucket (PBL_S3_BUCKET, default `pbl`)."""
+    return os.environ.get("PBL_S3_BUCKET") or "pbl"
+
+
+def store_spec() -> dict[str, Any]:
+    """The store as DataJoint's configuration has it. Makes the folder; asks no object store yet (`check_store` does).
+
+    Raises
+    ------
+    PblError
+        DB_REFUSED for a folder that cannot be used, USAGE for settings of an object store that cannot work,
+        STORE_UNAVAILABLE where the package for object stores is missing.
+    """
+    if is_remote():
+        return _bucket_spec()
+    folder = settings.store_dir()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _folder_error(folder, str(error)) from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise _folder_error(folder, "it exists, and you may not write to it")
+    return {"protocol": "file", "location": str(folder), "subfolding": [2, 2]}
+
+
+def _bucket_spec() -> dict[str, Any]:
+    endpoint = os.environ["PBL_S3_ENDPOINT"].rstrip("/")
+    key, password = secret("PBL_S3_KEY"), secret("PBL_S3_SECRET")
+    if not endpoint.startswith(("http://", "https://")) or "@" in endpoint:
+        raise PblError(
+            "USAGE",
+            key="PBL_S3_ENDPOINT",  # its value may hold a password where somebody wrote user:password@host
+            found="an address without http:// or https://, or with a user in it",
+            expected="such as https://minio.lab.example:9000",
+            next_step="correct the variable; key and secret go into PBL_S3_KEY_FILE and PBL_S3_SECRET_FILE",
+        )
+    if bool(key) != bool(password):
+        raise PblError(
+            "USAGE",
+            key=f"PBL_S3_ENDPOINT={endpoint}",
+            found="only one of key and secret is set",
+            expected="both, or neither where the machine itself has an identity",
+            next_step="set PBL_S3_KEY_FILE and PBL_S3_SECRET_FILE (or PBL_S3_KEY and PBL_S3_SECRET)",
+        )
+    if importlib.util.find_spec("s3fs") is None:
+        raise PblError(
+            "STORE_UNAVAILABLE",
+            key=f"PBL_S3_ENDPOINT={endpoint}",
+            found="the package s3fs is not installed",
+            expected="the extra `s3` of pbl-pipeline",
+            next_step="pip install 'pbl-pipeline[s3]', or unset PBL_S3_ENDPOINT to keep arrays in a folder",
+        )
+    spec = {"protocol": "s3", "endpoint": endpoint, "bucket": bucket(), "location": LOCATION, "subfolding": [2, 2]}
+    return {**spec, "secure": endpoint.startswith("https://"), **_login(key, password)}
+
+
+def _login(key: str | None, password: str | None) -> dict[str, str]:
+    return {"access_key": key, "secret_key": password} if key and password else {}
+
+
+def check_store(backend: Any, create: bool = False) -> None:
+    """Write, read and compare a small object in the store.
+
+    Parameters
+    ----------
+    backend
+        DataJoint's storage backend of the store `arrays` (`schemas.connection.store_backend()`).
+    create
+        Make the bucket where it is missing.
+
+    Raises
+    ------
+    PblError
+        STORE_UNAVAILABLE with what the store said.
+    """
+    probe, content = "probe/written-by-pbl-db-init", secrets.token_bytes(16)
+    try:
+        if create and backend.protocol == "s3" and not backend.fs.exists(bucket()):
+            backend.fs.mkdir(bucket())
+        backend.put_buffer(content, probe)
+        found = backend.get_buffer(probe)
+    except Exception as error:  # whatever layer of the client speaks, the reader needs the same advice
+        raise store_error(error) from error
+    if found != content:
+        raise store_error(OSError("an object came back with other bytes than were written"))
+
+
+def store_error(error: BaseException) -> PblError:
+    """The coded error for a store that does not do what it is asked. The clients' messages hold no secret."""
+    return PblError(
+        "STORE_UNAVAILABLE",
+        key=describe(),
+        found=f"{type(error).__name__}: {error}"[:500],
+        expected="an object store that keeps what is written to it",
+        next_step="see that it runs and has space, and that PBL_S3_* name it, its bucket and a key that may write",
+    )
+
+
+def _folder_error(folder: Path, found: str) -> PblError:
+    return PblError(
+        "DB_REFUSED",
+        key=folder,
+        found=f"the folder for arrays cannot be used: {found}",
+        expected="a folder you may write to",
+        next_step="set PBL_STORE (or PBL_HOME) to a folder of your own",
+    )

@@ -1,0 +1,115 @@
+"""Arrays in an object store: the whole way of `<npy@>` and `<object@>` columns, against a server that speaks S3."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from moto.server import ThreadedMotoServer
+
+import pbl_pipeline.video
+import schemas
+from pbl_pipeline.errors import PblError
+from schemas import _store, connection, lab, tracking, video
+from schemas._base import file_ref, stored_file
+from schemas.ingest import Visit, ingest
+
+from . import chain
+
+SECRET = "not-for-anybody-7f3a"
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[str]:
+    """Address of the object store."""
+    running = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    running.start()
+    host, port = running.get_host_and_port()
+    yield f"http://{host}:{port}"
+    running.stop()
+
+
+@pytest.fixture
+def remote(database: Path, server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The store `arrays` is a bucket; key and secret come from files, as containers mount them."""
+    (tmp_path / "key").write_text("pbl-worker\n")
+    (tmp_path / "secret").write_text(SECRET + "\n")
+    schemas.activate()
+    with monkeypatch.context() as patch:
+        chain.install(patch)
+        patch.setenv("PBL_S3_ENDPOINT", server)
+        patch.setenv("PBL_S3_BUCKET", "walks")
+        patch.setenv("PBL_S3_KEY_FILE", str(tmp_path / "key"))
+        patch.setenv("PBL_S3_SECRET_FILE", str(tmp_path / "secret"))
+        connection.connect()
+        yield
+    lab.Subject.delete(prompt=False, part_integrity="cascade")
+    for table in schemas.computed_tables():
+        table.jobs.delete_quick()
+    connection.connect()
+
+
+def test_arrays_and_files_go_to_the_bucket_and_come_back(remote: None, tmp_path: Path):
+    backend = connection.store_backend()
+    assert backend.protocol == "s3"
+    assert not backend.fs.exists("walks")
+    _store.check_store(backend, create=True)
+    path = chain.small_video(tmp_path, "walk")
+    ingest([path], Visit(subject="P001"))
+    for table in (video.VideoInfo, tracking.Tracking):
+        table.populate()
+    stored = sorted(backend.fs.find("walks"))
+    assert [p.split("/")[1:5] for p in stored] == [
+        ["arrays", "_schema", "pbl_tracking", "__tracking"],
+        ["arrays", "_schema", "pbl_video", "__video_info"],
+        ["arrays", "probe", "written-by-pbl-db-init"],
+    ]
+    # <npy@>: lazily, with shape and type from the row
+    times = video.VideoInfo.fetch1("frame_time")
+    assert (times.shape, str(times.dtype)) == ((chain.N_FRAMES,), "float64")
+    assert np.asarray(times).tolist() == pbl_pipeline.video.probe(path).time_s.tolist()
+    # <object@>: as a file that is gone afterwards
+    ref = file_ref(tracking.Tracking.fetch1("tracks"))
+    with stored_file(tracking.Tracking(), ref) as local:
+        found = tracking.load_tracking(local, (1920, 1080), "stand-in", "0" * 64)
+    assert not local.exists()
+    np.testing.assert_allclose(found.persons[0].box_px, chain.track_people(path).persons[0].box_px, rtol=1e-6)
+    # a file that is lost has a code and a next step
+    backend.remove(ref["path"])
+    with pytest.raises(PblError, match="the object store has no") as error, stored_file(tracking.Tracking(), ref):
+        pass
+    assert error.value.code == "FILE_FORMAT"
+
+
+def test_a_store_that_does_not_answer_is_said_without_the_secret(remote: None, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("PBL_S3_ENDPOINT", "http://127.0.0.1:1")
+    monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
+    connection.connect()
+    with pytest.raises(PblError) as error:
+        _store.check_store(connection.store_backend())
+    assert error.value.code == "STORE_UNAVAILABLE"
+    assert "127.0.0.1:1" in str(error.value)
+    cause: BaseException | None = error.value
+    while cause is not None:
+        assert SECRET not in f"{cause!r} {cause}"
+        cause = cause.__cause__ or cause.__context__
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [
+        ({"PBL_S3_ENDPOINT": "minio:9000"}, "USAGE"),
+        ({"PBL_S3_ENDPOINT": f"http://pbl:{SECRET}@minio:9000"}, "USAGE"),
+        ({"PBL_S3_ENDPOINT": "http://minio:9000", "PBL_S3_KEY": "pbl"}, "USAGE"),
+        ({"PBL_S3_ENDPOINT": "http://minio:9000", "PBL_S3_SECRET_FILE": "/nowhere"}, "FILE_MISSING"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(changes: dict[str, str], code: str, monkeypatch: pytest.MonkeyPatch):
+    for name, value in changes.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(PblError) as error:
+        _store.store_spec()
+    assert error.value.code == code
+    assert SECRET not in str(error.value)
