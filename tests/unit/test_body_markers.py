@@ -50,7 +50,7 @@ def other_side(set_name: str, name: str) -> str | None:
 
 
 def test_names():
-    assert set(MARKER_SETS) == {"bml_movi_87", "blazepose_33", "body25b", "mpi_inf_3dhp_17"}
+    assert set(MARKER_SETS) == {"bml_movi_87", "blazepose_33", "body25b", "halpe_26", "mpi_inf_3dhp_17"}
     assert list(marker_set("blazepose_33").names) == BLAZEPOSE
     assert list(marker_set("mpi_inf_3dhp_17").names) == MPI_INF_3DHP
     assert list(marker_set("body25b").names) == BODY_25B
