@@ -73,14 +73,11 @@ class Picture:
         return cls(data["picture_time_s"], data["picture_luma"], data["picture_detail"])
 
     @property
-    def contrast(self) -> float:
-        """Median over the frames of the 95th less the 5th percentile of the brightness, NaN without a frame."""
-        return _median(self.luma[:, 2] - self.luma[:, 0])
+    def bright(self) -> float:
+        """Median over the frames of the 95th percentile of the brightness, NaN without a frame.
 
-    @property
-    def brightness(self) -> float:
-        """Median brightness, NaN without a frame."""
-        return _median(self.luma[:, 1])
+        The brightest parts, because dark clothes do not make a picture dark."""
+        return _median(self.luma[:, 2])
 
     @property
     def detail_share(self) -> float:

@@ -1,51 +1,190 @@
-"""Checks of the keypoints of one trial: how much was seen, how sure, and whether left and right stayed where they were.
+"""Checks of the keypoints of one trial: how much was seen, how well, how sure, and whether left and right stayed.
 
 A body from the front and the same from behind, with the sides exchanged, give nearly one outline. Where the face tells
 nothing (pixelated for privacy, against the light) a network may answer with either, and change its mind within a trial.
 Which of the two is right cannot be told from the movement alone: the sequence that moves least may be the wrong one
 throughout. So such a trial is reported, not repaired.
+
+The thresholds of the picture were set where the detector begins to fall behind what it saw in the clean picture, on
+recordings that were darkened, blurred and shrunk (docs/confidence.md).
 """
 
 from __future__ import annotations
+
+import re
 
 import numpy as np
 
 from pbl_pipeline.qc import EMPTY, FAIL, PASS, WARN, Check
 
+from ._confidence import probability_within
+from ._in_view import SEEN_SHARE, step_s, visibility
 from ._types import Keypoints
 
+#: Seconds in view: about three strides; what a fit needs at least.
+SECONDS_WARN, SECONDS_FAIL = 3.0, 1.0
+#: Share of the frames between the first and the last sight of the person in which she is not found.
+ABSENT_WARN, ABSENT_FAIL = 0.05, 0.5
+#: Share of the frames in which feet or head are beyond the lower or upper border.
+CUT_WARN, CUT_FAIL = 0.1, 0.5
+#: Head to feet in the picture.
+HEIGHT_WARN_PX, HEIGHT_FAIL_PX = 100.0, 40.0
+#: Brightness (0..255) of the brightest twentieth of the person.
+BRIGHT_WARN, BRIGHT_FAIL = 30.0, 15.0
+#: Finest detail as a share of the person's size.
+DETAIL_WARN, DETAIL_FAIL = 0.04, 0.06
+#: Frames a second.
+RATE_WARN_HZ, RATE_FAIL_HZ = 24.0, 12.0
+#: Mean probability that a point of the legs is right; mean stated confidence of a detector that has no curve.
+LEGS_PROBABILITY_WARN, LEGS_CONFIDENCE_WARN = 0.85, 0.6
 #: Nobody turns by this much between neighbouring frames (deg); single frames of noise stay below.
 _TURN_DEG = 90.0
 _LONGEST_STEP_S = 0.2
 _LEGS = ("hip", "knee", "ankle", "heel", "foot_index")
+_FEET = re.compile(r"heel|toe|ankle|ankm|foot", re.IGNORECASE)
+_HEAD = re.compile(r"nose|head|eye|cheek", re.IGNORECASE)
 
 
 def check_keypoints(keypoints: Keypoints) -> tuple[Check, ...]:
-    """Checks `frames_seen_s`, `leg_confidence` and, where the points have sides, `side_changes`."""
+    """The checks of one trial, in the order of the chain; EMPTY alone where no frame shows the person.
+
+    `frames_seen_s`, `whole_person_s`, `frames_without_person_share`, `feet_cut_share`, `head_cut_share`,
+    `body_height_px`, `picture_brightness`, `picture_detail_share`, `frame_rate_hz`, `leg_points_right_share` (or
+    `leg_confidence`), `side_changes`. Those that a trial's points or file cannot tell are left out.
+    """
     seen = keypoints.confidence.max(axis=1) > 0
     if not seen.any():
         return (Check("frames_seen_s", EMPTY, 0.0, 1.0, "no frame shows the person"),)
-    time = keypoints.time_s
-    seconds = float(seen.sum()) * (float(time[-1] - time[0]) / (len(time) - 1) if len(time) > 1 else 0.0)
-    advice = "" if seconds >= 3.0 else "fewer than about three strides are in view: film a longer walk"
-    checks = [Check("frames_seen_s", PASS if seconds >= 3.0 else WARN, seconds, 3.0, advice)]
+    checks = [*_time(keypoints, seen), *_cut(keypoints), *_picture(keypoints), _rate(keypoints.time_s)]
+    return tuple(c for c in [*checks, *_legs(keypoints, seen), *_sides(keypoints, seen)] if c is not None)
+
+
+def _time(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
+    """How long the person, and the whole of her, is in view."""
+    seconds = float(seen.sum()) * step_s(keypoints.time_s)
+    shown = visibility(keypoints)
+    first, last = np.flatnonzero(seen)[[0, -1]]
+    absent = 1.0 - float(np.mean(seen[first : last + 1]))
+    return [
+        _low(
+            "frames_seen_s",
+            seconds,
+            SECONDS_WARN,
+            0.0,
+            "fewer than about three strides are in view: film a longer walk",
+        ),
+        _low(
+            "whole_person_s",
+            shown.counts_s,
+            SECONDS_WARN,
+            SECONDS_FAIL,
+            f"{shown.text()}: keep head and feet in the picture, step back or film a longer walk",
+        ),
+        _high(
+            "frames_without_person_share",
+            absent,
+            ABSENT_WARN,
+            ABSENT_FAIL,
+            "the person is lost again and again between the first and the last frame: film without others in between, "
+            "in more light, and follow the walk",
+        ),
+    ]
+
+
+def _cut(keypoints: Keypoints) -> list[Check | None]:
+    """Feet and head beyond the border, and how large the person is."""
+    width, height = keypoints.image_size_px
+    xy = np.nan_to_num(np.asarray(keypoints.xy_px, float), nan=-1.0)
+    found = (keypoints.confidence > 0) & np.all((xy >= 0) & (xy <= (width, height)), axis=2)
+    given = found.any(axis=0)
+    seen = found.mean(axis=1) >= SEEN_SHARE * given.mean()
+    feet, head = (np.array([bool(p.search(n)) for n in keypoints.names]) & given for p in (_FEET, _HEAD))
+    box = np.asarray(keypoints.box_px, float)
+    checks: list[Check | None] = []
+    for name, points, at_border, advice in (
+        (
+            "feet_cut_share",
+            feet,
+            box[:, 3] >= height - 1,
+            "the feet leave the picture below: tilt the phone or step back",
+        ),
+        ("head_cut_share", head, box[:, 1] <= 0, "the head leaves the picture above: tilt the phone or step back"),
+    ):
+        if points.any() and seen.any():
+            cut = at_border & ~found[:, points].all(axis=1)
+            checks.append(_high(name, float(np.mean(cut[seen])), CUT_WARN, CUT_FAIL, advice))
+    whole = found[:, feet].any(axis=1) & found[:, head].any(axis=1)
+    if whole.any():
+        points = np.where(found[whole][..., None], xy[whole], np.nan)
+        extent = np.nanmax(points, axis=1) - np.nanmin(points, axis=1)
+        checks.append(
+            _low(
+                "body_height_px",
+                float(np.median(extent.max(axis=1))),
+                HEIGHT_WARN_PX,
+                HEIGHT_FAIL_PX,
+                "the person is too small in the picture: film from nearer, or in a higher resolution; do not zoom "
+                "digitally",
+            )
+        )
+    return checks
+
+
+def _picture(keypoints: Keypoints) -> list[Check | None]:
+    """Light and sharpness."""
+    picture = keypoints.picture
+    if picture is None or not len(picture.time_s):
+        return []
+    blurred = (
+        "the picture of the person is blurred: film in more light (a shorter exposure), hold the phone still, wipe "
+    )
+    return [
+        _low(
+            "picture_brightness",
+            picture.bright,
+            BRIGHT_WARN,
+            BRIGHT_FAIL,
+            "the person is too dark: switch lights on, and do not film against a window",
+        ),
+        _high(
+            "picture_detail_share",
+            picture.detail_share,
+            DETAIL_WARN,
+            DETAIL_FAIL,
+            blurred + "the lens, and let it focus on the person",
+        ),
+    ]
+
+
+def _rate(time_s: np.ndarray) -> Check | None:
+    if len(time_s) < 2:
+        return None
+    rate = 1.0 / float(np.median(np.diff(time_s)))
+    advice = "too few frames a second for fast movements and the moment of a step: film with 30 or 60"
+    return _low("frame_rate_hz", rate, RATE_WARN_HZ, RATE_FAIL_HZ, advice)
+
+
+def _legs(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
+    """How sure the points of the legs are: what the confidence is worth, where that is known."""
     legs = [i for i, n in enumerate(keypoints.names) if n.startswith(("left_", "right_")) and n.endswith(_LEGS)]
-    if legs:
-        mean = float(keypoints.confidence[np.ix_(seen, legs)].mean())
-        advice = (
-            "" if mean >= 0.6 else "the legs are hidden or hard to see: film the whole body from the side, in light"
-        )
-        checks.append(Check("leg_confidence", PASS if mean >= 0.6 else WARN, mean, 0.6, advice))
-    if {"left_hip", "right_hip"} <= set(keypoints.names):
-        changes = len(side_changes(keypoints))
-        outcome = PASS if changes == 0 else WARN if changes <= 0.02 * seen.sum() else FAIL
-        advice = (
-            ""
-            if changes == 0
-            else "left and right change places between frames: look at the overlay; film from the side"
-        )
-        checks.append(Check("side_changes", outcome, float(changes), 0.0, advice))
-    return tuple(checks)
+    if not legs:
+        return []
+    probability = probability_within(keypoints)
+    values = keypoints.confidence if probability is None else probability
+    mean = float(values[np.ix_(seen, legs)].mean())
+    name, warn = ("leg_confidence", LEGS_CONFIDENCE_WARN)
+    if probability is not None:
+        name, warn = ("leg_points_right_share", LEGS_PROBABILITY_WARN)
+    advice = "the legs are hidden or hard to see: film the whole body from the side, in light"
+    return [_low(name, mean, warn, 0.0, advice)]
+
+
+def _sides(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
+    if not {"left_hip", "right_hip"} <= set(keypoints.names):
+        return []
+    changes = float(len(side_changes(keypoints)))
+    advice = "left and right change places between frames: look at the overlay; film from the side"
+    return [_high("side_changes", changes, 0.0, 0.02 * float(seen.sum()), advice)]
 
 
 def side_changes(keypoints: Keypoints) -> np.ndarray:
@@ -59,3 +198,19 @@ def side_changes(keypoints: Keypoints) -> np.ndarray:
     axis = axis[rows] / np.linalg.norm(axis[rows], axis=1, keepdims=True)
     turned = np.einsum("ij,ij->i", axis[1:], axis[:-1]) < np.cos(np.radians(_TURN_DEG))
     return rows[1:][turned & (np.diff(keypoints.time_s[rows]) <= _LONGEST_STEP_S)]
+
+
+def _low(check: str, value: float, warn: float, fail: float, advice: str) -> Check | None:
+    """A value that should be high; None where it is not known."""
+    if not np.isfinite(value):
+        return None
+    outcome = FAIL if value < fail else WARN if value < warn else PASS
+    return Check(check, outcome, value, fail if outcome == FAIL else warn, "" if outcome == PASS else advice)
+
+
+def _high(check: str, value: float, warn: float, fail: float, advice: str) -> Check | None:
+    """A value that should be low; None where it is not known."""
+    if not np.isfinite(value):
+        return None
+    outcome = FAIL if value > fail else WARN if value > warn else PASS
+    return Check(check, outcome, value, fail if outcome == FAIL else warn, "" if outcome == PASS else advice)
