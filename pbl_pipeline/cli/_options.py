@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,22 @@ if TYPE_CHECKING:
 #: Commands that fit: how the camera was held, and what is meant where nobody says.
 CAMERA_MOTIONS = ("static", "handheld")
 CAMERA_MOTION_HELP = "Default: handheld where the phone's orientation is known, else static."
+
+
+KEYPOINTS = click.option(
+    "--keypoints", "keypoints", metavar="NAME", help="Keypoint method: blazepose-33, or a model of `pbl models list`."
+)
+DEVICE = click.option(
+    "--device",
+    type=click.Choice(["auto", "cpu", "cuda"]),
+    help="Where ONNX models run (else PBL_ONNX_DEVICE, else CUDA where it works).",
+)
+
+
+def set_device(device: str | None) -> None:
+    """Let ONNX models of this process run on the device that `--device` names."""
+    if device is not None:
+        os.environ["PBL_ONNX_DEVICE"] = device
 
 
 class Person(click.ParamType):
