@@ -15,7 +15,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import write_angles_csv
 from pbl_pipeline.fit import SessionFit, TrialFit, check_trial, fit_session
 from pbl_pipeline.gait import DEFAULT_NORM, GaitMetrics, gait_metrics, load_norm
-from pbl_pipeline.keypoints import Keypoints, check_keypoints, detect_keypoints
+from pbl_pipeline.keypoints import Keypoints, check_keypoints, detect_keypoints, params_of
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import WARN, Check
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
@@ -67,21 +67,29 @@ class Session:
         return self.metrics.with_checks([*self.checks, *self.fit.qc])
 
 
-def detect_trial(path: Path, sheet: Path, camera_file: Path | None = None, person: int | None = None) -> Trial:
+def detect_trial(
+    path: Path,
+    sheet: Path,
+    camera_file: Path | None = None,
+    person: int | None = None,
+    keypoints: Paramset | None = None,
+) -> Trial:
     """Video to keypoints of the subject. `sheet` is the picture of the people that is written when one must be chosen.
+    `keypoints` is the method (`keypoints.find_method`), None the default.
 
     Raises
     ------
     PblError
         The VIDEO_ codes, TRACK_NO_PERSON, TRACK_TOO_SHORT, SUBJECT_NEEDS_CHOICE, SUBJECT_UNKNOWN_PERSON, ASSET_ codes,
-        CAMERA_INVALID.
+        CAMERA_INVALID, MODEL_ codes, DEVICE_UNAVAILABLE.
     """
     info = probe(path)
     camera = find_camera(info, camera_file)
     tracking = track_people(path, info=info)
     choice = choose_subject(tracking, override=person)
     subject = require_subject(choice, tracking, path, sheet)
-    return Trial(path.stem, path, info, choice, detect_keypoints(path, tracking, subject, camera))
+    params = params_of(keypoints) if keypoints is not None else None
+    return Trial(path.stem, path, info, choice, detect_keypoints(path, tracking, subject, camera, params=params))
 
 
 def run_session(
@@ -93,6 +101,7 @@ def run_session(
     camera_motion: str | None = None,
     norm: str | None = None,
     attitude_files: Sequence[Path] = (),
+    keypoints: Paramset | None = None,
 ) -> Session:
     """Videos of one session to gait measures. A video that fails is left out with its problem, and so is one whose
     bytes were named before, because its steps would count twice; the others go on. Into `out` goes only a picture of
@@ -117,7 +126,7 @@ def run_session(
             first = seen.setdefault(sha256_of(path), name)
             if first != name:
                 raise _named_twice(path, first)
-            trial = dataclasses.replace(detect_trial(path, out / f"{name}.persons.png", camera_file, person), name=name)
+            trial = dataclasses.replace(detect_trial(path, out / f"{name}.persons.png", camera_file, person, keypoints), name=name)
             if log is not None:
                 trial = dataclasses.replace(trial, keypoints=trial.keypoints.with_attitude(log))
             check_trial(trial.keypoints, name, paramset)
