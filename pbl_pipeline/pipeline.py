@@ -126,7 +126,9 @@ def run_session(
             first = seen.setdefault(sha256_of(path), name)
             if first != name:
                 raise _named_twice(path, first)
-            trial = dataclasses.replace(detect_trial(path, out / f"{name}.persons.png", camera_file, person, keypoints), name=name)
+            trial = dataclasses.replace(
+                detect_trial(path, out / f"{name}.persons.png", camera_file, person, keypoints), name=name
+            )
             if log is not None:
                 trial = dataclasses.replace(trial, keypoints=trial.keypoints.with_attitude(log))
             check_trial(trial.keypoints, name, paramset)
