@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from ._options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, Person, fit_paramset
+from ._options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, DEVICE, KEYPOINTS, Person, fit_paramset, set_device
 
 
 @click.command(epilog="Example: pbl run walk1.mp4 walk2.mp4 --out results --camera phone.toml")
@@ -22,6 +22,8 @@ from ._options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, Person, fit_paramset
 )
 @click.option("--camera-motion", type=click.Choice(CAMERA_MOTIONS), help=CAMERA_MOTION_HELP)
 @click.option("--person", type=Person(), default="auto", show_default=True, help="Whom to measure, of one video.")
+@KEYPOINTS
+@DEVICE
 @click.option("--solver", help="gauss-newton or implicit-adam; without it the solver of the paramset.")
 @click.option("--params", help="Name of a paramset, or a JSON file with changes to one (docs/files.md).")
 @click.option("--norm", help="Normative set of the GDI.")
@@ -33,6 +35,8 @@ def run(
     attitude: tuple[Path, ...],
     camera_motion: str | None,
     person: int | None,
+    keypoints: str | None,
+    device: str | None,
     solver: str | None,
     params: str | None,
     norm: str | None,
@@ -46,7 +50,8 @@ def run(
     """
     from pbl_pipeline.errors import PblError
     from pbl_pipeline.files import check_out_folder
-    from pbl_pipeline.pipeline import run_session, write_results
+    from pbl_pipeline.keypoints import find_method
+    from pbl_pipeline.pipeline import fit_default, run_session, write_results
 
     # What can be wrong with the call is found before minutes of work.
     if person is not None and len(videos) > 1:
@@ -65,11 +70,15 @@ def run(
             next_step="name a log for each video; run videos without a log in another call",
         )
     check_out_folder(out)
-    paramset = fit_paramset(solver, params)
-    session = run_session(videos, out, camera, person, paramset, camera_motion, norm, attitude)
+    set_device(device)
+    method = find_method(keypoints)
+    paramset = fit_paramset(solver, params, default=fit_default(method))
+    session = run_session(videos, out, camera, person, paramset, camera_motion, norm, attitude, method)
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
     paths = write_results(out, session, subject_code=subject, date=f"computed {today}")
     click.echo(session.judged.table())
+    for origin in sorted({t.keypoints.origin for t in session.trials if t.keypoints.origin}):
+        click.echo(f"keypoints by {origin}")
     for name, error in session.problems.items():
         click.echo(f"left out {name}\n{error.text()}", err=True)
     click.echo("\n".join(str(p) for p in paths))
