@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ._options import Person
+from ._options import DEVICE, KEYPOINTS, Person, set_device
 
 
 @click.command(epilog="Example: pbl detect walk.mp4 --out walk.keypoints.npz --person auto")
@@ -15,7 +15,17 @@ from ._options import Person
 @click.option("--camera", type=click.Path(path_type=Path), help="Calibration file; without it a phone is guessed.")
 @click.option("--attitude", type=click.Path(path_type=Path), help="Orientation log of the phone (docs/files.md).")
 @click.option("--person", type=Person(), default="auto", show_default=True, help="Whom to measure.")
-def detect(video: Path, out: Path, camera: Path | None, attitude: Path | None, person: int | None) -> None:
+@KEYPOINTS
+@DEVICE
+def detect(
+    video: Path,
+    out: Path,
+    camera: Path | None,
+    attitude: Path | None,
+    person: int | None,
+    keypoints: str | None,
+    device: str | None,
+) -> None:
     """Find the people in VIDEO, choose the one to measure, and write that person's keypoints.
 
     Where no one is clearly the subject, nothing is measured: a picture with the numbered people is written beside OUT,
@@ -23,7 +33,7 @@ def detect(video: Path, out: Path, camera: Path | None, attitude: Path | None, p
     and the fit then knows where gravity points and how the camera moved.
     """
     from pbl_pipeline.files import check_out_file
-    from pbl_pipeline.keypoints import check_keypoints, detect_keypoints
+    from pbl_pipeline.keypoints import check_keypoints, detect_keypoints, find_method, params_of
     from pbl_pipeline.tracking import choose_subject, require_subject, time_in_view_s, track_people
     from pbl_pipeline.video import check_timing, find_camera, load_attitude, probe
 
@@ -33,6 +43,8 @@ def detect(video: Path, out: Path, camera: Path | None, attitude: Path | None, p
     lens = find_camera(info, camera)
     log = load_attitude(attitude) if attitude else None
     check_out_file(out)
+    set_device(device)
+    method = find_method(keypoints)
     tracking = track_people(video, info=info)
     choice = choose_subject(tracking, override=person)
     for p in tracking.persons:
@@ -41,19 +53,21 @@ def detect(video: Path, out: Path, camera: Path | None, attitude: Path | None, p
     click.echo(f"{choice.status}: {choice.reason}")
     sheet = out.with_name(out.name.removesuffix(".npz") + ".persons.png")
     subject = require_subject(choice, tracking, video, sheet)
-    keypoints = detect_keypoints(video, tracking, subject, lens)
+    found = detect_keypoints(video, tracking, subject, lens, params=params_of(method))
     if log is not None:
-        keypoints = keypoints.with_attitude(log)
-    keypoints.save(out)
-    seen = keypoints.confidence.max(axis=1) > 0
+        found = found.with_attitude(log)
+    found.save(out)
+    seen = found.confidence.max(axis=1) > 0
     click.echo(
-        f"{out}: {len(keypoints.names)} points ({keypoints.marker_set}) of person {subject} "
+        f"{out}: {len(found.names)} points ({found.marker_set}) of person {subject} "
         f"in {int(seen.sum())} of {len(seen)} frames; camera {lens.source}"
     )
+    if found.origin:
+        click.echo(f"  keypoints by {found.origin}")
     if log is not None:
         click.echo(f"  orientation of the phone: {len(log.time_s)} samples over {log.time_s[-1] - log.time_s[0]:.1f} s")
     for note in info.notes:
         click.echo(f"  {note}")
-    for check in (*check_timing(info), *check_keypoints(keypoints)):
+    for check in (*check_timing(info), *check_keypoints(found)):
         if check.advice:
             click.echo(f"  {check.outcome} {check.check} = {check.value:.3g}: {check.advice}")
