@@ -15,7 +15,8 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import write_angles_csv
 from pbl_pipeline.fit import SessionFit, TrialFit, check_trial, fit_session
 from pbl_pipeline.gait import DEFAULT_NORM, GaitMetrics, gait_metrics, load_norm
-from pbl_pipeline.keypoints import Keypoints, check_keypoints, detect_keypoints, params_of
+from pbl_pipeline.keypoints import Keypoints, ModelKeypointParams, check_keypoints, detect_keypoints, params_of
+from pbl_pipeline.models import find, load_spec
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import WARN, Check
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
@@ -65,6 +66,15 @@ class Session:
     def judged(self) -> GaitMetrics:
         """The measures with every check of the session: what metrics.json, the terminal and the report judge by."""
         return self.metrics.with_checks([*self.checks, *self.fit.qc])
+
+
+def fit_default(keypoints: Paramset) -> str | None:
+    """Name of the fit's paramset where nobody names one: `gauss-newton`, tuned for MeTRAbs' 87 points, for a registered
+    model of these; None, the project's default, for all else."""
+    params = params_of(keypoints)
+    if isinstance(params, ModelKeypointParams) and load_spec(find(params.model.name)).marker_set == "bml_movi_87":
+        return "gauss-newton"
+    return None
 
 
 def detect_trial(
