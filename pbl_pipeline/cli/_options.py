@@ -32,10 +32,24 @@ DEVICE = click.option(
 )
 
 
-def set_device(device: str | None) -> None:
-    """Let ONNX models of this process run on the device that `--device` names."""
+def keypoint_method(name: str | None, device: str | None) -> Paramset:
+    """The keypoint method of `--keypoints`, with its model's licence on the terminal before it is used; ONNX models of
+    this process run on `--device`.
+
+    Raises `PblError` SOLVER_UNKNOWN, MODEL_INVALID, MARKER_SET_UNKNOWN, DEVICE_UNAVAILABLE.
+    """
+    from pbl_pipeline.keypoints import ModelKeypointParams, find_method, params_of
+
     if device is not None:
+        from pbl_pipeline.models import providers_for
+
+        providers_for(device)
         os.environ["PBL_ONNX_DEVICE"] = device
+    method = find_method(name)
+    params = params_of(method)
+    if isinstance(params, ModelKeypointParams):
+        click.echo(f"keypoints by the model {params.model.name}, licence: {params.model.licence}")
+    return method
 
 
 class Person(click.ParamType):
