@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ._options import DEVICE, KEYPOINTS, Person, set_device
+from ._options import DEVICE, KEYPOINTS, Person, keypoint_method
 
 
 @click.command(epilog="Example: pbl detect walk.mp4 --out walk.keypoints.npz --person auto")
@@ -33,7 +33,7 @@ def detect(
     and the fit then knows where gravity points and how the camera moved.
     """
     from pbl_pipeline.files import check_out_file
-    from pbl_pipeline.keypoints import check_keypoints, detect_keypoints, find_method, params_of
+    from pbl_pipeline.keypoints import check_keypoints, detect_keypoints, params_of
     from pbl_pipeline.tracking import choose_subject, require_subject, time_in_view_s, track_people
     from pbl_pipeline.video import check_timing, find_camera, load_attitude, probe
 
@@ -43,8 +43,7 @@ def detect(
     lens = find_camera(info, camera)
     log = load_attitude(attitude) if attitude else None
     check_out_file(out)
-    set_device(device)
-    method = find_method(keypoints)
+    method = keypoint_method(keypoints, device)
     tracking = track_people(video, info=info)
     choice = choose_subject(tracking, override=person)
     for p in tracking.persons:
