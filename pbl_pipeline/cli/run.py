@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from ._options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, DEVICE, KEYPOINTS, Person, fit_paramset, set_device
+from ._options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, DEVICE, KEYPOINTS, Person, fit_paramset, keypoint_method
 
 
 @click.command(epilog="Example: pbl run walk1.mp4 walk2.mp4 --out results --camera phone.toml")
@@ -50,7 +50,6 @@ def run(
     """
     from pbl_pipeline.errors import PblError
     from pbl_pipeline.files import check_out_folder
-    from pbl_pipeline.keypoints import find_method
     from pbl_pipeline.pipeline import fit_default, run_session, write_results
 
     # What can be wrong with the call is found before minutes of work.
@@ -70,8 +69,7 @@ def run(
             next_step="name a log for each video; run videos without a log in another call",
         )
     check_out_folder(out)
-    set_device(device)
-    method = find_method(keypoints)
+    method = keypoint_method(keypoints, device)
     paramset = fit_paramset(solver, params, default=fit_default(method))
     session = run_session(videos, out, camera, person, paramset, camera_motion, norm, attitude, method)
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
