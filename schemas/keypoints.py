@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,13 +16,16 @@ from ._base import (
     computes,
     dj,
     file_ref,
+    insert_methods,
     library,
     method_arguments,
     method_columns,
+    method_key,
     new_folder,
     number,
     origin_columns,
     rebuild_params,
+    resolve_method,
     stored_file,
 )
 
@@ -103,7 +107,7 @@ class Keypoints(dj.Computed):
         method: Mapping[str, Any],
     ) -> tuple:
         path = video.registered_file(file[0], file[1], key)
-        params = rebuild_params(library("keypoints").KeypointParams, **method)
+        params = rebuild_params(library("keypoints").params_class(method["params"]), **method)
         with stored_file(self, tracks[0]) as stored:
             everybody = tracking.load_tracking(stored, size, *tracks[1:])
         view = camera_of_row(camera) if camera else library("video").guess_camera(size)
@@ -131,6 +135,26 @@ class Keypoints(dj.Computed):
             )
         checks = library("keypoints").check_keypoints(found)
         self.Check.insert({**key, **check_row("keypoints", check)} for check in checks)
+
+
+def method_of(name: str) -> str:
+    """Key of the keypoint method of that name (`resolve_method`), or of the registered model of that name, which
+    becomes a method when it is first asked for. Another graph or `model.json` under the same name is its next version.
+
+    Raises `PblError` SOLVER_UNKNOWN, MODEL_INVALID, MARKER_SET_UNKNOWN.
+    """
+    if not library("models").is_registered(name):
+        return resolve_method(KeypointMethod, "keypoint", name)
+    rows = (KeypointMethod & {"keypoint_method_name": name}).to_dicts(order_by="keypoint_method_version")
+    versions = [row["keypoint_method_version"] for row in rows]
+    found = library("keypoints").method_of_model(name)
+    for version in versions:
+        known = dataclasses.replace(found, version=version)
+        if KeypointMethod & {"keypoint_method_sha": known.hash}:
+            return method_key(known)
+    new = dataclasses.replace(found, version=max(versions, default=0) + 1)
+    insert_methods(KeypointMethod, "keypoint", {name: new})
+    return method_key(new)
 
 
 def camera_of_row(row: Mapping[str, Any]) -> Any:
