@@ -135,7 +135,7 @@ def resolve(methods: Methods) -> dict[str, str]:
     return {
         "tracking_method": resolve_method(tracking.TrackingMethod, "tracking", methods.tracking or tracks.DEFAULT),
         "subject_method": resolve_method(tracking.SubjectMethod, "subject", methods.subject or tracks.SUBJECT_DEFAULT),
-        "keypoint_method": resolve_method(keypoints.KeypointMethod, "keypoint", methods.keypoint or points.DEFAULT),
+        "keypoint_method": keypoints.method_of(methods.keypoint or points.DEFAULT),
         "fit_method": resolve_method(fit.FitMethod, "fit", methods.fit or fits.DEFAULT),
         "gait_method": resolve_method(gait.GaitEventMethod, "gait", methods.gait or gaits.DEFAULT_EVENT_PARAMSET),
         **gdi.resolve(methods.gdi, methods.norm),
