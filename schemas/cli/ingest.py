@@ -29,7 +29,7 @@ import click
 @click.option("--population", metavar="NAME", help="Group of the subject, such as healthy (else: as it was).")
 @click.option("--person", type=click.IntRange(min=1), help="Measure this person of the tracking (else: automatic).")
 @click.option("--tracking-method", metavar="NAME", help="Method of person tracking (else: the default).")
-@click.option("--keypoint-method", metavar="NAME", help="Method of keypoint detection (else: the default).")
+@click.option("--keypoint-method", metavar="NAME", help="Keypoint method or model (else: default).")
 @click.option("--fit-method", metavar="NAME", help="Method of the session fit (else: the default).")
 @click.option("--norm", metavar="NAME", help="Normative set of the Gait Deviation Index (else: the default).")
 def ingest(
