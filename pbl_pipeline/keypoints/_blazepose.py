@@ -16,6 +16,7 @@ from pbl_pipeline.tracking._blazepose import circle_roi
 from pbl_pipeline.tracking._litert import LiteModel
 from pbl_pipeline.video import Camera
 
+from ._flips import leg_points, mirror_of
 from ._protocol import PersonKeypoints
 from ._view import crop_matrix, view_rotation
 
@@ -62,7 +63,14 @@ N_POINTS = len(NAMES)
 #: The network adds six points; the first two are the middle of the hips and a point of the body circle.
 N_ALL = 39
 #: For each point of the mirrored picture, whose it is: left and right change places.
-MIRROR = np.array([NAMES.index(n.replace("left", "~").replace("right", "left").replace("~", "right")) for n in NAMES])
+MIRROR = np.array(mirror_of(NAMES))
+_OWN = np.arange(N_POINTS)
+_GROUPS = (np.flatnonzero(leg_points(NAMES)), np.flatnonzero(~leg_points(NAMES)))
+#: The answers for picture and mirror image are taken to have other sides where they lie apart by more than this share
+#: of the crop, in the mean, and by less than half of that with the sides exchanged.
+LEAST_APART, MOST_CROSSED = 0.04, 0.5
+#: Factor of the confidence there.
+UNDECIDED = 0.5
 
 
 class BlazePoseLandmarks:
@@ -75,6 +83,10 @@ class BlazePoseLandmarks:
     1 / (1 + exp((sigma - agree_mm) / agree_width_mm)); sigma is half the 3D distance in mm between the answers. The
     first two factors are the network's own statement (the point is not hidden; it lies in the picture), which stays
     near 1 where it takes one leg for the other; the last is small there. presence = the network's own pose flag.
+
+    Where the two answers are one body with left and right exchanged, of the legs or of the rest, the second is renamed
+    after the first (their mean would be a body without width) and the confidence of these points is halved: which of
+    the two is right, the movement says (`exchange_sides`).
     """
 
     name = "blazepose"
@@ -104,10 +116,13 @@ class BlazePoseLandmarks:
         points, circle, world, confidence, presence = self._look(crop)
         if not quick:
             points_m, circle_m, world_m, confidence_m, presence_m = _mirrored(*self._look(crop[:, ::-1]))
+            same = _same_sides(points, points_m)
+            points_m, world_m, confidence_m = points_m[same], world_m[same], confidence_m[same]
             sigma_mm = 500.0 * np.linalg.norm(world - world_m, axis=1)
             agree = expit((self._agree_mm - sigma_mm) / self._agree_width_mm)
             points, circle, world = (points + points_m) / 2, (circle + circle_m) / 2, (world + world_m) / 2
             confidence, presence = (confidence + confidence_m) / 2 * agree, (presence + presence_m) / 2
+            confidence = np.where(same == _OWN, confidence, confidence * UNDECIDED)
         circle_px = circle @ to_picture[:, :2].T + to_picture[:, 2]
         return PersonKeypoints(
             xy_px=points @ to_picture[:, :2].T + to_picture[:, 2],
@@ -125,6 +140,18 @@ class BlazePoseLandmarks:
         world = output[N_ALL * 3].reshape(N_ALL, 3)[:N_POINTS].astype(np.float64)
         confidence = expit(points[:N_POINTS, 3]) * expit(points[:N_POINTS, 4])
         return points[:N_POINTS, :2], points[N_POINTS : N_POINTS + 2, :2], world, confidence, float(output[1].item())
+
+
+def _same_sides(points: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(33,) which point of `other` to compare with each of `points` (33, 2 in crop pixels): itself, or that of the
+    other side where the legs, or the rest of the body, lie clearly closer with left and right exchanged."""
+    order = _OWN.copy()
+    for group in _GROUPS:
+        apart = np.linalg.norm(points[group] - other[group], axis=1).mean()
+        crossed = np.linalg.norm(points[group] - other[MIRROR[group]], axis=1).mean()
+        if apart > LEAST_APART * INPUT_SIZE and crossed < MOST_CROSSED * apart:
+            order[group] = MIRROR[group]
+    return order
 
 
 def _mirrored(

@@ -23,6 +23,7 @@ from pbl_pipeline.video import Camera, Frame, read_frames
 from ._batched import BatchDetector, BatchedLooks
 from ._blazepose import MODEL_SHA256, BlazePoseLandmarks
 from ._crops import REACH_SD, corrected, first_looks, smooth_at, smooth_rois
+from ._flips import FlipParams, exchange_sides, exchanged, lowered
 from ._passes import Looks, look_twice, n_workers
 from ._picture import Picture, PictureMeter
 from ._protocol import KeypointDetector, PersonKeypoints
@@ -41,6 +42,7 @@ class KeypointParams:
     the track's, and differs from it in size by at most this factor.
     agree_mm, agree_width_mm: how far the answers for the picture and its mirror image may lie apart, see
     `BlazePoseLandmarks`.
+    sides: where left and right are exchanged back, see `exchange_sides`; None: nowhere.
     min_time_s: a person in view for less cannot be measured.
     box_margin: added to the keypoints' box on each side, as a share of its size.
     """
@@ -55,12 +57,13 @@ class KeypointParams:
     max_growth: float = 1.5
     agree_mm: float = 100.0
     agree_width_mm: float = 20.0
+    sides: FlipParams | None = dataclasses.field(default_factory=FlipParams)
     min_time_s: float = 1.0
     box_margin: float = 0.1
 
 
 DEFAULT = "blazepose-33"
-PARAMSETS: dict[str, Paramset] = {DEFAULT: Paramset.of("keypoints", DEFAULT, 1, KeypointParams())}
+PARAMSETS: dict[str, Paramset] = {DEFAULT: Paramset.of("keypoints", DEFAULT, 2, KeypointParams())}
 
 
 def _blazepose(params: KeypointParams) -> KeypointDetector:
@@ -223,6 +226,12 @@ def _assemble(
         low, high = person.xy_px.min(axis=0), person.xy_px.max(axis=0)
         margin = params.box_margin * (high - low)
         box[row] = np.clip(np.concatenate([low - margin, high + margin]), 0.0, [width, height, width, height])
+    changed = None
+    if params.sides is not None:
+        exchange = exchange_sides(tracking.time_s, detector.names, xy, xyz, confidence, params.sides)
+        xy, xyz = (exchanged(values, exchange, detector.names) for values in (xy, xyz))
+        confidence = lowered(confidence, exchange, detector.names, params.sides)
+        changed = exchange.table
     return Keypoints(
         time_s=tracking.time_s,
         names=detector.names,
@@ -236,4 +245,5 @@ def _assemble(
         box_px=box.astype(np.float32),
         origin=getattr(detector, "origin", ""),
         picture=picture,
+        sides_changed=changed,
     )

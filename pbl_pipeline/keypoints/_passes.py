@@ -13,6 +13,7 @@ import os
 import queue
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Protocol
 
 import numpy as np
 
@@ -28,6 +29,14 @@ def n_workers() -> int:
     """Detectors to run side by side: the cores this process may use, at most 8."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(cores, _MAX_WORKERS)
+
+
+class Looker(Protocol):
+    """Whoever takes the looks: `Looks`, or one that gathers them for a detector that wants many at once."""
+
+    n_detectors: int
+
+    def at(self, frame: Frame, roi_px: np.ndarray, *, quick: bool) -> Future[PersonKeypoints]: ...
 
 
 class Looks:
@@ -61,7 +70,7 @@ class Looks:
 
 def look_twice(
     frames: Iterable[Frame],
-    looks: Looks,
+    looks: Looker,
     time_s: np.ndarray,
     reach_s: float,
     first: dict[int, np.ndarray],

@@ -37,6 +37,8 @@ DETAIL_WARN, DETAIL_FAIL = 0.04, 0.06
 RATE_WARN_HZ, RATE_FAIL_HZ = 24.0, 12.0
 #: Mean probability that a point of the legs is right; mean stated confidence of a detector that has no curve.
 LEGS_PROBABILITY_WARN, LEGS_CONFIDENCE_WARN = 0.85, 0.6
+#: Share of the frames in which left and right were exchanged back; where many are, the rest may be the wrong ones.
+EXCHANGED_WARN, EXCHANGED_FAIL = 0.02, 0.3
 #: Nobody turns by this much between neighbouring frames (deg); single frames of noise stay below.
 _TURN_DEG = 90.0
 _LONGEST_STEP_S = 0.2
@@ -50,7 +52,8 @@ def check_keypoints(keypoints: Keypoints) -> tuple[Check, ...]:
 
     `frames_seen_s`, `whole_person_s`, `frames_without_person_share`, `feet_cut_share`, `head_cut_share`,
     `body_height_px`, `picture_brightness`, `picture_detail_share`, `frame_rate_hz`, `leg_points_right_share` (or
-    `leg_confidence`), `side_changes`. Those that a trial's points or file cannot tell are left out.
+    `leg_confidence`), `side_changes`, `sides_exchanged_share`. Those that a trial's points or file cannot tell are left
+    out.
     """
     seen = keypoints.confidence.max(axis=1) > 0
     if not seen.any():
@@ -184,7 +187,15 @@ def _sides(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
         return []
     changes = float(len(side_changes(keypoints)))
     advice = "left and right change places between frames: look at the overlay; film from the side"
-    return [_high("side_changes", changes, 0.0, 0.02 * float(seen.sum()), advice)]
+    found = [_high("side_changes", changes, 0.0, 0.02 * float(seen.sum()), advice)]
+    if keypoints.sides_changed is not None:
+        share = float(keypoints.sides_changed[seen].any(axis=1).mean())
+        advice = (
+            "the detector took left for right, or could not tell them, in this share of the frames; their names follow "
+            "the movement now: look at the overlay, film in better light or more from the side"
+        )
+        found.append(_high("sides_exchanged_share", share, EXCHANGED_WARN, EXCHANGED_FAIL, advice))
+    return found
 
 
 def side_changes(keypoints: Keypoints) -> np.ndarray:

@@ -42,6 +42,9 @@ class Keypoints:
         of sign, when made (`check_attitude`); how much of the recording it covers is for the fit to judge.
     origin
         Which detector and model made them, under which licence and on what; empty where nobody said.
+    sides_changed : (T, 3) bool or None
+        Frames in which left and right of the legs, and of the rest of the body, are not as the detector said but were
+        exchanged, and those in which its body has no width, so that the sides cannot be told; None: nobody looked.
     picture
         How light and sharp the picture of the person is, or None where no video was seen.
 
@@ -66,6 +69,7 @@ class Keypoints:
     confidence_curve: str = ""
     picture: Picture | None = None
     origin: str = ""
+    sides_changed: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         n, j = len(self.time_s), len(self.names)
@@ -78,6 +82,8 @@ class Keypoints:
             "camera_matrix": (self.camera.matrix, (3, 3)),
             "distortion": (self.camera.distortion, (5,)),
         }
+        if self.sides_changed is not None:
+            shapes["sides_changed"] = (self.sides_changed, (n, 3))
         for name, (array, shape) in shapes.items():
             if np.shape(array) != shape:
                 raise _format_error(f"{name} has shape {np.shape(array)}", f"shape {shape} for {n} frames, {j} names")
@@ -129,6 +135,8 @@ class Keypoints:
             optional["confidence_curve"] = np.asarray(self.confidence_curve)
         if self.origin:
             optional["origin"] = np.asarray(self.origin)
+        if self.sides_changed is not None:
+            optional["sides_changed"] = np.asarray(self.sides_changed, bool)
         if self.picture is not None:
             optional |= self.picture.arrays()
         np.savez_compressed(
@@ -177,6 +185,8 @@ class Keypoints:
         arrays |= {"image_size_px": (2,), "camera_matrix": (3, 3), "distortion": (5,), "root_relative": ()}
         if "focal_rel_sd" in data:
             arrays["focal_rel_sd"] = ()
+        if "sides_changed" in data:
+            arrays["sides_changed"] = (n, 3)
         check_numbers(path, data, arrays)
         rel_sd = float(data.get("focal_rel_sd", np.nan))
         return cls(
@@ -195,6 +205,7 @@ class Keypoints:
             confidence_curve=str(data.get("confidence_curve", "")),
             picture=Picture.from_arrays(path, data),
             origin=str(data.get("origin", "")),
+            sides_changed=data["sides_changed"].astype(bool) if "sides_changed" in data else None,
         )
 
 

@@ -282,7 +282,7 @@ def test_unknown_person_detector_and_changed_video(case, tmp_path):
 
 def test_paramset_names_the_model():
     paramset = PARAMSETS["blazepose-33"]
-    assert (paramset.stage, paramset.version) == ("keypoints", 1)
+    assert (paramset.stage, paramset.version) == ("keypoints", 2)
     assert paramset.params["model_sha256"] == KeypointParams().model_sha256
 
 
