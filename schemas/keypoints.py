@@ -143,7 +143,7 @@ def method_of(name: str) -> str:
 
     Raises `PblError` SOLVER_UNKNOWN, MODEL_INVALID, MARKER_SET_UNKNOWN.
     """
-    if not library("models").is_registered(name):
+    if name in library("keypoints").PARAMSETS or not library("models").is_registered(name):
         return resolve_method(KeypointMethod, "keypoint", name)
     rows = (KeypointMethod & {"keypoint_method_name": name}).to_dicts(order_by="keypoint_method_version")
     versions = [row["keypoint_method_version"] for row in rows]
