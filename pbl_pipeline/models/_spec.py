@@ -142,7 +142,9 @@ def parse_spec(content: Mapping[str, Any], path: str | Path) -> ModelSpec:
         raise invalid(path, "joint_names: not a list of names, all different", "a name for each point, in order")
     markers = _text(path, content, "marker_set") if points else ""
     if points:
-        _check_marker_set(markers, names)
+        if len(markers) > 32:
+        raise invalid(path, f"marker_set of {len(markers)} characters", "at most 32")
+    _check_marker_set(markers, names)
     origin = content.get("pixel_origin", "centre")
     if origin not in ("centre", "edge"):
         raise invalid(path, f"pixel_origin {origin!r}", "'centre' or 'edge'")
