@@ -62,6 +62,7 @@ def examine(fetch_errors: dict[str, PblError] | None = None) -> list[Finding]:
     """All findings, in the order they are printed. `fetch_errors` says why an asset could not be fetched just now."""
     found = [_python(), *_packages(), _jax_device(), _jax_cache(), _litert(), _onnx(), _codecs(), _database()]
     found += list(_assets(fetch_errors or {}))
+    found += list(_models())
     found.append(_folder("cache folder", settings.cache_dir, "PBL_CACHE"))
     found.append(_folder("home folder", settings.home_dir, "PBL_HOME"))
     return found
@@ -120,7 +121,7 @@ def _loads(what: str, look: Callable[[], Finding], next_step: str) -> Finding:
     """`look()`, with what a broken or absent installation raises turned into a finding."""
     try:
         return look()
-    except (ImportError, OSError, RuntimeError, ValueError) as error:
+    except (ImportError, OSError, RuntimeError, ValueError, PblError) as error:
         return Finding(what, MISSING, f"{type(error).__name__}: {error}".splitlines()[0], next_step)
 
 
@@ -177,13 +178,40 @@ def _litert() -> Finding:
 
 
 def _onnx() -> Finding:
+    """Which execution providers there are, and on which of them ONNX models will be run."""
+
     def look() -> Finding:
         import onnxruntime
 
-        providers = ", ".join(p.removesuffix("ExecutionProvider") for p in onnxruntime.get_available_providers())
-        return Finding("ONNX runtime", OK, f"{onnxruntime.__version__}: {providers}")
+        from pbl_pipeline import models
 
-    return _loads("ONNX runtime", look, "pip install onnxruntime")
+        there = models.available_devices()
+        detail = f"{onnxruntime.__version__}: {', '.join(there)}"
+        asked = models.asked_device()
+        try:
+            models.providers_for(asked)
+        except PblError as error:
+            return Finding("ONNX runtime", MISSING, f"{detail}; {asked} is asked for", error.next_step)
+        if "cuda" in there:
+            return Finding("ONNX runtime", OK, f"{detail}; {asked}: `pbl models verify` tells whether CUDA starts")
+        if shutil.which("nvidia-smi") and asked != "cpu":
+            remedy = "pip uninstall onnxruntime && pip install onnxruntime-gpu"
+            return Finding("ONNX runtime", NOTE, f"{detail}; an NVIDIA GPU is not used, models run on the CPU", remedy)
+        return Finding("ONNX runtime", OK, f"{detail}; models run on the CPU")
+
+    return _loads("ONNX runtime", look, "pip install onnxruntime, or correct PBL_ONNX_DEVICE")
+
+
+def _models() -> Iterator[Finding]:
+    """The registered keypoint models, with their licences."""
+    from pbl_pipeline import models
+
+    for model in models.registered():
+        if model.spec is None:
+            assert model.error is not None
+            yield Finding(f"model {model.name}", NOTE, f"{model.error.code}: {model.error.found}", model.error.next_step)
+        else:
+            yield Finding(f"model {model.name}", OK, f"{model.folder} ({model.spec.licence})")
 
 
 def _codecs() -> Finding:
