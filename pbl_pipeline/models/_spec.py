@@ -141,10 +141,10 @@ def parse_spec(content: Mapping[str, Any], path: str | Path) -> ModelSpec:
     if not isinstance(names, list) or bool(names) != points or not _all_text(names) or len(set(names)) != len(names):
         raise invalid(path, "joint_names: not a list of names, all different", "a name for each point, in order")
     markers = _text(path, content, "marker_set") if points else ""
-    if points:
-        if len(markers) > 32:
+    if len(markers) > 32:
         raise invalid(path, f"marker_set of {len(markers)} characters", "at most 32")
-    _check_marker_set(markers, names)
+    if points:
+        _check_marker_set(markers, names)
     origin = content.get("pixel_origin", "centre")
     if origin not in ("centre", "edge"):
         raise invalid(path, f"pixel_origin {origin!r}", "'centre' or 'edge'")
