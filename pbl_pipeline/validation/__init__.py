@@ -7,7 +7,19 @@ from ._frame import COLUMNS, TrialErrors, error_frame
 from ._joints import JOINTS_CLIP, JOINTS_OPENCAP, JOINTS_PAPER
 from ._paper import paper_figures
 from ._paper_tables import paper_tables
+from ._point_truth import PointTruth, resect, truth_of_bodies, truth_of_synthetic, truth_of_trc
 from ._reference import BODY_ROTATIONS, CONVENTIONS, QPOS, Reference
+from ._reliability import (
+    RELIABILITY_COLUMNS,
+    CurveScore,
+    PointErrors,
+    fit_curve,
+    leave_one_out,
+    point_errors,
+    reliability_table,
+    save_curve,
+)
+from ._reliability_page import write_reliability
 from ._rotations import body_rotation_angles
 from ._sources import (
     fit_angles,
@@ -32,9 +44,13 @@ __all__ = [
     "JOINTS_PAPER",
     "NIQR_FACTOR",
     "QPOS",
+    "RELIABILITY_COLUMNS",
     "Cell",
+    "CurveScore",
     "JointError",
     "KinematicErrors",
+    "PointErrors",
+    "PointTruth",
     "Reference",
     "Table",
     "TrialErrors",
@@ -48,18 +64,28 @@ __all__ = [
     "error_frame",
     "fit_angles",
     "fit_angles_sd",
+    "fit_curve",
     "html",
     "latex",
+    "leave_one_out",
     "median_niqr",
     "niqr",
     "paper_figures",
     "paper_tables",
+    "point_errors",
     "print_tables",
     "reference_of_bodies",
     "reference_of_fit",
     "reference_of_mot",
     "reference_of_qpos",
+    "reliability_table",
+    "resect",
+    "save_curve",
     "save_curves",
+    "truth_of_bodies",
+    "truth_of_synthetic",
+    "truth_of_trc",
     "view_classes",
+    "write_reliability",
     "write_tables",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import json
 import zlib
@@ -95,19 +96,44 @@ def reference_of_bodies(path: str | Path, source: str = "optical markers") -> Re
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT.
     """
+    bodies = load_bodies(path)
+    try:
+        pelvis = bodies.position_m["pelvis"] @ Y_UP_TO_Z_UP.T
+        angles = body_rotation_angles(bodies.rotation)
+    except (KeyError, ValueError) as error:
+        raise _unreadable(Path(path), error, _BODIES) from error
+    return Reference(Path(path).name.split(".")[0], source, BODY_ROTATIONS, bodies.time_s, angles, pelvis)
+
+
+@dataclasses.dataclass(frozen=True)
+class Bodies:
+    """Moving bodies of a model: `time_s` (T,); by body `rotation` (T), `position_m` (T, 3) in the y-up ground of the
+    file, and `scale` (3,) of the body's own axes (ones where the file has none)."""
+
+    time_s: np.ndarray
+    rotation: dict[str, Rotation]
+    position_m: dict[str, np.ndarray]
+    scale: dict[str, np.ndarray]
+
+
+_BODIES = "a file with `time` and `bodies`, each with `rotation` and `translation`"
+
+
+def load_bodies(path: str | Path) -> Bodies:
+    """The bodies of a file as `reference_of_bodies` reads it. Raises `PblError` FILE_MISSING, FILE_FORMAT."""
     path = Path(path)
     try:
         with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as file:
             data = json.load(file)
-        time = np.asarray(data["time"], float)
-        turned = {n: Rotation.from_euler("XYZ", np.asarray(b["rotation"], float)) for n, b in data["bodies"].items()}
-        pelvis = np.asarray(data["bodies"]["pelvis"]["translation"], float) @ Y_UP_TO_Z_UP.T
-        angles = body_rotation_angles(turned)
+        bodies = data["bodies"]
+        return Bodies(
+            np.asarray(data["time"], float),
+            {n: Rotation.from_euler("XYZ", np.asarray(b["rotation"], float)) for n, b in bodies.items()},
+            {n: np.asarray(b["translation"], float) for n, b in bodies.items()},
+            {n: np.asarray(b.get("scaleFactors", (1.0, 1.0, 1.0)), float) for n, b in bodies.items()},
+        )
     except (OSError, EOFError, zlib.error, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise _unreadable(
-            path, error, "a file with `time` and `bodies`, each with `rotation` and `translation`"
-        ) from error
-    return Reference(path.name.split(".")[0], source, BODY_ROTATIONS, time, angles, pelvis)
+        raise _unreadable(path, error, _BODIES) from error
 
 
 def reference_of_mot(path: str | Path, source: str = "optical markers", convention: str = QPOS) -> Reference:
