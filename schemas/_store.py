@@ -105,12 +105,17 @@ def check_store(backend: Any, create: bool = False) -> None:
     PblError
         STORE_UNAVAILABLE with what the store said.
     """
+    # In a bucket always the same object, for our key may not delete; in a folder a file of its own that goes again.
     probe, content = "probe/written-by-pbl-db-init", secrets.token_bytes(16)
+    if backend.protocol == "file":
+        probe = f"probe-{content.hex()}"
     try:
         if create and backend.protocol == "s3" and not backend.fs.exists(bucket()):
             backend.fs.mkdir(bucket())
         backend.put_buffer(content, probe)
         found = backend.get_buffer(probe)
+        if backend.protocol == "file":
+            backend.remove(probe)
     except Exception as error:  # whatever layer of the client speaks, the reader needs the same advice
         raise store_error(error) from error
     if found != content:

@@ -222,6 +222,24 @@ def _tls() -> bool | dict[str, Any] | None:
     return {"ca": authority, "check_hostname": True}
 
 
+def plain_connection(**options: Any) -> pymysql.Connection[Any]:
+    """A connection of the driver with the login of the tables, beside DataJoint's: for what is no query of a table.
+
+    Raises
+    ------
+    PblError
+        What `connect` raises.
+    """
+    target = _target(start=False)
+    _check_answers(target)
+    tls: dict[str, Any] = {"ssl_disabled": True} if target["use_tls"] is False else {"ssl": target["use_tls"]}
+    login = {name: target[name] for name in ("host", "port", "user", "password")}
+    try:
+        return pymysql.connect(**login, **tls, charset="utf8mb4", autocommit=True, **options)
+    except pymysql.err.OperationalError as error:
+        raise _login_error(target, error) from error
+
+
 def store_backend() -> Any:
     """DataJoint's access to the store of arrays, whatever it is. `connect()` or `configure()` must have been called."""
     return get_store_backend(STORE, config=dj.config)

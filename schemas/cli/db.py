@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from pbl_pipeline import settings
+from ._db_roles import roles
 
 # Each command imports what it needs: `pbl db --help` should not wait for the table engine.
 
@@ -21,6 +21,9 @@ def db() -> None:
 
     Example: pbl db init && pbl db status
     """
+
+
+db.add_command(roles)
 
 
 @db.command()
@@ -62,10 +65,10 @@ def status(as_json: bool) -> None:
         version = connection.connect().query("SELECT VERSION()").fetchone()[0]
         _print({"kind": "external", "running": True, "address": connection.external(), "version": version}, as_json)
         return
-    from schemas import embedded
+    from schemas import _store, embedded
 
     now = embedded.status()
-    _print({"kind": "embedded", **now.to_dict(), "store": str(settings.store_dir())}, as_json)
+    _print({"kind": "embedded", **now.to_dict(), "store": _store.describe()}, as_json)
     if not now.running:
         found = "there is no database yet" if not now.initialised else "it is not running"
         if now.pid is not None:
@@ -79,15 +82,15 @@ def init() -> None:
 
     Example: pbl db init
     """
-    import schemas
-    from schemas import connection
+    from schemas import _store, connection
+    from schemas._declare import declare_all
 
     if not _uses_external():
         from schemas import embedded
 
         embedded.start(click.echo)
     click.echo("Creating the tables as far as they are missing, and the method rows of this version")
-    schemas.activate()
+    declare_all()
     prefix = connection.prefix()
     rows = connection.connect().query(
         "SELECT table_schema, table_name FROM information_schema.tables WHERE table_schema LIKE %s "
@@ -100,7 +103,7 @@ def init() -> None:
         tables[schema] = tables.get(schema, 0) + (not table.startswith("~"))
     for schema, count in tables.items():
         click.echo(f"  {schema:<24} {count:>3} table{'' if count == 1 else 's'}")
-    click.echo(f"Arrays are kept in {settings.store_dir()}")
+    click.echo(f"Arrays are kept in {_store.describe()}")
     click.echo("Next: pbl ingest VIDEO --subject CODE, or pbl demo")
 
 

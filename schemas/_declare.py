@@ -1,0 +1,22 @@
+"""Everything declared at once: what an account without the right to create tables relies on."""
+
+from __future__ import annotations
+
+from . import _store, connection
+from ._activate import activate, computed_tables
+
+
+def declare_all() -> None:
+    """Create the store, all tables with their method rows, and the queue of every computed table.
+
+    DataJoint declares a queue when it is first used, which a worker's account may not. Safe to repeat.
+
+    Raises
+    ------
+    PblError
+        What `schemas.activate` raises, STORE_UNAVAILABLE.
+    """
+    activate()
+    for table in computed_tables():
+        _ = table.jobs  # declares it
+    _store.check_store(connection.store_backend(), create=True)

@@ -1,0 +1,142 @@
+"""Accounts of the roles: each can do its work and nothing more."""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pymysql
+import pytest
+
+import schemas
+from pbl_pipeline.errors import PblError
+from schemas import connection, embedded, lab, roles, views
+from schemas._declare import declare_all
+from schemas.ingest import Visit, ingest
+from tests.command import pbl
+from workers.populate import populate
+
+from . import chain
+
+Login = Callable[[str], None]
+
+
+@pytest.fixture
+def secrets(database: Path, tmp_path: Path) -> Path:
+    """The three accounts, with their password files."""
+    declare_all()
+    done = pbl("db", "roles", "--secrets", tmp_path / "secrets")
+    assert done.code == 0, done.err
+    return tmp_path / "secrets"
+
+
+@pytest.fixture
+def login(secrets: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Login]:
+    """Go on as the account of a role, in this process, as a worker does that is told so by its environment."""
+    port = embedded.Folder.default().state()["port"]
+    with monkeypatch.context() as patch:
+
+        def become(role: str) -> None:
+            user = roles.default_account(role, "127.0.0.1").user
+            for name, value in (("HOST", "127.0.0.1"), ("PORT", port), ("USER", user), ("PASS_FILE", secrets / user)):
+                patch.setenv(f"DJ_{name}", str(value))
+            connection.connect()
+
+        yield become
+    connection.connect()
+    lab.Subject.delete(prompt=False, part_integrity="cascade")
+    for table in schemas.computed_tables():
+        table.jobs.delete_quick()
+
+
+def refused(sql: str) -> bool:
+    """Whether the server denies the statement (and not something else about it)."""
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        try:
+            cursor.execute(sql)
+        except pymysql.err.Error as error:
+            assert error.args[0] in (1044, 1142, 1227, 1410), error
+            return True
+    return False
+
+
+def test_a_worker_fills_every_table_and_changes_none(login: Login, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    chain.install(monkeypatch)
+    login("worker")
+    schemas.activate()
+    ingest([chain.small_video(tmp_path, "walk")], Visit(subject="P001"))
+    run = populate()
+    assert all(t.done == 1 for t in run.tables if t.table != "KinematicError"), run
+    assert not any(t.errors for t in run.tables)
+    assert refused("DROP TABLE pbl_lab.subject")
+    assert refused("CREATE TABLE pbl_lab.more (i INT)")
+    assert refused("ALTER TABLE pbl_lab.subject ADD COLUMN name VARCHAR(9)")
+    assert refused("CREATE DATABASE pbl_more")
+    assert refused("SELECT * FROM mysql.user")
+    assert refused("CREATE USER 'x'@'%' IDENTIFIED BY 'long-enough-1'")
+    login("analyst")
+    schemas.activate(methods=False)
+    assert views.session_summary()["subject"].tolist() == ["P001"]
+    assert lab.Subject.to_arrays("subject").tolist() == ["P001"]
+    for sql in (
+        "INSERT INTO pbl_lab.project (project) VALUES ('x')",
+        "UPDATE pbl_lab.subject SET subject_height = 1",
+        "DELETE FROM pbl_lab.subject",
+        "DROP TABLE pbl_lab.subject",
+        "CREATE TABLE pbl_lab.more (i INT)",
+    ):
+        assert refused(sql), sql
+    assert len(lab.Subject()) == 1
+    login("admin")
+    assert not refused("CREATE DATABASE pbl_more")
+    assert not refused("CREATE TABLE pbl_more.t (i INT)")
+    assert not refused("ALTER TABLE pbl_more.t ADD COLUMN j INT")
+    assert not refused("DROP DATABASE pbl_more")
+    assert refused("CREATE DATABASE elsewhere")
+    assert refused("CREATE USER 'x'@'%' IDENTIFIED BY 'long-enough-1'")
+
+
+def test_it_can_be_repeated_and_takes_excess_rights_back(secrets: Path, login: Login):
+    analyst = roles.default_account("analyst", "127.0.0.1")
+    before = {p.name: p.read_text() for p in secrets.iterdir()}
+    assert set(before) == {"pbl_owner", "pbl_worker", "pbl_analyst"}
+    assert {stat.S_IMODE(p.stat().st_mode) for p in secrets.iterdir()} == {0o600}
+    roles._run([rf"GRANT ALL PRIVILEGES ON `pbl\_%`.* TO {analyst.name}"])
+    done = pbl("db", "roles", "--secrets", secrets)
+    assert done.code == 0, done.err
+    assert {p.name: p.read_text() for p in secrets.iterdir()} == before
+    assert not any(password in done.out + done.err for password in before.values())
+    login("analyst")
+    assert refused("DELETE FROM pbl_lab.subject")
+    # An analyst cannot make accounts, and is told who can; the password in the statement is not repeated.
+    denied = pbl("db", "roles", "--secrets", secrets)
+    assert denied.error_code == "DB_REFUSED"
+    assert "DJ_USER=root" in denied.err
+    assert not any(password in denied.out + denied.err for password in before.values())
+
+
+def test_another_account_of_a_role_and_its_end(secrets: Path):
+    assert pbl("db", "roles", "--role", "analyst", "--user", "maria", "--secrets", secrets).code == 0
+    names = "SELECT User FROM mysql.global_priv WHERE User = 'maria'"
+    with closing(roles._server_admin()) as server, server.cursor() as cursor:
+        assert cursor.execute(names) == 1
+    assert pbl("db", "roles", "--role", "analyst", "--user", "maria", "--drop").code == 0
+    with closing(roles._server_admin()) as server, server.cursor() as cursor:
+        assert cursor.execute(names) == 0
+
+
+@pytest.mark.parametrize("user", ["pbl", "pbl_admin", "root", "a'b", "x" * 33])
+def test_accounts_that_the_server_needs_are_left_alone(user: str):
+    with pytest.raises(PblError) as error:
+        roles.Account("worker", user, "%")
+    assert error.value.code == "USAGE"
+
+
+def test_the_dry_run_prints_what_would_be_done_and_no_password(database: Path, tmp_path: Path):
+    done = pbl("db", "roles", "--dry-run", "--require-tls", "--secrets", tmp_path / "secrets")
+    assert done.code == 0
+    assert not (tmp_path / "secrets").exists()
+    assert done.out.count("REQUIRE SSL") == 3
+    assert r"GRANT SELECT, INSERT, UPDATE, DELETE ON `pbl\_%`.* TO 'pbl_worker'@'127.0.0.1';" in done.out
