@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from pbl_pipeline.errors import PblError
 
 from ._heading import heading_agreement, heading_from_hips
+from ._legs import LEG_JOINTS, legs_from_points
 from ._poses import BodyPoses, trial_poses
 
 if TYPE_CHECKING:
@@ -72,6 +73,8 @@ class FootTrajectories:
     heading_agreement
         Cosine between heading and displacement, weighted by the way covered; 1 = walks where the pelvis faces,
         -1 = backwards or left and right exchanged; NaN where the pelvis does not travel or its position is relative.
+    legs_m : (T, 5, 2, 3) or None
+        Hip, knee, ankle, heel, toe of [left, right] in the same frame, NaN where not known; what the event model reads.
     """
 
     time_s: np.ndarray
@@ -83,10 +86,13 @@ class FootTrajectories:
     confidence: np.ndarray
     source: str
     heading_agreement: float = float("nan")
+    legs_m: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.time_s)
         wanted = {"heel_m": (n, 2, 3), "toe_m": (n, 2, 3), "pelvis_m": (n, 3), "forward": (n, 3), "confidence": (n, 2)}
+        if self.legs_m is not None:
+            wanted["legs_m"] = (n, len(LEG_JOINTS), 2, 3)
         for name, shape in wanted.items():
             if np.shape(getattr(self, name)) != shape:
                 raise _input_error(f"{name} has shape {np.shape(getattr(self, name))}", f"shape {shape}")
@@ -101,9 +107,11 @@ def feet_from_fit(fit: TrialFit, poses: BodyPoses | None = None) -> FootTrajecto
     Frames whose qpos is NaN stay NaN. Raises `PblError` GAIT_INPUT (no finite frame, time stamps out of order).
     """
     poses = poses or trial_poses(fit)
-    hip, heel, toe = [], [], []
+    hip, knee, ankle, heel, toe = [], [], [], [], []
     for side in "lr":
         calcn = poses.index(f"calcn_{side}")
+        knee.append(poses.position_m[:, poses.index(f"tibia_{side}")])
+        ankle.append(poses.position_m[:, poses.index(f"talus_{side}")])
         hip.append(poses.position_m[:, poses.index(f"femur_{side}")])
         toe.append(poses.position_m[:, poses.index(f"toes_{side}")])
         point = _HEEL_IN_CALCN_M * poses.scale_of(f"calcn_{side}", fit.scale)
@@ -112,7 +120,8 @@ def feet_from_fit(fit: TrialFit, poses: BodyPoses | None = None) -> FootTrajecto
     # A handheld phone moves with the person: the way in its frame is not the way on the ground.
     travels = fit.camera_motion == "static"
     hips, heels, toes = (np.stack(part, axis=1) for part in (hip, heel, toe))
-    return _assemble(fit.time_s, hips, heels, toes, _WORLD_UP, confidence, "fit", travels)
+    legs = np.stack([np.stack(part, axis=1) for part in (hip, knee, ankle, heel, toe)], axis=1)
+    return _assemble(fit.time_s, hips, heels, toes, _WORLD_UP, confidence, "fit", travels, legs)
 
 
 def feet_from_keypoints(keypoints: Keypoints) -> FootTrajectories:
@@ -173,20 +182,21 @@ def _from_points(time_s, names, marker_set, xyz, confidence, up, source, *, trav
         raise _input_error(f"no points named {', '.join(dict.fromkeys(missing))}", f"the names of {marker_set}")
     columns = {part: [index[n] for n in pair] for part, pair in wanted.items()}
     hip, heel, toe = (xyz[:, columns[part]] for part in ("hip", "heel", "toe"))
-    if not np.any(np.all(np.isfinite(np.concatenate([hip, heel, toe], axis=1)), axis=(1, 2))):
+    if not np.any(np.isfinite(hip).all(axis=(1, 2)) & np.isfinite(heel + toe).all(axis=2).any(axis=1)):
         raise _input_error("no frame with hips and feet in 3D", "3D points (xyz) of hips and feet")
     foot = np.minimum(confidence[:, columns["heel"]], confidence[:, columns["toe"]])
-    return _assemble(time_s, hip, heel, toe, up, foot, source, travels)
+    legs = legs_from_points(marker_set, names, xyz, confidence)
+    return _assemble(time_s, hip, heel, toe, up, foot, source, travels, legs)
 
 
-def _assemble(time_s, hip, heel, toe, up, confidence, source, travels) -> FootTrajectories:
+def _assemble(time_s, hip, heel, toe, up, confidence, source, travels, legs) -> FootTrajectories:
     time = np.asarray(time_s, float)
     pelvis = hip.mean(axis=1)
     if np.any(np.diff(time) <= 0) or not np.all(np.isfinite(time)):
         raise _input_error("time stamps that are missing or do not increase", "strictly increasing seconds")
     forward = heading_from_hips(time, hip, up)
     agreement = heading_agreement(time, pelvis, forward, up) if travels else float("nan")
-    return FootTrajectories(time, heel, toe, pelvis, forward, up, confidence, source, agreement)
+    return FootTrajectories(time, heel, toe, pelvis, forward, up, confidence, source, agreement, legs)
 
 
 def _input_error(found: str, expected: str) -> PblError:

@@ -7,7 +7,7 @@ import pytest
 
 from pbl_pipeline.gait import EventParams
 from pbl_pipeline.gait._signal import Segment, refine_extremum, uniform_segments
-from pbl_pipeline.gait.events._detect import _prominence, _walks
+from pbl_pipeline.gait.events._coordinates import _prominence, _walks
 from pbl_pipeline.gait.events._order import Candidate
 
 ABOUT = {"grid_hz": 100.0, "cutoff_hz": 6.0, "filter_order": 4, "max_gap_s": 0.15, "min_segment_s": 1.0}

@@ -1,9 +1,10 @@
 """Foot down and foot up of both sides."""
 
-from ._detect import detect_events, resolve_params
+from ._detect import detect_events
+from ._methods import DEFAULT_EVENT_PARAMSET, EVENT_PARAMSETS, resolve_params
+from ._phase import PhaseParams
+from ._phase_filter import FilterParams
 from ._types import (
-    DEFAULT_EVENT_PARAMSET,
-    EVENT_PARAMSETS,
     EVENTS,
     FOOT_DOWN,
     FOOT_UP,
@@ -15,6 +16,7 @@ from ._types import (
     GaitEvents,
     load_events,
 )
+from ._walking import WalkingParams
 
 __all__ = [
     "DEFAULT_EVENT_PARAMSET",
@@ -26,8 +28,11 @@ __all__ = [
     "RIGHT",
     "SIDES",
     "EventParams",
+    "FilterParams",
     "GaitEvent",
     "GaitEvents",
+    "PhaseParams",
+    "WalkingParams",
     "detect_events",
     "load_events",
     "resolve_params",

@@ -7,7 +7,6 @@ import dataclasses
 from pathlib import Path
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import Check
 
 LEFT, RIGHT = "left", "right"
@@ -63,13 +62,6 @@ class EventParams:
     min_foot_downs: int = 2
     foot_down_offset_s: float = 0.0
     foot_up_offset_s: float = 0.0
-
-
-METHOD = "zeni-2008"
-EVENT_PARAMSETS: dict[str, Paramset] = {
-    METHOD: Paramset.of("gait", METHOD, 1, EventParams()),
-}
-DEFAULT_EVENT_PARAMSET = METHOD
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,0 +1,268 @@
+"""The event model as a method: joints of both legs -> phases -> walking -> smoothed phases -> events."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
+
+from .._feet import FootTrajectories
+from ._phase_filter import FilterParams, SmoothPhases, crossings, smooth_phases
+from ._types import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, SIDES, GaitEvent, GaitEvents
+from ._walking import WalkingParams, swing_leg, turning_deg_per_s, walking_stretches
+
+#: Order of the model's phases.
+ORDER = ((LEFT, FOOT_DOWN), (RIGHT, FOOT_UP), (RIGHT, FOOT_DOWN), (LEFT, FOOT_UP))
+
+
+@dataclasses.dataclass(frozen=True)
+class PhaseParams:
+    """Parameters of the event model.
+
+    model, model_sha256
+        Name and checksum of the weights (`data/<model>.npz`).
+    walking, filter
+        What counts as walking; what the filter believes.
+    min_seen_s
+        Shortest time in view that is searched.
+    min_leg_share
+        Least share of a stretch in which a leg is seen below the hip.
+    min_foot_downs
+        Fewest foot downs of a walking bout.
+    min_probability
+        Events that are less likely real than this are left out, and end a bout.
+    """
+
+    model: str
+    model_sha256: str
+    walking: WalkingParams = dataclasses.field(default_factory=WalkingParams)
+    filter: FilterParams = dataclasses.field(default_factory=FilterParams)
+    min_seen_s: float = 1.0
+    min_leg_share: float = 0.5
+    min_foot_downs: int = 2
+    min_probability: float = 0.2
+
+
+def detect_by_phase(feet: FootTrajectories, paramset: Paramset) -> GaitEvents:
+    """Events of both feet where the phases of the event model wrap. See `detect_events`.
+
+    Raises `PblError` GAIT_INPUT: joints upside down or mirrored, no joints at all; ASSET_MISSING: no weights.
+    """
+    from . import _predict  # JAX loads only where the model runs
+
+    p = paramset.to(PhaseParams)
+    found = _Found(paramset, feet)
+    if feet.legs_m is None:
+        raise _input_error("feet without the joints of the legs", "hips and knees, ankles, heels or toes in 3D")
+    time = np.asarray(feet.time_s, float)
+    if len(time) < 4 or time[-1] - time[0] < p.min_seen_s:
+        return found.empty(f"the person is in view for less than {p.min_seen_s:g} s", "film at least three steps")
+    grid = _predict.on_grid(time, feet.legs_m, feet.up)
+    hips = grid.known[:, 0].all(axis=1)
+    if np.count_nonzero(hips) < p.min_seen_s * _predict.GRID_HZ or not math.isfinite(grid.leg_m):
+        return found.empty(f"hips and feet are seen for less than {p.min_seen_s:g} s", "film the whole person")
+    for s, side in enumerate(SIDES):
+        if not np.any(grid.known[hips, 2:, s]):
+            return found.empty(f"the {side} foot is never seen", "film from where both legs are in view")
+    check_upright(grid)
+    if feet.heading_agreement < -0.5:
+        return found.empty(
+            "the person walks backwards: the events of walking forwards do not apply",
+            "if the person walked forwards, left and right are exchanged: look at the overlay",
+        )
+    phases = _predict.predict(grid, p.model)
+    stretches = walking_stretches(grid, phases, p.walking)
+    weights = _predict.load(p.model)[1].get("probability", {})
+    events: list[GaitEvent] = []
+    bouts: list[tuple[float, float]] = []
+    half_seen = dropped = 0
+    for first, last in stretches:
+        cut = slice(first, last + 1)
+        below = grid.known[cut, 2:].any(axis=1)
+        if np.any(below.mean(axis=0) < p.min_leg_share):
+            half_seen += 1
+            continue
+        smooth = smooth_phases(np.where(below.any(axis=1)[:, None], phases.z[cut], 0), 1 / _predict.GRID_HZ, p.filter)
+        own = _events_of(smooth, grid.time_s[cut], phases.z[cut], phases.walking[cut], weights)
+        for bout in _bouts(own, p):
+            dropped += len(own) - len(bout)
+            events += [dataclasses.replace(e, bout=len(bouts)) for e in bout]
+            bouts.append((bout[0].time_s, bout[-1].time_s))
+    if not bouts:
+        return found.empty(*_why_not(grid, phases, stretches, half_seen, p))
+    turning = float(np.mean(np.abs(turning_deg_per_s(grid)) > p.walking.max_turn_deg_per_s))
+    return GaitEvents(
+        status=PASS,
+        events=tuple(sorted(events, key=lambda e: (e.time_s, e.bout))),
+        reason="",
+        method=paramset.name,
+        params_hash=paramset.hash,
+        source=feet.source,
+        walking_s=tuple(bouts),
+        n_candidates=len(events) + max(dropped, 0),
+        n_order_breaks=0,
+        qc=_checks(feet, events, half_seen, turning),
+    )
+
+
+def check_upright(grid: Any) -> None:
+    """Refuse legs that point up, and legs whose left and right are exchanged or mirrored: then the feet, or the knees,
+    point backwards of where the hips face. Raises `PblError` GAIT_INPUT."""
+    known, x = grid.known, grid.joints_m
+    hips = known[:, 0].all(axis=1)
+    pelvis = x[:, 0].mean(axis=1)
+    down = []
+    for j in (2, 3, 4):
+        use = hips[:, None] & known[:, j]
+        down.append(((pelvis[:, None] - x[:, j]) @ grid.up)[use])
+    height = np.concatenate(down) / grid.leg_m
+    if len(height) and np.median(height) < -0.1:
+        raise _input_error("feet above the hips", "points with the head up: is the vertical axis the right one?")
+    toes = hips[:, None] & known[:, 3] & known[:, 4]
+    if np.count_nonzero(toes) > 10:
+        points = np.einsum("tsi,ti->ts", x[:, 4] - x[:, 3], grid.ahead)[toes] / grid.leg_m
+        backwards = np.median(points) < -0.05
+    else:
+        legs = hips[:, None] & known[:, 1] & known[:, 2]
+        line = 0.5 * (x[:, 0] + x[:, 2])
+        bend = np.einsum("tsi,ti->ts", x[:, 1] - line, grid.ahead)[legs] / grid.leg_m
+        backwards = len(bend) > 10 and np.mean(bend) < -0.02
+    if backwards:
+        raise _input_error(
+            "feet or knees that point backwards of where the hips face",
+            "left and right as they are: points are mirrored, or the sides are exchanged",
+        )
+
+
+def _events_of(
+    smooth: SmoothPhases, time_s: np.ndarray, z: np.ndarray, walking: np.ndarray, weights: dict[str, Any]
+) -> list[GaitEvent]:
+    out = []
+    for k, (side, event) in enumerate(ORDER):
+        for at in crossings(smooth.phase_rad[:, k], time_s):
+            i = int(np.clip(np.searchsorted(time_s, at), 0, len(time_s) - 1))
+            values = event_evidence(smooth, z, walking, k, i)
+            out.append(GaitEvent(float(at), side, event, _probability(values, weights)))
+    return sorted(out, key=lambda e: e.time_s)
+
+
+def event_evidence(smooth: SmoothPhases, z: np.ndarray, walking: np.ndarray, k: int, i: int) -> np.ndarray:
+    """What speaks for an event of kind `k` at frame `i`: the logit of walking there, how sure the model's phase is
+    (log variance), how far it is from the smoothed one (rad), and the frames to the end of the stretch."""
+    near = slice(max(i - 4, 0), i + 5)
+    odds = float(np.mean(np.clip(walking[near], 1e-4, 1 - 1e-4)))
+    length = float(np.clip(np.mean(np.abs(z[near, k])), 0.02, 0.9999))
+    turned = z[near, k] * np.exp(-1j * smooth.phase_rad[near, k])
+    off = abs(float(np.angle(turned.sum()))) if np.any(turned) else np.pi
+    edge = min(i, len(z) - 1 - i) / 25.0
+    return np.array([math.log(odds / (1 - odds)), math.log(-2 * math.log(length)), off, min(edge, 1.0)])
+
+
+def _probability(values: np.ndarray, weights: dict[str, Any]) -> float:
+    """The logistic curve that was fitted to held-out synthetic walks."""
+    if not weights:
+        return float(1 / (1 + math.exp(-np.clip(values[0], -30, 30))))
+    score = weights["intercept"] + float(np.dot(weights["slope"], values))
+    return float(1 / (1 + math.exp(-np.clip(score, -30, 30))))
+
+
+def _bouts(events: list[GaitEvent], p: PhaseParams) -> list[list[GaitEvent]]:
+    """Runs of events that are likely enough, with enough foot downs of both sides."""
+    runs: list[list[GaitEvent]] = [[]]
+    for e in events:
+        if e.probability >= p.min_probability:
+            runs[-1].append(e)
+        elif runs[-1]:
+            runs.append([])
+    return [run for run in runs if len(_downs(run)) >= p.min_foot_downs and len({e.side for e in run}) == 2]
+
+
+def _downs(run: list[GaitEvent]) -> list[GaitEvent]:
+    return [e for e in run if e.event == FOOT_DOWN]
+
+
+def double_support_s(events: list[GaitEvent]) -> np.ndarray:
+    """From each foot down to the nearest foot up of the other foot (s) of the same bout; negative where it left before:
+    the body was in the air."""
+    out = []
+    for down in _downs(events):
+        ups = [e.time_s for e in events if e.event == FOOT_UP and e.side != down.side and e.bout == down.bout]
+        if ups:
+            out.append(min((u - down.time_s for u in ups), key=abs))
+    return np.array(out)
+
+
+def _why_not(grid: Any, phases: Any, stretches: list, half_seen: int, p: PhaseParams) -> tuple[str, str]:
+    if half_seen:
+        return "the person walks, but one leg is hardly seen", "film from where both legs are in view"
+    if stretches:
+        return f"walking, but not {p.min_foot_downs} foot downs", "film a longer stretch"
+    swing = swing_leg(grid)
+    swing = swing[np.isfinite(swing)]
+    reach = float(np.ptp(swing)) if len(swing) else 0.0
+    likely = float(phases.walking.max()) if len(phases.walking) else 0.0
+    advice = "nothing to do where the person does not walk; else look at the legs in the overlay"
+    return (
+        f"no walking: the feet pass each other by {reach:.2f} leg lengths at most, "
+        f"and the event model gives walking a probability of {likely:.2f} at most",
+        advice,
+    )
+
+
+def _checks(feet: FootTrajectories, events: list[GaitEvent], half_seen: int, turning: float) -> tuple[Check, ...]:
+    support = double_support_s(events)
+    runs = len(support) > 2 and float(np.median(support)) < 0
+    breaks = sum(
+        ORDER[(ORDER.index((a.side, a.event)) + 1) % 4] != (b.side, b.event)
+        for a, b in itertools.pairwise(events)
+        if a.bout == b.bout
+    )
+    checks = [
+        Check("walking", PASS, float(len(events)), None, ""),
+        Check(
+            "double_support_present",
+            WARN if runs else PASS,
+            round(float(np.median(support)), 3) if len(support) else None,
+            0.0,
+            "running: no double support; measures of walking do not apply" if runs else "",
+        ),
+    ]
+    if breaks and not runs:
+        advice = "two events are out of the order of walking: look at the feet in the overlay"
+        checks.append(Check("event_order_breaks", WARN, float(breaks), 0.0, advice))
+    if half_seen:
+        advice = "a leg is hardly seen for a while: no events there"
+        checks.append(Check("legs_seen", WARN, float(half_seen), 0.0, advice))
+    if turning > 0:
+        checks.append(Check("turning", PASS, round(turning, 3), None, "no events where the person turns"))
+    if np.isfinite(feet.heading_agreement):
+        ok = feet.heading_agreement >= 0.5
+        advice = "" if ok else "the person does not go where the pelvis faces: sideways, or the camera moved"
+        checks.append(Check("heading_agreement", PASS if ok else WARN, round(feet.heading_agreement, 3), 0.5, advice))
+    return tuple(checks)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Found:
+    paramset: Paramset
+    feet: FootTrajectories
+
+    def empty(self, reason: str, advice: str) -> GaitEvents:
+        check = Check("walking", EMPTY, None, None, f"{reason}: {advice}" if advice else reason)
+        return GaitEvents(EMPTY, (), reason, self.paramset.name, self.paramset.hash, self.feet.source, qc=(check,))
+
+
+def _input_error(found: str, expected: str) -> PblError:
+    return PblError(
+        "GAIT_INPUT",
+        found=found,
+        expected=expected,
+        next_step="correct the points or the axes; the overlay shows which leg is which",
+    )

@@ -1,0 +1,97 @@
+"""`python -m pbl_pipeline.gait.events.training`: make the corpus and train the event model.
+
+    python -m pbl_pipeline.gait.events.training --make-solved solved.npz --solved-count 1500   # needs MuJoCo
+    python -m pbl_pipeline.gait.events.training --out DIR --seed 0 --solved solved.npz         # on a GPU, minutes
+
+The second command needs only numpy, scipy, jax, equinox and optax. It writes `phase_transformer.npz` (at each report)
+and `metrics.json` to DIR.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import platform
+import sys
+import time
+from pathlib import Path
+
+
+def main(arguments: list[str] | None = None) -> None:
+    args = _parser().parse_args(arguments)
+    from . import _corpus
+
+    if args.make_solved:
+        from ._solved import solved_sequence
+
+        seeds = range(args.solved_first, args.solved_first + args.solved_count)
+        _corpus.save(args.make_solved, _corpus.make(solved_sequence, seeds, args.workers, _say))
+        _say(f"written: {args.make_solved}")
+        return
+    args.out.mkdir(parents=True, exist_ok=True)
+    parts = [_corpus.scenes(args.seed, args.scenes, args.workers, _say)]
+    if args.solved:
+        parts.append(_corpus.load(args.solved))
+    corpus = _corpus.join(*parts)
+
+    import jax
+
+    from .._transformer import Architecture, save_model
+    from ._train import TrainParams, train
+
+    size = Architecture(width=args.width, blocks=args.blocks, heads=args.heads, hidden=3 * args.width)
+    params = TrainParams(
+        seed=args.seed, steps=args.steps, batch=args.batch, report_every=args.report_every, validation=args.validation
+    )
+    about = {
+        "train": dataclasses.asdict(params),
+        "scenes": args.scenes,
+        "solved": sum(str(k).startswith("solved") for k in corpus.kind),
+        "device": str(jax.devices()[0].device_kind),
+        "jax": jax.__version__,
+        "python": platform.python_version(),
+        "made": time.strftime("%Y-%m-%d"),
+    }
+    path = args.out / "phase_transformer.npz"
+
+    def keep(model, metrics) -> None:
+        save_model(path, model, {**about, "metrics": metrics})
+
+    _, history = train(corpus, size, params, _say, keep)
+    (args.out / "metrics.json").write_text(json.dumps({**about, "history": history}, indent=1) + "\n")
+    _say(f"written: {path} ({path.stat().st_size / 1e6:.2f} MB), {args.out / 'metrics.json'}")
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def _parser() -> argparse.ArgumentParser:
+    p = argparse.ArgumentParser(
+        prog="python -m pbl_pipeline.gait.events.training",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("--out", type=Path, default=Path("event_model"), help="folder for weights and metrics")
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--steps", type=int, default=30000)
+    p.add_argument("--batch", type=int, default=256)
+    p.add_argument("--scenes", type=int, default=20000, help="sequences of 12 s that are made on the spot")
+    p.add_argument("--solved", type=Path, help="file of --make-solved")
+    p.add_argument("--width", type=int, default=128)
+    p.add_argument("--blocks", type=int, default=4)
+    p.add_argument("--heads", type=int, default=4)
+    p.add_argument("--report-every", type=int, default=500, help="steps between reports and checkpoints")
+    p.add_argument("--validation", type=int, default=2048, help="held-out examples per report")
+    p.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)), help="processes that make sequences")
+    p.add_argument("--make-solved", type=Path, help="only write this corpus of solved motions (needs MuJoCo)")
+    p.add_argument("--solved-count", type=int, default=1500)
+    p.add_argument("--solved-first", type=int, default=100000, help="seed of the first solved motion")
+    return p
+
+
+if __name__ == "__main__":
+    main()
