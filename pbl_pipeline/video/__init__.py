@@ -1,8 +1,11 @@
 """Video files: probe, frames in order with their own time stamps, intrinsics, pose and orientation of the camera."""
 
 from ._attitude import Attitude, camera_in_device, check_attitude, load_attitude
+from ._board import Board
+from ._calibrate import Calibration, calibrate_video
 from ._camera import guess_camera, load_camera, viewing_ray
 from ._camera_pose import CameraPose, load_camera_poses
+from ._draw_calibration import draw_calibration
 from ._find_camera import find_camera
 from ._probe import probe, sha256_of
 from ._read import read_frames
@@ -11,13 +14,17 @@ from ._types import Camera, Frame, VideoInfo
 
 __all__ = [
     "Attitude",
+    "Board",
+    "Calibration",
     "Camera",
     "CameraPose",
     "Frame",
     "VideoInfo",
+    "calibrate_video",
     "camera_in_device",
     "check_attitude",
     "check_timing",
+    "draw_calibration",
     "find_camera",
     "guess_camera",
     "load_attitude",

@@ -1,0 +1,81 @@
+"""`pbl calibrate`: a camera file from a video of a board."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+class Squares(click.ParamType):
+    """`9x6`: squares along and across."""
+
+    name = "NxM"
+
+    def convert(
+        self, value: object, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, int] | None:
+        if isinstance(value, tuple):
+            return value
+        parts = str(value).lower().split("x")
+        if len(parts) == 2 and all(p.isdecimal() for p in parts):
+            return int(parts[0]), int(parts[1])
+        return self.fail(f"{value!r} is not of the form 9x6", param, ctx)
+
+
+@click.command(epilog="Example: pbl calibrate board.mov --board charuco --squares 9x6 --square-mm 25 --out camera.json")
+@click.argument("video", type=click.Path(path_type=Path, readable=False))
+@click.option("--board", type=click.Choice(["checkerboard", "charuco"]), required=True, help="Kind of board.")
+@click.option("--squares", type=Squares(), required=True, help="Squares (not corners) along and across, such as 9x6.")
+@click.option("--square-mm", type=float, required=True, help="Side of a square, measured on the print.")
+@click.option("--marker-mm", type=float, help="Side of a marker of a ChArUco board (else: 3/4 of a square).")
+@click.option("--dictionary", default="DICT_5X5_100", show_default=True, help="Markers of a ChArUco board.")
+@click.option("--legacy", is_flag=True, help="ChArUco board printed by OpenCV before 4.6.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Camera file to write (.json).")
+def calibrate(
+    video: Path,
+    board: str,
+    squares: tuple[int, int],
+    square_mm: float,
+    marker_mm: float | None,
+    dictionary: str,
+    legacy: bool,
+    out: Path,
+) -> None:
+    """Measure the lens of a camera from VIDEO, in which it films a flat board from many sides.
+
+    OUT is what --camera of `pbl run`, `pbl detect` and `pbl ingest` reads; beside it a picture shows which parts of the
+    view the board was in and how far the fitted lens is off. Film with the settings of your recordings: the same phone,
+    lens, resolution, stabilisation, and the focus locked. docs/camera.md says how to film and how to read the figures.
+    """
+    import cv2
+
+    from pbl_pipeline.files import check_out_file
+    from pbl_pipeline.video import Board, calibrate_video, draw_calibration, probe
+
+    if out.suffix.lower() != ".json":
+        raise click.BadParameter(f"{out} does not end in .json", param_hint="--out")
+    plate = Board(board, squares, square_mm, marker_mm, dictionary, legacy)
+    check_out_file(out)
+    info = probe(video)
+    found = calibrate_video(video, plate, info)
+    about = {
+        "source": f"pbl calibrate: {board} of {squares[0]}x{squares[1]} squares of {square_mm:g} mm",
+        "video": {"name": video.name, "sha256": info.sha256, "rotation_deg": info.rotation_deg},
+        "phone": {"make": info.make, "model": info.model, "lens": info.lens},
+        "recorded_utc": info.recorded_utc,
+    }
+    found.save(out, about)
+    picture = out.with_suffix(".png")
+    cv2.imwrite(str(picture), draw_calibration(found))
+    matrix, sd = found.camera.matrix, found.sd
+    k = found.camera.distortion
+    click.echo(f"{len(found.views)} views used, the board found in {found.n_found} of {found.n_tried} sharp pictures")
+    click.echo(f"focal length     {matrix[0, 0]:.1f} +- {sd[0]:.1f} and {matrix[1, 1]:.1f} +- {sd[1]:.1f} px")
+    click.echo(f"principal point  {matrix[0, 2]:.1f} +- {sd[2]:.1f}, {matrix[1, 2]:.1f} +- {sd[3]:.1f} px")
+    click.echo(f"distortion       k1 {k[0]:.4f} k2 {k[1]:.4f} p1 {k[2]:.5f} p2 {k[3]:.5f} k3 {k[4]:.4f}")
+    click.echo(f"residual         {found.rms_px:.2f} px (rms)")
+    click.echo(f"coverage         {found.coverage:.0%} of the picture, tilts of up to {found.tilt_deg:.0f} deg")
+    for note in info.notes:
+        click.echo(f"  {note}")
+    click.echo(f"{out}\n{picture}")

@@ -1,0 +1,122 @@
+"""Boards for calibrating a camera: a chessboard, or a ChArUco board, whose white squares hold markers."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import cv2
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+
+CHECKERBOARD, CHARUCO = "checkerboard", "charuco"
+KINDS = (CHECKERBOARD, CHARUCO)
+DEFAULT_DICTIONARY = "DICT_5X5_100"
+#: Corners of a ChArUco board that must be seen in one picture: fewer say little, and may lie on one line.
+_FEWEST_CORNERS = 8
+
+
+@dataclasses.dataclass(frozen=True)
+class Board:
+    """A flat board. `squares`: how many along and across, counted by squares (their inner corners are one less).
+
+    square_mm is measured on the print. Of a ChArUco board only: marker_mm is the side of a marker (default: three
+    quarters of a square), dictionary the markers' family by OpenCV's name, legacy the pattern that OpenCV before 4.6
+    printed for an even number of rows.
+
+    Raises
+    ------
+    PblError
+        USAGE: an unknown kind or dictionary, a board too small, sizes that are not positive.
+    """
+
+    kind: str
+    squares: tuple[int, int]
+    square_mm: float
+    marker_mm: float | None = None
+    dictionary: str = DEFAULT_DICTIONARY
+    legacy: bool = False
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise _usage(f"board {self.kind!r}", f"one of {', '.join(KINDS)}")
+        if min(self.squares) < 4 or max(self.squares) > 50:
+            raise _usage(f"a board of {self.squares[0]}x{self.squares[1]} squares", "4 to 50 squares along each side")
+        if not self.square_mm > 0:
+            raise _usage(f"squares of {self.square_mm:g} mm", "the measured side of a square, in mm")
+        if self.kind == CHARUCO:
+            if not 0 < self.marker < self.square_mm:
+                raise _usage(f"markers of {self.marker:g} mm", f"a side below the square's {self.square_mm:g} mm")
+            if self.dictionary not in dictionaries():
+                raise _usage(f"dictionary {self.dictionary!r}", f"one of {', '.join(dictionaries())}")
+            held = len(self._dictionary().bytesList)
+            needed = self.squares[0] * self.squares[1] // 2
+            if needed > held:
+                raise _usage(f"a board of {needed} markers with {self.dictionary}", f"at most its {held} markers")
+
+    @property
+    def marker(self) -> float:
+        """Side of a marker, mm."""
+        return 0.75 * self.square_mm if self.marker_mm is None else self.marker_mm
+
+    @property
+    def corners_m(self) -> np.ndarray:
+        """(N, 3) inner corners in the board's plane, row by row, m; the first at the origin."""
+        along, across = (n - 1 for n in self.squares)
+        grid = np.stack(np.meshgrid(np.arange(along), np.arange(across)), axis=-1).reshape(-1, 2)
+        return np.column_stack([grid, np.zeros(len(grid))]) * self.square_mm / 1000
+
+    def find(self, grey: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Numbers (K,) of the corners seen in a picture (H, W) uint8 and their places (K, 2) in px; None without board.
+
+        A chessboard is seen whole or not at all; of a ChArUco board a part does.
+        """
+        if self.kind == CHECKERBOARD:
+            size = (self.squares[0] - 1, self.squares[1] - 1)
+            found, corners = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+            return (np.arange(size[0] * size[1]), corners.reshape(-1, 2).astype(np.float64)) if found else None
+        corners, ids, _, _ = self._detector().detectBoard(grey)
+        if ids is None or len(ids) < _FEWEST_CORNERS:
+            return None
+        return np.asarray(ids).ravel().astype(int), np.asarray(corners, np.float64).reshape(-1, 2)
+
+    def by_corners(self) -> Board | None:
+        """The chessboard that somebody means who counted its inner corners instead of the squares."""
+        if self.kind != CHECKERBOARD:
+            return None
+        return dataclasses.replace(self, squares=(self.squares[0] + 1, self.squares[1] + 1))
+
+    def picture(self, px_per_square: int) -> np.ndarray:
+        """(H, W) uint8: the board as it is printed, without a margin."""
+        along, across = self.squares
+        if self.kind == CHARUCO:
+            return self._charuco().generateImage((along * px_per_square, across * px_per_square), marginSize=0)
+        dark = np.add.outer(np.arange(across), np.arange(along)) % 2 == 0
+        return np.kron(np.where(dark, 0, 255), np.ones((px_per_square, px_per_square))).astype(np.uint8)
+
+    def _dictionary(self) -> Any:
+        return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+
+    def _charuco(self) -> Any:
+        board = cv2.aruco.CharucoBoard(self.squares, self.square_mm, self.marker, self._dictionary())
+        board.setLegacyPattern(self.legacy)
+        return board
+
+    def _detector(self) -> Any:
+        return _detector(self)
+
+
+@functools.lru_cache(maxsize=4)
+def _detector(board: Board) -> Any:
+    return cv2.aruco.CharucoDetector(board._charuco())
+
+
+def dictionaries() -> list[str]:
+    """Names of the marker families that OpenCV knows."""
+    return sorted(n for n in dir(cv2.aruco) if n.startswith("DICT_") and n == n.upper())
+
+
+def _usage(found: str, expected: str) -> PblError:
+    return PblError("USAGE", found=found, expected=expected, next_step="measure the printed board and pass its figures")
