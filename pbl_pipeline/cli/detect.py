@@ -33,7 +33,7 @@ def detect(
     and the fit then knows where gravity points and how the camera moved.
     """
     from pbl_pipeline.files import check_out_file
-    from pbl_pipeline.keypoints import check_keypoints, detect_keypoints, params_of
+    from pbl_pipeline.keypoints import check_keypoints, confidence_text, detect_keypoints, params_of, visibility
     from pbl_pipeline.tracking import choose_subject, require_subject, time_in_view_s, track_people
     from pbl_pipeline.video import check_timing, find_camera, load_attitude, probe
 
@@ -67,6 +67,8 @@ def detect(
         click.echo(f"  orientation of the phone: {len(log.time_s)} samples over {log.time_s[-1] - log.time_s[0]:.1f} s")
     for note in info.notes:
         click.echo(f"  {note}")
+    click.echo(f"  {visibility(found).text()}")
+    click.echo(f"  confidence: {confidence_text(found)}")
     for check in (*check_timing(info), *check_keypoints(found)):
         if check.advice:
             click.echo(f"  {check.outcome} {check.check} = {check.value:.3g}: {check.advice}")

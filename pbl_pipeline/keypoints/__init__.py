@@ -1,10 +1,20 @@
 """Keypoints of the tracked person from any detector, views of several cameras, markers of a laboratory."""
 
 from ._blazepose import BlazePoseLandmarks
+from ._confidence import (
+    BOUND_TRUNK,
+    ConfidenceCurve,
+    confidence_curve,
+    confidence_curves,
+    confidence_text,
+    probability_within,
+)
 from ._detect import DEFAULT, DETECTORS, PARAMSETS, KeypointParams, detect_keypoints
+from ._in_view import Gap, Visibility, visibility
 from ._methods import find_method, params_class, params_of
 from ._multi_view import SAME_TIME_S, MultiView, cameras_of_files
 from ._onnx_keypoints import ModelKeypointParams, ModelParams, OnnxKeypoints, method_of_model
+from ._picture import Picture, PictureMeter
 from ._protocol import KeypointDetector, PersonKeypoints
 from ._quality import check_keypoints, side_changes
 from ._types import Keypoints
@@ -12,11 +22,14 @@ from ._view import view_rotation
 from ._world_markers import WorldMarkers
 
 __all__ = [
+    "BOUND_TRUNK",
     "DEFAULT",
     "DETECTORS",
     "PARAMSETS",
     "SAME_TIME_S",
     "BlazePoseLandmarks",
+    "ConfidenceCurve",
+    "Gap",
     "KeypointDetector",
     "KeypointParams",
     "Keypoints",
@@ -25,14 +38,22 @@ __all__ = [
     "MultiView",
     "OnnxKeypoints",
     "PersonKeypoints",
+    "Picture",
+    "PictureMeter",
+    "Visibility",
     "WorldMarkers",
     "cameras_of_files",
     "check_keypoints",
+    "confidence_curve",
+    "confidence_curves",
+    "confidence_text",
     "detect_keypoints",
     "find_method",
     "method_of_model",
     "params_class",
     "params_of",
+    "probability_within",
     "side_changes",
     "view_rotation",
+    "visibility",
 ]

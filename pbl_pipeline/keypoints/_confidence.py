@@ -98,3 +98,19 @@ def probability_within(keypoints: Keypoints) -> np.ndarray | None:
     if not keypoints.confidence_curve:
         return None
     return confidence_curve(keypoints.confidence_curve)(keypoints.confidence)
+
+
+def confidence_text(keypoints: Keypoints) -> str:
+    """One sentence for people: how sure the points are, and what that is worth."""
+    found = keypoints.confidence > 0
+    if not found.any():
+        return "no point was found"
+    stated = f"median {np.median(keypoints.confidence[found]):.2f} as the detector states it"
+    probability = probability_within(keypoints)
+    if probability is None:
+        return f"{stated}; what that is worth was not measured"
+    bound = confidence_curve(keypoints.confidence_curve).bound_trunk
+    share = float(np.mean(probability[found]))
+    return (
+        f"{stated}; {share:.0%} of the points within {bound:.0%} of the trunk's length ({keypoints.confidence_curve})"
+    )

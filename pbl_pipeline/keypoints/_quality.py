@@ -28,13 +28,13 @@ ABSENT_WARN, ABSENT_FAIL = 0.05, 0.5
 #: Share of the frames in which feet or head are beyond the lower or upper border.
 CUT_WARN, CUT_FAIL = 0.1, 0.5
 #: Head to feet in the picture.
-HEIGHT_WARN_PX, HEIGHT_FAIL_PX = 100.0, 40.0
+HEIGHT_WARN_PX, HEIGHT_FAIL_PX = 100.0, 50.0
 #: Brightness (0..255) of the brightest twentieth of the person.
 BRIGHT_WARN, BRIGHT_FAIL = 30.0, 15.0
 #: Finest detail as a share of the person's size.
 DETAIL_WARN, DETAIL_FAIL = 0.04, 0.06
 #: Frames a second.
-RATE_WARN_HZ, RATE_FAIL_HZ = 24.0, 12.0
+RATE_WARN_HZ, RATE_FAIL_HZ = 20.0, 10.0
 #: Mean probability that a point of the legs is right; mean stated confidence of a detector that has no curve.
 LEGS_PROBABILITY_WARN, LEGS_CONFIDENCE_WARN = 0.85, 0.6
 #: Share of the frames in which left and right were exchanged back; where many are, the rest may be the wrong ones.

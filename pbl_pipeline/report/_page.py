@@ -9,6 +9,7 @@ import numpy as np
 import pbl_pipeline
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import Gdi, Measure, NormativeSet, TrialMetrics, load_norm, norm_names
+from pbl_pipeline.keypoints import confidence_text, visibility
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, OUTCOMES, PASS, WARN, Check, in_session
 from pbl_pipeline.report import _figures
 from pbl_pipeline.report._types import SessionReport, TrialReport
@@ -315,6 +316,8 @@ def _origin(
         ]
         if t.keypoints is not None:
             rows.append(("Keypoints", f"{t.keypoints.marker_set}, {plural(len(t.keypoints.names), 'point')}", False))
+            rows.append(("In view", visibility(t.keypoints).text(), False))
+            rows.append(("Confidence", confidence_text(t.keypoints), False))
         camera = t.fit.camera if t.fit is not None else t.keypoints.camera if t.keypoints is not None else None
         if camera is not None:
             rows.append(("Camera", f"{camera.source}; focal length {camera.matrix[0, 0]:.0f} px", False))

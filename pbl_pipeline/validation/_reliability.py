@@ -12,8 +12,7 @@ import pandas as pd
 from scipy.optimize import isotonic_regression
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.keypoints import Keypoints
-from pbl_pipeline.keypoints._confidence import BOUND_TRUNK, ConfidenceCurve
+from pbl_pipeline.keypoints import BOUND_TRUNK, ConfidenceCurve, Keypoints
 
 from ._point_truth import PointTruth
 

@@ -12,7 +12,7 @@ import pandas as pd
 from markupsafe import Markup
 
 import pbl_pipeline
-from pbl_pipeline.keypoints._confidence import BOUND_TRUNK, ConfidenceCurve
+from pbl_pipeline.keypoints import BOUND_TRUNK, ConfidenceCurve
 from pbl_pipeline.report._svg import Axes, nice_ticks
 
 from ._reliability import PointErrors, reliability_table
@@ -79,7 +79,7 @@ def reliability_chart(rows: pd.DataFrame, curve: ConfidenceCurve | None = None) 
 def error_chart(rows: pd.DataFrame) -> Markup:
     """Median and 90th percentile of the error (percent of the trunk's length) over stated confidence; errors beyond
     the chart stand at its upper edge."""
-    most = min(1.0, float(rows["error_90_trunk"].max()))
+    most = float(np.clip(rows["error_90_trunk"].max(), 1.25 * BOUND_TRUNK, 1.0))
     ticks = nice_ticks(0.0, 100 * most)
     axes = Axes(_SIZE, (0, 1), (0, ticks[-1]), margin=(40, 10, 10, 26))
     axes.grid([0.0, 0.2, 0.4, 0.6, 0.8, 1.0], ticks, "", "\N{NO-BREAK SPACE}%")

@@ -50,8 +50,7 @@ def reliability(
     how many points lie within 20 percent of it, measured and by the stored curve of the detector, where it has one.
     """
     from pbl_pipeline.files import check_out_folder
-    from pbl_pipeline.keypoints import Keypoints
-    from pbl_pipeline.keypoints._confidence import confidence_curve
+    from pbl_pipeline.keypoints import Keypoints, confidence_curve
     from pbl_pipeline.validation import point_errors, reliability_table, write_reliability
 
     if len(truths) != len(keypoints):
