@@ -61,6 +61,14 @@ def model_params(name: str, n_augmentations: int | None = None) -> ModelParams:
     """The parameters of a registered model as it is now: 10 augmentations where it gives 3D, the picture and its mirror
     image where it gives 2D only. Raises `PblError` MODEL_MISSING, MODEL_INVALID, MARKER_SET_UNKNOWN, USAGE."""
     spec = load_spec(find(name))
+    if not spec.joint_names:
+        raise PblError(
+            "MODEL_INVALID",
+            found=f"a model of kind {spec.kind}",
+            expected="a keypoint model (crop3d, simcc or heatmap)",
+            next_step="choose another one of `pbl models list`",
+            key=name,
+        )
     n = n_augmentations or (10 if spec.kind == "crop3d" else 2)
     params = ModelParams(name, spec.sha256, spec.spec_sha256, spec.licence, n)
     _check_augmentations(spec, params)
