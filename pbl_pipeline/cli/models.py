@@ -51,7 +51,8 @@ def add(source: str, sha256: str | None, replace: bool) -> None:
     spec, model = library.add(source, sha256, replace=replace)
     _show(spec)
     click.echo(f"registered; loads on {model.device}, its batch is {model.fixed_batch or 'any'}")
-    click.echo(f"use it:  pbl detect VIDEO --keypoints {spec.name} --out FILE.npz")
+    if spec.joint_names:
+        click.echo(f"use it:  pbl detect VIDEO --keypoints {spec.name} --out FILE.npz")
 
 
 @models.command(epilog="Example: pbl models verify metrabs-l --device cuda")
@@ -78,10 +79,15 @@ def remove(name: str) -> None:
 def _show(spec) -> None:
     from pbl_pipeline.body import MARKER_SETS
 
+    what = spec.kind
+    if spec.joint_names:
+        own = "" if spec.marker_set in MARKER_SETS else "; not a set of the body: `pbl fit --marker-set TABLE.csv`"
+        what += f", {len(spec.joint_names)} points ({spec.marker_set}{own})"
     sides = sum(i != m for i, m in enumerate(spec.mirror)) // 2
-    own = "" if spec.marker_set in MARKER_SETS else "; not a set of the body: `pbl fit --marker-set TABLE.csv`"
-    click.echo(f"{spec.name}: {spec.kind}, {len(spec.joint_names)} points ({spec.marker_set}{own})")
+    click.echo(f"{spec.name}: {what}")
     click.echo(f"  licence: {spec.licence}")
     click.echo(f"  source:  {spec.source}")
-    click.echo(f"  input:   {spec.input.width} x {spec.input.height} px; {sides} pairs of left and right")
+    click.echo(
+        f"  input:   {spec.input.width} x {spec.input.height} px" + (f"; {sides} pairs of left and right" if sides else "")
+    )
     click.echo(f"  sha256:  {spec.sha256}")
