@@ -94,7 +94,9 @@ def connect(start: bool = False) -> dj.Connection:
             with warnings.catch_warnings():
                 # MariaDB is supported here, by the two repairs below: no need to say the contrary at every start.
                 warnings.filterwarnings("ignore", message="MariaDB is not officially supported")
-                current = dj.conn(use_tls=target["use_tls"])
+                # Named, though the configuration has them: without them DataJoint takes no notice of use_tls.
+                login = {name: target[name] for name in ("host", "user", "password")}
+                current = dj.conn(**login, use_tls=target["use_tls"])
         else:
             # The server was started again, perhaps on another port. Tables keep this object, so it moves along.
             info = {name: target[name] for name in ("host", "port", "user")}
@@ -242,7 +244,8 @@ def plain_connection(**options: Any) -> pymysql.Connection[Any]:
 
 def store_backend() -> Any:
     """DataJoint's access to the store of arrays, whatever it is. `connect()` or `configure()` must have been called."""
-    return get_store_backend(STORE, config=dj.config)
+    config: Any = dj.config
+    return get_store_backend(STORE, config=config)
 
 
 def _check_answers(target: dict[str, Any]) -> None:
