@@ -49,6 +49,8 @@ CODES: dict[str, str] = {
     "DB_MIGRATION": "the tables on the server are not as this version of the code declares them",
     "STORE_UNAVAILABLE": "the object store of the arrays cannot be reached, or refuses",
     "BACKUP_INVALID": "a backup is incomplete or was changed",
+    "TIME_LIMIT": "a job took longer than a worker gives it and was ended",
+    "WORKER_CRASH": "a job took its worker's process down more than once",
     "USAGE": "the command was called in a way that cannot work",
     "INTERNAL": "an unforeseen error: please report it with the whole text",
 }

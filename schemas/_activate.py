@@ -7,7 +7,7 @@ from types import ModuleType
 from typing import Any
 
 #: Modules of tables, each its own schema on the server, in the order of dependency.
-STAGES = ("lab", "session", "video", "tracking", "keypoints", "fit", "gait", "gdi", "qc", "validation")
+STAGES = ("lab", "session", "video", "tracking", "keypoints", "fit", "gait", "gdi", "qc", "validation", "worker")
 
 #: The computed tables of the chain, in the order in which populate visits them: (module, class).
 COMPUTED = (

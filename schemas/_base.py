@@ -94,6 +94,11 @@ class Origin:
     seconds: float
     computed: datetime.datetime
 
+    @classmethod
+    def now(cls, seconds: float) -> Origin:
+        """Of a computation that ended now, here, and took `seconds`."""
+        return cls(__version__, platform.node()[:64], round(seconds, 3), utc_now())
+
     def row(self, prefix: str, *, method_hash: str | None = None, model_sha256: str | None = None) -> dict[str, Any]:
         """Values of `origin_columns(prefix)`."""
         return {
@@ -128,7 +133,7 @@ def computes(make_compute: Callable[..., tuple]) -> Callable[..., tuple]:
                 next_step="report this with the error stack that `pbl status --json` prints",
                 key=_cut(_key_text(self, key), _LIMITS["key"]),
             ) from error
-        return (*result, Origin(__version__, platform.node()[:64], round(time.monotonic() - start, 3), utc_now()))
+        return (*result, Origin.now(time.monotonic() - start))
 
     return wrapper
 

@@ -24,12 +24,7 @@ def choose_person(video_id: int, person: int, tracking_method: str | None = None
         DB_NOT_FOUND for a video that is not registered, SUBJECT_UNKNOWN_PERSON, SOLVER_UNKNOWN.
     """
     if not video.Video & {"video_id": video_id}:
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=f"no video_id {video_id}",
-            expected="a registered video",
-            next_step="`pbl ingest` prints the numbers of videos, and `pbl status` those that wait for a choice",
-        )
+        raise unknown_video(video_id)
     key: dict = {"video_id": video_id}
     if tracking_method is not None:
         key["tracking_method"] = resolve_method(tracking.TrackingMethod, "tracking", tracking_method)
@@ -42,3 +37,13 @@ def choose_person(video_id: int, person: int, tracking_method: str | None = None
             tracking.set_override(selection, person)
             (failed.errors & selection).delete_quick()
         return tracking.drop_outdated_choices(key)
+
+
+def unknown_video(video_id: int) -> PblError:
+    """DB_NOT_FOUND for a number that no video has."""
+    return PblError(
+        "DB_NOT_FOUND",
+        found=f"no video_id {video_id}",
+        expected="a registered video",
+        next_step="`pbl ingest` prints the numbers of videos, and `pbl status` those that wait for a choice",
+    )

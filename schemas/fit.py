@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline._names import distinct
+from pbl_pipeline.errors import PblError
 
 from . import keypoints, session, video  # noqa: F401  a definition refers to session
 from ._base import (
@@ -193,14 +195,41 @@ class SessionFit(dj.Computed):
 
     @computes
     def make_compute(self, key: dict, trials: Sequence[tuple], method: Mapping[str, Any]) -> tuple:
-        ids, names, motions, refs = (list(column) for column in zip(*trials, strict=True))
+        loaded, names, motions = self._loaded(trials)
+        result = library("fit").fit_session(loaded, names, stored_paramset(method), camera_motion=motions)
+        return result, [t[0] for t in trials], method["sha"]
+
+    def make_computes(self, keys: Sequence[dict], fetched: Sequence[tuple]) -> list[tuple | None]:
+        """Several sets in one call of the library: for each what `make_compute` returns, None where it would raise.
+
+        A worker with a GPU fits a batch so, and hands each result to the table's own make.
+        """
+        out: list[tuple | None] = [None] * len(keys)
+        for sha in dict.fromkeys(method["sha"] for _, method in fetched):
+            rows = [i for i, (_, method) in enumerate(fetched) if method["sha"] == sha]
+            start = time.monotonic()
+            sessions, places = [], []
+            for i in rows:
+                try:
+                    sessions.append(library("fit").SessionInput(*self._loaded(fetched[i][0])))
+                    places.append(i)
+                except PblError:
+                    continue  # make_compute will say it
+            results = library("fit").fit_sessions(sessions, stored_paramset(fetched[rows[0]][1]))
+            origin = Origin.now((time.monotonic() - start) / max(len(results), 1))
+            for i, result in zip(places, results, strict=True):
+                if not isinstance(result, PblError):
+                    out[i] = (result, [t[0] for t in fetched[i][0]], sha, origin)
+        return out
+
+    def _loaded(self, trials: Sequence[tuple]) -> tuple[list[Any], list[str], list[str]]:
+        """Keypoints, names and camera motions of the trials that `make_fetch` gave."""
+        _, names, motions, refs = (list(column) for column in zip(*trials, strict=True))
         with ExitStack() as stack:
             paths = [stack.enter_context(stored_file(self, ref)) for ref in refs]
             loaded = [library("keypoints").Keypoints.load(path) for path in paths]
         # The library knows one moving camera; "one of several" on stands is a static one for it.
-        motions = ["handheld" if m == "handheld" else "static" for m in motions]
-        result = library("fit").fit_session(loaded, names, stored_paramset(method), camera_motion=motions)
-        return result, ids, method["sha"]
+        return loaded, names, ["handheld" if m == "handheld" else "static" for m in motions]
 
     def make_insert(self, key: dict, result: Any, ids: list[int], sha: str, origin: Origin) -> None:
         body_sha = result.trials[0].body_sha256

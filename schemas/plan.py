@@ -19,7 +19,7 @@ GROUP = ("session_id", "tracking_method", "keypoint_method", "fit_method")
 UNDECIDED = (video.VideoInfo, tracking.Tracking, tracking.SubjectChoice, keypoints.Keypoints, fit.TrialInput)
 
 
-def plan_fit_sets() -> list[dict[str, Any]]:
+def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]:
     """Make a FitSet for every session whose trials are all decided and not yet in a current set.
 
     A trial is decided when it can be fitted (TrialInput), failed, shows nobody, or waits for a person's choice. While
@@ -27,21 +27,27 @@ def plan_fit_sets() -> list[dict[str, Any]]:
     would trigger a fit of its own. A later video (or choice) makes a new set; the old set and its fit stay, no longer
     current. Workers take turns at a session, and where several sets of it are current all but one cease to be.
 
+    Parameters
+    ----------
+    sessions
+        session_id of those to look at (None: all; that reads whole tables).
+
     Returns
     -------
     list of dict
         fit_set and fit_method of the sets that became current now.
     """
-    current = fit.FitSelection & {"fit_current": True}
+    chosen = True if sessions is None else [{"session_id": int(s)} for s in sessions]
+    current = (fit.FitSelection & {"fit_current": True}) & (fit.FitSet & chosen)
     fitted = (fit.FitSet.Video * current).proj("tracking_method", "keypoint_method")
     in_a_set = dj.U("video_id", "tracking_method", "keypoint_method", "fit_method") & fitted
-    new = fit.TrialInput.proj() * video.Video.proj("session_id") - in_a_set
+    new = fit.TrialInput.proj() * (video.Video.proj("session_id") & chosen) - in_a_set
     by_method = dj.U("session_id", "fit_method").aggr(current * fit.FitSet.proj("session_id"), n_current="count(*)")
     several = (by_method & "n_current > 1").proj()
-    sessions = sorted({int(s) for found in (new, several) for s in found.to_arrays("session_id")})
+    to_plan = sorted({int(s) for found in (new, several) for s in found.to_arrays("session_id")})
     failed = [table.jobs for table in UNDECIDED]  # declares the job tables, which would end a transaction
     made = []
-    for session_id in sessions:
+    for session_id in to_plan:
         with _locked(session_id):
             _keep_one_current(session_id)
             made += _plan_session(session_id, failed)
@@ -142,7 +148,7 @@ def _decided(videos: Any, failed: Sequence[Any]) -> Any:
     ids = {int(v) for v in videos.to_arrays("video_id")}
     stopped: list[dict] = []
     for jobs in failed:
-        stopped += [k for k in list(jobs.errors.keys()) if int(k["video_id"]) in ids]
+        stopped += list((jobs.errors & [{"video_id": i} for i in ids]).keys())
     unchosen = (tracking.SubjectChoice & videos) - [{"choice_status": s} for s in tracking.CHOSEN]
     stopped += list(unchosen.keys())
 

@@ -48,6 +48,12 @@ class SessionQc(dj.Computed):
         qc_advice         : varchar(1000)      # what to do about it
         """
 
+    @property
+    def key_source(self) -> Any:
+        """Sessions whose trials have all been searched for events: with several workers the measures may come first."""
+        trials = gdi.SessionGdi.proj() * fit.SessionFit.Trial.proj()
+        return gdi.SessionGdi.proj() - (trials - gait.GaitEvents.proj()).proj()
+
     def make_fetch(self, key: dict) -> tuple:
         found = []
         for stage, table, prefix in SOURCES:

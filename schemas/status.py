@@ -5,8 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from . import computed_tables, tracking, video
+from . import computed_tables, tracking, video, worker
 from ._base import error_code, error_found, error_next_step
+
+#: Fewer videos than this, and keys are counted that nobody has queued yet.
+SMALL = 5000
 
 #: Columns that say "ran well, nothing to produce": table -> (status, values, reason or None where a table above says).
 EMPTY_COLUMNS: dict[str, tuple[str, tuple[str, ...], str | None]] = {
@@ -20,7 +23,11 @@ EMPTY_COLUMNS: dict[str, tuple[str, tuple[str, ...], str | None]] = {
 
 @dataclasses.dataclass(frozen=True)
 class TableStatus:
-    """One computed table. pending: keys without a result, a reservation or an error; empty is part of done."""
+    """One computed table. pending: keys without a result, a reservation or an error; empty is part of done.
+
+    oldest_s: age of the oldest queued job. per_hour: done in the last hour. left_s: pending at that rate. delayed: why
+    jobs that were put back wait, such as a full store.
+    """
 
     table: str
     done: int
@@ -29,6 +36,10 @@ class TableStatus:
     reserved: int
     error: int
     waiting: int
+    oldest_s: float | None = None
+    per_hour: float = 0.0
+    left_s: float | None = None
+    delayed: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,24 +85,93 @@ class Status:
     errors: list[ErrorRow]
     empty: list[EmptyRow]
     waiting: list[Waiting]
+    workers: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    exact: bool = True
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
         return dataclasses.asdict(self)
 
 
-def pipeline_status() -> Status:
-    """Query the state of all computed tables. `schemas.activate()` must have been called."""
+def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
+    """Query the state of all computed tables. `schemas.activate()` must have been called.
+
+    Parameters
+    ----------
+    exact
+        Also count keys that no worker has queued yet; that compares whole tables (seconds each with 300,000 videos).
+        None: where there are fewer than `SMALL` videos.
+    most
+        Errors, empty and waiting rows that are listed, each; the counts are of all.
+    """
+    n_videos = len(video.Video())
+    exact = n_videos < SMALL if exact is None else exact
+    connection = video.Video.connection
+    queues, rates = queue_counts(connection), throughput(connection)
     tables, errors = [], []
     for table in computed_tables():
-        counts = table.jobs.progress()
-        remaining, _ = table().progress()
+        name = table.__name__
+        counts = queues[name]
+        pending = counts["pending"]
+        if exact:
+            remaining, _ = table().progress()
+            pending = max(0, remaining - counts["reserved"] - counts["error"] - counts["ignore"])
         waiting = len(table & {"choice_status": "NEEDS_CHOICE"}) if table is tracking.SubjectChoice else 0
-        pending = max(0, remaining - counts["reserved"] - counts["error"] - counts["ignore"])
         done, empty = len(table()), len(empty_rows(table))
-        tables.append(TableStatus(table.__name__, done, empty, pending, counts["reserved"], counts["error"], waiting))
-        errors += _errors(table)
-    return Status(len(video.Video()), tables, errors, _empty(), _waiting())
+        oldest, reason = _oldest(table, connection) if counts["pending"] else (None, "")
+        per_hour = rates.get(name, 0.0)
+        left = 3600.0 * pending / per_hour if per_hour and pending else None
+        tables.append(
+            TableStatus(
+                name, done, empty, pending, counts["reserved"], counts["error"], waiting, oldest, per_hour, left, reason
+            )
+        )
+        errors += _errors(table, most) if counts["error"] else []
+    return Status(n_videos, tables, errors, _empty(most), _waiting(most), live_workers(), exact)
+
+
+def queue_counts(connection: Any) -> dict[str, dict[str, int]]:
+    """Job rows of each computed table by status."""
+    out = {}
+    for table in computed_tables():
+        counts = dict.fromkeys(("pending", "reserved", "error", "ignore"), 0)
+        rows = connection.query(
+            f"SELECT status, COUNT(*) FROM {table.jobs.full_table_name} GROUP BY status"  # noqa: S608
+        ).fetchall()
+        out[table.__name__] = counts | {str(status): int(n) for status, n in rows}
+    return out
+
+
+def throughput(connection: Any, minutes: int = 60) -> dict[str, float]:
+    """Jobs an hour of each table, over the last `minutes` in which workers finished any of it."""
+    table = worker.Throughput.full_table_name
+    rows = connection.query(
+        f"SELECT stage, SUM(n_done), TIMESTAMPDIFF(SECOND, MIN(minute), CURRENT_TIMESTAMP) FROM {table}"  # noqa: S608
+        " WHERE minute >= CURRENT_TIMESTAMP - INTERVAL %s MINUTE GROUP BY stage",
+        args=(int(minutes),),
+    ).fetchall()
+    return {str(stage): 3600.0 * float(n) / max(float(seconds), 60.0) for stage, n, seconds in rows}
+
+
+def live_workers(seen_within_s: float = 180.0) -> list[dict[str, Any]]:
+    """Workers whose heart beat lately: host, process, resource, what they do."""
+    alive = worker.Worker & "worker_stopped IS NULL"
+    alive = alive & f"worker_seen > CURRENT_TIMESTAMP(3) - INTERVAL {float(seen_within_s)} SECOND"
+    names = ("worker_host", "worker_pid", "worker_resource", "worker_doing")
+    return [{n: r[n] for n in names} for r in alive.to_dicts(order_by="worker_host, worker_pid")]
+
+
+def _oldest(table: Any, connection: Any) -> tuple[float | None, str]:
+    """Age (s) of the oldest pending job, and why jobs that were put back wait."""
+    jobs = table.jobs.full_table_name
+    age = connection.query(
+        f"SELECT TIMESTAMPDIFF(SECOND, MIN(created_time), CURRENT_TIMESTAMP) FROM {jobs} WHERE status='pending'"  # noqa: S608
+    ).fetchone()[0]
+    why = connection.query(
+        f"SELECT error_message FROM {jobs} WHERE status='pending' AND scheduled_time > CURRENT_TIMESTAMP(3)"  # noqa: S608
+        " ORDER BY scheduled_time LIMIT 1"
+    ).fetchone()
+    return (None if age is None else float(age)), (str(why[0]) if why else "")
 
 
 def empty_rows(table: Any) -> Any:
@@ -102,23 +182,23 @@ def empty_rows(table: Any) -> Any:
     return table & [{column: v} for v in values]
 
 
-def _empty() -> list[EmptyRow]:
+def _empty(most: int) -> list[EmptyRow]:
     out: list[EmptyRow] = []
     for table in computed_tables():
         reason = EMPTY_COLUMNS.get(table.__name__, ("", (), None))[2]
         if reason is None:
             continue
         said = {e.video_id for e in out}  # the first table that has nothing knows why
-        for row in (empty_rows(table) * video.Video.proj("video_name")).to_dicts(order_by="video_id"):
+        for row in (empty_rows(table) * video.Video.proj("video_name")).to_dicts(order_by="video_id", limit=most):
             if int(row["video_id"]) in said:
                 continue
             out.append(EmptyRow(table.__name__, int(row["video_id"]), row["video_name"], row[reason]))
     return out
 
 
-def _errors(table: Any) -> list[ErrorRow]:
+def _errors(table: Any, most: int) -> list[ErrorRow]:
     out = []
-    for row in table.jobs.errors.to_dicts():
+    for row in table.jobs.errors.to_dicts(limit=most):
         key = {k: row[k] for k in table.jobs.primary_key}
         message = row["error_message"]
         out.append(
@@ -142,10 +222,10 @@ def _file_of(key: dict[str, Any]) -> str:
     return str(names[0]) if len(names) else ""
 
 
-def _waiting() -> list[Waiting]:
+def _waiting(most: int) -> list[Waiting]:
     out = []
     rows = (tracking.SubjectChoice & {"choice_status": "NEEDS_CHOICE"}) * video.Video.proj("video_name")
-    for row in rows.to_dicts(order_by="video_id"):
+    for row in rows.to_dicts(order_by="video_id", limit=most):
         key = {k: row[k] for k in ("video_id", "tracking_method")}
         persons = sorted(int(p) for p in (tracking.Tracking.Person & key).to_arrays("person_id"))
         out.append(

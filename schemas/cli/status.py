@@ -12,8 +12,9 @@ if TYPE_CHECKING:
 
 
 @click.command()
+@click.option("--exact", is_flag=True, help="Count also what is not queued yet, however many videos there are.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, with the full error stacks.")
-def status(as_json: bool) -> None:
+def status(exact: bool, as_json: bool) -> None:
     """Show per table what is done, pending, being computed, in error or waiting; errors with their next step.
 
     \b
@@ -24,7 +25,7 @@ def status(as_json: bool) -> None:
     from schemas.status import pipeline_status
 
     schemas.activate(methods=False)
-    state = pipeline_status()
+    state = pipeline_status(exact or None)
     if as_json:
         click.echo(json.dumps(state.to_dict(), indent=2))
         return
@@ -35,11 +36,25 @@ def status(as_json: bool) -> None:
 def lines(state: Status) -> list[str]:
     """The printed form."""
     out = [f"{state.videos} videos", ""]
-    out.append(f"{'table':<16}{'done':>7}{'empty':>7}{'pending':>9}{'reserved':>10}{'error':>7}{'waiting':>9}")
+    out.append(
+        f"{'table':<16}{'done':>8}{'empty':>7}{'pending':>9}{'reserved':>10}{'error':>7}{'waiting':>9}"
+        f"{'oldest':>9}{'per hour':>10}{'left':>9}"
+    )
     for t in state.tables:
-        out.append(f"{t.table:<16}{t.done:>7}{t.empty:>7}{t.pending:>9}{t.reserved:>10}{t.error:>7}{t.waiting:>9}")
+        out.append(
+            f"{t.table:<16}{t.done:>8}{t.empty:>7}{t.pending:>9}{t.reserved:>10}{t.error:>7}{t.waiting:>9}"
+            f"{span(t.oldest_s):>9}{f'{t.per_hour:.0f}' if t.per_hour else '-':>10}{span(t.left_s):>9}"
+        )
+    if not state.exact:
+        out.append("pending: what is queued; `--exact` also counts what no worker has queued yet")
+    out += [f"{t.table} waits: {t.delayed}" for t in state.tables if t.delayed]
+    for w in state.workers:
+        doing = w["worker_doing"] or "-"
+        out.append(f"worker {w['worker_host']}:{w['worker_pid']} ({w['worker_resource']}): {doing}")
     if state.errors:
-        out += ["", "errors (tried again with: pbl populate --retry-errors)"]
+        n = sum(t.error for t in state.tables)
+        shown = "" if n == len(state.errors) else f", {len(state.errors)} of {n}"
+        out += ["", f"errors (tried again with: pbl retry){shown}"]
     for e in state.errors:
         key = ", ".join(f"{k}={v}" for k, v in e.key.items())
         out += [
@@ -55,3 +70,14 @@ def lines(state: Status) -> list[str]:
     for w in state.waiting:
         out += [f"  video_id={w.video_id}  {w.about}", f"    {w.reason}", f"    next:  {w.next_step}"]
     return out
+
+
+def span(seconds: float | None) -> str:
+    """A time in the largest unit that gives at least 1: 45 s, 12 min, 3.5 h, 2.1 d."""
+    if seconds is None:
+        return "-"
+    for unit, length in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= length:
+            value = seconds / length
+            return f"{value:.1f} {unit}" if value < 10 and unit != "min" else f"{value:.0f} {unit}"
+    return f"{seconds:.0f} s"

@@ -1,0 +1,32 @@
+"""`pbl why`: where a video stands and what would happen next."""
+
+from __future__ import annotations
+
+import json
+
+import click
+
+
+@click.command()
+@click.argument("video_id", type=int)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def why(video_id: int, as_json: bool) -> None:
+    """Show every stage of one video: its row, its job or its error with advice, and what would run next.
+
+    \b
+    Example: pbl why 17
+    """
+    import schemas
+    from schemas.why import why as look
+
+    schemas.activate(methods=False)
+    found = look(video_id)
+    if as_json:
+        click.echo(json.dumps(found.to_dict(), indent=2, default=str))
+        return
+    click.echo(f"video {found.video_id}  {found.name}  session {found.session_id}\n{found.path}\n")
+    for step in found.steps:
+        click.echo(f"{step.table:<16}{step.what:<20}{step.method:<34}{step.note}".rstrip())
+        if step.next_step:
+            click.echo(f"{'':<16}next: {step.next_step}")
+    click.echo(f"\n{found.verdict}")

@@ -1,0 +1,121 @@
+"""Where one video stands: every stage, its row, its job or its error, and what would happen next."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from . import computed_tables, fit, video
+from ._base import error_code, error_found, error_next_step
+from .status import EMPTY_COLUMNS
+
+DONE, EMPTY, PENDING, RUNNING, ERROR, NOT_YET = "done", "empty", "pending", "being computed", "error", "not yet"
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """One stage of one video. what: one of the words above. method: that names the row. note: origin, error or reason;
+    next_step: of an error."""
+
+    table: str
+    what: str
+    method: str = ""
+    note: str = ""
+    next_step: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Why:
+    """The state of a video; `verdict` is the sentence that answers the question."""
+
+    video_id: int
+    name: str
+    path: str
+    session_id: int
+    steps: list[Step]
+    verdict: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return dataclasses.asdict(self)
+
+
+def why(video_id: int) -> Why:
+    """Look a registered video up in every table. `schemas.activate()` must have been called.
+
+    Raises `PblError` DB_NOT_FOUND for an unknown video.
+    """
+    from .choose import unknown_video
+
+    rows = (video.Video & {"video_id": video_id}).to_dicts()
+    if not rows:
+        raise unknown_video(video_id)
+    row = rows[0]
+    sets = [{"fit_set": s} for s in (fit.FitSet.Video & {"video_id": video_id}).to_arrays("fit_set")]
+    current = fit.FitSelection & {"fit_current": True}
+    sets = [{"fit_set": k["fit_set"]} for k in (current & sets).to_dicts()] if sets else []
+    steps: list[Step] = []
+    for table in computed_tables():
+        about = {"video_id": video_id} if "video_id" in table.heading.primary_key else sets
+        if "video_id" in table.heading.primary_key and "fit_set" in table.heading.primary_key:
+            about = [{**s, "video_id": video_id} for s in sets]
+        if isinstance(about, list) and not about:
+            steps.append(Step(table.__name__, NOT_YET))
+            continue
+        steps += _steps(table, about) or [Step(table.__name__, NOT_YET)]
+    return Why(
+        video_id, row["video_name"], row["video_path"], int(row["session_id"]), steps, _verdict(steps, bool(sets))
+    )
+
+
+def _steps(table: Any, about: Any) -> list[Step]:
+    out = []
+    name = table.__name__
+    prefix = next(n.removesuffix("_computed") for n in table.heading.names if n.endswith("_computed"))
+    for row in (table & about).to_dicts():
+        status, values, reason = EMPTY_COLUMNS.get(name, ("", (), None))
+        empty = bool(status) and row[status] in values
+        waits = row.get("choice_status") == "NEEDS_CHOICE"
+        note = f"{row[prefix + '_computed']} on {row[prefix + '_host']} in {row[prefix + '_seconds']:.1f} s"
+        if (empty or waits) and (text := row.get(reason or "choice_reason")):
+            note = str(text)
+        what = EMPTY if empty else "waits for a choice" if waits else DONE
+        step = f"pbl choose {row['video_id']} PERSON" if waits else ""
+        out.append(Step(name, what, _method(row, table), note, step))
+    for row in (table.jobs & about).to_dicts():
+        method = _method(row, table)
+        if row["status"] == "error":
+            message = row["error_message"]
+            note = f"{error_code(message)}: {error_found(message)}"
+            out.append(Step(name, ERROR, method, note, error_next_step(message)))
+        elif row["status"] == "reserved":
+            out.append(Step(name, RUNNING, method, f"by {row['host']}:{row['pid']} since {row['reserved_time']}"))
+        elif row["status"] == "pending":
+            late = f"; put back: {row['error_message']}" if row["error_message"] else ""
+            out.append(
+                Step(name, PENDING, method, f"priority {row['priority']}, from {row['scheduled_time']} on{late}")
+            )
+    return out
+
+
+def _method(row: dict[str, Any], table: Any) -> str:
+    return ", ".join(str(row[n]) for n in table.heading.primary_key if n.endswith("_method") or n == "norm")
+
+
+def _verdict(steps: list[Step], in_a_set: bool) -> str:
+    for step in steps:
+        if step.what == ERROR:
+            return f"{step.table} failed ({step.note}); next: {step.next_step}, then pbl retry"
+        if step.next_step:
+            return f"{step.table} {step.what}: {step.note}; next: {step.next_step}"
+        if step.what == RUNNING:
+            return f"{step.table} is being computed {step.note}"
+        if step.what == PENDING:
+            return f"{step.table} waits for a worker ({step.note}); next: pbl worker or pbl populate"
+        if step.what == EMPTY:
+            return f"{step.table} ran well and found nothing to go on with: {step.note}"
+        if step.what == NOT_YET and step.table != "KinematicError":
+            if step.table == "SessionFit" and not in_a_set:
+                return "its session is fitted when all of its videos are decided; next: pbl populate plans it"
+            return f"{step.table} is not queued yet; next: pbl populate, or a worker looks at all tables every minute"
+    return "everything is computed"

@@ -1,0 +1,103 @@
+"""A worker's heartbeat: that it lives, what it does, and what it has done, written every few seconds by a thread."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import secrets
+import threading
+from collections import defaultdict
+from typing import Any
+
+import pymysql
+
+from pbl_pipeline import __version__
+from pbl_pipeline.errors import PblError
+from schemas import connection, worker
+from schemas._base import dj
+
+#: Seconds between two heartbeats.
+PERIOD_S = 15.0
+
+
+class Heartbeat:
+    """Use as a context: the row of `Worker` is there from the first beat to the last.
+
+    The thread has a connection of its own (DataJoint's is not safe between threads). A database that is away costs
+    beats, nothing else: counts are kept until they can be written.
+    """
+
+    def __init__(self, resource: str) -> None:
+        self.worker = secrets.token_hex(8)
+        self.resource = resource
+        self._doing = ""
+        self._counts: dict[str, list[float]] = defaultdict(lambda: [0, 0, 0.0])
+        self._lock, self._stop = threading.Lock(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
+        self._connection: Any = None
+
+    def __enter__(self) -> Heartbeat:
+        self._beat(first=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join(timeout=5.0)
+        with contextlib.suppress(pymysql.err.Error, dj.DataJointError, PblError, OSError):
+            self._beat(last=True)
+            self._connection.close()
+
+    def doing(self, what: str) -> None:
+        """Say what is in hand; written with the next beat."""
+        with self._lock:
+            self._doing = what[:500]
+
+    def count(self, stage: str, done: int, failed: int, busy_s: float) -> None:
+        """Count what was finished."""
+        with self._lock:
+            row = self._counts[stage]
+            row[0], row[1], row[2] = row[0] + done, row[1] + failed, row[2] + busy_s
+
+    def _run(self) -> None:
+        while not self._stop.wait(PERIOD_S):
+            try:
+                self._beat()
+            except (pymysql.err.Error, dj.DataJointError, PblError, OSError):
+                self._connection = None  # away: again at the next beat
+
+    def _beat(self, first: bool = False, last: bool = False) -> None:
+        if self._connection is None:
+            self._connection = connection.another()
+        run, now = self._connection.query, "CURRENT_TIMESTAMP(3)"
+        table, minutes = worker.Worker.full_table_name, worker.Throughput.full_table_name
+        with self._lock:
+            doing, counts = self._doing, {k: tuple(v) for k, v in self._counts.items()}
+            self._counts.clear()
+        try:
+            if first:
+                columns = "worker, worker_host, worker_pid, worker_resource, worker_version"
+                run(
+                    f"INSERT INTO {table} ({columns}, worker_started, worker_seen, worker_doing)"  # noqa: S608
+                    f" VALUES (%s, %s, %s, %s, %s, {now}, {now}, '')",
+                    args=(self.worker, platform.node(), os.getpid(), self.resource, __version__),
+                )
+            stopped = f", worker_stopped={now}" if last else ""
+            run(
+                f"UPDATE {table} SET worker_seen={now}, worker_doing=%s{stopped} WHERE worker=%s",  # noqa: S608
+                args=(doing, self.worker),
+            )
+            minute = f"DATE_FORMAT({now}, '%%Y-%%m-%%d %%H:%%i:00')"
+            while counts:
+                stage, (done, failed, busy) = next(iter(counts.items()))
+                run(
+                    f"INSERT INTO {minutes} (worker, stage, minute, n_done, n_failed, busy)"  # noqa: S608
+                    f" VALUES (%s, %s, {minute}, %s, %s, %s) ON DUPLICATE KEY UPDATE n_done = n_done + VALUES(n_done),"
+                    " n_failed = n_failed + VALUES(n_failed), busy = busy + VALUES(busy)",
+                    args=(self.worker, stage, int(done), int(failed), float(busy)),
+                )
+                del counts[stage]
+        finally:
+            for stage, (done, failed, busy) in counts.items():  # not written: with the next beat
+                self.count(stage, int(done), int(failed), float(busy))

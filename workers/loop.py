@@ -1,0 +1,136 @@
+"""The working process: take jobs, compute, insert, queue what follows; wait when there is nothing to do."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import random
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from . import queue, refresh, registry, run_job
+from .batches import run_fits
+from .heartbeat import Heartbeat
+from .log import event
+from .queue import Claim
+from .run_job import Outcome
+
+log = logging.getLogger("pbl.worker")
+
+#: Pause after the first look that found nothing, and the longest; each look that finds nothing doubles it.
+IDLE_S = (0.5, 20.0)
+#: An idle worker looks at all tables when nobody has done so for as long.
+REFRESH_EVERY_S = 60.0
+
+
+@dataclasses.dataclass
+class Worker:
+    """One working process.
+
+    tables: the computed tables it serves. stop: set when it is to end after the job in hand. say: told of each job
+    before ("start") and after ("end") with the claim and the outcome; the supervisor listens. batch: fits per batch.
+    """
+
+    tables: Sequence[Any]
+    heartbeat: Heartbeat
+    stop: threading.Event = dataclasses.field(default_factory=threading.Event)
+    say: Callable[[str, Claim | None, Outcome | None], None] = lambda *_: None
+    batch: int = 1
+    done: int = 0
+    failed: int = 0
+    _refreshed: float = -1e9
+
+    def run(self, once: bool = False, max_jobs: int | None = None) -> None:
+        """Work until `stop`; with `once` until nothing is left to do."""
+        idle = IDLE_S[0]
+        while not self.stop.is_set() and (max_jobs is None or self.done + self.failed < max_jobs):
+            try:
+                n = self.step()
+            except run_job.DATABASE_ERRORS as error:
+                if not run_job.is_gone(error):
+                    raise
+                self.heartbeat.doing("waits for the database")
+                event(log, logging.WARNING, "database away", error=str(error)[:200])
+                run_job.wait_for_database(self.stop)
+                continue
+            if n:
+                idle = IDLE_S[0]
+                continue
+            found = self._refresh()
+            if found:
+                continue
+            if once and found is not None:
+                return
+            self.heartbeat.doing("idle")
+            # Not all at the same moment: workers that were started together would go on asking together.
+            self.stop.wait(idle * random.uniform(0.7, 1.3))  # noqa: S311
+            idle = min(2 * idle, IDLE_S[1])
+
+    def step(self) -> int:
+        """Take jobs of the table that is most urgent, and do them; returns how many."""
+        ranked = []
+        for position, table in enumerate(self.tables):
+            urgent = queue.most_urgent(table)
+            if urgent is not None:
+                ranked.append((urgent, -position, table))
+        # What is near its end first: a session that is nearly done should not wait for all others to begin.
+        for _, _, table in sorted(ranked, key=lambda r: r[:2]):
+            stage = registry.stage_of(table)
+            n = self.batch if stage.resource == registry.FIT else stage.batch
+            jobs = queue.claim(table, n)
+            if jobs:
+                self._do(jobs)
+                return len(jobs)
+        return 0
+
+    def _do(self, jobs: list[Claim]) -> None:
+        if registry.stage_of(jobs[0].table).resource == registry.FIT and self.batch > 1:
+            run_fits(jobs, self)
+            return
+        ended = []
+        for i, job in enumerate(jobs):
+            if self.stop.is_set():
+                for left in jobs[i:]:
+                    queue.put_back(left)
+                break
+            ended.append(self.one(job))
+        self.follow(ended)
+
+    def one(self, job: Claim, computed: run_job.Computed | None = None) -> Outcome:
+        """Do one job, with everything that is told about it."""
+        self.heartbeat.doing(str(job))
+        self.say("start", job, None)
+        outcome = run_job.run(job, computed, self.stop)
+        self.say("end", job, outcome)
+        good = outcome.what in (run_job.DONE, run_job.ALREADY)
+        self.done += good
+        self.failed += outcome.what == run_job.FAILED
+        self.heartbeat.count(job.table.__name__, int(good), int(outcome.what == run_job.FAILED), outcome.seconds)
+        level = logging.INFO if good else logging.WARNING
+        event(
+            log, level, outcome.what, job=job, seconds=round(outcome.seconds, 3), code=outcome.code, text=outcome.text
+        )
+        if outcome.what == run_job.LATER:
+            self.stop.wait(1.0)  # the cause is outside of the job: the next one would meet it too
+        return outcome
+
+    def follow(self, outcomes: Sequence[Outcome]) -> int:
+        """Queue what the jobs made computable."""
+        good = [o.job for o in outcomes if o.what in (run_job.DONE, run_job.ALREADY)]
+        return refresh.after(good, [o.job for o in outcomes if o.what == run_job.FAILED])
+
+    def _refresh(self) -> bool | None:
+        """Look at all tables if it is time. Whether something was found; None where another worker is at it."""
+        if time.monotonic() - self._refreshed < REFRESH_EVERY_S and self._refreshed > 0:
+            return False
+        self.heartbeat.doing("looks at all tables")
+        found = refresh.refresh()
+        if found is None:
+            return None
+        self._refreshed = time.monotonic()
+        if found.queued or found.freed:
+            event(log, logging.INFO, "refreshed", queued=found.queued, freed=found.freed, planned=found.planned)
+        mine = {t.__name__ for t in self.tables}
+        return any(name in mine for name in found.queued) or bool(found.freed)

@@ -1,0 +1,65 @@
+"""Prometheus metrics of a worker: what it did, and how long the queues are."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
+from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.registry import Collector
+
+#: Upper ends of the duration classes (s): from a light job to a long video.
+SECONDS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
+
+
+class Metrics:
+    """Counters of one supervisor; `serve` puts them at http://HOST:PORT/metrics."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        named = {"registry": self.registry}
+        self.jobs = Counter("pbl_jobs", "Jobs ended, by table and outcome", ["table", "outcome", "code"], **named)
+        self.seconds = Histogram("pbl_job_seconds", "Time of a job", ["table"], buckets=SECONDS, **named)
+        self.in_hand = Gauge("pbl_jobs_in_hand", "Jobs being computed by this worker", **named)
+        self.restarts = Counter("pbl_process_restarts", "Working processes that died and were replaced", **named)
+
+    def heard(self, message: dict[str, Any]) -> None:
+        """Count what a working process said."""
+        if message["what"] == "start":
+            self.in_hand.inc()
+            return
+        self.in_hand.dec()
+        self.jobs.labels(message["table"], message["outcome"], message["code"]).inc()
+        self.seconds.labels(message["table"]).observe(message["seconds"])
+
+    def serve(self, port: int, host: str, connect: Callable[[], Any]) -> None:
+        """Start the endpoint in a thread of its own. `connect` gives a database connection for the queue lengths."""
+        self.registry.register(_Queues(connect))
+        start_http_server(port, addr=host, registry=self.registry)
+
+
+class _Queues(Collector):
+    """Job rows by table and status, read when asked."""
+
+    def __init__(self, connect: Callable[[], Any]) -> None:
+        self._connect, self._connection, self._lock = connect, None, threading.Lock()
+
+    def collect(self) -> Iterator[GaugeMetricFamily]:
+        from schemas.status import queue_counts
+
+        rows = GaugeMetricFamily("pbl_queue_jobs", "Jobs by table and status", labels=["table", "status"])
+        up = GaugeMetricFamily("pbl_database_up", "1 when the database answers")
+        with self._lock:
+            try:
+                self._connection = self._connection or self._connect()
+                for table, counts in queue_counts(self._connection).items():
+                    for status, n in counts.items():
+                        rows.add_metric([table, status], n)
+                up.add_metric([], 1)
+            except Exception:  # noqa: BLE001  an endpoint that fails would hide all other figures
+                self._connection = None
+                up.add_metric([], 0)
+        yield rows
+        yield up

@@ -1,0 +1,210 @@
+"""The queue of a table: DataJoint's own job rows, filled in one statement, reserved, put back, fenced.
+
+A job row is `pending`, `reserved` or `error`; a finished one is deleted, because the result row says that it is done.
+What a reservation needs to be told from a dead one: host, process and connection (DataJoint writes them), and the
+heartbeat of that process (`workers.heartbeat`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import platform
+import random
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import pymysql
+
+from pbl_pipeline.errors import PblError
+from schemas._base import dj
+
+from .registry import NEW
+
+#: Error numbers of the server that a repetition mends: deadlock, lock wait.
+_AGAIN = (1205, 1213)
+_ATTEMPTS = 8
+#: Candidates looked at for each job that is wanted: others look at the same ones.
+_SPREAD = 4
+#: Jobs that this process holds: table and hash of the key.
+_held: set[tuple[str, str]] = set()
+
+
+@dataclasses.dataclass(frozen=True)
+class Claim:
+    """A reserved job. The reservation is its holder's as long as the row says what is written here."""
+
+    table: Any
+    key: dict[str, Any]
+    priority: int
+    host: str
+    pid: int
+    connection_id: int
+
+    def __str__(self) -> str:
+        return f"{self.table.__name__} " + ", ".join(f"{k}={v}" for k, v in self.key.items())
+
+    @property
+    def hash(self) -> str:
+        """16 hex digits of the key."""
+        return key_hash(self.key)
+
+
+def key_hash(key: Mapping[str, Any]) -> str:
+    """16 hex digits of a job's key."""
+    return hashlib.sha256(json.dumps(key, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+def is_held(table: Any, key: Mapping[str, Any]) -> bool:
+    """Whether this process has reserved the job and not ended it."""
+    return (table.__name__, key_hash(key)) in _held
+
+
+# ------------------------------------------------------------------------------------------------------------- filling
+def fill(table: Any, keys: Sequence[Mapping[str, Any]] | None = None, priority: int = NEW) -> int:
+    """Queue every key that can be computed and has neither a result nor a job, in one statement; returns how many.
+
+    `keys`: only what belongs to these (keys of a table above). DataJoint's own refresh inserts row by row.
+    """
+    if keys is not None and not keys:
+        return 0
+    jobs, quote = table.jobs, table.connection.adapter.quote_identifier
+    source = table().key_source
+    if keys is not None:
+        source = source & [dict(k) for k in keys]
+    todo = (source - table.proj()).restrict(dj.Not(jobs), semantic_check=False).proj()
+    columns = ",".join(quote(c) for c in todo.heading.primary_key)
+    names = f"{columns},{quote('status')},{quote('priority')}"
+    values = f"{columns},'pending',{int(priority)}"
+    # IGNORE: another process may queue the same key between the two halves of the statement. Nothing in it comes from
+    # outside: names are DataJoint's own, quoted by its adapter.
+    statement = f"INSERT IGNORE INTO {jobs.full_table_name} ({names}) SELECT {values} FROM ({todo.make_sql()}) AS todo"  # noqa: S608
+    return _repeated(table.connection, statement)
+
+
+def _repeated(connection: Any, statement: str) -> int:
+    """Run one statement that reads much and writes little: without locks on what it reads, again after a deadlock."""
+    for attempt in range(_ATTEMPTS):
+        try:
+            connection.query("SET TRANSACTION ISOLATION LEVEL READ COMMITTED")
+            with connection.transaction:
+                return int(connection.query(statement).rowcount)
+        except pymysql.err.OperationalError as error:
+            if error.args[0] not in _AGAIN or attempt == _ATTEMPTS - 1:
+                raise
+    raise AssertionError("unreachable")
+
+
+def sweep(table: Any) -> int:
+    """Delete jobs that nobody needs any more: done by another route, or no longer asked for; returns how many."""
+    jobs = table.jobs
+    n = (jobs & "status != 'reserved'").restrict(table.proj(), semantic_check=False).delete_quick(get_count=True)
+    waiting = jobs & "status != 'reserved'"
+    if len(waiting):
+        vanished = waiting.restrict(dj.Not(table().key_source.proj()), semantic_check=False)
+        n += vanished.delete_quick(get_count=True)
+    return int(n)
+
+
+# --------------------------------------------------------------------------------------------------- reserving, ending
+def most_urgent(table: Any) -> int | None:
+    """Priority of the first job that can be taken now; None where there is none."""
+    jobs = table.jobs
+    row = jobs.connection.query(
+        f"SELECT priority FROM {jobs.full_table_name} WHERE status='pending'"  # noqa: S608
+        " AND scheduled_time <= CURRENT_TIMESTAMP(3) ORDER BY priority, scheduled_time LIMIT 1"
+    ).fetchone()
+    return None if row is None else int(row[0])
+
+
+def claim(table: Any, n: int = 1) -> list[Claim]:
+    """Reserve up to n jobs, the most urgent and oldest first; where many workers draw, nearly so."""
+    jobs = table.jobs
+    ready = jobs.pending & "scheduled_time <= CURRENT_TIMESTAMP(3)"
+    rows = ready.proj("priority").to_dicts(order_by="priority, scheduled_time", limit=_SPREAD * n)
+    claims: list[Claim] = []
+    # Everybody sees the same candidates: a random order within a priority makes two hands on one job rare.
+    rows.sort(key=lambda r: (r["priority"], random.random()))  # noqa: S311
+    for row in rows:
+        key = {k: row[k] for k in jobs.primary_key}
+        if jobs.reserve(key):
+            here = (platform.node(), os.getpid(), jobs.connection.connection_id)
+            claims.append(Claim(table, key, int(row["priority"]), *here))
+            _held.add((table.__name__, claims[-1].hash))
+            if len(claims) == n:
+                break
+    return claims
+
+
+def finish(job: Claim) -> None:
+    """The job is done: its row goes, if it is still ours."""
+    _mine(job).delete_quick()
+    let_go(job)
+
+
+def fail(job: Claim, message: str, stack: str = "") -> None:
+    """Make an error row of the job; it is tried again only when somebody asks (`pbl retry`)."""
+    if len(_mine(job)):
+        job.table.jobs.error(job.key, error_message=message, error_stack=stack or None)
+    let_go(job)
+
+
+def put_back(job: Claim, reason: str = "", delay_s: float = 0.0) -> bool:
+    """Make the job pending again, taken earliest after `delay_s`; `reason` stays in its row. Whether it was ours."""
+    ours = reset(_mine(job), reason, delay_s) == 1
+    let_go(job)
+    return ours
+
+
+def let_go(job: Claim) -> None:
+    """Forget the job: somebody else has it."""
+    _held.discard((job.table.__name__, job.hash))
+
+
+def reset(jobs: Any, reason: str = "", delay_s: float = 0.0) -> int:
+    """Make all rows of a restricted queue pending, to be taken earliest after `delay_s`; returns how many."""
+    cursor = jobs.connection.query(  # the condition is DataJoint's, which escapes values
+        f"UPDATE {jobs.full_table_name} SET status='pending', error_message=%s, error_stack=NULL, host='', pid=0,"  # noqa: S608
+        f" scheduled_time=CURRENT_TIMESTAMP(3) + INTERVAL %s MICROSECOND{jobs.where_clause()}",
+        args=(reason[:2000], int(delay_s * 1e6)),
+    )
+    return int(cursor.rowcount)
+
+
+def _mine(job: Claim) -> Any:
+    held = {"status": "reserved", "host": job.host, "pid": job.pid, "connection_id": job.connection_id}
+    return job.table.jobs & job.key & held
+
+
+class ReservationLost(Exception):
+    """Somebody else holds the job by now: its result must not be written twice."""
+
+
+def hold(job: Claim) -> None:
+    """Inside the transaction that inserts: go on only while the reservation is ours, and let nobody else take it.
+
+    The job's row is locked until the transaction ends, so a second holder of the same job waits here and then finds
+    either that its reservation is gone or that the result is there.
+    """
+    jobs = job.table.jobs
+    where = " AND ".join(f"`{name}`=%s" for name in job.key)
+    row = jobs.connection.query(
+        f"SELECT status, host, pid, connection_id FROM {jobs.full_table_name} WHERE {where} FOR UPDATE",  # noqa: S608
+        args=tuple(job.key.values()),
+    ).fetchone()
+    if row is None or tuple(row) != ("reserved", job.host, job.pid, job.connection_id):
+        raise ReservationLost(str(job))
+
+
+def errors_of(table: Any, code: str | None = None, keys: Iterable[Mapping[str, Any]] | None = None) -> Any:
+    """The error rows of a table, of one code or of some keys if asked."""
+    rows = table.jobs.errors
+    if code is not None:
+        if not code.replace("_", "").isalnum():
+            raise PblError("USAGE", found=f"code {code!r}", expected="an error code", next_step="see docs/errors.md")
+        rows = rows & f"error_message LIKE 'PblError: {code}:%%' OR error_message LIKE '{code}%%'"
+    if keys is not None:
+        rows = rows & [dict(k) for k in keys]
+    return rows

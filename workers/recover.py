@@ -1,0 +1,93 @@
+"""Reservations of processes that are gone, and errors that say nothing about the job."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+from schemas import worker
+
+from . import queue
+
+#: A worker that has not been seen for so long is dead. Its heart beats every `heartbeat.PERIOD_S`; this also outlasts
+#: a database that is away for a minute and a process that compiles.
+DEAD_AFTER_S = 180.0
+
+#: How the message of an error begins that says nothing about the job: a signal, a lost server, or inputs that
+#: somebody changed during the computation. Such rows are tried again without being asked.
+INTERRUPTED = (
+    "KeyboardInterrupt",
+    "SystemExit",
+    "LostConnectionError",
+    "OperationalError",
+    "InterfaceError",
+    "DataJointError: Referential integrity failed",
+    "DataJointError: fetch1",
+)
+
+
+def free_dead(table: Any) -> int:
+    """Put jobs back that a dead process left: reserved by it, or in error because it was interrupted.
+
+    A process of this host is judged by its number and age. A process of another host is dead when no heartbeat of it
+    was seen for `DEAD_AFTER_S`; one that never had a heartbeat (a populate by hand) when its reservation is older than
+    the time limit of its table.
+    """
+    jobs, n = table.jobs, 0
+    for row in jobs.reserved.proj("host", "pid", "reserved_time").to_dicts():
+        if not _alive(row, table):
+            n += queue.reset(jobs.reserved & {k: row[k] for k in jobs.primary_key} & {"pid": row["pid"]})
+    for word in INTERRUPTED:
+        n += queue.reset(jobs.errors & f"error_message like '{word}%'")
+    return n
+
+
+def free_own(table: Any) -> int:
+    """Put back what this process was computing when a signal ended it."""
+    mine = table.jobs & {"host": platform.node(), "pid": os.getpid()}
+    interrupted = [f"error_message like '{word}%'" for word in INTERRUPTED]
+    return queue.reset(mine & {"status": "reserved"}) + queue.reset(mine & {"status": "error"} & interrupted)
+
+
+def _alive(row: dict[str, Any], table: Any) -> bool:
+    from .registry import stage_of
+
+    now = table.connection.query("SELECT CURRENT_TIMESTAMP(3)").fetchone()[0]
+    if row["host"] == platform.node():
+        if int(row["pid"]) == os.getpid():  # our number, but not our job: in a container every worker has the same
+            return queue.is_held(table, {k: row[k] for k in table.jobs.primary_key})
+        return _alive_here(int(row["pid"]), row["reserved_time"], now)
+    same = worker.Worker & {"worker_host": row["host"], "worker_pid": row["pid"]}
+    seen = [w["worker_seen"] for w in same.proj("worker_seen", "worker_stopped").to_dicts() if not w["worker_stopped"]]
+    if seen:
+        return (now - max(seen)).total_seconds() < DEAD_AFTER_S
+    reserved = row["reserved_time"]
+    return reserved is None or (now - reserved).total_seconds() < stage_of(table).limit_s
+
+
+def _alive_here(pid: int, reserved: datetime.datetime | None, now: datetime.datetime) -> bool:
+    """Whether a process of this host lives; a number that a younger process carries by now counts as dead."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    started = _age_of_process(pid)
+    if started is None or reserved is None:
+        return True
+    # A process younger than the reservation cannot have made it (two seconds for the clocks).
+    return started + 2.0 >= (now - reserved).total_seconds()
+
+
+def _age_of_process(pid: int) -> float | None:
+    """Seconds since a process started; None where the system does not tell (no /proc)."""
+    try:
+        ticks = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19])
+        uptime = float(Path("/proc/uptime").read_text().split()[0])
+    except (OSError, ValueError, IndexError):
+        return None
+    return uptime - ticks / os.sysconf("SC_CLK_TCK")

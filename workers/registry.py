@@ -1,0 +1,86 @@
+"""What each computed table needs of a worker: resource class, time limit, how many jobs it takes at once."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from pbl_pipeline.errors import PblError
+from schemas import computed_tables
+
+#: Resource classes: reading video, neural detectors on video, the session fit, and everything that takes milliseconds.
+DECODE, DETECTOR, FIT, LIGHT = "decode", "detector", "fit", "light"
+#: Names for what a machine is asked to serve.
+GROUPS: dict[str, tuple[str, ...]] = {
+    "all": (DECODE, DETECTOR, FIT, LIGHT),
+    "cpu": (DECODE, DETECTOR, LIGHT),
+    "gpu": (FIT,),
+    DECODE: (DECODE,),
+    DETECTOR: (DETECTOR,),
+    FIT: (FIT,),
+    LIGHT: (LIGHT,),
+}
+
+#: Priority of new work and of what is computed again: the lower number is taken first.
+NEW, AGAIN = 5, 8
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """One computed table. limit_s: after that a job is ended and becomes an error row. batch: jobs reserved at once:
+    1 where a job takes long, so that none waits behind it while other workers are idle."""
+
+    table: str
+    resource: str
+    limit_s: float
+    batch: int
+    followers: tuple[str, ...] = ()
+
+
+#: In the order of the chain. `followers`: tables in which a new row can make a key computable.
+STAGES: tuple[Stage, ...] = (
+    Stage("VideoInfo", DECODE, 1800.0, 4, ("Tracking",)),
+    Stage("Tracking", DETECTOR, 4 * 3600.0, 1, ("SubjectChoice",)),
+    Stage("SubjectChoice", LIGHT, 300.0, 16, ("Keypoints",)),
+    Stage("Keypoints", DETECTOR, 4 * 3600.0, 1, ("TrialInput",)),
+    Stage("TrialInput", LIGHT, 300.0, 16),  # what follows is planned: `workers.refresh.after`
+    Stage("SessionFit", FIT, 4 * 3600.0, 1, ("GaitEvents", "SessionGdi", "KinematicError")),
+    Stage("GaitEvents", LIGHT, 600.0, 16, ("GaitCycle", "SessionQc")),
+    Stage("GaitCycle", LIGHT, 600.0, 16, ("Spatiotemporal", "GDI")),
+    Stage("Spatiotemporal", LIGHT, 300.0, 16),
+    Stage("GDI", LIGHT, 300.0, 16),
+    Stage("SessionGdi", LIGHT, 600.0, 16, ("SessionQc",)),
+    Stage("SessionQc", LIGHT, 300.0, 16),
+    Stage("KinematicError", LIGHT, 300.0, 16),
+)
+
+
+def stage_of(table: Any) -> Stage:
+    """The entry of a computed table (class or name)."""
+    name = table if isinstance(table, str) else table.__name__
+    return next(s for s in STAGES if s.table == name)
+
+
+def tables_of(resource: str) -> list[Any]:
+    """The computed tables that a resource class or group serves, in the order of the chain. Raises USAGE."""
+    if resource not in GROUPS:
+        raise PblError(
+            "USAGE",
+            found=f"resource {resource!r}",
+            expected="one of " + ", ".join(GROUPS),
+            next_step="name one of these with --resource",
+        )
+    return [t for t in computed_tables() if stage_of(t).resource in GROUPS[resource]]
+
+
+def table_named(name: str) -> Any:
+    """A computed table by its name, in any case of letters. Raises USAGE."""
+    for table in computed_tables():
+        if table.__name__.lower() == name.lower():
+            return table
+    raise PblError(
+        "USAGE",
+        found=f"no computed table {name}",
+        expected="one of " + ", ".join(t.__name__ for t in computed_tables()),
+        next_step="name one of these with --table",
+    )

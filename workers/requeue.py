@@ -1,0 +1,185 @@
+"""Computing again: error rows on request, and results of an older method or code, behind all new work."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from pbl_pipeline.errors import PblError
+from schemas import computed_tables, fit, gait, gdi, keypoints, tracking, video
+from schemas._base import delete_below, dj, resolve_method
+
+from . import queue
+from .registry import AGAIN, table_named
+
+#: Rows deleted in one transaction.
+CHUNK = 200
+
+
+def retry(code: str | None = None, table: str | None = None, video_id: int | None = None) -> dict[str, int]:
+    """Make error rows pending again, of one code, one table, one video if asked; table -> how many.
+
+    Raises
+    ------
+    PblError
+        USAGE for an unknown table or code.
+    """
+    tables = [table_named(table)] if table else computed_tables()
+    out = {}
+    for one in tables:
+        keys = None if video_id is None else _of_video(one, video_id)
+        n = queue.reset(queue.errors_of(one, code, keys)) if keys is None or keys else 0
+        if n:
+            out[one.__name__] = n
+    return out
+
+
+def _of_video(table: Any, video_id: int) -> list[dict[str, Any]]:
+    """Keys of the error rows of a table that belong to a video, or to the set it is fitted in."""
+    names = table.jobs.primary_key
+    if "video_id" in names:
+        return (table.jobs.errors & {"video_id": video_id}).keys()
+    sets = [{"fit_set": s} for s in (fit.FitSet.Video & {"video_id": video_id}).to_arrays("fit_set")]
+    return (table.jobs.errors & sets).keys() if sets else []
+
+
+# ---------------------------------------------------------------------------------------------------------- reprocess
+@dataclasses.dataclass(frozen=True)
+class Reprocess:
+    """What is to be done again. `selected`: method rows added; `outdated`: keys whose results are deleted."""
+
+    table: str
+    add: list[dict[str, Any]]
+    outdated: list[dict[str, Any]]
+    below: dict[str, int]
+
+
+#: Where a method is selected: table -> (prefix of its columns, selection, method table).
+_SELECTIONS = {
+    "Tracking": ("tracking", "TrackingSelection", "TrackingMethod"),
+    "Keypoints": ("keypoint", "KeypointSelection", "KeypointMethod"),
+    "SessionFit": ("fit", "FitPlan", "FitMethod"),
+    "GaitEvents": ("gait", "GaitPlan", "GaitEventMethod"),
+    "GDI": ("gdi", "GdiPlan", "GdiModel"),
+}
+#: Modules by prefix of their columns.
+_MODULES = {"tracking": tracking, "keypoint": keypoints, "fit": fit, "gait": gait, "gdi": gdi}
+
+
+def plan_new_method(table: str, method: str, since: datetime.date | None = None) -> Reprocess:
+    """What selecting a method for everything that went through another method of that table would add.
+
+    Old rows stay: a method is part of the key. `since`: only videos registered from that day on.
+
+    Raises
+    ------
+    PblError
+        USAGE for a table without methods, SOLVER_UNKNOWN for an unknown method.
+    """
+    name = table_named(table).__name__
+    if name not in _SELECTIONS:
+        raise PblError(
+            "USAGE",
+            found=f"--new-method with table {name}",
+            expected="one of " + ", ".join(_SELECTIONS),
+            next_step="name the table whose method changed; what follows from it is computed by itself",
+        )
+    prefix, selection_name, method_name = _SELECTIONS[name]
+    module = _MODULES[prefix]
+    selection, methods = getattr(module, selection_name), getattr(module, method_name)
+    column = f"{prefix}_method"
+    chosen = resolve_method(methods, prefix, method)
+    rows = selection & (video.Video & _since(since))
+    others = [k for k in rows.primary_key if k != column]
+    have = {tuple(r[k] for k in others) for r in (selection & {column: chosen}).proj().to_dicts()}
+    add: dict[tuple, dict[str, Any]] = {}
+    for row in rows.to_dicts():
+        key = tuple(row[k] for k in others)
+        if key not in have:
+            add.setdefault(key, {**row, column: chosen})
+    return Reprocess(name, list(add.values()), [], {})
+
+
+def plan_again(
+    table: str,
+    method: str | None = None,
+    since: datetime.datetime | None = None,
+    before: datetime.datetime | None = None,
+) -> Reprocess:
+    """Which results of a table would be deleted and computed again: of a method, computed since or before a time.
+
+    Raises
+    ------
+    PblError
+        USAGE for an unknown table.
+    """
+    one = table_named(table)
+    rows = one()
+    prefix = next(n.removesuffix("_computed") for n in one.heading.names if n.endswith("_computed"))
+    if method is not None:
+        columns = [n for n in one.heading.names if n.endswith("_method")]
+        rows = rows & [{c: method} for c in columns]
+    if since is not None:
+        rows = rows & f"{prefix}_computed >= '{since:%Y-%m-%d %H:%M:%S}'"
+    if before is not None:
+        rows = rows & f"{prefix}_computed < '{before:%Y-%m-%d %H:%M:%S}'"
+    keys = rows.keys()
+    below = {}
+    if keys and len(keys) <= 10 * CHUNK:
+        counts = dj.Diagram.cascade(one & keys, part_integrity="cascade").counts()
+        below = {n: c for n, c in counts.items() if c}
+    return Reprocess(one.__name__, [], keys, below)
+
+
+def carry_out(plan: Reprocess) -> Iterator[int]:
+    """Do what was planned, in small transactions, and queue it behind new work; yields how many are done so far."""
+    one = table_named(plan.table)
+    if plan.add:
+        prefix, selection_name, _ = _SELECTIONS[plan.table]
+        for i in range(0, len(plan.add), 50 * CHUNK):
+            part = plan.add[i : i + 50 * CHUNK]
+            getattr(_MODULES[prefix], selection_name).insert(part, skip_duplicates=True)
+            yield min(i + 50 * CHUNK, len(plan.add))
+        _queue_at_low_priority(one)
+    for i in range(0, len(plan.outdated), CHUNK):
+        part = plan.outdated[i : i + CHUNK]
+        delete_below(one, part)
+        queue.fill(one, part, AGAIN)
+        yield min(i + CHUNK, len(plan.outdated))
+
+
+def _queue_at_low_priority(table: Any) -> None:
+    """Queue what a new selection made computable: of this table, or of the one that plans its keys."""
+    first = {"SessionFit": "TrialInput"}.get(table.__name__, table.__name__)
+    queue.fill(table_named(first), None, AGAIN)
+    if table.__name__ == "GDI":
+        queue.fill(table_named("SessionGdi"), None, AGAIN)
+
+
+def _since(day: datetime.date | None) -> Any:
+    return True if day is None else f"video_created >= '{day:%Y-%m-%d}'"
+
+
+def parse_time(text: str | None) -> datetime.datetime | None:
+    """A day or time of the command line, UTC. Raises USAGE."""
+    if text is None:
+        return None
+    try:
+        return datetime.datetime.fromisoformat(text)
+    except ValueError as error:
+        raise PblError(
+            "USAGE", found=repr(text), expected="YYYY-MM-DD or YYYY-MM-DDTHH:MM:SS (UTC)", next_step="correct the time"
+        ) from error
+
+
+def summary(plan: Reprocess) -> Sequence[str]:
+    """What a plan would do, in words."""
+    out = []
+    if plan.add:
+        out.append(f"{len(plan.add)} selections would be added for {plan.table}; nothing is deleted")
+    if plan.outdated:
+        out.append(f"{len(plan.outdated)} rows of {plan.table} would be deleted and computed again")
+        out += [f"  with it: {n} rows of {name}" for name, n in plan.below.items()]
+    return out or [f"nothing of {plan.table} is to be done again"]

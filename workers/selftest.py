@@ -1,0 +1,84 @@
+"""The job with a known answer that every working process does before it takes real ones."""
+
+from __future__ import annotations
+
+import secrets
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import registry
+
+#: Largest median error of the fit on the synthetic trial without noise (deg); it is 0.4 where all is well.
+FIT_DEG = 1.5
+#: Largest error of the cadence (steps/min) on the synthetic walk; it is below 1.
+CADENCE_PER_MIN = 3.0
+
+
+class SelfTestFailed(Exception):
+    """This machine computes something else than it should, or cannot reach what it needs."""
+
+
+def check(tables: Sequence[Any]) -> None:
+    """Write and read the store, and do known jobs of the resource classes that are served.
+
+    Raises
+    ------
+    SelfTestFailed
+        With what was expected and found.
+    """
+    served = {registry.stage_of(t).resource for t in tables}
+    _store(tables[0])
+    if registry.FIT in served:
+        _fit()
+    if registry.LIGHT in served:
+        _cadence()
+
+
+def _store(table: Any) -> None:
+    from datajoint.hash_registry import get_store_backend
+
+    from schemas.connection import STORE
+
+    backend = get_store_backend(STORE, config=table.connection._config)
+    content, name = secrets.token_bytes(64), f"selftest/{secrets.token_hex(8)}"
+    with tempfile.TemporaryDirectory(prefix="pbl-") as folder:
+        (Path(folder) / "in").write_bytes(content)
+        try:
+            backend.put_file(Path(folder) / "in", name)
+            backend.get_file(name, Path(folder) / "out")
+            backend.remove(name)
+        except OSError as error:
+            raise SelfTestFailed(f"the store cannot be written and read: {error}") from error
+        if (Path(folder) / "out").read_bytes() != content:
+            raise SelfTestFailed("the store gave back other bytes than were written")
+
+
+def _fit() -> None:
+    from pbl_pipeline.fit import fit_session
+    from pbl_pipeline.synthetic import SynthSpec, synthesise
+
+    made = synthesise(SynthSpec(seed=1, seconds=1.0, noise="none"))
+    fit = fit_session([made.keypoints], ["selftest"]).trials[0]
+    error = float(np.nanmedian(np.degrees(np.abs(fit.qpos[:, 6:] - made.truth.qpos[:, 6:]))))
+    if not error <= FIT_DEG:
+        raise SelfTestFailed(f"the fit of the known walk is {error:.2f} deg off, expected at most {FIT_DEG:g}")
+
+
+def _cadence() -> None:
+    from pbl_pipeline.gait import detect_events, feet_from_keypoints
+    from pbl_pipeline.synthetic import SynthSpec, synthesise
+
+    made = synthesise(SynthSpec(seed=1, seconds=6.0, noise="none"))
+    found = detect_events(feet_from_keypoints(made.keypoints))
+
+    def cadence(events: Sequence[Any]) -> float:
+        downs = np.sort([e.time_s for e in events if e.event == "foot_down"])
+        return 60.0 / float(np.mean(np.diff(downs[1:-1]))) if len(downs) > 4 else float("nan")
+
+    expected, measured = cadence(made.truth.events), cadence(found.events)
+    if not abs(expected - measured) <= CADENCE_PER_MIN:
+        raise SelfTestFailed(f"cadence of the known walk {measured:.1f}, expected {expected:.1f} steps/min")
