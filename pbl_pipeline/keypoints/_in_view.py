@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import re
 
 import numpy as np
 
@@ -17,6 +18,10 @@ INSIDE_SHARE = 0.95
 #: Mean confidence over the markers of a frame; a gap of partial view that is bridged is shorter than this; longer runs
 #: without sight of the person are left unknown (`fit.ViewParams` has the same, frozen in its paramsets).
 MIN_CONFIDENCE, MAX_GAP_S, MAX_BLIND_S = 0.5, 1.0, 0.15
+
+#: Names of points on feet and head, in any marker set.
+_FEET = re.compile(r"heel|toe|ankle|ankm|foot", re.IGNORECASE)
+_HEAD = re.compile(r"nose|head|eye|cheek", re.IGNORECASE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,7 +117,8 @@ def whole_person_in_view(keypoints: Keypoints, min_confidence: float) -> np.ndar
 
     The mean and not each marker: in a view from the side the far arm is hidden in every frame, and the person is in
     view all the same. Markers that the detector never gives in this trial say nothing of a single frame and do not
-    count, unless they are most of them.
+    count, unless they are most of them, or of a foot or the head where the person reaches to that border: there they
+    may have been beyond it all the time.
     """
     given = np.any(keypoints.confidence > 0, axis=0)
     if given.mean() < SEEN_SHARE:
@@ -121,8 +127,19 @@ def whole_person_in_view(keypoints: Keypoints, min_confidence: float) -> np.ndar
     xy = np.nan_to_num(keypoints.xy_px, nan=-1.0)
     inside = (xy[..., 0] >= 0) & (xy[..., 0] <= width) & (xy[..., 1] >= 0) & (xy[..., 1] <= height)
     inside &= keypoints.confidence > 0
-    confidence = keypoints.confidence[:, given]
-    return (inside[:, given].mean(axis=1) >= INSIDE_SHARE) & (confidence.mean(axis=1) >= min_confidence)
+    needed = np.tile(given, (len(inside), 1))
+    for points, at_border in ends(keypoints):
+        needed |= points & at_border[:, None]
+    share = np.sum(inside & needed, axis=1) / np.sum(needed, axis=1)
+    return (share >= INSIDE_SHARE) & (keypoints.confidence[:, given].mean(axis=1) >= min_confidence)
+
+
+def ends(keypoints: Keypoints) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Of the feet and the lower border, then of the head and the upper one: which points (J,) bool they are, and in
+    which frames (T,) bool the person reaches to that border."""
+    box, height = np.asarray(keypoints.box_px, float), keypoints.image_size_px[1]
+    feet, head = (np.array([bool(p.search(n)) for n in keypoints.names]) for p in (_FEET, _HEAD))
+    return (feet, box[:, 3] >= height - 1), (head, box[:, 1] <= 0)
 
 
 def bridge_gaps(in_view: np.ndarray, time_s: np.ndarray, max_gap_s: float) -> np.ndarray:

@@ -11,14 +11,12 @@ recordings that were darkened, blurred and shrunk (docs/confidence.md).
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 
 from pbl_pipeline.qc import EMPTY, FAIL, PASS, WARN, Check
 
 from ._confidence import probability_within
-from ._in_view import SEEN_SHARE, step_s, visibility
+from ._in_view import SEEN_SHARE, ends, step_s, visibility
 from ._types import Keypoints
 
 #: Seconds in view: about three strides; what a fit needs at least.
@@ -43,8 +41,6 @@ EXCHANGED_WARN, EXCHANGED_FAIL = 0.02, 0.3
 _TURN_DEG = 90.0
 _LONGEST_STEP_S = 0.2
 _LEGS = ("hip", "knee", "ankle", "heel", "foot_index")
-_FEET = re.compile(r"heel|toe|ankle|ankm|foot", re.IGNORECASE)
-_HEAD = re.compile(r"nose|head|eye|cheek", re.IGNORECASE)
 
 
 def check_keypoints(keypoints: Keypoints) -> tuple[Check, ...]:
@@ -101,17 +97,11 @@ def _cut(keypoints: Keypoints) -> list[Check | None]:
     found = (keypoints.confidence > 0) & np.all((xy >= 0) & (xy <= (width, height)), axis=2)
     given = found.any(axis=0)
     seen = found.mean(axis=1) >= SEEN_SHARE * given.mean()
-    feet, head = (np.array([bool(p.search(n)) for n in keypoints.names]) & given for p in (_FEET, _HEAD))
-    box = np.asarray(keypoints.box_px, float)
     checks: list[Check | None] = []
+    (feet, low), (head, high) = ends(keypoints)
     for name, points, at_border, advice in (
-        (
-            "feet_cut_share",
-            feet,
-            box[:, 3] >= height - 1,
-            "the feet leave the picture below: tilt the phone or step back",
-        ),
-        ("head_cut_share", head, box[:, 1] <= 0, "the head leaves the picture above: tilt the phone or step back"),
+        ("feet_cut_share", feet, low, "the feet leave the picture below: tilt the phone or step back"),
+        ("head_cut_share", head, high, "the head leaves the picture above: tilt the phone or step back"),
     ):
         if points.any() and seen.any():
             cut = at_border & ~found[:, points].all(axis=1)
