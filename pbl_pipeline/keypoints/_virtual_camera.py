@@ -153,7 +153,7 @@ def _step(view: VirtualCamera, camera: Camera) -> float:
 
 def _factor(step: float) -> int:
     """Whole pixels of the picture that become one before the crop is sampled."""
-    return max(int(step), 1) if step >= _SHRINK_FROM else 1
+    return round(step) if step >= _SHRINK_FROM else 1
 
 
 def _shrunk(
