@@ -8,9 +8,10 @@ from pbl_pipeline.video import Camera, viewing_ray
 
 #: Fewest points that fix a place.
 MIN_POINTS = 4
-#: Distance in the picture (px) beyond which a point counts less, and rounds of reweighting.
-_HUBER_PX = 5.0
-_ROUNDS = 8
+#: Distance in the picture (px) at which a point counts half, and rounds of reweighting: first with Huber's weights,
+#: which find their way from anywhere, then with Cauchy's, which let go of points that are far off.
+_HALF_PX = 5.0
+_ROUNDS = (8, 8)
 #: Nearest that a point may be to the camera (m).
 _NEAREST_M = 0.1
 
@@ -20,7 +21,7 @@ def absolute_root(xyz_m: np.ndarray, xy_px: np.ndarray, confidence: np.ndarray, 
 
     Least squares on ``(x + tx) - u (z + tz)`` and the same for y, u and v being the ray of the pixel without
     distortion, linear in the shift. Repeated with weights that divide by the depth, so that distances count as seen in
-    the picture, and that fall for points further than 5 px from where the last shift puts them. `confidence` (T, J)
+    the picture, and that fall with a point's distance in the picture from where the last shift puts it (Cauchy's, half at 5 px). `confidence` (T, J)
     weighs the points. NaN where fewer than four points have one, or where the person would stand behind the camera.
     """
     xyz, weight0 = np.asarray(xyz_m, np.float64), np.asarray(confidence, np.float64)
@@ -33,10 +34,12 @@ def absolute_root(xyz_m: np.ndarray, xy_px: np.ndarray, confidence: np.ndarray, 
     rows = np.flatnonzero(known.sum(axis=1) >= MIN_POINTS)
     x, d, w = xyz[rows], rays[rows], weight0[rows]
     shift = _solve(x, d, w)
-    for _ in range(_ROUNDS):
+    for number in range(sum(_ROUNDS)):
         z = np.maximum(x[..., 2] + shift[:, None, 2], _NEAREST_M)
         off = focal * np.linalg.norm((x[..., :2] + shift[:, None, :2]) / z[..., None] - d, axis=-1)
-        shift = _solve(x, d, w * np.minimum(1.0, _HUBER_PX / np.maximum(off, 1e-9)) / z**2)
+        far = off / _HALF_PX
+        robust = np.minimum(1.0, 1 / np.maximum(far, 1e-9)) if number < _ROUNDS[0] else 1 / (1 + far**2)
+        shift = _solve(x, d, w * robust / z**2)
     before = np.min(np.where(known[rows], x[..., 2] + shift[:, None, 2], np.inf), axis=1) > _NEAREST_M
     out[rows[before]] = shift[before]
     return out
