@@ -3,32 +3,91 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-_EPILOG = "Example: pbl gait out/walk1.fit.npz out/walk2.fit.npz --out out/metrics.json"
+from pbl_pipeline.errors import PblError
+
+if TYPE_CHECKING:
+    from pbl_pipeline.fit import TrialFit
+    from pbl_pipeline.gait import LabTrial
+
+_EPILOG = """\b
+Example: pbl gait out/walk1.fit.npz out/walk2.fit.npz --out out/metrics.json
+Example: pbl gait lab/walk1.c3d lab/walk2.c3d --out lab/metrics.json"""
 
 
 @click.command(epilog=_EPILOG)
-@click.argument("fits", nargs=-1, required=True, type=click.Path(path_type=Path, readable=False))
+@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path, readable=False))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="metrics.json to write.")
-@click.option("--norm", help="Normative set of the index: a name, or a .json file of build_norm.")
+@click.option(
+    "--index",
+    help="pbl-2025-three-angles (default of fits) or gillette-2008 (nine angles; default of C3D files).",
+)
+@click.option("--norm", help="Normative set of the index: a name, or a .json file (`pbl norm list`).")
 @click.option("--method", default="zeni-2008", show_default=True, help="Name of the event method.")
-def gait(fits: tuple[Path, ...], out: Path, norm: str | None, method: str) -> None:
-    """Events, cycles, spatiotemporal measures and GDI of the trials FITS of one session.
+@click.option(
+    "--events",
+    "event_files",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="events.csv of `pbl events` for C3D files, once for each in their order (default: the labels in the file).",
+)
+def gait(
+    files: tuple[Path, ...],
+    out: Path,
+    index: str | None,
+    norm: str | None,
+    method: str,
+    event_files: tuple[Path, ...],
+) -> None:
+    """Events, cycles, spatiotemporal measures and GDI of one session.
 
+    FILES are fits (fit.npz of `pbl fit`), or a laboratory's recordings (C3D with the nine angles of Plug-in Gait).
     Measures that cannot be trusted are null with a reason.
     """
     from pbl_pipeline import progress
     from pbl_pipeline.files import check_out_file
-    from pbl_pipeline.fit import TrialFit
-    from pbl_pipeline.gait import EventParams, GaitParams, gait_metrics
+    from pbl_pipeline.gait import GDI_PARAMSETS, GILLETTE_MODEL, EventParams, GaitParams, GdiParams, gait_metrics
     from pbl_pipeline.gait.events import resolve_params
 
     check_out_file(out)
-    params = GaitParams(events=EventParams(**resolve_params(method).params))
-    trials = [TrialFit.load(path) for path in progress.track(fits, "read fits", unit="trial")]
-    metrics = gait_metrics(trials, norm, params)
+    laboratory = [_is_c3d(path) for path in files]
+    if any(laboratory) and not all(laboratory):
+        raise _usage("fits and C3D files together", "one kind of file in a session")
+    if event_files and (not all(laboratory) or len(event_files) != len(files)):
+        raise _usage(f"{len(event_files)} --events for {len(files)} files", "C3D files, and one --events for each")
+    if index is None:
+        index = GILLETTE_MODEL if all(laboratory) else None
+    elif index not in GDI_PARAMSETS:
+        raise PblError(
+            "SOLVER_UNKNOWN",
+            found=f"index {index!r}",
+            expected=f"one of {', '.join(GDI_PARAMSETS)}",
+            next_step="choose one of the names above",
+        )
+    of_index = GDI_PARAMSETS[index].to(GdiParams) if index else GdiParams()
+    params = GaitParams(events=EventParams(**resolve_params(method).params), gdi=of_index)
+    given = event_files or (None,) * len(files)
+    pairs = progress.track(list(zip(files, given, strict=True)), "read files", unit="trial")
+    trials = [_read(path, events) for path, events in pairs]
+    metrics = gait_metrics(trials, norm, params, model=index)
     metrics.save(out)
     click.echo(metrics.table())
     click.echo(f"written: {out}")
+
+
+def _is_c3d(path: Path) -> bool:
+    return path.name.lower().removesuffix(".gz").endswith(".c3d")
+
+
+def _read(path: Path, events: Path | None) -> TrialFit | LabTrial:
+    from pbl_pipeline.fit import TrialFit
+    from pbl_pipeline.gait import read_lab_trial
+
+    return read_lab_trial(path, events) if _is_c3d(path) else TrialFit.load(path)
+
+
+def _usage(found: str, expected: str) -> PblError:
+    return PblError("USAGE", found=found, expected=expected, next_step="see `pbl gait --help`")

@@ -7,9 +7,22 @@ Each step is a function of its own with a frozen result: `feet_from_fit` or `fee
 from ._angles import ANGLE_NAMES, AngleSeries, angle_series, pelvis_angles
 from ._cycles import REPORT_PERCENT, GaitCycle, cycle_curves, find_cycles
 from ._feet import FOOT_MARKER_SETS, FootTrajectories, feet_from_fit, feet_from_keypoints, feet_from_markers
-from ._gdi import GDI_MODEL, GDI_PARAMSETS, Gdi, GdiCycle, GdiParams, gdi_vector, score_gdi
+from ._gdi import (
+    GDI_MODEL,
+    GDI_PARAMSETS,
+    GILLETTE_MODEL,
+    MODEL_ANGLES,
+    Gdi,
+    GdiCycle,
+    GdiParams,
+    gdi_vector,
+    score_gdi,
+)
+from ._ground import Lengths, cycle_lengths
+from ._laboratory import PLUG_IN_GAIT_POINTS, LabTrial, read_lab_trial
 from ._metrics import GaitMetrics, GaitParams, TrialMetrics, cycle_checks, gait_metrics
 from ._poses import BodyPoses, trial_poses
+from ._profile import MovementProfile, movement_profile, variable_scores
 from ._spatiotemporal import MEASURES, Measure, Spatiotemporal, spatiotemporal
 from .events import (
     DEFAULT_EVENT_PARAMSET,
@@ -20,18 +33,38 @@ from .events import (
     detect_events,
     load_events,
 )
-from .normative import DEFAULT_NORM, NormativeSet, fit_norm, load_norm, norm_names
+from .normative import (
+    ANGLE_MODELS,
+    BODY_ANGLES,
+    DEFAULT_NORM,
+    NINE_ANGLES,
+    PLUG_IN_GAIT,
+    THREE_ANGLES,
+    NormativeSet,
+    fit_norm,
+    load_norm,
+    norm_names,
+    offset_deg,
+)
 
 __all__ = [
+    "ANGLE_MODELS",
     "ANGLE_NAMES",
+    "BODY_ANGLES",
     "DEFAULT_EVENT_PARAMSET",
     "DEFAULT_NORM",
     "EVENT_PARAMSETS",
     "FOOT_MARKER_SETS",
     "GDI_MODEL",
     "GDI_PARAMSETS",
+    "GILLETTE_MODEL",
     "MEASURES",
+    "MODEL_ANGLES",
+    "NINE_ANGLES",
+    "PLUG_IN_GAIT",
+    "PLUG_IN_GAIT_POINTS",
     "REPORT_PERCENT",
+    "THREE_ANGLES",
     "AngleSeries",
     "BodyPoses",
     "EventParams",
@@ -44,13 +77,17 @@ __all__ = [
     "Gdi",
     "GdiCycle",
     "GdiParams",
+    "LabTrial",
+    "Lengths",
     "Measure",
+    "MovementProfile",
     "NormativeSet",
     "Spatiotemporal",
     "TrialMetrics",
     "angle_series",
     "cycle_checks",
     "cycle_curves",
+    "cycle_lengths",
     "detect_events",
     "feet_from_fit",
     "feet_from_keypoints",
@@ -61,9 +98,13 @@ __all__ = [
     "gdi_vector",
     "load_events",
     "load_norm",
+    "movement_profile",
     "norm_names",
+    "offset_deg",
     "pelvis_angles",
+    "read_lab_trial",
     "score_gdi",
     "spatiotemporal",
     "trial_poses",
+    "variable_scores",
 ]

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from ._feet import feet_from_fit
 from ._poses import BodyPoses, trial_poses
 from .events import RIGHT
+from .normative import BODY_ANGLES
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit
@@ -25,16 +26,21 @@ ANGLE_NAMES: dict[str, str] = {
     "pelvis_tilt": "deg, anterior tilt positive, against the horizontal in the walking direction",
     "pelvis_obliquity": "deg, the side in question up positive",
     "pelvis_rotation": "deg, the side in question ahead positive, against the walking direction",
+    "foot_progression": "deg, toes in positive: heel to toe, seen from above, against the walking direction",
 }
 
 
 @dataclasses.dataclass(frozen=True)
 class AngleSeries:
-    """Angles over a trial: `time_s` (T,), `left` and `right` map `ANGLE_NAMES` to (T,) degrees, NaN where unseen."""
+    """Angles over a trial: `time_s` (T,), `left` and `right` map `ANGLE_NAMES` to (T,) degrees, NaN where unseen.
+
+    `angle_model` says how pelvis and hip are defined (`normative.ANGLE_MODELS`).
+    """
 
     time_s: np.ndarray
     left: dict[str, np.ndarray]
     right: dict[str, np.ndarray]
+    angle_model: str = BODY_ANGLES
 
     def of_side(self, side: str) -> dict[str, np.ndarray]:
         """The angles of "left" or "right"."""
@@ -49,11 +55,13 @@ def angle_series(fit: TrialFit, poses: BodyPoses | None = None) -> AngleSeries:
     column = {name: i for i, name in enumerate(fit.joint_names)}
     degrees = np.degrees(np.asarray(fit.qpos, float))
     poses = poses or trial_poses(fit)
-    forward = feet_from_fit(fit, poses).forward
+    feet = feet_from_fit(fit, poses)
+    forward = feet.forward
+    out = toes_out(feet.toe_m - feet.heel_m, forward)
     # The pelvis frame of the model is forward, up, right.
     tilt, obliquity, rotation = pelvis_angles(poses.rotation[:, poses.index("pelvis")], forward).T
     sides = {}
-    for side, letter, sign in (("left", "l", -1.0), ("right", "r", 1.0)):
+    for i, (side, letter, sign) in enumerate((("left", "l", -1.0), ("right", "r", 1.0))):
         sides[side] = {
             "hip_flexion": degrees[:, column[f"hip_flexion_{letter}"]],
             "hip_adduction": degrees[:, column[f"hip_adduction_{letter}"]],
@@ -63,6 +71,7 @@ def angle_series(fit: TrialFit, poses: BodyPoses | None = None) -> AngleSeries:
             "pelvis_tilt": tilt,
             "pelvis_obliquity": sign * obliquity,
             "pelvis_rotation": sign * rotation,
+            "foot_progression": -out[:, i],
         }
     return AngleSeries(np.asarray(fit.time_s, float), sides["left"], sides["right"])
 
@@ -97,3 +106,12 @@ def pelvis_angles(R_world_pelvis: np.ndarray, forward: np.ndarray) -> np.ndarray
         # About +right the front rises (posterior tilt); about +forward the right side sinks; about +up it goes ahead.
         out[seen] = np.column_stack([-about_right, -about_forward, about_up])
     return out
+
+
+def toes_out(heel_to_toe: np.ndarray, forward: np.ndarray) -> np.ndarray:
+    """How far each foot (T, 2, 3) [left, right] points outwards of `forward` (T, 3) seen from above: (T, 2) deg."""
+    up = np.array([0.0, 0.0, 1.0])
+    right = np.cross(forward, up)
+    aside = np.einsum("tsi,ti->ts", heel_to_toe, right) * np.array([-1.0, 1.0])
+    ahead = np.einsum("tsi,ti->ts", heel_to_toe, forward)
+    return np.degrees(np.arctan2(aside, ahead))

@@ -12,8 +12,12 @@ from scipy.interpolate import PchipInterpolator
 from pbl_pipeline.qc import FIT_FAILED, Check, withheld
 
 from ._angles import AngleSeries, angle_series
-from ._poses import BodyPoses
+from ._feet import FootTrajectories, feet_from_fit
+from ._ground import Lengths, cycle_lengths, is_metric, why_no_lengths
+from ._outliers import ODD_CURVES, ODD_LENGTH, without_odd_curves, without_odd_lengths
+from ._poses import BodyPoses, trial_poses
 from .events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents
+from .normative import BODY_ANGLES
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit
@@ -22,14 +26,8 @@ if TYPE_CHECKING:
 REPORT_PERCENT = np.linspace(0.0, 100.0, 51)
 #: Frames further apart than this inside a cycle leave it without curves.
 MAX_CURVE_GAP_S = 0.15
-#: A stride longer than this times the typical one holds a step that was missed (at least half a stride more) or a
-#: pause; one shorter than its inverse an event that is none. Strides of one walk vary by a few percent, in ataxia ten.
-STRIDE_RATIO = 1.35
-#: Fewest cycles of a bout for a typical stride of its own; shorter bouts are compared with the whole trial.
-_OWN_MEDIAN = 5
-
-
-_ODD = "times the typical stride"
+#: Why a cycle without a fit has no lengths.
+NO_POSITIONS = "no positions on the floor"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,10 +36,12 @@ class GaitCycle:
 
     Times in seconds of the trial. In order: `start_s` (foot down), `opposite_foot_up_s`, `opposite_foot_down_s`,
     `foot_up_s`, `end_s`. `number` counts the cycles of a trial in order of time, both sides together, from 0.
-    `used` is False for the cycles that touch the first or last step of their walking bout and for those that are far
-    longer or shorter than the others (`odd_length`), and for all of a fit that failed; `excluded` says why.
+    `used` is False for the cycles that touch the first or last step of their walking bout, for those that are far
+    longer or shorter than the others (`odd_length`) or whose curves are far from the others' (`odd_curves`), and for
+    all of a fit that failed; `excluded` says why.
     `curves` maps names of `ANGLE_NAMES` to (51,) degrees at 0, 2, ..., 100 % of the cycle; empty where there is
-    no fit or frames are missing (`curves_missing` says which).
+    no fit or frames are missing (`curves_missing` says which). `angle_model` says how the angles are defined.
+    `lengths` are those on the floor, None with the reason where they are not known.
     """
 
     trial: str
@@ -57,11 +57,18 @@ class GaitCycle:
     excluded: str = ""
     curves: dict[str, np.ndarray] = dataclasses.field(default_factory=dict, compare=False, repr=False)
     curves_missing: str = ""
+    lengths: Lengths = dataclasses.field(default_factory=lambda: Lengths(missing=NO_POSITIONS))
+    angle_model: str = BODY_ANGLES
 
     @property
     def odd_length(self) -> bool:
         """Whether the cycle is left out because of its length."""
-        return _ODD in self.excluded
+        return ODD_LENGTH in self.excluded
+
+    @property
+    def odd_curves(self) -> bool:
+        """Whether the cycle is left out because of its curves."""
+        return ODD_CURVES in self.excluded
 
     @property
     def fit_failed(self) -> bool:
@@ -80,8 +87,12 @@ def find_cycles(
     trial: str = "",
     poses: BodyPoses | None = None,
     fit_checks: Sequence[Check] = (),
+    *,
+    series: AngleSeries | None = None,
+    feet: FootTrajectories | None = None,
+    keep_ends: bool = False,
 ) -> tuple[GaitCycle, ...]:
-    """All cycles whose four inner events are there in order, with curves where a fit is given.
+    """All cycles whose four inner events are there in order, with curves and lengths where a fit is given.
 
     First and last step of each bout are left out of the measures (Cotton et al.: "first and last step of a trial are
     discarded"). A step is the time from one foot down to the next foot down of the other foot. So of a bout with
@@ -90,14 +101,25 @@ def find_cycles(
     (nine foot downs) in view leave 5 cycles. Cycles that are not used stay in the result with `used` False, so that
     both counts can be shown.
 
-    A cycle longer than `STRIDE_RATIO` times the median stride of its bout, or shorter than its inverse, is not used
-    either: a step that was not detected makes one long cycle of each side, which would pass as a slow stride.
+    `keep_ends` uses them all the same: for a recording that begins and ends while the person walks, such as a
+    laboratory's, where the first step in view is not the first step of the walk.
+
+    A cycle longer than 1.35 times the median stride of its bout, or shorter than its inverse, is not used
+    either: a step that was not detected makes one long cycle of each side, which would pass as a slow stride. Nor is
+    one whose curves are far from the others' (`_outliers.py`).
+
+    `series` and `feet` stand for the fit's angles and feet where there is none (a laboratory's recording; positions in
+    metres in a world that stands still).
 
     Where one of `fit_checks`, the checks of the session fit, FAILs, no cycle is used (`pbl_pipeline.qc.withheld`).
     """
     found = events.events if isinstance(events, GaitEvents) else tuple(events)
     name = trial or (fit.name if fit is not None else "")
-    series = angle_series(fit, poses) if fit is not None else None
+    no_lengths, metric = "" if feet is not None else NO_POSITIONS, True
+    if fit is not None:
+        poses = poses or trial_poses(fit)
+        series, feet = angle_series(fit, poses), feet_from_fit(fit, poses)
+        no_lengths, metric = why_no_lengths(fit), is_metric(fit)
     cycles = []
     for bout in sorted({e.bout for e in found}):
         inside = sorted((e for e in found if e.bout == bout), key=lambda e: e.time_s)
@@ -112,13 +134,17 @@ def find_cycles(
             if [(e.side, e.event) for e in inner] != wanted:
                 continue
             reasons = []
-            if start is downs[0]:
+            if start is downs[0] and not keep_ends:
                 reasons.append("first step of the bout")
-            if end is downs[-1]:
+            if end is downs[-1] and not keep_ends:
                 reasons.append("last step of the bout")
             curves, missing = {}, "no fit"
             if series is not None:
                 curves, missing = cycle_curves(series, start.side, start.time_s, end.time_s)
+            lengths = Lengths(missing=no_lengths)
+            if feet is not None and not no_lengths:
+                times = (start.time_s, inner[1].time_s, end.time_s)
+                lengths = cycle_lengths(feet, start.side, *times, metric=metric)
             cycle = GaitCycle(
                 trial=name,
                 number=0,
@@ -133,27 +159,15 @@ def find_cycles(
                 excluded=" and ".join(reasons),
                 curves=curves,
                 curves_missing=missing,
+                lengths=lengths,
+                angle_model=series.angle_model if series is not None else BODY_ANGLES,
             )
             cycles.append(cycle)
-    cycles = _without_odd_lengths(cycles)
+    cycles = without_odd_curves(without_odd_lengths(cycles))
     if reason := withheld(fit_checks):
         cycles = [dataclasses.replace(c, used=False, excluded=reason) for c in cycles]
     cycles.sort(key=lambda c: c.start_s)
     return tuple(dataclasses.replace(c, number=number) for number, c in enumerate(cycles))
-
-
-def _without_odd_lengths(cycles: list[GaitCycle]) -> list[GaitCycle]:
-    out = []
-    for c in cycles:
-        own = [o.stride_time_s for o in cycles if o.bout == c.bout]
-        typical = np.median(own if len(own) >= _OWN_MEDIAN else [o.stride_time_s for o in cycles])
-        ratio = float(c.stride_time_s / typical)
-        if 1 / STRIDE_RATIO <= ratio <= STRIDE_RATIO:
-            out.append(c)
-            continue
-        reason = f"{ratio:.2f} {_ODD}"
-        out.append(dataclasses.replace(c, used=False, excluded=f"{c.excluded} and {reason}" if c.excluded else reason))
-    return out
 
 
 def cycle_curves(

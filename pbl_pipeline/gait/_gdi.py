@@ -1,4 +1,4 @@
-"""Gait Deviation Index of three angles."""
+"""Gait Deviation Index: the paper's of three angles, and the original of nine."""
 
 from __future__ import annotations
 
@@ -7,12 +7,22 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
 
 from ._cycles import GaitCycle
+from ._profile import MovementProfile, movement_profile, variable_scores
 from .events import LEFT, RIGHT
-from .normative import DEFAULT_NORM, NormativeSet, load_norm
+from .normative import (
+    BODY_ANGLES,
+    DEFAULT_NORM,
+    NINE_ANGLES,
+    THREE_ANGLES,
+    NormativeSet,
+    check_degrees,
+    load_norm,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,8 +45,16 @@ class GdiParams:
     min_explained: float = 0.5
 
 
-GDI_MODEL = "pbl-2025-three-angles"
-GDI_PARAMSETS: dict[str, Paramset] = {GDI_MODEL: Paramset.of("gdi", GDI_MODEL, 1, GdiParams())}
+#: The paper's index, and the original one (Schwartz & Rozumalski 2008).
+GDI_MODEL, GILLETTE_MODEL = "pbl-2025-three-angles", "gillette-2008"
+#: Angles that an index is made of.
+MODEL_ANGLES: dict[str, tuple[str, ...]] = {GDI_MODEL: THREE_ANGLES, GILLETTE_MODEL: NINE_ANGLES}
+#: Version 1 of the index of three angles had the norm `gillette-166-three-angles`.
+GDI_PARAMSETS: dict[str, Paramset] = {
+    GDI_MODEL: Paramset.of("gdi", GDI_MODEL, 2, GdiParams()),
+    GILLETTE_MODEL: Paramset.of("gdi", GILLETTE_MODEL, 1, GdiParams(norm="gillette-166-nine-angles")),
+}
+_NAMES = {GDI_MODEL: "GDI of three angles", GILLETTE_MODEL: "GDI (Schwartz & Rozumalski 2008)"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +74,8 @@ class GdiCycle:
 class Gdi:
     """The index of one trial or session: means over used cycles, None where too few (`reason`).
 
-    `mean` is over all cycles of both sides, `n` of them. Status PASS or EMPTY.
+    `mean` is over all cycles of both sides, `n` of them. Status PASS or EMPTY. `profile` says which angle deviates by
+    how much, None where there is no index.
     """
 
     status: str
@@ -72,6 +91,12 @@ class Gdi:
     params_hash: str
     cycles: tuple[GdiCycle, ...]
     qc: tuple[Check, ...]
+    profile: MovementProfile | None = None
+
+    @property
+    def title(self) -> str:
+        """The index by a name that says which of the two it is."""
+        return _NAMES.get(self.model, self.model)
 
     def to_dict(self) -> dict:
         """`gdi` of metrics.json."""
@@ -80,17 +105,24 @@ class Gdi:
 
 
 def score_gdi(
-    cycles: Sequence[GaitCycle], norm: NormativeSet | str | None = None, params: GdiParams | None = None
+    cycles: Sequence[GaitCycle],
+    norm: NormativeSet | str | None = None,
+    params: GdiParams | None = None,
+    model: str | None = None,
+    version: int | None = None,
 ) -> Gdi:
-    """Gait Deviation Index of three angles over the used cycles of one or several trials.
+    """Gait Deviation Index over the used cycles of one or several trials.
 
-    Each cycle's hip flexion, hip adduction and knee flexion at 0, 2, ..., 98 % make a vector of 150; the Euclidean
-    distance of its normative component scores to the normative mean, logarithm, standardised by the normative
-    cycles, GDI = 100 - 10 z (Schwartz & Rozumalski 2008, Gait & Posture 28:351-357). 100 is normative, each 10 points
-    one normative standard deviation. It is not the original index of nine angles and must not be compared with it.
+    Each cycle's curves of the norm's angles make a vector; the Euclidean distance of its normative component scores to
+    the normative mean, logarithm, standardised by the normative cycles, GDI = 100 - 10 z (Schwartz & Rozumalski 2008,
+    Gait & Posture 28:351-357). 100 is normative, each 10 points one normative standard deviation.
 
-    The components come from the normative vectors alone (the paper pools them with the patients'), so deviations in
-    directions in which healthy people do not vary are not counted; `GdiCycle.explained` says how much was.
+    `gillette-2008` is the original: nine angles at 51 points, the 15 published features. `pbl-2025-three-angles` is the
+    paper's: hip flexion, hip adduction and knee flexion at 0, 2, ..., 98 %, principal components. The two must not be
+    compared with each other.
+
+    The components come from the norm, so deviations in directions in which its people do not vary are not counted;
+    `GdiCycle.explained` says how much was.
 
     Parameters
     ----------
@@ -98,24 +130,41 @@ def score_gdi(
         Only cycles with `used` and with curves count.
     norm
         A set or its name; None for that of `params`.
+    params
+        None for those of `model`.
+    model, version
+        A name of `GDI_PARAMSETS`, which decides the angles, and its version (None: the newest). Without it the norm's
+        angles decide; a norm of other angles than the two indices have gives an index of its own name.
 
     Raises
     ------
     PblError
-        NORM_UNKNOWN, NORM_INVALID.
+        NORM_UNKNOWN; NORM_INVALID where the norm has not the model's angles; SOLVER_UNKNOWN for another model;
+        ANGLE_UNITS for curves that are not in degrees.
     """
-    params = params or GdiParams()
+    if model is not None and model not in GDI_PARAMSETS:
+        raise _unknown_model(model)
+    if params is None:
+        params = GDI_PARAMSETS[model].to(GdiParams) if model else GdiParams()
     if norm is None:
         norm = params.norm
     basis = load_norm(norm) if isinstance(norm, str) else norm
-    paramset = Paramset.of("gdi", GDI_MODEL, 1, dataclasses.replace(params, norm=basis.name))
+    model = _model_of(basis, model)
+    version = version or (GDI_PARAMSETS[model].version if model in GDI_PARAMSETS else 1)
+    paramset = Paramset.of("gdi", model, version, dataclasses.replace(params, norm=basis.name))
     usable = [c for c in cycles if c.used and all(v in c.curves for v in basis.variables)]
-    scored = tuple(_score(c, basis) for c in usable)
+    vectors = [_vector(c, basis) for c in usable]
+    scored = tuple(_score(c, v, basis) for c, v in zip(usable, vectors, strict=True))
     by_side = {side: [c.gdi for c in scored if c.side == side] for side in (LEFT, RIGHT)}
     left, right = (float(np.mean(by_side[s])) if by_side[s] else None for s in (LEFT, RIGHT))
     n_left, n_right = len(by_side[LEFT]), len(by_side[RIGHT])
     enough = min(n_left, n_right) >= params.min_cycles_per_side
     reason = "" if enough else _too_few(cycles, n_left, n_right, params)
+    profile = None
+    if enough:
+        scores = variable_scores(np.array(vectors), basis)
+        sides = np.array([c.side for c in usable])
+        profile = movement_profile({s: scores[sides == s] for s in (LEFT, RIGHT)}, basis)
     return Gdi(
         status=PASS if enough else EMPTY,
         reason=reason,
@@ -126,10 +175,11 @@ def score_gdi(
         n_left=n_left,
         n_right=n_right,
         norm=basis.name,
-        model=GDI_MODEL,
+        model=model,
         params_hash=paramset.hash,
         cycles=scored,
-        qc=_checks(scored, enough, reason, params),
+        qc=_checks(scored, {c.angle_model for c in usable}, basis, reason, params),
+        profile=profile,
     )
 
 
@@ -139,14 +189,41 @@ def gdi_vector(cycle: GaitCycle, norm: NormativeSet) -> np.ndarray:
     return np.concatenate([np.interp(norm.percent, phase, cycle.curves[v]) for v in norm.variables])
 
 
-def _score(cycle: GaitCycle, norm: NormativeSet) -> GdiCycle:
-    vector = gdi_vector(cycle, norm)
+def _vector(cycle: GaitCycle, norm: NormativeSet) -> np.ndarray:
+    check_degrees(np.concatenate([cycle.curves[v] for v in norm.variables]), f"{cycle.trial}, cycle {cycle.number}")
+    return gdi_vector(cycle, norm)
+
+
+def _score(cycle: GaitCycle, vector: np.ndarray, norm: NormativeSet) -> GdiCycle:
     deviation = vector - norm.mean_deg
     inside = norm.components @ deviation
     total = float(deviation @ deviation)
     z = float((norm.log_distance(vector)[0] - norm.ln_mean) / norm.ln_sd)
     explained = float(inside @ inside) / total if total > 0 else 1.0
     return GdiCycle(cycle.trial, cycle.number, cycle.side, float(norm.index(vector)[0]), z, explained)
+
+
+def _model_of(norm: NormativeSet, model: str | None) -> str:
+    fitting = next((m for m, angles in MODEL_ANGLES.items() if angles == norm.variables), None)
+    if model is None:
+        return fitting or f"index of {len(norm.variables)} angles"
+    if fitting != model:
+        raise PblError(
+            "NORM_INVALID",
+            found=f"normative set {norm.name} of {len(norm.variables)} angles for {model}",
+            expected=f"a set of {', '.join(MODEL_ANGLES[model])}, in this order",
+            next_step=f"leave the set out ({GDI_PARAMSETS[model].params['norm']} is the model's own), or build one",
+        )
+    return model
+
+
+def _unknown_model(model: str) -> PblError:
+    return PblError(
+        "SOLVER_UNKNOWN",
+        found=f"index {model!r}",
+        expected=f"one of {', '.join(GDI_PARAMSETS)}",
+        next_step="choose one of the names above",
+    )
 
 
 def _too_few(cycles: Sequence[GaitCycle], n_left: int, n_right: int, params: GdiParams) -> str:
@@ -160,21 +237,15 @@ def _too_few(cycles: Sequence[GaitCycle], n_left: int, n_right: int, params: Gdi
     return text + (f" ({'; '.join(missing)})" if missing else "")
 
 
-def _checks(scored: Sequence[GdiCycle], enough: bool, reason: str, params: GdiParams) -> tuple[Check, ...]:
-    if not enough:
+def _checks(
+    scored: Sequence[GdiCycle], angle_models: set[str], norm: NormativeSet, reason: str, params: GdiParams
+) -> tuple[Check, ...]:
+    if reason:
         return (Check("gdi_cycles", EMPTY, float(len(scored)), float(2 * params.min_cycles_per_side), reason),)
     few = len(scored) < params.advised_cycles
     share = float(np.mean([c.explained for c in scored]))
     return (
-        Check(
-            "norm_convention",
-            WARN,
-            None,
-            None,
-            "the normative angles come from a laboratory marker model, ours from the fitted OpenSim body, whose pelvis "
-            "and hip axes differ by constant offsets (hip flexion most): compare sessions with each other, do not read "
-            "a single value against 100",
-        ),
+        _convention(angle_models, norm),
         Check(
             "gdi_cycles",
             WARN if few else PASS,
@@ -192,3 +263,23 @@ def _checks(scored: Sequence[GdiCycle], enough: bool, reason: str, params: GdiPa
             else "most of the deviation is of a kind that healthy walking does not show: the index understates it",
         ),
     )
+
+
+def _convention(angle_models: set[str], norm: NormativeSet) -> Check:
+    """Whether the angles of cycles and norm mean the same."""
+    advice = ""
+    if len(angle_models) > 1:
+        advice = "cycles of several ways of measuring are mixed: score those of the laboratory and of the video apart"
+    elif angle_models != {norm.angle_model}:
+        advice = (
+            f"the angles of the norm are defined otherwise ({norm.angle_model}) than those of the cycles "
+            f"({next(iter(angle_models))}): pelvis tilt and hip flexion differ by a constant. Compare sessions with "
+            "each other, do not read a single value against 100, or take a norm of the same definition"
+        )
+    elif norm.angle_model == BODY_ANGLES and "mapped" in norm.convention:
+        advice = (
+            "the norm was measured with a laboratory's marker model and mapped to the fitted body's angles by a "
+            "constant; what else differs (hip joint centres, age, a person's own pelvis) is in the index. Changes "
+            "between sessions hold better than a single value against 100"
+        )
+    return Check("norm_convention", WARN if advice else PASS, None, None, advice)

@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import Paramset
@@ -14,7 +14,8 @@ from pbl_pipeline.qc import EMPTY, OUTCOMES, PASS, WARN, Check, in_session, wors
 
 from ._cycles import GaitCycle, find_cycles
 from ._feet import feet_from_fit
-from ._gdi import Gdi, GdiParams, score_gdi
+from ._gdi import GDI_MODEL, GDI_PARAMSETS, GILLETTE_MODEL, Gdi, GdiParams, score_gdi
+from ._laboratory import LabTrial
 from ._poses import trial_poses
 from ._spatiotemporal import MEASURES, Spatiotemporal, spatiotemporal
 from .events import EventParams, GaitEvents, detect_events
@@ -101,9 +102,10 @@ class GaitMetrics:
             else:
                 lines.append(f"{name:<24}{_cell(m.left)}{_cell(m.right)}{_cell(m.mean)}{_cell(m.sd, 8)}{m.n:>5}")
         g = self.gdi
-        lines.append(
-            f"{'GDI of three angles':<24}{_cell(g.left)}{_cell(g.right)}{_cell(g.mean)}{'':>8}{g.n:>5}  {g.reason}"
-        )
+        lines.append(f"{_short(g):<24}{_cell(g.left)}{_cell(g.right)}{_cell(g.mean)}{'':>8}{g.n:>5}  {g.reason}")
+        if g.profile is not None and g.profile.gps is not None:
+            p = g.profile
+            lines.append(f"{'GPS (deg)':<24}{_cell(p.gps_left)}{_cell(p.gps_right)}{_cell(p.gps)}")
         lines.append(f"quality checks: {self.outcome}")
         lines += [f"{c.outcome} {c.check}: {c.advice}" for c in self.checks if c.advice]
         return "\n".join(line.rstrip() for line in lines)
@@ -114,12 +116,17 @@ class GaitMetrics:
 
 
 def gait_metrics(
-    trials: Sequence[TrialFit],
+    trials: Sequence[TrialFit | LabTrial],
     norm: NormativeSet | str | None = None,
     params: GaitParams | None = None,
     fit_checks: Sequence[Check] = (),
+    model: str | None = None,
+    version: int | None = None,
 ) -> GaitMetrics:
     """Measures of the trials of one session and of the session (all used cycles of all trials pooled).
+
+    Trials are fits, or recordings of a laboratory, whose first and last steps in view count. `model` and `version` are
+    those of `score_gdi`.
 
     A trial without walking has status EMPTY and takes no part in the session; the session is EMPTY where no trial
     has a used cycle. Where one of `fit_checks`, the checks of the session fit, FAILs, there is none: measures and index
@@ -129,13 +136,14 @@ def gait_metrics(
         raise PblError(
             "GAIT_INPUT", found="no trial", expected="at least one fitted trial", next_step="pass fit.npz files"
         )
-    params = params or GaitParams()
+    params = params or GaitParams(gdi=GDI_PARAMSETS[model].to(GdiParams) if model in GDI_PARAMSETS else GdiParams())
     wanted = params.gdi.norm if norm is None else norm
     basis = load_norm(wanted) if isinstance(wanted, str) else wanted
-    done = tuple(_trial(fit, basis, params, fit_checks) for fit in trials)
+    index = {"norm": basis, "params": params.gdi, "model": model, "version": version}
+    done = tuple(_trial(t, params.events, index, fit_checks) for t in trials)
     cycles = [c for t in done for c in t.cycles]
     # Two trials may carry one name; their cycles are told apart by it.
-    measures, gdi = spatiotemporal(_distinct(done)), score_gdi(cycles, basis, params.gdi)
+    measures, gdi = spatiotemporal(_distinct(done)), score_gdi(cycles, **index)
     status = PASS if measures.status == PASS else EMPTY
     reason = "" if status == PASS else "; ".join(dict.fromkeys(f"{t.name}: {t.reason}" for t in done))
     return GaitMetrics(
@@ -149,14 +157,20 @@ def gait_metrics(
     )
 
 
-def _trial(fit: TrialFit, norm: NormativeSet, params: GaitParams, fit_checks: Sequence[Check]) -> TrialMetrics:
-    poses = trial_poses(fit)
-    events = detect_events(feet_from_fit(fit, poses), params.events)
-    cycles = find_cycles(events, fit, poses=poses, fit_checks=fit_checks)
-    measures, gdi = spatiotemporal(cycles), score_gdi(cycles, norm, params.gdi)
+def _trial(
+    trial: TrialFit | LabTrial, event_params: EventParams, index: dict[str, Any], fit_checks: Sequence[Check]
+) -> TrialMetrics:
+    if isinstance(trial, LabTrial):
+        events = trial.events
+        cycles = find_cycles(events, trial=trial.name, series=trial.series, feet=trial.feet, keep_ends=True)
+    else:
+        poses = trial_poses(trial)
+        events = detect_events(feet_from_fit(trial, poses), event_params)
+        cycles = find_cycles(events, trial, poses=poses, fit_checks=fit_checks)
+    measures, gdi = spatiotemporal(cycles), score_gdi(cycles, **index)
     reason = events.reason or measures.reason
     return TrialMetrics(
-        name=fit.name,
+        name=trial.name,
         status=EMPTY if reason else PASS,
         reason=reason,
         events=events,
@@ -172,7 +186,8 @@ def _distinct(trials: Sequence[TrialMetrics]) -> list[GaitCycle]:
 
 
 def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple[Check, ...]:
-    """Checks of the cycles that `measures` were made of: `cycles_used`, `cycles_of_odd_length`, `cadence_plausible`."""
+    """Checks of the cycles that `measures` were made of: `cycles_used`, `cycles_of_odd_length`,
+    `cycles_of_odd_curves`, `cadence_plausible`, `lengths_scale`."""
     odd = sum(c.odd_length for c in cycles)
     lengths = Check(
         "cycles_of_odd_length",
@@ -180,6 +195,16 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
         float(odd),
         0.0,
         "a step was missed or invented, or the person paused: left out of the measures, see the overlay" if odd else "",
+    )
+    unlike = sum(c.odd_curves for c in cycles)
+    curves = Check(
+        "cycles_of_odd_curves",
+        WARN if unlike else PASS,
+        float(unlike),
+        0.0,
+        "their angles are far from those of the other cycles: left out of the measures, see the overlay"
+        if unlike
+        else "",
     )
     if measures.status == EMPTY:
         return (Check("cycles_used", EMPTY, 0.0, 1.0, measures.reason), *((lengths,) if odd else ()))
@@ -193,6 +218,7 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
             "few cycles: film a longer stretch, or several passes" if few else "",
         ),
         lengths,
+        curves,
     ]
     cadence = measures["cadence_steps_per_min"]
     if cadence is not None:
@@ -206,7 +232,25 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
                 "" if plausible else "unusual for walking: count the steps in the overlay",
             )
         )
+    if measures["stride_length_m"] is not None:
+        guessed = any(c.used and c.lengths.stride_length_m is not None and not c.lengths.metric for c in cycles)
+        checks.append(
+            Check(
+                "lengths_scale",
+                WARN if guessed else PASS,
+                None,
+                None,
+                "lengths and speed are as large as the detector takes the person to be (one camera sees no scale): "
+                "compare sessions of one person, not persons"
+                if guessed
+                else "",
+            )
+        )
     return tuple(checks)
+
+
+def _short(gdi: Gdi) -> str:
+    return {GDI_MODEL: "GDI of three angles", GILLETTE_MODEL: "GDI of nine angles"}.get(gdi.model, gdi.model)
 
 
 def _cell(value: float | None, width: int = 9) -> str:
@@ -224,6 +268,7 @@ def _measures(part: TrialMetrics | GaitMetrics) -> dict:
         "reason": part.reason,
         **table,
         "gdi": part.gdi.to_dict(),
+        "profile_deg": None if part.gdi.profile is None else part.gdi.profile.to_dict(),
         "reasons": reasons,
         "cycles": {"found": values.n_cycles_found, "used": values.n_cycles_used},
         "outcome": worst(part.qc),

@@ -1,4 +1,4 @@
-"""Cadence, stride and step time, stance, swing and double support from cycles."""
+"""Cadence, stride and step time, stance, swing, support, lengths and speed from cycles; their spread and asymmetry."""
 
 from __future__ import annotations
 
@@ -15,26 +15,50 @@ MEASURES: tuple[str, ...] = (
     "cadence_steps_per_min",
     "stride_time_s",
     "step_time_s",
+    "stance_time_s",
+    "swing_time_s",
     "stance_percent",
     "swing_percent",
+    "single_support_percent",
     "double_support_percent",
     "double_support_time_s",
     "speed_m_per_s",
     "stride_length_m",
+    "step_length_m",
     "step_width_m",
 )
-_NO_SCALE = "the absolute scale of a single camera is not validated in this version"
+#: Measures that need to know where the feet stand on the floor.
+LENGTHS = ("speed_m_per_s", "stride_length_m", "step_length_m", "step_width_m")
+#: Measures of one leg, of which left and right may differ: those that have an asymmetry.
+SIDED = (
+    "step_time_s",
+    "stance_time_s",
+    "swing_time_s",
+    "stance_percent",
+    "swing_percent",
+    "single_support_percent",
+    "step_length_m",
+)
+NO_WIDTH = "one camera does not tell it: on synthetic walkers it comes out up to 4 cm too wide"
 
 
 @dataclasses.dataclass(frozen=True)
 class Measure:
-    """Mean and sd (n - 1; None for one value) over the n values of both sides; `left`, `right` are means of a side."""
+    """Mean and sd (n - 1; None for one value) over the n values of both sides; `left`, `right` are means of a side.
+
+    `variability` is the sd within a side, both sides together: the root of the mean of their variances (n - 1), which
+    an asymmetry does not touch; None with fewer than two values of a side. `cv_percent` is that in percent of the mean.
+    `asymmetry_percent` is 100 (right - left) / ((right + left) / 2), None for measures that are not `SIDED`.
+    """
 
     left: float | None
     right: float | None
     mean: float
     sd: float | None
     n: int
+    variability: float | None = None
+    cv_percent: float | None = None
+    asymmetry_percent: float | None = None
 
     def to_dict(self) -> dict:
         return {k: round(v, 4) if isinstance(v, float) else v for k, v in dataclasses.asdict(self).items()}
@@ -56,45 +80,65 @@ class Spatiotemporal:
     n_steps_used: int
 
     def __getitem__(self, name: str) -> Measure | None:
-        return self.measures[name]
+        return self.measures.get(name)
 
 
 def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
     """Measures over the used cycles of one or several trials (formulas and sources in docs/measures.md).
 
     For a cycle with foot down D, opposite foot up U', opposite foot down D', foot up U, next foot down E:
-    stride time E - D; stance 100 (U - D) / (E - D); swing 100 - stance; double support time (U' - D) + (U - D');
-    double support the same in percent of the stride; cadence 120 / (E - D). Step time is between successive foot downs
-    and belongs to the side that lands: D' - D is a step of the other side, E - D' one of this side; a step that is
-    part of two cycles counts once.
+    stride time E - D; stance U - D and swing E - U, also in percent of the stride; single support
+    100 (D' - U') / (E - D); double support time (U' - D) + (U - D'), also in percent; cadence 120 / (E - D). Step time
+    is between successive foot downs and belongs to the side that lands: D' - D is a step of the other side, E - D' one
+    of this side; a step that is part of two cycles counts once. Lengths are those of `cycle_lengths`, speed is stride
+    length by stride time.
 
     Status EMPTY with a reason where no cycle is used.
     """
     used = [c for c in cycles if c.used]
-    reasons: dict[str, str] = dict.fromkeys(MEASURES[-3:], _NO_SCALE)
+    reasons: dict[str, str] = {}
     measures: dict[str, Measure | None] = dict.fromkeys(MEASURES)
     if not used:
         reason = _none_used(cycles)
-        reasons.update(dict.fromkeys(MEASURES[:-3], reason))
-        return Spatiotemporal("EMPTY", reason, measures, reasons, len(cycles), 0, 0)
-    by_cycle: dict[str, list[tuple[str, float]]] = {name: [] for name in MEASURES[:-3]}
+        return Spatiotemporal("EMPTY", reason, measures, dict.fromkeys(MEASURES, reason), len(cycles), 0, 0)
+    by_cycle: dict[str, list[tuple[str, float]]] = {name: [] for name in MEASURES}
     steps: dict[tuple[str, str, float], float] = {}
     for c in used:
-        stride = c.stride_time_s
-        both = (c.opposite_foot_up_s - c.start_s) + (c.foot_up_s - c.opposite_foot_down_s)
-        stance = 100.0 * (c.foot_up_s - c.start_s) / stride
-        by_cycle["cadence_steps_per_min"].append(("", 120.0 / stride))
-        by_cycle["stride_time_s"].append((c.side, stride))
-        by_cycle["stance_percent"].append((c.side, stance))
-        by_cycle["swing_percent"].append((c.side, 100.0 - stance))
-        by_cycle["double_support_time_s"].append((c.side, both))
-        by_cycle["double_support_percent"].append((c.side, 100.0 * both / stride))
+        for name, value in _of_cycle(c).items():
+            by_cycle[name].append(("" if name == "cadence_steps_per_min" else c.side, value))
         other = RIGHT if c.side == LEFT else LEFT
         steps[c.trial, other, c.opposite_foot_down_s] = c.opposite_foot_down_s - c.start_s
         steps[c.trial, c.side, c.end_s] = c.end_s - c.opposite_foot_down_s
     by_cycle["step_time_s"] = [(side, value) for (_, side, _), value in steps.items()]
-    measures.update({name: _measure(values) for name, values in by_cycle.items()})
+    measures.update({name: _measure(name, values) for name, values in by_cycle.items() if values})
+    for name in LENGTHS:
+        if measures[name] is None:
+            reasons[name] = _no_length(name, used)
     return Spatiotemporal("PASS", "", measures, reasons, len(cycles), len(used), len(steps))
+
+
+def _of_cycle(c: GaitCycle) -> dict[str, float]:
+    """All measures of one cycle but its step times; what is not known is left out."""
+    stride, stance = c.stride_time_s, c.foot_up_s - c.start_s
+    both = (c.opposite_foot_up_s - c.start_s) + (c.foot_up_s - c.opposite_foot_down_s)
+    alone = c.opposite_foot_down_s - c.opposite_foot_up_s
+    values = {
+        "cadence_steps_per_min": 120.0 / stride,
+        "stride_time_s": stride,
+        "stance_time_s": stance,
+        "swing_time_s": stride - stance,
+        "stance_percent": 100.0 * stance / stride,
+        "swing_percent": 100.0 - 100.0 * stance / stride,
+        "single_support_percent": 100.0 * alone / stride,
+        "double_support_percent": 100.0 * both / stride,
+        "double_support_time_s": both,
+    }
+    if c.lengths.stride_length_m is not None:
+        values["speed_m_per_s"] = c.lengths.stride_length_m / stride
+    for name in LENGTHS[1:]:
+        if (length := getattr(c.lengths, name)) is not None:
+            values[name] = length
+    return values
 
 
 def _none_used(cycles: Sequence[GaitCycle]) -> str:
@@ -106,9 +150,24 @@ def _none_used(cycles: Sequence[GaitCycle]) -> str:
     return f"{len(cycles)} gait cycles, none left without the first and last step{odd}"
 
 
-def _measure(values: Sequence[tuple[str, float]]) -> Measure:
+def _no_length(name: str, used: Sequence[GaitCycle]) -> str:
+    if name == "step_width_m" and any(c.lengths.stride_length_m is not None for c in used):
+        return NO_WIDTH
+    return "; ".join(sorted({c.lengths.missing for c in used if c.lengths.missing})) or "not known"
+
+
+def _measure(name: str, values: Sequence[tuple[str, float]]) -> Measure:
     numbers = np.array([v for _, v in values])
     by_side = {side: [v for s, v in values if s == side] for side in (LEFT, RIGHT)}
     left, right = (float(np.mean(by_side[s])) if by_side[s] else None for s in (LEFT, RIGHT))
+    mean = float(numbers.mean())
     sd = float(np.std(numbers, ddof=1)) if len(numbers) > 1 else None
-    return Measure(left, right, float(numbers.mean()), sd, len(numbers))
+    # A measure without sides (cadence) has one group.
+    groups = list(by_side.values()) if left is not None or right is not None else [list(numbers)]
+    enough = all(len(g) > 1 for g in groups)
+    within = float(np.sqrt(np.mean([np.var(g, ddof=1) for g in groups]))) if enough else None
+    share = None if within is None or mean == 0 else 100.0 * within / abs(mean)
+    asymmetry = None
+    if name in SIDED and left is not None and right is not None and left + right != 0:
+        asymmetry = 100.0 * (right - left) / (0.5 * (right + left))
+    return Measure(left, right, mean, sd, len(numbers), within, share, asymmetry)

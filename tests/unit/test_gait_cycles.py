@@ -89,15 +89,45 @@ def test_measures_by_hand():
     # Right stance: down at 0, right foot up 0.12 s after left foot down at 0.6 -> 0.72 s.
     assert of(result, "stance_percent").right == pytest.approx(100 * 0.72 / 1.1)
     assert of(result, "swing_percent").left == pytest.approx(100 * 0.50 / 1.1)
+    # The left foot stands alone while the right one swings: from 0.12 to 0.50 s; the right one from 0.10 to 0.60 s.
+    assert of(result, "single_support_percent").left == pytest.approx(100 * 0.38 / 1.1)
+    assert of(result, "single_support_percent").right == pytest.approx(100 * 0.50 / 1.1)
+    assert of(result, "stance_time_s").right == pytest.approx(0.72)
+    assert of(result, "swing_time_s").left == pytest.approx(0.50)
     assert of(result, "double_support_time_s").mean == pytest.approx(0.22)
     assert of(result, "double_support_percent").mean == pytest.approx(20.0)
 
 
-def test_what_needs_a_scale_is_none_with_a_reason():
+def test_lengths_without_positions_are_none_with_a_reason():
     result = spatiotemporal(find_cycles(EVENTS))
-    for name in ("speed_m_per_s", "stride_length_m", "step_width_m"):
+    for name in ("speed_m_per_s", "stride_length_m", "step_length_m", "step_width_m"):
         assert result[name] is None
-        assert "scale" in result.reasons[name]
+        assert "positions" in result.reasons[name]
+
+
+def test_asymmetry_is_not_variability():
+    result = spatiotemporal(find_cycles(EVENTS))
+    step = of(result, "step_time_s")
+    # Steps of 0.6 and 0.5 s that never vary: 100 (0.5 - 0.6) / 0.55.
+    assert step.asymmetry_percent == pytest.approx(-18.1818, abs=1e-4)
+    assert (step.variability, step.cv_percent) == pytest.approx((0.0, 0.0), abs=1e-9)
+    assert step.sd == pytest.approx(0.0547723, abs=1e-6)
+    assert of(result, "stride_time_s").asymmetry_percent is None
+    assert of(result, "cadence_steps_per_min").asymmetry_percent is None
+
+
+def test_variability_is_the_mean_variance_of_the_sides():
+    # Steps (landing left, right) in s: 0.60 0.50 0.62 0.50 0.58 0.54; first and last are dropped.
+    times = np.cumsum([1.0, 0.5, 0.60, 0.50, 0.62, 0.50, 0.58, 0.54, 0.60]).tolist()
+    result = spatiotemporal(find_cycles(steps([t - 0.5 for t in times])))
+    step = of(result, "step_time_s")
+    left, right = [0.60, 0.62, 0.58], [0.50, 0.50, 0.54]
+    assert (step.left, step.right, step.n) == pytest.approx((0.6, np.mean(right), 6))
+    # Variances (n - 1): left 0.0004, right 0.16 / 300 = 0.00053333; root of their mean.
+    assert step.variability == pytest.approx(np.sqrt((0.0004 + 0.00053333) / 2), abs=1e-6)
+    assert step.cv_percent == pytest.approx(100 * 0.0216025 / np.mean(left + right), abs=1e-3)
+    one = spatiotemporal(find_cycles(EVENTS[:10]))
+    assert of(one, "stride_time_s").variability is None
 
 
 @pytest.mark.parametrize(
@@ -112,6 +142,14 @@ def test_counts_of_short_walks(n_downs, found, used):
         assert all(result[name] is None and result.reasons[name] for name in result.measures)
     if used == 1:
         assert of(result, "stride_time_s").sd is None
+
+
+def test_a_laboratory_keeps_the_ends():
+    cycles = find_cycles(EVENTS, keep_ends=True)
+    assert [c.used for c in cycles] == [True] * 6
+    # The rule of odd lengths holds all the same.
+    late = [GaitEvent(e.time_s + (0.9 if e.time_s > 4.2 else 0), e.side, e.event, 1.0) for e in EVENTS]
+    assert [c.used for c in find_cycles(late, keep_ends=True)] == [True, True, True, True, False, False]
 
 
 def test_each_bout_loses_its_ends():

@@ -10,8 +10,17 @@ import pytest
 from scipy.io import loadmat
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.gait import GaitCycle, GdiParams, fit_norm, load_norm, norm_names, score_gdi
-from pbl_pipeline.gait.build_norm import GILLETTE_ORDER, THREE_ANGLES, build_gillette, gillette_vectors
+from pbl_pipeline.gait import (
+    NINE_ANGLES,
+    THREE_ANGLES,
+    GaitCycle,
+    GdiParams,
+    fit_norm,
+    load_norm,
+    norm_names,
+    score_gdi,
+)
+from pbl_pipeline.gait.build_norm import build_gillette, gillette_vectors
 
 PERCENT = np.linspace(0, 98, 50)
 ABOUT = {"name": "toy", "version": 1, "source": "made up", "licence": "none", "convention": "none"}
@@ -123,7 +132,8 @@ def test_cycles_without_curves_are_named(toy):
     assert "frames are missing" in score_gdi([bare], toy).reason
 
 
-def test_the_convention_warning_stands_on_every_result(toy):
+def test_norms_of_another_convention_are_warned_of(toy):
+    # The toy norm is of a laboratory's model, the cycles of the fitted body.
     result = score_gdi([cycle(toy.mean_deg + 3), cycle(toy.mean_deg + 3, "right")], toy)
     checks = {c.check: c for c in result.qc}
     assert checks["norm_convention"].outcome == "WARN"
@@ -135,7 +145,7 @@ def test_bad_norms(toy):
     wrong = [
         toy_vectors(10),
         toy_vectors()[:, :149],
-        np.ones((40, 150)),
+        np.full((40, 150), 20.0),
         np.where(np.eye(80, 150), np.nan, toy_vectors()),
     ]
     for vectors in wrong:
@@ -163,10 +173,10 @@ def test_a_changed_file_is_refused(toy, tmp_path):
 
 
 def test_the_set_that_ships():
-    norm = load_norm()
-    assert norm.name in norm_names()
+    norm = load_norm("gillette-166-three-angles")
+    assert set(norm_names()) == {"gillette-166-three-angles", "gillette-166-body-angles", "gillette-166-nine-angles"}
     assert (norm.n, norm.variables, norm.components.shape[1]) == (166, THREE_ANGLES, 150)
-    assert set(norm.curves) == set(GILLETTE_ORDER)
+    assert set(norm.curves) == set(NINE_ANGLES)
     assert all(band["mean_deg"].shape == (51,) for band in norm.curves.values())
     # Signs of normal walking: knee bends most in swing, hip extends before foot up, adducts in early stance.
     knee, hip, adduction = (norm.curves[n]["mean_deg"] for n in ("knee_flexion", "hip_flexion", "hip_adduction"))
@@ -179,7 +189,7 @@ def test_the_set_that_ships():
 
 def test_the_set_is_what_the_command_builds(shared_data):
     source = shared_data / "real" / "gdi_gillette" / "GDI_Calc_Fast_Data.mat"
-    shipped, built = load_norm(), build_gillette(source)
+    shipped, built = load_norm("gillette-166-three-angles"), build_gillette(source)
     assert shipped.source_sha256 == built.source_sha256
     np.testing.assert_allclose(shipped.mean_deg, built.mean_deg, rtol=1e-6)
     np.testing.assert_allclose(shipped.components, built.components, atol=1e-6)

@@ -15,9 +15,12 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import canonical_json
 
+from ._conventions import ANGLE_MODELS, PLUG_IN_GAIT, check_degrees
+
 #: Fewest normative vectors that can carry mean and sd of the log distance.
 MIN_VECTORS = 30
-DEFAULT_NORM = "gillette-166-three-angles"
+#: The controls' three angles as the fitted body's joints count them.
+DEFAULT_NORM = "gillette-166-body-angles"
 _FOLDER = resources.files("pbl_pipeline.gait.normative").joinpath("data")
 
 
@@ -31,6 +34,8 @@ class NormativeSet:
         Identity, number of normative vectors, where they are from, how their angles are defined.
     variables
         Names of the angles in the feature vector (`ANGLE_NAMES`), in order, each at `percent` of the cycle.
+    angle_model
+        How the angles of the vectors are defined, one of `ANGLE_MODELS`.
     percent : (P,)
     mean_deg : (V * P,)
         Mean normative vector.
@@ -67,6 +72,7 @@ class NormativeSet:
     curves: dict[str, dict[str, np.ndarray]]
     source_sha256: str = ""
     sha256: str = ""
+    angle_model: str = PLUG_IN_GAIT
 
     def log_distance(self, vectors: np.ndarray) -> np.ndarray:
         """ln of the Euclidean distance of the component scores of (N, V * P) vectors to the normative mean."""
@@ -78,11 +84,15 @@ class NormativeSet:
         """100 - 10 z of (N, V * P) vectors: 100 is the normative mean, 10 one normative standard deviation."""
         return 100.0 - 10.0 * (self.log_distance(vectors) - self.ln_mean) / self.ln_sd
 
-    def save(self, path: str | Path) -> None:
-        """Write the set as JSON with 7 significant digits and the checksum of what was written."""
-        text = _to_json(self)
+    def save(self, path: str | Path, digits: int | None = 7) -> str:
+        """Write the set as JSON with the checksum of what was written, and return that (SHA-256).
+
+        `digits` significant digits; None writes every number whole (an index to 1e-6 needs it).
+        """
+        text = _to_json(self, digits)
         text["sha256"] = _checksum(text)
         Path(path).write_text(json.dumps(text, indent=None, separators=(",", ":")).replace(',"', ',\n"') + "\n")
+        return text["sha256"]
 
 
 def fit_norm(
@@ -97,29 +107,38 @@ def fit_norm(
     convention: str,
     curves: dict[str, dict[str, np.ndarray]] | None = None,
     variance: float = 0.95,
+    n_components: int | None = None,
+    pooled: np.ndarray | None = None,
+    angle_model: str = PLUG_IN_GAIT,
     source_sha256: str = "",
 ) -> NormativeSet:
     """Principal components that explain `variance` of normative vectors (N, V * P), and their log distances.
 
     Schwartz & Rozumalski 2008 (Gait & Posture 28:351-357) for the index; components of the covariance matrix of the
-    normative vectors alone. Raises `PblError` NORM_INVALID for too few vectors, another length or values that are
-    not finite.
+    normative vectors alone or, as in the paper, of these together with the vectors `pooled` (M, V * P) of patients:
+    mean and log distances are those of the normative vectors either way. `n_components` stands for `variance`.
+
+    Raises
+    ------
+    PblError
+        NORM_INVALID for too few vectors, no more vectors than components, another length or values that are not
+        finite; ANGLE_UNITS.
     """
-    vectors = np.asarray(vectors, float)
-    length = len(variables) * len(percent)
-    if vectors.ndim != 2 or vectors.shape[1] != length:
-        raise _invalid(f"vectors of shape {vectors.shape}", f"(N, {length}): {len(variables)} angles x {len(percent)}")
+    vectors = _vectors(vectors, variables, percent)
     if len(vectors) < MIN_VECTORS:
         raise _invalid(f"{len(vectors)} vectors", f"at least {MIN_VECTORS}")
-    if not np.all(np.isfinite(vectors)):
-        raise _invalid("values that are not finite", "complete curves")
+    if angle_model not in ANGLE_MODELS:
+        raise _invalid(f"angle model {angle_model!r}", f"one of {', '.join(ANGLE_MODELS)}")
     mean = vectors.mean(axis=0)
-    _, singular, rows = np.linalg.svd(vectors - mean, full_matrices=False)
-    spread = singular**2 / (len(vectors) - 1)
+    everybody = vectors if pooled is None else np.vstack([vectors, _vectors(pooled, variables, percent)])
+    _, singular, rows = np.linalg.svd(everybody - everybody.mean(axis=0), full_matrices=False)
+    spread = singular**2 / (len(everybody) - 1)
     if not spread.sum() > 0:
         raise _invalid("vectors without any variance", "different people")
     share = np.cumsum(spread) / spread.sum()
-    k = int(np.searchsorted(share, variance - 1e-12) + 1)
+    k = n_components or int(np.searchsorted(share, variance - 1e-12) + 1)
+    if k >= len(vectors) or k > len(share):
+        raise _invalid(f"{len(vectors)} vectors for {k} components", "more normative vectors than components")
     components = rows[:k]
     # The sign of a component is arbitrary: fixed so that two machines write the same file.
     components = components * np.sign(components[np.arange(k), np.abs(components).argmax(axis=1)])[:, None]
@@ -141,7 +160,21 @@ def fit_norm(
         ln_sd=float(distance.std(ddof=1)),
         curves=curves or {},
         source_sha256=source_sha256,
+        angle_model=angle_model,
     )
+
+
+def _vectors(vectors: np.ndarray, variables: Sequence[str], percent: np.ndarray) -> np.ndarray:
+    """The vectors as (N, V * P) floats. Raises `PblError` NORM_INVALID, ANGLE_UNITS."""
+    vectors = np.asarray(vectors, float)
+    length = len(variables) * len(percent)
+    if vectors.ndim != 2 or vectors.shape[1] != length:
+        raise _invalid(f"vectors of shape {vectors.shape}", f"(N, {length}): {len(variables)} angles x {len(percent)}")
+    if not np.all(np.isfinite(vectors)):
+        raise _invalid("values that are not finite", "complete curves")
+    for i, vector in enumerate(vectors):
+        check_degrees(vector, f"normative vector {i}")
+    return vectors
 
 
 def norm_names() -> tuple[str, ...]:
@@ -173,23 +206,26 @@ def load_norm(name: str = DEFAULT_NORM) -> NormativeSet:
         raise _invalid(f"{name}: {error}", "a file that build_norm wrote, unchanged") from error
 
 
-def _to_json(norm: NormativeSet) -> dict:
+def _to_json(norm: NormativeSet, digits: int | None) -> dict:
     out = {}
     for field in dataclasses.fields(norm):
         if field.name != "sha256":
-            out[field.name] = _plain(getattr(norm, field.name))
+            out[field.name] = _plain(getattr(norm, field.name), digits)
+    # Left out where it is the default: the first sets were written before there was another.
+    if norm.angle_model == PLUG_IN_GAIT:
+        del out["angle_model"]
     return out
 
 
-def _plain(value: object) -> object:
+def _plain(value: object, digits: int | None) -> object:
     if isinstance(value, np.ndarray):
-        return [_plain(v) for v in value]
+        return [_plain(v, digits) for v in value]
     if isinstance(value, float | np.floating):
-        return float(f"{value:.7g}")
+        return float(value) if digits is None else float(f"{value:.{digits}g}")
     if isinstance(value, tuple | list):
-        return [_plain(v) for v in value]
+        return [_plain(v, digits) for v in value]
     if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
+        return {k: _plain(v, digits) for k, v in value.items()}
     return value
 
 
@@ -225,5 +261,5 @@ def _invalid(found: str, expected: str) -> PblError:
         "NORM_INVALID",
         found=found,
         expected=expected,
-        next_step="build the set again: python -m pbl_pipeline.gait.build_norm --help",
+        next_step="add cycles or correct the data, and build the set again (docs/measures.md, section Normative sets)",
     )

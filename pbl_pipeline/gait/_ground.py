@@ -1,0 +1,96 @@
+"""Where the feet stand on the floor: stride length, step length and step width of a cycle."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ._feet import FootTrajectories
+from .events import LEFT
+
+if TYPE_CHECKING:
+    from pbl_pipeline.fit import TrialFit
+
+#: The part of a stride after its foot down in which the foot lies flat (share of the stride).
+FLAT_FROM, FLAT_TO = 0.08, 0.25
+#: A standing foot that moves over the floor at more than this share of its speed against the pelvis does not stand:
+#: a treadmill's belt carries it, or the camera moves.
+MAX_SLIDE = 0.35
+#: Fewest frames of a standing foot.
+_MIN_FRAMES = 3
+FOLLOWS = "the phone moves while filming: where the feet are on the floor is not known"
+SLIDES = "the standing foot slides over the floor: a treadmill, or a camera that moves"
+UNSEEN = "too few frames of the standing foot"
+
+
+@dataclasses.dataclass(frozen=True)
+class Lengths:
+    """Lengths (m) of one cycle, None where not known (`missing` says why).
+
+    `stride_length_m` between two places of the own foot; `step_length_m` of the step that ends the cycle, from the
+    other foot to the own one along the stride; `step_width_m` between that other foot and the line of the stride.
+    `metric` is False where the metres are those of a detector that guesses how tall a person is.
+    """
+
+    stride_length_m: float | None = None
+    step_length_m: float | None = None
+    step_width_m: float | None = None
+    missing: str = ""
+    metric: bool = False
+
+
+def is_metric(fit: TrialFit) -> bool:
+    """Whether the metres of a fit were measured: by several calibrated cameras or a laboratory's markers."""
+    return fit.orientation_source == "measured: calibration"
+
+
+def why_no_lengths(fit: TrialFit) -> str:
+    """Why a fit tells no lengths on the floor; empty where it does (a camera that stands still, or no camera)."""
+    return "" if fit.camera_motion == "static" else FOLLOWS
+
+
+def cycle_lengths(
+    feet: FootTrajectories, side: str, start_s: float, other_down_s: float, end_s: float, *, metric: bool
+) -> Lengths:
+    """Lengths of the cycle of `side` from `start_s` to `end_s`, whose other foot comes down at `other_down_s`.
+
+    The place of a foot is the median of its heel over the frames in which it lies flat. With A and C the own foot's
+    places at the start and the end and B the other's in between, all on the floor: stride length |C - A|, step length
+    the part of C - B along A to C, step width the distance of B from that line (Huxham et al. 2006, Gait & Posture
+    23:159-163), which holds on a curved path, too. Positions must be in a world that stands still. Without `metric` the
+    step width is left out: its error is too large a part of it.
+    """
+    stride_s = end_s - start_s
+    own, other = (0, 1) if side == LEFT else (1, 0)
+    places = []
+    for foot, down in ((own, start_s), (other, other_down_s), (own, end_s)):
+        place, slide = _place(feet, foot, down, stride_s)
+        if place is None:
+            return Lengths(missing=UNSEEN)
+        if slide > MAX_SLIDE:
+            return Lengths(missing=SLIDES)
+        places.append(place)
+    a, b, c = places
+    stride = float(np.linalg.norm(c - a))
+    if not stride > 1e-6:
+        return Lengths(missing=SLIDES)
+    along = (c - a) / stride
+    step = float((c - b) @ along)
+    width = float(np.linalg.norm((b - a) - ((b - a) @ along) * along))
+    return Lengths(stride, step, width if metric else None, metric=metric)
+
+
+def _place(feet: FootTrajectories, foot: int, down_s: float, stride_s: float) -> tuple[np.ndarray | None, float]:
+    """Place of a standing foot on the floor (3,), and its speed there against that relative to the pelvis."""
+    time = np.asarray(feet.time_s, float)
+    heel, pelvis = feet.heel_m[:, foot], feet.pelvis_m
+    use = (time >= down_s + FLAT_FROM * stride_s) & (time <= down_s + FLAT_TO * stride_s)
+    use &= np.isfinite(heel).all(axis=1) & np.isfinite(pelvis).all(axis=1)
+    if np.count_nonzero(use) < _MIN_FRAMES:
+        return None, 0.0
+    floor = np.eye(3) - np.outer(feet.up, feet.up)
+    at, here = heel[use] @ floor, (heel - pelvis)[use] @ floor
+    moves, passes = (float(np.linalg.norm(np.polyfit(time[use], x, 1)[0])) for x in (at, here))
+    return np.median(at, axis=0), moves / max(passes, 1e-6)

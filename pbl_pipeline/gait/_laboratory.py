@@ -1,0 +1,157 @@
+"""Recordings of a gait laboratory (C3D): the angles of its marker model, its event labels, its markers."""
+
+from __future__ import annotations
+
+import dataclasses
+import gzip
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+
+from ._angles import AngleSeries
+from ._feet import FootTrajectories, feet_from_markers
+from .events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents, detect_events, load_events
+from .normative import PLUG_IN_GAIT, check_degrees
+
+#: Our angle -> the marker model's point after L or R, and its component. Both count the same directions as positive.
+PLUG_IN_GAIT_POINTS: dict[str, tuple[str, int]] = {
+    "pelvis_tilt": ("PelvisAngles", 0),
+    "pelvis_obliquity": ("PelvisAngles", 1),
+    "pelvis_rotation": ("PelvisAngles", 2),
+    "hip_flexion": ("HipAngles", 0),
+    "hip_adduction": ("HipAngles", 1),
+    "hip_rotation": ("HipAngles", 2),
+    "knee_flexion": ("KneeAngles", 0),
+    "ankle_dorsiflexion": ("AnkleAngles", 0),
+    "foot_progression": ("FootProgressAngles", 2),
+}
+#: Markers that events are found from where the recording has no labels, and that tell lengths.
+_FOOT_MARKERS = ("LASI", "RASI", "LHEE", "RHEE", "LTOE", "RTOE")
+_LABELS = {"Foot Strike": FOOT_DOWN, "Foot Off": FOOT_UP}
+_SIDES = {"left": LEFT, "right": RIGHT}
+
+
+@dataclasses.dataclass(frozen=True)
+class LabTrial:
+    """One recording: `series` of nine angles per side (Plug-in Gait's, degrees), `events`, and `feet` where the markers
+    are there (metres)."""
+
+    name: str
+    series: AngleSeries
+    events: GaitEvents
+    feet: FootTrajectories | None
+
+
+def read_lab_trial(path: str | Path, events_csv: str | Path | None = None) -> LabTrial:
+    """Angles, events and feet of a C3D file (also gzipped) with the outputs of Plug-in Gait or a model of its kind.
+
+    The angles are the points LHipAngles and so on (`PLUG_IN_GAIT_POINTS`). Events: those of `events_csv`
+    (`pbl events`), else the recording's labels Foot Strike and Foot Off, else found from heel and toe markers. A sample
+    that the file marks as invalid is NaN.
+
+    Raises
+    ------
+    PblError
+        FILE_MISSING, FILE_FORMAT (not a C3D, a point is missing), ANGLE_UNITS (not degrees), GAIT_INPUT (neither labels
+        nor foot markers).
+    """
+    path = Path(path)
+    points, labels, time, table = _read(path)
+    column = {name: i for i, name in enumerate(labels)}
+    missing = [s + p for p, _ in PLUG_IN_GAIT_POINTS.values() for s in "LR" if s + p not in column]
+    if missing:
+        raise _format_error(path, f"no points {', '.join(dict.fromkeys(missing))}", "the angles of Plug-in Gait")
+    angles = {
+        letter: {name: points[:, column[letter + p], k] for name, (p, k) in PLUG_IN_GAIT_POINTS.items()}
+        for letter in "LR"
+    }
+    for letter, by_name in angles.items():
+        check_degrees(np.concatenate(list(by_name.values())), f"{path.name}, side {letter}")
+    feet = None
+    if all(m in column for m in _FOOT_MARKERS):
+        xyz = points[:, [column[m] for m in _FOOT_MARKERS]] * _metres(table, path)
+        feet = feet_from_markers(time, _FOOT_MARKERS, "plug_in_gait", xyz)
+    series = AngleSeries(time, angles["L"], angles["R"], PLUG_IN_GAIT)
+    name = path.name.removesuffix(".gz").removesuffix(".c3d")
+    return LabTrial(name, series, _events(path, table, feet, events_csv), feet)
+
+
+def _read(path: Path) -> tuple[np.ndarray, list[str], np.ndarray, Any]:
+    """Points (T, P, 3), their names, time stamps (T,) in s from frame 1, and the reader with the parameters."""
+    import c3d
+
+    if not path.is_file():
+        raise PblError(
+            "FILE_MISSING", found="no such file", expected="a C3D file", next_step="check the path", key=str(path)
+        )
+    try:
+        data = path.read_bytes()
+        reader = c3d.Reader(io.BytesIO(gzip.decompress(data) if path.suffix == ".gz" else data))
+        names: list[str] = []
+        # A parameter holds 255 names at most.
+        for key in ("POINT:LABELS", "POINT:LABELS2", "POINT:LABELS3"):
+            if (values := reader.get(key)) is not None:
+                names += [str(s).strip() for s in np.ravel(values.string_array)]
+        rows = np.array([points for _, points, _ in reader.read_frames()], float)
+        rate = float(reader.point_rate)
+    # The package raises whatever it stumbles over.
+    except Exception as error:
+        raise _format_error(path, f"{type(error).__name__}: {error}", "a C3D file") from error
+    if rows.ndim != 3 or not rate > 0:
+        raise _format_error(path, "no frames", "points over time")
+    xyz = np.where(rows[..., 3:4] < 0, np.nan, rows[..., :3])
+    return xyz, names, (reader.first_frame - 1 + np.arange(len(xyz))) / rate, reader
+
+
+def _metres(reader: Any, path: Path) -> float:
+    unit = reader.get("POINT:UNITS")
+    text = str(np.ravel(unit.string_array)[0]).strip().lower() if unit is not None else "mm"
+    factors = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+    if text not in factors:
+        raise _format_error(path, f"points in {text!r}", "mm, cm or m")
+    return factors[text]
+
+
+def _events(path: Path, reader: Any, feet: FootTrajectories | None, events_csv: str | Path | None) -> GaitEvents:
+    if events_csv is not None:
+        return _given(load_events(events_csv), "given", Path(events_csv).name)
+    table = reader.get("EVENT")
+    if table is not None and table.get("LABELS") is not None and table.get("TIMES") is not None:
+        found = []
+        words = (np.ravel(table.get(k).string_array) for k in ("CONTEXTS", "LABELS"))
+        for context, label, time in zip(*words, table.get("TIMES").float_array, strict=False):
+            side, event = _SIDES.get(str(context).strip().lower()), _LABELS.get(str(label).strip())
+            if side and event:
+                # Minutes and seconds.
+                found.append(GaitEvent(float(time[0] * 60 + time[1]), side, event, 1.0))
+        if found:
+            return _given(tuple(sorted(found, key=lambda e: e.time_s)), "labels", "labels of the recording")
+    if feet is None:
+        raise PblError(
+            "GAIT_INPUT",
+            found="neither event labels nor the markers " + ", ".join(_FOOT_MARKERS),
+            expected="labels Foot Strike and Foot Off, or foot markers",
+            next_step="pass events with --events",
+            key=str(path),
+        )
+    return detect_events(feet)
+
+
+def _given(events: tuple[GaitEvent, ...], method: str, source: str) -> GaitEvents:
+    span = ((events[0].time_s, events[-1].time_s),) if events else ()
+    reason = "" if events else "no event in the file"
+    return GaitEvents("PASS" if events else "EMPTY", events, reason, method, "", source, span, len(events))
+
+
+def _format_error(path: Path, found: str, expected: str) -> PblError:
+    return PblError(
+        "FILE_FORMAT",
+        found=found,
+        expected=expected,
+        next_step="export the recording with the angles of the laboratory's model, see docs/files.md",
+        key=str(path),
+    )

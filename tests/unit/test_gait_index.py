@@ -1,0 +1,224 @@
+"""The original index of nine angles, the profile score, units and conventions."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.gait import (
+    BODY_ANGLES,
+    GDI_PARAMSETS,
+    GILLETTE_MODEL,
+    NINE_ANGLES,
+    PLUG_IN_GAIT,
+    THREE_ANGLES,
+    GaitCycle,
+    GdiParams,
+    NormativeSet,
+    fit_norm,
+    load_norm,
+    movement_profile,
+    offset_deg,
+    score_gdi,
+    variable_scores,
+)
+from pbl_pipeline.gait.build_norm import BUILDERS
+from tests.unit.test_gait_gdi import ABOUT, PERCENT, toy_vectors
+
+NINE = "gillette-166-nine-angles"
+
+
+def nine_cycle(vector: np.ndarray, side: str = "left", model: str = PLUG_IN_GAIT) -> GaitCycle:
+    curves = dict(zip(NINE_ANGLES, vector.reshape(9, 51), strict=True))
+    return GaitCycle("c", 0, 0, side, 0.0, 0.1, 0.5, 0.6, 1.0, used=True, curves=curves, angle_model=model)
+
+
+def published(shared_data) -> tuple[np.ndarray, np.ndarray]:
+    """Vectors (166, 459) of the controls and the published features (459, 15)."""
+    data = loadmat(shared_data / "real" / "gdi_gillette" / "GDI_Calc_Fast_Data.mat")
+    return data["all_ctrl_gait_vectors"].T, data["gait_features"]
+
+
+def original_index(vectors: np.ndarray, controls: np.ndarray, features: np.ndarray) -> np.ndarray:
+    """As the paper of 2008 describes it: feature components c = g . f, distance to their mean over the controls."""
+
+    def raw(g):
+        return np.log(np.sqrt(np.sum((g @ features - (controls @ features).mean(axis=0)) ** 2, axis=-1)))
+
+    of_controls = raw(controls)
+    z = (raw(vectors) - np.mean(of_controls)) / np.sqrt(np.sum((of_controls - of_controls.mean()) ** 2) / 165)
+    return 100 - 10 * z
+
+
+def test_all_controls_to_a_millionth(shared_data):
+    controls, features = published(shared_data)
+    expected = original_index(controls, controls, features)
+    cycles = [nine_cycle(v, ("left", "right")[i % 2]) for i, v in enumerate(controls)]
+    result = score_gdi(cycles, model=GILLETTE_MODEL)
+    assert (result.model, result.norm, result.n) == (GILLETTE_MODEL, NINE, 166)
+    assert np.abs(np.array([c.gdi for c in result.cycles]) - expected).max() < 1e-6
+    assert result.mean == pytest.approx(100.0, abs=1e-6)
+    assert np.std([c.gdi for c in result.cycles], ddof=1) == pytest.approx(10.0, abs=1e-6)
+
+
+def test_far_from_the_controls_to_a_millionth(shared_data):
+    controls, features = published(shared_data)
+    rng = np.random.default_rng(1)
+    others = controls[:40] * rng.uniform(0.3, 1.8, (40, 1)) + rng.normal(0, 8, (40, 459))
+    expected = original_index(others, controls, features)
+    found = load_norm(NINE).index(others)
+    assert expected.min() < 70
+    assert np.abs(found - expected).max() < 1e-6
+
+
+def test_the_sets_are_what_the_command_builds(shared_data):
+    source = shared_data / "real" / "gdi_gillette" / "GDI_Calc_Fast_Data.mat"
+    for name, (build, digits) in BUILDERS.items():
+        built, shipped = build(source), load_norm(name)
+        same = ("name", "version", "n", "source", "licence", "convention", "variables", "source_sha256", "angle_model")
+        assert [getattr(built, k) for k in same] == [getattr(shipped, k) for k in same]
+        off = 1e-12 if digits is None else 1e-5
+        for k in ("mean_deg", "components", "percent", "ln_mean", "ln_sd", "explained_share"):
+            np.testing.assert_allclose(getattr(built, k), getattr(shipped, k), atol=off, rtol=0, err_msg=f"{name} {k}")
+
+
+def test_the_mapped_set_is_the_same_but_for_the_pelvis():
+    laboratory, body = load_norm("gillette-166-three-angles"), load_norm()
+    assert (laboratory.angle_model, body.angle_model) == (PLUG_IN_GAIT, BODY_ANGLES)
+    shift = np.repeat([offset_deg(a, PLUG_IN_GAIT, BODY_ANGLES) for a in THREE_ANGLES], 50)
+    np.testing.assert_allclose(body.mean_deg, laboratory.mean_deg + shift, atol=1e-4)
+    assert shift[0] == -12.0
+    assert not shift[50:].any()
+    vectors = laboratory.mean_deg + np.random.default_rng(0).normal(0, 5, (20, 150))
+    np.testing.assert_allclose(body.index(vectors + shift), laboratory.index(vectors), atol=1e-3)
+    tilt = [n.curves["pelvis_tilt"]["mean_deg"] for n in (laboratory, body)]
+    np.testing.assert_allclose(tilt[1], tilt[0] - 12.0, atol=1e-4)
+    with pytest.raises(PblError, match="NORM_INVALID"):
+        offset_deg("hip_flexion", "another", BODY_ANGLES)
+
+
+def test_profile_by_hand():
+    norm = load_norm(NINE)
+    # Left: every angle 3 deg off, hip flexion 9; right: pelvis 6, all others 0.
+    left, right = norm.mean_deg.copy(), norm.mean_deg.copy()
+    left += 3.0
+    left[3 * 51 : 4 * 51] += 6.0
+    right[: 3 * 51] -= 6.0
+    profile = movement_profile({"left": variable_scores(left, norm), "right": variable_scores(right, norm)}, norm)
+    assert profile.left == pytest.approx(dict.fromkeys(NINE_ANGLES, 3.0) | {"hip_flexion": 9.0})
+    assert profile.right == pytest.approx(dict.fromkeys(NINE_ANGLES[3:], 0.0) | dict.fromkeys(NINE_ANGLES[:3], 6.0))
+    # Root mean squares: (8 x 9 + 81) / 9 = 17; 3 x 36 / 9 = 12; of the person (8 x 9 + 81 + 6 x 0) / 15.
+    assert profile.gps_left == pytest.approx(np.sqrt(17.0))
+    assert profile.gps_right == pytest.approx(np.sqrt(12.0))
+    assert profile.gps == pytest.approx(np.sqrt(153 / 15))
+
+
+def test_a_score_is_the_root_mean_square_over_the_cycle():
+    norm = load_norm(NINE)
+    wave = norm.mean_deg.copy()
+    wave[:51] += np.where(np.arange(51) % 2, 4.0, -4.0)
+    wave[51:102] += np.r_[np.zeros(26), np.full(25, 10.0)]
+    scores = variable_scores(wave, norm)[0]
+    assert scores == pytest.approx([4.0, np.sqrt(25 * 100 / 51), *[0.0] * 7])
+
+
+def test_profile_stands_beside_the_index():
+    norm = load_norm(NINE)
+    cycles = [
+        nine_cycle(norm.mean_deg + 4.0),
+        nine_cycle(norm.mean_deg + 2.0),
+        nine_cycle(norm.mean_deg + 5.0, "right"),
+    ]
+    result = score_gdi(cycles, norm)
+    assert result.profile is not None
+    assert result.profile.left["knee_flexion"] == pytest.approx(3.0)
+    assert (result.profile.gps_left, result.profile.gps_right) == pytest.approx((3.0, 5.0))
+    assert score_gdi(cycles[:2], norm).profile is None
+    three = score_gdi([dataclasses.replace(c, angle_model=BODY_ANGLES) for c in cycles])
+    assert three.profile is not None
+    assert set(three.profile.left) == set(THREE_ANGLES)
+    assert three.profile.gps is None
+
+
+def test_radians_are_refused():
+    norm = load_norm(NINE)
+    for factor in (np.pi / 180, 180 / np.pi):
+        with pytest.raises(PblError, match="ANGLE_UNITS"):
+            score_gdi([nine_cycle(norm.mean_deg * factor)], norm)
+        with pytest.raises(PblError, match="ANGLE_UNITS"):
+            fit_norm(toy_vectors() * factor, variables=THREE_ANGLES, percent=PERCENT, **ABOUT)
+
+
+def test_index_and_norm_must_fit_together():
+    cycles = [nine_cycle(load_norm(NINE).mean_deg + 3.0)]
+    with pytest.raises(PblError, match="NORM_INVALID"):
+        score_gdi(cycles, "gillette-166-three-angles", model=GILLETTE_MODEL)
+    with pytest.raises(PblError, match="SOLVER_UNKNOWN"):
+        score_gdi(cycles, model="gdi")
+
+
+@pytest.mark.parametrize(
+    ("models", "norm", "outcome"),
+    [
+        ((PLUG_IN_GAIT, PLUG_IN_GAIT), NINE, "PASS"),
+        ((BODY_ANGLES, BODY_ANGLES), NINE, "WARN"),
+        ((BODY_ANGLES, BODY_ANGLES), "gillette-166-three-angles", "WARN"),
+        ((BODY_ANGLES, BODY_ANGLES), "gillette-166-body-angles", "WARN"),
+        ((PLUG_IN_GAIT, BODY_ANGLES), NINE, "WARN"),
+    ],
+)
+def test_mixed_conventions_warn(models, norm, outcome):
+    mean = load_norm(NINE).mean_deg
+    cycles = [nine_cycle(mean + 3, s, m) for s, m in zip(("left", "right"), models, strict=True)]
+    check = next(c for c in score_gdi(cycles, norm).qc if c.check == "norm_convention")
+    assert check.outcome == outcome
+    assert bool(check.advice) == (outcome == "WARN")
+
+
+def test_a_norm_of_the_bodys_own_cycles_passes():
+    own = fit_norm(toy_vectors(), variables=THREE_ANGLES, percent=PERCENT, angle_model=BODY_ANGLES, **ABOUT)
+    mean = load_norm(NINE).mean_deg
+    cycles = [nine_cycle(mean + 3, s, BODY_ANGLES) for s in ("left", "right")]
+    check = next(c for c in score_gdi(cycles, own).qc if c.check == "norm_convention")
+    assert check.outcome == "PASS"
+
+
+def make(vectors: np.ndarray, **changes) -> NormativeSet:
+    return fit_norm(vectors, variables=THREE_ANGLES, percent=PERCENT, **ABOUT, **changes)
+
+
+def test_no_more_components_than_cycles():
+    with pytest.raises(PblError, match="40 vectors for 40 components"):
+        make(toy_vectors(40), n_components=40)
+    assert len(make(toy_vectors(40), n_components=12).components) == 12
+    with pytest.raises(PblError, match="NORM_INVALID"):
+        make(toy_vectors(12), n_components=20)
+
+
+def test_pooled_components_come_from_patients_too():
+    tremor = np.tile(np.sin(2 * np.pi * 9 * PERCENT / 100), 3)
+    patients = toy_vectors(60, seed=5) + 12 * np.random.default_rng(2).standard_normal((60, 1)) * tremor
+    alone, pooled = make(toy_vectors()), make(toy_vectors(), pooled=patients)
+    np.testing.assert_allclose(alone.mean_deg, pooled.mean_deg)
+    scores = pooled.index(toy_vectors())
+    assert (scores.mean(), scores.std(ddof=1)) == pytest.approx((100, 10))
+    # The direction in which only the patients differ is among the components of the pooled set alone.
+    seen = [np.linalg.norm(n.components @ tremor) / np.linalg.norm(tremor) for n in (alone, pooled)]
+    assert seen[0] < 0.1
+    assert seen[1] > 0.95
+    both = np.vstack([toy_vectors(), patients])
+    values = np.linalg.eigvalsh(np.cov(both.T))[::-1]
+    np.testing.assert_allclose(pooled.explained_variance, values[: len(pooled.components)])
+
+
+def test_paramsets():
+    assert {name: p.version for name, p in GDI_PARAMSETS.items()} == {"pbl-2025-three-angles": 2, GILLETTE_MODEL: 1}
+    # A row of version 1 is understood as it was.
+    old = score_gdi([], "gillette-166-three-angles", GdiParams(), "pbl-2025-three-angles", 1)
+    assert (
+        old.params_hash != score_gdi([], "gillette-166-three-angles", GdiParams(), "pbl-2025-three-angles").params_hash
+    )
