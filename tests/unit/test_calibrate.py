@@ -63,7 +63,7 @@ def test_a_known_lens_comes_back(videos, tmp_path, kind):
     np.testing.assert_allclose(np.diag(camera.matrix)[:2], [472, 474], rtol=0.005)
     np.testing.assert_allclose(camera.matrix[:2, 2], [316, 183], atol=2.0)
     assert 0 < camera.focal_rel_sd < 0.005
-    # What matters of the distortion: where points end up, over the whole picture. A common shift is a turn of the camera.
+    # What matters is where points end up, over the whole picture; a common shift is a turn of the camera.
     grid = np.stack(np.meshgrid(np.linspace(-0.6, 0.6, 9), np.linspace(-0.35, 0.35, 7)), -1).reshape(-1, 2)
     rays = np.column_stack([grid, np.ones(len(grid))]).reshape(-1, 1, 3)
     none = np.zeros(3)
