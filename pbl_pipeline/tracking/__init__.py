@@ -1,12 +1,17 @@
 """People in a video: detection, tracks, choice of the subject."""
 
+from ._appearance import likeness, look_of
 from ._associate import AssociationParams
 from ._blazepose import BlazePoseDetector
+from ._join import JoinParams
 from ._require import require_subject
 from ._sheet import save_contact_sheet
 from ._subject import SUBJECT_DEFAULT, SUBJECT_PARAMSETS, SubjectParams, choose_subject, time_in_view_s
-from ._track import DEFAULT, DETECTORS, PARAMSETS, TrackingParams, track_people
+from ._track import DEFAULT, DETECTORS, PARAMSETS, TrackingParams, method_of_detector, track_people
 from ._types import Detection, PersonDetector, PersonTrack, SubjectChoice, Tracking
+from ._uncross import UncrossParams
+from ._watch import WatchParams
+from ._yolox import YoloxDetector
 
 __all__ = [
     "DEFAULT",
@@ -17,13 +22,20 @@ __all__ = [
     "AssociationParams",
     "BlazePoseDetector",
     "Detection",
+    "JoinParams",
     "PersonDetector",
     "PersonTrack",
     "SubjectChoice",
     "SubjectParams",
     "Tracking",
     "TrackingParams",
+    "UncrossParams",
+    "WatchParams",
+    "YoloxDetector",
     "choose_subject",
+    "likeness",
+    "look_of",
+    "method_of_detector",
     "require_subject",
     "save_contact_sheet",
     "time_in_view_s",

@@ -1,8 +1,17 @@
 """Association of detections over time: who in this frame is who in the last.
 
-Each live track predicts where its body box will be (constant velocity and growth); detections are assigned to
-predictions at least total cost (Hungarian algorithm, Kuhn 1955, scipy's `linear_sum_assignment`). Everything is
-measured in body sizes, so near and far people are treated alike.
+Each live track predicts where its body box will be (constant velocity); detections are assigned to predictions at least
+total cost (Hungarian algorithm, Kuhn 1955, scipy's `linear_sum_assignment`). Everything is measured in body sizes, so
+near and far people are treated alike.
+
+Why no tracker library, as of November 2026. They take a box in every frame at one rate; here a person is looked at when
+it is worth it (`Watch`), by the container's own time stamps, and both directions of time may be used afterwards
+(`uncross`, `join_trails`). Of those on the package index `trackers` 2.6 (Apache-2.0) is well kept, but brings 25
+packages, among them `opencv-python`, which overwrites the files of the headless OpenCV; `norfair` 2.3 asks for numpy
+below 2; `motpy` stands at 0.0.10. On 240 made crossings at 15 frames a second (tests/unit/crossings.py: eight pairs of
+speeds, three degrees of hiding, ten seeds) identities were exchanged in 7 (SORT, ByteTrack), 5 (OC-SORT) and 3 (C-BIoU)
+with `trackers`, in none with this module and `uncross`; one person hidden for a second, and behind somebody for 1.5
+seconds, all kept.
 """
 
 from __future__ import annotations
@@ -24,7 +33,8 @@ class AssociationParams:
     axis turned by 90 degrees, twice that for one upside down: where two people are close, the network at times puts
     one's head on the other's legs. sure_score: detections below it continue a track only within the unwidened gate
     and after the sure ones had their choice, and never begin one. max_gap_s: a person unseen for longer is lost, and
-    starts a new track when seen again. velocity_gain: share of a new velocity measurement in the estimate.
+    starts a new track when seen again; one who was seen fewer than `min_hits` times is lost after `doubt_gap_s`.
+    memory_s: the velocity is that of a straight line through so much of the past.
     """
 
     gate: float = 0.35
@@ -35,7 +45,7 @@ class AssociationParams:
     max_gap_s: float = 1.0
     min_hits: int = 3
     doubt_gap_s: float = 0.35
-    velocity_gain: float = 0.5
+    memory_s: float = 0.5
 
 
 @dataclasses.dataclass(eq=False)
@@ -70,17 +80,25 @@ class Trail:
         size = np.exp(state[2])
         return state + self.velocity * [size, size, 1.0] * reach
 
-    def add(self, frame: int, time_s: float, detection: Detection, gain: float) -> None:
+    def add(self, frame: int, time_s: float, detection: Detection, memory_s: float) -> None:
         new, old, expected = measure(detection), self.state(), self.predict(time_s)
-        dt = max(time_s - self.last_time, 1e-6)
         size = np.exp((new[2] + old[2]) / 2)
         self.surprise = float(np.hypot(*(new[:2] - expected[:2]))) / size
-        # Sizes jitter by a tenth from frame to frame: their rate is noise, so only the position is extrapolated.
-        seen = np.array([(new[0] - old[0]) / size, (new[1] - old[1]) / size, 0.0]) / dt
-        self.velocity = (1 - gain) * self.velocity + gain * np.clip(seen, -5.0, 5.0)
         self.frames.append(frame)
         self.times.append(time_s)
         self.detections.append(detection)
+        self.velocity = self._velocity(memory_s)
+
+    def _velocity(self, memory_s: float) -> np.ndarray:
+        """Slope of a straight line through the last `memory_s` (two sightings at least, whenever they were).
+
+        Sizes jitter by a tenth from frame to frame: their rate is noise, so only the position is extrapolated.
+        """
+        first = min(int(np.searchsorted(self.times, self.last_time - memory_s)), len(self.times) - 2)
+        seen = np.array([measure(d) for d in self.detections[first:]])
+        tau = np.array(self.times[first:]) - np.mean(self.times[first:])
+        slope = tau @ seen[:, :2] / max(float(tau @ tau), 1e-9) / np.exp(seen[:, 2].mean())
+        return np.array([*np.clip(slope, -5.0, 5.0), 0.0])
 
 
 def measure(detection: Detection) -> np.ndarray:
@@ -144,7 +162,7 @@ class Associator:
         taken = set()
         for i, j in zip(*linear_sum_assignment(blocked), strict=True):
             if blocked[i, j] < 1e3:
-                trails[i].add(frame, time_s, detections[j], self._params.velocity_gain)
+                trails[i].add(frame, time_s, detections[j], self._params.memory_s)
                 taken.add(int(j))
         return [d for j, d in enumerate(detections) if j not in taken]
 

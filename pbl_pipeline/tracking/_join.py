@@ -66,23 +66,23 @@ def _join_by_movement(trails: Sequence[Trail], size_px: tuple[int, int], params:
 
 def _join_by_clothes(trails: Sequence[Trail], params: JoinParams) -> list[Trail]:
     """In order of time each trail becomes part of a person who was seen before, or a new person."""
-    people: list[Trail] = []
+    people: list[list[Trail]] = []
     for trail in sorted(trails, key=lambda t: t.times[0]):
-        gone = [p for p in people if 0 < trail.times[0] - p.times[-1] <= params.return_gap_s]
-        alike = {id(p): _likeness(p, trail, params) for p in gone}
-        known = sorted((p for p in gone if np.isfinite(alike[id(p)])), key=lambda p: -alike[id(p)])
-        best = known[0] if known else None
-        if best is None or alike[id(best)] < params.same_clothes or not _alike_in_size(best, trail, params):
-            people.append(trail)
+        gone = [p for p in people if 0 < trail.times[0] - p[-1].times[-1] <= params.return_gap_s]
+        ranked = sorted(((_likeness(_whole(*p), trail, params), p) for p in gone), key=lambda c: -np.nan_to_num(c[0]))
+        if not ranked or not ranked[0][0] >= params.same_clothes:
+            people.append([trail])
             continue
+        alike, best = ranked[0]
         # Others who left before, and those who are surely somebody else, being there at the same time.
-        others = [*known[1:], *(t for t in trails if t is not trail and (_together(t, trail) or _together(t, best)))]
-        rivals = [r for r in (_likeness(t, trail, params) for t in others) if np.isfinite(r)]
-        if alike[id(best)] - max(rivals, default=0.0) < params.clothes_lead:
-            people.append(trail)
+        present = [t for t in trails if t not in best and any(_together(t, mine) for mine in (trail, *best))]
+        rivals = [a for a, _ in ranked[1:]] + [_likeness(t, trail, params) for t in present if t is not trail]
+        lead = alike - max((r for r in rivals if np.isfinite(r)), default=0.0)
+        if lead >= params.clothes_lead and _alike_in_size(best[-1], trail, params):
+            best.append(trail)
         else:
-            people[people.index(best)] = _whole(best, trail)
-    return people
+            people.append([trail])
+    return [_whole(*p) for p in people]
 
 
 def _together(a: Trail, b: Trail) -> bool:
@@ -104,8 +104,14 @@ def _alike_in_size(a: Trail, b: Trail, params: JoinParams) -> bool:
     return abs(float(np.log(before[2] / after[2]))) <= np.log(params.return_growth)
 
 
-def _whole(a: Trail, b: Trail) -> Trail:
-    return Trail([*a.frames, *b.frames], [*a.times, *b.times], [*a.detections, *b.detections], b.velocity)
+def _whole(*parts: Trail) -> Trail:
+    """One trail of parts that follow one another."""
+    return Trail(
+        [f for p in parts for f in p.frames],
+        [t for p in parts for t in p.times],
+        [d for p in parts for d in p.detections],
+        parts[-1].velocity,
+    )
 
 
 def _one_person(a: Trail, b: Trail, size_px: tuple[int, int], p: JoinParams) -> bool:

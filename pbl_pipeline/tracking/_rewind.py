@@ -44,7 +44,7 @@ def rewind(
         if excess and min(excess) <= 0:
             seen = free[int(np.argmin(excess))]
             seen = dataclasses.replace(seen, look=look_of(image, measure(seen), seen.roi_px[3]))
-            back.add(index, -time_s, seen, params.velocity_gain)
+            back.add(index, -time_s, seen, params.memory_s)
             misses = 0
             continue
         misses += 1

@@ -10,6 +10,8 @@ import numpy as np
 from ._blazepose import box_iou
 from ._types import Detection, PersonDetector
 
+#: A box that ends within this share of the window's width from its edge is taken as cut by it.
+CUT_SHARE = 0.02
 #: x0, y0, x1, y1 in px; it may reach beyond the picture.
 Window = tuple[int, int, int, int]
 
@@ -50,6 +52,8 @@ def detect_in(
             continue
         for d in detector.detect(image[y0:y1, x0:x1]):
             box = d.box_px + np.array([x0, y0, x0, y0])
+            if not np.isfinite(d.roi_px).all() and _cut(box, (x0, y0, x1, y1), (width, height)):
+                continue
             roi = d.roi_px + np.array([x0, y0, 0, 0])
             whole = _area(np.clip(box, 0, [width, height, width, height]))
             inside = _area(np.clip(box, [x0, y0, x0, y0], [x1, y1, x1, y1]))
@@ -85,6 +89,16 @@ def merge(found: list[tuple[float, Detection]], min_iou: float = 0.4, min_cover:
         mean_box = weight @ np.array([d.box_px for _, d in used])
         people.append(Detection(box_px=mean_box, score=max(d.score for _, d in used), roi_px=roi))
     return people
+
+
+def _cut(box: np.ndarray, window: Window, size: tuple[int, int]) -> bool:
+    """Whether a bare box ends at an edge of its window that is no edge of the picture: the person goes on beyond it.
+
+    Body circles need no such rule: they reach beyond the window, and `detect_in` trusts them the less.
+    """
+    near = CUT_SHARE * (window[2] - window[0])
+    inner = np.array([window[0] > 0, window[1] > 0, window[2] < size[0], window[3] < size[1]])
+    return bool((inner & (np.abs(box - np.array(window)) < near)).any())
 
 
 def _cover(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:

@@ -34,7 +34,7 @@ class UncrossParams:
     size_gate: float = 0.25
     look_gate: float = 0.1
     worst: float = 3.0
-    margin: float = 1.0
+    margin: float = 0.3
 
 
 def uncross(trails: Sequence[Trail], params: UncrossParams) -> list[Trail]:
