@@ -22,6 +22,7 @@ from pbl_pipeline.video import Camera, Frame, read_frames
 
 from ._batched import BatchDetector, BatchedLooks
 from ._blazepose import MODEL_SHA256, BlazePoseLandmarks
+from ._confidence import confidence_curve
 from ._crops import REACH_SD, corrected, first_looks, smooth_at, smooth_rois
 from ._flips import FlipParams, exchange_sides, exchanged, lowered
 from ._passes import Looks, look_twice, n_workers
@@ -45,6 +46,8 @@ class KeypointParams:
     sides: where left and right are exchanged back, see `exchange_sides`; None: nowhere.
     min_time_s: a person in view for less cannot be measured.
     box_margin: added to the keypoints' box on each side, as a share of its size.
+    confidence_curve: what the confidence is worth (`confidence_curve`), for the detector that the curve is of; empty
+    where none is known.
     """
 
     detector: str = "blazepose"
@@ -60,6 +63,7 @@ class KeypointParams:
     sides: FlipParams | None = dataclasses.field(default_factory=FlipParams)
     min_time_s: float = 1.0
     box_margin: float = 0.1
+    confidence_curve: str = "blazepose-v1"
 
 
 DEFAULT = "blazepose-33"
@@ -245,5 +249,12 @@ def _assemble(
         box_px=box.astype(np.float32),
         origin=getattr(detector, "origin", ""),
         picture=picture,
+        confidence_curve=_curve_of(detector, params),
         sides_changed=changed,
     )
+
+
+def _curve_of(detector: KeypointDetector, params: KeypointParams) -> str:
+    """The curve's name, where it is one of this detector. Raises `PblError` SOLVER_UNKNOWN."""
+    name = params.confidence_curve
+    return name if name and confidence_curve(name).detector == detector.name else ""

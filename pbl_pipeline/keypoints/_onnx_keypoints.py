@@ -54,6 +54,7 @@ class ModelKeypointParams(KeypointParams):
     detector: str = "onnx"
     model_sha256: str = ""
     min_presence: float = 0.0
+    confidence_curve: str = ""
     model: ModelParams = dataclasses.field(kw_only=True)
 
 
@@ -142,7 +143,8 @@ class OnnxKeypoints:
             order = [self._mirror if a.mirrored else np.arange(shape[2]) for a in looks]
             scores = np.stack([score.reshape(shape)[:, a, o] for a, o in enumerate(order)], axis=1).mean(axis=1)
             return [
-                _person(x, np.full((shape[2], 3), np.nan), c, r) for x, c, r in zip(mean_xy, scores, rois_px, strict=True)
+                _person(x, np.full((shape[2], 3), np.nan), c, r)
+                for x, c, r in zip(mean_xy, scores, rois_px, strict=True)
             ]
         together = aligned(xyz)
         mean_xyz = together.mean(axis=1)

@@ -33,8 +33,8 @@ BRIGHT_WARN, BRIGHT_FAIL = 30.0, 15.0
 DETAIL_WARN, DETAIL_FAIL = 0.04, 0.06
 #: Frames a second.
 RATE_WARN_HZ, RATE_FAIL_HZ = 20.0, 10.0
-#: Mean probability that a point of the legs is right; mean stated confidence of a detector that has no curve.
-LEGS_PROBABILITY_WARN, LEGS_CONFIDENCE_WARN = 0.85, 0.6
+#: Mean confidence of the legs' points as stated; share of them that is right within the bound of the detector's curve.
+LEGS_CONFIDENCE_WARN, LEGS_RIGHT_WARN = 0.6, 0.9
 #: Share of the frames in which left and right were exchanged back; where many are, the rest may be the wrong ones.
 EXCHANGED_WARN, EXCHANGED_FAIL = 0.02, 0.3
 #: Nobody turns by this much between neighbouring frames (deg); single frames of noise stay below.
@@ -47,9 +47,9 @@ def check_keypoints(keypoints: Keypoints) -> tuple[Check, ...]:
     """The checks of one trial, in the order of the chain; EMPTY alone where no frame shows the person.
 
     `frames_seen_s`, `whole_person_s`, `frames_without_person_share`, `feet_cut_share`, `head_cut_share`,
-    `body_height_px`, `picture_brightness`, `picture_detail_share`, `frame_rate_hz`, `leg_points_right_share` (or
-    `leg_confidence`), `side_changes`, `sides_exchanged_share`. Those that a trial's points or file cannot tell are left
-    out.
+    `body_height_px`, `picture_brightness`, `picture_detail_share`, `frame_rate_hz`, `leg_confidence`,
+    `leg_points_right_share`, `side_changes`, `sides_exchanged_share`. Those that a trial's points or file cannot tell
+    are left out.
     """
     seen = keypoints.confidence.max(axis=1) > 0
     if not seen.any():
@@ -158,18 +158,18 @@ def _rate(time_s: np.ndarray) -> Check | None:
 
 
 def _legs(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
-    """How sure the points of the legs are: what the confidence is worth, where that is known."""
+    """How sure the points of the legs are, as stated and, where it is known, what that is worth."""
     legs = [i for i, n in enumerate(keypoints.names) if n.startswith(("left_", "right_")) and n.endswith(_LEGS)]
     if not legs:
         return []
-    probability = probability_within(keypoints)
-    values = keypoints.confidence if probability is None else probability
-    mean = float(values[np.ix_(seen, legs)].mean())
-    name, warn = ("leg_confidence", LEGS_CONFIDENCE_WARN)
-    if probability is not None:
-        name, warn = ("leg_points_right_share", LEGS_PROBABILITY_WARN)
     advice = "the legs are hidden or hard to see: film the whole body from the side, in light"
-    return [_low(name, mean, warn, 0.0, advice)]
+    mean = float(keypoints.confidence[np.ix_(seen, legs)].mean())
+    found = [_low("leg_confidence", mean, LEGS_CONFIDENCE_WARN, 0.0, advice)]
+    probability = probability_within(keypoints)
+    if probability is not None:
+        share = float(probability[np.ix_(seen, legs)].mean())
+        found.append(_low("leg_points_right_share", share, LEGS_RIGHT_WARN, 0.0, advice))
+    return found
 
 
 def _sides(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
