@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from ._db_backup import backup, restore
 from ._db_roles import roles
 
 # Each command imports what it needs: `pbl db --help` should not wait for the table engine.
@@ -23,7 +24,8 @@ def db() -> None:
     """
 
 
-db.add_command(roles)
+for command in (backup, restore, roles):
+    db.add_command(command)
 
 
 @db.command()

@@ -1,0 +1,413 @@
+"""The database and its object store as one folder that belongs together, and back.
+
+    manifest.json        what it is: time, server, rows of every table, checksums; written last: it marks the end
+    database.sql.gz      every table and row, in the state of one moment
+    store.sha256         SHA-256 and path of every file of `store/`, as `sha256sum -c` reads it
+    store/               the files that rows of that moment name; files that no row names are not kept
+
+The rows are read in one transaction, then the files they name are copied. A file never changes once its row is there,
+so both are of the same moment while workers go on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import gzip
+import hashlib
+import json
+import re
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import pymysql
+
+from pbl_pipeline import __version__, progress
+from pbl_pipeline.errors import PblError
+
+from . import _dump, connection
+from ._store import store_error
+
+FORMAT = 1
+#: Marks a column whose values name files of the store, in the comment that DataJoint gives it.
+_STORED = re.compile(r"^:<(object|npy|blob|attach|hash)@")
+#: Schema (after the prefix) with the marker of a restore that has not ended.
+_MARKER = "restoring"
+
+Say = Callable[[str], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Backup:
+    """What was saved or brought back. rows: `schema.table` -> how many."""
+
+    folder: Path
+    created: str
+    rows: dict[str, int]
+    n_files: int
+    n_bytes: int
+
+
+def backup(folder: Path, store: bool = True, say: Say = lambda _: None) -> Backup:
+    """Save the database and the store into a new folder.
+
+    Parameters
+    ----------
+    folder
+        Must not exist, or be empty.
+    store
+        False leaves the files out, where the object store is saved by other means.
+    say
+        Told in a sentence what is being done.
+
+    Raises
+    ------
+    PblError
+        FILE_UNWRITABLE; BACKUP_INVALID where a file that a row names is lost (all are named); STORE_UNAVAILABLE;
+        DB_REFUSED when a table was changed in the middle.
+    """
+    _new_folder(folder)
+    prefix = connection.prefix()
+    connection.connect()
+    created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    try:
+        with closing(connection.plain_connection(conv={})) as server:
+            version = _snapshot(server)
+            tables = _dump.tables_of(server, prefix)
+            _check_some(tables, prefix)
+            say(f"Saving {len(tables)} tables of {prefix}_* into {folder}")
+            rows, files = _save_tables(server, tables, folder / "database.sql.gz")
+    except pymysql.err.Error as error:
+        raise PblError(
+            "DB_REFUSED",
+            found=str(error.args[-1]),
+            expected="tables that nobody changes (creates, alters) while they are saved",
+            next_step="run it again; rows may be written at any time, only the tables themselves must stay",
+        ) from error
+    n_bytes = 0
+    if store:
+        say(f"Saving {len(files)} files of the store")
+        n_bytes = _save_files(sorted(files), folder)
+    manifest = {
+        "format": FORMAT,
+        "pbl_pipeline": __version__,
+        "created": created,
+        "server": version,
+        "prefix": prefix,
+        "rows": rows,
+        "store": store,
+        "n_files": len(files) if store else 0,
+        "n_bytes": n_bytes,
+        "sha256": {
+            name: sha256_of(folder / name) for name in ("database.sql.gz", *(["store.sha256"] if store else []))
+        },
+    }
+    _write_text(folder / "manifest.json", json.dumps(manifest, indent=1) + "\n")
+    return Backup(folder, created, rows, manifest["n_files"], n_bytes)
+
+
+def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
+    """Compare a backup with its checksums, every byte; returns the manifest.
+
+    Raises
+    ------
+    PblError
+        BACKUP_INVALID naming what is missing or changed.
+    """
+    try:
+        manifest = json.loads((folder / "manifest.json").read_text())
+        parts = manifest["sha256"]
+        if manifest["format"] != FORMAT:
+            raise _invalid(folder, f"format {manifest['format']}", f"format {FORMAT}")
+    except FileNotFoundError as error:
+        found = "no manifest.json: this is no backup, or one that was broken off"
+        raise _invalid(folder, found, "manifest.json, written last") from error
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise _invalid(
+            folder, f"manifest.json cannot be read ({error})", "the manifest that pbl db backup wrote"
+        ) from error
+    for name, sha in parts.items():
+        if not (folder / name).is_file() or sha256_of(folder / name) != sha:
+            raise _invalid(folder, f"{name} is missing or was changed", f"SHA-256 {sha}")
+    listed = list(_listed(folder)) if manifest["store"] else []
+    say(f"Checking {len(listed)} files of the backup")
+    wrong = []
+    with progress.bar("check", total=len(listed), unit="file") as update:
+        for sha, path in listed:
+            file = folder / "store" / path
+            if not file.is_file() or sha256_of(file) != sha:
+                wrong.append(path)
+            update(1)
+    if wrong or len(listed) != manifest["n_files"]:
+        found = f"{len(wrong)} files of the store are missing or were changed: {', '.join(wrong[:5])}"
+        raise _invalid(folder, found, f"{manifest['n_files']} files as listed in store.sha256")
+    return manifest
+
+
+def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Backup:
+    """Bring a backup back into an empty database and its store. Everything is checked before anything is written.
+
+    Parameters
+    ----------
+    folder
+        What `backup` made.
+    again
+        After a restore that was broken off: remove the tables it left, then begin anew.
+    say
+        Told in a sentence what is being done.
+
+    Raises
+    ------
+    PblError
+        BACKUP_INVALID; DB_REFUSED when there are tables under this prefix already, when PBL_DB_PREFIX is another one
+        than the backup's, or when a file of the store has other bytes than the backup's; STORE_UNAVAILABLE.
+    """
+    manifest = check(folder, say)
+    connection.connect()
+    prefix = connection.prefix()
+    if prefix != manifest["prefix"]:
+        raise _refused(
+            f"the backup holds {manifest['prefix']}_*, this database is {prefix}_*",
+            "the same prefix",
+            f"set PBL_DB_PREFIX={manifest['prefix']}",
+        )
+    try:
+        with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+            _make_room(server, cursor, prefix, again)
+            if manifest["store"]:
+                say(f"Bringing {manifest['n_files']} files back")
+                _restore_files(folder)
+            say(f"Bringing {len(manifest['rows'])} tables back")
+            total = sum(manifest["rows"].values())
+            with progress.bar("restore", total=total, unit="row") as update:
+                for statement in _dump.read_lines(folder / "database.sql.gz"):
+                    n = cursor.execute(statement)
+                    update(n if statement.startswith("INSERT") else 0)
+            _check_rows(cursor, manifest["rows"])
+            cursor.execute(f"DROP DATABASE {_dump.quote(f'{prefix}_{_MARKER}')}")
+    except pymysql.err.Error as error:
+        raise _refused(
+            str(error.args[-1]),
+            "a server that takes the tables back",
+            "correct what it says and run the same with --again: what was begun is removed first",
+        ) from error
+    return Backup(folder, manifest["created"], manifest["rows"], manifest["n_files"], manifest["n_bytes"])
+
+
+# ----------------------------------------------------------------------------------------------------------- saving
+def _snapshot(server: pymysql.Connection[Any]) -> str:
+    """From here on this connection sees the rows of this moment; the server's version."""
+    with server.cursor() as cursor:
+        cursor.execute("SELECT VERSION()")
+        version = str((cursor.fetchone() or ("",))[0])
+        cursor.execute("SET SESSION time_zone = '+00:00'")
+        cursor.execute("SET SESSION TRANSACTION ISOLATION LEVEL REPEATABLE READ")
+        cursor.execute("START TRANSACTION WITH CONSISTENT SNAPSHOT, READ ONLY")
+    return version
+
+
+def _save_tables(
+    server: pymysql.Connection[Any], tables: list[tuple[str, str]], path: Path
+) -> tuple[dict[str, int], set[str]]:
+    rows: dict[str, int] = {}
+    files: set[str] = set()
+    with (
+        gzip.open(path, "wb", compresslevel=6) as out,
+        progress.bar("tables", total=len(tables), unit="table") as update,
+    ):
+        for statement in _dump.HEADER:
+            _dump.write_line(out, statement)
+        for schema in dict.fromkeys(schema for schema, _ in tables):
+            _dump.write_line(out, f"CREATE DATABASE IF NOT EXISTS {_dump.quote(schema)}")
+        for schema, table in tables:
+            columns = _dump.columns_of(server, schema, table)
+            _dump.write_line(out, f"USE {_dump.quote(schema)}")
+            _dump.write_line(out, _dump.create_statement(server, schema, table))
+            counted = _Counted(_dump.rows_of(server, schema, table, columns), columns, files)
+            for statement in _dump.inserts(schema, table, columns, iter(counted)):
+                _dump.write_line(out, statement)
+            rows[f"{schema}.{table}"] = counted.n
+            update(1)
+    return rows, files
+
+
+class _Counted:
+    """Passes rows on, counts them, and collects the files they name."""
+
+    def __init__(self, rows: Iterator[tuple], columns: list[tuple[str, str, str]], files: set[str]) -> None:
+        self._rows, self._files, self.n = rows, files, 0
+        self._stored = [i for i, (_, _, comment) in enumerate(columns) if _STORED.match(comment)]
+
+    def __iter__(self) -> Iterator[tuple]:
+        for row in self._rows:
+            self.n += 1
+            self._files.update(json.loads(row[i])["path"] for i in self._stored if row[i] is not None)
+            yield row
+
+
+def _save_files(paths: list[str], folder: Path) -> int:
+    store, lost, n_bytes = connection.store_backend(), [], 0
+    with (folder / "store.sha256").open("w") as listing, progress.bar("store", total=len(paths), unit="file") as update:
+        for path in paths:
+            target = folder / "store" / safe_path(path)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                store.get_file(path, target)
+                listing.write(f"{sha256_of(target)}  {path}\n")
+                n_bytes += target.stat().st_size
+            except FileNotFoundError:
+                lost.append(path)
+            except OSError as error:
+                raise _unwritable(target, error) from error
+            except Exception as error:
+                raise store_error(error) from error
+            update(1)
+    if lost:
+        raise PblError(
+            "BACKUP_INVALID",
+            key=folder,
+            found=f"{len(lost)} files that rows name are not in the store: {', '.join(lost[:5])}",
+            expected="every file that a row of the database names",
+            next_step="restore them from an older backup, or delete the rows so that they are computed again; "
+            "--database-only saves the tables as they are",
+        )
+    return n_bytes
+
+
+# -------------------------------------------------------------------------------------------------------- restoring
+def _make_room(server: pymysql.Connection[Any], cursor: Any, prefix: str, again: bool) -> None:
+    """Refuse where there are tables; set the marker. Where the marker stands, an earlier restore left the tables."""
+    marker = f"{prefix}_{_MARKER}"
+    if marker in _dump.schemas_of(server, prefix):
+        if not again:
+            raise _refused(
+                f"a restore was broken off here and left {len(_dump.tables_of(server, prefix))} tables",
+                "an empty database",
+                "run the same with --again: it removes these tables and begins anew",
+            )
+        for schema in _dump.schemas_of(server, prefix):
+            if schema != marker:
+                cursor.execute(f"DROP DATABASE {_dump.quote(schema)}")
+        return
+    tables = _dump.tables_of(server, prefix)
+    if tables:
+        raise _refused(
+            f"there are {len(tables)} tables under {prefix}_* already",
+            "an empty database: nothing is ever restored over another",
+            "start a new server (embedded: another PBL_HOME, then pbl db start) and restore there",
+        )
+    cursor.execute(f"CREATE DATABASE {_dump.quote(marker)}")
+
+
+def _restore_files(folder: Path) -> None:
+    store, listed = connection.store_backend(), list(_listed(folder))
+    with progress.bar("store", total=len(listed), unit="file") as update:
+        for sha, path in listed:
+            try:
+                if not store.exists(path):
+                    store.put_file(folder / "store" / path, path)
+                elif hashlib.sha256(store.get_buffer(path)).hexdigest() != sha:
+                    raise _refused(
+                        f"the store has another {path}", "no such file, or the same", "restore into an empty store"
+                    )
+            except PblError:
+                raise
+            except Exception as error:
+                raise store_error(error) from error
+            update(1)
+
+
+def _check_rows(cursor: Any, rows: dict[str, int]) -> None:
+    for name, expected in rows.items():
+        schema, table = name.split(".", 1)
+        cursor.execute(f"SELECT COUNT(*) FROM {_dump.quote(schema)}.{_dump.quote(table)}")  # noqa: S608
+        found = cursor.fetchone()[0]
+        if found != expected:
+            raise _refused(f"{found} rows in {name} after the restore", f"{expected}", "run the same with --again")
+
+
+# ------------------------------------------------------------------------------------------------------------ files
+def safe_path(path: str) -> PurePosixPath:
+    """A path of the store, refused where it would leave it. Raises BACKUP_INVALID."""
+    parts = PurePosixPath(path)
+    if parts.is_absolute() or ".." in parts.parts or not parts.parts or "\n" in path or "\\" in path:
+        raise PblError(
+            "BACKUP_INVALID",
+            key=repr(path)[:200],
+            found="a path that leaves the store",
+            expected="a relative path without ..",
+            next_step="the row was not written by this pipeline: find it and delete it",
+        )
+    return parts
+
+
+def _listed(folder: Path) -> Iterable[tuple[str, str]]:
+    """SHA-256 and path of the files of a backup."""
+    for line in (folder / "store.sha256").read_text().splitlines():
+        sha, _, path = line.partition("  ")
+        yield sha, str(safe_path(path))
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, in hex."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _new_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        empty = not any(folder.iterdir())
+    except OSError as error:
+        raise _unwritable(folder, error) from error
+    if not empty:
+        raise PblError(
+            "FILE_UNWRITABLE",
+            key=folder,
+            found="a folder with something in it",
+            expected="a new or empty folder: no backup is ever written over another",
+            next_step="name another folder, such as one with today's date",
+        )
+
+
+def _write_text(path: Path, text: str) -> None:
+    try:
+        path.write_text(text)
+    except OSError as error:
+        raise _unwritable(path, error) from error
+
+
+def _unwritable(path: Path, error: OSError) -> PblError:
+    return PblError(
+        "FILE_UNWRITABLE",
+        key=path,
+        found=error.strerror or str(error),
+        expected="a folder with room for the whole backup",
+        next_step="free space, remove what was begun, and run it again",
+    )
+
+
+def _check_some(tables: list[tuple[str, str]], prefix: str) -> None:
+    if not tables:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no table under {prefix}_*",
+            expected="a database with tables",
+            next_step="check PBL_DB_PREFIX and DJ_HOST, or: pbl db init",
+        )
+
+
+def _invalid(folder: Path, found: str, expected: str) -> PblError:
+    return PblError(
+        "BACKUP_INVALID",
+        key=folder,
+        found=found,
+        expected=expected,
+        next_step="use another backup; nothing was changed",
+    )
+
+
+def _refused(found: str, expected: str, next_step: str) -> PblError:
+    return PblError("DB_REFUSED", found=found, expected=expected, next_step=next_step)

@@ -1,0 +1,51 @@
+"""`pbl db backup` and `pbl db restore`: database and object store, together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("--database-only", is_flag=True, help="Leave the store's files out (where it is saved by other means).")
+def backup(folder: Path, database_only: bool) -> None:
+    """Save all tables and the files they name into the new folder FOLDER, as of one moment. Workers may go on.
+
+    It holds data of people: keep it as closed as the database itself. `pbl forget` does not reach into backups.
+
+    \b
+    Example: pbl db backup /backup/2026-03-01
+    """
+    from schemas.backup import backup as save
+
+    saved = save(folder, not database_only, click.echo)
+    click.echo(f"{sum(saved.rows.values())} rows of {len(saved.rows)} tables, {saved.n_files} files ", nl=False)
+    click.echo(f"({saved.n_bytes / 2**20:.1f} MB) of {saved.created} are in {saved.folder}")
+
+
+@click.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("--check", "only_check", is_flag=True, help="Compare the backup with its checksums; change nothing.")
+@click.option("--again", is_flag=True, help="After a restore that was broken off: remove what it left, begin anew.")
+def restore(folder: Path, only_check: bool, again: bool) -> None:
+    """Bring a backup back into an empty database and its store.
+
+    Never over another: where tables exist it refuses. Checksums are compared before anything is written, row counts
+    after.
+
+    \b
+    Example: pbl db restore --check /backup/2026-03-01
+    Example: PBL_HOME=/srv/pbl-new pbl db start && PBL_HOME=/srv/pbl-new pbl db restore /backup/2026-03-01
+    """
+    from schemas import backup
+
+    if only_check:
+        manifest = backup.check(folder, click.echo)
+        click.echo(f"The backup of {manifest['created']} is whole: {sum(manifest['rows'].values())} rows, ", nl=False)
+        click.echo(f"{manifest['n_files']} files")
+        return
+    done = backup.restore(folder, again, click.echo)
+    click.echo(f"{sum(done.rows.values())} rows and {done.n_files} files of {done.created} are back")
+    click.echo("Next: pbl db migrate --dry-run, where this version of the code is another than the backup's")

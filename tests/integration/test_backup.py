@@ -1,0 +1,207 @@
+"""Backups: what comes back is what was there, and nothing is ever written over."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import schemas
+from pbl_pipeline.errors import PblError
+from schemas import _dump, backup, connection, embedded, lab, video, views
+from schemas._declare import declare_all
+from schemas.ingest import Visit, ingest
+from schemas.results import load_session
+from tests.command import pbl
+from tests.database import new_home, remove_home
+from workers.populate import populate
+
+from . import chain
+
+#: A single-precision number that needs nine digits, and a text with everything that has to be escaped.
+HEIGHT = float(np.float32(1.7345679))
+TITLE = "knee ' \" \\ % `\n\t\0 \u00e4\u20ac\U0001f6b6 $(rm -rf /); --"
+
+
+def everything() -> dict[str, list[tuple]]:
+    """Every row of every table, as the server prints it."""
+    with closing(connection.plain_connection(conv={})) as server:
+        found = {}
+        for schema, table in _dump.tables_of(server, connection.prefix()):
+            columns = _dump.columns_of(server, schema, table)
+            found[f"{schema}.{table}"] = sorted(_dump.rows_of(server, schema, table, columns), key=str)
+        return found
+
+
+@pytest.fixture
+def filled(database: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """One visit through the whole chain, one error row, and awkward values."""
+    chain.install(monkeypatch)
+    declare_all()
+    (tmp_path / "notes.mp4").write_text("not a video")
+    ingest([chain.small_video(tmp_path, "walk"), tmp_path / "notes.mp4"], Visit(subject="P001", project="gait"))
+    populate()
+    lab.Project.update1({"project": "gait", "project_title": TITLE})
+    lab.Subject.update1({"subject": "P001", "subject_height": HEIGHT})
+    yield
+    lab.Subject.delete(prompt=False, part_integrity="cascade")
+    lab.Project.delete(prompt=False)
+    for table in schemas.computed_tables():
+        table.jobs.delete_quick()
+
+
+@pytest.fixture
+def elsewhere(filled: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """A call that starts an empty server and makes it the one in use; afterwards the old one is again."""
+    homes = []
+
+    def move() -> Path:
+        home = new_home()
+        homes.append(home)
+        patch.setenv("PBL_HOME", str(home))
+        embedded.start(folder=embedded.Folder(home / "db"))
+        return home
+
+    with monkeypatch.context() as patch:
+        yield move
+    connection.connect()
+    for home in homes:
+        remove_home(home)
+
+
+def test_there_and_back(elsewhere: Any, tmp_path: Path):
+    saved = tmp_path / "backup"
+    before = everything()
+    done = pbl("db", "backup", saved)
+    assert done.code == 0, done.err
+    assert before["pbl_video.~~video_info"]
+    assert "2 rows" not in done.out
+    assert saved.stat().st_mode & 0o077 == 0
+    # sha256sum understands the list, and the programs of the server the statements.
+    check = ["sha256sum", "--check", "--quiet", "../store.sha256"]
+    assert subprocess.run(check, cwd=saved / "store", check=False).returncode == 0
+    assert gzip.decompress((saved / "database.sql.gz").read_bytes()).count(b"\n") > 2 * len(before)
+    elsewhere()
+    assert pbl("db", "restore", "--check", saved).code == 0
+    done = pbl("db", "restore", saved)
+    assert done.code == 0, done.err
+    assert everything() == before
+    # The tables work: what was computed is there, with its arrays, and nothing is computed anew.
+    schemas.activate()
+    exact = connection.connect().query("SELECT subject_height + 0e0 FROM pbl_lab.subject").fetchone()[0]
+    assert exact == HEIGHT
+    assert lab.Project.fetch1("project_title") == TITLE
+    assert views.session_summary()["subject"].tolist() == ["P001"]
+    results = load_session({"subject": "P001"})
+    assert results.fitted
+    assert np.isfinite(results.fitted[0].fit.qpos).any()
+    assert not populate().did_something
+    # Never over another.
+    again = pbl("db", "restore", saved)
+    assert again.error_code == "DB_REFUSED"
+    assert everything() == before
+
+
+def test_a_restore_that_was_broken_off_is_repeated_on_demand(
+    elsewhere: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    before = everything()
+    backup.backup(tmp_path / "backup")
+    elsewhere()
+    lines = _dump.read_lines
+
+    def broken(path: Path) -> Iterator[str]:
+        for i, line in enumerate(lines(path)):
+            if i == 60:
+                raise KeyboardInterrupt
+            yield line
+
+    with monkeypatch.context() as patch:
+        patch.setattr(_dump, "read_lines", broken)
+        with pytest.raises(KeyboardInterrupt):
+            backup.restore(tmp_path / "backup")
+    assert pbl("db", "restore", tmp_path / "backup").error_code == "DB_REFUSED"
+    assert pbl("db", "restore", "--again", tmp_path / "backup").code == 0
+    assert everything() == before
+    # The marker is gone: --again is no way to write over a database.
+    assert pbl("db", "restore", "--again", tmp_path / "backup").error_code == "DB_REFUSED"
+
+
+def test_it_is_of_one_moment_while_others_write(filled: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    create = _dump.create_statement
+    late: list[str] = []
+
+    def slow(server: Any, schema: str, table: str) -> str:
+        if not late:
+            late.append("P999")
+            writer = threading.Thread(target=_insert_subject)
+            writer.start()
+            writer.join(20)
+            assert not writer.is_alive(), "the backup holds up who writes"
+        return create(server, schema, table)
+
+    monkeypatch.setattr(_dump, "create_statement", slow)
+    rows = backup.backup(tmp_path / "backup").rows
+    assert len(lab.Subject()) == 2
+    assert rows["pbl_lab.subject"] == 1
+
+
+def _insert_subject() -> None:
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        cursor.execute(
+            "INSERT INTO pbl_lab.subject (subject, population, subject_created) VALUES ('P999', 'unknown', NOW())"
+        )
+
+
+def test_a_changed_backup_is_refused_before_anything_is_written(elsewhere: Any, tmp_path: Path):
+    saved = tmp_path / "backup"
+    backup.backup(saved)
+    elsewhere()
+    one = next(p for p in sorted((saved / "store").rglob("*")) if p.is_file())
+    content = one.read_bytes()
+    one.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    done = pbl("db", "restore", saved)
+    assert done.error_code == "BACKUP_INVALID"
+    assert one.name in done.err
+    one.write_bytes(content)
+    sql = (saved / "database.sql.gz").read_bytes()
+    (saved / "database.sql.gz").write_bytes(sql[:-9])
+    assert pbl("db", "restore", saved).error_code == "BACKUP_INVALID"
+    (saved / "database.sql.gz").write_bytes(sql)
+    listing = (saved / "store.sha256").read_text()
+    (saved / "store.sha256").write_text(listing.replace("  _schema/", "  ../_schema/", 1))
+    manifest = json.loads((saved / "manifest.json").read_text())
+    manifest["sha256"]["store.sha256"] = backup.sha256_of(saved / "store.sha256")
+    (saved / "manifest.json").write_text(json.dumps(manifest))
+    assert pbl("db", "restore", saved).error_code == "BACKUP_INVALID"
+    (saved / "manifest.json").unlink()
+    assert pbl("db", "restore", saved).error_code == "BACKUP_INVALID"
+    assert everything() == {}
+
+
+def test_a_lost_file_and_a_full_folder_are_said(filled: None, tmp_path: Path):
+    saved = tmp_path / "backup"
+    saved.mkdir()
+    (saved / "something").touch()
+    assert pbl("db", "backup", saved).error_code == "FILE_UNWRITABLE"
+    connection.store_backend().remove(video.VideoInfo.fetch1("frame_time").path)
+    done = pbl("db", "backup", tmp_path / "other")
+    assert done.error_code == "BACKUP_INVALID"
+    assert "frame_time" in done.err
+    assert not (tmp_path / "other" / "manifest.json").exists()
+    assert pbl("db", "backup", "--database-only", tmp_path / "tables").code == 0
+
+
+@pytest.mark.parametrize("path", ["/etc/passwd", "../x", "a/../../x", "", "a\nb", "..\\x"])
+def test_paths_that_leave_the_store_are_refused(path: str):
+    with pytest.raises(PblError) as error:
+        backup.safe_path(path)
+    assert error.value.code == "BACKUP_INVALID"
