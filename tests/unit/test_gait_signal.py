@@ -7,7 +7,7 @@ import pytest
 
 from pbl_pipeline.gait import EventParams
 from pbl_pipeline.gait._signal import Segment, refine_extremum, uniform_segments
-from pbl_pipeline.gait.events._coordinates import _prominence, _walks
+from pbl_pipeline.gait.events._coordinates import _walks, prominence
 from pbl_pipeline.gait.events._order import Candidate
 
 ABOUT = {"grid_hz": 100.0, "cutoff_hz": 6.0, "filter_order": 4, "max_gap_s": 0.15, "min_segment_s": 1.0}
@@ -55,9 +55,9 @@ def test_a_parabola_is_found_exactly():
 
 def test_a_drop_cut_short_by_the_end_does_not_count():
     signal = np.array([0.0, 5, 10, 4, 8, 7])
-    assert _prominence(signal, 4, 3, 5) == 4.0  # right side cut short at the end: the left drop
-    assert _prominence(signal, 2, 0, 3) == 10.0  # left side reaches the start, the larger drop
-    assert _prominence(np.array([9.0, 0, 5, 3, 9]), 2, 1, 3) == 2.0
+    assert prominence(signal, 4, 3, 5) == 4.0  # right side cut short at the end: the left drop
+    assert prominence(signal, 2, 0, 3) == 10.0  # left side reaches the start, the larger drop
+    assert prominence(np.array([9.0, 0, 5, 3, 9]), 2, 1, 3) == 2.0
 
 
 def test_feet_that_do_not_pass_each_other_do_not_walk():

@@ -1,6 +1,7 @@
 """Foot down and foot up of both sides."""
 
 from ._detect import detect_events
+from ._foot_velocity import FootVelocityParams
 from ._methods import DEFAULT_EVENT_PARAMSET, EVENT_PARAMSETS, resolve_params
 from ._phase import PhaseParams
 from ._phase_filter import FilterParams
@@ -29,6 +30,7 @@ __all__ = [
     "SIDES",
     "EventParams",
     "FilterParams",
+    "FootVelocityParams",
     "GaitEvent",
     "GaitEvents",
     "PhaseParams",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from scipy.signal import find_peaks
@@ -55,7 +56,23 @@ def detect_by_coordinates(feet: FootTrajectories, paramset: Paramset) -> GaitEve
         GAIT_INPUT where no frame holds feet, pelvis and heading.
     """
     p = EventParams(**paramset.params)
-    x, leg = _forward_signals(feet, p)
+    x, leg = forward_signals(feet, p)
+    return detect_by_extrema(
+        feet, paramset, p, x, leg, lambda segment: _candidates(segment, leg, p), p.min_excursion_leg * leg
+    )
+
+
+def detect_by_extrema(
+    feet: FootTrajectories,
+    paramset: Paramset,
+    p: EventParams,
+    x: np.ndarray,
+    leg: float,
+    extrema: Callable[[Segment], list[Extremum]],
+    least: float,
+) -> GaitEvents:
+    """Events among the `extrema` of each segment of the signals `x` (T, C), whose first two columns are the heels'
+    places ahead of the pelvis; `least` is the smallest prominence that counts."""
     segments = uniform_segments(
         np.asarray(feet.time_s, float),
         x,
@@ -68,13 +85,13 @@ def detect_by_coordinates(feet: FootTrajectories, paramset: Paramset) -> GaitEve
     if not segments:
         return _empty(paramset, feet, f"the feet are not seen for {p.min_segment_s:g} s at a time")
     confidence = _mean_confidence(feet)
-    per_segment = [_candidates(s, leg, p) for s in segments]
-    threshold = _thresholds(per_segment, leg, p)
+    per_segment = [extrema(s) for s in segments]
+    threshold = _thresholds(per_segment, least, p)
     bouts: list[list[Candidate]] = []
     n_candidates = breaks = 0
-    for segment, extrema in zip(segments, per_segment, strict=True):
+    for segment, candidates in zip(segments, per_segment, strict=True):
         c = _local_confidence(feet, confidence, segment)
-        kept = [_candidate(e, threshold, c) for e in extrema if e.prominence >= threshold[e.side, e.event]]
+        kept = [_candidate(e, threshold, c) for e in candidates if e.prominence >= threshold[e.side, e.event]]
         n_candidates += len(kept)
         runs = best_sequence(kept, p)
         good = [r for r in runs if _walks(r, segment, leg, p)]
@@ -103,14 +120,16 @@ def detect_by_coordinates(feet: FootTrajectories, paramset: Paramset) -> GaitEve
 
 
 @dataclasses.dataclass(frozen=True)
-class _Extremum:
+class Extremum:
+    """A candidate: when, of which foot, of which kind, how much it stands out."""
+
     time_s: float
     side: str
     event: str
     prominence: float
 
 
-def _forward_signals(feet: FootTrajectories, p: EventParams) -> tuple[np.ndarray, float]:
+def forward_signals(feet: FootTrajectories, p: EventParams) -> tuple[np.ndarray, float]:
     """(T, 4): heel left, heel right, toe left, toe right, forward of the pelvis; and the leg length (same unit)."""
     heel = np.asarray(feet.heel_m, float) - feet.pelvis_m[:, None]
     toe = np.asarray(feet.toe_m, float) - feet.pelvis_m[:, None]
@@ -139,7 +158,7 @@ def _forward_signals(feet: FootTrajectories, p: EventParams) -> tuple[np.ndarray
     return x, leg
 
 
-def _candidates(segment: Segment, leg: float, p: EventParams) -> list[_Extremum]:
+def _candidates(segment: Segment, leg: float, p: EventParams) -> list[Extremum]:
     """All extrema of one segment that pass the absolute threshold."""
     window = int(2 * 60 / p.min_cadence_per_min * p.grid_hz) | 1
     found = []
@@ -147,12 +166,12 @@ def _candidates(segment: Segment, leg: float, p: EventParams) -> list[_Extremum]
         for event, signal in ((FOOT_DOWN, segment.values[:, _HEEL][:, s]), (FOOT_UP, -segment.values[:, _TOE][:, s])):
             at, about = find_peaks(signal, prominence=p.min_excursion_leg * leg, wlen=window)
             for k, i in enumerate(at):
-                size = _prominence(signal, i, int(about["left_bases"][k]), int(about["right_bases"][k]))
-                found.append(_Extremum(refine_extremum(segment.time_s, signal, i), side, event, size))
+                size = prominence(signal, i, int(about["left_bases"][k]), int(about["right_bases"][k]))
+                found.append(Extremum(refine_extremum(segment.time_s, signal, i), side, event, size))
     return found
 
 
-def _prominence(signal: np.ndarray, at: int, left: int, right: int) -> float:
+def prominence(signal: np.ndarray, at: int, left: int, right: int) -> float:
     """The smaller of the drops to both sides, but a drop that the end of the segment cuts short does not count."""
     before, after = float(signal[at] - signal[left]), float(signal[at] - signal[right])
     if left == 0 and right != len(signal) - 1:
@@ -162,18 +181,18 @@ def _prominence(signal: np.ndarray, at: int, left: int, right: int) -> float:
     return min(before, after)
 
 
-def _thresholds(per_segment: list[list[_Extremum]], leg: float, p: EventParams) -> dict[tuple[str, str], float]:
+def _thresholds(per_segment: list[list[Extremum]], least: float, p: EventParams) -> dict[tuple[str, str], float]:
     """Per side and event: the larger of the absolute threshold and a share of the typical prominence."""
     out = {}
     for side in SIDES:
         for event in (FOOT_DOWN, FOOT_UP):
             seen = [e.prominence for part in per_segment for e in part if (e.side, e.event) == (side, event)]
             typical = float(np.median(seen)) if seen else 0.0
-            out[side, event] = max(p.min_excursion_leg * leg, p.min_prominence_ratio * typical)
+            out[side, event] = max(least, p.min_prominence_ratio * typical)
     return out
 
 
-def _candidate(e: _Extremum, threshold: dict[tuple[str, str], float], confidence: np.ndarray) -> Candidate:
+def _candidate(e: Extremum, threshold: dict[tuple[str, str], float], confidence: np.ndarray) -> Candidate:
     c = confidence[SIDES.index(e.side)]
     ratio = threshold[e.side, e.event] / e.prominence
     return Candidate(e.time_s, e.side, e.event, float(c / (1 + ratio**2)))

@@ -6,12 +6,17 @@ from typing import Any
 
 from .._feet import FootTrajectories
 from ._coordinates import detect_by_coordinates
+from ._foot_velocity import FootVelocityParams, detect_by_foot_velocity
 from ._methods import resolve_params
 from ._phase import PhaseParams, detect_by_phase
 from ._types import EventParams, GaitEvents
 
 #: How the parameters of each class are used.
-_BY_PARAMS = {EventParams: detect_by_coordinates, PhaseParams: detect_by_phase}
+_BY_PARAMS = {
+    EventParams: detect_by_coordinates,
+    FootVelocityParams: detect_by_foot_velocity,
+    PhaseParams: detect_by_phase,
+}
 
 
 def detect_events(feet: FootTrajectories, params: Any = None) -> GaitEvents:
@@ -37,6 +42,6 @@ def detect_events(feet: FootTrajectories, params: Any = None) -> GaitEvents:
     """
     paramset = resolve_params(params)
     for kind, detect in _BY_PARAMS.items():
-        if set(paramset.params) == {f for f in kind.__dataclass_fields__}:
+        if set(paramset.params) == set(kind.__dataclass_fields__):
             return detect(feet, paramset)
     raise TypeError(f"{paramset.name}: parameters {sorted(paramset.params)} are of no method")

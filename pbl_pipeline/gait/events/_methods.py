@@ -8,10 +8,12 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import Paramset
 
+from ._foot_velocity import FootVelocityParams
 from ._types import EventParams
 
 EVENT_PARAMSETS: dict[str, Paramset] = {
     "zeni-2008": Paramset.of("gait", "zeni-2008", 1, EventParams()),
+    "oconnor-2007": Paramset.of("gait", "oconnor-2007", 1, FootVelocityParams()),
 }
 DEFAULT_EVENT_PARAMSET = "zeni-2008"
 
@@ -30,7 +32,7 @@ def resolve_params(params: Any) -> Paramset:
                 return known
             base = base or (name if set(known.params) == set(plain) else "")
         return Paramset("gait", f"{base or type(params).__name__}-custom", 1, plain)
-    if params not in EVENT_PARAMSETS:
+    if not isinstance(params, str) or params not in EVENT_PARAMSETS:
         raise PblError(
             "SOLVER_UNKNOWN",
             found=f"event method {params!r}",

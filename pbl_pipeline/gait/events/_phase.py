@@ -85,7 +85,7 @@ def detect_by_phase(feet: FootTrajectories, paramset: Paramset) -> GaitEvents:
     half_seen = dropped = 0
     for first, last in stretches:
         cut = slice(first, last + 1)
-        below = grid.known[cut, 2:].any(axis=1)
+        below: np.ndarray = np.logical_or.reduce(grid.known[cut, 2:], axis=1)
         if np.any(below.mean(axis=0) < p.min_leg_share):
             half_seen += 1
             continue

@@ -57,7 +57,7 @@ def on_grid(time_s: np.ndarray, legs_m: Float[np.ndarray, "T 5 2 3"], up: np.nda
     fast = len(time_s) > 2 and 1 / np.median(np.diff(time_s)) > _AVERAGE_ABOVE_HZ
     for j in range(legs_m.shape[1]):
         for s in range(2):
-            own = np.flatnonzero(np.all(np.isfinite(legs_m[:, j, s]), axis=1))
+            own = np.flatnonzero(np.isfinite(legs_m[:, j, s]).all(axis=1))
             if len(own) < 2:
                 continue
             t, x = time_s[own], np.asarray(legs_m[own, j, s], float)
@@ -74,7 +74,8 @@ def on_grid(time_s: np.ndarray, legs_m: Float[np.ndarray, "T 5 2 3"], up: np.nda
     up = np.asarray(up, float)
     line = joints[:, 0, 0] - joints[:, 0, 1]
     hips = known[:, 0].all(axis=1)
-    leg = float(leg_length(joints, known)) if np.any(hips[:, None] & known[:, 2:4].any(axis=1)) else float("nan")
+    measured = np.any(known[hips, 2:4])
+    leg = float(leg_length(joints, known)) if measured else float("nan")
     return Grid(grid, joints, known, up, heading(line, hips, up), leg)
 
 

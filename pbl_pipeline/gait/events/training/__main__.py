@@ -43,7 +43,12 @@ def main(arguments: list[str] | None = None) -> None:
 
     size = Architecture(width=args.width, blocks=args.blocks, heads=args.heads, hidden=3 * args.width)
     params = TrainParams(
-        seed=args.seed, steps=args.steps, batch=args.batch, report_every=args.report_every, validation=args.validation
+        seed=args.seed,
+        steps=args.steps,
+        batch=args.batch,
+        report_every=args.report_every,
+        validation=args.validation,
+        minutes=args.minutes,
     )
     about = {
         "train": dataclasses.asdict(params),
@@ -78,6 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--out", type=Path, default=Path("event_model"), help="folder for weights and metrics")
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--steps", type=int, default=30000)
+    p.add_argument("--minutes", type=float, help="at most this long for the steps: fewer of them, if need be")
     p.add_argument("--batch", type=int, default=256)
     p.add_argument("--scenes", type=int, default=20000, help="sequences of 12 s that are made on the spot")
     p.add_argument("--solved", type=Path, help="file of --make-solved")

@@ -108,8 +108,8 @@ def _noise(key, shape):
     size = jnp.exp(jax.random.uniform(k[0], minval=np.log(0.0008), maxval=np.log(0.035)))
     size = jnp.where(jax.random.bernoulli(k[1], 0.15), 0.0, size)
     # Fresh noise comes with the recording's frames; the grid interpolates between them.
-    fps = jnp.take(jnp.array([24.0, 30.0, 30.0, 50.0, 60.0, 100.0]), jax.random.randint(k[2], (), 0, 6))
-    fresh = jax.random.normal(k[3], (2 * t + 2, *shape[1:]))
+    fps = jnp.take(jnp.array([24.0, 30.0, 30.0, GRID_HZ]), jax.random.randint(k[2], (), 0, 4))
+    fresh = jax.random.normal(k[3], (t + 2, *shape[1:]))
     at = jnp.arange(t) * fps / GRID_HZ
     i = jnp.floor(at).astype(int)
     u = (at - i).reshape(-1, 1, 1, 1)

@@ -13,7 +13,7 @@ from ._rhythm import Rhythm
 
 #: How far the curves of two people differ (deg): standard deviations of harmonics 0 (the mean), 1, 2, 3, 4, 5. They add
 #: up to about what Schwartz et al. 2008 give for children, a little more.
-_PERSON_DEG = (5.0, 2.2, 1.6, 1.0, 0.6, 0.4)
+_PERSON_DEG = (5.0, 2.0, 1.4, 0.8, 0.4, 0.25)
 _SIDE_SHARE = 0.4
 
 #: Running, deg over the stride from foot down, foot off at 38 %. The project's own numbers, drawn to follow the course

@@ -21,7 +21,7 @@ class Bout:
     """Walking without a stop: times (s) of each of the four events, in `ORDER`; `open_ends`: the walk goes on
     beyond the sequence."""
 
-    events_s: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+    events_s: tuple[np.ndarray, ...]
     open_ends: bool
 
 

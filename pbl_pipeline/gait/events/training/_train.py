@@ -20,7 +20,8 @@ from ._corpus import UNIT_M, Corpus
 
 @dataclasses.dataclass(frozen=True)
 class TrainParams:
-    """How to train. `solved_share`: examples from solved motions, where the corpus has such."""
+    """How to train. `solved_share`: examples from solved motions, where the corpus has such. `minutes`: fewer steps
+    where more would take longer; the history says how many there were."""
 
     seed: int = 0
     steps: int = 30000
@@ -34,6 +35,7 @@ class TrainParams:
     solved_share: float = 0.35
     report_every: int = 500
     validation: int = 2048
+    minutes: float | None = None
 
 
 def train(
@@ -48,11 +50,10 @@ def train(
     k_model, k_valid, key = jax.random.split(key, 3)
     model = PhaseTransformer(size, k_model)
     weights, static = eqx.partition(model, eqx.is_array)
-    schedule = optax.warmup_cosine_decay_schedule(
-        0.0, params.learning_rate, min(params.warm_up, params.steps // 4 + 1), params.steps, 0.01 * params.learning_rate
-    )
     optimiser = optax.chain(
-        optax.clip_by_global_norm(params.clip), optax.adamw(schedule, weight_decay=params.weight_decay)
+        optax.clip_by_global_norm(params.clip),
+        optax.scale_by_adam(),
+        optax.add_decayed_weights(params.weight_decay),
     )
     data = {k: jnp.asarray(getattr(corpus, k)) for k in ("points", "phase", "walks", "start", "length")}
     picks = _picks(corpus, held_out=False, solved_share=params.solved_share)
@@ -64,34 +65,37 @@ def train(
         return _loss(eqx.combine(weights, static), batch, params.walking_weight)
 
     @jax.jit
-    def some_steps(state: Any, data: Any, keys: Any) -> Any:
-        def step(state: Any, key: Any) -> Any:
+    def some_steps(state: Any, data: Any, done: Any, total: Any, keys: Any) -> Any:
+        def step(state: Any, now: Any) -> Any:
+            key, number = now
             weights, average, optimiser_state = state
+            rate = _rate(number, total, params)
             loss, slope = jax.value_and_grad(loss_of)(weights, data, key)
             update, optimiser_state = optimiser.update(slope, optimiser_state, weights)
-            weights = optax.apply_updates(weights, update)
+            weights = optax.apply_updates(weights, jax.tree.map(lambda u: -rate * u, update))
             average = optax.incremental_update(weights, average, 1 - params.average)
             return (weights, average, optimiser_state), loss
 
-        return jax.lax.scan(step, state, keys)
+        return jax.lax.scan(step, state, (keys, done + jnp.arange(len(keys))))
 
     state = (weights, weights, optimiser.init(weights))
     validation = _validation(corpus, k_valid, params.validation)
     history: list[dict[str, Any]] = []
-    began, done = time.monotonic(), 0
     chunk = min(50, params.report_every)
+    total = _fitting_steps(lambda k: some_steps(state, data, 0, params.steps, k), key, chunk, params, say)
+    began, done = time.monotonic(), 0
     losses: list[np.ndarray] = []
-    while done < params.steps:
+    while done < total:
         key, k = jax.random.split(key)
-        state, loss = some_steps(state, data, jax.random.split(k, chunk))
+        state, loss = some_steps(state, data, done, total, jax.random.split(k, chunk))
         losses.append(np.asarray(loss))
         done += chunk
-        if done % params.report_every < chunk or done >= params.steps:
+        if done % params.report_every < chunk or done >= total:
             mean = float(np.concatenate(losses).mean())
             losses = []
             # Early on the average still holds the start.
             shown = state[1] if done > 5 / (1 - params.average) else state[0]
-            metrics = {"step": done, "loss": mean, "seconds": time.monotonic() - began}
+            metrics = {"step": done, "of": total, "loss": mean, "seconds": time.monotonic() - began}
             metrics |= validation(eqx.combine(shown, static))
             history.append(metrics)
             say("  ".join(f"{k} {v:.4g}" for k, v in metrics.items()))
@@ -100,6 +104,32 @@ def train(
                 raise FloatingPointError(f"the loss is {mean} after {done} steps")
     final = state[1] if done > 5 / (1 - params.average) else state[0]
     return eqx.combine(final, static), history
+
+
+def _rate(number: Any, total: Any, params: TrainParams) -> Any:
+    """Learning rate: up within the first steps, then down along half a cosine to a hundredth."""
+    warm = jnp.minimum(params.warm_up, total // 4 + 1)
+    share = jnp.clip((number - warm) / jnp.maximum(total - warm, 1), 0.0, 1.0)
+    down = 0.01 + 0.99 * 0.5 * (1 + jnp.cos(jnp.pi * share))
+    return params.learning_rate * jnp.minimum(number / warm, down)
+
+
+def _fitting_steps(run: Callable[[Any], Any], key: Any, chunk: int, params: TrainParams, say: Any) -> int:
+    """How many steps are made: those asked for, or as many as fit into the minutes."""
+    keys = jax.random.split(key, chunk)
+    began = time.monotonic()
+    jax.block_until_ready(run(keys))
+    compiled = time.monotonic()
+    jax.block_until_ready(run(keys))
+    step_s = (time.monotonic() - compiled) / chunk
+    minutes = params.steps * step_s / 60
+    say(f"compiled in {compiled - began:.0f} s, {1000 * step_s:.1f} ms a step, {minutes:.1f} min in all")
+    if params.minutes is None:
+        return params.steps
+    fits = int(60 * params.minutes / (1.05 * step_s)) // chunk * chunk
+    if fits < params.steps:
+        say(f"{fits} steps fit into {params.minutes:g} minutes")
+    return max(chunk, min(params.steps, fits))
 
 
 def _loss(model: PhaseTransformer, batch: dict[str, Any], walking_weight: float) -> Any:
