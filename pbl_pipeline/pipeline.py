@@ -22,7 +22,7 @@ from pbl_pipeline.qc import WARN, Check
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
 from pbl_pipeline.report import Picture, SessionReport, TrialReport, write_report
 from pbl_pipeline.tracking import SubjectChoice, choose_subject, require_subject, track_people
-from pbl_pipeline.video import VideoInfo, check_timing, find_camera, load_attitude, probe, sha256_of
+from pbl_pipeline.video import VideoInfo, attitude_of, check_timing, find_camera, probe, read_phone_log, sha256_of
 
 #: What `write_results` writes for each trial, after the trial's name and a dot.
 TRIAL_FILES = ("overlay.mp4", "angles.csv", "events.csv", "fit.npz", "keypoints.npz")
@@ -117,18 +117,18 @@ def run_session(
     bytes were named before, because its steps would count twice; the others go on. Into `out` goes only a picture of
     the people of a video in which one must be chosen.
 
-    `attitude_files` holds an orientation log of the phone for each path, or nothing. `camera_motion` None stands for
-    "handheld" where there are logs, else "static".
+    `attitude_files` holds a sensor log of the phone for each path, or nothing; one that does not belong to its video
+    leaves that out. `camera_motion` None stands for "handheld" where there are logs, else "static".
 
     Raises
     ------
     PblError
         The error of the video where no video of the session can be fitted; NORM_UNKNOWN, NORM_INVALID; FILE_MISSING,
-        PHONE_LOG for a log.
+        PHONE_LOG for a log that cannot be read.
     """
     # A wrong name or log must not cost a fit.
     basis = load_norm(norm or DEFAULT_NORM)
-    logs = [load_attitude(file) for file in attitude_files] or [None] * len(paths)
+    logs = [(file, read_phone_log(file)) for file in attitude_files] or [None] * len(paths)
     camera_motion = camera_motion or ("handheld" if attitude_files else "static")
     trials, problems, seen = [], {}, {}
     for path, name, log in zip(paths, distinct_names(paths), logs, strict=True):
@@ -140,7 +140,8 @@ def run_session(
                 detect_trial(path, out / f"{name}.persons.png", camera_file, person, keypoints), name=name
             )
             if log is not None:
-                trial = dataclasses.replace(trial, keypoints=trial.keypoints.with_attitude(log))
+                attitude = attitude_of(log[1], log[0], trial.video)
+                trial = dataclasses.replace(trial, keypoints=trial.keypoints.with_attitude(attitude))
             check_trial(trial.keypoints, name, paramset)
         except PblError as error:
             problems[name] = error

@@ -14,7 +14,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
@@ -39,11 +38,11 @@ _BODY_M = {
     "base": (-0.03, 1.0, -0.08),
     "left_shoulder": (0.2, -0.5, 0.12),
     "left_hip": (0.12, 0.02, -0.05),
-    "left_knee": (0.14, 0.4, 0.2),
+    "left_knee": (0.14, 0.4, 0.1),
     "left_ankle": (0.22, 0.8, -0.1),
     "right_shoulder": (-0.19, -0.48, -0.1),
-    "right_hip": (-0.12, 0.0, 0.1),
-    "right_knee": (-0.13, 0.42, -0.2),
+    "right_hip": (-0.12, 0.02, 0.05),
+    "right_knee": (-0.14, 0.4, -0.1),
     "right_ankle": (-0.22, 0.82, 0.05),
 }
 
@@ -93,10 +92,14 @@ def picture(xy_px: np.ndarray, size: tuple[int, int] = (960, 720), dot_px: float
     width, height = size
     image = np.full((height, width, 3), float(GREY))
     colours = [rgb for names, rgb in DOTS.items() for _ in names]
-    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    reach = int(5 * dot_px)
     for (u, v), rgb in zip(xy_px, colours, strict=True):
+        x = np.arange(max(int(u) - reach, 0), min(int(u) + reach, width))
+        y = np.arange(max(int(v) - reach, 0), min(int(v) + reach, height))[:, None]
         weight = np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * dot_px**2))[..., None]
-        image = image * (1 - weight) + 255.0 * np.array(rgb[::-1]) * weight
+        part = image[y[:, :1], x[None]] if x.size and y.size else None
+        if part is not None:
+            image[y, x[None]] = part * (1 - weight) + 255.0 * np.array(rgb[::-1]) * weight
     return np.round(image).astype(np.uint8)
 
 
@@ -134,7 +137,10 @@ class Graph:
 def _dot_weights(g: Graph, size: tuple[int, int]) -> str:
     """(N, J, H, W): how much each pixel belongs to each dot."""
     width, height = size
-    channels = [g("Slice", "image", g.const([i], np.int64), g.const([i + 1], np.int64), g.const([1], np.int64)) for i in range(3)]
+    channels = [
+        g("Slice", "image", g.const([i], np.int64), g.const([i + 1], np.int64), g.const([1], np.int64))
+        for i in range(3)
+    ]
     columns = g.const(np.tile(np.arange(width), (height, 1))[None, None])
     parts = []
     for names, rgb in DOTS.items():
@@ -157,7 +163,9 @@ def _centroid(g: Graph, weight: str, coordinate: str) -> str:
     return g("Div", g("ReduceSum", g("Mul", weight, coordinate), g.const([2, 3], np.int64), keepdims=1), total)
 
 
-def crop3d(xyz_m: np.ndarray, size: tuple[int, int] = (256, 256), drift_mm: dict[str, float] | None = None) -> onnx.ModelProto:
+def crop3d(
+    xyz_m: np.ndarray, size: tuple[int, int] = (256, 256), drift_mm: dict[str, float] | None = None
+) -> onnx.ModelProto:
     """A crop model of the points (J, 3) in the camera's frame: `coords2d` px, `coords3d` mm in the crop's frame.
 
     `drift_mm`: a point's depth grows by so much times the grey of the background, which gamma changes: what a network
@@ -197,7 +205,10 @@ def crop3d(xyz_m: np.ndarray, size: tuple[int, int] = (256, 256), drift_mm: dict
     shift = np.zeros((1, len(NAMES), 3))
     for name, value in (drift_mm or {}).items():
         shift[0, NAMES.index(name), 2] = value
-    channels = [g("Slice", "image", g.const([i], np.int64), g.const([i + 1], np.int64), g.const([1], np.int64)) for i in range(3)]
+    channels = [
+        g("Slice", "image", g.const([i], np.int64), g.const([i + 1], np.int64), g.const([1], np.int64))
+        for i in range(3)
+    ]
     grey = g("ReduceMax", g("Min", *channels), axes=[2, 3], keepdims=0)  # (N, 1)
     drift = g("Mul", g.const(shift), g("Unsqueeze", grey, g.const([2], np.int64)))
     # A network gives a shape, not a place: any shift may be added, another one in each picture.
@@ -216,8 +227,9 @@ def simcc(size: tuple[int, int] = (192, 256)) -> onnx.ModelProto:
     weight = g("Div", _dot_weights(g, size), g.const(1 - _FLOOR))
     for name, axis, n in (("simcc_x", 2, size[0]), ("simcc_y", 3, size[1])):
         profile = g("ReduceMax", weight, axes=[axis], keepdims=0)
-        scales = g.const([1.0, 1.0, 2.0])
-        g("Resize", profile, "", scales, mode="linear", coordinate_transformation_mode="asymmetric", out=name)
+        # Each bin is a Gaussian mean of the pixels around it, as wide as the labels such a model is trained with.
+        kernel = np.exp(-((np.arange(n)[:, None] - np.arange(2 * n) / 2) ** 2) / (2 * 1.5**2))
+        g("MatMul", profile, g.const(kernel / kernel.sum(axis=0)), out=name)
     n = len(NAMES)
     outputs = [
         helper.make_tensor_value_info("simcc_x", TensorProto.FLOAT, ["N", n, 2 * size[0]]),
@@ -273,8 +285,3 @@ def write(folder: Path, model: onnx.ModelProto, fields: dict[str, Any]) -> Path:
     content = {"sha256": hashlib.sha256(data).hexdigest(), **fields}
     (folder / "model.json").write_text(json.dumps(content, indent=2))
     return folder
-
-
-def same_picture(image: np.ndarray, times: int) -> np.ndarray:
-    """The picture enlarged `times`, for what is said of large pictures."""
-    return cv2.resize(image, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)

@@ -13,7 +13,7 @@ from ._options import DEVICE, KEYPOINTS, Person, keypoint_method
 @click.argument("video", type=click.Path(path_type=Path, readable=False))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="keypoints.npz to write.")
 @click.option("--camera", type=click.Path(path_type=Path), help="Calibration file; without it a phone is guessed.")
-@click.option("--attitude", type=click.Path(path_type=Path), help="Orientation log of the phone (docs/files.md).")
+@click.option("--attitude", type=click.Path(path_type=Path), help="Sensor log of the phone (docs/phone_capture.md).")
 @click.option("--person", type=Person(), default="auto", show_default=True, help="Whom to measure.")
 @KEYPOINTS
 @DEVICE
@@ -41,8 +41,8 @@ def detect(
         raise click.BadParameter(f"{out} does not end in .npz", param_hint="--out")
     info = probe(video)
     lens = find_camera(info, camera)
-    log = load_attitude(attitude) if attitude else None
     check_out_file(out)
+    log = load_attitude(attitude, info) if attitude else None
     method = keypoint_method(keypoints, device)
     tracking = track_people(video, info=info)
     choice = choose_subject(tracking, override=person)
@@ -64,7 +64,8 @@ def detect(
     if found.origin:
         click.echo(f"  keypoints by {found.origin}")
     if log is not None:
-        click.echo(f"  orientation of the phone: {len(log.time_s)} samples over {log.time_s[-1] - log.time_s[0]:.1f} s")
+        span = f"{len(log.time_s)} samples from {log.time_s[0]:.2f} to {log.time_s[-1]:.2f} s of the video"
+        click.echo(f"  orientation of the phone: {span}; {log.source}")
     for note in info.notes:
         click.echo(f"  {note}")
     click.echo(f"  {visibility(found).text()}")

@@ -209,7 +209,8 @@ def _models() -> Iterator[Finding]:
     for model in models.registered():
         if model.spec is None:
             assert model.error is not None
-            yield Finding(f"model {model.name}", NOTE, f"{model.error.code}: {model.error.found}", model.error.next_step)
+            found = f"{model.error.code}: {model.error.found}"
+            yield Finding(f"model {model.name}", NOTE, found, model.error.next_step)
         else:
             yield Finding(f"model {model.name}", OK, f"{model.folder} ({model.spec.licence})")
 

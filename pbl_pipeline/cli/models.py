@@ -88,6 +88,7 @@ def _show(spec) -> None:
     click.echo(f"  licence: {spec.licence}")
     click.echo(f"  source:  {spec.source}")
     click.echo(
-        f"  input:   {spec.input.width} x {spec.input.height} px" + (f"; {sides} pairs of left and right" if sides else "")
+        f"  input:   {spec.input.width} x {spec.input.height} px"
+        + (f"; {sides} pairs of left and right" if sides else "")
     )
     click.echo(f"  sha256:  {spec.sha256}")

@@ -18,7 +18,7 @@ from ._options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, DEVICE, KEYPOINTS, Per
     "--attitude",
     type=click.Path(path_type=Path),
     multiple=True,
-    help="Orientation log of the phone (docs/files.md), once for each VIDEO, in their order.",
+    help="Sensor log of the phone (docs/phone_capture.md), once for each VIDEO, in their order.",
 )
 @click.option("--camera-motion", type=click.Choice(CAMERA_MOTIONS), help=CAMERA_MOTION_HELP)
 @click.option("--person", type=Person(), default="auto", show_default=True, help="Whom to measure, of one video.")

@@ -1,7 +1,7 @@
 """Test-time augmentations: the crop shown several times, a little other each time, and what is made of the answers.
 
-Figures of scale, rotation and gamma as MeTRAbs uses them (Sarandi et al. 2023, WACV, and its published PyTorch code), so
-that the spread of its answers is the one for which the paper states its confidence.
+Figures of scale, rotation and gamma as MeTRAbs uses them (Sarandi et al. 2023, WACV, and its published PyTorch code),
+so that the spread of its answers is the one for which the paper states its confidence.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def aligned(xyz: np.ndarray) -> np.ndarray:
 
 
 def spread_mm(xyz_m: np.ndarray) -> np.ndarray:
-    """(..., J) standard deviation in mm of aligned answers (..., A, J, 3) in m: the root mean square distance from their
-    mean over the A answers. One answer has none: 0."""
+    """(..., J) standard deviation in mm of aligned answers (..., A, J, 3) in m: the root mean square distance from
+    their mean over the A answers. One answer has none: 0."""
     off = xyz_m - xyz_m.mean(axis=-3, keepdims=True)
     return 1000.0 * np.sqrt(np.mean(np.sum(off**2, axis=-1), axis=-2))

@@ -17,8 +17,8 @@ def from_simcc(x: np.ndarray, y: np.ndarray, split: float) -> tuple[np.ndarray, 
 
 
 def from_heatmap(heatmap: np.ndarray, size_px: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, J, 2) in px of the crop of `size_px` (width, height) and scores (N, J) from heat maps (N, J, h, w): the
-    place of the largest value, between the cells by the parabola along each axis; its value in 0..1 is the score.
+    """Points (N, J, 2) in px of the crop of `size_px` (width, height) and scores (N, J) from heat maps (N, J, h, w):
+    the place of the largest value, between the cells by the parabola along each axis; its value in 0..1 is the score.
 
     Cell i is at i * width / w: cells and pixels count from the centre of the first, or both from its edge less half a
     cell (`edge_shift`)."""

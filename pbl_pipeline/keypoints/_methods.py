@@ -14,7 +14,7 @@ from ._onnx_keypoints import ModelKeypointParams, method_of_model
 
 
 def find_method(name: str | None = None) -> Paramset:
-    """The method of that name: one of `PARAMSETS`, or the registered model of that name as it is now (None: the default).
+    """The method of that name: one of `PARAMSETS` (None: the default), or the registered model as it is now.
 
     Raises
     ------

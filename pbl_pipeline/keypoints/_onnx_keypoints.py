@@ -1,4 +1,4 @@
-"""Keypoints from a registered ONNX model: crops by virtual cameras, augmentations, and the way back into the picture."""
+"""Keypoints from a registered ONNX model: crops by virtual cameras, augmentations, the way back into the picture."""
 
 from __future__ import annotations
 
@@ -132,12 +132,14 @@ class OnnxKeypoints:
         xy_crop = xy_crop.reshape(*shape, 2)
         xy = np.empty_like(xy_crop)
         xyz = np.full((*shape, 3), np.nan)
+        if xyz_crop is not None:
+            xyz_crop = xyz_crop.reshape(*shape, 3)
         for f, views_f in enumerate(views):
             for a, view in enumerate(views_f):
                 whose = self._mirror if view.mirrored else slice(None)
                 xy[f, a] = view.to_picture(xy_crop[f, a][whose], camera)
                 if xyz_crop is not None:
-                    xyz[f, a] = view.to_camera(xyz_crop.reshape(*shape, 3)[f, a][whose])
+                    xyz[f, a] = view.to_camera(np.asarray(xyz_crop[f, a])[whose])
         mean_xy = xy.mean(axis=1)
         if xyz_crop is None:
             order = [self._mirror if a.mirrored else np.arange(shape[2]) for a in looks]

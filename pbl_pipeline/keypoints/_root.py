@@ -21,8 +21,9 @@ def absolute_root(xyz_m: np.ndarray, xy_px: np.ndarray, confidence: np.ndarray, 
 
     Least squares on ``(x + tx) - u (z + tz)`` and the same for y, u and v being the ray of the pixel without
     distortion, linear in the shift. Repeated with weights that divide by the depth, so that distances count as seen in
-    the picture, and that fall with a point's distance in the picture from where the last shift puts it (Cauchy's, half at 5 px). `confidence` (T, J)
-    weighs the points. NaN where fewer than four points have one, or where the person would stand behind the camera.
+    the picture, and that fall with a point's distance in the picture from where the last shift puts it (Cauchy's, half
+    at 5 px). `confidence` (T, J) weighs the points. NaN where fewer than four have one, or where the person would stand
+    behind the camera.
     """
     xyz, weight0 = np.asarray(xyz_m, np.float64), np.asarray(confidence, np.float64)
     known = np.isfinite(xyz).all(axis=2) & np.isfinite(xy_px).all(axis=2) & (weight0 > 0)
@@ -52,8 +53,6 @@ def _solve(x: np.ndarray, d: np.ndarray, w: np.ndarray) -> np.ndarray:
     normal[:, :2, 2] = normal[:, 2, :2] = -np.einsum("tj,tjk->tk", w, d)
     normal[:, 2, 2] = np.einsum("tj,tjk->t", w, d**2)
     right = d * x[..., 2:] - x[..., :2]
-    b = np.concatenate(
-        [np.einsum("tj,tjk->tk", w, right), -np.einsum("tj,tjk,tjk->t", w, d, right)[:, None]], axis=1
-    )
+    b = np.concatenate([np.einsum("tj,tjk->tk", w, right), -np.einsum("tj,tjk,tjk->t", w, d, right)[:, None]], axis=1)
     scale = np.maximum(w.sum(axis=1), 1e-300)[:, None, None]
     return np.linalg.solve(normal / scale + 1e-12 * np.eye(3), (b / scale[..., 0])[..., None])[..., 0]

@@ -49,7 +49,7 @@ class VirtualCamera:
         """(..., 2) pixels of the upright, distorted picture that show the crop pixels (..., 2)."""
         rays = self.rays(xy).reshape(-1, 1, 3)
         zero = np.zeros(3)
-        out, _ = cv2.projectPoints(rays, zero, zero, np.float64(camera.matrix), np.float64(camera.distortion))
+        out, _ = cv2.projectPoints(rays, zero, zero, *_lens(camera))
         return out.reshape(np.shape(xy))
 
     def to_camera(self, xyz: np.ndarray) -> np.ndarray:
@@ -90,7 +90,7 @@ def crops(image: np.ndarray, views: Sequence[VirtualCamera], camera: Camera) -> 
     averaged first, so that fine patterns do not flicker.
     """
     width, height = views[0].size_px
-    matrix, distortion = np.float64(camera.matrix), np.float64(camera.distortion)
+    matrix, distortion = _lens(camera)
     maps = [
         cv2.initUndistortRectifyMap(matrix, distortion, v.turn, v.matrix, (width, height), cv2.CV_32FC1) for v in views
     ]
@@ -107,6 +107,11 @@ def crops(image: np.ndarray, views: Sequence[VirtualCamera], camera: Camera) -> 
             map_x, map_y = ((m - c + 0.5) / factor - 0.5 for m, c in zip(maps[i], corner, strict=True))
             cv2.remap(small, map_x, map_y, cv2.INTER_LINEAR, out[i], cv2.BORDER_CONSTANT)
     return out
+
+
+def _lens(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix and distortion as OpenCV wants them."""
+    return np.asarray(camera.matrix, np.float64), np.asarray(camera.distortion, np.float64)
 
 
 def _per_pixel(roi_px: np.ndarray, camera: Camera) -> float:

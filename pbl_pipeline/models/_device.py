@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 
 from pbl_pipeline.errors import PblError
 
@@ -48,7 +49,7 @@ def providers_for(device: str | None = None) -> list[str]:
     return [_PROVIDERS[asked]]
 
 
-def device_of(providers: list[str]) -> str:
+def device_of(providers: Sequence[str]) -> str:
     """The device that a session with these providers computes on."""
     return next((d for d, p in _PROVIDERS.items() if providers and providers[0] == p), "cpu")
 

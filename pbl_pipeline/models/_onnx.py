@@ -50,7 +50,7 @@ class OnnxModel:
         options.log_severity_level = 4  # what it would print is raised below
         try:
             self._session = onnxruntime.InferenceSession(data, options, providers=providers)
-        except Exception as error:  # noqa: BLE001 - the runtime's own exceptions have no common base
+        except Exception as error:
             if asked_device(device) == "cuda" and "CUDA" in str(error):
                 raise unavailable(_first_line(error)) from error
             raise invalid(self._path, _first_line(error), "a graph that the installed onnxruntime loads") from error
@@ -65,7 +65,7 @@ class OnnxModel:
         black = np.zeros((1, self.spec.input.height, self.spec.input.width, 3), np.uint8)
         try:
             got = self(black)
-        except Exception as error:  # noqa: BLE001 - as above
+        except Exception as error:
             raise invalid(self._path, f"it does not run: {_first_line(error)}", "a graph that computes") from error
         self._check_shapes(got)
 

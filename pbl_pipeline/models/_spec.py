@@ -59,8 +59,9 @@ class ModelSpec:
     Attributes
     ----------
     kind
-        "crop3d": `coords2d` (N, J, 2) px of the crop and `coords3d` (N, J, 3) mm in the axes of the crop's camera (x right,
-        y down, z forward), up to one common shift. "simcc": `simcc_x` (N, J, width * split), `simcc_y` likewise.
+        "crop3d": `coords2d` (N, J, 2) px of the crop and `coords3d` (N, J, 3) mm in the axes of the crop's camera
+        (x right, y down, z forward), up to one common shift. "simcc": `simcc_x` (N, J, width * split), `simcc_y`
+        likewise.
         "heatmap": `heatmap` (N, J, h, w). "person_detector": `boxes` (N, cells, 5 + classes), YOLOX's rows; it has
         no marker set and no joint names.
     sha256

@@ -1,0 +1,390 @@
+"""Keypoints from ONNX models, against truth: dots at known 3D points through a known, distorted, tilted camera."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pbl_pipeline import models
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.keypoints import (
+    KeypointParams,
+    Keypoints,
+    ModelParams,
+    OnnxKeypoints,
+    detect_keypoints,
+    find_method,
+    params_of,
+)
+from pbl_pipeline.keypoints._augment import Augmentation, aligned, augmentations, sd_confidence, spread_mm
+from pbl_pipeline.keypoints._decode_2d import from_heatmap, from_simcc
+from pbl_pipeline.keypoints._root import absolute_root
+from pbl_pipeline.keypoints._virtual_camera import crops, look_at
+from pbl_pipeline.tracking import PersonTrack, Tracking
+from pbl_pipeline.video import Camera, probe, viewing_ray
+from tests import dot_models
+from tests.command import pbl
+from tests.dot_models import NAMES, lens, person, picture, project, region
+from tests.videos import constant_rate, write_video
+
+CAMERA = lens()
+PLACES = {"left edge": (-1.5, 0.1, 4.0), "middle": (0.0, 0.0, 4.0), "right, near": (1.0, 0.1, 3.2)}
+
+
+def detector(folder: Path, kind: str, graph, n: int = 10, size=(256, 256), **changes) -> OnnxKeypoints:
+    dot_models.write(folder, graph, dot_models.spec(kind, size, **changes))
+    spec = models.load_spec(folder)
+    params = ModelParams(spec.name, spec.sha256, spec.spec_sha256, spec.licence, n)
+    return OnnxKeypoints(params, "cpu", folder)
+
+
+# --- geometry
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("roi", [(480, 360, 300, 0.0), (120, 300, 400, 0.3), (900, 650, 250, -1.2)])
+def test_a_pixel_of_the_crop_is_a_pixel_of_the_picture_and_back(roi, mirrored):
+    view = look_at(np.array(roi, float), CAMERA, (192, 256), 1.2, 0.9, 0.4, mirrored)
+    rng = np.random.default_rng(0)
+    xyz = viewing_ray(np.array(roi[:2])[None], CAMERA)[0] * 4 + rng.uniform(-0.4, 0.4, (50, 3))
+    in_crop = xyz @ view.turn.T
+    xy_crop = in_crop[:, :2] / in_crop[:, 2:] @ view.matrix[:2, :2].T + view.matrix[:2, 2]
+    # The points' pixels by the lens equations, and by the crop's.
+    np.testing.assert_allclose(view.to_picture(xy_crop, CAMERA), project(xyz, CAMERA), atol=1e-6)
+    np.testing.assert_allclose(view.to_camera(in_crop), xyz, atol=1e-12)
+    np.testing.assert_allclose(view.turn @ view.turn.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(view.turn) == pytest.approx(-1.0 if mirrored else 1.0)
+
+
+def test_the_crop_is_centred_upright_in_the_region_and_as_large_as_asked():
+    roi = np.array([700.0, 250.0, 300.0, 0.35])
+    plain = Camera(CAMERA.matrix, np.zeros(5), "no distortion")
+    view = look_at(roi, plain, (192, 256))
+    np.testing.assert_allclose(view.to_picture(np.array([95.5, 127.5]), plain), roi[:2], atol=1e-9)
+    # Down in the crop is down in the region: the ends of its middle line, 300 px apart in the picture but for the
+    # stretch of the perspective.
+    top, bottom = view.to_picture(np.array([[95.5, -0.5], [95.5, 255.5]]), plain)
+    down = (bottom - top) / np.linalg.norm(bottom - top)
+    np.testing.assert_allclose(down, [-np.sin(0.35), np.cos(0.35)], atol=1e-3)
+    assert np.linalg.norm(bottom - top) == pytest.approx(300, rel=0.02)
+    double = look_at(roi, plain, (192, 256), margin=2.0)
+    enlarged = look_at(roi, plain, (192, 256), margin=2.0, scale=2.0)
+    assert double.matrix[0, 0] == pytest.approx(view.matrix[0, 0] / 2)
+    assert enlarged.matrix[0, 0] == pytest.approx(view.matrix[0, 0])
+
+
+@pytest.mark.parametrize("times", [1, 3])
+def test_the_crop_shows_what_the_virtual_camera_sees(times):
+    """Dots lie in the crop where their 3D points are seen, also where the picture is shown three times smaller."""
+    xyz = person()
+    camera = Camera(CAMERA.matrix * np.array([[times, 1, times], [1, times, times], [1, 1, 1]]), CAMERA.distortion, "")
+    xy = project(xyz, camera)
+    image = picture(xy, (960 * times, 720 * times), 5.0 * times)
+    views = [look_at(region(xy), camera, (256, 256), 1.0, s, r, m) for s, r, m in ((1, 0, False), (0.8, 0.4, True))]
+    for view, crop in zip(views, crops(image, views, camera), strict=True):
+        in_crop = xyz @ view.turn.T
+        seen = in_crop[:, :2] / in_crop[:, 2:] @ view.matrix[:2, :2].T + view.matrix[:2, 2]
+        red = np.clip(crop[..., 2].astype(float) - crop[..., :2].max(axis=2) - 30, 0, None)  # the head alone is red
+        y, x = np.indices(red.shape)
+        centre = np.array([np.sum(red * x), np.sum(red * y)]) / red.sum()
+        np.testing.assert_allclose(centre, seen[NAMES.index("head")], atol=0.1)
+
+
+def test_a_small_crop_of_a_fine_pattern_is_grey():
+    """Each pixel of the crop is the mean of those it stands for, not one of them."""
+    image = np.zeros((720, 960, 3), np.uint8)
+    image[::2] = 255
+    crop = crops(image, [look_at(np.array([480.0, 360, 640, 0]), CAMERA, (160, 160))], CAMERA)[0]
+    assert np.ptp(crop[20:-20, 20:-20].astype(int)) < 40
+    assert abs(crop[20:-20, 20:-20].mean() - 127.5) < 3
+
+
+def test_beyond_the_picture_and_beyond_the_lens_model_the_crop_is_black():
+    white = np.full((720, 960, 3), 255, np.uint8)
+    beyond = crops(white, [look_at(np.array([40.0, 360, 400, 0]), CAMERA, (128, 128))], CAMERA)[0]
+    assert beyond[:, -20:].min() == 255
+    assert beyond[:, :20].max() == 0
+    # This lens folds back at 52 degrees; without care the picture would appear a second time beyond that.
+    folding = Camera(np.array([[300.0, 0, 480], [0, 300.0, 360], [0, 0, 1]]), np.array([-0.2, 0, 0, 0, 0]), "folds")
+    wide = crops(white, [look_at(np.array([480.0, 360, 200, 0]), folding, (128, 128), margin=6.0)], folding)[0]
+    rays = look_at(np.array([480.0, 360, 200, 0]), folding, (128, 128), margin=6.0).rays(
+        np.stack(np.meshgrid(np.arange(128), np.arange(128)), -1)
+    )
+    radius = np.hypot(rays[..., 0], rays[..., 1]) / rays[..., 2]
+    assert wide[radius > 1.3].max() == 0
+    assert wide[radius < 1.0].max() == 255
+
+
+# --- augmentations and confidence
+
+
+def test_augmentations_are_ten_different_ones_and_always_the_same():
+    ten = augmentations(10)
+    assert ten == augmentations(10)
+    assert len(set(ten)) == 10
+    assert sum(a.mirrored for a in ten) == 5
+    assert (min(a.scale for a in ten), max(a.scale for a in ten)) == (0.8, 1.1)
+    np.testing.assert_allclose([ten[0].roll_rad, ten[-1].roll_rad], np.radians([-25, 25]))
+    assert (ten[0].gamma, ten[-1].gamma) == (0.6, 1.0)
+    assert augmentations(1) == (Augmentation(),)
+    assert augmentations(2) == (Augmentation(), Augmentation(mirrored=True))
+
+
+def test_confidence_by_hand():
+    np.testing.assert_allclose(
+        sd_confidence(np.array([30.0, 0.0, 40.0, 1e4])), [0.5, 1 / (1 + np.exp(-3)), 1 / (1 + np.e), 0], atol=1e-12
+    )
+
+
+def test_spread_by_hand():
+    """Two answers 60 mm apart: each 30 mm from their mean."""
+    xyz = np.zeros((2, 3, 3))
+    xyz[1, 0] = [0.0, 0.036, 0.048]
+    np.testing.assert_allclose(spread_mm(xyz), [30.0, 0, 0], atol=1e-9)
+
+
+def test_a_shift_of_a_whole_answer_is_no_spread_and_a_point_that_strays_spreads_alone():
+    rng = np.random.default_rng(2)
+    shape = rng.normal(0, 0.4, (20, 3))
+    answers = np.tile(shape, (10, 1, 1)) + rng.normal(0, 1.0, (10, 1, 3))
+    np.testing.assert_allclose(spread_mm(aligned(answers)), 0, atol=1e-9)
+    stray = rng.normal(0, 0.2, (10, 3))
+    answers[:, 7] += stray
+    wanted = 1000 * np.sqrt(np.mean(np.sum((stray - stray.mean(axis=0)) ** 2, axis=1)))
+    sigma = spread_mm(aligned(answers))
+    assert sigma[7] == pytest.approx(wanted, rel=0.03)
+    assert np.delete(sigma, 7).max() < 0.05 * wanted
+
+
+# --- 2D models
+
+
+def test_peaks_lie_between_the_bins():
+    """A parabola's top is found exactly; a value at the end of the profile is where it is."""
+    bins = np.arange(40)
+    x = 1 - ((bins - 12.3) / 20) ** 2
+    y = 0.8 - ((bins - 39.0) / 50) ** 2
+    points, score = from_simcc(x[None, None], y[None, None], 2.0)
+    np.testing.assert_allclose(points[0, 0], [6.15, 19.5], atol=1e-9)
+    np.testing.assert_allclose(score, 0.8)
+    rows, columns = np.ogrid[:30, :20]
+    hill = 0.9 - ((rows - 7.4) / 30) ** 2 - ((columns - 11.25) / 30) ** 2
+    points, score = from_heatmap(hill[None, None], (80, 120))
+    np.testing.assert_allclose(points[0, 0], [11.25 * 4, 7.4 * 4], atol=1e-9)
+    assert score[0, 0] == pytest.approx(hill.max())
+    flat, _ = from_heatmap(np.zeros((1, 1, 4, 4)), (4, 4))
+    assert np.isfinite(flat).all()
+
+
+# --- where the person is
+
+
+def test_root_by_hand_and_with_wrong_points():
+    rng = np.random.default_rng(3)
+    shape = rng.uniform(-0.6, 0.6, (5, 30, 3))
+    at = np.stack([rng.uniform(-1, 1, 5), rng.uniform(-0.5, 0.5, 5), rng.uniform(2, 8, 5)], axis=1)
+    xy = np.stack([project(x + a, CAMERA) for x, a in zip(shape, at, strict=True)])
+    np.testing.assert_allclose(absolute_root(shape, xy, np.ones((5, 30)), CAMERA), at, atol=1e-6)
+    wrong = xy.copy()
+    wrong[:, :4] += 120.0
+    assert np.abs(absolute_root(shape, wrong, np.ones((5, 30)), CAMERA) - at).max() < 0.15
+    weighed = np.ones((5, 30))
+    weighed[:, :4] = 0.0
+    np.testing.assert_allclose(absolute_root(shape, wrong, weighed, CAMERA), at, atol=1e-6)
+
+
+def test_root_that_cannot_be_known_is_nan():
+    shape = np.random.default_rng(4).uniform(-0.5, 0.5, (1, 10, 3))
+    xy = project(shape[0] + [0, 0, 3.0], CAMERA)[None]
+    few = np.zeros((1, 10))
+    few[0, :3] = 1
+    assert np.isnan(absolute_root(shape, xy, few, CAMERA)).all()
+    turned_over = 2 * CAMERA.matrix[:2, 2] - xy  # seen upside down: only behind the camera
+    assert np.isnan(absolute_root(shape, turned_over, np.ones((1, 10)), CAMERA)).all()
+
+
+# --- the whole way
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("n", [2, 10])
+def test_crop_model_brings_the_points_back(tmp_path, place, n):
+    """Within 0.5 px and 5 mm, each on its own side, from a tilted, rolled camera with a distorted lens."""
+    xyz = person(PLACES[place])
+    xy = project(xyz, CAMERA)
+    found = detector(tmp_path, "crop3d", dot_models.crop3d(xyz), n).detect(picture(xy), region(xy), CAMERA)
+    assert np.linalg.norm(found.xy_px - xy, axis=1).max() < 0.5
+    assert 1000 * np.linalg.norm(found.xyz_cam_m - xyz, axis=1).max() < 5.0
+    np.testing.assert_allclose(found.confidence, sd_confidence(np.array(0.0)), atol=0.005)
+    assert found.presence == pytest.approx(found.confidence.mean())
+    # The better region is around the points.
+    assert np.linalg.norm(found.roi_px[:2] - region(xy)[:2]) < 0.05 * found.roi_px[2]
+
+
+def test_without_exchanging_sides_the_mirrored_points_would_be_wrong(tmp_path):
+    """What the test above would see: the pairs are declared to be no pairs."""
+    xyz = person()
+    xy = project(xyz, CAMERA)
+    swap = {"left": "a", "right": "b"}
+    names = [swap.get(n.split("_")[0], n.split("_")[0]) + "".join(n.partition("_")[1:]) for n in NAMES]
+    model = detector(tmp_path, "crop3d", dot_models.crop3d(xyz), joint_names=names)
+    found = model.detect(picture(xy), region(xy), CAMERA)
+    sides = [i for i, n in enumerate(NAMES) if "_" in n]
+    assert np.linalg.norm(found.xy_px - xy, axis=1)[sides].min() > 5
+    assert found.confidence[sides].max() < 0.2
+
+
+def test_noise_gives_the_confidence_that_the_formula_says(tmp_path):
+    """Depths that grow with the grey of the background, which gamma makes another in each augmentation."""
+    xyz = person()
+    xy = project(xyz, CAMERA)
+    drift = {"left_hip": 300.0, "right_knee": 900.0}
+    found = detector(tmp_path, "crop3d", dot_models.crop3d(xyz, drift_mm=drift)).detect(picture(xy), region(xy), CAMERA)
+    grey = np.array([(dot_models.GREY / 255) ** a.gamma for a in augmentations(10)])
+    # Mirrored pictures show the other side: half of the answers of a pair are the partner's, which does not drift.
+    for j, name in enumerate(NAMES):
+        partner = name.replace("left", "~").replace("right", "left").replace("~", "right")
+        depth = np.array(
+            [drift.get(partner if a.mirrored else name, 0.0) * g for a, g in zip(augmentations(10), grey, strict=True)]
+        )
+        sigma_mm = float(np.std(depth))
+        wanted = 1 / (1 + np.exp((sigma_mm - 30) / 10))
+        # Alignment takes a little of the drift away: a tenth of the spread is the mean's.
+        tolerance = 0.25 * 0.1 * sigma_mm / 10 + 0.01
+        assert found.confidence[j] == pytest.approx(wanted, abs=tolerance), name
+    assert found.confidence[NAMES.index("right_knee")] < 0.02
+    assert found.confidence[NAMES.index("head")] > 0.94
+
+
+@pytest.mark.parametrize(("kind", "graph"), [("simcc", dot_models.simcc), ("heatmap", dot_models.heatmap)])
+def test_models_without_depth(tmp_path, kind, graph):
+    xyz = person()
+    xy = project(xyz, CAMERA)
+    found = detector(tmp_path, kind, graph(), 2, (192, 256)).detect(picture(xy), region(xy), CAMERA)
+    assert np.linalg.norm(found.xy_px - xy, axis=1).max() < 0.5
+    assert np.isnan(found.xyz_cam_m).all()
+    # The graph's own score, 1 at a dot's centre: dots are there, and smaller in the crop than a cell is wide.
+    assert found.confidence.min() > 0.7
+    black = detector(tmp_path, kind, graph(), 2, (192, 256)).detect(
+        np.zeros((720, 960, 3), np.uint8), region(xy), CAMERA
+    )
+    assert black.confidence.max() == 0
+    assert black.presence == 0
+
+
+def test_several_frames_in_one_call_are_the_same_as_one_by_one(tmp_path):
+    people = [dot_models.turned(person(), a) for a in (0.0, 0.1, 0.25)]
+    images = [picture(project(x, CAMERA)) for x in people]
+    rois = [region(project(x, CAMERA)) for x in people]
+    model = detector(tmp_path, "crop3d", dot_models.crop3d(people[0]))
+    for together, image, roi, xyz in zip(model.detect_many(images, rois, CAMERA), images, rois, people, strict=True):
+        alone = model.detect(image, roi, CAMERA)
+        np.testing.assert_allclose(together.xyz_cam_m, alone.xyz_cam_m, atol=1e-5)
+        assert np.abs(together.xyz_cam_m - xyz).max() < 0.005
+
+
+def test_a_model_without_spread_has_no_confidence(tmp_path):
+    with pytest.raises(PblError) as caught:
+        detector(tmp_path, "crop3d", dot_models.crop3d(person()), 1)
+    assert caught.value.code == "USAGE"
+
+
+def test_another_model_than_the_method_froze(tmp_path):
+    model = detector(tmp_path, "simcc", dot_models.simcc(), 2, (192, 256))
+    spec = models.load_spec(tmp_path)
+    assert model.model_sha256 == spec.sha256
+    for params in (
+        ModelParams(spec.name, "0" * 64, spec.spec_sha256, spec.licence, 2),
+        ModelParams(spec.name, spec.sha256, "0" * 64, spec.licence, 2),
+    ):
+        with pytest.raises(PblError) as caught:
+            OnnxKeypoints(params, "cpu", tmp_path)
+        assert caught.value.code == "MODEL_CHECKSUM"
+
+
+# --- a video
+
+
+N = 45
+
+
+@functools.cache
+def walk() -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, J, 3) of somebody carried around the camera, and their pixels."""
+    xyz = np.stack([dot_models.turned(person(), a) for a in np.linspace(-0.05, 0.45, N)])
+    return xyz, np.stack([project(x, CAMERA) for x in xyz])
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Tracking]:
+    """A video of her, and a track that is late and too large: the first look has to correct it."""
+    _, xy = walk()
+    path = tmp_path_factory.mktemp("dots") / "walk.mp4"
+    write_video(path, (picture(p) for p in xy), constant_rate(N), pixel_format="yuv444p", crf=8)
+    low, high = xy.min(axis=1), xy.max(axis=1)
+    box = np.concatenate([low - 30, high + 10], axis=1) + 8.0
+    track = PersonTrack(1, box, np.full((N, 4), np.nan), np.ones(N), np.ones(N, bool))
+    return path, Tracking(probe(path).time_s, (960, 720), (track,), "by hand", "0" * 64)
+
+
+@pytest.fixture
+def registered(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("PBL_MODELS", str(tmp_path / "models"))
+    models.add(dot_models.write(tmp_path / "a", dot_models.crop3d(person()), dot_models.spec("crop3d")))
+    models.add(dot_models.write(tmp_path / "b", dot_models.simcc(), dot_models.spec("simcc", (192, 256))))
+
+
+@pytest.mark.parametrize("name", ["dots-crop3d", "dots-simcc"])
+def test_a_video_through_detect_keypoints(video, registered, tmp_path, name):
+    path, tracking = video
+    xyz, xy = walk()
+    found = detect_keypoints(path, tracking, 1, CAMERA, params_of(find_method(name)))
+    assert found.names == NAMES
+    # The pictures are compressed, and a pixel of the 2D model's crop is 1.3 of them.
+    off = np.linalg.norm(found.xy_px - xy, axis=2)
+    assert np.median(off) < 0.5
+    assert off.max() < (0.5 if name == "dots-crop3d" else 2.0)
+    assert (found.confidence > 0.5).all()
+    if name == "dots-crop3d":
+        assert 1000 * np.linalg.norm(found.xyz_cam_m - xyz, axis=2).max() < 25
+        assert 1000 * np.median(np.linalg.norm(found.xyz_cam_m - xyz, axis=2)) < 5
+        assert not found.root_relative
+    else:
+        assert np.isnan(found.xyz_cam_m).all()
+    assert "licence: CC0-1.0, a test" in found.origin
+    assert "on cpu" in found.origin
+    found.save(tmp_path / "keypoints.npz")
+    again = Keypoints.load(tmp_path / "keypoints.npz")
+    assert again.origin == found.origin
+
+
+def test_the_detector_onnx_without_a_model(video):
+    path, tracking = video
+    with pytest.raises(PblError) as caught:
+        detect_keypoints(path, tracking, 1, CAMERA, KeypointParams(detector="onnx"))
+    assert caught.value.code == "SOLVER_UNKNOWN"
+
+
+def test_what_is_wrong_with_the_call_is_found_before_the_work(video, registered, tmp_path):
+    path, _ = video
+    unknown = pbl("detect", path, "--out", tmp_path / "k.npz", "--keypoints", "metrabs")
+    assert unknown.error_code == "SOLVER_UNKNOWN"
+    assert "dots-crop3d, dots-simcc" in unknown.err
+    cuda = pbl("detect", path, "--out", tmp_path / "k.npz", "--keypoints", "dots-simcc", "--device", "cuda")
+    if "cuda" not in models.available_devices():
+        assert cuda.error_code == "DEVICE_UNAVAILABLE"
+
+
+def test_rotation_of_the_crop_is_the_roll_that_was_asked():
+    """The turn of the virtual camera is the one of the region, rolled about its axis, whatever the lens."""
+    roi = np.array([300.0, 500.0, 200.0, 0.2])
+    straight, turned = (look_at(roi, CAMERA, (128, 128), roll_rad=r).turn for r in (0.0, 0.5))
+    np.testing.assert_allclose(turned @ straight.T, Rotation.from_rotvec([0, 0, 0.5]).as_matrix(), atol=1e-12)
+    axis = straight[2]
+    ray = cv2.undistortPoints(roi[None, None, :2], CAMERA.matrix, CAMERA.distortion)[0, 0]
+    np.testing.assert_allclose(axis[:2] / axis[2], ray, atol=1e-4)
