@@ -89,7 +89,9 @@ def detect_by_phase(feet: FootTrajectories, paramset: Paramset) -> GaitEvents:
         if np.any(below.mean(axis=0) < p.min_leg_share):
             half_seen += 1
             continue
-        smooth = smooth_phases(np.where(below.any(axis=1)[:, None], phases.z[cut], 0), 1 / _predict.GRID_HZ, p.filter)
+        smooth = smooth_phases(
+            np.where(np.logical_or.reduce(below, axis=1)[:, None], phases.z[cut], 0), 1 / _predict.GRID_HZ, p.filter
+        )
         own = _events_of(smooth, grid.time_s[cut], phases.z[cut], phases.walking[cut], weights)
         for bout in _bouts(own, p):
             dropped += len(own) - len(bout)
