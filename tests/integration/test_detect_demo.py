@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -12,8 +13,8 @@ from click.testing import CliRunner
 from pbl_pipeline import assets
 from pbl_pipeline.cli.detect import detect
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.keypoints import Keypoints, check_keypoints, detect_keypoints
-from pbl_pipeline.tracking import Tracking, choose_subject, track_people
+from pbl_pipeline.keypoints import KeypointParams, Keypoints, check_keypoints, detect_keypoints
+from pbl_pipeline.tracking import PersonTrack, Tracking, choose_subject, track_people
 from pbl_pipeline.video import guess_camera, load_camera, read_frames
 from tests.unit.test_blazepose import BY_EYE, asset
 from tests.videos import constant_rate, write_video
@@ -110,11 +111,35 @@ def test_feet_alternate_as_she_walks(keypoints):
 
 
 def test_the_keypoints_pass_their_checks(keypoints):
-    assert {c.check: c.outcome for c in check_keypoints(keypoints)} == {
-        "frames_seen_s": "PASS",
-        "leg_confidence": "PASS",
-        "side_changes": "PASS",
-    }
+    """A clean recording: nothing to say against it, but that the legs were mixed up for some frames."""
+    checks = {c.check: c.outcome for c in check_keypoints(keypoints)}
+    assert {check for check, outcome in checks.items() if outcome != "PASS"} <= {"sides_exchanged_share"}, checks
+    assert {"whole_person_s", "feet_cut_share", "picture_brightness", "picture_detail_share"} <= set(checks)
+    assert {"leg_confidence", "leg_points_right_share", "side_changes"} <= set(checks)
+
+
+@pytest.mark.parametrize(
+    ("change", "check"),
+    [
+        (lambda image: (image * 0.05).astype(np.uint8), "picture_brightness"),
+        (lambda image: cv2.blur(image, (61, 1)), "picture_detail_share"),
+        (lambda image: cv2.resize(image, None, fx=0.16, fy=0.16, interpolation=cv2.INTER_AREA), "body_height_px"),
+    ],
+)
+def test_a_recording_made_worse_is_told(demo, tracking, tmp_path, change, check):
+    """35 frames in which she is in full view, made dark, blurred by movement, or filmed from far away."""
+    frames = [change(f.image) for f in read_frames(demo, start=80, stop=115)]
+    video = write_video(tmp_path / "w.mkv", frames, constant_rate(35), "ffv1", pixel_format="bgr0")
+    scale = frames[0].shape[1] / SIZE[0]
+    track = next(p for p in tracking.persons if p.person_id == choose_subject(tracking).person_id)
+    roi = track.roi_px[80:115] * np.array([scale, scale, scale, 1.0])
+    person = PersonTrack(1, track.box_px[80:115] * scale, roi, track.score[80:115], track.observed[80:115])
+    size = (frames[0].shape[1], frames[0].shape[0])
+    worse = Tracking(constant_rate(35), size, (person,), "test", "")
+    found = detect_keypoints(video, worse, 1, guess_camera(size), KeypointParams(passes=1))
+    bad = {c.check: c for c in check_keypoints(found)}[check]
+    assert bad.outcome in ("WARN", "FAIL")
+    assert bad.advice
 
 
 def test_her_heading_does_not_turn_with_the_viewing_angle(keypoints):
@@ -142,7 +167,7 @@ def test_a_single_person_is_chosen_whatever_she_does(shared_data, demo, tmp_path
 
 
 def test_command_on_a_cut_of_the_demo(demo, tmp_path):
-    video = write_video(tmp_path / "she.mp4", cut(demo, 80, 125, slice(500, 1500), slice(394, 994)), constant_rate(45))
+    video = write_video(tmp_path / "she.mp4", cut(demo, 80, 125, slice(500, 1500), slice(394, 994)), constant_rate(35))
     result = run(video, "--out", tmp_path / "new" / "she.npz")
     assert result.exit_code == 0, result.output
     assert "CHOSEN" in result.output
@@ -160,7 +185,7 @@ def test_nobody_in_noise(demo, tmp_path):
     rng = np.random.default_rng(1)
     coarse = rng.integers(0, 256, (45, 18, 32, 3), np.uint8)
     video = write_video(
-        tmp_path / "n.mp4", (np.kron(c, np.ones((20, 20, 1), np.uint8)) for c in coarse), constant_rate(45)
+        tmp_path / "n.mp4", (np.kron(c, np.ones((20, 20, 1), np.uint8)) for c in coarse), constant_rate(35)
     )
     result = run(video, "--out", tmp_path / "n.npz")
     assert code_of(result) == "TRACK_NO_PERSON"
@@ -173,7 +198,7 @@ def test_her_and_her_mirror_image_need_a_choice(demo, tmp_path):
         for image in cut(demo, 75, 120, slice(700, 1500), slice(394, 994)):
             yield np.hstack([image, image[:, ::-1]])
 
-    video = write_video(tmp_path / "two.mp4", frames(), constant_rate(45))
+    video = write_video(tmp_path / "two.mp4", frames(), constant_rate(35))
     result = run(video, "--out", tmp_path / "two.npz")
     assert code_of(result) == "SUBJECT_NEEDS_CHOICE"
     assert "--person" in str(result.exception)
