@@ -108,7 +108,7 @@ def check_trial(
 ) -> tuple[np.ndarray, float]:
     """Which frames (T,) bool of a trial a fit would use, and the share of frames with the whole person in view.
 
-    Raises `PblError` FIT_INPUT or MARKER_SET_UNKNOWN where the trial cannot be fitted.
+    Raises `PblError` FIT_INPUT, MARKER_SET_UNKNOWN or PHONE_LOG where the trial cannot be fitted.
     """
     (markers or marker_set(trial.marker_set)).check_names(trial.names)
     step = np.diff(trial.time_s)
@@ -132,7 +132,9 @@ def check_trial(
     else:
         _check_points(name, trial, need_3d=has_3d(trial))
         shown = visibility(trial, view.min_confidence, view.max_gap_s, view.max_blind_s)
-        return _long_enough(shown.counts, trial.time_s, name, view), shown.whole_share
+        used = _long_enough(shown.counts, trial.time_s, name, view)
+        _check_phone(trial, name, used)
+        return used, shown.whole_share
     used = bridge_gaps(in_view, trial.time_s, view.max_gap_s)
     used &= ~blind_runs(np.mean(seen, axis=1) >= SEEN_SHARE, trial.time_s, view.max_blind_s)
     return _long_enough(used, trial.time_s, name, view), float(np.mean(in_view))
@@ -239,6 +241,16 @@ def _orientation(
     t = len(trial.time_s)
     if trial.phone_time_s is None or trial.phone_quat_wxyz is None:
         return np.tile(LEVEL_CAMERA_R_NC, (t, 1, 1)), None, LEVEL
+    turned = rotation_matrices(trial.phone_time_s, trial.phone_quat_wxyz, trial.time_s)
+    if motion == "static":
+        return np.tile(mean_rotation(turned[used]), (t, 1, 1)), None, MEASURED
+    return turned, (np.asarray(trial.phone_time_s), np.asarray(trial.phone_quat_wxyz)), MEASURED
+
+
+def _check_phone(trial: Keypoints, name: str, used: np.ndarray) -> None:
+    """The phone's log must cover the time that is used. Raises `PblError` PHONE_LOG."""
+    if trial.phone_time_s is None:
+        return
     first, last = trial.time_s[np.flatnonzero(used)[[0, -1]]]
     covered = min(last, trial.phone_time_s[-1]) - max(first, trial.phone_time_s[0])
     if covered < PHONE_COVERAGE * (last - first) - CLOCK_RANGE_S:
@@ -249,10 +261,6 @@ def _orientation(
             next_step="pass the log of this video, on its clock (docs/files.md), or leave it out",
             key=name,
         )
-    turned = rotation_matrices(trial.phone_time_s, trial.phone_quat_wxyz, trial.time_s)
-    if motion == "static":
-        return np.tile(mean_rotation(turned[used]), (t, 1, 1)), None, MEASURED
-    return turned, (np.asarray(trial.phone_time_s), np.asarray(trial.phone_quat_wxyz)), MEASURED
 
 
 def undistort_px(xy_px: np.ndarray, camera: Camera) -> np.ndarray:

@@ -1,12 +1,14 @@
 """Video files: probe, frames in order with their own time stamps, intrinsics, pose and orientation of the camera."""
 
-from ._attitude import Attitude, camera_in_device, check_attitude, load_attitude
+from ._attitude import Attitude, camera_in_device, check_attitude
 from ._board import Board
 from ._calibrate import Calibration, calibrate_video
 from ._camera import guess_camera, load_camera, viewing_ray
 from ._camera_pose import CameraPose, load_camera_poses
 from ._draw_calibration import draw_calibration
 from ._find_camera import find_camera
+from ._load_attitude import attitude_of, load_attitude
+from ._phone_log import PhoneLog, Sensor, read_phone_log
 from ._probe import probe, sha256_of
 from ._read import read_frames
 from ._timing import check_timing
@@ -19,7 +21,10 @@ __all__ = [
     "Camera",
     "CameraPose",
     "Frame",
+    "PhoneLog",
+    "Sensor",
     "VideoInfo",
+    "attitude_of",
     "calibrate_video",
     "camera_in_device",
     "check_attitude",
@@ -32,6 +37,7 @@ __all__ = [
     "load_camera_poses",
     "probe",
     "read_frames",
+    "read_phone_log",
     "sha256_of",
     "viewing_ray",
 ]

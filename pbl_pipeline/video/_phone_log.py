@@ -1,0 +1,270 @@
+"""The sensor log of a phone that filmed: orientation, and what else it measured, as a recording app wrote it.
+
+Two forms of the project's own (CSV, JSON; docs/phone_capture.md) and the exports of Sensor Logger are read. Nothing is
+turned or shifted here: `load_attitude` brings a log to a video.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import datetime
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pbl_pipeline.errors import PblError
+
+from ._attitude import CAMERA, DEVICE, check_attitude, log_error
+
+#: Clocks of a log: the video's own; UTC (`start_utc_s` is known); its own, begun some time before the video.
+VIDEO_CLOCK, UTC_CLOCK, OWN_CLOCK = "video", "utc", "own"
+QUATERNION = ("qw", "qx", "qy", "qz")
+_COLUMNS = ("time_s", *QUATERNION)
+_SETTINGS = ("frame", "rotation_deg", "start_utc")
+#: Further sensors: their columns in a CSV, and the unit of their values.
+SENSORS = {
+    "accelerometer": (("ax", "ay", "az"), "m/s^2"),
+    "gyroscope": (("gx", "gy", "gz"), "rad/s"),
+    "magnetometer": (("mx", "my", "mz"), "uT"),
+}
+#: An accelerometer shows gravity where its typical length (m/s^2) lies in this range; it then must agree with the log's
+#: way up within this angle.
+_GRAVITY, _MOST_TILT_DEG = (8.8, 10.8), 25.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensor:
+    """`time_s` (K,) on the log's clock, increasing; `xyz` (K, 3) along the device's axes, in the unit of `SENSORS`."""
+
+    time_s: np.ndarray
+    xyz: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class PhoneLog:
+    """A log as written; times are seconds of `clock`.
+
+    time_s, quat_wxyz: (P,), (P, 4) checked by `check_attitude`, from `frame` ("camera", "device") to a world with z up.
+    rotation_deg: how far the phone was turned clockwise from portrait, None where the log does not say. start_utc_s:
+    seconds from 1970 to time 0, None where not known. sensors: those of `SENSORS` that are there, and "gravity".
+    form: which format it was. notes: what was left out in reading.
+    """
+
+    time_s: np.ndarray
+    quat_wxyz: np.ndarray
+    frame: str
+    rotation_deg: float | None
+    clock: str
+    start_utc_s: float | None
+    sensors: Mapping[str, Sensor]
+    form: str
+    device: str = ""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples of the orientation per second, by the median interval."""
+        return float(1.0 / np.median(np.diff(self.time_s)))
+
+
+def read_phone_log(path: str | Path) -> PhoneLog:
+    """Read a log in one of the forms of docs/phone_capture.md; what it is follows from its content.
+
+    Raises
+    ------
+    PblError
+        FILE_MISSING: no such file. PHONE_LOG: none of the forms, a field missing, what `check_attitude` refuses, an
+        unknown frame, sensors whose gravity contradicts the orientation.
+    """
+    from ._sensor_logger import is_sensor_logger, read_sensor_logger
+
+    path = Path(path)
+    if is_sensor_logger(path):
+        log = read_sensor_logger(path)
+    else:
+        text = read_text(path)
+        log = _read_json(path, text) if text.lstrip()[:1] in ("{", "[") else _read_csv(path, text)
+    _check_gravity(path, log)
+    return log
+
+
+def read_text(path: Path) -> str:
+    """Text of a file. Raises `PblError` FILE_MISSING, PHONE_LOG (no text)."""
+    try:
+        return path.read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise PblError(
+            "FILE_MISSING",
+            found=error.strerror or str(error),
+            expected="a sensor log, CSV or JSON",
+            next_step="check the path, and that you may read the file",
+            key=str(path),
+        ) from error
+    except UnicodeDecodeError as error:
+        raise log_error("no text", "CSV or JSON with " + ", ".join(_COLUMNS), path) from error
+
+
+def read_table(path: Path, text: str) -> tuple[list[str], list[dict[str, str | None]]]:
+    """Column names and rows of a CSV text; empty lines and lines that start with # left out. Raises PHONE_LOG."""
+    rows = csv.DictReader((t for t in text.splitlines() if t.strip() and t[0] != "#"), skipinitialspace=True)
+    try:
+        table = list(rows)
+        names = [(n or "").strip() for n in rows.fieldnames or ()]
+    except csv.Error as error:
+        raise log_error(f"no CSV ({error})", "CSV with the columns " + ", ".join(_COLUMNS), path) from error
+    return names, [{(k or "").strip(): v for k, v in row.items()} for row in table]
+
+
+def numbers(path: Path, table: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
+    """(N,) float64 of one column. Raises `PblError` PHONE_LOG."""
+    try:
+        return np.array([float(row[name]) for row in table], np.float64)
+    except (KeyError, TypeError, ValueError) as error:
+        raise log_error(f"column {name}: {error}", "a number in each row", path) from error
+
+
+# -------------------------------------------------------------------------------------------------- the project's own
+def _read_csv(path: Path, text: str) -> PhoneLog:
+    names, table = read_table(path, text)
+    _check_names(path, names)
+    columns = [numbers(path, table, name) for name in _COLUMNS]
+    settings: dict[str, object] = {}
+    for name in _SETTINGS:
+        values = {str(row.get(name) or "").strip() for row in table} - {""}
+        if len(values) > 1:
+            raise log_error(f"column {name} holds {', '.join(sorted(values))}", "one value in the whole file", path)
+        if values:
+            settings[name] = values.pop()
+    sensors = {}
+    for sensor, (axes, _) in SENSORS.items():
+        if set(axes) <= set(names):
+            # A slower sensor has no value in some rows.
+            filled = [row for row in table if all((row.get(a) or "").strip() for a in axes)]
+            xyz = np.stack([numbers(path, filled, a) for a in axes], axis=1)
+            sensors[sensor] = _sensor(path, sensor, numbers(path, filled, "time_s"), xyz)
+    return _log(path, columns, settings, sensors, "CSV")
+
+
+def _read_json(path: Path, text: str) -> PhoneLog:
+    try:
+        content = json.loads(text)
+    except ValueError as error:
+        raise log_error(f"no JSON ({error})", "an object with " + ", ".join(_COLUMNS), path) from error
+    if not isinstance(content, dict):
+        raise log_error("JSON that is no object", "an object with " + ", ".join(_COLUMNS), path)
+    orientation = content.get("orientation", content)
+    if not isinstance(orientation, dict):
+        raise log_error("an orientation that is no object", "an object with " + ", ".join(_COLUMNS), path)
+    _check_names(path, list(orientation))
+    columns = _lists(path, orientation, _COLUMNS)
+    sensors = {}
+    for sensor in SENSORS:
+        if isinstance(content.get(sensor), dict):
+            time, *xyz = _lists(path, content[sensor], ("time_s", "x", "y", "z"), sensor)
+            sensors[sensor] = _sensor(path, sensor, time, np.stack(xyz, axis=1))
+    phone = content.get("phone")
+    device = " ".join(str(v) for v in phone.values() if v) if isinstance(phone, dict) else ""
+    settings = {name: content[name] for name in _SETTINGS if name in content}
+    return _log(path, columns, settings, sensors, "JSON", device)
+
+
+def _lists(path: Path, content: Mapping[str, Any], names: Sequence[str], where: str = "") -> list[np.ndarray]:
+    columns = []
+    for name in names:
+        try:
+            columns.append(np.asarray(content[name], np.float64))
+        except (KeyError, TypeError, ValueError) as error:
+            raise log_error(f"{where} field {name}: {error}".strip(), "a list of numbers", path) from error
+    if len({c.shape for c in columns}) > 1 or columns[0].ndim != 1:
+        shapes = ", ".join(f"{n} {c.shape}" for n, c in zip(names, columns, strict=True))
+        raise log_error(f"{where} {shapes}".strip(), "lists of the same length", path)
+    return columns
+
+
+def _log(
+    path: Path,
+    columns: list[np.ndarray],
+    settings: Mapping[str, object],
+    sensors: Mapping[str, Sensor],
+    form: str,
+    device: str = "",
+) -> PhoneLog:
+    time, quat = check_attitude(columns[0], np.stack(columns[1:], axis=1), path)
+    frame, rotation_deg = _frame(path, settings)
+    start = _utc(path, settings.get("start_utc"))
+    clock = VIDEO_CLOCK if start is None else UTC_CLOCK
+    return PhoneLog(time, quat, frame, rotation_deg, clock, start, sensors, form, device)
+
+
+def _check_names(path: Path, names: list[str]) -> None:
+    missing = [n for n in _COLUMNS if n not in names]
+    if missing:
+        raise log_error(f"no {', '.join(missing)}", "the fields " + ", ".join(_COLUMNS), path)
+
+
+def _frame(path: Path, settings: Mapping[str, object]) -> tuple[str, float | None]:
+    frame, turned = settings.get("frame", CAMERA), settings.get("rotation_deg")
+    if frame not in (CAMERA, DEVICE):
+        raise log_error(f"frame {frame!r}", f"{CAMERA} or {DEVICE}", path)
+    if turned is None:
+        return str(frame), None
+    try:
+        rotation_deg = float(turned)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        rotation_deg = math.nan
+    if rotation_deg not in (0.0, 90.0, 180.0, 270.0):
+        raise log_error(f"rotation_deg {turned!r}", "0, 90, 180 or 270", path)
+    if rotation_deg and frame == CAMERA:
+        found = f"rotation_deg {rotation_deg:g} with frame {CAMERA}"
+        raise log_error(
+            found, f"rotation_deg only with frame {DEVICE}: the camera's frame is the upright picture's", path
+        )
+    return str(frame), rotation_deg
+
+
+def _utc(path: Path, value: object) -> float | None:
+    """Seconds since 1970 of a time with its zone ("2026-03-01T09:15:30.250Z"). A time without one says too little."""
+    if value is None:
+        return None
+    try:
+        when = datetime.datetime.fromisoformat(str(value))
+    except ValueError as error:
+        raise log_error(f"start_utc {value!r}", "a time such as 2026-03-01T09:15:30.250Z", path) from error
+    if when.tzinfo is None:
+        raise log_error(f"start_utc {value!r} without a time zone", "a time such as 2026-03-01T09:15:30.250Z", path)
+    return when.timestamp()
+
+
+def _sensor(path: Path, name: str, time: np.ndarray, xyz: np.ndarray) -> Sensor:
+    if not np.isfinite(time).all() or not np.isfinite(xyz).all():
+        raise log_error(f"{name}: values that are not finite", "finite numbers; leave such samples out", path)
+    if np.any(np.diff(time) < 0):
+        raise log_error(f"{name}: stamps that run backwards", "increasing times", path)
+    return Sensor(time, xyz)
+
+
+def _check_gravity(path: Path, log: PhoneLog) -> None:
+    """Compare the way up of the orientation with that of the accelerometer. Android counts it upwards, iOS downwards,
+    so the line counts. It tells a wrong frame from a right one; heading it does not see."""
+    sensor = log.sensors.get("gravity") or log.sensors.get("accelerometer")
+    if sensor is None or log.frame != DEVICE or len(sensor.time_s) < 2:
+        return
+    length = np.linalg.norm(sensor.xyz, axis=1)
+    if not _GRAVITY[0] <= np.median(length) <= _GRAVITY[1]:
+        return
+    near = np.clip(np.searchsorted(log.time_s, sensor.time_s), 0, len(log.time_s) - 1)
+    up = Rotation.from_quat(log.quat_wxyz[near], scalar_first=True).inv().apply([0.0, 0.0, 1.0])
+    cos = np.abs(np.sum(up * sensor.xyz, axis=1)) / np.maximum(length, 1e-9)
+    off = float(np.degrees(np.median(np.arccos(np.clip(cos, 0, 1)))))
+    if off > _MOST_TILT_DEG:
+        raise log_error(
+            f"an orientation whose vertical lies {off:.0f} deg from the accelerometer's",
+            f"at most {_MOST_TILT_DEG:.0f} deg: quaternions that turn the phone's axes into a world with z up",
+            path,
+        )
