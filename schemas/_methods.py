@@ -38,17 +38,4 @@ def _norm(name: str) -> None:
     norm = library("gait").load_norm(name)
     if gdi.NormativeSet & {"norm_sha256": norm.sha256}:
         return
-    gdi.NormativeSet.insert1(
-        {
-            "norm": f"{norm.name}-v{norm.version}",
-            "norm_name": norm.name,
-            "norm_version": norm.version,
-            "norm_sha256": norm.sha256,
-            "norm_n": norm.n,
-            "norm_variables": list(norm.variables),
-            "norm_source": norm.source[:1000],
-            "norm_convention": norm.convention[:1000],
-            "norm_licence": norm.licence[:500],
-        },
-        skip_duplicates=True,
-    )
+    gdi.NormativeSet.insert1(gdi.norm_row(norm), skip_duplicates=True)

@@ -38,9 +38,12 @@ def measure_columns(prefix: str) -> str:
     {prefix}_left=null   : float32             # in the unit (see {prefix})
     {prefix}_right=null  : float32             # in the unit (see {prefix})
     {prefix}_sd=null     : float32             # in the unit (see {prefix}): n - 1, null for one value
+    {prefix}_variability=null : float32        # in the unit (see {prefix}): sd within a side, null below two values of a side
+    {prefix}_cv=null     : float32             # (percent) variability of the mean
+    {prefix}_asymmetry=null   : float32        # (percent) right minus left, of their mean; null where it means nothing
     {prefix}_n           : int16               # values
     {prefix}_missing     : varchar(255)        # why it is null
-    """
+    """  # noqa: E501
 
 
 @schema
@@ -149,7 +152,7 @@ class GaitCycle(dj.Computed):
     -> GaitEvents
     ---
     n_cycles        : int16                    # all complete cycles
-    n_cycles_used   : int16                    # without first and last steps and odd lengths
+    n_cycles_used   : int16                    # without first and last steps, odd lengths and odd curves
     curves          : <object@arrays>          # npz: cycle_no (N), names (A), percent (P) of the cycle, curve (N,A,P) deg
     {origin_columns("cycles")}
     """  # noqa: E501
@@ -166,9 +169,14 @@ class GaitCycle(dj.Computed):
         opposite_foot_down : float64           # (s)
         cycle_foot_up      : float64           # (s)
         cycle_end          : float64           # (s) next foot down of the same side
-        cycle_used         : bool              # false: first or last step, odd length, failed fit
+        cycle_used         : bool              # false: first or last step, odd length, odd curves, failed fit
         cycle_excluded     : varchar(100)      # why it is not used
         curves_missing     : varchar(100)      # why it has no curves
+        cycle_stride_length=null : float32     # (m) over the floor
+        cycle_step_length=null   : float32     # (m) of the step that ends the cycle
+        cycle_step_width=null    : float32     # (m) null unless the metres were measured
+        cycle_lengths_metric     : bool        # false: as large as the detector takes the person to be
+        cycle_lengths_missing    : varchar(150)  # why there are no lengths
         """
 
     def make_fetch(self, key: dict) -> tuple:
@@ -209,6 +217,11 @@ class GaitCycle(dj.Computed):
                 "cycle_used": c.used,
                 "cycle_excluded": c.excluded[:100],
                 "curves_missing": c.curves_missing[:100],
+                "cycle_stride_length": number(c.lengths.stride_length_m),
+                "cycle_step_length": number(c.lengths.step_length_m),
+                "cycle_step_width": number(c.lengths.step_width_m),
+                "cycle_lengths_metric": c.lengths.metric,
+                "cycle_lengths_missing": c.lengths.missing[:150],
             }
             for c in cycles
         )
@@ -280,6 +293,26 @@ MEASURE_COLUMNS = {
 }
 
 
+#: Column after its prefix -> attribute of the library's `Measure`.
+_MEASURE_PARTS = (
+    ("mean", "mean"),
+    ("left", "left"),
+    ("right", "right"),
+    ("sd", "sd"),
+    ("variability", "variability"),
+    ("cv", "cv_percent"),
+    ("asymmetry", "asymmetry_percent"),
+)
+
+
+def measure_of_row(row: Mapping[str, Any], prefix: str) -> Any:
+    """The library's `Measure` of a row of `measure_columns(prefix)`, None where it is not known."""
+    if row[f"{prefix}_mean"] is None:
+        return None
+    values = {k: number(row[f"{prefix}_{column}"]) for column, k in _MEASURE_PARTS}
+    return library("gait").Measure(**values, n=int(row[f"{prefix}_n"]))
+
+
 def mean_of(measure: Any) -> float | None:
     """The mean of a library `Measure`, None where there is none."""
     return None if measure is None else number(measure.mean)
@@ -290,7 +323,7 @@ def measure_rows(measures: Mapping[str, Any], reasons: Mapping[str, str], prefix
     rows = []
     for name, m in measures.items():
         row: dict[str, Any] = {prefix: name, f"{prefix}_missing": reasons.get(name, "")[:255]}
-        row |= {f"{prefix}_{k}": None if m is None else number(getattr(m, k)) for k in ("mean", "left", "right", "sd")}
+        row |= {f"{prefix}_{column}": None if m is None else number(getattr(m, k)) for column, k in _MEASURE_PARTS}
         rows.append({**row, f"{prefix}_n": 0 if m is None else m.n})
     return rows
 
@@ -322,6 +355,13 @@ def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Mapping[str, np.nda
         excluded=row["cycle_excluded"],
         curves=dict(curves or {}),
         curves_missing=row["curves_missing"],
+        lengths=library("gait").Lengths(
+            number(row["cycle_stride_length"]),
+            number(row["cycle_step_length"]),
+            number(row["cycle_step_width"]),
+            row["cycle_lengths_missing"],
+            bool(row["cycle_lengths_metric"]),
+        ),
     )
 
 

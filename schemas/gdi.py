@@ -24,9 +24,21 @@ from ._base import (
     rebuild_params,
     resolve_method,
     stored_file,
+    utc_now,
 )
 
 schema = dj.Schema()
+
+
+def profile_columns(prefix: str) -> str:
+    """Definition lines of a part table of the Movement Analysis Profile; `profile_rows` gives its rows."""
+    return f"""
+    -> master
+    {prefix}_angle             : varchar(32)   # name
+    ---
+    {prefix}_score_left=null   : float32       # (deg) root mean square distance from the normative mean curve
+    {prefix}_score_right=null  : float32       # (deg)
+    """
 
 
 @schema
@@ -43,6 +55,11 @@ class NormativeSet(dj.Lookup):
     norm_source         : varchar(1000)        # who measured whom, and where it is published
     norm_convention     : varchar(1000)        # how its angles are defined
     norm_licence        : varchar(500)
+    norm_angle_model    : varchar(32)          # how pelvis and hip are defined: plug_in_gait or pbl_body
+    norm_components     : int16                # components of the index
+    norm_file=null      : <object@arrays>      # JSON of the whole set; null for one that ships with the code
+    norm_query=null     : json                 # whose cycles it was built from; null for one that ships
+    norm_created        : datetime             # when registered, UTC
     unique index (norm_sha256)
     """
 
@@ -79,8 +96,11 @@ class GDI(dj.Computed):
     gdi_left=null   : float32                  # (-)
     gdi_right=null  : float32                  # (-)
     gdi_n           : int16                    # cycles with an index
+    gdi_gps=null       : float32               # (deg) Gait Profile Score of the person; null unless the norm has nine angles
+    gdi_gps_left=null  : float32               # (deg)
+    gdi_gps_right=null : float32               # (deg)
     {origin_columns("gdi")}
-    """
+    """  # noqa: E501
 
     class Cycle(dj.Part):
         definition = """
@@ -90,6 +110,12 @@ class GDI(dj.Computed):
         cycle_gdi       : float32              # (-)
         cycle_z         : float32              # (-) standardised log distance to the normative mean
         cycle_explained : float32              # (0..1) share of the deviation that the index sees
+        """
+
+    class Profile(dj.Part):
+        definition = f"""
+        # Movement Analysis Profile: how far each angle of the norm is from it
+        {profile_columns("gdi")}
         """
 
     class Check(dj.Part):
@@ -108,7 +134,7 @@ class GDI(dj.Computed):
         rows = (gait.GaitCycle.Cycle & key).to_dicts(order_by="cycle_no")
         cycles = [{k: v for k, v in r.items() if k not in key} for r in rows]
         curves = file_ref((gait.GaitCycle & key).fetch1("curves"))
-        norm = (NormativeSet & key).fetch1("norm_name", "norm_sha256")
+        norm = norm_ref(key)
         return name, cycles, curves, norm, method_arguments(GdiModel, "gdi", "gdi", key["gdi_method"])
 
     @computes
@@ -119,7 +145,8 @@ class GDI(dj.Computed):
         with stored_file(self, ref) as path:
             curves = gait.load_curves(path)
         cycles = [gait.cycle_of_row(r, name, curves.get(int(r["cycle_no"]))) for r in rows]
-        return library("gait").score_gdi(cycles, norm_of_row(*norm), params), method["sha"], norm[1]
+        result = library("gait").score_gdi(cycles, norm_of_row(*norm), params, method["name"], method["version"])
+        return result, method["sha"], norm[1]
 
     def make_insert(self, key: dict, result: Any, sha: str, norm_sha: str, origin: Origin) -> None:
         self.insert1(
@@ -131,6 +158,7 @@ class GDI(dj.Computed):
                 "gdi_left": number(result.left),
                 "gdi_right": number(result.right),
                 "gdi_n": result.n,
+                **gps_row(result.profile, "gdi"),
                 **origin.row("gdi", method_hash=sha, model_sha256=norm_sha),
             }
         )
@@ -138,6 +166,7 @@ class GDI(dj.Computed):
             {**key, "cycle_no": c.number, "cycle_gdi": c.gdi, "cycle_z": c.z, "cycle_explained": c.explained}
             for c in result.cycles
         )
+        self.Profile.insert({**key, **row} for row in profile_rows(result.profile, "gdi"))
         self.Check.insert({**key, **check_row("index", check)} for check in result.qc)
 
 
@@ -157,6 +186,9 @@ class SessionGdi(dj.Computed):
     session_gdi_left=null       : float32      # (-)
     session_gdi_right=null      : float32      # (-)
     session_gdi_n               : int16        # cycles with an index
+    session_gps=null            : float32      # (deg) Gait Profile Score of the person; null unless the norm has nine angles
+    session_gps_left=null       : float32      # (deg)
+    session_gps_right=null      : float32      # (deg)
     session_cycles              : int16        # used cycles
     session_params_hash         : char(16)     # hash over the parameters of events and index together
     session_cadence=null        : float32      # (steps/min)
@@ -166,12 +198,18 @@ class SessionGdi(dj.Computed):
     session_swing=null          : float32      # (percent) of the cycle
     session_double_support=null : float32      # (percent) of the cycle
     {origin_columns("session_gdi")}
-    """
+    """  # noqa: E501
 
     class Measure(dj.Part):
         definition = f"""
         # every measure with both sides and its spread
         {gait.measure_columns("session_measure")}
+        """
+
+    class Profile(dj.Part):
+        definition = f"""
+        # Movement Analysis Profile: how far each angle of the norm is from it
+        {profile_columns("session")}
         """
 
     class Check(dj.Part):
@@ -190,7 +228,7 @@ class SessionGdi(dj.Computed):
         rows = (fit.SessionFit.Trial & key).to_dicts(order_by="video_id")
         return (
             [file_ref(r["trial_file"]) for r in rows],
-            (NormativeSet & key).fetch1("norm_name", "norm_sha256"),
+            norm_ref(key),
             method_arguments(gait.GaitEventMethod, "gait", "gait", key["gait_method"]),
             method_arguments(GdiModel, "gdi", "gdi", key["gdi_method"]),
             fit.fit_checks(key),
@@ -212,7 +250,8 @@ class SessionGdi(dj.Computed):
             paths = [stack.enter_context(stored_file(self, ref)) for ref in refs]
             trials = [library("fit").TrialFit.load(path) for path in paths]
         about_fit = [library("qc").Check(*check) for check in checks]
-        return lib.gait_metrics(trials, norm_of_row(*norm), params, about_fit), index["sha"], norm[1]
+        result = lib.gait_metrics(trials, norm_of_row(*norm), params, about_fit, index["name"], index["version"])
+        return result, index["sha"], norm[1]
 
     def make_insert(self, key: dict, result: Any, sha: str, norm_sha: str, origin: Origin) -> None:
         measures, index = result.spatiotemporal, result.gdi
@@ -228,6 +267,7 @@ class SessionGdi(dj.Computed):
                 "session_gdi_left": number(index.left),
                 "session_gdi_right": number(index.right),
                 "session_gdi_n": index.n,
+                **gps_row(index.profile, "session"),
                 "session_cycles": measures.n_cycles_used,
                 "session_params_hash": result.params_hash,
                 **{f"session_{c}": gait.mean_of(measures.measures[by_column[c]]) for c in columns},
@@ -236,12 +276,73 @@ class SessionGdi(dj.Computed):
         )
         rows = gait.measure_rows(measures.measures, measures.reasons, prefix="session_measure")
         self.Measure.insert({**key, **row} for row in rows)
+        self.Profile.insert({**key, **row} for row in profile_rows(index.profile, "session"))
         self.Check.insert({**key, **check_row("gdi", check)} for check in result.qc)
 
 
-def norm_of_row(name: str, sha256: str) -> Any:
+def gps_row(profile: Any, prefix: str) -> dict[str, float | None]:
+    """The columns of the Gait Profile Score."""
+    scores = ("gps", "gps_left", "gps_right")
+    return {f"{prefix}_{k}": None if profile is None else number(getattr(profile, k)) for k in scores}
+
+
+def profile_rows(profile: Any, prefix: str) -> list[dict[str, Any]]:
+    """Rows of a part table with `profile_columns(prefix)`."""
+    if profile is None:
+        return []
+    return [
+        {
+            f"{prefix}_angle": angle,
+            f"{prefix}_score_left": number(profile.left.get(angle)),
+            f"{prefix}_score_right": number(profile.right.get(angle)),
+        }
+        for angle in dict.fromkeys([*profile.left, *profile.right])
+    ]
+
+
+def profile_of_rows(rows: Sequence[Mapping[str, Any]], master: Mapping[str, Any], prefix: str) -> Any:
+    """The library's `MovementProfile`, None where there are no rows."""
+    if not rows:
+        return None
+    sides = {
+        side: {r[f"{prefix}_angle"]: number(v) for r in rows if (v := r[f"{prefix}_score_{side}"]) is not None}
+        for side in ("left", "right")
+    }
+    gps = (number(master[f"{prefix}_{k}"]) for k in ("gps_left", "gps_right", "gps"))
+    return library("gait").MovementProfile(sides["left"], sides["right"], *gps)
+
+
+def norm_row(norm: Any) -> dict[str, Any]:
+    """A normative set of the library as a row, without file and query."""
+    return {
+        "norm": f"{norm.name}-v{norm.version}",
+        "norm_name": norm.name,
+        "norm_version": norm.version,
+        "norm_sha256": norm.sha256,
+        "norm_n": norm.n,
+        "norm_variables": list(norm.variables),
+        "norm_source": norm.source[:1000],
+        "norm_convention": norm.convention[:1000],
+        "norm_licence": norm.licence[:500],
+        "norm_angle_model": norm.angle_model,
+        "norm_components": len(norm.components),
+        "norm_created": utc_now(),
+    }
+
+
+def norm_ref(key: Mapping[str, Any]) -> tuple[str, str, dict | None]:
+    """What `norm_of_row` takes: name, checksum and, of a set that was built here, its file."""
+    name, sha256, stored = (NormativeSet & key).fetch1("norm_name", "norm_sha256", "norm_file")
+    return name, sha256, None if stored is None else file_ref(stored)
+
+
+def norm_of_row(name: str, sha256: str, ref: Mapping[str, Any] | None = None) -> Any:
     """The library's normative set, checked to be the one of the row. Raises NORM_UNKNOWN, NORM_INVALID."""
-    norm = library("gait").load_norm(name)
+    if ref is None:
+        norm = library("gait").load_norm(name)
+    else:
+        with stored_file(NormativeSet(), ref) as path:
+            norm = library("gait").load_norm(str(path))
     if norm.sha256 != sha256:
         raise PblError(
             "NORM_INVALID",
@@ -253,8 +354,14 @@ def norm_of_row(name: str, sha256: str) -> Any:
 
 
 def resolve(model: str | None, norm: str | None) -> dict[str, str]:
-    """Keys of the index and the normative set by name. Raises SOLVER_UNKNOWN, NORM_UNKNOWN."""
-    wanted = norm or library("gait").DEFAULT_NORM
+    """Keys of the index and the normative set by name; a set left out is the index's own.
+
+    Raises `PblError` SOLVER_UNKNOWN, NORM_UNKNOWN; NORM_INVALID for a set of other angles than the index has.
+    """
+    lib = library("gait")
+    method = resolve_method(GdiModel, "gdi", model or lib.GDI_MODEL)
+    name, params = (GdiModel & {"gdi_method": method}).fetch1("gdi_method_name", "gdi_params")
+    wanted = norm or params["norm"]
     rows = NormativeSet.proj("norm_name", "norm_version").to_dicts(order_by="norm_version DESC")
     found = next((r["norm"] for r in rows if wanted in (r["norm"], r["norm_name"])), None)
     if found is None:
@@ -264,4 +371,12 @@ def resolve(model: str | None, norm: str | None) -> dict[str, str]:
             expected="one of " + ", ".join(r["norm_name"] for r in rows),
             next_step="choose one of the names above",
         )
-    return {"gdi_method": resolve_method(GdiModel, "gdi", model or library("gait").GDI_MODEL), "norm": found}
+    variables = tuple((NormativeSet & {"norm": found}).fetch1("norm_variables"))
+    if variables != lib.MODEL_ANGLES.get(name, variables):
+        raise PblError(
+            "NORM_INVALID",
+            found=f"normative set {found} of {len(variables)} angles for {method}",
+            expected=f"a set of {len(lib.MODEL_ANGLES[name])} angles",
+            next_step="leave the set out, or name another (`pbl norm list`)",
+        )
+    return {"gdi_method": method, "norm": found}

@@ -235,6 +235,7 @@ def load_metrics(key: Any) -> Any:
         params_hash=row["session_gdi_method_hash"],
         cycles=tuple(c for t in trials for c in t.gdi.cycles),
         qc=tuple(c for c in _checks(gdi.SessionGdi.Check & row_key, "gdi") if c.check in _INDEX_CHECKS),
+        profile=gdi.profile_of_rows((gdi.SessionGdi.Profile & row_key).to_dicts(), row, "session"),
     )
     measures = _spatiotemporal(
         (gdi.SessionGdi.Measure & row_key).to_dicts(),
@@ -319,6 +320,7 @@ def load_gdi(key: Any, trial: str) -> Any:
         params_hash=row["gdi_method_hash"],
         cycles=cycles,
         qc=tuple(_checks(gdi.GDI.Check & key, "index")),
+        profile=gdi.profile_of_rows((gdi.GDI.Profile & key).to_dicts(), row, "gdi"),
     )
 
 
@@ -336,9 +338,7 @@ def _spatiotemporal(rows: list[dict], prefix: str, **fields: Any) -> Any:
         if name not in by_name:
             continue
         row = by_name[name]
-        mean = number(row[f"{prefix}_mean"])
-        left, right, sd = (number(row[f"{prefix}_{k}"]) for k in ("left", "right", "sd"))
-        measures[name] = None if mean is None else lib.Measure(left, right, mean, sd, int(row[f"{prefix}_n"]))
+        measures[name] = gait.measure_of_row(row, prefix)
         if row[f"{prefix}_missing"]:
             reasons[name] = row[f"{prefix}_missing"]
     return lib.Spatiotemporal(measures=measures, reasons=reasons, **fields)

@@ -21,6 +21,7 @@ from ._gdi import (
 from ._ground import Lengths, cycle_lengths
 from ._laboratory import PLUG_IN_GAIT_POINTS, LabTrial, read_lab_trial
 from ._metrics import GaitMetrics, GaitParams, TrialMetrics, cycle_checks, gait_metrics
+from ._own_norm import norm_from_cycles
 from ._poses import BodyPoses, trial_poses
 from ._profile import MovementProfile, movement_profile, variable_scores
 from ._spatiotemporal import MEASURES, Measure, Spatiotemporal, spatiotemporal
@@ -99,6 +100,7 @@ __all__ = [
     "load_events",
     "load_norm",
     "movement_profile",
+    "norm_from_cycles",
     "norm_names",
     "offset_deg",
     "pelvis_angles",

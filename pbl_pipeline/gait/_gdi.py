@@ -15,7 +15,6 @@ from ._cycles import GaitCycle
 from ._profile import MovementProfile, movement_profile, variable_scores
 from .events import LEFT, RIGHT
 from .normative import (
-    BODY_ANGLES,
     DEFAULT_NORM,
     NINE_ANGLES,
     THREE_ANGLES,
@@ -276,7 +275,7 @@ def _convention(angle_models: set[str], norm: NormativeSet) -> Check:
             f"({next(iter(angle_models))}): pelvis tilt and hip flexion differ by a constant. Compare sessions with "
             "each other, do not read a single value against 100, or take a norm of the same definition"
         )
-    elif norm.angle_model == BODY_ANGLES and "mapped" in norm.convention:
+    elif norm.mapped_from:
         advice = (
             "the norm was measured with a laboratory's marker model and mapped to the fitted body's angles by a "
             "constant; what else differs (hip joint centres, age, a person's own pelvis) is in the index. Changes "

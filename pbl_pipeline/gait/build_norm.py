@@ -126,6 +126,7 @@ def _three_angles(path: str | Path, angle_model: str) -> NormativeSet:
         curves=_curves(vectors, angle_model),
         source_sha256=_sha256(path),
         angle_model=angle_model,
+        mapped_from=PLUG_IN_GAIT if mapped else "",
     )
 
 

@@ -31,7 +31,8 @@ import click
 @click.option("--tracking-method", metavar="NAME", help="Method of person tracking (else: the default).")
 @click.option("--keypoint-method", metavar="NAME", help="Keypoint method or model (else: default).")
 @click.option("--fit-method", metavar="NAME", help="Method of the session fit (else: the default).")
-@click.option("--norm", metavar="NAME", help="Normative set of the Gait Deviation Index (else: the default).")
+@click.option("--index", metavar="NAME", help="Gait Deviation Index: pbl-2025-three-angles (default) or gillette-2008.")
+@click.option("--norm", metavar="NAME", help="Normative set of the Gait Deviation Index (else: the index's own).")
 def ingest(
     videos: tuple[Path, ...],
     subject: str,
@@ -45,6 +46,7 @@ def ingest(
     tracking_method: str | None,
     keypoint_method: str | None,
     fit_method: str | None,
+    index: str | None,
     norm: str | None,
 ) -> None:
     """Register videos of one visit; `pbl populate` then computes them. Nothing is decoded here.
@@ -63,7 +65,7 @@ def ingest(
 
     schemas.activate()
     visit = Visit(subject, session_label, project, camera, camera_motion, activity, person, population)
-    methods = Methods(tracking=tracking_method, keypoint=keypoint_method, fit=fit_method, norm=norm)
+    methods = Methods(tracking=tracking_method, keypoint=keypoint_method, fit=fit_method, gdi=index, norm=norm)
     results = register(videos, visit, methods)
     for result in results:
         if result.error is not None:

@@ -79,7 +79,18 @@ def test_the_sets_are_what_the_command_builds(shared_data):
     source = shared_data / "real" / "gdi_gillette" / "GDI_Calc_Fast_Data.mat"
     for name, (build, digits) in BUILDERS.items():
         built, shipped = build(source), load_norm(name)
-        same = ("name", "version", "n", "source", "licence", "convention", "variables", "source_sha256", "angle_model")
+        same = (
+            "name",
+            "version",
+            "n",
+            "source",
+            "licence",
+            "convention",
+            "variables",
+            "source_sha256",
+            "angle_model",
+            "mapped_from",
+        )
         assert [getattr(built, k) for k in same] == [getattr(shipped, k) for k in same]
         off = 1e-12 if digits is None else 1e-5
         for k in ("mean_deg", "components", "percent", "ln_mean", "ln_sd", "explained_share"):

@@ -36,6 +36,8 @@ class NormativeSet:
         Names of the angles in the feature vector (`ANGLE_NAMES`), in order, each at `percent` of the cycle.
     angle_model
         How the angles of the vectors are defined, one of `ANGLE_MODELS`.
+    mapped_from
+        The definition they were measured in, where they were mapped from another one; else empty.
     percent : (P,)
     mean_deg : (V * P,)
         Mean normative vector.
@@ -73,6 +75,7 @@ class NormativeSet:
     source_sha256: str = ""
     sha256: str = ""
     angle_model: str = PLUG_IN_GAIT
+    mapped_from: str = ""
 
     def log_distance(self, vectors: np.ndarray) -> np.ndarray:
         """ln of the Euclidean distance of the component scores of (N, V * P) vectors to the normative mean."""
@@ -110,6 +113,7 @@ def fit_norm(
     n_components: int | None = None,
     pooled: np.ndarray | None = None,
     angle_model: str = PLUG_IN_GAIT,
+    mapped_from: str = "",
     source_sha256: str = "",
 ) -> NormativeSet:
     """Principal components that explain `variance` of normative vectors (N, V * P), and their log distances.
@@ -161,6 +165,7 @@ def fit_norm(
         curves=curves or {},
         source_sha256=source_sha256,
         angle_model=angle_model,
+        mapped_from=mapped_from,
     )
 
 
@@ -211,9 +216,10 @@ def _to_json(norm: NormativeSet, digits: int | None) -> dict:
     for field in dataclasses.fields(norm):
         if field.name != "sha256":
             out[field.name] = _plain(getattr(norm, field.name), digits)
-    # Left out where it is the default: the first sets were written before there was another.
-    if norm.angle_model == PLUG_IN_GAIT:
-        del out["angle_model"]
+    # Left out where they are the default: the first set was written before there was another.
+    for name, default in (("angle_model", PLUG_IN_GAIT), ("mapped_from", "")):
+        if out[name] == default:
+            del out[name]
     return out
 
 

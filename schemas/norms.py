@@ -1,0 +1,191 @@
+"""Normative sets built from the gait cycles in the tables: data with a version, never rebuilt."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from pbl_pipeline.errors import PblError
+
+from . import fit, gait, gdi, lab, session
+from ._base import file_ref, library, new_folder, plain, stored_file
+
+#: What a set is called: as the shipped ones, and short enough for its column.
+_NAME = re.compile(r"[a-z0-9][a-z0-9-]{1,39}")
+#: What makes one chain of methods: cycles of several chains are not one norm.
+_CHAIN = ("tracking_method", "keypoint_method", "fit_method", "gait_method")
+
+
+@dataclasses.dataclass(frozen=True)
+class BuiltNorm:
+    """A set in the tables: its key, whether it is new, the library's set and its checks, people and cycles."""
+
+    norm: str
+    new: bool
+    set: Any  # pbl_pipeline.gait.NormativeSet
+    checks: tuple[Any, ...]
+    n_people: int
+    n_cycles: int
+
+
+def build_norm(
+    name: str,
+    populations: Sequence[str] = ("healthy",),
+    subjects: Sequence[str] = (),
+    pooled_populations: Sequence[str] = (),
+    restriction: Any = True,
+    *,
+    nine_angles: bool = False,
+    variance: float = 0.95,
+    source: str = "",
+) -> BuiltNorm:
+    """Build a normative set from the used cycles of the current fits and register it as the next version of its name.
+
+    Nothing that was registered changes: sessions keep the set they were planned with. Where the cycles are those of
+    the newest version, that version is given back.
+
+    Parameters
+    ----------
+    name
+        Small letters, digits and hyphens; not a name that ships with the code.
+    populations, subjects
+        Whose cycles: everybody of these populations, and these subjects. With subjects alone pass `populations=()`.
+    pooled_populations
+        Whose cycles the components are fitted to as well (the paper pools patients and controls).
+    restriction
+        A DataJoint restriction of `fit.SessionFit * gait.GaitCycle` and the methods, such as
+        `{"fit_method": "blazepose-v1"}`: needed where the tables hold several chains of methods.
+    nine_angles
+        All nine angles (for `gillette-2008`) and not three.
+
+    Raises
+    ------
+    PblError
+        USAGE (name, nobody asked for, several chains of methods), DB_NOT_FOUND (no cycles, unknown population or
+        subject), NORM_INVALID, ANGLE_UNITS.
+    """
+    lib = library("gait")
+    if not _NAME.fullmatch(name) or name in lib.norm_names():
+        raise _usage(f"the name {name!r}", "2 to 40 small letters, digits and hyphens, and no name that ships")
+    if not populations and not subjects:
+        raise _usage("neither populations nor subjects", "whose cycles make the norm")
+    _must_exist(lab.Population, "population", [*populations, *pooled_populations])
+    _must_exist(lab.Subject, "subject", subjects)
+    chosen = [{"population": p} for p in populations] + [{"subject": s} for s in subjects]
+    keys = _cycle_keys(chosen, restriction)
+    patients = _cycle_keys([{"population": p} for p in pooled_populations], restriction) if pooled_populations else []
+    if not keys:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no gait cycles of {', '.join([*populations, *subjects])}",
+            expected="fitted sessions of these people (`pbl ingest --population`, `pbl populate`)",
+            next_step="`pbl status` shows what is done",
+        )
+    _one_chain([*keys, *patients])
+    cycles, people = _cycles(keys)
+    query = {
+        "populations": sorted(populations),
+        "subjects": sorted({k["subject"] for k in keys}),
+        "pooled_populations": sorted(pooled_populations),
+        "fit_sets": sorted({k["fit_set"] for k in keys}),
+        "methods": {k: keys[0][k] for k in _CHAIN},
+        "variance": variance,
+    }
+    newest = _newest(name)
+    made: dict[str, Any] = {}
+    # As the newest version first: the same cycles give the same bytes, and then there is nothing to register.
+    for version in ([newest["norm_version"]] if newest else []) + [(newest or {}).get("norm_version", 0) + 1]:
+        norm, checks = lib.norm_from_cycles(
+            cycles,
+            people,
+            name=name,
+            version=version,
+            source=source or f"built here from the cycles of {', '.join([*populations, *subjects])}",
+            variables=lib.NINE_ANGLES if nine_angles else lib.THREE_ANGLES,
+            variance=variance,
+            pooled=_cycles(patients)[0],
+        )
+        made = {"set": norm, "checks": checks, "n_people": len(set(people)), "n_cycles": norm.n}
+        with new_folder() as folder:
+            sha256 = norm.save(folder / "norm.json", digits=None)
+            if newest and sha256 == newest["norm_sha256"]:
+                return BuiltNorm(norm=newest["norm"], new=False, **made)
+            if newest and version == newest["norm_version"]:
+                continue
+            row = gdi.norm_row(dataclasses.replace(norm, sha256=sha256))
+            row |= {"norm_file": folder / "norm.json", "norm_query": plain(query)}
+            gdi.NormativeSet.insert1(row)
+            return BuiltNorm(norm=row["norm"], new=True, **made)
+    raise AssertionError("the last version is always registered")
+
+
+def load_norm(norm: str) -> Any:
+    """The library's set of a key (`name-v2`) or name (its newest version). Raises `PblError` NORM_UNKNOWN."""
+    rows = gdi.NormativeSet.proj("norm_name", "norm_version").to_dicts(order_by="norm_version DESC")
+    found = next((r["norm"] for r in rows if norm in (r["norm"], r["norm_name"])), None)
+    if found is None:
+        raise PblError(
+            "NORM_UNKNOWN",
+            found=f"normative set {norm!r}",
+            expected="one of " + ", ".join(sorted(r["norm"] for r in rows)),
+            next_step="choose one of the names above",
+        )
+    return gdi.norm_of_row(*gdi.norm_ref({"norm": found}))
+
+
+def _cycle_keys(people: Sequence[dict], restriction: Any) -> list[dict[str, Any]]:
+    """Keys of GaitCycle of the current fits of these people, with subject and methods."""
+    found = (
+        (fit.FitSelection & {"fit_current": True}).proj()
+        * fit.FitSet.proj("session_id")
+        * session.Session.proj("subject")
+        * lab.Subject.proj("population")
+        * fit.FitSet.Video.proj("tracking_method", "keypoint_method")
+        * gait.GaitCycle.proj()
+    )
+    return (found & list(people) & restriction).to_dicts(order_by="KEY")
+
+
+def _cycles(keys: Sequence[dict[str, Any]]) -> tuple[list[Any], list[str]]:
+    """The library's cycles with their curves, and whose each is."""
+    cycles, people = [], []
+    for key in keys:
+        of = {k: key[k] for k in gait.GaitCycle.primary_key}
+        with stored_file(gait.GaitCycle(), file_ref((gait.GaitCycle & of).fetch1("curves"))) as path:
+            curves = gait.load_curves(path)
+        for row in (gait.GaitCycle.Cycle & of).to_dicts(order_by="cycle_no"):
+            cycles.append(gait.cycle_of_row(row, str(key["video_id"]), curves.get(int(row["cycle_no"]))))
+            people.append(key["subject"])
+    return cycles, people
+
+
+def _newest(name: str) -> dict[str, Any] | None:
+    rows = (gdi.NormativeSet & {"norm_name": name}).proj("norm_name", "norm_version", "norm_sha256")
+    return next(iter(rows.to_dicts(order_by="norm_version DESC")), None)
+
+
+def _one_chain(keys: Sequence[dict[str, Any]]) -> None:
+    chains = sorted({tuple(k[c] for c in _CHAIN) for k in keys})
+    if len(chains) > 1:
+        raise _usage(
+            f"cycles of {len(chains)} chains of methods: " + "; ".join(", ".join(c) for c in chains[:4]),
+            "one chain: restrict by " + ", ".join(_CHAIN),
+        )
+
+
+def _must_exist(table: Any, column: str, wanted: Sequence[str]) -> None:
+    known = set(table.to_arrays(column))
+    absent = [w for w in wanted if w not in known]
+    if absent:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no {column} {', '.join(absent)}",
+            expected="one of " + ", ".join(sorted(map(str, known))) if known else f"a registered {column}",
+            next_step="choose one of these",
+        )
+
+
+def _usage(found: str, expected: str) -> PblError:
+    return PblError("USAGE", found=found, expected=expected, next_step="see `pbl norm build --help`")
