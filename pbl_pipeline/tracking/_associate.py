@@ -10,8 +10,7 @@ it is worth it (`Watch`), by the container's own time stamps, and both direction
 packages, among them `opencv-python`, which overwrites the files of the headless OpenCV; `norfair` 2.3 asks for numpy
 below 2; `motpy` stands at 0.0.10. On 240 made crossings at 15 frames a second (tests/unit/crossings.py: eight pairs of
 speeds, three degrees of hiding, ten seeds) identities were exchanged in 7 (SORT, ByteTrack), 5 (OC-SORT) and 3 (C-BIoU)
-with `trackers`, in none with this module and `uncross`; one person hidden for a second, and behind somebody for 1.5
-seconds, all kept.
+with `trackers`, in none with this module and `uncross`; one person hidden for about a second all kept.
 """
 
 from __future__ import annotations

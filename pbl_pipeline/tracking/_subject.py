@@ -3,14 +3,19 @@
 The score of a person is a weighted mean of five shares in 0..1:
 
 - *in view*: share of the video's time in which she is tracked;
-- *walks*: share of the video's time in which she moves over the ground, upright, at a walking speed;
-- *size*: her median height in the picture over that of the tallest candidate;
+- *walks*: time in which she moves over the ground, upright, at a walking speed, over a time that is enough to measure;
+- *size*: her median height in the picture over that of the tallest candidate, or over a height that is enough;
 - *upright*: share of her frames with the body axis within 30 degrees of the vertical;
 - *central*: 1 in the middle of the picture, 0 at its edge (median over her frames).
 
 Walking is judged without a camera calibration: a person of height h px at (x, y) px stands, in units of her own
 height, at (x, y, f) / h from the camera, f being the focal length in px. Only the ratio of f to the picture size
-enters, and only for walking towards or away from the camera, so a usual value serves.
+enters, and only for walking towards or away from the camera, so a usual value serves. Which way somebody walks, and so
+whether she faces the camera, is said in the reason; it adds nothing to the score, as a walk is filmed from every side.
+
+The usual second person is a therapist beside the patient: nearer, larger, walking as far. That one of two who both walk
+is larger therefore decides nothing between them; what is left (time in view, the middle of the picture) often is too
+little, and a person chooses.
 """
 
 from __future__ import annotations
@@ -30,7 +35,9 @@ from ._types import Detection, PersonTrack, SubjectChoice, Tracking
 class SubjectParams:
     """Weights of the shares (they are normalised), and when the automatic choice is trusted.
 
-    margin: the best person is chosen when her score exceeds the second best by this much, else a person must choose.
+    margin: the best person is chosen when her score exceeds every other by this much, else a person must choose.
+    walk_enough_s: longer walking brings no more. size_enough: nor does a height above this share of the picture's.
+    beside: of two the smaller of whom walks, and is tall, at least this share of the other, size decides nothing.
     min_time_s: who is in view for less is no candidate while somebody else is.
     walk_windows_s: movement is judged over these times, the longer one for the slow and for those who walk towards or
     away from the camera. walk_distance: what counts as walking, in body heights: more than one step within a window.
@@ -46,6 +53,9 @@ class SubjectParams:
     weight_upright: float = 0.10
     weight_central: float = 0.10
     margin: float = 0.10
+    walk_enough_s: float = 4.0
+    size_enough: float = 0.35
+    beside: float = 0.5
     min_time_s: float = 1.0
     walk_windows_s: tuple[float, ...] = (2.0, 5.0)
     walk_distance: float = 0.4
@@ -57,7 +67,7 @@ class SubjectParams:
 
 
 SUBJECT_DEFAULT = "walker"
-SUBJECT_PARAMSETS: dict[str, Paramset] = {SUBJECT_DEFAULT: Paramset.of("subject", SUBJECT_DEFAULT, 1, SubjectParams())}
+SUBJECT_PARAMSETS: dict[str, Paramset] = {SUBJECT_DEFAULT: Paramset.of("subject", SUBJECT_DEFAULT, 2, SubjectParams())}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +75,10 @@ class _Person:
     person_id: int
     time_s: float
     in_view: float
+    walk_s: float
     walks: float
+    direction: str
+    appearances: int
     height_px: float
     upright: float
     central: float
@@ -80,7 +93,7 @@ def choose_subject(
     """
     params = params or SubjectParams()
     people = [_describe(p, tracking, params) for p in tracking.persons]
-    scores = _scores(people, params)
+    scores = _scores(people, tracking, params)
     if override is not None:
         if override not in scores:
             raise PblError(
@@ -108,9 +121,18 @@ def choose_subject(
         reason = f"Person {best} {words}, and is the only person{others}."
         return SubjectChoice("CHOSEN", best, scores[best], None, float("nan"), scores, reason)
     second = candidates[1]
-    lead = scores[best] - scores[second]
-    if lead < params.margin:
-        close = [k for k in candidates if scores[best] - scores[k] < params.margin]
+    tallest = max(p.height_px for p in people)
+
+    def lead(other: int) -> float:
+        """Of the best over another; without what size brings between two who walk beside each other."""
+        a, b = by_id[best], by_id[other]
+        walk, tall = sorted((a.walks, b.walks)), sorted((a.height_px, b.height_px))
+        beside = walk[0] > 0 and walk[0] >= params.beside * walk[1] and tall[0] >= params.beside * tall[1]
+        unfair = _size_part(a, tracking, tallest, params) - _size_part(b, tracking, tallest, params) if beside else 0.0
+        return scores[best] - scores[other] - max(unfair, 0.0)
+
+    if min(lead(k) for k in candidates[1:]) < params.margin:
+        close = [k for k in candidates if k == best or lead(k) < params.margin]
         listed = "; ".join(f"person {k} {_words(by_id[k], tracking)} (score {scores[k]:.2f})" for k in close)
         reason = f"{len(close)} people are too alike to choose between: {listed}. A person has to choose."
         return SubjectChoice("NEEDS_CHOICE", None, scores[best], second, scores[second], scores, reason)
@@ -139,13 +161,18 @@ def _describe(track: PersonTrack, tracking: Tracking, params: SubjectParams) -> 
     in_view = time_in_view_s(track, tracking.time_s)
     lean = np.abs(np.nan_to_num(track.roi_px[rows, 3]))
     upright = lean <= params.max_lean_rad
-    walking = _walking(state, time, upright, max(width, height) * params.focal_share, params)
+    walking, towards = _walking(state, time, upright, max(width, height) * params.focal_share, params)
+    walk_s = float(walking.mean()) * in_view
+    enough = min(params.walk_enough_s, total)
     offset = np.hypot(state[:, 0] / width - 0.5, state[:, 1] / height - 0.5)
     return _Person(
         person_id=track.person_id,
         time_s=in_view,
         in_view=in_view / total if total > 0 else 1.0,
-        walks=float(walking.mean()) * in_view / total if total > 0 else 0.0,
+        walk_s=walk_s,
+        walks=min(walk_s / enough, 1.0) if enough > 0 else 0.0,
+        direction=_direction(towards[walking]),
+        appearances=1 + int((np.diff(rows) > 1).sum()),
         height_px=float(np.exp(np.median(state[:, 2]))),
         upright=float(upright.mean()),
         central=float(np.clip(1.0 - 2.0 * np.median(offset), 0.0, 1.0)),
@@ -154,23 +181,27 @@ def _describe(track: PersonTrack, tracking: Tracking, params: SubjectParams) -> 
 
 def _walking(
     state: np.ndarray, time: np.ndarray, upright: np.ndarray, focal: float, params: SubjectParams
-) -> np.ndarray:
-    """(n,) bool: frames around which the person moves steadily over the ground, upright, at a walking speed.
+) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) bool: frames around which the person moves steadily over the ground, upright, at a walking speed; and (n,)
+    the share of that movement that leads to the camera (1 straight to it, -1 straight away, 0 across the picture).
 
     In each window a straight line is fitted to the position in body heights; what a step in place, a jump or a
     jitter of the box does has no lasting slope.
     """
     size = np.exp(state[:, 2])
     unit = np.median(size)
-    walking = np.zeros(len(time), bool)
+    # Ten places a second are judged, and the frames around each are as it is.
+    step = max(round(0.1 / _frame_interval(time)), 1) if len(time) > 1 else 1
+    walking, towards = np.zeros(len(time), bool), np.zeros(len(time))
     for window in params.walk_windows_s:
         # Near the ends of the track the window moves inwards, so that it keeps its length.
         middle = np.clip(time, time[0] + window / 2, max(time[-1] - window / 2, time[0] + window / 2))
-        for i, t in enumerate(middle):
-            near = np.abs(time - t) <= window / 2 + 1e-9
-            if near.sum() < 3:
+        for i in range(0, len(time), step):
+            first, last = np.searchsorted(time, middle[i] + np.array([-1, 1]) * (window / 2 + 1e-9))
+            if last - first < 3:
                 continue
-            span = time[near][-1] - time[near][0]
+            near, around = slice(first, last), slice(max(i - step // 2, 0), i + step - step // 2)
+            span = time[last - 1] - time[first]
             tau = time[near] - time[near].mean()
             across, up, log_size = (tau @ state[near] / (tau @ tau)) * span
             depth = focal / np.median(size[near]) * max(abs(log_size) - params.size_slack, 0.0)
@@ -181,28 +212,52 @@ def _walking(
             # Somebody who jumps off a wall also moves sideways, but more up or down than a walker on any slope.
             climbs = abs(up / unit) > 0.5 * moved
             at_speed = params.walk_distance <= moved <= params.walk_speed_max * span
-            walking[i] |= bool(at_speed and steady and not climbs and upright[near].mean() > 0.5)
-    return walking
+            if at_speed and steady and not climbs and upright[near].mean() > 0.5:
+                walking[around] = True
+                towards[around] = np.sign(log_size) * depth / moved
+    return walking, towards
 
 
-def _scores(people: list[_Person], params: SubjectParams) -> dict[int, float]:
+def _direction(towards: np.ndarray) -> str:
+    """Which way most of the walking leads; who walks to the camera faces it."""
+    if not len(towards):
+        return ""
+    to, away = float((towards > 0.7).mean()), float((towards < -0.7).mean())
+    if to + away <= 0.5:
+        return " across the picture"
+    if min(to, away) > 0.25 * max(to, away):
+        return " to and from the camera"
+    return " towards the camera" if to > away else " away from the camera"
+
+
+def _size(person: _Person, tracking: Tracking, tallest_px: float, params: SubjectParams) -> float:
+    return min(person.height_px / min(tallest_px, params.size_enough * tracking.image_size_px[1]), 1.0)
+
+
+def _size_part(person: _Person, tracking: Tracking, tallest_px: float, params: SubjectParams) -> float:
+    """What the size adds to the person's score."""
+    return params.weight_size * _size(person, tracking, tallest_px, params) / _weights(params).sum()
+
+
+def _weights(p: SubjectParams) -> np.ndarray:
+    return np.array([p.weight_in_view, p.weight_walks, p.weight_size, p.weight_upright, p.weight_central])
+
+
+def _scores(people: list[_Person], tracking: Tracking, params: SubjectParams) -> dict[int, float]:
     tallest = max((p.height_px for p in people), default=1.0)
-    weight = np.array(
-        [
-            params.weight_in_view,
-            params.weight_walks,
-            params.weight_size,
-            params.weight_upright,
-            params.weight_central,
-        ]
-    )
-    shares = {p.person_id: [p.in_view, p.walks, p.height_px / tallest, p.upright, p.central] for p in people}
-    return {k: float(np.clip(weight @ np.array(v) / weight.sum(), 0.0, 1.0)) for k, v in shares.items()}
+    weight = _weights(params) / _weights(params).sum()
+    shares = {
+        p.person_id: [p.in_view, p.walks, _size(p, tracking, tallest, params), p.upright, p.central] for p in people
+    }
+    return {k: float(np.clip(weight @ np.array(v), 0.0, 1.0)) for k, v in shares.items()}
 
 
 def _words(person: _Person, tracking: Tracking) -> str:
-    share = person.walks / person.in_view if person.in_view > 0 else 0.0
+    share = person.walk_s / person.time_s if person.time_s > 0 else 0.0
     walks = "walks" if share > 0.5 else "walks part of the time" if share > 0.2 else "stays in place"
+    way = person.direction if share > 0.2 else ""
     posture = "" if person.upright > 0.5 else ", mostly not upright"
     tall = person.height_px / tracking.image_size_px[1]
-    return f"is in view for {person.time_s:.1f} s, {walks}{posture}, and takes {tall:.0%} of the picture's height"
+    times = f" ({person.appearances} times)" if person.appearances > 1 else ""
+    seconds = f"is in view for {person.time_s:.1f} s{times}"
+    return f"{seconds}, {walks}{way}{posture}, and takes {tall:.0%} of the picture's height"

@@ -17,6 +17,7 @@ from pbl_pipeline.tracking import (
     Tracking,
     TrackingParams,
     choose_subject,
+    contact_sheet,
     save_contact_sheet,
     time_in_view_s,
     track_people,
@@ -282,7 +283,17 @@ def test_contact_sheet_shows_everybody(spots_video, tmp_path):
     tracking = track_people(spots_video, detector=Spots())
     sheet = cv2.imread(str(save_contact_sheet(spots_video, tracking, tmp_path / "sheet.png")))
     assert sheet is not None
-    assert sheet.shape == (360, 1280, 3)
+    # Four moments in rows of three; the last cells are empty.
+    assert sheet.shape == (720, 1920, 3)
+    assert not sheet[360:, 640:].any()
+    colours = [np.all(sheet == c, axis=2).sum() for c in ((80, 220, 80), (60, 120, 255))]
+    assert min(colours) > 500
+    # Only the candidates are shown where they are named, and a JPEG where the name says so.
+    small = save_contact_sheet(spots_video, tracking, tmp_path / "one.jpg", [2])
+    assert small.read_bytes()[:2] == b"\xff\xd8"
+    assert not np.all(contact_sheet(spots_video, tracking, [2]) == (80, 220, 80), axis=2).any()
+    with pytest.raises(ValueError, match="at least one person"):
+        contact_sheet(spots_video, tracking, [7])
 
 
 # --- the subject ------------------------------------------------------------------------------------------------
