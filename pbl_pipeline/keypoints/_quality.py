@@ -163,11 +163,11 @@ def _legs(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
     if not legs:
         return []
     advice = "the legs are hidden or hard to see: film the whole body from the side, in light"
-    mean = float(keypoints.confidence[np.ix_(seen, legs)].mean())
+    mean = float(keypoints.confidence[seen][:, legs].mean())
     found = [_low("leg_confidence", mean, LEGS_CONFIDENCE_WARN, 0.0, advice)]
     probability = probability_within(keypoints)
     if probability is not None:
-        share = float(probability[np.ix_(seen, legs)].mean())
+        share = float(probability[seen][:, legs].mean())
         found.append(_low("leg_points_right_share", share, LEGS_RIGHT_WARN, 0.0, advice))
     return found
 

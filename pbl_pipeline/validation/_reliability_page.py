@@ -41,19 +41,22 @@ def reliability_html(table: pd.DataFrame, curve: ConfidenceCurve | None = None) 
     """One page that asks for nothing from elsewhere, from the rows of `reliability_table`."""
     text = resources.files("pbl_pipeline.validation").joinpath("templates/reliability.html").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    groups = [
-        {
-            "detector": detector,
-            "dataset": dataset,
-            "recordings": int(rows["recordings"].iloc[0]),
-            "n": int(rows["n"].sum()),
-            "within": float(np.average(rows["within_bound"], weights=rows["n"])),
-            "reliability": reliability_chart(rows, curve),
-            "error": error_chart(rows),
-            "rows": rows.to_dict("records"),
-        }
-        for (detector, dataset), rows in table.groupby(["detector", "dataset"], sort=False)
-    ]
+    groups = []
+    for detector, dataset in dict.fromkeys(zip(table["detector"], table["dataset"], strict=True)):
+        rows = table.loc[(table["detector"] == detector) & (table["dataset"] == dataset)]
+        n = rows["n"].to_numpy()
+        groups.append(
+            {
+                "detector": detector,
+                "dataset": dataset,
+                "recordings": int(rows["recordings"].to_numpy()[0]),
+                "n": int(n.sum()),
+                "within": float(np.average(rows["within_bound"].to_numpy(), weights=n)),
+                "reliability": reliability_chart(rows, curve),
+                "error": error_chart(rows),
+                "rows": rows.to_dict("records"),
+            }
+        )
     return environment.from_string(text).render(
         groups=groups, curve=curve, bound=BOUND_TRUNK, version=pbl_pipeline.__version__
     )
@@ -69,10 +72,10 @@ def reliability_chart(rows: pd.DataFrame, curve: ConfidenceCurve | None = None) 
     if curve is not None:
         stated = np.linspace(0.001, 1, 200)
         axes.curve(stated, curve(stated), _CURVE, 2.0)
-    for row in rows.itertuples():
-        y = float(axes.y(row.within_bound))
-        axes.line((float(axes.x(row.stated_low)), y), (float(axes.x(row.stated_high)), y), _POINTS, 1.2)
-        axes.dot(float(axes.x(row.stated_mean)), y, _POINTS)
+    for row in rows.to_dict("records"):
+        y = float(axes.y(row["within_bound"]))
+        axes.line((float(axes.x(row["stated_low"])), y), (float(axes.x(row["stated_high"])), y), _POINTS, 1.2)
+        axes.dot(float(axes.x(row["stated_mean"])), y, _POINTS)
     return axes.svg("share of points within the bound over stated confidence")
 
 

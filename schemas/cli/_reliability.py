@@ -73,10 +73,11 @@ def reliability(
         f"\n{'stated':>14}{'points':>8}{'median':>9}{'90 %':>7} of the trunk{'within 20 %':>13}"
         + (f"{'curve':>7}" if curve else "")
     )
-    for r in table.itertuples():
+    for r in table.to_dict("records"):
         click.echo(
-            f"{r.stated_low:6.2f} to {r.stated_high:4.2f}{r.n:8d}{r.error_median_trunk:9.3f}{r.error_90_trunk:7.3f}"
-            f"{'':13}{r.within_bound:13.2f}" + (f"{r.probability_mean:7.2f}" if curve else "")
+            f"{r['stated_low']:6.2f} to {r['stated_high']:4.2f}{r['n']:8d}{r['error_median_trunk']:9.3f}"
+            f"{r['error_90_trunk']:7.3f}{'':13}{r['within_bound']:13.2f}"
+            + (f"{r['probability_mean']:7.2f}" if curve else "")
         )
     if out is not None:
         paths = write_reliability(errors, out, curve, bins)

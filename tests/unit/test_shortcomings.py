@@ -58,7 +58,7 @@ def lost(keypoints: Keypoints, frames: slice, points: list[int] | slice = slice(
     return dataclasses.replace(keypoints, xy_px=xy, xyz_cam_m=xyz, confidence=c, box_px=box)
 
 
-def outcome(keypoints: Keypoints, check: str) -> tuple[str, float]:
+def outcome(keypoints: Keypoints, check: str) -> tuple[str, float | None]:
     found = {c.check: c for c in check_keypoints(keypoints)}[check]
     assert bool(found.advice) == (found.outcome != "PASS")
     return found.outcome, found.value
