@@ -148,8 +148,8 @@ class SessionFit(dj.Computed):
     fit_residual_2d=null : float32             # (px) median distance of body and keypoints in the picture
     fit_residual_3d=null : float32             # (cm) median distance of body and 3D keypoints
     fit_outcome          : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')  # worst check
-    fit_iterations       : int32               # steps of the solver
-    fit_converged        : bool                # ended at a minimum, not at its bound on iterations or steps
+    fit_iterations=null  : int32               # steps of the solver, null for fits of before it was recorded
+    fit_converged=null   : bool                # ended at a minimum, not at its bound on iterations or steps; null as above
     fit_scale            : json                # multiplier (-) of each scale group, 1 = the unscaled body
     compile_seconds      : float32             # (s) of the duration, spent compiling
     compute_device       : varchar(64)         # what JAX computed on
@@ -167,7 +167,7 @@ class SessionFit(dj.Computed):
         trial_n_fitted    : int32              # frames with joint angles
         trial_residual_2d=null : float32       # (px) median distance of body and keypoints in the picture
         trial_residual_3d=null : float32       # (cm) median distance of body and 3D keypoints
-        trial_orientation : enum('measured: phone', 'measured: calibration', 'assumed: level', 'estimated: gait')  # where the vertical comes from
+        trial_orientation=null : enum('measured: phone', 'measured: calibration', 'assumed: level', 'estimated: gait')  # where the vertical comes from, null for fits of before it was recorded
         trial_clock_offset=null : float32      # (s) the phone sensor's clock minus the video's, null where not estimated
         trial_file        : <object@arrays>    # fit.npz: time_s (T) s, qpos and qpos_sd (T,40) m and rad, markers_world_m (T,J,3) m, residual_2d_px (T,J) px, residual_3d_m (T,J) m; docs/files.md
         """  # noqa: E501

@@ -142,8 +142,9 @@ def load_session_fit(key: Any) -> Any:
         scale=arrays["scale"],
         site_offset_m=arrays["site_offset_m"],
         loss_trace=arrays["loss_trace"],
-        iterations=int(row["fit_iterations"]),
-        converged=bool(row["fit_converged"]),
+        # null for fits of before these were recorded: the trace ends with the last step, convergence is unknown
+        iterations=int(arrays["loss_trace"][-1, 0] if row["fit_iterations"] is None else row["fit_iterations"]),
+        converged=None if row["fit_converged"] is None else bool(row["fit_converged"]),
         solver=row["solver"],
         params_hash=row["fit_method_hash"],
         seconds=float(row["fit_seconds"]),

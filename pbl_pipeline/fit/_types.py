@@ -83,14 +83,14 @@ class TrialFit:
 
 @dataclasses.dataclass(frozen=True)
 class SessionFit:
-    """All trials of a session with one body. loss_trace (K, 2): step, total loss."""
+    """All trials of a session with one body. loss_trace (K, 2): step, total loss. converged None: not recorded."""
 
     trials: tuple[TrialFit, ...]
     scale: np.ndarray
     site_offset_m: np.ndarray
     loss_trace: np.ndarray
     iterations: int
-    converged: bool
+    converged: bool | None
     solver: str
     params_hash: str
     seconds: float

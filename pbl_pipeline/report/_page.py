@@ -28,6 +28,8 @@ from pbl_pipeline.report._words import (
 
 GDI_NAME = "GDI of three angles"
 
+_CONVERGED = {True: "converged", False: "not converged", None: "convergence not recorded"}
+
 
 def page_of(report: SessionReport) -> dict:
     """Everything the template shows. Raises `PblError` FILE_FORMAT where trials and metrics do not belong together."""
@@ -329,7 +331,7 @@ def _origin(
         fit = next((t.fit for t in report.trials if t.fit is not None), None)
         rows = [
             ("Solver", f"{s.solver}, parameters {s.params_hash}", True),
-            ("Steps", f"{s.iterations}, {'converged' if s.converged else 'not converged'}", False),
+            ("Steps", f"{s.iterations}, {_CONVERGED[s.converged]}", False),
             ("Time", f"{s.seconds:.1f} s, of these {s.compile_seconds:.1f} s compiling, on {s.device}", False),
         ]
         if fit is not None:
