@@ -33,8 +33,8 @@ CLOCK_WARN_S = 0.3
 #: Standard deviation of the focal length as a share of it. By so much depth and the person's size are off.
 FOCAL_SD_WARN = 0.02
 
-#: Angle (deg) between where the person faces and the camera's axis, from the front (0) to the side (90), below which one
-#: camera without 3D points fails. On synthetic walkers (halpe_26, paramset `blazepose`, three people each), the mean
+#: Angle (deg) between where the person faces and the camera's axis, from the front (0) to the side (90), below which
+#: one camera without 3D points fails. On synthetic walkers (halpe_26, paramset `blazepose`, three people each), the mean
 #: error of hips, knees and ankles with and without 3D was 3.6 and 4.0 deg from the side, 3.9 and 4.8 at 42 to 52 deg;
 #: from the front 4.2 and 12.1 (knees 10 to 21), from the front at an equal distance 4.0 and 4.8 (knees 6 to 10).
 FACING_FAIL_DEG = 30.0
@@ -95,7 +95,7 @@ def _residual_3d(session: Session, trials: Sequence[TrialFit]) -> Check:
 
 
 def _depth(session: Session, trials: Sequence[TrialFit]) -> list[Check]:
-    """Of trials of one camera whose detector gave no 3D: whether the view can stand in for it. None of these: nothing."""
+    """Of trials of one camera whose detector gave no 3D: whether the view can stand in for it. Nothing without such."""
     facing = []
     for trial, fit in zip(session.trials, trials, strict=True):
         known = np.isfinite(fit.qpos[:, 0])
@@ -114,8 +114,8 @@ def _depth(session: Session, trials: Sequence[TrialFit]) -> list[Check]:
             WARN if value >= FACING_FAIL_DEG else FAIL,
             value,
             FACING_FAIL_DEG,
-            "the keypoint model gives pixels only, and one camera then tells nothing of depth: film from the side, or use "
-            "a model with 3D, or several cameras; from the front knee angles come out wrong by 6 to 21 deg",
+            "the keypoint model gives pixels only, and one camera then tells nothing of depth: film from the side, or "
+            "use a model with 3D, or several cameras; from the front knee angles come out wrong by 6 to 21 deg",
         )
     ]
 
