@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import hashlib
+import math
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -14,7 +15,7 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import canonical_json
 
-from . import fit, gait, gdi, keypoints, lab, session, tracking, video
+from . import fit, gait, gdi, keypoints, lab, sensors, session, tracking, video
 from ._activate import computed_tables
 from ._base import DuplicateError, delete_below, dj, error_code, library, resolve_method, utc_now
 
@@ -49,7 +50,8 @@ class Ingested:
 
 @dataclasses.dataclass(frozen=True)
 class Visit:
-    """What all files of one call share. None: camera motion static, activity walking, population unchanged."""
+    """What all files of one call share. None: camera motion handheld where the phone's log is known, else static;
+    activity walking; population unchanged."""
 
     subject: str
     session_label: str = session.UNLABELLED
@@ -74,14 +76,20 @@ METHOD_FIELDS = {
 _FILE_ERRORS = ("VIDEO_MISSING", "VIDEO_CHANGED")
 
 
-def ingest(paths: Sequence[str | Path], visit: Visit, methods: Methods | None = None) -> list[Ingested]:
+def ingest(
+    paths: Sequence[str | Path],
+    visit: Visit,
+    methods: Methods | None = None,
+    files: Sequence[sensors.Sensors] = (),
+) -> list[Ingested]:
     """Register videos of one session with the methods they go through. At most one picture of each is decoded.
 
     Files that are not videos are taken as well: their failure then stands in the table of the stage that meets it,
     with a code and a next step. Missing and empty files are refused at once; the other files are still registered.
 
     A file that is registered already takes what is given with it: a camera replaces its own, and what was computed with
-    that is deleted (keypoints and after); methods that are named are added to its selections and its session's plans.
+    that is deleted (keypoints and after), and so does a sensor log of the phone; methods that are named are added to
+    its selections and its session's plans. `files`: what belongs to each path, in their order; empty for none at all.
 
     Raises
     ------
@@ -116,13 +124,20 @@ def ingest(paths: Sequence[str | Path], visit: Visit, methods: Methods | None = 
             expected="a person's number with one video: people are numbered anew in each",
             next_step="ingest them without --person, then `pbl choose VIDEO_ID PERSON` where needed",
         )
+    if files and len(files) != len(paths):
+        raise PblError(
+            "USAGE",
+            found=f"sensor files for {len(files)} of {len(paths)} videos",
+            expected="none, or those of each video in the same order",
+            next_step=f"name a file for each video, '{sensors.NONE}' where there is none",
+        )
     methods = methods or Methods()
     chosen = resolve(methods)
     more = {key for key, field in METHOD_FIELDS.items() if getattr(methods, field) is not None}
     done = []
-    for path in (Path(p).absolute() for p in paths):
+    for path, given in zip((Path(p).absolute() for p in paths), files or [sensors.Sensors()] * len(paths), strict=True):
         try:
-            done.append(_ingest_one(path, visit, chosen, more))
+            done.append(_ingest_one(path, visit, chosen, more, given))
         except PblError as error:
             done.append(Ingested(path, "refused", error=error))
     return done
@@ -142,7 +157,7 @@ def resolve(methods: Methods) -> dict[str, str]:
     }
 
 
-def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]) -> Ingested:
+def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str], given: sensors.Sensors) -> Ingested:
     if not os.path.isfile(path):  # not Path.is_file: that raises where a folder on the way may not be entered
         raise PblError(
             "VIDEO_MISSING",
@@ -169,9 +184,10 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
             key=path,
         )
     sha256 = library("video").sha256_of(path)
+    found = sensors.read(given)
     known = _with_sha256(sha256)
     if known:
-        return _known(path, known, visit, chosen, more)
+        return _known(path, known, visit, chosen, more, found)
     camera = _camera(visit.camera_file, path) if visit.camera_file else None
     row = {
         "video_path": str(path),
@@ -179,9 +195,11 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
         "video_sha256": sha256,
         "video_size": size,
         "activity": visit.activity or "walking",
-        "camera_motion": visit.camera_motion or "static",
+        "camera_motion": visit.camera_motion or ("handheld" if given.has_log else "static"),
         "video_created": utc_now(),
     }
+
+    notes: list[str] = []
 
     def insert() -> None:
         row["session_id"] = _session(visit)
@@ -189,6 +207,7 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
         row["video_id"] = next_id(video.Video, "video_id")
         video.Video.insert1(row)
         _select(row["video_id"], row["session_id"], visit.person, chosen)
+        notes[:] = sensors.register(row["video_id"], found)
 
     try:
         _in_transaction(insert, until=lambda: bool(_with_sha256(sha256)))
@@ -196,8 +215,9 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
         known = _with_sha256(sha256)
         if not known:
             raise
-        return _known(path, known, visit, chosen, more)
-    return Ingested(path, "registered", row["video_id"], f"subject {visit.subject}, session {visit.session_label}")
+        return _known(path, known, visit, chosen, more, found)
+    said = "; ".join([f"subject {visit.subject}, session {visit.session_label}", *notes])
+    return Ingested(path, "registered", row["video_id"], said)
 
 
 def _with_sha256(sha256: str) -> dict[str, Any] | None:
@@ -218,8 +238,10 @@ def _in_transaction(work: Callable[[], None], until: Callable[[], bool] = lambda
             return
 
 
-def _known(path: Path, row: dict[str, Any], visit: Visit, chosen: dict[str, str], more: set[str]) -> Ingested:
-    """Take over the path where the old one is gone, the camera and the methods that were named; say the rest."""
+def _known(
+    path: Path, row: dict[str, Any], visit: Visit, chosen: dict[str, str], more: set[str], found: sensors.Read
+) -> Ingested:
+    """Take over the path where the old one is gone, and the camera, files and methods that were named; say the rest."""
     number = int(row["video_id"])
     status, notes = "known", [f"already video_id {number} of subject {row['subject']}, session {row['session_label']}"]
     if str(path) != row["video_path"] and not Path(row["video_path"]).is_file():
@@ -228,6 +250,7 @@ def _known(path: Path, row: dict[str, Any], visit: Visit, chosen: dict[str, str]
         status = "moved"
         notes.append(f"it was {row['video_path']}, which is gone")
     changes = _new_camera(path, row, visit.camera_file) if visit.camera_file else []
+    changes += _new_files(row, visit, found)
     changes += _new_methods(row, chosen, more)
     changes += _new_population(row["subject"], visit.population)
     if changes and status == "known":
@@ -260,6 +283,26 @@ def _new_camera(path: Path, row: dict[str, Any], camera_file: str | Path) -> lis
     _forget_errors(number)
     rows = ", ".join(f"{n} of {name}" for name, n in deleted.items())
     return ["the camera was attached" + (f", and what depends on it was deleted: {rows}" if rows else "")]
+
+
+def _new_files(row: dict[str, Any], visit: Visit, found: sensors.Read) -> list[str]:
+    """Register further files of a known video; what was done, in words."""
+    if not found.given:
+        return []
+    number = int(row["video_id"])
+    done: list[str] = []
+
+    def attach() -> None:
+        done[:] = sensors.register(number, found)
+        # A phone that was carried counted as standing only as long as nothing told how it turned.
+        if done and found.given.has_log and row["camera_motion"] == "static" and visit.camera_motion is None:
+            video.Video.update1({"video_id": number, "camera_motion": "handheld"})
+            done.append("the camera counts as handheld now")
+
+    _in_transaction(attach)
+    if done:
+        _forget_errors(number)
+    return done
 
 
 def _new_population(subject: str, population: str | None) -> list[str]:
@@ -358,6 +401,8 @@ def _camera(camera_file: str | Path, path: Path) -> dict[str, Any] | None:
         "camera_distortion": [float(d) for d in camera.distortion],
         "camera_origin": "measured",
         "camera_note": camera.source.removeprefix("file:").strip()[:255],
+        # Only where it is known: calibrations that were stored without it keep their hash.
+        **({"camera_focal_sd": sd} if math.isfinite(sd := camera.focal_rel_sd * camera.focal_px) else {}),
     }
 
 

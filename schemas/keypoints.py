@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -64,6 +65,8 @@ class Keypoints(dj.Computed):
     median_confidence=null: float32            # (0..1) median over the points that were seen, null when none was
     camera_source         : varchar(255)       # where the intrinsics come from
     focal_length          : float32            # (px) mean of fx and fy
+    focal_rel_sd=null     : float32            # (1) standard deviation of the focal length as a share of it, null when unknown
+    phone_log=null        : varchar(255)       # the phone's sensor log and how its clock was brought to the video's, null without
     keypoints_file        : <object@arrays>   # keypoints.npz: time_s (T) s, xy_px (T,J,2) px, xyz_cam_m (T,J,3) m, confidence (T,J) 0..1, box_px (T,4) px, camera; docs/files.md
     {origin_columns("keypoints")}
     """  # noqa: E501
@@ -81,17 +84,19 @@ class Keypoints(dj.Computed):
         return (chosen.proj() * KeypointSelection.proj()) & video.VideoInfo
 
     def make_fetch(self, key: dict) -> tuple:
-        file = (video.Video & key).fetch1("video_path", "video_sha256")
-        size = (video.VideoInfo & key).fetch1("width", "height")
+        probed = (video.Video * video.VideoInfo & key).fetch1()
+        times = file_ref(probed.pop("frame_time"))
         person = (tracking.SubjectChoice & key).fetch1("chosen_person_id")
         tracks, detector, model = (tracking.Tracking & key).fetch1("tracks", "detector", "tracking_model_sha256")
         camera = (lab.CameraCalibration & (video.Video & key)).to_dicts()
+        log = (video.PhoneAttitude & key).to_dicts()
         return (
-            file,
-            (int(size[0]), int(size[1])),
+            probed,
+            times,
             int(person),
             (file_ref(tracks), detector, model),
             camera[0] if camera else None,
+            (log[0]["attitude_name"], file_ref(log[0]["attitude_file"])) if log else None,
             method_arguments(KeypointMethod, "keypoint", "keypoints", key["keypoint_method"]),
         )
 
@@ -99,22 +104,43 @@ class Keypoints(dj.Computed):
     def make_compute(
         self,
         key: dict,
-        file: tuple,
-        size: tuple,
+        probed: Mapping[str, Any],
+        times: dict,
         person: int,
         tracks: tuple,
         camera: Mapping[str, Any] | None,
+        log: tuple | None,
         method: Mapping[str, Any],
     ) -> tuple:
-        path = video.registered_file(file[0], file[1], key)
+        path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
         params = rebuild_params(library("keypoints").params_class(method["params"]), **method)
+        with stored_file(self, times) as stored:
+            info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
+        attitude = None
+        if log is not None:
+            with stored_file(self, log[1]) as stored:
+                attitude = library("video").attitude_of(library("video").read_phone_log(stored), Path(log[0]), info)
         with stored_file(self, tracks[0]) as stored:
-            everybody = tracking.load_tracking(stored, size, *tracks[1:])
-        view = camera_of_row(camera) if camera else library("video").guess_camera(size)
+            everybody = tracking.load_tracking(stored, (info.width_px, info.height_px), *tracks[1:])
+        view = camera_of_row(camera) if camera else library("video").find_camera(info)
         found = library("keypoints").detect_keypoints(path, everybody, person, view, params=params)
-        return found, person, method["sha"], model_sha256(params)
+        if attitude is not None:
+            found = found.with_attitude(attitude)
+        checks = (*library("video").check_timing(info), *library("keypoints").check_keypoints(found))
+        source = None if attitude is None else attitude.source
+        return found, person, method["sha"], model_sha256(params), checks, source
 
-    def make_insert(self, key: dict, found: Any, person: int, sha: str, model: str | None, origin: Origin) -> None:
+    def make_insert(
+        self,
+        key: dict,
+        found: Any,
+        person: int,
+        sha: str,
+        model: str | None,
+        checks: Sequence[Any],
+        log: str | None,
+        origin: Origin,
+    ) -> None:
         seen = found.confidence > 0
         with new_folder() as folder:
             found.save(folder / "keypoints.npz")
@@ -128,12 +154,13 @@ class Keypoints(dj.Computed):
                     "n_seen": int(seen.any(axis=1).sum()),
                     "median_confidence": number(np.median(found.confidence[seen])) if seen.any() else None,
                     "camera_source": found.camera.source[:255],
-                    "focal_length": float(found.camera.matrix[0, 0] + found.camera.matrix[1, 1]) / 2,
+                    "focal_length": found.camera.focal_px,
+                    "focal_rel_sd": number(found.camera.focal_rel_sd),
+                    "phone_log": None if log is None else log[:255],
                     "keypoints_file": folder / "keypoints.npz",
                     **origin.row("keypoints", method_hash=sha, model_sha256=model),
                 }
             )
-        checks = library("keypoints").check_keypoints(found)
         self.Check.insert({**key, **check_row("keypoints", check)} for check in checks)
 
 
@@ -163,7 +190,9 @@ def camera_of_row(row: Mapping[str, Any]) -> Any:
         [[row["camera_fx"], 0.0, row["camera_cx"]], [0.0, row["camera_fy"], row["camera_cy"]], [0.0, 0.0, 1.0]]
     )
     distortion = np.asarray(row["camera_distortion"], np.float64)
-    return library("video").Camera(matrix, distortion, f"{row['camera_origin']}: {row['camera_note']}")
+    sd = row["camera_focal_sd"]
+    rel_sd = float("nan") if sd is None else float(sd) / float(matrix[0, 0] + matrix[1, 1]) * 2
+    return library("video").Camera(matrix, distortion, f"{row['camera_origin']}: {row['camera_note']}", rel_sd)
 
 
 def model_sha256(params: Any) -> str | None:

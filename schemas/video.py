@@ -38,6 +38,57 @@ class Video(dj.Manual):
 
 
 @schema
+class PhoneAttitude(dj.Manual):
+    definition = """
+    # sensor log of the phone that filmed a video; the keypoints take the camera's orientation from it
+    -> Video
+    ---
+    attitude_name           : varchar(255)     # name of the file or folder
+    attitude_sha256         : char(64)         # of the copy's bytes
+    attitude_size           : int64            # (byte) length of the copy
+    attitude_form           : varchar(32)      # format; docs/phone_capture.md
+    attitude_device=''      : varchar(128)     # phone, as the log names it
+    attitude_n              : int32            # orientations
+    attitude_rate           : float32          # (1/s) orientations per second, by the median interval
+    attitude_duration       : float32          # (s) from the first to the last
+    attitude_start_utc=null : varchar(40)      # moment of the first, null where the log does not count in UTC
+    attitude_sensors        : json             # other sensors in it: name to number of samples
+    attitude_notes          : json             # what was left out in reading
+    attitude_created        : datetime         # when registered, UTC
+    attitude_file           : <object@arrays> # the log; a folder as zip
+    """
+
+
+@schema
+class WearableImu(dj.Manual):
+    definition = """
+    # file of inertial sensors that the person wore in a video: kept, not read
+    -> Video
+    imu          : int16                       # number of the file, from 1
+    ---
+    imu_name     : varchar(255)                # name of the file
+    imu_sha256   : char(64)                    # of its bytes
+    imu_size     : int64                       # (byte) length
+    imu_created  : datetime                    # when registered, UTC
+    imu_file     : <object@arrays>            # the file
+    """
+
+
+@schema
+class DepthVideo(dj.Manual):
+    definition = """
+    # depth recording of the same phone beside a video: kept, not read
+    -> Video
+    ---
+    depth_name     : varchar(255)              # name of the file
+    depth_sha256   : char(64)                  # of its bytes
+    depth_size     : int64                     # (byte) length
+    depth_created  : datetime                  # when registered, UTC
+    depth_file     : <object@arrays>          # the file
+    """
+
+
+@schema
 class VideoInfo(dj.Computed):
     definition = f"""
     # what the file holds; sizes after the rotation flag is applied
@@ -57,6 +108,9 @@ class VideoInfo(dj.Computed):
     recorded_utc=null    : varchar(40)         # recording time as the file states it
     phone_make=null      : varchar(64)
     phone_model=null     : varchar(64)
+    phone_lens=null      : varchar(128)        # lens as the phone names it
+    focal_35mm=null      : float32             # (mm) focal length of the same view on 35 mm film, as the file states it
+    capture_fps=null     : float32             # (1/s) rate at which the phone says it recorded
     video_notes          : json                # remarks on the file, such as a mirrored picture
     frame_time           : <npy@arrays>       # (s) float64 (T): the container's own time stamps, first frame 0
     {origin_columns("video_info")}
@@ -88,6 +142,9 @@ class VideoInfo(dj.Computed):
                 "recorded_utc": _cut(info.recorded_utc, 40),
                 "phone_make": _cut(info.make, 64),
                 "phone_model": _cut(info.model, 64),
+                "phone_lens": _cut(info.lens, 128),
+                "focal_35mm": number(info.focal_35mm),
+                "capture_fps": number(info.capture_fps),
                 "video_notes": list(info.notes),
                 "frame_time": info.time_s,
                 **origin.row("video_info"),
@@ -122,6 +179,9 @@ def info_of_row(row: Mapping[str, Any], time_s: np.ndarray) -> Any:
         make=row["phone_make"],
         model=row["phone_model"],
         notes=tuple(row["video_notes"]),
+        lens=row["phone_lens"],
+        focal_35mm=number(row["focal_35mm"]),
+        capture_fps=number(row["capture_fps"]),
     )
 
 

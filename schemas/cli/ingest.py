@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+
+if TYPE_CHECKING:
+    from schemas.sensors import Sensors
 
 
 @click.command()
@@ -23,7 +27,24 @@ import click
 @click.option(
     "--camera-motion",
     type=click.Choice(["static", "handheld", "one of several"]),
-    help="How the camera was held (else: static).",
+    help="How the camera was held (else: handheld with --attitude, static without).",
+)
+@click.option(
+    "--attitude",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    metavar="LOG",
+    help="Sensor log of the phone (docs/phone_capture.md), once for each video, in their order; 'none' for no log.",
+)
+@click.option(
+    "--depth", type=click.Path(path_type=Path), multiple=True, metavar="FILE", help="Depth video, once for each video."
+)
+@click.option(
+    "--imu",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    metavar="FILE",
+    help="Files of wearable IMUs, of one video.",
 )
 @click.option("--activity", help="What the person does (else: walking).")
 @click.option("--population", metavar="NAME", help="Group of the subject, such as healthy (else: as it was).")
@@ -40,6 +61,9 @@ def ingest(
     project: str | None,
     camera: Path | None,
     camera_motion: str | None,
+    attitude: tuple[Path, ...],
+    depth: tuple[Path, ...],
+    imu: tuple[Path, ...],
     activity: str | None,
     population: str | None,
     person: int | None,
@@ -52,21 +76,23 @@ def ingest(
     """Register videos of one visit; `pbl populate` then computes them. Nothing is decoded here.
 
     A file whose bytes are registered already is not registered twice, but takes a new camera (what was computed with
-    another is deleted, and said) and further methods. Exit code 1 when a file was refused; the others
-    are registered all the same.
+    another is deleted, and said), a sensor log of the phone (the same) and further methods. Logs, depth videos and
+    IMU files are copied. Exit code 1 when a file was refused; the others are registered all the same.
 
     \b
     Example: pbl ingest walk1.mp4 walk2.mp4 --subject P017 --session 2026-03-01
     Example: pbl ingest walk.mov --subject P018 --camera iphone.toml --person 2
+    Example: pbl ingest walk.mov --subject P018 --attitude 2026-03-01_09-15-30.zip
     """
     import schemas
     from schemas.ingest import Methods, Visit
     from schemas.ingest import ingest as register
 
+    files = _files(len(videos), attitude, depth, imu)
     schemas.activate()
     visit = Visit(subject, session_label, project, camera, camera_motion, activity, person, population)
     methods = Methods(tracking=tracking_method, keypoint=keypoint_method, fit=fit_method, gdi=index, norm=norm)
-    results = register(videos, visit, methods)
+    results = register(videos, visit, methods, files)
     for result in results:
         if result.error is not None:
             click.echo(result.error.text(), err=True)
@@ -76,3 +102,28 @@ def ingest(
             click.echo(f"  to measure another person of it: pbl choose {result.video_id} {person}")
     if any(r.error for r in results):
         raise click.exceptions.Exit(1)
+
+
+def _files(n: int, attitude: tuple[Path, ...], depth: tuple[Path, ...], imu: tuple[Path, ...]) -> list[Sensors]:
+    """What belongs to each of the n videos. Raises `PblError` USAGE where files and videos do not match."""
+    from pbl_pipeline.errors import PblError
+    from schemas.sensors import Sensors
+
+    for what, given in (("--attitude", attitude), ("--depth", depth)):
+        if given and len(given) != n:
+            raise PblError(
+                "USAGE",
+                found=f"{len(given)} times {what} for {n} videos",
+                expected="none, or one for each video, in the same order",
+                next_step="name a file for each video"
+                + (", 'none' for one without a log" if what == "--attitude" else "; ingest the others in another call"),
+            )
+    if imu and n > 1:
+        raise PblError(
+            "USAGE",
+            found=f"--imu for {n} videos",
+            expected="IMU files with one video",
+            next_step="ingest that video in a call of its own",
+        )
+    logs, depths = (list(given) or [None] * n for given in (attitude, depth))
+    return [Sensors(a, d, imu) for a, d in zip(logs, depths, strict=True)]
