@@ -5,6 +5,7 @@ Each step is a function of its own with a frozen result: `feet_from_fit` or `fee
 """
 
 from ._angles import ANGLE_NAMES, AngleSeries, angle_series, pelvis_angles
+from ._bands import NormalBands, leg_length_m, normal_bands
 from ._cycles import REPORT_PERCENT, GaitCycle, cycle_curves, find_cycles
 from ._feet import FOOT_MARKER_SETS, FootTrajectories, feet_from_fit, feet_from_keypoints, feet_from_markers
 from ._gdi import (
@@ -82,6 +83,7 @@ __all__ = [
     "Lengths",
     "Measure",
     "MovementProfile",
+    "NormalBands",
     "NormativeSet",
     "Spatiotemporal",
     "TrialMetrics",
@@ -97,11 +99,13 @@ __all__ = [
     "fit_norm",
     "gait_metrics",
     "gdi_vector",
+    "leg_length_m",
     "load_events",
     "load_norm",
     "movement_profile",
     "norm_from_cycles",
     "norm_names",
+    "normal_bands",
     "offset_deg",
     "pelvis_angles",
     "read_lab_trial",

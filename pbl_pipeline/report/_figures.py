@@ -10,32 +10,30 @@ import numpy as np
 from markupsafe import Markup
 
 from pbl_pipeline.fit import TrialFit
-from pbl_pipeline.gait import GaitCycle, GaitEvents, NormativeSet
+from pbl_pipeline.gait import GaitCycle, GaitEvents, NormalBands
 from pbl_pipeline.render import SIDE_COLOUR, stance_spans
 from pbl_pipeline.report import _svg
 from pbl_pipeline.report._types import Picture
-from pbl_pipeline.report._words import ANGLES, PELVIS_ANGLES, number, plural
+from pbl_pipeline.report._words import ANGLES, FOOT_ANGLES, PELVIS_ANGLES, number, plural
 
 _SIDES = ("left", "right")
 _JPEG_QUALITY = 84
 
 
-def cycle_charts(cycles: Sequence[GaitCycle], norm: NormativeSet | None) -> list[dict]:
+def cycle_charts(cycles: Sequence[GaitCycle], bands: NormalBands) -> list[dict]:
     """One chart per angle over the cycles that count: the joints first, then the pelvis. Empty without curves."""
     usable = [c for c in cycles if c.used and c.curves]
     if not usable:
         return []
     foot_off = {s: _foot_off([c for c in usable if c.side == s]) for s in _SIDES}
-    names = {k: (title, positive) for k, (title, _, _, positive) in ANGLES.items()} | PELVIS_ANGLES
+    names = {k: (title, positive) for k, (title, _, _, positive) in ANGLES.items()}
+    names |= FOOT_ANGLES | PELVIS_ANGLES
     charts = []
     for key, (title, positive) in names.items():
         by_side = {s: [c.curves[key] for c in usable if c.side == s and key in c.curves] for s in _SIDES}
         if not any(by_side.values()):
             continue
-        band = None
-        if norm is not None and key in norm.curves:
-            curve = norm.curves[key]
-            band = (np.asarray(curve["percent"]), np.asarray(curve["mean_deg"]), np.asarray(curve["sd_deg"]))
+        band = (bands.percent, *bands.curves[key]) if key in bands.curves else None
         percent = np.linspace(0.0, 100.0, len(next(c for curves in by_side.values() for c in curves)))
         ranges = [
             f"{side} {number(float(np.min(mean)), 0)} to {number(float(np.max(mean)), 0)}\N{DEGREE SIGN}"
@@ -96,14 +94,14 @@ def known_spans(fit: TrialFit) -> list[tuple[float, float]]:
     return [(float(fit.time_s[a]), float(fit.time_s[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def index_chart(values: dict[str, list[float]]) -> Markup | None:
+def index_chart(values: dict[str, list[float]], title: str) -> Markup | None:
     """The index of each cycle; None without any."""
     if not any(values.values()):
         return None
     means = ", ".join(
         f"{side} mean {np.mean(v):.1f} of {plural(len(v), 'cycle')}" for side, v in values.items() if len(v)
     )
-    return _svg.index_chart(f"GDI of three angles per cycle: {means}.", values)
+    return _svg.index_chart(f"{title} per cycle: {means}.", values)
 
 
 def picture(trial: str, p: Picture) -> dict:

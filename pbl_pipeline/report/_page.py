@@ -8,15 +8,29 @@ import numpy as np
 
 import pbl_pipeline
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.gait import Gdi, Measure, NormativeSet, TrialMetrics, load_norm, norm_names
+from pbl_pipeline.gait import (
+    GILLETTE_MODEL,
+    Gdi,
+    Measure,
+    NormalBands,
+    NormativeSet,
+    TrialMetrics,
+    leg_length_m,
+    load_norm,
+    norm_names,
+    normal_bands,
+)
 from pbl_pipeline.keypoints import confidence_text, visibility
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, OUTCOMES, PASS, WARN, Check, in_session
 from pbl_pipeline.report import _figures
 from pbl_pipeline.report._types import SessionReport, TrialReport
 from pbl_pipeline.report._words import (
+    ANGLES,
+    FOOT_ANGLES,
     HEADLINES,
     MEASURES,
     OUTCOME_WORDS,
+    PELVIS_ANGLES,
     VERDICT_WORDS,
     check_name,
     number,
@@ -25,8 +39,6 @@ from pbl_pipeline.report._words import (
     significant,
     size,
 )
-
-GDI_NAME = "GDI of three angles"
 
 _CONVERGED = {True: "converged", False: "not converged", None: "convergence not recorded"}
 
@@ -51,7 +63,7 @@ def page_of(report: SessionReport) -> dict:
         "key_cycles": _figures.legend("left", "right", "cycles", "norm", "foot off"),
         "key_contacts": _figures.legend("stance", "foot down", "foot up", "in view"),
         "key_time": _figures.legend("left", "right", "stance"),
-        "notes": _notes(norm),
+        "notes": _notes(report, norm),
         "origin": _origin(report, pairs, norm),
         "footer": f"Made by the PBL pipeline {pbl_pipeline.__version__}. Research software: not a medical device, "
         "and no diagnosis. Everything on this page is contained in it; nothing is loaded from elsewhere.",
@@ -65,11 +77,13 @@ def page_of(report: SessionReport) -> dict:
         page["measures"].append(_gdi_row(metrics.gdi))
         page["measures_note"] = (
             f"{plural(values.n_cycles_used, 'gait cycle')} used of {values.n_cycles_found} found: the first and the "
-            "last step of each walk are left out, and strides of odd length. SD over all values of both sides; n "
-            "counts them."
+            "last step of each walk are left out, and cycles unlike the others in length or curves. SD over all values "
+            "of both sides, n counts them; CV is the spread within a side in percent of the mean; asymmetry is right "
+            "minus left in percent of their mean."
         )
-        page["cycle_charts"] = _figures.cycle_charts(cycles, norm)
-        page["cycles_note"] = _cycles_note(norm)
+        bands = _bands(report)
+        page["cycle_charts"] = _figures.cycle_charts(cycles, bands)
+        page["cycles_note"] = _cycles_note(bands)
         page["index"] = _index(metrics.gdi)
     return page
 
@@ -95,6 +109,13 @@ def _norm(report: SessionReport) -> NormativeSet | None:
         return report.norm
     name = report.metrics.gdi.norm
     return load_norm(name) if name in norm_names() else None
+
+
+def _bands(report: SessionReport) -> NormalBands:
+    """Normal curves at the person's speed."""
+    fit = next((t.fit for t in report.trials if t.fit is not None), None)
+    leg = None if fit is None else leg_length_m(fit.scale)
+    return normal_bands(None if report.metrics is None else report.metrics.spatiotemporal, leg)
 
 
 def _checks(report: SessionReport) -> list[Check]:
@@ -169,9 +190,9 @@ def _tile(key: str, m: Measure | None, reason: str) -> dict:
 
 def _gdi_tile(gdi: Gdi) -> dict:
     if gdi.mean is None:
-        return {"name": GDI_NAME, "value": None, "reason": gdi.reason}
+        return {"name": gdi.title, "value": None, "reason": gdi.reason}
     return {
-        "name": GDI_NAME,
+        "name": gdi.title,
         "value": number(gdi.mean, 1),
         "unit": "",
         "left": number(gdi.left, 1),
@@ -192,16 +213,19 @@ def _measure_row(key: str, m: Measure | None, reason: str) -> dict:
         "mean": number(m.mean, decimals),
         "sd": number(m.sd, _sd_decimals(decimals)),
         "n": m.n,
+        "cv": number(m.cv_percent, 1),
+        "asymmetry": number(m.asymmetry_percent, 1),
         "unit": unit,
     }
 
 
 def _gdi_row(gdi: Gdi) -> dict:
     if gdi.mean is None:
-        return {"name": GDI_NAME, "known": False, "reason": gdi.reason}
+        return {"name": gdi.title, "known": False, "reason": gdi.reason}
     values = {"left": number(gdi.left, 1), "right": number(gdi.right, 1), "mean": number(gdi.mean, 1)}
     unit = "100 = norm, 10 = 1 sd"
-    return {"name": GDI_NAME, "known": True, **values, "sd": number(_gdi_sd(gdi), 1), "n": gdi.n, "unit": unit}
+    more = {"sd": number(_gdi_sd(gdi), 1), "n": gdi.n, "cv": number(None, 1), "asymmetry": number(None, 1)}
+    return {"name": gdi.title, "known": True, **values, **more, "unit": unit}
 
 
 def _gdi_sd(gdi: Gdi) -> float | None:
@@ -218,13 +242,36 @@ def _index(gdi: Gdi) -> dict:
             f"Mean {number(gdi.mean, 1)} over {plural(gdi.n, 'cycle')}: left {number(gdi.left, 1)} "
             f"(n {gdi.n_left}), right {number(gdi.right, 1)} (n {gdi.n_right})"
         )
+    which = (
+        "This is the original Gait Deviation Index of nine angles."
+        if gdi.model == GILLETTE_MODEL
+        else "This index uses hip flexion, hip adduction and knee flexion. It is not the original Gait Deviation Index "
+        "of nine angles, and the two must not be compared."
+    )
     return {
-        "svg": _figures.index_chart(values),
+        "title": gdi.title,
+        "svg": _figures.index_chart(values, gdi.title),
         "sentence": sentence(text),
         "note": "Each dot is one gait cycle, the bar the mean of its side; the grey area is within one standard "
-        "deviation of the norm. This index uses hip flexion, hip adduction and knee flexion. It is not the "
-        "original Gait Deviation Index of nine angles, and the two must not be compared.",
+        f"deviation of the norm. {which}",
+        "profile": _profile(gdi),
     }
+
+
+def _profile(gdi: Gdi) -> list[dict]:
+    """Rows of the Movement Analysis Profile: how far each angle is from the norm's mean curve."""
+    p = gdi.profile
+    if p is None:
+        return []
+    titles = {k: v[0] for k, v in {**ANGLES, **PELVIS_ANGLES, **FOOT_ANGLES}.items()}
+    rows = [
+        {"name": titles.get(a, a), "left": number(p.left.get(a), 1), "right": number(p.right.get(a), 1), "both": ""}
+        for a in dict.fromkeys([*p.left, *p.right])
+    ]
+    if p.gps is not None:
+        gps = {"left": number(p.gps_left, 1), "right": number(p.gps_right, 1), "both": number(p.gps, 1)}
+        rows.append({"name": "Gait Profile Score", **gps})
+    return rows
 
 
 def _trial(t: TrialReport, m: TrialMetrics | None) -> dict:
@@ -269,15 +316,15 @@ def _check_row(c: Check) -> dict:
     }
 
 
-def _cycles_note(norm: NormativeSet | None) -> str:
-    text = (
+def _cycles_note(bands: NormalBands) -> str:
+    return (
         "0 % is foot down, 100 % the next foot down of the same foot. Left is dashed. Thin lines are the single "
-        "cycles that count, thick ones their mean."
+        f"cycles that count, thick ones their mean. Norm: typically developing children {bands.words()}; mapped to "
+        f"this body's pelvis; {bands.source}."
     )
-    return text if norm is None else f"{text} Norm: {norm.source}."
 
 
-def _notes(norm: NormativeSet | None) -> list[str]:
+def _notes(report: SessionReport, norm: NormativeSet | None) -> list[str]:
     notes = [
         "Angles are those of a model of the body that was fitted to the picture. Flexion, adduction, internal rotation "
         "and dorsiflexion are positive, on both sides.",
@@ -289,16 +336,22 @@ def _notes(norm: NormativeSet | None) -> list[str]:
         "The GDI of three angles follows Schwartz and Rozumalski 2008 (Gait & Posture 28:351-357) with hip flexion, "
         "hip adduction and knee flexion only: 100 is the mean of the norm, each 10 points one standard deviation, "
         "lower is further away. It is not the original index of nine angles.",
-        "Speed and lengths are left out: with one camera the absolute size of the person is not measured.",
     ]
-    if norm is not None:
-        notes.insert(
-            1,
-            f"The norm ({norm.name}, n = {norm.n}) comes from another way of measuring: {norm.convention}. The fitted "
-            "model places pelvis and hip axes differently, which shifts a curve against the band by a constant, at hip "
-            "flexion most. Shapes and changes between visits can be compared; a constant offset from the band alone "
-            "is no finding.",
+    if any(t.fit is not None and t.fit.orientation_source != "measured: calibration" for t in report.trials):
+        notes.append(
+            "Speed and lengths are known only where the camera stands still, and are then as large as the detector "
+            "takes the person to be: one camera sees no scale. On one recording with marker motion capture the speed "
+            "came out 6 % too high."
         )
+    notes.insert(
+        1,
+        "The grey bands come from a laboratory's marker model, whose pelvis leans 12 degrees further forward. The "
+        "constant is taken out, but a person's own pelvis may differ from it by some degrees, which shows at hip "
+        "flexion and pelvis tilt. Shapes and changes between visits can be compared; a constant offset from the band "
+        "alone is no finding.",
+    )
+    if norm is not None:
+        notes.append(f"The index compares with the set {norm.name} (n = {norm.n}): {norm.convention}.")
     return notes
 
 
@@ -343,7 +396,7 @@ def _origin(
         gdi = report.metrics.gdi
         rows = [
             ("Parameters", report.metrics.params_hash, True),
-            (GDI_NAME, f"{gdi.model}, parameters {gdi.params_hash}", True),
+            (gdi.title, f"{gdi.model}, parameters {gdi.params_hash}", True),
             ("Normative set", gdi.norm, True),
         ]
         if norm is not None:

@@ -176,7 +176,11 @@ def test_page_shows_the_measures(report: SessionReport, measured: GaitMetrics, t
         f"n {stance.n}",
         "Double support",
         "GDI of three angles",
-        "Speed Not known: the absolute scale",
+        "Speed Not known: the standing foot slides",
+        "CV",
+        "Asymmetry",
+        "How far each angle is from the mean curve",
+        "matched by cadence",
         "person 2 walks through the picture".capitalize(),
         "ab" * 32,
         "walk.mp4",
@@ -201,8 +205,8 @@ def test_gdi_is_always_named_with_its_three_angles(report: SessionReport, tmp_pa
 def test_charts_and_pictures_have_words(report: SessionReport, tmp_path: Path) -> None:
     page = _page(report, tmp_path)
     labels = [a.get("aria-label") or "" for a in page.all("svg") if a.get("role") == "img"]
-    # 8 angles over the cycle, the index, the contacts, 5 angles over time
-    assert len(labels) == 8 + 1 + 1 + 5
+    # 9 angles over the cycle, the index, the contacts, 5 angles over time
+    assert len(labels) == 9 + 1 + 1 + 5
     assert all(len(label) > 20 for label in labels)
     assert any(re.match(r"Knee flexion .* left \d+ to \d+°, right \d+ to \d+°", label) for label in labels)
     images = page.all("img")

@@ -1,0 +1,98 @@
+"""Bands of normal gait at the speed of a person, for reports and tables."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from ._spatiotemporal import Spatiotemporal
+from .normative import BODY_ANGLES, GRAVITY, PLUG_IN_GAIT, gait_norm, offset_deg
+
+#: Height (m, unscaled) of the calcaneus' origin above the floor with the foot flat.
+_SOLE_M = 0.015
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class NormalBands:
+    """Normal curves at one speed.
+
+    `percent` (P,) of the cycle; `curves` maps `ANGLE_NAMES` to mean and sd (P,) in degrees, the sd between people.
+    `speed` is dimensionless, v / sqrt(g L) with the leg length L; `matched` says by what it was found ("speed",
+    "cadence", or "" for the speed that people choose where neither is known), and `clipped` that the person is slower
+    or faster than the slowest or fastest of the five groups, whose curves these then are.
+    """
+
+    percent: np.ndarray
+    curves: dict[str, tuple[np.ndarray, np.ndarray]]
+    speed: float
+    matched: str
+    clipped: bool
+    source: str
+    licence: str
+
+    def words(self) -> str:
+        """How the bands were matched, as the end of a sentence."""
+        if not self.matched:
+            return "at the speed that they choose"
+        limit = (
+            "the slowest or fastest group's: the person is slower or faster" if self.clipped else f"{self.speed:.2f}"
+        )
+        return f"at the same speed for the length of the leg (v / sqrt(g L) = {limit}), matched by {self.matched}"
+
+
+def leg_length_m(scale: np.ndarray) -> float:
+    """From the hip to the floor of the body standing upright, mean of both legs (m), by its scale parameters (8,)."""
+    from pbl_pipeline.body import load_body  # JAX loads only where a fit is read
+
+    body, scale = load_body(), np.asarray(scale, float)
+    total = 0.0
+    for side in "lr":
+        for name in ("tibia", "talus", "calcn"):
+            at = body.body_names.index(f"{name}_{side}")
+            # The offset of a body is in the frame of its parent (y up) and grows with the parent.
+            total -= body.mj_model.body_pos[at + 1][1] * scale[body.scale_index[body.parent_index[at]]]
+        total += _SOLE_M * scale[body.scale_index[body.body_names.index(f"calcn_{side}")]]
+    return float(total / 2)
+
+
+def normal_bands(
+    measures: Spatiotemporal | None = None, leg_m: float | None = None, angle_model: str = BODY_ANGLES
+) -> NormalBands:
+    """Mean and sd of healthy people's angles at the speed of the measures.
+
+    Schwartz et al. 2008, J Biomech 41:1639-1650. Speed where it is known, else cadence: both are made dimensionless by
+    the leg length, because people of other sizes walk alike at the same v / sqrt(g L) (Hof 1996, Gait & Posture
+    4:222-223). By cadence a person with short steps is compared with faster walkers than by speed. The angles are
+    mapped to `angle_model` (the published ones are Plug-in Gait's).
+    """
+    norm = gait_norm()
+    wanted, matched = float(norm.speed[norm.groups.index("free")]), ""
+    if measures is not None and leg_m is not None:
+        speed, cadence = measures["speed_m_per_s"], measures["cadence_steps_per_min"]
+        if speed is not None:
+            wanted, matched = speed.mean / float(np.sqrt(GRAVITY * leg_m)), "speed"
+        elif cadence is not None:
+            steps = cadence.mean / 60.0 * float(np.sqrt(leg_m / GRAVITY))
+            # Outside the groups the line goes on, so that the clipping below is seen.
+            wanted, matched = float(_extrapolated(steps, norm.cadence, norm.speed)), "cadence"
+    low, high = float(norm.speed[0]), float(norm.speed[-1])
+    at = float(np.clip(wanted, low, high))
+    percent = np.linspace(0.0, 100.0, 51)
+    phase = 2 * np.pi * percent / 100.0
+    curves = {
+        angle: (
+            norm.curve(angle, phase, at) + offset_deg(angle, PLUG_IN_GAIT, angle_model),
+            norm.curve(angle, phase, at, sd=True),
+        )
+        for angle in norm.angles
+    }
+    return NormalBands(percent, curves, at, matched, not low <= wanted <= high, norm.source, norm.licence)
+
+
+def _extrapolated(x: float, xs: np.ndarray, ys: np.ndarray) -> float:
+    if x < xs[0]:
+        return float(ys[0] + (x - xs[0]) * (ys[1] - ys[0]) / (xs[1] - xs[0]))
+    if x > xs[-1]:
+        return float(ys[-1] + (x - xs[-1]) * (ys[-1] - ys[-2]) / (xs[-1] - xs[-2]))
+    return float(np.interp(x, xs, ys))
