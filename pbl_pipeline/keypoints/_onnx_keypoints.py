@@ -152,7 +152,7 @@ class OnnxKeypoints:
         mean_xyz = together.mean(axis=1)
         confidence = sd_confidence(spread_mm(together), self._params.half_mm, self._params.width_mm)
         root = absolute_root(mean_xyz, mean_xy, confidence, camera)
-        placed = np.isfinite(root).all(axis=1)
+        placed = np.asarray(np.isfinite(root).all(axis=1))
         # A shape that fits nowhere in front of the camera is no person.
         confidence = np.where(placed[:, None], confidence, 0.0)
         mean_xyz = mean_xyz + root[:, None]
