@@ -35,8 +35,8 @@ FOCAL_SD_WARN = 0.02
 
 #: Angle (deg) between where the person faces and the camera's axis, from the front (0) to the side (90), below which
 #: one camera without 3D points fails. On synthetic walkers (halpe_26, paramset `blazepose`, three people each), the
-#: mean error of hips, knees and ankles with and without 3D was 3.6 and 4.0 deg from the side, 3.9 and 4.8 at 42 to 52 deg;
-#: from the front 4.2 and 12.1 (knees 10 to 21), from the front at an equal distance 4.0 and 4.8 (knees 6 to 10).
+#: mean error of hips, knees and ankles with and without 3D was 3.6 and 4.0 deg from the side, 3.9 and 4.8 at 42 to 52
+#: deg; from the front 4.2 and 12.1 (knees 10 to 21), from the front at an equal distance 4.0 and 4.8 (knees 6 to 10).
 FACING_FAIL_DEG = 30.0
 
 
