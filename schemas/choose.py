@@ -1,11 +1,120 @@
-"""A person's choice who is measured, and its consequences."""
+"""A person's choice who is measured: what there is to choose from, the choice, and its consequences."""
 
 from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+from typing import Any
 
 from pbl_pipeline.errors import PblError
 
 from . import tracking, video
-from ._base import resolve_method
+from ._base import file_ref, library, resolve_method, stored_file
+from .results import load_tracking
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidates:
+    """One tracked video: the persons with their scores, best first, and what was decided so far.
+
+    status "TRACKED" stands for a choice that is not computed yet; `key` is that of the tracking.
+    """
+
+    key: dict[str, Any]
+    name: str
+    status: str
+    chosen: int | None
+    reason: str
+    scores: dict[int, float | None]
+
+
+def candidates(video_id: int, tracking_method: str | None = None) -> list[Candidates]:
+    """Who can be chosen in a video, once for each tracking method (or for one of them).
+
+    Raises
+    ------
+    PblError
+        DB_NOT_FOUND for a video that is not registered or not tracked yet, SOLVER_UNKNOWN.
+    """
+    key = _key(video_id, tracking_method)
+    name = (video.Video & {"video_id": video_id}).fetch1("video_name")
+    out, found = [], (tracking.Tracking & key).keys()
+    for tracked in found:
+        persons = sorted(int(p) for p in (tracking.Tracking.Person & tracked).to_arrays("person_id"))
+        rows = (tracking.SubjectChoice & tracked).to_dicts()
+        if not rows:
+            out.append(Candidates(dict(tracked), name, "TRACKED", None, "", dict.fromkeys(persons)))
+            continue
+        scores = {int(k): v for k, v in rows[0]["choice_scores"].items()}
+        ranked = sorted(persons, key=lambda p: -(scores.get(p) or 0.0))
+        chosen = rows[0]["chosen_person_id"]
+        out.append(
+            Candidates(
+                key=dict(tracked),
+                name=name,
+                status=rows[0]["choice_status"],
+                chosen=None if chosen is None else int(chosen),
+                reason=rows[0]["choice_reason"],
+                scores={p: scores.get(p) for p in ranked},
+            )
+        )
+    if not out:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"video_id {video_id} is not tracked yet",
+            expected="a video in which people were searched",
+            next_step="`pbl populate`; `pbl status` says what failed",
+        )
+    return out
+
+
+def write_sheet(about: Candidates, out_path: Path) -> Path:
+    """Write the picture of the people of a video, boxed and numbered, as JPEG, or as PNG where `out_path` says so.
+
+    It is the stored one where somebody had to choose (JPEG only), else it is drawn from the video.
+
+    Raises
+    ------
+    PblError
+        TRACK_NO_PERSON, FILE_UNWRITABLE, FILE_FORMAT (the stored picture is lost), VIDEO_MISSING, VIDEO_CHANGED.
+    """
+    if not about.scores:
+        raise PblError(
+            "TRACK_NO_PERSON",
+            found="nobody in the video",
+            expected="at least one person",
+            next_step="film from nearer, in light, so that the whole body is in the picture",
+            key=about.name,
+        )
+    stored = [s for s in (tracking.SubjectChoice & about.key).to_arrays("contact_sheet") if s is not None]
+    try:
+        if stored and out_path.suffix.lower() != ".png":
+            with stored_file(tracking.SubjectChoice(), file_ref(stored[0])) as path:
+                shutil.copyfile(path, out_path)
+            return out_path
+        path, sha256 = (video.Video & about.key).fetch1("video_path", "video_sha256")
+        file = video.registered_file(path, sha256, about.key)
+        tracks = load_tracking(about.key)
+        return library("tracking").save_contact_sheet(file, tracks, out_path, list(about.scores))
+    except OSError as error:
+        raise PblError(
+            "FILE_UNWRITABLE",
+            found=str(error),
+            expected="a picture file that can be written",
+            next_step="pass another path to --sheet",
+            key=str(out_path),
+        ) from error
+
+
+def _key(video_id: int, tracking_method: str | None) -> dict[str, Any]:
+    """Restriction to a registered video and, where named, one tracking method."""
+    if not video.Video & {"video_id": video_id}:
+        raise unknown_video(video_id)
+    key: dict[str, Any] = {"video_id": video_id}
+    if tracking_method is not None:
+        key["tracking_method"] = resolve_method(tracking.TrackingMethod, "tracking", tracking_method)
+    return key
 
 
 def choose_person(video_id: int, person: int, tracking_method: str | None = None) -> dict[str, int]:
@@ -23,11 +132,7 @@ def choose_person(video_id: int, person: int, tracking_method: str | None = None
     PblError
         DB_NOT_FOUND for a video that is not registered, SUBJECT_UNKNOWN_PERSON, SOLVER_UNKNOWN.
     """
-    if not video.Video & {"video_id": video_id}:
-        raise unknown_video(video_id)
-    key: dict = {"video_id": video_id}
-    if tracking_method is not None:
-        key["tracking_method"] = resolve_method(tracking.TrackingMethod, "tracking", tracking_method)
+    key = _key(video_id, tracking_method)
     selections = (tracking.TrackingSelection & key).keys()
     failed = tracking.SubjectChoice.jobs  # declares the job table, which would end a transaction
     connection = tracking.schema.connection

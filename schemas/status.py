@@ -67,13 +67,15 @@ class EmptyRow:
 
 @dataclasses.dataclass(frozen=True)
 class Waiting:
-    """A video that needs a person's choice, with the command that decides."""
+    """A video that needs a person's choice, with the command that decides, and the one that writes a picture of the
+    numbered people."""
 
     video_id: int
     about: str
     reason: str
     persons: list[int]
     next_step: str
+    look: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -235,6 +237,7 @@ def _waiting(most: int) -> list[Waiting]:
                 reason=row["choice_reason"],
                 persons=persons,
                 next_step=f"pbl choose {row['video_id']} {'|'.join(map(str, persons))}",
+                look=f"pbl choose {row['video_id']} --sheet persons_{row['video_id']}.jpg",
             )
         )
     return out

@@ -145,17 +145,19 @@ class SubjectChoice(dj.Computed):
     runner_up_score=null : float32             # (0..1) score of the next best person
     choice_scores        : json                # person number to score (0..1)
     choice_reason        : varchar(2000)       # why, in a sentence
+    contact_sheet=null   : <object@arrays>    # JPEG of the people, boxed and numbered, where somebody has to choose
     {origin_columns("choice")}
     """
 
     def make_fetch(self, key: dict) -> tuple:
+        file = (video.Video & key).fetch1("video_path", "video_sha256")
         tracks, detector, model = (Tracking & key).fetch1("tracks", "detector", "tracking_model_sha256")
         size = (video.VideoInfo & key).fetch1("width", "height")
         override = (SubjectOverride & key).to_dicts()
         person = int(override[0]["override_person_id"]) if override else None
         subject_method = (TrackingSelection & key).fetch1("subject_method")
         method = method_arguments(SubjectMethod, "subject", "subject", subject_method)
-        return file_ref(tracks), (int(size[0]), int(size[1])), (detector, model), person, method
+        return file, file_ref(tracks), (int(size[0]), int(size[1])), (detector, model), person, method
 
     @property
     def key_source(self) -> Any:
@@ -163,27 +165,44 @@ class SubjectChoice(dj.Computed):
 
     @computes
     def make_compute(
-        self, key: dict, ref: dict, size: tuple, about: tuple, override: int | None, method: Mapping[str, Any]
+        self,
+        key: dict,
+        file: tuple,
+        ref: dict,
+        size: tuple,
+        about: tuple,
+        override: int | None,
+        method: Mapping[str, Any],
     ) -> tuple:
         params = rebuild_params(library("tracking").SubjectParams, **method)
         with stored_file(self, ref) as path:
             tracking = load_tracking(path, size, *about)
-        return library("tracking").choose_subject(tracking, params=params, override=override), method["sha"]
+        choice = library("tracking").choose_subject(tracking, params=params, override=override)
+        sheet = None
+        if choice.status == "NEEDS_CHOICE":
+            path = video.registered_file(file[0], file[1], key)
+            sheet = library("tracking").contact_sheet_jpeg(path, tracking, choice)
+        return choice, sheet, method["sha"]
 
-    def make_insert(self, key: dict, choice: Any, sha: str, origin: Origin) -> None:
-        self.insert1(
-            {
-                **key,
-                "choice_status": choice.status,
-                "chosen_person_id": choice.person_id,
-                "choice_score": number(choice.score),
-                "runner_up_id": choice.runner_up_id,
-                "runner_up_score": number(choice.runner_up_score),
-                "choice_scores": {str(k): number(v) for k, v in choice.scores.items()},
-                "choice_reason": choice.reason[:2000],
-                **origin.row("choice", method_hash=sha),
-            }
-        )
+    def make_insert(self, key: dict, choice: Any, sheet: bytes | None, sha: str, origin: Origin) -> None:
+        with new_folder() as folder:
+            picture = folder / "persons.jpg"
+            if sheet is not None:
+                picture.write_bytes(sheet)
+            self.insert1(
+                {
+                    **key,
+                    "choice_status": choice.status,
+                    "chosen_person_id": choice.person_id,
+                    "choice_score": number(choice.score),
+                    "runner_up_id": choice.runner_up_id,
+                    "runner_up_score": number(choice.runner_up_score),
+                    "choice_scores": {str(k): number(v) for k, v in choice.scores.items()},
+                    "choice_reason": choice.reason[:2000],
+                    "contact_sheet": None if sheet is None else picture,
+                    **origin.row("choice", method_hash=sha),
+                }
+            )
 
 
 # ---------------------------------------------------------------------------------------------- override and effects

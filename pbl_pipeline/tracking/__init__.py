@@ -5,7 +5,7 @@ from ._associate import AssociationParams
 from ._blazepose import BlazePoseDetector
 from ._join import JoinParams
 from ._require import require_subject
-from ._sheet import contact_sheet, save_contact_sheet
+from ._sheet import contact_sheet, contact_sheet_jpeg, save_contact_sheet
 from ._subject import SUBJECT_DEFAULT, SUBJECT_PARAMSETS, SubjectParams, choose_subject, time_in_view_s
 from ._track import DEFAULT, DETECTORS, PARAMSETS, TrackingParams, method_of_detector, track_people
 from ._types import Detection, PersonDetector, PersonTrack, SubjectChoice, Tracking
@@ -34,6 +34,7 @@ __all__ = [
     "YoloxDetector",
     "choose_subject",
     "contact_sheet",
+    "contact_sheet_jpeg",
     "likeness",
     "look_of",
     "method_of_detector",

@@ -26,8 +26,8 @@ def require_subject(choice: SubjectChoice, tracking: Tracking, video_path: str |
             key=str(video_path),
         )
     sheet.parent.mkdir(parents=True, exist_ok=True)
-    save_contact_sheet(video_path, tracking, sheet)
     ranked = sorted(choice.scores, key=lambda k: -choice.scores[k])
+    save_contact_sheet(video_path, tracking, sheet, ranked)
     named = ", ".join(f"{k} (score {choice.scores[k]:.2f})" for k in ranked)
     raise PblError(
         "SUBJECT_NEEDS_CHOICE",

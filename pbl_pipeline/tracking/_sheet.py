@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from pbl_pipeline.video import read_frames
 
-from ._types import PersonTrack, Tracking
+from ._types import PersonTrack, SubjectChoice, Tracking
 
 #: Width of one moment in the sheet (px), moments at least and at most, moments side by side.
 _WIDTH, _LEAST, _MOST, _COLUMNS = 640, 4, 9, 3
@@ -37,10 +38,16 @@ def contact_sheet(video_path: str | Path, tracking: Tracking, persons: Sequence[
     for frame in read_frames(video_path, start=min(moments), stop=max(moments) + 1):
         if frame.index in moments:
             cells.append(_cell(frame.image, people, tracking, frame.index))
-    columns = min(len(cells), _COLUMNS)
+    columns = min(math.ceil(math.sqrt(len(cells))), _COLUMNS)
     cells += [np.zeros_like(cells[0])] * (-len(cells) % columns)
     rows = [np.hstack(cells[i : i + columns]) for i in range(0, len(cells), columns)]
     return np.vstack(rows)
+
+
+def contact_sheet_jpeg(video_path: str | Path, tracking: Tracking, choice: SubjectChoice) -> bytes:
+    """The `contact_sheet` of everybody, those with the best scores first, as the bytes of a JPEG. Raises as it."""
+    ranked = sorted(choice.scores, key=lambda k: -choice.scores[k])
+    return _encoded(contact_sheet(video_path, tracking, ranked), ".jpg")
 
 
 def save_contact_sheet(
@@ -50,13 +57,18 @@ def save_contact_sheet(
 
     Raises as `contact_sheet`, and OSError when the file cannot be written.
     """
-    path, sheet = Path(out_path), contact_sheet(video_path, tracking, persons)
-    options = [] if path.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-    done, data = cv2.imencode(".png" if path.suffix == ".png" else ".jpg", sheet, options)
-    if not done:
-        raise OSError(f"the picture {path} could not be encoded")
-    path.write_bytes(data.tobytes())
+    path = Path(out_path)
+    suffix = ".png" if path.suffix.lower() == ".png" else ".jpg"
+    path.write_bytes(_encoded(contact_sheet(video_path, tracking, persons), suffix))
     return path
+
+
+def _encoded(sheet: np.ndarray, suffix: str) -> bytes:
+    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if suffix == ".jpg" else []
+    done, data = cv2.imencode(suffix, sheet, options)
+    if not done:
+        raise OSError(f"a picture of {sheet.shape[1]}x{sheet.shape[0]} px could not be encoded as {suffix}")
+    return data.tobytes()
 
 
 def _moments(people: Sequence[PersonTrack], tracking: Tracking) -> set[int]:

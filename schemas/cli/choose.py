@@ -2,27 +2,63 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 import click
+
+if TYPE_CHECKING:
+    from schemas.choose import Candidates
 
 
 @click.command()
 @click.argument("video_id", type=int)
-@click.argument("person", type=click.IntRange(min=1))
+@click.argument("person", type=click.IntRange(min=1), required=False)
+@click.option("--sheet", type=click.Path(path_type=Path), help="Write a picture of the numbered people (.jpg, .png).")
 @click.option("--tracking-method", metavar="NAME", help="Only for this method's tracking (default: all of the video).")
-def choose(video_id: int, person: int, tracking_method: str | None) -> None:
+def choose(video_id: int, person: int | None, sheet: Path | None, tracking_method: str | None) -> None:
     """Measure PERSON of video VIDEO_ID. The choice wins over the automatic one.
 
-    What was computed for another person is deleted, and said; `pbl populate` computes it anew. The numbers of the
-    persons and the reason of the automatic choice are in `pbl status`.
+    What was computed for another person is deleted, and said; `pbl populate` computes it anew. Without PERSON nothing
+    changes: the persons, their scores and the reason of the automatic choice are printed, and with --sheet a picture of
+    them is written.
 
+    \b
+    Example: pbl choose 3 --sheet persons.jpg
     Example: pbl choose 3 2
     """
     import schemas
-    from schemas.choose import choose_person
+    from schemas.choose import candidates, choose_person, write_sheet
 
     schemas.activate(methods=False)
+    if person is None or sheet is not None:
+        found = candidates(video_id, tracking_method)
+        for line in lines(found):
+            click.echo(line)
+        if sheet is not None:
+            for number, about in enumerate(found):
+                name = sheet if number == 0 else sheet.with_stem(f"{sheet.stem}.{about.key['tracking_method']}")
+                click.echo(f"people: {write_sheet(about, name)}")
+    if person is None:
+        return
     result = choose_person(video_id, person, tracking_method)
     click.echo(f"video_id {video_id}: person {person} will be measured")
     for name, n in result.items():
         click.echo(f"  deleted {n} rows of {name}")
     click.echo("next: pbl populate")
+
+
+def lines(found: list[Candidates]) -> list[str]:
+    """The printed form of who can be chosen."""
+    out = []
+    for about in found:
+        out.append(f"video_id {about.key['video_id']}  {about.name}  {about.key['tracking_method']}: {about.status}")
+        for person, score in about.scores.items():
+            said = "no score" if score is None else f"score {score:.2f}"
+            out.append(f"  person {person}: {said}" + (", measured" if person == about.chosen else ""))
+        if about.reason:
+            out.append(f"  {about.reason}")
+        if about.status == "NEEDS_CHOICE":
+            numbers = "|".join(map(str, sorted(about.scores)))
+            out.append(f"  next: pbl choose {about.key['video_id']} {numbers}")
+    return out

@@ -68,7 +68,8 @@ def lines(state: Status) -> list[str]:
     if state.waiting:
         out += ["", "waiting for a choice"]
     for w in state.waiting:
-        out += [f"  video_id={w.video_id}  {w.about}", f"    {w.reason}", f"    next:  {w.next_step}"]
+        out += [f"  video_id={w.video_id}  {w.about}", f"    {w.reason}"]
+        out += [f"    look:  {w.look}", f"    next:  {w.next_step}"]
     return out
 
 

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pymysql
 import pytest
@@ -24,7 +25,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.pipeline import Session, Trial
 from pbl_pipeline.qc import Check
 from schemas import fit, gait, gdi, keypoints, lab, qc, session, table_map, tracking, video, views
-from schemas.choose import choose_person
+from schemas.choose import candidates, choose_person, write_sheet
 from schemas.ingest import Methods, Visit, ingest
 from schemas.plan import plan_fit_sets
 from schemas.results import load_session
@@ -392,6 +393,76 @@ def test_two_alike_wait_for_a_choice_and_the_rest_goes_on(tables: None, tmp_path
     assert views.session_summary()["fit_set_n"].tolist() == [2]
 
 
+def test_the_picture_of_the_people_is_stored_where_somebody_has_to_choose(tables: None, tmp_path: Path):
+    alike, clear, nobody = register(
+        chain.small_video(tmp_path, "both", people="two alike"),
+        chain.small_video(tmp_path, "clear"),
+        chain.small_video(tmp_path, "empty", people="nobody"),
+    )
+    populate(["VideoInfo", "Tracking", "SubjectChoice"])
+    stored = {r["video_id"]: r["contact_sheet"] is not None for r in tracking.SubjectChoice.to_dicts()}
+    assert stored == {alike: True, clear: False, nobody: False}
+    (about,) = candidates(alike)
+    assert (about.status, about.chosen, sorted(about.scores)) == ("NEEDS_CHOICE", None, [1, 2])
+    assert "A person has to choose" in about.reason
+    stored_bytes = write_sheet(about, tmp_path / "people.jpg").read_bytes()
+    assert cv2.imdecode(np.frombuffer(stored_bytes, np.uint8), cv2.IMREAD_COLOR) is not None
+    # The stored picture does not need the video; a drawn one does.
+    (tmp_path / "both_alike.mp4").rename(tmp_path / "gone.mp4")
+    assert write_sheet(about, tmp_path / "again.jpg").read_bytes() == stored_bytes
+    with pytest.raises(PblError, match="VIDEO_MISSING"):
+        write_sheet(about, tmp_path / "again.png")
+    with pytest.raises(PblError, match="FILE_UNWRITABLE"):
+        write_sheet(about, tmp_path / "no folder" / "people.jpg")
+    # Where the choice was clear the picture is drawn when it is asked for.
+    (chosen,) = candidates(clear)
+    assert (chosen.status, chosen.chosen) == ("CHOSEN", 1)
+    assert cv2.imread(str(write_sheet(chosen, tmp_path / "clear.png"))) is not None
+    with pytest.raises(PblError, match="TRACK_NO_PERSON"):
+        write_sheet(candidates(nobody)[0], tmp_path / "nobody.jpg")
+    (waiting,) = pipeline_status().waiting
+    assert waiting.look == f"pbl choose {alike} --sheet persons_{alike}.jpg"
+    with pytest.raises(PblError, match="DB_NOT_FOUND"):
+        candidates(register(chain.small_video(tmp_path, "later"))[0])
+
+
+def test_a_decision_triggers_exactly_the_rows_that_depend_on_it(tables: None, tmp_path: Path):
+    first, second = register(chain.small_video(tmp_path, "walk1"), chain.small_video(tmp_path, "walk2", n=210))
+    (apart,) = register(chain.small_video(tmp_path, "other"), subject="P002")
+    populate()
+
+    def computed() -> dict[str, dict]:
+        origin = {t: next(c for c in t.heading.names if c.endswith("_computed")) for t in schemas.computed_tables()}
+        return {
+            t.__name__: {tuple(r[k] for k in t.primary_key): r[column] for r in t.to_dicts()}
+            for t, column in origin.items()
+        }
+
+    before = computed()
+    choose_person(first, 2)
+    left = computed()
+    # Nothing of the other subject, nothing above the choice, nothing of the session's other video up to its input.
+    for name in ("VideoInfo", "Tracking"):
+        assert left[name] == before[name]
+    for name in ("SubjectChoice", "Keypoints", "TrialInput"):
+        assert {k for k in before[name] if k not in left[name]} == {k for k in before[name] if k[0] == first}, name
+    gone = {n: set(before[n]) - set(left[n]) for n in before}
+    assert all(gone[n] for n in ("SessionFit", "GaitEvents", "GaitCycle", "GDI", "SessionGdi", "SessionQc"))
+    fits = (fit.FitSet.Video & {"video_id": apart}).to_arrays("fit_set").tolist()
+    assert fits
+    assert all(fits[0] not in k for keys in gone.values() for k in keys)
+    run = populate()
+    assert not errors(run)
+    assert {n: done(run)[n] for n in ("Tracking", "SubjectChoice", "Keypoints", "SessionFit", "SessionQc")} == {
+        "Tracking": 0,
+        "SubjectChoice": 1,
+        "Keypoints": 1,
+        "SessionFit": 1,
+        "SessionQc": 1,
+    }
+    assert second in tracking.SubjectChoice.to_arrays("video_id")
+
+
 def test_a_decision_wins_and_recomputes_what_was_another_persons(tables: None, tmp_path: Path):
     (number,) = register(chain.small_video(tmp_path, "walk"))
     populate()
@@ -726,6 +797,12 @@ def test_the_commands_from_file_to_summary(tables: None, tmp_path: Path):
     shown = runner.invoke(status, [])
     assert "VIDEO_NOT_A_VIDEO" in shown.output
     assert f"pbl choose {number} 1|2" in shown.output
+    assert f"pbl choose {number} --sheet persons_{number}.jpg" in shown.output
+    look = runner.invoke(choose, [str(number), "--sheet", str(tmp_path / "people.jpg")])
+    assert (look.exit_code, (tmp_path / "people.jpg").is_file()) == (0, True), look.output
+    assert "person 1: score" in look.output
+    assert "NEEDS_CHOICE" in look.output
+    assert "deleted" not in look.output
     chosen = runner.invoke(choose, [str(number), "2"])
     assert "deleted 1 rows of" in chosen.output
     run = runner.invoke(populate_command, [])
