@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-import resource
 import sys
 import time
 from collections.abc import Callable
@@ -19,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline.errors import PblError
 
 from . import _data
+from ._machine import machine, peak_rss
 from ._plan import PARAMSET_OF, Case, Data
 
 if TYPE_CHECKING:
@@ -92,33 +91,12 @@ def paramset_of(solver: str, adam_steps: int | None) -> Paramset:
     )
 
 
-def machine() -> dict[str, Any]:
-    """Device and processor as this process saw them."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    out: dict[str, Any] = {"cores": cores}
-    if "jax" in sys.modules:
-        import jax
-
-        out |= {"device": str(jax.devices()[0].device_kind), "jax": jax.__version__}
-    return out
-
-
 def memory() -> dict[str, Any]:
     """Peak memory (bytes) of this process so far, and on the device where its backend says (else None)."""
     import jax
 
     stats = jax.local_devices()[0].memory_stats() or {}
-    return {"host_bytes": _peak_rss(), "device_bytes": stats.get("peak_bytes_in_use")}
-
-
-def _peak_rss() -> int:
-    # Linux counts ru_maxrss on from the process that forked; VmHWM belongs to this program alone.
-    try:
-        status = Path("/proc/self/status").read_text()
-        return 1024 * int(next(x for x in status.splitlines() if x.startswith("VmHWM:")).split()[1])
-    except (OSError, StopIteration):
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return peak if sys.platform == "darwin" else 1024 * peak
+    return {"host_bytes": peak_rss(), "device_bytes": stats.get("peak_bytes_in_use")}
 
 
 def _groups(case: Case) -> list[list[int]]:

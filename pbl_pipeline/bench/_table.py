@@ -48,7 +48,8 @@ def _rate(row: Row) -> float | None:
     return row["batch"] / row["warm_seconds"] if row.get("warm_seconds") else None
 
 
-def _mega(value: float | None) -> str:
+def mega(value: float | None) -> str:
+    """Bytes as millions, `-` where there are none."""
     return "-" if value is None else f"{value / 1e6:,.0f}"
 
 
@@ -62,8 +63,8 @@ _TIMES: list[Column] = [
     ("warm s", lambda r: number(r.get("warm_seconds"), 3)),
 ]
 _MEMORY: list[Column] = [
-    ("host MB", lambda r: _mega(r["host_bytes"])),
-    ("device MB", lambda r: _mega(r["device_bytes"])),
+    ("host MB", lambda r: mega(r["host_bytes"])),
+    ("device MB", lambda r: mega(r["device_bytes"])),
 ]
 _ERRORS: list[Column] = [
     ("all deg", lambda r: number(accuracy(r, "all_deg"))),

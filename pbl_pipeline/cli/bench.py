@@ -109,3 +109,41 @@ def fit(
             content = {"benchmark": "fit", "version": __version__, "time_utc": begun, "rows": rows}
             json_path.write_text(json.dumps(content | {"ratios": b.ratios(rows)}, indent=1) + "\n")
     click.echo(b.text(rows))
+
+
+@bench.command(epilog="Example: pbl bench detect walk.mp4 --minutes 10 --json detect.json")
+@click.argument("video", required=False, type=click.Path(path_type=Path, readable=False))
+@click.option(
+    "--minutes", type=click.FloatRange(0, 600, min_open=True), help="Repeat the video until it lasts so long."
+)
+@click.option("--person", type=click.IntRange(1), help="Whom to measure; else the subject, or who is seen longest.")
+@click.option("--repeat", type=click.IntRange(1), help="Runs; the fastest counts. Default: 3, with --minutes 1.")
+@click.option("--timeout-s", type=click.FloatRange(1), default=7200.0, show_default=True, help="Of the measurement.")
+@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write all figures to this file.")
+def detect(
+    video: Path | None,
+    minutes: float | None,
+    person: int | None,
+    repeat: int | None,
+    timeout_s: float,
+    json_path: Path | None,
+) -> None:
+    """Time decoding, tracking and keypoints of VIDEO; without one, of the demo recording at 1920x1080.
+
+    What is measured, and how, is in docs/benchmarks.md.
+    """
+    from pbl_pipeline import __version__
+    from pbl_pipeline import bench as b
+    from pbl_pipeline.files import check_out_file
+
+    if json_path is not None:
+        check_out_file(json_path)
+    begun = datetime.now(UTC).isoformat(timespec="seconds")
+    runs = repeat or (3 if minutes is None else 1)
+    row = b.run_detect(video, minutes, person, runs, timeout_s, note=lambda what: click.echo(what, err=True))
+    if json_path is not None:
+        content = {"benchmark": "detect", "version": __version__, "time_utc": begun, "rows": [row]}
+        json_path.write_text(json.dumps(content, indent=1) + "\n")
+    click.echo(b.detect_text(row))
+    if "error" in row:
+        raise SystemExit(1)

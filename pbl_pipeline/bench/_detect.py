@@ -1,0 +1,77 @@
+"""Frames a second, processor time and memory of detection on one video."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from ._run import Row
+from ._table import Column, mega, number, table
+
+
+def run_detect(
+    video: Path | None,
+    minutes: float | None,
+    person: int | None,
+    repeat: int,
+    timeout_s: float,
+    note: Callable[[str], None] = lambda _: None,
+) -> Row:
+    """Figures of probe, tracking and keypoints on `video` (None: `demo_clip`), repeated until it lasts `minutes`.
+
+    The measured process does nothing else, and a failure in it is a row with `error`. Raises the `PblError`s of
+    `demo_clip` and `repeated`, and VIDEO_MISSING.
+    """
+    from ._clip import demo_clip, repeated
+
+    with tempfile.TemporaryDirectory(prefix="pbl-bench-") as name:
+        folder = Path(name)
+        if video is None:
+            note("making a clip of 1920x1080 from the demo recording")
+            path = demo_clip(folder / "demo1080.mp4")
+        else:
+            from pbl_pipeline.video import sha256_of
+
+            sha256_of(video)  # raises what is wrong with the file before anything is measured
+            path = video
+        if minutes is not None:
+            path = repeated(path, folder / f"long{path.suffix}", 60 * minutes)
+        note("measuring")
+        spec = {"video": str(path), "person": person, "repeat": repeat, "result": str(folder / "result.json")}
+        command = [sys.executable, "-m", "pbl_pipeline.bench._detect_case", json.dumps(spec)]
+        row: Row = {"label": str(video) if video else "demo recording at 1080p"}
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s)
+        except subprocess.TimeoutExpired:
+            return row | {"error": f"over {timeout_s:g} s"}
+        result = Path(spec["result"])
+        if not result.exists():
+            return row | {"error": f"died, exit {done.returncode}", "error_text": done.stderr[-2000:]}
+        return row | json.loads(result.read_text())
+
+
+def detect_text(row: Row) -> str:
+    """The row as a table of stages with what was measured above it."""
+    if "error" in row:
+        return f"{row['label']}: {row['error']}\n{row.get('error_text', '')}".strip()
+    frames = row["frames"]
+    columns: list[Column] = [
+        ("stage", lambda r: r["stage"]),
+        ("frames/s", lambda r: number(frames / r["seconds"], 1)),
+        ("ms a frame", lambda r: number(1e3 * r["seconds"] / frames, 1)),
+        ("CPU ms a frame", lambda r: number(1e3 * r["cpu_seconds"] / frames, 1)),
+        ("memory MB", lambda r: mega(r["host_bytes"])),
+        ("growth MB", lambda r: mega(r["growth_bytes"])),
+    ]
+    rows = [{"stage": name, **figures} for name, figures in row["stages"].items()]
+    rows.append({"stage": "all", **{k: row[k] for k in ("seconds", "cpu_seconds", "host_bytes")}, "growth_bytes": None})
+    head = (
+        f"{row['label']}: {row['width_px']}x{row['height_px']} {row['codec']}, {row['mbit_per_s']:.1f} Mbit/s, "
+        f"{frames:,} frames in {row['video_seconds']:.1f} s; people tracked: {row['persons']}, the measured one "
+        f"in view in {row['frames_in_view']:,} frames; {row['cores']} cores; the fastest of {len(row['runs_seconds'])} runs"
+    )
+    return f"{head}\n\n{table(rows, columns)}"

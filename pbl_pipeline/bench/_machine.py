@@ -1,0 +1,31 @@
+"""The machine and the memory as a measured process sees them."""
+
+from __future__ import annotations
+
+import os
+import resource
+import sys
+from pathlib import Path
+from typing import Any
+
+
+def machine() -> dict[str, Any]:
+    """Device and processor as this process saw them."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    out: dict[str, Any] = {"cores": cores}
+    if "jax" in sys.modules:
+        import jax
+
+        out |= {"device": str(jax.devices()[0].device_kind), "jax": jax.__version__}
+    return out
+
+
+def peak_rss() -> int:
+    """Peak memory (bytes) of this process so far."""
+    # Linux counts ru_maxrss on from the process that forked; VmHWM belongs to this program alone.
+    try:
+        status = Path("/proc/self/status").read_text()
+        return 1024 * int(next(x for x in status.splitlines() if x.startswith("VmHWM:")).split()[1])
+    except (OSError, StopIteration):
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak if sys.platform == "darwin" else 1024 * peak
