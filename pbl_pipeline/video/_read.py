@@ -49,7 +49,10 @@ class _ToBgr:
     def __call__(self, frame: av.VideoFrame, turn: Orientation) -> np.ndarray:
         if not hasattr(self._local, "converter"):
             self._local.converter = VideoReformatter()
-        picture = self._local.converter.reformat(frame, format="bgr24", threads=1).to_ndarray()
+        plane = self._local.converter.reformat(frame, format="bgr24", threads=1).planes[0]
+        # The converter's own memory, which is new for each picture: a copy would cost more than the conversion.
+        rows = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)
+        picture = rows[:, : 3 * plane.width].reshape(plane.height, plane.width, 3)
         # Rows of some widths are padded for the converter; users get plain arrays.
         return np.ascontiguousarray(turn.apply(picture))
 
