@@ -365,6 +365,14 @@ def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Mapping[str, np.nda
     )
 
 
+def load_cycles(key: Mapping[str, Any], trial: str = "") -> list[Any]:
+    """The library's cycles of one row of GaitCycle, with their curves."""
+    with stored_file(GaitCycle(), file_ref((GaitCycle & key).fetch1("curves"))) as path:
+        curves = load_curves(path)
+    rows = (GaitCycle.Cycle & key).to_dicts(order_by="cycle_no")
+    return [cycle_of_row(r, trial, curves.get(int(r["cycle_no"]))) for r in rows]
+
+
 def save_curves(cycles: Sequence[Any], path: Any) -> None:
     """Write the curves of all cycles to one npz; a cycle without curves is NaN."""
     percent = np.asarray(library("gait").REPORT_PERCENT, np.float32)

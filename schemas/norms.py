@@ -10,7 +10,7 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 
 from . import fit, gait, gdi, lab, session
-from ._base import file_ref, library, new_folder, plain, stored_file
+from ._base import library, new_folder, plain
 
 #: What a set is called: as the shipped ones, and short enough for its column.
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{1,39}")
@@ -152,12 +152,9 @@ def _cycles(keys: Sequence[dict[str, Any]]) -> tuple[list[Any], list[str]]:
     """The library's cycles with their curves, and whose each is."""
     cycles, people = [], []
     for key in keys:
-        of = {k: key[k] for k in gait.GaitCycle.primary_key}
-        with stored_file(gait.GaitCycle(), file_ref((gait.GaitCycle & of).fetch1("curves"))) as path:
-            curves = gait.load_curves(path)
-        for row in (gait.GaitCycle.Cycle & of).to_dicts(order_by="cycle_no"):
-            cycles.append(gait.cycle_of_row(row, str(key["video_id"]), curves.get(int(row["cycle_no"]))))
-            people.append(key["subject"])
+        found = gait.load_cycles({k: key[k] for k in gait.GaitCycle.primary_key}, str(key["video_id"]))
+        cycles += found
+        people += [key["subject"]] * len(found)
     return cycles, people
 
 

@@ -203,11 +203,7 @@ def load_events(key: Any) -> Any:
 
 def load_cycles(key: Any, trial: str) -> tuple[Any, ...]:
     """The library's `GaitCycle`s of one row, with their curves."""
-    ref = file_ref((gait.GaitCycle & key).fetch1("curves"))
-    with stored_file(gait.GaitCycle(), ref) as path:
-        curves = gait.load_curves(path)
-    rows = (gait.GaitCycle.Cycle & key).to_dicts(order_by="cycle_no")
-    return tuple(gait.cycle_of_row(r, trial, curves.get(int(r["cycle_no"]))) for r in rows)
+    return tuple(gait.load_cycles(key, trial))
 
 
 def _checks(rows: Any, prefix: str) -> list[Any]:

@@ -49,6 +49,33 @@ def session_summary(restriction: Any = True) -> pd.DataFrame:
     return (current_sets() * fits * measures * quality & restriction).to_pandas(order_by="session_id").reset_index()
 
 
+def cycle_curves(restriction: Any = True) -> pd.DataFrame:
+    """Mean joint-angle curves of each visit beside the normal band at the person's speed.
+
+    One row per visit, chain of methods, side, angle and percent of the cycle, with the columns of
+    `pbl_pipeline.gait.curve_frame` (degrees) and `normal_matched`: how the band was matched ("speed", "cadence" or "").
+    Reads the stored curves of these visits.
+    """
+    import pandas as pd
+
+    lib = library("gait")
+    names = ["subject", "session_label", "session_id", "fit_set", "fit_method", "gait_method", "gdi_method", "norm"]
+    parts = [pd.DataFrame(columns=[*names, *lib.CURVE_FRAME_COLUMNS, "normal_matched"])]
+    visits = current_sets() * fit.SessionFit.proj("fit_scale") * gdi.SessionGdi.proj("session_status")
+    for row in (visits & {"session_status": "PASS"} & restriction).to_dicts(order_by="session_id"):
+        key = {k: row[k] for k in gdi.SessionGdi.primary_key}
+        measures = {
+            r["session_measure"]: gait.measure_of_row(r, "session_measure")
+            for r in (gdi.SessionGdi.Measure & key).to_dicts()
+        }
+        leg_m = lib.leg_length_m(row["fit_scale"])
+        bands = lib.normal_bands(lib.Spatiotemporal("PASS", "", measures, {}, 0, 0, 0), leg_m)
+        cycles = [c for k in (gait.GaitCycle & key).keys() for c in gait.load_cycles(k)]  # noqa: SIM118 a query
+        frame = lib.curve_frame(cycles, bands).assign(normal_matched=bands.matched)
+        parts.append(pd.DataFrame({n: [row[n]] * len(frame) for n in names}).join(frame))
+    return pd.concat([p for p in parts if len(p)] or parts, ignore_index=True)
+
+
 def trial_summary(restriction: Any = True) -> pd.DataFrame:
     """One row per fitted video: residuals, where the vertical comes from, events, measures and index of the trial."""
     trials = fit.SessionFit.Trial.proj(

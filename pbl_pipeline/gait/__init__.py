@@ -6,6 +6,7 @@ Each step is a function of its own with a frozen result: `feet_from_fit` or `fee
 
 from ._angles import ANGLE_NAMES, AngleSeries, angle_series, pelvis_angles
 from ._bands import NormalBands, leg_length_m, normal_bands
+from ._curve_frame import CURVE_FRAME_COLUMNS, curve_frame
 from ._cycles import REPORT_PERCENT, GaitCycle, cycle_curves, find_cycles
 from ._feet import FOOT_MARKER_SETS, FootTrajectories, feet_from_fit, feet_from_keypoints, feet_from_markers
 from ._gdi import (
@@ -53,6 +54,7 @@ __all__ = [
     "ANGLE_MODELS",
     "ANGLE_NAMES",
     "BODY_ANGLES",
+    "CURVE_FRAME_COLUMNS",
     "DEFAULT_EVENT_PARAMSET",
     "DEFAULT_NORM",
     "EVENT_PARAMSETS",
@@ -88,6 +90,7 @@ __all__ = [
     "Spatiotemporal",
     "TrialMetrics",
     "angle_series",
+    "curve_frame",
     "cycle_checks",
     "cycle_curves",
     "cycle_lengths",
