@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import marker_set
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit._inputs import undistort_px
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.keypoints._trc import read_trc
 from pbl_pipeline.render import to_pixels
@@ -89,9 +90,12 @@ def truth_of_synthetic(keypoints: Keypoints, truth: Truth) -> PointTruth:
     return _seen_by(keypoints, np.einsum("tij,tki->tkj", truth.R_nc, truth.markers_world_m), keypoints.camera, "known")
 
 
-def truth_of_trc(keypoints: Keypoints, path: str | Path, camera: Camera, pose: CameraPose) -> PointTruth:
-    """Of markers that several calibrated cameras triangulated (TRC with (x, y, z)_trc = (y, z, x)_world, as Pose2Sim
-    writes it), in the picture of one of them, frame by frame from the first.
+def truth_of_trc(
+    keypoints: Keypoints, path: str | Path, camera: Camera | None = None, pose: CameraPose | None = None
+) -> PointTruth:
+    """Of markers that several calibrated cameras triangulated (TRC), frame by frame from the first, in the picture of
+    one of these cameras: `camera` and `pose`, with (x, y, z)_trc = (y, z, x)_world as Pose2Sim writes it. Without a
+    pose the camera is found from the points (`resect`), with the lens of `camera` or of the keypoints.
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT, REFERENCE_INPUT (other frames, or too few points in common).
     """
@@ -103,8 +107,12 @@ def truth_of_trc(keypoints: Keypoints, path: str | Path, camera: Camera, pose: C
         theirs = name if name in trc.names else _OPENPOSE.get(name)
         if theirs in trc.names:
             world[:, j] = trc.xyz_m[:, trc.names.index(theirs)][:, [2, 0, 1]]
-    note = "triangulated from several cameras by others"
-    return _seen_by(keypoints, (world - pose.p_nc) @ pose.R_nc, camera, note)
+    lens = camera or keypoints.camera
+    if pose is None:
+        seen = dataclasses.replace(keypoints, camera=lens)
+        known = camera is not None
+        return resect(seen, keypoints.time_s, world, np.zeros(1), known, "points of several cameras")
+    return _seen_by(keypoints, (world - pose.p_nc) @ pose.R_nc, lens, "points of several cameras, as calibrated")
 
 
 def truth_of_bodies(keypoints: Keypoints, path: str | Path) -> PointTruth:
@@ -124,16 +132,29 @@ def truth_of_bodies(keypoints: Keypoints, path: str | Path) -> PointTruth:
     return resect(keypoints, bodies.time_s, room)
 
 
-def resect(keypoints: Keypoints, time_s: np.ndarray, room_m: np.ndarray) -> PointTruth:
+def resect(
+    keypoints: Keypoints,
+    time_s: np.ndarray,
+    room_m: np.ndarray,
+    lags_s: np.ndarray = _LAGS_S,
+    lens_known: bool = False,
+    what: str = "marker mocap",
+) -> PointTruth:
     """Find a camera at rest from the points it saw, and put the true points into its picture.
 
-    Place, orientation and focal length (7 numbers; the principal point is the keypoints' own, no distortion) and the
-    lag of the video, by robust least squares over `_FRAMES` frames.
+    Place, orientation and focal length (7 numbers; principal point and distortion are those of the keypoints' camera)
+    and the lag of the video, by robust least squares over `_FRAMES` frames.
 
     Parameters
     ----------
     time_s, room_m
-        (N,) and (N, J, 3): the true points in the room, on a clock within 0.15 s of the video's.
+        (N,) and (N, J, 3): the true points in the room, in the time of the video less the lag.
+    lags_s
+        Lags to try.
+    lens_known
+        The focal length is that of the keypoints' camera.
+    what
+        What the truth is, for the note.
 
     Raises
     ------
@@ -144,19 +165,20 @@ def resect(keypoints: Keypoints, time_s: np.ndarray, room_m: np.ndarray) -> Poin
     rows = np.unique(np.linspace(0, len(keypoints.time_s) - 1, _FRAMES).astype(int))
     seen = keypoints.confidence[rows] > 0
     matrix = np.asarray(keypoints.camera.matrix, float)
-    for lag in _LAGS_S:
+    xy = undistort_px(np.where(seen[..., None], keypoints.xy_px[rows], 0.0), keypoints.camera)
+    for lag in lags_s:
         at = _at(time_s, room_m, keypoints.time_s[rows] - lag)
         known = seen & np.isfinite(at[..., 0])
         if known.sum() < _LEAST_PAIRS:
             continue
-        places, pixels = at[known], keypoints.xy_px[rows][known].astype(float)
+        places, pixels = at[known], xy[known]
         cv2.setRNGSeed(0)
         found, turn, shift, _ = cv2.solvePnPRansac(
             places, pixels, matrix, None, reprojectionError=4 * _SOFT_PX, iterationsCount=500
         )
         if not found:
             continue
-        start = np.concatenate([turn.ravel(), shift.ravel(), [0.0]])
+        start = np.concatenate([turn.ravel(), shift.ravel(), [] if lens_known else [0.0]])
         solution = least_squares(_misses, start, args=(places, pixels, matrix), loss="soft_l1", f_scale=_SOFT_PX)
         cost = float(solution.cost) / len(places)
         if best is None or cost < best[0]:
@@ -164,21 +186,26 @@ def resect(keypoints: Keypoints, time_s: np.ndarray, room_m: np.ndarray) -> Poin
     if best is None:
         raise _refused(
             "no camera at rest that sees these points",
-            f"{_LEAST_PAIRS} points or more that both know, and clocks within {_LAGS_S[-1]:g} s",
+            f"{_LEAST_PAIRS} points or more that both know, and clocks within {np.max(np.abs(lags_s)):g} s",
         )
     _, lag, x = best
     lens = matrix.copy()
-    lens[[0, 1], [0, 1]] *= np.exp(x[6])
+    lens[[0, 1], [0, 1]] *= _zoom(x)
     room = _at(time_s, room_m, keypoints.time_s - lag)
     in_camera = Rotation.from_rotvec(x[:3]).apply(room.reshape(-1, 3)).reshape(room.shape) + x[3:6]
-    note = f"marker mocap in a camera found from the points (focal length {lens[0, 0]:.0f} px, lag {1000 * lag:.0f} ms)"
-    return _seen_by(keypoints, in_camera, Camera(lens, np.zeros(5), "resected"), note)
+    note = f"{what} in a camera found from the points (focal length {lens[0, 0]:.0f} px, lag {1000 * lag:.0f} ms)"
+    return _seen_by(keypoints, in_camera, Camera(lens, keypoints.camera.distortion, "resected"), note)
 
 
 def _misses(x: np.ndarray, places: np.ndarray, pixels: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     p = Rotation.from_rotvec(x[:3]).apply(places) + x[3:6]
-    focal = np.exp(x[6]) * np.diag(matrix)[:2]
+    focal = _zoom(x) * np.diag(matrix)[:2]
     return (focal * p[:, :2] / np.maximum(p[:, 2:], 0.1) + matrix[:2, 2] - pixels).ravel()
+
+
+def _zoom(x: np.ndarray) -> float:
+    """The focal length found over the one stated; 1 where it is known."""
+    return float(np.exp(x[6])) if len(x) > 6 else 1.0
 
 
 def _at(time_s: np.ndarray, points: np.ndarray, at_s: np.ndarray) -> np.ndarray:

@@ -62,6 +62,11 @@ class PointErrors:
     error_trunk: np.ndarray
     error_3d_cm: np.ndarray
 
+    @property
+    def title(self) -> str:
+        """Dataset and recording."""
+        return f"{self.dataset}, {self.recording}"
+
 
 def point_errors(keypoints: Keypoints, truth: PointTruth, detector: str, dataset: str, recording: str) -> PointErrors:
     """The errors of a trial. Points beyond the picture and those without truth do not count.
@@ -161,7 +166,7 @@ def fit_curve(
     keep = total > 0
     probability = isotonic_regression(share[keep], weights=total[keep]).x
     knots, first = np.unique(np.round(middle[keep], 4), return_index=True)
-    source = "; ".join(f"{e.dataset} {e.recording} ({len(e.stated)} points)" for e in errors)
+    source = "; ".join(f"{e.title} ({len(e.stated)} points)" for e in errors)
     return ConfidenceCurve(
         name, detectors[0], bound, knots, np.round(probability[first], 4), n, source, dict(params or {})
     )
@@ -192,7 +197,7 @@ def leave_one_out(errors: Sequence[PointErrors], bound: float = BOUND_TRUNK) -> 
             right, p = (e.error_trunk <= bound).astype(float), curve(e.stated)
             scores.append(
                 CurveScore(
-                    f"{dataset} {e.recording}",
+                    e.title,
                     float(right.mean()),
                     float(np.mean((e.stated - right) ** 2)),
                     float(np.mean((p - right) ** 2)),

@@ -26,7 +26,9 @@ CURVES = Path(__file__).parents[1] / "keypoints" / "data" / "confidence_curves.j
 MOCAP_CLIPS = ("walk", "STS")
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 _TRC = "S00_P00_T01_BalancingTrial_0-100.trc"
-#: That of the TRC; as calibrated (two of the videos are 8 px narrower).
+#: That of the TRC; as calibrated (two of the videos are 8 px narrower). Only its lenses are used, and where the cameras
+#: stood is found from the points: by its poses even the points that the TRC was triangulated from (OpenPose's) lie
+#: 20 px off in cam03, 14 to the right and 13 down in the median, and the embedded detector's with them.
 _CALIBRATION, _CALIBRATED_SIZE_PX = "Calib_qualisys.toml", (1088, 1920)
 
 
@@ -40,12 +42,11 @@ def truth_of(name: str, keypoints: Keypoints, data: Path) -> tuple[PointTruth, s
     """The truth of one of `recordings`, and the dataset it belongs to: one movement of one person."""
     if name in MOCAP_CLIPS:
         folder = data / "real" / "video_mocap" / name
-        return truth_of_bodies(keypoints, folder / "sample_mocap.json.gz"), f"video_mocap {name}"
+        return truth_of_bodies(keypoints, folder / "sample_mocap.json.gz"), f"phone clip beside marker mocap ({name})"
     folder = data / "real" / "multiview"
-    poses = load_camera_poses(folder / _CALIBRATION)
-    camera = list(poses)[CAMERAS.index(name)]
+    camera = list(load_camera_poses(folder / _CALIBRATION))[CAMERAS.index(name)]
     lens = load_camera(folder / _CALIBRATION, _CALIBRATED_SIZE_PX, camera)
-    return truth_of_trc(keypoints, folder / _TRC, lens, poses[camera]), "multiview"
+    return truth_of_trc(keypoints, folder / _TRC, lens), "Pose2Sim balancing trial"
 
 
 def measured(data: Path, keypoints_folder: Path) -> list[PointErrors]:
@@ -87,7 +88,7 @@ def main(data: Path, version: int, keypoints: Path, out: Path, plots: Path | Non
     click.echo("\nof a recording, by a curve fitted to the other datasets (stated confidence taken as it is | curve)")
     for s in leave_one_out(errors):
         click.echo(
-            f"  {s.recording:20} within {s.within:.2f}; Brier {s.brier_stated:.3f} | {s.brier_curve:.3f}; "
+            f"  {s.recording:44} within {s.within:.2f}; Brier {s.brier_stated:.3f} | {s.brier_curve:.3f}; "
             f"too sure by {s.gap_stated:+.2f} | {s.gap_curve:+.2f}"
         )
     save_curve(curve, out)

@@ -20,9 +20,11 @@ _FILE = click.Path(path_type=Path, readable=False)
     type=_FILE,
     metavar="FILE",
     help="True points, once for each of KEYPOINTS, in their order: truth.npz of pbl synth, bodies of a marker mocap "
-    "(.json.gz), or markers of several cameras (.trc, with --calibration).",
+    "(.json.gz), or markers of several cameras (.trc). Where the camera stood is found from the points.",
 )
-@click.option("--calibration", type=_FILE, metavar="FILE", help="Of the cameras of .trc files (Pose2Sim's TOML).")
+@click.option(
+    "--calibration", type=_FILE, metavar="FILE", help="Take the poses of the cameras of .trc files from there."
+)
 @click.option(
     "--camera",
     "cameras",
@@ -85,12 +87,12 @@ def reliability(
 
 
 def _cameras(truths: Sequence[Path], calibration: Path | None, cameras: Sequence[str]) -> Sequence[str]:
-    """The cameras of the .trc files. Raises `click.UsageError` where they are not said."""
+    """The camera of each .trc file, "" where it is to be found. Raises `click.UsageError` where they do not belong."""
     n = sum(t.suffix == ".trc" for t in truths)
-    if n and (calibration is None or len(cameras) != n):
-        raise click.UsageError(f"{n} .trc files: name their --calibration, and --camera once for each")
-    if not n and (calibration is not None or cameras):
-        raise click.UsageError("--calibration and --camera go with .trc files")
+    if calibration is None and not cameras:
+        return [""] * n
+    if calibration is None or len(cameras) != n or not n:
+        raise click.UsageError(f"--calibration and --camera go together: --camera once for each .trc file, here {n}")
     return cameras
 
 
@@ -104,7 +106,8 @@ def _truth(keypoints, file: Path, calibration: Path | None, camera: str):
         return truth_of_synthetic(keypoints, Truth.load(file))
     if file.suffix != ".trc":
         return truth_of_bodies(keypoints, file)
-    assert calibration is not None
+    if calibration is None:
+        return truth_of_trc(keypoints, file)
     poses = load_camera_poses(calibration)
     if camera not in poses:
         raise PblError(
