@@ -64,8 +64,8 @@ class PointErrors:
 
     @property
     def title(self) -> str:
-        """Dataset and recording."""
-        return f"{self.dataset}, {self.recording}"
+        """Dataset and recording, once where the one names the other."""
+        return self.dataset if self.recording in self.dataset else f"{self.dataset}, {self.recording}"
 
 
 def point_errors(keypoints: Keypoints, truth: PointTruth, detector: str, dataset: str, recording: str) -> PointErrors:

@@ -42,7 +42,7 @@ def truth_of(name: str, keypoints: Keypoints, data: Path) -> tuple[PointTruth, s
     """The truth of one of `recordings`, and the dataset it belongs to: one movement of one person."""
     if name in MOCAP_CLIPS:
         folder = data / "real" / "video_mocap" / name
-        return truth_of_bodies(keypoints, folder / "sample_mocap.json.gz"), f"phone clip beside marker mocap ({name})"
+        return truth_of_bodies(keypoints, folder / "sample_mocap.json.gz"), f"phone clip with marker mocap, {name}"
     folder = data / "real" / "multiview"
     camera = list(load_camera_poses(folder / _CALIBRATION))[CAMERAS.index(name)]
     lens = load_camera(folder / _CALIBRATION, _CALIBRATED_SIZE_PX, camera)
