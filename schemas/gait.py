@@ -175,8 +175,8 @@ class GaitCycle(dj.Computed):
         cycle_stride_length=null : float32     # (m) over the floor
         cycle_step_length=null   : float32     # (m) of the step that ends the cycle
         cycle_step_width=null    : float32     # (m) null unless the metres were measured
-        cycle_lengths_metric     : bool        # false: as large as the detector takes the person to be
-        cycle_lengths_missing    : varchar(150)  # why there are no lengths
+        cycle_lengths_metric=null : bool       # false: as large as the detector takes the person to be
+        cycle_lengths_missing='' : varchar(150)  # why there are no lengths
         """
 
     def make_fetch(self, key: dict) -> tuple:

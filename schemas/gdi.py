@@ -55,11 +55,11 @@ class NormativeSet(dj.Lookup):
     norm_source         : varchar(1000)        # who measured whom, and where it is published
     norm_convention     : varchar(1000)        # how its angles are defined
     norm_licence        : varchar(500)
-    norm_angle_model    : varchar(32)          # how pelvis and hip are defined: plug_in_gait or pbl_body
-    norm_components     : int16                # components of the index
+    norm_angle_model='plug_in_gait' : varchar(32)  # how pelvis and hip are defined: plug_in_gait or pbl_body
+    norm_components=null : int16               # components of the index
     norm_file=null      : <object@arrays>      # JSON of the whole set; null for one that ships with the code
     norm_query=null     : json                 # whose cycles it was built from; null for one that ships
-    norm_created        : datetime             # when registered, UTC
+    norm_created=null   : datetime             # when registered, UTC
     unique index (norm_sha256)
     """
 
