@@ -21,7 +21,7 @@ from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import WARN, Check
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
 from pbl_pipeline.report import Picture, SessionReport, TrialReport, write_report
-from pbl_pipeline.tracking import SubjectChoice, choose_subject, require_subject, track_people
+from pbl_pipeline.tracking import SubjectChoice, TrackingParams, choose_subject, require_subject, track_people
 from pbl_pipeline.video import VideoInfo, attitude_of, check_timing, find_camera, probe, read_phone_log, sha256_of
 
 #: What `write_results` writes for each trial, after the trial's name and a dot.
@@ -83,9 +83,10 @@ def detect_trial(
     camera_file: Path | None = None,
     person: int | None = None,
     keypoints: Paramset | None = None,
+    people: Paramset | None = None,
 ) -> Trial:
     """Video to keypoints of the subject. `sheet` is the picture of the people that is written when one must be chosen.
-    `keypoints` is the method (`keypoints.find_method`), None the default.
+    `keypoints` and `people` are the methods (`find_method` of keypoints and tracking), None the default.
 
     Raises
     ------
@@ -95,7 +96,7 @@ def detect_trial(
     """
     info = probe(path)
     camera = find_camera(info, camera_file)
-    tracking = track_people(path, info=info)
+    tracking = track_people(path, people.to(TrackingParams) if people is not None else None, info=info)
     choice = choose_subject(tracking, override=person)
     subject = require_subject(choice, tracking, path, sheet)
     params = params_of(keypoints) if keypoints is not None else None
@@ -112,6 +113,7 @@ def run_session(
     norm: str | None = None,
     attitude_files: Sequence[Path] = (),
     keypoints: Paramset | None = None,
+    people: Paramset | None = None,
 ) -> Session:
     """Videos of one session to gait measures. A video that fails is left out with its problem, and so is one whose
     bytes were named before, because its steps would count twice; the others go on. Into `out` goes only a picture of
@@ -137,7 +139,7 @@ def run_session(
             if first != name:
                 raise _named_twice(path, first)
             trial = dataclasses.replace(
-                detect_trial(path, out / f"{name}.persons.png", camera_file, person, keypoints), name=name
+                detect_trial(path, out / f"{name}.persons.png", camera_file, person, keypoints, people), name=name
             )
             if log is not None:
                 attitude = attitude_of(log[1], log[0], trial.video)

@@ -243,6 +243,20 @@ def resolve_method(table: Any, prefix: str, name: str) -> str:
     )
 
 
+def method_of_model(table: Any, prefix: str, found: Paramset) -> str:
+    """Key of the method of a registered model, which becomes one when it is first asked for. Other parameters (another
+    graph or `model.json`) under the same name are its next version."""
+    rows = (table & {f"{prefix}_method_name": found.name}).to_dicts(order_by=f"{prefix}_method_version")
+    versions = [row[f"{prefix}_method_version"] for row in rows]
+    for version in versions:
+        known = dataclasses.replace(found, version=version)
+        if table & {f"{prefix}_method_sha": known.hash}:
+            return method_key(known)
+    new = dataclasses.replace(found, version=max(versions, default=0) + 1)
+    insert_methods(table, prefix, {new.name: new})
+    return method_key(new)
+
+
 def method_arguments(table: Any, prefix: str, stage: str, method: str) -> dict[str, Any]:
     """A method row as the arguments of `rebuild_params`: what `make_fetch` hands on."""
     row = (table & {f"{prefix}_method": method}).fetch1()

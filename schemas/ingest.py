@@ -148,7 +148,7 @@ def resolve(methods: Methods) -> dict[str, str]:
     names = library("tracking"), library("keypoints"), library("fit"), library("gait")
     tracks, points, fits, gaits = names
     return {
-        "tracking_method": resolve_method(tracking.TrackingMethod, "tracking", methods.tracking or tracks.DEFAULT),
+        "tracking_method": tracking.method_of(methods.tracking or tracks.DEFAULT),
         "subject_method": resolve_method(tracking.SubjectMethod, "subject", methods.subject or tracks.SUBJECT_DEFAULT),
         "keypoint_method": keypoints.method_of(methods.keypoint or points.DEFAULT),
         "fit_method": resolve_method(fit.FitMethod, "fit", methods.fit or fits.DEFAULT),

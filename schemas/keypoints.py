@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,11 +16,10 @@ from ._base import (
     computes,
     dj,
     file_ref,
-    insert_methods,
     library,
     method_arguments,
     method_columns,
-    method_key,
+    method_of_model,
     new_folder,
     number,
     origin_columns,
@@ -172,16 +170,7 @@ def method_of(name: str) -> str:
     """
     if name in library("keypoints").PARAMSETS or not library("models").is_registered(name):
         return resolve_method(KeypointMethod, "keypoint", name)
-    rows = (KeypointMethod & {"keypoint_method_name": name}).to_dicts(order_by="keypoint_method_version")
-    versions = [row["keypoint_method_version"] for row in rows]
-    found = library("keypoints").method_of_model(name)
-    for version in versions:
-        known = dataclasses.replace(found, version=version)
-        if KeypointMethod & {"keypoint_method_sha": known.hash}:
-            return method_key(known)
-    new = dataclasses.replace(found, version=max(versions, default=0) + 1)
-    insert_methods(KeypointMethod, "keypoint", {name: new})
-    return method_key(new)
+    return method_of_model(KeypointMethod, "keypoint", library("keypoints").method_of_model(name))
 
 
 def camera_of_row(row: Mapping[str, Any]) -> Any:

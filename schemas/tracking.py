@@ -20,10 +20,12 @@ from ._base import (
     library,
     method_arguments,
     method_columns,
+    method_of_model,
     new_folder,
     number,
     origin_columns,
     rebuild_params,
+    resolve_method,
     stored_file,
     utc_now,
 )
@@ -203,6 +205,17 @@ class SubjectChoice(dj.Computed):
                     **origin.row("choice", method_hash=sha),
                 }
             )
+
+
+def method_of(name: str) -> str:
+    """Key of the tracking method of that name (`resolve_method`), or of the registered person detector of that name,
+    which becomes a method when it is first asked for (`method_of_model`).
+
+    Raises `PblError` SOLVER_UNKNOWN, MODEL_INVALID.
+    """
+    if name in library("tracking").PARAMSETS or not library("models").is_registered(name):
+        return resolve_method(TrackingMethod, "tracking", name)
+    return method_of_model(TrackingMethod, "tracking", library("tracking").method_of_detector(name))
 
 
 # ---------------------------------------------------------------------------------------------- override and effects

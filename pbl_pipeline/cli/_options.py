@@ -32,6 +32,25 @@ DEVICE = click.option(
 )
 
 
+PEOPLE = click.option(
+    "--people", "people", metavar="NAME", help="Tracking method: blazepose-tiles, or a detector of `pbl models list`."
+)
+
+
+def tracking_method(name: str | None) -> Paramset:
+    """The tracking method of `--people`, with its model's licence on the terminal before it is used.
+
+    Raises `PblError` SOLVER_UNKNOWN, MODEL_INVALID.
+    """
+    from pbl_pipeline.models import find, load_spec
+    from pbl_pipeline.tracking import find_method
+
+    method = find_method(name)
+    if model := method.params["model"]:
+        click.echo(f"people by the model {model}, licence: {load_spec(find(model)).licence}")
+    return method
+
+
 def keypoint_method(name: str | None, device: str | None) -> Paramset:
     """The keypoint method of `--keypoints`, with its model's licence on the terminal before it is used; ONNX models of
     this process run on `--device`.

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ._options import DEVICE, KEYPOINTS, Person, keypoint_method
+from ._options import DEVICE, KEYPOINTS, PEOPLE, Person, keypoint_method, tracking_method
 
 
 @click.command(epilog="Example: pbl detect walk.mp4 --out walk.keypoints.npz --person auto")
@@ -15,6 +15,7 @@ from ._options import DEVICE, KEYPOINTS, Person, keypoint_method
 @click.option("--camera", type=click.Path(path_type=Path), help="Calibration file; without it a phone is guessed.")
 @click.option("--attitude", type=click.Path(path_type=Path), help="Sensor log of the phone (docs/phone_capture.md).")
 @click.option("--person", type=Person(), default="auto", show_default=True, help="Whom to measure.")
+@PEOPLE
 @KEYPOINTS
 @DEVICE
 def detect(
@@ -23,6 +24,7 @@ def detect(
     camera: Path | None,
     attitude: Path | None,
     person: int | None,
+    people: str | None,
     keypoints: str | None,
     device: str | None,
 ) -> None:
@@ -34,7 +36,7 @@ def detect(
     """
     from pbl_pipeline.files import check_out_file
     from pbl_pipeline.keypoints import check_keypoints, confidence_text, detect_keypoints, params_of, visibility
-    from pbl_pipeline.tracking import choose_subject, require_subject, time_in_view_s, track_people
+    from pbl_pipeline.tracking import TrackingParams, choose_subject, require_subject, time_in_view_s, track_people
     from pbl_pipeline.video import check_timing, find_camera, load_attitude, probe
 
     if out.suffix != ".npz":
@@ -43,8 +45,8 @@ def detect(
     lens = find_camera(info, camera)
     check_out_file(out)
     log = load_attitude(attitude, info) if attitude else None
-    method = keypoint_method(keypoints, device)
-    tracking = track_people(video, info=info)
+    method, finder = keypoint_method(keypoints, device), tracking_method(people)
+    tracking = track_people(video, finder.to(TrackingParams), info=info)
     choice = choose_subject(tracking, override=person)
     for p in tracking.persons:
         seconds = time_in_view_s(p, tracking.time_s)

@@ -7,7 +7,17 @@ from pathlib import Path
 
 import click
 
-from ._options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, DEVICE, KEYPOINTS, Person, fit_paramset, keypoint_method
+from ._options import (
+    CAMERA_MOTION_HELP,
+    CAMERA_MOTIONS,
+    DEVICE,
+    KEYPOINTS,
+    PEOPLE,
+    Person,
+    fit_paramset,
+    keypoint_method,
+    tracking_method,
+)
 
 
 @click.command(epilog="Example: pbl run walk1.mp4 walk2.mp4 --out results --camera phone.toml")
@@ -22,6 +32,7 @@ from ._options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, DEVICE, KEYPOINTS, Per
 )
 @click.option("--camera-motion", type=click.Choice(CAMERA_MOTIONS), help=CAMERA_MOTION_HELP)
 @click.option("--person", type=Person(), default="auto", show_default=True, help="Whom to measure, of one video.")
+@PEOPLE
 @KEYPOINTS
 @DEVICE
 @click.option("--solver", help="gauss-newton or implicit-adam; without it the solver of the paramset.")
@@ -35,6 +46,7 @@ def run(
     attitude: tuple[Path, ...],
     camera_motion: str | None,
     person: int | None,
+    people: str | None,
     keypoints: str | None,
     device: str | None,
     solver: str | None,
@@ -69,9 +81,9 @@ def run(
             next_step="name a log for each video; run videos without a log in another call",
         )
     check_out_folder(out)
-    method = keypoint_method(keypoints, device)
+    method, finder = keypoint_method(keypoints, device), tracking_method(people)
     paramset = fit_paramset(solver, params, default=fit_default(method))
-    session = run_session(videos, out, camera, person, paramset, camera_motion, norm, attitude, method)
+    session = run_session(videos, out, camera, person, paramset, camera_motion, norm, attitude, method, finder)
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
     paths = write_results(out, session, subject_code=subject, date=f"computed {today}")
     click.echo(session.judged.table())

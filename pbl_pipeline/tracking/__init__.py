@@ -4,10 +4,11 @@ from ._appearance import likeness, look_of
 from ._associate import AssociationParams
 from ._blazepose import BlazePoseDetector
 from ._join import JoinParams
+from ._methods import find_method, method_of_detector
 from ._require import require_subject
 from ._sheet import contact_sheet, contact_sheet_jpeg, save_contact_sheet
 from ._subject import SUBJECT_DEFAULT, SUBJECT_PARAMSETS, SubjectParams, choose_subject, time_in_view_s
-from ._track import DEFAULT, DETECTORS, PARAMSETS, TrackingParams, method_of_detector, track_people
+from ._track import DEFAULT, DETECTORS, PARAMSETS, TrackingParams, track_people
 from ._types import Detection, PersonDetector, PersonTrack, SubjectChoice, Tracking
 from ._uncross import UncrossParams
 from ._watch import WatchParams
@@ -35,6 +36,7 @@ __all__ = [
     "choose_subject",
     "contact_sheet",
     "contact_sheet_jpeg",
+    "find_method",
     "likeness",
     "look_of",
     "method_of_detector",

@@ -92,13 +92,14 @@ def merge(found: list[tuple[float, Detection]], min_iou: float = 0.4, min_cover:
 
 
 def _cut(box: np.ndarray, window: Window, size: tuple[int, int]) -> bool:
-    """Whether a bare box ends at an edge of its window that is no edge of the picture: the person goes on beyond it.
+    """Whether a bare box reaches an edge of its window that is no edge of the picture: the person goes on beyond it.
 
     Body circles need no such rule: they reach beyond the window, and `detect_in` trusts them the less.
     """
     near = CUT_SHARE * (window[2] - window[0])
     inner = np.array([window[0] > 0, window[1] > 0, window[2] < size[0], window[3] < size[1]])
-    return bool((inner & (np.abs(box - np.array(window)) < near)).any())
+    beyond = np.array([1, 1, -1, -1]) * (box - np.array(window)) < near
+    return bool((inner & beyond).any())
 
 
 def _cover(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from pbl_pipeline import assets, progress
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.models import OnnxModel, find, load_spec
+from pbl_pipeline.models import OnnxModel, find
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.video import VideoInfo, probe, read_frames
 
@@ -85,32 +85,6 @@ def _yolox(params: TrackingParams) -> PersonDetector:
 
 #: Detectors by the name that `TrackingParams.detector` uses. Another detector joins here.
 DETECTORS: dict[str, Callable[[TrackingParams], PersonDetector]] = {"blazepose": _blazepose, "yolox": _yolox}
-
-
-def method_of_detector(name: str, version: int = 1) -> Paramset:
-    """The tracking method of a registered person detector (YOLOX), under its own name.
-
-    Raises `PblError` MODEL_MISSING, and MODEL_INVALID for a model of another kind.
-    """
-    spec = load_spec(find(name))
-    if spec.kind != "person_detector":
-        raise PblError(
-            "MODEL_INVALID",
-            found=f"a model of the kind {spec.kind}",
-            expected="kind person_detector",
-            next_step="name a person detector (`pbl models list`)",
-            key=name,
-        )
-    params = TrackingParams(
-        detector="yolox",
-        model=name,
-        model_sha256=spec.sha256,
-        spec_sha256=spec.spec_sha256,
-        # Its scores are lower than BlazePose's: 0.7 to 0.85 in the median over people in seven recordings.
-        min_score=0.3,
-        association=AssociationParams(sure_score=0.5),
-    )
-    return Paramset.of("tracking", name, version, params)
 
 
 def track_people(
