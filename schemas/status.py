@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from . import computed_tables, tracking, video, worker
-from ._base import error_code, error_found, error_next_step
+from . import computed_tables, keypoints, tracking, video, worker
+from ._base import dj, error_code, error_found, error_next_step
 
 #: Fewer videos than this, and keys are counted that nobody has queued yet.
 SMALL = 5000
@@ -89,6 +89,8 @@ class Status:
     waiting: list[Waiting]
     workers: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     exact: bool = True
+    #: How the focal length was had (file, measured, metadata, preset, guess) -> keypoints with it.
+    cameras: dict[str, int] = dataclasses.field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -129,7 +131,14 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
             )
         )
         errors += _errors(table, most) if counts["error"] else []
-    return Status(n_videos, tables, errors, _empty(most), _waiting(most), live_workers(), exact)
+    return Status(n_videos, tables, errors, _empty(most), _waiting(most), live_workers(), exact, camera_kinds())
+
+
+def camera_kinds() -> dict[str, int]:
+    """Where the intrinsics of the keypoints come from (first word of `camera_source`), and of how many."""
+    kinds = keypoints.Keypoints.proj(camera_kind="substring_index(camera_source, ':', 1)")
+    rows = dj.U("camera_kind").aggr(kinds, n_cameras="count(*)").to_dicts(order_by="n_cameras DESC")
+    return {row["camera_kind"]: int(row["n_cameras"]) for row in rows}
 
 
 def queue_counts(connection: Any) -> dict[str, dict[str, int]]:

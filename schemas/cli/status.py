@@ -48,6 +48,9 @@ def lines(state: Status) -> list[str]:
     if not state.exact:
         out.append("pending: what is queued; `--exact` also counts what no worker has queued yet")
     out += [f"{t.table} waits: {t.delayed}" for t in state.tables if t.delayed]
+    if state.cameras:
+        kinds = ", ".join(f"{n} {kind}" for kind, n in state.cameras.items())
+        out.append(f"intrinsics of the keypoints: {kinds} (file and measured are calibrations; docs/camera.md)")
     for w in state.workers:
         doing = w["worker_doing"] or "-"
         out.append(f"worker {w['worker_host']}:{w['worker_pid']} ({w['worker_resource']}): {doing}")
