@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import re
@@ -338,6 +339,26 @@ def test_odd_tags_of_a_file_are_cut_not_an_error(tables: None, tmp_path: Path, m
 def test_one_persons_number_for_several_videos_is_refused(tables: None, tmp_path: Path):
     with pytest.raises(PblError, match="USAGE"):
         ingest([tmp_path / "a.mp4", tmp_path / "b.mp4"], Visit("P001", person=2))
+
+
+def test_a_registered_person_detector_becomes_a_method(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Its parameters freeze the hashes of graph and spec; another spec under its name is another version."""
+    monkeypatch.setenv("PBL_MODELS", str(tmp_path / "models"))
+    folder = tmp_path / "models" / "crowd"
+    folder.mkdir(parents=True)
+    entry = {"name": "images", "width": 416, "height": 416, "layout": "NCHW", "mean": [0, 0, 0], "std": [1, 1, 1]}
+    spec = {"name": "crowd", "kind": "person_detector", "sha256": "1" * 64, "licence": "MIT", "source": "a lab"}
+    spec |= {"input": {**entry, "colour": "BGR"}, "outputs": {"boxes": "rows"}}
+    (folder / "model.json").write_text(json.dumps(spec))
+    assert tracking.method_of("crowd") == tracking.method_of("crowd") == "crowd-v1"
+    (folder / "model.json").write_text(json.dumps(spec | {"input": {**entry, "colour": "RGB"}}))
+    assert tracking.method_of("crowd") == "crowd-v2"
+    path = chain.small_video(tmp_path, "walk")
+    (row,) = ingest([path], Visit("P001"), Methods(tracking="crowd"))
+    assert (tracking.TrackingSelection & {"video_id": row.video_id}).fetch1("tracking_method") == "crowd-v2"
+    populate(["VideoInfo", "Tracking"])
+    assert len(tracking.Tracking & {"video_id": row.video_id, "tracking_method": "crowd-v2"}) == 1
+    assert tracking.method_of("blazepose-tiles") == "blazepose-tiles-v2"
 
 
 def test_unknown_methods_are_refused_with_the_names_there_are(tables: None, tmp_path: Path):

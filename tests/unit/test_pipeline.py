@@ -26,7 +26,7 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """Names of the trials of each fit; detection and fit are stand-ins."""
     calls: list[list[str]] = []
 
-    def detect(path, sheet, camera_file=None, person=None):
+    def detect(path, sheet, camera_file=None, person=None, keypoints=None, people=None):
         info = pipeline.probe(path)
         points = chain.detect_keypoints(path, chain.track_people(path), 1, pipeline.find_camera(info))
         points = dataclasses.replace(points, image_size_px=(1920, 1080))
