@@ -258,7 +258,7 @@ def _check_phone(trial: Keypoints, name: str, used: np.ndarray) -> None:
             "PHONE_LOG",
             found=f"trial {name}: orientation from {trial.phone_time_s[0]:.2f} to {trial.phone_time_s[-1]:.2f} s",
             expected=f"the time in which the person is in view, {first:.2f} to {last:.2f} s of the video",
-            next_step="pass the log of this video, on its clock (docs/files.md), or leave it out",
+            next_step="pass the log of this video, on its clock (docs/phone_capture.md), or leave it out",
             key=name,
         )
 
