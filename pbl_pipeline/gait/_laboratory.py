@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import gzip
 import io
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +97,9 @@ def _read(path: Path) -> tuple[np.ndarray, list[str], np.ndarray, Any]:
         for key in ("POINT:LABELS", "POINT:LABELS2", "POINT:LABELS3"):
             if (values := reader.get(key)) is not None:
                 names += [str(s).strip() for s in np.ravel(values.string_array)]
-        rows = np.array([points for _, points, _ in reader.read_frames()], float)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # a file without analog channels is none of our concern
+            rows = np.array([points for _, points, _ in reader.read_frames()], float)
         rate = float(reader.point_rate)
     # The package raises whatever it stumbles over.
     except Exception as error:

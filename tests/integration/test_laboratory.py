@@ -1,0 +1,194 @@
+"""Laboratory recordings (C3D) through cycles, measures and the original index."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from pbl_pipeline.cli.gait import gait as command
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.gait import (
+    NINE_ANGLES,
+    PLUG_IN_GAIT,
+    PLUG_IN_GAIT_POINTS,
+    GaitEvents,
+    gait_metrics,
+    load_norm,
+    read_lab_trial,
+)
+from pbl_pipeline.gait.normative import gait_norm
+from tests.benchmarks.gdi import children
+
+MARKERS = ("LASI", "RASI", "LHEE", "RHEE", "LTOE", "RTOE")
+
+
+def write_c3d(path: Path, angles: np.ndarray, names: list[str], rate: float = 100.0) -> Path:
+    """A C3D file with points (T, P, 3) and no events."""
+    import c3d
+
+    writer = c3d.Writer(point_rate=rate, analog_rate=rate)
+    writer.set_point_labels(names)
+    for frame in angles:
+        points = np.zeros((len(names), 5))
+        points[:, :3] = frame
+        writer.add_frames([(points, np.zeros((0, 1)))])
+    with path.open("wb") as f:
+        writer.write(f)
+    return path
+
+
+@pytest.fixture(scope="module")
+def walk(shared_data) -> Path:
+    return shared_data / "real" / "gait_lab_c3d" / "Straight_HC038A11.c3d.gz"
+
+
+def test_angles_are_those_of_the_laboratory(walk):
+    trial = read_lab_trial(walk)
+    assert trial.name == "Straight_HC038A11"
+    assert trial.series.angle_model == PLUG_IN_GAIT
+    assert (trial.events.method, len(trial.events.events)) == ("labels", 10)
+    # The first frame is 270 at 100 Hz; frame 1 is at 0 s.
+    assert trial.series.time_s[[0, -1]] == pytest.approx([2.69, 5.14])
+    assert trial.events.times("left", "foot_down") == pytest.approx([2.81, 3.87, 4.93], abs=0.005)
+    assert set(trial.series.left) == set(NINE_ANGLES)
+
+
+def test_the_mean_curves_have_the_shape_and_signs_of_the_norm(shared_data):
+    """Eleven children against the 166 controls: a sign or a side exchanged would turn a correlation."""
+    cycles = [c for _, metrics in children(shared_data) for t in metrics.trials for c in t.cycles]
+    assert len(cycles) == 25
+    norm = load_norm("gillette-166-nine-angles")
+    for angle in NINE_ANGLES:
+        mean = np.mean([c.curves[angle] for c in cycles], axis=0)
+        normal = norm.curves[angle]["mean_deg"]
+        assert abs(mean.mean() - normal.mean()) < 3.5, angle
+        if angle != "hip_rotation":  # its shape differs between laboratories
+            assert np.corrcoef(mean, normal)[0, 1] > 0.9, angle
+
+
+def test_healthy_children_are_within_the_norm(shared_data):
+    means = [m.gdi.mean for _, m in children(shared_data) if m.gdi.mean is not None]
+    assert len(means) == 11
+    assert np.mean(means) == pytest.approx(100.2, abs=0.1)
+    assert np.std(means, ddof=1) == pytest.approx(7.3, abs=0.1)
+
+
+def test_measures_of_a_child(walk):
+    metrics = gait_metrics([read_lab_trial(walk)], model="gillette-2008")
+    values = metrics.spatiotemporal
+    assert values.n_cycles_used == values.n_cycles_found == 3
+    stride, speed, width = (values[k] for k in ("stride_length_m", "speed_m_per_s", "step_width_m"))
+    assert stride is not None
+    assert speed is not None
+    assert width is not None
+    # The pelvis' way by its markers is another measurement of the same speed.
+    feet = read_lab_trial(walk).feet
+    assert feet is not None
+    way = np.linalg.norm(np.diff(feet.pelvis_m[[0, -1], :2], axis=0)) / (feet.time_s[-1] - feet.time_s[0])
+    assert speed.mean == pytest.approx(way, rel=0.03)
+    assert 0.03 < width.mean < 0.2
+    assert {c.check: c.outcome for c in metrics.qc}["norm_convention"] == "PASS"
+    assert {c.check: c.outcome for c in metrics.qc}["lengths_scale"] == "PASS"
+
+
+def test_the_command(walk, tmp_path):
+    out = tmp_path / "metrics.json"
+    run = CliRunner().invoke(command, [str(walk), "--out", str(out)])
+    assert run.exit_code == 0, run.output
+    assert "GDI of nine angles" in run.output
+    session = json.loads(out.read_text())["session"]
+    assert session["gdi"]["norm"] == "gillette-166-nine-angles"
+    assert session["profile_deg"]["gps"] > 0
+    assert session["step_time_s"]["asymmetry_percent"] is not None
+    with pytest.raises(PblError, match="NORM_INVALID"):
+        CliRunner().invoke(
+            command, [str(walk), "--out", str(out), "--norm", "gillette-166-three-angles"], catch_exceptions=False
+        )
+
+
+def test_events_may_be_given(walk, tmp_path):
+    trial = read_lab_trial(walk)
+    shifted = [e for e in trial.events.events if e.time_s > 3.2]
+    events = GaitEvents("PASS", tuple(shifted), "", "x", "", "y")
+    events.save(tmp_path / "events.csv")
+    again = read_lab_trial(walk, tmp_path / "events.csv")
+    assert (again.events.method, len(again.events.events)) == ("given", len(shifted))
+
+
+def normal_walk(n: int = 300, factor: float = 1.0) -> tuple[np.ndarray, list[str]]:
+    """Points (T, P, 3) of normal angles over three cycles, no markers."""
+    phase = 2 * np.pi * np.arange(n) / 100.0
+    names, values = [], []
+    for point in dict.fromkeys(p for p, _ in PLUG_IN_GAIT_POINTS.values()):
+        for k, side in enumerate("LR"):
+            names.append(side + point)
+            xyz = np.zeros((n, 3))
+            for angle, (of, component) in PLUG_IN_GAIT_POINTS.items():
+                if of == point:
+                    xyz[:, component] = gait_norm().curve(angle, phase + k * np.pi, 0.43)
+            values.append(xyz * factor)
+    return np.stack(values, axis=1), names
+
+
+def test_a_file_of_ones_own(tmp_path):
+    points, names = normal_walk()
+    path = write_c3d(tmp_path / "own.c3d", points, names)
+    rows = [f"{t:.2f},{side},{event},1.0" for t, side, event in _events()]
+    (tmp_path / "events.csv").write_text("\n".join(["time_s,side,event,probability", *rows]) + "\n")
+    trial = read_lab_trial(path, tmp_path / "events.csv")
+    metrics = gait_metrics([trial])
+    knee = next(c for c in metrics.trials[0].cycles if c.side == "left").curves["knee_flexion"]
+    np.testing.assert_allclose(
+        knee, gait_norm().curve("knee_flexion", 2 * np.pi * np.linspace(0, 1, 51), 0.43), atol=0.1
+    )
+    speed = metrics.spatiotemporal["speed_m_per_s"]
+    assert speed is None
+    assert "positions" in metrics.spatiotemporal.reasons["speed_m_per_s"]
+    with pytest.raises(PblError, match="GAIT_INPUT"):
+        read_lab_trial(path)
+
+
+def _events() -> list[tuple[float, str, str]]:
+    out = []
+    for k in range(3):
+        out += [(k, "left", "foot_down"), (k + 0.1, "right", "foot_up")]
+        out += [(k + 0.5, "right", "foot_down"), (k + 0.6, "left", "foot_up")]
+    return [e for e in out if e[0] < 2.99]
+
+
+def test_bad_files(tmp_path, walk):
+    points, names = normal_walk(factor=np.pi / 180)
+    with pytest.raises(PblError, match="ANGLE_UNITS"):
+        read_lab_trial(write_c3d(tmp_path / "rad.c3d", points, names))
+    points, names = normal_walk()
+    with pytest.raises(PblError, match="FILE_FORMAT") as caught:
+        read_lab_trial(write_c3d(tmp_path / "few.c3d", points[:, 2:], names[2:]))
+    assert "LPelvisAngles" in caught.value.found
+    (tmp_path / "text.c3d").write_text("no C3D file at all")
+    with pytest.raises(PblError, match="FILE_FORMAT"):
+        read_lab_trial(tmp_path / "text.c3d")
+    (tmp_path / "cut.c3d").write_bytes(gzip.decompress(walk.read_bytes())[:3000])
+    with pytest.raises(PblError, match="FILE_FORMAT"):
+        read_lab_trial(tmp_path / "cut.c3d")
+    with pytest.raises(PblError, match="FILE_MISSING"):
+        read_lab_trial(tmp_path / "absent.c3d")
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (["a.c3d", "b.fit.npz"], "USAGE"),
+        (["a.fit.npz", "--events", "e.csv"], "USAGE"),
+        (["a.c3d", "b.c3d", "--events", "e.csv"], "USAGE"),
+        (["a.c3d", "--index", "gdi"], "SOLVER_UNKNOWN"),
+    ],
+)
+def test_wrong_calls(tmp_path, words, code):
+    with pytest.raises(PblError) as caught:
+        CliRunner().invoke(command, [*words, "--out", str(tmp_path / "m.json")], catch_exceptions=False)
+    assert caught.value.code == code
