@@ -72,9 +72,10 @@ def fit_default(keypoints: Paramset) -> str | None:
     """Name of the fit's paramset where nobody names one: `gauss-newton`, tuned for MeTRAbs' 87 points, for a registered
     model of these; None, the project's default, for all else."""
     params = params_of(keypoints)
-    if isinstance(params, ModelKeypointParams) and load_spec(find(params.model.name)).marker_set == "bml_movi_87":
-        return "gauss-newton"
-    return None
+    if not isinstance(params, ModelKeypointParams):
+        return None
+    spec = load_spec(find(params.model.name))
+    return "gauss-newton" if (spec.kind, spec.marker_set) == ("crop3d", "bml_movi_87") else None
 
 
 def detect_trial(
