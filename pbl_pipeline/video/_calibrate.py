@@ -124,7 +124,8 @@ def calibrate_video(path: str | Path, board: Board, info: VideoInfo | None = Non
 
 def sharpest_frames(path: str | Path, info: VideoInfo) -> list[int]:
     """Numbers of the frames with the strongest edges, one of each part of the video."""
-    n_parts = int(np.clip(info.duration_s / SHORTEST_PART_S, 1, MOST_CANDIDATES))
+    # A single picture has no length.
+    n_parts = int(np.clip(np.nan_to_num(info.duration_s) / SHORTEST_PART_S, 1, MOST_CANDIDATES))
     part = np.minimum((np.arange(info.n_frames) * n_parts) // max(info.n_frames, 1), n_parts - 1)
     best: dict[int, tuple[float, int]] = {}
     for frame in progress.track(read_frames(path), "sharpness", total=info.n_frames):

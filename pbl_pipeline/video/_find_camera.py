@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ._camera import guess_camera, load_camera
-from ._presets import preset_camera
+from ._presets import PRESET_REL_SD, preset_camera
 from ._types import Camera, VideoInfo
 
 #: 35 mm film: width and diagonal of its frame (mm).
@@ -40,6 +40,8 @@ def metadata_camera(video: VideoInfo) -> Camera | None:
 
     Two readings of such figures are in use: as long as a lens that gives the same view along the diagonal (CIPA
     DCG-001), or along the longer side. In a picture of 16:9 the second is 5 % longer; their geometric mean is taken.
+    The distortion is that of the phone's published calibration, where it has one whose focal length agrees: then it is
+    the same lens, not zoomed. Else it is zero.
     """
     if video.focal_35mm is None or not 5 <= video.focal_35mm <= 500:
         return None
@@ -48,8 +50,11 @@ def metadata_camera(video: VideoInfo) -> Camera | None:
     focal = math.sqrt(along * across)
     matrix = np.array([[focal, 0, (video.width_px - 1) / 2], [0, focal, (video.height_px - 1) / 2], [0, 0, 1]])
     camera = video.lens or " ".join(t for t in (video.make, video.model) if t)
+    known = preset_camera(video)
+    same = known is not None and abs(focal / known.focal_px - 1) <= 2 * math.hypot(METADATA_REL_SD, PRESET_REL_SD)
+    distortion = known.distortion if known is not None and same else np.zeros(5)
     source = (
         f"metadata: {video.focal_35mm:g} mm on 35 mm film{f', {camera[:80]}' if camera else ''} (focal length "
-        f"{focal:.0f} px +- {100 * METADATA_REL_SD:.0f} %, no distortion)"
+        f"{focal:.0f} px +- {100 * METADATA_REL_SD:.0f} %, {'distortion of that model' if same else 'no distortion'})"
     )
-    return Camera(matrix, np.zeros(5), source, METADATA_REL_SD)
+    return Camera(matrix, distortion, source, METADATA_REL_SD)

@@ -163,8 +163,15 @@ def test_focal_length_from_film():
 
 
 def test_film_and_published_calibration_agree_on_one_phone():
-    film, known = find_camera(video(focal_35mm=27.0)), find_camera(video(model="iPhone 13"))
+    film, known = find_camera(video(model="iPhone 13", focal_35mm=27.0)), find_camera(video(model="iPhone 13"))
     assert film.focal_px == pytest.approx(known.focal_px, rel=film.focal_rel_sd)
+    np.testing.assert_array_equal(film.distortion, known.distortion)
+    assert "distortion of that model" in film.source
+    # Zoomed, or another lens of that phone: nothing is known of its distortion.
+    for other in (13.0, 54.0):
+        camera = find_camera(video(model="iPhone 13", focal_35mm=other))
+        assert not camera.distortion.any()
+        assert "no distortion" in camera.source
 
 
 def test_presets_are_those_published(shared_data):

@@ -10,12 +10,14 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import check_trial
 from pbl_pipeline.video import Attitude, load_attitude, probe, read_phone_log
 from pbl_pipeline.video._attitude import held_deg
 from pbl_pipeline.video._clock import match_pictures
 from tests.inputs import csv_log
 from tests.phone_film import EPOCH_NS, as_json, as_zip, device_quat, film, hand, sensor_logger
 from tests.unit.test_camera_sources import video
+from tests.walker import observe, walking_qpos
 
 BEGIN_S, SECONDS = 3.25, 6.0
 
@@ -258,6 +260,16 @@ def test_a_log_shorter_than_the_video(tmp_path, info):
     short = sensor_logger(tmp_path / "short", 3.0, begin_s=BEGIN_S)
     assert "a log of 3.0 s" in error_of(load_attitude, short, info).found
     error_of(load_attitude, short, recorded(info, 0.0))
+
+
+def test_a_log_that_covers_half_the_trial_is_left_out_of_the_session():
+    walk = observe(walking_qpos(np.arange(120) / 30), np.arange(120) / 30)
+    quat = hand(np.arange(3.0)).as_quat(scalar_first=True)
+    whole = dataclasses.replace(walk, phone_time_s=np.array([0, 2.0, 4.0]), phone_quat_wxyz=quat)
+    used, _ = check_trial(whole, "walk")
+    assert used.all()
+    half = dataclasses.replace(walk, phone_time_s=np.array([0, 1.0, 2.0]), phone_quat_wxyz=quat)
+    assert "from 0.00 to 2.00 s" in error_of(check_trial, half, "walk").found
 
 
 def test_a_phone_on_a_stand(tmp_path):
