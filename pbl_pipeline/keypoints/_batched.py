@@ -77,8 +77,8 @@ class BatchedLooks:
             self._look(batch)
 
     def _look(self, batch: list[_Item]) -> None:
-        images, rois = [i[0].image for i in batch], [i[1] for i in batch]
         try:
+            images, rois = [i[0].image for i in batch], [i[1] for i in batch]
             found = self._detector.detect_many(images, rois, self._camera, quick=batch[0][2])
         except BaseException as error:  # noqa: BLE001 - handed to whoever asks for the result
             for item in batch:

@@ -111,7 +111,9 @@ class OnnxKeypoints:
     def origin(self) -> str:
         """Where these keypoints come from, for the result."""
         spec = self._spec
-        looks = f"{len(self._augmentations)} augmentations, ONNX on {self.device}" + (f" ({self.note})" if self.note else "")
+        looks = f"{len(self._augmentations)} augmentations, ONNX on {self.device}" + (
+            f" ({self.note})" if self.note else ""
+        )
         return f"{spec.kind} model {spec.name}, SHA-256 {spec.sha256}, licence: {spec.licence}; {looks}"
 
     def detect(self, image: np.ndarray, roi_px: np.ndarray, camera: Camera, *, quick: bool = False) -> PersonKeypoints:

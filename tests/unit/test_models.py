@@ -6,6 +6,7 @@ import functools
 import hashlib
 import http.server
 import json
+import re
 import shutil
 import tarfile
 import threading
@@ -21,6 +22,8 @@ from pbl_pipeline import models
 from pbl_pipeline.body import MARKER_SETS, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import ModelKeypointParams, find_method, params_of
+from pbl_pipeline.models import _spec
+from pbl_pipeline.pipeline import fit_default
 from tests import dot_models
 from tests.command import pbl
 
@@ -128,6 +131,31 @@ def test_pairs_told_by_the_names_are_mirror_images_on_the_body(name):
     assert len(paired) == 2 * len(pairs)
     # The published sites scatter about the midline by 2 cm.
     assert all(abs(place[n][2]) < 0.02 for n in set(markers.names) - paired)
+
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_page_names_every_field_kind_and_role():
+    text = (ROOT / "docs" / "models.md").read_text()
+    table = text.split("| field of `model.json` |")[1].split("\n\n")[0]
+    fields = {f for line in table.splitlines() for f in re.findall(r"`([a-z0-9_]+)`", line.split("|")[1])}
+    known = {*_spec._REQUIRED, *_spec._POINTS, *_spec._OPTIONAL_POINTS, *_spec._OPTIONAL}
+    assert fields == known
+    assert all(f"`{n}`" in table for n in _spec._INPUT)
+    kinds = text.split("| kind | role |")[1].split("\n\n")[0]
+    assert {k for line in kinds.splitlines() for k in re.findall(r"`([a-z0-9_]+)`", line.split("|")[1])} == set(
+        models.KINDS
+    )
+    assert all(f"`{role}`" in kinds for roles in models.KINDS.values() for role in roles)
+
+
+def test_the_example_of_the_page_is_a_sound_spec():
+    text = (ROOT / "docs" / "models.md").read_text()
+    content = json.loads(re.findall(r"```json\n(.*?)```", text, re.DOTALL)[0])
+    spec = models.parse_spec(content | {"sha256": "0" * 64}, "docs/models.md")
+    assert len(spec.joint_names) == 26
+    assert sum(i != m for i, m in enumerate(spec.mirror)) == 22
 
 
 # --- the graph
@@ -397,3 +425,29 @@ def test_another_graph_or_spec_is_another_method(folder, registry):
     assert first.hash != second.hash
     models.add(changed(folder, pixel_origin="centre", comment="as before"), replace=True)
     assert find_method("dots-crop3d").hash != second.hash
+
+
+def still(kind: str, names: list[str]) -> onnx.ModelProto:
+    """A model that gives the same points for every picture."""
+    g = dot_models.Graph()
+    zero = g("Mul", g("ReduceMean", "image", axes=[1, 2, 3], keepdims=0), g.const(0.0))
+    zero = g("Unsqueeze", zero, g.const([1, 2], np.int64))
+    shapes = {"coords2d": (1, len(names), 2), "coords3d": (1, len(names), 3)} if kind == "crop3d" else {}
+    shapes = shapes or {"simcc_x": (1, len(names), 64), "simcc_y": (1, len(names), 64)}
+    for role, shape in shapes.items():
+        g("Add", zero, g.const(np.zeros(shape)), out=role)
+    value = onnx.helper.make_tensor_value_info
+    outputs = [value(role, 1, ["N", *shape[1:]]) for role, shape in shapes.items()]
+    return g.build([value("image", 1, ["N", 3, 32, 32])], outputs)
+
+
+@pytest.mark.parametrize(
+    ("kind", "markers", "paramset"),
+    [("crop3d", "bml_movi_87", "gauss-newton"), ("crop3d", "mpi_inf_3dhp_17", None), ("simcc", "bml_movi_87", None)],
+)
+def test_the_fit_that_suits_the_points(registry, tmp_path, kind, markers, paramset):
+    names = list(marker_set(markers).names)
+    fields = dot_models.spec(kind, (32, 32), name="still", marker_set=markers, joint_names=names)
+    models.add(dot_models.write(tmp_path / "still", still(kind, names), fields))
+    assert fit_default(find_method("still")) == paramset
+    assert fit_default(find_method(None)) is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import threading
 from pathlib import Path
 
 import cv2
@@ -17,16 +18,18 @@ from pbl_pipeline.keypoints import (
     Keypoints,
     ModelParams,
     OnnxKeypoints,
+    PersonKeypoints,
     detect_keypoints,
     find_method,
     params_of,
 )
 from pbl_pipeline.keypoints._augment import Augmentation, aligned, augmentations, sd_confidence, spread_mm
+from pbl_pipeline.keypoints._batched import BatchedLooks
 from pbl_pipeline.keypoints._decode_2d import from_heatmap, from_simcc
 from pbl_pipeline.keypoints._root import absolute_root
 from pbl_pipeline.keypoints._virtual_camera import crops, look_at
 from pbl_pipeline.tracking import PersonTrack, Tracking
-from pbl_pipeline.video import Camera, probe, viewing_ray
+from pbl_pipeline.video import Camera, Frame, probe, viewing_ray
 from tests import dot_models
 from tests.command import pbl
 from tests.dot_models import NAMES, lens, person, picture, project, region
@@ -305,6 +308,57 @@ def test_another_model_than_the_method_froze(tmp_path):
         with pytest.raises(PblError) as caught:
             OnnxKeypoints(params, "cpu", tmp_path)
         assert caught.value.code == "MODEL_CHECKSUM"
+
+
+# --- batches
+
+
+class Counts:
+    """A detector that only counts; a region of side 13 is one it cannot bear."""
+
+    batch = 3
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[list[float], bool]] = []
+        self.begin = threading.Event()
+
+    def detect_many(self, images, rois_px, camera, *, quick=False):
+        assert self.begin.wait(10)
+        self.calls.append(([float(r[0]) for r in rois_px], quick))
+        if any(r[2] == 13 for r in rois_px):
+            raise ValueError("13")
+        return [PersonKeypoints(np.zeros((1, 2)), np.zeros((1, 3)), np.ones(1), 1.0, r) for r in rois_px]
+
+
+def roi(x: float, side: float = 10) -> np.ndarray:
+    return np.array([x, 0, side, 0])
+
+
+def test_what_waits_goes_together_in_order_and_quick_looks_apart():
+    counts, frame = Counts(), Frame(0, 0.0, lambda: np.zeros((2, 2, 3), np.uint8))
+    with BatchedLooks(counts, CAMERA) as looks:
+        futures = [looks.at(frame, roi(x), quick=x in (4, 5)) for x in range(9)]
+        counts.begin.set()
+        assert [f.result(10).roi_px[0] for f in futures] == list(range(9))
+    assert [x for xs, _ in counts.calls for x in xs] == list(range(9))
+    assert all(quick == (xs[0] in (4, 5)) and len(xs) <= 3 for xs, quick in counts.calls)
+    assert max(len(xs) for xs, _ in counts.calls) == 3
+
+
+def test_an_error_goes_to_who_asked_and_leaving_drops_what_waits():
+    counts, frame = Counts(), Frame(0, 0.0, lambda: np.zeros((2, 2, 3), np.uint8))
+    counts.begin.set()
+    with BatchedLooks(counts, CAMERA) as looks:
+        bad = looks.at(frame, roi(0, 13), quick=False)
+        with pytest.raises(ValueError, match="13"):
+            bad.result(10)
+        assert looks.at(frame, roi(1), quick=False).result(10).roi_px[0] == 1
+        with pytest.raises(TypeError):
+            looks.at(Frame(1, 0.1, None), roi(2), quick=False).result(10)  # type: ignore[arg-type]
+        counts.begin.clear()
+        waiting = [looks.at(frame, roi(x), quick=False) for x in range(50)]
+        counts.begin.set()
+    assert sum(f.done() for f in waiting) < 50
 
 
 # --- a video
