@@ -225,6 +225,8 @@ def _to_track(person_id: int, trail: Trail, time_s: np.ndarray, size: tuple[int,
             roi[a + 1 : b], box[a + 1 : b], score[a + 1 : b] = np.nan, np.nan, 0.0
     width, height = size
     box = np.clip(box, 0.0, [width, height, width, height])
+    # As they are stored; in a long video with many passers-by the arrays are what takes memory.
+    box, roi, score = (a.astype(np.float32) for a in (box, roi, score))
     return PersonTrack(person_id, box, roi, score, observed)
 
 

@@ -20,7 +20,7 @@ from ._tiles import Window, tiles
 @dataclasses.dataclass(frozen=True)
 class WatchParams:
     """tile_fraction, tile_overlap: tiles are squares of this share of the shorter side, overlapping by that share or
-    more. search_interval_s: how often one of the whole frame and the tiles is searched, by turns.
+    more. search_interval_s, search_windows: how often how many of the whole frame and the tiles are searched, by turns.
     follow_interval_s: how often a window around each known person is searched. rest_interval_s: the same for one who
     keeps still (slower than `still` body heights per second). close_interval_s: the same where the person was seen
     fewer than `known_hits` times, was missed, surprised by more than `surprise` body heights, or is nearer to another
@@ -32,6 +32,7 @@ class WatchParams:
     tile_fraction: float = 0.7
     tile_overlap: float = 0.3
     search_interval_s: float = 0.2
+    search_windows: int = 1
     follow_interval_s: float = 0.2
     rest_interval_s: float = 0.4
     close_interval_s: float = 0.06
@@ -56,7 +57,7 @@ class Watch:
     @property
     def n_turn(self) -> int:
         """Searches until every place was searched."""
-        return len(self._ring)
+        return -(-len(self._ring) // self._params.search_windows)
 
     def due(self, time_s: float, live: Sequence[Trail], last: bool) -> list[Trail]:
         """Who is to be looked at in this frame, and who is so close to one of them that her window shows both."""
@@ -77,13 +78,15 @@ class Watch:
         if self._first:
             self._first = False
             return list(self._ring)
-        around = self.around(time_s, live)
+        around, out = self.around(time_s, live), []
         for _ in range(len(self._ring)):
             window = self._ring[self._at]
             self._at = (self._at + 1) % len(self._ring)
             if not any(_share(window, a) >= self._params.covered for a in around):
-                return [window]
-        return []
+                out.append(window)
+            if len(out) == self._params.search_windows:
+                break
+        return out
 
     def looked(self, time_s: float, due: Sequence[Trail], live: Sequence[Trail]) -> None:
         """After a look at those who were due, or were found: says when they are due again."""
