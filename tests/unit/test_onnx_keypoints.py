@@ -330,6 +330,10 @@ class Counts:
         return [PersonKeypoints(np.zeros((1, 2)), np.zeros((1, 3)), np.ones(1), 1.0, r) for r in rois_px]
 
 
+def torn() -> np.ndarray:
+    raise ValueError("torn")
+
+
 def roi(x: float, side: float = 10) -> np.ndarray:
     return np.array([x, 0, side, 0])
 
@@ -353,8 +357,8 @@ def test_an_error_goes_to_who_asked_and_leaving_drops_what_waits():
         with pytest.raises(ValueError, match="13"):
             bad.result(10)
         assert looks.at(frame, roi(1), quick=False).result(10).roi_px[0] == 1
-        with pytest.raises(TypeError):
-            looks.at(Frame(1, 0.1, None), roi(2), quick=False).result(10)  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match="torn"):
+            looks.at(Frame(1, 0.1, torn), roi(2), quick=False).result(10)
         counts.begin.clear()
         waiting = [looks.at(frame, roi(x), quick=False) for x in range(50)]
         counts.begin.set()
