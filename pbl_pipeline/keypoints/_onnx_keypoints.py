@@ -16,6 +16,7 @@ from pbl_pipeline.video import Camera
 from ._augment import aligned, augmentations, sd_confidence, spread_mm
 from ._decode_2d import edge_shift, from_heatmap, from_simcc
 from ._detect import KeypointParams
+from ._flips import FlipParams
 from ._protocol import PersonKeypoints
 from ._root import absolute_root
 from ._virtual_camera import crops, look_at
@@ -46,9 +47,10 @@ class ModelParams:
 
 @dataclasses.dataclass(frozen=True)
 class ModelKeypointParams(KeypointParams):
-    """Parameters of `detect_keypoints` with a registered model. The agreement of the base class is BlazePose's alone.
+    """Parameters of `detect_keypoints` with a registered model.
 
-    min_presence is 0: no network here says whether somebody is there; who is not, has low confidences.
+    min_presence is 0: no network here says whether somebody is there; who is not, has low confidences. `agree_mm`,
+    `confidence_curve` and `sides` were made and measured with BlazePose: the first does nothing here, the others are off.
     """
 
     detector: str = "onnx"
