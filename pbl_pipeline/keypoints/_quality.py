@@ -44,7 +44,8 @@ _LEGS = ("hip", "knee", "ankle", "heel", "foot_index")
 
 
 def check_keypoints(keypoints: Keypoints) -> tuple[Check, ...]:
-    """The checks of one trial, in the order of the chain; EMPTY alone where no frame shows the person.
+    """The checks of one trial, in the order of the chain. Where no frame shows the person: EMPTY, and why if the
+    picture tells.
 
     `frames_seen_s`, `whole_person_s`, `frames_without_person_share`, `feet_cut_share`, `head_cut_share`,
     `body_height_px`, `picture_brightness`, `picture_detail_share`, `frame_rate_hz`, `leg_confidence`,
@@ -53,7 +54,9 @@ def check_keypoints(keypoints: Keypoints) -> tuple[Check, ...]:
     """
     seen = keypoints.confidence.max(axis=1) > 0
     if not seen.any():
-        return (Check("frames_seen_s", EMPTY, 0.0, 1.0, "no frame shows the person"),)
+        # Where the picture says why, it is said.
+        why = [c for c in _picture(keypoints) if c is not None and c.outcome != PASS]
+        return (Check("frames_seen_s", EMPTY, 0.0, 1.0, "no frame shows the person"), *why)
     checks = [*_time(keypoints, seen), *_cut(keypoints), *_picture(keypoints), _rate(keypoints.time_s)]
     return tuple(c for c in [*checks, *_legs(keypoints, seen), *_sides(keypoints, seen)] if c is not None)
 

@@ -123,6 +123,14 @@ def test_too_few_frames_a_second(fps, expected):
     assert outcome(person(300, fps), "frame_rate_hz") == (expected, pytest.approx(fps))
 
 
+def test_too_dark_for_any_point():
+    nobody = dataclasses.replace(lost(person(), slice(None)), picture=measured(scene(gain=0.03)))
+    assert {c.check: c.outcome for c in check_keypoints(nobody)} == {
+        "frames_seen_s": "EMPTY",
+        "picture_brightness": "FAIL",
+    }
+
+
 def test_what_a_file_cannot_tell_is_left_out():
     without = dataclasses.replace(person(), picture=None)
     names = {c.check for c in check_keypoints(without)}
