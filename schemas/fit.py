@@ -149,7 +149,7 @@ class SessionFit(dj.Computed):
     fit_residual_3d=null : float32             # (cm) median distance of body and 3D keypoints
     fit_outcome          : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')  # worst check
     fit_iterations=null  : int32               # steps of the solver, null for fits of before it was recorded
-    fit_converged=null   : bool                # ended at a minimum, not at its bound on iterations or steps; null as above
+    fit_converged=null   : bool                # ended at a minimum, not at its bound on iterations or steps; null too
     fit_scale            : json                # multiplier (-) of each scale group, 1 = the unscaled body
     compile_seconds      : float32             # (s) of the duration, spent compiling
     compute_device       : varchar(64)         # what JAX computed on

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from ._db_backup import backup, restore
+from ._db_migrate import migrate
 from ._db_roles import roles
 
 # Each command imports what it needs: `pbl db --help` should not wait for the table engine.
@@ -24,7 +25,7 @@ def db() -> None:
     """
 
 
-for command in (backup, restore, roles):
+for command in (backup, restore, migrate, roles):
     db.add_command(command)
 
 

@@ -1,0 +1,35 @@
+"""`pbl db migrate`: bring the tables of an older version to this one."""
+
+from __future__ import annotations
+
+import click
+
+
+@click.command()
+@click.option("--dry-run", is_flag=True, help="Print what would be done, change nothing. Exit code 1: more is needed.")
+def migrate(dry_run: bool) -> None:
+    """Bring the tables on the server to their declarations in this version, by numbered migrations. Safe to repeat.
+
+    Rows stay as they are. Make a backup first, stop the workers, and use an account that may alter tables.
+
+    \b
+    Example: pbl db migrate --dry-run
+    Example: pbl db backup /backup/before && pbl db migrate
+    """
+    from schemas import migrations
+
+    known = migrations.applied()
+    click.echo(f"{len(known)} migrations applied so far" + (f", last {known[-1].when} UTC" if known else ""))
+    outcome = migrations.migrate(dry_run, click.echo)
+    for line in outcome.created:
+        click.echo(f"  {line}")
+    for title, statements in outcome.steps:
+        click.echo(f"{title}: {len(statements)} statements")
+        for statement in statements if dry_run else ():
+            click.echo(f"  {statement};")
+    for line in outcome.open:
+        click.echo(f"  needs a migration of its own: {line}")
+    if outcome.open:
+        raise click.exceptions.Exit(1)
+    done = not outcome.created and not any(s for _, s in outcome.steps)
+    click.echo("The tables are as this version declares them." if done or not dry_run else "Nothing was changed.")
