@@ -50,12 +50,15 @@ class ModelKeypointParams(KeypointParams):
     """Parameters of `detect_keypoints` with a registered model.
 
     min_presence is 0: no network here says whether somebody is there; who is not, has low confidences. `agree_mm`,
-    `confidence_curve` and `sides` were made and measured with BlazePose: the first does nothing here, the others are off.
+    `confidence_curve` and `sides` were made and measured with BlazePose: the first does nothing here, the others are
+    off.
     """
 
     detector: str = "onnx"
     model_sha256: str = ""
     min_presence: float = 0.0
+    confidence_curve: str = ""
+    sides: FlipParams | None = None
     confidence_curve: str = ""
     model: ModelParams = dataclasses.field(kw_only=True)
 

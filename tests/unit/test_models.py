@@ -409,6 +409,8 @@ def test_a_registered_model_is_a_keypoint_method(folder, registry):
     assert isinstance(params, ModelKeypointParams)
     assert params.model.licence == "CC0-1.0, a test"
     assert params.model.n_augmentations == 10
+    # What was measured with BlazePose is not said of another network.
+    assert (params.confidence_curve, params.sides) == ("", None)
     assert params.model_sha256 == models.load_spec(folder).sha256
     # What a database hands back: JSON, numbers without their point.
     again = json.loads(
