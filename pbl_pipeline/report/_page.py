@@ -376,6 +376,7 @@ def _origin(
         camera = t.fit.camera if t.fit is not None else t.keypoints.camera if t.keypoints is not None else None
         if camera is not None:
             rows.append(("Camera", f"{camera.source}; focal length {camera.matrix[0, 0]:.0f} px", False))
+        rows += [("Remark", note, False) for note in v.notes]
         if m is not None and m.events is not None:
             rows.append(("Gait events", f"{m.events.method}, parameters {m.events.params_hash}", True))
         groups.append({"name": f"Recording {t.name}", "rows": rows})
