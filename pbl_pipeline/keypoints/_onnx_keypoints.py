@@ -59,7 +59,6 @@ class ModelKeypointParams(KeypointParams):
     min_presence: float = 0.0
     confidence_curve: str = ""
     sides: FlipParams | None = None
-    confidence_curve: str = ""
     model: ModelParams = dataclasses.field(kw_only=True)
 
 
