@@ -200,10 +200,16 @@ def write_results(
         metrics=metrics,
         session=session.fit,
         checks=session.checks,
-        origin=dict(origin or {}) | {"Software": {"pbl-pipeline": __version__}},
+        origin=dict(origin or {}) | {"Software": {"pbl-pipeline": __version__} | _models(session)},
     )
     write_report(out / "report.html", report)
     return [*paths, out / "session.json", out / "metrics.json"]
+
+
+def _models(session: Session) -> dict[str, str]:
+    """Which model made the keypoints of each trial, under which licence; nothing where none says."""
+    made = {t.name: t.keypoints.origin for t in session.trials if t.keypoints.origin}
+    return {f"keypoints of {name}": origin for name, origin in made.items()}
 
 
 def write_session_json(fit: SessionFit, path: Path) -> None:
