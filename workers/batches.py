@@ -28,8 +28,16 @@ def run_fits(first: list[Claim], worker: Worker) -> list[Outcome]:
             worker.heartbeat.doing(f"{table.__name__}: batch of {len(batch)}")
             for job in batch:
                 worker.say("start", job, None)  # the time limit counts from here
-            computed = result.result()
-            ended = [worker.one(job, made) for job, made in zip(batch, computed, strict=True)]
+            left = [*batch, *following]
+            try:
+                ended = []
+                for job, made in zip(batch, result.result(), strict=True):
+                    left.remove(job)
+                    ended.append(worker.one(job, made))
+            except (KeyboardInterrupt, SystemExit):  # told to end at once
+                for job in left:
+                    queue.put_back(job)
+                raise
             worker.follow(ended)
             out += ended
             batch = following

@@ -89,20 +89,24 @@ class Worker:
         if registry.stage_of(jobs[0].table).resource == registry.FIT and self.batch > 1:
             run_fits(jobs, self)
             return
-        ended = []
-        for i, job in enumerate(jobs):
-            if self.stop.is_set():
-                for left in jobs[i:]:
-                    queue.put_back(left)
-                break
-            ended.append(self.one(job))
+        ended, left = [], list(jobs)
+        try:
+            while left and not self.stop.is_set():
+                ended.append(self.one(left.pop(0)))
+        finally:  # also where we are told to end at once
+            for job in left:
+                queue.put_back(job)
         self.follow(ended)
 
     def one(self, job: Claim, computed: run_job.Computed | None = None) -> Outcome:
         """Do one job, with everything that is told about it."""
         self.heartbeat.doing(str(job))
         self.say("start", job, None)
-        outcome = run_job.run(job, computed, self.stop)
+        try:
+            outcome = run_job.run(job, computed, self.stop)
+        except (KeyboardInterrupt, SystemExit):  # it was put back
+            self.say("end", job, Outcome(job, run_job.LATER))
+            raise
         self.say("end", job, outcome)
         good = outcome.what in (run_job.DONE, run_job.ALREADY)
         self.done += good

@@ -19,11 +19,11 @@ class Metrics:
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
-        named = {"registry": self.registry}
-        self.jobs = Counter("pbl_jobs", "Jobs ended, by table and outcome", ["table", "outcome", "code"], **named)
-        self.seconds = Histogram("pbl_job_seconds", "Time of a job", ["table"], buckets=SECONDS, **named)
-        self.in_hand = Gauge("pbl_jobs_in_hand", "Jobs being computed by this worker", **named)
-        self.restarts = Counter("pbl_process_restarts", "Working processes that died and were replaced", **named)
+        here = self.registry
+        self.jobs = Counter("pbl_jobs", "Jobs ended, by table and outcome", ["table", "outcome", "code"], registry=here)
+        self.seconds = Histogram("pbl_job_seconds", "Time of a job", ["table"], buckets=SECONDS, registry=here)
+        self.in_hand = Gauge("pbl_jobs_in_hand", "Jobs being computed by this worker", registry=here)
+        self.restarts = Counter("pbl_process_restarts", "Working processes that died and were replaced", registry=here)
 
     def heard(self, message: dict[str, Any]) -> None:
         """Count what a working process said."""

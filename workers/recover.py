@@ -60,10 +60,10 @@ def _alive(row: dict[str, Any], table: Any) -> bool:
         if int(row["pid"]) == os.getpid():  # our number, but not our job: in a container every worker has the same
             return queue.is_held(table, {k: row[k] for k in table.jobs.primary_key})
         return _alive_here(int(row["pid"]), row["reserved_time"], now)
-    same = worker.Worker & {"worker_host": row["host"], "worker_pid": row["pid"]}
-    seen = [w["worker_seen"] for w in same.proj("worker_seen", "worker_stopped").to_dicts() if not w["worker_stopped"]]
-    if seen:
-        return (now - max(seen)).total_seconds() < DEAD_AFTER_S
+    same = (worker.Worker & {"worker_host": row["host"], "worker_pid": row["pid"]}).to_dicts()
+    if same:
+        beating = [w["worker_seen"] for w in same if w["worker_stopped"] is None]
+        return bool(beating) and (now - max(beating)).total_seconds() < DEAD_AFTER_S
     reserved = row["reserved_time"]
     return reserved is None or (now - reserved).total_seconds() < stage_of(table).limit_s
 

@@ -152,7 +152,7 @@ def carry_out(plan: Reprocess) -> Iterator[int]:
 
 def _queue_at_low_priority(table: Any) -> None:
     """Queue what a new selection made computable: of this table, or of the one that plans its keys."""
-    first = {"SessionFit": "TrialInput"}.get(table.__name__, table.__name__)
+    first: str = {"SessionFit": "TrialInput"}.get(table.__name__, table.__name__)
     queue.fill(table_named(first), None, AGAIN)
     if table.__name__ == "GDI":
         queue.fill(table_named("SessionGdi"), None, AGAIN)

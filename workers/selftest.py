@@ -58,11 +58,11 @@ def _store(table: Any) -> None:
 
 
 def _fit() -> None:
-    from pbl_pipeline.fit import fit_session
+    from pbl_pipeline.fit import PARAMSETS, fit_session
     from pbl_pipeline.synthetic import SynthSpec, synthesise
 
-    made = synthesise(SynthSpec(seed=1, seconds=1.0, noise="none"))
-    fit = fit_session([made.keypoints], ["selftest"]).trials[0]
+    made = synthesise(SynthSpec(seed=1, seconds=2.0, noise="none"))
+    fit = fit_session([made.keypoints], ["selftest"], PARAMSETS["gauss-newton"]).trials[0]
     error = float(np.nanmedian(np.degrees(np.abs(fit.qpos[:, 6:] - made.truth.qpos[:, 6:]))))
     if not error <= FIT_DEG:
         raise SelfTestFailed(f"the fit of the known walk is {error:.2f} deg off, expected at most {FIT_DEG:g}")

@@ -17,6 +17,7 @@ import platform
 import signal
 import threading
 import time
+from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -38,6 +39,8 @@ CRASHES = 3
 RESTART_S = (0.5, 60.0)
 #: A process that lived for so long was well: the pause begins anew (s).
 HEALTHY_S = 60.0
+#: So many processes in a row that died before they lived that long, without a job in hand: the worker gives up.
+HOPELESS = 5
 #: After the grace for the job in hand a process gets this much to put it back, then it is killed (s).
 LAST_S = 15.0
 
@@ -78,10 +81,12 @@ class _Child:
 class Supervisor:
     """Keeps `options.processes` working processes alive until told to stop; `run` returns the exit code."""
 
-    def __init__(self, options: Options, metrics: Metrics | None = None) -> None:
-        self.options, self.metrics = options, metrics or Metrics()
+    def __init__(self, options: Options, metrics: Metrics | None = None, target: Callable[..., None] | None = None):
+        """`target` replaces `work` as what the processes run: tests and benchmarks put stand-ins before it."""
+        self.options, self.metrics, self.target = options, metrics or Metrics(), target or work
         self._children: list[_Child] = []
         self._pause = RESTART_S[0]
+        self._stillborn = 0
         self._stop_at: float | None = None
         self._signalled = 0
         # Not fork: threads of the numerical libraries do not survive it.
@@ -122,7 +127,7 @@ class Supervisor:
     # ------------------------------------------------------------------------------------------------- processes
     def _launch(self) -> _Child:
         here, there = self._start.Pipe(duplex=False)
-        process = self._start.Process(target=work, args=(self.options, there), name="pbl-worker")
+        process = self._start.Process(target=self.target, args=(self.options, there), name="pbl-worker")
         process.start()
         there.close()
         return _Child(process, here, time.monotonic())
@@ -135,19 +140,16 @@ class Supervisor:
                 os.kill(child.process.pid, signum)
 
     def _listen(self, seconds: float) -> None:
-        by_pipe = {c.pipe: c for c in self._children if not c.pipe.closed}
-        ready = wait([*by_pipe, *(c.process.sentinel for c in self._children)], timeout=seconds)
-        for pipe in ready:
-            if isinstance(pipe, int):
-                continue
-            child = by_pipe[pipe]
+        speaking = [c for c in self._children if not c.pipe.closed]
+        wait([*(c.pipe for c in speaking), *(c.process.sentinel for c in self._children)], timeout=seconds)
+        for child in speaking:
             try:
-                while pipe.poll():
-                    message = pipe.recv()
+                while child.pipe.poll():
+                    message = child.pipe.recv()
                     child.holds(message, self.options.limit_factor)
                     self.metrics.heard(message)
             except (EOFError, OSError):
-                pipe.close()
+                child.pipe.close()
 
     def _end_overdue(self) -> None:
         now = time.monotonic()
@@ -179,7 +181,14 @@ class Supervisor:
                 continue
             if exit_code == SELFTEST_FAILED:
                 return SELFTEST_FAILED
-            if time.monotonic() - child.started > HEALTHY_S:
+            healthy = time.monotonic() - child.started > HEALTHY_S
+            self._stillborn = 0 if healthy or child.jobs else self._stillborn + 1
+            if self._stillborn >= HOPELESS:
+                event(log, logging.CRITICAL, "gives up", why=f"{HOPELESS} processes in a row died at their start")
+                self.stop()
+                code = 1
+                continue
+            if healthy:
                 self._pause = RESTART_S[0]
             self.metrics.restarts.inc()
             time.sleep(self._pause)
@@ -266,14 +275,19 @@ def work(options: Options, pipe: Connection) -> None:
         stop.set()
 
     def end_now(*_: object) -> None:
-        raise SystemExit("stopped in the middle of a job")
+        raise SystemExit(0)  # the job in hand is put back on the way up
 
     signal.signal(signal.SIGTERM, end)
     signal.signal(signal.SIGINT, end)  # of a terminal: the supervisor decides
     signal.signal(signal.SIGUSR1, end_now)
     to_stderr()
-    if not _connected(schemas, stop):
-        return
+    try:
+        if not _connected(schemas, stop):
+            return
+    except PblError as error:
+        event(log, logging.CRITICAL, "cannot start", code=error.code, text=error.text())
+        raise SystemExit(1) from error
+    to_stderr()  # connecting set DataJoint's own level
     tables = registry.tables_of(options.resource)
     if options.selftest:
         try:

@@ -1,0 +1,417 @@
+"""Workers: the queue, what happens when a process, the database or the store goes away, and doing things again."""
+
+from __future__ import annotations
+
+import datetime
+import errno
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from click.testing import CliRunner
+
+import pbl_pipeline.video
+import schemas
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import PARAMSETS
+from schemas import embedded, fit, gait, gdi, lab, qc, tracking, video, worker
+from schemas.cli.why import why as why_command
+from schemas.ingest import Visit, ingest
+from schemas.status import live_workers, pipeline_status, queue_counts
+from schemas.why import why
+from workers import queue, recover, refresh, registry, requeue, run_job
+from workers.heartbeat import Heartbeat
+from workers.loop import Worker
+from workers.supervisor import CRASHES, Options, Supervisor
+
+from . import chain, worker_target
+
+
+@pytest.fixture(scope="module")
+def declared(database: Path) -> None:
+    schemas.activate()
+
+
+@pytest.fixture
+def tables(declared: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Empty tables with the method rows, and stand-ins for the slow stages."""
+    chain.install(monkeypatch)
+    yield
+    lab.Subject.delete(prompt=False, part_integrity="cascade")
+    for table in schemas.computed_tables():
+        table.jobs.delete_quick()
+    for table in (worker.Throughput, worker.Crash, worker.Worker):
+        table.delete_quick()
+
+
+def register(*paths: Path, **visit) -> list[int]:
+    results = ingest(paths, Visit(subject=visit.pop("subject", "P001"), **visit))
+    assert [r.status for r in results] == ["registered"] * len(paths)
+    return [r.video_id or 0 for r in results]
+
+
+def work(**options) -> Worker:
+    """One worker in this process until nothing is left."""
+    one = Worker(schemas.computed_tables(), SimpleNamespace(doing=lambda _: None, count=lambda *_: None), **options)
+    one.run(once=True)
+    return one
+
+
+def videos(folder: Path, *names: str) -> list[Path]:
+    return [chain.small_video(folder, name) for name in names]
+
+
+def counts() -> dict[str, int]:
+    return {t.__name__: len(t()) for t in schemas.computed_tables()}
+
+
+def jobs_left() -> dict[str, dict[str, int]]:
+    left = {t: {s: n for s, n in c.items() if n} for t, c in queue_counts(video.Video.connection).items()}
+    return {t: c for t, c in left.items() if c}
+
+
+# ------------------------------------------------------------------------------------------------------ the whole chain
+def test_what_follows_a_job_is_queued_at_once_and_nothing_is_forgotten(tables: None, tmp_path: Path, monkeypatch):
+    register(*videos(tmp_path, "walk1", "walk2"), session_label="1")
+    register(*videos(tmp_path, "walk3"), session_label="2")
+    monkeypatch.setattr("workers.loop.REFRESH_EVERY_S", 1e9)  # one look at all tables, at the beginning
+    done = work()
+    expected = {t.__name__: 3 for t in schemas.computed_tables()}
+    expected |= {"SessionFit": 2, "SessionGdi": 2, "SessionQc": 2, "KinematicError": 0}
+    assert counts() == expected
+    assert (done.done, done.failed) == (sum(expected.values()), 0)
+    assert jobs_left() == {}
+    found = refresh.refresh()
+    assert found is not None
+    assert (found.queued, found.planned, found.swept, found.freed) == ({}, 0, 0, 0)
+    # A visit's checks are those of all its trials.
+    assert set(qc.SessionQc.Check.to_arrays("qc_stage")) >= {"keypoints", "fit", "gait", "gdi"}
+
+
+def test_the_last_trial_of_a_session_may_fail(tables: None, tmp_path: Path):
+    (tmp_path / "bad.mp4").write_text("not a video")
+    register(*videos(tmp_path, "walk1"), tmp_path / "bad.mp4")
+    done = work()
+    assert done.failed == 1
+    assert len(fit.SessionFit()) == 1
+    assert jobs_left() == {"VideoInfo": {"error": 1}}
+
+
+def test_fits_in_batches_are_the_fits_alone(tables: None, tmp_path: Path, monkeypatch):
+    import pbl_pipeline.fit
+
+    batches = []
+
+    def fit_sessions(sessions, paramset=None, batch=None):
+        batches.append(len(sessions))
+        return [chain.fit_session(s.trials, s.names, paramset, s.camera_motion) for s in sessions]
+
+    monkeypatch.setattr(pbl_pipeline.fit, "fit_sessions", fit_sessions)
+    for i in range(5):
+        register(*videos(tmp_path, f"walk{i}"), session_label=str(i))
+    monkeypatch.setattr("workers.loop.REFRESH_EVERY_S", 1e9)
+    one = Worker(
+        [t for t in schemas.computed_tables() if t.__name__ not in ("SessionFit",)],
+        SimpleNamespace(doing=lambda _: None, count=lambda *_: None),
+    )
+    one.run(once=True)
+    assert jobs_left() == {"SessionFit": {"pending": 5}}
+    work(batch=2)
+    assert batches == [2, 2, 1]
+    assert len(fit.SessionFit()) == len(gdi.SessionGdi()) == 5
+    assert jobs_left() == {}
+
+
+def test_a_batch_that_fails_is_computed_one_by_one(tables: None, tmp_path: Path, monkeypatch):
+    import pbl_pipeline.fit
+
+    def fails(*_, **__):
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(pbl_pipeline.fit, "fit_sessions", fails)
+    for i in range(2):
+        register(*videos(tmp_path, f"walk{i}"), session_label=str(i))
+    assert work(batch=2).failed == 0
+    assert len(fit.SessionFit()) == 2
+
+
+# ------------------------------------------------------------------------------------------------- one job, one result
+def first_job() -> queue.Claim:
+    refresh.refresh()
+    (job,) = queue.claim(video.VideoInfo, 1)
+    return job
+
+
+def test_two_processes_with_the_same_job_leave_one_row(tables: None, tmp_path: Path):
+    register(*videos(tmp_path, "walk"))
+    job = first_job()
+    # Somebody took us for dead and gave the job to another process.
+    video.VideoInfo.jobs.update1({**job.key, "host": "another-host", "pid": 7, "connection_id": 99})
+    outcome = run_job.run(job)
+    assert outcome.what == run_job.LOST
+    assert len(video.VideoInfo()) == 0
+    assert len(video.VideoInfo.jobs.reserved) == 1  # still the other's
+    other = queue.Claim(video.VideoInfo, job.key, 5, "another-host", 7, 99)
+    assert run_job.run(other).what == run_job.DONE
+    assert len(video.VideoInfo()) == 1
+    assert jobs_left() == {}
+
+
+def test_a_job_that_is_done_already_is_ended(tables: None, tmp_path: Path):
+    register(*videos(tmp_path, "walk"))
+    job = first_job()
+    video.VideoInfo.populate(job.key)
+    assert run_job.run(job).what == run_job.ALREADY
+    assert (len(video.VideoInfo()), jobs_left()) == (1, {})
+
+
+def test_claims_are_by_priority_and_never_shared(tables: None, tmp_path: Path):
+    ids = register(*videos(tmp_path, *(f"walk{i}" for i in range(6))))
+    refresh.refresh()
+    jobs = video.VideoInfo.jobs
+    for i in ids[:3]:
+        jobs.update1({"video_id": i, "priority": registry.AGAIN})
+    assert queue.most_urgent(video.VideoInfo) == registry.NEW
+    first = queue.claim(video.VideoInfo, 3)
+    assert {c.key["video_id"] for c in first} == set(ids[3:])
+    second = queue.claim(video.VideoInfo, 10)
+    assert {c.key["video_id"] for c in second} == set(ids[:3])
+    assert queue.claim(video.VideoInfo, 1) == []
+    for job in first + second:
+        queue.put_back(job)
+    assert jobs_left() == {"VideoInfo": {"pending": 6}}
+
+
+def test_a_full_store_delays_the_job_and_says_why(tables: None, tmp_path: Path, monkeypatch):
+    register(*videos(tmp_path, "walk"))
+    job = first_job()
+    real = video.VideoInfo.make_insert
+
+    def full(self, *args):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(video.VideoInfo, "make_insert", full)
+    assert run_job.run(job).what == run_job.LATER
+    assert jobs_left() == {"VideoInfo": {"pending": 1}}
+    assert queue.claim(video.VideoInfo, 1) == []  # not before a minute is over
+    state = next(t for t in pipeline_status().tables if t.table == "VideoInfo")
+    assert "No space left on device" in state.delayed
+    monkeypatch.setattr(video.VideoInfo, "make_insert", real)
+    video.VideoInfo.jobs.update1({**job.key, "scheduled_time": datetime.datetime(2020, 1, 1)})
+    work()
+    assert len(video.VideoInfo()) == 1
+
+
+def test_the_result_survives_a_database_that_goes_away(tables: None, tmp_path: Path, monkeypatch, database: Path):
+    register(*videos(tmp_path, "walk"))
+    job = first_job()
+    real, calls = pbl_pipeline.video.probe, []
+    server = embedded.Folder(database / "db")
+
+    def probe(path):
+        calls.append(path)
+        os.kill(server.state()["pid"], signal.SIGKILL)
+        threading.Timer(1.5, lambda: embedded.start(folder=server)).start()
+        return real(path)
+
+    monkeypatch.setattr(pbl_pipeline.video, "probe", probe)
+    monkeypatch.setattr(run_job, "DATABASE_PAUSE_S", 0.2)
+    outcome = run_job.run(job)
+    assert outcome.what == run_job.DONE
+    assert len(calls) == 1  # computed once, written when it was back
+    assert outcome.seconds > 1.0
+    assert (len(video.VideoInfo()), jobs_left()) == (1, {})
+
+
+def test_inputs_that_changed_meanwhile_are_read_again(tables: None, tmp_path: Path, monkeypatch):
+    (number,) = register(*videos(tmp_path, "walk"))
+    job = first_job()
+    real = pbl_pipeline.video.probe
+
+    def probe(path):
+        video.Video.update1({"video_id": number, "video_path": str(tmp_path / "elsewhere.mp4")})
+        return real(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pbl_pipeline.video, "probe", probe)
+        assert run_job.run(job).what == run_job.LATER
+    assert jobs_left() == {"VideoInfo": {"pending": 1}}
+    assert len(video.VideoInfo()) == 0
+
+
+# ----------------------------------------------------------------------------------------------- processes that go away
+def supervise(**options) -> int:
+    """A worker as it runs in production, behind stand-ins."""
+    return Supervisor(Options(once=True, selftest=False, **options), target=worker_target.work).run()
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("workers.supervisor.RESTART_S", (0.05, 0.1))
+
+
+def test_a_job_that_kills_its_process_becomes_an_error_and_the_others_are_done(tables, tmp_path: Path, quick: None):
+    register(*videos(tmp_path, "walk1", "kills", "walk2"))
+    assert supervise() == 0
+    (error,) = pipeline_status().errors
+    assert (error.table, error.code, error.about) == ("VideoInfo", "WORKER_CRASH", "kills.mp4")
+    assert f"died {CRASHES} times" in error.found
+    assert "SIGKILL" in error.found
+    assert len(fit.SessionFit()) == 1
+    assert len(fit.SessionFit.Trial()) == 2
+    assert len(worker.Crash()) == 0
+
+
+def test_a_job_beyond_its_time_limit_is_ended(tables, tmp_path: Path, quick: None, monkeypatch):
+    register(*videos(tmp_path, "walk", "hangs"))
+    limits = tuple(
+        registry.Stage(s.table, s.resource, 3.0 if s.table == "VideoInfo" else s.limit_s, s.batch, s.followers)
+        for s in registry.STAGES
+    )
+    monkeypatch.setattr(registry, "STAGES", limits)
+    assert supervise() == 0
+    (error,) = pipeline_status().errors
+    assert (error.code, error.about) == ("TIME_LIMIT", "hangs.mp4")
+    assert len(fit.SessionFit()) == 1
+
+
+def test_sigterm_lets_the_job_in_hand_end_or_puts_it_back(tables, tmp_path: Path, quick: None):
+    for grace_s, done in ((20.0, 1), (0.0, 0)):
+        (path,) = videos(tmp_path, f"slow{int(grace_s)}")
+        register(path, session_label=path.stem)
+        boss = Supervisor(Options(resource="decode", selftest=False, grace_s=grace_s), target=worker_target.work)
+        timer = threading.Thread(target=_stop_when_begun, args=(boss, Path(f"{path}.begun")))
+        timer.start()
+        start = time.monotonic()
+        assert boss.run() == 0
+        timer.join()
+        assert len(video.VideoInfo()) == done
+        assert time.monotonic() - start < 30.0
+        if done:
+            lab.Subject.delete(prompt=False, part_integrity="cascade")
+    assert jobs_left() == {"VideoInfo": {"pending": 1}}
+    assert all(w["worker_stopped"] for w in worker.Worker.to_dicts())
+
+
+def _stop_when_begun(boss: Supervisor, begun: Path) -> None:
+    while not begun.exists():
+        time.sleep(0.05)
+    boss.stop()
+
+
+def test_a_worker_elsewhere_is_dead_when_its_heart_stops(tables: None, tmp_path: Path):
+    ids = register(*videos(tmp_path, "walk1", "walk2", "walk3"))
+    refresh.refresh()
+    jobs = video.VideoInfo.jobs
+    now = jobs.connection.query("SELECT CURRENT_TIMESTAMP(3)").fetchone()[0]
+    ago = {"alive": 10, "dead": recover.DEAD_AFTER_S + 10}
+    for number, (name, seconds) in zip(ids, ago.items(), strict=False):
+        seen = now - datetime.timedelta(seconds=seconds)
+        row = {"worker": name, "worker_host": name, "worker_pid": 1, "worker_resource": "all", "worker_version": "0"}
+        worker.Worker.insert1({**row, "worker_started": seen, "worker_seen": seen, "worker_doing": ""})
+        jobs.update1({"video_id": number, "status": "reserved", "host": name, "pid": 1, "reserved_time": now})
+    # A populate by hand on another machine has no heart: only the time limit of its table ends the reservation.
+    jobs.update1({"video_id": ids[2], "status": "reserved", "host": "hand", "pid": 1, "reserved_time": now})
+    assert recover.free_dead(video.VideoInfo) == 1
+    assert jobs.pending.to_arrays("video_id").tolist() == [ids[1]]
+    jobs.update1({"video_id": ids[2], "reserved_time": now - datetime.timedelta(hours=1)})
+    assert recover.free_dead(video.VideoInfo) == 1
+    assert jobs.reserved.to_arrays("video_id").tolist() == [ids[0]]
+
+
+def test_the_heartbeat_says_what_is_done(tables: None, monkeypatch):
+    monkeypatch.setattr("workers.heartbeat.PERIOD_S", 0.05)
+    with Heartbeat("cpu") as beats:
+        beats.doing("VideoInfo video_id=3")
+        beats.count("VideoInfo", 2, 1, 0.5)
+        time.sleep(0.4)
+        (alive,) = live_workers()
+        assert (alive["worker_pid"], alive["worker_doing"]) == (os.getpid(), "VideoInfo video_id=3")
+    assert live_workers() == []
+    rows = worker.Throughput.to_dicts()
+    assert (sum(r["n_done"] for r in rows), sum(r["n_failed"] for r in rows)) == (2, 1)
+
+
+# ---------------------------------------------------------------------------------------------------- looking, redoing
+def test_why_says_where_a_video_stands(tables: None, tmp_path: Path):
+    (tmp_path / "bad.mp4").write_text("not a video")
+    good, bad = register(*videos(tmp_path, "walk"), tmp_path / "bad.mp4")
+    assert "not queued" in why(good).verdict
+    refresh.refresh()
+    assert why(good).verdict.startswith("VideoInfo waits for a worker")
+    work()
+    assert why(good).verdict == "everything is computed"
+    assert {s.table for s in why(good).steps if s.what == "done"} >= {"VideoInfo", "SessionFit", "SessionQc"}
+    assert why(bad).verdict.startswith("VideoInfo failed (VIDEO_NOT_A_VIDEO")
+    alike = chain.small_video(tmp_path, "two", people="two alike")
+    (waiting,) = register(alike, session_label="2")
+    work()
+    assert "pbl choose" in why(waiting).verdict
+    result = CliRunner().invoke(why_command, [str(good), "--json"])
+    assert json.loads(result.output)["verdict"] == "everything is computed"
+    with pytest.raises(PblError, match="DB_NOT_FOUND"):
+        why(999)
+
+
+def test_errors_are_tried_again_by_code_table_and_video(tables: None, tmp_path: Path):
+    (tmp_path / "bad.mp4").write_text("not a video")
+    gone = videos(tmp_path, "gone")[0]
+    bad, lost = register(tmp_path / "bad.mp4", gone)
+    gone.unlink()
+    assert work().failed == 2
+    assert requeue.retry(code="VIDEO_DAMAGED") == {}
+    assert requeue.retry(table="Tracking") == {}
+    assert requeue.retry(code="VIDEO_MISSING") == {"VideoInfo": 1}
+    assert video.VideoInfo.jobs.pending.to_arrays("video_id").tolist() == [lost]
+    assert requeue.retry(video_id=bad) == {"VideoInfo": 1}
+    assert work().failed == 2
+    with pytest.raises(PblError, match="USAGE"):
+        requeue.retry(table="Tables")
+
+
+def test_a_new_method_adds_rows_and_touches_no_old_one(tables: None, tmp_path: Path):
+    register(*videos(tmp_path, "walk1", "walk2"))
+    work()
+    before = {t.__name__: t.to_dicts() for t in (video.VideoInfo, tracking.Tracking, fit.SessionFit, gait.GaitEvents)}
+    plan = requeue.plan_new_method("SessionFit", "paper-2025")
+    assert (len(plan.add), plan.outdated) == (1, [])
+    list(requeue.carry_out(plan))
+    pending = {t: c["pending"] for t, c in jobs_left().items()}
+    assert pending == {"TrialInput": 2}  # nothing above the fit
+    assert set(fit.TrialInput.jobs.to_arrays("priority")) == {registry.AGAIN}
+    work()
+    assert len(fit.SessionFit()) == 2
+    assert len(gait.GaitEvents()) == 4
+    for table, prefix in ((video.VideoInfo, "video_info"), (tracking.Tracking, "tracking")):
+        stamps = [r[f"{prefix}_computed"] for r in before[table.__name__]]
+        assert table.to_arrays(f"{prefix}_computed").tolist() == stamps
+    key = {"fit_method": before["SessionFit"][0]["fit_method"]}
+    assert [r["fit_computed"] for r in (fit.SessionFit & key).to_dicts()] == [
+        r["fit_computed"] for r in before["SessionFit"]
+    ]
+    assert requeue.plan_new_method("SessionFit", "paper-2025").add == []
+    assert PARAMSETS["paper-2025"].name == "paper-2025"
+    with pytest.raises(PblError, match="USAGE"):
+        requeue.plan_new_method("VideoInfo", "paper-2025")
+
+
+def test_results_are_computed_again_behind_new_work(tables: None, tmp_path: Path):
+    register(*videos(tmp_path, "walk1"), session_label="1")
+    work()
+    plan = requeue.plan_again("GaitEvents", before=datetime.datetime(2000, 1, 1))
+    assert plan.outdated == []
+    plan = requeue.plan_again("GaitEvents", since=datetime.datetime(2000, 1, 1))
+    assert len(plan.outdated) == 1
+    assert any("gait_cycle" in name for name in plan.below)
+    assert len(gait.GaitEvents()) == 1  # a plan changes nothing
+    list(requeue.carry_out(plan))
+    assert len(gait.GaitEvents()) == 0
+    assert set(gait.GaitEvents.jobs.to_arrays("priority")) == {registry.AGAIN}
+    work()
+    assert len(gait.GaitEvents()) == len(gdi.SessionGdi()) == 1

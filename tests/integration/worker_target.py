@@ -1,0 +1,47 @@
+"""What the processes of a worker run in tests: the real one, behind stand-ins for the slow stages.
+
+A recording's name says what it does to the process that probes it: `kills` ends it at once, `hangs` never returns,
+`slow` takes seconds.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import pytest
+
+import pbl_pipeline.video
+from workers import heartbeat, supervisor
+from workers.supervisor import Options
+
+from . import chain
+
+
+def work(options: Options, pipe: Connection) -> None:
+    """`workers.supervisor.work` with stand-ins."""
+    patch = pytest.MonkeyPatch()
+    chain.install(patch)
+    real = pbl_pipeline.video.probe
+
+    def probe(path: Path):
+        name = Path(path).stem
+        if "kills" in name:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if "hangs" in name:
+            time.sleep(3600)
+        if "slow" in name:
+            _note(path, "begun")
+            time.sleep(3.0)
+        return real(path)
+
+    patch.setattr(pbl_pipeline.video, "probe", probe)
+    patch.setattr(heartbeat, "PERIOD_S", 0.2)
+    supervisor.work(options, pipe)
+
+
+def _note(path: Path, what: str) -> None:
+    Path(f"{path}.{what}").touch()
