@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import threading
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,20 +21,29 @@ from pbl_pipeline.keypoints import (
     ModelParams,
     OnnxKeypoints,
     PersonKeypoints,
+    _onnx_keypoints,
     detect_keypoints,
     find_method,
     params_of,
 )
 from pbl_pipeline.keypoints._augment import Augmentation, aligned, augmentations, sd_confidence, spread_mm
 from pbl_pipeline.keypoints._batched import BatchedLooks
+from pbl_pipeline.keypoints._blazepose import CROP_MARGIN, MIRROR, N_ALL, BlazePoseLandmarks
+from pbl_pipeline.keypoints._blazepose import MODEL_SHA256 as BLAZEPOSE_SHA256
+from pbl_pipeline.keypoints._blazepose import NAMES as BLAZEPOSE_NAMES
 from pbl_pipeline.keypoints._decode_2d import from_heatmap, from_simcc
 from pbl_pipeline.keypoints._root import absolute_root
 from pbl_pipeline.keypoints._virtual_camera import crops, look_at
+from pbl_pipeline.pipeline import _models
 from pbl_pipeline.tracking import PersonTrack, Tracking
-from pbl_pipeline.video import Camera, Frame, probe, viewing_ray
+from pbl_pipeline.tracking._litert import LiteModel
+from pbl_pipeline.video import Camera, Frame, probe, read_frames, viewing_ray
 from tests import dot_models
 from tests.command import pbl
 from tests.dot_models import NAMES, lens, person, picture, project, region
+from tests.unit.test_blazepose import BY_EYE, asset
+from tests.unit.test_blazepose import CAMERA as DEMO_CAMERA
+from tests.unit.test_blazepose import region as demo_region
 from tests.videos import constant_rate, write_video
 
 CAMERA = lens()
@@ -310,6 +321,48 @@ def test_another_model_than_the_method_froze(tmp_path):
         assert caught.value.code == "MODEL_CHECKSUM"
 
 
+class BlazePoseAsCropModel:
+    """BlazePose's network in the place of a session: a real one, whose answers are known by another way."""
+
+    device, note, fixed_batch = "cpu", "", None
+
+    def __init__(self, *_: object) -> None:
+        entry = {"name": "image", "width": 256, "height": 256, "layout": "NHWC", "colour": "RGB"}
+        fields = dot_models.spec("crop3d", input=entry | {"mean": [0, 0, 0], "std": [255, 255, 255]})
+        fields |= {"sha256": "0" * 64, "marker_set": "blazepose_33", "joint_names": list(BLAZEPOSE_NAMES)}
+        self.spec = models.parse_spec(fields | {"pixel_origin": "edge", "box_margin": CROP_MARGIN}, "a test")
+        self._network = LiteModel(asset("blazepose_landmarks"), BLAZEPOSE_SHA256)
+
+    def __call__(self, crops: np.ndarray, gamma: np.ndarray) -> dict[str, np.ndarray]:
+        outputs = [
+            self._network(((c[..., ::-1] / 255.0) ** g).astype(np.float32)) for c, g in zip(crops, gamma, strict=True)
+        ]
+        return {
+            "coords2d": np.stack([o[N_ALL * 5].reshape(N_ALL, 5)[:33, :2] for o in outputs]),
+            "coords3d": 1000 * np.stack([o[N_ALL * 3].reshape(N_ALL, 3)[:33] for o in outputs]),
+        }
+
+
+def test_a_real_network_gives_the_same_by_this_way_and_its_own(monkeypatch):
+    """Two looks, plain and mirrored, at a woman about 440 px high; the camera is that of the recording."""
+    monkeypatch.setattr(_onnx_keypoints, "OnnxModel", BlazePoseAsCropModel)
+    spec = BlazePoseAsCropModel().spec
+    assert list(spec.mirror) == list(MIRROR)
+    model = OnnxKeypoints(ModelParams(spec.name, "0" * 64, spec.spec_sha256, spec.licence, 2), folder="nowhere")
+    direct = BlazePoseLandmarks(asset("blazepose_landmarks"))
+    for frame in read_frames(asset("demo_video"), start=100, stop=135):
+        if frame.index not in BY_EYE:
+            continue
+        roi = direct.detect(frame.image, demo_region(frame.index), DEMO_CAMERA).roi_px
+        a, b = (d.detect(frame.image, roi, DEMO_CAMERA) for d in (direct, model))
+        assert np.median(np.linalg.norm(a.xy_px - b.xy_px, axis=1)) < 2
+        hips = [BLAZEPOSE_NAMES.index(f"{s}_hip") for s in ("left", "right")]
+        relative = b.xyz_cam_m - b.xyz_cam_m[hips].mean(axis=0)
+        assert np.median(np.linalg.norm(relative - a.xyz_cam_m, axis=1)) < 0.03
+        # She walks at about 9.5 m, as large as she is: the leg of 190 px.
+        assert 8.5 < b.xyz_cam_m[hips, 2].mean() < 10.5
+
+
 # --- batches
 
 
@@ -436,6 +489,13 @@ def test_what_is_wrong_with_the_call_is_found_before_the_work(video, registered,
     cuda = pbl("detect", path, "--out", tmp_path / "k.npz", "--keypoints", "dots-simcc", "--device", "cuda")
     if "cuda" not in models.available_devices():
         assert cuda.error_code == "DEVICE_UNAVAILABLE"
+
+
+def test_the_report_names_the_model(video, registered):
+    path, tracking = video
+    found = detect_keypoints(path, tracking, 1, CAMERA, params_of(find_method("dots-simcc")))
+    session: Any = SimpleNamespace(trials=[SimpleNamespace(name="walk", keypoints=found)])
+    assert _models(session) == {"keypoints of walk": found.origin}
 
 
 def test_rotation_of_the_crop_is_the_roll_that_was_asked():
