@@ -3,10 +3,9 @@
 A network may take one leg for the other where they cross, or a body seen from the front for one seen from behind. Then
 all points of a side jump to the other side within a frame and back some frames later, which no body does: whoever
 follows each point at its own speed sees it. So the exchanges (nothing, the legs, the rest, both) are chosen over the
-whole track together, such that the points move most smoothly in the picture and in depth, the thighs keep their length,
-and as few frames as possible differ from what the detector said (dynamic programming over pairs of neighbouring
-frames). Legs that cross in a view from the side are not exchanged: they pass each other at a steady speed, and keep
-their depth.
+whole track together, such that the points move most smoothly in the picture and in depth, the exchanges begin and end
+seldom, and few frames differ from what the detector said (dynamic programming over pairs of neighbouring frames). Legs
+that cross in a view from the side are not exchanged: they pass each other at a steady speed, and keep their depth.
 
 What this cannot tell: whether the sides are right for the greater part of the track. `check_keypoints` reports that.
 """
@@ -40,7 +39,8 @@ class FlipParams:
     min_confidence: frames whose mean confidence (of the legs, of the rest) is below do not link others.
     depth_weight: of metres along the line of sight against metres across it.
     most_m: a point that is further than this from where it is expected counts as so far.
-    change_cost_m: for each frame that differs from what the detector said; a mean over points, as the distances.
+    switch_cost_m: for each beginning and each end of an exchange; a mean over points, as the distances.
+    change_cost_m: for each frame that differs from what the detector said.
     lower: the confidence of exchanged points is multiplied by it.
     """
 
@@ -51,7 +51,8 @@ class FlipParams:
     min_confidence: float = 0.1
     depth_weight: float = 0.5
     most_m: float = 0.3
-    change_cost_m: float = 0.01
+    switch_cost_m: float = 0.02
+    change_cost_m: float = 0.001
     lower: float = 0.5
 
 
@@ -108,9 +109,10 @@ def exchange_sides(
         return Exchange(none, none, none)
     narrow = _narrow(names, xyz_cam_m, params.least_width)
     points = _in_metres(xy_px, xyz_cam_m, params.depth_weight)
-    # What belongs to either side of a point counts alike, whichever name it has.
+    # A pair of points counts alike under either name, and only where both are seen.
     weight = np.sqrt(0.5 * (confidence + confidence[:, mirror]))
-    weight[~np.isfinite(points).all(axis=2)] = 0.0
+    lost = ~np.isfinite(points).all(axis=2)
+    weight[lost | lost[:, mirror]] = 0.0
     good = np.flatnonzero(
         np.all([confidence[:, g].mean(axis=1) >= params.min_confidence for g in paired], axis=0)
         & np.isfinite(points).any(axis=(1, 2))
@@ -120,10 +122,9 @@ def exchange_sides(
         return Exchange(none, none, narrow)
     points = np.where(np.isfinite(points), points, 0.0)
     shown = _Shown(points, weight, mirror, paired, params)
-    thighs = _thigh_cost(names, xyz_cam_m)
     key = _every(good, time_s, params.step_s)
     states = np.zeros(len(time_s), int)
-    states[key] = _smoothest(shown, thighs, time_s, key, params)
+    states[key] = _smoothest(shown, time_s, key, params)
     for row in np.setdiff1d(np.arange(len(time_s))[weight.any(axis=1)], key):
         after = int(np.searchsorted(key, row))
         near = [k for k in key[max(after - 1, 0) : after + 1] if abs(time_s[k] - time_s[row]) <= params.max_gap_s]
@@ -239,36 +240,13 @@ def _narrow(names: Sequence[str], xyz_cam_m: np.ndarray, least_width: float) -> 
     return known & (width < least_width * np.median(width[known])) if known.any() else known
 
 
-def _thigh_cost(names: Sequence[str], xyz_cam_m: np.ndarray) -> np.ndarray:
-    """(T, 2) how much (m) the thighs differ from their usual length, for legs and hips that belong to each other and
-    for legs that were exchanged alone; 0 where not known."""
-    try:
-        hip, knee = ([names.index(f"{side}_{part}") for side in ("left", "right")] for part in ("hip", "knee"))
-    except ValueError:
-        return np.zeros((len(xyz_cam_m), 2))
-    own = np.linalg.norm(xyz_cam_m[:, hip] - xyz_cam_m[:, knee], axis=2)
-    other = np.linalg.norm(xyz_cam_m[:, hip] - xyz_cam_m[:, knee[::-1]], axis=2)
-    known = np.isfinite(own).all(axis=1) & np.isfinite(other).all(axis=1)
-    if not known.any():
-        return np.zeros((len(xyz_cam_m), 2))
-    usual = np.median(own[known])
-    cost = np.stack([np.abs(own - usual).mean(axis=1), np.abs(other - usual).mean(axis=1)], axis=1)
-    return np.where(known[:, None], cost, 0.0)
-
-
-def _smoothest(
-    shown: _Shown, thighs: np.ndarray, time_s: np.ndarray, key: np.ndarray, params: FlipParams
-) -> np.ndarray:
+def _smoothest(shown: _Shown, time_s: np.ndarray, key: np.ndarray, params: FlipParams) -> np.ndarray:
     """(K,) states of the frames `key` with the least cost: second-order dynamic programming over pairs of states."""
-    crossed = (_STATES[:, 0] != _STATES[:, 1]).astype(int)
-    changed = _STATES.any(axis=1)
-
-    def own_cost(row: int) -> np.ndarray:
-        return params.change_cost_m * changed + thighs[row][crossed]
-
+    changed = params.change_cost_m * _STATES.any(axis=1)
+    switched = params.switch_cost_m * (_STATES[:, None] != _STATES[None]).any(axis=2)
     n = len(key)
     cost = np.full((_N_STATES, _N_STATES), 0.0)  # (state before, state now)
-    cost += own_cost(key[0])[:, None] + own_cost(key[1])[None]
+    cost += changed[:, None] + changed[None] + switched
     if time_s[key[1]] - time_s[key[0]] <= params.max_gap_s:
         a, b = shown.at(key[0]), shown.at(key[1])
         cost += shown.distance(b[None], a[:, None], shown.weight(key[0], key[1]))
@@ -289,7 +267,7 @@ def _smoothest(
             link = shown.distance(at[None, None], expected[:, :, None], shown.weight(first, before, now))
         total = cost[:, :, None] + link
         came_from[i] = np.argmin(total, axis=0)
-        cost = np.min(total, axis=0) + own_cost(now)[None]
+        cost = np.min(total, axis=0) + changed[None] + switched
     states = np.zeros(n, int)
     states[n - 2], states[n - 1] = np.unravel_index(np.argmin(cost), cost.shape)
     for i in range(n - 1, 1, -1):
