@@ -304,6 +304,8 @@ def profile_of_rows(rows: Sequence[Mapping[str, Any]], master: Mapping[str, Any]
     """The library's `MovementProfile`, None where there are no rows."""
     if not rows:
         return None
+    order = {angle: i for i, angle in enumerate(library("gait").NINE_ANGLES)}
+    rows = sorted(rows, key=lambda r: order.get(r[f"{prefix}_angle"], len(order)))
     sides = {
         side: {r[f"{prefix}_angle"]: number(v) for r in rows if (v := r[f"{prefix}_score_{side}"]) is not None}
         for side in ("left", "right")

@@ -265,12 +265,12 @@ def _profile(gdi: Gdi) -> list[dict]:
         return []
     titles = {k: v[0] for k, v in {**ANGLES, **PELVIS_ANGLES, **FOOT_ANGLES}.items()}
     rows = [
-        {"name": titles.get(a, a), "left": number(p.left.get(a), 1), "right": number(p.right.get(a), 1), "both": ""}
+        {"name": titles.get(a, a), "left": number(p.left.get(a), 1), "right": number(p.right.get(a), 1)}
         for a in dict.fromkeys([*p.left, *p.right])
     ]
     if p.gps is not None:
-        gps = {"left": number(p.gps_left, 1), "right": number(p.gps_right, 1), "both": number(p.gps, 1)}
-        rows.append({"name": "Gait Profile Score", **gps})
+        name = f"Gait Profile Score (of the person {number(p.gps, 1)})"
+        rows.append({"name": name, "left": number(p.gps_left, 1), "right": number(p.gps_right, 1)})
     return rows
 
 

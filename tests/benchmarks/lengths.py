@@ -4,7 +4,8 @@
     python -m tests.benchmarks.lengths --seeds 2
 
 One camera that stands still, three views, two marker sets with the noise of `pbl bench fit`; then markers of a
-laboratory with 4 mm of noise. The detector knows how large the person is: what a real one gets wrong there is not in these errors.
+laboratory with 4 mm of noise. The detector knows how large the person is: what a real one gets wrong there is not in
+these errors.
 Prints for each the largest error of a person (length and speed in percent, step width in cm) and its mean.
 """
 
