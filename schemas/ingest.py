@@ -20,7 +20,8 @@ from ._activate import computed_tables
 from ._base import DuplicateError, delete_below, dj, error_code, library, resolve_method, utc_now
 
 _ATTEMPTS = 20
-_SUBJECT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
+#: Form of a pseudonymous code.
+SUBJECT_CODE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +98,7 @@ def ingest(
         USAGE for a subject code that could be a name, a label too long, or one person's number for several videos;
         SOLVER_UNKNOWN, NORM_UNKNOWN for unknown methods. Errors of single files are in the result.
     """
-    if not _SUBJECT.fullmatch(visit.subject):
+    if not SUBJECT_CODE.fullmatch(visit.subject):
         raise PblError(
             "USAGE",
             found=f"subject code {visit.subject!r}",

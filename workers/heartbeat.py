@@ -8,7 +8,7 @@ import platform
 import secrets
 import threading
 from collections import defaultdict
-from typing import Any
+from typing import Any, Protocol
 
 import pymysql
 
@@ -19,6 +19,26 @@ from schemas._base import dj
 
 #: Seconds between two heartbeats.
 PERIOD_S = 15.0
+
+
+class Listener(Protocol):
+    """What a worker tells of its work."""
+
+    def doing(self, what: str) -> None:
+        """What is in hand."""
+
+    def count(self, stage: str, done: int, failed: int, busy_s: float) -> None:
+        """What was finished."""
+
+
+class Silent:
+    """Nobody listens: a worker without a row of its own."""
+
+    def doing(self, what: str) -> None:
+        """Nothing."""
+
+    def count(self, stage: str, done: int, failed: int, busy_s: float) -> None:
+        """Nothing."""
 
 
 class Heartbeat:

@@ -12,7 +12,7 @@ from typing import Any
 
 from . import queue, refresh, registry, run_job
 from .batches import run_fits
-from .heartbeat import Heartbeat
+from .heartbeat import Listener
 from .log import event
 from .queue import Claim
 from .run_job import Outcome
@@ -34,7 +34,7 @@ class Worker:
     """
 
     tables: Sequence[Any]
-    heartbeat: Heartbeat
+    heartbeat: Listener
     stop: threading.Event = dataclasses.field(default_factory=threading.Event)
     say: Callable[[str, Claim | None, Outcome | None], None] = lambda *_: None
     batch: int = 1

@@ -152,8 +152,8 @@ def carry_out(plan: Reprocess) -> Iterator[int]:
 
 def _queue_at_low_priority(table: Any) -> None:
     """Queue what a new selection made computable: of this table, or of the one that plans its keys."""
-    first: str = {"SessionFit": "TrialInput"}.get(table.__name__, table.__name__)
-    queue.fill(table_named(first), None, AGAIN)
+    planned = table.__name__ == "SessionFit"
+    queue.fill(table_named("TrialInput") if planned else table, None, AGAIN)
     if table.__name__ == "GDI":
         queue.fill(table_named("SessionGdi"), None, AGAIN)
 

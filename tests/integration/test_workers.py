@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
@@ -26,7 +25,7 @@ from schemas.ingest import Visit, ingest
 from schemas.status import live_workers, pipeline_status, queue_counts
 from schemas.why import why
 from workers import queue, recover, refresh, registry, requeue, run_job
-from workers.heartbeat import Heartbeat
+from workers.heartbeat import Heartbeat, Silent
 from workers.loop import Worker
 from workers.supervisor import CRASHES, Options, Supervisor
 
@@ -58,7 +57,7 @@ def register(*paths: Path, **visit) -> list[int]:
 
 def work(**options) -> Worker:
     """One worker in this process until nothing is left."""
-    one = Worker(schemas.computed_tables(), SimpleNamespace(doing=lambda _: None, count=lambda *_: None), **options)
+    one = Worker(schemas.computed_tables(), Silent(), **options)
     one.run(once=True)
     return one
 
@@ -118,7 +117,7 @@ def test_fits_in_batches_are_the_fits_alone(tables: None, tmp_path: Path, monkey
     monkeypatch.setattr("workers.loop.REFRESH_EVERY_S", 1e9)
     one = Worker(
         [t for t in schemas.computed_tables() if t.__name__ not in ("SessionFit",)],
-        SimpleNamespace(doing=lambda _: None, count=lambda *_: None),
+        Silent(),
     )
     one.run(once=True)
     assert jobs_left() == {"SessionFit": {"pending": 5}}

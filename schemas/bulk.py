@@ -1,0 +1,155 @@
+"""Registering very many recordings at once: an archive, or what arrived in a drop folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from collections.abc import Iterable, Iterator
+from itertools import islice
+from pathlib import PurePath
+from typing import Any
+
+from pbl_pipeline.errors import PblError
+
+from . import fit, gait, gdi, keypoints, lab, session, tracking, video
+from ._base import DuplicateError, utc_now
+from .ingest import SUBJECT_CODE, Methods, next_id, resolve
+
+#: Rows in one transaction.
+CHUNK = 5000
+_ATTEMPTS = 20
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """A file whose bytes are known: `sha256` was computed when it was taken over."""
+
+    path: str
+    sha256: str
+    size: int
+    subject: str
+    session_label: str = session.UNLABELLED
+    activity: str = "walking"
+    camera_motion: str = "static"
+
+
+@dataclasses.dataclass
+class Registered:
+    """How many were new, and how many had been registered before."""
+
+    new: int = 0
+    known: int = 0
+
+
+def register_many(recordings: Iterable[Recording], methods: Methods | None = None) -> Registered:
+    """Register recordings with the methods they go through, some thousand in a transaction.
+
+    The same bytes are registered once. The files are not opened: what is wrong with one is found when it is computed.
+
+    Raises
+    ------
+    PblError
+        USAGE for a subject code that could be a name; SOLVER_UNKNOWN, NORM_UNKNOWN.
+    """
+    chosen = resolve(methods or Methods())
+    out = Registered()
+    for chunk in _chunks(recordings):
+        for one in chunk:
+            if not SUBJECT_CODE.fullmatch(one.subject):
+                raise PblError(
+                    "USAGE",
+                    found=f"subject code {one.subject!r}",
+                    expected="a pseudonymous code of letters, digits, '-', '_' and '.', at most 32 long",
+                    next_step="give the person such a code",
+                    key=one.path,
+                )
+        new = _register(chunk, chosen)
+        out.new += new
+        out.known += len(chunk) - new
+    return out
+
+
+def _chunks(recordings: Iterable[Recording]) -> Iterator[list[Recording]]:
+    rest = iter(recordings)
+    while chunk := list(islice(rest, CHUNK)):
+        yield chunk
+
+
+def _register(chunk: list[Recording], chosen: dict[str, str]) -> int:
+    """One chunk in one transaction; numbers another process took meanwhile make it begin again."""
+    for attempt in range(_ATTEMPTS):
+        try:
+            with video.schema.connection.transaction:  # type: ignore[union-attr]
+                return _insert(chunk, chosen)
+        except DuplicateError:
+            if attempt == _ATTEMPTS - 1:
+                raise
+    raise AssertionError("unreachable")
+
+
+def _insert(chunk: list[Recording], chosen: dict[str, str]) -> int:
+    here = [{"video_sha256": r.sha256} for r in chunk]
+    known = set((video.Video & here).to_arrays("video_sha256"))
+    new = {r.sha256: r for r in chunk if r.sha256 not in known}
+    if not new:
+        return 0
+    now = utc_now()
+    subjects = (
+        {"subject": s, "population": "unknown", "subject_created": now} for s in {r.subject for r in new.values()}
+    )
+    lab.Subject.insert(subjects, skip_duplicates=True)
+    sessions = _sessions({(r.subject, r.session_label) for r in new.values()}, now)
+    first = next_id(video.Video, "video_id")
+    rows: list[dict[str, Any]] = [
+        {
+            "video_id": first + i,
+            "session_id": sessions[r.subject, r.session_label],
+            "camera_id": None,
+            "video_path": r.path,
+            "video_name": PurePath(r.path).name[-255:],
+            "video_sha256": r.sha256,
+            "video_size": r.size,
+            "activity": r.activity,
+            "camera_motion": r.camera_motion,
+            "video_created": now,
+        }
+        for i, r in enumerate(new.values())
+    ]
+    video.Video.insert(rows)
+    tracked = [{"video_id": r["video_id"], "tracking_method": chosen["tracking_method"]} for r in rows]
+    tracking.TrackingSelection.insert({**t, "subject_method": chosen["subject_method"]} for t in tracked)
+    keypoints.KeypointSelection.insert({**t, "keypoint_method": chosen["keypoint_method"]} for t in tracked)
+    planned = [{"session_id": i} for i in set(sessions.values())]
+    for table, names in (
+        (fit.FitPlan, ("fit_method",)),
+        (gait.GaitPlan, ("gait_method",)),
+        (gdi.GdiPlan, ("gdi_method", "norm")),
+    ):
+        table.insert(({**p, **{n: chosen[n] for n in names}} for p in planned), skip_duplicates=True)
+    return len(rows)
+
+
+def _sessions(wanted: set[tuple[str, str]], now: datetime.datetime) -> dict[tuple[str, str], int]:
+    """session_id of each (subject, label); those that are missing are made."""
+    asked = [{"subject": s, "session_label": label} for s, label in wanted]
+    found = {(r["subject"], r["session_label"]): int(r["session_id"]) for r in (session.Session & asked).to_dicts()}
+    missing = sorted(wanted - set(found))
+    first = next_id(session.Session, "session_id")
+    session.Session.insert(
+        {
+            "session_id": first + i,
+            "subject": subject,
+            "session_label": label,
+            "session_date": _date(label),
+            "session_created": now,
+        }
+        for i, (subject, label) in enumerate(missing)
+    )
+    return found | {pair: first + i for i, pair in enumerate(missing)}
+
+
+def _date(label: str) -> datetime.date | None:
+    try:
+        return datetime.date.fromisoformat(label)
+    except ValueError:
+        return None
