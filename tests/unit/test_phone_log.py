@@ -233,7 +233,7 @@ def test_the_pictures_tell_the_clock(folder, info):
     assert worst_deg(log) < 0.3
 
 
-@pytest.mark.parametrize("ended", [False, True], ids=["iOS", "Android"])
+@pytest.mark.parametrize("ended", [False, True], ids=["beginning", "end"])
 def test_the_time_of_recording_and_the_pictures(folder, info, ended):
     log = load_attitude(folder, recorded(info, BEGIN_S + (SECONDS if ended else 0)))
     assert "pictures" in log.source
@@ -245,14 +245,22 @@ def test_a_log_on_the_videos_clock_is_not_moved(tmp_path, info):
     np.testing.assert_allclose(load_attitude(path, info).time_s, [10, 10.02, 10.04])
 
 
-def test_a_log_in_another_time_zone(folder, info):
-    error = error_of(load_attitude, folder, recorded(info, BEGIN_S, zone_h=-5.5))
+def test_a_log_in_another_time_zone(tmp_path, folder, info):
+    """The pictures tell that it is the right log; of one that moves otherwise the zone is named."""
+    log = load_attitude(folder, recorded(info, BEGIN_S, zone_h=-5.5))
+    assert "5.5 h from the time of recording in the file" in log.source
+    assert worst_deg(log) < 0.3
+    other = sensor_logger(tmp_path / "other", 12.0, begin_s=100.0)
+    error = error_of(load_attitude, other, recorded(info, BEGIN_S, zone_h=-5.5))
     assert "5.5 h apart" in error.next_step
     assert "UTC" in error.found
 
 
-def test_a_log_of_another_day(folder, info):
-    error = error_of(load_attitude, folder, recorded(info, BEGIN_S + 3 * 86400))
+def test_a_log_of_another_day(tmp_path, folder, info):
+    """A converted file states when it was converted."""
+    assert "3.0 days from" in load_attitude(folder, recorded(info, BEGIN_S + 3 * 86400)).source
+    other = sensor_logger(tmp_path / "other", 12.0, begin_s=100.0)
+    error = error_of(load_attitude, other, recorded(info, BEGIN_S + 3 * 86400))
     assert "apart" not in error.next_step
 
 
