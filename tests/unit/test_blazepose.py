@@ -5,6 +5,7 @@ The tests with models need the assets and skip where those are absent and cannot
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import cv2
@@ -14,9 +15,12 @@ import pytest
 from pbl_pipeline import assets
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import BlazePoseLandmarks
-from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES
+from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES, _same_sides
+from pbl_pipeline.keypoints._flips import leg_points
 from pbl_pipeline.tracking import BlazePoseDetector
 from pbl_pipeline.tracking._blazepose import N_ANCHORS, anchor_centres, decode, suppress
+from pbl_pipeline.tracking._litert import LiteModel
+from pbl_pipeline.tracking._prune import keep_outputs
 from pbl_pipeline.tracking._tiles import detect_in, tiles
 from pbl_pipeline.video import Camera, read_frames
 
@@ -165,6 +169,39 @@ def test_a_turned_picture_gives_the_turned_person(landmarks, frames):
     np.testing.assert_allclose(b.xy_px, a.xy_px @ warp[:, :2].T + warp[:, 2], atol=12)
     roll = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
     np.testing.assert_allclose(b.xyz_cam_m, a.xyz_cam_m @ roll.T, atol=0.06)
+
+
+def test_what_is_left_of_the_network_computes_the_same_bits(frames):
+    path = asset("blazepose_landmarks")
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    whole, part = LiteModel(path, sha256), LiteModel(path, sha256, (195, 117, 1), num_threads=1)
+    for image in frames.values():
+        crop = np.ascontiguousarray(image[:256, :256, ::-1].astype(np.float32) / 255)
+        a, b = whole(crop), part(crop)
+        assert set(b) == {195, 117, 1} < set(a)
+        for size, values in b.items():
+            np.testing.assert_array_equal(values, a[size])
+
+
+def test_an_output_that_the_network_lacks():
+    path = asset("blazepose_landmarks")
+    with pytest.raises(ValueError, match="no output of \\[7\\] elements"):
+        keep_outputs(path.read_bytes(), (195, 7))
+
+
+def test_answers_of_exchanged_sides_are_not_averaged():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(50, 200, (33, 2))
+    own, legs = np.arange(33), leg_points(NAMES)
+    np.testing.assert_array_equal(_same_sides(points, points + rng.normal(0, 3, points.shape)), own)
+    for group in (legs, ~legs, np.ones(33, bool)):
+        other = points.copy()
+        other[group] = points[MIRROR][group]
+        found = _same_sides(points, other + rng.normal(0, 3, points.shape))
+        np.testing.assert_array_equal(found, np.where(group, MIRROR, own))
+    # Legs one before the other, seen from the side: nothing to tell, nothing is renamed.
+    points[legs] = points[MIRROR][legs] + 2
+    np.testing.assert_array_equal(_same_sides(points, points + rng.normal(0, 3, points.shape)), own)
 
 
 def test_quick_gives_nearly_the_same_circle(landmarks, frames):
