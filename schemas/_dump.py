@@ -20,6 +20,8 @@ from pymysql.cursors import SSCursor
 #: A statement of inserts is ended when it is longer than this (characters); the server takes far more.
 STATEMENT = 1_000_000
 _FETCH = 500
+#: Marks a column whose values name files of the store, in the comment that DataJoint gives it.
+STORED = re.compile(r"^:<(object|npy|blob|attach|hash)@")
 #: Types whose values are bytes; everything else comes as text, exactly as the server prints it.
 _BYTES = {"binary", "varbinary", "tinyblob", "blob", "mediumblob", "longblob", "bit"}
 _FLOAT = "float"

@@ -16,7 +16,6 @@ import datetime
 import gzip
 import hashlib
 import json
-import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from pathlib import Path, PurePosixPath
@@ -31,8 +30,6 @@ from . import _dump, connection
 from ._store import store_error
 
 FORMAT = 1
-#: Marks a column whose values name files of the store, in the comment that DataJoint gives it.
-_STORED = re.compile(r"^:<(object|npy|blob|attach|hash)@")
 #: Schema (after the prefix) with the marker of a restore that has not ended.
 _MARKER = "restoring"
 
@@ -238,7 +235,7 @@ class _Counted:
 
     def __init__(self, rows: Iterator[tuple], columns: list[tuple[str, str, str]], files: set[str]) -> None:
         self._rows, self._files, self.n = rows, files, 0
-        self._stored = [i for i, (_, _, comment) in enumerate(columns) if _STORED.match(comment)]
+        self._stored = [i for i, (_, _, comment) in enumerate(columns) if _dump.STORED.match(comment)]
 
     def __iter__(self) -> Iterator[tuple]:
         for row in self._rows:

@@ -248,6 +248,11 @@ def store_backend() -> Any:
     return get_store_backend(STORE, config=config)
 
 
+def store_root() -> str:
+    """The folder of the store under which DataJoint files by schema, table and key."""
+    return str(dj.config.get_store_spec(STORE)["schema_prefix"]).strip("/")
+
+
 def _check_answers(target: dict[str, Any]) -> None:
     """Fail within seconds when nothing sends a greeting; the driver itself would wait three times ten."""
     try:

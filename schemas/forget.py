@@ -1,0 +1,396 @@
+"""Removing a person: every row, every queued job, every stored file, and a list that proves it.
+
+Whose a row is, is read from its columns: a subject's code, or the number of a session, video or set of videos of that
+person. Every table that depends on a person has one of them (a test looks at all foreign keys), also the queues, which
+have no foreign keys at all.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import json
+import os
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from pbl_pipeline import progress, settings
+from pbl_pipeline.errors import PblError
+
+from . import _dump, connection, fit, lab, session, video
+from ._base import delete_below, library
+from ._store import store_error
+from .ingest import SUBJECT_CODE
+
+#: Columns that say whose a row is. `fit_set` is a hash over one session's videos.
+IDENTITIES = ("subject", "session_id", "video_id", "fit_set")
+
+Say = Callable[[str], None]
+Ids = dict[str, list[Any]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """What there is of a person. rows: table -> how many. files: paths in the store, those without a row as well.
+    videos: path, SHA-256 and size of the video files themselves. running: jobs in a worker's hands."""
+
+    rows: dict[str, int]
+    files: list[str]
+    videos: list[dict[str, Any]]
+    running: list[str]
+
+    @property
+    def nothing(self) -> bool:
+        """True when no row and no stored file is left."""
+        return not self.rows and not self.files
+
+
+@dataclasses.dataclass(frozen=True)
+class Forgotten:
+    """What was done. left: what still names the person, empty when all is gone. kept: videos that stay, and why."""
+
+    manifest: Path
+    rows: dict[str, int]
+    files: list[str]
+    videos: list[str]
+    kept: dict[str, str]
+    left: list[str]
+
+
+def manifest_path(subject: str) -> Path:
+    """Where the list of what is removed is kept: `PBL_HOME/forgotten/<subject>.json`. USAGE for what is no code."""
+    if not SUBJECT_CODE.fullmatch(subject):
+        raise PblError(
+            "USAGE",
+            found=f"subject code {subject[:50]!r}",
+            expected="a code as `pbl ingest` takes it",
+            next_step="check the code",
+        )
+    return settings.home_dir() / "forgotten" / f"{subject}.json"
+
+
+def find(subject: str) -> tuple[Ids, Found]:
+    """Everything there is of a person; changes nothing.
+
+    Raises
+    ------
+    PblError
+        DB_NOT_FOUND when neither the database nor a list of an earlier run knows the subject.
+    """
+    ids, earlier = _identities(subject), read_manifest(subject)
+    if not lab.Subject & {"subject": subject} and not earlier:
+        raise PblError(
+            "DB_NOT_FOUND",
+            key=subject,
+            found="no such subject",
+            expected="the code of a subject",
+            next_step="the codes are in `schemas.lab.Subject`; they are case-sensitive",
+        )
+    for name, values in earlier.get("ids", {}).items():
+        ids[name] = list(dict.fromkeys([*ids[name], *values]))
+    return ids, _find(ids, earlier)
+
+
+def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> Forgotten:
+    """Remove a person. Broken off, it is repeated until done: the list of files is written before the first row goes.
+
+    Parameters
+    ----------
+    subject
+        Code of the person.
+    videos
+        Delete the video files as well, where they still are what was registered.
+    say
+        Told in a sentence what is being done.
+
+    Raises
+    ------
+    PblError
+        DB_NOT_FOUND; DB_REFUSED while a worker computes something of this person; STORE_UNAVAILABLE.
+    """
+    ids, found = find(subject)
+    if found.running:
+        raise PblError(
+            "DB_REFUSED",
+            key=subject,
+            found=f"{len(found.running)} computations are running: {'; '.join(found.running[:5])}",
+            expected="none, so that no result appears after it was deleted",
+            next_step="wait for their end, or stop those workers (pbl cron release frees dead ones); then repeat",
+        )
+    manifest = {**read_manifest(subject), "subject": subject, "ids": ids, "state": "begun"}
+    manifest["files"] = sorted({*manifest.get("files", []), *found.files})
+    manifest["videos"] = found.videos
+    manifest["rows"] = {**manifest.get("rows", {}), **found.rows}
+    manifest.setdefault("begun", _now())
+    _write(subject, manifest)
+    say(f"The list of what goes is in {manifest_path(subject)}")
+    _delete_rows(subject, ids, say)
+    _delete_files(found.files, say)
+    gone, kept = _delete_videos(found.videos) if videos else ([], {v["path"]: "not asked for" for v in found.videos})
+    _, after = find(subject)
+    left = [f"{n} rows of {table}" for table, n in after.rows.items()] + after.files
+    left += _mentions(subject, found.videos)
+    manifest.update(state="left over" if left else "done", ended=_now(), kept=kept, left=left)
+    manifest["videos_deleted"] = sorted({*manifest.get("videos_deleted", []), *gone})
+    _write(subject, manifest)
+    return Forgotten(
+        manifest_path(subject), manifest["rows"], manifest["files"], manifest["videos_deleted"], kept, left
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------- finding
+def _identities(subject: str) -> Ids:
+    sessions = [int(s) for s in (session.Session & {"subject": subject}).to_arrays("session_id")]
+    of_sessions = [{"session_id": s} for s in sessions]
+    videos = (video.Video & of_sessions).to_arrays("video_id") if sessions else []
+    sets = (fit.FitSet & of_sessions).to_arrays("fit_set") if sessions else []
+    return {
+        "subject": [subject],
+        "session_id": sessions,
+        "video_id": [int(v) for v in videos],
+        "fit_set": [str(s) for s in sets],
+    }
+
+
+def _find(ids: Ids, earlier: dict[str, Any]) -> Found:
+    conn = connection.connect()
+    rows: dict[str, int] = {}
+    files: set[str] = set()
+    running: list[str] = []
+    for schema, table, columns in _personal_tables(conn):
+        where, values = _whose(columns, ids)
+        if not where:
+            continue
+        name = f"{_dump.quote(schema)}.{_dump.quote(table)}"
+        n = conn.query(f"SELECT COUNT(*) FROM {name} WHERE {where}", args=values).fetchone()[0]  # noqa: S608
+        if not n:
+            continue
+        rows[f"{schema}.{table}"] = int(n)
+        for column in (c for c, comment in columns.items() if _dump.STORED.match(comment)):
+            chosen = f"SELECT {_dump.quote(column)} FROM {name} WHERE {where}"  # noqa: S608
+            found = conn.query(f"{chosen} AND {_dump.quote(column)} IS NOT NULL", args=values)
+            files.update(json.loads(row[0])["path"] for row in found.fetchall())
+        if table.startswith("~~"):
+            held = conn.query(f"SELECT host, pid FROM {name} WHERE ({where}) AND status = 'reserved'", args=values)  # noqa: S608
+            running += [f"{table.removeprefix('~~')} on {host}, process {pid}" for host, pid in held.fetchall()]
+    files.update(_without_row(conn, ids))
+    files.update(path for path in earlier.get("files", []) if path not in files and _exists(path))
+    return Found(rows, sorted(files), _videos(ids, earlier), running)
+
+
+def _personal_tables(conn: Any) -> Iterable[tuple[str, str, dict[str, str]]]:
+    """Schema, name and columns (name: comment) of the tables that can hold a row of a person."""
+    rows = conn.query(
+        "SELECT c.table_schema, c.table_name, c.column_name, c.column_comment FROM information_schema.columns c "
+        "JOIN information_schema.tables t USING (table_schema, table_name) "
+        "WHERE c.table_schema LIKE %s AND t.table_type = 'BASE TABLE' "
+        "ORDER BY c.table_schema, c.table_name, c.ordinal_position",
+        args=(_dump.like(connection.prefix()),),
+    )
+    tables: dict[tuple[str, str], dict[str, str]] = {}
+    for schema, table, column, comment in rows.fetchall():
+        tables.setdefault((schema, table), {})[column] = comment
+    for (schema, table), columns in tables.items():
+        if set(columns) & {*IDENTITIES, "job_key"}:
+            yield schema, table, columns
+
+
+def _whose(columns: dict[str, str], ids: Ids) -> tuple[str, tuple]:
+    """A condition that holds for the person's rows, and its values; empty where the table can hold none."""
+    parts, values = [], []
+    for name in IDENTITIES:
+        marks = ",".join(["%s"] * len(ids[name]))
+        if not ids[name]:
+            continue
+        if name in columns:
+            parts.append(f"{_dump.quote(name)} IN ({marks})")
+            values += ids[name]
+        elif "job_key" in columns:  # a job's key as JSON
+            parts.append(f"JSON_VALUE(job_key, '$.{name}') IN ({marks})")
+            values += [str(v) for v in ids[name]]
+    return " OR ".join(parts), tuple(values)
+
+
+def _without_row(conn: Any, ids: Ids) -> list[str]:
+    """Files in the person's folders of the store that no row may name: left by a computation that was killed.
+
+    A path is `_schema/<schema>/<table>/<key>=<value>/...`, the key in the order of the table.
+    """
+    store = connection.store_backend()
+    root = connection.store_root()
+    tables = conn.query(
+        "SELECT DISTINCT table_schema, table_name FROM information_schema.columns "
+        "WHERE table_schema LIKE %s AND column_comment REGEXP '^:<(object|npy)@'",
+        args=(_dump.like(connection.prefix()),),
+    )
+    out = []
+    for schema, table in tables.fetchall():
+        for name in IDENTITIES:
+            for value in ids[name]:
+                out += _below(store, f"{root}/{schema}/{table}/{name}={value}")
+    return out
+
+
+def _below(store: Any, folder: str) -> list[str]:
+    """The files under a folder of the store, as paths in the store."""
+    try:
+        base = str(store._full_path(""))
+        return [str(p).removeprefix(base).lstrip("/") for p in store.fs.find(store._full_path(folder))]
+    except Exception as error:
+        raise store_error(error) from error
+
+
+def _exists(path: str) -> bool:
+    try:
+        return bool(connection.store_backend().exists(path))
+    except Exception as error:
+        raise store_error(error) from error
+
+
+def _videos(ids: Ids, earlier: dict[str, Any]) -> list[dict[str, Any]]:
+    rows = (video.Video & [{"video_id": v} for v in ids["video_id"]]).to_dicts() if ids["video_id"] else []
+    now = [{"path": r["video_path"], "sha256": r["video_sha256"], "size": int(r["video_size"])} for r in rows]
+    return now + [v for v in earlier.get("videos", []) if v not in now]
+
+
+# --------------------------------------------------------------------------------------------------------- removing
+def _delete_rows(subject: str, ids: Ids, say: Say) -> None:
+    """Queued jobs, then the person with all that depends on it in one transaction, then what depends on nothing."""
+    cameras = _cameras(ids)
+    conn = connection.connect()
+    tables = list(_personal_tables(conn))
+    _delete_where(conn, [t for t in tables if t[1].startswith("~~") or "job_key" in t[2]], ids)
+    counts = delete_below(lab.Subject, (lab.Subject & {"subject": subject}).keys())
+    say(f"{sum(counts.values())} rows of {len(counts)} tables were deleted")
+    _delete_where(conn, tables, ids)
+    unused = [c for c in cameras if not video.Video & {"camera_id": c}]
+    delete_below(lab.CameraCalibration, [{"camera_id": c} for c in unused])
+
+
+def _delete_where(conn: Any, tables: Iterable[tuple[str, str, dict[str, str]]], ids: Ids) -> None:
+    for schema, table, columns in tables:
+        where, values = _whose(columns, ids)
+        if where:
+            conn.query(f"DELETE FROM {_dump.quote(schema)}.{_dump.quote(table)} WHERE {where}", args=values)  # noqa: S608
+
+
+def _cameras(ids: Ids) -> list[int]:
+    """Calibrations of the person's videos: their note may name a file. They go where nobody else has them."""
+    if not ids["video_id"]:
+        return []
+    rows = video.Video & [{"video_id": v} for v in ids["video_id"]] & "camera_id IS NOT NULL"
+    return sorted({int(c) for c in rows.to_arrays("camera_id")})
+
+
+def _delete_files(files: Sequence[str], say: Say) -> None:
+    store = connection.store_backend()
+    say(f"Removing {len(files)} files from the store")
+    with progress.bar("files", total=len(files), unit="file") as update:
+        for path in files:
+            try:
+                store.remove(path)
+            except Exception as error:
+                raise store_error(error) from error
+            if store.protocol == "file":
+                _remove_empty(Path(store._full_path(path)).parent, len(PurePosixPath(path).parts) - 4)
+            update(1)
+
+
+def _remove_empty(folder: Path, levels: int) -> None:
+    """Remove empty folders upwards: their names carry the person's numbers."""
+    for _ in range(max(levels, 0)):
+        try:
+            folder.rmdir()
+        except OSError:
+            return
+        folder = folder.parent
+
+
+def _delete_videos(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict[str, str]]:
+    gone, kept = [], {}
+    for item in videos:
+        path = Path(item["path"])
+        if not os.path.lexists(path):
+            continue
+        if path.is_symlink() or not path.is_file():
+            kept[str(path)] = "it is no plain file"
+        elif video.Video & {"video_path": str(path)}:
+            kept[str(path)] = "another row names this path"
+        elif path.stat().st_size != item["size"] or library("video").sha256_of(path) != item["sha256"]:
+            kept[str(path)] = "it holds other bytes than were registered: another file took its place"
+        else:
+            try:
+                path.unlink()
+                gone.append(str(path))
+            except OSError as error:
+                kept[str(path)] = error.strerror or str(error)
+    return gone, kept
+
+
+# ------------------------------------------------------------------------------------------------------------- proof
+def _mentions(subject: str, videos: Sequence[dict[str, Any]]) -> list[str]:
+    """Columns anywhere that still hold the subject's code, or the path or checksum of one of the videos."""
+    terms = [t for v in videos for t in (v["path"], v["sha256"])]
+    conn = connection.connect()
+    rows = conn.query(
+        "SELECT table_schema, table_name, column_name, data_type FROM information_schema.columns "
+        "WHERE table_schema LIKE %s AND data_type IN ('char', 'varchar', 'text', 'longtext', 'json')",
+        args=(_dump.like(connection.prefix()),),
+    )
+    out = []
+    for schema, table, column, kind in rows.fetchall():
+        name = _dump.quote(column)
+        if column.startswith("subject") and "method" not in column:
+            test, values = f"{name} = %s", [subject]
+        elif not terms:
+            continue
+        elif kind in ("char", "varchar"):
+            test, values = f"{name} IN ({','.join(['%s'] * len(terms))})", terms
+        else:
+            test, values = " OR ".join([f"LOCATE(%s, {name})"] * len(terms)), terms
+        table_name = f"{_dump.quote(schema)}.{_dump.quote(table)}"
+        n = conn.query(f"SELECT COUNT(*) FROM {table_name} WHERE {test}", args=tuple(values)).fetchone()[0]  # noqa: S608
+        if n:
+            out.append(f"{n} rows of {schema}.{table} name it in {column}")
+    return out
+
+
+def read_manifest(subject: str) -> dict[str, Any]:
+    """The list that an earlier run wrote; empty where there is none."""
+    try:
+        return json.loads(manifest_path(subject).read_text())
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise PblError(
+            "FILE_FORMAT",
+            key=manifest_path(subject),
+            found=f"the list of an earlier run cannot be read ({error})",
+            expected="what pbl forget wrote",
+            next_step="restore the file; without it files that no row names any more cannot be found",
+        ) from error
+
+
+def _write(subject: str, manifest: dict[str, Any]) -> None:
+    path = manifest_path(subject)
+    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with os.fdopen(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as out:
+            json.dump(manifest, out, indent=1)
+            out.flush()
+            os.fsync(out.fileno())
+        aside.replace(path)
+    except OSError as error:
+        raise PblError(
+            "FILE_UNWRITABLE",
+            key=path,
+            found=error.strerror or str(error),
+            expected="a place for the list of what is removed: nothing was removed without it",
+            next_step="free space, or set PBL_HOME to a folder you may write to",
+        ) from error
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")

@@ -1,0 +1,188 @@
+"""A person who is forgotten leaves no row, no job and no file; everybody else stays."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+import schemas
+from schemas import _dump, connection, forget, keypoints, lab, video
+from schemas._declare import declare_all
+from schemas.ingest import Visit, ingest
+from tests.command import pbl
+from tests.inputs import CALIBRATION
+from workers.populate import populate
+
+from . import chain
+
+
+def everything() -> dict[str, list[tuple]]:
+    """Every row of every table but the server's memory of migrations and workers."""
+    with closing(connection.plain_connection(conv={})) as server:
+        found = {}
+        for schema, table in _dump.tables_of(server, "pbl"):
+            columns = _dump.columns_of(server, schema, table)
+            found[f"{schema}.{table}"] = sorted(_dump.rows_of(server, schema, table, columns), key=str)
+        return found
+
+
+def stored() -> set[str]:
+    """Every file of the store."""
+    root = Path(connection.store_backend().spec["location"])
+    return {str(p.relative_to(root)) for p in root.rglob("*") if p.is_file()}
+
+
+@pytest.fixture
+def two(database: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[dict, set[str], list[Path]]]:
+    """P001 alone through the chain; then P017 as well, with everything a person can have. What was there before P017,
+    the files, and P017's videos."""
+    chain.install(monkeypatch)
+    declare_all()
+    for path in stored():
+        (Path(connection.store_backend().spec["location"]) / path).unlink()
+    ingest([chain.small_video(tmp_path, "other")], Visit(subject="P001"))
+    populate()
+    rows, files = everything(), stored()
+    videos = [chain.small_video(tmp_path, "walk"), chain.small_video(tmp_path, "waits", people="two alike")]
+    (tmp_path / "notes.mp4").write_text("not a video")
+    (tmp_path / "camera.toml").write_text(CALIBRATION.replace("[1000, 1000]", "[128, 72]"))
+    videos.append(tmp_path / "notes.mp4")
+    results = ingest(videos, Visit(subject="P017", session_label="2026-03-01"))
+    assert [r.status for r in results] == ["registered"] * 3
+    populate()
+    # The queues have finished rows of this person, too; and a computation that was killed left a file without a row.
+    number = results[0].video_id
+    _queue(video.VideoInfo, "error", number)
+    _queue(keypoints.Keypoints, "pending", number)
+    connection.store_backend().put_buffer(
+        b"x", f"_schema/pbl_keypoints/__keypoints/video_id={number}/a=b/left_over.npz"
+    )
+    connection.connect().query(
+        "INSERT INTO pbl_worker.crash (stage, job_hash, job_key, crash_n, crash_reason, crash_time) "
+        "VALUES ('Tracking', 'h', %s, 1, '', NOW())",
+        args=(json.dumps({"video_id": number, "tracking_method": "x"}),),
+    )
+    yield rows, files, videos
+    lab.Subject.delete(prompt=False, part_integrity="cascade")
+    connection.connect().query("DELETE FROM pbl_worker.crash")
+    for table in schemas.computed_tables():
+        table.jobs.delete_quick()
+    forget.manifest_path("P017").unlink(missing_ok=True)
+
+
+def _queue(table: type, status: str, number: int | None) -> None:
+    jobs = table.jobs  # type: ignore[attr-defined]
+    key = {"video_id": number, "tracking_method": "m", "keypoint_method": "m"}
+    row = {k: v for k, v in key.items() if k in jobs.primary_key} | {"status": status, "priority": 5}
+    jobs.insert1(row, skip_duplicates=True)
+
+
+def test_nothing_of_the_person_is_left_and_nothing_else_is_touched(two: tuple[dict, set[str], list[Path]]):
+    rows, files, videos = two
+    full, all_files = everything(), stored()
+    dry = pbl("forget", "P017", "--videos")
+    assert dry.code == 0, dry.err
+    assert "this is a dry run" in dry.out
+    assert "left_over.npz" in dry.out
+    for table in ("subject", "__session_fit", "~~video_info", "crash"):
+        assert f".{table}\n" in dry.out
+    assert everything() == full
+    assert stored() == all_files
+    done = pbl("forget", "P017", "--yes")
+    assert done.code == 0, done.err + done.out
+    assert everything() == rows
+    assert stored() == files
+    assert all(v.exists() for v in videos)
+    # The proof names what went; folders whose names carried the person's numbers are gone as well.
+    proof = json.loads(forget.manifest_path("P017").read_text())
+    assert proof["state"] == "done"
+    assert set(proof["files"]) == all_files - files
+    assert proof["left"] == []
+    root = Path(connection.store_backend().spec["location"])
+    assert not list(root.rglob(f"video_id={proof['ids']['video_id'][0]}"))
+    # Later the videos are to go as well; nothing else is left to do.
+    again = pbl("forget", "P017", "--yes", "--videos")
+    assert again.code == 0, again.err
+    assert not any(v.exists() for v in videos)
+    assert everything() == rows
+
+
+def test_broken_off_it_is_repeated_until_done(two: tuple[dict, set[str], list[Path]], monkeypatch: pytest.MonkeyPatch):
+    rows, files, _ = two
+    removed = []
+
+    def remove(self: object, path: str) -> None:
+        if len(removed) == 3:
+            raise KeyboardInterrupt
+        removed.append(path)
+        original(self, path)
+
+    backend = type(connection.store_backend())
+    original = backend.remove
+    with monkeypatch.context() as patch:
+        patch.setattr(backend, "remove", remove)
+        with pytest.raises(KeyboardInterrupt):
+            forget.forget("P017")
+    assert everything() == rows
+    assert stored() != files
+    assert json.loads(forget.manifest_path("P017").read_text())["state"] == "begun"
+    # The rows are gone, and still the command knows what to remove.
+    done = pbl("forget", "P017", "--yes")
+    assert done.code == 0, done.err
+    assert stored() == files
+
+
+def test_an_unknown_code_removes_nothing_and_a_running_computation_holds_it_up(
+    two: tuple[dict, set[str], list[Path]],
+):
+    before = everything()
+    for subject in ("nobody", "P01", "p017", "../P017", "P017/../x", ""):
+        assert pbl("forget", subject, "--yes").error_code in ("DB_NOT_FOUND", "USAGE"), subject
+    assert everything() == before
+    jobs = keypoints.Keypoints.jobs
+    jobs.update1({**jobs.pending.keys()[0], "status": "reserved", "host": "node7", "pid": 4711})
+    held = pbl("forget", "P017", "--yes")
+    assert held.error_code == "DB_REFUSED"
+    assert "node7, process 4711" in held.err
+    assert {t: len(r) for t, r in everything().items()} == {t: len(r) for t, r in before.items()}
+
+
+def test_a_video_in_whose_place_another_lies_stays(two: tuple[dict, set[str], list[Path]]):
+    _, _, videos = two
+    videos[0].write_bytes(b"somebody else's")
+    done = pbl("forget", "P017", "--yes", "--videos")
+    assert done.code == 0, done.err
+    assert "another file took its place" in done.out
+    assert videos[0].read_bytes() == b"somebody else's"
+    assert not videos[1].exists()
+
+
+def test_every_table_of_a_person_says_whose_its_rows_are(database: Path):
+    """A new table that depends on a person, but has none of the columns that `pbl forget` looks at, fails here."""
+    declare_all()
+    conn = connection.connect()
+    edges = conn.query(
+        "SELECT table_schema, table_name, column_name, referenced_table_schema, referenced_table_name, "
+        "referenced_column_name FROM information_schema.key_column_usage "
+        "WHERE referenced_table_name IS NOT NULL AND table_schema LIKE %s",
+        args=(r"pbl\_%",),
+    ).fetchall()
+    personal = {("pbl_lab", "subject")}
+    while True:
+        more = {(s, t) for s, t, _, ps, pt, _ in edges if (ps, pt) in personal}
+        if more <= personal:
+            break
+        personal |= more
+    assert len(personal) > 30
+    known = {(s, t): columns for s, t, columns in forget._personal_tables(conn)}
+    assert not [t for t in personal if not set(forget.IDENTITIES) & set(known.get(t, {}))]
+    renamed = [e for e in edges if e[5] in forget.IDENTITIES and e[2] != e[5]]
+    assert not renamed
+    # The queues of these tables as well.
+    queues = {(s, "~~" + t.lstrip("_")) for s, t in personal if t.startswith("__") and "__" not in t[2:]}
+    assert queues
+    assert not [q for q in queues if q not in known]
