@@ -2,8 +2,8 @@
 
 A log that counts in UTC meets the time of recording in the video's file, which is rounded to seconds, and which some
 phones write for the beginning and others for the end. That is too coarse for a hand that shakes at 3 Hz, and the fit
-looks for half a second only. So the pictures decide where they can: a camera that turns moves the whole picture, and the
-movement of the picture must be that of the log at one shift of the clocks only.
+looks for half a second only. So the pictures decide where they can: a camera that turns moves the whole picture, and
+the movement of the picture must be that of the log at one shift of the clocks only.
 """
 
 from __future__ import annotations
