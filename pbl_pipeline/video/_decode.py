@@ -17,6 +17,7 @@ import av
 from av.container import InputContainer
 from av.error import FFmpegError
 
+from pbl_pipeline._memory import return_large_blocks
 from pbl_pipeline.errors import PblError
 
 from ._structure import family, missing_end
@@ -81,6 +82,7 @@ class Decoder:
     """
 
     def __init__(self, path: Path, threads: int | None = None, exact: bool = False) -> None:
+        return_large_blocks()
         self.path = path
         self.container = _open(path)
         self.stream = self._pick_stream()
