@@ -1,4 +1,7 @@
-"""The detector in two of the four cameras of the development recording (all: `python -m tests.benchmarks.detection`)."""
+"""The detector in two of the four cameras of the development recording.
+
+All four: `python -m tests.benchmarks.detection`.
+"""
 
 from __future__ import annotations
 

@@ -25,10 +25,10 @@ def arrays(keypoints: Keypoints) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def judged(keypoints: Keypoints, spoiled: Exchange | None = None) -> Exchange:
-    values = arrays(keypoints)
+    xy, xyz, confidence = arrays(keypoints)
     if spoiled is not None:
-        values = tuple(exchanged(v, spoiled, keypoints.names) for v in values)
-    return exchange_sides(keypoints.time_s, keypoints.names, *values)
+        xy, xyz, confidence = (exchanged(v, spoiled, keypoints.names) for v in (xy, xyz, confidence))
+    return exchange_sides(keypoints.time_s, keypoints.names, xy, xyz, confidence)
 
 
 def spoil(n_frames: int, what: str, first: int, length: int) -> Exchange:
@@ -76,8 +76,8 @@ def test_at_any_rate_of_frames_and_over_a_gap():
     spoiled = spoil(len(slow.time_s), "both", 60, 12)
     lost = [v.copy() for v in arrays(slow)]
     lost[0][58:62], lost[1][58:62], lost[2][58:62] = np.nan, np.nan, 0.0
-    values = (exchanged(v, spoiled, slow.names) for v in lost)
-    found = exchange_sides(slow.time_s, slow.names, *values)
+    xy, xyz, confidence = (exchanged(v, spoiled, slow.names) for v in lost)
+    found = exchange_sides(slow.time_s, slow.names, xy, xyz, confidence)
     np.testing.assert_array_equal(found.legs[62:], spoiled.legs[62:])
 
 
@@ -110,11 +110,11 @@ def test_a_body_without_width_is_marked_and_bridged():
     keypoints = seen(view="frontal")
     n, names = len(keypoints.time_s), keypoints.names
     spoiled = spoil(n, "both", 50, 6)
-    values = [exchanged(v, spoiled, names) for v in arrays(keypoints)]
+    xy, xyz, confidence = (exchanged(v, spoiled, names) for v in arrays(keypoints))
     for row in (49, 56):  # as the sides change
-        for v in values[:2]:
+        for v in (xy, xyz):
             v[row] = (v[row] + v[row][mirror_of(names)]) / 2
-    found = exchange_sides(keypoints.time_s, names, *values)
+    found = exchange_sides(keypoints.time_s, names, xy, xyz, confidence)
     np.testing.assert_array_equal(np.flatnonzero(found.narrow), [49, 56])
     keep = np.setdiff1d(np.arange(n), [49, 56])
     np.testing.assert_array_equal(found.legs[keep], spoiled.legs[keep])

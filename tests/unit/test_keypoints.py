@@ -229,7 +229,9 @@ def test_one_reading_sees_what_two_readings_of_the_video_see(case):
         found = _look([Cross() for _ in range(n_detectors)], video, roi, time, CAMERA, params, PictureMeter())
         assert [row for row, person in enumerate(found) if person is not None] == rows.tolist()
         for row in rows:
-            np.testing.assert_array_equal(found[row].xy_px[0], plain[row][:2])
+            person = found[row]
+            assert person is not None
+            np.testing.assert_array_equal(person.xy_px[0], plain[row][:2])
 
 
 def test_an_error_in_a_thread_is_raised(case):
