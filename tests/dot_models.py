@@ -164,12 +164,15 @@ def _centroid(g: Graph, weight: str, coordinate: str) -> str:
 
 
 def crop3d(
-    xyz_m: np.ndarray, size: tuple[int, int] = (256, 256), drift_mm: dict[str, float] | None = None
+    xyz_m: np.ndarray,
+    size: tuple[int, int] = (256, 256),
+    drift_mm: dict[str, float] | None = None,
+    origin_px: float = 0.0,
 ) -> onnx.ModelProto:
     """A crop model of the points (J, 3) in the camera's frame: `coords2d` px, `coords3d` mm in the crop's frame.
 
     `drift_mm`: a point's depth grows by so much times the grey of the background, which gamma changes: what a network
-    that is not sure does.
+    that is not sure does. `origin_px`: where the centre of the first pixel is.
     """
     width, height = size
     g = Graph()
@@ -178,7 +181,7 @@ def crop3d(
     rows = g.const(np.tile(np.arange(height)[:, None], (1, width))[None, None])
     xy = g("Concat", _centroid(g, weight, columns), _centroid(g, weight, rows), axis=3)
     xy = g("Squeeze", xy, g.const([2], np.int64))  # (N, J, 2)
-    g("Identity", xy, out="coords2d")
+    g("Add", xy, g.const([origin_px, origin_px]), out="coords2d")
     p = g("Sub", xy, g.const([(width - 1) / 2, (height - 1) / 2]))
     a, b = NAMES.index("head"), NAMES.index("base")
     norm = np.linalg.norm(xyz_m, axis=1)
