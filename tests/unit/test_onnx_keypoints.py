@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+import pbl_pipeline.tracking
 from pbl_pipeline import models
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import (
@@ -486,6 +488,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Tracking]:
 @pytest.fixture
 def registered(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("PBL_MODELS", str(tmp_path / "models"))
+    monkeypatch.setenv("PBL_ONNX_DEVICE", "cpu")  # also put back what `--device` sets
     models.add(dot_models.write(tmp_path / "a", dot_models.crop3d(person()), dot_models.spec("crop3d")))
     models.add(dot_models.write(tmp_path / "b", dot_models.simcc(), dot_models.spec("simcc", (192, 256))))
 
@@ -529,6 +532,21 @@ def test_what_is_wrong_with_the_call_is_found_before_the_work(video, registered,
     cuda = pbl("detect", path, "--out", tmp_path / "k.npz", "--keypoints", "dots-simcc", "--device", "cuda")
     if "cuda" not in models.available_devices():
         assert cuda.error_code == "DEVICE_UNAVAILABLE"
+
+
+def test_pbl_detect_shows_the_licence_before_the_work(video, registered, tmp_path, monkeypatch):
+    path, tracking = video
+    monkeypatch.setattr(pbl_pipeline.tracking, "track_people", lambda *_, **__: tracking)
+    camera = {"camera_matrix": CAMERA.matrix.tolist(), "distortion": CAMERA.distortion.tolist()}
+    (tmp_path / "camera.json").write_text(json.dumps(camera | {"image_size_px": [960, 720]}))
+    arguments = ("--out", tmp_path / "k.npz", "--camera", tmp_path / "camera.json", "--person", 1)
+    done = pbl("detect", path, *arguments, "--keypoints", "dots-crop3d", "--device", "cpu")
+    assert done.code == 0, done.err
+    lines = done.out.splitlines()
+    assert lines[0] == "keypoints by the model dots-crop3d, licence: CC0-1.0, a test"
+    assert any("10 points (dots_10) of person 1 in 45 of 45 frames" in line for line in lines)
+    assert any(line.startswith("  keypoints by crop3d model dots-crop3d, SHA-256") for line in lines)
+    assert Keypoints.load(tmp_path / "k.npz").marker_set == "dots_10"
 
 
 def test_the_report_names_the_model(video, registered):
