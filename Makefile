@@ -28,10 +28,14 @@ format: $(READY) ## rewrite the source in the project's format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-lock: $(READY)  ## choose the newest allowed version of every dependency and write requirements.lock
+LOCK := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+	  --no-emit-find-links --upgrade --custom-compile-command "make lock"
+
+lock: $(READY)  ## choose the newest allowed version of every dependency and write requirements.lock and the images' two
 	$(BIN)/pip install --quiet uv
-	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev --generate-hashes --no-emit-index-url \
-	  --no-emit-find-links --upgrade --custom-compile-command "make lock" --output-file requirements.lock pyproject.toml
+	$(LOCK) --extra dev --output-file requirements.lock pyproject.toml
+	$(LOCK) --extra s3 --output-file workers/deploy/requirements-cpu.lock pyproject.toml
+	$(LOCK) --extra s3 --extra gpu --output-file workers/deploy/requirements-gpu.lock pyproject.toml
 
 # Debian splits `venv` off; without it the environment cannot hold pip, so it is installed once (root or sudo).
 $(READY): pyproject.toml requirements.lock

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pymysql
 import pytest
+import yaml
 
 import schemas
 from pbl_pipeline.errors import PblError
@@ -21,6 +22,8 @@ from workers.populate import populate
 from . import chain
 
 Login = Callable[[str], None]
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -96,6 +99,21 @@ def test_a_worker_fills_every_table_and_changes_none(login: Login, tmp_path: Pat
     assert not refused("DROP DATABASE pbl_more")
     assert refused("CREATE DATABASE elsewhere")
     assert refused("CREATE USER 'x'@'%' IDENTIFIED BY 'long-enough-1'")
+
+
+def test_the_queries_that_scale_workers_count_the_queues(login: Login):
+    """What KEDA asks the database in workers/deploy/kubernetes/scale.yaml."""
+    login("worker")
+    objects = yaml.safe_load_all((ROOT / "workers" / "deploy" / "kubernetes" / "scale.yaml").read_text())
+    queries = [d["spec"]["triggers"][0]["metadata"]["query"] for d in objects if d["kind"] == "ScaledObject"]
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        for query in queries:
+            cursor.execute(query)
+            assert cursor.fetchall() == ((0,),)
+        jobs = "INSERT INTO pbl_video.`~~video_info` (video_id, status, priority) VALUES (%s, %s, 5)"
+        cursor.executemany(jobs, [(1, "pending"), (2, "reserved"), (3, "error")])
+        counted = [cursor.execute(query) and cursor.fetchall()[0][0] for query in queries]
+    assert sorted(counted) == [0, 2]
 
 
 def test_it_can_be_repeated_and_takes_excess_rights_back(secrets: Path, login: Login):

@@ -1,0 +1,269 @@
+"""The files that bring workers onto machines: valid, without passwords, and calling commands that exist."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+import yaml
+
+from pbl_pipeline.cli._main import cli
+
+ROOT = Path(__file__).resolve().parents[2]
+DEPLOY = ROOT / "workers" / "deploy"
+KUBERNETES = sorted((DEPLOY / "kubernetes").glob("*.yaml"))
+SCRIPTS = [*sorted(DEPLOY.rglob("*.sh")), DEPLOY / "slurm" / "worker.sbatch"]
+CRON = ("import", "refresh", "release", "disk", "reprocess", "summary")
+
+
+def compose() -> dict[str, Any]:
+    return yaml.safe_load((ROOT / "docker-compose.yml").read_text())
+
+
+def documents(path: Path) -> list[dict[str, Any]]:
+    return list(yaml.safe_load_all(path.read_text()))
+
+
+def program(folder: Path, name: str, text: str) -> Path:
+    path = folder / name
+    path.write_text("#!/bin/sh\n" + text)
+    path.chmod(0o755)
+    return path
+
+
+# ------------------------------------------------------------------------------------------------------------- compose
+def test_the_compose_file_is_what_its_specification_allows():
+    check = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec"]
+    done = subprocess.run([*check, ROOT / "docker-compose.yml"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_services_listen_on_this_machine_only_and_have_no_password_of_their_own():
+    services = compose()["services"]
+    assert set(services) >= {"db", "store", "worker-cpu", "worker-gpu", "cron", "migrate", "roles"}
+    for name, service in services.items():
+        assert all(str(port).startswith("127.0.0.1:") for port in service.get("ports", [])), name
+        assert service["logging"]["options"].keys() == {"max-size", "max-file"}, name
+        assert "restart" in service, name
+        for variable, value in service.get("environment", {}).items():
+            if re.search(r"PASS|SECRET|TOKEN", variable):
+                assert variable.endswith("_FILE"), f"{name}: {variable}"
+                assert value.startswith("/run/secrets/"), f"{name}: {variable}"
+                assert Path(value).name in service["secrets"], f"{name} reads a secret that it does not mount"
+    for name in ("db", "store", "worker-cpu", "worker-gpu"):
+        assert "healthcheck" in services[name], name
+    for name in ("worker-cpu", "worker-gpu", "cron", "migrate", "roles"):
+        assert services[name]["cap_drop"] == ["ALL"], name
+        assert services[name]["read_only"] is True, name
+    # Rights that a service does not need it cannot even look up.
+    assert not {"mysql_root", "pbl_owner", "store_root", "store_owner"} & set(services["worker-cpu"]["secrets"])
+    assert services["worker-gpu"]["profiles"] == ["gpu"]
+    assert services["worker-gpu"]["deploy"]["resources"]["reservations"]["devices"][0]["capabilities"] == ["gpu"]
+
+
+def test_a_worker_has_longer_to_end_than_it_takes():
+    grace = next(p for p in command(["worker"]).params if p.name == "grace_s").default
+    assert int(compose()["services"]["worker-cpu"]["stop_grace_period"].removesuffix("s")) > grace
+    for name in ("worker-cpu", "worker-gpu"):
+        (deployment,) = documents(DEPLOY / "kubernetes" / f"{name}.yaml")
+        assert deployment["spec"]["template"]["spec"]["terminationGracePeriodSeconds"] > grace
+    unit = (DEPLOY / "systemd" / "pbl-worker@.service").read_text()
+    assert int(re.search(r"TimeoutStopSec=(\d+)", unit).group(1)) > grace  # type: ignore[union-attr]
+
+
+def test_every_secret_is_made_by_the_script(tmp_path: Path):
+    folder = tmp_path / "secrets"
+    for _ in range(2):
+        subprocess.run(["sh", DEPLOY / "make-secrets.sh", folder], check=True)
+        made = {p.name: p.read_text() for p in folder.iterdir()}
+        assert made.keys() == compose()["secrets"].keys()
+        assert len(set(made.values())) == len(made)
+        assert all(re.fullmatch("[0-9a-f]{48}", text) for text in made.values())
+        assert {p.stat().st_mode & 0o777 for p in folder.iterdir()} == {0o600}
+    (folder / "pbl_worker").write_text("my own")
+    subprocess.run(["sh", DEPLOY / "make-secrets.sh", folder], check=True)
+    assert (folder / "pbl_worker").read_text() == "my own"
+    assert "/secrets/" in (ROOT / ".gitignore").read_text()
+
+
+# ------------------------------------------------------------------------------------------------- commands that exist
+def command(words: list[str]) -> click.Command:
+    """The command that a call of pbl names, its options checked; fails where there is none."""
+    context, found = click.Context(cli), cli
+    rest = [w for w in words if w != "--quiet"]
+    while isinstance(found, click.Group):
+        name = rest.pop(0)
+        below = found.get_command(context, name)
+        assert below is not None, f"pbl has no {name} ({' '.join(words)})"
+        found = below
+    known = {o for p in found.params for o in p.opts}
+    assert not [w for w in rest if w.startswith("--") and w not in known], words
+    return found
+
+
+def calls() -> list[list[str]]:
+    """Every call of pbl in the files of the deployment."""
+    out = []
+    for service in compose()["services"].values():
+        if "image" in service and service["image"].startswith("pbl:") and "command" in service:
+            out.append([str(w) for w in service["command"]])
+    for path in KUBERNETES:
+        for document in documents(path):
+            text = str(document)
+            out += [re.findall(r"'([^']*)'", args) for args in re.findall(r"'args': \[([^\]]*)\]", text)]
+    for path in (
+        DEPLOY / "crontab",
+        *sorted((DEPLOY / "systemd").glob("*.service")),
+        DEPLOY / "slurm" / "worker.sbatch",
+    ):
+        for line in path.read_text().splitlines():
+            match = re.search(r"(?:^|[ /])pbl\"? ((?:--quiet )?(?:worker|cron) .*)$", line)
+            if match and not line.startswith("#"):
+                words = match.group(1).replace('"', "").removesuffix(" &").split()
+                # the unit of systemd stands for all of its instances
+                out += [[w.replace("%i", job) for w in words] for job in (CRON if "cron" in words else ("cpu",))][:99]
+    return out
+
+
+def test_all_files_call_commands_and_options_that_exist():
+    found = calls()
+    assert len(found) > 20
+    for words in found:
+        if "cron" in words and cli.get_command(click.Context(cli), "cron") is None:
+            pytest.skip("pbl cron is not registered yet")
+        command(words)
+    assert {w[w.index("cron") + 1] for w in found if "cron" in w} == set(CRON)
+
+
+def test_the_loop_and_the_timers_run_every_cron_job():
+    loop = (DEPLOY / "cron-loop.sh").read_text()
+    assert set(re.findall(r"run (\w+)$", loop, re.MULTILINE)) == set(CRON)
+    timers = {p.name.split("@")[1].removesuffix(".timer") for p in (DEPLOY / "systemd").glob("*.timer")}
+    assert timers == set(CRON)
+    jobs = {d["metadata"]["name"].removeprefix("cron-") for d in documents(DEPLOY / "kubernetes" / "cron.yaml")}
+    assert jobs == set(CRON)
+
+
+# ------------------------------------------------------------------------------------------------------------- scripts
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda p: p.name)
+def test_scripts_have_no_fault_that_shellcheck_knows(script: Path):
+    linter = Path(sys.executable).with_name("shellcheck")
+    done = subprocess.run([linter, script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_entrypoint_seeds_an_empty_cache_and_runs_pbl(tmp_path: Path):
+    seed, cache = tmp_path / "seed", tmp_path / "cache"
+    (seed / "assets").mkdir(parents=True)
+    (seed / "assets" / "model.tflite").write_text("model")
+    (seed / "assets" / "other").write_text("new")
+    (cache / "assets").mkdir(parents=True)
+    (cache / "assets" / "other").write_text("there already")
+    program(tmp_path, "pbl", 'echo "pbl $*"\nexit 7\n')
+    environment = {"PATH": f"{tmp_path}:/usr/bin:/bin", "PBL_SEED": str(seed), "PBL_CACHE": str(cache)}
+    start = ["sh", str(DEPLOY / "entrypoint.sh"), "worker", "--resource", "a b"]
+    done = subprocess.run(start, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (7, "pbl worker --resource a b\n"), done.stderr
+    found = {p.name: p.read_text() for p in cache.rglob("*") if p.is_file()}
+    assert found == {"model.tflite": "model", "other": "there already"}
+
+
+def test_the_cron_loop_goes_on_after_a_job_that_fails_and_ends_when_told(tmp_path: Path):
+    program(tmp_path, "pbl", f'echo "$3" >> {tmp_path}/ran\n[ "$3" != import ]\n')
+    environment = {"PATH": f"{tmp_path}:/usr/bin:/bin", "PBL_CRON_TICK_S": "0.02"}
+    loop = subprocess.Popen(["sh", DEPLOY / "cron-loop.sh"], env=environment, stderr=subprocess.PIPE, text=True)
+    ran = tmp_path / "ran"
+    deadline = time.monotonic() + 30
+    while not (ran.exists() and ran.read_text().count("refresh") >= 3) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    loop.send_signal(signal.SIGTERM)
+    _, said = loop.communicate(timeout=10)
+    assert loop.returncode == 0
+    names = ran.read_text().split()
+    assert names[:3] == ["import", "refresh", "release"]
+    assert names.count("import") > 2 * names.count("refresh") > 2
+    assert "pbl cron import failed with code 1" in said
+
+
+def test_the_slurm_script_ends_its_worker_in_order(tmp_path: Path):
+    (tmp_path / "bin").mkdir()
+    worker = "trap 'sleep 0.3; echo ended; exit 5' TERM\necho \"$DJ_HOST $*\"\nwhile :; do sleep 0.05; done\n"
+    program(tmp_path / "bin", "pbl", worker)
+    settings = tmp_path / "worker.env"
+    settings.write_text("DJ_HOST=db.example\n")
+    environment = {"PATH": "/usr/bin:/bin", "HOME": str(tmp_path), "PBL_VENV": str(tmp_path), "PBL_RESOURCE": "gpu"}
+    start = ["bash", DEPLOY / "slurm" / "worker.sbatch"]
+    missing = subprocess.run(start, env=environment, capture_output=True, text=True, check=False)
+    assert missing.returncode == 2
+    assert "PBL_SETTINGS" in missing.stderr
+    environment["PBL_SETTINGS"] = str(settings)
+    job = subprocess.Popen(start, env=environment, stdout=subprocess.PIPE, text=True)
+    assert job.stdout is not None
+    assert job.stdout.readline() == "db.example worker --resource gpu --grace 90\n"
+    job.send_signal(signal.SIGTERM)
+    said, _ = job.communicate(timeout=10)
+    assert said == "ended\n"
+    assert job.returncode == 5
+
+
+# ---------------------------------------------------------------------------------------------------------- kubernetes
+def test_pods_run_as_nobody_special_and_read_secrets_from_files():
+    pods = 0
+    for path in KUBERNETES:
+        for document in documents(path):
+            if document["kind"] not in ("Deployment", "CronJob", "Job"):
+                continue
+            pods += 1
+            spec = document["spec"]
+            spec = (spec.get("jobTemplate", {"spec": spec})["spec"])["template"]["spec"]
+            assert spec["securityContext"]["runAsNonRoot"] is True
+            assert spec["automountServiceAccountToken"] is False
+            (container,) = spec["containers"]
+            assert container["securityContext"]["readOnlyRootFilesystem"] is True
+            assert {"requests", "limits"} <= container["resources"].keys()
+            assert {m["name"] for m in container["volumeMounts"]} == {v["name"] for v in spec["volumes"]}
+            wanted = {e["value"] for e in container.get("env", []) if e["name"].endswith("_FILE")}
+            secret = next(v["secret"] for v in spec["volumes"] if v["name"] == "secrets")
+            mounted = {f"/run/secrets/pbl/{item['path']}" for item in secret["items"]}
+            assert wanted <= mounted
+            if document["kind"] != "Job":
+                assert not any("owner" in m for m in mounted)
+    assert pods == 9
+    assert not [d for p in KUBERNETES for d in documents(p) if d["kind"] == "Secret"]
+    kustomization = documents(DEPLOY / "kubernetes" / "kustomization.yaml")[0]
+    assert {p.name for p in KUBERNETES} == {"kustomization.yaml", *kustomization["resources"]}
+
+
+def test_manifests_are_what_their_schemas_allow():
+    validate = pytest.importorskip("kubernetes_validate", reason="pip install kubernetes-validate (100 MB)")
+    for path in KUBERNETES:
+        for document in documents(path):
+            if not document["apiVersion"].startswith(("keda.sh", "kustomize")):
+                validate.validate(document, "1.30", strict=True)
+
+
+def test_the_number_of_workers_follows_every_queue():
+    """The query names the queue of each table that the worker serves (the tables are tested with a database)."""
+    from schemas import COMPUTED
+    from workers.registry import GROUPS, STAGES
+
+    queries = {
+        d["metadata"]["name"]: d["spec"]["triggers"][0]["metadata"]["query"]
+        for d in documents(DEPLOY / "kubernetes" / "scale.yaml")
+        if d["kind"] == "ScaledObject"
+    }
+    for group in ("cpu", "gpu"):
+        served = {s.table for s in STAGES if s.resource in GROUPS[group]}
+        wanted = {f"pbl_{module}.`~~{_snake(name)}`" for module, name in COMPUTED if name in served}
+        assert set(re.findall(r"FROM (\S+) WHERE", queries[f"worker-{group}"])) == wanted
+
+
+def _snake(name: str) -> str:
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower()

@@ -1,0 +1,10 @@
+#!/bin/sh
+# Random passwords of 190 bits, one per file, readable by you only. What is there stays.
+#   sh workers/deploy/make-secrets.sh [DIR]     (default: secrets/, which git ignores)
+set -eu
+folder="${1:-secrets}"
+umask 077
+mkdir -p "$folder"
+for name in mysql_root pbl_owner pbl_worker pbl_analyst store_root store_owner store_worker; do
+    [ -s "$folder/$name" ] || od -An -N24 -tx1 /dev/urandom | tr -d ' \n' >"$folder/$name"
+done
