@@ -14,14 +14,14 @@ from pbl_pipeline import assets, progress
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import read_frames
 
-#: The frames of the demo recording in which the woman is wholly in the picture.
-_FIRST, _STOP = 45, 181
+#: The frames of the demo recording in which the woman is wholly in the picture and not near its border.
+_FIRST, _STOP = 60, 166
 _SIZE = (1920, 1080)
 _FPS = 30
 
 
 def demo_clip(path: Path) -> Path:
-    """Write the demo recording's walk there and back, 9 s of 1920x1080 H.264 at 30 fps and about 8 Mbit/s.
+    """Write the demo recording's walk there and back, 7 s of 1920x1080 H.264 at 30 fps and about 8 Mbit/s.
 
     Forwards and then backwards: repeated, nobody jumps. Raises those of `assets.fetch`.
     """

@@ -111,7 +111,7 @@ def exchange_sides(
     points = _in_metres(xy_px, xyz_cam_m, params.depth_weight)
     # A pair of points counts alike under either name, and only where both are seen.
     weight = np.sqrt(0.5 * (confidence + confidence[:, mirror]))
-    lost = ~np.isfinite(points).all(axis=2)
+    lost = np.isnan(points.sum(axis=2))
     weight[lost | lost[:, mirror]] = 0.0
     good = np.flatnonzero(
         np.all([confidence[:, g].mean(axis=1) >= params.min_confidence for g in paired], axis=0)
@@ -242,7 +242,7 @@ def _narrow(names: Sequence[str], xyz_cam_m: np.ndarray, least_width: float) -> 
 
 def _smoothest(shown: _Shown, time_s: np.ndarray, key: np.ndarray, params: FlipParams) -> np.ndarray:
     """(K,) states of the frames `key` with the least cost: second-order dynamic programming over pairs of states."""
-    changed = params.change_cost_m * _STATES.any(axis=1)
+    changed = np.where(_STATES.any(axis=1), params.change_cost_m, 0.0)
     switched = params.switch_cost_m * (_STATES[:, None] != _STATES[None]).any(axis=2)
     n = len(key)
     cost = np.full((_N_STATES, _N_STATES), 0.0)  # (state before, state now)
