@@ -154,6 +154,19 @@ def test_curves_have_the_signs_of_gait():
     assert angles.left["pelvis_tilt"][40] == pytest.approx(10, abs=1e-3)  # OpenSim's negative tilt is anterior
 
 
+@pytest.mark.parametrize("heading_deg", [0, 110])
+def test_toes_in_is_positive_on_both_sides(heading_deg):
+    """A straight leg that turns inwards at the hip turns its foot by as much, whatever the heading."""
+    still = {"pelvis_rotation": np.radians(heading_deg)}
+    straight = angle_series(make_fit(np.arange(60) / 30, still))
+    turned = angle_series(
+        make_fit(np.arange(60) / 30, {**still, "hip_rotation_l": np.radians(15), "hip_rotation_r": np.radians(-10)})
+    )
+    for side, deg in (("left", 15.0), ("right", -10.0)):
+        change = turned.of_side(side)["foot_progression"] - straight.of_side(side)["foot_progression"]
+        np.testing.assert_allclose(change, deg, atol=1.0)
+
+
 def test_pelvis_curves_belong_to_a_side():
     """Right side ahead and right side up are positive for the right, negative for the left."""
     time = np.arange(0, 12, 1 / 30)
