@@ -2,8 +2,8 @@
 
 The C library of Linux keeps blocks of up to 32 MB in one heap once the first of them was freed. A picture of a phone
 video has 6 MB; between two of them small results are stored that stay, so the hole that a picture leaves is soon too
-small for the next one, and the heap grows although nothing is held: 1 MB for each frame of 1080p tracked, 11 GB over ten
-minutes. With a fixed limit large blocks are mapped on their own and returned when freed.
+small for the next one, and the heap grows although nothing is held: tracking took 3.3 GB after two minutes of 1080p.
+With a fixed limit large blocks are mapped on their own and returned when freed.
 """
 
 from __future__ import annotations

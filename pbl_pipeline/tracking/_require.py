@@ -9,6 +9,9 @@ from pbl_pipeline.errors import PblError
 from ._sheet import save_contact_sheet
 from ._types import SubjectChoice, Tracking
 
+#: With fewer frames nobody can be followed, whoever is in the picture.
+LEAST_FRAMES = 10
+
 
 def require_subject(choice: SubjectChoice, tracking: Tracking, video_path: str | Path, sheet: Path) -> int:
     """The chosen person's number. Where a person has to choose, the numbered people are drawn into `sheet` (PNG).
@@ -18,13 +21,7 @@ def require_subject(choice: SubjectChoice, tracking: Tracking, video_path: str |
     if choice.person_id is not None:
         return choice.person_id
     if choice.status == "NO_PERSON":
-        raise PblError(
-            "TRACK_NO_PERSON",
-            found="no person in any frame",
-            expected="a person who takes at least about a fifth of the picture's height",
-            next_step="film from nearer, in light, so that the whole body is in the picture",
-            key=str(video_path),
-        )
+        raise _nobody(tracking, video_path)
     sheet.parent.mkdir(parents=True, exist_ok=True)
     ranked = sorted(choice.scores, key=lambda k: -choice.scores[k])
     save_contact_sheet(video_path, tracking, sheet, ranked)
@@ -34,5 +31,24 @@ def require_subject(choice: SubjectChoice, tracking: Tracking, video_path: str |
         found=f"{len(tracking.persons)} people, none clearly the subject: person {named}",
         expected="one person who walks, is in view longer, or is larger than the others",
         next_step=f"look at {sheet} and call again with --person N, for example --person {ranked[0]}",
+        key=str(video_path),
+    )
+
+
+def _nobody(tracking: Tracking, video_path: str | Path) -> PblError:
+    n = len(tracking.time_s)
+    if n < LEAST_FRAMES:
+        return PblError(
+            "TRACK_NO_PERSON",
+            found=f"nobody can be followed in a video of {n} frame{'s' * (n != 1)}",
+            expected="a recording of several steps",
+            next_step="choose the recording itself, not a still picture or a preview of it",
+            key=str(video_path),
+        )
+    return PblError(
+        "TRACK_NO_PERSON",
+        found="no person in any frame",
+        expected="a person who takes at least about a fifth of the picture's height",
+        next_step="film from nearer, in light, so that the whole body is in the picture",
         key=str(video_path),
     )

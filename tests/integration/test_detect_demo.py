@@ -14,7 +14,14 @@ from pbl_pipeline import assets
 from pbl_pipeline.cli.detect import detect
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import KeypointParams, Keypoints, check_keypoints, detect_keypoints
-from pbl_pipeline.tracking import PersonTrack, Tracking, choose_subject, track_people
+from pbl_pipeline.tracking import (
+    PersonTrack,
+    Tracking,
+    TrackingParams,
+    WatchParams,
+    choose_subject,
+    track_people,
+)
 from pbl_pipeline.video import guess_camera, load_camera, read_frames
 from tests.unit.test_blazepose import BY_EYE, asset
 from tests.videos import constant_rate, write_video
@@ -60,19 +67,15 @@ def hips_at(tracking: Tracking, frame: int) -> dict[int, np.ndarray]:
     return {p.person_id: p.roi_px[frame, :2] for p in tracking.persons if np.isfinite(p.roi_px[frame, 0])}
 
 
+#: Middle of her hips by eye: frame, x, y (px).
+HER_WAY = ((45, 1525, 750), (75, 1266, 740), (105, 959, 715), (135, 680, 715), (165, 370, 712), (180, 200, 730))
+
+
 def test_both_people_are_tracked_and_she_is_one_person(tracking):
     # By eye: she walks from x = 1525 in frame 45 to x = 199 in frame 180; he stands on the wall, at x = 640 in
     # frame 60; from about frame 195 on he has landed on the lawn, at x = 1250 in frame 210.
     ids = {
-        next(k for k, xy in hips_at(tracking, f).items() if np.hypot(xy[0] - x, xy[1] - y) < 60)
-        for f, x, y in [
-            (45, 1525, 750),
-            (75, 1266, 740),
-            (105, 959, 715),
-            (135, 680, 715),
-            (165, 370, 712),
-            (180, 200, 730),
-        ]
+        next(k for k, xy in hips_at(tracking, f).items() if np.hypot(xy[0] - x, xy[1] - y) < 60) for f, x, y in HER_WAY
     }
     assert len(ids) == 1
     man = {k for k, xy in hips_at(tracking, 60).items() if np.hypot(xy[0] - 635, xy[1] - 270) < 60}
@@ -80,6 +83,55 @@ def test_both_people_are_tracked_and_she_is_one_person(tracking):
     assert man
     assert landed
     assert not ids & (man | landed)
+
+
+def test_she_is_one_person_from_her_first_to_her_last_frame_in_view(tracking):
+    """She comes from behind a tree, wholly in the picture from frame 43 on, and until 185 before she leaves it."""
+    her = choose_subject(tracking).person_id
+    (track,) = (p for p in tracking.persons if p.person_id == her)
+    seen = np.flatnonzero(np.isfinite(track.box_px[:, 0]))
+    assert seen[0] <= 43
+    assert seen[-1] >= 185
+    assert len(seen) == seen[-1] - seen[0] + 1
+    frames = np.arange(45, 181)
+    x, y = (np.interp(frames, [w[0] for w in HER_WAY], [w[k] for w in HER_WAY]) for k in (1, 2))
+    apart = np.hypot(track.roi_px[frames, 0] - x, track.roi_px[frames, 1] - y)
+    assert apart.max() < 60
+    # Nobody else is ever where she is.
+    for other in tracking.persons:
+        if other.person_id != her:
+            away = np.hypot(other.roi_px[frames, 0] - x, other.roi_px[frames, 1] - y)
+            assert not (away < 150).any()
+
+
+def test_landmarks_are_on_her_in_98_percent_of_these_frames(keypoints):
+    frames = np.arange(43, 186)
+    x, y = (np.interp(frames, [w[0] for w in HER_WAY], [w[k] for w in HER_WAY]) for k in (1, 2))
+    hips = np.mean([keypoints.xy_px[frames, keypoints.names.index(f"{s}_hip")] for s in ("left", "right")], axis=0)
+    assert (np.hypot(hips[:, 0] - x, hips[:, 1] - y) < 60).mean() >= 0.98
+
+
+def test_looking_where_it_is_needed_is_as_good_as_looking_in_every_frame(demo, tracking, tmp_path):
+    """Body circles of the walker, against the whole frame and all tiles searched in each of 60 frames."""
+    everywhere = WatchParams(
+        follow_interval_s=0.0, rest_interval_s=0.0, close_interval_s=0.0, search_interval_s=0.0, search_windows=99
+    )
+    frames = slice(80, 140)
+    part = write_video(
+        tmp_path / "part.mkv",
+        (f.image for f in read_frames(demo, start=80, stop=140)),
+        constant_rate(60),
+        codec="ffv1",
+        pixel_format="bgr0",
+    )
+    dense = track_people(part, TrackingParams(watch=everywhere))
+    her = choose_subject(tracking).person_id
+    (sparse,) = (p.roi_px[frames] for p in tracking.persons if p.person_id == her)
+    (throughout,) = (p.roi_px for p in dense.persons if np.hypot(*(p.roi_px[25, :2] - (959, 715))) < 60)
+    apart = np.hypot(*(sparse[:, :2] - throughout[:, :2]).T) / throughout[:, 2]
+    assert np.median(apart) < 0.03
+    assert np.percentile(apart, 95) < 0.08
+    assert abs(np.median(np.log(sparse[:, 2] / throughout[:, 2]))) < 0.08
 
 
 def test_the_walker_is_chosen_with_a_reason(tracking):
@@ -167,7 +219,7 @@ def test_a_single_person_is_chosen_whatever_she_does(shared_data, demo, tmp_path
 
 
 def test_command_on_a_cut_of_the_demo(demo, tmp_path):
-    video = write_video(tmp_path / "she.mp4", cut(demo, 80, 125, slice(500, 1500), slice(394, 994)), constant_rate(35))
+    video = write_video(tmp_path / "she.mp4", cut(demo, 80, 125, slice(500, 1500), slice(394, 994)), constant_rate(45))
     result = run(video, "--out", tmp_path / "new" / "she.npz")
     assert result.exit_code == 0, result.output
     assert "CHOSEN" in result.output
@@ -185,7 +237,7 @@ def test_nobody_in_noise(demo, tmp_path):
     rng = np.random.default_rng(1)
     coarse = rng.integers(0, 256, (45, 18, 32, 3), np.uint8)
     video = write_video(
-        tmp_path / "n.mp4", (np.kron(c, np.ones((20, 20, 1), np.uint8)) for c in coarse), constant_rate(35)
+        tmp_path / "n.mp4", (np.kron(c, np.ones((20, 20, 1), np.uint8)) for c in coarse), constant_rate(45)
     )
     result = run(video, "--out", tmp_path / "n.npz")
     assert code_of(result) == "TRACK_NO_PERSON"
@@ -193,12 +245,21 @@ def test_nobody_in_noise(demo, tmp_path):
     assert not (tmp_path / "n.npz").exists()
 
 
+def test_one_frame(demo, tmp_path):
+    """Somebody is in it, but nobody can be followed: a code that says so."""
+    video = write_video(tmp_path / "one.mp4", cut(demo, 100, 101, slice(500, 1500), slice(394, 994)), [0.0])
+    result = run(video, "--out", tmp_path / "one.npz")
+    assert code_of(result) == "TRACK_NO_PERSON"
+    assert "a video of 1 frame" in str(result.exception)
+    assert not (tmp_path / "one.npz").exists()
+
+
 def test_her_and_her_mirror_image_need_a_choice(demo, tmp_path):
     def frames():
         for image in cut(demo, 75, 120, slice(700, 1500), slice(394, 994)):
             yield np.hstack([image, image[:, ::-1]])
 
-    video = write_video(tmp_path / "two.mp4", frames(), constant_rate(35))
+    video = write_video(tmp_path / "two.mp4", frames(), constant_rate(45))
     result = run(video, "--out", tmp_path / "two.npz")
     assert code_of(result) == "SUBJECT_NEEDS_CHOICE"
     assert "--person" in str(result.exception)
