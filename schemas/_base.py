@@ -164,8 +164,9 @@ def error_code(message: str) -> str:
 
 
 def error_next_step(message: str) -> str:
-    """The next step an error row's message states, or how to report it."""
-    for line in message.splitlines():
+    """The next step an error row's message states, or how to report it. The last one: names stand before it, and the
+    name of a file may hold a line that looks like one."""
+    for line in reversed(message.splitlines()):
         if line.strip().startswith("next:"):
             return line.strip().removeprefix("next:").strip()
     return "report this with the error stack that `pbl status --json` prints"
@@ -316,6 +317,17 @@ def plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     return value
+
+
+# ---------------------------------------------------------------------------------------------------- job tables
+_jobs: dict[Any, Any] = {}
+
+
+def jobs_of(table: Any) -> Any:
+    """The job table of a computed table (class), made once: DataJoint reads every foreign key of the server for it."""
+    if table not in _jobs:
+        _jobs[table] = table.jobs
+    return _jobs[table]
 
 
 # ------------------------------------------------------------------------------------------------- files of a row

@@ -10,7 +10,7 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 
 from . import tracking, video
-from ._base import file_ref, library, resolve_method, stored_file
+from ._base import file_ref, jobs_of, library, resolve_method, stored_file
 from .results import load_tracking
 
 
@@ -134,7 +134,7 @@ def choose_person(video_id: int, person: int, tracking_method: str | None = None
     """
     key = _key(video_id, tracking_method)
     selections = (tracking.TrackingSelection & key).keys()
-    failed = tracking.SubjectChoice.jobs  # declares the job table, which would end a transaction
+    failed = jobs_of(tracking.SubjectChoice)  # declares the job table, which would end a transaction
     connection = tracking.schema.connection
     assert connection is not None
     with connection.transaction:

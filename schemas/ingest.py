@@ -11,13 +11,14 @@ import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+from unicodedata import category
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import canonical_json
 
 from . import fit, gait, gdi, keypoints, lab, sensors, session, tracking, video
 from ._activate import computed_tables
-from ._base import DuplicateError, delete_below, dj, error_code, library, resolve_method, utc_now
+from ._base import DuplicateError, delete_below, dj, error_code, jobs_of, library, resolve_method, utc_now
 
 _ATTEMPTS = 20
 #: Form of a pseudonymous code.
@@ -166,6 +167,14 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
             expected="a video file",
             next_step="check the path",
             key=path,
+        )
+    if any(category(c) in ("Cc", "Cs", "Zl", "Zp") for c in str(path)):  # Cs: bytes that are no text
+        raise PblError(
+            "USAGE",
+            found="a path with line breaks, other control characters, or bytes that are no UTF-8",
+            expected="a path of ordinary characters",
+            next_step="rename the file or folder",
+            key=ascii(str(path)),
         )
     if len(str(path)) > 1000:
         raise PblError(
@@ -350,7 +359,7 @@ def _forget_errors(video_id: int, codes: Sequence[str] | None = None) -> None:
     for table in computed_tables():
         if "video_id" not in table.primary_key:
             continue
-        jobs = table.jobs
+        jobs = jobs_of(table)
         for row in (jobs.errors & {"video_id": video_id}).to_dicts():
             if codes is None or error_code(row["error_message"]) in codes:
                 (jobs & {k: row[k] for k in jobs.primary_key}).delete_quick()

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from . import fit, keypoints, session, tracking, video
-from ._base import dj, utc_now
+from ._base import dj, jobs_of, utc_now
 
 #: What one fit is for: a session, seen through one chain of methods.
 GROUP = ("session_id", "tracking_method", "keypoint_method", "fit_method")
@@ -45,7 +45,7 @@ def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]
     by_method = dj.U("session_id", "fit_method").aggr(current * fit.FitSet.proj("session_id"), n_current="count(*)")
     several = (by_method & "n_current > 1").proj()
     to_plan = sorted({int(s) for found in (new, several) for s in found.to_arrays("session_id")})
-    failed = [table.jobs for table in UNDECIDED]  # declares the job tables, which would end a transaction
+    failed = [jobs_of(table) for table in UNDECIDED]  # declares the job tables, which would end a transaction
     made = []
     for session_id in to_plan:
         with _locked(session_id):

@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 from . import computed_tables, keypoints, tracking, video, worker
-from ._base import dj, error_code, error_found, error_next_step
+from ._base import dj, error_code, error_found, error_next_step, jobs_of
 
 #: Fewer videos than this, and keys are counted that nobody has queued yet.
 SMALL = 5000
@@ -147,7 +147,7 @@ def queue_counts(connection: Any) -> dict[str, dict[str, int]]:
     for table in computed_tables():
         counts = dict.fromkeys(("pending", "reserved", "error", "ignore"), 0)
         rows = connection.query(
-            f"SELECT status, COUNT(*) FROM {table.jobs.full_table_name} GROUP BY status"  # noqa: S608
+            f"SELECT status, COUNT(*) FROM {jobs_of(table).full_table_name} GROUP BY status"  # noqa: S608
         ).fetchall()
         out[table.__name__] = counts | {str(status): int(n) for status, n in rows}
     return out
@@ -174,7 +174,7 @@ def live_workers(seen_within_s: float = 180.0) -> list[dict[str, Any]]:
 
 def _oldest(table: Any, connection: Any) -> tuple[float | None, str]:
     """Age (s) of the oldest pending job, and why jobs that were put back wait."""
-    jobs = table.jobs.full_table_name
+    jobs = jobs_of(table).full_table_name
     age = connection.query(
         f"SELECT TIMESTAMPDIFF(SECOND, MIN(created_time), CURRENT_TIMESTAMP) FROM {jobs} WHERE status='pending'"  # noqa: S608
     ).fetchone()[0]
@@ -209,8 +209,8 @@ def _empty(most: int) -> list[EmptyRow]:
 
 def _errors(table: Any, most: int) -> list[ErrorRow]:
     out = []
-    for row in table.jobs.errors.to_dicts(limit=most):
-        key = {k: row[k] for k in table.jobs.primary_key}
+    for row in jobs_of(table).errors.to_dicts(limit=most):
+        key = {k: row[k] for k in jobs_of(table).primary_key}
         message = row["error_message"]
         out.append(
             ErrorRow(

@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 from . import computed_tables, fit, video
-from ._base import error_code, error_found, error_next_step
+from ._base import error_code, error_found, error_next_step, jobs_of
 from .status import EMPTY_COLUMNS
 
 DONE, EMPTY, PENDING, RUNNING, ERROR, NOT_YET = "done", "empty", "pending", "being computed", "error", "not yet"
@@ -82,7 +82,7 @@ def _steps(table: Any, about: Any) -> list[Step]:
         what = EMPTY if empty else "waits for a choice" if waits else DONE
         step = f"pbl choose {row['video_id']} PERSON" if waits else ""
         out.append(Step(name, what, _method(row, table), note, step))
-    for row in (table.jobs & about).to_dicts():
+    for row in (jobs_of(table) & about).to_dicts():
         method = _method(row, table)
         if row["status"] == "error":
             message = row["error_message"]

@@ -10,6 +10,7 @@ from typing import Any
 from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
 from schemas import computed_tables
+from schemas._base import jobs_of
 from schemas.status import empty_rows
 
 from . import queue, recover, refresh, run_job
@@ -72,7 +73,7 @@ def populate(tables: Sequence[str] | None = None, limit: int | None = None, retr
     for table in chosen:
         run.freed += recover.free_dead(table)
         if retry_errors:
-            run.retried += queue.reset(table.jobs.errors)
+            run.retried += queue.reset(jobs_of(table).errors)
     run.dropped = drop_outdated_choices()
     names = [t.__name__ for t in chosen]
     for table in chosen:
@@ -132,7 +133,7 @@ def _populate_table(table: Any, part: TableRun, limit: int | None) -> None:
 
 def ready(table: Any) -> int:
     """How many jobs can be taken now."""
-    return len(table.jobs.pending & "scheduled_time <= CURRENT_TIMESTAMP(3)")
+    return len(jobs_of(table).pending & "scheduled_time <= CURRENT_TIMESTAMP(3)")
 
 
 def count_waiting(table: Any) -> int:

@@ -19,7 +19,7 @@ from typing import Any
 import pymysql
 
 from pbl_pipeline.errors import PblError
-from schemas._base import dj
+from schemas._base import dj, jobs_of
 
 from .registry import NEW
 
@@ -70,7 +70,7 @@ def fill(table: Any, keys: Sequence[Mapping[str, Any]] | None = None, priority: 
     """
     if keys is not None and not keys:
         return 0
-    jobs, quote = table.jobs, table.connection.adapter.quote_identifier
+    jobs, quote = jobs_of(table), table.connection.adapter.quote_identifier
     source = table().key_source
     if keys is not None:
         source = source & [dict(k) for k in keys]
@@ -99,7 +99,7 @@ def _repeated(connection: Any, statement: str) -> int:
 
 def sweep(table: Any) -> int:
     """Delete jobs that nobody needs any more: done by another route, or no longer asked for; returns how many."""
-    jobs = table.jobs
+    jobs = jobs_of(table)
     n = (jobs & "status != 'reserved'").restrict(table.proj(), semantic_check=False).delete_quick(get_count=True)
     waiting = jobs & "status != 'reserved'"
     if len(waiting):
@@ -111,7 +111,7 @@ def sweep(table: Any) -> int:
 # --------------------------------------------------------------------------------------------------- reserving, ending
 def most_urgent(table: Any) -> int | None:
     """Priority of the first job that can be taken now; None where there is none."""
-    jobs = table.jobs
+    jobs = jobs_of(table)
     row = jobs.connection.query(
         f"SELECT priority FROM {jobs.full_table_name} WHERE status='pending'"  # noqa: S608
         " AND scheduled_time <= CURRENT_TIMESTAMP(3) ORDER BY priority, scheduled_time LIMIT 1"
@@ -121,7 +121,7 @@ def most_urgent(table: Any) -> int | None:
 
 def claim(table: Any, n: int = 1) -> list[Claim]:
     """Reserve up to n jobs, the most urgent and oldest first; where many workers draw, nearly so."""
-    jobs = table.jobs
+    jobs = jobs_of(table)
     ready = jobs.pending & "scheduled_time <= CURRENT_TIMESTAMP(3)"
     rows = ready.proj("priority").to_dicts(order_by="priority, scheduled_time", limit=_SPREAD * n)
     claims: list[Claim] = []
@@ -147,7 +147,7 @@ def finish(job: Claim) -> None:
 def fail(job: Claim, message: str, stack: str = "") -> None:
     """Make an error row of the job; it is tried again only when somebody asks (`pbl retry`)."""
     if len(_mine(job)):
-        job.table.jobs.error(job.key, error_message=message, error_stack=stack or None)
+        jobs_of(job.table).error(job.key, error_message=message, error_stack=stack or None)
     let_go(job)
 
 
@@ -175,7 +175,7 @@ def reset(jobs: Any, reason: str = "", delay_s: float = 0.0) -> int:
 
 def _mine(job: Claim) -> Any:
     held = {"status": "reserved", "host": job.host, "pid": job.pid, "connection_id": job.connection_id}
-    return job.table.jobs & job.key & held
+    return jobs_of(job.table) & job.key & held
 
 
 class ReservationLost(Exception):
@@ -188,7 +188,7 @@ def hold(job: Claim) -> None:
     The job's row is locked until the transaction ends, so a second holder of the same job waits here and then finds
     either that its reservation is gone or that the result is there.
     """
-    jobs = job.table.jobs
+    jobs = jobs_of(job.table)
     where = " AND ".join(f"`{name}`=%s" for name in job.key)
     row = jobs.connection.query(
         f"SELECT status, host, pid, connection_id FROM {jobs.full_table_name} WHERE {where} FOR UPDATE",  # noqa: S608
@@ -200,7 +200,7 @@ def hold(job: Claim) -> None:
 
 def errors_of(table: Any, code: str | None = None, keys: Iterable[Mapping[str, Any]] | None = None) -> Any:
     """The error rows of a table, of one code or of some keys if asked."""
-    rows = table.jobs.errors
+    rows = jobs_of(table).errors
     if code is not None:
         if not code.replace("_", "").isalnum():
             raise PblError("USAGE", found=f"code {code!r}", expected="an error code", next_step="see docs/errors.md")

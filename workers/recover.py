@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from schemas import worker
+from schemas._base import jobs_of
 
 from . import queue
 
@@ -36,7 +37,7 @@ def free_dead(table: Any) -> int:
     was seen for `DEAD_AFTER_S`; one that never had a heartbeat (a populate by hand) when its reservation is older than
     the time limit of its table.
     """
-    jobs, n = table.jobs, 0
+    jobs, n = jobs_of(table), 0
     for row in jobs.reserved.proj("host", "pid", "reserved_time").to_dicts():
         if not _alive(row, table):
             n += queue.reset(jobs.reserved & {k: row[k] for k in jobs.primary_key} & {"pid": row["pid"]})
@@ -47,7 +48,7 @@ def free_dead(table: Any) -> int:
 
 def free_own(table: Any) -> int:
     """Put back what this process was computing when a signal ended it."""
-    mine = table.jobs & {"host": platform.node(), "pid": os.getpid()}
+    mine = jobs_of(table) & {"host": platform.node(), "pid": os.getpid()}
     interrupted = [f"error_message like '{word}%'" for word in INTERRUPTED]
     return queue.reset(mine & {"status": "reserved"}) + queue.reset(mine & {"status": "error"} & interrupted)
 
@@ -58,7 +59,7 @@ def _alive(row: dict[str, Any], table: Any) -> bool:
     now = table.connection.query("SELECT CURRENT_TIMESTAMP(3)").fetchone()[0]
     if row["host"] == platform.node():
         if int(row["pid"]) == os.getpid():  # our number, but not our job: in a container every worker has the same
-            return queue.is_held(table, {k: row[k] for k in table.jobs.primary_key})
+            return queue.is_held(table, {k: row[k] for k in jobs_of(table).primary_key})
         return _alive_here(int(row["pid"]), row["reserved_time"], now)
     same = (worker.Worker & {"worker_host": row["host"], "worker_pid": row["pid"]}).to_dicts()
     if same:

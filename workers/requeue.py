@@ -9,7 +9,7 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 from schemas import computed_tables, fit, gait, gdi, keypoints, tracking, video
-from schemas._base import delete_below, dj, resolve_method
+from schemas._base import delete_below, dj, jobs_of, resolve_method
 
 from . import queue
 from .registry import AGAIN, table_named
@@ -38,11 +38,11 @@ def retry(code: str | None = None, table: str | None = None, video_id: int | Non
 
 def _of_video(table: Any, video_id: int) -> list[dict[str, Any]]:
     """Keys of the error rows of a table that belong to a video, or to the set it is fitted in."""
-    names = table.jobs.primary_key
+    names = jobs_of(table).primary_key
     if "video_id" in names:
-        return (table.jobs.errors & {"video_id": video_id}).keys()
+        return (jobs_of(table).errors & {"video_id": video_id}).keys()
     sets = [{"fit_set": s} for s in (fit.FitSet.Video & {"video_id": video_id}).to_arrays("fit_set")]
-    return (table.jobs.errors & sets).keys() if sets else []
+    return (jobs_of(table).errors & sets).keys() if sets else []
 
 
 # ---------------------------------------------------------------------------------------------------------- reprocess

@@ -1,0 +1,44 @@
+"""The processes of a worker for measuring the queue: heavy stages give a recorded result, the others are real."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import pytest
+
+import pbl_pipeline.video
+import schemas.video
+from tests.integration import chain
+from workers import heartbeat, supervisor
+from workers.supervisor import Options
+
+#: Variable that names the recording whose probe every video gives.
+RECORDED = "PBL_BENCH_RECORDED"
+#: Seconds that a probe takes, where a fault should meet jobs in hand.
+SLEEP = "PBL_BENCH_SLEEP"
+
+
+def install(patch: pytest.MonkeyPatch) -> None:
+    """Put the recorded results in place of the heavy stages; no video is opened."""
+    chain.install(patch)
+    probe = functools.cache(pbl_pipeline.video.probe)
+    recorded, pause = Path(os.environ[RECORDED]), float(os.environ.get(SLEEP, "0"))
+
+    def given(path: Path):
+        time.sleep(pause)
+        return dataclasses.replace(probe(recorded), path=str(path))
+
+    patch.setattr(pbl_pipeline.video, "probe", given)
+    patch.setattr(schemas.video, "registered_file", lambda path, sha256, key: Path(path))
+
+
+def work(options: Options, pipe: Connection) -> None:
+    """`workers.supervisor.work` with recorded results."""
+    install(pytest.MonkeyPatch())
+    heartbeat.PERIOD_S = 1.0
+    supervisor.work(options, pipe)

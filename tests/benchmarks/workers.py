@@ -1,0 +1,352 @@
+"""What the queue costs, and what it survives: figures of docs/operations.md.
+
+    python -m tests.benchmarks.workers scale              # 300,000 videos: register, status, refresh, cost per job
+    python -m tests.benchmarks.workers speed              # jobs a second of 1, 2 and 4 workers on 5,000 keys
+    python -m tests.benchmarks.workers kills              # kill -9 of workers and of the database during 2,000 jobs
+    python -m tests.benchmarks.workers memory             # a worker's memory over 500 jobs
+
+Heavy stages give a recorded result: the point is the queue. Each command starts a database of its own in a temporary
+folder and removes it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import random
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+
+from tests.benchmarks import worker_standins
+from tests.integration import chain
+
+#: Videos of a session.
+EACH = 6
+
+
+@contextlib.contextmanager
+def installation() -> Iterator[Path]:
+    """A database and store of its own, the recorded stages in this process too; yields the folder."""
+    import schemas
+    from schemas import embedded
+
+    with tempfile.TemporaryDirectory(prefix="pbl-bench-") as name:
+        home = Path(name)
+        home.chmod(0o755)
+        os.environ["PBL_HOME"] = name
+        folder = embedded.Folder(home / "db")
+        embedded.start(folder=folder)
+        try:
+            schemas.activate()
+            os.environ[worker_standins.RECORDED] = str(chain.small_video(home, "recorded"))
+            with pytest.MonkeyPatch.context() as patch:
+                worker_standins.install(patch)
+                yield home
+        finally:
+            embedded.stop(folder=folder)
+
+
+def recordings(first: int, n: int) -> Iterator[Any]:
+    """Numbered recordings, `EACH` of a session, one session of a subject."""
+    from schemas.bulk import Recording
+
+    for i in range(first, first + n):
+        sha256 = hashlib.sha256(str(i).encode()).hexdigest()
+        yield Recording(f"/recordings/{i:07d}.mp4", sha256, 1000 + i, f"S{i // EACH:07d}", "1")
+
+
+def say(what: str, value: float, unit: str, bar: str = "") -> None:
+    """One line of the table."""
+    click.echo(f"{what:<66}{value:>10.3g} {unit:<10}{bar}")
+
+
+def work(processes: int, **options: Any) -> float:
+    """Work until nothing is left; the seconds from the first job in hand to the last one ended."""
+    from workers.metrics import Metrics
+    from workers.supervisor import Options, Supervisor
+
+    times: list[float] = []
+
+    class Clock(Metrics):
+        def heard(self, message: dict[str, Any]) -> None:
+            times.append(time.monotonic())
+            super().heard(message)
+
+    once = {"once": True, "selftest": False, "processes": processes, **options}
+    assert Supervisor(Options(**once), Clock(), worker_standins.work).run() == 0
+    return times[-1] - times[0]
+
+
+# --------------------------------------------------------------------------------------------------------------- scale
+@click.group()
+def main() -> None:
+    """Benchmarks of the queue."""
+
+
+@main.command()
+@click.option("--videos", default=300_000, show_default=True)
+def scale(videos: int) -> None:
+    """Register, look, refresh, work, with as many videos."""
+    from schemas.bulk import register_many
+    from schemas.status import pipeline_status
+    from workers import refresh
+
+    with installation():
+        small = 3000
+        register_many(recordings(0, EACH))
+        work(1)  # the session whose rows are copied
+        register_many(recordings(EACH, small - EACH))
+        _copy_results(0, small // EACH)
+        few = _cost_per_job(small, sessions=40)
+        begin = small + 40 * EACH
+        t = time.monotonic()
+        registered = register_many(recordings(begin, videos - begin)).new
+        seconds = time.monotonic() - t
+        say(f"{videos:,} videos registered", seconds * videos / max(registered, 1), "s", "bar 300")
+        _copy_results(begin // EACH, videos // EACH)
+        t = time.monotonic()
+        state = pipeline_status()
+        say("pbl status", time.monotonic() - t, "s", "bar 3")
+        click.echo("".join(f"  {s.table} {s.done}" for s in state.tables))
+        register_many(recordings(videos, 1002))
+        t = time.monotonic()
+        found = refresh.refresh()
+        assert found is not None
+        say(f"refresh with 1,002 new videos ({found.queued})", time.monotonic() - t, "s", "bar 10")
+        many = _cost_per_job(videos + 1002, sessions=40)
+        say("cost of a job beside its work, 2 workers, 3,000 videos", 1000 * few, "ms", "bar 25")
+        say(f"cost of a job beside its work, 2 workers, {videos:,} videos", 1000 * many, "ms", "bar 25")
+        say("ratio of the two", many / few, "", "bar 1.5")
+
+
+def _cost_per_job(first: int, sessions: int) -> float:
+    """Seconds a job of two workers costs beside make_compute, over a whole chain of new sessions."""
+    from schemas import computed_tables
+    from schemas.bulk import register_many
+
+    before = {t.__name__: _computed(t) for t in computed_tables()}
+    register_many(recordings(first, sessions * EACH))
+    seconds = work(2)
+    n, compute = 0, 0.0
+    for table in computed_tables():
+        rows, total = _computed(table)
+        n += rows - before[table.__name__][0]
+        compute += total - before[table.__name__][1]
+    return (2 * seconds - compute) / n
+
+
+def _computed(table: Any) -> tuple[int, float]:
+    """Rows of a table and the seconds their computation took."""
+    column = next(n for n in table.heading.names if n.endswith("_seconds") and n != "compile_seconds")
+    n, total = table.connection.query(f"SELECT COUNT(*), SUM({column}) FROM {table.full_table_name}").fetchone()
+    return int(n), float(total or 0.0)
+
+
+def _copy_results(first_session: int, last_session: int) -> None:
+    """Give sessions the rows of session 1, in the tables that the queue reads, without the parts it does not read."""
+    from schemas import fit, gait, gdi, keypoints, qc, tracking, video
+
+    copied = (
+        video.VideoInfo,
+        tracking.Tracking,
+        tracking.SubjectChoice,
+        keypoints.Keypoints,
+        fit.TrialInput,
+        fit.FitSet,
+        fit.FitSet.Video,
+        fit.FitSelection,
+        fit.SessionFit,
+        fit.SessionFit.Trial,
+        gait.GaitEvents,
+        gait.GaitCycle,
+        gait.Spatiotemporal,
+        gdi.GDI,
+        gdi.SessionGdi,
+        qc.SessionQc,
+    )
+    first = max(first_session, 1)
+    template = _first_set()
+    for table in copied:
+        names = [f"`{n}`" for n in table.heading.names]
+        values = {
+            "`video_id`": f"t.video_id + {EACH} * s.seq",
+            "`session_id`": "t.session_id + s.seq",
+            "`fit_set`": "LEFT(MD5(CONCAT(t.fit_set, s.seq)), 16)",
+        }
+        where = "t.fit_set = %s" if "fit_set" in table.heading.names else f"t.video_id <= {EACH} AND %s != ''"
+        table.connection.query(
+            f"INSERT INTO {table.full_table_name} ({','.join(names)})"
+            f" SELECT {','.join(values.get(n, f't.{n}') for n in names)} FROM {table.full_table_name} AS t"
+            f" JOIN `{table.database}`.seq_{first}_to_{last_session - 1} AS s WHERE {where}",
+            args=(template,),
+        )
+
+
+def _first_set() -> str:
+    from schemas import fit
+
+    return str((fit.FitSet & {"session_id": 1}).fetch1("fit_set"))
+
+
+# --------------------------------------------------------------------------------------------------------------- speed
+@main.command()
+@click.option("--keys", default=5000, show_default=True)
+def speed(keys: int) -> None:
+    """Jobs a second of one table (VideoInfo) by 1, 2 and 4 workers; each key exactly once."""
+    from schemas import lab, video
+    from schemas.bulk import register_many
+
+    with installation():
+        alone = 0.0
+        for processes in (1, 2, 4):
+            register_many(recordings(0, keys))
+            seconds = work(processes, resource="decode")
+            assert len(video.VideoInfo()) == keys
+            rate = keys / seconds
+            alone = alone or rate
+            say(
+                f"jobs a second, {processes} workers ({os.cpu_count()} cores)",
+                rate,
+                "1/s",
+                f"{rate / alone:.2f} times one",
+            )
+            lab.Subject.delete(prompt=False, part_integrity="cascade")
+
+
+# --------------------------------------------------------------------------------------------------------------- kills
+@main.command()
+@click.option("--jobs", default=2000, show_default=True)
+@click.option("--kills", "n_kills", default=200, show_default=True)
+@click.option("--server-kills", default=5, show_default=True)
+@click.option("--seed", default=0, show_default=True)
+def kills(jobs: int, n_kills: int, server_kills: int, seed: int) -> None:
+    """kill -9 of working processes, whole workers and the database at random moments; then count."""
+    import multiprocessing
+
+    from schemas import embedded, video
+    from schemas.bulk import register_many
+    from workers import refresh, supervisor
+
+    with installation() as home:
+        register_many(recordings(0, jobs))
+        os.environ[worker_standins.SLEEP] = "0.02"
+        context = multiprocessing.get_context("spawn")
+        draw, over = random.Random(seed), threading.Event()
+        folder = embedded.Folder(home / "db")
+        bosses: list[Any] = []
+
+        def boss() -> Any:
+            process = context.Process(target=_boss)
+            process.start()
+            return process
+
+        bosses = [boss() for _ in range(4)]
+        killed = {"worker": 0, "supervisor": 0, "server": 0}
+        t = time.monotonic()
+        while True:
+            time.sleep(draw.uniform(0.02, 0.3))
+            with contextlib.suppress(Exception):
+                if len(video.VideoInfo()) >= jobs:
+                    break
+            if time.monotonic() - t > 1500:
+                break
+            bosses = [b if b.is_alive() else boss() for b in bosses]
+            if killed["server"] < server_kills and sum(killed.values()) >= (killed["server"] + 1) * n_kills / (
+                server_kills + 1
+            ):
+                os.kill(folder.state()["pid"], signal.SIGKILL)
+                time.sleep(draw.uniform(0.2, 2.0))
+                embedded.start(folder=folder)
+                killed["server"] += 1
+                import schemas
+
+                schemas.activate(methods=False)
+            if killed["worker"] + killed["supervisor"] >= n_kills:
+                continue
+            victim = draw.choice(bosses)
+            if draw.random() < 0.1:
+                victim.kill()
+                killed["supervisor"] += 1
+            else:
+                killed["worker"] += _kill_child(victim.pid)
+        over.set()
+        seconds = time.monotonic() - t
+        for b in bosses:
+            b.terminate()
+        for b in bosses:
+            b.join(60)
+        refresh.refresh()
+        done = len(video.VideoInfo())
+        left = {s: n for s, n in video.VideoInfo.jobs.progress().items() if n and s != "total"}
+        click.echo(f"killed {killed}; {done} of {jobs} done in {seconds:.0f} s; job rows left: {left or 'none'}")
+        errors = video.VideoInfo.jobs.errors.to_arrays("error_message")
+        click.echo("\n".join(sorted({str(e)[:200] for e in errors})))
+        from schemas.orphans import orphans
+
+        found = orphans()
+        click.echo(f"files of the store: {found.n_files}, without a row: {len(found.orphans)} (reported)")
+        assert supervisor.CRASHES
+        if done != jobs or left:
+            raise SystemExit(1)
+
+
+def _boss() -> None:
+    import schemas
+    from workers.supervisor import Options, Supervisor
+
+    schemas.activate(methods=False)
+    Supervisor(Options(resource="decode", selftest=False, grace_s=5.0), target=worker_standins.work).run()
+
+
+def _kill_child(pid: int) -> int:
+    """kill -9 of the working process under a supervisor; 0 where it has none at the moment."""
+    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+        command = Path(f"/proc/{child}/cmdline").read_bytes()
+        if b"spawn_main" in command:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(int(child), signal.SIGKILL)
+                return 1
+    return 0
+
+
+# -------------------------------------------------------------------------------------------------------------- memory
+@main.command()
+@click.option("--jobs", default=500, show_default=True)
+def memory(jobs: int) -> None:
+    """Resident memory of one worker after 20 jobs and after all."""
+    from schemas.bulk import register_many
+
+    with installation():
+        register_many(recordings(0, jobs // 10))
+        sizes: list[float] = []
+
+        from workers.metrics import Metrics
+        from workers.supervisor import Options, Supervisor
+
+        class Watch(Metrics):
+            def heard(self, message: dict[str, Any]) -> None:
+                if message["what"] == "end":
+                    (child,) = [c.process.pid for c in boss._children]
+                    pages = int(Path(f"/proc/{child}/statm").read_text().split()[1])
+                    sizes.append(pages * os.sysconf("SC_PAGE_SIZE") / 2**20)
+
+        boss = Supervisor(Options(once=True, selftest=False), Watch(), worker_standins.work)
+        assert boss.run() == 0
+        say(f"jobs of all {len(sizes)} kinds and keys", len(sizes), "")
+        say("memory after 20 jobs", sizes[20], "MiB")
+        say(
+            f"memory after {len(sizes)} jobs", sizes[-1], "MiB", f"{100 * (sizes[-1] / sizes[20] - 1):+.1f} %, bar +5 %"
+        )
+
+
+if __name__ == "__main__":
+    main()
