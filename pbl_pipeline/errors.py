@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from unicodedata import category
+
 #: code -> one line on what it means. The code is what a lab searches for and what an error row stores.
 CODES: dict[str, str] = {
     "VIDEO_MISSING": "the video file does not exist or cannot be opened",
@@ -83,13 +85,23 @@ class PblError(Exception):
         """One line per part; the form stored in error rows and printed on stderr."""
         lines = [f"{self.code}: {CODES[self.code]}"]
         if self.key is not None:
-            lines.append(f"  about:    {self.key}")
-        lines += [f"  found:    {self.found}", f"  expected: {self.expected}", f"  next:     {self.next_step}"]
+            lines.append(f"  about:    {_harmless(str(self.key), lines=False)}")
+        lines.append(f"  found:    {_harmless(self.found)}")
+        lines += [f"  expected: {self.expected}", f"  next:     {self.next_step}"]
         return "\n".join(lines)
 
     def __reduce__(self):
         parts = (self.code, self.found, self.expected, self.next_step, self.key)
         return (_rebuild, parts)
+
+
+def _harmless(text: str, lines: bool = True) -> str:
+    """Text with control characters written out: a name from outside must not move the reader's cursor, nor (without
+    `lines`) begin a line that looks like ours."""
+    kept = "\n" if lines else ""
+    # Control, format (direction of writing), lone surrogates (bytes that are no text), separators of lines, paragraphs.
+    odd = ("Cc", "Cf", "Cs", "Zl", "Zp")
+    return "".join(c.encode("unicode_escape").decode() if category(c) in odd and c not in kept else c for c in text)
 
 
 def _rebuild(code: str, found: str, expected: str, next_step: str, key: object) -> PblError:

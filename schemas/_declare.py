@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 from . import _store, connection
 from ._activate import activate, computed_tables
 
@@ -17,6 +19,12 @@ def declare_all() -> None:
         What `schemas.activate` raises, STORE_UNAVAILABLE.
     """
     activate()
-    for table in computed_tables():
-        _ = table.jobs  # declares it
+    log = logging.getLogger("datajoint")
+    level = log.level
+    log.setLevel(logging.ERROR)  # it warns of the types that it takes itself for the keys of a queue
+    try:
+        for table in computed_tables():
+            _ = table.jobs  # declares it
+    finally:
+        log.setLevel(level)
     _store.check_store(connection.store_backend(), create=True)

@@ -127,10 +127,9 @@ def _unzipped(path: Path, name: str) -> str | None:
 def _time(path: Path, rows: _Rows) -> tuple[int, np.ndarray, _Rows, list[str]]:
     """First stamp (ns), times (s) after it, and the rows they belong to, repeats left out."""
     try:
-        stamps = [int(str(row["time"]).split(".")[0]) for row in rows]
-    except (KeyError, ValueError) as error:
+        ns = np.array([int(str(row["time"]).split(".")[0]) for row in rows], np.int64)
+    except (KeyError, ValueError, OverflowError) as error:
         raise log_error(f"column time: {error}", "nanoseconds since 1970 in each row", path) from error
-    ns = np.array(stamps, np.int64)
     kept = np.concatenate([[True], np.diff(ns) != 0])
     n = int((~kept).sum())
     if n > _MOST_REPEATS * len(ns):

