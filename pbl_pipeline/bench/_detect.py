@@ -72,6 +72,7 @@ def detect_text(row: Row) -> str:
     head = (
         f"{row['label']}: {row['width_px']}x{row['height_px']} {row['codec']}, {row['mbit_per_s']:.1f} Mbit/s, "
         f"{frames:,} frames in {row['video_seconds']:.1f} s; people tracked: {row['persons']}, the measured one "
-        f"in view in {row['frames_in_view']:,} frames; {row['cores']} cores; the fastest of {len(row['runs_seconds'])} runs"
+        f"in view in {row['frames_in_view']:,} frames; {row['cores']} cores; "
+        f"the fastest of {len(row['runs_seconds'])} runs"
     )
     return f"{head}\n\n{table(rows, columns)}"

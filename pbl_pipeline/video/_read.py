@@ -51,7 +51,7 @@ class _ToBgr:
             self._local.converter = VideoReformatter()
         plane = self._local.converter.reformat(frame, format="bgr24", threads=1).planes[0]
         # The converter's own memory, which is new for each picture: a copy would cost more than the conversion.
-        rows = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)
+        rows = np.frombuffer(memoryview(plane), np.uint8).reshape(plane.height, plane.line_size)
         picture = rows[:, : 3 * plane.width].reshape(plane.height, plane.width, 3)
         # Rows of some widths are padded for the converter; users get plain arrays.
         return np.ascontiguousarray(turn.apply(picture))
