@@ -69,7 +69,7 @@ def test_services_listen_on_this_machine_only_and_have_no_password_of_their_own(
 
 
 def test_a_worker_has_longer_to_end_than_it_takes():
-    grace = next(p for p in command(["worker"]).params if p.name == "grace_s").default
+    grace: Any = next(p for p in command(["worker"]).params if p.name == "grace_s").default
     assert int(compose()["services"]["worker-cpu"]["stop_grace_period"].removesuffix("s")) > grace
     for name in ("worker-cpu", "worker-gpu"):
         (deployment,) = documents(DEPLOY / "kubernetes" / f"{name}.yaml")
