@@ -87,7 +87,7 @@ def find(subject: str) -> tuple[Ids, Found]:
             expected="the code of a subject",
             next_step="the codes are in `schemas.lab.Subject`; they are case-sensitive",
         )
-    for name, values in earlier.get("ids", {}).items():
+    for name, values in _still_free(earlier.get("ids", {})).items():
         ids[name] = list(dict.fromkeys([*ids[name], *values]))
     return ids, _find(ids, earlier)
 
@@ -150,6 +150,14 @@ def _identities(subject: str) -> Ids:
         "session_id": sessions,
         "video_id": [int(v) for v in videos],
         "fit_set": [str(s) for s in sets],
+    }
+
+
+def _still_free(ids: Ids) -> Ids:
+    """The numbers of an earlier run that nobody has now: after a deletion the next person may get the same ones."""
+    owners = {"session_id": session.Session, "video_id": video.Video, "fit_set": fit.FitSet}
+    return {
+        name: [v for v in values if name not in owners or not owners[name] & {name: v}] for name, values in ids.items()
     }
 
 

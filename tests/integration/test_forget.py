@@ -81,7 +81,9 @@ def _queue(table: type, status: str, number: int | None) -> None:
     jobs.insert1(row, skip_duplicates=True)
 
 
-def test_nothing_of_the_person_is_left_and_nothing_else_is_touched(two: tuple[dict, set[str], list[Path]]):
+def test_nothing_of_the_person_is_left_and_nothing_else_is_touched(
+    two: tuple[dict, set[str], list[Path]], tmp_path: Path
+):
     rows, files, videos = two
     full, all_files = everything(), stored()
     dry = pbl("forget", "P017", "--videos")
@@ -109,6 +111,14 @@ def test_nothing_of_the_person_is_left_and_nothing_else_is_touched(two: tuple[di
     assert again.code == 0, again.err
     assert not any(v.exists() for v in videos)
     assert everything() == rows
+    # Numbers are given anew: the next person has those of the one who was forgotten, and keeps what is theirs.
+    ingest([chain.small_video(tmp_path, "next")], Visit(subject="P018"))
+    assert set(video.Video.to_arrays("video_id")) & set(proof["ids"]["video_id"])
+    populate()
+    theirs, their_files = everything(), stored()
+    assert pbl("forget", "P017", "--yes", "--videos").code == 0
+    assert everything() == theirs
+    assert stored() == their_files
 
 
 def test_broken_off_it_is_repeated_until_done(two: tuple[dict, set[str], list[Path]], monkeypatch: pytest.MonkeyPatch):

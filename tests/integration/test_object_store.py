@@ -12,8 +12,9 @@ from moto.server import ThreadedMotoServer
 import pbl_pipeline.video
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import _store, connection, lab, tracking, video
+from schemas import _store, backup, connection, forget, lab, tracking, video
 from schemas._base import file_ref, stored_file
+from schemas._declare import declare_all
 from schemas.ingest import Visit, ingest
 
 from . import chain
@@ -81,6 +82,27 @@ def test_arrays_and_files_go_to_the_bucket_and_come_back(remote: None, tmp_path:
     with pytest.raises(PblError, match="the object store has no") as error, stored_file(tracking.Tracking(), ref):
         pass
     assert error.value.code == "FILE_FORMAT"
+
+
+def test_a_backup_and_a_person_who_is_forgotten(remote: None, tmp_path: Path):
+    declare_all()
+    backend = connection.store_backend()
+    ingest([chain.small_video(tmp_path, "walk")], Visit(subject="P002"))
+    for table in (video.VideoInfo, tracking.Tracking):
+        table.populate()
+    number = video.Video.fetch1("video_id")
+    saved = backup.backup(tmp_path / "backup")
+    assert saved.n_files == 2
+    assert backup.check(tmp_path / "backup")["n_files"] == 2
+    backend.put_buffer(b"x", f"_schema/pbl_keypoints/__keypoints/video_id={number}/left_over.npz")
+    done = forget.forget("P002")
+    assert done.left == []
+    assert {p.rpartition("/")[2].split("_")[0] for p in done.files} == {"left", "tracks", "frame"}
+    assert [p for p in backend.fs.find("walks") if f"video_id={number}/" in p] == []
+    # Back into the bucket, from the files alone.
+    backup._restore_files(tmp_path / "backup")
+    assert len([p for p in backend.fs.find("walks") if f"video_id={number}/" in p]) == 2
+    forget.manifest_path("P002").unlink()
 
 
 def test_a_store_that_does_not_answer_is_said_without_the_secret(remote: None, monkeypatch: pytest.MonkeyPatch):
