@@ -24,6 +24,7 @@ from ._base import (
     rebuild_params,
     resolve_method,
     stored_file,
+    stored_paramset,
     utc_now,
 )
 
@@ -245,7 +246,7 @@ class SessionGdi(dj.Computed):
         checks: Sequence[tuple],
     ) -> tuple:
         lib = library("gait")
-        params = lib.GaitParams(rebuild_params(lib.EventParams, **events), rebuild_params(lib.GdiParams, **index))
+        params = lib.GaitParams(stored_paramset(events), rebuild_params(lib.GdiParams, **index))
         with ExitStack() as stack:
             paths = [stack.enter_context(stored_file(self, ref)) for ref in refs]
             trials = [library("fit").TrialFit.load(path) for path in paths]

@@ -9,13 +9,15 @@ import click
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_out_file, load_npz
 
+from .gait import EVENT_METHODS
+
 _EPILOG = "Example: pbl events walk.fit.npz --out walk.events.csv"
 
 
 @click.command(epilog=_EPILOG)
 @click.argument("file", type=click.Path(path_type=Path, readable=False))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="events.csv to write.")
-@click.option("--method", default="zeni-2008", show_default=True, help="Name of the event method.")
+@click.option("--method", default="phase-transformer", show_default=True, help=EVENT_METHODS)
 def events(file: Path, out: Path, method: str) -> None:
     """Find foot down and foot up in FILE and write them as CSV.
 

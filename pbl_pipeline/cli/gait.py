@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit
     from pbl_pipeline.gait import LabTrial
 
+EVENT_METHODS = "Event method: phase-transformer, zeni-2008 or oconnor-2007."
 _EPILOG = """\b
 Example: pbl gait out/walk1.fit.npz out/walk2.fit.npz --out out/metrics.json
 Example: pbl gait lab/walk1.c3d lab/walk2.c3d --out lab/metrics.json"""
@@ -26,7 +27,7 @@ Example: pbl gait lab/walk1.c3d lab/walk2.c3d --out lab/metrics.json"""
     help="pbl-2025-three-angles (default of fits) or gillette-2008 (nine angles; default of C3D files).",
 )
 @click.option("--norm", help="Normative set of the index: a name, or a .json file (`pbl norm list`).")
-@click.option("--method", default="zeni-2008", show_default=True, help="Name of the event method.")
+@click.option("--method", default="phase-transformer", show_default=True, help=EVENT_METHODS)
 @click.option(
     "--events",
     "event_files",
@@ -49,7 +50,7 @@ def gait(
     """
     from pbl_pipeline import progress
     from pbl_pipeline.files import check_out_file
-    from pbl_pipeline.gait import GDI_PARAMSETS, GILLETTE_MODEL, EventParams, GaitParams, GdiParams, gait_metrics
+    from pbl_pipeline.gait import GDI_PARAMSETS, GILLETTE_MODEL, GaitParams, GdiParams, gait_metrics
     from pbl_pipeline.gait.events import resolve_params
 
     check_out_file(out)
@@ -68,7 +69,7 @@ def gait(
             next_step="choose one of the names above",
         )
     of_index = GDI_PARAMSETS[index].to(GdiParams) if index else GdiParams()
-    params = GaitParams(events=EventParams(**resolve_params(method).params), gdi=of_index)
+    params = GaitParams(events=resolve_params(method), gdi=of_index)
     given = event_files or (None,) * len(files)
     pairs = progress.track(list(zip(files, given, strict=True)), "read files", unit="trial")
     trials = [_read(path, events) for path, events in pairs]

@@ -32,6 +32,8 @@ PLUG_IN_GAIT_POINTS: dict[str, tuple[str, int]] = {
 }
 #: Markers that events are found from where the recording has no labels, and that tell lengths.
 _FOOT_MARKERS = ("LASI", "RASI", "LHEE", "RHEE", "LTOE", "RTOE")
+#: Markers that the event model knows the legs by as well, where they are there.
+_LEG_MARKERS = ("LPSI", "RPSI", "SACR", "LKNE", "RKNE", "LANK", "RANK")
 _LABELS = {"Foot Strike": FOOT_DOWN, "Foot Off": FOOT_UP}
 _SIDES = {"left": LEFT, "right": RIGHT}
 
@@ -51,7 +53,7 @@ def read_lab_trial(path: str | Path, events_csv: str | Path | None = None) -> La
     """Angles, events and feet of a C3D file (also gzipped) with the outputs of Plug-in Gait or a model of its kind.
 
     The angles are the points LHipAngles and so on (`PLUG_IN_GAIT_POINTS`). Events: those of `events_csv`
-    (`pbl events`), else the recording's labels Foot Strike and Foot Off, else found from heel and toe markers. A sample
+    (`pbl events`), else the recording's labels Foot Strike and Foot Off, else found from the markers of the legs. A sample
     that the file marks as invalid is NaN.
 
     Raises
@@ -74,8 +76,9 @@ def read_lab_trial(path: str | Path, events_csv: str | Path | None = None) -> La
         check_degrees(np.concatenate(list(by_name.values())), f"{path.name}, side {letter}")
     feet = None
     if all(m in column for m in _FOOT_MARKERS):
-        xyz = points[:, [column[m] for m in _FOOT_MARKERS]] * _metres(table, path)
-        feet = feet_from_markers(time, _FOOT_MARKERS, "plug_in_gait", xyz)
+        there = [*_FOOT_MARKERS, *(m for m in _LEG_MARKERS if m in column)]
+        xyz = points[:, [column[m] for m in there]] * _metres(table, path)
+        feet = feet_from_markers(time, there, "plug_in_gait", xyz)
     series = AngleSeries(time, angles["L"], angles["R"], PLUG_IN_GAIT)
     name = path.name.removesuffix(".gz").removesuffix(".c3d")
     return LabTrial(name, series, _events(path, table, feet, events_csv), feet)

@@ -18,7 +18,7 @@ from ._gdi import GDI_MODEL, GDI_PARAMSETS, GILLETTE_MODEL, Gdi, GdiParams, scor
 from ._laboratory import LabTrial
 from ._poses import trial_poses
 from ._spatiotemporal import MEASURES, Spatiotemporal, spatiotemporal
-from .events import EventParams, GaitEvents, detect_events
+from .events import GaitEvents, detect_events, resolve_params
 from .normative import NormativeSet, load_norm
 
 if TYPE_CHECKING:
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class GaitParams:
-    """Parameters of events and index together."""
+    """Method of the events (`events.resolve_params`) and parameters of the index together."""
 
-    events: EventParams = dataclasses.field(default_factory=EventParams)
+    events: Paramset = dataclasses.field(default_factory=lambda: resolve_params(None))
     gdi: GdiParams = dataclasses.field(default_factory=GdiParams)
 
 
@@ -158,14 +158,14 @@ def gait_metrics(
 
 
 def _trial(
-    trial: TrialFit | LabTrial, event_params: EventParams, index: dict[str, Any], fit_checks: Sequence[Check]
+    trial: TrialFit | LabTrial, event_method: Paramset, index: dict[str, Any], fit_checks: Sequence[Check]
 ) -> TrialMetrics:
     if isinstance(trial, LabTrial):
         events = trial.events
         cycles = find_cycles(events, trial=trial.name, series=trial.series, feet=trial.feet, keep_ends=True)
     else:
         poses = trial_poses(trial)
-        events = detect_events(feet_from_fit(trial, poses), event_params)
+        events = detect_events(feet_from_fit(trial, poses), event_method)
         cycles = find_cycles(events, trial, poses=poses, fit_checks=fit_checks)
     measures, gdi = spatiotemporal(cycles), score_gdi(cycles, **index)
     reason = events.reason or measures.reason

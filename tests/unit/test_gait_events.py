@@ -1,4 +1,4 @@
-"""Events against a walker of known events, and everything that is not walking."""
+"""The coordinate-based events against a walker of known events, and everything that is not walking."""
 
 from __future__ import annotations
 
@@ -8,13 +8,18 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.gait import EventParams, detect_events, load_events
+from pbl_pipeline import gait
+from pbl_pipeline.gait import EventParams, load_events
 from pbl_pipeline.gait.events import EVENT_PARAMSETS, GaitEvent
 from pbl_pipeline.gait.events._order import Candidate, best_sequence
 
 from .gait_walker import Walker, errors_s, make_feet
 
 DURATION_S = 9.0
+
+
+def detect_events(feet, params="zeni-2008"):
+    return gait.detect_events(feet, params)
 
 
 def regular(fps: float) -> np.ndarray:

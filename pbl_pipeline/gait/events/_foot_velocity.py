@@ -20,13 +20,14 @@ class FootVelocityParams(EventParams):
     """Parameters of the foot-velocity detector, on top of those it shares with the coordinate-based one.
 
     min_speed_leg_per_s
-        Smallest extremum of the vertical speed that counts, in leg lengths per second.
+        Smallest extremum of the vertical speed that counts, in leg lengths per second. The foot sinks with only 0.15 to
+        0.3 m/s where it meets the floor.
     max_heel_share
         At foot down the heel is below this share of its range of heights.
     """
 
     cutoff_hz: float = 7.0
-    min_speed_leg_per_s: float = 0.25
+    min_speed_leg_per_s: float = 0.10
     max_heel_share: float = 0.35
 
 

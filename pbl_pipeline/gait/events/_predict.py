@@ -111,7 +111,7 @@ def predict(grid: Grid, model: str) -> Phases:
 
 @functools.cache
 def load(model: str) -> tuple[Any, dict[str, Any]]:
-    """Network and what is known of it, by its name in `data/` or by path."""
+    """Network and what is known of it (`probability`: the calibration), by its name in `data/` or by path."""
     from ._transformer import load_model
 
     return load_model(model_path(model))
@@ -128,6 +128,22 @@ def model_path(model: str) -> Path:
             next_step="install the package again, or train them: docs/events.md",
         )
     return path
+
+
+def check_model(model: str, sha256: str) -> None:
+    """Whether the weights are those that the method names. Raises `PblError` ASSET_MISSING."""
+    if sha256 and _sha256(model) != sha256:
+        raise PblError(
+            "ASSET_MISSING",
+            found=f"weights of the event model with SHA-256 {_sha256(model)}",
+            expected=f"SHA-256 {sha256}, as the method says",
+            next_step="use the version of pbl-pipeline that the method came with, or a newer method",
+        )
+
+
+@functools.cache
+def _sha256(model: str) -> str:
+    return model_sha256(model)
 
 
 def model_sha256(model: str) -> str:

@@ -2,9 +2,11 @@
 
     python -m pbl_pipeline.gait.events.training --make-solved solved.npz --solved-count 1500   # needs MuJoCo
     python -m pbl_pipeline.gait.events.training --out DIR --seed 0 --solved solved.npz         # on a GPU, minutes
+    python -m pbl_pipeline.gait.events.training --out DIR --calibrate DIR/phase_transformer.npz --solved solved.npz
 
 The second command needs only numpy, scipy, jax, equinox and optax. It writes `phase_transformer.npz` (at each report)
-and `metrics.json` to DIR.
+and `metrics.json` to DIR. The third fits the probability of an event on people that training has not seen, minutes on
+a CPU, and writes `phase_transformer_calibrated.npz`, which is what detection reads.
 """
 
 from __future__ import annotations
@@ -31,6 +33,9 @@ def main(arguments: list[str] | None = None) -> None:
         _say(f"written: {args.make_solved}")
         return
     args.out.mkdir(parents=True, exist_ok=True)
+    if args.calibrate:
+        _calibrate(args)
+        return
     parts = [_corpus.scenes(args.seed, args.scenes, args.workers, _say)]
     if args.solved:
         parts.append(_corpus.load(args.solved))
@@ -69,6 +74,34 @@ def main(arguments: list[str] | None = None) -> None:
     _say(f"written: {path} ({path.stat().st_size / 1e6:.2f} MB), {args.out / 'metrics.json'}")
 
 
+def _calibrate(args: argparse.Namespace) -> None:
+    """Fit the probability on scenes of other seeds and on the solved motions that training held out."""
+    import numpy as np
+
+    from .. import PhaseParams
+    from .._transformer import load_model, save_model
+    from . import _calibrate as calibration
+    from . import _corpus
+
+    params = PhaseParams(str(args.calibrate), "")
+    fresh = _corpus.scenes(args.seed + 1000, args.calibrate_scenes, args.workers, _say)
+    found = list(calibration.cases(fresh, np.arange(len(fresh.start)), params.model, args.seed))
+    if args.solved:
+        solved = _corpus.load(args.solved)
+        for draw in range(4):
+            found += list(calibration.cases(solved, calibration.held_out(solved), params.model, args.seed + 1 + draw))
+    curve, measured = calibration.calibrate(found, params, _say)
+    kinds = sorted({c.kind.split()[0] for c in found})
+    parts = {k: [c for c in found if c.kind.split()[0] == k] for k in kinds}
+    scores = {k: {"sequences": len(v), **calibration.score(v, params)} for k, v in parts.items()}
+    for kind, values in scores.items():
+        _say(f"{kind}: " + "  ".join(f"{k} {v:.4g}" for k, v in values.items()))
+    model, about = load_model(args.calibrate)
+    path = args.out / "phase_transformer_calibrated.npz"
+    save_model(path, model, {**about, "probability": curve, "reliability": measured, "held_out": scores})
+    _say(f"written: {path}")
+
+
 def _say(text: str) -> None:
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
@@ -87,6 +120,8 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--batch", type=int, default=256)
     p.add_argument("--scenes", type=int, default=20000, help="sequences of 12 s that are made on the spot")
     p.add_argument("--solved", type=Path, help="file of --make-solved")
+    p.add_argument("--calibrate", type=Path, help="weights whose events get a probability")
+    p.add_argument("--calibrate-scenes", type=int, default=800)
     p.add_argument("--width", type=int, default=128)
     p.add_argument("--blocks", type=int, default=4)
     p.add_argument("--heads", type=int, default=4)

@@ -7,6 +7,7 @@ missing feet, joints, legs and frames, short recordings. All sizes are in metres
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -30,16 +31,8 @@ def augment(key: Any, xyz: Any, phase: Any, walks: Any) -> dict[str, Any]:
     """
     k = iter(jax.random.split(key, 64))
     xyz, phase, walks = _paced(next(k), xyz, phase, walks)
-    joints = _markers(next(k), next(k), next(k), xyz)
-    mirror = jax.random.bernoulli(next(k))
-    joints = jnp.where(mirror, joints[:, :, ::-1] * jnp.array([1.0, -1.0, 1.0]), joints)
+    joints, known, mirror = _seen_joints(k, xyz)
     phase = jnp.where(mirror, phase[:, _MIRRORED], phase)
-    joints = _turned_about_up(joints, jax.random.uniform(next(k), maxval=2 * np.pi))
-    joints = _leaning(next(k), joints)
-    joints = joints + _noise(next(k), joints.shape)
-    joints = _exchanged(next(k), joints)
-    joints = _outliers(next(k), joints)
-    known = _missing(next(k), joints.shape[:3])
     scale = jnp.exp(0.03 * jax.random.normal(next(k)))
     leg = scale * leg_length(joints, known, jnp)
     leg = jnp.where(jnp.isfinite(leg) & (leg > 0.05), leg, 0.7)
@@ -48,6 +41,24 @@ def augment(key: Any, xyz: Any, phase: Any, walks: Any) -> dict[str, Any]:
     defined = jnp.isfinite(phase) & seen[:, None] & walks[:, None]
     target = jnp.stack([jnp.cos(turns), jnp.sin(turns)], axis=-1)
     return {"features": values, "seen": seen, "target": target, "defined": defined, "walks": walks}
+
+
+def seen_joints(key: Any, xyz: Any) -> tuple[Any, Any, Any]:
+    """What is seen of points (T, 6, 2, 3) of any length: joints (T, 5, 2, 3), which are known (T, 5, 2), and whether
+    left and right have changed places. As in training, but at the pace of the points and without the wrong scale."""
+    return _seen_joints(iter(jax.random.split(key, 64)), xyz)
+
+
+def _seen_joints(k: Iterator[Any], xyz: Any) -> tuple[Any, Any, Any]:
+    joints = _markers(next(k), next(k), next(k), xyz)
+    mirror = jax.random.bernoulli(next(k))
+    joints = jnp.where(mirror, joints[:, :, ::-1] * jnp.array([1.0, -1.0, 1.0]), joints)
+    joints = _turned_about_up(joints, jax.random.uniform(next(k), maxval=2 * np.pi))
+    joints = _leaning(next(k), joints)
+    joints = joints + _noise(next(k), joints.shape)
+    joints = _exchanged(next(k), joints)
+    joints = _outliers(next(k), joints)
+    return joints, _missing(next(k), joints.shape[:3]), mirror
 
 
 def _paced(key, xyz, phase, walks):
@@ -177,8 +188,8 @@ def _missing(key, shape):
     # Single points.
     known &= ~(jax.random.bernoulli(next(k), 0.03, shape) & jax.random.bernoulli(next(k), 0.2) & below)
     # A short recording.
-    length = jnp.where(jax.random.bernoulli(next(k), 0.45), jax.random.randint(next(k), (), 50, WINDOW + 1), WINDOW)
-    first = jax.random.randint(next(k), (), 0, WINDOW - length + 1)
+    length = jnp.where(jax.random.bernoulli(next(k), 0.45), jax.random.randint(next(k), (), 50, t + 1), t)
+    first = jax.random.randint(next(k), (), 0, t - length + 1)
     frame = jnp.arange(t)
     return known & ((frame >= first) & (frame < first + length))[:, None, None]
 

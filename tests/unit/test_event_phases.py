@@ -1,0 +1,335 @@
+"""Parts of the event model: features, grid, filter, walking, training data, calibration."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pbl_pipeline.gait.events import FilterParams, PhaseParams, WalkingParams
+from pbl_pipeline.gait.events._features import N_FEATURES, features, heading, leg_length
+from pbl_pipeline.gait.events._phase_filter import crossings, smooth_phases
+from pbl_pipeline.gait.events._predict import GRID_HZ, Grid, Phases, on_grid
+from pbl_pipeline.gait.events._transformer import Architecture, PhaseTransformer, load_model, save_model
+from pbl_pipeline.gait.events._walking import turning_deg_per_s, walking_stretches
+from pbl_pipeline.gait.events.training._augment import SOURCE, WINDOW, augment
+from pbl_pipeline.gait.events.training._calibrate import _wraps, fit_logistic, probability, reliability
+from pbl_pipeline.gait.events.training._corpus import UNIT_M, load, pack, save
+from pbl_pipeline.gait.events.training._rhythm import draw_rhythm, draw_run, schedule
+from pbl_pipeline.gait.events.training._scenes import scene
+from pbl_pipeline.gait.events.training._sequence import Bout, Sequence
+
+UP = np.array([0.0, 0.0, 1.0])
+SMALL = Architecture(width=16, blocks=1, heads=2, hidden=32)
+
+
+def legs(n: int = 120, seed: int = 0) -> np.ndarray:
+    """Joints (T, 5, 2, 3) of a body that goes along x and swings its legs."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(n) / GRID_HZ
+    out = np.zeros((n, 5, 2, 3))
+    for s, (side, phase) in enumerate(((1.0, 0.0), (-1.0, np.pi))):
+        for j, (down, reach) in enumerate(((0.0, 0.0), (0.4, 0.1), (0.8, 0.25), (0.85, 0.25), (0.86, 0.25))):
+            out[:, j, s, 0] = 1.1 * t + reach * np.cos(2 * np.pi * t + phase) + (0.15 if j == 4 else 0.0)
+            out[:, j, s, 1] = 0.1 * side
+            out[:, j, s, 2] = 0.9 - down
+    return out + 0.001 * rng.standard_normal(out.shape)
+
+
+# --- features
+
+
+@pytest.mark.parametrize("angle_deg", [35.0, -160.0])
+def test_features_do_not_know_where_the_body_is_how_large_it_is_or_where_it_heads(angle_deg):
+    joints, known = legs(), np.ones((120, 5, 2), bool)
+    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    turned = 37.0 * (joints @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]]) + [5.0, -3.0, 1.0])
+    a, seen = features(joints, known, UP, leg_length(joints, known))
+    b, _ = features(turned, known, UP, leg_length(turned, known))
+    assert a.shape == (120, N_FEATURES)
+    assert seen.all()
+    np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+def test_features_of_a_point_ahead_to_the_left_and_below():
+    joints, known = np.zeros((60, 5, 2, 3)), np.zeros((60, 5, 2), bool)
+    joints[:, 0, 0], joints[:, 0, 1] = [0, 0.1, 0.9], [0, -0.1, 0.9]  # faces along x
+    joints[:, 2, 0] = [0.3, 0.2, 0.1]
+    known[:, 0], known[:, 2, 0] = True, True
+    values, _ = features(joints, known, UP, 0.5)
+    place, there = values[:, :30].reshape(60, 5, 2, 3), values[:, 30:].reshape(60, 5, 2)
+    np.testing.assert_allclose(place[5, 2, 0], [0.6, 0.4, -1.6], atol=1e-9)
+    assert (there[5, 2] == [1.0, 0.0]).all()
+    assert (place[5, 2, 1] == 0).all()
+
+
+def test_what_is_not_known_does_not_matter():
+    joints, known = legs(), np.ones((120, 5, 2), bool)
+    known[30:60, 3], known[80:90, 0, 1] = False, False
+    wild = np.where(known[..., None], joints, 1e6)
+    a, seen = features(joints, known, UP, 0.8)
+    b, _ = features(wild, known, UP, 0.8)
+    np.testing.assert_array_equal(a, b)
+    assert not seen[80:90].any()
+    assert (a[80:90] == 0).all()
+
+
+def test_features_are_the_same_in_jax():
+    joints, known = legs(), np.ones((120, 5, 2), bool)
+    known[10:20, 2, 0] = False
+    a, _ = features(joints, known, UP, 0.8)
+    b, _ = features(jnp.asarray(joints, jnp.float32), jnp.asarray(known), jnp.asarray(UP, jnp.float32), 0.8, jnp)
+    np.testing.assert_allclose(a, np.asarray(b), atol=2e-5)
+
+
+def test_heading_is_level_and_across_the_hips():
+    line = np.tile([0.0, 0.2, 0.05], (60, 1))
+    np.testing.assert_allclose(heading(line, np.ones(60, bool), UP), np.tile([1.0, 0, 0], (60, 1)), atol=1e-6)
+
+
+# --- grid
+
+
+@pytest.mark.parametrize("fps", [24.0, 30.0, 60.0, 100.0, 240.0])
+def test_the_grid_does_not_shift_in_time(fps):
+    time = np.arange(0, 4, 1 / fps)
+    legs_m = np.zeros((len(time), 5, 2, 3))
+    legs_m[..., 0] = np.sin(2 * np.pi * time)[:, None, None]
+    legs_m[:, 0, 0, 1], legs_m[:, 0, 1, 1] = 0.1, -0.1
+    legs_m[:, 2, :, 2] = -0.8
+    grid = on_grid(time, legs_m, UP)
+    middle = slice(10, -10)
+    np.testing.assert_allclose(np.diff(grid.time_s), 1 / GRID_HZ, atol=1e-9)
+    np.testing.assert_allclose(
+        grid.joints_m[middle, 2, 0, 0], np.sin(2 * np.pi * grid.time_s[middle]), atol=0.012 if fps < 50 else 0.004
+    )
+
+
+def test_short_gaps_are_filled_and_long_ones_are_not():
+    time = np.arange(0, 3, 1 / 30)
+    legs_m = np.ones((len(time), 5, 2, 3))
+    legs_m[30:34, 2, 0], legs_m[50:70, 2, 0] = np.nan, np.nan
+    known = on_grid(time, legs_m, UP).known[:, 2, 0]
+    at = np.arange(len(known)) / GRID_HZ
+    assert known[(at > 0.9) & (at < 1.4)].all()
+    assert not known[(at > 1.7) & (at < 2.2)].any()
+
+
+# --- filter
+
+
+def true_phases(n: int, rate: float = 0.9, offsets=(0.0, 0.12, 0.5, 0.62)) -> np.ndarray:
+    """Phases (T, 4) in rad at a rate in turns a second, which changes a little."""
+    t = np.arange(n) / GRID_HZ
+    turn = rate * t + 0.05 * np.sin(0.7 * t)
+    return 2 * np.pi * (turn[:, None] - np.array(offsets))
+
+
+def test_the_filter_finds_the_phases_in_noise():
+    rng = np.random.default_rng(0)
+    phase = true_phases(400)
+    z = np.exp(1j * (phase + 0.25 * rng.standard_normal(phase.shape))) * np.exp(-0.25**2 / 2)
+    smooth = smooth_phases(z, 1 / GRID_HZ, FilterParams(memory_frames=1.0))
+    off = np.angle(np.exp(1j * (smooth.phase_rad - phase)))
+    assert off.std() < 0.08
+    assert abs(off.mean()) < 0.02
+    np.testing.assert_allclose(smooth.rate[20:-20] / 2 / np.pi, 0.9, atol=0.08)
+    # Its own standard deviation is of the size of its error.
+    assert 0.4 < off.std() / smooth.sd_rad.mean() < 2.0
+
+
+def test_the_filter_goes_on_through_a_gap():
+    phase = true_phases(300)
+    z = 0.99 * np.exp(1j * phase)
+    z[140:160] = 0
+    smooth = smooth_phases(z, 1 / GRID_HZ, FilterParams())
+    off = np.angle(np.exp(1j * (smooth.phase_rad - phase)))
+    assert np.abs(off).max() < 0.1
+    assert smooth.sd_rad[150].mean() > 1.2 * smooth.sd_rad[100].mean()
+
+
+def test_one_wrong_event_is_pulled_by_the_other_three():
+    phase = true_phases(300)
+    z = 0.995 * np.exp(1j * phase)
+    z[140:150, 0] *= 0.5 * np.exp(1j * 1.5) / 0.995
+    smooth = smooth_phases(z, 1 / GRID_HZ, FilterParams())
+    assert abs(np.angle(np.exp(1j * (smooth.phase_rad[145, 0] - phase[145, 0])))) < 0.1
+
+
+def test_crossings_lie_between_frames():
+    time = np.arange(0, 3, 0.02)
+    at = crossings(2 * np.pi * (1.3 * time - 0.51), time)
+    np.testing.assert_allclose(at, (np.arange(4) + 0.51)[: len(at)] / 1.3, atol=1e-9)
+    assert len(at) == 4
+    assert len(crossings(np.array([0.1]), np.array([0.0]))) == 0
+
+
+# --- walking
+
+
+def a_grid(n: int, swing: np.ndarray, heading_rad: np.ndarray | None = None) -> Grid:
+    joints, known = np.zeros((n, 5, 2, 3)), np.ones((n, 5, 2), bool)
+    turn = np.zeros(n) if heading_rad is None else heading_rad
+    ahead = np.stack([np.cos(turn), np.sin(turn), np.zeros(n)], axis=1)
+    joints[:, 2:, 0] += 0.5 * swing[:, None, None] * ahead[:, None]
+    joints[:, 2:, 1] -= 0.5 * swing[:, None, None] * ahead[:, None]
+    return Grid(np.arange(n) / GRID_HZ, joints, known, UP, ahead, 1.0)
+
+
+def some_phases(n: int, walking: np.ndarray, seen: np.ndarray | None = None) -> Phases:
+    return Phases(np.ones((n, 4), complex), walking, np.ones(n, bool) if seen is None else seen)
+
+
+def test_stretches_end_at_standing_gaps_and_turns():
+    n = 1000
+    swing = 0.6 * np.sin(2 * np.pi * np.arange(n) / GRID_HZ)
+    walking, seen, turn = np.ones(n), np.ones(n, bool), np.zeros(n)
+    walking[200:300] = 0.01  # stands
+    walking[340:346] = 0.01  # a moment of doubt
+    seen[500:560] = False  # out of view
+    turn[750:800] = np.pi * np.linspace(0, 1, 50)  # turns round within a second
+    turn[800:] = np.pi
+    found = walking_stretches(a_grid(n, swing, turn), some_phases(n, walking, seen), WalkingParams())
+    assert len(found) == 4
+    assert found[0][0] == 0
+    for edges, wanted in zip(found[1:], ((300, 499), (560, 750), (800, 999)), strict=True):
+        np.testing.assert_allclose(edges, wanted, atol=15)
+
+
+def test_feet_that_do_not_pass_each_other_do_not_walk():
+    n = 300
+    still = a_grid(n, 0.05 * np.sin(2 * np.pi * np.arange(n) / GRID_HZ))
+    assert walking_stretches(still, some_phases(n, np.ones(n)), WalkingParams()) == []
+
+
+def test_turning_is_positive_to_the_left():
+    turn = np.radians(40.0) * np.arange(200) / GRID_HZ
+    np.testing.assert_allclose(turning_deg_per_s(a_grid(200, np.zeros(200), turn))[20:-20], 40.0, atol=0.5)
+
+
+# --- network
+
+
+def test_the_network_is_saved_and_read_again(tmp_path):
+    model = eqx.filter_jit(PhaseTransformer)(SMALL, jax.random.key(3))
+    save_model(tmp_path / "m.npz", model, {"seed": 3})
+    again, about = load_model(tmp_path / "m.npz")
+    assert about["seed"] == 3
+    x, seen = jax.random.normal(jax.random.key(0), (40, N_FEATURES)), jnp.ones(40, bool)
+    run = eqx.filter_jit(lambda m: m(x, seen))
+    np.testing.assert_allclose(run(model), run(again), atol=0.02)
+    np.savez(tmp_path / "other.npz", about=np.array('{"architecture": {"width": 16, "blocks": 1, "heads": 2}}'))
+    with pytest.raises(ValueError, match="architecture"):
+        load_model(tmp_path / "other.npz")
+
+
+def test_frames_that_are_not_seen_do_not_change_the_others_much():
+    """Attention leaves them out; only the convolution of the frames beside them sees their zeros."""
+    model = eqx.filter_jit(PhaseTransformer)(SMALL, jax.random.key(3))
+    x = jax.random.normal(jax.random.key(0), (80, N_FEATURES))
+    seen = jnp.arange(80) < 50
+    run = eqx.filter_jit(lambda x, seen: model(x, seen))
+    long = run(jnp.where(seen[:, None], x, 0.0), seen)
+    short = run(x[:50], jnp.ones(50, bool))
+    np.testing.assert_allclose(long[:46], short[:46], atol=0.01)
+    everything = run(jnp.where(seen[:, None], x, 0.0), jnp.ones(80, bool))
+    assert np.abs(everything[:46] - short[:46]).max() > 0.05
+
+
+# --- training data
+
+
+def test_a_schedule_keeps_the_order_of_walking_and_of_running():
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        left_down, right_up, right_down, left_up = schedule(rng, draw_rhythm(rng), 10.0)
+        table = np.stack([left_down, right_up, right_down, left_up], axis=1).ravel()
+        assert (np.diff(table) > 0).all()
+        rng = np.random.default_rng(seed)
+        left_down, right_up, right_down, left_up = schedule(rng, draw_run(rng), 10.0)
+        assert (left_up < right_down).all()  # one foot leaves before the other comes down
+        assert (left_down < left_up).all()
+        assert right_up[0] < left_down[0] or right_up[0] > left_down[0] + 0.1
+
+
+def test_a_scene_is_its_seeds_and_has_feet_below_the_hips():
+    a, b, c = scene(5), scene(5), scene(6)
+    np.testing.assert_array_equal(a.xyz_m, b.xyz_m)
+    assert a.xyz_m.shape == c.xyz_m.shape == (600, 6, 2, 3)
+    assert not np.array_equal(a.xyz_m, c.xyz_m)
+    standing = [s for s in (scene(i) for i in range(12)) if s.kind in ("walk", "start_stop")]
+    for s in standing:
+        assert (s.xyz_m[:, 3, :, 2].mean(axis=0) < s.xyz_m[:, 1, :, 2].mean(axis=0)).all()
+        assert (s.xyz_m[:, 1, :, 2].mean(axis=0) < s.xyz_m[:, 0, :, 2].mean(axis=0)).all()
+
+
+def test_feet_are_ahead_where_they_come_down():
+    """The events of a scene fit its movement: at a foot down the foot is ahead of the other one."""
+    for seed in range(30):
+        s = scene(seed)
+        if s.kind not in ("walk", "start_stop") or not s.bouts:
+            continue
+        hips = s.xyz_m[:, 0, 0] - s.xyz_m[:, 0, 1]
+        ahead = np.cross(hips, UP)
+        apart = np.sum((s.xyz_m[:, 3, 0] - s.xyz_m[:, 3, 1]) * ahead, axis=1)
+        for bout in s.bouts:
+            left, right = ([round(t * GRID_HZ) for t in bout.events_s[k] if 0.1 < t < 11.9] for k in (0, 2))
+            if len(left) > 3 and len(right) > 3:
+                assert np.mean(apart[left]) > np.mean(apart[right])
+
+
+def test_phases_are_whole_at_the_events():
+    events = tuple(np.arange(4) * 1.1 + shift for shift in (0.5, 0.63, 1.05, 1.2))
+    s = Sequence(np.zeros((300, 6, 2, 3), np.float32), (Bout(events, open_ends=False),), "walk")
+    phase, walks = s.phases()
+    assert not walks[s.time_s < 0.49].any()
+    for k, times in enumerate(events):
+        np.testing.assert_allclose(_wraps(phase[:, k], s.time_s), times, atol=1e-3)
+    assert np.isnan(phase[~walks]).all()
+
+
+def test_an_example_is_what_the_model_takes():
+    s = next(s for s in (scene(i) for i in range(50)) if s.kind == "walk")
+    phase, walks = s.phases()
+    cut = slice(0, SOURCE)
+    made = jax.jit(augment)(jax.random.key(0), s.xyz_m[cut], phase[cut].astype(np.float32), walks[cut])
+    assert made["features"].shape == (WINDOW, N_FEATURES)
+    assert np.isfinite(made["features"]).all()
+    assert np.isfinite(made["target"]).all()
+    assert made["defined"].any()
+    assert not (np.asarray(made["defined"]).any(axis=1) & ~np.asarray(made["seen"])).any()
+
+
+def test_a_corpus_survives_the_file(tmp_path):
+    corpus = pack(scene(i) for i in range(3))
+    save(tmp_path / "c.npz", corpus)
+    again = load(tmp_path / "c.npz")
+    for f in dataclasses.fields(corpus):
+        np.testing.assert_array_equal(getattr(corpus, f.name), getattr(again, f.name))
+    first = scene(0).xyz_m
+    middle = first[:, 0].mean(axis=1, keepdims=True)[:, None]
+    np.testing.assert_allclose(UNIT_M * again.points[:600], first - middle, atol=UNIT_M)
+
+
+# --- calibration
+
+
+def test_the_fitted_curve_says_how_often_events_are_real():
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((20000, 2))
+    real = rng.random(20000) < 1 / (1 + np.exp(-(1.0 + 2.0 * x[:, 0] - 0.5 * x[:, 1])))
+    curve = fit_logistic(x[:10000], real[:10000])
+    np.testing.assert_allclose([curve["intercept"], *curve["slope"]], [1.0, 2.0, -0.5], atol=0.12)
+    assert reliability(probability(x[10000:], curve), real[10000:])["expected_error"] < 0.02
+    assert reliability(np.full(10000, 0.99), real[10000:])["expected_error"] > 0.2
+
+
+def test_parameters_go_through_the_database_form():
+    from pbl_pipeline.paramset import Paramset
+
+    params = PhaseParams("m", "s", filter=FilterParams(rate_noise=2.0))
+    assert Paramset.of("gait", "x", 1, params).to(PhaseParams) == params
