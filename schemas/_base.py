@@ -26,10 +26,19 @@ from pbl_pipeline.paramset import Paramset
 from . import connection as _connection  # noqa: F401  configures DataJoint before the import below
 
 import datajoint  # isort: skip
-from datajoint.errors import DuplicateError  # isort: skip
+from datajoint.errors import DuplicateError, LostConnectionError  # isort: skip
 from datajoint.hash_registry import get_store_backend  # isort: skip
 
-__all__ = ["DuplicateError", "Origin", "computes", "dj", "method_columns", "origin_columns", "stored_file"]
+__all__ = [
+    "DuplicateError",
+    "LostConnectionError",
+    "Origin",
+    "computes",
+    "dj",
+    "method_columns",
+    "origin_columns",
+    "stored_file",
+]
 
 P = TypeVar("P")
 

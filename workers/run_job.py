@@ -12,11 +12,10 @@ from typing import Any
 
 import deepdiff
 import pymysql
-from datajoint.errors import LostConnectionError
 
 from pbl_pipeline.errors import PblError
 from schemas import connection
-from schemas._base import DuplicateError, error_code
+from schemas._base import DuplicateError, LostConnectionError, error_code
 
 from . import queue
 from .queue import Claim, ReservationLost

@@ -39,8 +39,7 @@ def check(tables: Sequence[Any]) -> None:
 
 
 def _store(table: Any) -> None:
-    from datajoint.hash_registry import get_store_backend
-
+    from schemas._base import get_store_backend
     from schemas.connection import STORE
 
     backend = get_store_backend(STORE, config=table.connection._config)
