@@ -41,12 +41,13 @@ def events(file: Path, out: Path, method: str) -> None:
 
 
 def _feet(path: Path):
-    from pbl_pipeline.fit import TrialFit
     from pbl_pipeline.gait import feet_from_fit, feet_from_keypoints, feet_from_markers
     from pbl_pipeline.keypoints import Keypoints, WorldMarkers
 
     fields = set(load_npz(path))
     if "qpos" in fields:
+        from pbl_pipeline.fit import TrialFit  # loads the fit's libraries
+
         return feet_from_fit(TrialFit.load(path))
     if "xyz_cam_m" in fields:
         return feet_from_keypoints(Keypoints.load(path))

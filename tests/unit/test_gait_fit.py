@@ -329,14 +329,28 @@ def make_keypoints(fit: TrialFit, marker_set: str, root_relative: bool = True, t
 def test_keypoints_give_the_events_of_the_fit(tilt_deg):
     time = np.arange(0, 8, 1 / 30)
     fit = make_fit(time, walking(time, 90.0))
-    expected = detect_events(feet_from_fit(fit))
-    found = detect_events(feet_from_keypoints(make_keypoints(fit, "blazepose_33", tilt_deg=tilt_deg)))
+    expected = detect_events(feet_from_fit(fit), "zeni-2008")
+    found = detect_events(feet_from_keypoints(make_keypoints(fit, "blazepose_33", tilt_deg=tilt_deg)), "zeni-2008")
     assert [(e.side, e.event) for e in found.events] == [(e.side, e.event) for e in expected.events]
     np.testing.assert_allclose(
         [e.time_s for e in found.events], [e.time_s for e in expected.events], atol=1e-6 if not tilt_deg else 0.01
     )
     assert found.source == "keypoints blazepose_33"
     assert max(e.probability for e in found.events) < 0.8
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 10.0])
+def test_the_event_model_needs_neither_knees_nor_a_level_camera(tilt_deg):
+    """Hips, heels and toes instead of all joints, and a camera that is tilted: the same events within half a frame."""
+    time = np.arange(0, 8, 1 / 30)
+    fit = make_fit(time, walking(time, 90.0))
+    expected = detect_events(feet_from_fit(fit))
+    found = detect_events(feet_from_keypoints(make_keypoints(fit, "blazepose_33", tilt_deg=tilt_deg)))
+    inner = [e for e in expected.events if 0.3 < e.time_s < 7.7]
+    assert len(inner) > 22
+    for e in inner:
+        assert min(abs(np.array(found.times(e.side, e.event)) - e.time_s)) < 0.5 / 30
+    assert len([e for e in found.events if 0.3 < e.time_s < 7.7]) == pytest.approx(len(inner), abs=1)
 
 
 def test_absolute_keypoints_know_the_way():
