@@ -1,7 +1,7 @@
 """Where to look in which frame: around known people as often as their movement asks for, elsewhere in turn.
 
 One call of a detector costs as much as decoding three frames, so pictures are not searched throughout. A person who
-moves evenly is looked at every fifth of a second and interpolated between, one who keeps still more rarely; one who
+moves evenly is looked at ten times a second and interpolated between, one who keeps still more rarely; one who
 surprises, was missed or comes close to another is looked at more often. The whole frame and its tiles are visited by
 turns: nobody new is overlooked for longer than a turn, and `rewind` then finds the frames between.
 """
@@ -33,8 +33,8 @@ class WatchParams:
     tile_overlap: float = 0.3
     search_interval_s: float = 0.2
     search_windows: int = 1
-    follow_interval_s: float = 0.2
-    rest_interval_s: float = 0.4
+    follow_interval_s: float = 0.1
+    rest_interval_s: float = 0.2
     close_interval_s: float = 0.06
     still: float = 0.1
     surprise: float = 0.15
