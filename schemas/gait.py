@@ -76,7 +76,7 @@ class GaitEvents(dj.Computed):
     events_source     : varchar(64)            # what the feet come from
     walking_bouts     : json                   # (s) start and end of each walking bout
     n_events          : int16
-    n_candidates      : int16                  # extrema before the check of their order
+    n_candidates      : int16                  # possible events before their check
     n_order_breaks    : int16                  # bouts that ended because an event was missing or out of order
     {origin_columns("events")}
     """
@@ -89,7 +89,7 @@ class GaitEvents(dj.Computed):
         event_time        : float64            # (s) time of the trial
         event_side        : enum('left', 'right')
         event_kind        : enum('foot_down', 'foot_up')
-        event_probability : float32            # (0..1) how clear the event is, not calibrated
+        event_probability : float32            # (0..1) that it is real; by coordinates: how clear it is, not calibrated
         event_bout        : int16              # walking bout, from 0
         """
 

@@ -53,8 +53,8 @@ def read_lab_trial(path: str | Path, events_csv: str | Path | None = None) -> La
     """Angles, events and feet of a C3D file (also gzipped) with the outputs of Plug-in Gait or a model of its kind.
 
     The angles are the points LHipAngles and so on (`PLUG_IN_GAIT_POINTS`). Events: those of `events_csv`
-    (`pbl events`), else the recording's labels Foot Strike and Foot Off, else found from the markers of the legs. A sample
-    that the file marks as invalid is NaN.
+    (`pbl events`), else the recording's labels Foot Strike and Foot Off, else found from the markers of the legs. A
+    sample that the file marks as invalid is NaN.
 
     Raises
     ------

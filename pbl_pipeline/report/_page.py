@@ -324,15 +324,33 @@ def _cycles_note(bands: NormalBands) -> str:
     )
 
 
+#: What a reader should know of each method of the gait events.
+_EVENT_NOTES = {
+    "phase-transformer": "Foot contacts come from a neural network that was trained on synthetic people and a Kalman "
+    "smoother over its phases (after Cotton et al. 2022). Against the force plates of a laboratory, on 11 children "
+    "with markers, they scatter by 12 ms and are 7 ms early, foot down and foot up alike, so that stance and double "
+    "support keep their length. Against the eye, on one recording of an adult, foot down is about 20 ms late.",
+    "zeni-2008": "Foot contacts are found from the position of heel and toe relative to the pelvis (Zeni, Richards and "
+    "Higginson 2008, Gait & Posture 27:710-714). On laboratory markers this method sets foot down some hundredths "
+    "of a second early and foot up a little late, so stance and double support come out too long and swing too "
+    "short. Nothing is corrected for it. Cadence, stride time and step time are hardly touched, and changes "
+    "between visits less than single values.",
+    "oconnor-2007": "Foot contacts are found from the vertical speed of the foot (O'Connor, Thorpe, O'Malley and "
+    "Vaughan 2007, Gait & Posture 25:469-474). On laboratory markers it misses steps that come down flat.",
+}
+
+
+def _event_methods(report: SessionReport) -> list[str]:
+    """The event methods of the trials, each once."""
+    trials = () if report.metrics is None else report.metrics.trials
+    return [m for m in dict.fromkeys(t.events.method for t in trials) if m in _EVENT_NOTES]
+
+
 def _notes(report: SessionReport, norm: NormativeSet | None) -> list[str]:
     notes = [
         "Angles are those of a model of the body that was fitted to the picture. Flexion, adduction, internal rotation "
         "and dorsiflexion are positive, on both sides.",
-        "Foot contacts are found from the position of heel and toe relative to the pelvis (Zeni, Richards and "
-        "Higginson 2008, Gait & Posture 27:710-714). On laboratory markers this method sets foot down some hundredths "
-        "of a second early and foot up a little late, so stance and double support come out too long and swing too "
-        "short. Nothing is corrected for it. Cadence, stride time and step time are hardly touched, and changes "
-        "between visits less than single values.",
+        *(_EVENT_NOTES[m] for m in _event_methods(report)),
         "The GDI of three angles follows Schwartz and Rozumalski 2008 (Gait & Posture 28:351-357) with hip flexion, "
         "hip adduction and knee flexion only: 100 is the mean of the norm, each 10 points one standard deviation, "
         "lower is further away. It is not the original index of nine angles.",

@@ -8,7 +8,8 @@ Parts:
   from all markers, and from 17 joints at 30 Hz with 20 mm noise. With the event model also the cross-validation of its
   one constant: the delay of each child from the other ten.
 - `markers`: true markers of synthetic people (`pbl synth`), healthy and impaired, without and with noise.
-- `chain`: synthetic people seen by a phone in the hand -> `pbl fit` (gauss-newton) -> events -> cadence, double support.
+- `chain`: synthetic people seen by a phone in the hand -> `pbl fit` (gauss-newton) -> events ->
+  cadence, double support.
 - `time`: a six-minute walk.
 
 Exit code 1 where a bar is missed (only the default method has bars).
@@ -20,7 +21,6 @@ import dataclasses
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 
 import click
 import numpy as np
@@ -146,8 +146,10 @@ def cross_validated(say=click.echo) -> tuple[float, dict[str, tuple[float, float
         )
         ms = 1000 * np.concatenate([np.array(t.errors[event]) + d / 2 for t, d in zip(each, left_out, strict=True)])
         say(f"delay, {event}: with half of it {ms.mean():+.1f} +- {ms.std(ddof=1):.1f} ms")
-    say(f"delay over all children {1000 * whole:.1f} ms, leaving one out {1000 * min(left_out):.1f} to "
-        f"{1000 * max(left_out):.1f} ms; children's means {1000 * means.min():.0f} to {1000 * means.max():.0f} ms")
+    say(
+        f"delay over all children {1000 * whole:.1f} ms, leaving one out {1000 * min(left_out):.1f} to "
+        f"{1000 * max(left_out):.1f} ms; children's means {1000 * means.min():.0f} to {1000 * means.max():.0f} ms"
+    )
     return whole, result
 
 
@@ -204,13 +206,16 @@ def chain(methods: Sequence[str], seeds: int, say=click.echo) -> dict[str, list[
                 tally = Tally()
                 tally.add(found, one.truth.events)
                 got = spatiotemporal(find_cycles(found, trial))
-                error = {}
-                for measure in ("cadence_steps_per_min", "double_support_percent"):
-                    a, b = got[measure], true[measure]
-                    error[measure] = float("nan") if a is None or b is None else a.mean - b.mean
-                out[method].append(Walked(name, *error.values(), tally))
+                cadence, support = (
+                    float("nan") if (a := got[m]) is None or (b := true[m]) is None else a.mean - b.mean
+                    for m in ("cadence_steps_per_min", "double_support_percent")
+                )
+                out[method].append(Walked(name, cadence, support, tally))
                 w = out[method][-1]
-                say(f"chain, {method}, {name}: cadence {w.cadence:+.2f}/min, double support {w.double_support:+.2f} %, {tally}")
+                say(
+                    f"chain, {method}, {name}: cadence {w.cadence:+.2f}/min, "
+                    f"double support {w.double_support:+.2f} %, {tally}"
+                )
     for method in methods:
         say(f"chain, {method}: {summary(out[method])}")
     return out
@@ -222,8 +227,8 @@ def summary(walked: Sequence[Walked]) -> str:
     n = sum(sum(map(len, w.tally.errors.values())) for w in walked)
     labels = sum(w.tally.labels for w in walked)
     return (
-        f"{len(walked)} walks, matched {n / labels:.1%}, invented {sum(w.tally.invented for w in walked)}; error of the "
-        f"cadence: median {np.nanmedian(abs(cadence)):.2f}, 95th percentile {np.nanpercentile(abs(cadence), 95):.2f}, "
+        f"{len(walked)} walks, matched {n / labels:.1%}, invented {sum(w.tally.invented for w in walked)}; "
+        f"error of the cadence: median {np.nanmedian(abs(cadence)):.2f}, 95th percentile {np.nanpercentile(abs(cadence), 95):.2f}, "
         f"greatest {np.nanmax(abs(cadence)):.2f} per min; of double support: mean {np.nanmean(support):+.2f}, median "
         f"{np.nanmedian(abs(support)):.2f}, 95th percentile {np.nanpercentile(abs(support), 95):.2f}, greatest "
         f"{np.nanmax(abs(support)):.2f} % of the cycle; without a measure: {int(np.isnan(cadence).sum())}"
@@ -240,7 +245,9 @@ def six_minutes() -> FootTrajectories:
     at = first + np.mod(stamps, last - first)
     xyz = truth.markers_world_m.reshape(len(truth.time_s), -1)
     xyz = np.stack([np.interp(at, truth.time_s, column) for column in xyz.T], axis=1).reshape(len(at), -1, 3)
-    return dataclasses.replace(feet_of_truth(dataclasses.replace(truth, time_s=stamps), xyz + rng.normal(0, 0.01, xyz.shape)))
+    return dataclasses.replace(
+        feet_of_truth(dataclasses.replace(truth, time_s=stamps), xyz + rng.normal(0, 0.01, xyz.shape))
+    )
 
 
 def how_long(method: str, say=click.echo) -> tuple[float, float]:
@@ -277,7 +284,10 @@ def main(parts: Sequence[str], methods: Sequence[str], seeds: int) -> None:
             if method == default:
                 full, few = found.values()
                 bars += [("lab: 97 % matched, none invented", full.matched >= 0.97 and full.invented == 0)]
-                bars += [(f"lab: {e} within 15 ms, sd 25 ms", abs(full.ms(e)[0]) <= 15 and full.ms(e)[1] <= 25) for e in EVENTS]
+                bars += [
+                    (f"lab: {e} within 15 ms, sd 25 ms", abs(full.ms(e)[0]) <= 15 and full.ms(e)[1] <= 25)
+                    for e in EVENTS
+                ]
                 bars += [("17 joints: 95 % matched", few.matched >= 0.95)]
                 bars += [(f"17 joints: {e} sd 35 ms", few.ms(e)[1] <= 35) for e in EVENTS]
         if default in methods:

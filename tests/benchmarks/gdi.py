@@ -1,12 +1,12 @@
 """The original Gait Deviation Index on the gait cycles of eleven children, as a laboratory measured them.
 
     python -m tests.benchmarks.gdi
-    python -m tests.benchmarks.gdi --events zeni
+    python -m tests.benchmarks.gdi --events phase-transformer
 
 Reads `../shared/data/real/gait_lab_c3d` (see the README there for source and licence): one walk of each child, angles
 by Plug-in Gait, events labelled from force plates. Prints each child's index (`gillette-2008`), profile score and
-cycles, the mean over the children, and the means of the index of three angles. `--events zeni` finds the events from
-the markers.
+cycles, the mean over the children, and the means of the index of three angles. `--events METHOD` finds the events
+from the markers.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from pbl_pipeline.gait import GaitMetrics, detect_events, gait_metrics, read_lab_trial
+from pbl_pipeline.gait import EVENT_PARAMSETS, GaitMetrics, detect_events, gait_metrics, read_lab_trial
 from tests.conftest import SHARED
 
 
@@ -29,12 +29,12 @@ def children(
     for path in sorted((shared / "real" / "gait_lab_c3d").glob("Straight_*.c3d.gz")):
         trial = read_lab_trial(path)
         if events != "labels" and trial.feet is not None:
-            trial = dataclasses.replace(trial, events=detect_events(trial.feet))
+            trial = dataclasses.replace(trial, events=detect_events(trial.feet, events))
         yield trial.name.removeprefix("Straight_"), gait_metrics([trial], norm)
 
 
 @click.command()
-@click.option("--events", type=click.Choice(["labels", "zeni"]), default="labels", show_default=True)
+@click.option("--events", type=click.Choice(["labels", *EVENT_PARAMSETS]), default="labels", show_default=True)
 def main(events: str) -> None:
     """Print index and profile score of each child, and their means."""
     click.echo(f"{'child':<12}{'cycles':>7}{'left':>8}{'right':>8}{'GDI':>8}{'GPS':>7}")

@@ -69,6 +69,7 @@ def test_the_event_model_against_the_force_plates(shared_data):
     these walks ask for (docs/events.md)."""
     tally = Tally()
     for walk in lab_walks():
+        assert walk.feet is not None
         tally.add(detect_events(walk.feet, "phase-transformer"), walk.events.events)
     print(tally)  # noqa: T201
     assert tally.labels == 95

@@ -188,7 +188,7 @@ def test_page_shows_the_measures(report: SessionReport, measured: GaitMetrics, t
         measured.params_hash,
         "Version 0.1.0",
         "not the original",
-        "Zeni",
+        "Kalman smoother",
     ):
         assert words in page.text, words
     assert "/somewhere/secret" not in page.text  # a file's name is provenance, a folder of the laboratory is not

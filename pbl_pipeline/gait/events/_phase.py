@@ -39,9 +39,9 @@ class PhaseParams:
     min_probability
         Events that are less likely real than this are left out, and end a bout.
     event_delay_s
-        Added to every event of all four kinds alike, so that it changes neither step times nor supports: half of the 15
-        ms by which the model is early against the force plates of 11 children, because against the eye, on the one adult
-        on video whose contacts were read, it is 10 ms late without any (docs/events.md).
+        Added to every event of all four kinds alike, so that it changes neither step times nor supports: half of
+        the 15 ms by which the model is early against the force plates of 11 children, because against the eye, on the
+        one adult on video whose contacts were read, it is 10 ms late without any (docs/events.md).
     """
 
     model: str

@@ -66,7 +66,8 @@ class EventParams:
 
 @dataclasses.dataclass(frozen=True)
 class GaitEvent:
-    """One event. `probability` in 0..1 is not calibrated (see `detect_events`); `bout` counts walking bouts from 0."""
+    """One event. `probability` in 0..1 that it is real: calibrated by the event model, by the coordinate-based methods
+    only how clear it is; `bout` counts walking bouts from 0."""
 
     time_s: float
     side: str
@@ -85,8 +86,8 @@ class GaitEvents:
 
     `status` is "PASS" or "EMPTY" (nobody walks: `reason` says what was seen). `params_hash` identifies the
     parameters, `source` the trajectories ("fit", "keypoints blazepose_33", ...). `walking_s` lists start and end of
-    each bout. `n_candidates` counts the extrema before the check of order, `n_order_breaks` where a bout ended
-    because an event was missing or out of order.
+    each bout. `n_candidates` counts what might have been events before their check, `n_order_breaks` where a bout
+    ended because an event was missing, or where two are out of order.
     """
 
     status: str

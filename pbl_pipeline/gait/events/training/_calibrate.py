@@ -1,8 +1,8 @@
-"""Calibration of the events' probability, and what the filter's parameters are worth, on sequences held out of training.
+"""Calibration of the events' probability, and what the filter's parameters are worth, on sequences held out.
 
-Each sequence is augmented as in training (`seen_joints`) and then goes the way of any recording: grid, network, walking,
-filter, events. An event that lies within `NEAR_S` of a true one of its kind is real. The curve is fitted to one half of
-the sequences and measured on the other.
+Each sequence is augmented as in training (`seen_joints`) and then goes the way of any recording: grid, network,
+walking, filter, events. An event that lies within `NEAR_S` of a true one of its kind is real. The curve is fitted to
+one half of the sequences and measured on the other.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def cases(corpus: Corpus, numbers: np.ndarray, model: str, seed: int) -> Iterato
         grid = _predict.on_grid(time, np.where(known[..., None], joints, np.nan), _UP)
         if not np.isfinite(grid.leg_m) or np.count_nonzero(grid.known[:, 0].all(axis=1)) < GRID_HZ:
             continue
-        seen = grid.known[:, 0].all(axis=1)
+        seen: np.ndarray = np.logical_and.reduce(grid.known[:, 0], axis=1)
         true = tuple(_wraps(phase[:, k], time) for k in range(4))
         near = tuple(t[seen[np.clip(np.round(t * GRID_HZ).astype(int), 0, len(seen) - 1)]] for t in true)
         yield Case(grid, _predict.predict(grid, model), near, str(corpus.kind[number]))
@@ -154,15 +154,15 @@ def score(found: list[Case], p: PhaseParams) -> dict[str, float]:
     }
 
 
-def calibrate(
-    found: list[Case], p: PhaseParams, say: Callable[[str], None]
-) -> tuple[dict[str, Any], dict[str, Any]]:
+def calibrate(found: list[Case], p: PhaseParams, say: Callable[[str], None]) -> tuple[dict[str, Any], dict[str, Any]]:
     """The curve (fitted to all cases) and its reliability (fitted to every other case, measured on the rest)."""
     half = fit_logistic(*evidence(found[::2], p))
     x, real = evidence(found[1::2], p)
     measured = reliability(probability(x, half), real)
-    say(f"probability on {measured['events']} held-out events: Brier {measured['brier']:.4f}, "
-        f"expected error {measured['expected_error']:.4f}")
+    say(
+        f"probability on {measured['events']} held-out events: Brier {measured['brier']:.4f}, "
+        f"expected error {measured['expected_error']:.4f}"
+    )
     for stated, share, n in measured["bands"]:
         say(f"  stated {stated:.3f}  real {share:.3f}  n {n}")
     return fit_logistic(*evidence(found, p)), measured
