@@ -226,12 +226,15 @@ def summary(walked: Sequence[Walked]) -> str:
     support = np.array([w.double_support for w in walked])
     n = sum(sum(map(len, w.tally.errors.values())) for w in walked)
     labels = sum(w.tally.labels for w in walked)
+
+    def sizes(values: np.ndarray) -> str:
+        size = np.abs(values[np.isfinite(values)])
+        return f"median {np.median(size):.2f}, 95th percentile {np.percentile(size, 95):.2f}, greatest {size.max():.2f}"
+
     return (
-        f"{len(walked)} walks, matched {n / labels:.1%}, invented {sum(w.tally.invented for w in walked)}; "
-        f"error of the cadence: median {np.nanmedian(abs(cadence)):.2f}, 95th percentile {np.nanpercentile(abs(cadence), 95):.2f}, "
-        f"greatest {np.nanmax(abs(cadence)):.2f} per min; of double support: mean {np.nanmean(support):+.2f}, median "
-        f"{np.nanmedian(abs(support)):.2f}, 95th percentile {np.nanpercentile(abs(support), 95):.2f}, greatest "
-        f"{np.nanmax(abs(support)):.2f} % of the cycle; without a measure: {int(np.isnan(cadence).sum())}"
+        f"{len(walked)} walks, matched {n / labels:.1%}, invented {sum(w.tally.invented for w in walked)}; error of the "
+        f"cadence: {sizes(cadence)} per min; of double support: mean {np.nanmean(support):+.2f}, {sizes(support)} % of "
+        f"the cycle; without a measure: {int(np.isnan(cadence).sum())}"
     )
 
 
