@@ -239,8 +239,9 @@ def insert_methods(table: Any, prefix: str, paramsets: Mapping[str, Paramset]) -
 
 def resolve_method(table: Any, prefix: str, name: str) -> str:
     """Key of a method named by key (`demo-v1`) or by name (`demo`: its newest version). Raises SOLVER_UNKNOWN."""
+    # Of one version the shorter key first: a migration may have put an old row aside as `demo-v1-<hash>`.
     rows = table.proj(f"{prefix}_method_name", f"{prefix}_method_version").to_dicts(
-        order_by=f"{prefix}_method_version DESC"
+        order_by=[f"{prefix}_method_version DESC", f"{prefix}_method"]
     )
     for row in rows:
         if name in (row[f"{prefix}_method"], row[f"{prefix}_method_name"]):

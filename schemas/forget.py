@@ -264,7 +264,7 @@ def _videos(ids: Ids, earlier: dict[str, Any]) -> list[dict[str, Any]]:
 
 # --------------------------------------------------------------------------------------------------------- removing
 def _delete_rows(subject: str, ids: Ids, say: Say) -> None:
-    """Queued jobs, then the person with all that depends on it in one transaction, then what depends on nothing."""
+    """Queued jobs (no worker takes one up meanwhile), the person with what depends on it, what depends on nothing."""
     cameras = _cameras(ids)
     conn = connection.connect()
     tables = list(_personal_tables(conn))

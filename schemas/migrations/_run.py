@@ -18,6 +18,7 @@ from schemas import connection
 from schemas._base import utc_now
 from schemas._declare import declare_all
 from schemas._differences import Difference, bind_all, differences, rebind
+from schemas._methods import insert_all
 
 _NAME = re.compile(r"(\d{4})_(\w+)")
 Say = Callable[[str], None]
@@ -127,6 +128,7 @@ def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
         bind_all(create=True)
         steps = _apply(cursor, say)
     rebind({s.split("`.`")[0].split("`")[-1] for _, statements in steps for s in statements})
+    insert_all()  # also where this process has done it before: a migration may have moved a method's name
     declare_all()
     left = [d.text() for d in differences()]
     if left:

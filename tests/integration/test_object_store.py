@@ -38,18 +38,18 @@ def remote(database: Path, server: str, tmp_path: Path, monkeypatch: pytest.Monk
     (tmp_path / "key").write_text("pbl-worker\n")
     (tmp_path / "secret").write_text(SECRET + "\n")
     schemas.activate()
-    with monkeypatch.context() as patch:
-        chain.install(patch)
-        patch.setenv("PBL_S3_ENDPOINT", server)
-        patch.setenv("PBL_S3_BUCKET", "walks")
-        patch.setenv("PBL_S3_KEY_FILE", str(tmp_path / "key"))
-        patch.setenv("PBL_S3_SECRET_FILE", str(tmp_path / "secret"))
-        connection.connect()
-        yield
+    chain.install(monkeypatch)
+    monkeypatch.setenv("PBL_S3_ENDPOINT", server)
+    monkeypatch.setenv("PBL_S3_BUCKET", "walks")
+    monkeypatch.setenv("PBL_S3_KEY_FILE", str(tmp_path / "key"))
+    monkeypatch.setenv("PBL_S3_SECRET_FILE", str(tmp_path / "secret"))
+    connection.connect()
+    yield
+    monkeypatch.undo()  # also what the test itself set: what follows is for the store in the folder
+    connection.connect()
     lab.Subject.delete(prompt=False, part_integrity="cascade")
     for table in schemas.computed_tables():
         table.jobs.delete_quick()
-    connection.connect()
 
 
 def test_arrays_and_files_go_to_the_bucket_and_come_back(remote: None, tmp_path: Path):
