@@ -14,6 +14,8 @@ from schemas._base import delete_below, dj, jobs_of, resolve_method
 from . import queue
 from .registry import AGAIN, table_named
 
+#: Errors whose cause lies outside of the recording and may be gone tomorrow.
+OUTSIDE = ("ASSET_MISSING", "MODEL_MISSING", "VIDEO_MISSING", "WORKER_CRASH", "DEVICE_UNAVAILABLE", "STORE_UNAVAILABLE")
 #: Rows deleted in one transaction.
 CHUNK = 200
 

@@ -17,7 +17,6 @@ import os
 import random
 import signal
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -234,13 +233,13 @@ def kills(jobs: int, n_kills: int, server_kills: int, seed: int) -> None:
 
     from schemas import embedded, video
     from schemas.bulk import register_many
-    from workers import refresh, supervisor
+    from workers import refresh
 
     with installation() as home:
         register_many(recordings(0, jobs))
-        os.environ[worker_standins.SLEEP] = "0.02"
+        os.environ[worker_standins.SLEEP] = "0.2"  # so that kills meet jobs in hand
         context = multiprocessing.get_context("spawn")
-        draw, over = random.Random(seed), threading.Event()
+        draw = random.Random(seed)
         folder = embedded.Folder(home / "db")
         bosses: list[Any] = []
 
@@ -253,7 +252,7 @@ def kills(jobs: int, n_kills: int, server_kills: int, seed: int) -> None:
         killed = {"worker": 0, "supervisor": 0, "server": 0}
         t = time.monotonic()
         while True:
-            time.sleep(draw.uniform(0.02, 0.3))
+            time.sleep(draw.uniform(0.05, 0.6))
             with contextlib.suppress(Exception):
                 if len(video.VideoInfo()) >= jobs:
                     break
@@ -272,13 +271,16 @@ def kills(jobs: int, n_kills: int, server_kills: int, seed: int) -> None:
                 schemas.activate(methods=False)
             if killed["worker"] + killed["supervisor"] >= n_kills:
                 continue
-            victim = draw.choice(bosses)
-            if draw.random() < 0.1:
+            with_child = [b for b in bosses if _child_of(b.pid)]
+            if not with_child:
+                continue  # all of them are just starting
+            victim = draw.choice(with_child)
+            if draw.random() < 0.2:
                 victim.kill()
                 killed["supervisor"] += 1
-            else:
-                killed["worker"] += _kill_child(victim.pid)
-        over.set()
+            elif child := _child_of(victim.pid):
+                os.kill(child, signal.SIGKILL)
+                killed["worker"] += 1
         seconds = time.monotonic() - t
         for b in bosses:
             b.terminate()
@@ -294,7 +296,6 @@ def kills(jobs: int, n_kills: int, server_kills: int, seed: int) -> None:
 
         found = orphans()
         click.echo(f"files of the store: {found.n_files}, without a row: {len(found.orphans)} (reported)")
-        assert supervisor.CRASHES
         if done != jobs or left:
             raise SystemExit(1)
 
@@ -307,14 +308,12 @@ def _boss() -> None:
     Supervisor(Options(resource="decode", selftest=False, grace_s=5.0), target=worker_standins.work).run()
 
 
-def _kill_child(pid: int) -> int:
-    """kill -9 of the working process under a supervisor; 0 where it has none at the moment."""
-    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
-        command = Path(f"/proc/{child}/cmdline").read_bytes()
-        if b"spawn_main" in command:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(int(child), signal.SIGKILL)
-                return 1
+def _child_of(pid: int) -> int:
+    """The working process under a supervisor; 0 where it has none at the moment."""
+    with contextlib.suppress(OSError):
+        for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+            if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
+                return int(child)
     return 0
 
 

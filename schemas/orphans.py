@@ -1,0 +1,102 @@
+"""Files of the store that no row names, and rows whose file is gone: what killed computations and full disks leave."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import json
+from collections.abc import Iterator
+from typing import Any
+
+from . import _dump, connection
+
+#: A file younger than this may belong to a row that is about to be written (s).
+YOUNG_S = 3600.0
+
+
+@dataclasses.dataclass(frozen=True)
+class StoredFile:
+    """A file of the store: path in it, size in bytes, age in seconds."""
+
+    path: str
+    size: int
+    age_s: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """n_files, n_bytes: all of the store. orphans: older than `YOUNG_S`, without a row. lost: named by a row, not
+    there."""
+
+    n_files: int
+    n_bytes: int
+    orphans: list[StoredFile]
+    lost: list[str]
+
+
+def orphans(young_s: float = YOUNG_S) -> Report:
+    """Compare the store with the rows. The rows are read after the files, so that no file is new to them.
+
+    A row's file is written before the row and never changes: a file without a row that is older than a computation
+    can take to insert was left behind.
+    """
+    files = {f.path: f for f in _files()}
+    named = set(_named())
+    root = connection.store_root() + "/"
+    loose = [f for path, f in files.items() if path.startswith(root) and not _is_named(path, named)]
+    there = {"/".join(path.split("/")[:i]) for path in files for i in range(1, path.count("/") + 2)}
+    lost = sorted(named - there)
+    old = sorted((f for f in loose if f.age_s >= young_s), key=lambda f: f.path)
+    return Report(len(files), sum(f.size for f in files.values()), old, lost)
+
+
+def remove(found: Report, older_than_s: float) -> int:
+    """Delete orphans of that age, after asking the database once more about each; returns how many."""
+    store, n = connection.store_backend(), 0
+    named = set(_named())
+    for file in found.orphans:
+        if file.age_s >= older_than_s and not _is_named(file.path, named):
+            store.remove(file.path)
+            n += 1
+    return n
+
+
+def _is_named(path: str, named: set[str]) -> bool:
+    """Whether a row names the file or a folder it lies in."""
+    parts = path.split("/")
+    return any("/".join(parts[:i]) in named for i in range(len(parts), 0, -1))
+
+
+def _files() -> Iterator[StoredFile]:
+    store = connection.store_backend()
+    base = str(store._full_path(""))
+    now = datetime.datetime.now(datetime.UTC)
+    for path, about in store.fs.find(base, detail=True).items():
+        changed = about.get("mtime") or about.get("LastModified")
+        if isinstance(changed, int | float):
+            changed = datetime.datetime.fromtimestamp(changed, datetime.UTC)
+        age = (now - changed).total_seconds() if changed else 0.0
+        yield StoredFile(str(path).removeprefix(base).lstrip("/"), int(about.get("size") or 0), age)
+
+
+def _named() -> Iterator[str]:
+    """The paths of the store that rows name, read through a connection of its own, a row at a time."""
+    import pymysql
+
+    conn: Any = connection.another()
+    try:
+        server = conn._conn
+        for schema, table in _dump.tables_of(server, connection.prefix()):
+            stored = [
+                name for name, _, comment in _dump.columns_of(server, schema, table) if _dump.STORED.match(comment)
+            ]
+            for name in stored:
+                with server.cursor(pymysql.cursors.SSCursor) as cursor:
+                    cursor.execute(
+                        f"SELECT {_dump.quote(name)} FROM {_dump.quote(schema)}.{_dump.quote(table)}"  # noqa: S608
+                        f" WHERE {_dump.quote(name)} IS NOT NULL"
+                    )
+                    for (value,) in cursor:
+                        yield json.loads(value)["path"]
+    finally:
+        conn.close()

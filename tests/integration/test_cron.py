@@ -1,0 +1,219 @@
+"""Regular jobs: uploads that are taken over whole or not at all, the summary, the report of disk and store."""
+
+from __future__ import annotations
+
+import errno
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+import schemas
+from pbl_pipeline.errors import PblError
+from schemas import connection, lab, session, tracking, video
+from schemas.bulk import Recording, register_many
+from schemas.orphans import orphans, remove
+from workers import incoming
+from workers.cli.cron import cron
+from workers.heartbeat import Silent
+from workers.incoming import take_over
+from workers.loop import Worker
+
+from . import chain
+
+
+@pytest.fixture(scope="module")
+def declared(database: Path) -> None:
+    schemas.activate()
+
+
+@pytest.fixture
+def tables(declared: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    chain.install(monkeypatch)
+    yield
+    lab.Subject.delete(prompt=False, part_integrity="cascade")
+    for table in schemas.computed_tables():
+        table.jobs.delete_quick()
+
+
+@pytest.fixture
+def drop(tables: None, tmp_path: Path) -> Path:
+    folder = tmp_path / "uploads"
+    folder.mkdir()
+    return folder
+
+
+def upload(drop: Path, where: str, name: str = "walk") -> Path:
+    path = drop / where
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return chain.small_video(path.parent, name, n=60).rename(path)
+
+
+def twice(drop: Path, archive: Path) -> incoming.Taken:
+    """The look that sees a file for the first time, and the one that may take it."""
+    first = take_over(str(drop), archive, settled_s=0.05)
+    assert not first.registered
+    time.sleep(0.1)
+    return take_over(str(drop), archive, settled_s=0.05)
+
+
+def files(folder: Path) -> list[str]:
+    return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file() and ".incoming" not in p.parts)
+
+
+def test_whole_files_are_taken_checked_and_registered(drop: Path, tmp_path: Path):
+    archive = tmp_path / "archive"
+    content = upload(drop, "P001/2026-11-20/walk.mp4").read_bytes()
+    upload(drop, "P002/2026-11-20/walk.MOV", "other")
+    (drop / "notes.txt").write_text("no place in the layout")
+    (drop / "P001/2026-11-20/.walk2.mp4.part").write_bytes(b"hidden: still being uploaded")
+    taken = twice(drop, archive)
+    assert taken.registered == ["P001/2026-11-20/walk.mp4", "P002/2026-11-20/walk.MOV"]
+    assert (taken.ignored, taken.refused) == (2, {})
+    rows = (video.Video * session.Session).to_dicts(order_by="subject")
+    assert [(r["subject"], r["session_label"]) for r in rows] == [("P001", "2026-11-20"), ("P002", "2026-11-20")]
+    assert Path(rows[0]["video_path"]).read_bytes() == content
+    assert files(drop) == ["P001/2026-11-20/.walk2.mp4.part", "notes.txt"]
+    assert len(files(archive)) == 2
+    one = Worker(schemas.computed_tables(), Silent())
+    one.run(once=True)
+    assert (len(video.VideoInfo()), one.failed) == (2, 0)
+
+
+def test_a_file_that_grows_is_left_until_it_is_whole(drop: Path, tmp_path: Path):
+    archive = tmp_path / "archive"
+    path = upload(drop, "P001/1/walk.mp4")
+    content = path.read_bytes()
+    path.write_bytes(content[:1000])
+    assert take_over(str(drop), archive, settled_s=0.05).uploading == 1
+    time.sleep(0.1)
+    path.write_bytes(content)
+    assert take_over(str(drop), archive, settled_s=0.05).uploading == 1
+    assert take_over(str(drop), archive, settled_s=60.0).uploading == 1
+    time.sleep(0.1)
+    assert take_over(str(drop), archive, settled_s=0.05).registered == ["P001/1/walk.mp4"]
+
+
+def test_the_phones_log_comes_along(drop: Path, tmp_path: Path):
+    archive = tmp_path / "archive"
+    upload(drop, "P001/1/walk.mp4")
+    lines = ["time_s,qw,qx,qy,qz"] + [f"{0.02 * i},1,0,0,0" for i in range(200)]
+    (drop / "P001/1/walk.csv").write_text("\n".join(lines))
+    taken = twice(drop, archive)
+    kept = files(archive)
+    assert files(drop) == []
+    # Taken, or refused with its reason: never lost.
+    assert len(taken.registered) + len(taken.refused) == 1
+    assert sum(name.endswith(".csv") for name in kept) == 1
+
+
+def test_breaking_off_anywhere_loses_nothing_and_registers_once(drop: Path, tmp_path: Path, monkeypatch):
+    archive = tmp_path / "archive"
+    upload(drop, "P001/1/walk.mp4")
+    real = incoming.ingest
+
+    def dies(*args, **kwargs):
+        real(*args, **kwargs)
+        raise KeyboardInterrupt  # after the row was committed, before the upload is removed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(incoming, "ingest", dies)
+        with pytest.raises(KeyboardInterrupt):
+            twice(drop, archive)
+    assert files(drop) == ["P001/1/walk.mp4"]
+    assert len(video.Video()) == 1
+    again = take_over(str(drop), archive, settled_s=0.05)
+    assert again.known == ["P001/1/walk.mp4"]
+    assert (len(video.Video()), files(drop), len(files(archive))) == (1, [], 1)
+
+
+def test_a_full_archive_leaves_the_upload(drop: Path, tmp_path: Path, monkeypatch):
+    archive = tmp_path / "archive"
+    upload(drop, "P001/1/walk.mp4")
+    take_over(str(drop), archive, settled_s=0.0)
+
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(PblError, match="FILE_UNWRITABLE"):
+            take_over(str(drop), archive, settled_s=0.0)
+    assert files(drop) == ["P001/1/walk.mp4"]
+    assert files(archive) == []
+    assert take_over(str(drop), archive, settled_s=0.0).registered == ["P001/1/walk.mp4"]
+
+
+def test_what_cannot_be_registered_is_kept_with_its_reason(drop: Path, tmp_path: Path):
+    archive = tmp_path / "archive"
+    upload(drop, "Jane Doe/1/walk.mp4")
+    (drop / "P001/1").mkdir(parents=True)
+    (drop / "P001/1/empty.mp4").touch()
+    taken = twice(drop, archive)
+    assert taken.refused == {"Jane Doe/1/walk.mp4": "USAGE", "P001/1/empty.mp4": "VIDEO_EMPTY"}
+    assert files(drop) == []
+    assert len(video.Video()) == 0
+    names = files(archive)
+    assert all(n.startswith("_refused/") for n in names)
+    assert len([n for n in names if n.endswith(".txt")]) == 2
+
+
+def test_names_from_outside_do_not_leave_the_archive(drop: Path, tmp_path: Path):
+    archive = tmp_path / "archive"
+    hostile = drop / "P001" / "..%2f..%2fetc" / "..\\..\\x;rm -rf.mp4"
+    hostile.parent.mkdir(parents=True)
+    chain.small_video(tmp_path, "x", n=60).rename(hostile)
+    twice(drop, archive)
+    assert not (tmp_path / "etc").exists()
+    for path in archive.rglob("*.mp4"):
+        assert path.resolve().is_relative_to(archive.resolve())
+
+
+def test_the_command_says_what_it_needs(tables: None, monkeypatch):
+    monkeypatch.delenv("PBL_INCOMING", raising=False)
+    result = CliRunner().invoke(cron, ["import"])
+    assert isinstance(result.exception, PblError)
+    assert result.exception.code == "USAGE"
+
+
+def test_all_other_jobs_run(tables: None, tmp_path: Path):
+    path = chain.small_video(tmp_path, "walk")
+    register_many([Recording(str(path), "0" * 64, path.stat().st_size, "P001")])
+    for words, said in (
+        (["refresh"], "1 of VideoInfo"),
+        (["release"], "no dead"),
+        (["reprocess"], "nothing to try again"),
+        (["summary", "--out", str(tmp_path / "out")], "new videos"),
+        (["disk", "--least-free", "0"], "files without a row: 0"),
+    ):
+        result = CliRunner().invoke(cron, words)
+        assert result.exit_code == 0, (words, result.output, result.exception)
+        assert said in result.output
+    (page,) = (tmp_path / "out").glob("*.html")
+    assert "<script" not in page.read_text()
+
+
+def test_files_without_a_row_are_found_and_rows_without_a_file(tables: None, tmp_path: Path):
+    before = orphans(young_s=0.0)
+    register_many([Recording(str(chain.small_video(tmp_path, "walk")), "1" * 64, 1, "P001")])
+    video.Video.update1(
+        {
+            "video_id": 1,
+            "video_sha256": __import__("hashlib").sha256((tmp_path / "walk.mp4").read_bytes()).hexdigest(),
+        }
+    )
+    Worker(schemas.computed_tables(), Silent()).run(once=True)
+    found = orphans(young_s=0.0)
+    assert (found.lost, len(found.orphans)) == ([], len(before.orphans))
+    assert found.n_files > before.n_files
+    (tracks,) = connection.connect().query(f"SELECT tracks FROM {tracking.Tracking.full_table_name}").fetchall()
+    lab.Subject.delete(prompt=False, part_integrity="cascade")
+    left = orphans(young_s=0.0)
+    assert len(left.orphans) > len(before.orphans)
+    assert tracks
+    assert remove(left, older_than_s=1e6) == 0
+    assert remove(left, older_than_s=0.0) == len(left.orphans)
+    assert orphans(young_s=0.0).orphans == []

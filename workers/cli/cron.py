@@ -1,0 +1,150 @@
+"""`pbl cron`: what is to be done regularly; a crontab, systemd timers or a cluster's scheduler call it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from pbl_pipeline.errors import PblError
+
+
+@click.group()
+def cron() -> None:
+    """Regular jobs; each may run at any time, also twice. See docs/operations.md for a crontab and systemd timers.
+
+    Example: pbl cron import && pbl cron refresh
+    """
+
+
+@cron.command("import")
+@click.option("--settled", "settled_s", type=click.FloatRange(min=0), default=60.0, show_default=True,
+              help="Seconds without a change after which a file counts as whole.")  # fmt: skip
+def import_(settled_s: float) -> None:
+    """Take over recordings that were uploaded to PBL_INCOMING as SUBJECT/SESSION/FILE, and register them.
+
+    Example: PBL_INCOMING=/srv/uploads pbl cron import
+    """
+    import schemas
+    from workers.incoming import take_over
+
+    schemas.activate()
+    taken = take_over(settled_s=settled_s)
+    click.echo(
+        f"{len(taken.registered)} registered, {len(taken.known)} known, {len(taken.refused)} refused, "
+        f"{taken.uploading} not whole yet, {taken.ignored} not SUBJECT/SESSION/FILE of a video"
+    )
+    for name, code in taken.refused.items():
+        click.echo(f"{code}: {name}", err=True)
+    if taken.refused:
+        raise click.exceptions.Exit(1)
+
+
+@cron.command()
+def refresh() -> None:
+    """Queue everything that can be computed, over all tables.
+
+    Example: pbl cron refresh
+    """
+    import schemas
+    from workers.refresh import refresh as look
+
+    schemas.activate()
+    found = look()
+    if found is None:
+        click.echo("another process is at it")
+        return
+    queued = ", ".join(f"{n} of {name}" for name, n in found.queued.items()) or "nothing"
+    click.echo(f"queued: {queued}; {found.planned} fits planned, {found.freed} freed, {found.swept} obsolete")
+
+
+@cron.command()
+def release() -> None:
+    """Put the jobs of dead workers back into the queue.
+
+    Example: pbl cron release
+    """
+    import schemas
+    from workers.recover import free_dead
+
+    schemas.activate(methods=False)
+    freed = {t.__name__: n for t in schemas.computed_tables() if (n := free_dead(t))}
+    click.echo(", ".join(f"{n} of {name}" for name, n in freed.items()) or "no dead reservations")
+
+
+@cron.command()
+def reprocess() -> None:
+    """Put error rows back whose cause was outside of the recording: a model or file that was absent, a crash.
+
+    Results are never deleted by a cron job: for another method or newer code see `pbl reprocess`.
+
+    Example: pbl cron reprocess
+    """
+    import schemas
+    from workers.requeue import OUTSIDE, retry
+
+    schemas.activate(methods=False)
+    done = {code: sum(retry(code).values()) for code in OUTSIDE}
+    click.echo(", ".join(f"{n} {code}" for code, n in done.items() if n) or "nothing to try again")
+
+
+@cron.command()
+@click.option("--hours", type=click.FloatRange(min=0.01), default=24.0, show_default=True)
+@click.option(
+    "--out", type=click.Path(path_type=Path, file_okay=False), help="Also write summary-DATE.txt and .html there."
+)
+def summary(hours: float, out: Path | None) -> None:
+    """Say what was done in the last hours, what failed and waits, who works, how full the disks are.
+
+    Example: pbl cron summary --out /var/www/pbl
+    """
+    import schemas
+    from workers.summary import as_text, make_summary, write
+
+    schemas.activate(methods=False)
+    found = make_summary(hours)
+    click.echo(as_text(found), nl=False)
+    if out is not None:
+        for path in write(found, out):
+            click.echo(str(path), err=True)
+
+
+@cron.command()
+@click.option("--remove-older-than", "days", type=click.FloatRange(min=1), metavar="DAYS",
+              help="Delete files of the store that no row names and that are older.")  # fmt: skip
+@click.option("--least-free", "least_gb", type=click.FloatRange(min=0), default=10.0, show_default=True,
+              metavar="GB", help="Less free space is an error.")  # fmt: skip
+def disk(days: float | None, least_gb: float) -> None:
+    """Report free space, the store's size, files without a row and rows without their file.
+
+    Example: pbl cron disk --remove-older-than 30
+    """
+    import schemas
+    from schemas.orphans import orphans, remove
+    from workers.summary import disks
+
+    schemas.activate(methods=False)
+    found = orphans()
+    click.echo(f"store: {found.n_files} files, {found.n_bytes / 1e9:.2f} GB")
+    click.echo(f"files without a row: {len(found.orphans)}, {sum(f.size for f in found.orphans) / 1e9:.2f} GB")
+    for file in found.orphans[:20]:
+        click.echo(f"  {file.path}  {file.age_s / 86400:.1f} days")
+    if days is not None:
+        click.echo(f"removed: {remove(found, days * 86400)}")
+    for name, free, total in disks():
+        click.echo(f"disk {name}: {free:.1f} of {total:.1f} GB free")
+    if found.lost:
+        raise PblError(
+            "BACKUP_INVALID",
+            found=f"{len(found.lost)} files that rows name are not in the store: {', '.join(found.lost[:5])}",
+            expected="every file that a row names",
+            next_step="restore them from a backup, or delete the rows so that they are computed again",
+        )
+    full = [name for name, free, _ in disks() if free < least_gb]
+    if full:
+        raise PblError(
+            "FILE_UNWRITABLE",
+            found=f"less than {least_gb:g} GB free: {', '.join(full)}",
+            expected="room for the next recordings",
+            next_step="make room, or move PBL_STORE or PBL_ARCHIVE to a larger disk",
+        )
