@@ -157,7 +157,14 @@ class Associator:
         cost = np.array([[pair_cost(t, time_s, d, self._params) for d in detections] for t in trails])
         gate = np.array([self._params.gate + gate_per_s * (time_s - t.last_time) for t in trails])
         # An impossible pair costs more than any number of possible ones, so it is chosen only where nothing else is.
-        blocked = np.where(cost > gate[:, None], 1e3, cost)
+        # Where somebody else is expected, looked for or not, that one must not continue the track of one who was missed.
+        expected = cost <= self._params.gate
+        absent = [t for t in self._live if t not in trails]
+        of_absent = [
+            any(pair_cost(t, time_s, d, self._params) <= self._params.gate for t in absent) for d in detections
+        ]
+        of_other = (expected.sum(axis=0) + of_absent > expected) & ~expected
+        blocked = np.where((cost > gate[:, None]) | of_other, 1e3, cost)
         taken = set()
         for i, j in zip(*linear_sum_assignment(blocked), strict=True):
             if blocked[i, j] < 1e3:

@@ -149,6 +149,20 @@ def test_a_weak_or_upside_down_detection_does_not_take_over_a_track():
     assert len(trails) == 2
 
 
+def test_one_who_was_missed_does_not_take_over_somebody_else_who_is_not_looked_for():
+    """As when somebody jumps off a wall while another walks below: the window around where he was shows the other."""
+    associator = Associator(AssociationParams())
+    for i in range(5):
+        for new in associator.step(i, 0.1 * i, [person(500, 300), person(600, 600)]):
+            associator.begin(Trail.of(i, 0.1 * i, new))
+    missed, other = associator.live
+    assert associator.step(11, 1.2, [person(610, 610)], among=[missed])
+    assert (missed.frames[-1], other.frames[-1]) == (4, 4)
+    # Where nobody else is expected he is taken up again.
+    assert associator.step(12, 1.25, [person(450, 450)], among=[missed]) == []
+    assert missed.frames[-1] == 12
+
+
 PICTURE = (1920, 1080)
 
 
