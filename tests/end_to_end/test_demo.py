@@ -98,14 +98,16 @@ def test_cadence_is_what_a_person_counts(out):
 
 
 def test_each_foot_down_is_where_a_person_sees_it(out):
-    """Every contact within 0.1 s, each on its side; at both ends of her walk one may be missing."""
+    """Every contact on its side: in full view within a frame and a half (the eye is right to one), the first, behind a
+    tree, and the last, cut off by the picture's edge, within two and a half where they are found."""
     found = [e for e in load_events(out / "demo.events.csv") if e.event == "foot_down"]
     for event in found:
-        assert min(abs(event.time_s - f / 30) for f in CONTACTS[event.side]) < 0.1, event
+        assert min(abs(event.time_s - f / 30) for f in CONTACTS[event.side]) < 2.5 / 30, event
     assert len({(e.side, round(e.time_s, 1)) for e in found}) == len(found)
     inner = [(s, f) for s, frames in CONTACTS.items() for f in frames if 41 < f < 188]
-    missed = [(s, f) for s, f in inner if not any(e.side == s and abs(e.time_s - f / 30) < 0.1 for e in found)]
+    missed = [(s, f) for s, f in inner if not any(e.side == s and abs(e.time_s - f / 30) < 1.5 / 30 for e in found)]
     assert not missed
+    assert min(e.probability for e in found) > 0.8
 
 
 def test_the_fitted_body_lies_on_her(out):
