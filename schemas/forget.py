@@ -128,6 +128,10 @@ def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> For
     _delete_rows(subject, ids, say)
     _delete_files(found.files, say)
     gone, kept = _delete_videos(found.videos) if videos else ([], {v["path"]: "not asked for" for v in found.videos})
+    if videos:
+        gone += _delete_archived(subject)
+    else:
+        kept |= {str(p): "not asked for" for p in archived(subject)}
     _, after = find(subject)
     left = [f"{n} rows of {table}" for table, n in after.rows.items()] + after.files
     left += _mentions(subject, found.videos)
@@ -334,6 +338,28 @@ def _delete_videos(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict[st
             except OSError as error:
                 kept[str(path)] = error.strerror or str(error)
     return gone, kept
+
+
+def archived(subject: str) -> list[Path]:
+    """All files of the person's own folder in the archive of `pbl cron import`: videos and the logs beside them."""
+    folder = _archive(subject)
+    return [] if folder.is_symlink() else sorted(p for p in folder.rglob("*") if p.is_symlink() or p.is_file())
+
+
+def _archive(subject: str) -> Path:
+    return Path(os.environ.get("PBL_ARCHIVE") or settings.home_dir() / "recordings") / subject
+
+
+def _delete_archived(subject: str) -> list[str]:
+    gone = []
+    for path in archived(subject):
+        if not video.Video & {"video_path": str(path)}:  # somebody else's row may name a file that was moved here
+            path.unlink(missing_ok=True)
+            gone.append(str(path))
+    for folder in sorted({p for p in _archive(subject).rglob("*") if p.is_dir()} | {_archive(subject)}, reverse=True):
+        if folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir()):
+            folder.rmdir()
+    return gone
 
 
 # ------------------------------------------------------------------------------------------------------------- proof

@@ -9,7 +9,9 @@ import click
 @click.argument("subject")
 @click.option("--yes", is_flag=True, help="Do it. Without it only the list of what would go is printed.")
 @click.option(
-    "--videos", is_flag=True, help="Delete the video files as well, where they are still what was registered."
+    "--videos",
+    is_flag=True,
+    help="Delete the video files (where they still are what was registered) and the person's folder of the archive.",
 )
 def forget(subject: str, yes: bool, videos: bool) -> None:
     """Remove every row and every stored file of the person SUBJECT, and prove it with a list.
@@ -34,6 +36,8 @@ def forget(subject: str, yes: bool, videos: bool) -> None:
             click.echo(f"    file {path}")
         for item in found.videos:
             click.echo(f"   video {item['path']}{'' if videos else ' (stays, without --videos)'}")
+        for path in lib.archived(subject):
+            click.echo(f" archive {path}{'' if videos else ' (stays, without --videos)'}")
         for job in found.running:
             click.echo(f" running {job}")
         click.echo(

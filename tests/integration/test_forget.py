@@ -82,7 +82,7 @@ def _queue(table: type, status: str, number: int | None) -> None:
 
 
 def test_nothing_of_the_person_is_left_and_nothing_else_is_touched(
-    two: tuple[dict, set[str], list[Path]], tmp_path: Path
+    two: tuple[dict, set[str], list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     rows, files, videos = two
     full, all_files = everything(), stored()
@@ -106,10 +106,16 @@ def test_nothing_of_the_person_is_left_and_nothing_else_is_touched(
     assert proof["left"] == []
     root = Path(connection.store_backend().spec["location"])
     assert not list(root.rglob(f"video_id={proof['ids']['video_id'][0]}"))
-    # Later the videos are to go as well; nothing else is left to do.
+    # Later the videos are to go as well, with what `pbl cron import` keeps; nothing else is left to do.
+    archive = tmp_path / "archive"
+    for path in ("P017/visit/ab-walk.csv", "P0171/visit/cd-walk.csv"):
+        (archive / path).parent.mkdir(parents=True)
+        (archive / path).write_text("log")
+    monkeypatch.setenv("PBL_ARCHIVE", str(archive))
     again = pbl("forget", "P017", "--yes", "--videos")
     assert again.code == 0, again.err
     assert not any(v.exists() for v in videos)
+    assert [p.name for p in archive.rglob("*")] == ["P0171", "visit", "cd-walk.csv"]
     assert everything() == rows
     # Numbers are given anew: the next person has those of the one who was forgotten, and keeps what is theirs.
     ingest([chain.small_video(tmp_path, "next")], Visit(subject="P018"))
