@@ -157,7 +157,7 @@ class Associator:
         cost = np.array([[pair_cost(t, time_s, d, self._params) for d in detections] for t in trails])
         gate = np.array([self._params.gate + gate_per_s * (time_s - t.last_time) for t in trails])
         # An impossible pair costs more than any number of possible ones, so it is chosen only where nothing else is.
-        # Where somebody else is expected, looked for or not, that one must not continue the track of one who was missed.
+        # Who is seen where somebody else is expected, looked for or not, does not continue the track of one missed.
         expected = cost <= self._params.gate
         absent = [t for t in self._live if t not in trails]
         of_absent = [
