@@ -232,9 +232,9 @@ def summary(walked: Sequence[Walked]) -> str:
         return f"median {np.median(size):.2f}, 95th percentile {np.percentile(size, 95):.2f}, greatest {size.max():.2f}"
 
     return (
-        f"{len(walked)} walks, matched {n / labels:.1%}, invented {sum(w.tally.invented for w in walked)}; error of the "
-        f"cadence: {sizes(cadence)} per min; of double support: mean {np.nanmean(support):+.2f}, {sizes(support)} % of "
-        f"the cycle; without a measure: {int(np.isnan(cadence).sum())}"
+        f"{len(walked)} walks, matched {n / labels:.1%}, invented {sum(w.tally.invented for w in walked)}; error of "
+        f"the cadence: {sizes(cadence)} per min; of double support: mean {np.nanmean(support):+.2f}, {sizes(support)} "
+        f"% of the cycle; without a measure: {int(np.isnan(cadence).sum())}"
     )
 
 

@@ -66,7 +66,7 @@ def check_fields(path: Path, title: str, sizes: dict[str, int], optional: tuple[
 def test_keypoints_are_as_described(detected):
     sizes = {"T": 90, "J": 33}
     undocumented = check_fields(
-        detected, "<name>.keypoints.npz", sizes, optional=("phone_time_s", "phone_quat_wxyz", "xyz_world_m")
+        detected, "<name>.keypoints.npz", sizes, optional=("phone_time_s", "phone_quat_wxyz", "xyz_world_m", "origin")
     )
     assert undocumented <= {"root_relative"}  # named in the row of xyz_cam_m
     with np.load(detected) as f:
@@ -160,13 +160,13 @@ def test_metrics_are_as_described(fitted, tmp_path):
     assert done.code == 0, done.err
     content = json.loads((tmp_path / "metrics.json").read_text())
     measures = re.findall(r"`(\w+_(?:per_min|s|percent|per_s|m))`", section("metrics.json"))
-    assert len(measures) == 10
+    assert len(measures) == 14
     for part in (content["session"], *content["trials"]):
         for name in measures:
             if part[name] is None:
                 assert part["reasons"][name]
             else:
-                assert set(part[name]) == {"left", "right", "mean", "sd", "n"}
+                assert {"left", "right", "mean", "sd", "n"} <= set(part[name])
         assert {"left", "right", "mean", "n", "norm"} <= set(part["gdi"])
         assert part["gdi"]["mean"] is not None or part["reasons"]["gdi"]
     assert all({"check", "outcome", "value", "threshold", "advice"} <= set(c) for c in content["session"]["qc"])

@@ -132,7 +132,7 @@ def true_phases(n: int, rate: float = 0.9, offsets=(0.0, 0.12, 0.5, 0.62)) -> np
 def test_the_filter_finds_the_phases_in_noise():
     rng = np.random.default_rng(0)
     phase = true_phases(400)
-    z = np.exp(1j * (phase + 0.25 * rng.standard_normal(phase.shape))) * np.exp(-0.25**2 / 2)
+    z = np.exp(1j * (phase + 0.25 * rng.standard_normal(phase.shape))) * np.exp(-(0.25**2) / 2)
     smooth = smooth_phases(z, 1 / GRID_HZ, FilterParams(memory_frames=1.0))
     off = np.angle(np.exp(1j * (smooth.phase_rad - phase)))
     assert off.std() < 0.08
