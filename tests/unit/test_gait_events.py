@@ -18,7 +18,7 @@ from .gait_walker import Walker, errors_s, make_feet
 DURATION_S = 9.0
 
 
-def detect_events(feet, params="zeni-2008"):
+def detect_events(feet: gait.FootTrajectories, params: str | EventParams = "zeni-2008") -> gait.GaitEvents:
     return gait.detect_events(feet, params)
 
 
