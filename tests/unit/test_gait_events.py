@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pbl_pipeline.errors import PblError
 from pbl_pipeline import gait
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import EventParams, load_events
 from pbl_pipeline.gait.events import EVENT_PARAMSETS, GaitEvent
 from pbl_pipeline.gait.events._order import Candidate, best_sequence
