@@ -25,6 +25,8 @@ from ._structure import family, missing_end
 #: Containers that phones, cameras and converters write. Pictures, texts and playlists (which could name other files)
 #: are not videos even where FFmpeg would open them.
 _CONTAINERS = "mov,matroska,avi,mpegts,mpeg,asf,flv,ogg,mxf,ivf,h264,hevc"
+#: What reading a file can raise. Memory: a header that lies about sizes asks for more than there is.
+FFMPEG_ERRORS = (FFmpegError, MemoryError)
 _OPTIONS = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"}
 
 #: Share of frames whose stamp may repeat or run backwards and be left out; more means the stamps cannot be trusted.
@@ -57,7 +59,7 @@ def check_file(path: str | Path) -> Path:
     except OSError as error:
         raise PblError(
             "VIDEO_MISSING",
-            found=f"the file cannot be read ({error.strerror})",
+            found=f"the file cannot be read ({_words(error)})",
             expected="a file that this account may read",
             next_step="change the file's permissions or copy it to a folder of your own",
             key=path,
@@ -116,7 +118,7 @@ class Decoder:
         for packet in self._packets():
             try:
                 frames = self.stream.decode(packet)
-            except FFmpegError:
+            except FFMPEG_ERRORS:
                 # Before the first picture this is a recording whose start an editor cut off: nothing is lost.
                 if self.n_frames:
                     self._n_damaged += 1
@@ -135,8 +137,8 @@ class Decoder:
         while True:
             try:
                 packet = next(packets, None)
-            except FFmpegError as error:
-                self._demux_error = error.strerror
+            except FFMPEG_ERRORS as error:
+                self._demux_error = _words(error)
                 packet = None
             if packet is None:
                 break
@@ -296,15 +298,20 @@ class Decoder:
         )
 
 
+def _words(error: BaseException) -> str:
+    """What FFmpeg says."""
+    return str(getattr(error, "strerror", None) or error or type(error).__name__)
+
+
 def _open(path: Path) -> InputContainer:
     try:
         return av.open(str(path), options=_OPTIONS, metadata_errors="replace")
-    except FFmpegError as error:
+    except FFMPEG_ERRORS as error:
         lost = missing_end(path) if family(path) else None
         if lost is None:
             raise PblError(
                 "VIDEO_NOT_A_VIDEO",
-                found=f"no decoder recognises the file's {path.stat().st_size} bytes ({error.strerror})",
+                found=f"no decoder recognises the file's {path.stat().st_size} bytes ({_words(error)})",
                 expected=_EXPECTED,
                 next_step="check that it is the video itself, not a link, a preview or a text, and copy it again",
                 key=path,
@@ -321,5 +328,5 @@ def _open(path: Path) -> InputContainer:
 
 def _count_packets(path: Path, index: int) -> int:
     """Packets of one stream that are whole, as stored, whatever an edit list says."""
-    with av.open(str(path), options=_OPTIONS | {"ignore_editlist": "1"}) as container:
+    with av.open(str(path), options=_OPTIONS | {"ignore_editlist": "1"}, metadata_errors="replace") as container:
         return sum(1 for p in container.demux(container.streams[index]) if p.size and not p.is_corrupt)
