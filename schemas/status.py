@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Collection
 from typing import Any
 
 from . import computed_tables, keypoints, tracking, video, worker
@@ -108,7 +109,7 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
     most
         Errors, empty and waiting rows that are listed, each; the counts are of all.
     """
-    n_videos = len(video.Video())
+    n_videos = int(video.Video.connection.query(f"SELECT COUNT(*) FROM {video.Video.full_table_name}").fetchone()[0])  # noqa: S608
     exact = n_videos < SMALL if exact is None else exact
     connection = video.Video.connection
     queues, rates = queue_counts(connection), throughput(connection)
@@ -120,8 +121,7 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
         if exact:
             remaining, _ = table().progress()
             pending = max(0, remaining - counts["reserved"] - counts["error"] - counts["ignore"])
-        waiting = len(table & {"choice_status": "NEEDS_CHOICE"}) if table is tracking.SubjectChoice else 0
-        done, empty = len(table()), len(empty_rows(table))
+        done, empty, waiting = _rows(table, connection)
         oldest, reason = _oldest(table, connection) if counts["pending"] else (None, "")
         per_hour = rates.get(name, 0.0)
         left = 3600.0 * pending / per_hour if per_hour and pending else None
@@ -131,7 +131,9 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
             )
         )
         errors += _errors(table, most) if counts["error"] else []
-    return Status(n_videos, tables, errors, _empty(most), _waiting(most), live_workers(), exact, camera_kinds())
+    empty = {t.table for t in tables if t.empty}
+    waiting = _waiting(most) if any(t.waiting for t in tables) else []
+    return Status(n_videos, tables, errors, _empty(empty, most), waiting, live_workers(), exact, camera_kinds())
 
 
 def camera_kinds() -> dict[str, int]:
@@ -185,6 +187,15 @@ def _oldest(table: Any, connection: Any) -> tuple[float | None, str]:
     return (None if age is None else float(age)), (str(why[0]) if why else "")
 
 
+def _rows(table: Any, connection: Any) -> tuple[int, int, int]:
+    """All rows, those that are empty, those that wait for a choice: in one reading of the table."""
+    column, values, _ = EMPTY_COLUMNS.get(table.__name__, ("", (), None))
+    waits = "SUM(choice_status = 'NEEDS_CHOICE')" if table is tracking.SubjectChoice else "0"
+    empty = f"SUM({column} IN ({','.join(repr(v) for v in values)}))" if column else "0"
+    row = connection.query(f"SELECT COUNT(*), {empty}, {waits} FROM {table.full_table_name}").fetchone()  # noqa: S608
+    return int(row[0]), int(row[1] or 0), int(row[2] or 0)
+
+
 def empty_rows(table: Any) -> Any:
     """Rows of a computed table that say "ran well, nothing to produce"."""
     if table.__name__ not in EMPTY_COLUMNS:
@@ -193,11 +204,11 @@ def empty_rows(table: Any) -> Any:
     return table & [{column: v} for v in values]
 
 
-def _empty(most: int) -> list[EmptyRow]:
+def _empty(names: Collection[str], most: int) -> list[EmptyRow]:
     out: list[EmptyRow] = []
     for table in computed_tables():
         reason = EMPTY_COLUMNS.get(table.__name__, ("", (), None))[2]
-        if reason is None:
+        if reason is None or table.__name__ not in names:
             continue
         said = {e.video_id for e in out}  # the first table that has nothing knows why
         for row in (empty_rows(table) * video.Video.proj("video_name")).to_dicts(order_by="video_id", limit=most):

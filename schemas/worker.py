@@ -50,3 +50,13 @@ class Crash(dj.Manual):
     crash_reason    : varchar(255)             # of the last time
     crash_time      : datetime                 # of the last time, UTC
     """
+
+
+@schema
+class Look(dj.Manual):
+    definition = """
+    # when somebody last looked at all tables for what can be computed
+    look        : enum('recent', 'all')        # recordings of the last days, or all
+    ---
+    look_time   : datetime(3)                  # clock of the database server
+    """

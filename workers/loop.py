@@ -41,9 +41,11 @@ class Worker:
     done: int = 0
     failed: int = 0
     _refreshed: float = -1e9
+    _everything: bool | None = None
 
     def run(self, once: bool = False, max_jobs: int | None = None) -> None:
-        """Work until `stop`; with `once` until nothing is left to do."""
+        """Work until `stop`; with `once` until nothing is left to do anywhere."""
+        self._everything = True if once else None
         idle = IDLE_S[0]
         while not self.stop.is_set() and (max_jobs is None or self.done + self.failed < max_jobs):
             try:
@@ -130,7 +132,7 @@ class Worker:
         if time.monotonic() - self._refreshed < REFRESH_EVERY_S and self._refreshed > 0:
             return False
         self.heartbeat.doing("looks at all tables")
-        found = refresh.refresh()
+        found = refresh.refresh(self._everything)
         if found is None:
             return None
         self._refreshed = time.monotonic()

@@ -63,10 +63,13 @@ def is_held(table: Any, key: Mapping[str, Any]) -> bool:
 
 
 # ------------------------------------------------------------------------------------------------------------- filling
-def fill(table: Any, keys: Sequence[Mapping[str, Any]] | None = None, priority: int = NEW) -> int:
+def fill(
+    table: Any, keys: Sequence[Mapping[str, Any]] | None = None, priority: int = NEW, where: str | None = None
+) -> int:
     """Queue every key that can be computed and has neither a result nor a job, in one statement; returns how many.
 
-    `keys`: only what belongs to these (keys of a table above). DataJoint's own refresh inserts row by row.
+    `keys`: only what belongs to these (keys of a table above); `where`: only what a condition on the key holds for.
+    DataJoint's own refresh inserts row by row.
     """
     if keys is not None and not keys:
         return 0
@@ -74,6 +77,8 @@ def fill(table: Any, keys: Sequence[Mapping[str, Any]] | None = None, priority: 
     source = table().key_source
     if keys is not None:
         source = source & [dict(k) for k in keys]
+    if where is not None:
+        source = source & where
     todo = (source - table.proj()).restrict(dj.Not(jobs), semantic_check=False).proj()
     columns = ",".join(quote(c) for c in todo.heading.primary_key)
     names = f"{columns},{quote('status')},{quote('priority')}"

@@ -6,13 +6,17 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from schemas import computed_tables, video
+from schemas import computed_tables, fit, tracking, video, worker
 from schemas.connection import schema_name
 
 from . import queue, recover
 from .queue import Claim
 from .registry import NEW, stage_of, table_named
 
+#: Days in which something from outside counts as recent, and seconds after which somebody looks at everything again.
+RECENT_DAYS, ALL_EVERY_S = 2, 3600.0
+#: With fewer videos every look is at everything: it takes no time.
+FEW = 10_000
 #: A failure here decides that a trial does not take part in the fit of its session.
 DECIDES = ("VideoInfo", "Tracking", "SubjectChoice", "Keypoints", "TrialInput")
 
@@ -64,24 +68,63 @@ def plan(sessions: Sequence[int] | None = None, priority: int = NEW) -> int:
     return len(made)
 
 
-def refresh(tables: Sequence[Any] | None = None) -> Refreshed | None:
-    """Look at everything: free dead reservations, drop what a person's decision made outdated, queue what is missing.
+def refresh(everything: bool | None = None) -> Refreshed | None:
+    """Look for what can be computed: free dead reservations, drop what a decision made outdated, queue what is missing.
 
-    One process at a time: None where another one is at it. Workers and `pbl cron refresh` call it now and then; what
-    workers finish themselves is queued at once by `after`.
+    What workers finish is queued at once (`after`), so a look is for what came from outside: new recordings, choices,
+    methods, deleted rows. Comparing whole tables takes long with 300,000 videos, so most looks are at the recordings
+    that were registered or decided about in the last `RECENT_DAYS`, and one an hour at all.
+
+    Parameters
+    ----------
+    everything
+        Look at all rows; None where it is an hour since somebody did, or where there are few videos.
+
+    Returns
+    -------
+    Refreshed or None
+        None where another process is at it.
     """
-    chosen = list(tables) if tables is not None else computed_tables()
-    connection = chosen[0].connection
+    connection = computed_tables()[0].connection
     lock = schema_name("refresh")  # of this installation: locks are the server's
     if connection.query("SELECT GET_LOCK(%s, 0)", args=(lock,)).fetchone()[0] != 1:
         return None
     try:
-        return _refresh(chosen)
+        if everything is None:
+            everything = _few(connection) or _age_of_look("all") > ALL_EVERY_S
+        out = _refresh(computed_tables(), None if everything else Recent.find())
+        for look in ("recent", "all") if everything else ("recent",):
+            _note_look(look)
+        return out
     finally:
         connection.query("SELECT RELEASE_LOCK(%s)", args=(lock,))
 
 
-def _refresh(tables: Sequence[Any]) -> Refreshed:
+@dataclasses.dataclass(frozen=True)
+class Recent:
+    """Recordings that something from outside may have happened to lately, and their sessions."""
+
+    videos: list[int]
+    sessions: list[int]
+
+    @classmethod
+    def find(cls) -> Recent:
+        """Registered, or decided about by a person, in the last `RECENT_DAYS`."""
+        since = f">= CURRENT_TIMESTAMP - INTERVAL {RECENT_DAYS} DAY"
+        ids = {int(v) for v in (video.Video & f"video_created {since}").to_arrays("video_id")}
+        ids |= {int(v) for v in (tracking.SubjectOverride & f"override_created {since}").to_arrays("video_id")}
+        return cls(sorted(ids), sessions_of([{"video_id": v} for v in ids]))
+
+    def where(self, table: Any) -> str | None:
+        """Condition on the key of a table; None where nothing of it can be recent."""
+        if "video_id" in table.heading.primary_key:
+            return f"video_id in ({','.join(map(str, self.videos))})" if self.videos else None
+        rows = fit.FitSet & f"session_id in ({','.join(map(str, self.sessions))})" if self.sessions else None
+        sets = [] if rows is None else [str(s) for s in rows.to_arrays("fit_set")]
+        return "fit_set in (" + ",".join(f"'{s}'" for s in sets) + ")" if sets else None
+
+
+def _refresh(tables: Sequence[Any], recent: Recent | None) -> Refreshed:
     from schemas.tracking import drop_outdated_choices
 
     out = Refreshed()
@@ -90,9 +133,34 @@ def _refresh(tables: Sequence[Any]) -> Refreshed:
     out.dropped = drop_outdated_choices()
     for table in tables:
         if table.__name__ == "SessionFit":
-            out.planned = plan()
+            out.planned = plan(None if recent is None else recent.sessions)
+        where = None if recent is None else recent.where(table)
+        if recent is not None and where is None:
+            continue
         out.swept += queue.sweep(table)
-        n = queue.fill(table)
+        n = queue.fill(table, where=where)
         if n:
             out.queued[table.__name__] = n
     return out
+
+
+def _few(connection: Any) -> bool:
+    return len(connection.query(f"SELECT 1 FROM {video.Video.full_table_name} LIMIT {FEW}").fetchall()) < FEW  # noqa: S608
+
+
+def _age_of_look(look: str) -> float:
+    """Seconds since the last look of that kind; infinite where there was none."""
+    row = video.Video.connection.query(
+        "SELECT TIMESTAMPDIFF(SECOND, look_time, CURRENT_TIMESTAMP(3))"
+        f" FROM {worker.Look.full_table_name} WHERE look=%s",
+        args=(look,),
+    ).fetchone()
+    return float("inf") if row is None else float(row[0])
+
+
+def _note_look(look: str) -> None:
+    video.Video.connection.query(
+        f"INSERT INTO {worker.Look.full_table_name} (look, look_time) VALUES (%s, CURRENT_TIMESTAMP(3))"  # noqa: S608
+        " ON DUPLICATE KEY UPDATE look_time = CURRENT_TIMESTAMP(3)",
+        args=(look,),
+    )

@@ -41,8 +41,11 @@ def import_(settled_s: float) -> None:
 
 
 @cron.command()
-def refresh() -> None:
-    """Queue everything that can be computed, over all tables.
+@click.option(
+    "--all", "everything", is_flag=True, help="Look at all rows, and not only what is recent if that is enough."
+)
+def refresh(everything: bool) -> None:
+    """Queue what can be computed: new recordings, choices and methods, and once an hour whatever is missing anywhere.
 
     Example: pbl cron refresh
     """
@@ -50,7 +53,7 @@ def refresh() -> None:
     from workers.refresh import refresh as look
 
     schemas.activate()
-    found = look()
+    found = look(everything or None)
     if found is None:
         click.echo("another process is at it")
         return
