@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from . import computed_tables, keypoints, tracking, video, worker
+from . import computed_tables, connection, keypoints, tracking, video, worker
 from ._base import dj, error_code, error_found, error_next_step, jobs_of
 
 #: Fewer videos than this, and keys are counted that nobody has queued yet.
@@ -111,8 +112,9 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
     """
     n_videos = int(video.Video.connection.query(f"SELECT COUNT(*) FROM {video.Video.full_table_name}").fetchone()[0])  # noqa: S608
     exact = n_videos < SMALL if exact is None else exact
-    connection = video.Video.connection
-    queues, rates = queue_counts(connection), throughput(connection)
+    server = video.Video.connection
+    queues, rates = queue_counts(server), throughput(server)
+    rows = _rows_of_all(n_videos)
     tables, errors = [], []
     for table in computed_tables():
         name = table.__name__
@@ -121,8 +123,8 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
         if exact:
             remaining, _ = table().progress()
             pending = max(0, remaining - counts["reserved"] - counts["error"] - counts["ignore"])
-        done, empty, waiting = _rows(table, connection)
-        oldest, reason = _oldest(table, connection) if counts["pending"] else (None, "")
+        done, empty, waiting = rows[name]
+        oldest, reason = _oldest(table, server) if counts["pending"] else (None, "")
         per_hour = rates.get(name, 0.0)
         left = 3600.0 * pending / per_hour if per_hour and pending else None
         tables.append(
@@ -143,22 +145,22 @@ def camera_kinds() -> dict[str, int]:
     return {row["camera_kind"]: int(row["n_cameras"]) for row in rows}
 
 
-def queue_counts(connection: Any) -> dict[str, dict[str, int]]:
+def queue_counts(server: Any) -> dict[str, dict[str, int]]:
     """Job rows of each computed table by status."""
     out = {}
     for table in computed_tables():
         counts = dict.fromkeys(("pending", "reserved", "error", "ignore"), 0)
-        rows = connection.query(
+        rows = server.query(
             f"SELECT status, COUNT(*) FROM {jobs_of(table).full_table_name} GROUP BY status"  # noqa: S608
         ).fetchall()
         out[table.__name__] = counts | {str(status): int(n) for status, n in rows}
     return out
 
 
-def throughput(connection: Any, minutes: int = 60) -> dict[str, float]:
+def throughput(server: Any, minutes: int = 60) -> dict[str, float]:
     """Jobs an hour of each table, over the last `minutes` in which workers finished any of it."""
     table = worker.Throughput.full_table_name
-    rows = connection.query(
+    rows = server.query(
         f"SELECT stage, SUM(n_done), TIMESTAMPDIFF(SECOND, MIN(minute), CURRENT_TIMESTAMP) FROM {table}"  # noqa: S608
         " WHERE minute >= CURRENT_TIMESTAMP - INTERVAL %s MINUTE GROUP BY stage",
         args=(int(minutes),),
@@ -174,25 +176,43 @@ def live_workers(seen_within_s: float = 180.0) -> list[dict[str, Any]]:
     return [{n: r[n] for n in names} for r in alive.to_dicts(order_by="worker_host, worker_pid")]
 
 
-def _oldest(table: Any, connection: Any) -> tuple[float | None, str]:
+def _oldest(table: Any, server: Any) -> tuple[float | None, str]:
     """Age (s) of the oldest pending job, and why jobs that were put back wait."""
     jobs = jobs_of(table).full_table_name
-    age = connection.query(
+    age = server.query(
         f"SELECT TIMESTAMPDIFF(SECOND, MIN(created_time), CURRENT_TIMESTAMP) FROM {jobs} WHERE status='pending'"  # noqa: S608
     ).fetchone()[0]
-    why = connection.query(
+    why = server.query(
         f"SELECT error_message FROM {jobs} WHERE status='pending' AND scheduled_time > CURRENT_TIMESTAMP(3)"  # noqa: S608
         " ORDER BY scheduled_time LIMIT 1"
     ).fetchone()
     return (None if age is None else float(age)), (str(why[0]) if why else "")
 
 
-def _rows(table: Any, connection: Any) -> tuple[int, int, int]:
+def _rows_of_all(n_videos: int) -> dict[str, tuple[int, int, int]]:
+    """`_rows` of each table; of large ones several at a time, since the server reads each from its beginning to end."""
+    tables = computed_tables()
+    if n_videos < SMALL:
+        return {t.__name__: _rows(t, t.connection) for t in tables}
+    lanes = 4
+    servers = [connection.another() for _ in range(lanes)]
+    try:
+        with ThreadPoolExecutor(lanes) as pool:
+            parts = pool.map(
+                lambda lane: {t.__name__: _rows(t, servers[lane]) for t in tables[lane::lanes]}, range(lanes)
+            )
+            return {name: row for part in parts for name, row in part.items()}
+    finally:
+        for server in servers:
+            server.close()
+
+
+def _rows(table: Any, server: Any) -> tuple[int, int, int]:
     """All rows, those that are empty, those that wait for a choice: in one reading of the table."""
     column, values, _ = EMPTY_COLUMNS.get(table.__name__, ("", (), None))
     waits = "SUM(choice_status = 'NEEDS_CHOICE')" if table is tracking.SubjectChoice else "0"
     empty = f"SUM({column} IN ({','.join(repr(v) for v in values)}))" if column else "0"
-    row = connection.query(f"SELECT COUNT(*), {empty}, {waits} FROM {table.full_table_name}").fetchone()  # noqa: S608
+    row = server.query(f"SELECT COUNT(*), {empty}, {waits} FROM {table.full_table_name}").fetchone()  # noqa: S608
     return int(row[0]), int(row[1] or 0), int(row[2] or 0)
 
 

@@ -92,7 +92,11 @@ def refresh(everything: bool | None = None) -> Refreshed | None:
     try:
         if everything is None:
             everything = _few(connection) or _age_of_look("all") > ALL_EVERY_S
-        out = _refresh(computed_tables(), None if everything else Recent.find())
+        recent = None if everything else Recent.find()
+        if recent is not None and len(recent.videos) > FEW:  # an archive that was just registered
+            recent = None
+        everything = recent is None
+        out = _refresh(computed_tables(), recent)
         for look in ("recent", "all") if everything else ("recent",):
             _note_look(look)
         return out
@@ -150,9 +154,9 @@ def _few(connection: Any) -> bool:
 
 def _age_of_look(look: str) -> float:
     """Seconds since the last look of that kind; infinite where there was none."""
+    table = worker.Look.full_table_name
     row = video.Video.connection.query(
-        "SELECT TIMESTAMPDIFF(SECOND, look_time, CURRENT_TIMESTAMP(3))"
-        f" FROM {worker.Look.full_table_name} WHERE look=%s",
+        f"SELECT TIMESTAMPDIFF(SECOND, look_time, CURRENT_TIMESTAMP(3)) FROM {table} WHERE look=%s",  # noqa: S608
         args=(look,),
     ).fetchone()
     return float("inf") if row is None else float(row[0])

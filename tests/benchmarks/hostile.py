@@ -83,8 +83,9 @@ def noise(data: bytes, draw: random.Random) -> bytes:
 
 KINDS = {f.__name__: f for f in (flipped, truncated, frames_flipped, overflowing, noise)}
 NAMES = (
-    "..%2f..%2fetc%2fpasswd", "..\\..\\walk", "'; DROP TABLE video; --", "<img src=x onerror=alert(1)>", "walk\u202e4pm",
-    "$(touch pwned)", "%s%s%n", "{key}", "a" * 200, "\u00e9\u4e2d\u6587", "CON", "-rf", "walk\n\tmp4", "null\u0001",
+    "..%2f..%2fetc%2fpasswd", "..\\..\\walk", "'; DROP TABLE video; --", "<img src=x onerror=alert(1)>",
+    "walk\u202e4pm", "$(touch pwned)", "%s%s%n", "{key}", "a" * 200,
+    "\u00e9\u4e2d\u6587", "CON", "-rf", "walk\n\tmp4", "null\u0001",
 )  # fmt: skip
 
 

@@ -95,6 +95,7 @@ def main() -> None:
 @click.option("--videos", default=300_000, show_default=True)
 def scale(videos: int) -> None:
     """Register, look, refresh, work, with as many videos."""
+    from schemas import video
     from schemas.bulk import register_many
     from schemas.status import pipeline_status
     from workers import refresh
@@ -116,6 +117,10 @@ def scale(videos: int) -> None:
         state = pipeline_status()
         say("pbl status", time.monotonic() - t, "s", "bar 3")
         click.echo("".join(f"  {s.table} {s.done}" for s in state.tables))
+        t = time.monotonic()
+        assert refresh.refresh(True) is not None
+        say("a look at everything (once an hour)", time.monotonic() - t, "s")
+        video.Video.connection.query(f"UPDATE {video.Video.full_table_name} SET video_created = '2026-01-01'")
         register_many(recordings(videos, 1002))
         t = time.monotonic()
         found = refresh.refresh()

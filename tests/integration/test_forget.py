@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -42,8 +43,7 @@ def two(database: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iter
     the files, and P017's videos."""
     chain.install(monkeypatch)
     declare_all()
-    for path in stored():
-        (Path(connection.store_backend().spec["location"]) / path).unlink()
+    shutil.rmtree(Path(connection.store_backend().spec["location"]) / "_schema", ignore_errors=True)
     ingest([chain.small_video(tmp_path, "other")], Visit(subject="P001"))
     populate()
     rows, files = everything(), stored()
