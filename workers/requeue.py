@@ -10,6 +10,8 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 from schemas import computed_tables, fit, gait, gdi, keypoints, tracking, video
 from schemas._base import delete_below, dj, jobs_of, resolve_method
+from schemas.ingest import Methods
+from schemas.ingest import resolve as resolve_ingest
 
 from . import queue
 from .registry import AGAIN, table_named
@@ -96,11 +98,13 @@ def plan_new_method(table: str, method: str, since: datetime.date | None = None)
     rows = selection & (video.Video & _since(since))
     others = [k for k in rows.primary_key if k != column]
     have = {tuple(r[k] for k in others) for r in (selection & {column: chosen}).proj().to_dicts()}
+    # The choice of the subject goes with the tracking: that of this version, not that of the older row.
+    beside = {"subject_method": resolve_ingest(Methods())["subject_method"]} if prefix == "tracking" else {}
     add: dict[tuple, dict[str, Any]] = {}
     for row in rows.to_dicts():
         key = tuple(row[k] for k in others)
         if key not in have:
-            add.setdefault(key, {**row, column: chosen})
+            add.setdefault(key, {**row, column: chosen, **beside})
     return Reprocess(name, list(add.values()), [], {})
 
 

@@ -174,7 +174,7 @@ class Supervisor:
             stopping = self._stop_at is not None
             if child.jobs:
                 self._see_to_jobs(child, exit_code, stopping)
-            elif exit_code:
+            elif exit_code and not stopping:
                 event(log, logging.ERROR, "process died", exit_code=exit_code, reason=_death(exit_code))
             if stopping or (exit_code == 0 and not child.jobs):
                 code = max(code, 1 if exit_code > 0 else 0)
