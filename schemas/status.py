@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection
+import queue
+from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any
 
 from . import computed_tables, connection, keypoints, tracking, video, worker
@@ -113,29 +115,34 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
     n_videos = int(video.Video.connection.query(f"SELECT COUNT(*) FROM {video.Video.full_table_name}").fetchone()[0])  # noqa: S608
     exact = n_videos < SMALL if exact is None else exact
     server = video.Video.connection
-    queues, rates = queue_counts(server), throughput(server)
-    rows = _rows_of_all(n_videos)
-    tables, errors = [], []
-    for table in computed_tables():
-        name = table.__name__
-        counts = queues[name]
-        pending = counts["pending"]
-        if exact:
-            remaining, _ = table().progress()
-            pending = max(0, remaining - counts["reserved"] - counts["error"] - counts["ignore"])
-        done, empty, waiting = rows[name]
-        oldest, reason = _oldest(table, server) if counts["pending"] else (None, "")
-        per_hour = rates.get(name, 0.0)
-        left = 3600.0 * pending / per_hour if per_hour and pending else None
-        tables.append(
-            TableStatus(
-                name, done, empty, pending, counts["reserved"], counts["error"], waiting, oldest, per_hour, left, reason
-            )
-        )
-        errors += _errors(table, most) if counts["error"] else []
+    with _counting(n_videos) as rows_of:
+        queues, rates, cameras = queue_counts(server), throughput(server), camera_kinds()
+        tables = [_table_status(t, rows_of(t), queues[t.__name__], rates, exact) for t in computed_tables()]
+    errors = [e for t in tables if t.error for e in _errors(table_of(t.table), most)]
     empty = {t.table for t in tables if t.empty}
     waiting = _waiting(most) if any(t.waiting for t in tables) else []
-    return Status(n_videos, tables, errors, _empty(empty, most), waiting, live_workers(), exact, camera_kinds())
+    return Status(n_videos, tables, errors, _empty(empty, most), waiting, live_workers(), exact, cameras)
+
+
+def _table_status(
+    table: Any, rows: tuple[int, int, int], counts: dict[str, int], rates: dict[str, float], exact: bool
+) -> TableStatus:
+    name, pending = table.__name__, counts["pending"]
+    if exact:
+        remaining, _ = table().progress()
+        pending = max(0, remaining - counts["reserved"] - counts["error"] - counts["ignore"])
+    done, empty, waiting = rows
+    oldest, reason = _oldest(table, table.connection) if counts["pending"] else (None, "")
+    per_hour = rates.get(name, 0.0)
+    left = 3600.0 * pending / per_hour if per_hour and pending else None
+    return TableStatus(
+        name, done, empty, pending, counts["reserved"], counts["error"], waiting, oldest, per_hour, left, reason
+    )
+
+
+def table_of(name: str) -> Any:
+    """The computed table of that name."""
+    return next(t for t in computed_tables() if t.__name__ == name)
 
 
 def camera_kinds() -> dict[str, int]:
@@ -189,19 +196,28 @@ def _oldest(table: Any, server: Any) -> tuple[float | None, str]:
     return (None if age is None else float(age)), (str(why[0]) if why else "")
 
 
-def _rows_of_all(n_videos: int) -> dict[str, tuple[int, int, int]]:
-    """`_rows` of each table; of large ones several at a time, since the server reads each from its beginning to end."""
-    tables = computed_tables()
+@contextmanager
+def _counting(n_videos: int) -> Iterator[Callable[[Any], tuple[int, int, int]]]:
+    """`_rows` of the tables; of large ones four at a time, while other things are asked: each is read as a whole."""
     if n_videos < SMALL:
-        return {t.__name__: _rows(t, t.connection) for t in tables}
-    lanes = 4
-    servers = [connection.another() for _ in range(lanes)]
+        yield lambda table: _rows(table, table.connection)
+        return
+    free: queue.SimpleQueue[Any] = queue.SimpleQueue()
+
+    def count(table: Any) -> tuple[int, int, int]:
+        server = free.get()
+        try:
+            return _rows(table, server)
+        finally:
+            free.put(server)
+
+    servers = [connection.another() for _ in range(4)]
+    for server in servers:
+        free.put(server)
     try:
-        with ThreadPoolExecutor(lanes) as pool:
-            parts = pool.map(
-                lambda lane: {t.__name__: _rows(t, servers[lane]) for t in tables[lane::lanes]}, range(lanes)
-            )
-            return {name: row for part in parts for name, row in part.items()}
+        with ThreadPoolExecutor(len(servers)) as pool:
+            counted = {table: pool.submit(count, table) for table in computed_tables()}
+            yield lambda table: counted[table].result()
     finally:
         for server in servers:
             server.close()

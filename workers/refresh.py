@@ -120,8 +120,8 @@ class Recent:
         return cls(sorted(ids), sessions_of([{"video_id": v} for v in ids]))
 
     def where(self, table: Any) -> str | None:
-        """Condition on the key of a table; None where nothing of it can be recent."""
-        if "video_id" in table.heading.primary_key:
+        """Condition on the first column of a table's key; None where nothing of it can be recent."""
+        if "fit_set" not in table.heading.primary_key:
             return f"video_id in ({','.join(map(str, self.videos))})" if self.videos else None
         rows = fit.FitSet & f"session_id in ({','.join(map(str, self.sessions))})" if self.sessions else None
         sets = [] if rows is None else [str(s) for s in rows.to_arrays("fit_set")]
