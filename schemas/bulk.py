@@ -9,11 +9,10 @@ from itertools import islice
 from pathlib import PurePath
 from typing import Any
 
-from pbl_pipeline.errors import PblError
-
 from . import fit, gait, gdi, keypoints, lab, session, tracking, video
 from ._base import DuplicateError, utc_now
-from .ingest import SUBJECT_CODE, Methods, next_id, resolve
+from ._codes import check_subject, day_of
+from .ingest import Methods, next_id, resolve
 
 #: Rows in one transaction.
 CHUNK = 5000
@@ -55,14 +54,7 @@ def register_many(recordings: Iterable[Recording], methods: Methods | None = Non
     out = Registered()
     for chunk in _chunks(recordings):
         for one in chunk:
-            if not SUBJECT_CODE.fullmatch(one.subject):
-                raise PblError(
-                    "USAGE",
-                    found=f"subject code {one.subject!r}",
-                    expected="a pseudonymous code of letters, digits, '-', '_' and '.', at most 32 long",
-                    next_step="give the person such a code",
-                    key=one.path,
-                )
+            check_subject(one.subject, "give the person such a code", one.path)
         new = _register(chunk, chosen)
         out.new += new
         out.known += len(chunk) - new
@@ -140,16 +132,9 @@ def _sessions(wanted: set[tuple[str, str]], now: datetime.datetime) -> dict[tupl
             "session_id": first + i,
             "subject": subject,
             "session_label": label,
-            "session_date": _date(label),
+            "session_date": day_of(label),
             "session_created": now,
         }
         for i, (subject, label) in enumerate(missing)
     )
     return found | {pair: first + i for i, pair in enumerate(missing)}
-
-
-def _date(label: str) -> datetime.date | None:
-    try:
-        return datetime.date.fromisoformat(label)
-    except ValueError:
-        return None

@@ -20,8 +20,8 @@ from pbl_pipeline.errors import PblError
 
 from . import _dump, connection, fit, lab, session, video
 from ._base import delete_below, library
+from ._codes import check_subject
 from ._store import store_error
-from .ingest import SUBJECT_CODE
 
 #: Columns that say whose a row is. `fit_set` is a hash over one session's videos.
 IDENTITIES = ("subject", "session_id", "video_id", "fit_set")
@@ -60,13 +60,7 @@ class Forgotten:
 
 def manifest_path(subject: str) -> Path:
     """Where the list of what is removed is kept: `PBL_HOME/forgotten/<subject>.json`. USAGE for what is no code."""
-    if not SUBJECT_CODE.fullmatch(subject):
-        raise PblError(
-            "USAGE",
-            found=f"subject code {subject[:50]!r}",
-            expected="a code as `pbl ingest` takes it",
-            next_step="check the code",
-        )
+    check_subject(subject, "check the code")
     return settings.home_dir() / "forgotten" / f"{subject}.json"
 
 

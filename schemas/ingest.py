@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime
 import hashlib
 import math
 import os
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,10 +17,9 @@ from pbl_pipeline.paramset import canonical_json
 from . import fit, gait, gdi, keypoints, lab, sensors, session, tracking, video
 from ._activate import computed_tables
 from ._base import DuplicateError, delete_below, dj, error_code, jobs_of, library, resolve_method, utc_now
+from ._codes import check_subject, day_of
 
 _ATTEMPTS = 20
-#: Form of a pseudonymous code.
-SUBJECT_CODE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,13 +96,7 @@ def ingest(
         USAGE for a subject code that could be a name, a label too long, or one person's number for several videos;
         SOLVER_UNKNOWN, NORM_UNKNOWN for unknown methods. Errors of single files are in the result.
     """
-    if not SUBJECT_CODE.fullmatch(visit.subject):
-        raise PblError(
-            "USAGE",
-            found=f"subject code {visit.subject!r}",
-            expected="a pseudonymous code of letters, digits, '-', '_' and '.', at most 32 long (never a name)",
-            next_step="pass such a code with --subject",
-        )
+    check_subject(visit.subject, "pass such a code with --subject")
     for what, text, longest in (
         ("session", visit.session_label, 64),
         ("project", visit.project or "", 32),
@@ -378,16 +369,9 @@ def _session(visit: Visit) -> int:
     if found:
         return int(found[0]["session_id"])
     number = next_id(session.Session, "session_id")
-    day = {"session_date": _date(visit.session_label), "session_created": utc_now()}
+    day = {"session_date": day_of(visit.session_label), "session_created": utc_now()}
     session.Session.insert1({"session_id": number, **label, **day})
     return number
-
-
-def _date(label: str) -> datetime.date | None:
-    try:
-        return datetime.date.fromisoformat(label)
-    except ValueError:
-        return None
 
 
 def _camera(camera_file: str | Path, path: Path) -> dict[str, Any] | None:

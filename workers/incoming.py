@@ -24,7 +24,8 @@ import fsspec
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from schemas import connection, video
-from schemas.ingest import SUBJECT_CODE, Visit, ingest
+from schemas._codes import check_subject
+from schemas.ingest import Visit, ingest
 from schemas.sensors import Sensors
 
 #: Seconds in which a file must not have changed.
@@ -139,13 +140,7 @@ def _take(fs: Any, name: PurePosixPath, given: _File, logs: list[_File], archive
         return
     target = copy
     try:
-        if not SUBJECT_CODE.fullmatch(subject):
-            raise PblError(
-                "USAGE",
-                found=f"folder {subject!r} as the subject's code",
-                expected="letters, digits, '-', '_' and '.', at most 32",
-                next_step="rename the folder and upload again",
-            )
+        check_subject(subject, "rename the folder and upload again", name)
         target = archive / subject / _plain(session) / f"{sha256[:12]}-{_plain(file)}"
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(copy, target)

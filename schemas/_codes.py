@@ -1,0 +1,31 @@
+"""Pseudonymous codes of people and labels of sessions: what both must look like."""
+
+from __future__ import annotations
+
+import datetime
+import re
+
+from pbl_pipeline.errors import PblError
+
+#: Form of a pseudonymous code.
+SUBJECT_CODE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
+
+
+def check_subject(code: str, next_step: str, key: object = None) -> None:
+    """Raise USAGE for what is no pseudonymous code; `next_step` and `key` are those of the error."""
+    if not SUBJECT_CODE.fullmatch(code):
+        raise PblError(
+            "USAGE",
+            found=f"subject code {code[:50]!r}",
+            expected="a pseudonymous code of letters, digits, '-', '_' and '.', at most 32 long (never a name)",
+            next_step=next_step,
+            key=key,
+        )
+
+
+def day_of(label: str) -> datetime.date | None:
+    """The day that a session's label says (YYYY-MM-DD); None where it says something else."""
+    try:
+        return datetime.date.fromisoformat(label)
+    except ValueError:
+        return None
