@@ -32,6 +32,8 @@ import json
 import os
 import socket
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from pbl_pipeline.errors import PblError
@@ -240,6 +242,21 @@ def plain_connection(**options: Any) -> pymysql.Connection[Any]:
         return pymysql.connect(**login, **tls, charset="utf8mb4", autocommit=True, **options)
     except pymysql.err.OperationalError as error:
         raise _login_error(target, error) from error
+
+
+@contextmanager
+def alone(work: str, server: dj.Connection) -> Iterator[bool]:
+    """Hold the lock of this installation for some work: one process of all machines at a time.
+
+    Gives whether it was had; never waits. A process that dies, or whose connection is lost, has let go of it.
+    """
+    name = schema_name(work)  # locks are the server's, which may hold other installations
+    had = server.query("SELECT GET_LOCK(%s, 0)", args=(name,)).fetchone()[0] == 1
+    try:
+        yield had
+    finally:
+        if had:
+            server.query("SELECT RELEASE_LOCK(%s)", args=(name,))
 
 
 def store_backend() -> Any:

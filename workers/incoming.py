@@ -76,37 +76,34 @@ def take_over(url: str | None = None, archive: Path | None = None, settled_s: fl
     """
     url, archive = url or incoming_url(), archive or archive_dir()
     fs, root = fsspec.core.url_to_fs(url, **_login(url))
-    out = Taken()
-    lock = connection.schema_name("incoming")
-    query = video.Video.connection.query
-    if query("SELECT GET_LOCK(%s, 0)", args=(lock,)).fetchone()[0] != 1:
-        return out
-    try:
-        seen = _load_seen(archive)
-        now, still, whole = time.time(), {}, {}
-        for path, about in sorted(fs.find(root, detail=True).items()):
-            name = PurePosixPath(str(path).removeprefix(str(root)).lstrip("/"))
-            if not _has_place(name):
-                out.ignored += 1
-                continue
-            state = [int(about["size"] or 0), str(about.get("mtime") or about.get("LastModified") or "")]
-            before = seen.get(str(name))
-            first_seen = before[2] if before is not None and before[:2] == state else now
-            still[str(name)] = [*state, first_seen]
-            if before is None or before[:2] != state or now - first_seen < settled_s:
-                out.uploading += 1
-            else:
-                whole[name] = _File(path, state)
-        for name, file in whole.items():
-            if name.suffix.lower() not in VIDEO_ENDINGS:
-                continue
-            logs = [PurePosixPath(n) for n in still if _is_log_of(PurePosixPath(n), name)]
-            if all(n in whole for n in logs):  # else its log is still on its way
-                _take(fs, name, file, [whole[n] for n in logs[:1]], archive, out)
-        _save_seen(archive, still)
-        return out
-    finally:
-        query("SELECT RELEASE_LOCK(%s)", args=(lock,))
+    with connection.alone("incoming", video.Video.connection) as had:
+        return _look(fs, str(root), archive, settled_s) if had else Taken()
+
+
+def _look(fs: Any, root: str, archive: Path, settled_s: float) -> Taken:
+    out, seen = Taken(), _load_seen(archive)
+    now, still, whole = time.time(), {}, {}
+    for path, about in sorted(fs.find(root, detail=True).items()):
+        name = PurePosixPath(str(path).removeprefix(root).lstrip("/"))
+        if not _has_place(name):
+            out.ignored += 1
+            continue
+        state = [int(about["size"] or 0), str(about.get("mtime") or about.get("LastModified") or "")]
+        before = seen.get(str(name))
+        first_seen = before[2] if before is not None and before[:2] == state else now
+        still[str(name)] = [*state, first_seen]
+        if before is None or before[:2] != state or now - first_seen < settled_s:
+            out.uploading += 1
+        else:
+            whole[name] = _File(path, state)
+    for name, file in whole.items():
+        if name.suffix.lower() not in VIDEO_ENDINGS:
+            continue
+        logs = [PurePosixPath(n) for n in still if _is_log_of(PurePosixPath(n), name)]
+        if all(n in whole for n in logs):  # else its log is still on its way
+            _take(fs, name, file, [whole[n] for n in logs[:1]], archive, out)
+    _save_seen(archive, still)
+    return out
 
 
 def _has_place(name: PurePosixPath) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from schemas import computed_tables, fit, tracking, video, worker
-from schemas.connection import schema_name
+from schemas.connection import alone
 
 from . import queue, recover
 from .queue import Claim
@@ -85,13 +85,12 @@ def refresh(everything: bool | None = None) -> Refreshed | None:
     Refreshed or None
         None where another process is at it.
     """
-    connection = computed_tables()[0].connection
-    lock = schema_name("refresh")  # of this installation: locks are the server's
-    if connection.query("SELECT GET_LOCK(%s, 0)", args=(lock,)).fetchone()[0] != 1:
-        return None
-    try:
+    server = video.Video.connection
+    with alone("refresh", server) as had:
+        if not had:
+            return None
         if everything is None:
-            everything = _few(connection) or _age_of_look("all") > ALL_EVERY_S
+            everything = _few(server) or _age_of_look("all") > ALL_EVERY_S
         recent = None if everything else Recent.find()
         if recent is not None and len(recent.videos) > FEW:  # an archive that was just registered
             recent = None
@@ -100,8 +99,6 @@ def refresh(everything: bool | None = None) -> Refreshed | None:
         for look in ("recent", "all") if everything else ("recent",):
             _note_look(look)
         return out
-    finally:
-        connection.query("SELECT RELEASE_LOCK(%s)", args=(lock,))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,8 +145,8 @@ def _refresh(tables: Sequence[Any], recent: Recent | None) -> Refreshed:
     return out
 
 
-def _few(connection: Any) -> bool:
-    return len(connection.query(f"SELECT 1 FROM {video.Video.full_table_name} LIMIT {FEW}").fetchall()) < FEW  # noqa: S608
+def _few(server: Any) -> bool:
+    return len(server.query(f"SELECT 1 FROM {video.Video.full_table_name} LIMIT {FEW}").fetchall()) < FEW  # noqa: S608
 
 
 def _age_of_look(look: str) -> float:
