@@ -8,13 +8,12 @@ from collections.abc import Sequence
 from typing import Any
 
 from pbl_pipeline import progress
-from pbl_pipeline.errors import PblError
 from schemas import computed_tables
 from schemas._base import jobs_of
 from schemas.status import empty_rows
 
 from . import queue, recover, refresh, run_job
-from .registry import stage_of
+from .registry import stage_of, table_named
 
 
 @dataclasses.dataclass
@@ -93,20 +92,8 @@ def populate(tables: Sequence[str] | None = None, limit: int | None = None, retr
 
 
 def _choose(names: Sequence[str] | None) -> list[Any]:
-    tables = computed_tables()
-    if not names:
-        return tables
-    known = {t.__name__.lower(): t for t in tables}
-    unknown = [n for n in names if n.lower() not in known]
-    if unknown:
-        raise PblError(
-            "USAGE",
-            found=f"no computed table {', '.join(unknown)}",
-            expected="one of " + ", ".join(t.__name__ for t in tables),
-            next_step="name one of these with --table, or leave it out",
-        )
-    wanted = {n.lower() for n in names}
-    return [t for t in tables if t.__name__.lower() in wanted]
+    wanted = {table_named(n).__name__ for n in names or ()}
+    return [t for t in computed_tables() if not names or t.__name__ in wanted]
 
 
 def _populate_table(table: Any, part: TableRun, limit: int | None) -> None:
