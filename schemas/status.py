@@ -118,7 +118,7 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
     with _counting(n_videos) as rows_of:
         queues, rates, cameras = queue_counts(server), throughput(server), camera_kinds()
         tables = [_table_status(t, rows_of(t), queues[t.__name__], rates, exact) for t in computed_tables()]
-    errors = [e for t in tables if t.error for e in _errors(table_of(t.table), most)]
+    errors = [e for t, s in zip(computed_tables(), tables, strict=True) if s.error for e in _errors(t, most)]
     empty = {t.table for t in tables if t.empty}
     waiting = _waiting(most) if any(t.waiting for t in tables) else []
     return Status(n_videos, tables, errors, _empty(empty, most), waiting, live_workers(), exact, cameras)
@@ -138,11 +138,6 @@ def _table_status(
     return TableStatus(
         name, done, empty, pending, counts["reserved"], counts["error"], waiting, oldest, per_hour, left, reason
     )
-
-
-def table_of(name: str) -> Any:
-    """The computed table of that name."""
-    return next(t for t in computed_tables() if t.__name__ == name)
 
 
 def camera_kinds() -> dict[str, int]:
