@@ -23,7 +23,7 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 from schemas import connection
-from schemas._base import dj, utc_now
+from schemas._base import utc_now
 
 from . import queue, registry, run_job
 from .log import event, to_stderr
@@ -335,7 +335,7 @@ def _connected(schemas: Any, stop: threading.Event) -> bool:
             if error.code != "DB_NOT_RUNNING":
                 raise
             event(log, logging.WARNING, "database away", error=error.found)
-        except (dj.errors.LostConnectionError, *run_job.DATABASE_ERRORS) as error:
+        except run_job.DATABASE_ERRORS as error:
             event(log, logging.WARNING, "database away", error=str(error)[:200])
         stop.wait(run_job.DATABASE_PAUSE_S)
     return False
