@@ -17,25 +17,20 @@ import schemas
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait.events import load_events
 from pbl_pipeline.video import probe
-from schemas import fit, gait, gdi, keypoints, lab, qc, tracking, video, views
+from schemas import fit, gait, gdi, keypoints, qc, tracking, video, views
 from tests.command import Done, pbl
+from tests.rows import remove_all
 from tests.videos import constant_rate, numbered_frames, write_video
 
 EMPTY = "niemand ist da, früh.mp4"
 
 
-def clean() -> None:
-    lab.Subject.delete(prompt=False, part_integrity="cascade")
-    for table in schemas.computed_tables():
-        table.jobs.delete_quick()
-
-
 @pytest.fixture(scope="module")
 def tables(database: Path) -> Iterator[None]:
     schemas.activate()
-    clean()
+    remove_all()
     yield
-    clean()
+    remove_all()
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,7 @@ from schemas.ingest import Visit, ingest
 from schemas.results import load_session
 from tests.command import pbl
 from tests.database import new_home, remove_home
+from tests.rows import everything, remove_all
 from workers.populate import populate
 
 from . import chain
@@ -29,16 +30,6 @@ from . import chain
 #: A single-precision number that needs nine digits, and a text with everything that has to be escaped.
 HEIGHT = float(np.float32(1.7345679))
 TITLE = "knee ' \" \\ % `\n\t\0 \u00e4\u20ac\U0001f6b6 $(rm -rf /); --"
-
-
-def everything() -> dict[str, list[tuple]]:
-    """Every row of every table, as the server prints it."""
-    with closing(connection.plain_connection(conv={})) as server:
-        found = {}
-        for schema, table in _dump.tables_of(server, connection.prefix()):
-            columns = _dump.columns_of(server, schema, table)
-            found[f"{schema}.{table}"] = sorted(_dump.rows_of(server, schema, table, columns), key=str)
-        return found
 
 
 @pytest.fixture
@@ -52,10 +43,7 @@ def filled(database: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     lab.Project.update1({"project": "gait", "project_title": TITLE})
     lab.Subject.update1({"subject": "P001", "subject_height": HEIGHT})
     yield
-    lab.Subject.delete(prompt=False, part_integrity="cascade")
-    lab.Project.delete(prompt=False)
-    for table in schemas.computed_tables():
-        table.jobs.delete_quick()
+    remove_all()
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,20 +22,6 @@ from workers.incoming import take_over
 from workers.loop import Worker
 
 from . import chain
-
-
-@pytest.fixture(scope="module")
-def declared(database: Path) -> None:
-    schemas.activate()
-
-
-@pytest.fixture
-def tables(declared: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    chain.install(monkeypatch)
-    yield
-    lab.Subject.delete(prompt=False, part_integrity="cascade")
-    for table in schemas.computed_tables():
-        table.jobs.delete_quick()
 
 
 @pytest.fixture

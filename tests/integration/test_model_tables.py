@@ -16,10 +16,11 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.video import probe
-from schemas import keypoints, lab
+from schemas import keypoints
 from schemas._base import file_ref, stored_file
 from schemas.ingest import Methods, Visit, ingest
 from tests import dot_models
+from tests.rows import remove_all
 from tests.videos import constant_rate, write_video
 from workers.populate import populate
 
@@ -47,12 +48,9 @@ def tables(database: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> I
     monkeypatch.setenv("PBL_MODELS", str(tmp_path / "models"))
     monkeypatch.setattr(pbl_pipeline.tracking, "track_people", track_people)
     yield
-    lab.Subject.delete(prompt=False, part_integrity="cascade")
-    lab.CameraCalibration.delete(prompt=False)
+    remove_all()
     # Other tests count the method rows of the project.
     (keypoints.KeypointMethod & 'keypoint_method_name LIKE "dots-%"').delete(prompt=False)
-    for table in schemas.computed_tables():
-        table.jobs.delete_quick()
 
 
 def test_a_registered_model_is_a_method_of_the_tables(tables: None, tmp_path: Path):

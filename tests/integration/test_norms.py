@@ -18,6 +18,7 @@ from schemas import fit, gait, gdi, lab, norms, session, views
 from schemas.cli.norm import norm as command
 from schemas.ingest import Methods, Visit, ingest
 from schemas.results import load_session
+from tests.rows import remove_all
 from workers.populate import populate
 
 from . import chain
@@ -36,10 +37,8 @@ def walkers(database: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
         populate()
         assert len(gdi.SessionGdi()) == 5
         yield folder
-    lab.Subject.delete(prompt=False, part_integrity="cascade")
+    remove_all()
     (gdi.NormativeSet & "norm_query IS NOT NULL").delete(prompt=False)
-    for table in schemas.computed_tables():
-        table.jobs.delete_quick()
 
 
 def shipped() -> list[dict]:

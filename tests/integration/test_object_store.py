@@ -12,10 +12,11 @@ from moto.server import ThreadedMotoServer
 import pbl_pipeline.video
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import _store, backup, connection, forget, lab, tracking, video
+from schemas import _store, backup, connection, forget, tracking, video
 from schemas._base import file_ref, stored_file
 from schemas._declare import declare_all
 from schemas.ingest import Visit, ingest
+from tests.rows import remove_all
 
 from . import chain
 
@@ -47,9 +48,7 @@ def remote(database: Path, server: str, tmp_path: Path, monkeypatch: pytest.Monk
     yield
     monkeypatch.undo()  # also what the test itself set: what follows is for the store in the folder
     connection.connect()
-    lab.Subject.delete(prompt=False, part_integrity="cascade")
-    for table in schemas.computed_tables():
-        table.jobs.delete_quick()
+    remove_all()
 
 
 def test_arrays_and_files_go_to_the_bucket_and_come_back(remote: None, tmp_path: Path):

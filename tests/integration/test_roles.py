@@ -17,6 +17,7 @@ from schemas import connection, embedded, lab, roles, views
 from schemas._declare import declare_all
 from schemas.ingest import Visit, ingest
 from tests.command import pbl
+from tests.rows import remove_all
 from workers.populate import populate
 
 from . import chain
@@ -49,9 +50,7 @@ def login(secrets: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Login]:
 
         yield become
     connection.connect()
-    lab.Subject.delete(prompt=False, part_integrity="cascade")
-    for table in schemas.computed_tables():
-        table.jobs.delete_quick()
+    remove_all()
 
 
 def refused(sql: str) -> bool:

@@ -16,9 +16,10 @@ from schemas.ingest import Visit, ingest
 from schemas.sensors import Sensors
 from tests.command import pbl
 from tests.integration import chain
-from tests.integration.test_tables import declared, errors, register, tables  # noqa: F401  two fixtures
+from tests.integration.test_tables import errors
 from tests.phone_film import as_zip, film, sensor_logger
 from tests.quicktime import insert, meta
+from tests.rows import register
 from workers.populate import populate
 
 pytestmark = pytest.mark.usefixtures("tables")

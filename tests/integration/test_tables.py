@@ -8,7 +8,6 @@ import platform
 import re
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -31,28 +30,12 @@ from schemas.ingest import Methods, Visit, ingest
 from schemas.plan import plan_fit_sets
 from schemas.results import load_session
 from schemas.status import pipeline_status
+from tests.rows import register
 from workers.populate import populate
 
 from . import chain
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture(scope="module")
-def declared(database: Path) -> None:
-    schemas.activate()
-
-
-@pytest.fixture
-def tables(declared: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Empty tables with the method rows, and stand-ins for the slow stages."""
-    chain.install(monkeypatch)
-    yield
-    lab.Subject.delete(prompt=False, part_integrity="cascade")
-    lab.CameraCalibration.delete(prompt=False)
-    for table in schemas.computed_tables():
-        assert len(table()) == 0
-        table.jobs.delete_quick()
 
 
 def errors(run) -> dict[str, dict[str, int]]:
@@ -61,12 +44,6 @@ def errors(run) -> dict[str, dict[str, int]]:
 
 def done(run) -> dict[str, int]:
     return {t.table: t.done for t in run.tables}
-
-
-def register(*paths: Path, **visit) -> list[int]:
-    results = ingest(paths, Visit(subject=visit.pop("subject", "P001"), **visit))
-    assert [r.status for r in results] == ["registered"] * len(paths)
-    return [r.video_id or 0 for r in results]
 
 
 # ------------------------------------------------------------------------------------------------ the whole chain

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,18 +11,18 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner, Result
 
-import schemas
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.synthetic import SynthSpec, synthesise
 from pbl_pipeline.validation import Reference, compare, reference_of_fit
-from schemas import lab, validation, video, views
+from schemas import validation, video, views
 from schemas.cli.validate import validate
 from schemas.ingest import Visit, ingest
 from schemas.references import add_reference, find_video, read_reference
 from schemas.status import pipeline_status
 from tests.conftest import SHARED
+from tests.rows import register
 from tests.walking_fit import walking_fit
 from workers.populate import populate
 
@@ -31,22 +30,6 @@ from . import chain
 
 #: What the reference differs from the fit by: two frames later, the right knee bent 5 degrees more.
 LAG_S, KNEE_DEG = 2 / 30, 5.0
-
-
-@pytest.fixture(scope="module")
-def declared(database: Path) -> None:
-    schemas.activate()
-
-
-@pytest.fixture
-def tables(declared: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Empty tables with the method rows, and stand-ins for the slow stages."""
-    chain.install(monkeypatch)
-    yield
-    lab.Subject.delete(prompt=False, part_integrity="cascade")
-    for table in schemas.computed_tables():
-        assert len(table()) == 0
-        table.jobs.delete_quick()
 
 
 def fitted(n_frames: int = chain.N_FRAMES) -> TrialFit:
@@ -67,13 +50,6 @@ def saved(folder: Path, name: str, truth: Reference) -> Path:
     return folder / name
 
 
-def register(path: Path, **visit) -> int:
-    (result,) = ingest([path], Visit(visit.pop("subject", "P001"), **visit))
-    assert result.status == "registered"
-    assert result.video_id is not None
-    return result.video_id
-
-
 def call(*words: object) -> Result:
     return CliRunner().invoke(validate, [str(w) for w in words], prog_name="pbl validate")
 
@@ -85,7 +61,7 @@ def done(run) -> int:
 # ------------------------------------------------------------------------------------------------------ the tables
 def test_a_reference_that_is_added_later_gives_the_errors_that_were_put_in(tables: None, tmp_path: Path):
     first, second = (chain.small_video(tmp_path, n) for n in ("walk1", "walk2"))
-    number = register(first, population="healthy", camera_motion="handheld")
+    (number,) = register(first, population="healthy", camera_motion="handheld")
     register(second)
     assert done(populate()) == 0
     assert views.validation_frame().empty
@@ -122,7 +98,7 @@ def test_a_reference_that_is_added_later_gives_the_errors_that_were_put_in(table
 
 
 def test_another_file_of_a_source_is_another_row_and_takes_the_place(tables: None, tmp_path: Path):
-    number = register(chain.small_video(tmp_path, "walk"))
+    (number,) = register(chain.small_video(tmp_path, "walk"))
     old, new = saved(tmp_path, "old.npz", reference()), saved(tmp_path, "new.npz", reference(knee_deg=9.0))
     add_reference(number, old, dataset="LAB")
     populate()
@@ -155,7 +131,7 @@ def _knee_bias() -> float:
 
 def test_a_reference_of_another_time_is_one_error_row(tables: None, tmp_path: Path):
     paths = [chain.small_video(tmp_path, n) for n in ("walk1", "walk2")]
-    numbers = [register(p) for p in paths]
+    numbers = register(*paths)
     add_reference(numbers[0], saved(tmp_path, "elsewhere.npz", reference(lag_s=-900.0)))
     add_reference(numbers[1], saved(tmp_path, "truth.npz", reference()))
     run = populate()
@@ -175,7 +151,7 @@ def test_a_reference_of_another_time_is_one_error_row(tables: None, tmp_path: Pa
 # ------------------------------------------------------------------------------------------------------- the files
 def test_a_video_by_number_path_copy_or_name(tables: None, tmp_path: Path):
     path = chain.small_video(tmp_path, "walk")
-    number = register(path)
+    (number,) = register(path)
     copy = tmp_path / "elsewhere" / "copy.mp4"
     copy.parent.mkdir()
     shutil.copy(path, copy)
@@ -229,7 +205,7 @@ def test_rotations_of_bodies_are_a_reference(shared_data: Path):
 
 @pytest.mark.parametrize("texts", [{"dataset": "d" * 33}, {"source": ""}, {"origin": "o" * 1001}])
 def test_texts_that_do_not_fit_are_refused(tables: None, tmp_path: Path, texts: dict):
-    number = register(chain.small_video(tmp_path, "walk"))
+    (number,) = register(chain.small_video(tmp_path, "walk"))
     with pytest.raises(PblError, match="USAGE"):
         add_reference(number, saved(tmp_path, "truth.npz", reference()), **texts)
 
@@ -243,7 +219,7 @@ def test_the_command_says_what_to_do_where_there_is_nothing(tables: None):
 
 def test_the_command_from_reference_to_tables(tables: None, tmp_path: Path):
     path = chain.small_video(tmp_path, "walk")
-    number = register(path, population="healthy")
+    (number,) = register(path, population="healthy")
     truth = saved(tmp_path, "truth.npz", reference())
     result = call("add", path, "--reference", truth, "--dataset", "LAB")
     assert result.exit_code == 0, result.output

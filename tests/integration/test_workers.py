@@ -9,7 +9,6 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -21,38 +20,15 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import PARAMSETS
 from schemas import embedded, fit, gait, gdi, lab, qc, tracking, video, worker
 from schemas.cli.why import why as why_command
-from schemas.ingest import Visit, ingest
 from schemas.status import live_workers, pipeline_status, queue_counts
 from schemas.why import why
+from tests.rows import register
 from workers import queue, recover, refresh, registry, requeue, run_job
 from workers.heartbeat import Heartbeat, Silent
 from workers.loop import Worker
 from workers.supervisor import CRASHES, Options, Supervisor
 
 from . import chain, worker_target
-
-
-@pytest.fixture(scope="module")
-def declared(database: Path) -> None:
-    schemas.activate()
-
-
-@pytest.fixture
-def tables(declared: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Empty tables with the method rows, and stand-ins for the slow stages."""
-    chain.install(monkeypatch)
-    yield
-    lab.Subject.delete(prompt=False, part_integrity="cascade")
-    for table in schemas.computed_tables():
-        table.jobs.delete_quick()
-    for table in (worker.Throughput, worker.Crash, worker.Worker):
-        table.delete_quick()
-
-
-def register(*paths: Path, **visit) -> list[int]:
-    results = ingest(paths, Visit(subject=visit.pop("subject", "P001"), **visit))
-    assert [r.status for r in results] == ["registered"] * len(paths)
-    return [r.video_id or 0 for r in results]
 
 
 def work(**options) -> Worker:
