@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import os
 import secrets
@@ -105,10 +106,11 @@ def check_store(backend: Any, create: bool = False) -> None:
     PblError
         STORE_UNAVAILABLE with what the store said.
     """
-    # In a bucket always the same object, for our key may not delete; in a folder a file of its own that goes again.
-    probe, content = "probe/written-by-pbl-db-init", secrets.token_bytes(16)
-    if backend.protocol == "file":
-        probe = f"probe-{content.hex()}"
+    # In a bucket always the same object, for a worker's key may not delete; in a folder a file of its own that goes
+    # again. Several processes may write that object at once: whoever wrote it, it holds some bytes and their hash.
+    name = secrets.token_bytes(16)
+    content = name + hashlib.sha256(name).digest()
+    probe = f"probe-{name.hex()}" if backend.protocol == "file" else "probe/written-by-pbl-db-init"
     try:
         if create and backend.protocol == "s3" and not backend.fs.exists(bucket()):
             backend.fs.mkdir(bucket())
@@ -118,8 +120,24 @@ def check_store(backend: Any, create: bool = False) -> None:
             backend.remove(probe)
     except Exception as error:  # whatever layer of the client speaks, the reader needs the same advice
         raise store_error(error) from error
-    if found != content:
+    if len(found) != len(content) or hashlib.sha256(found[:16]).digest() != found[16:]:
         raise store_error(OSError("an object came back with other bytes than were written"))
+
+
+def files_below(backend: Any, folder: str = "") -> dict[str, dict[str, Any]]:
+    """The files under a folder of the store (a path in it; default: all), with what the store says of each.
+
+    Raises
+    ------
+    PblError
+        STORE_UNAVAILABLE with what the store said.
+    """
+    try:
+        base = str(backend._full_path(""))
+        found = backend.fs.find(backend._full_path(folder), detail=True)
+    except Exception as error:
+        raise store_error(error) from error
+    return {str(path).removeprefix(base).lstrip("/"): about for path, about in found.items()}
 
 
 def store_error(error: BaseException) -> PblError:
