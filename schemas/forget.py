@@ -21,7 +21,7 @@ from pbl_pipeline.errors import PblError
 from . import _dump, connection, fit, lab, session, video
 from ._base import delete_below, library
 from ._codes import check_subject
-from ._store import store_error
+from ._store import files_below, store_error
 
 #: Columns that say whose a row is. `fit_set` is a hash over one session's videos.
 IDENTITIES = ("subject", "session_id", "video_id", "fit_set")
@@ -234,17 +234,8 @@ def _without_row(conn: Any, ids: Ids) -> list[str]:
     for schema, table in tables.fetchall():
         for name in IDENTITIES:
             for value in ids[name]:
-                out += _below(store, f"{root}/{schema}/{table}/{name}={value}")
+                out += files_below(store, f"{root}/{schema}/{table}/{name}={value}")
     return out
-
-
-def _below(store: Any, folder: str) -> list[str]:
-    """The files under a folder of the store, as paths in the store."""
-    try:
-        base = str(store._full_path(""))
-        return [str(p).removeprefix(base).lstrip("/") for p in store.fs.find(store._full_path(folder))]
-    except Exception as error:
-        raise store_error(error) from error
 
 
 def _exists(path: str) -> bool:

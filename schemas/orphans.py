@@ -6,9 +6,12 @@ import dataclasses
 import datetime
 import json
 from collections.abc import Iterator
-from typing import Any
+from contextlib import closing
+
+from pymysql.cursors import SSCursor
 
 from . import _dump, connection
+from ._store import files_below
 
 #: A file younger than this may belong to a row that is about to be written (s).
 YOUNG_S = 3600.0
@@ -68,35 +71,26 @@ def _is_named(path: str, named: set[str]) -> bool:
 
 
 def _files() -> Iterator[StoredFile]:
-    store = connection.store_backend()
-    base = str(store._full_path(""))
     now = datetime.datetime.now(datetime.UTC)
-    for path, about in store.fs.find(base, detail=True).items():
+    for path, about in files_below(connection.store_backend()).items():
         changed = about.get("mtime") or about.get("LastModified")
         if isinstance(changed, int | float):
             changed = datetime.datetime.fromtimestamp(changed, datetime.UTC)
         age = (now - changed).total_seconds() if changed else 0.0
-        yield StoredFile(str(path).removeprefix(base).lstrip("/"), int(about.get("size") or 0), age)
+        yield StoredFile(path, int(about.get("size") or 0), age)
 
 
 def _named() -> Iterator[str]:
     """The paths of the store that rows name, read through a connection of its own, a row at a time."""
-    import pymysql
-
-    conn: Any = connection.another()
-    try:
-        server = conn._conn
+    with closing(connection.plain_connection()) as server:
         for schema, table in _dump.tables_of(server, connection.prefix()):
-            stored = [
-                name for name, _, comment in _dump.columns_of(server, schema, table) if _dump.STORED.match(comment)
-            ]
-            for name in stored:
-                with server.cursor(pymysql.cursors.SSCursor) as cursor:
+            for name, _, comment in _dump.columns_of(server, schema, table):
+                if not _dump.STORED.match(comment):
+                    continue
+                with server.cursor(SSCursor) as cursor:
                     cursor.execute(
                         f"SELECT {_dump.quote(name)} FROM {_dump.quote(schema)}.{_dump.quote(table)}"  # noqa: S608
                         f" WHERE {_dump.quote(name)} IS NOT NULL"
                     )
                     for (value,) in cursor:
                         yield json.loads(value)["path"]
-    finally:
-        conn.close()
