@@ -7,19 +7,19 @@ from typing import TYPE_CHECKING, Any
 
 from . import queue, run_job
 from .queue import Claim
-from .run_job import Computed, Outcome
+from .run_job import Computed
 
 if TYPE_CHECKING:
     from .loop import Worker
 
 
-def run_fits(first: list[Claim], worker: Worker) -> list[Outcome]:
+def run_fits(first: list[Claim], worker: Worker) -> None:
     """Do the jobs of `first` and, as long as there are more of that table, the next batches.
 
     One thread computes and touches no database; this one reserves, fetches and inserts, so that the device always has
     the next batch waiting. A job that the batch could not compute is computed alone.
     """
-    table, out = first[0].table, []
+    table = first[0].table
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="fits") as device:
         batch, result = first, _start(device, first)
         while batch:
@@ -39,11 +39,9 @@ def run_fits(first: list[Claim], worker: Worker) -> list[Outcome]:
                     queue.put_back(job)
                 raise
             worker.follow(ended)
-            out += ended
             batch = following
             if ahead is not None:
                 result = ahead
-    return out
 
 
 def _start(device: ThreadPoolExecutor, jobs: list[Claim]) -> Future[list[Computed | None]]:

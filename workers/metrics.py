@@ -26,11 +26,9 @@ class Metrics:
         self.restarts = Counter("pbl_process_restarts", "Working processes that died and were replaced", registry=here)
 
     def heard(self, message: dict[str, Any]) -> None:
-        """Count what a working process said."""
-        if message["what"] == "start":
-            self.in_hand.inc()
+        """Count a job that a working process ended."""
+        if message["what"] != "end":
             return
-        self.in_hand.dec()
         self.jobs.labels(message["table"], message["outcome"], message["code"]).inc()
         self.seconds.labels(message["table"]).observe(message["seconds"])
 

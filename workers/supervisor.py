@@ -85,6 +85,8 @@ class Supervisor:
         """`target` replaces `work` as what the processes run: tests and benchmarks put stand-ins before it."""
         self.options, self.metrics, self.target = options, metrics or Metrics(), target or work
         self._children: list[_Child] = []
+        # Looked up, not counted: a process may announce a job twice, and die without ending any.
+        self.metrics.in_hand.set_function(lambda: sum(len(c.jobs) for c in self._children))
         self._pause = RESTART_S[0]
         self._stillborn = 0
         self._stop_at: float | None = None

@@ -1,0 +1,81 @@
+"""The supervisor's figures: jobs in hand are those of processes that live, whatever these said, however they ended."""
+
+from __future__ import annotations
+
+import multiprocessing
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from workers.metrics import Metrics
+from workers.supervisor import Options, Supervisor, _Child
+
+
+class Process:
+    """A working process as its supervisor sees it: a pipe to speak through, and a death."""
+
+    pid, exitcode = 12345, None
+
+    def __init__(self) -> None:
+        self.sentinel, self._lives = multiprocessing.Pipe(duplex=False)
+        here, self.says = multiprocessing.Pipe(duplex=False)
+        self.child = _Child(self, here, 0.0)
+
+    def is_alive(self) -> bool:
+        return self.exitcode is None
+
+    def join(self) -> None:
+        assert not self.is_alive()
+
+    def die(self, exit_code: int) -> None:
+        self.exitcode = exit_code
+        self._lives.close()
+
+    def say(self, what: str, number: int, **more: Any) -> None:
+        self.says.send({"what": what, "table": "SessionFit", "hash": f"{number:016x}", "about": str(number), **more})
+
+
+@pytest.fixture
+def boss(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """A supervisor of one process whose jobs no database knows, and what was left of each that died."""
+    found = Supervisor(Options(), Metrics())
+    left: list[int] = []
+    monkeypatch.setattr(found, "_see_to_jobs", lambda child, *_: left.append(len(child.jobs)))
+    monkeypatch.setattr(found, "_launch", lambda: Process().child)
+    monkeypatch.setattr("workers.supervisor.time.sleep", lambda _: None)
+    process = Process()
+    found._children = [process.child]
+    return SimpleNamespace(supervisor=found, process=process, left=left)
+
+
+def in_hand(boss: SimpleNamespace) -> float:
+    boss.supervisor._listen(0.0)
+    value = boss.supervisor.metrics.registry.get_sample_value("pbl_jobs_in_hand")
+    assert value is not None
+    return value
+
+
+def test_a_job_that_is_announced_twice_is_in_hand_once(boss: SimpleNamespace):
+    """Fits of a batch are begun together, and each again when it is inserted."""
+    for number in (1, 2):
+        boss.process.say("start", number)
+    assert in_hand(boss) == 2
+    for number in (1, 2):
+        boss.process.say("start", number)
+        boss.process.say("end", number, outcome="done", seconds=2.0, code="")
+    assert in_hand(boss) == 0
+    done = {"table": "SessionFit", "outcome": "done", "code": ""}
+    assert boss.supervisor.metrics.registry.get_sample_value("pbl_jobs_total", done) == 2
+
+
+def test_jobs_of_a_process_that_died_are_in_nobodys_hand(boss: SimpleNamespace):
+    for number in (1, 2, 3):
+        boss.process.say("start", number)
+    boss.process.say("end", 1, outcome="done", seconds=2.0, code="")
+    assert in_hand(boss) == 2
+    boss.process.die(-9)
+    boss.supervisor._bury()
+    assert boss.left == [2]
+    assert in_hand(boss) == 0
+    assert len(boss.supervisor._children) == 1  # another took its place
