@@ -8,15 +8,12 @@ into an empty cache on purpose). Set PBL_CACHE to try a cold start. The database
 
 from __future__ import annotations
 
-import atexit
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from schemas import embedded
-from tests.database import new_home, remove_home
+from tests.database import installation, leave_nothing_of_the_developer
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -33,9 +30,7 @@ def shared_data() -> Path:
 def nothing_of_the_developer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Without DJ_* and the database's PBL_* variables: no test can reach a real server or the user's tables."""
     with pytest.MonkeyPatch.context() as patch:
-        for name in [n for n in os.environ if n.startswith("DJ_") or n in ("PBL_STORE", "PBL_DB_PREFIX")]:
-            if name not in ("DJ_LOG_LEVEL", "DJ_IGNORE_CONFIG_FILE"):
-                patch.delenv(name)
+        leave_nothing_of_the_developer(patch)
         # Where no test asks for a database, a command that wants one finds none running.
         patch.setenv("PBL_HOME", str(tmp_path_factory.mktemp("home")))
         yield
@@ -44,13 +39,5 @@ def nothing_of_the_developer(tmp_path_factory: pytest.TempPathFactory) -> Iterat
 @pytest.fixture(scope="session")
 def database(nothing_of_the_developer: None) -> Iterator[Path]:
     """The embedded server, running, with PBL_HOME set to its folder for the whole session; yields that folder."""
-    home = new_home()
-    atexit.register(remove_home, home)  # also when pytest itself breaks off
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PBL_HOME", str(home))
-        try:
-            embedded.start(folder=embedded.Folder(home / "db"))
-            yield home
-        finally:
-            remove_home(home)
-            atexit.unregister(remove_home)
+    with installation() as home:
+        yield home

@@ -1,10 +1,17 @@
-"""Homes of private database servers for tests."""
+"""Private database servers for tests and benchmarks, each in a home of its own."""
 
 from __future__ import annotations
 
+import atexit
+import contextlib
+import functools
+import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
 
 from schemas import embedded
 
@@ -20,3 +27,27 @@ def remove_home(home: Path) -> None:
     """Stop the server of this home, if any, and delete everything."""
     embedded.remove(embedded.Folder(home / "db"))
     shutil.rmtree(home, ignore_errors=True)
+
+
+def leave_nothing_of_the_developer(patch: pytest.MonkeyPatch) -> None:
+    """Take away DJ_* and the database's PBL_* variables: no real server and none of the user's tables is in reach."""
+    for name in [n for n in os.environ if n.startswith("DJ_") or n in ("PBL_STORE", "PBL_DB_PREFIX")]:
+        if name not in ("DJ_LOG_LEVEL", "DJ_IGNORE_CONFIG_FILE"):
+            patch.delenv(name)
+
+
+@contextlib.contextmanager
+def installation() -> Iterator[Path]:
+    """A running embedded server with its store, and PBL_HOME set to its folder, which is yielded and removed after."""
+    home = new_home()
+    end = functools.partial(remove_home, home)
+    atexit.register(end)  # also when what uses it breaks off
+    with pytest.MonkeyPatch.context() as patch:
+        leave_nothing_of_the_developer(patch)
+        patch.setenv("PBL_HOME", str(home))
+        try:
+            embedded.start(folder=embedded.Folder(home / "db"))
+            yield home
+        finally:
+            end()
+            atexit.unregister(end)

@@ -8,15 +8,13 @@ died, a job met its time limit, or an input gave neither a row nor a coded error
 from __future__ import annotations
 
 import collections
-import os
 import random
 import struct
-import tempfile
 import time
-from pathlib import Path
 
 import click
 
+from tests.database import installation
 from tests.integration import chain
 
 
@@ -123,79 +121,68 @@ def fuzzed_log(draw: random.Random) -> bytes:
 def main(inputs: int, seed: int) -> None:
     """Make the inputs, put them through, count."""
     import schemas
-    from schemas import embedded, tracking, video
+    from schemas import tracking, video
     from schemas._base import error_code, jobs_of
     from schemas.ingest import Visit, ingest
     from schemas.sensors import Sensors
     from workers.supervisor import Options, Supervisor
 
-    with tempfile.TemporaryDirectory(prefix="pbl-bench-") as name:
-        home = Path(name)
-        home.chmod(0o755)
-        os.environ["PBL_HOME"] = name
-        folder = embedded.Folder(home / "db")
-        embedded.start(folder=folder)
-        try:
-            schemas.activate()
-            good = chain.small_video(home, "good", n=40).read_bytes()
-            draw = random.Random(seed)
-            refused: collections.Counter = collections.Counter()
-            kind_of: dict[int, str] = {}
-            start = time.monotonic()
-            for i in range(inputs):
-                kind = draw.choice([*KINDS, "log"])
-                place = home / "in" / str(i)
-                place.mkdir(parents=True)
-                path = place / f"{draw.choice(NAMES)}{i}.mp4"
-                sensors = []
-                if kind == "log":
-                    path.write_bytes(good + struct.pack(">I4sQ", 16, b"free", i))
-                    log = place / draw.choice(["log.csv", "log.json", "log.zip"])
-                    log.write_bytes(fuzzed_log(draw))
-                    sensors = [Sensors(attitude=log)]
-                else:
-                    path.write_bytes(KINDS[kind](good, draw))
-                (result,) = ingest([path], Visit(subject="P001", session_label=str(i)), files=sensors)
-                if result.error is not None:
-                    refused[f"{kind}: refused, {result.error.code}"] += 1
-                elif result.video_id is not None:
-                    kind_of[result.video_id] = kind
-            click.echo(
-                f"{inputs} inputs in {time.monotonic() - start:.0f} s, {sum(refused.values())} refused at the door"
-            )
-            start = time.monotonic()
-            options = Options(resource="cpu", processes=2, once=True, selftest=False, limit_factor=0.05)
-            boss = Supervisor(options)
-            code = boss.run()
-            click.echo(f"worker: exit code {code}, {time.monotonic() - start:.0f} s")
-            became: collections.Counter = collections.Counter(refused)
-            undecided = 0
-            bad = 0
-            for video_id, kind in kind_of.items():
-                key = {"video_id": video_id}
-                errors = [
-                    error_code(str(message))
-                    for table in (video.VideoInfo, tracking.Tracking, tracking.SubjectChoice)
-                    for message in (jobs_of(table).errors & key).to_arrays("error_message")
-                ]
-                bad += sum(e in ("TIME_LIMIT", "WORKER_CRASH", "INTERNAL") for e in errors)
-                if errors:
-                    became[f"{kind}: error row, {errors[0]}"] += 1
-                elif len(video.VideoInfo & key):
-                    became[f"{kind}: decodes, goes on"] += 1
-                else:
-                    undecided += 1
-            for what, n in sorted(became.items()):
-                click.echo(f"{n:>6}  {what}")
-            restarts = boss.metrics.restarts._value.get()
-            click.echo(
-                f"processes that died: {restarts:g}; time limits, crashes, unforeseen errors: {bad}; "
-                f"undecided: {undecided}"
-            )
-            if code or restarts or bad or undecided:
-                raise SystemExit(1)
-        finally:
-            embedded.stop(folder=folder)
+    with installation() as home:
+        schemas.activate()
+        good = chain.small_video(home, "good", n=40).read_bytes()
+        draw = random.Random(seed)
+        refused: collections.Counter = collections.Counter()
+        kind_of: dict[int, str] = {}
+        start = time.monotonic()
+        for i in range(inputs):
+            kind = draw.choice([*KINDS, "log"])
+            place = home / "in" / str(i)
+            place.mkdir(parents=True)
+            path = place / f"{draw.choice(NAMES)}{i}.mp4"
+            sensors = []
+            if kind == "log":
+                path.write_bytes(good + struct.pack(">I4sQ", 16, b"free", i))
+                log = place / draw.choice(["log.csv", "log.json", "log.zip"])
+                log.write_bytes(fuzzed_log(draw))
+                sensors = [Sensors(attitude=log)]
+            else:
+                path.write_bytes(KINDS[kind](good, draw))
+            (result,) = ingest([path], Visit(subject="P001", session_label=str(i)), files=sensors)
+            if result.error is not None:
+                refused[f"{kind}: refused, {result.error.code}"] += 1
+            elif result.video_id is not None:
+                kind_of[result.video_id] = kind
+        click.echo(f"{inputs} inputs in {time.monotonic() - start:.0f} s, {sum(refused.values())} refused at the door")
+        start = time.monotonic()
+        options = Options(resource="cpu", processes=2, once=True, selftest=False, limit_factor=0.05)
+        boss = Supervisor(options)
+        code = boss.run()
+        click.echo(f"worker: exit code {code}, {time.monotonic() - start:.0f} s")
+        became: collections.Counter = collections.Counter(refused)
+        undecided = 0
+        bad = 0
+        for video_id, kind in kind_of.items():
+            key = {"video_id": video_id}
+            errors = [
+                error_code(str(message))
+                for table in (video.VideoInfo, tracking.Tracking, tracking.SubjectChoice)
+                for message in (jobs_of(table).errors & key).to_arrays("error_message")
+            ]
+            bad += sum(e in ("TIME_LIMIT", "WORKER_CRASH", "INTERNAL") for e in errors)
+            if errors:
+                became[f"{kind}: error row, {errors[0]}"] += 1
+            elif len(video.VideoInfo & key):
+                became[f"{kind}: decodes, goes on"] += 1
+            else:
+                undecided += 1
+        for what, n in sorted(became.items()):
+            click.echo(f"{n:>6}  {what}")
+        restarts = boss.metrics.restarts._value.get()
+        click.echo(
+            f"processes that died: {restarts:g}; time limits, crashes, unforeseen errors: {bad}; undecided: {undecided}"
+        )
+        if code or restarts or bad or undecided:
+            raise SystemExit(1)
 
 
 if __name__ == "__main__":

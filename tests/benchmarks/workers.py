@@ -16,7 +16,6 @@ import hashlib
 import os
 import random
 import signal
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +24,7 @@ from typing import Any
 import click
 import pytest
 
+from tests import database
 from tests.benchmarks import worker_standins
 from tests.integration import chain
 
@@ -36,22 +36,12 @@ EACH = 6
 def installation() -> Iterator[Path]:
     """A database and store of its own, the recorded stages in this process too; yields the folder."""
     import schemas
-    from schemas import embedded
 
-    with tempfile.TemporaryDirectory(prefix="pbl-bench-") as name:
-        home = Path(name)
-        home.chmod(0o755)
-        os.environ["PBL_HOME"] = name
-        folder = embedded.Folder(home / "db")
-        embedded.start(folder=folder)
-        try:
-            schemas.activate()
-            os.environ[worker_standins.RECORDED] = str(chain.small_video(home, "recorded"))
-            with pytest.MonkeyPatch.context() as patch:
-                worker_standins.install(patch)
-                yield home
-        finally:
-            embedded.stop(folder=folder)
+    with database.installation() as home, pytest.MonkeyPatch.context() as patch:
+        schemas.activate()
+        patch.setenv(worker_standins.RECORDED, str(chain.small_video(home, "recorded")))
+        worker_standins.install(patch)
+        yield home
 
 
 def recordings(first: int, n: int) -> Iterator[Any]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import json
 import subprocess
 import threading
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,12 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import _dump, backup, connection, embedded, lab, video, views
+from schemas import _dump, backup, connection, lab, video, views
 from schemas._declare import declare_all
 from schemas.ingest import Visit, ingest
 from schemas.results import load_session
 from tests.command import pbl
-from tests.database import new_home, remove_home
+from tests.database import installation
 from tests.rows import everything, remove_all
 from workers.populate import populate
 
@@ -47,22 +47,11 @@ def filled(database: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
 
 
 @pytest.fixture
-def elsewhere(filled: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def elsewhere(filled: None) -> Iterator[Any]:
     """A call that starts an empty server and makes it the one in use; afterwards the old one is again."""
-    homes = []
-
-    def move() -> Path:
-        home = new_home()
-        homes.append(home)
-        patch.setenv("PBL_HOME", str(home))
-        embedded.start(folder=embedded.Folder(home / "db"))
-        return home
-
-    with monkeypatch.context() as patch:
-        yield move
+    with contextlib.ExitStack() as stack:
+        yield lambda: stack.enter_context(installation())
     connection.connect()
-    for home in homes:
-        remove_home(home)
 
 
 def test_there_and_back(elsewhere: Any, tmp_path: Path):
@@ -143,7 +132,7 @@ def test_it_is_of_one_moment_while_others_write(filled: None, tmp_path: Path, mo
 
 
 def _insert_subject() -> None:
-    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+    with contextlib.closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute(
             "INSERT INTO pbl_lab.subject (subject, population, subject_created) VALUES ('P999', 'unknown', NOW())"
         )

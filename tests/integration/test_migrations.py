@@ -11,13 +11,13 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import _base, _differences, _dump, connection, embedded, fit, lab, migrations, video, views
+from schemas import _base, _differences, _dump, connection, fit, lab, migrations, video, views
 from schemas._base import resolve_method
 from schemas.ingest import Visit, ingest
 from schemas.migrations import _run
 from schemas.migrations._fill import fill
 from tests.command import pbl
-from tests.database import new_home, remove_home
+from tests.database import installation
 from workers.populate import populate
 
 from . import chain
@@ -28,17 +28,13 @@ OLD = Path(__file__).parent / "data" / "old_database.sql.gz"
 @pytest.fixture
 def old(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A server of its own with a database that commit 28e5ab3 made (see data/old_rows.py)."""
-    home = new_home()
-    with monkeypatch.context() as patch:
-        patch.setenv("PBL_HOME", str(home))
+    with installation(), monkeypatch.context() as patch:
         patch.setattr(connection.dj_instance, "_singleton_connection", None)
         _unbind(patch)
-        embedded.start(folder=embedded.Folder(home / "db"))
         with closing(connection.plain_connection()) as server, server.cursor() as cursor:
             for statement in _dump.read_lines(OLD):
                 cursor.execute(statement)
         yield
-        remove_home(home)
 
 
 def _unbind(patch: pytest.MonkeyPatch) -> None:
