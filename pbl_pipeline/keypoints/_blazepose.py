@@ -14,7 +14,7 @@ from scipy.special import expit
 
 from pbl_pipeline.tracking._blazepose import circle_roi
 from pbl_pipeline.tracking._litert import LiteModel
-from pbl_pipeline.video import Camera
+from pbl_pipeline.video import Camera, cut_image
 
 from ._flips import leg_points, mirror_of
 from ._protocol import PersonKeypoints
@@ -106,12 +106,21 @@ class BlazePoseLandmarks:
 
     def detect(self, image: np.ndarray, roi_px: np.ndarray, camera: Camera, *, quick: bool = False) -> PersonKeypoints:
         """See `KeypointDetector`. `image` (H, W, 3) uint8 BGR; what lies beyond it is black to the network."""
-        roi = np.array([roi_px[0], roi_px[1], roi_px[2] * CROP_MARGIN, roi_px[3]], np.float64)
+        return self.detect_crop(cut_image(image, *self.crop_of(roi_px)), roi_px, camera, quick=quick)
+
+    def crop_of(self, roi_px: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
+        """See `CropDetector`."""
+        matrix = crop_matrix(_with_margin(roi_px), INPUT_SIZE)
+        # A cut counts from pixel centres of the crop, the network from the crop's edge.
+        matrix[:, 2] += 0.5 * (matrix[:, 0] + matrix[:, 1])
+        return matrix, (INPUT_SIZE, INPUT_SIZE)
+
+    def detect_crop(
+        self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, quick: bool = False
+    ) -> PersonKeypoints:
+        """See `CropDetector`."""
+        roi = _with_margin(roi_px)
         to_picture = crop_matrix(roi, INPUT_SIZE)
-        # warpAffine counts from pixel centres in the crop, the network from the crop's edge.
-        warp = to_picture.copy()
-        warp[:, 2] += 0.5 * (to_picture[:, 0] + to_picture[:, 1])
-        crop = cv2.warpAffine(image, warp, (INPUT_SIZE, INPUT_SIZE), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
         crop = np.multiply(cv2.cvtColor(crop, cv2.COLOR_BGR2RGB), np.float32(1 / 255), dtype=np.float32)
         points, circle, world, confidence, presence = self._look(crop)
         if not quick:
@@ -140,6 +149,11 @@ class BlazePoseLandmarks:
         world = output[N_ALL * 3].reshape(N_ALL, 3)[:N_POINTS].astype(np.float64)
         confidence = expit(points[:N_POINTS, 3]) * expit(points[:N_POINTS, 4])
         return points[:N_POINTS, :2], points[N_POINTS : N_POINTS + 2, :2], world, confidence, float(output[1].item())
+
+
+def _with_margin(roi_px: np.ndarray) -> np.ndarray:
+    """The region that the network sees."""
+    return np.array([roi_px[0], roi_px[1], roi_px[2] * CROP_MARGIN, roi_px[3]], np.float64)
 
 
 def _same_sides(points: np.ndarray, other: np.ndarray) -> np.ndarray:

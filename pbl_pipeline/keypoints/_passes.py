@@ -19,7 +19,7 @@ import numpy as np
 
 from pbl_pipeline.video import Camera, Frame
 
-from ._protocol import KeypointDetector, PersonKeypoints
+from ._protocol import CropDetector, KeypointDetector, PersonKeypoints
 
 #: More detectors than this bring little and cost memory.
 _MAX_WORKERS = 8
@@ -63,6 +63,9 @@ class Looks:
     def _look(self, frame: Frame, roi_px: np.ndarray, quick: bool) -> PersonKeypoints:
         detector = self._idle.get()
         try:
+            if isinstance(detector, CropDetector):
+                crop = frame.cut(*detector.crop_of(roi_px))
+                return detector.detect_crop(crop, roi_px, self._camera, quick=quick)
             return detector.detect(frame.image, roi_px, self._camera, quick=quick)
         finally:
             self._idle.put(detector)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -41,4 +41,22 @@ class KeypointDetector(Protocol):
 
         `quick`: only the better crop is wanted (`roi_px` and `presence`), so accuracy may be spared.
         """
+        ...
+
+
+@runtime_checkable
+class CropDetector(Protocol):
+    """A `KeypointDetector` that sees one region alone, so that the rest of the picture need not be converted.
+
+    `detect(image, roi, camera)` is `detect_crop(cut_image(image, *crop_of(roi)), roi, camera)`.
+    """
+
+    def crop_of(self, roi_px: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
+        """The matrix and the size of `video.Frame.cut` for the body circle `roi_px` (4,)."""
+        ...
+
+    def detect_crop(
+        self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, quick: bool = False
+    ) -> PersonKeypoints:
+        """As `KeypointDetector.detect`, from the region (height, width, 3) uint8 BGR."""
         ...

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pbl_pipeline import assets, progress
+from pbl_pipeline._ahead import ahead
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.models import OnnxModel, find
 from pbl_pipeline.paramset import Paramset
@@ -29,6 +30,8 @@ from ._yolox import YoloxDetector
 #: A second look must find a new person with at least this overlap of the boxes; nearer to where somebody known is
 #: expected than so many body heights, it is a poor view of that one.
 CONFIRM_IOU, SAME_BODY = 0.3, 0.25
+#: Decoding goes on while a detector looks at a frame, which takes as long as decoding some.
+FRAMES_AHEAD = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,7 +131,8 @@ def _follow(video_path: str | Path, params: TrackingParams, detector: PersonDete
     # The frames of the last searches, to follow new people back in: as long as a turn of all windows takes.
     kept: deque[tuple[int, float, np.ndarray]] = deque(maxlen=watch.n_turn)
     n_frames = 0
-    for frame in progress.track(read_frames(video_path), "people", total=info.n_frames):
+    frames = ahead(read_frames(video_path), FRAMES_AHEAD)
+    for frame in progress.track(frames, "people", total=info.n_frames):
         n_frames, now = n_frames + 1, frame.time_s
         associator.forget(now)
         # The last frame too, so that tracks do not end before the video does.

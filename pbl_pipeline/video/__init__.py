@@ -12,7 +12,7 @@ from ._phone_log import PhoneLog, Sensor, read_phone_log
 from ._probe import probe, sha256_of
 from ._read import read_frames
 from ._timing import check_timing
-from ._types import Camera, Frame, VideoInfo
+from ._types import Camera, Frame, VideoInfo, cut_image
 
 __all__ = [
     "Attitude",
@@ -29,6 +29,7 @@ __all__ = [
     "camera_in_device",
     "check_attitude",
     "check_timing",
+    "cut_image",
     "draw_calibration",
     "find_camera",
     "guess_camera",

@@ -11,6 +11,7 @@ import av
 import numpy as np
 from av.video.reformatter import VideoReformatter
 
+from ._cut import cut_planes
 from ._decode import Decoder, check_file
 from ._orientation import Orientation, orientation_of
 from ._types import Frame
@@ -47,14 +48,13 @@ class _ToBgr:
         self._local = threading.local()
 
     def __call__(self, frame: av.VideoFrame, turn: Orientation) -> np.ndarray:
+        """The picture (H, W, 3); its rows may lie apart in memory, as those of a region of an array do."""
         if not hasattr(self._local, "converter"):
             self._local.converter = VideoReformatter()
         plane = self._local.converter.reformat(frame, format="bgr24", threads=1).planes[0]
         # The converter's own memory, which is new for each picture: a copy would cost more than the conversion.
         rows = np.frombuffer(memoryview(plane), np.uint8).reshape(plane.height, plane.line_size)
-        picture = rows[:, : 3 * plane.width].reshape(plane.height, plane.width, 3)
-        # Rows of some widths are padded for the converter; users get plain arrays.
-        return np.ascontiguousarray(turn.apply(picture))
+        return turn.apply(rows[:, : 3 * plane.width].reshape(plane.height, plane.width, 3))
 
 
 def _frames(path: Path, start: int, stop: int | None, step: int, threads: int | None) -> Iterator[Frame]:
@@ -69,6 +69,7 @@ def _frames(path: Path, start: int, stop: int | None, step: int, threads: int | 
             if index >= start and (index - start) % step == 0:
                 # Same arithmetic as probe, so that the stamps are equal to the last bit.
                 time_s = float(np.int64(pts - first_pts) * float(decoder.time_base))
-                yield Frame(index, time_s, functools.partial(to_bgr, frame, turn))
+                whole = functools.partial(to_bgr, frame, turn)
+                yield Frame(index, time_s, whole, functools.partial(cut_planes, frame, turn))
             if last is not None and index >= last:
                 return

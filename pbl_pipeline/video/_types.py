@@ -7,7 +7,11 @@ import functools
 import math
 from collections.abc import Callable
 
+import cv2
 import numpy as np
+
+#: Region of a picture by matrix and size as `Frame.cut` says, or None where it cannot be taken without the whole.
+Cut = Callable[[np.ndarray, tuple[int, int]], np.ndarray | None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,20 +73,35 @@ class VideoInfo:
 class Frame:
     """One decoded frame. `image` (H, W, 3) uint8, channels BGR (OpenCV's order), upright.
 
-    The picture is converted when it is first asked for: who looks at every tenth frame pays for every tenth. Not to be
-    asked by two threads at once.
+    The picture is converted when it is first asked for: who looks at every tenth frame pays for every tenth. Who looks
+    at one region only takes `cut`, which converts no more than that. Not to be asked by two threads at once.
     """
 
-    def __init__(self, index: int, time_s: float, convert: Callable[[], np.ndarray]) -> None:
+    def __init__(self, index: int, time_s: float, convert: Callable[[], np.ndarray], cut: Cut | None = None) -> None:
         self.index, self.time_s = index, time_s
         self._convert: Callable[[], np.ndarray] | None = convert
+        self._cut = cut
 
     @functools.cached_property
     def image(self) -> np.ndarray:
         assert self._convert is not None
         image = self._convert()
-        self._convert = None  # lets go of the decoder's own picture
+        self._convert = self._cut = None  # lets go of the decoder's own picture
         return image
+
+    def cut(self, matrix: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+        """A region of the upright picture, (height, width, 3) uint8 BGR for `size_px` = (width, height).
+
+        `matrix` (2, 3) sends pixel centres of the region (0, 0 is the first) to pixel centres of the picture. Bilinear;
+        black beyond the picture.
+        """
+        region = self._cut(matrix, size_px) if self._cut is not None else None
+        return cut_image(self.image, matrix, size_px) if region is None else region
+
+
+def cut_image(image: np.ndarray, matrix: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+    """`Frame.cut` of a picture (H, W, 3) that is converted already."""
+    return cv2.warpAffine(image, matrix, size_px, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
 
 
 @dataclasses.dataclass(frozen=True)
