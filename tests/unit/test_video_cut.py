@@ -90,6 +90,7 @@ def test_a_region_stands_upright(transpose, flip_x, flip_y):
     turn = Orientation(transpose, flip_x, flip_y)
     frame = decoded(smooth_picture(160, 120), "yuv444p", "bt601", False)
     region = cut_planes(frame, turn, MATRIX, SIZE)
+    assert region is not None
     expected = cut_image(turn.apply(converted(frame)), MATRIX, SIZE)
     inside = well_inside(*((160, 120) if transpose else (120, 160)))
     apart = np.abs(region[inside].astype(int) - expected[inside])
