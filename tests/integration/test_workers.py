@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import errno
 import json
@@ -11,6 +12,7 @@ import threading
 import time
 from pathlib import Path
 
+import pymysql
 import pytest
 from click.testing import CliRunner
 
@@ -18,7 +20,7 @@ import pbl_pipeline.video
 import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import PARAMSETS
-from schemas import embedded, fit, gait, gdi, lab, qc, tracking, video, worker
+from schemas import connection, embedded, fit, gait, gdi, lab, qc, tracking, video, worker
 from schemas.cli.why import why as why_command
 from schemas.status import live_workers, pipeline_status, queue_counts
 from schemas.why import why
@@ -138,6 +140,31 @@ def test_two_processes_with_the_same_job_leave_one_row(tables: None, tmp_path: P
     assert jobs_left() == {}
 
 
+def test_nobody_takes_a_job_over_while_its_result_is_inserted(tables: None, tmp_path: Path):
+    register(*videos(tmp_path, "walk"))
+    job, jobs = first_job(), video.VideoInfo.jobs
+    with contextlib.closing(connection.plain_connection()) as other, other.cursor() as cursor:
+        cursor.execute("SET SESSION innodb_lock_wait_timeout = 1")
+        take = f"UPDATE {jobs.full_table_name} SET host = 'another-host'"
+        with jobs.connection.transaction:
+            queue.hold(job)
+            with pytest.raises(pymysql.err.OperationalError) as waited:
+                cursor.execute(take)
+            assert waited.value.args[0] == 1205  # waited for the lock in vain
+        assert cursor.execute(take) == 1
+
+
+@pytest.mark.parametrize(
+    "end", [queue.finish, queue.put_back, lambda job: queue.fail(job, "PblError: VIDEO_DAMAGED: x")]
+)
+def test_who_lost_a_job_cannot_end_it_for_its_new_holder(tables: None, tmp_path: Path, end):
+    register(*videos(tmp_path, "walk"))
+    job, jobs = first_job(), video.VideoInfo.jobs
+    jobs.update1({**job.key, "host": "another-host", "pid": 7, "connection_id": 99})
+    end(job)
+    assert jobs.fetch1("status", "host", "pid") == ("reserved", "another-host", 7)
+
+
 def test_a_job_that_is_done_already_is_ended(tables: None, tmp_path: Path):
     register(*videos(tmp_path, "walk"))
     job = first_job()
@@ -191,8 +218,9 @@ def test_the_result_survives_a_database_that_goes_away(tables: None, tmp_path: P
 
     def probe(path):
         calls.append(path)
-        os.kill(server.state()["pid"], signal.SIGKILL)
-        threading.Timer(1.5, lambda: embedded.start(folder=server)).start()
+        if len(calls) == 1:
+            os.kill(server.state()["pid"], signal.SIGKILL)
+            threading.Timer(1.5, lambda: embedded.start(folder=server)).start()
         return real(path)
 
     monkeypatch.setattr(pbl_pipeline.video, "probe", probe)
@@ -305,9 +333,11 @@ def test_the_heartbeat_says_what_is_done(tables: None, monkeypatch):
     with Heartbeat("cpu") as beats:
         beats.doing("VideoInfo video_id=3")
         beats.count("VideoInfo", 2, 1, 0.5)
-        time.sleep(0.4)
-        (alive,) = live_workers()
-        assert (alive["worker_pid"], alive["worker_doing"]) == (os.getpid(), "VideoInfo video_id=3")
+        until = time.monotonic() + 30
+        while not (alive := [w["worker_doing"] for w in live_workers()])[0] and time.monotonic() < until:
+            time.sleep(0.05)
+        assert alive == ["VideoInfo video_id=3"]
+        assert [w["worker_pid"] for w in live_workers()] == [os.getpid()]
     assert live_workers() == []
     rows = worker.Throughput.to_dicts()
     assert (sum(r["n_done"] for r in rows), sum(r["n_failed"] for r in rows)) == (2, 1)
