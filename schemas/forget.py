@@ -261,7 +261,7 @@ def _delete_rows(subject: str, ids: Ids, say: Say) -> None:
     counts = delete_below(lab.Subject, (lab.Subject & {"subject": subject}).keys())
     say(f"{sum(counts.values())} rows of {len(counts)} tables were deleted")
     _delete_where(conn, tables, ids)
-    unused = [c for c in cameras if not video.Video & {"camera_id": c}]
+    unused = [c for c in cameras if not video.Video & {"camera_id": c} and not lab.DeviceCalibration & {"camera_id": c}]
     delete_below(lab.CameraCalibration, [{"camera_id": c} for c in unused])
 
 

@@ -204,14 +204,14 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
 
     def insert() -> None:
         row["session_id"] = _session(visit)
-        row["camera_id"] = _camera_id(camera) if camera else None
+        row["camera_id"] = camera_id_of(camera) if camera else None
         row["video_id"] = next_id(video.Video, "video_id")
         video.Video.insert1(row)
         _select(row["video_id"], row["session_id"], visit.person, chosen)
         notes[:] = sensors.register(row["video_id"], found)
 
     try:
-        _in_transaction(insert, until=lambda: bool(_with_sha256(sha256)))
+        in_transaction(insert, until=lambda: bool(_with_sha256(sha256)))
     except DuplicateError:
         known = _with_sha256(sha256)
         if not known:
@@ -226,7 +226,7 @@ def _with_sha256(sha256: str) -> dict[str, Any] | None:
     return rows[0] if rows else None
 
 
-def _in_transaction(work: Callable[[], None], until: Callable[[], bool] = lambda: False) -> None:
+def in_transaction(work: Callable[[], None], until: Callable[[], bool] = lambda: False) -> None:
     """Numbers are taken as the highest plus one; where another process took the same one, we try again."""
     for attempt in range(_ATTEMPTS):
         try:
@@ -247,7 +247,7 @@ def _known(
     status, notes = "known", [f"already video_id {number} of subject {row['subject']}, session {row['session_label']}"]
     if str(path) != row["video_path"] and not Path(row["video_path"]).is_file():
         video.Video.update1({"video_id": number, "video_path": str(path), "video_name": path.name[-255:]})
-        _forget_errors(number, _FILE_ERRORS)
+        forget_errors(number, _FILE_ERRORS)
         status = "moved"
         notes.append(f"it was {row['video_path']}, which is gone")
     changes = _new_camera(path, row, visit.camera_file) if visit.camera_file else []
@@ -276,12 +276,12 @@ def _new_camera(path: Path, row: dict[str, Any], camera_file: str | Path) -> lis
 
     def attach() -> None:
         deleted.clear()
-        video.Video.update1({"video_id": number, "camera_id": _camera_id(camera)})
+        video.Video.update1({"video_id": number, "camera_id": camera_id_of(camera)})
         deleted.update(delete_below(keypoints.Keypoints, (keypoints.Keypoints & {"video_id": number}).keys()))
 
-    _in_transaction(attach)
+    in_transaction(attach)
     # What failed with the other camera may do with this one.
-    _forget_errors(number)
+    forget_errors(number)
     rows = ", ".join(f"{n} of {name}" for name, n in deleted.items())
     return ["the camera was attached" + (f", and what depends on it was deleted: {rows}" if rows else "")]
 
@@ -300,9 +300,9 @@ def _new_files(row: dict[str, Any], visit: Visit, found: sensors.Read) -> list[s
             video.Video.update1({"video_id": number, "camera_motion": "handheld"})
             done.append("the camera counts as handheld now")
 
-    _in_transaction(attach)
+    in_transaction(attach)
     if done:
-        _forget_errors(number)
+        forget_errors(number)
     return done
 
 
@@ -345,7 +345,7 @@ def _new_methods(row: dict[str, Any], chosen: dict[str, str], more: set[str]) ->
     return added
 
 
-def _forget_errors(video_id: int, codes: Sequence[str] | None = None) -> None:
+def forget_errors(video_id: int, codes: Sequence[str] | None = None) -> None:
     """Delete the error rows of a video (with these codes), so that the next populate tries again without being told."""
     for table in computed_tables():
         if "video_id" not in table.primary_key:
@@ -384,10 +384,15 @@ def _camera(camera_file: str | Path, path: Path) -> dict[str, Any] | None:
         height, width = next(iter(frames)).image.shape[:2]
     except PblError:
         return None
-    camera = library("video").load_camera(camera_file, (int(width), int(height)))
+    size = (int(width), int(height))
+    return camera_row(library("video").load_camera(camera_file, size), size)
+
+
+def camera_row(camera: Any, size_px: tuple[int, int]) -> dict[str, Any]:
+    """The library's `Camera` of upright pictures (width, height) as a row of CameraCalibration, without its number."""
     return {
-        "camera_width": int(width),
-        "camera_height": int(height),
+        "camera_width": size_px[0],
+        "camera_height": size_px[1],
         "camera_fx": float(camera.matrix[0, 0]),
         "camera_fy": float(camera.matrix[1, 1]),
         "camera_cx": float(camera.matrix[0, 2]),
@@ -400,7 +405,8 @@ def _camera(camera_file: str | Path, path: Path) -> dict[str, Any] | None:
     }
 
 
-def _camera_id(camera: dict[str, Any]) -> int:
+def camera_id_of(camera: dict[str, Any]) -> int:
+    """Number of the calibration of this `camera_row`, which is inserted where it is new."""
     known = _known_camera(camera)
     if known is not None:
         return known

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from . import lab, tracking, video
+from . import tracking, video
 from ._base import (
     Origin,
     check_columns,
@@ -64,6 +64,7 @@ class Keypoints(dj.Computed):
     camera_source         : varchar(255)       # where the intrinsics come from
     focal_length          : float32            # (px) mean of fx and fy
     focal_rel_sd=null     : float32            # (1) standard deviation of the focal length as a share of it, null when unknown
+    keypoints_camera_id=null : int32           # calibration that was used (lab.CameraCalibration), null where none was there
     phone_log=null        : varchar(255)       # the phone's sensor log and how its clock was brought to the video's, null without
     keypoints_file        : <object@arrays>   # keypoints.npz: time_s (T) s, xy_px (T,J,2) px, xyz_cam_m (T,J,3) m, confidence (T,J) 0..1, box_px (T,4) px, camera; docs/files.md
     {origin_columns("keypoints")}
@@ -86,14 +87,14 @@ class Keypoints(dj.Computed):
         times = file_ref(probed.pop("frame_time"))
         person = (tracking.SubjectChoice & key).fetch1("chosen_person_id")
         tracks, detector, model = (tracking.Tracking & key).fetch1("tracks", "detector", "tracking_model_sha256")
-        camera = (lab.CameraCalibration & (video.Video & key)).to_dicts()
+        camera = video.camera_of(probed)
         log = (video.PhoneAttitude & key).to_dicts()
         return (
             probed,
             times,
             int(person),
             (file_ref(tracks), detector, model),
-            camera[0] if camera else None,
+            camera,
             (log[0]["attitude_name"], file_ref(log[0]["attitude_file"])) if log else None,
             method_arguments(KeypointMethod, "keypoint", "keypoints", key["keypoint_method"]),
         )
@@ -126,7 +127,8 @@ class Keypoints(dj.Computed):
             found = found.with_attitude(attitude)
         checks = (*library("video").check_timing(info), *library("keypoints").check_keypoints(found))
         source = None if attitude is None else attitude.source
-        return found, person, method["sha"], model_sha256(params), checks, source
+        camera_id = int(camera["camera_id"]) if camera else None
+        return found, person, method["sha"], model_sha256(params), checks, source, camera_id
 
     def make_insert(
         self,
@@ -137,6 +139,7 @@ class Keypoints(dj.Computed):
         model: str | None,
         checks: Sequence[Any],
         log: str | None,
+        camera_id: int | None,
         origin: Origin,
     ) -> None:
         seen = found.confidence > 0
@@ -154,6 +157,7 @@ class Keypoints(dj.Computed):
                     "camera_source": found.camera.source[:255],
                     "focal_length": found.camera.focal_px,
                     "focal_rel_sd": number(found.camera.focal_rel_sd),
+                    "keypoints_camera_id": camera_id,
                     "phone_log": None if log is None else log[:255],
                     "keypoints_file": folder / "keypoints.npz",
                     **origin.row("keypoints", method_hash=sha, model_sha256=model),
@@ -174,14 +178,17 @@ def method_of(name: str) -> str:
 
 
 def camera_of_row(row: Mapping[str, Any]) -> Any:
-    """The library's `Camera` from a row of CameraCalibration."""
+    """The library's `Camera` from a row of CameraCalibration with `turn_deg` (`video.camera_of`)."""
     matrix = np.array(
         [[row["camera_fx"], 0.0, row["camera_cx"]], [0.0, row["camera_fy"], row["camera_cy"]], [0.0, 0.0, 1.0]]
     )
     distortion = np.asarray(row["camera_distortion"], np.float64)
     sd = row["camera_focal_sd"]
     rel_sd = float("nan") if sd is None else float(sd) / float(matrix[0, 0] + matrix[1, 1]) * 2
-    return library("video").Camera(matrix, distortion, f"{row['camera_origin']}: {row['camera_note']}", rel_sd)
+    source = f"{row['camera_origin']}: {row['camera_note']}"[:255]
+    camera = library("video").Camera(matrix, distortion, source, rel_sd)
+    size = (int(row["camera_width"]), int(row["camera_height"]))
+    return library("video").turned_camera(camera, size, row["turn_deg"])
 
 
 def model_sha256(params: Any) -> str | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from ._base import dj
 
 schema = dj.Schema()
@@ -53,6 +55,7 @@ class Device(dj.Manual):
     ---
     device_make=''   : varchar(64)
     device_model=''  : varchar(64)
+    device_lens=''   : varchar(128)            # lens as the phone names it, empty where its files name none
     """
 
 
@@ -76,3 +79,29 @@ class CameraCalibration(dj.Manual):
     camera_sha256            : char(64)        # over all of the above, so that one calibration is stored once
     unique index (camera_sha256)
     """
+
+
+@schema
+class DeviceCalibration(dj.Manual):
+    definition = """
+    # calibration of all videos of a device at one size and rate that have none of their own
+    -> Device
+    stored_width      : int32                  # (px) of the picture as stored, before the rotation flag is applied
+    stored_height     : int32                  # (px) likewise
+    capture_rate      : int16                  # (1/s) the nearest of 30, 60, 120, 240
+    ---
+    -> CameraCalibration
+    stored_rotation   : int16                  # (deg) rotation flag of the calibration video, whose upright picture was measured
+    device_focal_35mm=null : float32           # (mm) on 35 mm film, as that video states it: a video of another one is not of this lens
+    device_calibrated : datetime               # when registered, UTC
+    """  # noqa: E501
+
+
+def device_columns(lens: Any) -> dict[str, str]:
+    """The library's `PhoneLens` as columns of Device."""
+    return {"device_make": lens.make[:64], "device_model": lens.model[:64], "device_lens": lens.lens[:128]}
+
+
+def mode_columns(lens: Any) -> dict[str, int]:
+    """Size and rate of the library's `PhoneLens` as columns of DeviceCalibration."""
+    return {"stored_width": lens.stored_px[0], "stored_height": lens.stored_px[1], "capture_rate": lens.rate}

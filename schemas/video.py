@@ -185,6 +185,25 @@ def info_of_row(row: Mapping[str, Any], time_s: np.ndarray) -> Any:
     )
 
 
+def camera_of(row: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The calibration that counts for a video, by its joined row of Video and VideoInfo: its own, else that of the
+    phone which recorded it; None where there is neither.
+
+    A row of CameraCalibration, and `turn_deg`: how far its picture has to be turned clockwise to be this video's.
+    """
+    if row["camera_id"] is not None:
+        return {**(lab.CameraCalibration & {"camera_id": row["camera_id"]}).fetch1(), "turn_deg": 0}
+    lens = library("video").phone_lens(info_of_row(row, np.zeros(0)))
+    if lens is None:
+        return None
+    of_device = (lab.DeviceCalibration & (lab.Device & lab.device_columns(lens)) & lab.mode_columns(lens)).to_dicts()
+    if not of_device or not lens.same_focal(number(of_device[0]["device_focal_35mm"])):
+        return None
+    found = (lab.CameraCalibration & {"camera_id": of_device[0]["camera_id"]}).fetch1()
+    found["camera_note"] += f", of {of_device[0]['device']}"
+    return {**found, "turn_deg": int(row["rotation"]) - int(of_device[0]["stored_rotation"])}
+
+
 def registered_file(path: str, sha256: str, key: dict) -> Path:
     """The video file, after checking that it is still the one that was registered.
 

@@ -35,6 +35,7 @@ def remove_all() -> None:
     """
     lab.Subject.delete(prompt=False, part_integrity="cascade")
     lab.CameraCalibration.delete(prompt=False)
+    lab.Device.delete(prompt=False)
     lab.Project.delete(prompt=False)
     kept = {table.__name__: len(table()) for table in schemas.computed_tables()}
     for table in schemas.computed_tables():

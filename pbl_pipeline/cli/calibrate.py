@@ -51,7 +51,7 @@ def calibrate(
     import cv2
 
     from pbl_pipeline.files import check_out_file
-    from pbl_pipeline.video import Board, calibrate_video, draw_calibration, probe
+    from pbl_pipeline.video import Board, about_phone, calibrate_video, draw_calibration, phone_lens, probe
 
     if out.suffix.lower() != ".json":
         raise click.BadParameter(f"{out} does not end in .json", param_hint="--out")
@@ -59,13 +59,8 @@ def calibrate(
     check_out_file(out)
     info = probe(video)
     found = calibrate_video(video, plate, info)
-    about = {
-        "source": f"pbl calibrate: {board} of {squares[0]}x{squares[1]} squares of {square_mm:g} mm",
-        "video": {"name": video.name, "sha256": info.sha256, "rotation_deg": info.rotation_deg},
-        "phone": {"make": info.make, "model": info.model, "lens": info.lens},
-        "recorded_utc": info.recorded_utc,
-    }
-    found.save(out, about)
+    source = f"pbl calibrate: {board} of {squares[0]}x{squares[1]} squares of {square_mm:g} mm"
+    found.save(out, {"source": source, **about_phone(info)})
     picture = out.with_suffix(".png")
     cv2.imwrite(str(picture), draw_calibration(found))
     matrix, sd = found.camera.matrix, found.sd
@@ -79,3 +74,5 @@ def calibrate(
     for note in info.notes:
         click.echo(f"  {note}")
     click.echo(f"{out}\n{picture}")
+    if (lens := phone_lens(info)) is not None:
+        click.echo(f"for every video of this lens ({lens.text()}): pbl camera add {out}")

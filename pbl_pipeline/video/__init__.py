@@ -8,6 +8,7 @@ from ._camera_pose import CameraPose, load_camera_poses
 from ._draw_calibration import draw_calibration
 from ._find_camera import find_camera
 from ._load_attitude import attitude_of, load_attitude
+from ._phone_lens import LensCalibration, PhoneLens, about_phone, load_lens_calibration, phone_lens, turned_camera
 from ._phone_log import PhoneLog, Sensor, read_phone_log
 from ._probe import probe, sha256_of
 from ._read import read_frames
@@ -21,9 +22,12 @@ __all__ = [
     "Camera",
     "CameraPose",
     "Frame",
+    "LensCalibration",
+    "PhoneLens",
     "PhoneLog",
     "Sensor",
     "VideoInfo",
+    "about_phone",
     "attitude_of",
     "calibrate_video",
     "camera_in_device",
@@ -36,9 +40,12 @@ __all__ = [
     "load_attitude",
     "load_camera",
     "load_camera_poses",
+    "load_lens_calibration",
+    "phone_lens",
     "probe",
     "read_frames",
     "read_phone_log",
     "sha256_of",
+    "turned_camera",
     "viewing_ray",
 ]

@@ -1,0 +1,158 @@
+"""Calibrations that serve every video of a phone's lens: register, list, remove (`pbl camera`).
+
+Which one counts for a video is `video.camera_of`, asked when its keypoints are computed. A calibration that is
+registered, corrected or removed deletes exactly the keypoints that were made with another one than counts now, and what
+was computed from them; the next populate computes them anew.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+
+from . import keypoints, lab, video
+from ._base import delete_below, library, number, utc_now
+from .ingest import camera_id_of, camera_row, forget_errors, in_transaction
+
+
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """What became of a device's calibration: its number now (None: removed) and before (None: there was none), and the
+    deleted rows by table."""
+
+    device: str
+    camera_id: int | None
+    before: int | None
+    deleted: dict[str, int]
+
+
+def add_calibration(file: str | Path, like: str | Path | None = None) -> Change:
+    """Register the calibration in `file` for all videos of its phone's lens, size and rate that have none of their own.
+    It takes the place of an older one. `like`: a recording of the phone, where the file does not name it.
+
+    Raises
+    ------
+    PblError
+        What `pbl_pipeline.video.load_lens_calibration` raises.
+    """
+    found = library("video").load_lens_calibration(file, like)
+    done: list[Change] = []
+    outdated: list[dict[str, Any]] = []
+
+    def insert() -> None:
+        key = {"device": _device(found.lens), **lab.mode_columns(found.lens)}
+        before = (lab.DeviceCalibration & key).to_dicts()
+        camera_id = camera_id_of(camera_row(found.camera, found.size_px))
+        row = {
+            **key,
+            "camera_id": camera_id,
+            "stored_rotation": found.rotation_deg,
+            "device_focal_35mm": found.lens.focal_35mm,
+            "device_calibrated": utc_now(),
+        }
+        (lab.DeviceCalibration & key).delete_quick()
+        lab.DeviceCalibration.insert1(row)
+        outdated[:] = _outdated(key)
+        deleted = delete_below(keypoints.Keypoints, outdated)
+        done[:] = [Change(key["device"], camera_id, int(before[0]["camera_id"]) if before else None, deleted)]
+
+    in_transaction(insert)
+    _retry(outdated)
+    return done[0]
+
+
+def remove_calibration(camera_id: int) -> list[Change]:
+    """Withdraw a calibration from the devices that it is registered for. Videos that have it as their own keep it.
+
+    Raises
+    ------
+    PblError
+        DB_NOT_FOUND: no device has this calibration.
+    """
+    rows = (lab.DeviceCalibration & {"camera_id": camera_id}).to_dicts()
+    if not rows:
+        there = sorted({int(n) for n in lab.DeviceCalibration.to_arrays("camera_id")})
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no device with calibration {camera_id}",
+            expected=f"one of {', '.join(map(str, there))}" if there else "a device with a calibration",
+            next_step="`pbl camera list` shows the numbers",
+        )
+    done: list[Change] = []
+    outdated: list[dict[str, Any]] = []
+
+    def withdraw() -> None:
+        done.clear()
+        outdated.clear()
+        for row in rows:
+            key = {k: row[k] for k in lab.DeviceCalibration.primary_key}
+            (lab.DeviceCalibration & key).delete_quick()
+            keys = _outdated(key)
+            outdated.extend(keys)
+            done.append(Change(row["device"], None, camera_id, delete_below(keypoints.Keypoints, keys)))
+
+    in_transaction(withdraw)
+    _retry(outdated)
+    return done
+
+
+def calibrations() -> list[dict[str, Any]]:
+    """The calibrations of devices: rows of DeviceCalibration with those of Device and CameraCalibration, and
+    `n_keypoints`, the keypoints that were made with each."""
+    used = [int(n) for n in (keypoints.Keypoints & "keypoints_camera_id IS NOT NULL").to_arrays("keypoints_camera_id")]
+    rows = []
+    for row in lab.DeviceCalibration.to_dicts(order_by=list(lab.DeviceCalibration.primary_key)):
+        device = (lab.Device & {"device": row["device"]}).fetch1()
+        camera = (lab.CameraCalibration & {"camera_id": row["camera_id"]}).fetch1()
+        camera.pop("device")
+        rows.append({**camera, **device, **row, "n_keypoints": used.count(int(row["camera_id"]))})
+    return rows
+
+
+def _device(lens: Any) -> str:
+    """Short name of a lens's device, which is registered where it is new."""
+    columns = lab.device_columns(lens)
+    known = (lab.Device & columns).keys()
+    if known:
+        return str(known[0]["device"])
+    words = " ".join(v for v in columns.values() if v).lower()
+    plain = re.sub(r"[^a-z0-9.]+", "-", words).strip("-") or "phone"
+    taken = set(lab.Device.to_arrays("device"))
+    names = [plain[:64], *(f"{plain[:60]}-{n}" for n in range(2, 1000))]
+    name = next(n for n in names if n not in taken)
+    lab.Device.insert1({"device": name, **columns})
+    return name
+
+
+def _retry(outdated: list[dict[str, Any]]) -> None:
+    """What failed with the other calibration may do with this one. Not in a transaction: it may declare job tables."""
+    for video_id in sorted({key["video_id"] for key in outdated}):
+        forget_errors(video_id)
+
+
+def _outdated(key: dict[str, Any]) -> list[dict[str, Any]]:
+    """Keys of the keypoints of this device, size and rate (`key` of DeviceCalibration) for whose video another
+    calibration counts than they were made with."""
+    device = (lab.Device & {"device": key["device"]}).fetch1()
+    names = {f"phone_{name}": device[f"device_{name}"] or None for name in ("make", "model", "lens")}
+    recorded = (video.Video & "camera_id IS NULL") * (video.VideoInfo & names)
+    made = (keypoints.Keypoints & recorded.proj()).proj("keypoints_camera_id").to_dicts()
+    registered = (lab.DeviceCalibration & key).to_dicts()
+    counts: dict[int, int | None] = {}
+    for row in recorded.to_dicts() if made else ():
+        lens = library("video").phone_lens(video.info_of_row(row, np.zeros(0)))
+        if lens is None or any(key[name] != value for name, value in lab.mode_columns(lens).items()):
+            continue
+        fits = bool(registered) and lens.same_focal(number(registered[0]["device_focal_35mm"]))
+        counts[row["video_id"]] = int(registered[0]["camera_id"]) if fits else None
+    return [
+        {name: row[name] for name in keypoints.Keypoints.primary_key}
+        for row in made
+        if row["video_id"] in counts and row["keypoints_camera_id"] != counts[row["video_id"]]
+    ]

@@ -1,0 +1,82 @@
+"""`pbl camera`: calibrations for every video of a phone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.group(epilog="Example: pbl camera add camera.json")
+def camera() -> None:
+    """Calibrations that serve every video of a phone's lens (docs/camera.md): add, list, remove.
+
+    A video takes the calibration that was ingested with it (`pbl ingest --camera`); else the one that is registered
+    here for its phone's make, model and lens, the size and the rate of its frames; else what the file says.
+    """
+
+
+@camera.command(epilog="Example: pbl camera add camera.json && pbl populate")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option(
+    "--like",
+    type=click.Path(path_type=Path),
+    metavar="VIDEO",
+    help="An original recording of the phone, where FILE does not name it (not of `pbl calibrate`).",
+)
+def add(file: Path, like: Path | None) -> None:
+    """Register the calibration in FILE, in the place of an older one of the same lens, size and rate.
+
+    What was computed with another calibration than now counts is deleted, and said; `pbl populate` computes it anew.
+    """
+    import schemas
+    from schemas import cameras
+
+    schemas.activate(methods=False)
+    _say(cameras.add_calibration(file, like))
+
+
+@camera.command("list", epilog="Example: pbl camera list")
+def list_() -> None:
+    """The registered calibrations: number, phone, focal length and how many keypoints were made with each."""
+    import schemas
+    from schemas import cameras
+
+    schemas.activate(methods=False)
+    rows = cameras.calibrations()
+    for row in rows:
+        focal, sd = (row["camera_fx"] + row["camera_fy"]) / 2, row["camera_focal_sd"]
+        names = " ".join(n for n in (row["device_make"], row["device_model"], row["device_lens"]) if n)
+        click.echo(f"{row['camera_id']:>4}  {row['device']}: {names}")
+        click.echo(
+            f"      {row['stored_width']}x{row['stored_height']} px as stored, about {row['capture_rate']} frames a "
+            f"second; focal length {focal:.1f} px{'' if sd is None else f' +- {sd:.1f}'}; {row['camera_note']}"
+        )
+        click.echo(f"      {row['device_calibrated']} UTC; keypoints made with it: {row['n_keypoints']}")
+    if not rows:
+        click.echo("no calibration of a phone is registered; `pbl calibrate` measures one, `pbl camera add` registers")
+
+
+@camera.command(epilog="Example: pbl camera remove 3")
+@click.argument("camera_id", metavar="NUMBER", type=int)
+def remove(camera_id: int) -> None:
+    """Withdraw calibration NUMBER of `pbl camera list` from the phones that have it.
+
+    What was computed with it is deleted, and said. Videos that were ingested with it keep it.
+    """
+    import schemas
+    from schemas import cameras
+
+    schemas.activate(methods=False)
+    for change in cameras.remove_calibration(camera_id):
+        _say(change)
+
+
+def _say(change) -> None:
+    before = "" if change.before in (None, change.camera_id) else f", in the place of {change.before}"
+    what = f"has calibration {change.camera_id} now{before}" if change.camera_id else "has no calibration now"
+    click.echo(f"{change.device} {what}")
+    for name, n in change.deleted.items():
+        click.echo(f"  deleted {n} rows of {name}")
+    if change.deleted:
+        click.echo("next: pbl populate")
