@@ -5,6 +5,7 @@ from ._board import Board
 from ._calibrate import Calibration, calibrate_video
 from ._camera import guess_camera, load_camera, viewing_ray
 from ._camera_pose import CameraPose, load_camera_poses
+from ._cut import cut_image
 from ._draw_calibration import draw_calibration
 from ._find_camera import find_camera
 from ._load_attitude import attitude_of, load_attitude
@@ -13,7 +14,7 @@ from ._phone_log import PhoneLog, Sensor, read_phone_log
 from ._probe import probe, sha256_of
 from ._read import read_frames
 from ._timing import check_timing
-from ._types import Camera, Frame, VideoInfo, cut_image
+from ._types import Camera, Frame, VideoInfo
 
 __all__ = [
     "Attitude",

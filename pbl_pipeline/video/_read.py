@@ -11,7 +11,7 @@ import av
 import numpy as np
 from av.video.reformatter import VideoReformatter
 
-from ._cut import cut_planes
+from ._cut_planes import cut_planes
 from ._decode import Decoder, check_file
 from ._orientation import Orientation, orientation_of
 from ._types import Frame

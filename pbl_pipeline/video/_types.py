@@ -7,11 +7,9 @@ import functools
 import math
 from collections.abc import Callable
 
-import cv2
 import numpy as np
 
-#: Region of a picture by matrix and size as `Frame.cut` says, or None where it cannot be taken without the whole.
-Cut = Callable[[np.ndarray, tuple[int, int]], np.ndarray | None]
+from ._cut import cut_image
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +75,13 @@ class Frame:
     at one region only takes `cut`, which converts no more than that. Not to be asked by two threads at once.
     """
 
-    def __init__(self, index: int, time_s: float, convert: Callable[[], np.ndarray], cut: Cut | None = None) -> None:
+    def __init__(
+        self,
+        index: int,
+        time_s: float,
+        convert: Callable[[], np.ndarray],
+        cut: Callable[[np.ndarray, tuple[int, int]], np.ndarray | None] | None = None,
+    ) -> None:
         self.index, self.time_s = index, time_s
         self._convert: Callable[[], np.ndarray] | None = convert
         self._cut = cut
@@ -92,16 +96,11 @@ class Frame:
     def cut(self, matrix: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
         """A region of the upright picture, (height, width, 3) uint8 BGR for `size_px` = (width, height).
 
-        `matrix` (2, 3) sends pixel centres of the region (0, 0 is the first) to pixel centres of the picture. Bilinear;
-        black beyond the picture.
+        `matrix` (2, 3) sends pixel centres of the region (0, 0 is the first) to pixel centres of the picture. Pixels
+        that lie far apart there show the mean of what is between them. Black beyond the picture.
         """
         region = self._cut(matrix, size_px) if self._cut is not None else None
         return cut_image(self.image, matrix, size_px) if region is None else region
-
-
-def cut_image(image: np.ndarray, matrix: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
-    """`Frame.cut` of a picture (H, W, 3) that is converted already."""
-    return cv2.warpAffine(image, matrix, size_px, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,7 @@ from av.video.reformatter import VideoReformatter
 
 from pbl_pipeline._ahead import ahead
 from pbl_pipeline.video import cut_image, read_frames
-from pbl_pipeline.video._cut import cut_planes
+from pbl_pipeline.video._cut_planes import cut_planes
 from pbl_pipeline.video._orientation import Orientation
 from tests.videos import constant_rate, write_video
 
@@ -116,6 +116,37 @@ def test_frames_of_a_file_are_cut_alike_before_and_after_conversion(tmp_path, ro
         np.testing.assert_array_equal(after, cut_image(whole, MATRIX, SIZE))
         inside = well_inside(66, 98)
         assert np.abs(before[inside].astype(int) - after[inside]).mean() < 2.5
+
+
+@pytest.mark.parametrize("step", [0.4, 1.0, 1.9, 2.0, 3.7, 7.3, 17.0])
+def test_a_region_shows_the_places_it_was_asked_for_at_any_size(step):
+    # A ramp has one value at each place, however much is averaged around it. The size is no multiple of the blocks.
+    y, x = np.mgrid[0:1003, 0:1201]
+    ramp = np.stack([x / 8, y / 8, (x + y) / 16], axis=-1).astype(np.float32)
+    matrix = np.array([[0.96 * step, -0.28 * step, 420.0], [0.28 * step, 0.96 * step, 310.0]])
+    region = cut_image(ramp, matrix, (31, 27))
+    v, u = np.mgrid[0:27, 0:31]
+    place = np.stack([u, v, np.ones_like(u)], axis=-1) @ matrix.T
+    inside = np.all((place > 17) & (place < np.array([1201, 1003]) - 18), axis=-1)
+    assert inside.sum() > 500
+    expected = np.stack([place[..., 0] / 8, place[..., 1] / 8, place.sum(axis=-1) / 16], axis=-1)
+    # warpAffine knows a place to 1/32 of a sample.
+    np.testing.assert_allclose(region[inside], expected[inside], atol=max(step, 1.0) / 8 / 16)
+    assert not region[np.any((place < -2 * step - 2) | (place > np.array([1201, 1003]) + 2 * step), axis=-1)].any()
+
+
+def test_fine_patterns_become_their_mean():
+    y, x = np.mgrid[0:600, 0:800]
+    chess = np.repeat((255 * ((x + y) % 2))[..., None], 3, axis=2).astype(np.uint8)
+    region = cut_image(chess, np.array([[8.0, 0.0, 40.0], [0.0, 8.0, 40.0]]), (60, 50))
+    assert np.ptp(region) <= 1
+    assert region.mean() == pytest.approx(127.5, abs=1)
+
+
+def test_a_region_beyond_the_picture_is_black():
+    picture = np.full((90, 120, 3), 200, np.uint8)
+    for x in (-5000.0, 5000.0):
+        assert not cut_image(picture, np.array([[4.0, 0.0, x], [0.0, 4.0, 0.0]]), (20, 20)).any()
 
 
 def test_ahead_gives_all_in_order_and_then_the_error():
