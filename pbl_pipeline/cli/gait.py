@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +14,7 @@ from pbl_pipeline.errors import PblError
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit
     from pbl_pipeline.gait import LabTrial
+    from pbl_pipeline.qc import Check
 
 EVENT_METHODS = "Event method: phase-transformer, zeni-2008 or oconnor-2007."
 _EPILOG = """\b
@@ -46,7 +49,8 @@ def gait(
     """Events, cycles, spatiotemporal measures and GDI of one session.
 
     FILES are fits (fit.npz of `pbl fit`), or a laboratory's recordings (C3D with the nine angles of Plug-in Gait).
-    Measures that cannot be trusted are null with a reason.
+    Measures that cannot be trusted are null with a reason. Whether a fit lies on the person stands in the session.json
+    that `pbl fit` wrote beside it: without that it is not known.
     """
     from pbl_pipeline import progress
     from pbl_pipeline.files import check_out_file
@@ -73,7 +77,8 @@ def gait(
     given = event_files or (None,) * len(files)
     pairs = progress.track(list(zip(files, given, strict=True)), "read files", unit="trial")
     trials = [_read(path, events) for path, events in pairs]
-    metrics = gait_metrics(trials, norm, params, model=index)
+    of_fit = () if all(laboratory) else fit_checks(files, trials)
+    metrics = gait_metrics(trials, norm, params, of_fit, model=index).with_checks(of_fit)
     metrics.save(out)
     click.echo(metrics.table())
     click.echo(f"written: {out}")
@@ -88,6 +93,45 @@ def _read(path: Path, events: Path | None) -> TrialFit | LabTrial:
     from pbl_pipeline.gait import read_lab_trial
 
     return read_lab_trial(path, events) if _is_c3d(path) else TrialFit.load(path)
+
+
+def fit_checks(paths: Sequence[Path], trials: Sequence[TrialFit | LabTrial]) -> tuple[Check, ...]:
+    """Checks of the fits from the `session.json` beside each, each once; a WARN where one of them has none.
+
+    A file counts where it names the trial and has the paramset of its fit. Raises `PblError` FILE_FORMAT for one that
+    `pbl fit` did not write.
+    """
+    from pbl_pipeline.qc import WARN, Check
+
+    found: dict[Path, tuple[list[str], str, list[Check]]] = {}
+    for path in {p.parent / "session.json" for p in paths}:
+        if not path.is_file():
+            continue
+        try:
+            content = json.loads(path.read_text())
+            found[path] = content["trials"], content["params_hash"], [Check(**c) for c in content["qc"]]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise PblError(
+                "FILE_FORMAT",
+                found=f"{type(error).__name__}: {error}",
+                expected="the session.json that `pbl fit` wrote with the fits beside it",
+                next_step="fit again, or move the file away: then the checks of the fit are not known",
+                key=str(path),
+            ) from error
+    checks, unknown = [], []
+    for path, trial in zip(paths, trials, strict=True):
+        names, params_hash, own = found.get(path.parent / "session.json", ((), "", ()))
+        if trial.name in names and getattr(trial, "params_hash", None) == params_hash:
+            checks += own
+        else:
+            unknown.append(trial.name)
+    if unknown:
+        advice = (
+            f"no session.json of {', '.join(unknown)} lies beside the fit: whether the body lies on the person is not "
+            "known; look at what `pbl fit` printed"
+        )
+        checks.append(Check("fit_checks_known", WARN, float(len(unknown)), 0.0, advice))
+    return tuple(dict.fromkeys(checks))
 
 
 def _usage(found: str, expected: str) -> PblError:

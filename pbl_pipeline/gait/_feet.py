@@ -50,6 +50,11 @@ FOOT_MARKER_SETS = tuple(_POINTS)
 _HEEL_IN_CALCN_M = np.array([-0.01617, -0.00123, 0.0])
 _WORLD_UP = np.array([0.0, 0.0, 1.0])
 
+#: The fit's movement between two sights of a foot is taken for real up to this time from the nearer one (s).
+BRIDGED_S = 0.25
+#: Bodies whose points are those of a foot.
+_FOOT = ("talus", "calcn", "toes")
+
 
 @dataclasses.dataclass(frozen=True)
 class FootTrajectories:
@@ -104,7 +109,9 @@ class FootTrajectories:
 def feet_from_fit(fit: TrialFit, poses: BodyPoses | None = None) -> FootTrajectories:
     """Heel, toe joint and hip centres of the fitted body, world frame (z up); `poses` saves computing them again.
 
-    Frames whose qpos is NaN stay NaN. Raises `PblError` GAIT_INPUT (no finite frame, time stamps out of order).
+    Frames whose qpos is NaN stay NaN, and so does a leg below the hip for as long as nothing of its foot was seen
+    (`_feet_seen`): there the fit goes by its priors, which know no step. Raises `PblError` GAIT_INPUT (no finite
+    frame, time stamps out of order).
     """
     poses = poses or trial_poses(fit)
     hip, knee, ankle, heel, toe = [], [], [], [], []
@@ -119,9 +126,37 @@ def feet_from_fit(fit: TrialFit, poses: BodyPoses | None = None) -> FootTrajecto
     confidence = np.full((len(fit.time_s), 2), np.nan)
     # A handheld phone moves with the person: the way in its frame is not the way on the ground.
     travels = fit.camera_motion == "static"
-    hips, heels, toes = (np.stack(part, axis=1) for part in (hip, heel, toe))
-    legs = np.stack([np.stack(part, axis=1) for part in (hip, knee, ankle, heel, toe)], axis=1)
+    hips, knees, ankles, heels, toes = (np.stack(part, axis=1) for part in (hip, knee, ankle, heel, toe))
+    unseen = ~_feet_seen(fit)
+    for joint in (knees, ankles, heels, toes):
+        joint[unseen] = np.nan
+    legs = np.stack([hips, knees, ankles, heels, toes], axis=1)
     return _assemble(fit.time_s, hips, heels, toes, _WORLD_UP, confidence, "fit", travels, legs)
+
+
+def _feet_seen(fit: TrialFit) -> np.ndarray:
+    """(T, 2) [left, right]: whether a point of that foot, from the ankle down, was observed within `BRIDGED_S`.
+
+    The residuals tell which points were. A fit of a laboratory's own marker set does not tell where its points are
+    fixed, and counts as seen.
+    """
+    from pbl_pipeline.body import MARKER_SETS, marker_set  # JAX loads only where a fit is read
+
+    seen = np.ones((len(fit.time_s), 2), bool)
+    if fit.marker_set not in MARKER_SETS or marker_set(fit.marker_set).names != fit.marker_names:
+        return seen
+    time = np.asarray(fit.time_s, float)
+    observed = np.isfinite(fit.residual_2d_px) | np.isfinite(fit.residual_3d_m)
+    for s, side in enumerate("lr"):
+        foot = np.isin(marker_set(fit.marker_set).body_names, [f"{b}_{side}" for b in _FOOT])
+        known = time[observed[:, foot].any(axis=1)]
+        if not len(known):
+            seen[:, s] = False
+            continue
+        after = np.clip(np.searchsorted(known, time), 0, len(known) - 1)
+        away = np.minimum(np.abs(known[after] - time), np.abs(known[np.maximum(after - 1, 0)] - time))
+        seen[:, s] = away <= BRIDGED_S
+    return seen
 
 
 def feet_from_keypoints(keypoints: Keypoints) -> FootTrajectories:

@@ -16,7 +16,7 @@ from ._cycles import GaitCycle, find_cycles
 from ._feet import feet_from_fit
 from ._gdi import GDI_MODEL, GDI_PARAMSETS, GILLETTE_MODEL, Gdi, GdiParams, score_gdi
 from ._laboratory import LabTrial
-from ._poses import trial_poses
+from ._poses import BodyPoses, trial_poses
 from ._spatiotemporal import MEASURES, Spatiotemporal, spatiotemporal
 from .events import GaitEvents, detect_events, resolve_params
 from .normative import NormativeSet, load_norm
@@ -164,8 +164,7 @@ def _trial(
         events = trial.events
         cycles = find_cycles(events, trial=trial.name, series=trial.series, feet=trial.feet, keep_ends=True)
     else:
-        poses = trial_poses(trial)
-        events = detect_events(feet_from_fit(trial, poses), event_method)
+        poses, events = _events(trial, event_method)
         cycles = find_cycles(events, trial, poses=poses, fit_checks=fit_checks)
     measures, gdi = spatiotemporal(cycles), score_gdi(cycles, **index)
     reason = events.reason or measures.reason
@@ -179,6 +178,19 @@ def _trial(
         gdi=gdi,
         qc=(*events.qc, *cycle_checks(measures, cycles), *gdi.qc),
     )
+
+
+def _events(trial: TrialFit, method: Paramset) -> tuple[BodyPoses, GaitEvents]:
+    """Poses and events of a fit. An error names the trial: a session has several."""
+    try:
+        poses = trial_poses(trial)
+        return poses, detect_events(feet_from_fit(trial, poses), method)
+    except PblError as error:
+        if error.key is not None:
+            raise
+        raise PblError(
+            error.code, found=error.found, expected=error.expected, next_step=error.next_step, key=trial.name
+        ) from error
 
 
 def _distinct(trials: Sequence[TrialMetrics]) -> list[GaitCycle]:

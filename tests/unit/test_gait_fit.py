@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import load_body
+from pbl_pipeline.body import load_body, marker_set
 from pbl_pipeline.cli.events import events as events_command
 from pbl_pipeline.cli.gait import gait as gait_command
 from pbl_pipeline.errors import PblError
@@ -423,6 +423,98 @@ def test_commands(tmp_path):
     assert [t["status"] for t in json.loads(out.read_text())["trials"]] == ["PASS", "EMPTY"]
     for command in (events_command, gait_command):
         assert "Example: pbl" in run.invoke(command, ["--help"]).output
+
+
+def fit_with_points(time_s: np.ndarray, unseen: np.ndarray, side: str = "left") -> TrialFit:
+    """A walk whose points were all observed but those of one foot in the frames `unseen` (T,)."""
+    points = marker_set("blazepose_33")
+    residual = np.zeros((len(time_s), len(points)))
+    foot = [i for i, n in enumerate(points.names) if n in (f"{side}_ankle", f"{side}_heel", f"{side}_foot_index")]
+    residual[np.ix_(unseen, foot)] = np.nan
+    return make_fit(
+        time_s,
+        walking(time_s),
+        marker_names=points.names,
+        markers_world_m=np.zeros((*residual.shape, 3)),
+        site_offset_m=np.zeros((len(points), 3)),
+        residual_2d_px=residual,
+        residual_3d_m=residual,
+    )
+
+
+@pytest.mark.parametrize("method", ["phase-transformer", "zeni-2008", "oconnor-2007"])
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_foot_that_the_fit_never_saw_takes_no_steps(method, side):
+    """The fit moves it all the same, by its priors: here even as it walked."""
+    time = np.arange(0, 5, 1 / 30)
+    seen = detect_events(feet_from_fit(fit_with_points(time, np.zeros(len(time), bool))), method)
+    assert seen.status == "PASS"
+    found = detect_events(feet_from_fit(fit_with_points(time, np.ones(len(time), bool), side)), method)
+    assert (found.status, found.events, found.reason) == ("EMPTY", (), f"the {side} foot is never seen")
+
+
+def test_a_foot_out_of_sight_for_a_moment_is_bridged_and_for_longer_is_not():
+    time = np.arange(0, 8, 1 / 30)
+    whole = feet_from_fit(fit_with_points(time, np.zeros(len(time), bool)))
+    short = feet_from_fit(fit_with_points(time, (time > 4) & (time < 4.45)))
+    assert whole.legs_m is not None
+    assert short.legs_m is not None
+    np.testing.assert_array_equal(short.legs_m, whole.legs_m)
+    long = feet_from_fit(fit_with_points(time, (time > 3) & (time < 5)))
+    assert long.legs_m is not None
+    hidden = (time > 3.3) & (time < 4.7)
+    assert np.isnan(long.legs_m[hidden, 1:, 0]).all()
+    assert np.isnan(long.heel_m[hidden, 0]).all()
+    assert np.isfinite(long.legs_m[:, :, 1]).all()
+    assert np.isfinite(long.legs_m[(time < 3.2) | (time > 4.8)]).all()
+
+
+def test_the_checks_of_the_fit_lie_beside_it(tmp_path):
+    """`pbl gait` obeys the session.json of the fit, as `pbl run` and the tables obey its checks."""
+    time = np.arange(0, 6, 1 / 30)
+    fit = make_fit(time, walking(time))
+    path, out, beside = tmp_path / "walk.fit.npz", tmp_path / "metrics.json", tmp_path / "session.json"
+    fit.save(path)
+    run = CliRunner()
+
+    def session() -> dict:
+        result = run.invoke(gait_command, [str(path), "--out", str(out)], catch_exceptions=False)
+        assert result.exit_code == 0
+        return json.loads(out.read_text())["session"]
+
+    def write(outcome: str, **changes) -> None:
+        check = Check("residual_3d_cm", outcome, 20.0, 6.0, "they disagree")
+        content = {"trials": ["walk"], "params_hash": fit.params_hash, "qc": [check.to_dict()]}
+        beside.write_text(json.dumps({**content, **changes}))
+
+    alone = session()
+    assert alone["status"] == "PASS"
+    assert {c["check"]: c["outcome"] for c in alone["qc"]}["fit_checks_known"] == "WARN"
+    write("WARN")
+    good = session()
+    assert good["cadence_steps_per_min"] == alone["cadence_steps_per_min"]
+    assert {c["check"]: c["outcome"] for c in good["qc"]}["residual_3d_cm"] == "WARN"
+    assert "fit_checks_known" not in {c["check"] for c in good["qc"]}
+    write("FAIL")
+    failed = session()
+    assert (failed["status"], failed["outcome"], failed["gdi"]["mean"]) == ("EMPTY", "FAIL", None)
+    assert "residual_3d_cm" in failed["reason"]
+    for other in ({"trials": ["another"]}, {"params_hash": "another"}):  # of other fits
+        write("FAIL", **other)
+        assert {c["check"] for c in session()["qc"]} == {c["check"] for c in alone["qc"]}
+    for text in ("{", "{}", '{"trials": [], "params_hash": "", "qc": [{"check": 1}]}', "[]"):
+        beside.write_text(text)
+        with pytest.raises(PblError, match="FILE_FORMAT"):
+            session()
+
+
+def test_an_error_names_the_trial():
+    time = np.arange(0, 4, 1 / 30)
+    good = make_fit(time, walking(time))
+    upside_down = make_fit(time, {**walking(time), "pelvis_list": np.pi}, name="the second")
+    with pytest.raises(PblError, match="GAIT_INPUT") as error:
+        gait_metrics([good, upside_down])
+    assert error.value.key == "the second"
 
 
 @pytest.mark.parametrize("content", [b"", b"not a zip"])

@@ -48,7 +48,8 @@ def detect_by_coordinates(feet: FootTrajectories, paramset: Paramset) -> GaitEve
     Returns
     -------
     GaitEvents
-        Status PASS, or EMPTY with a reason where nobody walks (standing, sit-to-stand, too short in view).
+        Status PASS, or EMPTY with a reason where nobody walks (standing, sit-to-stand, too short in view) or one foot
+        is never seen.
 
     Raises
     ------
@@ -56,6 +57,8 @@ def detect_by_coordinates(feet: FootTrajectories, paramset: Paramset) -> GaitEve
         GAIT_INPUT where no frame holds feet, pelvis and heading.
     """
     p = EventParams(**paramset.params)
+    if unseen := never_seen(feet):
+        return empty(paramset, feet, unseen)
     x, leg = forward_signals(feet, p)
     return detect_by_extrema(
         feet, paramset, p, x, leg, lambda segment: _candidates(segment, leg, p), p.min_excursion_leg * leg
@@ -83,7 +86,7 @@ def detect_by_extrema(
         min_segment_s=p.min_segment_s,
     )
     if not segments:
-        return _empty(paramset, feet, f"the feet are not seen for {p.min_segment_s:g} s at a time")
+        return empty(paramset, feet, f"the feet are not seen for {p.min_segment_s:g} s at a time")
     confidence = _mean_confidence(feet)
     per_segment = [extrema(s) for s in segments]
     threshold = _thresholds(per_segment, least, p)
@@ -99,7 +102,7 @@ def detect_by_extrema(
         bouts += good
     swing = max(float(np.ptp(s.values[:, 0] - s.values[:, 1])) for s in segments) / leg
     if not bouts:
-        return _empty(paramset, feet, _why_not(swing, n_candidates, p), n_candidates, breaks)
+        return empty(paramset, feet, _why_not(swing, n_candidates, p), n_candidates, breaks)
     events = tuple(
         GaitEvent(c.time_s + _offset(c.event, p), c.side, c.event, c.weight, number)
         for number, bout in enumerate(bouts)
@@ -235,11 +238,18 @@ def _why_not(swing: float, n_candidates: int, p: EventParams) -> str:
     )
 
 
+def never_seen(feet: FootTrajectories) -> str:
+    """Which one foot, heel and toe, is seen in no frame; empty where both are, or neither is."""
+    known = np.isfinite(feet.heel_m + feet.toe_m).all(axis=2) & np.isfinite(feet.pelvis_m).all(axis=1)[:, None]
+    sides = [side for s, side in enumerate(SIDES) if not known[:, s].any()]
+    return f"the {sides[0]} foot is never seen" if len(sides) == 1 else ""
+
+
 def _offset(event: str, p: EventParams) -> float:
     return p.foot_down_offset_s if event == FOOT_DOWN else p.foot_up_offset_s
 
 
-def _empty(paramset: Paramset, feet: FootTrajectories, reason: str, n: int = 0, breaks: int = 0) -> GaitEvents:
+def empty(paramset: Paramset, feet: FootTrajectories, reason: str, n: int = 0, breaks: int = 0) -> GaitEvents:
     check = Check("walking", "EMPTY", None, None, reason)
     return GaitEvents("EMPTY", (), reason, paramset.name, paramset.hash, feet.source, (), n, breaks, (check,))
 

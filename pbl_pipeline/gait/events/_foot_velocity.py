@@ -11,7 +11,7 @@ from pbl_pipeline.paramset import Paramset
 
 from .._feet import FootTrajectories
 from .._signal import Segment, refine_extremum
-from ._coordinates import Extremum, detect_by_extrema, forward_signals, prominence
+from ._coordinates import Extremum, detect_by_extrema, empty, forward_signals, never_seen, prominence
 from ._types import FOOT_DOWN, FOOT_UP, SIDES, EventParams, GaitEvents
 
 
@@ -43,6 +43,8 @@ def detect_by_foot_velocity(feet: FootTrajectories, paramset: Paramset) -> GaitE
     Raises `PblError` GAIT_INPUT where no frame holds feet, pelvis and heading.
     """
     p = paramset.to(FootVelocityParams)
+    if unseen := never_seen(feet):
+        return empty(paramset, feet, unseen)
     x, leg = forward_signals(feet, p)
     heel = (np.asarray(feet.heel_m, float) - feet.pelvis_m[:, None]) @ feet.up
     toe = (np.asarray(feet.toe_m, float) - feet.pelvis_m[:, None]) @ feet.up

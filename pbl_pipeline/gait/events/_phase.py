@@ -16,7 +16,7 @@ from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
 from .._feet import FootTrajectories
 from ._phase_filter import FilterParams, SmoothPhases, crossings, smooth_phases
 from ._types import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, SIDES, GaitEvent, GaitEvents
-from ._walking import WalkingParams, swing_leg, turning_deg_per_s, walking_stretches
+from ._walking import WalkingParams, reach_leg, swing_leg, turning_deg_per_s, walking_stretches
 
 #: Order of the model's phases.
 ORDER = ((LEFT, FOOT_DOWN), (RIGHT, FOOT_UP), (RIGHT, FOOT_DOWN), (LEFT, FOOT_UP))
@@ -223,15 +223,14 @@ def _why_not(grid: Any, phases: Any, stretches: int, half_seen: int, p: PhasePar
         return "the person walks, but one leg is hardly seen", "film from where both legs are in view"
     if stretches:
         return f"walking, but not {p.min_foot_downs} foot downs", "film a longer stretch"
-    swing = swing_leg(grid)
-    swing = swing[np.isfinite(swing)]
-    reach = float(np.ptp(swing)) if len(swing) else 0.0
+    reach = reach_leg(swing_leg(grid))
     likely = float(phases.walking.max()) if len(phases.walking) else 0.0
-    advice = "nothing to do where the person does not walk; else look at the legs in the overlay"
+    said = f"the feet pass each other by {reach:.2f} leg lengths, the event model's probability of walking is"
+    if reach < p.walking.min_swing_leg:
+        return f"no walking: {said} {likely:.2f} at most", "nothing to do where the person does not walk"
     return (
-        f"no walking: the feet pass each other by {reach:.2f} leg lengths at most, "
-        f"and the event model gives walking a probability of {likely:.2f} at most",
-        advice,
+        f"no walking: the legs do not move as in walking forwards ({said} {likely:.2f} at most)",
+        "walking backwards, sideways and on the spot has no events; else look at the legs in the overlay",
     )
 
 

@@ -49,7 +49,7 @@ def walking_stretches(grid: Grid, phases: Phases, params: WalkingParams) -> list
     walks &= ~(np.abs(turning_deg_per_s(grid)) > params.max_turn_deg_per_s)
     walks = _without_short(walks, True, round(params.shortest_s * GRID_HZ))
     swing = swing_leg(grid)
-    return [(a, b) for a, b in _runs(walks) if _range(swing[a : b + 1]) >= params.min_swing_leg]
+    return [(a, b) for a, b in _runs(walks) if reach_leg(swing[a : b + 1]) >= params.min_swing_leg]
 
 
 def turning_deg_per_s(grid: Grid) -> Float[np.ndarray, " N"]:
@@ -70,9 +70,11 @@ def swing_leg(grid: Grid) -> Float[np.ndarray, " N"]:
     return out
 
 
-def _range(values: np.ndarray) -> float:
-    seen = values[np.isfinite(values)]
-    return float(np.ptp(seen)) if len(seen) > 1 else 0.0
+def reach_leg(swing: np.ndarray) -> float:
+    """How far the feet pass each other, to both sides together (leg lengths), from `swing_leg`: between its 5th and
+    95th percentile, so that a point far off does not count."""
+    seen = swing[np.isfinite(swing)]
+    return float(np.diff(np.percentile(seen, [5, 95]))[0]) if len(seen) > 1 else 0.0
 
 
 def _runs(flags: Bool[np.ndarray, " N"]) -> list[tuple[int, int]]:
