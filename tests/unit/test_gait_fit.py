@@ -429,8 +429,8 @@ def fit_with_points(time_s: np.ndarray, unseen: np.ndarray, side: str = "left") 
     """A walk whose points were all observed but those of one foot in the frames `unseen` (T,)."""
     points = marker_set("blazepose_33")
     residual = np.zeros((len(time_s), len(points)))
-    foot = [i for i, n in enumerate(points.names) if n in (f"{side}_ankle", f"{side}_heel", f"{side}_foot_index")]
-    residual[np.ix_(unseen, foot)] = np.nan
+    foot = np.isin(points.names, [f"{side}_ankle", f"{side}_heel", f"{side}_foot_index"])
+    residual[unseen[:, None] & foot] = np.nan
     return make_fit(
         time_s,
         walking(time_s),

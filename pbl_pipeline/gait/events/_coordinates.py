@@ -240,8 +240,7 @@ def _why_not(swing: float, n_candidates: int, p: EventParams) -> str:
 
 def never_seen(feet: FootTrajectories) -> str:
     """Which one foot, heel and toe, is seen in no frame; empty where both are, or neither is."""
-    known = np.isfinite(feet.heel_m + feet.toe_m).all(axis=2) & np.isfinite(feet.pelvis_m).all(axis=1)[:, None]
-    sides = [side for s, side in enumerate(SIDES) if not known[:, s].any()]
+    sides = [side for s, side in enumerate(SIDES) if not np.isfinite(feet.heel_m + feet.toe_m)[:, s].all(axis=1).any()]
     return f"the {sides[0]} foot is never seen" if len(sides) == 1 else ""
 
 
