@@ -61,10 +61,19 @@ def add(source: str, sha256: str | None, replace: bool) -> None:
 def verify(names: tuple[str, ...], device: str | None) -> None:
     """Load registered models (without a name: all) and run each once on a black picture."""
     from pbl_pipeline import models as library
+    from pbl_pipeline.errors import PblError
 
+    failed: list[PblError] = []
     for name in names or [m.name for m in library.registered()]:
-        model = library.verify(name, device)
-        click.echo(f"{name}: ok on {model.device}" + (f" ({model.note})" if model.note else ""))
+        try:
+            model = library.verify(name, device)
+        except PblError as error:
+            click.echo(f"{name}: {error.code}, {error.found}")
+            failed.append(error)
+        else:
+            click.echo(f"{name}: ok on {model.device}" + (f" ({model.note})" if model.note else ""))
+    if failed:
+        raise failed[0]
 
 
 @models.command(epilog="Example: pbl models remove rtmpose-m")

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import http.client
+import lzma
 import tarfile
 import tempfile
 import urllib.error
 import urllib.request
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import IO
@@ -23,6 +26,8 @@ _CHUNK = 1 << 20
 #: Only these leave an archive; the graph is at most what one ONNX file may be.
 _MEMBERS = (GRAPH_FILE, SPEC_FILE, "LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "NOTICE", "README.md")
 _LARGEST = 2 << 30
+#: What the readers of archives raise; RuntimeError: one with a password, or packed in a way that is not known.
+_DAMAGED = (tarfile.TarError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, RuntimeError)
 
 
 @contextlib.contextmanager
@@ -54,13 +59,13 @@ def _download(address: str, into: Path) -> Path:
     if settings.offline():
         raise _missing(address, "PBL_OFFLINE forbids fetching", "copy the archive here and add it as a file")
     path = into / "archive"
-    request = urllib.request.Request(address, headers={"User-Agent": "pbl-pipeline"})  # noqa: S310 - http(s) only
     try:
+        request = urllib.request.Request(address, headers={"User-Agent": "pbl-pipeline"})  # noqa: S310 - http(s) only
         with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer, path.open("wb") as file:  # noqa: S310
             total = int(answer.headers.get("Content-Length") or 0)
             with progress.bar("fetching the model", total=round(total / 1e6), unit="MB") as update:
                 _copy(answer, file, address, update)
-    except (OSError, urllib.error.URLError, ValueError) as error:
+    except (OSError, urllib.error.URLError, http.client.HTTPException, ValueError) as error:
         raise _missing(address, str(getattr(error, "reason", error)), "check the address and the connection") from error
     return path
 
@@ -119,8 +124,9 @@ def _extract(archive: Path, folder: Path, source: str) -> None:
                     with data, (folder / plain).open("wb") as file:
                         while chunk := data.read(_CHUNK):
                             file.write(chunk)
-    except (tarfile.TarError, zipfile.BadZipFile, EOFError, OSError) as error:
-        raise invalid(source, f"no readable archive ({error})", "a folder, or a .zip, .tar or .tar.gz") from error
+    except (*_DAMAGED, EOFError, OSError) as error:
+        what = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+        raise invalid(source, f"no readable archive ({what})", f"a folder with {SPEC_FILE}, or its archive") from error
 
 
 def _missing(source: str, found: str, next_step: str) -> PblError:

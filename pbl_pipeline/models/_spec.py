@@ -114,7 +114,7 @@ def load_spec(folder: str | Path) -> ModelSpec:
             next_step="see docs/models.md for what a model's folder holds",
             key=str(path),
         ) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise invalid(path, f"no JSON text ({error})", "a JSON object") from error
     if not isinstance(content, dict):
         raise invalid(path, "no named fields", "a JSON object")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from typing import Any
 
 import cv2
@@ -14,7 +15,7 @@ from pbl_pipeline.errors import PblError
 CHECKERBOARD, CHARUCO = "checkerboard", "charuco"
 KINDS = (CHECKERBOARD, CHARUCO)
 DEFAULT_DICTIONARY = "DICT_5X5_100"
-#: Corners of a ChArUco board that must be seen in one picture: fewer say little, and may lie on one line.
+#: Corners of a ChArUco board that must be seen in one picture: fewer say little.
 _FEWEST_CORNERS = 8
 
 
@@ -44,7 +45,7 @@ class Board:
             raise _usage(f"board {self.kind!r}", f"one of {', '.join(KINDS)}")
         if min(self.squares) < 4 or max(self.squares) > 50:
             raise _usage(f"a board of {self.squares[0]}x{self.squares[1]} squares", "4 to 50 squares along each side")
-        if not self.square_mm > 0:
+        if not 0 < self.square_mm < math.inf:
             raise _usage(f"squares of {self.square_mm:g} mm", "the measured side of a square, in mm")
         if self.kind == CHARUCO:
             if not 0 < self.marker < self.square_mm:
@@ -80,7 +81,12 @@ class Board:
         corners, ids, _, _ = self._detector().detectBoard(grey)
         if ids is None or len(ids) < _FEWEST_CORNERS:
             return None
-        return np.asarray(ids).ravel().astype(int), np.asarray(corners, np.float64).reshape(-1, 2)
+        ids = np.asarray(ids).ravel().astype(int)
+        rows, columns = np.divmod(ids, self.squares[0] - 1)
+        # Points on one line see a plane of any tilt.
+        if min(np.ptp(rows), np.ptp(columns)) == 0:
+            return None
+        return ids, np.asarray(corners, np.float64).reshape(-1, 2)
 
     def by_corners(self) -> Board | None:
         """The chessboard that somebody means who counted its inner corners instead of the squares."""

@@ -105,7 +105,7 @@ def _read(path: Path, name: str | None) -> tuple[str, Mapping[str, Any]]:
         content = tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
     except OSError as error:
         raise _invalid(path, f"the file cannot be read ({error.strerror})", "a calibration file") from error
-    except ValueError as error:  # also TOML's, JSON's and the text decoder's errors
+    except (ValueError, RecursionError) as error:  # also TOML's, JSON's and the text decoder's errors
         raise _invalid(path, f"the text cannot be parsed ({error})", "a TOML or JSON calibration") from error
     if not isinstance(content, dict):
         raise _invalid(path, "no named fields", "a table of fields")

@@ -63,9 +63,11 @@ def align_clock(log: PhoneLog, quat_wxyz: np.ndarray, video: VideoInfo, path: Pa
         PHONE_LOG: the log and the video are of other times (a time zone is named where it explains that), or nothing
         tells which part of the log is the video's.
     """
-    if log.clock == VIDEO_CLOCK:
-        return 0.0, "on the video's clock"
     duration = _duration(video)
+    if log.clock == VIDEO_CLOCK:
+        if _cover(log, 0.0, duration, 0.0) == 0.0:
+            raise _not_from_zero(log, duration, path)
+        return 0.0, "on the video's clock"
     stated = _stated(log, video, duration)
     if stated:
         shifts = [s for s in stated if _cover(log, s, duration, STATED_WITHIN_S) >= LEAST_COVER]
@@ -189,6 +191,17 @@ def _other_time(log: PhoneLog, video: VideoInfo, shift: float, duration: float, 
         found=f"a log from {begin:%Y-%m-%d %H:%M:%S} to {end:%H:%M:%S} UTC",
         expected=f"the time of the video, {duration:.1f} s around {video.recorded_utc}",
         next_step=f"{zone}, or time_s on the video's clock (docs/phone_capture.md)",
+        key=str(path),
+    )
+
+
+def _not_from_zero(log: PhoneLog, duration: float, path: Path) -> PblError:
+    return PblError(
+        "PHONE_LOG",
+        found=f"a log from {log.time_s[0]:.6g} to {log.time_s[-1]:.6g} s, without start_utc",
+        expected=f"seconds from the first frame of the video, which lasts {duration:.1f} s",
+        next_step="subtract the time at which the recording began, and write seconds; or add start_utc "
+        "(docs/phone_capture.md)",
         key=str(path),
     )
 

@@ -127,7 +127,7 @@ def about_phone(video: VideoInfo) -> dict[str, Any]:
 def _read(path: Path) -> tuple[PhoneLens, tuple[int, int], int]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         content = None
     if not isinstance(content, dict):
         load_camera(path, (1, 1))  # says what is wrong with it, unless it is a TOML

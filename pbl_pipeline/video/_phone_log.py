@@ -154,7 +154,7 @@ def _read_csv(path: Path, text: str) -> PhoneLog:
 def _read_json(path: Path, text: str) -> PhoneLog:
     try:
         content = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise log_error(f"no JSON ({error})", "an object with " + ", ".join(_COLUMNS), path) from error
     if not isinstance(content, dict):
         raise log_error("JSON that is no object", "an object with " + ", ".join(_COLUMNS), path)

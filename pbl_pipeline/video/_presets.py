@@ -42,12 +42,9 @@ def preset_camera(video: VideoInfo) -> Camera | None:
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     distortion = np.array(camera["distortion"])
     width, height = camera["size_px"]
-    if video.width_px > video.height_px:
-        # The sensor lies along the phone: a landscape recording is stored as it comes (0) or on its head (180).
-        quarters = 3 if video.rotation_deg == 180 else 1
-        for _ in range(quarters):
-            matrix, distortion = quarter_turn(matrix, distortion, width)
-            width, height = height, width
+    for _ in range(_quarters(video)):
+        matrix, distortion = quarter_turn(matrix, distortion, width)
+        width, height = height, width
     factor = long_side / max(width, height)
     matrix[:2] *= factor
     # Pixel centres have whole numbers, so the middle of n pixels is at (n - 1) / 2.
@@ -81,12 +78,24 @@ def quarter_turn(matrix: np.ndarray, distortion: np.ndarray, width: float) -> tu
     return turned, np.array([k1, k2, -p2, p1, k3])
 
 
+def _quarters(video: VideoInfo) -> int:
+    """Quarter turns (counter-clockwise) from the portrait picture to the recording's.
+
+    The sensor lies along the phone: stored pictures are turned by 90 deg in portrait, by 0 or 180 in landscape, by 270
+    on the phone's head. A flag that does not fit the shape is that of a copy whose pictures were turned.
+    """
+    portrait = video.width_px <= video.height_px
+    if (video.rotation_deg in (90, 270)) != portrait:
+        return 0 if portrait else 1
+    return (90 - video.rotation_deg) // 90 % 4
+
+
 def _is_main(lens: str | None) -> bool:
     if not lens:
         return True
     glass = re.search(r"([\d.]+)\s*mm", lens)
     short = glass is not None and float(glass[1]) < _SHORTEST_MAIN_MM
-    return not short and "front" not in lens.lower() and "ultra" not in lens.lower()
+    return not short and not any(word in lens.lower() for word in ("front", "ultra", "tele"))
 
 
 def _plain(text: str | None) -> str:

@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import io
 import json
+import lzma
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -32,6 +34,8 @@ _SENSORS = {
 }
 #: A member of an archive larger than this is no log of a walk.
 _LARGEST = 512 << 20
+#: What reading of an archive raises; RuntimeError: one with a password, or packed in a way that is not known.
+_DAMAGED = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, RuntimeError)
 #: Repeated rows are left out; more than this share, and the stamps are not to be trusted.
 _MOST_REPEATS = 0.1
 #: How far the sine of the stated pitch may lie from the quaternion's.
@@ -92,7 +96,7 @@ def _tables(path: Path) -> tuple[Callable[[str], _Rows], str]:
     if text.lstrip()[:1] == "[":
         try:
             content = json.loads(text)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise log_error(f"no JSON ({error})", "a list of rows, as Sensor Logger exports it", path) from error
         rows = [r for r in content if isinstance(r, dict)]
         return lambda name: [r for r in rows if r.get("sensor") == name], "JSON"
@@ -118,7 +122,7 @@ def _unzipped(path: Path, name: str) -> str | None:
             if member.file_size > _LARGEST:
                 raise log_error(f"{member.filename} of {member.file_size >> 20} MB", "a log of some minutes", path)
             return io.TextIOWrapper(archive.open(member), "utf-8-sig").read()
-    except (OSError, zipfile.BadZipFile, UnicodeDecodeError, NotImplementedError, RuntimeError) as error:
+    except (OSError, EOFError, UnicodeDecodeError, *_DAMAGED) as error:
         if isinstance(error, FileNotFoundError):
             read_text(path)  # says so
         raise log_error(f"no readable archive ({error})", "the zip that Sensor Logger exports", path) from error

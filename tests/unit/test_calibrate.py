@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -178,6 +179,23 @@ def test_views_are_chosen_for_their_difference():
     assert len(chosen) == 20
     assert covered(chosen, SIZE) >= 0.95 * covered(views, SIZE)
     assert len({v.frame % 20 for v in chosen}) >= 15
+
+
+def test_corners_on_one_line_are_no_view(monkeypatch):
+    """They see a plane of any tilt, so the views would seem to be tilted."""
+    board = BOARDS["charuco"]
+    view = seen(board, varied_poses(board, MATRIX, SIZE, 1))[0]
+
+    def find(ids: np.ndarray):
+        answer = (view.xy_px[ids].reshape(-1, 1, 2), ids.reshape(-1, 1), None, None)
+        monkeypatch.setattr(board.__class__, "_detector", lambda _: SimpleNamespace(detectBoard=lambda _: answer))
+        return board.find(np.zeros((4, 4), np.uint8))
+
+    along = board.squares[0] - 1
+    assert find(np.arange(along)) is None
+    found = find(np.arange(along + 1))
+    assert found is not None
+    np.testing.assert_array_equal(found[1], view.xy_px[: along + 1])
 
 
 def test_boards_that_cannot_be():

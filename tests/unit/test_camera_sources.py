@@ -204,6 +204,7 @@ def test_a_preset_by_name_or_identifier(name):
         (None, None),
         ("iPhone 13", "iPhone 13 front camera 2.71mm f/2.2"),
         ("iPhone 13", "1.54mm f/2.4"),
+        ("iPhone 13 Pro", "iPhone 13 Pro back telephoto camera 9mm f/2.8"),
     ],
 )
 def test_no_preset(model, lens):
@@ -235,6 +236,15 @@ def test_a_preset_scales_and_turns_with_the_recording():
         np.stack([1279 - seen[:, 1], seen[:, 0]], 1),
         atol=1e-6,
     )
+    # Upright, the phone on its head (flag 270): half a turn.
+    upside_down = preset_camera(video(model="iPhone 11", rotation_deg=270))
+    assert upside_down is not None
+    np.testing.assert_allclose(_project(points * [-1, -1, 1], upside_down), [719, 1279] - seen, atol=1e-6)
+    # Copies whose pictures were turned: the shape tells more than the flag.
+    for size, flag, same in (((720, 1280), 0, portrait), ((1280, 720), 90, level)):
+        copy = preset_camera(video(model="iPhone 11", width_px=size[0], height_px=size[1], rotation_deg=flag))
+        assert copy is not None
+        np.testing.assert_array_equal(copy.matrix, same.matrix)
 
 
 def test_four_quarter_turns_are_none():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import http.server
@@ -370,6 +371,24 @@ def test_an_archive_cannot_write_elsewhere(folder, registry, tmp_path):
     assert "2 files" in refused("MODEL_INVALID", models.add, tmp_path / "two.zip")
     (tmp_path / "none.zip").write_bytes(b"PK")
     refused("MODEL_INVALID", models.add, tmp_path / "none.zip")
+    # The graph alone is no model.
+    text = refused("MODEL_INVALID", models.add, folder / "model.onnx")
+    assert "a folder with model.json" in text
+    assert len(text.splitlines()) == 5
+
+
+@pytest.mark.parametrize("suffix", ["zip", "tar.gz", "tar.xz"])
+def test_an_archive_with_wrong_bytes(folder, registry, tmp_path, suffix):
+    """Whatever is wrong inside, it has a code, and nothing of it is registered."""
+    kind = {"zip": "zip", "tar.gz": "gztar", "tar.xz": "xztar"}[suffix]
+    data = Path(shutil.make_archive(str(tmp_path / "packed"), kind, tmp_path, "dots")).read_bytes()
+    for place in np.linspace(20, len(data) - 20, 40).astype(int):
+        spoiled = bytearray(data)
+        spoiled[place : place + 4] = bytes(255 - b for b in data[place : place + 4])
+        (tmp_path / f"spoiled.{suffix}").write_bytes(spoiled)
+        with contextlib.suppress(PblError):
+            models.add(tmp_path / f"spoiled.{suffix}")
+    assert {m.error for m in models.registered()} <= {None}
 
 
 class Quiet(http.server.SimpleHTTPRequestHandler):
@@ -390,6 +409,8 @@ def test_add_from_an_address(folder, registry, tmp_path, monkeypatch):
             assert pbl("models", "add", f"{base}/packed.zip").error_code == "USAGE"
             assert pbl("models", "add", f"{base}/packed.zip", "--sha256", "1" * 64).error_code == "MODEL_CHECKSUM"
             assert pbl("models", "add", f"{base}/gone.zip", "--sha256", sha256).error_code == "MODEL_MISSING"
+            for address in ("http://127 0 0 1/a.zip", "http://[::1/a.zip", "https://"):
+                assert pbl("models", "add", address, "--sha256", sha256).error_code == "MODEL_MISSING"
             assert pbl("models", "add", f"{base}/packed.zip", "--sha256", sha256).code == 0
             monkeypatch.setenv("PBL_OFFLINE", "1")
             assert pbl("models", "add", f"{base}/packed.zip", "--sha256", sha256).error_code == "MODEL_MISSING"

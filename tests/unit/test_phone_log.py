@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import zipfile
 
 import numpy as np
 import pytest
@@ -148,11 +149,25 @@ def test_broken_exports(tmp_path, folder):
     assert "no orientation" in error_of(read_phone_log, empty).found
     (tmp_path / "a.zip").write_bytes(b"PK no zip")
     error_of(read_phone_log, tmp_path / "a.zip")
-    (tmp_path / "b.json").write_text('[{"sensor": "Orientation", "time": "x"')
-    error_of(read_phone_log, tmp_path / "b.json")
+    for text in ('[{"sensor": "Orientation", "time": "x"', '[{"sensor":' * 20_000, '{"a":' * 20_000):
+        (tmp_path / "b.json").write_text(text)
+        error_of(read_phone_log, tmp_path / "b.json")
     with pytest.raises(PblError) as error:
         read_phone_log(tmp_path / "none.zip")
     assert error.value.code == "FILE_MISSING"
+
+
+def test_an_archive_with_wrong_bytes(folder, tmp_path):
+    whole = tmp_path / "whole.zip"
+    with zipfile.ZipFile(whole, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.write(folder / "Orientation.csv", "Orientation.csv")
+        end = archive.start_dir
+    data = np.frombuffer(whole.read_bytes(), np.uint8)
+    for place in np.linspace(60, end - 8, 60).astype(int):  # within the packed rows
+        spoiled = data.copy()
+        spoiled[place : place + 4] ^= 0xFF
+        (tmp_path / "spoiled.zip").write_bytes(spoiled.tobytes())
+        error_of(read_phone_log, tmp_path / "spoiled.zip")
 
 
 # --- stamps and quaternions
@@ -242,7 +257,12 @@ def test_the_time_of_recording_and_the_pictures(folder, info, ended):
 
 def test_a_log_on_the_videos_clock_is_not_moved(tmp_path, info):
     path = csv_log(tmp_path / "a.csv", [0.7071, 0.7071, 0, 0], {"frame": "device"})
-    np.testing.assert_allclose(load_attitude(path, info).time_s, [10, 10.02, 10.04])
+    late = dataclasses.replace(info, time_s=np.arange(400) / 30)
+    np.testing.assert_allclose(load_attitude(path, late).time_s, [10, 10.02, 10.04])
+    # The stamps of a sensor that counts from the phone's start, or in milliseconds.
+    error = error_of(load_attitude, path, info)
+    assert error.found == "a log from 10 to 10.04 s, without start_utc"
+    assert "start_utc" in error.next_step
 
 
 def test_a_log_in_another_time_zone(tmp_path, folder, info):
