@@ -7,6 +7,8 @@ forbid to join two tracks, and may join them only where nobody else in the video
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -15,6 +17,7 @@ _PATCHES = ((0.06, 0.46, 0.14), (-0.62, -0.10, 0.16))
 _PATCH_SIZE = (12, 24)
 #: Bins of lightness, and of each of the two colour axes (CIE Lab as 8 bit).
 _LIGHT_BINS, _COLOUR_BINS = 6, 8
+_SIZE = 2 * (_LIGHT_BINS + _COLOUR_BINS**2)
 #: Range of the colour axes: clothes hardly leave it.
 _COLOUR_RANGE = (88.0, 168.0)
 
@@ -28,7 +31,7 @@ def look_of(image: np.ndarray, state: np.ndarray, turn_rad: float) -> np.ndarray
     x, y, radius = float(state[0]), float(state[1]), 0.5 * float(np.exp(state[2]))
     height, width = image.shape[:2]
     if not (0 <= x < width and 0 <= y < height):
-        return np.full(2 * (_LIGHT_BINS + _COLOUR_BINS**2), np.nan)
+        return np.full(_SIZE, np.nan)
     turn = turn_rad if np.isfinite(turn_rad) else 0.0
     down, right = np.array([-np.sin(turn), np.cos(turn)]), np.array([np.cos(turn), np.sin(turn)])
     parts = []
@@ -60,10 +63,10 @@ def likeness(a: np.ndarray, b: np.ndarray) -> float:
     return float(min((shared[:_LIGHT_BINS].sum() + shared[_LIGHT_BINS:size].sum()) / 2, _second(shared, size)))
 
 
-def mean_look(looks: list[np.ndarray]) -> np.ndarray:
-    """The mean of the looks that are known; NaN where none is. The list must not be empty."""
-    known = [k for k in looks if np.isfinite(k).all()]
-    return np.mean(known, axis=0) if known else np.full_like(looks[0], np.nan)
+def mean_look(looks: Sequence[np.ndarray | None], least: int = 1) -> np.ndarray:
+    """The mean of the looks that are known; NaN where those are fewer than `least`."""
+    known = [k for k in looks if k is not None and np.isfinite(k).all()]
+    return np.mean(known, axis=0) if len(known) >= max(least, 1) else np.full(_SIZE, np.nan)
 
 
 def _second(shared: np.ndarray, size: int) -> float:

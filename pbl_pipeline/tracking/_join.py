@@ -67,16 +67,24 @@ def _join_by_movement(trails: Sequence[Trail], size_px: tuple[int, int], params:
 def _join_by_clothes(trails: Sequence[Trail], params: JoinParams) -> list[Trail]:
     """In order of time each trail becomes part of a person who was seen before, or a new person."""
     people: list[list[Trail]] = []
+    known: dict[tuple[int, ...], np.ndarray] = {}  # a corridor sees hundreds, each compared with all others
+
+    def look(*parts: Trail) -> np.ndarray:
+        key = tuple(map(id, parts))
+        if key not in known:
+            known[key] = _look(parts, params)
+        return known[key]
+
     for trail in sorted(trails, key=lambda t: t.times[0]):
         gone = [p for p in people if 0 < trail.times[0] - p[-1].times[-1] <= params.return_gap_s]
-        ranked = sorted(((_likeness(_whole(*p), trail, params), p) for p in gone), key=lambda c: -np.nan_to_num(c[0]))
+        ranked = sorted(((likeness(look(*p), look(trail)), p) for p in gone), key=lambda c: -np.nan_to_num(c[0]))
         if not ranked or not ranked[0][0] >= params.same_clothes:
             people.append([trail])
             continue
         alike, best = ranked[0]
         # Others who left before, and those who are surely somebody else, being there at the same time.
         present = [t for t in trails if t not in best and any(_together(t, mine) for mine in (trail, *best))]
-        rivals = [a for a, _ in ranked[1:]] + [_likeness(t, trail, params) for t in present if t is not trail]
+        rivals = [a for a, _ in ranked[1:]] + [likeness(look(t), look(trail)) for t in present if t is not trail]
         lead = alike - max((r for r in rivals if np.isfinite(r)), default=0.0)
         if lead >= params.clothes_lead and _alike_in_size(best[-1], trail, params):
             best.append(trail)
@@ -89,12 +97,9 @@ def _together(a: Trail, b: Trail) -> bool:
     return a.times[0] <= b.times[-1] and b.times[0] <= a.times[-1]
 
 
-def _likeness(a: Trail, b: Trail, params: JoinParams) -> float:
-    """Of the clothes; NaN where too few sightings of one of them know it."""
-    looks = [[d.look for d in t.detections if d.look is not None and np.isfinite(d.look).all()] for t in (a, b)]
-    if min(map(len, looks)) < params.min_looks:
-        return float("nan")
-    return likeness(mean_look(looks[0]), mean_look(looks[1]))
+def _look(parts: Sequence[Trail], params: JoinParams) -> np.ndarray:
+    """Mean look of a person's trails; NaN where too few sightings know it."""
+    return mean_look([d.look for t in parts for d in t.detections], params.min_looks)
 
 
 def _alike_in_size(a: Trail, b: Trail, params: JoinParams) -> bool:
@@ -119,7 +124,7 @@ def _one_person(a: Trail, b: Trail, size_px: tuple[int, int], p: JoinParams) -> 
     if not 0 < gap <= p.max_gap_s:
         return False
     before, after = line_near(a, a.times[-1], p.velocity_s), line_near(b, b.times[0], p.velocity_s)
-    if before is None or after is None or _likeness(a, b, p) < p.other_clothes:
+    if before is None or after is None or likeness(_look([a], p), _look([b], p)) < p.other_clothes:
         return False
     (end, going, height), (begin, coming, next_height) = before, after
     if not 1 / p.max_growth <= next_height / height <= p.max_growth:

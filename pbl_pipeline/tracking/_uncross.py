@@ -42,6 +42,8 @@ def uncross(trails: Sequence[Trail], params: UncrossParams) -> list[Trail]:
     out = list(trails)
     for i in range(len(out)):
         for j in range(i + 1, len(out)):
+            if max(out[i].times[0], out[j].times[0]) > min(out[i].times[-1], out[j].times[-1]):
+                continue  # never seen at one time
             # Each encounter is judged on the trails as the earlier ones left them.
             n = 0
             while (spans := list(_encounters(out[i], out[j], params)))[n:]:
@@ -112,9 +114,7 @@ def _cost(before: Trail, after: Trail, params: UncrossParams) -> float:
 
 def look_near(trail: Trail, at_s: float, length_s: float = 1.5) -> np.ndarray:
     """The mean look of the sightings within `length_s` of `at_s`; NaN where it is not known."""
-    looks = [d.look for d, t in zip(trail.detections, trail.times, strict=True) if abs(t - at_s) <= length_s]
-    known = [k for k in looks if k is not None]
-    return mean_look(known) if known else np.full(2, np.nan)
+    return mean_look([d.look for d, t in zip(trail.detections, trail.times, strict=True) if abs(t - at_s) <= length_s])
 
 
 def _exchanged(a: Trail, b: Trail, at_s: float) -> tuple[Trail, Trail]:

@@ -10,6 +10,7 @@ import pytest
 from pbl_pipeline.tracking import JoinParams, UncrossParams, likeness
 from pbl_pipeline.tracking._appearance import look_of
 from pbl_pipeline.tracking._associate import Trail
+from pbl_pipeline.tracking._join import join_trails
 from pbl_pipeline.tracking._uncross import uncross
 from tests.unit.crossings import Walker, clothes, identities, scene
 from tests.unit.test_tracking import person
@@ -155,6 +156,14 @@ def test_an_encounter_without_an_end_changes_nothing():
 
 
 # --- looks --------------------------------------------------------------------------------------------------------
+
+
+def test_clothes_of_which_nothing_is_known_decide_nothing():
+    """Of one the look is known, for the other's nobody asked."""
+    known, unknown = trail(lambda t: 100 + 400 * t, clothes(1)), trail(lambda t: 1700 - 400 * t)
+    assert [places(t) for t in uncross([known, unknown], PARAMS)] == [places(known), places(unknown)]
+    later = Trail([f + 200 for f in unknown.frames], [t + 20 for t in unknown.times], unknown.detections, np.zeros(3))
+    assert len(join_trails([known, later], (1920, 1080), JoinParams())) == 2
 
 
 def test_look_tells_clothes_and_not_place_size_or_light():
