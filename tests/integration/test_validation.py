@@ -11,18 +11,19 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner, Result
 
+import schemas
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.synthetic import SynthSpec, synthesise
 from pbl_pipeline.validation import Reference, compare, reference_of_fit
-from schemas import validation, video, views
+from schemas import lab, validation, video, views
 from schemas.cli.validate import validate
 from schemas.ingest import Visit, ingest
 from schemas.references import add_reference, find_video, read_reference
 from schemas.status import pipeline_status
 from tests.conftest import SHARED
-from tests.rows import register
+from tests.rows import everything, register
 from tests.walking_fit import walking_fit
 from workers.populate import populate
 
@@ -121,6 +122,22 @@ def test_another_file_of_a_source_is_another_row_and_takes_the_place(tables: Non
         f"{number} walk against optical markers",
         f"{number} walk against several cameras",
     }
+
+
+def test_every_result_of_a_person_goes_with_them_and_nothing_of_another(tables: None, tmp_path: Path):
+    first, second = (chain.small_video(tmp_path, n) for n in ("walk1", "walk2"))
+    truth = saved(tmp_path, "truth.npz", reference())
+    for path, subject in ((first, "P001"), (second, "P002")):
+        (number,) = register(path, subject=subject)
+        add_reference(number, truth)
+    populate()
+    results = {t.__name__: len(t()) for t in schemas.computed_tables()}
+    assert set(results.values()) == {2}
+    (lab.Subject & {"subject": "P001"}).delete(prompt=False, part_integrity="cascade")
+    assert {t.__name__: len(t()) for t in schemas.computed_tables()} == dict.fromkeys(results, 1)
+    lab.Subject.delete(prompt=False, part_integrity="cascade")
+    kept = {name: len(rows) for name, rows in everything().items() if rows and ".#" not in name and ".~" not in name}
+    assert kept == {}
 
 
 def _knee_bias() -> float:

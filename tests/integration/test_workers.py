@@ -7,7 +7,9 @@ import datetime
 import errno
 import json
 import os
+import platform
 import signal
+import subprocess
 import threading
 import time
 from pathlib import Path
@@ -248,10 +250,43 @@ def test_inputs_that_changed_meanwhile_are_read_again(tables: None, tmp_path: Pa
     assert len(video.VideoInfo()) == 0
 
 
+def test_a_result_of_other_inputs_is_not_used(tables: None, tmp_path: Path):
+    """As of a batch that was computed before its inputs changed."""
+    register(*videos(tmp_path, "walk"))
+    stale = run_job.Computed(("the inputs of then",), ("their result",))
+    assert run_job.run(first_job(), stale).what == run_job.DONE
+    assert video.VideoInfo.fetch1("n_frames") == chain.N_FRAMES
+
+
 # ----------------------------------------------------------------------------------------------- processes that go away
+@pytest.mark.parametrize("table", [video.VideoInfo, fit.SessionFit])
+def test_a_worker_that_is_told_to_end_at_once_puts_back_all_it_holds(tables, tmp_path: Path, monkeypatch, table):
+    """The job in hand and those that were taken with it, one after the other or in batches."""
+    for i in range(3):
+        register(*videos(tmp_path, f"walk{i}"), session_label=str(i))
+    if table is fit.SessionFit:
+        Worker([t for t in schemas.computed_tables() if t is not table], Silent()).run(once=True)
+    refresh.refresh()
+
+    def ends(*_: object) -> None:
+        assert len(table.jobs.reserved) == 3
+        raise SystemExit(0)
+
+    monkeypatch.setattr(table, "make_insert", ends)
+    with pytest.raises(SystemExit):
+        Worker([table], Silent(), batch=3).run()
+    assert jobs_left()[table.__name__] == {"pending": 3}
+
+
 def supervise(**options) -> int:
     """A worker as it runs in production, behind stand-ins."""
-    return Supervisor(Options(once=True, selftest=False, **options), target=worker_target.work).run()
+    boss = Supervisor(Options(once=True, selftest=False, **options), target=worker_target.work)
+    watchdog = threading.Timer(180, boss.stop)  # one that never ends fails, too
+    watchdog.start()
+    try:
+        return boss.run()
+    finally:
+        watchdog.cancel()
 
 
 @pytest.fixture
@@ -341,6 +376,33 @@ def test_the_heartbeat_says_what_is_done(tables: None, monkeypatch):
     assert live_workers() == []
     rows = worker.Throughput.to_dicts()
     assert (sum(r["n_done"] for r in rows), sum(r["n_failed"] for r in rows)) == (2, 1)
+
+
+def test_a_worker_that_said_goodbye_holds_nothing(tables: None, tmp_path: Path):
+    (number,) = register(*videos(tmp_path, "walk"))
+    refresh.refresh()
+    jobs = video.VideoInfo.jobs
+    now = jobs.connection.query("SELECT CURRENT_TIMESTAMP(3)").fetchone()[0]
+    row = {"worker": "w", "worker_host": "there", "worker_pid": 1, "worker_resource": "all", "worker_version": "0"}
+    row |= {"worker_started": now, "worker_seen": now, "worker_doing": ""}
+    worker.Worker.insert1(row)
+    jobs.update1({"video_id": number, "status": "reserved", "host": "there", "pid": 1, "reserved_time": now})
+    assert recover.free_dead(video.VideoInfo) == 0
+    worker.Worker.update1({"worker": "w", "worker_stopped": now})
+    assert recover.free_dead(video.VideoInfo) == 1
+
+
+def test_a_number_that_a_younger_process_has_by_now_is_a_dead_ones(tables: None, tmp_path: Path):
+    (number,) = register(*videos(tmp_path, "walk"))
+    refresh.refresh()
+    jobs = video.VideoInfo.jobs
+    now = jobs.connection.query("SELECT CURRENT_TIMESTAMP(3)").fetchone()[0]
+    with subprocess.Popen(["sleep", "600"]) as young:
+        row = {"video_id": number, "status": "reserved", "host": platform.node(), "pid": young.pid}
+        for reserved_s, freed in ((0, 0), (3600, 1)):
+            jobs.update1({**row, "reserved_time": now - datetime.timedelta(seconds=reserved_s)})
+            assert recover.free_dead(video.VideoInfo) == freed
+        young.kill()
 
 
 # ---------------------------------------------------------------------------------------------------- looking, redoing
