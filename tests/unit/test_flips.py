@@ -8,9 +8,12 @@ import functools
 import numpy as np
 import pytest
 
+from pbl_pipeline.body import SCALE_NAMES
 from pbl_pipeline.keypoints import Keypoints, check_keypoints
 from pbl_pipeline.keypoints._flips import Exchange, FlipParams, exchange_sides, exchanged, lowered, mirror_of
-from pbl_pipeline.synthetic import SynthSpec, synthesise
+from pbl_pipeline.synthetic import SynthSpec, _synth, synthesise
+
+_synth_physique = _synth.physique
 
 
 @functools.cache
@@ -64,6 +67,31 @@ def test_exchanged_sides_are_put_back(view, what, length):
         found = judged(keypoints, spoiled)
         np.testing.assert_array_equal(found.legs, spoiled.legs, err_msg=f"from frame {first}")
         np.testing.assert_array_equal(found.rest, spoiled.rest, err_msg=f"from frame {first}")
+
+
+@pytest.mark.parametrize("view", ["sagittal", "oblique", "frontal"])
+@pytest.mark.parametrize("short", [("left_thigh",), ("left_leg_and_foot",), ("left_thigh", "left_leg_and_foot")])
+def test_legs_of_very_different_length_are_neither_exchanged_nor_mistaken(monkeypatch, short, view):
+    """One leg's thigh, shank or both 30 % shorter: which side is which is told by the movement, not by the lengths."""
+
+    def physique(seed, markers):
+        scale, offsets = _synth_physique(seed, markers)
+        return np.where(np.isin(SCALE_NAMES, short), 0.7, 1.0) * scale, offsets
+
+    monkeypatch.setattr(_synth, "physique", physique)
+    keypoints = seen.__wrapped__(view=view)
+    hip, knee, ankle = (keypoints.xyz_cam_m[:, keypoints.names.index(f"left_{n}")] for n in ("hip", "knee", "ankle"))
+    assert not judged(keypoints).table.any()
+    right = [keypoints.xyz_cam_m[:, keypoints.names.index(f"right_{n}")] for n in ("hip", "knee", "ankle")]
+    ratio = [
+        np.nanmedian(np.linalg.norm(a - b, axis=1)) / np.nanmedian(np.linalg.norm(c - d, axis=1))
+        for a, b, c, d in ((hip, knee, *right[:2]), (knee, ankle, *right[1:]))
+    ]
+    assert min(ratio) < 0.85  # the legs are as unlike as was asked for, as seen by the detector
+    n = len(keypoints.time_s)
+    for first, length in ((20, 3), (50, 10), (80, 1)):
+        spoiled = spoil(n, "legs", first, length)
+        np.testing.assert_array_equal(judged(keypoints, spoiled).table, spoiled.table)
 
 
 def test_at_any_rate_of_frames_and_over_a_gap():
