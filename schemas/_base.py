@@ -62,6 +62,7 @@ def origin_columns(prefix: str) -> str:
     {prefix}_host              : varchar(64)     # computer
     {prefix}_seconds           : float32         # (s) duration of the computation
     {prefix}_computed          : datetime        # when it ended, UTC
+    index ({prefix}_computed)
     """
 
 

@@ -79,6 +79,7 @@ class GaitEvents(dj.Computed):
     n_candidates      : int16                  # possible events before their check
     n_order_breaks    : int16                  # bouts that ended because an event was missing or out of order
     {origin_columns("events")}
+    index (events_status)
     """
 
     class Event(dj.Part):
@@ -247,6 +248,7 @@ class Spatiotemporal(dj.Computed):
     stride_length=null       : float32         # (m)
     step_width=null          : float32         # (m)
     {origin_columns("measures")}
+    index (measures_status)
     """
 
     class Measure(dj.Part):

@@ -101,6 +101,7 @@ class GDI(dj.Computed):
     gdi_gps_left=null  : float32               # (deg)
     gdi_gps_right=null : float32               # (deg)
     {origin_columns("gdi")}
+    index (gdi_status)
     """  # noqa: E501
 
     class Cycle(dj.Part):
@@ -199,6 +200,7 @@ class SessionGdi(dj.Computed):
     session_swing=null          : float32      # (percent) of the cycle
     session_double_support=null : float32      # (percent) of the cycle
     {origin_columns("session_gdi")}
+    index (session_status)
     """  # noqa: E501
 
     class Measure(dj.Part):

@@ -68,6 +68,7 @@ class Keypoints(dj.Computed):
     phone_log=null        : varchar(255)       # the phone's sensor log and how its clock was brought to the video's, null without
     keypoints_file        : <object@arrays>   # keypoints.npz: time_s (T) s, xy_px (T,J,2) px, xyz_cam_m (T,J,3) m, confidence (T,J) 0..1, box_px (T,4) px, camera; docs/files.md
     {origin_columns("keypoints")}
+    index (camera_source)
     """  # noqa: E501
 
     class Check(dj.Part):

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import queue
-from collections.abc import Callable, Collection, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Collection
 from typing import Any
 
-from . import computed_tables, connection, keypoints, tracking, video, worker
-from ._base import dj, error_code, error_found, error_next_step, jobs_of
+from . import computed_tables, keypoints, tracking, video, worker
+from ._base import error_code, error_found, error_next_step, jobs_of
 
 #: Fewer videos than this, and keys are counted that nobody has queued yet.
 SMALL = 5000
@@ -115,23 +112,20 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
     n_videos = int(video.Video.connection.query(f"SELECT COUNT(*) FROM {video.Video.full_table_name}").fetchone()[0])  # noqa: S608
     exact = n_videos < SMALL if exact is None else exact
     server = video.Video.connection
-    with _counting(n_videos) as rows_of:
-        queues, rates, cameras = queue_counts(server), throughput(server), camera_kinds()
-        tables = [_table_status(t, rows_of(t), queues[t.__name__], rates, exact) for t in computed_tables()]
+    queues, rates = queue_counts(server), throughput(server)
+    tables = [_table_status(t, queues[t.__name__], rates, exact) for t in computed_tables()]
     errors = [e for t, s in zip(computed_tables(), tables, strict=True) if s.error for e in _errors(t, most)]
     empty = {t.table for t in tables if t.empty}
     waiting = _waiting(most) if any(t.waiting for t in tables) else []
-    return Status(n_videos, tables, errors, _empty(empty, most), waiting, live_workers(), exact, cameras)
+    return Status(n_videos, tables, errors, _empty(empty, most), waiting, live_workers(), exact, camera_kinds(server))
 
 
-def _table_status(
-    table: Any, rows: tuple[int, int, int], counts: dict[str, int], rates: dict[str, float], exact: bool
-) -> TableStatus:
+def _table_status(table: Any, counts: dict[str, int], rates: dict[str, float], exact: bool) -> TableStatus:
     name, pending = table.__name__, counts["pending"]
     if exact:
         remaining, _ = table().progress()
         pending = max(0, remaining - counts["reserved"] - counts["error"] - counts["ignore"])
-    done, empty, waiting = rows
+    done, empty, waiting = _rows(table, table.connection)
     oldest, reason = _oldest(table, table.connection) if counts["pending"] else (None, "")
     per_hour = rates.get(name, 0.0)
     left = 3600.0 * pending / per_hour if per_hour and pending else None
@@ -140,22 +134,37 @@ def _table_status(
     )
 
 
-def camera_kinds() -> dict[str, int]:
+def camera_kinds(server: Any) -> dict[str, int]:
     """Where the intrinsics of the keypoints come from (first word of `camera_source`), and of how many."""
-    kinds = keypoints.Keypoints.proj(camera_kind="substring_index(camera_source, ':', 1)")
-    rows = dj.U("camera_kind").aggr(kinds, n_cameras="count(*)").to_dicts(order_by="n_cameras DESC")
-    return {row["camera_kind"]: int(row["n_cameras"]) for row in rows}
+    sources = f"SELECT camera_source, COUNT(*) AS n FROM {keypoints.Keypoints.full_table_name} GROUP BY camera_source"  # noqa: S608
+    rows = server.query(  # sources first, by their index: there are few
+        f"SELECT SUBSTRING_INDEX(camera_source, ':', 1) AS kind, SUM(n) FROM ({sources}) AS sources"  # noqa: S608
+        " GROUP BY kind ORDER BY SUM(n) DESC, kind"
+    ).fetchall()
+    return {str(kind): int(n) for kind, n in rows}
+
+
+def queue_name(table: Any) -> tuple[str, str]:
+    """Schema and name of a computed table's queue, as DataJoint names it. It reads all foreign keys of the server for
+    the object (`jobs_of`), which takes longer than to count a queue's rows."""
+    return str(table.database), "~~" + str(table.table_name).lstrip("_")
+
+
+def _quoted_queue(table: Any) -> str:
+    return ".".join(f"`{part}`" for part in queue_name(table))
 
 
 def queue_counts(server: Any) -> dict[str, dict[str, int]]:
-    """Job rows of each computed table by status."""
+    """Job rows of each computed table by status; none where the queue was never used. Only `server` is asked, so that
+    a thread may call it with a connection of its own."""
+    rows = server.query("SELECT table_schema, table_name FROM information_schema.tables WHERE table_name LIKE '~~%%'")
+    there = {(str(schema), str(name)) for schema, name in rows.fetchall()}
     out = {}
     for table in computed_tables():
-        counts = dict.fromkeys(("pending", "reserved", "error", "ignore"), 0)
-        rows = server.query(
-            f"SELECT status, COUNT(*) FROM {jobs_of(table).full_table_name} GROUP BY status"  # noqa: S608
-        ).fetchall()
-        out[table.__name__] = counts | {str(status): int(n) for status, n in rows}
+        out[table.__name__] = dict.fromkeys(("pending", "reserved", "error", "ignore"), 0)
+        if queue_name(table) in there:
+            found = server.query(f"SELECT status, COUNT(*) FROM {_quoted_queue(table)} GROUP BY status")  # noqa: S608
+            out[table.__name__] |= {str(status): int(n) for status, n in found.fetchall()}
     return out
 
 
@@ -180,7 +189,7 @@ def live_workers(seen_within_s: float = 180.0) -> list[dict[str, Any]]:
 
 def _oldest(table: Any, server: Any) -> tuple[float | None, str]:
     """Age (s) of the oldest pending job, and why jobs that were put back wait."""
-    jobs = jobs_of(table).full_table_name
+    jobs = _quoted_queue(table)
     age = server.query(
         f"SELECT TIMESTAMPDIFF(SECOND, MIN(created_time), CURRENT_TIMESTAMP) FROM {jobs} WHERE status='pending'"  # noqa: S608
     ).fetchone()[0]
@@ -191,40 +200,14 @@ def _oldest(table: Any, server: Any) -> tuple[float | None, str]:
     return (None if age is None else float(age)), (str(why[0]) if why else "")
 
 
-@contextmanager
-def _counting(n_videos: int) -> Iterator[Callable[[Any], tuple[int, int, int]]]:
-    """`_rows` of the tables; of large ones four at a time, while other things are asked: each is read as a whole."""
-    if n_videos < SMALL:
-        yield lambda table: _rows(table, table.connection)
-        return
-    free: queue.SimpleQueue[Any] = queue.SimpleQueue()
-
-    def count(table: Any) -> tuple[int, int, int]:
-        server = free.get()
-        try:
-            return _rows(table, server)
-        finally:
-            free.put(server)
-
-    servers = [connection.another() for _ in range(4)]
-    for server in servers:
-        free.put(server)
-    try:
-        with ThreadPoolExecutor(len(servers)) as pool:
-            counted = {table: pool.submit(count, table) for table in computed_tables()}
-            yield lambda table: counted[table].result()
-    finally:
-        for server in servers:
-            server.close()
-
-
 def _rows(table: Any, server: Any) -> tuple[int, int, int]:
-    """All rows, those that are empty, those that wait for a choice: in one reading of the table."""
-    column, values, _ = EMPTY_COLUMNS.get(table.__name__, ("", (), None))
-    waits = "SUM(choice_status = 'NEEDS_CHOICE')" if table is tracking.SubjectChoice else "0"
-    empty = f"SUM({column} IN ({','.join(repr(v) for v in values)}))" if column else "0"
-    row = server.query(f"SELECT COUNT(*), {empty}, {waits} FROM {table.full_table_name}").fetchone()  # noqa: S608
-    return int(row[0]), int(row[1] or 0), int(row[2] or 0)
+    """All rows, those that are empty, those that wait for a choice. Narrow indexes answer, the rows are not read."""
+    if table.__name__ not in EMPTY_COLUMNS:
+        return int(server.query(f"SELECT COUNT(*) FROM {table.full_table_name}").fetchone()[0]), 0, 0  # noqa: S608
+    column, values, _ = EMPTY_COLUMNS[table.__name__]
+    rows = server.query(f"SELECT {column}, COUNT(*) FROM {table.full_table_name} GROUP BY {column}").fetchall()  # noqa: S608
+    counts = {str(value): int(n) for value, n in rows}
+    return sum(counts.values()), sum(counts.get(v, 0) for v in values), counts.get("NEEDS_CHOICE", 0)
 
 
 def empty_rows(table: Any) -> Any:

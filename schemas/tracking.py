@@ -149,6 +149,7 @@ class SubjectChoice(dj.Computed):
     choice_reason        : varchar(2000)       # why, in a sentence
     contact_sheet=null   : <object@arrays>    # JPEG of the people, boxed and numbered, where somebody has to choose
     {origin_columns("choice")}
+    index (choice_status)
     """
 
     def make_fetch(self, key: dict) -> tuple:
