@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import time
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import pytest
 from click.testing import CliRunner
@@ -15,6 +16,7 @@ from pbl_pipeline.errors import PblError
 from schemas import connection, lab, session, tracking, video
 from schemas.bulk import Recording, register_many
 from schemas.orphans import orphans, remove
+from tests.rows import register
 from workers import incoming
 from workers.cli.cron import cron
 from workers.heartbeat import Silent
@@ -87,12 +89,64 @@ def test_the_phones_log_comes_along(drop: Path, tmp_path: Path):
     upload(drop, "P001/1/walk.mp4")
     lines = ["time_s,qw,qx,qy,qz"] + [f"{0.02 * i},1,0,0,0" for i in range(200)]
     (drop / "P001/1/walk.csv").write_text("\n".join(lines))
-    taken = twice(drop, archive)
-    kept = files(archive)
+    assert twice(drop, archive).registered == ["P001/1/walk.mp4"]
     assert files(drop) == []
-    # Taken, or refused with its reason: never lost.
-    assert len(taken.registered) + len(taken.refused) == 1
-    assert sum(name.endswith(".csv") for name in kept) == 1
+    stored, log = sorted(files(archive), key=lambda name: name.endswith(".csv"))
+    assert log == stored.removesuffix(".mp4") + ".csv"
+    assert video.PhoneAttitude.fetch1("attitude_n") == 200
+    assert video.Video.fetch1("camera_motion") == "handheld"
+
+
+def test_a_video_waits_for_the_log_that_is_on_its_way(drop: Path, tmp_path: Path):
+    archive = tmp_path / "archive"
+    upload(drop, "P001/1/walk.mp4")
+    take_over(str(drop), archive, settled_s=0.0)
+    log = drop / "P001/1/walk.csv"
+    log.write_text("time_s,qw,qx,qy,qz\n")  # still being uploaded
+    assert take_over(str(drop), archive, settled_s=0.0).registered == []
+    log.write_text("time_s,qw,qx,qy,qz\n" + "".join(f"{0.02 * i},1,0,0,0\n" for i in range(200)))
+    assert twice(drop, archive).registered == ["P001/1/walk.mp4"]
+    assert len(video.PhoneAttitude()) == 1
+
+
+def test_a_log_that_cannot_be_read_is_kept_aside_with_its_video(drop: Path, tmp_path: Path):
+    archive = tmp_path / "archive"
+    upload(drop, "P001/1/walk.mp4")
+    (drop / "P001/1/walk.csv").write_text("time_s,qw,qx,qy,qz\nnan,1,0,0,0\n")
+    assert twice(drop, archive).refused == {"P001/1/walk.mp4": "PHONE_LOG"}
+    assert (files(drop), len(video.Video())) == ([], 0)
+    assert [Path(name).suffix for name in files(archive)] == [".mp4", ".csv", ".txt"]
+
+
+def test_what_grows_while_it_is_copied_is_left(drop: Path, tmp_path: Path, monkeypatch):
+    archive = tmp_path / "archive"
+    path = upload(drop, "P001/1/walk.mp4")
+    take_over(str(drop), archive, settled_s=0.0)
+    real = incoming._has_place
+
+    def grows(name):  # asked after the files were listed, before one is copied
+        with path.open("ab") as file:
+            file.write(b"more")
+        return real(name)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(incoming, "_has_place", grows)
+        taken = take_over(str(drop), archive, settled_s=0.0)
+    assert (taken.registered, taken.uploading) == ([], 1)
+    assert (files(drop), len(video.Video())) == (["P001/1/walk.mp4"], 0)
+    assert [p.name for p in archive.rglob("*") if p.is_file()] == ["seen.json"]
+
+
+def test_the_same_bytes_under_another_name_are_kept_once(drop: Path, tmp_path: Path):
+    archive = tmp_path / "archive"
+    content = upload(drop, "P001/1/walk.mp4").read_bytes()
+    twice(drop, archive)
+    (drop / "P001/2").mkdir()
+    (drop / "P001/2/again.mp4").write_bytes(content)
+    assert twice(drop, archive).known == ["P001/2/again.mp4"]
+    assert (len(video.Video()), len(files(archive))) == (1, 1)
+    assert Path(video.Video.fetch1("video_path")).read_bytes() == content
+    assert files(drop) == []
 
 
 def test_breaking_off_anywhere_loses_nothing_and_registers_once(drop: Path, tmp_path: Path, monkeypatch):
@@ -148,13 +202,22 @@ def test_what_cannot_be_registered_is_kept_with_its_reason(drop: Path, tmp_path:
 
 def test_names_from_outside_do_not_leave_the_archive(drop: Path, tmp_path: Path):
     archive = tmp_path / "archive"
-    hostile = drop / "P001" / "..%2f..%2fetc" / "..\\..\\x;rm -rf.mp4"
+    hostile = drop / "P001" / "a..%2f..%2fetc" / "b..\\..\\x;rm -rf $(touch hacked) \x1b[2J.mp4"
     hostile.parent.mkdir(parents=True)
     chain.small_video(tmp_path, "x", n=60).rename(hostile)
-    twice(drop, archive)
-    assert not (tmp_path / "etc").exists()
-    for path in archive.rglob("*.mp4"):
-        assert path.resolve().is_relative_to(archive.resolve())
+    taken = twice(drop, archive)
+    assert taken.registered == [str(hostile.relative_to(drop))]
+    (kept,) = files(archive)
+    assert re.fullmatch(r"P001/[\w. -]+/[0-9a-f]{12}-[\w. -]+\.mp4", kept), kept
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["archive", "uploads"]
+
+
+@pytest.mark.parametrize(
+    "name", ["P001/../x.mp4", "../1/x.mp4", "P001/1/.x.mp4", "P001/_1/x.mp4", "x.mp4", "P001/1/2/x.mp4", "P001/1/x.exe"]
+)
+def test_places_that_an_object_store_can_hold_but_the_layout_does_not(name: str):
+    assert incoming._has_place(PurePosixPath("P001/1/x.mp4"))
+    assert not incoming._has_place(PurePosixPath(name))
 
 
 def test_the_command_says_what_it_needs(tables: None, monkeypatch):
@@ -183,13 +246,7 @@ def test_all_other_jobs_run(tables: None, tmp_path: Path):
 
 def test_files_without_a_row_are_found_and_rows_without_a_file(tables: None, tmp_path: Path):
     before = orphans(young_s=0.0)
-    register_many([Recording(str(chain.small_video(tmp_path, "walk")), "1" * 64, 1, "P001")])
-    video.Video.update1(
-        {
-            "video_id": 1,
-            "video_sha256": __import__("hashlib").sha256((tmp_path / "walk.mp4").read_bytes()).hexdigest(),
-        }
-    )
+    register(chain.small_video(tmp_path, "walk"))
     Worker(schemas.computed_tables(), Silent()).run(once=True)
     found = orphans(young_s=0.0)
     assert (found.lost, len(found.orphans)) == ([], len(before.orphans))
