@@ -1,7 +1,8 @@
-"""Fits in batches: while the device solves one batch, the one before is inserted and the next is fetched."""
+"""Fits in batches: while the device solves one, the one before is inserted and the next is prepared."""
 
 from __future__ import annotations
 
+from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -16,32 +17,39 @@ if TYPE_CHECKING:
 def run_fits(first: list[Claim], worker: Worker) -> None:
     """Do the jobs of `first` and, as long as there are more of that table, the next batches.
 
-    One thread computes and touches no database; this one reserves, fetches and inserts, so that the device always has
-    the next batch waiting. A job that the batch could not compute is computed alone.
+    Threads compute and touch no database; this one reserves, fetches and inserts, so that the device always has the
+    next batch waiting. A job that the batch could not compute is computed alone.
     """
-    table = first[0].table
-    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="fits") as device:
-        batch, result = first, _start(device, first)
-        while batch:
-            following = [] if worker.stop.is_set() else queue.claim(table, worker.batch)
-            ahead = _start(device, following) if following else None
+    table, n = first[0].table, _threads()
+    with ThreadPoolExecutor(max_workers=n, thread_name_prefix="fits") as device:
+        waiting = deque([(first, _start(device, first))])
+        while waiting:
+            while len(waiting) <= n and not worker.stop.is_set() and (more := queue.claim(table, worker.batch)):
+                waiting.append((more, _start(device, more)))
+            batch, result = waiting.popleft()
             worker.heartbeat.doing(f"{table.__name__}: batch of {len(batch)}")
             for job in batch:
                 worker.say("start", job, None)  # the time limit counts from here
-            left = [*batch, *following]
+            left = list(batch)
             try:
                 ended = []
                 for job, made in zip(batch, result.result(), strict=True):
                     left.remove(job)
                     ended.append(worker.one(job, made))
             except (KeyboardInterrupt, SystemExit):  # told to end at once
-                for job in left:
+                device.shutdown(wait=False, cancel_futures=True)
+                for job in (*left, *(job for jobs, _ in waiting for job in jobs)):
                     queue.put_back(job)
                 raise
             worker.follow(ended)
-            batch = following
-            if ahead is not None:
-                result = ahead
+
+
+def _threads() -> int:
+    """How many batches are computed at a time: on a GPU two, so that one is packed and unpacked on the host while the
+    other is solved; a CPU does both itself."""
+    import jax
+
+    return 1 if jax.default_backend() == "cpu" else 2
 
 
 def _start(device: ThreadPoolExecutor, jobs: list[Claim]) -> Future[list[Computed | None]]:

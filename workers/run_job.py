@@ -56,7 +56,10 @@ class Computed:
 
     def of(self, fetched: tuple) -> bool:
         """Whether these inputs are the same."""
-        return deepdiff.DeepHash(fetched)[fetched] == deepdiff.DeepHash(self.fetched)[self.fetched]
+        try:
+            return bool(fetched == self.fetched)
+        except ValueError:  # arrays among them have no one answer; hashing takes milliseconds
+            return deepdiff.DeepHash(fetched)[fetched] == deepdiff.DeepHash(self.fetched)[self.fetched]
 
 
 def run(job: Claim, computed: Computed | None = None, stop: threading.Event | None = None) -> Outcome:

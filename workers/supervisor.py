@@ -267,6 +267,9 @@ SELFTEST_FAILED = 3
 
 def work(options: Options, pipe: Connection) -> None:
     """The working process: connect, test itself, work."""
+    if options.processes > 1:
+        # Processes that share a GPU take of its memory what they need; JAX gives the first one most of it otherwise.
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     import schemas
 
     from . import batches, heartbeat, loop, selftest
