@@ -1,0 +1,92 @@
+"""Batches of fits on two threads: each session once, two batches at a time, and what becomes of them at the end."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import pbl_pipeline.fit
+from schemas import fit
+from schemas._base import jobs_of
+from tests.benchmarks import gpu_worker
+from workers import batches, queue
+from workers.heartbeat import Silent
+from workers.loop import Worker
+
+from . import chain
+
+#: Sessions, in batches of two.
+N = 7
+
+
+@pytest.fixture
+def sessions(tables: None, database: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable], Worker]:
+    """Sessions that wait for their fit, and a worker on two threads, given what stands for `fit_sessions`."""
+    gpu_worker.put_sessions(database, gpu_worker.plans(N, alike=True))
+    assert gpu_worker.queue_fits(0) == N
+    monkeypatch.setattr(batches, "_threads", lambda: 2)
+
+    def worker(solve: Callable[[int], None]) -> Worker:
+        def fit_sessions(given, paramset=None, batch=None):
+            solve(len(given))
+            return [chain.fit_session(s.trials, s.names, paramset, s.camera_motion) for s in given]
+
+        monkeypatch.setattr(pbl_pipeline.fit, "fit_sessions", fit_sessions)
+        return Worker([fit.SessionFit], Silent(), batch=2)
+
+    return worker
+
+
+def jobs() -> dict[str, int]:
+    return {s: n for s, n in jobs_of(fit.SessionFit).progress().items() if n and s != "total"}
+
+
+def test_two_batches_are_computed_at_a_time_and_each_session_once(sessions):
+    together, sizes = threading.Barrier(2, timeout=30), []
+
+    def solve(n: int) -> None:
+        sizes.append(n)
+        together.wait()  # breaks, and with it the batch, where no other one is being computed
+
+    worker = sessions(solve)
+    batches.run_fits(queue.claim(fit.SessionFit, 2), worker)
+    assert sorted(sizes) == [1, 2, 2, 2]
+    assert not together.broken
+    assert (worker.done, worker.failed) == (N, 0)
+    assert len(fit.SessionFit()) == N
+    assert set((fit.SessionFit.Trial & "trial_n_fitted > 0").to_arrays("video_id")) == set(
+        fit.TrialInput.to_arrays("video_id")
+    )
+    assert jobs() == {}
+
+
+def test_told_to_stop_it_ends_what_it_has_and_takes_no_more(sessions):
+    computed = []
+    worker = sessions(computed.append)
+
+    def stop(what, job, outcome) -> None:
+        if what == "end":
+            worker.stop.set()
+
+    worker.say = stop
+    batches.run_fits(queue.claim(fit.SessionFit, 2), worker)
+    # The batch that was written when it was told, and one for each thread.
+    assert worker.done == len(fit.SessionFit()) == sum(computed) == 6
+    assert jobs() == {"pending": N - 6}
+
+
+def test_told_to_end_at_once_it_puts_all_back(sessions):
+    worker = sessions(lambda n: None)
+
+    def end(*_: object) -> None:
+        raise SystemExit(0)
+
+    worker.one = end
+    with pytest.raises(SystemExit):
+        batches.run_fits(queue.claim(fit.SessionFit, 2), worker)
+    # `one` itself puts back the job it has in hand; here it is a stand-in.
+    assert jobs() == {"pending": N - 1, "reserved": 1}
+    assert len(fit.SessionFit()) == 0
