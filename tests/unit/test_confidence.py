@@ -58,6 +58,7 @@ def made(n: int, chance, seed: int = 0, dataset: str = "a", recording: str = "x1
 
 
 def test_curves_that_ship_are_monotone_and_say_where_they_come_from():
+    assert confidence_curves()
     for name, curve in confidence_curves().items():
         assert curve.name == name
         values = curve(np.linspace(0, 1, 101))

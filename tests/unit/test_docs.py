@@ -37,6 +37,8 @@ def test_readme_has_no_placeholder_and_no_dead_link():
 
 
 def test_every_command_has_help_with_an_example():
-    for entry in entry_points(group="pbl.commands"):
+    commands = entry_points(group="pbl.commands")
+    assert len(commands) > 15
+    for entry in commands:
         command = entry.load()
         assert "Example:" in command.get_help(click.Context(command)), entry.name

@@ -262,6 +262,7 @@ def test_a_scene_is_its_seeds_and_has_feet_below_the_hips():
     assert a.xyz_m.shape == c.xyz_m.shape == (600, 6, 2, 3)
     assert not np.array_equal(a.xyz_m, c.xyz_m)
     standing = [s for s in (scene(i) for i in range(12)) if s.kind in ("walk", "start_stop")]
+    assert len(standing) > 5
     for s in standing:
         assert (s.xyz_m[:, 3, :, 2].mean(axis=0) < s.xyz_m[:, 1, :, 2].mean(axis=0)).all()
         assert (s.xyz_m[:, 1, :, 2].mean(axis=0) < s.xyz_m[:, 0, :, 2].mean(axis=0)).all()
@@ -269,6 +270,7 @@ def test_a_scene_is_its_seeds_and_has_feet_below_the_hips():
 
 def test_feet_are_ahead_where_they_come_down():
     """The events of a scene fit its movement: at a foot down the foot is ahead of the other one."""
+    judged = 0
     for seed in range(30):
         s = scene(seed)
         if s.kind not in ("walk", "start_stop") or not s.bouts:
@@ -280,6 +282,8 @@ def test_feet_are_ahead_where_they_come_down():
             left, right = ([round(t * GRID_HZ) for t in bout.events_s[k] if 0.1 < t < 11.9] for k in (0, 2))
             if len(left) > 3 and len(right) > 3:
                 assert np.mean(apart[left]) > np.mean(apart[right])
+                judged += 1
+    assert judged > 15
 
 
 def test_phases_are_whole_at_the_events():

@@ -60,6 +60,7 @@ def test_without_a_leg_the_free_speed():
 
 def test_bands_are_mapped_to_the_body():
     body, laboratory = (normal_bands(None, None, m).curves for m in (BODY_ANGLES, PLUG_IN_GAIT))
+    assert {"hip_flexion", "pelvis_tilt", "knee_flexion"} < set(body)
     for angle in body:
         shift = 12.0 if angle in ("hip_flexion", "pelvis_tilt") else 0.0
         np.testing.assert_allclose(laboratory[angle][0] - body[angle][0], shift)

@@ -196,7 +196,9 @@ def test_page_shows_the_measures(report: SessionReport, measured: GaitMetrics, t
 
 def test_gdi_is_always_named_with_its_three_angles(report: SessionReport, tmp_path: Path) -> None:
     text = _page(report, tmp_path).text
-    for match in re.finditer(r"\bGDI\b", text):
+    matches = list(re.finditer(r"\bGDI\b", text))
+    assert matches
+    for match in matches:
         follows = text[match.end() : match.end() + 20]
         # Checks and hashes carry the index in their identifiers.
         assert follows.startswith((" of three angles", " cycles", " explained", "_Calc", " with 100")), follows
