@@ -56,6 +56,8 @@ class Worker:
                 self.heartbeat.doing("waits for the database")
                 event(log, logging.WARNING, "database away", error=str(error)[:200])
                 run_job.wait_for_database(self.stop)
+                queue.let_go_all()  # what was reserved for later; a job in hand has waited for the database itself
+                self._refreshed = -1e9
                 continue
             if n:
                 idle = IDLE_S[0]

@@ -168,6 +168,11 @@ def let_go(job: Claim) -> None:
     _held.discard((job.table.__name__, job.hash))
 
 
+def let_go_all() -> None:
+    """Forget every job: nothing is in hand any more. What is still reserved is freed like a dead process'."""
+    _held.clear()
+
+
 def reset(jobs: Any, reason: str = "", delay_s: float = 0.0) -> int:
     """Make all rows of a restricted queue pending, to be taken earliest after `delay_s`; returns how many."""
     cursor = jobs.connection.query(  # the condition is DataJoint's, which escapes values

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
+import pymysql
 import pytest
 
 import pbl_pipeline.fit
@@ -90,3 +91,18 @@ def test_told_to_end_at_once_it_puts_all_back(sessions):
     # `one` itself puts back the job it has in hand; here it is a stand-in.
     assert jobs() == {"pending": N - 1, "reserved": 1}
     assert len(fit.SessionFit()) == 0
+
+
+def test_a_database_that_is_away_between_two_batches_leaves_no_job_behind(sessions, monkeypatch):
+    worker, claim, asked = sessions(lambda n: None), queue.claim, []
+
+    def away_once(table, n=1):
+        asked.append(n)
+        if len(asked) == 3:
+            raise pymysql.err.OperationalError(2006, "Server has gone away")
+        return claim(table, n)
+
+    monkeypatch.setattr(queue, "claim", away_once)
+    worker.run(once=True)
+    assert (worker.done, len(fit.SessionFit())) == (N, N)
+    assert jobs() == {}
