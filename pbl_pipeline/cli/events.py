@@ -9,9 +9,11 @@ import click
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_out_file, load_npz
 
-from .gait import EVENT_METHODS
+from .gait import EVENT_METHODS, is_c3d
 
-_EPILOG = "Example: pbl events walk.fit.npz --out walk.events.csv"
+_EPILOG = """\b
+Example: pbl events walk.fit.npz --out walk.events.csv
+Example: pbl events walk.c3d --out walk.events.csv"""
 
 
 @click.command(epilog=_EPILOG)
@@ -21,8 +23,8 @@ _EPILOG = "Example: pbl events walk.fit.npz --out walk.events.csv"
 def events(file: Path, out: Path, method: str) -> None:
     """Find foot down and foot up in FILE and write them as CSV.
 
-    FILE is a fit.npz, or a keypoints.npz with 3D markers: its fields decide. Where nobody walks, the CSV has only its
-    header and the reason is printed.
+    FILE is a fit.npz, a keypoints.npz with 3D markers (its fields decide), or a laboratory's C3D, whose markers are
+    searched whatever its labels say. Where nobody walks, the CSV has only its header and the reason is printed.
     """
     from pbl_pipeline.gait import detect_events
 
@@ -41,9 +43,11 @@ def events(file: Path, out: Path, method: str) -> None:
 
 
 def _feet(path: Path):
-    from pbl_pipeline.gait import feet_from_fit, feet_from_keypoints, feet_from_markers
+    from pbl_pipeline.gait import feet_from_fit, feet_from_keypoints, feet_from_markers, read_lab_feet
     from pbl_pipeline.keypoints import Keypoints, WorldMarkers
 
+    if is_c3d(path):
+        return read_lab_feet(path)
     fields = set(load_npz(path))
     if "qpos" in fields:
         from pbl_pipeline.fit import TrialFit  # loads the fit's libraries
@@ -61,7 +65,7 @@ def _format_error(path: Path, found: str) -> PblError:
     return PblError(
         "FILE_FORMAT",
         found=found,
-        expected="a fit.npz (qpos), or a keypoints.npz (xyz_cam_m or xyz_world_m)",
+        expected="a fit.npz (qpos), a keypoints.npz (xyz_cam_m or xyz_world_m), or a C3D",
         next_step="make one with `pbl detect` or `pbl fit`",
         key=str(path),
     )

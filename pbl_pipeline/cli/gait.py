@@ -36,7 +36,8 @@ Example: pbl gait lab/walk1.c3d lab/walk2.c3d --out lab/metrics.json"""
     "event_files",
     multiple=True,
     type=click.Path(path_type=Path),
-    help="events.csv of `pbl events` for C3D files, once for each in their order (default: the labels in the file).",
+    help="events.csv of `pbl events` for C3D files, once for each in their order (default: the labels in the file, "
+    "else by --method).",
 )
 def gait(
     files: tuple[Path, ...],
@@ -58,7 +59,7 @@ def gait(
     from pbl_pipeline.gait.events import resolve_params
 
     check_out_file(out)
-    laboratory = [_is_c3d(path) for path in files]
+    laboratory = [is_c3d(path) for path in files]
     if any(laboratory) and not all(laboratory):
         raise _usage("fits and C3D files together", "one kind of file in a session")
     if event_files and (not all(laboratory) or len(event_files) != len(files)):
@@ -76,7 +77,7 @@ def gait(
     params = GaitParams(events=resolve_params(method), gdi=of_index)
     given = event_files or (None,) * len(files)
     pairs = progress.track(list(zip(files, given, strict=True)), "read files", unit="trial")
-    trials = [_read(path, events) for path, events in pairs]
+    trials = [_read(path, events, method) for path, events in pairs]
     of_fit = () if all(laboratory) else fit_checks(files, trials)
     metrics = gait_metrics(trials, norm, params, of_fit, model=index).with_checks(of_fit)
     metrics.save(out)
@@ -84,15 +85,16 @@ def gait(
     click.echo(f"written: {out}")
 
 
-def _is_c3d(path: Path) -> bool:
+def is_c3d(path: Path) -> bool:
+    """Whether a file is a laboratory's recording, by its name; it may be gzipped."""
     return path.name.lower().removesuffix(".gz").endswith(".c3d")
 
 
-def _read(path: Path, events: Path | None) -> TrialFit | LabTrial:
+def _read(path: Path, events: Path | None, method: str) -> TrialFit | LabTrial:
     from pbl_pipeline.fit import TrialFit
     from pbl_pipeline.gait import read_lab_trial
 
-    return read_lab_trial(path, events) if _is_c3d(path) else TrialFit.load(path)
+    return read_lab_trial(path, events, method) if is_c3d(path) else TrialFit.load(path)
 
 
 def fit_checks(paths: Sequence[Path], trials: Sequence[TrialFit | LabTrial]) -> tuple[Check, ...]:

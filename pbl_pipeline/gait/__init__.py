@@ -21,7 +21,7 @@ from ._gdi import (
     score_gdi,
 )
 from ._ground import Lengths, cycle_lengths
-from ._laboratory import PLUG_IN_GAIT_POINTS, LabTrial, read_lab_trial
+from ._laboratory import PLUG_IN_GAIT_POINTS, LabTrial, read_lab_feet, read_lab_trial
 from ._metrics import GaitMetrics, GaitParams, TrialMetrics, cycle_checks, gait_metrics
 from ._own_norm import norm_from_cycles
 from ._poses import BodyPoses, trial_poses
@@ -111,6 +111,7 @@ __all__ = [
     "normal_bands",
     "offset_deg",
     "pelvis_angles",
+    "read_lab_feet",
     "read_lab_trial",
     "score_gdi",
     "spatiotemporal",

@@ -49,12 +49,12 @@ class LabTrial:
     feet: FootTrajectories | None
 
 
-def read_lab_trial(path: str | Path, events_csv: str | Path | None = None) -> LabTrial:
+def read_lab_trial(path: str | Path, events_csv: str | Path | None = None, method: Any = None) -> LabTrial:
     """Angles, events and feet of a C3D file (also gzipped) with the outputs of Plug-in Gait or a model of its kind.
 
     The angles are the points LHipAngles and so on (`PLUG_IN_GAIT_POINTS`). Events: those of `events_csv`
-    (`pbl events`), else the recording's labels Foot Strike and Foot Off, else found from the markers of the legs. A
-    sample that the file marks as invalid is NaN.
+    (`pbl events`), else the recording's labels Foot Strike and Foot Off, else found from the markers of the legs by
+    `method` (`detect_events`). A sample that the file marks as invalid is NaN.
 
     Raises
     ------
@@ -74,14 +74,37 @@ def read_lab_trial(path: str | Path, events_csv: str | Path | None = None) -> La
     }
     for letter, by_name in angles.items():
         check_degrees(np.concatenate(list(by_name.values())), f"{path.name}, side {letter}")
-    feet = None
-    if all(m in column for m in _FOOT_MARKERS):
-        there = [*_FOOT_MARKERS, *(m for m in _LEG_MARKERS if m in column)]
-        xyz = points[:, [column[m] for m in there]] * _metres(table, path)
-        feet = feet_from_markers(time, there, "plug_in_gait", xyz)
+    feet = _feet(path, points, labels, time, table) if all(m in column for m in _FOOT_MARKERS) else None
     series = AngleSeries(time, angles["L"], angles["R"], PLUG_IN_GAIT)
     name = path.name.removesuffix(".gz").removesuffix(".c3d")
-    return LabTrial(name, series, _events(path, table, feet, events_csv), feet)
+    return LabTrial(name, series, _events(path, table, feet, events_csv, method), feet)
+
+
+def read_lab_feet(path: str | Path) -> FootTrajectories:
+    """Feet and legs from the markers of a C3D file (also gzipped), metres; needs neither angles nor labels.
+
+    Raises
+    ------
+    PblError
+        FILE_MISSING, FILE_FORMAT (not a C3D), GAIT_INPUT (a foot marker is missing).
+    """
+    path = Path(path)
+    points, labels, time, table = _read(path)
+    if missing := [m for m in _FOOT_MARKERS if m not in labels]:
+        raise PblError(
+            "GAIT_INPUT",
+            found=f"no markers {', '.join(missing)}",
+            expected="the markers " + ", ".join(_FOOT_MARKERS),
+            next_step="name the markers as Plug-in Gait does",
+            key=str(path),
+        )
+    return _feet(path, points, labels, time, table)
+
+
+def _feet(path: Path, points: np.ndarray, labels: list[str], time: np.ndarray, table: Any) -> FootTrajectories:
+    there = [*_FOOT_MARKERS, *(m for m in _LEG_MARKERS if m in labels)]
+    xyz = points[:, [labels.index(m) for m in there]] * _metres(table, path)
+    return feet_from_markers(time, there, "plug_in_gait", xyz)
 
 
 def _read(path: Path) -> tuple[np.ndarray, list[str], np.ndarray, Any]:
@@ -122,7 +145,9 @@ def _metres(reader: Any, path: Path) -> float:
     return factors[text]
 
 
-def _events(path: Path, reader: Any, feet: FootTrajectories | None, events_csv: str | Path | None) -> GaitEvents:
+def _events(
+    path: Path, reader: Any, feet: FootTrajectories | None, events_csv: str | Path | None, method: Any
+) -> GaitEvents:
     if events_csv is not None:
         return _given(load_events(events_csv), "given", Path(events_csv).name)
     table = reader.get("EVENT")
@@ -144,7 +169,7 @@ def _events(path: Path, reader: Any, feet: FootTrajectories | None, events_csv: 
             next_step="pass events with --events",
             key=str(path),
         )
-    return detect_events(feet)
+    return detect_events(feet, method)
 
 
 def _given(events: tuple[GaitEvent, ...], method: str, source: str) -> GaitEvents:

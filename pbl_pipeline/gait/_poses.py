@@ -35,8 +35,11 @@ class BodyPoses:
 
 
 def trial_poses(fit: TrialFit) -> BodyPoses:
-    """Forward kinematics of a fit. Raises `PblError` GAIT_INPUT where no frame is finite or joints are missing."""
-    from pbl_pipeline.body import load_body  # JAX loads only where a fit is read
+    """Forward kinematics of a fit.
+
+    Raises `PblError` GAIT_INPUT where no frame is finite, joints are missing or in degrees.
+    """
+    from pbl_pipeline.body import SLIDES, load_body  # JAX loads only where a fit is read
 
     body = load_body()
     if tuple(fit.joint_names) != body.joint_names:
@@ -45,6 +48,17 @@ def trial_poses(fit: TrialFit) -> BodyPoses:
     seen = np.flatnonzero(np.all(np.isfinite(qpos), axis=1))
     if len(seen) == 0:
         raise _input_error("a fit without one finite frame", "joint angles in at least some frames")
+    turns = np.array([n not in SLIDES and not n.startswith("pelvis") for n in body.joint_names])
+    widest = float(np.abs(qpos[np.ix_(seen, np.flatnonzero(turns))]).max())
+    # A joint turns by less than half a turn; the pelvis may go round and round.
+    if widest > 2 * np.pi:
+        raise PblError(
+            "GAIT_INPUT",
+            found=f"a joint at {widest:.3g} rad",
+            expected="qpos in radians, no joint beyond a full turn",
+            next_step="write qpos in radians, as `pbl fit` does; the angles.csv beside it is in degrees",
+            key=fit.name,
+        )
     padded = np.zeros((-(-len(seen) // _CHUNK) * _CHUNK, qpos.shape[1]), np.float32)
     padded[: len(seen)] = qpos[seen]
     scale = np.asarray(fit.scale, np.float32)

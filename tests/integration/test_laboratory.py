@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from pbl_pipeline.cli.events import events as events_command
 from pbl_pipeline.cli.gait import gait as command
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import (
@@ -18,9 +19,12 @@ from pbl_pipeline.gait import (
     PLUG_IN_GAIT_POINTS,
     GaitEvents,
     gait_metrics,
+    load_events,
     load_norm,
+    read_lab_feet,
     read_lab_trial,
 )
+from pbl_pipeline.gait._laboratory import _read
 from pbl_pipeline.gait.normative import gait_norm
 from tests.benchmarks.gdi import children
 
@@ -118,6 +122,44 @@ def test_events_may_be_given(walk, tmp_path):
     events.save(tmp_path / "events.csv")
     again = read_lab_trial(walk, tmp_path / "events.csv")
     assert (again.events.method, len(again.events.events)) == ("given", len(shifted))
+
+
+def test_events_of_a_recording_by_command(walk, tmp_path):
+    """From its markers, whatever its labels say; then given back to `pbl gait`."""
+    csv, out = tmp_path / "events.csv", tmp_path / "metrics.json"
+    run = CliRunner().invoke(events_command, [str(walk), "--out", str(csv)], catch_exceptions=False)
+    assert run.exit_code == 0
+    trial = read_lab_trial(walk)
+    found, labels = load_events(csv), trial.events.events
+    for label in labels:
+        assert min(abs(e.time_s - label.time_s) for e in found if (e.side, e.event) == (label.side, label.event)) < 0.05
+    run = CliRunner().invoke(command, [str(walk), "--events", str(csv), "--out", str(out)], catch_exceptions=False)
+    assert run.exit_code == 0
+    assert json.loads(out.read_text())["session"]["stride_time_s"]["mean"] == pytest.approx(
+        gait_metrics([trial]).to_dict()["session"]["stride_time_s"]["mean"], abs=0.02
+    )
+
+
+def test_without_labels_the_method_finds_the_events(walk, tmp_path):
+    """Angles and foot markers of a child, written without events."""
+    points, names, _, _ = _read(walk)
+    wanted = [n for n in names if n in MARKERS or n[1:] in {p for p, _ in PLUG_IN_GAIT_POINTS.values()}]
+    own = points[:, [names.index(n) for n in wanted]]
+    path = write_c3d(tmp_path / "own.c3d", own, wanted)
+    for method in ("phase-transformer", "zeni-2008"):
+        assert read_lab_trial(path, method=method).events.method == method
+        out = tmp_path / f"{method}.json"
+        words = [str(path), "--method", method, "--out", str(out)]
+        assert CliRunner().invoke(command, words, catch_exceptions=False).exit_code == 0
+    early, late = (
+        json.loads((tmp_path / f"{m}.json").read_text())["session"]["double_support_percent"]["mean"]
+        for m in ("phase-transformer", "zeni-2008")
+    )
+    assert late > early + 5  # Zeni's foot down is 39 ms early
+    points, names = normal_walk()
+    with pytest.raises(PblError, match="GAIT_INPUT") as error:
+        read_lab_feet(write_c3d(tmp_path / "bare.c3d", points, names))
+    assert "LHEE" in error.value.found
 
 
 def normal_walk(n: int = 300, factor: float = 1.0) -> tuple[np.ndarray, list[str]]:

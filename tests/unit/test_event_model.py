@@ -257,6 +257,23 @@ def test_upside_down_and_mirrored_points_are_refused(flip):
     assert "feet" in error.value.found
 
 
+@pytest.mark.parametrize("axes", [[0, 2, 1], [2, 0, 1]])
+def test_another_vertical_axis_is_told(axes):
+    """A laboratory's file whose height is y, read as if it were z: the legs lie on the floor."""
+    truth = truth_of(seed=1, seconds=6.0)
+    for sign in (1, -1):
+        found = detect_events(feet_of(truth, lambda xyz, s=sign: xyz[..., axes] * [s, 1, 1]))
+        empty(found, "nobody stands")
+        assert "z up" in found.qc[0].advice
+
+
+def test_time_stamps_that_are_no_seconds():
+    truth = truth_of(seed=1, seconds=6.0)
+    for factor in (1e3, 1e6, 1e9):
+        slow = dataclasses.replace(truth, time_s=truth.time_s * factor)
+        empty(detect_events(feet_of(slow)), "s apart")
+
+
 def test_mirrored_legs_without_feet_are_refused_by_their_knees():
     feet = feet_of(truth_of(seed=1, seconds=6.0), lambda xyz: xyz * [1, -1, 1])
     assert feet.legs_m is not None

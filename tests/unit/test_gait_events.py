@@ -246,7 +246,24 @@ def test_file_round_trip(tmp_path):
     np.testing.assert_allclose([e.time_s for e in again], [e.time_s for e in found.events], atol=1e-4)
 
 
-@pytest.mark.parametrize("text", ["", "time,side\n", "time_s,side,event,probability\n1.0,middle,foot_down,0.5\n"])
+def test_the_order_in_the_file_does_not_matter(tmp_path):
+    path = tmp_path / "events.csv"
+    path.write_text("time_s,side,event,probability\n2.0,left,foot_down,1\n1.0,right,foot_up,1\n")
+    assert [e.time_s for e in load_events(path)] == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "time,side\n",
+        "time_s,side,event,probability\n1.0,middle,foot_down,0.5\n",
+        "time_s,side,event,probability\nnan,left,foot_down,0.5\n",
+        "time_s,side,event,probability\ninf,left,foot_down,0.5\n",
+        "time_s,side,event,probability\n1.0,left,foot_down,1.5\n",
+        "time_s,side,event,probability\n1.0,left,foot_down,nan\n",
+    ],
+)
 def test_broken_file_is_an_error(tmp_path, text):
     path = tmp_path / "events.csv"
     path.write_text(text)

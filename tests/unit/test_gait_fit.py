@@ -517,6 +517,16 @@ def test_an_error_names_the_trial():
     assert error.value.key == "the second"
 
 
+def test_joints_in_degrees_are_refused():
+    time = np.arange(0, 4, 1 / 30)
+    fit = make_fit(time, walking(time))
+    with pytest.raises(PblError, match="GAIT_INPUT") as error:
+        gait_metrics([fit, dataclasses.replace(fit, name="degrees", qpos=np.degrees(fit.qpos))])
+    assert (error.value.key, "radians" in error.value.expected) == ("degrees", True)
+    round_and_round = make_fit(time, {**walking(time), "pelvis_rotation": 20.0})
+    assert gait_metrics([round_and_round]).status == "PASS"
+
+
 @pytest.mark.parametrize("content", [b"", b"not a zip"])
 def test_events_of_a_broken_file(tmp_path, content):
     path = tmp_path / "x.npz"

@@ -15,12 +15,14 @@ from pbl_pipeline.gait import (
     THREE_ANGLES,
     GaitCycle,
     GdiParams,
+    NormativeSet,
     fit_norm,
     load_norm,
     norm_names,
     score_gdi,
 )
 from pbl_pipeline.gait.build_norm import build_gillette, gillette_vectors
+from pbl_pipeline.gait.normative._norm import _checksum, _to_json
 
 PERCENT = np.linspace(0, 98, 50)
 ABOUT = {"name": "toy", "version": 1, "source": "made up", "licence": "none", "convention": "none"}
@@ -170,6 +172,34 @@ def test_a_changed_file_is_refused(toy, tmp_path):
     path.write_text("{}")
     with pytest.raises(PblError, match="NORM_INVALID"):
         load_norm(str(path))
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "words"),
+    [
+        ({"n": 5}, "NORM_INVALID", "5 vectors"),
+        ({"n": 31, "repeat": 4}, "NORM_INVALID", "components"),
+        ({"radians": ["mean_deg"]}, "ANGLE_UNITS", "radians"),
+        ({"ln_sd": 0.0}, "NORM_INVALID", "spread"),
+        ({"angle_model": "another"}, "NORM_INVALID", "another"),
+        ({"curves": 3}, "NORM_INVALID", ""),
+        ({"explained_variance": [1.0]}, "NORM_INVALID", "sizes"),
+    ],
+)
+def test_a_set_by_another_program_is_looked_at(toy, tmp_path, changes, code, words):
+    """Its checksum is right, its content is not: too few people for its components, another unit, numbers missing."""
+    changes = dict(changes)
+    fields = {f.name: getattr(toy, f.name) for f in dataclasses.fields(toy)}
+    for name in changes.pop("radians", ()):
+        fields[name] = np.radians(fields[name])
+    if times := changes.pop("repeat", 0):
+        fields |= {k: np.repeat(fields[k], times, axis=0) for k in ("components", "explained_variance")}
+    path = tmp_path / "set.json"
+    data = _to_json(NormativeSet(**fields), None) | changes
+    path.write_text(json.dumps({**data, "sha256": _checksum(data)}))
+    with pytest.raises(PblError, match=code) as error:
+        load_norm(str(path))
+    assert words in error.value.found
 
 
 def test_the_set_that_ships():

@@ -70,6 +70,9 @@ def detect_by_phase(feet: FootTrajectories, paramset: Paramset) -> GaitEvents:
     time = np.asarray(feet.time_s, float)
     if len(time) < 4 or time[-1] - time[0] < p.min_seen_s:
         return found.empty(f"the person is in view for less than {p.min_seen_s:g} s", "film at least three steps")
+    if np.median(np.diff(time)) > _predict.MAX_GAP_S:
+        slow = f"frames {np.median(np.diff(time)):.3g} s apart: gait events cannot be seen in these"
+        return found.empty(slow, "check that the time stamps are in seconds")
     grid = _predict.on_grid(time, feet.legs_m, feet.up)
     hips = grid.known[:, 0].all(axis=1)
     if np.count_nonzero(hips) < p.min_seen_s * _predict.GRID_HZ or not math.isfinite(grid.leg_m):
@@ -77,7 +80,11 @@ def detect_by_phase(feet: FootTrajectories, paramset: Paramset) -> GaitEvents:
     for s, side in enumerate(SIDES):
         if not np.any(grid.known[hips, 2:, s]):
             return found.empty(f"the {side} foot is never seen", "film from where both legs are in view")
-    check_upright(grid)
+    if (height := check_upright(grid)) < MIN_HIP_HEIGHT:
+        return found.empty(
+            f"the hips are {height:.2f} leg lengths above the feet: nobody stands",
+            "nothing to do where the person lies or sits; else the vertical axis (z up) is another one",
+        )
     if feet.heading_agreement < -0.5:
         return found.empty(
             "the person walks backwards: the events of walking forwards do not apply",
@@ -111,9 +118,16 @@ def detect_by_phase(feet: FootTrajectories, paramset: Paramset) -> GaitEvents:
     )
 
 
-def check_upright(grid: Any) -> None:
-    """Refuse legs that point up, and legs whose left and right are exchanged or mirrored: then the feet, or the knees,
-    point backwards of where the hips face. Raises `PblError` GAIT_INPUT."""
+#: Somebody who sits has the hips at half of this length above the feet and more; below it the legs lie.
+MIN_HIP_HEIGHT = 0.3
+
+
+def check_upright(grid: Any) -> float:
+    """How high the hips are above the feet (leg lengths, median over frames and joints below the knee).
+
+    Refuses legs that point up, and legs whose left and right are exchanged or mirrored: then the feet, or the knees,
+    point backwards of where the hips face. Raises `PblError` GAIT_INPUT.
+    """
     known, x = grid.known, grid.joints_m
     hips = known[:, 0].all(axis=1)
     pelvis = x[:, 0].mean(axis=1)
@@ -121,8 +135,8 @@ def check_upright(grid: Any) -> None:
     for j in (2, 3, 4):
         use = hips[:, None] & known[:, j]
         down.append(((pelvis[:, None] - x[:, j]) @ grid.up)[use])
-    height = np.concatenate(down) / grid.leg_m
-    if len(height) and np.median(height) < -0.1:
+    height = float(np.median(np.concatenate(down))) / grid.leg_m
+    if height < -0.1:
         raise _input_error("feet above the hips", "points with the head up: is the vertical axis the right one?")
     toes = hips[:, None] & known[:, 3] & known[:, 4]
     if np.count_nonzero(toes) > 10:
@@ -133,11 +147,12 @@ def check_upright(grid: Any) -> None:
         line = 0.5 * (x[:, 0] + x[:, 2])
         bend = np.einsum("tsi,ti->ts", x[:, 1] - line, grid.ahead)[legs] / grid.leg_m
         backwards = len(bend) > 10 and np.mean(bend) < -0.02
-    if backwards:
+    if backwards and height >= MIN_HIP_HEIGHT:
         raise _input_error(
             "feet or knees that point backwards of where the hips face",
             "left and right as they are: points are mirrored, or the sides are exchanged",
         )
+    return height
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

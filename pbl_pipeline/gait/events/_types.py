@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import math
 from pathlib import Path
 
 from pbl_pipeline.errors import PblError
@@ -115,13 +116,19 @@ class GaitEvents:
 
 
 def load_events(path: str | Path) -> tuple[GaitEvent, ...]:
-    """Read `events.csv`. The file does not hold bouts: all events get bout 0. Raises `PblError` FILE_FORMAT."""
+    """Read `events.csv`, in order of time. The file does not hold bouts: all events get bout 0.
+
+    Raises `PblError` FILE_FORMAT.
+    """
     try:
         with Path(path).open(newline="") as f:
             rows = csv.DictReader(f)
             if tuple(rows.fieldnames or ()) != COLUMNS:
                 raise ValueError(f"columns {rows.fieldnames}")
-            return tuple(GaitEvent(float(r["time_s"]), r["side"], r["event"], float(r["probability"])) for r in rows)
+            found = [GaitEvent(float(r["time_s"]), r["side"], r["event"], float(r["probability"])) for r in rows]
+            if not all(math.isfinite(e.time_s) and 0.0 <= e.probability <= 1.0 for e in found):
+                raise ValueError("a time that is not finite, or a probability outside 0..1")
+            return tuple(sorted(found, key=lambda e: e.time_s))
     except (OSError, ValueError, TypeError) as error:
         raise PblError(
             "FILE_FORMAT",

@@ -129,8 +129,7 @@ def fit_norm(
         finite; ANGLE_UNITS.
     """
     vectors = _vectors(vectors, variables, percent)
-    if len(vectors) < MIN_VECTORS:
-        raise _invalid(f"{len(vectors)} vectors", f"at least {MIN_VECTORS}")
+    _enough(len(vectors), n_components or 0)
     if angle_model not in ANGLE_MODELS:
         raise _invalid(f"angle model {angle_model!r}", f"one of {', '.join(ANGLE_MODELS)}")
     mean = vectors.mean(axis=0)
@@ -141,8 +140,9 @@ def fit_norm(
         raise _invalid("vectors without any variance", "different people")
     share = np.cumsum(spread) / spread.sum()
     k = n_components or int(np.searchsorted(share, variance - 1e-12) + 1)
-    if k >= len(vectors) or k > len(share):
-        raise _invalid(f"{len(vectors)} vectors for {k} components", "more normative vectors than components")
+    _enough(len(vectors), k)
+    if k > len(share):
+        raise _invalid(f"{len(share)} components in all", f"at least {k}")
     components = rows[:k]
     # The sign of a component is arbitrary: fixed so that two machines write the same file.
     components = components * np.sign(components[np.arange(k), np.abs(components).argmax(axis=1)])[:, None]
@@ -190,7 +190,8 @@ def norm_names() -> tuple[str, ...]:
 def load_norm(name: str = DEFAULT_NORM) -> NormativeSet:
     """A set that ships, by name, or a file of `NormativeSet.save`, by a path that ends in .json.
 
-    Raises `PblError` NORM_UNKNOWN, or NORM_INVALID where the file is damaged.
+    Raises `PblError` NORM_UNKNOWN; NORM_INVALID where the file is damaged or its people are too few for its components;
+    ANGLE_UNITS.
     """
     if name.endswith(".json"):
         path = Path(name)
@@ -207,7 +208,7 @@ def load_norm(name: str = DEFAULT_NORM) -> NormativeSet:
         if _checksum(data) != checksum:
             raise ValueError("the numbers are not those the checksum was made of")
         return _from_json(data, checksum)
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise _invalid(f"{name}: {error}", "a file that build_norm wrote, unchanged") from error
 
 
@@ -248,9 +249,28 @@ def _from_json(data: dict, checksum: str) -> NormativeSet:
     }
     norm = NormativeSet(**values)
     length = len(norm.variables) * len(norm.percent)
-    if norm.mean_deg.shape != (length,) or norm.components.shape[1:] != (length,) or not norm.ln_sd > 0:
+    k = len(norm.components)
+    if (
+        norm.mean_deg.shape != (length,)
+        or norm.components.shape != (k, length)
+        or norm.explained_variance.shape != (k,)
+    ):
         raise ValueError("sizes of mean, components and variables do not fit together")
+    if not norm.ln_sd > 0:
+        raise ValueError("log distances without a spread")
+    if norm.angle_model not in ANGLE_MODELS:
+        raise ValueError(f"angle model {norm.angle_model!r}")
+    _enough(norm.n, k)
+    check_degrees(norm.mean_deg, f"mean of {norm.name}")
     return norm
+
+
+def _enough(n: int, k: int) -> None:
+    """Whether `n` vectors carry an index of `k` components. Raises `PblError` NORM_INVALID."""
+    if n < MIN_VECTORS:
+        raise _invalid(f"{n} vectors", f"at least {MIN_VECTORS}")
+    if k >= n:
+        raise _invalid(f"{n} vectors for {k} components", "more normative vectors than components")
 
 
 def _unknown(name: str) -> PblError:
