@@ -2,7 +2,8 @@
 
     python -m tests.benchmarks.gpu_worker                                  # 256 sessions, batches of 32
     python -m tests.benchmarks.gpu_worker --batch 1,8,32 --json gpu.json   # what the size of a batch brings
-    python -m tests.benchmarks.gpu_worker --sessions 4 --alike --warm-up 2 --batch 2   # to try it on a CPU
+    python -m tests.benchmarks.gpu_worker --seconds 8                      # trials of one length: fewer programs
+    python -m tests.benchmarks.gpu_worker --sessions 4 --warm-up 2 --batch 2 --alike   # to try it on a CPU
 
 A database of its own holds sessions of one to three walks with their keypoints (the walker of `pbl synth`, a few walks
 with new noise for each trial), as they lie there when detection is through. One worker fits all of them. The first ones
@@ -32,8 +33,8 @@ import numpy as np
 from tests.benchmarks import gpu_worker_watch
 from tests.database import installation
 
-#: Durations (s) that a trial may have, trials that a session may have, cameras.
-SECONDS, TRIALS, CAMERAS = (5.0, 7.5, 10.0), (1, 2, 3), ("static", "handheld")
+#: Trials that a session may have, and cameras.
+TRIALS, CAMERAS = (1, 2, 3), ("static", "handheld")
 #: Noise of a trial beside that of the walk it is made from.
 JITTER_PX, JITTER_M = 1.0, 0.005
 #: Priority of the sessions that let the worker compile: before all others.
@@ -70,13 +71,14 @@ class Plan:
     camera: str
 
 
-def plans(n: int, alike: bool, seed: int = 0) -> list[Plan]:
-    """Sessions of chance sizes, or (`alike`) of one trial of 5 s and a static camera."""
+def plans(n: int, seconds: Sequence[float], alike: bool, seed: int = 0) -> list[Plan]:
+    """Sessions of chance sizes with trials that last one of `seconds`, or (`alike`) one trial of the first and a static
+    camera."""
     if alike:
-        return [Plan((SECONDS[0],), CAMERAS[0])] * n
+        return [Plan((seconds[0],), CAMERAS[0])] * n
     draw = np.random.default_rng(seed)
     return [
-        Plan(tuple(map(float, draw.choice(SECONDS, size=draw.choice(TRIALS)))), str(draw.choice(CAMERAS)))
+        Plan(tuple(map(float, draw.choice(seconds, size=draw.choice(TRIALS)))), str(draw.choice(CAMERAS)))
         for _ in range(n)
     ]
 
@@ -325,9 +327,12 @@ def lines(batch: int, processes: int, f: dict[str, Any]) -> list[str]:
 @click.option("--warm-up", default=64, show_default=True, help="Sessions before them, so that programs are compiled.")
 @click.option("--batch", "batches", default="32", show_default=True, help="Sessions that are reserved together; a,b,c.")
 @click.option("--processes", default="1", show_default=True, help="Working processes that share the device; a,b,c.")
-@click.option("--alike", is_flag=True, help="All sessions of one size: few programs to compile.")
+@click.option("--seconds", default="5,7.5,10", show_default=True, help="That a trial may last; a,b,c.")
+@click.option("--alike", is_flag=True, help="All sessions of one size: a single program.")
 @click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write the figures there.")
-def main(sessions: int, warm_up: int, batches: str, processes: str, alike: bool, json_path: Path | None) -> None:
+def main(
+    sessions: int, warm_up: int, batches: str, processes: str, seconds: str, alike: bool, json_path: Path | None
+) -> None:
     """Measure a worker that fits."""
     os.environ["JAX_PLATFORMS"] = "cpu"  # this process only makes the sessions: the device is the worker's
     import schemas
@@ -338,7 +343,7 @@ def main(sessions: int, warm_up: int, batches: str, processes: str, alike: bool,
         schemas.activate()
         logging.getLogger("datajoint").setLevel(logging.ERROR)
         begin = time.monotonic()
-        put_sessions(home, plans(sessions + warm_up, alike))
+        put_sessions(home, plans(sessions + warm_up, [float(s) for s in seconds.split(",")], alike))
         click.echo(f"{sessions + warm_up} sessions registered in {time.monotonic() - begin:.0f} s")
         del os.environ["JAX_PLATFORMS"]
         for b in map(int, batches.split(",")):

@@ -26,7 +26,7 @@ N = 7
 @pytest.fixture
 def sessions(tables: None, database: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable], Worker]:
     """Sessions that wait for their fit, and a worker on two threads, given what stands for `fit_sessions`."""
-    gpu_worker.put_sessions(database, gpu_worker.plans(N, alike=True))
+    gpu_worker.put_sessions(database, gpu_worker.plans(N, [5.0], alike=True))
     assert gpu_worker.queue_fits(0) == N
     monkeypatch.setattr(batches, "_threads", lambda: 2)
 
