@@ -384,6 +384,7 @@ def _camera(camera_file: str | Path, path: Path) -> dict[str, Any] | None:
         height, width = next(iter(frames)).image.shape[:2]
     except PblError:
         return None
+    library("video").check_same_phone(camera_file, library("video").read_phone(path), path)
     size = (int(width), int(height))
     return camera_row(library("video").load_camera(camera_file, size), size)
 

@@ -9,9 +9,17 @@ from ._cut import cut_image
 from ._draw_calibration import draw_calibration
 from ._find_camera import find_camera
 from ._load_attitude import attitude_of, load_attitude
-from ._phone_lens import LensCalibration, PhoneLens, about_phone, load_lens_calibration, phone_lens, turned_camera
+from ._phone_lens import (
+    LensCalibration,
+    PhoneLens,
+    about_phone,
+    check_same_phone,
+    load_lens_calibration,
+    phone_lens,
+    turned_camera,
+)
 from ._phone_log import PhoneLog, Sensor, read_phone_log
-from ._probe import probe, sha256_of
+from ._probe import probe, read_phone, sha256_of
 from ._read import read_frames
 from ._timing import check_timing
 from ._types import Camera, Frame, VideoInfo
@@ -33,6 +41,7 @@ __all__ = [
     "calibrate_video",
     "camera_in_device",
     "check_attitude",
+    "check_same_phone",
     "check_timing",
     "cut_image",
     "draw_calibration",
@@ -45,6 +54,7 @@ __all__ = [
     "phone_lens",
     "probe",
     "read_frames",
+    "read_phone",
     "read_phone_log",
     "sha256_of",
     "turned_camera",

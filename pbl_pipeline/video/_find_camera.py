@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ._camera import guess_camera, load_camera
+from ._phone_lens import check_same_phone
 from ._presets import PRESET_REL_SD, preset_camera
 from ._types import Camera, VideoInfo
 
@@ -28,9 +29,10 @@ def find_camera(video: VideoInfo, file: str | Path | None = None) -> Camera:
     Raises
     ------
     PblError
-        CAMERA_INVALID for a calibration that cannot be used (`load_camera`).
+        CAMERA_INVALID for a calibration that cannot be used (`load_camera`), or is of another phone or lens.
     """
     if file is not None:
+        check_same_phone(file, vars(video), video.path)
         return load_camera(file, (video.width_px, video.height_px))
     return metadata_camera(video) or preset_camera(video) or guess_camera(video)
 

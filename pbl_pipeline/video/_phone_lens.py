@@ -108,6 +108,36 @@ def load_lens_calibration(path: str | Path, like: str | Path | None = None) -> L
     return LensCalibration(lens, load_camera(path, size), size, rotation)
 
 
+def check_same_phone(file: str | Path, phone: Mapping[str, Any], video: str | Path) -> None:
+    """Refuse a camera file of `pbl calibrate` for a video of another phone, lens or zoom. What one of them does not say
+    is no difference. `phone`: what the video says, as `read_phone`.
+
+    Raises
+    ------
+    PblError
+        CAMERA_INVALID.
+    """
+    measured = _content(Path(file)).get("phone")
+    if not isinstance(measured, Mapping):
+        return
+    for name, what in (("make", ""), ("model", ""), ("lens", ""), ("focal_35mm", " mm on 35 mm film")):
+        theirs, ours = measured.get(name), phone.get(name)
+        if not theirs or not ours:
+            continue
+        if name == "focal_35mm":
+            same = isinstance(theirs, (int, float)) and abs(theirs - ours) <= _SAME_FOCAL_MM
+        else:
+            same = str(theirs).casefold() == str(ours).casefold()
+        if not same:
+            raise PblError(
+                "CAMERA_INVALID",
+                found=f"a calibration of {theirs}{what}, and a video of {ours}{what}",
+                expected="the calibration of the lens that recorded the video",
+                next_step="pass the calibration of that lens with --camera, or none",
+                key=video,
+            )
+
+
 def about_phone(video: VideoInfo) -> dict[str, Any]:
     """What a camera file says of the video that it was measured with, for `load_lens_calibration`."""
     lens = phone_lens(video)
@@ -125,11 +155,8 @@ def about_phone(video: VideoInfo) -> dict[str, Any]:
 
 
 def _read(path: Path) -> tuple[PhoneLens, tuple[int, int], int]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        content = None
-    if not isinstance(content, dict):
+    content = _content(path)
+    if not content:
         load_camera(path, (1, 1))  # says what is wrong with it, unless it is a TOML
         raise _nameless(path, "a camera file that names no phone")
     phone, video = content.get("phone"), content.get("video")
@@ -145,6 +172,15 @@ def _read(path: Path) -> tuple[PhoneLens, tuple[int, int], int]:
     stored = _stored(width, height, rotation)
     film = float(focal) if isinstance(focal, (int, float)) and not isinstance(focal, bool) and focal > 0 else None
     return PhoneLens(names[0], names[1], names[2], stored, rate, film), (width, height), rotation
+
+
+def _content(path: Path) -> dict[str, Any]:
+    """The fields of a JSON file; none where it is no such file."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def _stored(width: int, height: int, rotation_deg: int) -> tuple[int, int]:

@@ -7,6 +7,7 @@ import hashlib
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -81,13 +82,33 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
             n_frames_announced=decoder.n_announced,
             variable_frame_rate=varies,
             recorded_utc=_recorded_utc(metadata),
-            make=_first(metadata, "com.apple.quicktime.make", "com.android.manufacturer", "make"),
-            model=_first(metadata, "com.apple.quicktime.model", "com.android.model", "model"),
             notes=tuple(notes),
-            lens=_first(metadata, "com.apple.quicktime.camera.lens_model"),
-            focal_35mm=_number(metadata, "com.apple.quicktime.camera.focal_length.35mm_equivalent"),
             capture_fps=capture_fps,
+            **_phone(metadata),
         )
+
+
+def read_phone(path: str | Path) -> dict[str, Any]:
+    """What a video says of the phone that recorded it: `make`, `model`, `lens`, `focal_35mm` as in `VideoInfo`. Nothing
+    is decoded.
+
+    Raises
+    ------
+    PblError
+        VIDEO_MISSING, VIDEO_EMPTY, VIDEO_NOT_A_VIDEO.
+    """
+    path = check_file(path)
+    with Decoder(path) as decoder:
+        return _phone(dict(decoder.stream.metadata) | dict(decoder.container.metadata) | read_tags(path).items)
+
+
+def _phone(metadata: Mapping[str, str]) -> dict[str, Any]:
+    return {
+        "make": _first(metadata, "com.apple.quicktime.make", "com.android.manufacturer", "make"),
+        "model": _first(metadata, "com.apple.quicktime.model", "com.android.model", "model"),
+        "lens": _first(metadata, "com.apple.quicktime.camera.lens_model"),
+        "focal_35mm": _number(metadata, "com.apple.quicktime.camera.focal_length.35mm_equivalent"),
+    }
 
 
 def _rate(time_s: np.ndarray, tick_s: float, announced_fps: float | None) -> tuple[float, bool]:

@@ -10,6 +10,7 @@ import pytest
 
 from schemas import fit, keypoints, lab, video
 from schemas._base import file_ref, stored_file
+from schemas.ingest import Visit, ingest
 from tests.command import pbl
 from tests.integration import chain
 from tests.integration.test_tables import errors
@@ -148,6 +149,14 @@ def test_another_rate_zoom_or_size_is_another_view(tmp_path: Path):
     assert sources()[ids[2]] == "measured"
     assert len(lab.DeviceCalibration()) == 2
     assert len(lab.Device()) == 1
+
+
+def test_a_calibration_of_another_phone_is_refused(tmp_path: Path):
+    path, file = recording(tmp_path, "pixel", PIXEL), calibration(tmp_path / "camera.json")
+    (result,) = ingest([path], Visit("P001", camera_file=file))
+    assert result.error is not None
+    assert (result.error.code, result.status) == ("CAMERA_INVALID", "refused")
+    assert not video.Video()
 
 
 def test_devices_of_one_short_name(tmp_path: Path):

@@ -15,9 +15,11 @@ from pbl_pipeline.video import (
     PhoneLens,
     VideoInfo,
     about_phone,
+    find_camera,
     load_lens_calibration,
     phone_lens,
     probe,
+    read_phone,
     turned_camera,
 )
 from tests.quicktime import insert, meta
@@ -113,6 +115,33 @@ def test_what_pbl_calibrate_writes_of_the_phone_is_read_back(tmp_path):
     # The same from a file that names no phone, and a recording of it.
     (tmp_path / "plain.json").write_text(json.dumps(fields))
     assert load_lens_calibration(tmp_path / "plain.json", like=path).lens == found.lens
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"model": "iPhone 15"}, "a calibration of iPhone 13, and a video of iPhone 15"),
+        ({"lens": "ultra wide camera"}, "a calibration of back camera, and a video of ultra wide camera"),
+        ({"focal_35mm": 54.0}, "a calibration of 27 mm on 35 mm film, and a video of 54.0 mm on 35 mm film"),
+        ({"make": "APPLE", "model": "iPhone 13", "focal_35mm": 27.2}, None),
+        ({"make": None, "model": None}, None),
+    ],
+)
+def test_a_calibration_of_another_phone_is_refused(tmp_path, changes, found):
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(FIELDS))
+    recorded = video(width_px=1920, height_px=1080, **changes)
+    if found is None:
+        assert find_camera(recorded, path).source.startswith("file: camera.json")
+        return
+    with pytest.raises(PblError) as caught:
+        find_camera(recorded, path)
+    assert (caught.value.code, caught.value.found) == ("CAMERA_INVALID", found)
+
+
+def test_what_a_video_says_of_its_phone_without_decoding_it(tmp_path):
+    path = insert(small(tmp_path / "a.mov"), of_file=meta({"com.apple.quicktime.model": "iPhone 15"}))
+    assert read_phone(path) == {"make": None, "model": "iPhone 15", "lens": None, "focal_35mm": None}
 
 
 @pytest.mark.parametrize(
