@@ -1,7 +1,7 @@
 """What the queue costs, and what it survives: figures of docs/operations.md.
 
     python -m tests.benchmarks.workers scale              # 300,000 videos: register, status, refresh, cost per job
-    python -m tests.benchmarks.workers speed              # jobs a second of 1, 2 and 4 workers on 5,000 keys
+    python -m tests.benchmarks.workers speed              # jobs a second of 1 to 4 workers on 5,000 keys
     python -m tests.benchmarks.workers kills              # kill -9 of workers and of the database during 2,000 jobs
     python -m tests.benchmarks.workers memory             # a worker's memory over 500 jobs
 
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import os
 import random
 import signal
@@ -25,11 +26,13 @@ import click
 import pytest
 
 from tests import database
-from tests.benchmarks import worker_standins
+from tests.benchmarks import worker_replay, worker_standins
 from tests.integration import chain
 
 #: Videos of a session.
 EACH = 6
+#: Jobs that follow from a session: nine for each video, three for all.
+_JOBS_OF_A_SESSION = 9 * EACH + 3
 
 
 @contextlib.contextmanager
@@ -58,21 +61,24 @@ def say(what: str, value: float, unit: str, bar: str = "") -> None:
     click.echo(f"{what:<66}{value:>10.3g} {unit:<10}{bar}")
 
 
-def work(processes: int, **options: Any) -> float:
-    """Work until nothing is left; the seconds from the first job in hand to the last one ended."""
+def work(processes: int, heard: list[tuple[float, dict[str, Any]]] | None = None, **options: Any) -> float:
+    """Work until nothing is left; the seconds from the first job in hand to the last one ended.
+
+    `heard`: takes what the workers say, with the time.
+    """
     from workers.metrics import Metrics
     from workers.supervisor import Options, Supervisor
 
-    times: list[float] = []
+    said = [] if heard is None else heard
 
     class Clock(Metrics):
         def heard(self, message: dict[str, Any]) -> None:
-            times.append(time.monotonic())
+            said.append((time.monotonic(), message))
             super().heard(message)
 
     once = {"once": True, "selftest": False, "processes": processes, **options}
     assert Supervisor(Options(**once), Clock(), worker_standins.work).run() == 0
-    return times[-1] - times[0]
+    return said[-1][0] - said[0][0]
 
 
 # --------------------------------------------------------------------------------------------------------------- scale
@@ -195,25 +201,59 @@ def _first_set() -> str:
 @main.command()
 @click.option("--keys", default=5000, show_default=True)
 def speed(keys: int) -> None:
-    """Jobs a second of one table (VideoInfo) by 1, 2 and 4 workers; each key exactly once."""
-    from schemas import lab, video
+    """Jobs a second of one table (VideoInfo) by 1 to 4 workers, each key exactly once; what the database could do."""
+    from schemas import embedded, tracking, video
     from schemas.bulk import register_many
+    from workers import queue
 
-    with installation():
+    def begin() -> None:
+        """All keys wait, nothing is done."""
+        for rows in (video.VideoInfo, tracking.Tracking.jobs, video.VideoInfo.jobs):
+            rows.delete_quick()
+        assert queue.fill(video.VideoInfo) == keys
+
+    with installation() as home:
+        server = embedded.Folder(home / "db").state()["pid"]
+        register_many(recordings(0, keys))
+        click.echo(f"{keys} keys, {os.cpu_count()} cores for workers and database together")
         alone = 0.0
-        for processes in (1, 2, 4):
-            register_many(recordings(0, keys))
-            seconds = work(processes, resource="decode")
-            assert len(video.VideoInfo()) == keys
-            rate = keys / seconds
+        for processes in (1, 2, 3, 4):
+            begin()
+            heard: list[tuple[float, dict[str, Any]]] = []
+            before = _processor_s(server)
+            work(processes, heard, resource="decode")
+            ended = [(t, m) for t, m in heard if m["what"] == "end"]
+            once = {m["hash"]: m["outcome"] for _, m in ended}
+            assert len(ended) == len(once) == len(video.VideoInfo()) == keys
+            assert set(once.values()) == {"done"}
+            # Workers start one after the other: counted from when all of them had begun.
+            begun = max(min(t for t, m in heard if m["connection_id"] == c) for c in _connections(heard, processes))
+            rate = sum(t > begun for t, _ in ended) / (ended[-1][0] - begun)
             alone = alone or rate
-            say(
-                f"jobs a second, {processes} workers ({os.cpu_count()} cores)",
-                rate,
-                "1/s",
-                f"{rate / alone:.2f} times one",
-            )
-            lab.Subject.delete(prompt=False, part_integrity="cascade")
+            say(f"{processes} workers, each key done once", rate, "jobs/s", f"{rate / alone:.2f} times one")
+            say("  processor time of the database", 1000 * (_processor_s(server) - before) / keys, "ms a job")
+        begin()
+        steps = worker_replay.record([video.VideoInfo])
+        for n in (1, 2, 4, 8):
+            begin()
+            seconds, repeated = worker_replay.replay(steps, n)
+            assert len(video.VideoInfo()) == keys
+            again = f"{repeated} steps again after a deadlock" if repeated else ""
+            say(f"the same statements without the workers, {n} connections", keys / seconds, "jobs/s", again)
+        say("statements of a job", sum(map(len, steps)) / keys, "")
+
+
+def _connections(heard: list[tuple[float, dict[str, Any]]], n: int) -> set[int]:
+    """The workers' connections, from what they said; all of them must have worked."""
+    found = {m["connection_id"] for _, m in heard}
+    assert len(found) == n, found
+    return found
+
+
+def _processor_s(pid: int) -> float:
+    """Processor time of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 # --------------------------------------------------------------------------------------------------------------- kills
@@ -316,30 +356,35 @@ def _child_of(pid: int) -> int:
 @main.command()
 @click.option("--jobs", default=500, show_default=True)
 def memory(jobs: int) -> None:
-    """Resident memory of one worker after 20 jobs and after all."""
+    """Resident memory of one worker, started as in production: after 20 jobs, after all, after as many again."""
     from schemas.bulk import register_many
+    from workers.metrics import Metrics
+    from workers.supervisor import Options, Supervisor
 
     with installation():
-        register_many(recordings(0, jobs // 10))
-        sizes: list[float] = []
-
-        from workers.metrics import Metrics
-        from workers.supervisor import Options, Supervisor
+        register_many(recordings(0, EACH * math.ceil(2 * jobs / _JOBS_OF_A_SESSION)))
+        sizes: list[tuple[str, float]] = []
 
         class Watch(Metrics):
             def heard(self, message: dict[str, Any]) -> None:
                 if message["what"] == "end":
                     (child,) = [c.process.pid for c in boss._children]
                     pages = int(Path(f"/proc/{child}/statm").read_text().split()[1])
-                    sizes.append(pages * os.sysconf("SC_PAGE_SIZE") / 2**20)
+                    sizes.append((message["table"], pages * os.sysconf("SC_PAGE_SIZE") / 2**20))
 
-        boss = Supervisor(Options(once=True, selftest=False), Watch(), worker_standins.work)
+        boss = Supervisor(Options(once=True), Watch(), worker_standins.work)
         assert boss.run() == 0
-        say(f"jobs of all {len(sizes)} kinds and keys", len(sizes), "")
-        say("memory after 20 jobs", sizes[20], "MiB")
+        mib = [size for _, size in sizes]
+        assert len(mib) >= 2 * jobs
+        first = {name: i for i, (name, _) in reversed([*enumerate(sizes)])}
+        for name, i in sorted(first.items(), key=lambda f: f[1]):
+            say(f"job {i + 1}, the first of {name}", mib[i], "MiB", f"{mib[i] - mib[max(i - 1, 0)]:+.1f}")
+        say("memory after 20 jobs", mib[19], "MiB")
         say(
-            f"memory after {len(sizes)} jobs", sizes[-1], "MiB", f"{100 * (sizes[-1] / sizes[20] - 1):+.1f} %, bar +5 %"
+            f"memory after {jobs} jobs", mib[jobs - 1], "MiB", f"{100 * (mib[jobs - 1] / mib[19] - 1):+.1f} %, bar +5 %"
         )
+        again = 100 * (mib[2 * jobs - 1] / mib[jobs - 1] - 1)
+        say(f"memory after {2 * jobs} jobs", mib[2 * jobs - 1], "MiB", f"{again:+.1f} % since then")
 
 
 if __name__ == "__main__":
