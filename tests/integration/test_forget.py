@@ -9,15 +9,22 @@ from pathlib import Path
 
 import pytest
 
-from schemas import connection, forget, keypoints, video
+from schemas import connection, forget, keypoints, lab, session, video
 from schemas._declare import declare_all
 from schemas.ingest import Visit, ingest
 from tests.command import pbl
-from tests.inputs import CALIBRATION
-from tests.rows import everything, remove_all
+from tests.rows import everything, register, remove_all
 from workers.populate import populate
 
 from . import chain
+
+
+def camera(folder: Path, name: str, focal_px: float) -> Path:
+    """A file with a lens."""
+    path = folder / f"{name}.json"
+    matrix = [[focal_px, 0, 64], [0, focal_px, 36], [0, 0, 1]]
+    path.write_text(json.dumps({"camera_matrix": matrix, "distortion": [0] * 5, "image_size_px": [128, 72]}))
+    return path
 
 
 def stored() -> set[str]:
@@ -33,18 +40,21 @@ def two(database: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iter
     chain.install(monkeypatch)
     declare_all()
     shutil.rmtree(Path(connection.store_backend().spec["location"]) / "_schema", ignore_errors=True)
-    ingest([chain.small_video(tmp_path, "other")], Visit(subject="P001"))
+    shared, own = camera(tmp_path, "shared", 900), camera(tmp_path, "own", 905)
+    ingest([chain.small_video(tmp_path, "other")], Visit(subject="P001", camera_file=shared))
     populate()
     rows, files = everything(), stored()
     videos = [chain.small_video(tmp_path, "walk"), chain.small_video(tmp_path, "waits", people="two alike")]
     (tmp_path / "notes.mp4").write_text("not a video")
-    (tmp_path / "camera.toml").write_text(CALIBRATION.replace("[1000, 1000]", "[128, 72]"))
     videos.append(tmp_path / "notes.mp4")
-    results = ingest(videos, Visit(subject="P017", session_label="2026-03-01"))
-    assert [r.status for r in results] == ["registered"] * 3
+    numbers = [
+        register(path, subject="P017", session_label="2026-03-01", camera_file=lens)[0]
+        for path, lens in zip(videos, (own, shared, None), strict=True)
+    ]
+    assert len(lab.CameraCalibration()) == 2
     populate()
     # The queues have finished rows of this person, too; and a computation that was killed left a file without a row.
-    number = results[0].video_id
+    number = numbers[0]
     _queue(video.VideoInfo, "error", number)
     _queue(keypoints.Keypoints, "pending", number)
     connection.store_backend().put_buffer(
@@ -113,7 +123,9 @@ def test_nothing_of_the_person_is_left_and_nothing_else_is_touched(
     assert stored() == their_files
 
 
-def test_broken_off_it_is_repeated_until_done(two: tuple[dict, set[str], list[Path]], monkeypatch: pytest.MonkeyPatch):
+def test_broken_off_it_is_repeated_until_done(
+    two: tuple[dict, set[str], list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     rows, files, _ = two
     removed = []
 
@@ -132,10 +144,16 @@ def test_broken_off_it_is_repeated_until_done(two: tuple[dict, set[str], list[Pa
     assert everything() == rows
     assert stored() != files
     assert json.loads(forget.manifest_path("P017").read_text())["state"] == "begun"
-    # The rows are gone, and still the command knows what to remove.
+    # The rows are gone and somebody else has the numbers by now: still the command knows what to remove, and what not.
+    left = stored()
+    ingest([chain.small_video(tmp_path, "next")], Visit(subject="P018"))
+    video.VideoInfo.populate()
+    theirs = stored() - left
+    numbers = json.loads(forget.manifest_path("P017").read_text())["ids"]["video_id"]
+    assert any(f"video_id={n}/" in path for n in numbers for path in theirs)
     done = pbl("forget", "P017", "--yes")
     assert done.code == 0, done.err
-    assert stored() == files
+    assert stored() == files | theirs
 
 
 def test_an_unknown_code_removes_nothing_and_a_running_computation_holds_it_up(
@@ -161,6 +179,27 @@ def test_a_video_in_whose_place_another_lies_stays(two: tuple[dict, set[str], li
     assert "another file took its place" in done.out
     assert videos[0].read_bytes() == b"somebody else's"
     assert not videos[1].exists()
+
+
+def test_a_file_that_somebody_elses_row_names_stays(
+    two: tuple[dict, set[str], list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    _, _, videos = two
+    other = (video.Video & (session.Session & {"subject": "P001"})).fetch1("video_id")
+    video.Video.update1({"video_id": other, "video_path": str(videos[0])})
+    done = pbl("forget", "P017", "--yes", "--videos")
+    assert [v.exists() for v in videos] == [True, False, False]
+    assert "another row names this path" in done.out
+    assert done.code == 1
+    assert "1 rows of pbl_video.video name it in video_path" in done.err
+    archived = tmp_path / "archive" / "P017" / "visit" / "ab-walk.mp4"
+    archived.parent.mkdir(parents=True)
+    archived.write_bytes(b"another recording")
+    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+    video.Video.update1({"video_id": other, "video_path": str(archived)})
+    assert pbl("forget", "P017", "--yes", "--videos").code == 0
+    assert archived.exists()
+    assert not videos[0].exists()
 
 
 def test_every_table_of_a_person_says_whose_its_rows_are(database: Path):
