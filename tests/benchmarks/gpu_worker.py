@@ -56,7 +56,9 @@ PARTS = (
     ("savez_compressed", "of that: compress arrays"),
 )
 
-#: Of these, what follows the computation.
+#: What computes: a batch, or one session alone.
+COMPUTE = ("compute_batch", "make_compute")
+#: Of the parts, what follows the computation.
 AFTER = ("run", "make_insert", "savez_compressed")
 
 Span = tuple[float, float]
@@ -254,8 +256,8 @@ def windows(spans: Sequence[dict[str, Any]], warm_up: int) -> tuple[Span, Span]:
     ValueError
         Nothing was computed after the warm-up.
     """
-    computed = sorted((s["end"], s["begin"], s["n"]) for s in spans if s["name"] == "compute_batch")
-    done, begin = 0, computed[0][1]
+    computed = sorted((s["end"], s["begin"], s["n"]) for s in spans if s["name"] in COMPUTE)
+    done, begin = 0, min((b for _, b, _ in computed), default=0.0)
     for end, _, n in computed:
         if done >= warm_up:
             break
@@ -280,11 +282,12 @@ def figures(spans: Sequence[dict[str, Any]], warm_up: int) -> dict[str, Any]:
     smi = [s["n"] for s in of("smi")]
     solves = of("solve")
     # Counted where they end: some were begun before, as others are at the end of any time that one looks at.
-    fitted = sum(s["n"] for s in spans if s["name"] == "compute_batch" and s["end"] > whole[0])
+    fitted = sum(s["n"] for s in spans if s["name"] in COMPUTE and s["end"] > whole[0])
     inserted = len(of("run", whole))
     first = min(s["begin"] for s in spans if s["name"] in ("fetch_batch", "run"))
     ms: dict[str, float] = {name: 1000 * sum(s["end"] - s["begin"] for s in of(name, whole)) for name, _ in PARTS}
     ms |= {"device": 1000 * union_s(device, whole)}
+    ms["run"] -= 1000 * sum(s["end"] - s["begin"] for s in of("make_compute", whole))
     return {
         "sessions": fitted,
         "sessions_per_s": fitted / (whole[1] - whole[0]),

@@ -60,6 +60,7 @@ def watch(path: Path) -> None:
         (gauss_newton, "_on_floor", None),
         (gauss_newton, "_solve", number_of),
         (fit.SessionFit, "_loaded", None),
+        (fit.SessionFit, "make_compute", None),
         (fit.SessionFit, "make_insert", None),
         (np, "savez_compressed", None),
     ):

@@ -45,6 +45,18 @@ def test_the_window_begins_where_the_warm_up_is_computed():
     assert windows(SPANS, 0) == ((1, 20), (1, 24))
     with pytest.raises(ValueError, match="nothing was computed"):
         windows(SPANS, 6)
+    with pytest.raises(ValueError, match="nothing was computed"):
+        windows([span("run", 0, 1)], 0)
+
+
+def test_sessions_that_are_computed_one_by_one():
+    each = [
+        (t, span("run", t, t + 3), span("make_compute", t + 1, t + 2), span("device", t + 1, t + 2)) for t in (0, 3, 6)
+    ]
+    found = figures([s for _, *spans in each for s in spans], 1)
+    assert windows([s for _, *spans in each for s in spans], 1) == ((2, 8), (2, 9))
+    assert (found["sessions"], found["busy_share"]) == (2, pytest.approx(2 / 6))
+    assert found["ms_per_session"]["run"] == pytest.approx(2000)
 
 
 def test_figures():
