@@ -159,6 +159,17 @@ def test_a_calibration_of_another_phone_is_refused(tmp_path: Path):
     assert not video.Video()
 
 
+def test_a_phones_calibration_outlives_a_person_whose_video_has_it(tmp_path: Path):
+    file = calibration(tmp_path / "camera.json")
+    register(recording(tmp_path, "apple", APPLE), camera_file=file)
+    added(file)
+    assert len(lab.CameraCalibration()) == 1
+    done = pbl("forget", "P001", "--yes")
+    assert done.code == 0, done.err
+    assert not video.Video()
+    assert len(lab.DeviceCalibration()) == 1
+
+
 def test_devices_of_one_short_name(tmp_path: Path):
     for model in ("Pixel 8", "Pixel-8"):
         added(calibration(tmp_path / "camera.json", make="Google", model=model))

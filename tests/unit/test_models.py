@@ -331,6 +331,12 @@ def test_a_registered_model_that_changed_is_named(folder, registry):
     assert listed.code == 1
     assert "MODEL_CHECKSUM" in listed.out
     assert pbl("models", "verify", "dots-crop3d").error_code == "MODEL_CHECKSUM"
+    # The others are looked at all the same.
+    models.add(changed(folder, name="sound"))
+    every = pbl("models", "verify")
+    assert every.error_code == "MODEL_CHECKSUM"
+    assert "dots-crop3d: MODEL_CHECKSUM" in every.out
+    assert "sound: ok on cpu" in every.out
 
 
 def test_another_model_under_the_name(folder, registry):
