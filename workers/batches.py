@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from . import queue, run_job
 from .queue import Claim
@@ -56,14 +56,3 @@ def _start(device: ThreadPoolExecutor, jobs: list[Claim]) -> Future[list[Compute
     """Fetch the inputs here, compute there."""
     fetched = run_job.fetch_batch(jobs)
     return device.submit(run_job.compute_batch, jobs, fetched)
-
-
-def warm(tables: list[Any]) -> None:
-    """Load what the first job would load (imports, compiled programs), before it is reserved."""
-    import importlib
-
-    names = {t.__name__ for t in tables}
-    if "SessionFit" in names:
-        importlib.import_module("pbl_pipeline.fit")
-    if names & {"Tracking", "Keypoints"}:
-        importlib.import_module("pbl_pipeline.keypoints")

@@ -24,7 +24,8 @@ class SelfTestFailed(Exception):
 
 
 def check(tables: Sequence[Any]) -> None:
-    """Write and read the store, and do known jobs of the resource classes that are served.
+    """Write and read the store, and do known jobs of the resource classes that are served: real ones then find the
+    networks loaded and the programs of that size compiled.
 
     Raises
     ------

@@ -272,7 +272,7 @@ def work(options: Options, pipe: Connection) -> None:
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     import schemas
 
-    from . import batches, heartbeat, loop, selftest
+    from . import heartbeat, loop, selftest
 
     stop = threading.Event()
 
@@ -300,7 +300,6 @@ def work(options: Options, pipe: Connection) -> None:
         except selftest.SelfTestFailed as error:
             event(log, logging.CRITICAL, "self-test failed", error=str(error))
             raise SystemExit(SELFTEST_FAILED) from error
-    batches.warm(tables)
 
     def say(what: str, job: Claim | None, outcome: Outcome | None) -> None:
         if job is None:
@@ -331,7 +330,7 @@ def work(options: Options, pipe: Connection) -> None:
 
 
 def _connected(schemas: Any, stop: threading.Event) -> bool:
-    """Connect and bind the tables; wait for a database that is not there yet."""
+    """Connect and bind the tables, which loads the numerical libraries; wait for a database that is not there yet."""
     while not stop.is_set():
         try:
             schemas.activate()
