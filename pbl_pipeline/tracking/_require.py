@@ -7,6 +7,7 @@ from pathlib import Path
 from pbl_pipeline.errors import PblError
 
 from ._sheet import save_contact_sheet
+from ._subject import MOST_LISTED
 from ._types import SubjectChoice, Tracking
 
 #: With fewer frames nobody can be followed, whoever is in the picture.
@@ -25,7 +26,8 @@ def require_subject(choice: SubjectChoice, tracking: Tracking, video_path: str |
     sheet.parent.mkdir(parents=True, exist_ok=True)
     ranked = sorted(choice.scores, key=lambda k: -choice.scores[k])
     save_contact_sheet(video_path, tracking, sheet, ranked)
-    named = ", ".join(f"{k} (score {choice.scores[k]:.2f})" for k in ranked)
+    named = ", ".join(f"{k} (score {choice.scores[k]:.2f})" for k in ranked[:MOST_LISTED])
+    named += f" and {len(ranked) - MOST_LISTED} others" if len(ranked) > MOST_LISTED else ""
     raise PblError(
         "SUBJECT_NEEDS_CHOICE",
         found=f"{len(tracking.persons)} people, none clearly the subject: person {named}",

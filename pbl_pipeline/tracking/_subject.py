@@ -30,6 +30,9 @@ from pbl_pipeline.paramset import Paramset
 from ._associate import measure
 from ._types import Detection, PersonTrack, SubjectChoice, Tracking
 
+#: Of people who are too alike to choose between, so many are described, the best first.
+MOST_LISTED = 6
+
 
 @dataclasses.dataclass(frozen=True)
 class SubjectParams:
@@ -133,7 +136,9 @@ def choose_subject(
 
     if min(lead(k) for k in candidates[1:]) < params.margin:
         close = [k for k in candidates if k == best or lead(k) < params.margin]
-        listed = "; ".join(f"person {k} {_words(by_id[k], tracking)} (score {scores[k]:.2f})" for k in close)
+        shown = close[:MOST_LISTED]
+        listed = "; ".join(f"person {k} {_words(by_id[k], tracking)} (score {scores[k]:.2f})" for k in shown)
+        listed += f"; and {len(close) - len(shown)} others" if len(close) > len(shown) else ""
         reason = f"{len(close)} people are too alike to choose between: {listed}. A person has to choose."
         return SubjectChoice("NEEDS_CHOICE", None, scores[best], second, scores[second], scores, reason)
     reason = (

@@ -50,6 +50,16 @@ def test_a_therapist_beside_the_patient_leaves_the_choice_to_a_person():
     assert choice.runner_up_id is not None
 
 
+def test_of_a_crowd_the_first_few_are_described():
+    crowd = [track(k + 1, x=300.0 + 20 * k, side=400.0, n=60) for k in range(30)]
+    choice = choose_subject(video_of(*crowd))
+    assert choice.status == "NEEDS_CHOICE"
+    assert choice.reason.count("stays in place") == 6
+    assert "30 people are too alike" in choice.reason
+    assert "; and 24 others. A person has to choose." in choice.reason
+    assert len(choice.scores) == 30
+
+
 def test_a_therapist_who_stands_and_watches_is_not_taken():
     patient = track(1, x=lambda t: 100 + 60 * t, n=N, jitter=0.02)
     therapist = track(2, x=700.0, side=700.0, n=N, jitter=0.02)
