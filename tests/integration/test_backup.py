@@ -154,7 +154,10 @@ def test_a_changed_backup_is_refused_before_anything_is_written(elsewhere: Any, 
     assert pbl("db", "restore", saved).error_code == "BACKUP_INVALID"
     (saved / "database.sql.gz").write_bytes(sql)
     listing = (saved / "store.sha256").read_text()
-    (saved / "store.sha256").write_text(listing.replace("  _schema/", "  ../_schema/", 1))
+    # A path that leaves the store is refused even where there is such a file, with the right bytes.
+    path = listing.splitlines()[0].split("  ", 1)[1]
+    (saved / "outside").write_bytes((saved / "store" / path).read_bytes())
+    (saved / "store.sha256").write_text(listing.replace(path, "../outside", 1))
     manifest = json.loads((saved / "manifest.json").read_text())
     manifest["sha256"]["store.sha256"] = backup.sha256_of(saved / "store.sha256")
     (saved / "manifest.json").write_text(json.dumps(manifest))
@@ -175,6 +178,39 @@ def test_a_lost_file_and_a_full_folder_are_said(filled: None, tmp_path: Path):
     assert "frame_time" in done.err
     assert not (tmp_path / "other" / "manifest.json").exists()
     assert pbl("db", "backup", "--database-only", tmp_path / "tables").code == 0
+
+
+def test_a_row_that_names_a_file_outside_of_the_store_is_refused(filled: None, tmp_path: Path):
+    """Whoever can write rows must not make a backup read or write elsewhere."""
+    store = Path(connection.store_backend().spec["location"])
+    (store.parent / "secret").write_text("of somebody else")
+    column = '{"path": "../secret", "store": "arrays", "shape": [1], "dtype": "float64"}'
+    query = connection.connect().query
+    query(f"UPDATE {video.VideoInfo.full_table_name} SET frame_time = %s", args=(column,))
+    done = pbl("db", "backup", tmp_path / "backup")
+    assert done.error_code == "BACKUP_INVALID"
+    assert "leaves the store" in done.err
+    assert not list(tmp_path.rglob("secret"))
+
+
+def test_a_backup_of_another_prefix_and_other_bytes_in_the_store_are_refused(
+    elsewhere: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    saved = tmp_path / "backup"
+    backup.backup(saved)
+    elsewhere()
+    with monkeypatch.context() as patch:
+        patch.setenv("PBL_DB_PREFIX", "other")
+        assert pbl("db", "restore", saved).error_code == "DB_REFUSED"
+    path = (saved / "store.sha256").read_text().split("  ", 1)[1].splitlines()[0]
+    connection.connect()
+    connection.store_backend().put_buffer(b"other bytes", path)
+    done = pbl("db", "restore", saved)
+    assert done.error_code == "DB_REFUSED"
+    assert path in done.err
+    assert connection.store_backend().get_buffer(path) == b"other bytes"
+    connection.store_backend().remove(path)
+    assert pbl("db", "restore", "--again", saved).code == 0
 
 
 @pytest.mark.parametrize("path", ["/etc/passwd", "../x", "a/../../x", "", "a\nb", "..\\x"])
