@@ -179,9 +179,10 @@ def test_a_leg_that_is_hardly_seen():
     empty(found, "one leg is hardly seen")
 
 
-def test_walking_backwards_on_the_ground():
+@pytest.mark.parametrize("method", [*EVENT_PARAMSETS])
+def test_walking_backwards_on_the_ground(method):
     truth = truth_of(seed=1, seconds=6.0)
-    empty(detect_events(feet_of(truth, lambda xyz: xyz[::-1])), "backwards")
+    empty(detect_events(feet_of(truth, lambda xyz: xyz[::-1]), method), "backwards")
 
 
 def test_walking_backwards_where_only_the_legs_tell():
@@ -250,10 +251,11 @@ def test_standing_on_the_spot_and_a_kick_are_no_walk():
         assert found.status == "EMPTY", seed
 
 
+@pytest.mark.parametrize("method", [*EVENT_PARAMSETS])
 @pytest.mark.parametrize("flip", [[1, 1, -1], [1, -1, -1], [1, -1, 1], [-1, 1, 1]])
-def test_upside_down_and_mirrored_points_are_refused(flip):
+def test_upside_down_and_mirrored_points_are_refused(flip, method):
     with pytest.raises(PblError, match="GAIT_INPUT") as error:
-        detect_events(feet_of(truth_of(seed=1, seconds=6.0), lambda xyz: xyz * flip))
+        detect_events(feet_of(truth_of(seed=1, seconds=6.0), lambda xyz: xyz * flip), method)
     assert "feet" in error.value.found
 
 

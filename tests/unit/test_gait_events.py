@@ -171,12 +171,18 @@ def test_standing_then_walking_gives_only_the_walk():
     assert found.walking_s[0][0] > 2.8
 
 
-def test_walking_backwards_warns():
-    time = regular(30)
-    found = detect_events(make_feet(time, Walker(), speed_m_per_s=-1.0))
-    check = next(c for c in found.qc if c.check == "heading_agreement")
-    assert check.outcome == "WARN"
-    assert check.value == pytest.approx(-1.0, abs=0.02)
+def test_walking_backwards_is_empty():
+    found = detect_events(make_feet(regular(30), Walker(), speed_m_per_s=-1.0))
+    assert (found.status, found.events) == ("EMPTY", ())
+    assert "backwards" in found.reason
+    assert "left and right" in found.qc[0].advice
+
+
+def test_a_way_that_is_not_where_the_pelvis_faces_warns():
+    feet = dataclasses.replace(make_feet(regular(30), Walker()), heading_agreement=0.1)
+    found = detect_events(feet)
+    assert found.status == "PASS"
+    assert next(c for c in found.qc if c.check == "heading_agreement").outcome == "WARN"
 
 
 def test_no_frame_is_an_error():

@@ -14,6 +14,7 @@ from pbl_pipeline.qc import PASS, WARN, Check
 
 from .._feet import FootTrajectories
 from .._signal import Segment, refine_extremum, uniform_segments
+from ._door import look
 from ._order import Candidate, best_sequence
 from ._types import (
     FOOT_DOWN,
@@ -48,17 +49,18 @@ def detect_by_coordinates(feet: FootTrajectories, paramset: Paramset) -> GaitEve
     Returns
     -------
     GaitEvents
-        Status PASS, or EMPTY with a reason where nobody walks (standing, sit-to-stand, too short in view) or one foot
-        is never seen.
+        Status PASS, or EMPTY with a reason where nobody walks (standing, sit-to-stand, too short in view), one foot is
+        never seen, or the person walks backwards.
 
     Raises
     ------
     PblError
-        GAIT_INPUT where no frame holds feet, pelvis and heading.
+        GAIT_INPUT where no frame holds feet, pelvis and heading, or the legs are upside down or mirrored.
     """
     p = EventParams(**paramset.params)
-    if unseen := never_seen(feet):
-        return empty(paramset, feet, unseen)
+    _, reason, advice = look(feet, p.min_segment_s)
+    if reason:
+        return empty(paramset, feet, reason, advice=advice)
     x, leg = forward_signals(feet, p)
     return detect_by_extrema(
         feet, paramset, p, x, leg, lambda segment: _candidates(segment, leg, p), p.min_excursion_leg * leg
@@ -238,18 +240,15 @@ def _why_not(swing: float, n_candidates: int, p: EventParams) -> str:
     )
 
 
-def never_seen(feet: FootTrajectories) -> str:
-    """Which one foot, heel and toe, is seen in no frame; empty where both are, or neither is."""
-    sides = [side for s, side in enumerate(SIDES) if not np.isfinite(feet.heel_m + feet.toe_m)[:, s].all(axis=1).any()]
-    return f"the {sides[0]} foot is never seen" if len(sides) == 1 else ""
-
-
 def _offset(event: str, p: EventParams) -> float:
     return p.foot_down_offset_s if event == FOOT_DOWN else p.foot_up_offset_s
 
 
-def empty(paramset: Paramset, feet: FootTrajectories, reason: str, n: int = 0, breaks: int = 0) -> GaitEvents:
-    check = Check("walking", "EMPTY", None, None, reason)
+def empty(
+    paramset: Paramset, feet: FootTrajectories, reason: str, n: int = 0, breaks: int = 0, advice: str = ""
+) -> GaitEvents:
+    """No events, with the reason."""
+    check = Check("walking", "EMPTY", None, None, f"{reason}: {advice}" if advice else reason)
     return GaitEvents("EMPTY", (), reason, paramset.name, paramset.hash, feet.source, (), n, breaks, (check,))
 
 
@@ -274,7 +273,7 @@ def _checks(feet: FootTrajectories, n_events: int, n_candidates: int, breaks: in
                 PASS if ok else WARN,
                 round(feet.heading_agreement, 3),
                 0.5,
-                "" if ok else "the person does not go where the pelvis faces: backwards, or left and right exchanged",
+                "" if ok else "the person does not go where the pelvis faces: sideways, or the camera moved",
             )
         )
     return tuple(checks)

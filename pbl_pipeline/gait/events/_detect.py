@@ -37,7 +37,7 @@ def detect_events(feet: FootTrajectories, params: Any = None) -> GaitEvents:
     Raises
     ------
     PblError
-        GAIT_INPUT where no frame holds what the method needs, or the legs are upside down or mirrored;
+        GAIT_INPUT where no frame holds what the method needs, or the legs are upside down or mirrored (`_door`);
         SOLVER_UNKNOWN for an unknown name; ASSET_MISSING where the event model's weights are not there.
     """
     paramset = resolve_params(params)

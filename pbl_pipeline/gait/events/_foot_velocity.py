@@ -11,7 +11,8 @@ from pbl_pipeline.paramset import Paramset
 
 from .._feet import FootTrajectories
 from .._signal import Segment, refine_extremum
-from ._coordinates import Extremum, detect_by_extrema, empty, forward_signals, never_seen, prominence
+from ._coordinates import Extremum, detect_by_extrema, empty, forward_signals, prominence
+from ._door import look
 from ._types import FOOT_DOWN, FOOT_UP, SIDES, EventParams, GaitEvents
 
 
@@ -40,11 +41,12 @@ def detect_by_foot_velocity(feet: FootTrajectories, paramset: Paramset) -> GaitE
     matter; the pelvis' own movement of a few cm is part of them. Order and cadence are then checked as for
     `zeni-2008`, and `probability` is as there.
 
-    Raises `PblError` GAIT_INPUT where no frame holds feet, pelvis and heading.
+    Raises `PblError` GAIT_INPUT as there.
     """
     p = paramset.to(FootVelocityParams)
-    if unseen := never_seen(feet):
-        return empty(paramset, feet, unseen)
+    _, reason, advice = look(feet, p.min_segment_s)
+    if reason:
+        return empty(paramset, feet, reason, advice=advice)
     x, leg = forward_signals(feet, p)
     heel = (np.asarray(feet.heel_m, float) - feet.pelvis_m[:, None]) @ feet.up
     toe = (np.asarray(feet.toe_m, float) - feet.pelvis_m[:, None]) @ feet.up

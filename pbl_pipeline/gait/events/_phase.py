@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
 
 from .._feet import FootTrajectories
+from ._door import input_error, look
 from ._phase_filter import FilterParams, SmoothPhases, crossings, smooth_phases
-from ._types import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, SIDES, GaitEvent, GaitEvents
+from ._types import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents
 from ._walking import WalkingParams, reach_leg, swing_leg, turning_deg_per_s, walking_stretches
 
 #: Order of the model's phases.
@@ -66,30 +66,11 @@ def detect_by_phase(feet: FootTrajectories, paramset: Paramset) -> GaitEvents:
     _predict.check_model(p.model, p.model_sha256)
     found = _Found(paramset, feet)
     if feet.legs_m is None:
-        raise _input_error("feet without the joints of the legs", "hips and knees, ankles, heels or toes in 3D")
+        raise input_error("feet without the joints of the legs", "hips and knees, ankles, heels or toes in 3D")
+    grid, reason, advice = look(feet, p.min_seen_s)
+    if grid is None or reason:
+        return found.empty(reason, advice)
     time = np.asarray(feet.time_s, float)
-    if len(time) < 4 or time[-1] - time[0] < p.min_seen_s:
-        return found.empty(f"the person is in view for less than {p.min_seen_s:g} s", "film at least three steps")
-    if np.median(np.diff(time)) > _predict.MAX_GAP_S:
-        slow = f"frames {np.median(np.diff(time)):.3g} s apart: gait events cannot be seen in these"
-        return found.empty(slow, "check that the time stamps are in seconds")
-    grid = _predict.on_grid(time, feet.legs_m, feet.up)
-    hips = grid.known[:, 0].all(axis=1)
-    if np.count_nonzero(hips) < p.min_seen_s * _predict.GRID_HZ or not math.isfinite(grid.leg_m):
-        return found.empty(f"hips and feet are seen for less than {p.min_seen_s:g} s", "film the whole person")
-    for s, side in enumerate(SIDES):
-        if not np.any(grid.known[hips, 2:, s]):
-            return found.empty(f"the {side} foot is never seen", "film from where both legs are in view")
-    if (height := check_upright(grid)) < MIN_HIP_HEIGHT:
-        return found.empty(
-            f"the hips are {height:.2f} leg lengths above the feet: nobody stands",
-            "nothing to do where the person lies or sits; else the vertical axis (z up) is another one",
-        )
-    if feet.heading_agreement < -0.5:
-        return found.empty(
-            "the person walks backwards: the events of walking forwards do not apply",
-            "if the person walked forwards, left and right are exchanged: look at the overlay",
-        )
     phases = _predict.predict(grid, p.model)
     curve = _predict.load(p.model)[1]["probability"]
     stretches, half_seen = candidates(grid, phases, p)
@@ -116,43 +97,6 @@ def detect_by_phase(feet: FootTrajectories, paramset: Paramset) -> GaitEvents:
         n_order_breaks=_breaks(events),
         qc=_checks(feet, events, half_seen, turning),
     )
-
-
-#: Somebody who sits has the hips at half of this length above the feet and more; below it the legs lie.
-MIN_HIP_HEIGHT = 0.3
-
-
-def check_upright(grid: Any) -> float:
-    """How high the hips are above the feet (leg lengths, median over frames and joints below the knee).
-
-    Refuses legs that point up, and legs whose left and right are exchanged or mirrored: then the feet, or the knees,
-    point backwards of where the hips face. Raises `PblError` GAIT_INPUT.
-    """
-    known, x = grid.known, grid.joints_m
-    hips = known[:, 0].all(axis=1)
-    pelvis = x[:, 0].mean(axis=1)
-    down = []
-    for j in (2, 3, 4):
-        use = hips[:, None] & known[:, j]
-        down.append(((pelvis[:, None] - x[:, j]) @ grid.up)[use])
-    height = float(np.median(np.concatenate(down))) / grid.leg_m
-    if height < -0.1:
-        raise _input_error("feet above the hips", "points with the head up: is the vertical axis the right one?")
-    toes = hips[:, None] & known[:, 3] & known[:, 4]
-    if np.count_nonzero(toes) > 10:
-        points = np.einsum("tsi,ti->ts", x[:, 4] - x[:, 3], grid.ahead)[toes] / grid.leg_m
-        backwards = np.median(points) < -0.05
-    else:
-        legs = hips[:, None] & known[:, 1] & known[:, 2]
-        line = 0.5 * (x[:, 0] + x[:, 2])
-        bend = np.einsum("tsi,ti->ts", x[:, 1] - line, grid.ahead)[legs] / grid.leg_m
-        backwards = len(bend) > 10 and np.mean(bend) < -0.02
-    if backwards and height >= MIN_HIP_HEIGHT:
-        raise _input_error(
-            "feet or knees that point backwards of where the hips face",
-            "left and right as they are: points are mirrored, or the sides are exchanged",
-        )
-    return height
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -295,12 +239,3 @@ class _Found:
     def empty(self, reason: str, advice: str) -> GaitEvents:
         check = Check("walking", EMPTY, None, None, f"{reason}: {advice}" if advice else reason)
         return GaitEvents(EMPTY, (), reason, self.paramset.name, self.paramset.hash, self.feet.source, qc=(check,))
-
-
-def _input_error(found: str, expected: str) -> PblError:
-    return PblError(
-        "GAIT_INPUT",
-        found=found,
-        expected=expected,
-        next_step="correct the points or the axes; the overlay shows which leg is which",
-    )

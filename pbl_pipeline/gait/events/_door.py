@@ -1,0 +1,100 @@
+"""What no method searches: too little in view, legs that cannot be a walking person's, somebody who walks backwards."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+
+from .._feet import FootTrajectories
+from ._predict import GRID_HZ, MAX_GAP_S, Grid, on_grid
+from ._types import SIDES
+
+#: Somebody who sits has the hips at half of this length above the feet and more; below it the legs lie.
+MIN_HIP_HEIGHT = 0.3
+#: Cosine between where the pelvis faces and where it goes, below which the person walks backwards.
+BACKWARDS = -0.5
+
+
+def look(feet: FootTrajectories, least_s: float) -> tuple[Grid | None, str, str]:
+    """The legs on an even grid, and why they are not searched: reason and advice, both empty where they are.
+
+    The grid is None where the legs' joints are not known (`legs_m` None; then only the way on the ground is looked at)
+    or are in view for less than `least_s`. Raises `PblError` GAIT_INPUT: joints upside down or mirrored.
+    """
+    grid, reason, advice = _grid(feet, least_s)
+    if not reason and feet.heading_agreement < BACKWARDS:
+        reason = "the person walks backwards: the events of walking forwards do not apply"
+        advice = "if the person walked forwards, left and right are exchanged: look at the overlay"
+    return grid, reason, advice
+
+
+def _grid(feet: FootTrajectories, least_s: float) -> tuple[Grid | None, str, str]:
+    if feet.legs_m is None:
+        return None, "", ""
+    time = np.asarray(feet.time_s, float)
+    if len(time) < 4 or time[-1] - time[0] < least_s:
+        return None, f"the person is in view for less than {least_s:g} s", "film at least three steps"
+    step_s = float(np.median(np.diff(time)))
+    if step_s > MAX_GAP_S:
+        said = f"frames {step_s:.3g} s apart: gait events cannot be seen in these"
+        return None, said, "check that the time stamps are in seconds"
+    grid = on_grid(time, feet.legs_m, feet.up)
+    hips = grid.known[:, 0].all(axis=1)
+    if np.count_nonzero(hips) < least_s * GRID_HZ or not math.isfinite(grid.leg_m):
+        return None, f"hips and feet are seen for less than {least_s:g} s", "film the whole person"
+    for s, side in enumerate(SIDES):
+        if not np.any(grid.known[hips, 2:, s]):
+            return grid, f"the {side} foot is never seen", "film from where both legs are in view"
+    height = check_upright(grid)
+    if height < MIN_HIP_HEIGHT:
+        said = f"the hips are {height:.2f} leg lengths above the feet: nobody stands"
+        return grid, said, "nothing to do where the person lies or sits; else the vertical axis (z up) is another one"
+    return grid, "", ""
+
+
+def check_upright(grid: Grid) -> float:
+    """How high the hips are above the feet (leg lengths, median over frames and joints below the knee).
+
+    Refuses legs that point up, and legs whose left and right are exchanged or mirrored: then the feet, or the knees,
+    point backwards of where the hips face. Raises `PblError` GAIT_INPUT.
+    """
+    known, x = grid.known, grid.joints_m
+    hips: np.ndarray = known[:, 0].all(axis=1)
+    pelvis = x[:, 0].mean(axis=1)
+    down = []
+    for j in (2, 3, 4):
+        use = hips[:, None] & known[:, j]
+        down.append(((pelvis[:, None] - x[:, j]) @ grid.up)[use])
+    height = float(np.median(np.concatenate(down))) / grid.leg_m
+    if height < -0.1:
+        raise input_error("feet above the hips", "points with the head up: is the vertical axis the right one?")
+    if height < MIN_HIP_HEIGHT:
+        return height
+    toes = hips[:, None] & known[:, 3] & known[:, 4]
+    if np.count_nonzero(toes) > 10:
+        points = np.einsum("tsi,ti->ts", x[:, 4] - x[:, 3], grid.ahead)[toes] / grid.leg_m
+        backwards = np.median(points) < -0.05
+    else:
+        legs = hips[:, None] & known[:, 1] & known[:, 2]
+        line = 0.5 * (x[:, 0] + x[:, 2])
+        bend = np.einsum("tsi,ti->ts", x[:, 1] - line, grid.ahead)[legs] / grid.leg_m
+        backwards = len(bend) > 10 and np.mean(bend) < -0.02
+    if backwards:
+        raise input_error(
+            "feet or knees that point backwards of where the hips face",
+            "left and right as they are: points are mirrored, or the sides are exchanged",
+        )
+    return height
+
+
+def input_error(found: str, expected: str) -> PblError:
+    """GAIT_INPUT of points that cannot be searched."""
+    return PblError(
+        "GAIT_INPUT",
+        found=found,
+        expected=expected,
+        next_step="correct the points or the axes; the overlay shows which leg is which",
+    )
