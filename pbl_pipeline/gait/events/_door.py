@@ -62,7 +62,7 @@ def check_upright(grid: Grid) -> float:
     point backwards of where the hips face. Raises `PblError` GAIT_INPUT.
     """
     known, x = grid.known, grid.joints_m
-    hips: np.ndarray = known[:, 0].all(axis=1)
+    hips = np.asarray(known[:, 0].all(axis=1))
     pelvis = x[:, 0].mean(axis=1)
     down = []
     for j in (2, 3, 4):
