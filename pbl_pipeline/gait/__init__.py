@@ -1,4 +1,4 @@
-"""Gait: feet, events, cycles, spatiotemporal measures and the Gait Deviation Index of three angles.
+"""Gait: feet, events, cycles, spatiotemporal measures and the Gait Deviation Index, of three angles or nine.
 
 Each step is a function of its own with a frozen result: `feet_from_fit` or `feet_from_keypoints`, `detect_events`,
 `find_cycles`, `spatiotemporal`, `score_gdi`; `gait_metrics` runs them for a session.

@@ -33,7 +33,7 @@ class MovementProfile:
         return self.right if side == RIGHT else self.left
 
     def to_dict(self) -> dict:
-        """`profile` of metrics.json."""
+        """`profile_deg` of metrics.json."""
         return {k: _rounded(v) for k, v in dataclasses.asdict(self).items()}
 
 

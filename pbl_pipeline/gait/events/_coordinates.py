@@ -120,7 +120,7 @@ def detect_by_extrema(
         walking_s=tuple((b[0].time_s, b[-1].time_s) for b in bouts),
         n_candidates=n_candidates,
         n_order_breaks=breaks,
-        qc=_checks(feet, len(events), n_candidates, breaks),
+        qc=_checks(feet, len(events), breaks),
     )
 
 
@@ -252,7 +252,7 @@ def empty(
     return GaitEvents("EMPTY", (), reason, paramset.name, paramset.hash, feet.source, (), n, breaks, (check,))
 
 
-def _checks(feet: FootTrajectories, n_events: int, n_candidates: int, breaks: int) -> tuple[Check, ...]:
+def _checks(feet: FootTrajectories, n_events: int, breaks: int) -> tuple[Check, ...]:
     checks = [
         Check("walking", PASS, float(n_events), None, ""),
         Check(
