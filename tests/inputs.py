@@ -91,10 +91,12 @@ def about(axis: int, angle_deg: float) -> list[float]:
     return quat
 
 
-def csv_log(path: Path, quat: list[float], extra: dict[str, object] | None = None, n: int = 3) -> Path:
+def csv_log(
+    path: Path, quat: list[float], extra: dict[str, object] | None = None, n: int = 3, begin_s: float = 0.0
+) -> Path:
     extra = extra or {}
     lines = [",".join(["time_s", "qw", "qx", "qy", "qz", *extra])]
-    lines += [",".join(map(str, [10 + 0.02 * i, *quat, *extra.values()])) for i in range(n)]
+    lines += [",".join(map(str, [round(begin_s + 0.02 * i, 6), *quat, *extra.values()])) for i in range(n)]
     path.write_text("\n".join(["# phone 7", *lines]) + "\n")
     return path
 

@@ -116,7 +116,7 @@ def test_a_phone_turned_with_its_picture_upright(tmp_path, rotation_deg, top):
 
 def test_a_log_in_the_cameras_frame_is_taken_as_it_is(tmp_path):
     # Level, along world x: the camera's right is -y, its down -z (docs/files.md).
-    path = csv_log(tmp_path / "a.csv", [2 * q for q in LEVEL])
+    path = csv_log(tmp_path / "a.csv", [2 * q for q in LEVEL], begin_s=10.0)
     np.testing.assert_allclose(axes(path), np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), atol=1e-9)
     log = load_attitude(path)
     np.testing.assert_allclose(log.time_s, [10, 10.02, 10.04])

@@ -256,7 +256,7 @@ def test_the_time_of_recording_and_the_pictures(folder, info, ended):
 
 
 def test_a_log_on_the_videos_clock_is_not_moved(tmp_path, info):
-    path = csv_log(tmp_path / "a.csv", [0.7071, 0.7071, 0, 0], {"frame": "device"})
+    path = csv_log(tmp_path / "a.csv", [0.7071, 0.7071, 0, 0], {"frame": "device"}, begin_s=10.0)
     late = dataclasses.replace(info, time_s=np.arange(400) / 30)
     np.testing.assert_allclose(load_attitude(path, late).time_s, [10, 10.02, 10.04])
     # The stamps of a sensor that counts from the phone's start, or in milliseconds.
