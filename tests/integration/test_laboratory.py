@@ -26,7 +26,7 @@ from pbl_pipeline.gait import (
 )
 from pbl_pipeline.gait._laboratory import _read
 from pbl_pipeline.gait.normative import gait_norm
-from tests.benchmarks.gdi import children
+from tests.benchmarks.gdi import children, conventions
 
 MARKERS = ("LASI", "RASI", "LHEE", "RHEE", "LTOE", "RTOE")
 
@@ -80,6 +80,17 @@ def test_healthy_children_are_within_the_norm(shared_data):
     assert len(means) == 11
     assert np.mean(means) == pytest.approx(100.2, abs=0.1)
     assert np.std(means, ddof=1) == pytest.approx(7.3, abs=0.1)
+
+
+def test_no_other_convention_is_the_controls(shared_data):
+    """Any sign turned makes the children's curves less like the controls'; and the way of the program that was
+    published with the index (its resampling, its frames) comes to the same index."""
+    made = conventions(shared_data, say=lambda _: None)
+    mean, _, distance = made["as it is"]
+    turned = {name: values for name, values in made.items() if "turned" in name}
+    assert len(turned) == 10
+    assert min(away for _, _, away in turned.values()) > distance + 0.4
+    assert made["as the program published with the index"][0] == pytest.approx(mean, abs=1.0)
 
 
 def test_measures_of_a_child(walk):
