@@ -379,14 +379,11 @@ def _camera(camera_file: str | Path, path: Path) -> dict[str, Any] | None:
 
     None when no picture can be decoded: the tables will say why, and there is nothing to calibrate.
     """
-    frames = library("video").read_frames(path, stop=1)
     try:
-        height, width = next(iter(frames)).image.shape[:2]
+        first = library("video").read_first(path)
     except PblError:
         return None
-    library("video").check_same_phone(camera_file, library("video").read_phone(path), path)
-    size = (int(width), int(height))
-    return camera_row(library("video").load_camera(camera_file, size), size)
+    return camera_row(library("video").calibrated_camera(camera_file, first), (first.width_px, first.height_px))
 
 
 def camera_row(camera: Any, size_px: tuple[int, int]) -> dict[str, Any]:

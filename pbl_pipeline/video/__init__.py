@@ -13,16 +13,16 @@ from ._phone_lens import (
     LensCalibration,
     PhoneLens,
     about_phone,
-    check_same_phone,
+    calibrated_camera,
     load_lens_calibration,
     phone_lens,
     turned_camera,
 )
 from ._phone_log import PhoneLog, Sensor, read_phone_log
-from ._probe import probe, read_phone, sha256_of
+from ._probe import probe, read_first, sha256_of
 from ._read import read_frames
 from ._timing import check_timing
-from ._types import Camera, Frame, VideoInfo
+from ._types import Camera, FirstPicture, Frame, VideoInfo
 
 __all__ = [
     "Attitude",
@@ -30,6 +30,7 @@ __all__ = [
     "Calibration",
     "Camera",
     "CameraPose",
+    "FirstPicture",
     "Frame",
     "LensCalibration",
     "PhoneLens",
@@ -39,9 +40,9 @@ __all__ = [
     "about_phone",
     "attitude_of",
     "calibrate_video",
+    "calibrated_camera",
     "camera_in_device",
     "check_attitude",
-    "check_same_phone",
     "check_timing",
     "cut_image",
     "draw_calibration",
@@ -53,8 +54,8 @@ __all__ = [
     "load_lens_calibration",
     "phone_lens",
     "probe",
+    "read_first",
     "read_frames",
-    "read_phone",
     "read_phone_log",
     "sha256_of",
     "turned_camera",

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ._camera import guess_camera, load_camera
-from ._phone_lens import check_same_phone
+from ._camera import guess_camera
+from ._phone_lens import calibrated_camera
 from ._presets import PRESET_REL_SD, preset_camera
 from ._types import Camera, VideoInfo
 
@@ -29,11 +29,10 @@ def find_camera(video: VideoInfo, file: str | Path | None = None) -> Camera:
     Raises
     ------
     PblError
-        CAMERA_INVALID for a calibration that cannot be used (`load_camera`), or is of another phone or lens.
+        CAMERA_INVALID for a calibration that cannot be used (`calibrated_camera`).
     """
     if file is not None:
-        check_same_phone(file, vars(video), video.path)
-        return load_camera(file, (video.width_px, video.height_px))
+        return calibrated_camera(file, video)
     return metadata_camera(video) or preset_camera(video) or guess_camera(video)
 
 

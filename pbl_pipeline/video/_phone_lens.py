@@ -13,14 +13,14 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from pbl_pipeline.errors import PblError
 
 from ._camera import load_camera
 from ._presets import quarter_turn
 from ._probe import probe
-from ._types import Camera, VideoInfo
+from ._types import Camera, FirstPicture, VideoInfo
 
 #: Rates (1/s) at which phones read their sensor; a recording belongs to the nearest (24 and 25 to 30, 50 to 60).
 RATES = (30, 60, 120, 240)
@@ -108,20 +108,50 @@ def load_lens_calibration(path: str | Path, like: str | Path | None = None) -> L
     return LensCalibration(lens, load_camera(path, size), size, rotation)
 
 
-def check_same_phone(file: str | Path, phone: Mapping[str, Any], video: str | Path) -> None:
-    """Refuse a camera file of `pbl calibrate` for a video of another phone, lens or zoom. What one of them does not say
-    is no difference. `phone`: what the video says, as `read_phone`.
+def calibrated_camera(file: str | Path, video: VideoInfo | FirstPicture) -> Camera:
+    """The intrinsics in a calibration file, for the upright picture of a video.
+
+    Where the file says how the phone was held (`pbl calibrate` does) and the video is of the other format, they are
+    turned by the difference of the two rotation flags. What does not fit without being turned is else refused.
 
     Raises
     ------
     PblError
-        CAMERA_INVALID.
+        CAMERA_INVALID: as `load_camera`, and a calibration of another phone, lens or zoom than the video's; what one of
+        them does not say is no difference.
     """
-    measured = _content(Path(file)).get("phone")
+    content = _content(Path(file))
+    _check_same_phone(content, video)
+    turn = _turn_between(content, video)
+    size = _stored(video.width_px, video.height_px, turn)  # before it is turned
+    camera = load_camera(file, size)
+    if turn:
+        camera = dataclasses.replace(camera, source=f"{camera.source}, turned by {turn} deg")
+    return turned_camera(camera, size, turn)
+
+
+def _turn_between(content: Mapping[str, Any], video: VideoInfo | FirstPicture) -> int:
+    """How far (deg, clockwise) the calibrated picture has to be turned to be the video's. Flags that differ by a
+    quarter in pictures of one format are those of a copy whose pictures were turned."""
+    filmed, size = content.get("video"), content.get("image_size_px")
+    measured = filmed.get("rotation_deg") if isinstance(filmed, Mapping) else None
+    if measured not in (0, 90, 180, 270) or not _whole(size):
+        return 0
+    turn = (video.rotation_deg - measured) % 360
+    other_format = (size[0] > size[1]) != (video.width_px > video.height_px)
+    return turn if other_format == (turn in (90, 270)) else 0
+
+
+def _whole(size: object) -> TypeGuard[list[int]]:
+    return isinstance(size, list) and len(size) == 2 and all(isinstance(n, int) for n in size)
+
+
+def _check_same_phone(content: Mapping[str, Any], video: VideoInfo | FirstPicture) -> None:
+    measured = content.get("phone")
     if not isinstance(measured, Mapping):
         return
     for name, what in (("make", ""), ("model", ""), ("lens", ""), ("focal_35mm", " mm on 35 mm film")):
-        theirs, ours = measured.get(name), phone.get(name)
+        theirs, ours = measured.get(name), getattr(video, name)
         if not theirs or not ours:
             continue
         if name == "focal_35mm":
@@ -134,7 +164,7 @@ def check_same_phone(file: str | Path, phone: Mapping[str, Any], video: str | Pa
                 found=f"a calibration of {theirs}{what}, and a video of {ours}{what}",
                 expected="the calibration of the lens that recorded the video",
                 next_step="pass the calibration of that lens with --camera, or none",
-                key=video,
+                key=video.path,
             )
 
 
@@ -164,8 +194,7 @@ def _read(path: Path) -> tuple[PhoneLens, tuple[int, int], int]:
         raise _nameless(path, "a camera file that does not name the phone's model")
     rate, rotation, focal = phone.get("rate"), video.get("rotation_deg"), phone.get("focal_35mm")
     size = content.get("image_size_px")
-    whole = isinstance(size, list) and len(size) == 2 and all(isinstance(n, int) for n in size)
-    if rate not in RATES or rotation not in (0, 90, 180, 270) or not whole:
+    if rate not in RATES or rotation not in (0, 90, 180, 270) or not _whole(size):
         raise _nameless(path, "a camera file without the phone's rate of frames, rotation flag or size")
     names = [str(phone.get(n) or "") for n in ("make", "model", "lens")]
     width, height = int(size[0]), int(size[1])  # type: ignore[index]

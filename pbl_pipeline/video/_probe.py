@@ -17,7 +17,7 @@ from ._decode import Decoder, check_file
 from ._orientation import Orientation, orientation_of
 from ._tags import read_tags
 from ._timing import speed_notes
-from ._types import VideoInfo
+from ._types import FirstPicture, VideoInfo
 
 
 def sha256_of(path: str | Path) -> str:
@@ -88,18 +88,21 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
         )
 
 
-def read_phone(path: str | Path) -> dict[str, Any]:
-    """What a video says of the phone that recorded it: `make`, `model`, `lens`, `focal_35mm` as in `VideoInfo`. Nothing
-    is decoded.
+def read_first(path: str | Path) -> FirstPicture:
+    """Size and rotation of a video's first picture, and the phone that recorded it. No more is decoded.
 
     Raises
     ------
     PblError
-        VIDEO_MISSING, VIDEO_EMPTY, VIDEO_NOT_A_VIDEO.
+        As `probe`.
     """
     path = check_file(path)
     with Decoder(path) as decoder:
-        return _phone(dict(decoder.stream.metadata) | dict(decoder.container.metadata) | read_tags(path).items)
+        _, frame = next(iter(decoder))  # without a picture it raises
+        turn = orientation_of(frame)
+        metadata = dict(decoder.stream.metadata) | dict(decoder.container.metadata) | read_tags(path).items
+        width, height = turn.size(frame.width, frame.height)
+        return FirstPicture(str(path), width, height, turn.rotation_deg, **_phone(metadata))
 
 
 def _phone(metadata: Mapping[str, str]) -> dict[str, Any]:

@@ -13,6 +13,20 @@ from ._cut import cut_image
 
 
 @dataclasses.dataclass(frozen=True)
+class FirstPicture:
+    """What a video says of its pictures and its phone without being decoded further; fields as in `VideoInfo`."""
+
+    path: str
+    width_px: int
+    height_px: int
+    rotation_deg: int
+    make: str | None
+    model: str | None
+    lens: str | None
+    focal_35mm: float | None
+
+
+@dataclasses.dataclass(frozen=True)
 class VideoInfo:
     """A probed video. Sizes are after the rotation flag is applied: what a person sees when it plays.
 

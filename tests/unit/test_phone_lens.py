@@ -19,7 +19,7 @@ from pbl_pipeline.video import (
     load_lens_calibration,
     phone_lens,
     probe,
-    read_phone,
+    read_first,
     turned_camera,
 )
 from tests.quicktime import insert, meta
@@ -139,9 +139,47 @@ def test_a_calibration_of_another_phone_is_refused(tmp_path, changes, found):
     assert (caught.value.code, caught.value.found) == ("CAMERA_INVALID", found)
 
 
-def test_what_a_video_says_of_its_phone_without_decoding_it(tmp_path):
-    path = insert(small(tmp_path / "a.mov"), of_file=meta({"com.apple.quicktime.model": "iPhone 15"}))
-    assert read_phone(path) == {"make": None, "model": "iPhone 15", "lens": None, "focal_35mm": None}
+@pytest.mark.parametrize(
+    ("size", "flag", "turn"),
+    [
+        ((1920, 1080), 0, 0),
+        ((1920, 1080), 180, 180),
+        ((1080, 1920), 90, 90),
+        ((1080, 1920), 270, 270),
+        ((1920, 1080), 90, 0),  # copies whose pictures were turned
+        ((960, 540), 0, 0),
+    ],
+)
+def test_a_landscape_calibration_serves_however_the_phone_was_held(tmp_path, size, flag, turn):
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(FIELDS))
+    found = find_camera(video(width_px=size[0], height_px=size[1], rotation_deg=flag), path)
+    expected = turned_camera(CAMERA, SIZE, turn)
+    if size == (960, 540):
+        assert found.matrix[0, 0] == CAMERA.matrix[0, 0] / 2
+    else:
+        np.testing.assert_array_equal(found.matrix, expected.matrix)
+    np.testing.assert_array_equal(found.distortion, expected.distortion)
+    assert found.source == "file: camera.json" + (
+        f", turned by {turn} deg" if turn else ", scaled by 0.5 from 1920x1080 px" if size[0] == 960 else ""
+    )
+
+
+def test_turned_pictures_of_which_no_flag_is_known_are_refused(tmp_path):
+    upright = video(width_px=1080, height_px=1920, rotation_deg=90)
+    for changes in ({"video": None}, {"video": {"rotation_deg": 90}}):  # the second: turned by nothing, and yet lies
+        (tmp_path / "camera.json").write_text(json.dumps({**FIELDS, **changes}))
+        with pytest.raises(PblError, match="turned"):
+            find_camera(upright, tmp_path / "camera.json")
+
+
+def test_the_first_picture_says_what_the_whole_video_does(tmp_path):
+    path = tmp_path / "a.mov"
+    write_video(path, numbered_frames(6, 96, 64), constant_rate(6), rotation_deg=270)
+    insert(path, of_file=meta({"com.apple.quicktime.model": "iPhone 15"}))
+    first, whole = read_first(path), probe(path)
+    assert (first.width_px, first.height_px, first.rotation_deg, first.model) == (64, 96, 270, "iPhone 15")
+    assert all(getattr(whole, f.name) == getattr(first, f.name) for f in dataclasses.fields(first))
 
 
 @pytest.mark.parametrize(
