@@ -64,7 +64,7 @@ def test_names_go_through_tables_and_report_as_text(tables: None, tmp_path: Path
     folder = tmp_path / "in"
     folder.mkdir()
     monkeypatch.chdir(folder)
-    paths = [chain.small_video(folder, f"v{i}", n=210 + i) for i in range(len(NAMES))]
+    paths = [chain.small_video(folder, f"v{i}", n=60 + i) for i in range(len(NAMES))]
     paths = [p.rename(folder / f"{name}.mp4") for p, name in zip(paths, NAMES, strict=True)]
     bad = [folder / f"{name}.mp4" for name in REFUSED]
     for path in bad:

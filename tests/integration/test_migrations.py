@@ -11,13 +11,13 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import _base, _differences, _dump, connection, fit, lab, migrations, video, views
+from schemas import _base, _differences, _dump, connection, embedded, fit, lab, migrations, video, views
 from schemas._base import resolve_method
 from schemas.ingest import Visit, ingest
 from schemas.migrations import _run
 from schemas.migrations._fill import fill
 from tests.command import pbl
-from tests.database import installation
+from tests.database import new_home, remove_home
 from workers.populate import populate
 
 from . import chain
@@ -25,13 +25,26 @@ from . import chain
 OLD = Path(__file__).parent / "data" / "old_database.sql.gz"
 
 
+@pytest.fixture(scope="module")
+def home() -> Iterator[Path]:
+    """A server of its own, in use only where `old` says so."""
+    path = new_home()
+    embedded.start(folder=embedded.Folder(path / "db"))
+    yield path
+    remove_home(path)
+
+
 @pytest.fixture
-def old(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A server of its own with a database that commit 28e5ab3 made (see data/old_rows.py)."""
-    with installation(), monkeypatch.context() as patch:
+def old(home: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The server of its own with nothing but a database that commit 28e5ab3 made (see data/old_rows.py)."""
+    with monkeypatch.context() as patch:
+        patch.setenv("PBL_HOME", str(home))
         patch.setattr(connection.dj_instance, "_singleton_connection", None)
         _unbind(patch)
         with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+            cursor.execute("SET foreign_key_checks = 0")
+            for schema in _dump.schemas_of(server, "pbl"):
+                cursor.execute(f"DROP DATABASE {_dump.quote(schema)}")
             for statement in _dump.read_lines(OLD):
                 cursor.execute(statement)
         yield

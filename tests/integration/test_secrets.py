@@ -163,6 +163,7 @@ def test_no_secret_is_printed_or_logged(database: Path, use: Use, tmp_path: Path
     s3.write_text("s3-secret-91c2")
     use(database, DJ_LOG_LEVEL="DEBUG", PBL_S3_SECRET_FILE=str(s3), PBL_S3_KEY="pbl", PBL_HOME=str(tmp_path / "home"))
     said = ""
+    running = []
     for arguments, changes in (
         (["--debug", "db", "status"], {}),
         (["--debug", "db", "status"], {"DJ_PASS_FILE": str(wrong)}),
@@ -171,16 +172,11 @@ def test_no_secret_is_printed_or_logged(database: Path, use: Use, tmp_path: Path
         (["--debug", "status"], {"DJ_USER": "nobody"}),
         (["--debug", "doctor"], {}),
     ):
-        done = subprocess.run(
-            [*PBL, *arguments],
-            capture_output=True,
-            text=True,
-            env={**os.environ, **changes},
-            cwd=tmp_path,
-            timeout=120,
-            check=False,
-        )
-        said += done.stdout + done.stderr
+        env, output = {**os.environ, **changes}, {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        running.append(subprocess.Popen([*PBL, *arguments], text=True, env=env, cwd=tmp_path, **output))
+    for process in running:  # beside each other
+        with process:
+            said += process.communicate(timeout=120)[0]
     assert "DB_REFUSED" in said
     assert "STORE_UNAVAILABLE" in said
     for file in (p for p in tmp_path.rglob("*") if p.is_file() and p not in (wrong, s3)):

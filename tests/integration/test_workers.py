@@ -306,17 +306,15 @@ def test_a_job_that_kills_its_process_becomes_an_error_and_the_others_are_done(t
     assert len(worker.Crash()) == 0
 
 
-def test_a_job_beyond_its_time_limit_is_ended(tables, tmp_path: Path, quick: None, monkeypatch):
-    register(*videos(tmp_path, "walk", "hangs"))
-    limits = tuple(
-        registry.Stage(s.table, s.resource, 3.0 if s.table == "VideoInfo" else s.limit_s, s.batch, s.followers)
-        for s in registry.STAGES
-    )
-    monkeypatch.setattr(registry, "STAGES", limits)
-    assert supervise() == 0
+def test_a_job_beyond_its_time_limit_is_ended(tables, tmp_path: Path, quick: None):
+    ids = register(*videos(tmp_path, "walk1", "hangs", "walk2"))
+    factor = 3.0 / registry.stage_of("VideoInfo").limit_s
+    assert supervise(resource="decode", limit_factor=factor) == 0
     (error,) = pipeline_status().errors
     assert (error.code, error.about) == ("TIME_LIMIT", "hangs.mp4")
-    assert len(fit.SessionFit()) == 1
+    assert "time limit of 3 s" in error.found
+    assert sorted(video.VideoInfo.to_arrays("video_id")) == [ids[0], ids[2]]
+    assert jobs_left()["VideoInfo"] == {"error": 1}
 
 
 def test_sigterm_lets_the_job_in_hand_end_or_puts_it_back(tables, tmp_path: Path, quick: None):
