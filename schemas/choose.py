@@ -130,18 +130,33 @@ def choose_person(video_id: int, person: int, tracking_method: str | None = None
     Raises
     ------
     PblError
-        DB_NOT_FOUND for a video that is not registered, SUBJECT_UNKNOWN_PERSON, SOLVER_UNKNOWN.
+        DB_NOT_FOUND for a video that is not registered, SUBJECT_UNKNOWN_PERSON, SOLVER_UNKNOWN; USAGE where several
+        methods track the video and none is named, or another one.
     """
     key = _key(video_id, tracking_method)
     selections = (tracking.TrackingSelection & key).keys()
+    if len(selections) != 1:
+        raise _which_tracking(video_id, tracking_method)
     failed = jobs_of(tracking.SubjectChoice)  # declares the job table, which would end a transaction
     connection = tracking.schema.connection
     assert connection is not None
     with connection.transaction:
-        for selection in selections:
-            tracking.set_override(selection, person)
-            (failed.errors & selection).delete_quick()
+        tracking.set_override(selections[0], person)
+        (failed.errors & selections[0]).delete_quick()
         return tracking.drop_outdated_choices(key)
+
+
+def _which_tracking(video_id: int, tracking_method: str | None) -> PblError:
+    """Each tracking method numbers the people anew: one number may mean two."""
+    there = sorted((tracking.TrackingSelection & {"video_id": video_id}).to_arrays("tracking_method"))
+    return PblError(
+        "USAGE",
+        found=f"video_id {video_id} is tracked by {len(there)} methods"
+        + (f", not by {tracking_method}" if tracking_method else ", each with its own numbers"),
+        expected=f"one of {', '.join(there)}" if there else "a video that is to be tracked",
+        next_step=f"`pbl choose {video_id}` shows the numbers; pass --tracking-method with one of these",
+        key=f"video_id={video_id}",
+    )
 
 
 def unknown_video(video_id: int) -> PblError:

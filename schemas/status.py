@@ -270,7 +270,7 @@ def _waiting(most: int) -> list[Waiting]:
                 about=row["video_name"],
                 reason=row["choice_reason"],
                 persons=persons,
-                next_step=f"pbl choose {row['video_id']} {'|'.join(map(str, persons))}",
+                next_step=tracking.choose_command(key, "|".join(map(str, persons))),
                 look=f"pbl choose {row['video_id']} --sheet persons_{row['video_id']}.jpg",
             )
         )

@@ -246,6 +246,15 @@ def set_override(key: Mapping[str, Any], person_id: int) -> None:
         SubjectOverride.insert1(row)
 
 
+def choose_command(key: Mapping[str, Any], persons: str) -> str:
+    """The command by which somebody decides about the tracking `key`; `persons`: such as "1|2". The method is named
+    where the video has several: each numbers people anew."""
+    several = len(TrackingSelection & {"video_id": key["video_id"]}) > 1
+    return f"pbl choose {key['video_id']} {persons}" + (
+        f" --tracking-method {key['tracking_method']}" if several else ""
+    )
+
+
 def outdated_choices(restriction: Any = True) -> Any:
     """Choices that contradict the overrides: another person decided, or the decision was withdrawn."""
     decided = SubjectChoice.proj("chosen_person_id") * SubjectOverride.proj("override_person_id")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from . import computed_tables, fit, video
+from . import computed_tables, fit, tracking, video
 from ._base import error_code, error_found, error_next_step, jobs_of
 from .status import EMPTY_COLUMNS
 
@@ -80,7 +80,7 @@ def _steps(table: Any, about: Any) -> list[Step]:
         if (empty or waits) and (text := row.get(reason or "choice_reason")):
             note = str(text)
         what = EMPTY if empty else "waits for a choice" if waits else DONE
-        step = f"pbl choose {row['video_id']} PERSON" if waits else ""
+        step = tracking.choose_command(row, "PERSON") if waits else ""
         out.append(Step(name, what, _method(row, table), note, step))
     for row in (jobs_of(table) & about).to_dicts():
         method = _method(row, table)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 @click.argument("video_id", type=int)
 @click.argument("person", type=click.IntRange(min=1), required=False)
 @click.option("--sheet", type=click.Path(path_type=Path), help="Write a picture of the numbered people (.jpg, .png).")
-@click.option("--tracking-method", metavar="NAME", help="Only for this method's tracking (default: all of the video).")
+@click.option("--tracking-method", metavar="NAME", help="Which tracking is meant, where a video has several.")
 def choose(video_id: int, person: int | None, sheet: Path | None, tracking_method: str | None) -> None:
     """Measure PERSON of video VIDEO_ID. The choice wins over the automatic one.
 
@@ -50,6 +50,8 @@ def choose(video_id: int, person: int | None, sheet: Path | None, tracking_metho
 
 def lines(found: list[Candidates]) -> list[str]:
     """The printed form of who can be chosen."""
+    from schemas.tracking import choose_command
+
     out = []
     for about in found:
         out.append(f"video_id {about.key['video_id']}  {about.name}  {about.key['tracking_method']}: {about.status}")
@@ -60,5 +62,5 @@ def lines(found: list[Candidates]) -> list[str]:
             out.append(f"  {about.reason}")
         if about.status == "NEEDS_CHOICE":
             numbers = "|".join(map(str, sorted(about.scores)))
-            out.append(f"  next: pbl choose {about.key['video_id']} {numbers}")
+            out.append(f"  next: {choose_command(about.key, numbers)}")
     return out

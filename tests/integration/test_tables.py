@@ -22,6 +22,7 @@ import pbl_pipeline.video
 import schemas
 import workers.populate
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.pipeline import Session, Trial
 from pbl_pipeline.qc import Check
 from schemas import fit, gait, gdi, keypoints, lab, qc, session, table_map, tracking, video, views
@@ -30,6 +31,7 @@ from schemas.ingest import Methods, Visit, ingest
 from schemas.plan import plan_fit_sets
 from schemas.results import load_session
 from schemas.status import pipeline_status
+from tests.command import pbl
 from tests.rows import register
 from workers.populate import populate
 
@@ -481,6 +483,37 @@ def test_a_decision_wins_and_recomputes_what_was_another_persons(tables: None, t
     run = populate()
     assert run.dropped
     assert tracking.SubjectChoice.fetch1("choice_status", "chosen_person_id") == ("CHOSEN", 1)
+
+
+def test_of_two_trackings_the_one_that_is_meant_is_named(tables: None, tmp_path: Path):
+    """Each numbers the people anew: number 2 of one may be number 1 of the other."""
+    (number,) = register(chain.small_video(tmp_path, "both", people="two alike"))
+    (method,) = tracking.TrackingMethod.to_dicts()[:1]
+    params = {**method["tracking_params"], "min_hits": 4}
+    other = Paramset("tracking", "other", 1, params)
+    row = {"tracking_method_name": "other", "tracking_method_version": 1, "tracking_params": params}
+    tracking.TrackingMethod.insert1({"tracking_method": "other-v1", **row, "tracking_method_sha": other.hash})
+    selection = tracking.TrackingSelection.fetch1()
+    tracking.TrackingSelection.insert1({**selection, "tracking_method": "other-v1"})
+    populate(["VideoInfo", "Tracking", "SubjectChoice"])
+    with pytest.raises(PblError, match="USAGE") as caught:
+        choose_person(number, 2)
+    assert "other-v1" in caught.value.expected
+    assert not tracking.SubjectOverride()
+    asked = {w.next_step for w in pipeline_status().waiting}
+    assert asked == {
+        f"pbl choose {number} 1|2 --tracking-method {m}" for m in (selection["tracking_method"], "other-v1")
+    }
+    shown = pbl("choose", number)
+    assert all(f"next: {command}" in shown.out for command in asked)
+    assert pbl("choose", number, 2, "--tracking-method", "other").code == 0
+    assert tracking.SubjectOverride.fetch1("tracking_method", "override_person_id") == ("other-v1", 2)
+    (waiting,) = pipeline_status().waiting
+    assert selection["tracking_method"] in waiting.next_step
+    (tracking.TrackingSelection & {"tracking_method": "other-v1"}).delete(prompt=False, part_integrity="cascade")
+    (tracking.TrackingMethod & {"tracking_method": "other-v1"}).delete(prompt=False)
+    with pytest.raises(PblError, match="SOLVER_UNKNOWN"):
+        choose_person(number, 2, "other-v1")
 
 
 def test_confirming_the_automatic_choice_deletes_nothing(tables: None, tmp_path: Path):
