@@ -95,9 +95,10 @@ def add(source: str | Path, sha256: str | None = None, *, replace: bool = False)
                 for name in (GRAPH_FILE, SPEC_FILE, *_TEXTS):
                     if (folder / name).is_file():
                         shutil.copyfile(folder / name, new / name)
-                if there.exists():
-                    shutil.rmtree(there)
-                os.replace(new, there)
+                with _scratch(there.parent) as old:
+                    if there.exists():  # put aside in one step: nobody meets half of it
+                        os.replace(there, old / "model")
+                    os.replace(new, there)
         except OSError as error:
             raise PblError(
                 "FILE_UNWRITABLE",
