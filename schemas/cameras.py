@@ -145,7 +145,7 @@ def _outdated(key: dict[str, Any]) -> list[dict[str, Any]]:
     made = (keypoints.Keypoints & recorded.proj()).proj("keypoints_camera_id").to_dicts()
     registered = (lab.DeviceCalibration & key).to_dicts()
     counts: dict[int, int | None] = {}
-    for row in recorded.to_dicts() if made else ():
+    for row in recorded.proj(..., "-frame_time").to_dicts() if made else ():
         lens = library("video").phone_lens(video.info_of_row(row, np.zeros(0)))
         if lens is None or any(key[name] != value for name, value in lab.mode_columns(lens).items()):
             continue
