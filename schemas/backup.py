@@ -284,6 +284,7 @@ def _make_room(server: pymysql.Connection[Any], cursor: Any, prefix: str, again:
                 "an empty database",
                 "run the same with --again: it removes these tables and begins anew",
             )
+        cursor.execute("SET SESSION foreign_key_checks = 0")  # the schemas refer to each other
         for schema in _dump.schemas_of(server, prefix):
             if schema != marker:
                 cursor.execute(f"DROP DATABASE {_dump.quote(schema)}")

@@ -84,6 +84,7 @@ def test_there_and_back(elsewhere: Any, tmp_path: Path):
     # Never over another.
     again = pbl("db", "restore", saved)
     assert again.error_code == "DB_REFUSED"
+    assert "nothing is ever restored over another" in again.err
     assert everything() == before
 
 
@@ -210,6 +211,15 @@ def test_a_backup_of_another_prefix_and_other_bytes_in_the_store_are_refused(
     assert path in done.err
     assert connection.store_backend().get_buffer(path) == b"other bytes"
     connection.store_backend().remove(path)
+    # Not every row came back: of that, too, nobody is told that it is whole.
+    manifest = json.loads((saved / "manifest.json").read_text())
+    manifest["rows"]["pbl_lab.subject"] += 1
+    (saved / "manifest.json").write_text(json.dumps(manifest))
+    short = pbl("db", "restore", "--again", saved)
+    assert short.error_code == "DB_REFUSED"
+    assert "1 rows in pbl_lab.subject" in short.err
+    manifest["rows"]["pbl_lab.subject"] -= 1
+    (saved / "manifest.json").write_text(json.dumps(manifest))
     assert pbl("db", "restore", "--again", saved).code == 0
 
 

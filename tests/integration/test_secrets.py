@@ -172,8 +172,11 @@ def test_no_secret_is_printed_or_logged(database: Path, use: Use, tmp_path: Path
         (["--debug", "status"], {"DJ_USER": "nobody"}),
         (["--debug", "doctor"], {}),
     ):
-        env, output = {**os.environ, **changes}, {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-        running.append(subprocess.Popen([*PBL, *arguments], text=True, env=env, cwd=tmp_path, **output))
+        env, pipe = {**os.environ, **changes}, subprocess.PIPE
+        command = [*PBL, *arguments]
+        running.append(
+            subprocess.Popen(command, text=True, env=env, cwd=tmp_path, stdout=pipe, stderr=subprocess.STDOUT)
+        )
     for process in running:  # beside each other
         with process:
             said += process.communicate(timeout=120)[0]
