@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.qc import EMPTY, PASS, Check
 
 from ._angles import AngleSeries
 from ._feet import FootTrajectories, feet_from_markers
 from .events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents, detect_events, load_events
+from .events._door import look
 from .normative import PLUG_IN_GAIT, check_degrees
 
 #: Our angle -> the marker model's point after L or R, and its component. Both count the same directions as positive.
@@ -54,13 +56,14 @@ def read_lab_trial(path: str | Path, events_csv: str | Path | None = None, metho
 
     The angles are the points LHipAngles and so on (`PLUG_IN_GAIT_POINTS`). Events: those of `events_csv`
     (`pbl events`), else the recording's labels Foot Strike and Foot Off, else found from the markers of the legs by
-    `method` (`detect_events`). A sample that the file marks as invalid is NaN.
+    `method` (`detect_events`). Whosever the events are, there are none where the markers show somebody who lies or
+    walks backwards, or a world whose vertical is not z. A sample that the file marks as invalid is NaN.
 
     Raises
     ------
     PblError
         FILE_MISSING, FILE_FORMAT (not a C3D, a point is missing), ANGLE_UNITS (not degrees), GAIT_INPUT (neither labels
-        nor foot markers).
+        nor foot markers; markers upside down or mirrored).
     """
     path = Path(path)
     points, labels, time, table = _read(path)
@@ -148,6 +151,15 @@ def _metres(reader: Any, path: Path) -> float:
 def _events(
     path: Path, reader: Any, feet: FootTrajectories | None, events_csv: str | Path | None, method: Any
 ) -> GaitEvents:
+    if feet is not None:
+        try:
+            grid, reason, advice = look(feet, 0.0)
+        except PblError as error:
+            words = {"found": error.found, "expected": error.expected, "next_step": error.next_step}
+            raise PblError(error.code, **words, key=str(path)) from error
+        if grid is not None and reason:
+            check = Check("walking", EMPTY, None, None, f"{reason}: {advice}")
+            return GaitEvents(EMPTY, (), reason, "none", "", feet.source, qc=(check,))
     if events_csv is not None:
         return _given(load_events(events_csv), "given", Path(events_csv).name)
     table = reader.get("EVENT")
@@ -175,7 +187,7 @@ def _events(
 def _given(events: tuple[GaitEvent, ...], method: str, source: str) -> GaitEvents:
     span = ((events[0].time_s, events[-1].time_s),) if events else ()
     reason = "" if events else "no event in the file"
-    return GaitEvents("PASS" if events else "EMPTY", events, reason, method, "", source, span, len(events))
+    return GaitEvents(PASS if events else EMPTY, events, reason, method, "", source, span, len(events))
 
 
 def _format_error(path: Path, found: str, expected: str) -> PblError:

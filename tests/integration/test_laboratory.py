@@ -151,6 +151,31 @@ def test_events_of_a_recording_by_command(walk, tmp_path):
     )
 
 
+@pytest.mark.parametrize(
+    ("axes", "signs", "words"),
+    [([0, 2, 1], [1, 1, -1], "nobody stands"), ([0, 1, 2], [1, -1, 1], None), ([0, 1, 2], [1, -1, -1], None)],
+    ids=["y up", "mirrored", "upside down"],
+)
+def test_labels_do_not_make_up_for_odd_markers(walk, tmp_path, monkeypatch, axes, signs, words):
+    """The labels and angles of the recording are right, its markers are turned: no lengths, no cycles by them."""
+
+    def turned(path):
+        points, names, time, table = _read(path)
+        at = [i for i, n in enumerate(names) if not n.endswith(("Angles", "Angle"))]
+        points[:, at] = points[:, at][..., axes] * signs
+        return points, names, time, table
+
+    monkeypatch.setattr("pbl_pipeline.gait._laboratory._read", turned)
+    if words is None:
+        with pytest.raises(PblError, match="GAIT_INPUT") as error:
+            read_lab_trial(walk)
+        assert error.value.key == str(walk)
+        return
+    metrics = gait_metrics([read_lab_trial(walk)])
+    assert (metrics.status, metrics.gdi.mean) == ("EMPTY", None)
+    assert words in metrics.reason
+
+
 def test_without_labels_the_method_finds_the_events(walk, tmp_path):
     """Angles and foot markers of a child, written without events."""
     points, names, _, _ = _read(walk)
