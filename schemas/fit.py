@@ -236,7 +236,7 @@ class SessionFit(dj.Computed):
         residual_2d = np.concatenate([t.residual_2d_px.ravel() for t in result.trials])
         residual_3d = np.concatenate([t.residual_3d_m.ravel() for t in result.trials])
         with new_folder() as folder:
-            np.savez_compressed(
+            np.savez(
                 folder / "session.npz",
                 scale=np.asarray(result.scale, np.float32),
                 site_offset_m=np.asarray(result.site_offset_m, np.float32),

@@ -1,7 +1,8 @@
 """What was seen in a session, as arrays on the device: the frames of all trials one after another.
 
 Frames, markers and trials are padded to a few sizes, so that a worker compiles a handful of programs. Padding has
-weight 0 everywhere and never changes a result.
+weight 0 everywhere and never changes a result. On a GPU the sizes are fewer: there a program takes ten seconds to
+compile and many sessions of one size are solved in little more time than one, while on a CPU each padded frame counts.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from ._rotation import quat_wxyz, rotation_matrices
 
 #: Sizes to which markers are padded; larger sets are padded to a multiple of 64.
 MARKER_SIZES = (24, 40, 64, 96, 128)
-#: Fewest frames of a program, in all trials together.
+#: Fewest frames of a program, in all trials together; and on a GPU fewest frames, trials and samples of the phone.
 MIN_FRAMES = 64
+COARSE_FRAMES, COARSE_TRIALS, COARSE_SAMPLES = 256, 4, 2048
 #: Points of the soles (`solvers/_contact.py`).
 SOLE_POINTS = 4
 #: Frame interval (s) for which second differences are stated: 30 Hz.
@@ -93,12 +95,19 @@ SAMPLE_S, CLOCK_RANGE_S = 0.01, 0.5
 SMOOTH_S = 0.02
 
 
-def pad_frames(n: int) -> int:
-    """The size to which `n` frames are padded: 64, 96, 128, 192, 256, 384 ..."""
+def pad_frames(n: int, coarse: bool = False) -> int:
+    """The size to which `n` frames are padded: 64, 96, 128, 192, 256, 384 ...; `coarse`: 256, 512, 1024 ..."""
+    if coarse:
+        return max(COARSE_FRAMES, _power_of_2(n))
     size = MIN_FRAMES
     while size < n:
         size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
     return size
+
+
+def pad_samples(n: int, coarse: bool = False) -> int:
+    """The size to which `n` samples of the phone's orientation are padded."""
+    return max(COARSE_SAMPLES, _power_of_2(n)) if coarse else pad_frames(n)
 
 
 def pad_markers(n: int) -> int:
@@ -106,8 +115,12 @@ def pad_markers(n: int) -> int:
     return next((s for s in MARKER_SIZES if s >= n), -(-n // 64) * 64)
 
 
-def pad_trials(n: int) -> int:
+def pad_trials(n: int, coarse: bool = False) -> int:
     """The size to which `n` trials are padded: a power of 2."""
+    return max(COARSE_TRIALS if coarse else 1, _power_of_2(n))
+
+
+def _power_of_2(n: int) -> int:
     return 1 << (n - 1).bit_length()
 
 
@@ -130,10 +143,11 @@ def bend_weights(time_s: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 def pack(trials: Sequence[TrialArrays]) -> Observations:
     """All trials of a session as one `Observations`, still on the host."""
+    coarse = jax.default_backend() != "cpu"
     total = sum(len(t.time_s) for t in trials)
-    frames, markers = pad_frames(total) - total, pad_markers(trials[0].c_world.shape[1])
+    frames, markers = pad_frames(total, coarse) - total, pad_markers(trials[0].c_world.shape[1])
     n_markers = trials[0].c_world.shape[1]
-    n = pad_trials(len(trials))
+    n = pad_trials(len(trials), coarse)
 
     def joined(field: str, marker_axis: int | None = None) -> np.ndarray:
         a = np.concatenate([getattr(t, field) for t in trials])
@@ -144,7 +158,7 @@ def pack(trials: Sequence[TrialArrays]) -> Observations:
         return np.pad(a, widths, mode="constant" if marker_axis is not None else "edge")
 
     used = np.concatenate([t.used for t in trials])
-    quats, starts = _phone_samples(trials, n)
+    quats, starts = _phone_samples(trials, n, coarse)
     bend = np.concatenate([bend_weights(t.time_s, t.used) for t in trials])
     arrays = {
         "time_s": np.concatenate([t.time_s - t.time_s[0] for t in trials] + [np.zeros(frames)]),
@@ -177,13 +191,13 @@ def _padded(used: np.ndarray, frames: int) -> np.ndarray:
     return np.pad(used.astype(float), (0, frames))
 
 
-def _phone_samples(trials: Sequence[TrialArrays], n: int) -> tuple[np.ndarray, np.ndarray]:
+def _phone_samples(trials: Sequence[TrialArrays], n: int, coarse: bool) -> tuple[np.ndarray, np.ndarray]:
     """Orientations (n, P, 4) every `SAMPLE_S` and the time (n,) of the first, on each trial's own clock."""
     moving = [i for i, t in enumerate(trials) if t.phone_time_s is not None]
     if not moving:
         return np.tile([1.0, 0, 0, 0], (n, 2, 1)), np.zeros(n)
     longest = max(t.time_s[-1] - t.time_s[0] for t in trials) + 2 * CLOCK_RANGE_S
-    count = pad_frames(int(np.ceil(longest / SAMPLE_S)) + 2)
+    count = pad_samples(int(np.ceil(longest / SAMPLE_S)) + 2, coarse)
     out = np.tile([1.0, 0, 0, 0], (n, count, 1))
     for i in moving:
         trial = trials[i]

@@ -139,7 +139,7 @@ class Keypoints:
             optional["sides_changed"] = np.asarray(self.sides_changed, bool)
         if self.picture is not None:
             optional |= self.picture.arrays()
-        np.savez_compressed(
+        np.savez(  # not packed, see `TrialFit.save`
             path,
             time_s=np.asarray(self.time_s, np.float64),
             names=np.asarray(self.names),

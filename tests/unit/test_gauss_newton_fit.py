@@ -47,7 +47,7 @@ SEEDS = (5, 6, 7)
 def one_size() -> Iterator[None]:
     """One trial is packed like two."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_observations, "pad_trials", lambda n: max(2, 1 << (n - 1).bit_length()))
+        patch.setattr(_observations, "pad_trials", lambda n, coarse=False: max(2, 1 << (n - 1).bit_length()))
         yield
 
 
@@ -239,10 +239,10 @@ def test_neither_company_nor_padding_changes_a_result(walkers, one_by_one, monke
     trial = walkers[0].trials[0]
     assert isinstance(trial, Keypoints)
     bad = SessionInput([dataclasses.replace(trial, confidence=np.zeros_like(trial.confidence))], ["bad"])
-    monkeypatch.setattr(_observations, "pad_frames", lambda n: 192 if n <= 192 else 512)
+    monkeypatch.setattr(_observations, "pad_frames", lambda n, coarse=False: 192 if n <= 192 else 512)
     monkeypatch.setattr(_observations, "pad_markers", lambda n: 128)
     monkeypatch.setattr(_inputs, "pad_markers", lambda n: 128)
-    monkeypatch.setattr(_observations, "pad_trials", lambda n: 4)
+    monkeypatch.setattr(_observations, "pad_trials", lambda n, coarse=False: 4)
     together = fit_sessions([walkers[0], bad, *walkers[1:]], PARAMSET, batch=3)
     error = together.pop(1)
     assert isinstance(error, PblError)

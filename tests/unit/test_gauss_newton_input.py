@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import PARAMSETS, SessionInput, fit_sessions
+from pbl_pipeline.fit import PARAMSETS, SessionInput, _observations, fit_sessions
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.synthetic import observe, observe_markers, walk_qpos
 
@@ -104,3 +104,11 @@ def test_each_bad_session_has_its_own_error(trial):
     ]
     found = fit_sessions([SessionInput([k], [n], "handheld") for k, n in zip(bad, "ab", strict=True)], batch=3)
     assert [e.key for e in found if isinstance(e, PblError)] == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("frames", "trials", "samples", "sizes"), [(100, 1, 300, (256, 4, 2048)), (700, 5, 3000, (1024, 8, 4096))]
+)
+def test_a_gpu_is_given_few_sizes(frames, trials, samples, sizes):
+    pads = _observations.pad_frames, _observations.pad_trials, _observations.pad_samples
+    assert tuple(pad(n, coarse=True) for pad, n in zip(pads, (frames, trials, samples), strict=True)) == sizes
