@@ -103,15 +103,18 @@ def remove_calibration(camera_id: int) -> list[Change]:
 
 
 def calibrations() -> list[dict[str, Any]]:
-    """The calibrations of devices: rows of DeviceCalibration with those of Device and CameraCalibration, and
-    `n_keypoints`, the keypoints that were made with each."""
+    """The calibrations of devices: rows of DeviceCalibration and CameraCalibration, `lens` (the library's `PhoneLens`)
+    and `n_keypoints`, the keypoints that were made with each."""
     used = [int(n) for n in (keypoints.Keypoints & "keypoints_camera_id IS NOT NULL").to_arrays("keypoints_camera_id")]
     rows = []
     for row in lab.DeviceCalibration.to_dicts(order_by=list(lab.DeviceCalibration.primary_key)):
         device = (lab.Device & {"device": row["device"]}).fetch1()
         camera = (lab.CameraCalibration & {"camera_id": row["camera_id"]}).fetch1()
         camera.pop("device")
-        rows.append({**camera, **device, **row, "n_keypoints": used.count(int(row["camera_id"]))})
+        names = [device[f"device_{name}"] for name in ("make", "model", "lens")]
+        size = (int(row["stored_width"]), int(row["stored_height"]))
+        lens = library("video").PhoneLens(*names, size, int(row["capture_rate"]))
+        rows.append({**camera, **row, "lens": lens, "n_keypoints": used.count(int(row["camera_id"]))})
     return rows
 
 
@@ -121,8 +124,7 @@ def _device(lens: Any) -> str:
     known = (lab.Device & columns).keys()
     if known:
         return str(known[0]["device"])
-    words = " ".join(v for v in columns.values() if v).lower()
-    plain = re.sub(r"[^a-z0-9.]+", "-", words).strip("-") or "phone"
+    plain = re.sub(r"[^a-z0-9.]+", "-", lens.name.lower()).strip("-") or "phone"
     taken = set(lab.Device.to_arrays("device"))
     names = [plain[:64], *(f"{plain[:60]}-{n}" for n in range(2, 1000))]
     name = next(n for n in names if n not in taken)

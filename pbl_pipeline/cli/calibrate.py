@@ -56,13 +56,14 @@ def calibrate(
     if out.suffix.lower() != ".json":
         raise click.BadParameter(f"{out} does not end in .json", param_hint="--out")
     plate = Board(board, squares, square_mm, marker_mm, dictionary, legacy)
+    picture = out.with_suffix(".png")
     check_out_file(out)
+    check_out_file(picture)
     info = probe(video)
     found = calibrate_video(video, plate, info)
     source = f"pbl calibrate: {board} of {squares[0]}x{squares[1]} squares of {square_mm:g} mm"
     found.save(out, {"source": source, **about_phone(info)})
-    picture = out.with_suffix(".png")
-    cv2.imwrite(str(picture), draw_calibration(found))
+    picture.write_bytes(cv2.imencode(".png", draw_calibration(found))[1].tobytes())
     matrix, sd = found.camera.matrix, found.sd
     k = found.camera.distortion
     click.echo(f"{len(found.views)} views used, the board found in {found.n_found} of {found.n_tried} sharp pictures")

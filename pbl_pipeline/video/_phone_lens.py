@@ -48,10 +48,15 @@ class PhoneLens:
         known = self.focal_35mm is not None and focal_35mm is not None
         return not known or abs(self.focal_35mm - focal_35mm) <= _SAME_FOCAL_MM  # type: ignore[operator]
 
+    @property
+    def name(self) -> str:
+        """Make, model and lens; phones begin the lens's name with the model."""
+        model = "" if self.lens.startswith(self.model) else self.model
+        return " ".join(n for n in (self.make, model, self.lens) if n)
+
     def text(self) -> str:
         """In words."""
-        names = " ".join(n for n in (self.make, self.model, self.lens) if n)
-        return f"{names}, {self.stored_px[0]}x{self.stored_px[1]} px as stored, about {self.rate} frames a second"
+        return f"{self.name}, {self.stored_px[0]}x{self.stored_px[1]} px as stored, about {self.rate} frames a second"
 
 
 def phone_lens(video: VideoInfo) -> PhoneLens | None:

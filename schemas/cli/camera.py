@@ -46,12 +46,9 @@ def list_() -> None:
     rows = cameras.calibrations()
     for row in rows:
         focal, sd = (row["camera_fx"] + row["camera_fy"]) / 2, row["camera_focal_sd"]
-        names = " ".join(n for n in (row["device_make"], row["device_model"], row["device_lens"]) if n)
-        click.echo(f"{row['camera_id']:>4}  {row['device']}: {names}")
-        click.echo(
-            f"      {row['stored_width']}x{row['stored_height']} px as stored, about {row['capture_rate']} frames a "
-            f"second; focal length {focal:.1f} px{'' if sd is None else f' +- {sd:.1f}'}; {row['camera_note']}"
-        )
+        click.echo(f"{row['camera_id']:>4}  {row['device']}: {row['lens'].text()}")
+        spread = "" if sd is None else f" +- {sd:.1f}"
+        click.echo(f"      focal length {focal:.1f} px{spread}; {row['camera_note']}")
         click.echo(f"      {row['device_calibrated']} UTC; keypoints made with it: {row['n_keypoints']}")
     if not rows:
         click.echo("no calibration of a phone is registered; `pbl calibrate` measures one, `pbl camera add` registers")

@@ -109,8 +109,8 @@ def test_a_phone_is_registered_once(tmp_path: Path):
     assert not errors(populate(SEEN))
     assert matrix_of(ids[0])[0, 0] == pytest.approx(110)
     listed = pbl("camera", "list").out
-    assert "apple-iphone-13: Apple iPhone 13" in listed
-    assert "128x72 px as stored, about 30 frames a second; focal length 110.5 px +- 0.5" in listed
+    assert "apple-iphone-13: Apple iPhone 13, 128x72 px as stored, about 30 frames a second" in listed
+    assert "focal length 110.5 px +- 0.5" in listed
     assert "keypoints made with it: 2" in listed
     # A video that is recorded later has it at once.
     ids += register(recording(tmp_path, "later", APPLE), session_label="later")

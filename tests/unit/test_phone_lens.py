@@ -93,6 +93,12 @@ def test_another_focal_length_is_another_lens():
     assert dataclasses.replace(lens, focal_35mm=None).same_focal(52.0)
 
 
+def test_the_model_is_said_once():
+    assert PhoneLens("Apple", "iPhone 13", "iPhone 13 back camera", SIZE, 30).name == "Apple iPhone 13 back camera"
+    assert PhoneLens("Google", "Pixel 8", "", SIZE, 30).name == "Google Pixel 8"
+    assert PhoneLens("", "X", "wide", SIZE, 30).name == "X wide"
+
+
 def test_a_recording_without_a_model_has_no_lens():
     assert phone_lens(video(model=None)) is None
     assert phone_lens(video(fps=float("nan"))) is None
