@@ -181,6 +181,15 @@ def test_a_database_of_a_newer_version_is_left_alone(old: None):
     assert error.value.code == "DB_MIGRATION"
 
 
+def test_one_process_migrates_at_a_time(database: Path):
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        cursor.execute("SELECT GET_LOCK(%s, 0)", (f"{connection.prefix()}_migrate",))
+        assert cursor.fetchone() == (1,)
+        with pytest.raises(PblError, match="another process is migrating") as error:
+            migrations.migrate()
+        assert error.value.code == "DB_MIGRATION"
+
+
 def test_a_new_database_needs_nothing(database: Path):
     schemas.activate()
     outcome = migrations.migrate()
