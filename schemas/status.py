@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Collection
+import functools
+import queue
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from . import computed_tables, keypoints, tracking, video, worker
+from . import computed_tables, connection, keypoints, tracking, video, worker
 from ._base import error_code, error_found, error_next_step, jobs_of
 
 #: Fewer videos than this, and keys are counted that nobody has queued yet.
@@ -112,26 +116,51 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
     n_videos = int(video.Video.connection.query(f"SELECT COUNT(*) FROM {video.Video.full_table_name}").fetchone()[0])  # noqa: S608
     exact = n_videos < SMALL if exact is None else exact
     server = video.Video.connection
-    queues, rates = queue_counts(server), throughput(server)
-    tables = [_table_status(t, queues[t.__name__], rates, exact) for t in computed_tables()]
-    errors = [e for t, s in zip(computed_tables(), tables, strict=True) if s.error for e in _errors(t, most)]
+    queues, rates, chain = queue_counts(server), throughput(server), computed_tables()
+    # The longest first: the sources of cameras are long texts, keys grow along the chain.
+    counts = [camera_kinds, *(functools.partial(_rows, t) for t in reversed(chain))]
+    cameras, *rows = [c(server) for c in counts] if n_videos < SMALL else _side_by_side(counts)
+    rows.reverse()
+    states = zip(chain, rows, strict=True)
+    tables = [_table_status(t, n, queues[t.__name__], rates, exact) for t, n in states]
+    errors = [e for t, s in zip(chain, tables, strict=True) if s.error for e in _errors(t, most)]
     empty = {t.table for t in tables if t.empty}
     waiting = _waiting(most) if any(t.waiting for t in tables) else []
-    return Status(n_videos, tables, errors, _empty(empty, most), waiting, live_workers(), exact, camera_kinds(server))
+    return Status(n_videos, tables, errors, _empty(empty, most), waiting, live_workers(), exact, cameras)
 
 
-def _table_status(table: Any, counts: dict[str, int], rates: dict[str, float], exact: bool) -> TableStatus:
+def _table_status(
+    table: Any, rows: tuple[int, int, int], counts: dict[str, int], rates: dict[str, float], exact: bool
+) -> TableStatus:
     name, pending = table.__name__, counts["pending"]
     if exact:
         remaining, _ = table().progress()
         pending = max(0, remaining - counts["reserved"] - counts["error"] - counts["ignore"])
-    done, empty, waiting = _rows(table, table.connection)
+    done, empty, waiting = rows
     oldest, reason = _oldest(table, table.connection) if counts["pending"] else (None, "")
     per_hour = rates.get(name, 0.0)
     left = 3600.0 * pending / per_hour if per_hour and pending else None
     return TableStatus(
         name, done, empty, pending, counts["reserved"], counts["error"], waiting, oldest, per_hour, left, reason
     )
+
+
+def _side_by_side(questions: Sequence[Callable[[Any], Any]], at_once: int = 4) -> list[Any]:
+    """Answers of functions of a connection, in their order, so many at a time: each thread has its own connection."""
+    free: queue.SimpleQueue[Any] = queue.SimpleQueue()
+
+    def ask(question: Callable[[Any], Any]) -> Any:
+        server = free.get()
+        try:
+            return question(server)
+        finally:
+            free.put(server)
+
+    with contextlib.ExitStack() as stack:
+        for _ in range(at_once):
+            free.put(stack.enter_context(contextlib.closing(connection.another())))
+        pool = stack.enter_context(ThreadPoolExecutor(at_once))
+        return list(pool.map(ask, questions))
 
 
 def camera_kinds(server: Any) -> dict[str, int]:

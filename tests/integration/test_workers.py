@@ -424,6 +424,26 @@ def test_why_says_where_a_video_stands(tables: None, tmp_path: Path):
         why(999)
 
 
+def test_few_and_many_videos_are_counted_alike(tables: None, tmp_path: Path, monkeypatch):
+    (tmp_path / "bad.mp4").write_text("not a video")
+    register(*videos(tmp_path, "walk"), tmp_path / "bad.mp4", session_label="1")
+    register(chain.small_video(tmp_path, "two", people="two alike"), session_label="2")
+    register(chain.small_video(tmp_path, "none", people="nobody"), session_label="3")
+    work()
+    few = pipeline_status(exact=False)
+    done = {t.table: t.done for t in few.tables}
+    assert done == counts()
+    assert {t.table: t.error for t in few.tables if t.error} == {"VideoInfo": 1}
+    assert {t.table: (t.empty, t.waiting) for t in few.tables if t.empty or t.waiting} == {"SubjectChoice": (1, 1)}
+    assert few.cameras == {"guess": done["Keypoints"]}
+    monkeypatch.setattr("schemas.status.SMALL", 0)  # through connections side by side
+    many = pipeline_status(exact=False)
+    assert [(t.table, t.done, t.empty, t.pending, t.error, t.waiting) for t in many.tables] == [
+        (t.table, t.done, t.empty, t.pending, t.error, t.waiting) for t in few.tables
+    ]
+    assert (many.cameras, many.errors, many.empty, many.waiting) == (few.cameras, few.errors, few.empty, few.waiting)
+
+
 def test_errors_are_tried_again_by_code_table_and_video(tables: None, tmp_path: Path):
     (tmp_path / "bad.mp4").write_text("not a video")
     gone = videos(tmp_path, "gone")[0]
