@@ -160,7 +160,8 @@ class SubjectChoice(dj.Computed):
         person = int(override[0]["override_person_id"]) if override else None
         subject_method = (TrackingSelection & key).fetch1("subject_method")
         method = method_arguments(SubjectMethod, "subject", "subject", subject_method)
-        return file, file_ref(tracks), (int(size[0]), int(size[1])), (detector, model), person, method
+        elsewhere = None if override else _decided_elsewhere(key)
+        return file, file_ref(tracks), (int(size[0]), int(size[1])), (detector, model), person, elsewhere, method
 
     @property
     def key_source(self) -> Any:
@@ -175,12 +176,19 @@ class SubjectChoice(dj.Computed):
         size: tuple,
         about: tuple,
         override: int | None,
+        elsewhere: tuple | None,
         method: Mapping[str, Any],
     ) -> tuple:
         params = rebuild_params(library("tracking").SubjectParams, **method)
         with stored_file(self, ref) as path:
             tracking = load_tracking(path, size, *about)
-        choice = library("tracking").choose_subject(tracking, params=params, override=override)
+        if elsewhere is None:
+            choice = library("tracking").choose_subject(tracking, params=params, override=override)
+        else:
+            other_tracks, other_about, number_there, other_method = elsewhere
+            with stored_file(self, other_tracks) as path:
+                other = load_tracking(path, size, *other_about)
+            choice = library("tracking").carried_choice(other, number_there, other_method, tracking, params)
         sheet = None
         if choice.status == "NEEDS_CHOICE":
             path = video.registered_file(file[0], file[1], key)
@@ -217,6 +225,20 @@ def method_of(name: str) -> str:
     if name in library("tracking").PARAMSETS or not library("models").is_registered(name):
         return resolve_method(TrackingMethod, "tracking", name)
     return method_of_model(TrackingMethod, "tracking", library("tracking").method_of_detector(name))
+
+
+def _decided_elsewhere(key: Mapping[str, Any]) -> tuple | None:
+    """The last decision about another tracking of this video: its tracks, detector and model, the person's number
+    there, the method. None where nobody has decided."""
+    others = Tracking * SubjectOverride & {"video_id": key["video_id"]}
+    others &= f"tracking_method != '{key['tracking_method']}'"
+    for row in others.to_dicts(order_by=["override_created DESC", "tracking_method"]):
+        there = {k: row[k] for k in Tracking.primary_key}
+        number_there = int(row["override_person_id"])
+        if Tracking.Person & there & {"person_id": number_there}:
+            about = (row["detector"], row["tracking_model_sha256"])
+            return file_ref(row["tracks"]), about, number_there, row["tracking_method"]
+    return None
 
 
 # ---------------------------------------------------------------------------------------------- override and effects

@@ -3,6 +3,7 @@
 from ._appearance import likeness, look_of
 from ._associate import AssociationParams
 from ._blazepose import BlazePoseDetector
+from ._carry import carried_choice, same_person
 from ._join import JoinParams
 from ._methods import find_method, method_of_detector
 from ._require import require_subject
@@ -33,6 +34,7 @@ __all__ = [
     "UncrossParams",
     "WatchParams",
     "YoloxDetector",
+    "carried_choice",
     "choose_subject",
     "contact_sheet",
     "contact_sheet_jpeg",
@@ -41,6 +43,7 @@ __all__ = [
     "look_of",
     "method_of_detector",
     "require_subject",
+    "same_person",
     "save_contact_sheet",
     "time_in_view_s",
     "track_people",

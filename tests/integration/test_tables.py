@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import platform
@@ -514,6 +515,43 @@ def test_of_two_trackings_the_one_that_is_meant_is_named(tables: None, tmp_path:
     (tracking.TrackingMethod & {"tracking_method": "other-v1"}).delete(prompt=False)
     with pytest.raises(PblError, match="SOLVER_UNKNOWN"):
         choose_person(number, 2, "other-v1")
+
+
+def test_a_decision_is_carried_to_a_tracking_that_comes_later(
+    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The other method numbers the people the other way round; then it does not find the one who was chosen."""
+    (number,) = register(chain.small_video(tmp_path, "walk"))
+    populate(["VideoInfo", "Tracking", "SubjectChoice"])
+    assert tracking.SubjectChoice.fetch1("chosen_person_id") == 1
+    choose_person(number, 2)
+    populate(["SubjectChoice"])
+    found = chain.track_people(tmp_path / "walk.mp4")
+    walks, stands = found.persons
+    later = {
+        "turned": (dataclasses.replace(stands, person_id=1), dataclasses.replace(walks, person_id=2)),
+        "without": (walks,),
+    }
+    (method,) = tracking.TrackingMethod.to_dicts()[:1]
+    first = tracking.TrackingSelection.fetch1()
+    for hits, (name, persons) in enumerate(later.items(), 4):
+        params = {**method["tracking_params"], "min_hits": hits}
+        row = {"tracking_method_name": name, "tracking_method_version": 1, "tracking_params": params}
+        sha = Paramset("tracking", name, 1, params).hash
+        tracking.TrackingMethod.insert1({"tracking_method": f"{name}-v1", **row, "tracking_method_sha": sha})
+        tracking.TrackingSelection.insert1({**first, "tracking_method": f"{name}-v1"})
+        now = dataclasses.replace(found, persons=persons)
+        monkeypatch.setattr(pbl_pipeline.tracking, "track_people", lambda *a, _now=now, **k: _now)
+        assert not errors(populate(["Tracking", "SubjectChoice"]))
+    rows = {r["tracking_method"]: r for r in tracking.SubjectChoice.to_dicts()}
+    assert (rows["turned-v1"]["choice_status"], rows["turned-v1"]["chosen_person_id"]) == ("CHOSEN", 1)
+    assert f"by hand in the tracking {first['tracking_method']}" in rows["turned-v1"]["choice_reason"]
+    assert (rows["without-v1"]["choice_status"], rows["without-v1"]["chosen_person_id"]) == ("NEEDS_CHOICE", None)
+    assert rows["without-v1"]["contact_sheet"] is not None
+    assert not populate(["Tracking", "SubjectChoice"]).did_something
+    others = "tracking_method in ('turned-v1', 'without-v1')"
+    (tracking.TrackingSelection & others).delete(prompt=False, part_integrity="cascade")
+    (tracking.TrackingMethod & others).delete(prompt=False)
 
 
 def test_confirming_the_automatic_choice_deletes_nothing(tables: None, tmp_path: Path):

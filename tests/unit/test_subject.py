@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
-from pbl_pipeline.tracking import PersonTrack, choose_subject
+from pbl_pipeline.tracking import PersonTrack, carried_choice, choose_subject, same_person
 from tests.unit.test_tracking import FPS, HEIGHT, track, video_of
 
 N = 360  # 12 s
@@ -48,6 +50,32 @@ def test_a_therapist_beside_the_patient_leaves_the_choice_to_a_person():
     assert (choice.status, choice.person_id) == ("NEEDS_CHOICE", None)
     assert "walks towards the camera" in choice.reason
     assert choice.runner_up_id is not None
+
+
+def test_a_decision_is_carried_to_another_tracking():
+    """By another detector's boxes: larger, with a gap, numbered anew."""
+    patient, therapist = track(2, x=lambda t: 300 + 40 * t, n=N), track(1, x=lambda t: 380 + 40 * t, side=460.0, n=N)
+    decided = video_of(therapist, patient)
+    grown = patient.box_px + np.array([-10.0, -20.0, 10.0, 20.0])
+    grown[40:90] = np.nan
+    here = dataclasses.replace(patient, person_id=3, box_px=grown)
+    beside = dataclasses.replace(therapist, person_id=7)
+    assert same_person(decided, 2, video_of(beside, here)) == 3
+    assert same_person(decided, 1, video_of(beside, here)) == 7
+    choice = carried_choice(decided, 2, "old-v1", video_of(beside, here))
+    assert (choice.status, choice.person_id) == ("CHOSEN", 3)
+    assert choice.reason == "Person 3 is the one whom somebody chose by hand in the tracking old-v1."
+    # Who walks close beside her is not she, and of her of whom a quarter is left nobody can say it.
+    near = dataclasses.replace(therapist, box_px=patient.box_px + np.array([25.0, 0.0, 25.0, 0.0]))
+    assert same_person(video_of(near, patient), 2, video_of(near)) is None
+    grown[90:] = np.nan
+    for people in ((beside, here), (beside,), (here,)):
+        choice = carried_choice(decided, 2, "old-v1", video_of(*people))
+        assert (choice.status, choice.person_id) == ("NEEDS_CHOICE", None)
+        assert "person 2 was chosen by hand" in choice.reason
+    empty = dataclasses.replace(decided, persons=())
+    assert carried_choice(decided, 2, "old-v1", empty).status == "NO_PERSON"
+    assert same_person(decided, 2, video_of(track(1, x=300.0, n=N // 2))) is None
 
 
 def test_of_a_crowd_the_first_few_are_described():

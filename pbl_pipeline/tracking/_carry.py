@@ -1,0 +1,62 @@
+"""A decision about one tracking of a video, carried to another tracking of it: numbers are new, people are the same."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from ._subject import SubjectParams, choose_subject
+from ._types import PersonTrack, SubjectChoice, Tracking
+
+#: Mean overlap (intersection over union) of the body boxes, over the frames in which either is in view, from which two
+#: tracks may be of one person.
+SAME_OVERLAP = 0.4
+
+
+def same_person(decided: Tracking, person_id: int, tracking: Tracking) -> int | None:
+    """Number in `tracking` of the person `person_id` of `decided`, both of the same video; None where nobody surely is.
+
+    Each must be the other's best match: where she was not found, the one beside her is not taken for her.
+    """
+    if len(decided.time_s) != len(tracking.time_s) or not tracking.persons:
+        return None
+    there = next(p for p in decided.persons if p.person_id == person_id)
+    best = max(tracking.persons, key=lambda p: _overlap(there, p))
+    back = max(decided.persons, key=lambda p: _overlap(p, best))
+    return best.person_id if back is there and _overlap(there, best) >= SAME_OVERLAP else None
+
+
+def carried_choice(
+    decided: Tracking, person_id: int, method: str, tracking: Tracking, params: SubjectParams | None = None
+) -> SubjectChoice:
+    """The choice in `tracking` after somebody chose `person_id` by hand in `decided`, another tracking (by `method`).
+
+    It is the same person (status CHOSEN). Where nobody surely is, a person has to choose again: what the automatic
+    choice would say is not what somebody decided.
+    """
+    found = same_person(decided, person_id, tracking)
+    if found is not None:
+        reason = f"Person {found} is the one whom somebody chose by hand in the tracking {method}."
+        return dataclasses.replace(choose_subject(tracking, params, found), status="CHOSEN", reason=reason)
+    choice = choose_subject(tracking, params)
+    if choice.person_id is None:
+        return choice
+    reason = (
+        f"In the tracking {method} person {person_id} was chosen by hand, whom nobody here surely is. A person has to "
+        "choose again."
+    )
+    return dataclasses.replace(choice, status="NEEDS_CHOICE", person_id=None, reason=reason)
+
+
+def _overlap(a: PersonTrack, b: PersonTrack) -> float:
+    """Mean intersection over union of the boxes over the frames in which one of the two is in view, 0 where one only
+    is."""
+    here, there = a.box_px.astype(np.float64), b.box_px.astype(np.float64)
+    both = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
+    n = int((np.isfinite(here).all(axis=1) | np.isfinite(there).all(axis=1)).sum())
+    here, there = here[both], there[both]
+    size = np.minimum(here[:, 2:], there[:, 2:]) - np.maximum(here[:, :2], there[:, :2])
+    shared = np.prod(np.maximum(size, 0.0), axis=1)
+    areas = np.prod(here[:, 2:] - here[:, :2], axis=1) + np.prod(there[:, 2:] - there[:, :2], axis=1)
+    return float(np.sum(shared / np.maximum(areas - shared, 1e-9))) / max(n, 1)
