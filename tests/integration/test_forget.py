@@ -160,8 +160,10 @@ def test_an_unknown_code_removes_nothing_and_a_running_computation_holds_it_up(
     two: tuple[dict, set[str], list[Path]],
 ):
     before = everything()
-    for subject in ("nobody", "P01", "p017", "../P017", "P017/../x", ""):
-        assert pbl("forget", subject, "--yes").error_code in ("DB_NOT_FOUND", "USAGE"), subject
+    for subject in ("nobody", "P01", "p017"):
+        assert pbl("forget", subject, "--yes").error_code == "DB_NOT_FOUND", subject
+    for subject in ("../P017", "P017/../x", ""):
+        assert pbl("forget", subject, "--yes").error_code == "USAGE", subject
     assert everything() == before
     jobs = keypoints.Keypoints.jobs
     jobs.update1({**jobs.pending.keys()[0], "status": "reserved", "host": "node7", "pid": 4711})

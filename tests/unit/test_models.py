@@ -339,6 +339,16 @@ def test_a_registered_model_that_changed_is_named(folder, registry):
     assert "sound: ok on cpu" in every.out
 
 
+def test_a_name_that_is_a_path_is_no_registered_model(folder, registry):
+    models.add(folder)
+    assert models.is_registered("dots-crop3d")
+    assert (registry / "../dots" / "model.json").is_file()
+    for name in ("../dots", str(folder), ".hidden"):
+        assert not models.is_registered(name)
+    refused("MODEL_MISSING", models.remove, "../dots")
+    assert folder.is_dir()
+
+
 def test_another_model_under_the_name(folder, registry):
     models.add(folder)
     models.add(folder)  # the same again: nothing changes
