@@ -96,10 +96,8 @@ SMOOTH_S = 0.02
 
 
 def pad_frames(n: int, coarse: bool = False) -> int:
-    """The size to which `n` frames are padded: 64, 96, 128, 192, 256, 384 ...; `coarse`: 256, 512, 1024 ..."""
-    if coarse:
-        return max(COARSE_FRAMES, _power_of_2(n))
-    size = MIN_FRAMES
+    """The size to which `n` frames are padded: 64, 96, 128, 192, 256, 384 ...; `coarse`: 256 or more of these."""
+    size = COARSE_FRAMES if coarse else MIN_FRAMES
     while size < n:
         size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
     return size
