@@ -195,14 +195,15 @@ def _phone_samples(trials: Sequence[TrialArrays], n: int, coarse: bool) -> tuple
     if not moving:
         return np.tile([1.0, 0, 0, 0], (n, 2, 1)), np.zeros(n)
     longest = max(t.time_s[-1] - t.time_s[0] for t in trials) + 2 * CLOCK_RANGE_S
-    count = pad_samples(int(np.ceil(longest / SAMPLE_S)) + 2, coarse)
-    out = np.tile([1.0, 0, 0, 0], (n, count, 1))
+    needed = int(np.ceil(longest / SAMPLE_S)) + 2
+    out = np.tile([1.0, 0, 0, 0], (n, pad_samples(needed, coarse), 1))
     for i in moving:
         trial = trials[i]
         assert trial.phone_time_s is not None
         assert trial.phone_quat_wxyz is not None
-        at = trial.time_s[0] - CLOCK_RANGE_S + SAMPLE_S * np.arange(count)
+        at = trial.time_s[0] - CLOCK_RANGE_S + SAMPLE_S * np.arange(needed)
         quat = quat_wxyz(rotation_matrices(trial.phone_time_s, trial.phone_quat_wxyz, at))
         smooth = gaussian_filter1d(quat, SMOOTH_S / SAMPLE_S, axis=0, mode="nearest")
-        out[i] = smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
+        out[i, :needed] = smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
+        out[i, needed:] = out[i, needed - 1]
     return out, np.full(n, -CLOCK_RANGE_S)
