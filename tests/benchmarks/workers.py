@@ -2,6 +2,7 @@
 
     python -m tests.benchmarks.workers scale              # 300,000 videos: register, status, refresh, cost per job
     python -m tests.benchmarks.workers speed              # jobs a second of 1 to 4 workers on 5,000 keys
+    python -m tests.benchmarks.workers method             # a new parameter set over 10,000 fitted sessions
     python -m tests.benchmarks.workers kills              # kill -9 of workers and of the database during 2,000 jobs
     python -m tests.benchmarks.workers memory             # a worker's memory over 500 jobs
 
@@ -183,20 +184,39 @@ def _copy_results(first_session: int, last_session: int) -> None:
     )
     first = max(first_session, 1)
     template = _first_set()
+    names_of_sets = _names_of_sets(first, last_session)
     for table in copied:
         names = [f"`{n}`" for n in table.heading.names]
         values = {
             "`video_id`": f"t.video_id + {EACH} * s.seq",
             "`session_id`": "t.session_id + s.seq",
-            "`fit_set`": "LEFT(MD5(CONCAT(t.fit_set, s.seq)), 16)",
+            "`fit_set`": "s.name",
         }
         where = "t.fit_set = %s" if "fit_set" in table.heading.names else f"t.video_id <= {EACH} AND %s != ''"
         table.connection.query(
             f"INSERT INTO {table.full_table_name} ({','.join(names)})"
             f" SELECT {','.join(values.get(n, f't.{n}') for n in names)} FROM {table.full_table_name} AS t"
-            f" JOIN `{table.database}`.seq_{first}_to_{last_session - 1} AS s WHERE {where}",
+            f" JOIN {names_of_sets} AS s WHERE {where}",
             args=(template,),
         )
+
+
+def _names_of_sets(first: int, last: int) -> str:
+    """A temporary table of the sessions `range(first, last)` and the names that planning would give their sets."""
+    from schemas import fit
+    from schemas.plan import fit_set_hash
+
+    methods = (fit.FitSet.Video & {"fit_set": _first_set()}).to_dicts(limit=1)[0]
+    name = f"`{fit.FitSet.database}`.`names_of_sets`"
+    query = fit.FitSet.connection.query
+    query(f"CREATE OR REPLACE TEMPORARY TABLE {name} (seq INT PRIMARY KEY, name CHAR(16))")
+    for start in range(first, last, 1000):
+        values = []
+        for i in range(start, min(start + 1000, last)):
+            rows = [{"video_sha256": r.sha256, "keypoints_person_id": 1} for r in recordings(i * EACH, EACH)]
+            values += [i, fit_set_hash({**methods, "session_id": 1 + i}, rows)]
+        query(f"INSERT INTO {name} VALUES {','.join(['(%s,%s)'] * (len(values) // 2))}", args=values)
+    return name
 
 
 def _first_set() -> str:
@@ -208,7 +228,10 @@ def _first_set() -> str:
 # --------------------------------------------------------------------------------------------------------------- speed
 @main.command()
 @click.option("--keys", default=5000, show_default=True)
-def speed(keys: int) -> None:
+@click.option(
+    "--work-ms", default=0.0, show_default=True, help="What a job takes that needs no processor of this machine."
+)
+def speed(keys: int, work_ms: float) -> None:
     """Jobs a second of one table (VideoInfo) by 1 to 4 workers, each key exactly once; what the database could do."""
     from schemas import embedded, tracking, video
     from schemas.bulk import register_many
@@ -223,7 +246,10 @@ def speed(keys: int) -> None:
     with installation() as home:
         server = embedded.Folder(home / "db").state()["pid"]
         register_many(recordings(0, keys))
-        click.echo(f"{keys} keys, {os.cpu_count()} cores for workers and database together")
+        os.environ[worker_standins.SLEEP] = str(work_ms / 1000)
+        click.echo(
+            f"{keys} keys, {work_ms:g} ms of work each, {os.cpu_count()} cores for workers and database together"
+        )
         alone = 0.0
         for processes in (1, 2, 3, 4):
             begin()
@@ -262,6 +288,66 @@ def _processor_s(pid: int) -> float:
     """Processor time of a process so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+# -------------------------------------------------------------------------------------------------------------- method
+@main.command()
+@click.option("--sessions", default=10_000, show_default=True)
+@click.option("--worked", default=20, show_default=True, help="Sessions whose new fits are computed then.")
+def method(sessions: int, worked: int) -> None:
+    """A new parameter set of the fit over fitted sessions: what becomes pending, and that no old row changes."""
+    from schemas import computed_tables, fit
+    from schemas.bulk import register_many
+    from workers import refresh, requeue
+
+    with installation():
+        register_many(recordings(0, EACH))
+        work(1)  # the session whose rows are copied
+        register_many(recordings(EACH, (sessions - 1) * EACH))
+        _copy_results(0, sessions)
+        refresh.refresh(True)
+        tables = computed_tables()
+        assert not any(_pending(tables).values()), "the copied sessions are not complete"
+        old = {t.__name__: _contents(t) for t in tables}
+        t = time.monotonic()
+        plan = requeue.plan_new_method("SessionFit", "paper-2025")
+        say("planned", time.monotonic() - t, "s", f"{len(plan.add)} selections")
+        t = time.monotonic()
+        for _ in requeue.carry_out(plan):
+            pass
+        say("queued", time.monotonic() - t, "s")
+        refresh.refresh(True)
+        pending = {name: n for name, n in _pending(tables).items() if n}
+        click.echo(f"pending: {pending}")
+        assert pending == {"TrialInput": sessions * EACH}  # from which the fits are planned
+        assert {t.__name__: _contents(t) for t in tables} == old
+        jobs = fit.TrialInput.jobs
+        jobs.connection.query(f"UPDATE {jobs.full_table_name} SET priority = 1 WHERE video_id <= {worked * EACH}")
+        work(2, resource="light", max_jobs=worked * EACH // 2)
+        work(2, resource="fit")
+        made = len(fit.SessionFit()) - sessions
+        click.echo(f"{made} new fits; pending: { {name: n for name, n in _pending(tables).items() if n} }")
+        assert made == worked
+        new = plan.add[0]["fit_method"]
+        for table in tables:
+            assert _contents(table, new) == old[table.__name__], table.__name__
+        click.echo(f"old rows of {len(tables)} tables unchanged (number and sum over every column of every row)")
+
+
+def _pending(tables: list[Any]) -> dict[str, int]:
+    return {t.__name__: len(t.jobs.pending) for t in tables}
+
+
+def _contents(table: Any, but: str = "") -> tuple[int, int]:
+    """Number of rows, and a sum over a hash of every column of each; those of the fit method `but` left out."""
+    columns = ",".join(f"COALESCE(`{n}`,'')" for n in table.heading.names)
+    query = f"SELECT COUNT(*), COALESCE(SUM(CRC32(CONCAT_WS('|',{columns}))),0) FROM {table.full_table_name}"
+    if "fit_method" in table.heading.names:
+        query += " WHERE fit_method <> %s"
+        n, total = table.connection.query(query, args=(but,)).fetchone()
+    else:
+        n, total = table.connection.query(query).fetchone()
+    return int(n), int(total)
 
 
 # --------------------------------------------------------------------------------------------------------------- kills
