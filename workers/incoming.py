@@ -131,7 +131,11 @@ def _take(fs: Any, name: PurePosixPath, given: _File, logs: list[_File], archive
     subject, session, file = name.parts
     try:
         copy, sha256 = _copy(fs, given, archive)
-        log = _copy(fs, logs[0], archive)[0] if logs else None
+        try:
+            log = _copy(fs, logs[0], archive)[0] if logs else None
+        except BaseException:
+            copy.unlink()
+            raise
     except _StillChanging:
         out.uploading += 1
         return

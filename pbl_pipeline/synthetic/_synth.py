@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -48,6 +49,19 @@ GROUNDS = ("overground", "treadmill")
 LANDSCAPE_PX = (1920, 1080)
 #: Share of the points that may be outside of the picture.
 OUTSIDE_SHARE = 0.2
+
+
+#: What stands in the name of a trial where it is not the default, so that no other trial's files are overwritten.
+_IN_NAME: dict[str, Callable[[Any], str]] = {
+    "ground": str,
+    "speed_m_per_s": "{:g}mps".format,
+    "seconds": "{:g}s".format,
+    "fps": "{:g}fps".format,
+    "marker_set": str,
+    "noise": "noise-{}".format,
+    "sensor": lambda sensor: f"sensor-{hashlib.sha256(repr(sensor).encode()).hexdigest()[:6]}",
+    "root_relative": lambda _: "absolute",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,8 +119,13 @@ class SynthSpec:
 
     @property
     def name(self) -> str:
-        """Name of the files, of what is not the default."""
+        """Name of the files: task, impairments, view, camera, what else is not the default, seed."""
         words = [self.task, *(f"{i.name}{round(100 * i.severity)}" for i in self.impairments), self.view, self.camera]
+        fields = {f.name: f.default for f in dataclasses.fields(self)}
+        for field, form in _IN_NAME.items():
+            value = getattr(self, field)
+            if value != fields[field]:
+                words.append(form(value))
         return "_".join([*words, f"seed{self.seed}"])
 
 

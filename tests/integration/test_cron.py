@@ -186,6 +186,27 @@ def test_a_full_archive_leaves_the_upload(drop: Path, tmp_path: Path, monkeypatc
     assert take_over(str(drop), archive, settled_s=0.0).registered == ["P001/1/walk.mp4"]
 
 
+def test_an_archive_that_is_full_at_the_log_keeps_no_half(drop: Path, tmp_path: Path, monkeypatch):
+    archive = tmp_path / "archive"
+    upload(drop, "P001/1/walk.mp4")
+    (drop / "P001/1/walk.csv").write_text("time_s,qw,qx,qy,qz\n0,1,0,0,0\n1,1,0,0,0\n")
+    take_over(str(drop), archive, settled_s=0.0)
+    calls = []
+
+    def full_at_second(number: int) -> None:
+        calls.append(number)
+        if len(calls) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full_at_second)
+        with pytest.raises(PblError, match="FILE_UNWRITABLE"):
+            take_over(str(drop), archive, settled_s=0.0)
+    assert len(calls) == 2
+    assert files(drop) == ["P001/1/walk.csv", "P001/1/walk.mp4"]
+    assert files(archive) == []
+
+
 def test_what_cannot_be_registered_is_kept_with_its_reason(drop: Path, tmp_path: Path):
     archive = tmp_path / "archive"
     upload(drop, "Jane Doe/1/walk.mp4")

@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import itertools
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from pbl_pipeline.synthetic import (
     IMPAIRMENTS,
     TASKS,
     Impairment,
+    PhoneSensor,
     Synthetic,
     SynthSpec,
     Truth,
@@ -327,6 +329,30 @@ def test_the_same_seed_is_the_same_trial_and_another_one_is_not():
     assert np.array_equal(a.truth.qpos, b.truth.qpos)
     assert a.truth.events == b.truth.events
     assert not np.allclose(a.truth.qpos, c.truth.qpos)
+
+
+def test_trials_that_differ_have_other_names():
+    plain = SynthSpec(seed=5)
+    assert plain.name == "walk_frontal_static_seed5"
+    other: dict[str, Any] = {
+        "ground": "treadmill",
+        "speed_m_per_s": 0.8,
+        "seconds": 4.0,
+        "fps": 60.0,
+        "marker_set": "blazepose_33",
+        "noise": "none",
+        "sensor": PhoneSensor(),
+        "root_relative": False,
+        "task": "standing",
+        "seed": 6,
+        "view": "oblique",
+        "camera": "handheld",
+        "impairments": (Impairment("crouch", 0.5),),
+    }
+    assert set(other) == {f.name for f in dataclasses.fields(SynthSpec)}
+    names = {dataclasses.replace(plain, **{field: value}).name for field, value in other.items()}
+    assert len(names) == len(other)
+    assert plain.name not in names
 
 
 @pytest.mark.parametrize("view", ["frontal", "oblique", "sagittal", "follow"])
