@@ -76,7 +76,10 @@ def worker(
 
 
 def default_batch(resource: str) -> int:
-    """128 where a GPU fits, else 1: among so many are enough of one size to be solved together. Asked without loading the numerical library, which would take the device."""
+    """128 where a GPU fits, else 1: among so many are enough of one size to be solved together.
+
+    Asked without loading the numerical library, which would take the device.
+    """
     import shutil
 
     return 128 if "fit" in GROUPS[resource] and shutil.which("nvidia-smi") else 1
