@@ -246,7 +246,10 @@ class Decoder:
             return f"the pictures of the last {beyond_s:.2f} s do not decode"
         if self._n_packets < self.n_announced:
             # An edit list also leaves out packets beyond its end; without it every packet of the file comes.
-            n_stored = _count_packets(self.path, self.stream.index)
+            try:
+                n_stored = _count_packets(self.path, self.stream.index)
+            except FFMPEG_ERRORS as error:
+                return f"the container announces {self.n_announced} frames and cannot be read for them: {_words(error)}"
             if n_stored < self.n_announced:
                 return f"the container announces {self.n_announced} frames and holds {n_stored}"
             self._n_hidden = n_stored - self.n_frames

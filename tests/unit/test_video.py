@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.video import Frame, VideoInfo, guess_camera, load_camera, probe, read_frames, sha256_of
+from pbl_pipeline.video import Frame, VideoInfo, _decode, guess_camera, load_camera, probe, read_frames, sha256_of
 from tests.videos import constant_rate, numbered_frames, write_video
 
 VARIABLE_S = np.cumsum(np.r_[0.0, np.random.default_rng(0).uniform(0.01, 0.05, 39)])
@@ -182,7 +182,8 @@ def test_unknown_recording_time_is_none(tmp_path, written):
 # --- edit lists, and the recordings that have them
 
 
-def test_frames_that_an_edit_list_hides_do_not_count(tmp_path):
+@pytest.fixture
+def with_edit_list(tmp_path) -> Path:
     """Stamps below zero become an edit list: a player begins at the 21st picture."""
     path = tmp_path / "v.mp4"
     with av.open(str(path), "w", options={"avoid_negative_ts": "disabled", "use_editlist": "1"}) as container:
@@ -199,11 +200,28 @@ def test_frames_that_an_edit_list_hides_do_not_count(tmp_path):
                 assert packet.dts is not None
                 packet.pts, packet.dts = packet.pts - 20, packet.dts - 20
                 container.mux(packet)
+    return path
+
+
+def test_frames_that_an_edit_list_hides_do_not_count(with_edit_list):
+    path = with_edit_list
     info = probe(path)
     assert (info.n_frames, info.n_frames_announced) == (40, 60)
     assert info.notes == ("20 frames are hidden by the file's edit list and do not count",)
     np.testing.assert_allclose(info.time_s, constant_rate(40), atol=1e-4)
     assert [grey(f) for f in read_frames(path)] == [(20 + i) % 30 for i in range(40)]
+
+
+def test_hidden_frames_that_cannot_be_counted_are_lost_ones(with_edit_list, monkeypatch):
+    """A header that lies about sizes: FFmpeg opens the file as a player does, and not without its edit list."""
+
+    def too_large(*_: object) -> int:
+        raise MemoryError(12, "Cannot allocate memory")
+
+    monkeypatch.setattr(_decode, "_count_packets", too_large)
+    with pytest.raises(PblError, match="Cannot allocate memory") as error:
+        probe(with_edit_list)
+    assert error.value.code == "VIDEO_TRUNCATED"
 
 
 @pytest.mark.parametrize(("clip", "n_frames", "n_announced"), [("walk", 75, 271), ("STS", 798, 841)])
