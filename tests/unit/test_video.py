@@ -212,8 +212,9 @@ def test_frames_that_an_edit_list_hides_do_not_count(with_edit_list):
     assert [grey(f) for f in read_frames(path)] == [(20 + i) % 30 for i in range(40)]
 
 
-def test_hidden_frames_that_cannot_be_counted_are_lost_ones(with_edit_list, monkeypatch):
+def test_frames_that_are_announced_and_cannot_be_counted_are_lost(with_edit_list, monkeypatch):
     """A header that lies about sizes: FFmpeg opens the file as a player does, and not without its edit list."""
+    monkeypatch.setattr(_decode.Decoder, "n_announced", property(lambda _: 100))
 
     def too_large(*_: object) -> int:
         raise MemoryError(12, "Cannot allocate memory")
