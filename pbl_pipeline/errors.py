@@ -90,6 +90,10 @@ class PblError(Exception):
         lines += [f"  expected: {self.expected}", f"  next:     {self.next_step}"]
         return "\n".join(lines)
 
+    def about(self, key: object) -> PblError:
+        """This error where it says what it is about, else the same about `key`: who reads several files knows which."""
+        return self if self.key is not None else _rebuild(self.code, self.found, self.expected, self.next_step, key)
+
     def __reduce__(self):
         parts = (self.code, self.found, self.expected, self.next_step, self.key)
         return (_rebuild, parts)

@@ -155,8 +155,7 @@ def _events(
         try:
             grid, reason, advice = look(feet, 0.0)
         except PblError as error:
-            words = {"found": error.found, "expected": error.expected, "next_step": error.next_step}
-            raise PblError(error.code, **words, key=str(path)) from error
+            raise error.about(str(path)) from error.__cause__
         if grid is not None and reason:
             check = Check("walking", EMPTY, None, None, f"{reason}: {advice}")
             return GaitEvents(EMPTY, (), reason, "none", "", feet.source, qc=(check,))

@@ -186,11 +186,7 @@ def _events(trial: TrialFit, method: Paramset) -> tuple[BodyPoses, GaitEvents]:
         poses = trial_poses(trial)
         return poses, detect_events(feet_from_fit(trial, poses), method)
     except PblError as error:
-        if error.key is not None:
-            raise
-        raise PblError(
-            error.code, found=error.found, expected=error.expected, next_step=error.next_step, key=trial.name
-        ) from error
+        raise error.about(trial.name) from error.__cause__
 
 
 def _distinct(trials: Sequence[TrialMetrics]) -> list[GaitCycle]:
