@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.qc import EMPTY, PASS, Check
+from pbl_pipeline.qc import EMPTY, PASS
 
 from ._angles import AngleSeries
 from ._feet import FootTrajectories, feet_from_markers
 from .events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents, detect_events, load_events
 from .events._door import look
+from .events._types import no_events
 from .normative import PLUG_IN_GAIT, check_degrees
 
 #: Our angle -> the marker model's point after L or R, and its component. Both count the same directions as positive.
@@ -157,8 +158,7 @@ def _events(
         except PblError as error:
             raise error.about(str(path)) from error.__cause__
         if grid is not None and reason:
-            check = Check("walking", EMPTY, None, None, f"{reason}: {advice}")
-            return GaitEvents(EMPTY, (), reason, "none", "", feet.source, qc=(check,))
+            return no_events("none", "", feet.source, reason, advice)
     if events_csv is not None:
         return _given(load_events(events_csv), "given", Path(events_csv).name)
     table = reader.get("EVENT")

@@ -23,6 +23,8 @@ from ._types import (
     EventParams,
     GaitEvent,
     GaitEvents,
+    heading_check,
+    no_events,
 )
 
 _HEEL, _TOE = slice(0, 2), slice(2, 4)
@@ -60,7 +62,7 @@ def detect_by_coordinates(feet: FootTrajectories, paramset: Paramset) -> GaitEve
     p = EventParams(**paramset.params)
     _, reason, advice = look(feet, p.min_segment_s)
     if reason:
-        return empty(paramset, feet, reason, advice=advice)
+        return no_events(paramset.name, paramset.hash, feet.source, reason, advice)
     x, leg = forward_signals(feet, p)
     return detect_by_extrema(
         feet, paramset, p, x, leg, lambda segment: _candidates(segment, leg, p), p.min_excursion_leg * leg
@@ -88,7 +90,9 @@ def detect_by_extrema(
         min_segment_s=p.min_segment_s,
     )
     if not segments:
-        return empty(paramset, feet, f"the feet are not seen for {p.min_segment_s:g} s at a time")
+        return no_events(
+            paramset.name, paramset.hash, feet.source, f"the feet are not seen for {p.min_segment_s:g} s at a time"
+        )
     confidence = _mean_confidence(feet)
     per_segment = [extrema(s) for s in segments]
     threshold = _thresholds(per_segment, least, p)
@@ -104,7 +108,8 @@ def detect_by_extrema(
         bouts += good
     swing = max(float(np.ptp(s.values[:, 0] - s.values[:, 1])) for s in segments) / leg
     if not bouts:
-        return empty(paramset, feet, _why_not(swing, n_candidates, p), n_candidates, breaks)
+        reason = _why_not(swing, n_candidates, p)
+        return no_events(paramset.name, paramset.hash, feet.source, reason, "", n_candidates, breaks)
     events = tuple(
         GaitEvent(c.time_s + _offset(c.event, p), c.side, c.event, c.weight, number)
         for number, bout in enumerate(bouts)
@@ -244,14 +249,6 @@ def _offset(event: str, p: EventParams) -> float:
     return p.foot_down_offset_s if event == FOOT_DOWN else p.foot_up_offset_s
 
 
-def empty(
-    paramset: Paramset, feet: FootTrajectories, reason: str, n: int = 0, breaks: int = 0, advice: str = ""
-) -> GaitEvents:
-    """No events, with the reason."""
-    check = Check("walking", "EMPTY", None, None, f"{reason}: {advice}" if advice else reason)
-    return GaitEvents("EMPTY", (), reason, paramset.name, paramset.hash, feet.source, (), n, breaks, (check,))
-
-
 def _checks(feet: FootTrajectories, n_events: int, breaks: int) -> tuple[Check, ...]:
     checks = [
         Check("walking", PASS, float(n_events), None, ""),
@@ -265,15 +262,4 @@ def _checks(feet: FootTrajectories, n_events: int, breaks: int) -> tuple[Check, 
             else "",
         ),
     ]
-    if np.isfinite(feet.heading_agreement):
-        ok = feet.heading_agreement >= 0.5
-        checks.append(
-            Check(
-                "heading_agreement",
-                PASS if ok else WARN,
-                round(feet.heading_agreement, 3),
-                0.5,
-                "" if ok else "the person does not go where the pelvis faces: sideways, or the camera moved",
-            )
-        )
-    return tuple(checks)
+    return (*checks, *heading_check(feet.heading_agreement))

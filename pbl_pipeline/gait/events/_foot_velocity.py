@@ -11,9 +11,9 @@ from pbl_pipeline.paramset import Paramset
 
 from .._feet import FootTrajectories
 from .._signal import Segment, refine_extremum
-from ._coordinates import Extremum, detect_by_extrema, empty, forward_signals, prominence
+from ._coordinates import Extremum, detect_by_extrema, forward_signals, prominence
 from ._door import look
-from ._types import FOOT_DOWN, FOOT_UP, SIDES, EventParams, GaitEvents
+from ._types import FOOT_DOWN, FOOT_UP, SIDES, EventParams, GaitEvents, no_events
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +46,7 @@ def detect_by_foot_velocity(feet: FootTrajectories, paramset: Paramset) -> GaitE
     p = paramset.to(FootVelocityParams)
     _, reason, advice = look(feet, p.min_segment_s)
     if reason:
-        return empty(paramset, feet, reason, advice=advice)
+        return no_events(paramset.name, paramset.hash, feet.source, reason, advice)
     x, leg = forward_signals(feet, p)
     heel = (np.asarray(feet.heel_m, float) - feet.pelvis_m[:, None]) @ feet.up
     toe = (np.asarray(feet.toe_m, float) - feet.pelvis_m[:, None]) @ feet.up

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline.paramset import Paramset
-from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
+from pbl_pipeline.qc import PASS, WARN, Check
 
 from .._feet import FootTrajectories
 from ._door import input_error, look
 from ._phase_filter import FilterParams, SmoothPhases, crossings, smooth_phases
-from ._types import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents
+from ._types import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents, heading_check, no_events
 from ._walking import WalkingParams, reach_leg, swing_leg, turning_deg_per_s, walking_stretches
 
 #: Order of the model's phases.
@@ -64,12 +64,11 @@ def detect_by_phase(feet: FootTrajectories, paramset: Paramset) -> GaitEvents:
 
     p = paramset.to(PhaseParams)
     _predict.check_model(p.model, p.model_sha256)
-    found = _Found(paramset, feet)
     if feet.legs_m is None:
         raise input_error("feet without the joints of the legs", "hips and knees, ankles, heels or toes in 3D")
     grid, reason, advice = look(feet, p.min_seen_s)
     if grid is None or reason:
-        return found.empty(reason, advice)
+        return no_events(paramset.name, paramset.hash, feet.source, reason, advice)
     time = np.asarray(feet.time_s, float)
     phases = _predict.predict(grid, p.model)
     curve = _predict.load(p.model)[1]["probability"]
@@ -83,7 +82,8 @@ def detect_by_phase(feet: FootTrajectories, paramset: Paramset) -> GaitEvents:
             events += [dataclasses.replace(e, bout=len(bouts)) for e in bout]
             bouts.append((bout[0].time_s, bout[-1].time_s))
     if not bouts:
-        return found.empty(*_why_not(grid, phases, len(stretches), half_seen, p))
+        reason, advice = _why_not(grid, phases, len(stretches), half_seen, p)
+        return no_events(paramset.name, paramset.hash, feet.source, reason, advice)
     turning = float(np.mean(np.abs(turning_deg_per_s(grid)) > p.walking.max_turn_deg_per_s))
     return GaitEvents(
         status=PASS,
@@ -215,11 +215,7 @@ def _checks(feet: FootTrajectories, events: list[GaitEvent], half_seen: int, tur
         checks.append(Check("legs_seen", WARN, float(half_seen), 0.0, advice))
     if turning > 0:
         checks.append(Check("turning", PASS, round(turning, 3), None, "no events where the person turns"))
-    if np.isfinite(feet.heading_agreement):
-        ok = feet.heading_agreement >= 0.5
-        advice = "" if ok else "the person does not go where the pelvis faces: sideways, or the camera moved"
-        checks.append(Check("heading_agreement", PASS if ok else WARN, round(feet.heading_agreement, 3), 0.5, advice))
-    return tuple(checks)
+    return (*checks, *heading_check(feet.heading_agreement))
 
 
 def _breaks(events: list[GaitEvent]) -> int:
@@ -229,13 +225,3 @@ def _breaks(events: list[GaitEvent]) -> int:
         for a, b in itertools.pairwise(events)
         if a.bout == b.bout
     )
-
-
-@dataclasses.dataclass(frozen=True)
-class _Found:
-    paramset: Paramset
-    feet: FootTrajectories
-
-    def empty(self, reason: str, advice: str) -> GaitEvents:
-        check = Check("walking", EMPTY, None, None, f"{reason}: {advice}" if advice else reason)
-        return GaitEvents(EMPTY, (), reason, self.paramset.name, self.paramset.hash, self.feet.source, qc=(check,))

@@ -8,7 +8,7 @@ import math
 from pathlib import Path
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.qc import Check
+from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
 
 LEFT, RIGHT = "left", "right"
 FOOT_DOWN, FOOT_UP = "foot_down", "foot_up"
@@ -113,6 +113,29 @@ class GaitEvents:
             rows.writerow(COLUMNS)
             for e in self.events:
                 rows.writerow([f"{e.time_s:.4f}", e.side, e.event, f"{e.probability:.3f}"])
+
+
+def no_events(
+    method: str,
+    params_hash: str,
+    source: str,
+    reason: str,
+    advice: str = "",
+    n_candidates: int = 0,
+    n_order_breaks: int = 0,
+) -> GaitEvents:
+    """EMPTY, with the reason and what to do about it."""
+    check = Check("walking", EMPTY, None, None, f"{reason}: {advice}" if advice else reason)
+    return GaitEvents(EMPTY, (), reason, method, params_hash, source, (), n_candidates, n_order_breaks, (check,))
+
+
+def heading_check(agreement: float) -> tuple[Check, ...]:
+    """Whether the person goes where the pelvis faces; nothing where the way is not known (NaN)."""
+    if not math.isfinite(agreement):
+        return ()
+    ok = agreement >= 0.5
+    advice = "" if ok else "the person does not go where the pelvis faces: sideways, or the camera moved"
+    return (Check("heading_agreement", PASS if ok else WARN, round(agreement, 3), 0.5, advice),)
 
 
 def load_events(path: str | Path) -> tuple[GaitEvent, ...]:
