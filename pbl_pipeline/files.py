@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import lzma
 import os
 import zipfile
 import zlib
@@ -13,6 +14,9 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 
+#: What the readers of zip archives raise for a damaged one; RuntimeError: one with a password, or packed in a way that
+#: is not known.
+DAMAGED_ZIP = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, RuntimeError)
 #: A shape; None stands for any length.
 Shape = tuple[int | None, ...]
 

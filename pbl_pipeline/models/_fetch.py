@@ -5,19 +5,18 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import http.client
-import lzma
 import tarfile
 import tempfile
 import urllib.error
 import urllib.request
 import zipfile
-import zlib
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import IO
 
 from pbl_pipeline import progress, settings
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import DAMAGED_ZIP
 
 from ._spec import GRAPH_FILE, SPEC_FILE, invalid
 
@@ -26,8 +25,6 @@ _CHUNK = 1 << 20
 #: Only these leave an archive; the graph is at most what one ONNX file may be.
 _MEMBERS = (GRAPH_FILE, SPEC_FILE, "LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "NOTICE", "README.md")
 _LARGEST = 2 << 30
-#: What the readers of archives raise; RuntimeError: one with a password, or packed in a way that is not known.
-_DAMAGED = (tarfile.TarError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, RuntimeError)
 
 
 @contextlib.contextmanager
@@ -124,7 +121,7 @@ def _extract(archive: Path, folder: Path, source: str) -> None:
                     with data, (folder / plain).open("wb") as file:
                         while chunk := data.read(_CHUNK):
                             file.write(chunk)
-    except (*_DAMAGED, EOFError, OSError) as error:
+    except (*DAMAGED_ZIP, tarfile.TarError, EOFError, OSError) as error:
         what = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
         raise invalid(source, f"no readable archive ({what})", f"a folder with {SPEC_FILE}, or its archive") from error
 

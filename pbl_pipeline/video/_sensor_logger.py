@@ -11,15 +11,15 @@ from __future__ import annotations
 
 import io
 import json
-import lzma
 import zipfile
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+
+from pbl_pipeline.files import DAMAGED_ZIP
 
 from ._attitude import DEVICE, check_attitude, log_error
 from ._phone_log import OWN_CLOCK, QUATERNION, UTC_CLOCK, PhoneLog, Sensor, numbers, read_table, read_text
@@ -34,8 +34,6 @@ _SENSORS = {
 }
 #: A member of an archive larger than this is no log of a walk.
 _LARGEST = 512 << 20
-#: What reading of an archive raises; RuntimeError: one with a password, or packed in a way that is not known.
-_DAMAGED = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, RuntimeError)
 #: Repeated rows are left out; more than this share, and the stamps are not to be trusted.
 _MOST_REPEATS = 0.1
 #: How far the sine of the stated pitch may lie from the quaternion's.
@@ -122,7 +120,7 @@ def _unzipped(path: Path, name: str) -> str | None:
             if member.file_size > _LARGEST:
                 raise log_error(f"{member.filename} of {member.file_size >> 20} MB", "a log of some minutes", path)
             return io.TextIOWrapper(archive.open(member), "utf-8-sig").read()
-    except (OSError, EOFError, UnicodeDecodeError, *_DAMAGED) as error:
+    except (OSError, EOFError, UnicodeDecodeError, *DAMAGED_ZIP) as error:
         if isinstance(error, FileNotFoundError):
             read_text(path)  # says so
         raise log_error(f"no readable archive ({error})", "the zip that Sensor Logger exports", path) from error
