@@ -105,7 +105,7 @@ def pad_frames(n: int, coarse: bool = False) -> int:
 
 def pad_samples(n: int, coarse: bool = False) -> int:
     """The size to which `n` samples of the phone's orientation are padded."""
-    return max(COARSE_SAMPLES, _power_of_2(n)) if coarse else pad_frames(n)
+    return max(COARSE_SAMPLES, power_of_2(n)) if coarse else pad_frames(n)
 
 
 def pad_markers(n: int) -> int:
@@ -115,10 +115,11 @@ def pad_markers(n: int) -> int:
 
 def pad_trials(n: int, coarse: bool = False) -> int:
     """The size to which `n` trials are padded: a power of 2."""
-    return max(COARSE_TRIALS if coarse else 1, _power_of_2(n))
+    return max(COARSE_TRIALS if coarse else 1, power_of_2(n))
 
 
-def _power_of_2(n: int) -> int:
+def power_of_2(n: int) -> int:
+    """The least power of 2 that is `n` or more."""
     return 1 << (n - 1).bit_length()
 
 

@@ -24,7 +24,7 @@ from pbl_pipeline.body._jacobian import MarkerTable
 
 from .._inputs import Session
 from .._marker_cost import Kinds, kinds_of
-from .._observations import Observations
+from .._observations import Observations, power_of_2
 from .._outcome import Outcome, outcome
 from .._params import GaussNewtonParams
 from .._phone_error import phone_variance
@@ -210,7 +210,7 @@ def _solve(
     alone = len(given) == 1
     if not alone:
         # The last one stands in for those that are missing, so that a worker compiles a program for few sizes.
-        given += [given[-1]] * (pad_batch(len(given)) - len(given))
+        given += [given[-1]] * (power_of_2(len(given)) - len(given))
     # Stacked on the host, so that each array goes to the device once.
     table, obs, start = jax.device_put(given[0] if alone else jax.tree.map(lambda *a: np.stack(a), *given))
     minimise_, finish_ = (_minimise_one, _finish_one) if alone else (_minimise_many, _finish_many)
@@ -255,11 +255,6 @@ def _on_floor(session: Session, found: Solution) -> tuple[Session, State]:
 
 def _padded(a: np.ndarray, n: int) -> np.ndarray:
     return np.pad(a, [(0, n - len(a)), *[(0, 0)] * (a.ndim - 1)])
-
-
-def pad_batch(n: int) -> int:
-    """The size to which a batch of `n` sessions is padded: a power of 2."""
-    return 1 << (n - 1).bit_length()
 
 
 def _solution(
