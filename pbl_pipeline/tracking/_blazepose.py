@@ -76,10 +76,11 @@ def suppress(values: np.ndarray, scores: np.ndarray, min_iou: float) -> tuple[np
 
 
 def box_iou(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Intersection over union of one box (4,) with boxes (N, 4), corners x0 y0 x1 y1. Empty boxes give 0."""
-    size = np.minimum(box[2:4], boxes[:, 2:4]) - np.maximum(box[0:2], boxes[:, 0:2])
+    """Intersection over union of one box (4,), or as many (N, 4), with boxes (N, 4), corners x0 y0 x1 y1. Empty boxes
+    give 0."""
+    size = np.minimum(box[..., 2:4], boxes[:, 2:4]) - np.maximum(box[..., 0:2], boxes[:, 0:2])
     intersection = np.prod(np.maximum(size, 0.0), axis=1)
-    area = np.prod(np.maximum(box[2:4] - box[0:2], 0.0))
+    area = np.prod(np.maximum(box[..., 2:4] - box[..., 0:2], 0.0), axis=-1)
     areas = np.prod(np.maximum(boxes[:, 2:4] - boxes[:, 0:2], 0.0), axis=1)
     union = area + areas - intersection
     return np.where(union > 0, intersection / np.where(union > 0, union, 1.0), 0.0)

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from ._blazepose import box_iou
 from ._subject import SubjectParams, choose_subject
 from ._types import PersonTrack, SubjectChoice, Tracking
 
@@ -53,10 +54,6 @@ def _overlap(a: PersonTrack, b: PersonTrack) -> float:
     """Mean intersection over union of the boxes over the frames in which one of the two is in view, 0 where one only
     is."""
     here, there = a.box_px.astype(np.float64), b.box_px.astype(np.float64)
-    both = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
-    n = int((np.isfinite(here).all(axis=1) | np.isfinite(there).all(axis=1)).sum())
-    here, there = here[both], there[both]
-    size = np.minimum(here[:, 2:], there[:, 2:]) - np.maximum(here[:, :2], there[:, :2])
-    shared = np.prod(np.maximum(size, 0.0), axis=1)
-    areas = np.prod(here[:, 2:] - here[:, :2], axis=1) + np.prod(there[:, 2:] - there[:, :2], axis=1)
-    return float(np.sum(shared / np.maximum(areas - shared, 1e-9))) / max(n, 1)
+    in_here, in_there = np.isfinite(here).all(axis=1), np.isfinite(there).all(axis=1)
+    both, n = in_here & in_there, int((in_here | in_there).sum())
+    return float(box_iou(here[both], there[both]).sum()) / max(n, 1)
