@@ -56,7 +56,7 @@ class Crash(dj.Manual):
 class Look(dj.Manual):
     definition = """
     # when somebody last looked at all tables for what can be computed
-    look        : enum('recent', 'all')        # recordings of the last days, or all
+    look        : enum('recent', 'all')        # of all rows; looks at recent recordings are no longer noted
     ---
     look_time   : datetime(3)                  # clock of the database server
     """

@@ -15,6 +15,8 @@ from .registry import NEW, stage_of, table_named
 
 #: Days in which something from outside counts as recent, and seconds after which somebody looks at everything again.
 RECENT_DAYS, ALL_EVERY_S = 2, 3600.0
+#: Name of a look at all rows in `worker.Look`.
+ALL = "all"
 #: With fewer videos every look is at everything: it takes no time.
 FEW = 10_000
 #: A failure here decides that a trial does not take part in the fit of its session.
@@ -90,14 +92,13 @@ def refresh(everything: bool | None = None) -> Refreshed | None:
         if not had:
             return None
         if everything is None:
-            everything = _few(server) or _age_of_look("all") > ALL_EVERY_S
+            everything = _few(server) or _age_of_full_look() > ALL_EVERY_S
         recent = None if everything else Recent.find()
         if recent is not None and len(recent.videos) > FEW:  # an archive that was just registered
             recent = None
-        everything = recent is None
         out = _refresh(computed_tables(), recent)
-        for look in ("recent", "all") if everything else ("recent",):
-            _note_look(look)
+        if recent is None:
+            _note_full_look()
         return out
 
 
@@ -149,19 +150,19 @@ def _few(server: Any) -> bool:
     return len(server.query(f"SELECT 1 FROM {video.Video.full_table_name} LIMIT {FEW}").fetchall()) < FEW  # noqa: S608
 
 
-def _age_of_look(look: str) -> float:
-    """Seconds since the last look of that kind; infinite where there was none."""
+def _age_of_full_look() -> float:
+    """Seconds since the last look at all rows; infinite where there was none."""
     table = worker.Look.full_table_name
     row = video.Video.connection.query(
         f"SELECT TIMESTAMPDIFF(SECOND, look_time, CURRENT_TIMESTAMP(3)) FROM {table} WHERE look=%s",  # noqa: S608
-        args=(look,),
+        args=(ALL,),
     ).fetchone()
     return float("inf") if row is None else float(row[0])
 
 
-def _note_look(look: str) -> None:
+def _note_full_look() -> None:
     video.Video.connection.query(
         f"INSERT INTO {worker.Look.full_table_name} (look, look_time) VALUES (%s, CURRENT_TIMESTAMP(3))"  # noqa: S608
         " ON DUPLICATE KEY UPDATE look_time = CURRENT_TIMESTAMP(3)",
-        args=(look,),
+        args=(ALL,),
     )
