@@ -12,6 +12,7 @@ from typing import Any
 
 from . import computed_tables, connection, keypoints, tracking, video, worker
 from ._base import error_code, error_found, error_next_step, jobs_of
+from ._dump import quote
 
 #: Fewer videos than this, and keys are counted that nobody has queued yet.
 SMALL = 5000
@@ -180,7 +181,7 @@ def queue_name(table: Any) -> tuple[str, str]:
 
 
 def _quoted_queue(table: Any) -> str:
-    return ".".join(f"`{part}`" for part in queue_name(table))
+    return ".".join(quote(part) for part in queue_name(table))
 
 
 def queue_counts(server: Any) -> dict[str, dict[str, int]]:
