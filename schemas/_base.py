@@ -8,14 +8,13 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import functools
-import importlib
 import platform
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, TypeVarTuple, cast
 
 import numpy as np
 
@@ -29,6 +28,9 @@ import datajoint  # isort: skip
 from datajoint.errors import DuplicateError, LostConnectionError  # isort: skip
 from datajoint.hash_registry import get_store_backend  # isort: skip
 
+if TYPE_CHECKING:
+    from pbl_pipeline.qc import Check
+
 __all__ = [
     "DuplicateError",
     "LostConnectionError",
@@ -41,6 +43,8 @@ __all__ = [
 ]
 
 P = TypeVar("P")
+Arguments = ParamSpec("Arguments")
+Results = TypeVarTuple("Results")
 
 #: DataJoint without its types: its metaclass lends classes the operators of queries, which no type checker can see.
 dj: Any = datajoint
@@ -79,7 +83,7 @@ def check_columns(prefix: str) -> str:
     """
 
 
-def check_row(prefix: str, check: Any) -> dict[str, Any]:
+def check_row(prefix: str, check: Check) -> dict[str, Any]:
     """A library `Check` as values of `check_columns(prefix)`."""
     return {
         f"{prefix}_check": check.check,
@@ -121,7 +125,7 @@ class Origin:
         }
 
 
-def computes(make_compute: Callable[..., tuple]) -> Callable[..., tuple]:
+def computes(make_compute: Callable[Arguments, tuple[*Results]]) -> Callable[Arguments, tuple[*Results, Origin]]:
     """Decorator of every `make_compute`: appends an `Origin` to its results and leaves only coded errors.
 
     A `PblError` keeps its code and next step but is cut to fit the job's error row (its full text stays in the error
@@ -129,10 +133,11 @@ def computes(make_compute: Callable[..., tuple]) -> Callable[..., tuple]:
     """
 
     @functools.wraps(make_compute)
-    def wrapper(self: Any, key: dict, *fetched: Any) -> tuple:
+    def wrapper(*arguments: Arguments.args, **named: Arguments.kwargs) -> tuple[*Results, Origin]:
         start = time.monotonic()
+        table, key = cast("tuple[Any, dict[str, Any]]", arguments[:2])
         try:
-            result = make_compute(self, key, *fetched)
+            result = make_compute(*arguments, **named)
         except PblError as error:
             raise _fitted(error, key) from error
         except Exception as error:
@@ -141,7 +146,7 @@ def computes(make_compute: Callable[..., tuple]) -> Callable[..., tuple]:
                 found=_cut(f"{type(error).__name__}: {error}", _LIMITS["found"]),
                 expected="a result or a coded error",
                 next_step="report this with the error stack that `pbl status --json` prints",
-                key=_cut(_key_text(self, key), _LIMITS["key"]),
+                key=_cut(_key_text(table, key), _LIMITS["key"]),
             ) from error
         return (*result, Origin.now(time.monotonic() - start))
 
@@ -410,8 +415,3 @@ def number(value: Any) -> float | None:
         return None
     value = float(value)
     return value if np.isfinite(value) else None
-
-
-def library(name: str) -> Any:
-    """Import a part of the library when it is first needed: tables declare without loading detectors or JAX."""
-    return importlib.import_module(f"pbl_pipeline.{name}")

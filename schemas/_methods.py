@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from . import fit, gait, gdi, keypoints, tracking
-from ._base import insert_methods, library
+from ._base import insert_methods
 
 
 def insert_all() -> None:
     """Insert what the lookup tables lack; nothing is ever edited. Loads the numerical libraries."""
-    tracks, points, fits, gaits = (library(name) for name in ("tracking", "keypoints", "fit", "gait"))
+    from pbl_pipeline import fit as fits
+    from pbl_pipeline import gait as gaits
+    from pbl_pipeline import keypoints as points
+    from pbl_pipeline import tracking as tracks
+
     insert_methods(tracking.TrackingMethod, "tracking", tracks.PARAMSETS)
     insert_methods(tracking.SubjectMethod, "subject", tracks.SUBJECT_PARAMSETS)
     insert_methods(keypoints.KeypointMethod, "keypoint", points.PARAMSETS)
@@ -21,21 +25,25 @@ def insert_all() -> None:
 
 
 def _body() -> None:
-    body = library("body").load_body()
+    from pbl_pipeline.body import SCALE_NAMES, load_body
+
+    body = load_body()
     row = {
         "body_model": f"{body.name}-{body.version}",
         "body_name": body.name,
         "body_version": body.version,
         "body_sha256": body.sha256,
         "joint_names": list(body.joint_names),
-        "scale_names": list(library("body").SCALE_NAMES),
+        "scale_names": list(SCALE_NAMES),
     }
     if not fit.BodyModel & {"body_sha256": body.sha256}:
         fit.BodyModel.insert1(row, skip_duplicates=True)
 
 
 def _norm(name: str) -> None:
-    norm = library("gait").load_norm(name)
+    from pbl_pipeline.gait import load_norm
+
+    norm = load_norm(name)
     if gdi.NormativeSet & {"norm_sha256": norm.sha256}:
         return
     gdi.NormativeSet.insert1(gdi.norm_row(norm), skip_duplicates=True)

@@ -10,15 +10,18 @@ from __future__ import annotations
 import dataclasses
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pbl_pipeline.errors import PblError
 
 from . import keypoints, lab, video
-from ._base import delete_below, library, number, utc_now
+from ._base import delete_below, number, utc_now
 from .ingest import camera_id_of, camera_row, forget_errors, in_transaction
+
+if TYPE_CHECKING:
+    from pbl_pipeline.video import PhoneLens
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +44,9 @@ def add_calibration(file: str | Path, like: str | Path | None = None) -> Change:
     PblError
         What `pbl_pipeline.video.load_lens_calibration` raises.
     """
-    found = library("video").load_lens_calibration(file, like)
+    from pbl_pipeline.video import load_lens_calibration
+
+    found = load_lens_calibration(file, like)
     done: list[Change] = []
     outdated: list[dict[str, Any]] = []
 
@@ -105,20 +110,23 @@ def remove_calibration(camera_id: int) -> list[Change]:
 def calibrations() -> list[dict[str, Any]]:
     """The calibrations of devices: rows of DeviceCalibration and CameraCalibration, `lens` (the library's `PhoneLens`)
     and `n_keypoints`, the keypoints that were made with each."""
+    from pbl_pipeline.video import PhoneLens
+
     used = [int(n) for n in (keypoints.Keypoints & "keypoints_camera_id IS NOT NULL").to_arrays("keypoints_camera_id")]
     rows = []
     for row in lab.DeviceCalibration.to_dicts(order_by=list(lab.DeviceCalibration.primary_key)):
         device = (lab.Device & {"device": row["device"]}).fetch1()
         camera = (lab.CameraCalibration & {"camera_id": row["camera_id"]}).fetch1()
         camera.pop("device")
-        names = [device[f"device_{name}"] for name in ("make", "model", "lens")]
         size = (int(row["stored_width"]), int(row["stored_height"]))
-        lens = library("video").PhoneLens(*names, size, int(row["capture_rate"]))
+        lens = PhoneLens(
+            device["device_make"], device["device_model"], device["device_lens"], size, int(row["capture_rate"])
+        )
         rows.append({**camera, **row, "lens": lens, "n_keypoints": used.count(int(row["camera_id"]))})
     return rows
 
 
-def _device(lens: Any) -> str:
+def _device(lens: PhoneLens) -> str:
     """Short name of a lens's device, which is registered where it is new."""
     columns = lab.device_columns(lens)
     known = (lab.Device & columns).keys()
@@ -141,6 +149,8 @@ def _retry(outdated: list[dict[str, Any]]) -> None:
 def _outdated(key: dict[str, Any]) -> list[dict[str, Any]]:
     """Keys of the keypoints of this device, size and rate (`key` of DeviceCalibration) for whose video another
     calibration counts than they were made with."""
+    from pbl_pipeline.video import phone_lens
+
     device = (lab.Device & {"device": key["device"]}).fetch1()
     names = {f"phone_{name}": device[f"device_{name}"] or None for name in ("make", "model", "lens")}
     recorded = (video.Video & "camera_id IS NULL") * (video.VideoInfo & names)
@@ -148,7 +158,7 @@ def _outdated(key: dict[str, Any]) -> list[dict[str, Any]]:
     registered = (lab.DeviceCalibration & key).to_dicts()
     counts: dict[int, int | None] = {}
     for row in recorded.proj(..., "-frame_time").to_dicts() if made else ():
-        lens = library("video").phone_lens(video.info_of_row(row, np.zeros(0)))
+        lens = phone_lens(video.info_of_row(row, np.zeros(0)))
         if lens is None or any(key[name] != value for name, value in lab.mode_columns(lens).items()):
             continue
         fits = bool(registered) and lens.same_focal(number(registered[0]["device_focal_35mm"]))

@@ -10,7 +10,7 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 
 from . import tracking, video
-from ._base import file_ref, jobs_of, library, resolve_method, stored_file
+from ._base import file_ref, jobs_of, resolve_method, stored_file
 from .results import load_tracking
 
 
@@ -79,6 +79,8 @@ def write_sheet(about: Candidates, out_path: Path) -> Path:
     PblError
         TRACK_NO_PERSON, FILE_UNWRITABLE, FILE_FORMAT (the stored picture is lost), VIDEO_MISSING, VIDEO_CHANGED.
     """
+    from pbl_pipeline.tracking import save_contact_sheet
+
     if not about.scores:
         raise PblError(
             "TRACK_NO_PERSON",
@@ -96,7 +98,7 @@ def write_sheet(about: Candidates, out_path: Path) -> Path:
         path, sha256 = (video.Video & about.key).fetch1("video_path", "video_sha256")
         file = video.registered_file(path, sha256, about.key)
         tracks = load_tracking(about.key)
-        return library("tracking").save_contact_sheet(file, tracks, out_path, list(about.scores))
+        return save_contact_sheet(file, tracks, out_path, list(about.scores))
     except OSError as error:
         raise PblError(
             "FILE_UNWRITABLE",

@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from ._base import (
     computes,
     dj,
     file_ref,
-    library,
     method_arguments,
     method_columns,
     new_folder,
@@ -32,6 +31,10 @@ from ._base import (
     stored_file,
     stored_paramset,
 )
+
+if TYPE_CHECKING:
+    from pbl_pipeline import fit as lib
+    from pbl_pipeline import keypoints as keypoints_lib
 
 schema = dj.Schema()
 
@@ -94,10 +97,13 @@ class TrialInput(dj.Computed):
         )
 
     @computes
-    def make_compute(self, key: dict, ref: dict, name: str, method: Mapping[str, Any]) -> tuple:
+    def make_compute(self, key: dict, ref: dict, name: str, method: Mapping[str, Any]) -> tuple[int, float, str]:
+        from pbl_pipeline.fit import check_trial
+        from pbl_pipeline.keypoints import Keypoints
+
         with stored_file(self, ref) as path:
-            found = library("keypoints").Keypoints.load(path)
-        used, share = library("fit").check_trial(found, name, stored_paramset(method))
+            found = Keypoints.load(path)
+        used, share = check_trial(found, name, stored_paramset(method))
         return int(np.sum(used)), float(share), method["sha"]
 
     def make_insert(self, key: dict, n_used: int, share: float, sha: str, origin: Origin) -> None:
@@ -194,44 +200,56 @@ class SessionFit(dj.Computed):
         return trials, method_arguments(FitMethod, "fit", "fit", key["fit_method"])
 
     @computes
-    def make_compute(self, key: dict, trials: Sequence[tuple], method: Mapping[str, Any]) -> tuple:
+    def make_compute(
+        self, key: dict, trials: Sequence[tuple], method: Mapping[str, Any]
+    ) -> tuple[lib.SessionFit, list[int], str]:
+        from pbl_pipeline.fit import fit_session
+
         loaded, names, motions = self._loaded(trials)
-        result = library("fit").fit_session(loaded, names, stored_paramset(method), camera_motion=motions)
+        result = fit_session(loaded, names, stored_paramset(method), camera_motion=motions)
         return result, [t[0] for t in trials], method["sha"]
 
-    def make_computes(self, keys: Sequence[dict], fetched: Sequence[tuple]) -> list[tuple | None]:
+    def make_computes(
+        self, keys: Sequence[dict], fetched: Sequence[tuple]
+    ) -> list[tuple[lib.SessionFit, list[int], str, Origin] | None]:
         """Several sets in one call of the library: for each what `make_compute` returns, None where it would raise.
 
         A worker with a GPU fits a batch so, and hands each result to the table's own make.
         """
-        out: list[tuple | None] = [None] * len(keys)
+        from pbl_pipeline.fit import SessionInput, fit_sessions
+
+        out: list[tuple[lib.SessionFit, list[int], str, Origin] | None] = [None] * len(keys)
         for sha in dict.fromkeys(method["sha"] for _, method in fetched):
             rows = [i for i, (_, method) in enumerate(fetched) if method["sha"] == sha]
             start = time.monotonic()
             sessions, places = [], []
             for i in rows:
                 try:
-                    sessions.append(library("fit").SessionInput(*self._loaded(fetched[i][0])))
+                    sessions.append(SessionInput(*self._loaded(fetched[i][0])))
                     places.append(i)
                 except PblError:
                     continue  # make_compute will say it
-            results = library("fit").fit_sessions(sessions, stored_paramset(fetched[rows[0]][1]))
+            results = fit_sessions(sessions, stored_paramset(fetched[rows[0]][1]))
             origin = Origin.now((time.monotonic() - start) / max(len(results), 1))
             for i, result in zip(places, results, strict=True):
                 if not isinstance(result, PblError):
                     out[i] = (result, [t[0] for t in fetched[i][0]], sha, origin)
         return out
 
-    def _loaded(self, trials: Sequence[tuple]) -> tuple[list[Any], list[str], list[str]]:
+    def _loaded(self, trials: Sequence[tuple]) -> tuple[list[keypoints_lib.Keypoints], list[str], list[str]]:
         """Keypoints, names and camera motions of the trials that `make_fetch` gave."""
+        from pbl_pipeline.keypoints import Keypoints
+
         _, names, motions, refs = (list(column) for column in zip(*trials, strict=True))
         with ExitStack() as stack:
             paths = [stack.enter_context(stored_file(self, ref)) for ref in refs]
-            loaded = [library("keypoints").Keypoints.load(path) for path in paths]
+            loaded = [Keypoints.load(path) for path in paths]
         # The library knows one moving camera; "one of several" on stands is a static one for it.
         return loaded, names, ["handheld" if m == "handheld" else "static" for m in motions]
 
-    def make_insert(self, key: dict, result: Any, ids: list[int], sha: str, origin: Origin) -> None:
+    def make_insert(self, key: dict, result: lib.SessionFit, ids: list[int], sha: str, origin: Origin) -> None:
+        from pbl_pipeline.qc import worst
+
         body_sha = result.trials[0].body_sha256
         residual_2d = np.concatenate([t.residual_2d_px.ravel() for t in result.trials])
         residual_3d = np.concatenate([t.residual_3d_m.ravel() for t in result.trials])
@@ -250,7 +268,7 @@ class SessionFit(dj.Computed):
                     "fit_loss": float(result.trials[0].loss),
                     "fit_residual_2d": median(residual_2d),
                     "fit_residual_3d": median(100 * residual_3d),
-                    "fit_outcome": library("qc").worst(result.qc),
+                    "fit_outcome": worst(result.qc),
                     "fit_iterations": int(result.iterations),
                     "fit_converged": bool(result.converged),
                     "fit_scale": [round(float(s), 5) for s in result.scale],
@@ -296,7 +314,7 @@ def trial_names(videos: Sequence[tuple[int, str]]) -> list[str]:
     return distinct([Path(name).stem for _, name in videos], [number for number, _ in videos])
 
 
-def float32_trial(trial: Any) -> Any:
+def float32_trial(trial: lib.TrialFit) -> lib.TrialFit:
     """The trial with float32 arrays, time stamps excepted: what the store keeps."""
     wide = [f.name for f in dataclasses.fields(trial) if isinstance(getattr(trial, f.name), np.ndarray)]
     return dataclasses.replace(trial, **{n: np.asarray(getattr(trial, n), np.float32) for n in wide if n != "time_s"})

@@ -19,7 +19,7 @@ from pbl_pipeline import progress, settings
 from pbl_pipeline.errors import PblError
 
 from . import _dump, connection, fit, lab, session, video
-from ._base import delete_below, library
+from ._base import delete_below
 from ._codes import check_subject
 from ._store import files_below, store_error
 
@@ -305,6 +305,8 @@ def _remove_empty(folder: Path, levels: int) -> None:
 
 
 def _delete_videos(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict[str, str]]:
+    from pbl_pipeline.video import sha256_of
+
     gone, kept = [], {}
     for item in videos:
         path = Path(item["path"])
@@ -314,7 +316,7 @@ def _delete_videos(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict[st
             kept[str(path)] = "it is no plain file"
         elif video.Video & {"video_path": str(path)}:
             kept[str(path)] = "another row names this path"
-        elif path.stat().st_size != item["size"] or library("video").sha256_of(path) != item["sha256"]:
+        elif path.stat().st_size != item["size"] or sha256_of(path) != item["sha256"]:
             kept[str(path)] = "it holds other bytes than were registered: another file took its place"
         else:
             try:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from ._base import (
     computes,
     dj,
     file_ref,
-    library,
     method_arguments,
     method_columns,
     new_folder,
@@ -24,6 +24,9 @@ from ._base import (
     stored_file,
     stored_paramset,
 )
+
+if TYPE_CHECKING:
+    from pbl_pipeline import gait as lib
 
 schema = dj.Schema()
 
@@ -110,13 +113,15 @@ class GaitEvents(dj.Computed):
         return ref, method_arguments(GaitEventMethod, "gait", "gait", key["gait_method"])
 
     @computes
-    def make_compute(self, key: dict, ref: dict, method: Mapping[str, Any]) -> tuple:
-        gait = library("gait")
-        with stored_file(self, ref) as path:
-            trial = library("fit").TrialFit.load(path)
-        return gait.detect_events(gait.feet_from_fit(trial), stored_paramset(method)), method["sha"]
+    def make_compute(self, key: dict, ref: dict, method: Mapping[str, Any]) -> tuple[lib.GaitEvents, str]:
+        from pbl_pipeline.fit import TrialFit
+        from pbl_pipeline.gait import detect_events, feet_from_fit
 
-    def make_insert(self, key: dict, found: Any, sha: str, origin: Origin) -> None:
+        with stored_file(self, ref) as path:
+            trial = TrialFit.load(path)
+        return detect_events(feet_from_fit(trial), stored_paramset(method)), method["sha"]
+
+    def make_insert(self, key: dict, found: lib.GaitEvents, sha: str, origin: Origin) -> None:
         self.insert1(
             {
                 **key,
@@ -186,13 +191,19 @@ class GaitCycle(dj.Computed):
         return [{k: v for k, v in e.items() if k.startswith("event_")} for e in events], ref, fit.fit_checks(key)
 
     @computes
-    def make_compute(self, key: dict, events: Sequence[Mapping[str, Any]], ref: dict, checks: Sequence[tuple]) -> tuple:
-        with stored_file(self, ref) as path:
-            trial = library("fit").TrialFit.load(path)
-        about_fit = [library("qc").Check(*check) for check in checks]
-        return (library("gait").find_cycles([event_of_row(e) for e in events], trial, fit_checks=about_fit),)
+    def make_compute(
+        self, key: dict, events: Sequence[Mapping[str, Any]], ref: dict, checks: Sequence[tuple]
+    ) -> tuple[tuple[lib.GaitCycle, ...]]:
+        from pbl_pipeline.fit import TrialFit
+        from pbl_pipeline.gait import find_cycles
+        from pbl_pipeline.qc import Check
 
-    def make_insert(self, key: dict, cycles: Sequence[Any], origin: Origin) -> None:
+        with stored_file(self, ref) as path:
+            trial = TrialFit.load(path)
+        about_fit = [Check(*check) for check in checks]
+        return (find_cycles([event_of_row(e) for e in events], trial, fit_checks=about_fit),)
+
+    def make_insert(self, key: dict, cycles: Sequence[lib.GaitCycle], origin: Origin) -> None:
         with new_folder() as folder:
             save_curves(cycles, folder / "curves.npz")
             self.insert1(
@@ -263,10 +274,12 @@ class Spatiotemporal(dj.Computed):
         return name, [{k: v for k, v in r.items() if k not in key} for r in rows]
 
     @computes
-    def make_compute(self, key: dict, name: str, rows: Sequence[Mapping[str, Any]]) -> tuple:
-        return (library("gait").spatiotemporal([cycle_of_row(r, name) for r in rows]),)
+    def make_compute(self, key: dict, name: str, rows: Sequence[Mapping[str, Any]]) -> tuple[lib.Spatiotemporal]:
+        from pbl_pipeline.gait import spatiotemporal
 
-    def make_insert(self, key: dict, result: Any, origin: Origin) -> None:
+        return (spatiotemporal([cycle_of_row(r, name) for r in rows]),)
+
+    def make_insert(self, key: dict, result: lib.Spatiotemporal, origin: Origin) -> None:
         self.insert1(
             {
                 **key,
@@ -307,20 +320,24 @@ _MEASURE_PARTS = (
 )
 
 
-def measure_of_row(row: Mapping[str, Any], prefix: str) -> Any:
+def measure_of_row(row: Mapping[str, Any], prefix: str) -> lib.Measure | None:
     """The library's `Measure` of a row of `measure_columns(prefix)`, None where it is not known."""
+    from pbl_pipeline.gait import Measure
+
     if row[f"{prefix}_mean"] is None:
         return None
-    values = {k: number(row[f"{prefix}_{column}"]) for column, k in _MEASURE_PARTS}
-    return library("gait").Measure(**values, n=int(row[f"{prefix}_n"]))
+    values: dict[str, Any] = {k: number(row[f"{prefix}_{column}"]) for column, k in _MEASURE_PARTS}
+    return Measure(**values, n=int(row[f"{prefix}_n"]))
 
 
-def mean_of(measure: Any) -> float | None:
+def mean_of(measure: lib.Measure | None) -> float | None:
     """The mean of a library `Measure`, None where there is none."""
     return None if measure is None else number(measure.mean)
 
 
-def measure_rows(measures: Mapping[str, Any], reasons: Mapping[str, str], prefix: str = "measure") -> list[dict]:
+def measure_rows(
+    measures: Mapping[str, lib.Measure | None], reasons: Mapping[str, str], prefix: str = "measure"
+) -> list[dict]:
     """Rows of a part table with `measure_columns(prefix)`."""
     rows = []
     for name, m in measures.items():
@@ -330,9 +347,11 @@ def measure_rows(measures: Mapping[str, Any], reasons: Mapping[str, str], prefix
     return rows
 
 
-def event_of_row(row: Mapping[str, Any]) -> Any:
+def event_of_row(row: Mapping[str, Any]) -> lib.GaitEvent:
     """The library's `GaitEvent`."""
-    return library("gait").GaitEvent(
+    from pbl_pipeline.gait import GaitEvent
+
+    return GaitEvent(
         float(row["event_time"]),
         row["event_side"],
         row["event_kind"],
@@ -341,9 +360,11 @@ def event_of_row(row: Mapping[str, Any]) -> Any:
     )
 
 
-def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Mapping[str, np.ndarray] | None = None) -> Any:
+def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Mapping[str, np.ndarray] | None = None) -> lib.GaitCycle:
     """The library's `GaitCycle`."""
-    return library("gait").GaitCycle(
+    from pbl_pipeline import gait as lib
+
+    return lib.GaitCycle(
         trial=trial,
         number=int(row["cycle_no"]),
         bout=int(row["cycle_bout"]),
@@ -357,7 +378,7 @@ def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Mapping[str, np.nda
         excluded=row["cycle_excluded"],
         curves=dict(curves or {}),
         curves_missing=row["curves_missing"],
-        lengths=library("gait").Lengths(
+        lengths=lib.Lengths(
             number(row["cycle_stride_length"]),
             number(row["cycle_step_length"]),
             number(row["cycle_step_width"]),
@@ -367,7 +388,7 @@ def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Mapping[str, np.nda
     )
 
 
-def load_cycles(key: Mapping[str, Any], trial: str = "") -> list[Any]:
+def load_cycles(key: Mapping[str, Any], trial: str = "") -> list[lib.GaitCycle]:
     """The library's cycles of one row of GaitCycle, with their curves."""
     with stored_file(GaitCycle(), file_ref((GaitCycle & key).fetch1("curves"))) as path:
         curves = load_curves(path)
@@ -375,9 +396,11 @@ def load_cycles(key: Mapping[str, Any], trial: str = "") -> list[Any]:
     return [cycle_of_row(r, trial, curves.get(int(r["cycle_no"]))) for r in rows]
 
 
-def save_curves(cycles: Sequence[Any], path: Any) -> None:
+def save_curves(cycles: Sequence[lib.GaitCycle], path: Path) -> None:
     """Write the curves of all cycles to one npz; a cycle without curves is NaN."""
-    percent = np.asarray(library("gait").REPORT_PERCENT, np.float32)
+    from pbl_pipeline.gait import REPORT_PERCENT
+
+    percent = np.asarray(REPORT_PERCENT, np.float32)
     names = sorted({name for c in cycles for name in c.curves})
     curve = np.full((len(cycles), len(names), len(percent)), np.nan, np.float32)
     for i, cycle in enumerate(cycles):
@@ -388,7 +411,7 @@ def save_curves(cycles: Sequence[Any], path: Any) -> None:
     np.savez_compressed(path, cycle_no=numbers, names=np.asarray(names, dtype=str), percent=percent, curve=curve)
 
 
-def load_curves(path: Any) -> dict[int, dict[str, np.ndarray]]:
+def load_curves(path: Path) -> dict[int, dict[str, np.ndarray]]:
     """Curves by cycle number and name, (P,) degrees; cycles without curves have none."""
     with np.load(path, allow_pickle=False) as f:
         data = {k: f[k] for k in f.files}

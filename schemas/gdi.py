@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
 
@@ -16,7 +16,6 @@ from ._base import (
     computes,
     dj,
     file_ref,
-    library,
     method_arguments,
     method_columns,
     number,
@@ -27,6 +26,9 @@ from ._base import (
     stored_paramset,
     utc_now,
 )
+
+if TYPE_CHECKING:
+    from pbl_pipeline import gait as lib
 
 schema = dj.Schema()
 
@@ -142,15 +144,17 @@ class GDI(dj.Computed):
     @computes
     def make_compute(
         self, key: dict, name: str, rows: Sequence[Mapping[str, Any]], ref: dict, norm: tuple, method: Mapping[str, Any]
-    ) -> tuple:
-        params = rebuild_params(library("gait").GdiParams, **method)
+    ) -> tuple[lib.Gdi, str, str]:
+        from pbl_pipeline.gait import GdiParams, score_gdi
+
+        params = rebuild_params(GdiParams, **method)
         with stored_file(self, ref) as path:
             curves = gait.load_curves(path)
         cycles = [gait.cycle_of_row(r, name, curves.get(int(r["cycle_no"]))) for r in rows]
-        result = library("gait").score_gdi(cycles, norm_of_row(*norm), params, method["name"], method["version"])
+        result = score_gdi(cycles, norm_of_row(*norm), params, method["name"], method["version"])
         return result, method["sha"], norm[1]
 
-    def make_insert(self, key: dict, result: Any, sha: str, norm_sha: str, origin: Origin) -> None:
+    def make_insert(self, key: dict, result: lib.Gdi, sha: str, norm_sha: str, origin: Origin) -> None:
         self.insert1(
             {
                 **key,
@@ -246,17 +250,20 @@ class SessionGdi(dj.Computed):
         events: Mapping[str, Any],
         index: Mapping[str, Any],
         checks: Sequence[tuple],
-    ) -> tuple:
-        lib = library("gait")
+    ) -> tuple[lib.GaitMetrics, str, str]:
+        from pbl_pipeline import gait as lib
+        from pbl_pipeline.fit import TrialFit
+        from pbl_pipeline.qc import Check
+
         params = lib.GaitParams(stored_paramset(events), rebuild_params(lib.GdiParams, **index))
         with ExitStack() as stack:
             paths = [stack.enter_context(stored_file(self, ref)) for ref in refs]
-            trials = [library("fit").TrialFit.load(path) for path in paths]
-        about_fit = [library("qc").Check(*check) for check in checks]
+            trials = [TrialFit.load(path) for path in paths]
+        about_fit = [Check(*check) for check in checks]
         result = lib.gait_metrics(trials, norm_of_row(*norm), params, about_fit, index["name"], index["version"])
         return result, index["sha"], norm[1]
 
-    def make_insert(self, key: dict, result: Any, sha: str, norm_sha: str, origin: Origin) -> None:
+    def make_insert(self, key: dict, result: lib.GaitMetrics, sha: str, norm_sha: str, origin: Origin) -> None:
         measures, index = result.spatiotemporal, result.gdi
         columns = ("cadence", "stride_time", "step_time", "stance", "swing", "double_support")
         by_column = {column: name for name, column in gait.MEASURE_COLUMNS.items()}
@@ -283,13 +290,13 @@ class SessionGdi(dj.Computed):
         self.Check.insert({**key, **check_row("gdi", check)} for check in result.qc)
 
 
-def gps_row(profile: Any, prefix: str) -> dict[str, float | None]:
+def gps_row(profile: lib.MovementProfile | None, prefix: str) -> dict[str, float | None]:
     """The columns of the Gait Profile Score."""
     scores = ("gps", "gps_left", "gps_right")
     return {f"{prefix}_{k}": None if profile is None else number(getattr(profile, k)) for k in scores}
 
 
-def profile_rows(profile: Any, prefix: str) -> list[dict[str, Any]]:
+def profile_rows(profile: lib.MovementProfile | None, prefix: str) -> list[dict[str, Any]]:
     """Rows of a part table with `profile_columns(prefix)`."""
     if profile is None:
         return []
@@ -303,21 +310,25 @@ def profile_rows(profile: Any, prefix: str) -> list[dict[str, Any]]:
     ]
 
 
-def profile_of_rows(rows: Sequence[Mapping[str, Any]], master: Mapping[str, Any], prefix: str) -> Any:
+def profile_of_rows(
+    rows: Sequence[Mapping[str, Any]], master: Mapping[str, Any], prefix: str
+) -> lib.MovementProfile | None:
     """The library's `MovementProfile`, None where there are no rows."""
+    from pbl_pipeline.gait import NINE_ANGLES, MovementProfile
+
     if not rows:
         return None
-    order = {angle: i for i, angle in enumerate(library("gait").NINE_ANGLES)}
+    order = {angle: i for i, angle in enumerate(NINE_ANGLES)}
     rows = sorted(rows, key=lambda r: order.get(r[f"{prefix}_angle"], len(order)))
     sides = {
-        side: {r[f"{prefix}_angle"]: number(v) for r in rows if (v := r[f"{prefix}_score_{side}"]) is not None}
+        side: {r[f"{prefix}_angle"]: float(v) for r in rows if (v := r[f"{prefix}_score_{side}"]) is not None}
         for side in ("left", "right")
     }
     gps = (number(master[f"{prefix}_{k}"]) for k in ("gps_left", "gps_right", "gps"))
-    return library("gait").MovementProfile(sides["left"], sides["right"], *gps)
+    return MovementProfile(sides["left"], sides["right"], *gps)
 
 
-def norm_row(norm: Any) -> dict[str, Any]:
+def norm_row(norm: lib.NormativeSet) -> dict[str, Any]:
     """A normative set of the library as a row, without file and query."""
     return {
         "norm": f"{norm.name}-v{norm.version}",
@@ -341,13 +352,15 @@ def norm_ref(key: Mapping[str, Any]) -> tuple[str, str, dict | None]:
     return name, sha256, None if stored is None else file_ref(stored)
 
 
-def norm_of_row(name: str, sha256: str, ref: Mapping[str, Any] | None = None) -> Any:
+def norm_of_row(name: str, sha256: str, ref: Mapping[str, Any] | None = None) -> lib.NormativeSet:
     """The library's normative set, checked to be the one of the row. Raises NORM_UNKNOWN, NORM_INVALID."""
+    from pbl_pipeline.gait import load_norm
+
     if ref is None:
-        norm = library("gait").load_norm(name)
+        norm = load_norm(name)
     else:
         with stored_file(NormativeSet(), ref) as path:
-            norm = library("gait").load_norm(str(path))
+            norm = load_norm(str(path))
     if norm.sha256 != sha256:
         raise PblError(
             "NORM_INVALID",
@@ -363,7 +376,8 @@ def resolve(model: str | None, norm: str | None) -> dict[str, str]:
 
     Raises `PblError` SOLVER_UNKNOWN, NORM_UNKNOWN; NORM_INVALID for a set of other angles than the index has.
     """
-    lib = library("gait")
+    from pbl_pipeline import gait as lib
+
     method = resolve_method(GdiModel, "gdi", model or lib.GDI_MODEL)
     name, params = (GdiModel & {"gdi_method": method}).fetch1("gdi_method_name", "gdi_params")
     wanted = norm or params["norm"]

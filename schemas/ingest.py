@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from unicodedata import category
 
 from pbl_pipeline.errors import PblError
@@ -16,8 +16,11 @@ from pbl_pipeline.paramset import canonical_json
 
 from . import fit, gait, gdi, keypoints, lab, sensors, session, tracking, video
 from ._activate import computed_tables
-from ._base import DuplicateError, delete_below, dj, error_code, jobs_of, library, resolve_method, utc_now
+from ._base import DuplicateError, delete_below, dj, error_code, jobs_of, resolve_method, utc_now
 from ._codes import check_subject, day_of
+
+if TYPE_CHECKING:
+    from pbl_pipeline.video import Camera
 
 _ATTEMPTS = 20
 
@@ -138,19 +141,26 @@ def ingest(
 
 def resolve(methods: Methods) -> dict[str, str]:
     """Keys of the method rows, defaults filled in. Raises SOLVER_UNKNOWN, NORM_UNKNOWN."""
-    names = library("tracking"), library("keypoints"), library("fit"), library("gait")
-    tracks, points, fits, gaits = names
+
+    from pbl_pipeline.fit import DEFAULT as DEFAULT_FIT
+    from pbl_pipeline.gait import DEFAULT_EVENT_PARAMSET
+    from pbl_pipeline.keypoints import DEFAULT as DEFAULT_KEYPOINTS
+    from pbl_pipeline.tracking import DEFAULT as DEFAULT_TRACKING
+    from pbl_pipeline.tracking import SUBJECT_DEFAULT
+
     return {
-        "tracking_method": tracking.method_of(methods.tracking or tracks.DEFAULT),
-        "subject_method": resolve_method(tracking.SubjectMethod, "subject", methods.subject or tracks.SUBJECT_DEFAULT),
-        "keypoint_method": keypoints.method_of(methods.keypoint or points.DEFAULT),
-        "fit_method": resolve_method(fit.FitMethod, "fit", methods.fit or fits.DEFAULT),
-        "gait_method": resolve_method(gait.GaitEventMethod, "gait", methods.gait or gaits.DEFAULT_EVENT_PARAMSET),
+        "tracking_method": tracking.method_of(methods.tracking or DEFAULT_TRACKING),
+        "subject_method": resolve_method(tracking.SubjectMethod, "subject", methods.subject or SUBJECT_DEFAULT),
+        "keypoint_method": keypoints.method_of(methods.keypoint or DEFAULT_KEYPOINTS),
+        "fit_method": resolve_method(fit.FitMethod, "fit", methods.fit or DEFAULT_FIT),
+        "gait_method": resolve_method(gait.GaitEventMethod, "gait", methods.gait or DEFAULT_EVENT_PARAMSET),
         **gdi.resolve(methods.gdi, methods.norm),
     }
 
 
 def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str], given: sensors.Sensors) -> Ingested:
+    from pbl_pipeline.video import sha256_of
+
     if not os.path.isfile(path):  # not Path.is_file: that raises where a folder on the way may not be entered
         raise PblError(
             "VIDEO_MISSING",
@@ -184,7 +194,7 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
             next_step="copy it from the phone again",
             key=path,
         )
-    sha256 = library("video").sha256_of(path)
+    sha256 = sha256_of(path)
     found = sensors.read(given)
     known = _with_sha256(sha256)
     if known:
@@ -379,14 +389,16 @@ def _camera(camera_file: str | Path, path: Path) -> dict[str, Any] | None:
 
     None when no picture can be decoded: the tables will say why, and there is nothing to calibrate.
     """
+    from pbl_pipeline.video import calibrated_camera, read_first
+
     try:
-        first = library("video").read_first(path)
+        first = read_first(path)
     except PblError:
         return None
-    return camera_row(library("video").calibrated_camera(camera_file, first), (first.width_px, first.height_px))
+    return camera_row(calibrated_camera(camera_file, first), (first.width_px, first.height_px))
 
 
-def camera_row(camera: Any, size_px: tuple[int, int]) -> dict[str, Any]:
+def camera_row(camera: Camera, size_px: tuple[int, int]) -> dict[str, Any]:
     """The library's `Camera` of upright pictures (width, height) as a row of CameraCalibration, without its number."""
     return {
         "camera_width": size_px[0],

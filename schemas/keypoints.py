@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from ._base import (
     computes,
     dj,
     file_ref,
-    library,
     method_arguments,
     method_columns,
     method_of_model,
@@ -27,6 +26,11 @@ from ._base import (
     resolve_method,
     stored_file,
 )
+
+if TYPE_CHECKING:
+    from pbl_pipeline import keypoints as lib
+    from pbl_pipeline.qc import Check
+    from pbl_pipeline.video import Camera
 
 schema = dj.Schema()
 
@@ -111,22 +115,25 @@ class Keypoints(dj.Computed):
         camera: Mapping[str, Any] | None,
         log: tuple | None,
         method: Mapping[str, Any],
-    ) -> tuple:
+    ) -> tuple[lib.Keypoints, int, str, str | None, tuple[Check, ...], str | None, int | None]:
+        from pbl_pipeline.keypoints import check_keypoints, detect_keypoints, params_class
+        from pbl_pipeline.video import attitude_of, check_timing, find_camera, read_phone_log
+
         path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
-        params = rebuild_params(library("keypoints").params_class(method["params"]), **method)
+        params = rebuild_params(params_class(method["params"]), **method)
         with stored_file(self, times) as stored:
             info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
         attitude = None
         if log is not None:
             with stored_file(self, log[1]) as stored:
-                attitude = library("video").attitude_of(library("video").read_phone_log(stored), Path(log[0]), info)
+                attitude = attitude_of(read_phone_log(stored), Path(log[0]), info)
         with stored_file(self, tracks[0]) as stored:
             everybody = tracking.load_tracking(stored, (info.width_px, info.height_px), *tracks[1:])
-        view = camera_of_row(camera) if camera else library("video").find_camera(info)
-        found = library("keypoints").detect_keypoints(path, everybody, person, view, params=params)
+        view = camera_of_row(camera) if camera else find_camera(info)
+        found = detect_keypoints(path, everybody, person, view, params=params)
         if attitude is not None:
             found = found.with_attitude(attitude)
-        checks = (*library("video").check_timing(info), *library("keypoints").check_keypoints(found))
+        checks = (*check_timing(info), *check_keypoints(found))
         source = None if attitude is None else attitude.source
         camera_id = int(camera["camera_id"]) if camera else None
         return found, person, method["sha"], model_sha256(params), checks, source, camera_id
@@ -134,11 +141,11 @@ class Keypoints(dj.Computed):
     def make_insert(
         self,
         key: dict,
-        found: Any,
+        found: lib.Keypoints,
         person: int,
         sha: str,
         model: str | None,
-        checks: Sequence[Any],
+        checks: Sequence[Check],
         log: str | None,
         camera_id: int | None,
         origin: Origin,
@@ -173,13 +180,18 @@ def method_of(name: str) -> str:
 
     Raises `PblError` SOLVER_UNKNOWN, MODEL_INVALID, MARKER_SET_UNKNOWN.
     """
-    if name in library("keypoints").PARAMSETS or not library("models").is_registered(name):
+    from pbl_pipeline import keypoints as lib
+    from pbl_pipeline.models import is_registered
+
+    if name in lib.PARAMSETS or not is_registered(name):
         return resolve_method(KeypointMethod, "keypoint", name)
-    return method_of_model(KeypointMethod, "keypoint", library("keypoints").method_of_model(name))
+    return method_of_model(KeypointMethod, "keypoint", lib.method_of_model(name))
 
 
-def camera_of_row(row: Mapping[str, Any]) -> Any:
+def camera_of_row(row: Mapping[str, Any]) -> Camera:
     """The library's `Camera` from a row of CameraCalibration with `turn_deg` (`video.camera_of`)."""
+    from pbl_pipeline.video import Camera, turned_camera
+
     matrix = np.array(
         [[row["camera_fx"], 0.0, row["camera_cx"]], [0.0, row["camera_fy"], row["camera_cy"]], [0.0, 0.0, 1.0]]
     )
@@ -187,9 +199,9 @@ def camera_of_row(row: Mapping[str, Any]) -> Any:
     sd = row["camera_focal_sd"]
     rel_sd = float("nan") if sd is None else float(sd) / float(matrix[0, 0] + matrix[1, 1]) * 2
     source = f"{row['camera_origin']}: {row['camera_note']}"[:255]
-    camera = library("video").Camera(matrix, distortion, source, rel_sd)
+    camera = Camera(matrix, distortion, source, rel_sd)
     size = (int(row["camera_width"]), int(row["camera_height"]))
-    return library("video").turned_camera(camera, size, row["turn_deg"])
+    return turned_camera(camera, size, row["turn_deg"])
 
 
 def model_sha256(params: Any) -> str | None:

@@ -5,12 +5,16 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
 
 from . import fit, gait, gdi, lab, session
-from ._base import library, new_folder, plain
+from ._base import new_folder, plain
+
+if TYPE_CHECKING:
+    from pbl_pipeline import gait as lib
+    from pbl_pipeline.qc import Check
 
 #: What a set is called: as the shipped ones, and short enough for its column.
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{1,39}")
@@ -24,8 +28,8 @@ class BuiltNorm:
 
     norm: str
     new: bool
-    set: Any  # pbl_pipeline.gait.NormativeSet
-    checks: tuple[Any, ...]
+    set: lib.NormativeSet
+    checks: tuple[Check, ...]
     n_people: int
     n_cycles: int
 
@@ -66,7 +70,8 @@ def build_norm(
         USAGE (name, nobody asked for, several chains of methods), DB_NOT_FOUND (no cycles, unknown population or
         subject), NORM_INVALID, ANGLE_UNITS.
     """
-    lib = library("gait")
+    from pbl_pipeline import gait as lib
+
     if not _NAME.fullmatch(name) or name in lib.norm_names():
         raise _usage(f"the name {name!r}", "2 to 40 small letters, digits and hyphens, and no name that ships")
     if not populations and not subjects:
@@ -121,7 +126,7 @@ def build_norm(
     raise AssertionError("the last version is always registered")
 
 
-def load_norm(norm: str) -> Any:
+def load_norm(norm: str) -> lib.NormativeSet:
     """The library's set of a key (`name-v2`) or name (its newest version). Raises `PblError` NORM_UNKNOWN."""
     rows = gdi.NormativeSet.proj("norm_name", "norm_version").to_dicts(order_by="norm_version DESC")
     found = next((r["norm"] for r in rows if norm in (r["norm"], r["norm_name"])), None)
@@ -148,7 +153,7 @@ def _cycle_keys(people: Sequence[dict], restriction: Any) -> list[dict[str, Any]
     return (found & list(people) & restriction).to_dicts(order_by="KEY")
 
 
-def _cycles(keys: Sequence[dict[str, Any]]) -> tuple[list[Any], list[str]]:
+def _cycles(keys: Sequence[dict[str, Any]]) -> tuple[list[lib.GaitCycle], list[str]]:
     """The library's cycles with their curves, and whose each is."""
     cycles, people = [], []
     for key in keys:

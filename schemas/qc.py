@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from . import fit, gait, gdi, keypoints
-from ._base import Origin, check_values, computes, dj, library, origin_columns
+from ._base import Origin, check_values, computes, dj, origin_columns
 
 schema = dj.Schema()
 
@@ -63,8 +63,11 @@ class SessionQc(dj.Computed):
         return found, (gdi.SessionGdi & key).fetch1("session_status")
 
     @computes
-    def make_compute(self, key: dict, rows: Sequence[dict[str, Any]], session_status: str) -> tuple:
-        qc = library("qc")
+    def make_compute(
+        self, key: dict, rows: Sequence[dict[str, Any]], session_status: str
+    ) -> tuple[str, list[str], Sequence[dict[str, Any]]]:
+        from pbl_pipeline import qc
+
         outcomes = [qc.in_session(r["qc_check_outcome"], session_status == qc.PASS) for r in rows]
         outcome = max(outcomes, key=qc.OUTCOMES.index, default=qc.PASS)
         named = [r["qc_check"] for r, o in zip(rows, outcomes, strict=True) if o == outcome != qc.PASS]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,7 +14,10 @@ from pbl_pipeline.files import load_npz
 from pbl_pipeline.paramset import canonical_json
 
 from . import validation, video
-from ._base import library, new_folder, utc_now
+from ._base import new_folder, utc_now
+
+if TYPE_CHECKING:
+    from pbl_pipeline import validation as lib
 
 #: Dataset of references that were registered without one.
 UNNAMED = "unnamed"
@@ -34,7 +37,7 @@ class Added:
     note: str
 
 
-def read_reference(path: str | Path, source: str | None = None, shift_s: float = 0.0) -> Any:
+def read_reference(path: str | Path, source: str | None = None, shift_s: float = 0.0) -> lib.Reference:
     """The library's `Reference` from a file, by what the file is.
 
     Accepted: the library's own npz, a `fit.npz` of ours (from markers or several cameras), the `truth.npz` of
@@ -52,7 +55,9 @@ def read_reference(path: str | Path, source: str | None = None, shift_s: float =
     PblError
         FILE_MISSING, FILE_FORMAT (also what the readers raise).
     """
-    lib, path = library("validation"), Path(path)
+    from pbl_pipeline import validation as lib
+
+    path = Path(path)
     name = path.name.lower()
     if not path.is_file():
         raise PblError(
@@ -87,17 +92,22 @@ def read_reference(path: str | Path, source: str | None = None, shift_s: float =
     return dataclasses.replace(found, source=source or found.source, time_s=found.time_s + shift_s)
 
 
-def _read_npz(path: Path) -> Any:
-    lib = library("validation")
+def _read_npz(path: Path) -> lib.Reference:
+    from pbl_pipeline import validation as lib
+
     fields = load_npz(path)
     if "qpos" not in fields:
         return lib.Reference.load(path)
     if "event_time_s" in fields:
-        truth = library("synthetic").Truth.load(path)
+        from pbl_pipeline.synthetic import Truth
+
+        truth = Truth.load(path)
         return lib.reference_of_qpos(
             path.stem, "synthetic", truth.time_s, truth.joint_names, truth.qpos, truth.pelvis_m
         )
-    fitted = library("fit").TrialFit.load(path)
+    from pbl_pipeline.fit import TrialFit
+
+    fitted = TrialFit.load(path)
     by_markers = bool(np.isnan(fitted.camera_position_m).all())
     return lib.reference_of_fit(fitted, "optical markers" if by_markers else "several cameras")
 
@@ -133,6 +143,8 @@ def add_reference(
         DB_NOT_FOUND for an unknown video, USAGE for a name that several videos have or a text too long, and what
         `read_reference` raises.
     """
+    from pbl_pipeline.video import sha256_of
+
     for what, text in (("dataset", dataset), ("source", source), ("origin", origin)):
         if text is not None and not 0 < len(text) <= _LONGEST[what]:
             raise PblError(
@@ -144,7 +156,7 @@ def add_reference(
     video_id = find_video(about)
     path = Path(path).absolute()
     truth = read_reference(path, source, shift_s)
-    sha256 = library("video").sha256_of(path)
+    sha256 = sha256_of(path)
     key = {"video_id": video_id, "reference": _hash(truth, sha256, shift_s)}
     of_source = {"video_id": video_id, "reference_source": truth.source[:64]}
     table = validation.ReferenceKinematics
@@ -172,7 +184,7 @@ def add_reference(
     return Added(video_id, key["reference"], "replaced" if older else "registered", note)
 
 
-def _insert(row: dict[str, Any], truth: Any, path: Path, sha256: str, origin: str | None) -> None:
+def _insert(row: dict[str, Any], truth: lib.Reference, path: Path, sha256: str, origin: str | None) -> None:
     with new_folder() as folder:
         truth.save(folder / "reference.npz")
         validation.ReferenceKinematics.insert1(
@@ -193,13 +205,15 @@ def _insert(row: dict[str, Any], truth: Any, path: Path, sha256: str, origin: st
         )
 
 
-def _hash(truth: Any, sha256: str, shift_s: float) -> str:
+def _hash(truth: lib.Reference, sha256: str, shift_s: float) -> str:
     what = {"source": truth.source, "convention": truth.convention, "sha256": sha256, "shift_s": float(shift_s)}
     return hashlib.sha256(canonical_json(what).encode()).hexdigest()[:16]
 
 
 def find_video(about: int | str | Path) -> int:
     """Number of a registered video, from its number, its path, or its file's name. Raises DB_NOT_FOUND, USAGE."""
+    from pbl_pipeline.video import sha256_of
+
     text = str(about)
     if text.isdecimal():
         found = (video.Video & {"video_id": int(text)}).to_arrays("video_id")
@@ -207,7 +221,7 @@ def find_video(about: int | str | Path) -> int:
         path = Path(text).absolute()
         found = (video.Video & {"video_path": str(path)}).to_arrays("video_id")
         if not len(found) and path.is_file():
-            found = (video.Video & {"video_sha256": library("video").sha256_of(path)}).to_arrays("video_id")
+            found = (video.Video & {"video_sha256": sha256_of(path)}).to_arrays("video_id")
         if not len(found):
             found = (video.Video & {"video_name": Path(text).name}).to_arrays("video_id")
     if len(found) == 1:

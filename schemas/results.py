@@ -6,14 +6,22 @@ import dataclasses
 import datetime
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pbl_pipeline.errors import PblError
 
 from . import fit, gait, gdi, keypoints, session, tracking, video
-from ._base import check_values, error_code, error_found, file_ref, library, number, stored_file
+from ._base import check_values, error_code, error_found, file_ref, number, stored_file
+
+if TYPE_CHECKING:
+    from pbl_pipeline import gait as lib
+    from pbl_pipeline import tracking as tracking_lib
+    from pbl_pipeline.fit import SessionFit, TrialFit
+    from pbl_pipeline.keypoints import Keypoints
+    from pbl_pipeline.qc import Check
+    from pbl_pipeline.video import VideoInfo
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,13 +31,13 @@ class TrialResults:
     video_id: int
     name: str
     path: Path
-    info: Any = None  # pbl_pipeline.video.VideoInfo
-    tracking: Any = None  # pbl_pipeline.tracking.Tracking
-    choice: Any = None  # pbl_pipeline.tracking.SubjectChoice
-    keypoints: Any = None  # pbl_pipeline.keypoints.Keypoints
-    fit: Any = None  # pbl_pipeline.fit.TrialFit
-    events: Any = None  # pbl_pipeline.gait.GaitEvents
-    cycles: tuple[Any, ...] = ()  # of pbl_pipeline.gait.GaitCycle
+    info: VideoInfo | None = None
+    tracking: tracking_lib.Tracking | None = None
+    choice: tracking_lib.SubjectChoice | None = None
+    keypoints: Keypoints | None = None
+    fit: TrialFit | None = None
+    events: lib.GaitEvents | None = None
+    cycles: tuple[lib.GaitCycle, ...] = ()
     problem: str = ""
 
 
@@ -42,8 +50,8 @@ class SessionResults:
     session_label: str
     session_date: datetime.date | None
     trials: tuple[TrialResults, ...]
-    fit: Any = None  # pbl_pipeline.fit.SessionFit
-    metrics: Any = None  # pbl_pipeline.gait.GaitMetrics
+    fit: SessionFit | None = None
+    metrics: lib.GaitMetrics | None = None
     key: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
@@ -117,27 +125,33 @@ def _videos(key: Mapping[str, Any]) -> list[int]:
     return [int(v) for v in (fit.SessionFit.Trial & key).to_arrays("video_id", order_by="video_id")]
 
 
-def load_keypoints(key: Any) -> Any:
+def load_keypoints(key: Any) -> Keypoints:
     """The library's `Keypoints` of one row."""
+    from pbl_pipeline.keypoints import Keypoints
+
     ref = file_ref((keypoints.Keypoints & key).fetch1("keypoints_file"))
     with stored_file(keypoints.Keypoints(), ref) as path:
-        return library("keypoints").Keypoints.load(path)
+        return Keypoints.load(path)
 
 
-def load_trial_fit(key: Any) -> Any:
+def load_trial_fit(key: Any) -> TrialFit:
     """The library's `TrialFit` of one row of SessionFit.Trial."""
+    from pbl_pipeline.fit import TrialFit
+
     ref = file_ref((fit.SessionFit.Trial & key).fetch1("trial_file"))
     with stored_file(fit.SessionFit(), ref) as path:
-        return library("fit").TrialFit.load(path)
+        return TrialFit.load(path)
 
 
-def load_session_fit(key: Any) -> Any:
+def load_session_fit(key: Any) -> SessionFit:
     """The library's `SessionFit` of one row, its trials in the order of their video numbers."""
+    from pbl_pipeline.fit import SessionFit
+
     row = (fit.SessionFit & key).fetch1()
     with stored_file(fit.SessionFit(), file_ref(row["session_file"])) as path, np.load(path, allow_pickle=False) as f:
         arrays = {k: f[k] for k in f.files}
     trials = tuple(load_trial_fit({**key, "video_id": v}) for v in _videos(key))
-    return library("fit").SessionFit(
+    return SessionFit(
         trials=trials,
         scale=arrays["scale"],
         site_offset_m=arrays["site_offset_m"],
@@ -154,13 +168,13 @@ def load_session_fit(key: Any) -> Any:
     )
 
 
-def load_info(key: Any) -> Any:
+def load_info(key: Any) -> VideoInfo:
     """The library's `VideoInfo` of one video."""
     row = (video.Video * video.VideoInfo & key).fetch1()
     return video.info_of_row(row, row["frame_time"].load())
 
 
-def load_tracking(key: Any) -> Any:
+def load_tracking(key: Any) -> tracking_lib.Tracking:
     """The library's `Tracking` of one row."""
     row = (tracking.Tracking & key).fetch1()
     size = (video.VideoInfo & {"video_id": row["video_id"]}).fetch1("width", "height")
@@ -168,11 +182,13 @@ def load_tracking(key: Any) -> Any:
         return tracking.load_tracking(path, (int(size[0]), int(size[1])), row["detector"], row["tracking_model_sha256"])
 
 
-def load_choice(key: Any) -> Any:
+def load_choice(key: Any) -> tracking_lib.SubjectChoice:
     """The library's `SubjectChoice` of one row."""
+    from pbl_pipeline.tracking import SubjectChoice
+
     row = (tracking.SubjectChoice & key).fetch1()
     nan = float("nan")
-    return library("tracking").SubjectChoice(
+    return SubjectChoice(
         status=row["choice_status"],
         person_id=None if row["chosen_person_id"] is None else int(row["chosen_person_id"]),
         score=nan if row["choice_score"] is None else float(row["choice_score"]),
@@ -183,11 +199,13 @@ def load_choice(key: Any) -> Any:
     )
 
 
-def load_events(key: Any) -> Any:
+def load_events(key: Any) -> lib.GaitEvents:
     """The library's `GaitEvents` of one row."""
+    from pbl_pipeline.gait import GaitEvents
+
     row = (gait.GaitEvents & key).fetch1()
     events = (gait.GaitEvents.Event & key).to_dicts(order_by="event_no")
-    return library("gait").GaitEvents(
+    return GaitEvents(
         status=row["events_status"],
         events=tuple(gait.event_of_row(e) for e in events),
         reason=row["events_reason"],
@@ -201,20 +219,23 @@ def load_events(key: Any) -> Any:
     )
 
 
-def load_cycles(key: Any, trial: str) -> tuple[Any, ...]:
+def load_cycles(key: Any, trial: str) -> tuple[lib.GaitCycle, ...]:
     """The library's `GaitCycle`s of one row, with their curves."""
     return tuple(gait.load_cycles(key, trial))
 
 
-def _checks(rows: Any, prefix: str) -> list[Any]:
-    check = library("qc").Check
-    return [check(*check_values(prefix, row)) for row in rows.to_dicts(order_by="KEY")]
+def _checks(rows: Any, prefix: str) -> list[Check]:
+    from pbl_pipeline.qc import Check
+
+    return [Check(*check_values(prefix, row)) for row in rows.to_dicts(order_by="KEY")]
 
 
-def load_metrics(key: Any) -> Any:
+def load_metrics(key: Any) -> lib.GaitMetrics:
     """The library's `GaitMetrics` of one row of SessionGdi, from the rows of its trials and its own: nothing is
     computed anew but the checks of a trial's cycles."""
-    lib, row = library("gait"), (gdi.SessionGdi & key).fetch1()
+    from pbl_pipeline import gait as lib
+
+    row = (gdi.SessionGdi & key).fetch1()
     row_key = {k: row[k] for k in gdi.SessionGdi.primary_key}
     trials = tuple(_trial_metrics({**row_key, "video_id": v}) for v in _videos(row_key))
     norm_name, model = _names(row_key)
@@ -258,8 +279,9 @@ def load_metrics(key: Any) -> Any:
 _INDEX_CHECKS = ("gdi_cycles", "gdi_explained", "norm_convention")
 
 
-def _trial_metrics(key: Mapping[str, Any]) -> Any:
-    lib = library("gait")
+def _trial_metrics(key: Mapping[str, Any]) -> lib.TrialMetrics:
+    from pbl_pipeline import gait as lib
+
     name = (fit.SessionFit.Trial & key).fetch1("trial_name")
     counts = (gait.GaitCycle & key).fetch1("n_cycles", "n_cycles_used")
     row = (gait.Spatiotemporal & key).fetch1()
@@ -287,9 +309,11 @@ def _trial_metrics(key: Mapping[str, Any]) -> Any:
     )
 
 
-def load_gdi(key: Any, trial: str) -> Any:
+def load_gdi(key: Any, trial: str) -> lib.Gdi:
     """The library's `Gdi` of one row of GDI."""
-    lib, row = library("gait"), (gdi.GDI & key).fetch1()
+    from pbl_pipeline import gait as lib
+
+    row = (gdi.GDI & key).fetch1()
     norm_name, model = _names(row)
     rows = (gdi.GDI.Cycle * gait.GaitCycle.Cycle.proj("cycle_side") & key).to_dicts(order_by="cycle_no")
     cycles = tuple(
@@ -326,9 +350,10 @@ def _names(key: Mapping[str, Any]) -> tuple[str, str]:
     return norm, (gdi.GdiModel & {"gdi_method": key["gdi_method"]}).fetch1("gdi_method_name")
 
 
-def _spatiotemporal(rows: list[dict], prefix: str, **fields: Any) -> Any:
+def _spatiotemporal(rows: list[dict], prefix: str, **fields: Any) -> lib.Spatiotemporal:
     """The library's `Spatiotemporal` from the rows of a Measure part table, measures in the library's order."""
-    lib = library("gait")
+    from pbl_pipeline import gait as lib
+
     by_name = {row[prefix]: row for row in rows}
     measures, reasons = {}, {}
     for name in (*lib.MEASURES, *sorted(set(by_name) - set(lib.MEASURES))):
@@ -341,7 +366,9 @@ def _spatiotemporal(rows: list[dict], prefix: str, **fields: Any) -> Any:
     return lib.Spatiotemporal(measures=measures, reasons=reasons, **fields)
 
 
-def _trial(row: Mapping[str, Any], restriction: Any, fitted: Any, metrics: Mapping[str, Any]) -> TrialResults:
+def _trial(
+    row: Mapping[str, Any], restriction: Any, fitted: TrialFit | None, metrics: Mapping[str, lib.TrialMetrics]
+) -> TrialResults:
     key = {"video_id": int(row["video_id"])}
     name = fitted.name if fitted is not None else Path(row["video_name"]).stem
     out = TrialResults(key["video_id"], name, Path(row["video_path"]), fit=fitted)
@@ -362,7 +389,7 @@ def _trial(row: Mapping[str, Any], restriction: Any, fitted: Any, metrics: Mappi
     return dataclasses.replace(out, **found, problem=_problem(key, found.get("choice"), fitted))
 
 
-def _problem(key: Mapping[str, Any], choice: Any, fitted: Any) -> str:
+def _problem(key: Mapping[str, Any], choice: tracking_lib.SubjectChoice | None, fitted: TrialFit | None) -> str:
     """Why a video has no fit, in a sentence."""
     if fitted is not None:
         return ""

@@ -8,12 +8,15 @@ import shutil
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
 
 from . import keypoints, video
-from ._base import delete_below, library, new_folder, utc_now
+from ._base import delete_below, new_folder, utc_now
+
+if TYPE_CHECKING:
+    from pbl_pipeline.video import PhoneLog
 
 #: As a path of `--attitude`: no log for this video, or no longer.
 NONE = "none"
@@ -41,7 +44,7 @@ class Read:
     """Files that were found good, before anything is inserted."""
 
     given: Sensors
-    log: Any = None  # pbl_pipeline.video.PhoneLog
+    log: PhoneLog | None = None
 
 
 def read(given: Sensors) -> Read:
@@ -52,10 +55,13 @@ def read(given: Sensors) -> Read:
     PblError
         FILE_MISSING, PHONE_LOG; FILE_FORMAT for a file without bytes.
     """
+    from pbl_pipeline.video import read_phone_log
+
     for path in (given.depth, *given.imu):
         if path is not None:
             _check_there(path)
-    return Read(given, library("video").read_phone_log(given.attitude) if given.has_log else None)
+    log = given.attitude if given.has_log else None
+    return Read(given, None if log is None else read_phone_log(log))
 
 
 def register(video_id: int, found: Read) -> list[str]:
@@ -75,6 +81,8 @@ def register(video_id: int, found: Read) -> list[str]:
 
 
 def _register_log(key: dict[str, Any], found: Read) -> list[str]:
+    from pbl_pipeline.video import sha256_of
+
     table, path = video.PhoneAttitude, found.given.attitude
     assert path is not None
     before = (table & key).to_dicts()
@@ -86,7 +94,7 @@ def _register_log(key: dict[str, Any], found: Read) -> list[str]:
     with new_folder() as folder:
         copy = folder / f"attitude{path.suffix if path.is_file() else '.zip'}"
         _copy(path, copy)
-        sha256 = library("video").sha256_of(copy)
+        sha256 = sha256_of(copy)
         if before and before[0]["attitude_sha256"] == sha256:
             return []
         (table & key).delete(prompt=False)
@@ -120,8 +128,10 @@ def _outdated(key: dict[str, Any]) -> str:
 
 
 def _register_depth(key: dict[str, Any], path: Path) -> list[str]:
+    from pbl_pipeline.video import sha256_of
+
     table = video.DepthVideo
-    sha256 = library("video").sha256_of(path)
+    sha256 = sha256_of(path)
     before = (table & key).to_dicts()
     if before and before[0]["depth_sha256"] == sha256:
         return []
@@ -135,8 +145,10 @@ def _register_depth(key: dict[str, Any], path: Path) -> list[str]:
 
 
 def _register_imu(key: dict[str, Any], path: Path) -> list[str]:
+    from pbl_pipeline.video import sha256_of
+
     table = video.WearableImu
-    sha256 = library("video").sha256_of(path)
+    sha256 = sha256_of(path)
     if table & key & {"imu_sha256": sha256}:
         return []
     numbers = [int(n) for n in (table & key).to_arrays("imu")]
@@ -184,7 +196,7 @@ def _check_there(path: Path) -> None:
         )
 
 
-def _utc(log: Any) -> str | None:
+def _utc(log: PhoneLog) -> str | None:
     """Moment of the first orientation, where the log counts in UTC."""
     if log.start_utc_s is None:
         return None

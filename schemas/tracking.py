@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from ._base import (
     delete_below,
     dj,
     file_ref,
-    library,
     method_arguments,
     method_columns,
     method_of_model,
@@ -29,6 +28,9 @@ from ._base import (
     stored_file,
     utc_now,
 )
+
+if TYPE_CHECKING:
+    from pbl_pipeline import tracking as lib
 
 schema = dj.Schema()
 
@@ -112,14 +114,18 @@ class Tracking(dj.Computed):
         return probed, file_ref(probed.pop("frame_time")), method
 
     @computes
-    def make_compute(self, key: dict, probed: Mapping[str, Any], times: dict, method: Mapping[str, Any]) -> tuple:
+    def make_compute(
+        self, key: dict, probed: Mapping[str, Any], times: dict, method: Mapping[str, Any]
+    ) -> tuple[lib.Tracking, str]:
+        from pbl_pipeline.tracking import TrackingParams, track_people
+
         path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
-        params = rebuild_params(library("tracking").TrackingParams, **method)
+        params = rebuild_params(TrackingParams, **method)
         with stored_file(self, times) as stored:
             info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
-        return library("tracking").track_people(path, params=params, info=info), method["sha"]
+        return track_people(path, params=params, info=info), method["sha"]
 
-    def make_insert(self, key: dict, tracking: Any, sha: str, origin: Origin) -> None:
+    def make_insert(self, key: dict, tracking: lib.Tracking, sha: str, origin: Origin) -> None:
         with new_folder() as folder:
             save_tracking(tracking, folder / "tracks.npz")
             self.insert1(
@@ -178,24 +184,26 @@ class SubjectChoice(dj.Computed):
         override: int | None,
         elsewhere: tuple | None,
         method: Mapping[str, Any],
-    ) -> tuple:
-        params = rebuild_params(library("tracking").SubjectParams, **method)
+    ) -> tuple[lib.SubjectChoice, bytes | None, str]:
+        from pbl_pipeline.tracking import SubjectParams, carried_choice, choose_subject, contact_sheet_jpeg
+
+        params = rebuild_params(SubjectParams, **method)
         with stored_file(self, ref) as path:
             tracking = load_tracking(path, size, *about)
         if elsewhere is None:
-            choice = library("tracking").choose_subject(tracking, params=params, override=override)
+            choice = choose_subject(tracking, params=params, override=override)
         else:
             other_tracks, other_about, number_there, other_method = elsewhere
             with stored_file(self, other_tracks) as path:
                 other = load_tracking(path, size, *other_about)
-            choice = library("tracking").carried_choice(other, number_there, other_method, tracking, params)
+            choice = carried_choice(other, number_there, other_method, tracking, params)
         sheet = None
         if choice.status == "NEEDS_CHOICE":
             path = video.registered_file(file[0], file[1], key)
-            sheet = library("tracking").contact_sheet_jpeg(path, tracking, choice)
+            sheet = contact_sheet_jpeg(path, tracking, choice)
         return choice, sheet, method["sha"]
 
-    def make_insert(self, key: dict, choice: Any, sheet: bytes | None, sha: str, origin: Origin) -> None:
+    def make_insert(self, key: dict, choice: lib.SubjectChoice, sheet: bytes | None, sha: str, origin: Origin) -> None:
         with new_folder() as folder:
             picture = folder / "persons.jpg"
             if sheet is not None:
@@ -222,9 +230,12 @@ def method_of(name: str) -> str:
 
     Raises `PblError` SOLVER_UNKNOWN, MODEL_INVALID.
     """
-    if name in library("tracking").PARAMSETS or not library("models").is_registered(name):
+    from pbl_pipeline.models import is_registered
+    from pbl_pipeline.tracking import PARAMSETS, method_of_detector
+
+    if name in PARAMSETS or not is_registered(name):
         return resolve_method(TrackingMethod, "tracking", name)
-    return method_of_model(TrackingMethod, "tracking", library("tracking").method_of_detector(name))
+    return method_of_model(TrackingMethod, "tracking", method_of_detector(name))
 
 
 def _decided_elsewhere(key: Mapping[str, Any]) -> tuple | None:
@@ -306,7 +317,7 @@ def drop_outdated_choices(restriction: Any = True) -> dict[str, int]:
 
 
 # ------------------------------------------------------------------------------------------------------- files, rows
-def save_tracking(tracking: Any, path: Path) -> None:
+def save_tracking(tracking: lib.Tracking, path: Path) -> None:
     """Write all tracks of a video to one npz, float32 but for the time stamps."""
     t, people = len(tracking.time_s), tracking.persons
     stack = {
@@ -322,19 +333,20 @@ def save_tracking(tracking: Any, path: Path) -> None:
     np.savez_compressed(path, time_s=np.asarray(tracking.time_s, np.float64), person_id=ids, **stack)
 
 
-def load_tracking(path: Path, size_px: tuple[int, int], detector: str, model_sha256: str) -> Any:
+def load_tracking(path: Path, size_px: tuple[int, int], detector: str, model_sha256: str) -> lib.Tracking:
     """The library's `Tracking` from the npz that `save_tracking` wrote and the row's figures."""
-    types = library("tracking")
+    from pbl_pipeline import tracking as lib
+
     with np.load(path, allow_pickle=False) as f:
         data = {k: f[k] for k in f.files}
     people = tuple(
-        types.PersonTrack(int(p), data["box_px"][i], data["roi_px"][i], data["score"][i], data["observed"][i])
+        lib.PersonTrack(int(p), data["box_px"][i], data["roi_px"][i], data["score"][i], data["observed"][i])
         for i, p in enumerate(data["person_id"])
     )
-    return types.Tracking(data["time_s"], size_px, people, detector, model_sha256)
+    return lib.Tracking(data["time_s"], size_px, people, detector, model_sha256)
 
 
-def _person_row(person: Any, time_s: np.ndarray) -> dict[str, Any]:
+def _person_row(person: lib.PersonTrack, time_s: np.ndarray) -> dict[str, Any]:
     frames = np.flatnonzero(np.isfinite(person.box_px).all(axis=1))
     seen = np.asarray(person.observed, bool)
     height = person.box_px[frames, 3] - person.box_px[frames, 1]

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from . import fit, video  # noqa: F401  a definition refers to video
-from ._base import Origin, computes, dj, file_ref, library, number, origin_columns, stored_file
+from ._base import Origin, computes, dj, file_ref, number, origin_columns, stored_file
+
+if TYPE_CHECKING:
+    from pbl_pipeline import validation as lib
 
 schema = dj.Schema()
 
@@ -79,15 +82,19 @@ class KinematicError(dj.Computed):
         )
 
     @computes
-    def make_compute(self, key: dict, fitted: Mapping[str, Any], reference: Mapping[str, Any]) -> tuple:
-        lib = library("validation")
+    def make_compute(
+        self, key: dict, fitted: Mapping[str, Any], reference: Mapping[str, Any]
+    ) -> tuple[lib.KinematicErrors]:
+        from pbl_pipeline import validation as lib
+        from pbl_pipeline.fit import TrialFit
+
         with stored_file(self, fitted) as path:
-            trial = library("fit").TrialFit.load(path)
+            trial = TrialFit.load(path)
         with stored_file(self, reference) as path:
             truth = lib.Reference.load(path)
         return (lib.compare(trial, truth),)
 
-    def make_insert(self, key: dict, errors: Any, origin: Origin) -> None:
+    def make_insert(self, key: dict, errors: lib.KinematicErrors, origin: Origin) -> None:
         self.insert1(
             {
                 **key,
@@ -118,18 +125,19 @@ JOINT_COLUMNS = {
 }
 
 
-def joint_row(error: Any) -> dict[str, Any]:
+def joint_row(error: lib.JointError) -> dict[str, Any]:
     """A library `JointError` as columns of KinematicError.Joint."""
     row = {column: getattr(error, field) for field, column in JOINT_COLUMNS.items()}
     return {c: v if c in ("error_joint", "joint_n") else number(v) for c, v in row.items()}
 
 
-def errors_of_rows(row: Mapping[str, Any], joints: Sequence[Mapping[str, Any]]) -> Any:
+def errors_of_rows(row: Mapping[str, Any], joints: Sequence[Mapping[str, Any]]) -> lib.KinematicErrors:
     """The library's `KinematicErrors` from a row of KinematicError joined with its trial and reference, and its joints.
 
     The residuals are those of the trial, which are not stored again here.
     """
-    lib = library("validation")
+    from pbl_pipeline import validation as lib
+
     return lib.KinematicErrors(
         trial=row["trial_name"],
         reference=row["reference_name"],

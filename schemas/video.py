@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pbl_pipeline.errors import PblError
 
 from . import lab, session  # noqa: F401  the definitions refer to them
-from ._base import Origin, computes, dj, library, number, origin_columns
+from ._base import Origin, computes, dj, number, origin_columns
+
+if TYPE_CHECKING:
+    from pbl_pipeline import video as lib
 
 schema = dj.Schema()
 
@@ -120,10 +123,12 @@ class VideoInfo(dj.Computed):
         return (Video & key).fetch1("video_path", "video_sha256")
 
     @computes
-    def make_compute(self, key: dict, path: str, sha256: str) -> tuple:
-        return (library("video").probe(registered_file(path, sha256, key)),)
+    def make_compute(self, key: dict, path: str, sha256: str) -> tuple[lib.VideoInfo]:
+        from pbl_pipeline.video import probe
 
-    def make_insert(self, key: dict, info: Any, origin: Origin) -> None:
+        return (probe(registered_file(path, sha256, key)),)
+
+    def make_insert(self, key: dict, info: lib.VideoInfo, origin: Origin) -> None:
         self.insert1(
             {
                 **key,
@@ -156,10 +161,12 @@ def _cut(text: str | None, limit: int) -> str | None:
     return None if text is None else text[:limit]
 
 
-def info_of_row(row: Mapping[str, Any], time_s: np.ndarray) -> Any:
+def info_of_row(row: Mapping[str, Any], time_s: np.ndarray) -> lib.VideoInfo:
     """The library's `VideoInfo` from a joined row of Video and VideoInfo and the array in `frame_time`."""
+    from pbl_pipeline import video as lib
+
     nan = float("nan")
-    return library("video").VideoInfo(
+    return lib.VideoInfo(
         path=row["video_path"],
         sha256=row["video_sha256"],
         size_bytes=int(row["video_size"]),
@@ -191,9 +198,11 @@ def camera_of(row: Mapping[str, Any]) -> dict[str, Any] | None:
 
     A row of CameraCalibration, and `turn_deg`: how far its picture has to be turned clockwise to be this video's.
     """
+    from pbl_pipeline.video import phone_lens
+
     if row["camera_id"] is not None:
         return {**(lab.CameraCalibration & {"camera_id": row["camera_id"]}).fetch1(), "turn_deg": 0}
-    lens = library("video").phone_lens(info_of_row(row, np.zeros(0)))
+    lens = phone_lens(info_of_row(row, np.zeros(0)))
     if lens is None:
         return None
     of_device = (lab.DeviceCalibration & (lab.Device & lab.device_columns(lens)) & lab.mode_columns(lens)).to_dicts()
@@ -212,6 +221,8 @@ def registered_file(path: str, sha256: str, key: dict) -> Path:
     PblError
         VIDEO_MISSING, VIDEO_CHANGED.
     """
+    from pbl_pipeline.video import sha256_of
+
     if not Path(path).is_file():
         raise PblError(
             "VIDEO_MISSING",
@@ -221,7 +232,7 @@ def registered_file(path: str, sha256: str, key: dict) -> Path:
             "if it lies elsewhere now, `pbl ingest` the new path and the row takes it over",
             key=f"video_id={key['video_id']}",
         )
-    found = library("video").sha256_of(path)
+    found = sha256_of(path)
     if found != sha256:
         raise PblError(
             "VIDEO_CHANGED",

@@ -7,10 +7,12 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from . import fit, gait, gdi, lab, qc, session, tracking, validation, video
-from ._base import file_ref, library, stored_file
+from ._base import file_ref, stored_file
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from pbl_pipeline.validation import TrialErrors
 
 
 def current_sets() -> Any:
@@ -58,7 +60,8 @@ def cycle_curves(restriction: Any = True) -> pd.DataFrame:
     """
     import pandas as pd
 
-    lib = library("gait")
+    from pbl_pipeline import gait as lib
+
     names = ["subject", "session_label", "session_id", "fit_set", "fit_method", "gait_method", "gdi_method", "norm"]
     parts = [pd.DataFrame(columns=[*names, *lib.CURVE_FRAME_COLUMNS, "normal_matched"])]
     visits = current_sets() * fit.SessionFit.proj("fit_scale") * gdi.SessionGdi.proj("session_status")
@@ -120,7 +123,9 @@ def validation_frame(restriction: Any = True) -> pd.DataFrame:
     The frame of `pbl_pipeline.validation.error_frame`: errors in degrees, lag in s, RTE in m, residuals in px and cm.
     Dataset, population, activity and camera are those of the reference, the subject and the video.
     """
-    return library("validation").error_frame(row for _, row in _compared(restriction))
+    from pbl_pipeline.validation import error_frame
+
+    return error_frame(row for _, row in _compared(restriction))
 
 
 def validation_curves(frame: pd.DataFrame) -> pd.DataFrame:
@@ -131,14 +136,16 @@ def validation_curves(frame: pd.DataFrame) -> pd.DataFrame:
     """
     import pandas as pd
 
-    lib = library("validation")
+    from pbl_pipeline import validation as lib
+    from pbl_pipeline.fit import TrialFit
+
     wanted = set(zip(frame["trial"], frame["detector"], frame["solver"], strict=True))
     parts = [pd.DataFrame(columns=list(lib.CURVE_COLUMNS))]
     for key, row in _compared():
         if (row.trial, row.detector, row.solver) not in wanted:
             continue
         with stored_file(fit.SessionFit, file_ref((fit.SessionFit.Trial & key).fetch1("trial_file"))) as path:
-            trial = library("fit").TrialFit.load(path)
+            trial = TrialFit.load(path)
         references = validation.ReferenceKinematics
         with stored_file(references, file_ref((references & key).fetch1("reference_file"))) as path:
             truth = lib.Reference.load(path)
@@ -153,8 +160,10 @@ def validation_curves(frame: pd.DataFrame) -> pd.DataFrame:
     return pd.concat([p for p in parts if len(p)] or parts, ignore_index=True)
 
 
-def _compared(restriction: Any = True) -> Iterator[tuple[dict[str, Any], Any]]:
+def _compared(restriction: Any = True) -> Iterator[tuple[dict[str, Any], TrialErrors]]:
     """Key and `TrialErrors` of each current fit against each current reference of its video."""
+    from pbl_pipeline.validation import TrialErrors
+
     references = validation.ReferenceKinematics & {"reference_current": True}
     compared = (
         validation.KinematicError
@@ -178,7 +187,7 @@ def _compared(restriction: Any = True) -> Iterator[tuple[dict[str, Any], Any]]:
         if n_references[row["fit_set"], row["fit_method"], row["video_id"]] > 1:
             trial += f" against {row['reference_source']}"
         key = {k: row[k] for k in names}
-        about = library("validation").TrialErrors(
+        about = TrialErrors(
             errors=validation.errors_of_rows(row, joints.get(tuple(key.values()), [])),
             # A camera that is one of several is fitted alone here: it stands still.
             camera="handheld" if row["camera_motion"] == "handheld" else "static",

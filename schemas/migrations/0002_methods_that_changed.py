@@ -12,13 +12,17 @@ from typing import Any
 from pymysql.converters import escape_string
 
 from schemas import fit, gait, gdi, keypoints, tracking
-from schemas._base import library, method_key
+from schemas._base import method_key
 from schemas._dump import quote
 
 
 def statements(conn: Any) -> list[str]:
     """What is still to be done."""
-    tracks, points, fits, gaits = (library(name) for name in ("tracking", "keypoints", "fit", "gait"))
+    from pbl_pipeline import fit as fits
+    from pbl_pipeline import gait as gaits
+    from pbl_pipeline import keypoints as points
+    from pbl_pipeline import tracking as tracks
+
     out: list[str] = []
     for table, prefix, paramsets in (
         (tracking.TrackingMethod, "tracking", tracks.PARAMSETS),

@@ -33,6 +33,22 @@ def test_the_library_imports_with_the_tables_blocked():
     assert int(done.stdout.split()[-1]) > 40
 
 
+LIGHT = """
+import sys
+import schemas
+from schemas._activate import modules
+modules()
+print(*(name for name in ("jax", "mujoco", "cv2", "scipy", "onnxruntime", "ai_edge_litert") if name in sys.modules))
+"""
+
+
+def test_importing_the_tables_loads_no_numerical_library():
+    """Commands that only look at rows answer at once: the library is imported inside the functions that compute."""
+    done = subprocess.run([sys.executable, "-c", LIGHT], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert done.stdout.split() == []
+
+
 @pytest.mark.parametrize(
     ("package", "forbidden"),
     [("pbl_pipeline", {"schemas", "workers", "datajoint", "pymysql"}), ("schemas", {"workers"})],
