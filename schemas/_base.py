@@ -64,7 +64,7 @@ def origin_columns(prefix: str) -> str:
     {prefix}_method_hash=null  : char(16)        # hash of the frozen parameters, null where the stage has none
     {prefix}_model_sha256=null : char(64)        # SHA-256 of the model file, null where the stage has none
     {prefix}_host              : varchar(64)     # computer
-    {prefix}_seconds           : float32         # (s) duration of the computation
+    {prefix}_seconds           : float64         # (s) duration of the computation
     {prefix}_computed          : datetime        # when it ended, UTC
     index ({prefix}_computed)
     """

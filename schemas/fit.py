@@ -78,7 +78,7 @@ class TrialInput(dj.Computed):
     -> keypoints.Keypoints
     -> FitMethod
     ---
-    in_view_share   : float32                  # (0..1) share of frames with the whole person in view
+    in_view_share   : float64                  # (0..1) share of frames with the whole person in view
     n_used          : int32                    # frames that the fit will use
     {origin_columns("trial_input")}
     """
@@ -150,20 +150,21 @@ class SessionFit(dj.Computed):
     ---
     -> BodyModel
     solver               : varchar(32)
-    fit_loss             : float32             # (-) total loss at the end
-    fit_residual_2d=null : float32             # (px) median distance of body and keypoints in the picture
-    fit_residual_3d=null : float32             # (cm) median distance of body and 3D keypoints
+    fit_loss             : float64             # (-) total loss at the end
+    fit_residual_2d=null : float64             # (px) median distance of body and keypoints in the picture
+    fit_residual_3d=null : float64             # (cm) median distance of body and 3D keypoints
     fit_outcome          : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')  # worst check
     fit_iterations=null  : int32               # steps of the solver, null for fits of before it was recorded
     fit_converged=null   : bool                # ended at a minimum, not at its bound on iterations or steps; null too
     fit_scale            : json                # multiplier (-) of each scale group, 1 = the unscaled body
-    compile_seconds      : float32             # (s) of the duration, spent compiling
+    compile_seconds      : float64             # (s) of the duration, spent compiling
     compute_device       : varchar(64)         # what JAX computed on
     session_file         : <object@arrays>     # npz: scale (8), site_offset_m (J,3) m, loss_trace (K,2)
     {origin_columns("fit")}
     """
 
     class Trial(dj.Part):
+        # trial_orientation is no enum: DataJoint 2.3.5 cannot read one back whose values hold a colon.
         definition = """
         # the fitted movement of one video
         -> master
@@ -171,10 +172,10 @@ class SessionFit(dj.Computed):
         ---
         trial_name        : varchar(255)
         trial_n_fitted    : int32              # frames with joint angles
-        trial_residual_2d=null : float32       # (px) median distance of body and keypoints in the picture
-        trial_residual_3d=null : float32       # (cm) median distance of body and 3D keypoints
-        trial_orientation=null : enum('measured: phone', 'measured: calibration', 'assumed: level', 'estimated: gait')  # where the vertical comes from, null for fits of before it was recorded
-        trial_clock_offset=null : float32      # (s) the phone sensor's clock minus the video's, null where not estimated
+        trial_residual_2d=null : float64       # (px) median distance of body and keypoints in the picture
+        trial_residual_3d=null : float64       # (cm) median distance of body and 3D keypoints
+        trial_orientation=null : varchar(32)   # where the vertical comes from, such as 'measured: phone', null where it was not recorded
+        trial_clock_offset=null : float64      # (s) the phone sensor's clock minus the video's, null where not estimated
         trial_file        : <object@arrays>    # fit.npz: time_s (T) s, qpos and qpos_sd (T,40) m and rad, markers_world_m (T,J,3) m, residual_2d_px (T,J) px, residual_3d_m (T,J) m; docs/files.md
         """  # noqa: E501
 

@@ -37,13 +37,13 @@ def measure_columns(prefix: str) -> str:
     -> master
     {prefix}             : varchar(32)         # name, with its unit
     ---
-    {prefix}_mean=null   : float32             # in the unit (see {prefix}): both sides
-    {prefix}_left=null   : float32             # in the unit (see {prefix})
-    {prefix}_right=null  : float32             # in the unit (see {prefix})
-    {prefix}_sd=null     : float32             # in the unit (see {prefix}): n - 1, null for one value
-    {prefix}_variability=null : float32        # in the unit (see {prefix}): sd within a side, null below two values of a side
-    {prefix}_cv=null     : float32             # (percent) variability of the mean
-    {prefix}_asymmetry=null   : float32        # (percent) right minus left, of their mean; null where it means nothing
+    {prefix}_mean=null   : float64             # in the unit (see {prefix}): both sides
+    {prefix}_left=null   : float64             # in the unit (see {prefix})
+    {prefix}_right=null  : float64             # in the unit (see {prefix})
+    {prefix}_sd=null     : float64             # in the unit (see {prefix}): n - 1, null for one value
+    {prefix}_variability=null : float64        # in the unit (see {prefix}): sd within a side, null below two values of a side
+    {prefix}_cv=null     : float64             # (percent) variability of the mean
+    {prefix}_asymmetry=null   : float64        # (percent) right minus left, of their mean; null where it means nothing
     {prefix}_n           : int16               # values
     {prefix}_missing     : varchar(255)        # why it is null
     """  # noqa: E501
@@ -93,7 +93,7 @@ class GaitEvents(dj.Computed):
         event_time        : float64            # (s) time of the trial
         event_side        : enum('left', 'right')
         event_kind        : enum('foot_down', 'foot_up')
-        event_probability : float32            # (0..1) that it is real; by coordinates: how clear it is, not calibrated
+        event_probability : float64            # (0..1) that it is real; by coordinates: how clear it is, not calibrated
         event_bout        : int16              # walking bout, from 0
         """
 
@@ -178,9 +178,9 @@ class GaitCycle(dj.Computed):
         cycle_used         : bool              # false: first or last step, odd length, odd curves, failed fit
         cycle_excluded     : varchar(100)      # why it is not used
         curves_missing     : varchar(100)      # why it has no curves
-        cycle_stride_length=null : float32     # (m) over the floor
-        cycle_step_length=null   : float32     # (m) of the step that ends the cycle
-        cycle_step_width=null    : float32     # (m) null unless the metres were measured
+        cycle_stride_length=null : float64     # (m) over the floor
+        cycle_step_length=null   : float64     # (m) of the step that ends the cycle
+        cycle_step_width=null    : float64     # (m) null unless the metres were measured
         cycle_lengths_metric=null : bool       # false: as large as the detector takes the person to be
         cycle_lengths_missing='' : varchar(150)  # why there are no lengths
         """
@@ -248,16 +248,16 @@ class Spatiotemporal(dj.Computed):
     measures_status          : enum('PASS', 'EMPTY')
     measures_reason          : varchar(1000)   # why EMPTY
     n_steps_used             : int16
-    cadence=null             : float32         # (steps/min)
-    stride_time=null         : float32         # (s)
-    step_time=null           : float32         # (s)
-    stance=null              : float32         # (percent) of the cycle
-    swing=null               : float32         # (percent) of the cycle
-    double_support=null      : float32         # (percent) of the cycle
-    double_support_time=null : float32         # (s) both double supports of a cycle
-    speed=null               : float32         # (m/s)
-    stride_length=null       : float32         # (m)
-    step_width=null          : float32         # (m)
+    cadence=null             : float64         # (steps/min)
+    stride_time=null         : float64         # (s)
+    step_time=null           : float64         # (s)
+    stance=null              : float64         # (percent) of the cycle
+    swing=null               : float64         # (percent) of the cycle
+    double_support=null      : float64         # (percent) of the cycle
+    double_support_time=null : float64         # (s) both double supports of a cycle
+    speed=null               : float64         # (m/s)
+    stride_length=null       : float64         # (m)
+    step_width=null          : float64         # (m)
     {origin_columns("measures")}
     index (measures_status)
     """

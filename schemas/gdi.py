@@ -39,8 +39,8 @@ def profile_columns(prefix: str) -> str:
     -> master
     {prefix}_angle             : varchar(32)   # name
     ---
-    {prefix}_score_left=null   : float32       # (deg) root mean square distance from the normative mean curve
-    {prefix}_score_right=null  : float32       # (deg)
+    {prefix}_score_left=null   : float64       # (deg) root mean square distance from the normative mean curve
+    {prefix}_score_right=null  : float64       # (deg)
     """
 
 
@@ -95,13 +95,13 @@ class GDI(dj.Computed):
     ---
     gdi_status      : enum('PASS', 'EMPTY')
     gdi_reason      : varchar(1000)            # why EMPTY
-    gdi=null        : float32                  # (-) mean over all used cycles
-    gdi_left=null   : float32                  # (-)
-    gdi_right=null  : float32                  # (-)
+    gdi=null        : float64                  # (-) mean over all used cycles
+    gdi_left=null   : float64                  # (-)
+    gdi_right=null  : float64                  # (-)
     gdi_n           : int16                    # cycles with an index
-    gdi_gps=null       : float32               # (deg) Gait Profile Score of the person; null unless the norm has nine angles
-    gdi_gps_left=null  : float32               # (deg)
-    gdi_gps_right=null : float32               # (deg)
+    gdi_gps=null       : float64               # (deg) Gait Profile Score of the person; null unless the norm has nine angles
+    gdi_gps_left=null  : float64               # (deg)
+    gdi_gps_right=null : float64               # (deg)
     {origin_columns("gdi")}
     index (gdi_status)
     """  # noqa: E501
@@ -111,9 +111,9 @@ class GDI(dj.Computed):
         -> master
         -> gait.GaitCycle.Cycle
         ---
-        cycle_gdi       : float32              # (-)
-        cycle_z         : float32              # (-) standardised log distance to the normative mean
-        cycle_explained : float32              # (0..1) share of the deviation that the index sees
+        cycle_gdi       : float64              # (-)
+        cycle_z         : float64              # (-) standardised log distance to the normative mean
+        cycle_explained : float64              # (0..1) share of the deviation that the index sees
         """
 
     class Profile(dj.Part):
@@ -188,21 +188,21 @@ class SessionGdi(dj.Computed):
     session_status              : enum('PASS', 'EMPTY')
     session_reason              : varchar(2000)  # why EMPTY
     session_gdi_reason          : varchar(1000)  # why there is no index
-    session_gdi=null            : float32      # (-) mean over all used cycles
-    session_gdi_left=null       : float32      # (-)
-    session_gdi_right=null      : float32      # (-)
+    session_gdi=null            : float64      # (-) mean over all used cycles
+    session_gdi_left=null       : float64      # (-)
+    session_gdi_right=null      : float64      # (-)
     session_gdi_n               : int16        # cycles with an index
-    session_gps=null            : float32      # (deg) Gait Profile Score of the person; null unless the norm has nine angles
-    session_gps_left=null       : float32      # (deg)
-    session_gps_right=null      : float32      # (deg)
+    session_gps=null            : float64      # (deg) Gait Profile Score of the person; null unless the norm has nine angles
+    session_gps_left=null       : float64      # (deg)
+    session_gps_right=null      : float64      # (deg)
     session_cycles              : int16        # used cycles
     session_params_hash         : char(16)     # hash over the parameters of events and index together
-    session_cadence=null        : float32      # (steps/min)
-    session_stride_time=null    : float32      # (s)
-    session_step_time=null      : float32      # (s)
-    session_stance=null         : float32      # (percent) of the cycle
-    session_swing=null          : float32      # (percent) of the cycle
-    session_double_support=null : float32      # (percent) of the cycle
+    session_cadence=null        : float64      # (steps/min)
+    session_stride_time=null    : float64      # (s)
+    session_step_time=null      : float64      # (s)
+    session_stance=null         : float64      # (percent) of the cycle
+    session_swing=null          : float64      # (percent) of the cycle
+    session_double_support=null : float64      # (percent) of the cycle
     {origin_columns("session_gdi")}
     index (session_status)
     """  # noqa: E501

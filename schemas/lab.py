@@ -42,7 +42,7 @@ class Subject(dj.Manual):
     ---
     -> [nullable] Project
     -> Population
-    subject_height=null   : float32            # (m) measured body height
+    subject_height=null   : float64            # (m) measured body height
     subject_created       : datetime           # when registered, UTC
     """
 
@@ -74,7 +74,7 @@ class CameraCalibration(dj.Manual):
     camera_cx                : float64         # (px) principal point from the left edge
     camera_cy                : float64         # (px) principal point from the upper edge
     camera_distortion        : json            # k1 k2 p1 p2 k3 (-), OpenCV's order
-    camera_focal_sd=null     : float32         # (px) standard deviation of the focal length, null when unknown
+    camera_focal_sd=null     : float64         # (px) standard deviation of the focal length, null when unknown
     camera_note              : varchar(255)    # file or rule they come from
     camera_sha256            : char(64)        # over all of the above, so that one calibration is stored once
     unique index (camera_sha256)
@@ -92,7 +92,7 @@ class DeviceCalibration(dj.Manual):
     ---
     -> CameraCalibration
     stored_rotation   : int16                  # (deg) rotation flag of the calibration video, whose upright picture was measured
-    device_focal_35mm=null : float32           # (mm) on 35 mm film, as that video states it: a video of another one is not of this lens
+    device_focal_35mm=null : float64           # (mm) on 35 mm film, as that video states it: a video of another one is not of this lens
     device_calibrated : datetime               # when registered, UTC
     """  # noqa: E501
 

@@ -96,11 +96,11 @@ class Tracking(dj.Computed):
         ---
         first_frame     : int32                # first frame in view
         last_frame      : int32                # last frame in view
-        first_time      : float32              # (s) time of the first frame in view
-        last_time       : float32              # (s) time of the last frame in view
+        first_time      : float64              # (s) time of the first frame in view
+        last_time       : float64              # (s) time of the last frame in view
         n_observed      : int32                # frames in which the detector saw the person itself
-        detection_score : float32              # (0..1) median score of those frames
-        box_height      : float32              # (px) median height of the box
+        detection_score : float64              # (0..1) median score of those frames
+        box_height      : float64              # (px) median height of the box
         """
 
     @property
@@ -148,9 +148,9 @@ class SubjectChoice(dj.Computed):
     ---
     choice_status        : enum('CHOSEN', 'MANUAL', 'NEEDS_CHOICE', 'NO_PERSON')
     chosen_person_id=null: int16               # null unless CHOSEN or MANUAL
-    choice_score=null    : float32             # (0..1) score of the chosen person
+    choice_score=null    : float64             # (0..1) score of the chosen person
     runner_up_id=null    : int16               # next best person
-    runner_up_score=null : float32             # (0..1) score of the next best person
+    runner_up_score=null : float64             # (0..1) score of the next best person
     choice_scores        : json                # person number to score (0..1)
     choice_reason        : varchar(2000)       # why, in a sentence
     contact_sheet=null   : <object@arrays>    # JPEG of the people, boxed and numbered, where somebody has to choose

@@ -45,11 +45,11 @@ class KinematicError(dj.Computed):
     -> fit.SessionFit.Trial
     -> ReferenceKinematics
     ---
-    error_lag             : float32            # (s) found by comparison; positive: the video is later than the reference
-    error_max_lag         : float32            # (s) how far it was searched to both sides
+    error_lag             : float64            # (s) found by comparison; positive: the video is later than the reference
+    error_max_lag         : float64            # (s) how far it was searched to both sides
     error_n               : int32              # frames compared
-    error_median_abs=null : float32            # (deg) median absolute error over all frames and the paper's joints
-    rte=null              : float32            # (m) mean distance of the pelvis paths after alignment, null where unknown
+    error_median_abs=null : float64            # (deg) median absolute error over all frames and the paper's joints
+    rte=null              : float64            # (m) mean distance of the pelvis paths after alignment, null where unknown
     error_view_left       : varchar(16)        # joints of the left side seen from: front, back, ipsilateral, contralateral, mixed (also without a camera)
     error_view_right      : varchar(16)        # the same for the right side
     {origin_columns("error")}
@@ -61,13 +61,13 @@ class KinematicError(dj.Computed):
         error_joint           : varchar(32)    # OpenSim's name; the knee as knee_flexion, positive in flexion
         ---
         joint_n               : int32          # frames compared; where there is none, all below are null
-        joint_median_abs=null : float32        # (deg) median absolute error
-        joint_mean_abs=null   : float32        # (deg) mean absolute error
-        joint_bias=null       : float32        # (deg) mean of fit minus reference
-        joint_sd=null         : float32        # (deg) standard deviation of fit minus reference
-        joint_rms=null        : float32        # (deg) root of its mean square
-        joint_correlation=null: float32        # (-1..1) null where one of the two does not move
-        joint_within_90=null  : float32        # (0..1) share of frames inside the fit's 90 percent interval, or null
+        joint_median_abs=null : float64        # (deg) median absolute error
+        joint_mean_abs=null   : float64        # (deg) mean absolute error
+        joint_bias=null       : float64        # (deg) mean of fit minus reference
+        joint_sd=null         : float64        # (deg) standard deviation of fit minus reference
+        joint_rms=null        : float64        # (deg) root of its mean square
+        joint_correlation=null: float64        # (-1..1) null where one of the two does not move
+        joint_within_90=null  : float64        # (0..1) share of frames inside the fit's 90 percent interval, or null
         """
 
     @property

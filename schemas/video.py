@@ -52,8 +52,8 @@ class PhoneAttitude(dj.Manual):
     attitude_form           : varchar(32)      # format; docs/phone_capture.md
     attitude_device=''      : varchar(128)     # phone, as the log names it
     attitude_n              : int32            # orientations
-    attitude_rate           : float32          # (1/s) orientations per second, by the median interval
-    attitude_duration       : float32          # (s) from the first to the last
+    attitude_rate           : float64          # (1/s) orientations per second, by the median interval
+    attitude_duration       : float64          # (s) from the first to the last
     attitude_start_utc=null : varchar(40)      # moment of the first, null where the log does not count in UTC
     attitude_sensors        : json             # other sensors in it: name to number of samples
     attitude_notes          : json             # what was left out in reading
@@ -103,8 +103,8 @@ class VideoInfo(dj.Computed):
     width                : int32               # (px) of the upright frame
     height               : int32               # (px) of the upright frame
     rotation             : int16               # (deg) rotation flag of the file
-    fps=null             : float32             # (1/s) 1 / median frame interval, a description only
-    duration=null        : float32             # (s) from the first frame to the end of the last
+    fps=null             : float64             # (1/s) 1 / median frame interval, a description only
+    duration=null        : float64             # (s) from the first frame to the end of the last
     n_frames             : int32               # frames that decode
     n_frames_announced   : int32               # frames the header claims, 0 when it says nothing
     variable_frame_rate  : bool                # whether frame intervals differ
@@ -112,8 +112,8 @@ class VideoInfo(dj.Computed):
     phone_make=null      : varchar(64)
     phone_model=null     : varchar(64)
     phone_lens=null      : varchar(128)        # lens as the phone names it
-    focal_35mm=null      : float32             # (mm) focal length of the same view on 35 mm film, as the file states it
-    capture_fps=null     : float32             # (1/s) rate at which the phone says it recorded
+    focal_35mm=null      : float64             # (mm) focal length of the same view on 35 mm film, as the file states it
+    capture_fps=null     : float64             # (1/s) rate at which the phone says it recorded
     video_notes          : json                # remarks on the file, such as a mirrored picture
     frame_time           : <npy@arrays>       # (s) float64 (T): the container's own time stamps, first frame 0
     {origin_columns("video_info")}

@@ -34,7 +34,7 @@ class Throughput(dj.Manual):
     ---
     n_done          : int32
     n_failed        : int32
-    busy            : float32                  # (s) spent on these jobs
+    busy            : float64                  # (s) spent on these jobs
     """
 
 
