@@ -8,7 +8,6 @@ from ._angles import ANGLE_NAMES, AngleSeries, angle_series, pelvis_angles
 from ._bands import NormalBands, leg_length_m, normal_bands
 from ._curve_frame import CURVE_FRAME_COLUMNS, curve_frame
 from ._cycles import REPORT_PERCENT, GaitCycle, cycle_curves, find_cycles
-from ._feet import FOOT_MARKER_SETS, FootTrajectories, feet_from_fit, feet_from_keypoints, feet_from_markers
 from ._gdi import (
     GDI_MODEL,
     GDI_PARAMSETS,
@@ -24,7 +23,6 @@ from ._ground import Lengths, cycle_lengths
 from ._laboratory import PLUG_IN_GAIT_POINTS, LabTrial, read_lab_feet, read_lab_trial
 from ._metrics import GaitMetrics, GaitParams, TrialMetrics, cycle_checks, gait_metrics
 from ._own_norm import norm_from_cycles
-from ._poses import BodyPoses, trial_poses
 from ._profile import MovementProfile, movement_profile, variable_scores
 from ._spatiotemporal import MEASURES, Measure, Spatiotemporal, spatiotemporal
 from .events import (
@@ -35,6 +33,15 @@ from .events import (
     GaitEvents,
     detect_events,
     load_events,
+)
+from .motion import (
+    FOOT_MARKER_SETS,
+    BodyPoses,
+    FootTrajectories,
+    feet_from_fit,
+    feet_from_keypoints,
+    feet_from_markers,
+    trial_poses,
 )
 from .normative import (
     ANGLE_MODELS,

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ._feet import feet_from_fit
-from ._poses import BodyPoses, trial_poses
 from .events import RIGHT
+from .motion import BodyPoses, feet_from_fit, trial_poses
 from .normative import BODY_ANGLES
 
 if TYPE_CHECKING:

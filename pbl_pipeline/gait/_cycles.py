@@ -12,11 +12,10 @@ from scipy.interpolate import PchipInterpolator
 from pbl_pipeline.qc import FIT_FAILED, Check, withheld
 
 from ._angles import AngleSeries, angle_series
-from ._feet import FootTrajectories, feet_from_fit
 from ._ground import Lengths, cycle_lengths, is_metric, why_no_lengths
 from ._outliers import ODD_CURVES, ODD_LENGTH, without_odd_curves, without_odd_lengths
-from ._poses import BodyPoses, trial_poses
 from .events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents
+from .motion import BodyPoses, FootTrajectories, feet_from_fit, trial_poses
 from .normative import BODY_ANGLES
 
 if TYPE_CHECKING:

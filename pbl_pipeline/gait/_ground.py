@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ._feet import FootTrajectories
 from .events import LEFT
+from .motion import FootTrajectories
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit

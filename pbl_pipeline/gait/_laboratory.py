@@ -15,10 +15,19 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import EMPTY, PASS
 
 from ._angles import AngleSeries
-from ._feet import FootTrajectories, feet_from_markers
-from .events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents, detect_events, load_events
-from .events._door import look
-from .events._types import no_events
+from .events import (
+    FOOT_DOWN,
+    FOOT_UP,
+    LEFT,
+    RIGHT,
+    GaitEvent,
+    GaitEvents,
+    check_preconditions,
+    detect_events,
+    load_events,
+    no_events,
+)
+from .motion import FootTrajectories, feet_from_markers
 from .normative import PLUG_IN_GAIT, check_degrees
 
 #: Our angle -> the marker model's point after L or R, and its component. Both count the same directions as positive.
@@ -154,7 +163,7 @@ def _events(
 ) -> GaitEvents:
     if feet is not None:
         try:
-            grid, reason, advice = look(feet, 0.0)
+            grid, reason, advice = check_preconditions(feet, 0.0)
         except PblError as error:
             raise error.about(str(path)) from error.__cause__
         if grid is not None and reason:

@@ -13,12 +13,11 @@ from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import EMPTY, OUTCOMES, PASS, WARN, Check, in_session, worst
 
 from ._cycles import GaitCycle, find_cycles
-from ._feet import feet_from_fit
 from ._gdi import GDI_MODEL, GDI_PARAMSETS, GILLETTE_MODEL, Gdi, GdiParams, score_gdi
 from ._laboratory import LabTrial
-from ._poses import BodyPoses, trial_poses
 from ._spatiotemporal import MEASURES, Spatiotemporal, spatiotemporal
 from .events import GaitEvents, detect_events, resolve_params
+from .motion import BodyPoses, feet_from_fit, trial_poses
 from .normative import NormativeSet, load_norm
 
 if TYPE_CHECKING:

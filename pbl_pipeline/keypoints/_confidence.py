@@ -2,7 +2,7 @@
 
 A stated confidence is a number between 0 and 1 in a scale of the detector's own. A curve turns it into the probability
 that the point lies within a stated bound of the true one in the picture. Curves are data with a name and a version
-(`data/confidence_curves.json`, made by `python -m pbl_pipeline.validation.build_confidence`) and never change: another
+(`data/confidence_curves.json`, made by `python -m research.confidence`) and never change: another
 fit is another version, and its name stands in the parameters of the keypoint method.
 
 The stated confidence stays what the fit weighs with (docs/confidence.md says why); the probability is what people are

@@ -11,13 +11,9 @@ from ._point_truth import PointTruth, resect, truth_of_bodies, truth_of_syntheti
 from ._reference import BODY_ROTATIONS, CONVENTIONS, QPOS, Reference
 from ._reliability import (
     RELIABILITY_COLUMNS,
-    CurveScore,
     PointErrors,
-    fit_curve,
-    leave_one_out,
     point_errors,
     reliability_table,
-    save_curve,
 )
 from ._reliability_page import write_reliability
 from ._rotations import body_rotation_angles
@@ -46,7 +42,6 @@ __all__ = [
     "QPOS",
     "RELIABILITY_COLUMNS",
     "Cell",
-    "CurveScore",
     "JointError",
     "KinematicErrors",
     "PointErrors",
@@ -64,10 +59,8 @@ __all__ = [
     "error_frame",
     "fit_angles",
     "fit_angles_sd",
-    "fit_curve",
     "html",
     "latex",
-    "leave_one_out",
     "median_niqr",
     "niqr",
     "paper_figures",
@@ -80,7 +73,6 @@ __all__ = [
     "reference_of_qpos",
     "reliability_table",
     "resect",
-    "save_curve",
     "save_curves",
     "truth_of_bodies",
     "truth_of_synthetic",

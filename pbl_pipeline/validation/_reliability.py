@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from scipy.optimize import isotonic_regression
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import BOUND_TRUNK, ConfidenceCurve, Keypoints
@@ -34,8 +31,6 @@ RELIABILITY_COLUMNS = (
     "within_bound",
     "probability_mean",
 )
-#: Points a knot of a curve stands for at least, in shares of all, and what is added to either outcome of each knot.
-_KNOTS, _PRIOR = 24, 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,105 +128,3 @@ def reliability_table(
                 )
             )
     return pd.DataFrame(rows, columns=list(RELIABILITY_COLUMNS))
-
-
-def fit_curve(
-    errors: Sequence[PointErrors], name: str, params: dict | None = None, bound: float = BOUND_TRUNK
-) -> ConfidenceCurve:
-    """The monotone curve (isotonic regression) through the shares of points within `bound`.
-
-    Every recording weighs the same, however long it is. The points are pooled into `_KNOTS` bins of equal weight, each
-    with one point more on either side of the bound (so nothing is ever certain), and the bins made monotone.
-
-    Raises `PblError` REFERENCE_INPUT for errors of several detectors, or too few points.
-    """
-    detectors = sorted({e.detector for e in errors})
-    n = sum(len(e.stated) for e in errors)
-    if len(detectors) != 1 or n < 10 * _KNOTS:
-        raise PblError(
-            "REFERENCE_INPUT",
-            found=f"{n} points of {', '.join(detectors) or 'no detector'}",
-            expected=f"one detector and {10 * _KNOTS} points or more",
-            next_step="take more recordings",
-        )
-    stated = np.concatenate([e.stated for e in errors])
-    right = np.concatenate([e.error_trunk <= bound for e in errors]).astype(float)
-    weight = np.concatenate([np.full(len(e.stated), n / len(errors) / len(e.stated)) for e in errors])
-    order = np.argsort(stated, kind="stable")
-    stated, right, weight = stated[order], right[order], weight[order]
-    part = np.minimum((np.cumsum(weight) - 0.5 * weight) / weight.sum() * _KNOTS, _KNOTS - 1).astype(int)
-    total = np.bincount(part, weight, _KNOTS)
-    share = (np.bincount(part, weight * right, _KNOTS) + _PRIOR) / (total + 2 * _PRIOR)
-    middle = np.bincount(part, weight * stated, _KNOTS) / np.maximum(total, 1e-12)
-    keep = total > 0
-    probability = isotonic_regression(share[keep], weights=total[keep]).x
-    knots, first = np.unique(np.round(middle[keep], 4), return_index=True)
-    source = "; ".join(f"{e.title} ({len(e.stated)} points)" for e in errors)
-    return ConfidenceCurve(
-        name, detectors[0], bound, knots, np.round(probability[first], 4), n, source, dict(params or {})
-    )
-
-
-@dataclasses.dataclass(frozen=True)
-class CurveScore:
-    """How well probabilities say what happens in a recording; lower is better.
-
-    brier: mean squared difference of probability and outcome (0 or 1). gap: mean probability less the share within
-    the bound. Of the stated confidence taken as a probability, and of a curve that never saw the recording.
-    """
-
-    recording: str
-    within: float
-    brier_stated: float
-    brier_curve: float
-    gap_stated: float
-    gap_curve: float
-
-
-def leave_one_out(errors: Sequence[PointErrors], bound: float = BOUND_TRUNK) -> list[CurveScore]:
-    """For each dataset the score of a curve fitted to the others: recordings of one movement are not independent."""
-    scores = []
-    for dataset in dict.fromkeys(e.dataset for e in errors):
-        curve = fit_curve([e for e in errors if e.dataset != dataset], "others", bound=bound)
-        for e in (e for e in errors if e.dataset == dataset):
-            right, p = (e.error_trunk <= bound).astype(float), curve(e.stated)
-            scores.append(
-                CurveScore(
-                    e.title,
-                    float(right.mean()),
-                    float(np.mean((e.stated - right) ** 2)),
-                    float(np.mean((p - right) ** 2)),
-                    float(e.stated.mean() - right.mean()),
-                    float(p.mean() - right.mean()),
-                )
-            )
-    return scores
-
-
-def save_curve(curve: ConfidenceCurve, path: str | Path) -> None:
-    """Add the curve to a file of curves.
-
-    Raises `PblError` FILE_FORMAT where the file holds another curve of this name: a curve never changes.
-    """
-    path = Path(path)
-    known = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"curves": {}}
-    row = {
-        "detector": curve.detector,
-        "bound_trunk": curve.bound_trunk,
-        "n": curve.n,
-        "source": curve.source,
-        "params": curve.params,
-        "stated": curve.stated.tolist(),
-        "probability": curve.probability.tolist(),
-    }
-    if known["curves"].get(curve.name, row) != row:
-        raise PblError(
-            "FILE_FORMAT",
-            found=f"another curve {curve.name} in the file",
-            expected="a curve that never changes once it has a name",
-            next_step="give the new one the next version",
-            key=str(path),
-        )
-    known["curves"][curve.name] = row
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")

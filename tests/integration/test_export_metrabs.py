@@ -17,8 +17,8 @@ import pytest
 
 from pbl_pipeline import models
 from pbl_pipeline.body import marker_set
-from pbl_pipeline.models import export_metrabs
-from pbl_pipeline.models.export_metrabs import ExportError, export, matched_names
+from research import export_metrabs
+from research.export_metrabs import ExportError, export, matched_names
 
 NAMES = list(marker_set("bml_movi_87").names)
 SIDE, RAW = 64, 100

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from pbl_pipeline.gait import FootTrajectories
-from pbl_pipeline.gait._heading import heading_agreement, heading_from_hips
+from pbl_pipeline.gait.motion import heading_agreement, heading_from_hips
 
 UP = np.array([0.0, 0.0, 1.0])
 LEG_M = 0.9

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from pbl_pipeline import body as package
 from pbl_pipeline.body import SCALE_NAMES, body_poses, capsules, load_body
-from pbl_pipeline.body.build import build
+from research.body import build
 
 DATA = Path(package.__file__).parent / "data"
 
@@ -103,7 +103,7 @@ def test_shipped_files_are_what_the_builder_writes(shared_data, tmp_path):
     result = CliRunner().invoke(build, [str(shared_data / "body_model_figures.json"), "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
     for name in ("pbl_body_40.xml", "markers_bml_movi_87.csv"):
-        assert (tmp_path / name).read_text() == (DATA / name).read_text(), f"run pbl_pipeline.body.build: {name}"
+        assert (tmp_path / name).read_text() == (DATA / name).read_text(), f"run research.body: {name}"
 
 
 def test_stands_upright_and_has_a_plausible_height():

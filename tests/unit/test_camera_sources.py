@@ -14,7 +14,7 @@ from pbl_pipeline.video import Camera, VideoInfo, check_timing, find_camera, pro
 from pbl_pipeline.video._camera import reaches_corners
 from pbl_pipeline.video._presets import preset_camera, presets, quarter_turn
 from pbl_pipeline.video._tags import read_tags
-from pbl_pipeline.video.build_presets import build
+from research.phone_cameras import build
 from tests.inputs import keypoints
 from tests.quicktime import edit_list, insert, meta
 from tests.videos import constant_rate, numbered_frames, write_video

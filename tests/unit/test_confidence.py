@@ -25,18 +25,15 @@ from pbl_pipeline.keypoints import (
 from pbl_pipeline.synthetic import Synthetic, SynthSpec, synthesise
 from pbl_pipeline.validation import (
     PointErrors,
-    fit_curve,
-    leave_one_out,
     point_errors,
     reliability_table,
     resect,
-    save_curve,
     truth_of_synthetic,
     truth_of_trc,
     write_reliability,
 )
-from pbl_pipeline.validation.build_confidence import curve_params
 from pbl_pipeline.video import CameraPose
+from research.confidence import curve_params, fit_curve, leave_one_out, save_curve
 from schemas.cli.validate import validate
 from tests.unit.test_shortcomings import person
 
@@ -72,7 +69,7 @@ def test_curves_that_ship_are_monotone_and_say_where_they_come_from():
 
 def test_the_default_curve_is_of_what_the_default_method_does():
     """Another detection states other confidences: fit a curve to it, `python -m
-    pbl_pipeline.validation.build_confidence`, under the next version."""
+    research.confidence`, under the next version."""
     params = PARAMSETS[DEFAULT].to(KeypointParams)
     curve = confidence_curve(params.confidence_curve)
     assert curve.detector == params.detector

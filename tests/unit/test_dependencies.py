@@ -1,4 +1,4 @@
-"""One direction of dependency: pbl_pipeline <- schemas <- workers."""
+"""One direction of dependency: pbl_pipeline <- schemas <- workers; research is below nothing."""
 
 from __future__ import annotations
 
@@ -51,7 +51,12 @@ def test_importing_the_tables_loads_no_numerical_library():
 
 @pytest.mark.parametrize(
     ("package", "forbidden"),
-    [("pbl_pipeline", {"schemas", "workers", "datajoint", "pymysql"}), ("schemas", {"workers"})],
+    [
+        ("pbl_pipeline", {"schemas", "workers", "research", "datajoint", "pymysql"}),
+        ("schemas", {"workers", "research"}),
+        ("workers", {"research"}),
+        ("research", {"schemas", "workers", "datajoint", "tests"}),
+    ],
 )
 def test_no_import_against_the_direction(package: str, forbidden: set[str]):
     files = sorted((ROOT / package).rglob("*.py"))

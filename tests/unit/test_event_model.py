@@ -16,14 +16,14 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import FootTrajectories, GaitEvents, detect_events, feet_from_markers, find_cycles
 from pbl_pipeline.gait.events import DEFAULT_EVENT_PARAMSET, EVENT_PARAMSETS, PhaseParams, resolve_params
 from pbl_pipeline.gait.events._phase import double_support_s
-from pbl_pipeline.gait.events._predict import load, model_path
-from pbl_pipeline.gait.events.training._gaits import curve_foot_off, gait_angles
-from pbl_pipeline.gait.events.training._leg import leg_points
-from pbl_pipeline.gait.events.training._rhythm import Rhythm, draw_run, leg_phase, schedule
-from pbl_pipeline.gait.events.training._scenes import not_walking
-from pbl_pipeline.gait.events.training._sequence import ORDER
+from pbl_pipeline.gait.events.network.predict import load, model_path
 from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.synthetic import Impairment, SynthSpec, Truth, synthesise
+from research.events._gaits import curve_foot_off, gait_angles
+from research.events._leg import leg_points
+from research.events._rhythm import Rhythm, draw_run, leg_phase, schedule
+from research.events._scenes import not_walking
+from research.events._sequence import ORDER
 
 SET = marker_set("bml_movi_87")
 PLAIN = dataclasses.replace(resolve_params(None).to(PhaseParams), event_delay_s=0.0)

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.gait.events import FilterParams, PhaseParams, WalkingParams
-from pbl_pipeline.gait.events._features import N_FEATURES, features, heading, leg_length
 from pbl_pipeline.gait.events._phase_filter import crossings, smooth_phases
-from pbl_pipeline.gait.events._predict import GRID_HZ, Grid, Phases, on_grid
-from pbl_pipeline.gait.events._transformer import Architecture, PhaseTransformer, load_model, save_model
 from pbl_pipeline.gait.events._walking import turning_deg_per_s, walking_stretches
-from pbl_pipeline.gait.events.training._augment import SOURCE, WINDOW, augment
-from pbl_pipeline.gait.events.training._calibrate import _wraps, fit_logistic, probability, reliability
-from pbl_pipeline.gait.events.training._corpus import UNIT_M, load, pack, save
-from pbl_pipeline.gait.events.training._rhythm import draw_rhythm, draw_run, schedule
-from pbl_pipeline.gait.events.training._scenes import scene
-from pbl_pipeline.gait.events.training._sequence import Bout, Sequence
+from pbl_pipeline.gait.events.network.features import N_FEATURES, features, heading, leg_length
+from pbl_pipeline.gait.events.network.predict import GRID_HZ, Grid, Phases, on_grid
+from pbl_pipeline.gait.events.network.transformer import Architecture, PhaseTransformer, load_model, save_model
+from research.events._augment import SOURCE, WINDOW, augment
+from research.events._calibrate import _wraps, fit_logistic, probability, reliability
+from research.events._corpus import UNIT_M, load, pack, save
+from research.events._rhythm import draw_rhythm, draw_run, schedule
+from research.events._scenes import scene
+from research.events._sequence import Bout, Sequence
 
 UP = np.array([0.0, 0.0, 1.0])
 SMALL = Architecture(width=16, blocks=1, heads=2, hidden=32)

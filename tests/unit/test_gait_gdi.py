@@ -21,8 +21,8 @@ from pbl_pipeline.gait import (
     norm_names,
     score_gdi,
 )
-from pbl_pipeline.gait.build_norm import build_gillette, gillette_vectors
 from pbl_pipeline.gait.normative._norm import _checksum, _to_json
+from research.norms import build_gillette, gillette_vectors
 
 PERCENT = np.linspace(0, 98, 50)
 ABOUT = {"name": "toy", "version": 1, "source": "made up", "licence": "none", "convention": "none"}

@@ -26,7 +26,7 @@ from pbl_pipeline.gait import (
     score_gdi,
     variable_scores,
 )
-from pbl_pipeline.gait.build_norm import BUILDERS
+from research.norms import BUILDERS
 from tests.unit.test_gait_gdi import ABOUT, PERCENT, toy_vectors
 
 NINE = "gillette-166-nine-angles"

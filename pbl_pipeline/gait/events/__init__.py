@@ -1,10 +1,11 @@
-"""Foot down and foot up of both sides."""
+"""Initial contact and toe-off (`foot_down`, `foot_up`) of both sides."""
 
 from ._detect import detect_events
 from ._foot_velocity import FootVelocityParams
 from ._methods import DEFAULT_EVENT_PARAMSET, EVENT_PARAMSETS, resolve_params
-from ._phase import PhaseParams
+from ._phase import PHASE_ORDER, PhaseParams, candidates
 from ._phase_filter import FilterParams
+from ._preconditions import check_preconditions
 from ._types import (
     EVENTS,
     FOOT_DOWN,
@@ -16,6 +17,7 @@ from ._types import (
     GaitEvent,
     GaitEvents,
     load_events,
+    no_events,
 )
 from ._walking import WalkingParams
 
@@ -26,6 +28,7 @@ __all__ = [
     "FOOT_DOWN",
     "FOOT_UP",
     "LEFT",
+    "PHASE_ORDER",
     "RIGHT",
     "SIDES",
     "EventParams",
@@ -35,7 +38,10 @@ __all__ = [
     "GaitEvents",
     "PhaseParams",
     "WalkingParams",
+    "candidates",
+    "check_preconditions",
     "detect_events",
     "load_events",
+    "no_events",
     "resolve_params",
 ]

@@ -9,13 +9,13 @@ import numpy as np
 from scipy.signal import find_peaks
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.gait.motion import FootTrajectories
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import PASS, WARN, Check
 
-from .._feet import FootTrajectories
-from .._signal import Segment, refine_extremum, uniform_segments
-from ._door import look
 from ._order import Candidate, best_sequence
+from ._preconditions import check_preconditions
+from ._signal import Segment, refine_extremum, uniform_segments
 from ._types import (
     FOOT_DOWN,
     FOOT_UP,
@@ -60,7 +60,7 @@ def detect_by_coordinates(feet: FootTrajectories, paramset: Paramset) -> GaitEve
         GAIT_INPUT where no frame holds feet, pelvis and heading, or the legs are upside down or mirrored.
     """
     p = EventParams(**paramset.params)
-    _, reason, advice = look(feet, p.min_segment_s)
+    _, reason, advice = check_preconditions(feet, p.min_segment_s)
     if reason:
         return no_events(paramset.name, paramset.hash, feet.source, reason, advice)
     x, leg = forward_signals(feet, p)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from .._feet import FootTrajectories
+from pbl_pipeline.gait.motion import FootTrajectories
+
 from ._coordinates import detect_by_coordinates
 from ._foot_velocity import FootVelocityParams, detect_by_foot_velocity
 from ._methods import resolve_params
@@ -37,7 +38,7 @@ def detect_events(feet: FootTrajectories, params: Any = None) -> GaitEvents:
     Raises
     ------
     PblError
-        GAIT_INPUT where no frame holds what the method needs, or the legs are upside down or mirrored (`_door`);
+        GAIT_INPUT where no frame holds what the method needs, or the legs are upside down or mirrored;
         SOLVER_UNKNOWN for an unknown name; ASSET_MISSING where the event model's weights are not there.
     """
     paramset = resolve_params(params)

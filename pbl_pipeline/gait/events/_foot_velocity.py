@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 from scipy.signal import find_peaks
 
+from pbl_pipeline.gait.motion import FootTrajectories
 from pbl_pipeline.paramset import Paramset
 
-from .._feet import FootTrajectories
-from .._signal import Segment, refine_extremum
 from ._coordinates import Extremum, detect_by_extrema, forward_signals, prominence
-from ._door import look
+from ._preconditions import check_preconditions
+from ._signal import Segment, refine_extremum
 from ._types import FOOT_DOWN, FOOT_UP, SIDES, EventParams, GaitEvents, no_events
 
 
@@ -44,7 +44,7 @@ def detect_by_foot_velocity(feet: FootTrajectories, paramset: Paramset) -> GaitE
     Raises `PblError` GAIT_INPUT as there.
     """
     p = paramset.to(FootVelocityParams)
-    _, reason, advice = look(feet, p.min_segment_s)
+    _, reason, advice = check_preconditions(feet, p.min_segment_s)
     if reason:
         return no_events(paramset.name, paramset.hash, feet.source, reason, advice)
     x, leg = forward_signals(feet, p)

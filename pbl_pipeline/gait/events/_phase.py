@@ -9,17 +9,18 @@ from typing import Any
 
 import numpy as np
 
+from pbl_pipeline.gait.motion import FootTrajectories
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import PASS, WARN, Check
 
-from .._feet import FootTrajectories
-from ._door import input_error, look
 from ._phase_filter import FilterParams, SmoothPhases, crossings, smooth_phases
+from ._preconditions import check_preconditions, input_error
 from ._types import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents, heading_check, no_events
 from ._walking import WalkingParams, reach_leg, swing_leg, turning_deg_per_s, walking_stretches
+from .network.predict import GRID_HZ, check_model, load, predict
 
 #: Order of the model's phases.
-ORDER = ((LEFT, FOOT_DOWN), (RIGHT, FOOT_UP), (RIGHT, FOOT_DOWN), (LEFT, FOOT_UP))
+PHASE_ORDER = ((LEFT, FOOT_DOWN), (RIGHT, FOOT_UP), (RIGHT, FOOT_DOWN), (LEFT, FOOT_UP))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,18 +61,16 @@ def detect_by_phase(feet: FootTrajectories, paramset: Paramset) -> GaitEvents:
 
     Raises `PblError` GAIT_INPUT: joints upside down or mirrored, no joints at all; ASSET_MISSING: no weights.
     """
-    from . import _predict  # JAX loads only where the model runs
-
     p = paramset.to(PhaseParams)
-    _predict.check_model(p.model, p.model_sha256)
+    check_model(p.model, p.model_sha256)
     if feet.legs_m is None:
         raise input_error("feet without the joints of the legs", "hips and knees, ankles, heels or toes in 3D")
-    grid, reason, advice = look(feet, p.min_seen_s)
+    grid, reason, advice = check_preconditions(feet, p.min_seen_s)
     if grid is None or reason:
         return no_events(paramset.name, paramset.hash, feet.source, reason, advice)
     time = np.asarray(feet.time_s, float)
-    phases = _predict.predict(grid, p.model)
-    curve = _predict.load(p.model)[1]["probability"]
+    phases = predict(grid, p.model)
+    curve = load(p.model)[1]["probability"]
     stretches, half_seen = candidates(grid, phases, p)
     events: list[GaitEvent] = []
     bouts: list[tuple[float, float]] = []
@@ -118,8 +117,6 @@ class Candidate:
 def candidates(grid: Any, phases: Any, p: PhaseParams) -> tuple[list[list[Candidate]], int]:
     """The wraps of all four phases in each stretch of walking, in order of time, before any is judged; and how many
     stretches were left out because a leg is hardly seen."""
-    from ._predict import GRID_HZ
-
     out, half_seen = [], 0
     for first, last in walking_stretches(grid, phases, p.walking):
         cut = slice(first, last + 1)
@@ -130,7 +127,7 @@ def candidates(grid: Any, phases: Any, p: PhaseParams) -> tuple[list[list[Candid
         z = np.where(np.logical_or.reduce(below, axis=1)[:, None], phases.z[cut], 0)
         smooth = smooth_phases(z, 1 / GRID_HZ, p.filter)
         time_s, own = grid.time_s[cut], []
-        for k, (side, event) in enumerate(ORDER):
+        for k, (side, event) in enumerate(PHASE_ORDER):
             for at in crossings(smooth.phase_rad[:, k], time_s):
                 i = int(np.clip(np.searchsorted(time_s, at), 0, len(time_s) - 1))
                 values = event_evidence(smooth, phases.z[cut], phases.walking[cut], k, i)
@@ -221,7 +218,7 @@ def _checks(feet: FootTrajectories, events: list[GaitEvent], half_seen: int, tur
 def _breaks(events: list[GaitEvent]) -> int:
     """How often an event does not follow the one that comes before it in walking."""
     return sum(
-        ORDER[(ORDER.index((a.side, a.event)) + 1) % 4] != (b.side, b.event)
+        PHASE_ORDER[(PHASE_ORDER.index((a.side, a.event)) + 1) % 4] != (b.side, b.event)
         for a, b in itertools.pairwise(events)
         if a.bout == b.bout
     )

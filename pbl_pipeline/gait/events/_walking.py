@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import uniform_filter1d
 
-from ._features import GRID_HZ
-from ._predict import Grid, Phases
+from .network.features import GRID_HZ
+from .network.predict import Grid, Phases
 
 
 @dataclasses.dataclass(frozen=True)

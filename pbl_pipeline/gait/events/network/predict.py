@@ -14,7 +14,7 @@ from scipy.interpolate import PchipInterpolator
 
 from pbl_pipeline.errors import PblError
 
-from ._features import GRID_HZ, features, heading, leg_length
+from .features import GRID_HZ, features, heading, leg_length
 
 #: Frames of a window as in training; windows begin every `HOP`; so many are computed at once.
 WINDOW, HOP, CHUNK = 256, 160, 8
@@ -22,7 +22,7 @@ WINDOW, HOP, CHUNK = 256, 160, 8
 MAX_GAP_S = 0.2
 #: Recordings with more frames a second are averaged over a step of the grid.
 _AVERAGE_ABOVE_HZ = 75.0
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[1] / "data"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -112,7 +112,7 @@ def predict(grid: Grid, model: str) -> Phases:
 @functools.cache
 def load(model: str) -> tuple[Any, dict[str, Any]]:
     """Network and what is known of it (`probability`: the calibration), by its name in `data/` or by path."""
-    from ._transformer import load_model
+    from .transformer import load_model
 
     return load_model(model_path(model))
 

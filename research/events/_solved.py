@@ -1,7 +1,7 @@
 """Walks and other tasks of `pbl_pipeline.synthetic`, whose feet stand still: one part of the training corpus.
 
 The motions come from a least-squares solution that needs MuJoCo (a second each), so they are made once, by
-`python -m pbl_pipeline.gait.events.training --make-solved FILE`, and carried to where the model is trained.
+`python -m research.events --make-solved FILE`, and carried to where the model is trained.
 """
 
 from __future__ import annotations

@@ -8,7 +8,8 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 
-from ...normative import GRAVITY, gait_norm
+from pbl_pipeline.gait.normative import GRAVITY, gait_norm
+
 from ._sequence import GRID_HZ
 
 #: Limits of the cadence (steps/min).

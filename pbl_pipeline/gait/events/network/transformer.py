@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from ._features import N_FEATURES
+from .features import N_FEATURES
 
 #: Outputs per frame: (cosine, sine) of each event's phase in the order left down, right up, right down, left up, then
 #: the logit of walking.

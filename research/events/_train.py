@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from .._transformer import Architecture, PhaseTransformer
+from pbl_pipeline.gait.events.network.transformer import Architecture, PhaseTransformer
+
 from ._augment import SOURCE, augment
 from ._corpus import UNIT_M, Corpus
 

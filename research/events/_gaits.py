@@ -7,7 +7,8 @@ import functools
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from ...normative import gait_norm, harmonic_sum
+from pbl_pipeline.gait.normative import gait_norm, harmonic_sum
+
 from ._leg import LEG_ANGLES, PELVIS_ANGLES
 from ._rhythm import Rhythm
 

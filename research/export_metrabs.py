@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 OPSET = 18
-MARKERS = Path(__file__).resolve().parents[1] / "body" / "data" / "markers_bml_movi_87.csv"
+MARKERS = Path(__file__).resolve().parents[1] / "pbl_pipeline" / "body" / "data" / "markers_bml_movi_87.csv"
 #: How far the exported graph may be from the network: px of the crop and mm.
 TOLERANCE_PX, TOLERANCE_MM = 0.05, 0.5
 #: Ending that MeTRAbs gives the names of this skeleton among all its joints.

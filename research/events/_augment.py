@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._features import GRID_HZ, JOINTS, features, leg_length
+from pbl_pipeline.gait.events.network.features import GRID_HZ, features, leg_length
+from pbl_pipeline.gait.motion import LEG_JOINTS
 
 #: Frames of a training window, and of the stretch that it is taken from (the pace may be faster).
 WINDOW, SOURCE = 256, 324
@@ -159,7 +160,7 @@ def _missing(key, shape):
     k = iter(jax.random.split(key, 24))
     t = shape[0]
     known = jnp.ones(shape, bool)
-    foot = np.array([name in ("heel", "toe") for name in JOINTS])
+    foot = np.array([name in ("heel", "toe") for name in LEG_JOINTS])
 
     def gone(p, joints):
         return jax.random.bernoulli(next(k), p) & jnp.asarray(joints)
@@ -172,13 +173,13 @@ def _missing(key, shape):
         (0.05, ("knee",)),
         (0.05, ("ankle",)),
     ):
-        known &= ~gone(p, np.isin(JOINTS, names))[None, :, None]
+        known &= ~gone(p, np.isin(LEG_JOINTS, names))[None, :, None]
     # One joint, one leg, everything for a while.
     joint = jax.nn.one_hot(jax.random.randint(next(k), (), 1, 5), 5, dtype=bool)[:, None]
     side = jax.nn.one_hot(jax.random.randint(next(k), (), 0, 2), 2, dtype=bool)[None, :]
     span = _span(next(k), t, 8, 100)[:, None, None]
     known &= ~(span & joint & side & jax.random.bernoulli(next(k), 0.2))
-    below = jnp.asarray(np.array(JOINTS) != "hip")[:, None]
+    below = jnp.asarray(np.array(LEG_JOINTS) != "hip")[:, None]
     span = _span(next(k), t, 8, 60)[:, None, None]
     known &= ~(span & below & side & jax.random.bernoulli(next(k), 0.12))
     span = _span(next(k), t, 8, 60)[:, None, None]

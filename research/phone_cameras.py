@@ -1,4 +1,4 @@
-"""Write `data/phone_cameras.json`: `python -m pbl_pipeline.video.build_presets opencap_iphone_intrinsics.json`.
+"""Write the presets of phone cameras: `python -m research.phone_cameras opencap_iphone_intrinsics.json`.
 
 The input holds the calibrations of iPhones' main cameras that are published with OpenCap (stanfordnmbl/opencap-core,
 commit d5a5258, Apache-2.0; Uhlrich et al. 2023, PLoS Comput Biol 19(10):e1011462): by model identifier and recording
@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import click
+
+from research._paths import PACKAGE
 
 SOURCE = (
     "OpenCap's calibrations of iPhones (stanfordnmbl/opencap-core, commit d5a5258, Apache-2.0; "
@@ -90,12 +92,12 @@ def _number(model: str) -> tuple[int, ...]:
     return tuple(int(n) for n in model.removeprefix("iPhone").split(","))
 
 
-@click.command(epilog="Example: python -m pbl_pipeline.video.build_presets opencap_iphone_intrinsics.json")
+@click.command(epilog="Example: python -m research.phone_cameras opencap_iphone_intrinsics.json")
 @click.argument("published", type=click.Path(path_type=Path, exists=True, dir_okay=False))
 def main(published: Path) -> None:
     """Write the presets of phone cameras from the file that OpenCap publishes."""
     content = build(json.loads(published.read_text()))
-    out = Path(__file__).parent / "data" / "phone_cameras.json"
+    out = PACKAGE / "video" / "data" / "phone_cameras.json"
     head = {k: v for k, v in content.items() if k != "cameras"}
     text = json.dumps(head, indent=1)[:-2] + ',\n "cameras": [\n'
     text += ",\n".join("  " + json.dumps(c) for c in content["cameras"]) + "\n ]\n}\n"

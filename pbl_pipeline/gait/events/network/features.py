@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from pbl_pipeline.gait.motion import LEG_JOINTS
+
 #: Frames a second of the grid.
 GRID_HZ = 50.0
-#: Joints of a leg that marker sets share; a set may lack some.
-JOINTS = ("hip", "knee", "ankle", "heel", "toe")
 #: Per frame: each joint's place (3) and whether it is known (1), for left and right.
-N_FEATURES = len(JOINTS) * 2 * 4
+N_FEATURES = len(LEG_JOINTS) * 2 * 4
 #: Frames over which the hip line is averaged, twice, for the heading: a stride or so.
 HEADING_FRAMES = 51
 

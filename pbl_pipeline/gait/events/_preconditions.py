@@ -1,4 +1,4 @@
-"""What no method searches: too little in view, legs that cannot be a walking person's, somebody who walks backwards."""
+"""Checks that every event method requires: enough in view, legs as those of a standing person, walking forwards."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import math
 import numpy as np
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.gait.motion import FootTrajectories
 
-from .._feet import FootTrajectories
-from ._predict import GRID_HZ, MAX_GAP_S, Grid, on_grid
 from ._types import SIDES
+from .network.predict import GRID_HZ, MAX_GAP_S, Grid, on_grid
 
 #: Somebody who sits has the hips at half of this length above the feet and more; below it the legs lie.
 MIN_HIP_HEIGHT = 0.3
@@ -18,7 +18,7 @@ MIN_HIP_HEIGHT = 0.3
 BACKWARDS = -0.5
 
 
-def look(feet: FootTrajectories, least_s: float) -> tuple[Grid | None, str, str]:
+def check_preconditions(feet: FootTrajectories, least_s: float) -> tuple[Grid | None, str, str]:
     """The legs on an even grid, and why they are not searched: reason and advice, both empty where they are.
 
     The grid is None where the legs' joints are not known (`legs_m` None; then only the way on the ground is looked at)

@@ -1,4 +1,4 @@
-"""Build the normal gait that ships: `python -m pbl_pipeline.gait.normative.build_schwartz Schwartz2008_original.xls`.
+"""Build the normal gait that ships: `python -m research.normal_gait Schwartz2008_original.xls`.
 
 The file is the electronic addendum of Schwartz, Rozumalski and Trost 2008 (J Biomech 41:1639-1650): mean and standard
 deviation of joint angles over the gait cycle of typically developing children at five speeds. Its
@@ -14,6 +14,9 @@ from pathlib import Path
 
 import click
 import numpy as np
+
+from pbl_pipeline.gait.normative import harmonic_sum
+from research._paths import PACKAGE
 
 GROUPS = ("very_slow", "slow", "free", "fast", "very_fast")
 #: Our name -> the name in the file.
@@ -46,13 +49,13 @@ def build(path: Path) -> tuple[dict, float]:
     book = importlib.import_module("xlrd").open_workbook(str(path))
     sheet = book.sheet_by_name("Joint Rotations")
     rows = [[sheet.cell_value(r, c) for c in range(17)] for r in range(2, sheet.nrows)]
-    worst, angles = 0.0, {}
+    worst, angles, phase = 0.0, {}, 2 * np.pi * np.linspace(0, 1, POINTS)
     for name, theirs in ANGLES.items():
         table = np.array([r[2:] for r in rows if r[0] == theirs], float).reshape(POINTS, len(GROUPS), 3)
         mean, sd = table[..., 1], 0.5 * (table[..., 2] - table[..., 0])
         means = [fourier(m, MEAN_HARMONICS) for m in mean.T]
         for m, c in zip(mean.T, means, strict=True):
-            worst = max(worst, float(np.abs(_at(c, POINTS) - m).max()))
+            worst = max(worst, float(np.abs(harmonic_sum(c, phase) - m).max()))
         angles[name] = {
             "mean_deg": [np.round(c, 3).tolist() for c in means],
             "sd_deg": [np.round(fourier(s, SD_HARMONICS), 3).tolist() for s in sd.T],
@@ -81,23 +84,16 @@ def build(path: Path) -> tuple[dict, float]:
     return norm, worst
 
 
-def _at(coefficients: np.ndarray, points: int) -> np.ndarray:
-    phase = 2 * np.pi * np.linspace(0, 1, points)
-    k = np.arange(1, len(coefficients) // 2 + 1)
-    turns = np.multiply.outer(phase, k)
-    return coefficients[0] + np.cos(turns) @ coefficients[1::2] + np.sin(turns) @ coefficients[2::2]
-
-
 @click.command()
 @click.argument("xls", type=click.Path(path_type=Path, exists=True))
 @click.option("--out", type=click.Path(path_type=Path), help="JSON to write (default: into the package).")
 def main(xls: Path, out: Path | None) -> None:
     """Write the normal gait of XLS as harmonics.
 
-    Example: python -m pbl_pipeline.gait.normative.build_schwartz Schwartz2008_original.xls --out norm.json
+    Example: python -m research.normal_gait Schwartz2008_original.xls --out norm.json
     """
     norm, worst = build(xls)
-    target = out or Path(__file__).parent / "curves" / "schwartz_2008.json"
+    target = out or PACKAGE / "gait" / "normative" / "curves" / "schwartz_2008.json"
     lines = json.dumps(norm, indent=1)
     # One list a line: readable, and a change shows as one line.
     for inner in ("      ", "     ", "    "):

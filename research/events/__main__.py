@@ -1,8 +1,8 @@
-"""`python -m pbl_pipeline.gait.events.training`: make the corpus and train the event model.
+"""`python -m research.events`: make the corpus and train the event model.
 
-    python -m pbl_pipeline.gait.events.training --make-solved solved.npz --solved-count 1500   # needs MuJoCo
-    python -m pbl_pipeline.gait.events.training --out DIR --seed 0 --solved solved.npz         # on a GPU, minutes
-    python -m pbl_pipeline.gait.events.training --out DIR --calibrate DIR/phase_transformer.npz --solved solved.npz
+    python -m research.events --make-solved solved.npz --solved-count 1500   # needs MuJoCo
+    python -m research.events --out DIR --seed 0 --solved solved.npz         # on a GPU, minutes
+    python -m research.events --out DIR --calibrate DIR/phase_transformer.npz --solved solved.npz
 
 The second command needs only numpy, scipy, jax, equinox and optax. It writes `phase_transformer.npz` (at each report)
 and `metrics.json` to DIR. The third fits the probability of an event on people that training has not seen, minutes on
@@ -43,7 +43,8 @@ def main(arguments: list[str] | None = None) -> None:
 
     import jax
 
-    from .._transformer import Architecture, save_model
+    from pbl_pipeline.gait.events.network.transformer import Architecture, save_model
+
     from ._train import TrainParams, train
 
     size = Architecture(width=args.width, blocks=args.blocks, heads=args.heads, hidden=3 * args.width)
@@ -78,8 +79,9 @@ def _calibrate(args: argparse.Namespace) -> None:
     """Fit the probability on scenes of other seeds and on the solved motions that training held out."""
     import numpy as np
 
-    from .. import PhaseParams
-    from .._transformer import load_model, save_model
+    from pbl_pipeline.gait.events import PhaseParams
+    from pbl_pipeline.gait.events.network.transformer import load_model, save_model
+
     from . import _calibrate as calibration
     from . import _corpus
 
@@ -109,7 +111,7 @@ def _say(text: str) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
-        prog="python -m pbl_pipeline.gait.events.training",
+        prog="python -m research.events",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

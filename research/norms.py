@@ -1,4 +1,4 @@
-"""Build the normative sets that ship: `python -m pbl_pipeline.gait.build_norm GDI_Calc_Fast_Data.mat`.
+"""Build the normative sets that ship: `python -m research.norms GDI_Calc_Fast_Data.mat`.
 
 The file is the one published with the Gait Deviation Index (Schwartz & Rozumalski 2008, Gait & Posture 28:351-357):
 `all_ctrl_gait_vectors` (459, 166), one column per control subject, nine angles x 51 points of the cycle in degrees;
@@ -17,8 +17,7 @@ from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
 from pbl_pipeline.errors import PblError
-
-from .normative import (
+from pbl_pipeline.gait.normative import (
     BODY_ANGLES,
     DEFAULT_NORM,
     NINE_ANGLES,
@@ -28,6 +27,7 @@ from .normative import (
     fit_norm,
     offset_deg,
 )
+from research._paths import PACKAGE
 
 POINTS = 51
 
@@ -162,9 +162,9 @@ def _not_gillette(path: str | Path, found: str) -> PblError:
 def main(mat: Path, out: Path | None) -> None:
     """Build the sets of the 166 controls in MAT and write each as JSON.
 
-    Example: python -m pbl_pipeline.gait.build_norm GDI_Calc_Fast_Data.mat --out norms
+    Example: python -m research.norms GDI_Calc_Fast_Data.mat --out norms
     """
-    folder = out or Path(__file__).parent / "normative" / "data"
+    folder = out or PACKAGE / "gait" / "normative" / "data"
     folder.mkdir(parents=True, exist_ok=True)
     for name, (build, digits) in BUILDERS.items():
         try:

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
-from .. import _predict
-from .._phase import ORDER, PhaseParams, candidates
+from pbl_pipeline.gait.events import PHASE_ORDER, PhaseParams, candidates
+from pbl_pipeline.gait.events.network.predict import Grid, Phases, on_grid, predict
+
 from ._augment import _MIRRORED, seen_joints
 from ._corpus import HELD_OUT_EVERY, UNIT_M, Corpus
 from ._sequence import GRID_HZ
@@ -31,10 +32,10 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Case:
-    """One sequence as the network sees it, and the truth: times (s) of the four events in `ORDER`."""
+    """One sequence as the network sees it, and the truth: times (s) of the four events in `PHASE_ORDER`."""
 
-    grid: _predict.Grid
-    phases: _predict.Phases
+    grid: Grid
+    phases: Phases
     true_s: tuple[np.ndarray, ...]
     kind: str
 
@@ -51,13 +52,13 @@ def cases(corpus: Corpus, numbers: np.ndarray, model: str, seed: int) -> Iterato
         joints, known, mirror = (np.asarray(x) for x in see(key, jnp.asarray(UNIT_M * corpus.points[cut])))
         phase = corpus.phase[cut][:, _MIRRORED] if mirror else corpus.phase[cut]
         time = np.arange(len(phase)) / GRID_HZ
-        grid = _predict.on_grid(time, np.where(known[..., None], joints, np.nan), _UP)
+        grid = on_grid(time, np.where(known[..., None], joints, np.nan), _UP)
         if not np.isfinite(grid.leg_m) or np.count_nonzero(grid.known[:, 0].all(axis=1)) < GRID_HZ:
             continue
         seen: np.ndarray = np.logical_and.reduce(grid.known[:, 0], axis=1)
         true = tuple(_wraps(phase[:, k], time) for k in range(4))
         near = tuple(t[seen[np.clip(np.round(t * GRID_HZ).astype(int), 0, len(seen) - 1)]] for t in true)
-        yield Case(grid, _predict.predict(grid, model), near, str(corpus.kind[number]))
+        yield Case(grid, predict(grid, model), near, str(corpus.kind[number]))
 
 
 def held_out(corpus: Corpus) -> np.ndarray:
@@ -169,7 +170,7 @@ def calibrate(found: list[Case], p: PhaseParams, say: Callable[[str], None]) -> 
 
 
 def _events(case: Case, p: PhaseParams) -> Iterator[tuple[int, int, float, np.ndarray]]:
-    """Stretch, kind (place in `ORDER`), time, evidence of each event before probability is asked for."""
+    """Stretch, kind (place in `PHASE_ORDER`), time, evidence of each event before probability is asked for."""
     for number, stretch in enumerate(candidates(case.grid, case.phases, p)[0]):
         for c in stretch:
-            yield number, ORDER.index((c.side, c.event)), c.time_s, c.evidence
+            yield number, PHASE_ORDER.index((c.side, c.event)), c.time_s, c.evidence

@@ -1,6 +1,8 @@
-"""The MJCF of the 40-degree-of-freedom body and its marker table as text, from the published figures.
+"""Write the body's MJCF and the BML-MoVi marker table from figures: `python -m research.body FIGURES.json`.
 
-Bodies, positions, joints, ranges, masses, centres of mass and scale groups are the figures'. The project's own are
+Needed only when the figures or the shapes change. The body's SHA-256 changes with them, and every fit names the SHA-256
+it was made with. Bodies, positions, joints, ranges, masses, centres of mass and scale groups are the figures'. The
+project's own are
 
 - the shapes (`_shapes.py`), for looks only: they touch nothing;
 - the inertias. The body is used for kinematics only, but MuJoCo wants a valid one, so each is that of a solid
@@ -9,10 +11,15 @@ Bodies, positions, joints, ranges, masses, centres of mass and scale groups are 
 
 from __future__ import annotations
 
+import json
 import xml.etree.ElementTree as ET
+from pathlib import Path
 from typing import Any
 
-from pbl_pipeline.body._shapes import RGBA, SHAPES, mirrored
+import click
+
+from research._body_shapes import RGBA, SHAPES, mirrored
+from research._paths import PACKAGE
 
 MODEL_NAME = "pbl_body_40"
 MODEL_VERSION = "1"
@@ -41,6 +48,7 @@ _CYLINDER: dict[str, tuple[float, float]] = {
 def body_xml(figures: dict[str, Any]) -> str:
     """The MJCF text. `figures` is the parsed body_model_figures.json: metres, kilograms, degrees."""
     root = ET.Element("mujoco", model=MODEL_NAME)
+    # The command had this name when the file was made; the words are part of its SHA-256.
     root.append(ET.Comment(f" Written by pbl_pipeline.body.build. Figures: {SOURCE}. Shapes are for looks only. "))
     ET.SubElement(root, "compiler", angle="degree", autolimits="true", inertiafromgeom="false")
     ET.SubElement(root, "option", gravity="0 0 -9.80665")
@@ -98,3 +106,28 @@ def marker_csv(figures: dict[str, Any]) -> str:
 
 def _text(values: list[float] | tuple[float, ...]) -> str:
     return " ".join(f"{x:g}" for x in values)
+
+
+@click.command()
+@click.argument("figures", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option(
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=PACKAGE / "body" / "data",
+    show_default="the package's data folder",
+    help="Folder the two files are written to.",
+)
+def build(figures: Path, out: Path) -> None:
+    """Write pbl_body_40.xml and markers_bml_movi_87.csv from FIGURES (body_model_figures.json).
+
+    Example: python -m research.body body_model_figures.json
+    """
+    data = json.loads(figures.read_text(encoding="utf-8"))
+    out.mkdir(parents=True, exist_ok=True)
+    for name, text in (("pbl_body_40.xml", body_xml(data)), ("markers_bml_movi_87.csv", marker_csv(data))):
+        (out / name).write_text(text, encoding="utf-8")
+        click.echo(out / name)
+
+
+if __name__ == "__main__":
+    build()

@@ -1,0 +1,27 @@
+"""How a trial moves: poses of the fitted body, the legs' joints, the feet and the heading."""
+
+from ._feet import (
+    BRIDGED_S,
+    FOOT_MARKER_SETS,
+    FootTrajectories,
+    feet_from_fit,
+    feet_from_keypoints,
+    feet_from_markers,
+)
+from ._heading import heading_agreement, heading_from_hips
+from ._legs import LEG_JOINTS
+from ._poses import BodyPoses, trial_poses
+
+__all__ = [
+    "BRIDGED_S",
+    "FOOT_MARKER_SETS",
+    "LEG_JOINTS",
+    "BodyPoses",
+    "FootTrajectories",
+    "feet_from_fit",
+    "feet_from_keypoints",
+    "feet_from_markers",
+    "heading_agreement",
+    "heading_from_hips",
+    "trial_poses",
+]

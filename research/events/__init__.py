@@ -1,0 +1,1 @@
+"""Training of the event model: corpus, augmentation, optimisation (`python -m research.events`)."""
