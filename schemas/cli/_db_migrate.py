@@ -1,4 +1,4 @@
-"""`pbl db migrate`: bring the tables of an older version to this one."""
+"""`pbl db migrate`: bring the tables of an older release to this one."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import click
 @click.command()
 @click.option("--dry-run", is_flag=True, help="Print what would be done, change nothing. Exit code 1: more is needed.")
 def migrate(dry_run: bool) -> None:
-    """Bring the tables on the server to their declarations in this version, by numbered migrations. Safe to repeat.
+    """Bring the tables on the server to their definitions in this version: create what is missing, apply numbered
+    migrations, then compare. Safe to repeat.
 
     Rows stay as they are. Make a backup first, stop the workers, and use an account that may alter tables.
 
@@ -32,4 +33,4 @@ def migrate(dry_run: bool) -> None:
     if outcome.open:
         raise click.exceptions.Exit(1)
     done = not outcome.created and not any(s for _, s in outcome.steps)
-    click.echo("The tables are as this version declares them." if done or not dry_run else "Nothing was changed.")
+    click.echo("The tables are as this version defines them." if done or not dry_run else "Nothing was changed.")

@@ -1,12 +1,13 @@
-"""Numbered migrations: what brings the tables of an older version to this one.
+"""Numbered migrations: what brings the tables of an older release to this one. There are none before the first release.
 
-A migration is a module here whose name begins with its number, `0002_what_it_does.py`, with a docstring and
+A migration is a module here whose name begins with its number, `0001_what_it_does.py`, with a docstring and
 
     def statements(conn) -> list[str]
 
-which looks at the server and returns what is still to be done, so that it can be repeated: where it was broken off,
-it goes on. `REPEATS = True` marks one that is planned at every run and not only once. The table `~migrations` in the
-schema `lab` says which were applied, when, by which version, with which statements.
+which reads the server's tables and returns the SQL that is still to be executed: nothing on a database whose tables
+are as this version defines them, and what is left after a run that was interrupted. New tables are created by
+DataJoint before the migrations run. The table `~migrations` in the schema `lab` records which migrations were
+applied, when, by which version, with which statements.
 """
 
 from ._run import Applied, Migration, Outcome, applied, available, migrate

@@ -15,10 +15,12 @@ import pymysql
 from pbl_pipeline import __version__
 from pbl_pipeline.errors import PblError
 from schemas import connection
-from schemas._base import utc_now
+from schemas._activate import STAGES, modules
+from schemas._base import dj, utc_now
 from schemas._declare import declare_all
-from schemas._differences import Difference, bind_all, differences, rebind
-from schemas._methods import insert_all
+from schemas.table_map import tables
+
+from ._differences import differences
 
 _NAME = re.compile(r"(\d{4})_(\w+)")
 Say = Callable[[str], None]
@@ -30,8 +32,6 @@ class Migration:
 
     number: int
     name: str
-    about: str
-    repeats: bool
     statements: Callable[[Any], list[str]]
 
 
@@ -47,7 +47,7 @@ class Applied:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a run did, or (dry run) would do. open: differences that no migration removes, in words."""
+    """What a run did, or (dry run) would do. open: differences that no migration removes, as text."""
 
     steps: list[tuple[str, list[str]]]
     created: list[str]
@@ -69,9 +69,7 @@ def available() -> list[Migration]:
         match = _NAME.fullmatch(module.name)
         if match:
             loaded = importlib.import_module(f"{package.__name__}.{module.name}")
-            about = (loaded.__doc__ or "").splitlines()[0]
-            repeats = getattr(loaded, "REPEATS", False)
-            found.append(Migration(int(match[1]), match[2], about, repeats, loaded.statements))
+            found.append(Migration(int(match[1]), match[2], loaded.statements))
     found.sort(key=lambda m: m.number)
     if [m.number for m in found] != list(range(1, len(found) + 1)):
         raise ValueError(f"migrations must be numbered 1, 2, 3 ...: {[m.number for m in found]}")
@@ -92,7 +90,7 @@ def applied() -> list[Applied]:
 
 
 def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
-    """Bring the tables on the server to their declarations in this version of the code. Safe to repeat.
+    """Bring the tables on the server to their definitions in this version of the code. Safe to repeat.
 
     Needs an account that may create and alter tables. Stop the workers before.
 
@@ -101,60 +99,85 @@ def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
     dry_run
         Change nothing, return what would be done.
     say
-        Told in a sentence what is being done.
+        Called with each statement before it is executed.
 
     Raises
     ------
     PblError
         DB_MIGRATION when differences remain that no migration removes (what could be done is done then), when the
-        database has seen a newer version of the code, or when another process is at it; DB_REFUSED when the account
-        may not alter tables.
+        database has seen a newer version of the code, or when another process is migrating it; DB_REFUSED when the
+        account may not alter tables.
     """
-    numbers = {m.number for m in available()}
-    newer = [a for a in applied() if a.number not in numbers]
-    if newer:
-        raise _error(
-            f"migration {newer[-1].number:04d} ({newer[-1].name}) of pbl-pipeline {newer[-1].version} was applied",
-            f"a database that pbl-pipeline {__version__} knows",
-            f"use pbl-pipeline {newer[-1].version} or newer",
-        )
+    _refuse_newer()
     if dry_run:
         return _plan()
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute("SELECT GET_LOCK(%s, 5)", (f"{connection.prefix()}_migrate",))
         if (cursor.fetchone() or (0,))[0] != 1:
             raise _error("another process is migrating this database", "one at a time", "wait until it has ended")
-        created = [d.text() for d in bind_all(create=False)] + [d.text() for d in differences() if d.statement == ""]
-        bind_all(create=True)
+        created = _bind(create=True)
         steps = _apply(cursor, say)
-    rebind({s.split("`.`")[0].split("`")[-1] for _, statements in steps for s in statements})
-    insert_all()  # also where this process has done it before: a migration may have moved a method's name
+    if any(statements for _, statements in steps):
+        _reread()
     declare_all()
     left = [d.text() for d in differences()]
     if left:
         raise _error(
             f"{len(left)} differences that no migration removes: {'; '.join(left[:8])}",
-            "tables as this version declares them",
-            "they need a migration of their own: see docs/deployment.md, section Upgrade",
+            "tables as this version defines them",
+            "they need a migration: see docs/deployment.md, section Upgrade",
         )
     return Outcome(steps, created, [])
 
 
+def _refuse_newer() -> None:
+    numbers = {m.number for m in available()}
+    newer = [a for a in applied() if a.number not in numbers]
+    if newer:
+        raise _error(
+            f"migration {newer[-1].number:04d} ({newer[-1].name}) of pbl-pipeline {newer[-1].version} was applied",
+            f"a database that pbl-pipeline {__version__} knows",
+            f"use the pbl-pipeline that applied it ({newer[-1].version}) or a newer one",
+        )
+
+
+def _bind(create: bool) -> list[str]:
+    """Bind the classes to the server's tables; returns what is missing, and creates it if `create`."""
+    conn, absent = connection.connect(), []
+    with dj.config.override(database__create_tables=False):
+        for stage, module in zip(STAGES, modules(), strict=True):
+            name = connection.schema_name(stage)
+            if not conn.query(
+                "SELECT 1 FROM information_schema.schemata WHERE schema_name = %s", args=(name,)
+            ).fetchone():
+                absent.append(f"{name}: the schema is created")
+                if not create:
+                    continue
+            connection.bind(stage, module.schema)
+    for cls in tables().values():
+        if cls.database and not cls().is_declared:
+            absent.append(f"{cls.full_table_name}: the table is created")
+            if create:
+                cls().declare(cls.declaration_context)
+    return absent
+
+
+def _reread() -> None:
+    """Read the tables' columns anew, and where they come from: DataJoint keeps both from before the migrations."""
+    for module in modules():
+        module.schema.rebuild_lineage()
+    for cls in tables().values():
+        cls._heading = type(cls._heading)(table_info=cls._heading.table_info)
+
+
 def _plan() -> Outcome:
-    conn = connection.connect()
-    missing = bind_all(create=False)
-    now = differences()
+    conn, created = connection.connect(), _bind(create=False)
     done = {a.number for a in applied()}
-    steps = [(_title(m), m.statements(conn)) for m in available() if m.repeats or m.number not in done]
-    planned = {s for _, statements in steps for s in statements}
-    left = [d.text() for d in now if d.statement not in planned and d.statement != "" and not _covered(d, planned)]
-    return Outcome(steps, [d.text() for d in missing + now if d.statement == ""], left)
-
-
-def _covered(difference: Difference, planned: set[str]) -> bool:
-    """Whether a migration makes the column, in whatever way."""
-    start, column = f"ALTER TABLE {difference.table} ", f" COLUMN `{difference.column}` "
-    return any(s.startswith(start) and column in s for s in planned)
+    steps = [(_title(m), m.statements(conn)) for m in available() if m.number not in done]
+    planned = " ".join(s for _, statements in steps for s in statements)
+    # What a planned statement changes, and what refers to a table that is still to be created, is compared afterwards.
+    left = [d.text() for d in differences() if d.table not in planned and (d.known or not created)]
+    return Outcome(steps, created, left)
 
 
 def _apply(cursor: Any, say: Say) -> list[tuple[str, list[str]]]:
@@ -162,7 +185,7 @@ def _apply(cursor: Any, say: Say) -> list[tuple[str, list[str]]]:
     done = {a.number for a in applied()}
     steps = []
     for migration in available():
-        if migration.number in done and not migration.repeats:
+        if migration.number in done:
             continue
         statements = migration.statements(conn)
         for statement in statements:
@@ -177,8 +200,7 @@ def _apply(cursor: Any, say: Say) -> list[tuple[str, list[str]]]:
                     expected="an account that may alter the tables, and tables that nobody uses at the moment",
                     next_step="stop the workers, use the account pbl_owner (pbl db roles), then repeat: it goes on",
                 ) from error
-        if statements or migration.number not in done:
-            _record(cursor, table, migration, statements)
+        _record(cursor, table, migration, statements)
         steps.append((_title(migration), statements))
     return steps
 
