@@ -1,13 +1,17 @@
 """All rows of the database as statements, one a line, and back: what `pbl db backup` and `pbl db restore` rest on.
 
-Written here and not with mysqldump because that needs the clients' package on every machine, and because it writes
-single-precision numbers with six digits, which are other numbers afterwards. The file is plain SQL:
+By hand, and not with mariadb-dump or mysqldump, for three reasons. A backup counts the rows and collects the files
+they name in the transaction that reads them; a dump program has a snapshot of its own, so that a row which is deleted
+in between would be restored without its file. It prints single precision with six digits, which DataJoint uses for
+a column of its own in every computed table (`_job_duration`). And it would have to be installed wherever a backup is
+made; the packages of the embedded server do not include it. The file is plain SQL:
 `zcat database.sql.gz | mariadb -h HOST -u USER -p` restores it without us.
 """
 
 from __future__ import annotations
 
 import gzip
+import json
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -22,9 +26,6 @@ STATEMENT = 1_000_000
 _FETCH = 500
 #: Marks a column whose values name files of the store, in the comment that DataJoint gives it.
 STORED = re.compile(r"^:<(object|npy|blob|attach|hash)@")
-#: Types whose values are bytes; everything else comes as text, exactly as the server prints it.
-_BYTES = {"binary", "varbinary", "tinyblob", "blob", "mediumblob", "longblob", "bit"}
-_FLOAT = "float"
 
 HEADER = (
     "SET NAMES utf8mb4",
@@ -90,44 +91,46 @@ def create_statement(server: pymysql.Connection[Any], schema: str, table: str) -
 def rows_of(
     server: pymysql.Connection[Any], schema: str, table: str, columns: Sequence[tuple[str, str, str]]
 ) -> Iterator[tuple]:
-    """The rows of a table in the order of its primary key, read from the server as they are needed.
+    """The rows of a table, read from the server as they are needed.
 
     The connection must have been opened with `conv={}`: values are text as the server prints it, or bytes.
     """
     # A single-precision number is printed with six digits; as double precision it is printed to the last one.
-    chosen = ", ".join(f"{quote(c)} + 0e0" if kind == _FLOAT else quote(c) for c, kind, _ in columns)
+    chosen = ", ".join(f"{quote(c)} + 0e0" if kind == "float" else quote(c) for c, kind, _ in columns)
     with server.cursor(SSCursor) as cursor:
         cursor.execute(f"SELECT {chosen} FROM {quote(schema)}.{quote(table)}")  # noqa: S608  names of the server's own
         while rows := cursor.fetchmany(_FETCH):
             yield from rows
 
 
-def literal(value: Any, kind: str) -> str:
+def save_table(server: pymysql.Connection[Any], schema: str, table: str, out: gzip.GzipFile) -> tuple[int, set[str]]:
+    """Write the statements that make a table and insert its rows; returns how many rows, and the files they name."""
+    columns = columns_of(server, schema, table)
+    stored = [i for i, (_, _, comment) in enumerate(columns) if STORED.match(comment)]
+    write_line(out, f"USE {quote(schema)}")
+    write_line(out, create_statement(server, schema, table))
+    names = ", ".join(quote(c) for c, _, _ in columns)
+    head = f"INSERT INTO {quote(schema)}.{quote(table)} ({names}) VALUES "  # noqa: S608  values are escaped
+    n, size, files = 0, 0, set()
+    parts: list[str] = []
+    for row in rows_of(server, schema, table, columns):
+        n += 1
+        files.update(json.loads(row[i])["path"] for i in stored if row[i] is not None)
+        parts.append("(" + ",".join(map(literal, row)) + ")")
+        size += len(parts[-1])
+        if size > STATEMENT:
+            write_line(out, head + ",".join(parts))
+            parts, size = [], 0
+    if parts:
+        write_line(out, head + ",".join(parts))
+    return n, files
+
+
+def literal(value: str | bytes | None) -> str:
     """A value as a statement has it."""
     if value is None:
         return "NULL"
-    if kind in _BYTES:
-        raw = value if isinstance(value, bytes) else str(value).encode("latin1")
-        return f"X'{raw.hex()}'"
-    return f"'{escape_string(value.decode() if isinstance(value, bytes) else str(value))}'"
-
-
-def inserts(schema: str, table: str, columns: Sequence[tuple[str, str, str]], rows: Iterator[tuple]) -> Iterator[str]:
-    """Statements that insert the rows, each of about a megabyte at most."""
-    names = ", ".join(quote(c) for c, _, _ in columns)
-    head = f"INSERT INTO {quote(schema)}.{quote(table)} ({names}) VALUES "  # noqa: S608  values are escaped above
-    kinds = [kind for _, kind, _ in columns]
-    parts: list[str] = []
-    size = 0
-    for row in rows:
-        text = "(" + ",".join(literal(v, k) for v, k in zip(row, kinds, strict=True)) + ")"
-        if parts and size + len(text) > STATEMENT:
-            yield head + ",".join(parts)
-            parts, size = [], 0
-        parts.append(text)
-        size += len(text) + 1
-    if parts:
-        yield head + ",".join(parts)
+    return f"X'{value.hex()}'" if isinstance(value, bytes) else f"'{escape_string(value)}'"
 
 
 def write_line(out: gzip.GzipFile, statement: str) -> None:

@@ -16,7 +16,7 @@ import datetime
 import gzip
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -219,29 +219,10 @@ def _save_tables(
         for schema in dict.fromkeys(schema for schema, _ in tables):
             _dump.write_line(out, f"CREATE DATABASE IF NOT EXISTS {_dump.quote(schema)}")
         for schema, table in tables:
-            columns = _dump.columns_of(server, schema, table)
-            _dump.write_line(out, f"USE {_dump.quote(schema)}")
-            _dump.write_line(out, _dump.create_statement(server, schema, table))
-            counted = _Counted(_dump.rows_of(server, schema, table, columns), columns, files)
-            for statement in _dump.inserts(schema, table, columns, iter(counted)):
-                _dump.write_line(out, statement)
-            rows[f"{schema}.{table}"] = counted.n
+            rows[f"{schema}.{table}"], named = _dump.save_table(server, schema, table, out)
+            files |= named
             update(1)
     return rows, files
-
-
-class _Counted:
-    """Passes rows on, counts them, and collects the files they name."""
-
-    def __init__(self, rows: Iterator[tuple], columns: list[tuple[str, str, str]], files: set[str]) -> None:
-        self._rows, self._files, self.n = rows, files, 0
-        self._stored = [i for i, (_, _, comment) in enumerate(columns) if _dump.STORED.match(comment)]
-
-    def __iter__(self) -> Iterator[tuple]:
-        for row in self._rows:
-            self.n += 1
-            self._files.update(json.loads(row[i])["path"] for i in self._stored if row[i] is not None)
-            yield row
 
 
 def _save_files(paths: list[str], folder: Path) -> int:

@@ -27,8 +27,8 @@ from workers.populate import populate
 
 from . import chain
 
-#: A single-precision number that needs nine digits, and a text with everything that has to be escaped.
-HEIGHT = float(np.float32(1.7345679))
+#: A number that needs all 17 digits, and a text with everything that has to be escaped.
+HEIGHT = 1.7345678901234567
 TITLE = "knee ' \" \\ % `\n\t\0 \u00e4\u20ac\U0001f6b6 $(rm -rf /); --"
 
 
@@ -54,7 +54,8 @@ def elsewhere(filled: None) -> Iterator[Any]:
     connection.connect()
 
 
-def test_there_and_back(elsewhere: Any, tmp_path: Path):
+def test_there_and_back(elsewhere: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(_dump, "STATEMENT", 500)  # several inserts of a table
     saved = tmp_path / "backup"
     before = everything()
     done = pbl("db", "backup", saved)
@@ -73,8 +74,7 @@ def test_there_and_back(elsewhere: Any, tmp_path: Path):
     assert everything() == before
     # The tables work: what was computed is there, with its arrays, and nothing is computed anew.
     schemas.activate()
-    exact = connection.connect().query("SELECT subject_height + 0e0 FROM pbl_lab.subject").fetchone()[0]
-    assert exact == HEIGHT
+    assert lab.Subject.fetch1("subject_height") == HEIGHT
     assert lab.Project.fetch1("project_title") == TITLE
     assert views.session_summary()["subject"].tolist() == ["P001"]
     results = load_session({"subject": "P001"})
