@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from . import fit, gait, gdi, keypoints, tracking
-from ._base import insert_methods
+from .method_rows import insert_methods
 
 
 def insert_all() -> None:

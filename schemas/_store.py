@@ -12,6 +12,7 @@ from typing import Any
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
+from ._datajoint import full_path
 from ._secrets import secret
 
 #: Folder of the bucket under which everything of ours lies; the phones' uploads may have another one beside it.
@@ -133,8 +134,8 @@ def files_below(backend: Any, folder: str = "") -> dict[str, dict[str, Any]]:
         STORE_UNAVAILABLE with what the store said.
     """
     try:
-        base = str(backend._full_path(""))
-        found = backend.fs.find(backend._full_path(folder), detail=True)
+        base = full_path(backend, "")
+        found = backend.fs.find(full_path(backend, folder), detail=True)
     except Exception as error:
         raise store_error(error) from error
     return {str(path).removeprefix(base).lstrip("/"): about for path, about in found.items()}

@@ -10,9 +10,10 @@ from pathlib import PurePath
 from typing import Any
 
 from . import fit, gait, gdi, keypoints, lab, session, tracking, video
-from ._base import DuplicateError, utc_now
 from ._codes import check_subject, day_of
+from ._datajoint import DuplicateError
 from .ingest import Methods, next_id, resolve
+from .rows import utc_now
 
 #: Rows in one transaction.
 CHUNK = 5000

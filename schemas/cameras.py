@@ -17,8 +17,8 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 
 from . import keypoints, lab, video
-from ._base import delete_below, number, utc_now
 from .ingest import camera_id_of, camera_row, forget_errors, in_transaction
+from .rows import delete_below, number, utc_now
 
 if TYPE_CHECKING:
     from pbl_pipeline.video import PhoneLens

@@ -10,8 +10,10 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 
 from . import tracking, video
-from ._base import file_ref, jobs_of, resolve_method, stored_file
+from .jobs import jobs_of
+from .method_rows import resolve_method
 from .results import load_tracking
+from .stored_files import file_ref, stored_file
 
 
 @dataclasses.dataclass(frozen=True)

@@ -28,7 +28,6 @@ Until then the classes exist and can be imported; using one raises DataJoint's "
 
 from __future__ import annotations
 
-import json
 import os
 import socket
 import warnings
@@ -36,31 +35,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import pymysql
+
 from pbl_pipeline.errors import PblError
 
-# DataJoint reads its configuration while it is imported. Ours comes from here alone: a datajoint.json that happens to
-# lie in the working directory must not point the tables at another server.
-os.environ.setdefault("DJ_IGNORE_CONFIG_FILE", "true")
-os.environ.setdefault("DJ_LOG_LEVEL", "WARNING")
-
-with warnings.catch_warnings():
-    warnings.filterwarnings("ignore", message="No datajoint.json found")  # on purpose
-    try:
-        import datajoint as dj
-    except ValueError as error:  # it reads the DJ_ variables while it is imported
-        raise PblError(
-            "USAGE",
-            found=str(error).split("For further information")[0].strip(),
-            expected="values of the DJ_ variables as DataJoint knows them (DJ_PORT: a number)",
-            next_step="correct the variable, or unset it",
-        ) from error
-import pymysql
-from datajoint import instance as dj_instance
-from datajoint.adapters.mysql import MySQLAdapter
-from datajoint.hash_registry import get_store_backend
-from pymysql.converters import escape_string
-
 from . import embedded
+from ._datajoint import DuplicateError as DuplicateError  # for the workers
+from ._datajoint import LostConnectionError, backend_of, datajoint, dj
 from ._secrets import secret
 from ._store import store_spec
 from .embedded import APP_USER, HOST, Folder, not_running
@@ -70,8 +51,11 @@ CONNECT_TIMEOUT_S = 4.0
 #: Name of the store that holds the arrays. Write it out, `<npy@arrays>`: DataJoint 2.3.5 finds no default for `<npy@>`.
 STORE = "arrays"
 
+#: The process's connection, once there is one.
+_current: datajoint.Connection | None = None
 
-def connect(start: bool = False) -> dj.Connection:
+
+def connect(start: bool = False) -> datajoint.Connection:
     """The process's connection, made on first use and again when the server has moved.
 
     Parameters
@@ -87,7 +71,8 @@ def connect(start: bool = False) -> dj.Connection:
     """
     target = _target(start)
     configure(target)
-    current = dj_instance._singleton_connection
+    global _current
+    current = _current
     if current is not None and _same(current, target) and _alive(current):
         return current
     _check_answers(target)
@@ -98,13 +83,14 @@ def connect(start: bool = False) -> dj.Connection:
                 warnings.filterwarnings("ignore", message="MariaDB is not officially supported")
                 # Named, though the configuration has them: without them DataJoint takes no notice of use_tls.
                 login = {name: target[name] for name in ("host", "user", "password")}
-                current = dj.conn(**login, use_tls=target["use_tls"])
+                current = _current = dj.conn(**login, use_tls=target["use_tls"])
         else:
             # The server was started again, perhaps on another port. Tables keep this object, so it moves along.
             info = {name: target[name] for name in ("host", "port", "user")}
             tls = {"ssl": True if target["use_tls"] is None else target["use_tls"], "ssl_input": target["use_tls"]}
             current.conn_info.update(info, passwd=target["password"], **tls)
             current.connect()
+            current.cancel_transaction()  # one that was open when the server went is gone, which DataJoint does not see
     except pymysql.err.OperationalError as error:
         raise _login_error(target, error) from error
     except RuntimeError as error:  # the driver's, where it cannot do the server's way of logging in
@@ -114,12 +100,12 @@ def connect(start: bool = False) -> dj.Connection:
     return current
 
 
-def another() -> dj.Connection:
+def another() -> datajoint.Connection:
     """A connection beside the process's own, to the same server: for a thread, since DataJoint's serves one only."""
     target = _target(start=False)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="MariaDB is not officially supported")
-        return dj.Connection(
+        return datajoint.Connection(
             target["host"], target["user"], target["password"], port=target["port"], use_tls=target["use_tls"]
         )
 
@@ -134,7 +120,7 @@ def schema_name(stage: str) -> str:
     return f"{prefix()}_{stage}"
 
 
-def bind(stage: str, schema: dj.Schema) -> None:
+def bind(stage: str, schema: datajoint.Schema) -> None:
     """Create the schema of a stage and its tables as far as they are missing, and bind the classes to them.
 
     Call it in the order of dependency: a table can only refer to tables that are bound.
@@ -152,7 +138,6 @@ def external() -> str | None:
 
 def configure(target: dict[str, Any] | None = None) -> None:
     """Set DataJoint's configuration: server, store, job bookkeeping. `connect()` calls it."""
-    install_mariadb_shim()
     if target is not None:
         dj.config["database.host"] = target["host"]
         dj.config["database.port"] = target["port"]
@@ -245,7 +230,7 @@ def plain_connection(**options: Any) -> pymysql.Connection[Any]:
 
 
 @contextmanager
-def alone(work: str, server: dj.Connection) -> Iterator[bool]:
+def alone(work: str, server: datajoint.Connection) -> Iterator[bool]:
     """Hold the lock of this installation for some work: one process of all machines at a time.
 
     Gives whether it was had; never waits. A process that dies, or whose connection is lost, has let go of it.
@@ -261,8 +246,7 @@ def alone(work: str, server: dj.Connection) -> Iterator[bool]:
 
 def store_backend() -> Any:
     """DataJoint's access to the store of arrays, whatever it is. `connect()` or `configure()` must have been called."""
-    config: Any = dj.config
-    return get_store_backend(STORE, config=config)
+    return backend_of(STORE)
 
 
 def store_root() -> str:
@@ -309,17 +293,16 @@ def _no_answer(target: dict[str, Any], found: str) -> PblError:
     )
 
 
-def _alive(connection: dj.Connection) -> bool:
+def _alive(connection: datajoint.Connection) -> bool:
     # Not `connection.is_connected`: in DataJoint 2.3.5 it stays True after the server has gone.
-    driver: Any = connection._conn
     try:
-        driver.ping(reconnect=False)
-    except pymysql.err.Error:
+        connection.query("SELECT 1", reconnect=False)
+    except (LostConnectionError, pymysql.err.Error):
         return False
     return True
 
 
-def _same(connection: dj.Connection, target: dict[str, Any]) -> bool:
+def _same(connection: datajoint.Connection, target: dict[str, Any]) -> bool:
     info = connection.conn_info
     return (info["host"], info["port"], info["user"], info["passwd"]) == (
         target["host"],
@@ -327,30 +310,3 @@ def _same(connection: dj.Connection, target: dict[str, Any]) -> bool:
         target["user"],
         target["password"],
     )
-
-
-def install_mariadb_shim() -> None:
-    """Make every connection DataJoint opens, also a later reconnect, work on MariaDB; MySQL is left as it is.
-
-    Two things differ. MariaDB does not see that a primary key determines the other columns of its table, so that with
-    ONLY_FULL_GROUP_BY `A.aggr(B)` fails with error 1055; and its JSON type is text, for which DataJoint hands a bare
-    dict to the driver when it stores the pointer to an object in the store.
-    """
-    original = MySQLAdapter.connect
-    if getattr(original, "_pbl_shim", False):
-        return
-
-    def connect(self: MySQLAdapter, *args: Any, **kwargs: Any) -> Any:
-        connection = original(self, *args, **kwargs)
-        if "MariaDB" in connection.get_server_info():
-            with connection.cursor() as cursor:
-                cursor.execute("SET SESSION sql_mode = REPLACE(@@SESSION.sql_mode, 'ONLY_FULL_GROUP_BY', '')")
-            connection.encoders = {**connection.encoders, dict: _json_literal}
-        return connection
-
-    connect._pbl_shim = True  # type: ignore[attr-defined]
-    MySQLAdapter.connect = connect
-
-
-def _json_literal(value: dict[str, Any], _mapping: object = None) -> str:
-    return "'" + escape_string(json.dumps(value)) + "'"

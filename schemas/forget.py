@@ -19,9 +19,10 @@ from pbl_pipeline import progress, settings
 from pbl_pipeline.errors import PblError
 
 from . import _dump, connection, fit, lab, session, video
-from ._base import delete_below
 from ._codes import check_subject
+from ._datajoint import full_path
 from ._store import files_below, store_error
+from .rows import delete_below
 
 #: Columns that say whose a row is. `fit_set` is a hash over one session's videos.
 IDENTITIES = ("subject", "session_id", "video_id", "fit_set")
@@ -290,7 +291,7 @@ def _delete_files(files: Sequence[str], say: Say) -> None:
             except Exception as error:
                 raise store_error(error) from error
             if store.protocol == "file":
-                _remove_empty(Path(store._full_path(path)).parent, len(PurePosixPath(path).parts) - 4)
+                _remove_empty(Path(full_path(store, path)).parent, len(PurePosixPath(path).parts) - 4)
             update(1)
 
 

@@ -9,21 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from . import fit, session  # noqa: F401  a definition refers to session
-from ._base import (
-    Origin,
-    check_columns,
-    check_row,
-    computes,
-    dj,
-    file_ref,
-    method_arguments,
-    method_columns,
-    new_folder,
-    number,
-    origin_columns,
-    stored_file,
-    stored_paramset,
-)
+from ._datajoint import dj
+from .checks import check_columns, check_row
+from .method_rows import method_arguments, method_columns, stored_paramset
+from .origin import Origin, computes, origin_columns
+from .rows import number
+from .stored_files import file_ref, new_folder, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib

@@ -9,23 +9,12 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline.errors import PblError
 
 from . import fit, gait, session  # noqa: F401  a definition refers to session
-from ._base import (
-    Origin,
-    check_columns,
-    check_row,
-    computes,
-    dj,
-    file_ref,
-    method_arguments,
-    method_columns,
-    number,
-    origin_columns,
-    rebuild_params,
-    resolve_method,
-    stored_file,
-    stored_paramset,
-    utc_now,
-)
+from ._datajoint import dj
+from .checks import check_columns, check_row
+from .method_rows import method_arguments, method_columns, rebuild_params, resolve_method, stored_paramset
+from .origin import Origin, computes, origin_columns
+from .rows import number, utc_now
+from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib

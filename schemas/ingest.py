@@ -16,8 +16,12 @@ from pbl_pipeline.paramset import canonical_json
 
 from . import fit, gait, gdi, keypoints, lab, sensors, session, tracking, video
 from ._activate import computed_tables
-from ._base import DuplicateError, delete_below, dj, error_code, jobs_of, resolve_method, utc_now
 from ._codes import check_subject, day_of
+from ._datajoint import DuplicateError, dj
+from .coded_errors import error_code
+from .jobs import jobs_of
+from .method_rows import resolve_method
+from .rows import delete_below, utc_now
 
 if TYPE_CHECKING:
     from pbl_pipeline.video import Camera

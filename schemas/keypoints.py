@@ -9,23 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from . import tracking, video
-from ._base import (
-    Origin,
-    check_columns,
-    check_row,
-    computes,
-    dj,
-    file_ref,
-    method_arguments,
-    method_columns,
-    method_of_model,
-    new_folder,
-    number,
-    origin_columns,
-    rebuild_params,
-    resolve_method,
-    stored_file,
-)
+from ._datajoint import dj
+from .checks import check_columns, check_row
+from .method_rows import method_arguments, method_columns, method_of_model, rebuild_params, resolve_method
+from .origin import Origin, computes, origin_columns
+from .rows import number
+from .stored_files import file_ref, new_folder, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import keypoints as lib

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ._base import dj
+from ._datajoint import dj
 
 schema = dj.Schema()
 

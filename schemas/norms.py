@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline.errors import PblError
 
 from . import fit, gait, gdi, lab, session
-from ._base import new_folder, plain
+from .rows import plain
+from .stored_files import new_folder
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib

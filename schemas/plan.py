@@ -9,7 +9,9 @@ from contextlib import contextmanager
 from typing import Any
 
 from . import fit, keypoints, session, tracking, video
-from ._base import dj, jobs_of, utc_now
+from ._datajoint import dj
+from .jobs import jobs_of
+from .rows import utc_now
 
 #: What one fit is for: a session, seen through one chain of methods.
 GROUP = ("session_id", "tracking_method", "keypoint_method", "fit_method")

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from . import fit, gait, gdi, keypoints
-from ._base import Origin, check_values, computes, dj, origin_columns
+from ._datajoint import dj
+from .checks import check_values
+from .origin import Origin, computes, origin_columns
 
 schema = dj.Schema()
 

@@ -14,7 +14,8 @@ from pbl_pipeline.files import load_npz
 from pbl_pipeline.paramset import canonical_json
 
 from . import validation, video
-from ._base import new_folder, utc_now
+from .rows import utc_now
+from .stored_files import new_folder
 
 if TYPE_CHECKING:
     from pbl_pipeline import validation as lib

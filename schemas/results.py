@@ -13,7 +13,10 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 
 from . import fit, gait, gdi, keypoints, session, tracking, video
-from ._base import check_values, error_code, error_found, file_ref, number, stored_file
+from .checks import check_values
+from .coded_errors import error_code, error_found
+from .rows import number
+from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib

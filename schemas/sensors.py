@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline.errors import PblError
 
 from . import keypoints, video
-from ._base import delete_below, new_folder, utc_now
+from .rows import delete_below, utc_now
+from .stored_files import new_folder
 
 if TYPE_CHECKING:
     from pbl_pipeline.video import PhoneLog

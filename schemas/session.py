@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from . import lab  # noqa: F401  the definition refers to it
-from ._base import dj
+from ._datajoint import dj
 
 schema = dj.Schema()
 

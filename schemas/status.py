@@ -11,8 +11,9 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from . import computed_tables, connection, keypoints, tracking, video, worker
-from ._base import error_code, error_found, error_next_step, jobs_of
 from ._dump import quote
+from .coded_errors import error_code, error_found, error_next_step
+from .jobs import jobs_of
 
 #: Fewer videos than this, and keys are counted that nobody has queued yet.
 SMALL = 5000

@@ -8,7 +8,7 @@ import sys
 from typing import Any
 
 from ._activate import STAGES, modules
-from ._base import dj
+from ._datajoint import dj
 
 _ORIGIN = ("code_version", "method_hash", "model_sha256", "host", "seconds", "computed")
 _KINDS = {dj.Manual: "manual", dj.Lookup: "lookup", dj.Computed: "computed", dj.Part: "part"}

@@ -11,23 +11,11 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 
 from . import video
-from ._base import (
-    Origin,
-    computes,
-    delete_below,
-    dj,
-    file_ref,
-    method_arguments,
-    method_columns,
-    method_of_model,
-    new_folder,
-    number,
-    origin_columns,
-    rebuild_params,
-    resolve_method,
-    stored_file,
-    utc_now,
-)
+from ._datajoint import dj
+from .method_rows import method_arguments, method_columns, method_of_model, rebuild_params, resolve_method
+from .origin import Origin, computes, origin_columns
+from .rows import delete_below, number, utc_now
+from .stored_files import file_ref, new_folder, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import tracking as lib

@@ -6,7 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from . import fit, video  # noqa: F401  a definition refers to video
-from ._base import Origin, computes, dj, file_ref, number, origin_columns, stored_file
+from ._datajoint import dj
+from .origin import Origin, computes, origin_columns
+from .rows import number
+from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import validation as lib

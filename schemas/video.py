@@ -11,7 +11,9 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 
 from . import lab, session  # noqa: F401  the definitions refer to them
-from ._base import Origin, computes, dj, number, origin_columns
+from ._datajoint import dj
+from .origin import Origin, computes, origin_columns
+from .rows import number
 
 if TYPE_CHECKING:
     from pbl_pipeline import video as lib

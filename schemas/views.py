@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from . import fit, gait, gdi, lab, qc, session, tracking, validation, video
-from ._base import file_ref, stored_file
+from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
     import pandas as pd

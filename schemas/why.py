@@ -6,7 +6,8 @@ import dataclasses
 from typing import Any
 
 from . import computed_tables, fit, tracking, video
-from ._base import error_code, error_found, error_next_step, jobs_of
+from .coded_errors import error_code, error_found, error_next_step
+from .jobs import jobs_of
 from .status import EMPTY_COLUMNS
 
 DONE, EMPTY, PENDING, RUNNING, ERROR, NOT_YET = "done", "empty", "pending", "being computed", "error", "not yet"

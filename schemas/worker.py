@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ._base import dj
+from ._datajoint import dj
 
 schema = dj.Schema()
 

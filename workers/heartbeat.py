@@ -15,7 +15,7 @@ import pymysql
 from pbl_pipeline import __version__
 from pbl_pipeline.errors import PblError
 from schemas import connection, worker
-from schemas._base import dj
+from schemas.connection import dj
 
 #: Seconds between two heartbeats.
 PERIOD_S = 15.0

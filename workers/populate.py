@@ -9,7 +9,7 @@ from typing import Any
 
 from pbl_pipeline import progress
 from schemas import computed_tables
-from schemas._base import jobs_of
+from schemas.jobs import jobs_of
 from schemas.status import empty_rows
 
 from . import queue, recover, refresh, run_job

@@ -19,7 +19,8 @@ from typing import Any
 import pymysql
 
 from pbl_pipeline.errors import PblError
-from schemas._base import dj, jobs_of
+from schemas.connection import dj
+from schemas.jobs import jobs_of
 
 from .registry import NEW
 

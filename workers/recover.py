@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from schemas import worker
-from schemas._base import jobs_of
+from schemas.jobs import jobs_of
 
 from . import queue
 

@@ -9,9 +9,12 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 from schemas import computed_tables, fit, gait, gdi, keypoints, tracking, video
-from schemas._base import delete_below, dj, jobs_of, resolve_method
+from schemas.connection import dj
 from schemas.ingest import Methods
 from schemas.ingest import resolve as resolve_ingest
+from schemas.jobs import jobs_of
+from schemas.method_rows import resolve_method
+from schemas.rows import delete_below
 
 from . import queue
 from .registry import AGAIN, table_named

@@ -15,7 +15,8 @@ import pymysql
 
 from pbl_pipeline.errors import PblError
 from schemas import connection
-from schemas._base import DuplicateError, LostConnectionError, error_code
+from schemas.coded_errors import error_code
+from schemas.connection import DuplicateError, LostConnectionError
 
 from . import queue
 from .queue import Claim, ReservationLost

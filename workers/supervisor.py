@@ -23,7 +23,7 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 from schemas import connection
-from schemas._base import utc_now
+from schemas.rows import utc_now
 
 from . import queue, registry, run_job
 from .log import event, to_stderr

@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 from schemas import connection
-from schemas._base import dj
+from schemas._datajoint import dj
 from schemas.table_map import tables
 
 

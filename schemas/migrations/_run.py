@@ -16,8 +16,9 @@ from pbl_pipeline import __version__
 from pbl_pipeline.errors import PblError
 from schemas import connection
 from schemas._activate import STAGES, modules
-from schemas._base import dj, utc_now
+from schemas._datajoint import dj, read_heading_again
 from schemas._declare import declare_all
+from schemas.rows import utc_now
 from schemas.table_map import tables
 
 from ._differences import differences
@@ -167,7 +168,7 @@ def _reread() -> None:
     for module in modules():
         module.schema.rebuild_lineage()
     for cls in tables().values():
-        cls._heading = type(cls._heading)(table_info=cls._heading.table_info)
+        read_heading_again(cls)
 
 
 def _plan() -> Outcome:

@@ -131,7 +131,7 @@ def put_sessions(home: Path, sessions: Sequence[Plan]) -> None:
 
 def _insert_rows(folder: Path, trials: Sequence[Any]) -> None:
     from schemas import fit, keypoints, tracking, video
-    from schemas._base import Origin
+    from schemas.origin import Origin
 
     def origin(prefix: str) -> dict[str, Any]:
         return Origin.now(0.0).row(prefix)

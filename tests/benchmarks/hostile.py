@@ -122,8 +122,9 @@ def main(inputs: int, seed: int) -> None:
     """Make the inputs, put them through, count."""
     import schemas
     from schemas import tracking, video
-    from schemas._base import error_code, jobs_of
+    from schemas.coded_errors import error_code
     from schemas.ingest import Visit, ingest
+    from schemas.jobs import jobs_of
     from schemas.sensors import Sensors
     from workers.supervisor import Options, Supervisor
 

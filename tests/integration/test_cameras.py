@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from schemas import fit, keypoints, lab, video
-from schemas._base import file_ref, stored_file
 from schemas.ingest import Visit, ingest
+from schemas.stored_files import file_ref, stored_file
 from tests.command import pbl
 from tests.integration import chain
 from tests.integration.test_tables import errors

@@ -11,7 +11,7 @@ import pytest
 
 import pbl_pipeline.fit
 from schemas import fit
-from schemas._base import jobs_of
+from schemas.jobs import jobs_of
 from tests.benchmarks import gpu_worker
 from workers import batches, queue
 from workers.heartbeat import Silent

@@ -17,7 +17,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import load_npz
 from pbl_pipeline.video import read_phone_log
 from schemas import fit, video
-from schemas._base import error_next_step
+from schemas.coded_errors import error_next_step
 from schemas.ingest import Visit, ingest
 from schemas.report import write_session
 from tests.command import pbl

@@ -10,11 +10,12 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 
+import datajoint
 import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import _base, connection, embedded, lab, migrations, video, views
+from schemas import connection, embedded, jobs, lab, migrations, video, views
 from schemas.ingest import Visit, ingest
 from tests.command import pbl
 from tests.database import new_home, remove_home
@@ -64,7 +65,8 @@ def empty(home: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], 
     process."""
     with monkeypatch.context() as patch:
         patch.setenv("PBL_HOME", str(home))
-        patch.setattr(connection.dj_instance, "_singleton_connection", None)
+        patch.setattr(connection, "_current", None)
+        patch.setattr(datajoint.instance, "_singleton_connection", None)
         _unbind(patch)
         with closing(connection.plain_connection()) as server, server.cursor() as cursor:
             cursor.execute("SET foreign_key_checks = 0")
@@ -112,7 +114,7 @@ def _unbind(patch: pytest.MonkeyPatch) -> None:
     """The classes as a new process has them: what they know of another server's tables must not count here."""
     from schemas.table_map import tables
 
-    patch.setattr(_base, "_jobs", {})
+    patch.setattr(jobs, "_jobs", {})
     patch.setattr(schemas._activate, "_methods_done", set())
     for module in schemas._activate.modules():
         patch.setattr(module.schema, "database", None)

@@ -17,8 +17,8 @@ from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.video import probe
 from schemas import keypoints
-from schemas._base import file_ref, stored_file
 from schemas.ingest import Methods, Visit, ingest
+from schemas.stored_files import file_ref, stored_file
 from tests import dot_models
 from tests.rows import remove_all
 from tests.videos import constant_rate, write_video

@@ -13,9 +13,9 @@ import pbl_pipeline.video
 import schemas
 from pbl_pipeline.errors import PblError
 from schemas import _store, backup, connection, forget, tracking, video
-from schemas._base import file_ref, stored_file
 from schemas._declare import declare_all
 from schemas.ingest import Visit, ingest
+from schemas.stored_files import file_ref, stored_file
 from tests.rows import remove_all
 
 from . import chain

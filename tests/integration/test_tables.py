@@ -813,7 +813,7 @@ def test_the_page_of_the_tables_is_up_to_date():
 
 def test_methods_are_frozen(declared: None):
     from schemas import _methods
-    from schemas._base import insert_methods
+    from schemas.method_rows import insert_methods
 
     before = len(tracking.TrackingMethod()), len(fit.BodyModel()), len(gdi.NormativeSet())
     _methods.insert_all()

@@ -10,7 +10,7 @@ import pytest
 
 import schemas
 from schemas import connection, status, video
-from schemas._base import jobs_of
+from schemas.jobs import jobs_of
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,106 @@
+"""DataJoint behind our configuration, its repairs for MariaDB, and every name of it that is private.
+
+Everything else in `schemas` and `workers` uses DataJoint's public face only. `tests/unit/test_datajoint_face.py` lists
+the private names below and fails where a version of DataJoint has other ones.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from pbl_pipeline.errors import PblError
+
+# DataJoint reads its configuration while it is imported. Ours comes from `connection.configure` alone: a datajoint.json
+# that happens to lie in the working directory must not point the tables at another server.
+os.environ.setdefault("DJ_IGNORE_CONFIG_FILE", "true")
+os.environ.setdefault("DJ_LOG_LEVEL", "WARNING")
+
+with warnings.catch_warnings():
+    warnings.filterwarnings("ignore", message="No datajoint.json found")  # on purpose
+    try:
+        import datajoint
+    except ValueError as error:  # it reads the DJ_ variables while it is imported
+        raise PblError(
+            "USAGE",
+            found=str(error).split("For further information")[0].strip(),
+            expected="values of the DJ_ variables as DataJoint knows them (DJ_PORT: a number)",
+            next_step="correct the variable, or unset it",
+        ) from error
+from datajoint.adapters import ADAPTERS, MySQLAdapter
+from datajoint.errors import DuplicateError, LostConnectionError
+from datajoint.hash_registry import get_store_backend
+from datajoint.storage import StorageBackend
+from pymysql.converters import escape_string
+
+__all__ = [
+    "DuplicateError",
+    "LostConnectionError",
+    "backend_of",
+    "datajoint",
+    "dj",
+    "full_path",
+    "inserting",
+    "read_heading_again",
+]
+
+#: DataJoint without its types: its metaclass lends classes the operators of queries, which no type checker can see.
+dj: Any = datajoint
+
+
+# ------------------------------------------------------------------------------------------------------------ MariaDB
+class MySQLOrMariaDB(MySQLAdapter):
+    """DataJoint's adapter for MySQL, which makes each new connection (also a later one) work on MariaDB too.
+
+    Two things differ there. MariaDB does not see that a primary key determines the other columns of its table, so that
+    with ONLY_FULL_GROUP_BY `A.aggr(B)` fails with error 1055; and its JSON type is text, for which DataJoint hands a
+    bare dict to the driver when it stores the pointer to an object in the store.
+    """
+
+    def connect(self, *args: Any, **kwargs: Any) -> Any:
+        """The driver's connection, repaired where the server is MariaDB."""
+        connection = super().connect(*args, **kwargs)
+        if "MariaDB" in connection.get_server_info():
+            with connection.cursor() as cursor:
+                cursor.execute("SET SESSION sql_mode = REPLACE(@@SESSION.sql_mode, 'ONLY_FULL_GROUP_BY', '')")
+            connection.encoders = {**connection.encoders, dict: _json_literal}
+        return connection
+
+
+def _json_literal(value: dict[str, Any], _mapping: object = None) -> str:
+    return "'" + escape_string(json.dumps(value)) + "'"
+
+
+ADAPTERS["mysql"] = MySQLOrMariaDB
+
+
+# ------------------------------------------------------------------------------------------------------ private names
+def backend_of(name: str) -> StorageBackend:
+    """DataJoint's access to a store of the configuration."""
+    config: Any = datajoint.config
+    return get_store_backend(name, config=config)
+
+
+def full_path(backend: Any, path: str) -> str:
+    """Where a store keeps an object: a path of the file system, or `bucket/key`."""
+    return str(backend._full_path(path))
+
+
+@contextmanager
+def inserting(table: Any) -> Iterator[None]:
+    """Let a computed table (instance) take rows, as DataJoint's populate does while it inserts."""
+    cls = type(table)
+    cls._allow_insert = True
+    try:
+        yield
+    finally:
+        cls._allow_insert = False
+
+
+def read_heading_again(cls: Any) -> None:
+    """Read the columns of a table (class) anew: DataJoint keeps those that it read first."""
+    cls._heading = type(cls._heading)(table_info=cls._heading.table_info)

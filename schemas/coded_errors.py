@@ -1,0 +1,62 @@
+"""Coded errors in the error rows of jobs: what is written there, and what is read back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pbl_pipeline.errors import CODES, PblError
+
+#: Longest texts that keep a whole coded error within the 2047 characters of a job's error_message.
+_LIMITS = {"found": 600, "expected": 350, "next_step": 600, "key": 250}
+
+
+def fitted(error: PblError, key: Mapping[str, Any]) -> PblError:
+    """The same error, cut to fit the job's error row; without a key of its own it gets the job's."""
+    about = error.key if error.key is not None else ", ".join(f"{k}={v}" for k, v in key.items())
+    return PblError(
+        error.code,
+        found=_cut(error.found, _LIMITS["found"]),
+        expected=_cut(error.expected, _LIMITS["expected"]),
+        next_step=_cut(error.next_step, _LIMITS["next_step"]),
+        key=_cut(str(about), _LIMITS["key"]),
+    )
+
+
+def internal(error: BaseException, table: str, key: Mapping[str, Any]) -> PblError:
+    """INTERNAL for an error without a code: a table never shows a bare traceback as its message."""
+    about = f"{table} " + ", ".join(f"{k}={v}" for k, v in key.items())
+    return PblError(
+        "INTERNAL",
+        found=_cut(f"{type(error).__name__}: {error}", _LIMITS["found"]),
+        expected="a result or a coded error",
+        next_step="report this with the error stack that `pbl status --json` prints",
+        key=_cut(about, _LIMITS["key"]),
+    )
+
+
+def _cut(text: str, limit: int) -> str:
+    return text if len(text) <= limit else text[: limit - 4] + " ..."
+
+
+def error_code(message: str) -> str:
+    """The code of an error row's message, INTERNAL when it carries none (an error outside `make_compute`)."""
+    head = message.removeprefix("PblError: ").split(":", 1)[0].strip()
+    return head if head in CODES else "INTERNAL"
+
+
+def error_next_step(message: str) -> str:
+    """The next step an error row's message states, or how to report it. The last one: names stand before it, and the
+    name of a file may hold a line that looks like one."""
+    for line in reversed(message.splitlines()):
+        if line.strip().startswith("next:"):
+            return line.strip().removeprefix("next:").strip()
+    return "report this with the error stack that `pbl status --json` prints"
+
+
+def error_found(message: str) -> str:
+    """What an error row's message found; the message itself when it is not a coded one."""
+    for line in message.splitlines():
+        if line.strip().startswith("found:"):
+            return line.strip().removeprefix("found:").strip()
+    return message.strip()

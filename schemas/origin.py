@@ -1,0 +1,84 @@
+"""Where a result row comes from: version, method, model, host, duration, time."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import functools
+import platform
+import time
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVarTuple, cast
+
+from pbl_pipeline import __version__
+from pbl_pipeline.errors import PblError
+
+from .coded_errors import fitted, internal
+from .rows import utc_now
+
+Arguments = ParamSpec("Arguments")
+Results = TypeVarTuple("Results")
+
+
+def origin_columns(prefix: str) -> str:
+    """Definition lines that say where a result row comes from.
+
+    The names carry the table's prefix, because DataJoint refuses joins of tables that share a secondary attribute.
+    """
+    return f"""
+    {prefix}_code_version      : varchar(32)     # version of pbl-pipeline that computed the row
+    {prefix}_method_hash=null  : char(16)        # hash of the frozen parameters, null where the stage has none
+    {prefix}_model_sha256=null : char(64)        # SHA-256 of the model file, null where the stage has none
+    {prefix}_host              : varchar(64)     # computer
+    {prefix}_seconds           : float64         # (s) duration of the computation
+    {prefix}_computed          : datetime        # when it ended, UTC
+    index ({prefix}_computed)
+    """
+
+
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """Version, host, duration and time of one computation."""
+
+    code_version: str
+    host: str
+    seconds: float
+    computed: datetime.datetime
+
+    @classmethod
+    def now(cls, seconds: float) -> Origin:
+        """Of a computation that ended now, here, and took `seconds`."""
+        return cls(__version__, platform.node()[:64], round(seconds, 3), utc_now())
+
+    def row(self, prefix: str, *, method_hash: str | None = None, model_sha256: str | None = None) -> dict[str, Any]:
+        """Values of `origin_columns(prefix)`."""
+        return {
+            f"{prefix}_code_version": self.code_version,
+            f"{prefix}_method_hash": method_hash,
+            f"{prefix}_model_sha256": model_sha256,
+            f"{prefix}_host": self.host,
+            f"{prefix}_seconds": self.seconds,
+            f"{prefix}_computed": self.computed,
+        }
+
+
+def computes(make_compute: Callable[Arguments, tuple[*Results]]) -> Callable[Arguments, tuple[*Results, Origin]]:
+    """Decorator of every `make_compute`: appends an `Origin` to its results and leaves only coded errors.
+
+    A `PblError` keeps its code and next step but is cut to fit the job's error row (its full text stays in the error
+    stack, as the cause). Anything else becomes INTERNAL: a table never shows a bare traceback as its message.
+    """
+
+    @functools.wraps(make_compute)
+    def wrapper(*arguments: Arguments.args, **named: Arguments.kwargs) -> tuple[*Results, Origin]:
+        start = time.monotonic()
+        table, key = cast("tuple[Any, dict[str, Any]]", arguments[:2])
+        try:
+            result = make_compute(*arguments, **named)
+        except PblError as error:
+            raise fitted(error, key) from error
+        except Exception as error:
+            raise internal(error, type(table).__name__, key) from error
+        return (*result, Origin.now(time.monotonic() - start))
+
+    return wrapper
