@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pbl_pipeline import __version__
-from pbl_pipeline._names import distinct
 from pbl_pipeline.body import SCALE_NAMES
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import write_angles_csv
@@ -17,6 +16,7 @@ from pbl_pipeline.fit import SessionFit, TrialFit, check_trial, fit_session
 from pbl_pipeline.gait import DEFAULT_NORM, GaitMetrics, gait_metrics, load_norm
 from pbl_pipeline.keypoints import Keypoints, ModelKeypointParams, check_keypoints, detect_keypoints, params_of
 from pbl_pipeline.models import find, load_spec
+from pbl_pipeline.names import distinct
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import WARN, Check
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pbl_pipeline._names import distinct
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import distinct
 
 from . import keypoints, session, video  # noqa: F401  a definition refers to session
 from ._datajoint import dj

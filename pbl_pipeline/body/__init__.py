@@ -4,10 +4,10 @@ Frames: the body frames are OpenSim's (x forward, y up, z right), the world has 
 upright and looks along world +x, with its right side towards world -y.
 """
 
-from pbl_pipeline import _jax_setup
+from pbl_pipeline import jax_setup
 
 # Before anything below makes an array: JAX reads the cache's folder once.
-_jax_setup.configure()
+jax_setup.configure()
 
 from pbl_pipeline.body._capsules import Capsules, capsules  # noqa: E402
 from pbl_pipeline.body._kinematics import body_poses, marker_positions  # noqa: E402

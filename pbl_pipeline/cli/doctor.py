@@ -143,11 +143,11 @@ def _jax_cache() -> Finding:
     def look() -> Finding:
         import jax
 
-        from pbl_pipeline import _jax_setup
+        from pbl_pipeline import jax_setup
 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what it would warn of is the finding below
-            _jax_setup.configure()
+            jax_setup.configure()
         folder = getattr(jax.config, "jax_compilation_cache_dir", None)
         if not folder:
             return Finding("compile cache", NOTE, "off: every start compiles anew", "make PBL_CACHE a writable folder")

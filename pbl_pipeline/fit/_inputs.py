@@ -10,9 +10,17 @@ import numpy as np
 from pbl_pipeline.body import Body, MarkerSet, load_body, marker_set
 from pbl_pipeline.body._jacobian import MarkerTable
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
-from pbl_pipeline.keypoints._in_view import SEEN_SHARE, blind_runs, bridge_gaps, longest_run_s, visibility
-from pbl_pipeline.video import Camera, viewing_ray
+from pbl_pipeline.keypoints import (
+    SEEN_SHARE,
+    Keypoints,
+    MultiView,
+    WorldMarkers,
+    blind_runs,
+    bridge_gaps,
+    longest_run_s,
+    visibility,
+)
+from pbl_pipeline.video import undistort_px
 
 from ._observations import CLOCK_RANGE_S, Observations, TrialArrays, pack, pad_markers
 from ._params import ViewParams
@@ -261,14 +269,6 @@ def _check_phone(trial: Keypoints, name: str, used: np.ndarray) -> None:
             next_step="pass the log of this video, on its clock (docs/phone_capture.md), or leave it out",
             key=name,
         )
-
-
-def undistort_px(xy_px: np.ndarray, camera: Camera) -> np.ndarray:
-    """(T, J, 2) pixels of an ideal pinhole camera with the same matrix."""
-    if not np.any(camera.distortion):
-        return np.asarray(xy_px, float)
-    pinhole = viewing_ray(xy_px.reshape(-1, 2), camera) @ np.asarray(camera.matrix, np.float64).T
-    return pinhole[:, :2].reshape(xy_px.shape)
 
 
 def _input_error(found: str, expected: str, key: str | None = None, next_step: str = "") -> PblError:

@@ -10,13 +10,23 @@ from ._confidence import (
     probability_within,
 )
 from ._detect import DEFAULT, DETECTORS, PARAMSETS, KeypointParams, detect_keypoints
-from ._in_view import Gap, Visibility, visibility
+from ._in_view import (
+    SEEN_SHARE,
+    Gap,
+    Visibility,
+    blind_runs,
+    bridge_gaps,
+    longest_run_s,
+    visibility,
+    whole_person_in_view,
+)
 from ._methods import find_method, params_class, params_of
 from ._multi_view import SAME_TIME_S, MultiView, cameras_of_files
 from ._onnx_keypoints import ModelKeypointParams, ModelParams, OnnxKeypoints, method_of_model
 from ._picture import Picture, PictureMeter
 from ._protocol import KeypointDetector, PersonKeypoints
 from ._quality import check_keypoints, side_changes
+from ._trc import read_trc
 from ._types import Keypoints
 from ._view import view_rotation
 from ._world_markers import WorldMarkers
@@ -27,6 +37,7 @@ __all__ = [
     "DETECTORS",
     "PARAMSETS",
     "SAME_TIME_S",
+    "SEEN_SHARE",
     "BlazePoseLandmarks",
     "ConfidenceCurve",
     "Gap",
@@ -42,6 +53,8 @@ __all__ = [
     "PictureMeter",
     "Visibility",
     "WorldMarkers",
+    "blind_runs",
+    "bridge_gaps",
     "cameras_of_files",
     "check_keypoints",
     "confidence_curve",
@@ -49,11 +62,14 @@ __all__ = [
     "confidence_text",
     "detect_keypoints",
     "find_method",
+    "longest_run_s",
     "method_of_model",
     "params_class",
     "params_of",
     "probability_within",
+    "read_trc",
     "side_changes",
     "view_rotation",
     "visibility",
+    "whole_person_in_view",
 ]

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from scipy.special import expit
 
-from pbl_pipeline.tracking._blazepose import circle_roi
-from pbl_pipeline.tracking._litert import LiteModel
+from pbl_pipeline.models import LiteModel
+from pbl_pipeline.tracking import circle_roi
 from pbl_pipeline.video import Camera, cut_image
 
 from ._flips import leg_points, mirror_of

@@ -1,13 +1,15 @@
-"""Keypoint models as ONNX: a folder with graph and spec, the registry of this machine, sessions on CPU or CUDA."""
+"""Networks: BlazePose (tflite) and any as ONNX: folder with graph and spec, the registry, sessions on CPU or CUDA."""
 
 from ._device import DEVICES, asked_device, available_devices, providers_for
 from ._onnx import OnnxModel
 from ._registry import ModelStatus, add, find, is_registered, registered, remove, verify
-from ._spec import KINDS, ModelInput, ModelSpec, load_spec, mirror_pairs, parse_spec
+from ._spec import KINDS, ModelInput, ModelSpec, load_spec, mirror_pairs, model_invalid, parse_spec
+from ._tflite import LiteModel
 
 __all__ = [
     "DEVICES",
     "KINDS",
+    "LiteModel",
     "ModelInput",
     "ModelSpec",
     "ModelStatus",
@@ -19,6 +21,7 @@ __all__ = [
     "is_registered",
     "load_spec",
     "mirror_pairs",
+    "model_invalid",
     "parse_spec",
     "providers_for",
     "registered",

@@ -18,7 +18,7 @@ from pbl_pipeline import progress, settings
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import DAMAGED_ZIP
 
-from ._spec import GRAPH_FILE, SPEC_FILE, invalid
+from ._spec import GRAPH_FILE, SPEC_FILE, model_invalid
 
 _TIMEOUT_S = 60.0
 _CHUNK = 1 << 20
@@ -109,7 +109,7 @@ def _extract(archive: Path, folder: Path, source: str) -> None:
                 opened = tar.extractfile
             specs = [n for n, _ in members if PurePosixPath(n).name == SPEC_FILE]
             if len(specs) != 1:
-                raise invalid(source, f"{len(specs)} files {SPEC_FILE} in the archive", "one")
+                raise model_invalid(source, f"{len(specs)} files {SPEC_FILE} in the archive", "one")
             home = PurePosixPath(specs[0]).parent
             for name, size in members:
                 path = PurePosixPath(name)
@@ -123,7 +123,9 @@ def _extract(archive: Path, folder: Path, source: str) -> None:
                             file.write(chunk)
     except (*DAMAGED_ZIP, tarfile.TarError, EOFError, OSError) as error:
         what = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
-        raise invalid(source, f"no readable archive ({what})", f"a folder with {SPEC_FILE}, or its archive") from error
+        raise model_invalid(
+            source, f"no readable archive ({what})", f"a folder with {SPEC_FILE}, or its archive"
+        ) from error
 
 
 def _missing(source: str, found: str, next_step: str) -> PblError:

@@ -12,7 +12,7 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 
 from ._device import asked_device, device_of, providers_for, unavailable
-from ._spec import GRAPH_FILE, WITHOUT_POINTS, ModelSpec, invalid, load_spec
+from ._spec import GRAPH_FILE, WITHOUT_POINTS, ModelSpec, load_spec, model_invalid
 
 _DTYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
@@ -53,7 +53,9 @@ class OnnxModel:
         except Exception as error:
             if asked_device(device) == "cuda" and "CUDA" in str(error):
                 raise unavailable(_first_line(error)) from error
-            raise invalid(self._path, _first_line(error), "a graph that the installed onnxruntime loads") from error
+            raise model_invalid(
+                self._path, _first_line(error), "a graph that the installed onnxruntime loads"
+            ) from error
         self.device = device_of(self._session.get_providers())
         self.note = ""
         if asked_device(device) == "cuda" and self.device != "cuda":
@@ -66,7 +68,9 @@ class OnnxModel:
         try:
             got = self(black)
         except Exception as error:
-            raise invalid(self._path, f"it does not run: {_first_line(error)}", "a graph that computes") from error
+            raise model_invalid(
+                self._path, f"it does not run: {_first_line(error)}", "a graph that computes"
+            ) from error
         self._check_shapes(got)
 
     def __call__(self, crops: np.ndarray, gamma: np.ndarray | None = None) -> dict[str, np.ndarray]:
@@ -140,7 +144,7 @@ class OnnxModel:
                 raise self._wrong(f"{self.spec.outputs[role]} of shape {array.shape}", expected)
 
     def _wrong(self, found: str, expected: str) -> PblError:
-        return invalid(self._path, found, f"{expected}, as its model.json says")
+        return model_invalid(self._path, found, f"{expected}, as its model.json says")
 
 
 def check_graph_file(folder: str | Path, spec: ModelSpec) -> bytes:

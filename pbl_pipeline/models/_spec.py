@@ -115,9 +115,9 @@ def load_spec(folder: str | Path) -> ModelSpec:
             key=str(path),
         ) from error
     except (ValueError, RecursionError) as error:
-        raise invalid(path, f"no JSON text ({error})", "a JSON object") from error
+        raise model_invalid(path, f"no JSON text ({error})", "a JSON object") from error
     if not isinstance(content, dict):
-        raise invalid(path, "no named fields", "a JSON object")
+        raise model_invalid(path, "no named fields", "a JSON object")
     return parse_spec(content, path)
 
 
@@ -128,27 +128,27 @@ def parse_spec(content: Mapping[str, Any], path: str | Path) -> ModelSpec:
     _fields(path, "", content, required, (*(_OPTIONAL_POINTS if points else ()), *_OPTIONAL))
     name = _text(path, content, "name")
     if not _NAME.fullmatch(name):
-        raise invalid(path, f"name {name!r}", "small letters, digits, '.', '_' and '-', at most 40")
+        raise model_invalid(path, f"name {name!r}", "small letters, digits, '.', '_' and '-', at most 40")
     kind = _text(path, content, "kind")
     if kind not in KINDS:
-        raise invalid(path, f"kind {kind!r}", f"one of {', '.join(KINDS)}")
+        raise model_invalid(path, f"kind {kind!r}", f"one of {', '.join(KINDS)}")
     sha256 = _text(path, content, "sha256").lower()
     if not _SHA256.fullmatch(sha256):
-        raise invalid(path, f"sha256 {sha256[:80]!r}", f"the 64 hex digits of the SHA-256 of {GRAPH_FILE}")
+        raise model_invalid(path, f"sha256 {sha256[:80]!r}", f"the 64 hex digits of the SHA-256 of {GRAPH_FILE}")
     outputs = content["outputs"]
     if not isinstance(outputs, dict) or set(outputs) != set(KINDS[kind]) or not _all_text(outputs.values()):
-        raise invalid(path, f"outputs {outputs!r}", f"the graph's names of {', '.join(KINDS[kind])}")
+        raise model_invalid(path, f"outputs {outputs!r}", f"the graph's names of {', '.join(KINDS[kind])}")
     names = content.get("joint_names", [])
     if not isinstance(names, list) or bool(names) != points or not _all_text(names) or len(set(names)) != len(names):
-        raise invalid(path, "joint_names: not a list of names, all different", "a name for each point, in order")
+        raise model_invalid(path, "joint_names: not a list of names, all different", "a name for each point, in order")
     markers = _text(path, content, "marker_set") if points else ""
     if len(markers) > 32:
-        raise invalid(path, f"marker_set of {len(markers)} characters", "at most 32")
+        raise model_invalid(path, f"marker_set of {len(markers)} characters", "at most 32")
     if points:
         _check_marker_set(markers, names)
     origin = content.get("pixel_origin", "centre")
     if origin not in ("centre", "edge"):
-        raise invalid(path, f"pixel_origin {origin!r}", "'centre' or 'edge'")
+        raise model_invalid(path, f"pixel_origin {origin!r}", "'centre' or 'edge'")
     hashed = {k: v for k, v in content.items() if k not in _WORDS}
     return ModelSpec(
         name=name,
@@ -185,7 +185,7 @@ def mirror_pairs(names: Sequence[str]) -> list[tuple[str, str]]:
     return pairs
 
 
-def invalid(path: str | Path, found: str, expected: str) -> PblError:
+def model_invalid(path: str | Path, found: str, expected: str) -> PblError:
     """MODEL_INVALID about a file of a model."""
     return PblError(
         "MODEL_INVALID",
@@ -202,18 +202,18 @@ def _mirror(path: str | Path, names: list[str], stated: Any) -> tuple[int, ...]:
     elif isinstance(stated, list) and all(isinstance(p, list) and len(p) == 2 and _all_text(p) for p in stated):
         pairs = [(a, b) for a, b in stated]
     else:
-        raise invalid(path, "mirror_pairs: not a list of pairs of names", "[[left, right], ...]")
+        raise model_invalid(path, "mirror_pairs: not a list of pairs of names", "[[left, right], ...]")
     flat = [n for pair in pairs for n in pair]
     wrong = sorted({n for n in flat if n not in names or flat.count(n) > 1})
     if wrong:
-        raise invalid(path, f"mirror_pairs with {', '.join(wrong)}", "names of joint_names, each once at most")
+        raise model_invalid(path, f"mirror_pairs with {', '.join(wrong)}", "names of joint_names, each once at most")
     out = list(range(len(names)))
     for left, right in pairs:
         i, j = names.index(left), names.index(right)
         out[i], out[j] = j, i
     lone = [n for i, n in enumerate(names) if out[i] == i and re.search("left|right", n.lower())]
     if lone:
-        raise invalid(path, f"no other side of {', '.join(lone)}", "a pair for each, by name or in mirror_pairs")
+        raise model_invalid(path, f"no other side of {', '.join(lone)}", "a pair for each, by name or in mirror_pairs")
     return tuple(out)
 
 
@@ -227,20 +227,20 @@ def _check_marker_set(markers: str, names: Sequence[str]) -> None:
 
 def _input(path: str | Path, value: Any) -> ModelInput:
     if not isinstance(value, dict):
-        raise invalid(path, "input: no named fields", f"an object with {', '.join(_INPUT)}")
+        raise model_invalid(path, "input: no named fields", f"an object with {', '.join(_INPUT)}")
     _fields(path, "input.", value, _INPUT, ())
     layout, colour = _text(path, value, "layout"), _text(path, value, "colour")
     if layout not in ("NCHW", "NHWC") or colour not in ("RGB", "BGR"):
-        raise invalid(path, f"input layout {layout!r}, colour {colour!r}", "NCHW or NHWC, RGB or BGR")
+        raise model_invalid(path, f"input layout {layout!r}, colour {colour!r}", "NCHW or NHWC, RGB or BGR")
     for side in ("width", "height"):
         size = value[side]
         if not isinstance(size, int) or isinstance(size, bool) or not 16 <= size <= 4096:
-            raise invalid(path, f"input {side} {size!r}", "a whole number of pixels, 16 to 4096")
+            raise model_invalid(path, f"input {side} {size!r}", "a whole number of pixels, 16 to 4096")
     for field in ("mean", "std"):
         numbers = value[field]
         three = isinstance(numbers, list) and len(numbers) == 3 and all(_is_number(n) for n in numbers)
         if not three or (field == "std" and min(numbers) <= 0):
-            raise invalid(path, f"input {field} {numbers!r}", "three numbers on the scale 0..255, std positive")
+            raise model_invalid(path, f"input {field} {numbers!r}", "three numbers on the scale 0..255, std positive")
     mean, std = tuple(map(float, value["mean"])), tuple(map(float, value["std"]))
     name = _text(path, value, "name")
     return ModelInput(name, value["width"], value["height"], layout, colour, mean, std)  # type: ignore[arg-type]
@@ -254,13 +254,13 @@ def _fields(
     if missing or unknown:
         found = [f"no {', '.join(missing)}"] * bool(missing) + [f"unknown {', '.join(unknown)}"] * bool(unknown)
         known = f"the fields {', '.join(required)}" + (f"; optional {', '.join(optional)}" if optional else "")
-        raise invalid(path, "; ".join(found), known)
+        raise model_invalid(path, "; ".join(found), known)
 
 
 def _text(path: str | Path, content: Mapping[str, Any], field: str) -> str:
     value = content[field]
     if not isinstance(value, str) or not value.strip() or len(value) > _LONGEST:
-        raise invalid(path, f"{field} {str(value)[:80]!r}", f"a text of 1 to {_LONGEST} characters")
+        raise model_invalid(path, f"{field} {str(value)[:80]!r}", f"a text of 1 to {_LONGEST} characters")
     return value.strip()
 
 
@@ -275,5 +275,5 @@ def _is_number(value: Any) -> bool:
 def _number(path: str | Path, content: Mapping[str, Any], field: str, default: float, low: float, high: float) -> float:
     value = content.get(field, default)
     if not _is_number(value) or not low <= value <= high:
-        raise invalid(path, f"{field} {value!r}", f"a number from {low:g} to {high:g}")
+        raise model_invalid(path, f"{field} {value!r}", f"a number from {low:g} to {high:g}")
     return float(value)

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from markupsafe import Markup
 
+from pbl_pipeline import charts
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import GaitCycle, GaitEvents, NormalBands
 from pbl_pipeline.render import SIDE_COLOUR, stance_spans
-from pbl_pipeline.report import _svg
 from pbl_pipeline.report._types import Picture
 from pbl_pipeline.report._words import ANGLES, FOOT_ANGLES, PELVIS_ANGLES, number, plural
 
@@ -28,7 +28,7 @@ def cycle_charts(cycles: Sequence[GaitCycle], bands: NormalBands) -> list[dict]:
     foot_off = {s: _foot_off([c for c in usable if c.side == s]) for s in _SIDES}
     names = {k: (title, positive) for k, (title, _, _, positive) in ANGLES.items()}
     names |= FOOT_ANGLES | PELVIS_ANGLES
-    charts = []
+    drawn = []
     for key, (title, positive) in names.items():
         by_side = {s: [c.curves[key] for c in usable if c.side == s and key in c.curves] for s in _SIDES}
         if not any(by_side.values()):
@@ -38,17 +38,17 @@ def cycle_charts(cycles: Sequence[GaitCycle], bands: NormalBands) -> list[dict]:
         ranges = [
             f"{side} {number(float(np.min(mean)), 0)} to {number(float(np.max(mean)), 0)}\N{DEGREE SIGN}"
             for side, curves in by_side.items()
-            if curves and np.isfinite(mean := _svg.mean_curve(curves)).all()
+            if curves and np.isfinite(mean := charts.mean_curve(curves)).all()
         ]
         label = f"{title} in degrees over the gait cycle in percent. Mean curves: {', '.join(ranges)}."
-        charts.append(
+        drawn.append(
             {
                 "name": title,
                 "note": ", ".join(x for x in (positive, "" if band is not None else "no norm") if x),
-                "svg": _svg.cycle_chart(label, percent, by_side, foot_off, band),
+                "svg": charts.cycle_chart(label, percent, by_side, foot_off, band),
             }
         )
-    return charts
+    return drawn
 
 
 def time_charts(fit: TrialFit, events: GaitEvents | None) -> list[dict]:
@@ -58,7 +58,7 @@ def time_charts(fit: TrialFit, events: GaitEvents | None) -> list[dict]:
         return []
     column = {name: i for i, name in enumerate(fit.joint_names)}
     spans = {s: stance_spans(events.events, s) for s in _SIDES} if events is not None else {}
-    charts = []
+    drawn = []
     for title, joint, sign, positive in ANGLES.values():
         curves = {
             side: sign * np.degrees(qpos[:, column[f"{joint}_{side[0]}"]])
@@ -66,8 +66,8 @@ def time_charts(fit: TrialFit, events: GaitEvents | None) -> list[dict]:
             if f"{joint}_{side[0]}" in column
         }
         label = f"{title} in degrees over the {fit.time_s[-1]:.1f} seconds of the recording."
-        charts.append({"name": title, "note": positive, "svg": _svg.time_chart(label, fit.time_s, curves, spans)})
-    return charts
+        drawn.append({"name": title, "note": positive, "svg": charts.time_chart(label, fit.time_s, curves, spans)})
+    return drawn
 
 
 def contact_chart(fit: TrialFit, events: GaitEvents) -> Markup | None:
@@ -78,7 +78,7 @@ def contact_chart(fit: TrialFit, events: GaitEvents) -> Markup | None:
         f"{side} foot down {len(events.times(side, 'foot_down'))} and up {len(events.times(side, 'foot_up'))} times"
         for side in _SIDES
     )
-    return _svg.contact_chart(
+    return charts.contact_chart(
         f"Foot contacts over the recording: {counts}.",
         float(fit.time_s[-1]),
         known_spans(fit),
@@ -101,7 +101,7 @@ def index_chart(values: dict[str, list[float]], title: str) -> Markup | None:
     means = ", ".join(
         f"{side} mean {np.mean(v):.1f} of {plural(len(v), 'cycle')}" for side, v in values.items() if len(v)
     )
-    return _svg.index_chart(f"{title} per cycle: {means}.", values)
+    return charts.index_chart(f"{title} per cycle: {means}.", values)
 
 
 def picture(trial: str, p: Picture) -> dict:

@@ -2,17 +2,17 @@
 
 from ._appearance import likeness, look_of
 from ._associate import AssociationParams
-from ._blazepose import BlazePoseDetector
-from ._carry import carried_choice, same_person
-from ._join import JoinParams
+from ._blazepose import BlazePoseDetector, body_box, box_iou, circle_roi
+from ._detection_schedule import WatchParams
+from ._identity_swaps import UncrossParams
 from ._methods import find_method, method_of_detector
+from ._reidentify import JoinParams
 from ._require import require_subject
 from ._sheet import contact_sheet, contact_sheet_jpeg, save_contact_sheet
 from ._subject import SUBJECT_DEFAULT, SUBJECT_PARAMSETS, SubjectParams, choose_subject, time_in_view_s
 from ._track import DEFAULT, DETECTORS, PARAMSETS, TrackingParams, track_people
+from ._transfer_choice import carried_choice, same_person
 from ._types import Detection, PersonDetector, PersonTrack, SubjectChoice, Tracking
-from ._uncross import UncrossParams
-from ._watch import WatchParams
 from ._yolox import YoloxDetector
 
 __all__ = [
@@ -34,8 +34,11 @@ __all__ = [
     "UncrossParams",
     "WatchParams",
     "YoloxDetector",
+    "body_box",
+    "box_iou",
     "carried_choice",
     "choose_subject",
+    "circle_roi",
     "contact_sheet",
     "contact_sheet_jpeg",
     "find_method",

@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 from scipy.special import expit
 
-from ._litert import LiteModel
+from pbl_pipeline.models import LiteModel
+
 from ._types import Detection
 
 MODEL_SHA256 = "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c"

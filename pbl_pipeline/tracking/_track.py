@@ -10,21 +10,21 @@ from pathlib import Path
 import numpy as np
 
 from pbl_pipeline import assets, progress
-from pbl_pipeline._ahead import ahead
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.models import OnnxModel, find
 from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.prefetch import prefetched
 from pbl_pipeline.video import VideoInfo, probe, read_frames
 
 from ._appearance import look_of
 from ._associate import AssociationParams, Associator, Trail, measure
+from ._backtrack import rewind
 from ._blazepose import MODEL_SHA256, BlazePoseDetector, body_box, box_iou
-from ._join import JoinParams, join_trails
-from ._rewind import rewind
+from ._detection_schedule import Watch, WatchParams, window_around
+from ._identity_swaps import UncrossParams, uncross
+from ._reidentify import JoinParams, join_trails
 from ._tiles import detect_in
 from ._types import Detection, PersonDetector, PersonTrack, Tracking
-from ._uncross import UncrossParams, uncross
-from ._watch import Watch, WatchParams, window_around
 from ._yolox import YoloxDetector
 
 #: A second look must find a new person with at least this overlap of the boxes; nearer to where somebody known is
@@ -131,7 +131,7 @@ def _follow(video_path: str | Path, params: TrackingParams, detector: PersonDete
     # The frames of the last searches, to follow new people back in: as long as a turn of all windows takes.
     kept: deque[tuple[int, float, np.ndarray]] = deque(maxlen=watch.n_turn)
     n_frames = 0
-    frames = ahead(read_frames(video_path), FRAMES_AHEAD)
+    frames = prefetched(read_frames(video_path), FRAMES_AHEAD)
     for frame in progress.track(frames, "people", total=info.n_frames):
         n_frames, now = n_frames + 1, frame.time_s
         associator.forget(now)

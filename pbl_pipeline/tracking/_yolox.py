@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.models import OnnxModel
-from pbl_pipeline.models._spec import invalid
+from pbl_pipeline.models import OnnxModel, model_invalid
 
 from ._types import Detection
 
@@ -90,4 +89,4 @@ class YoloxDetector:
         ]
 
     def _invalid(self, found: str, expected: str) -> PblError:
-        return invalid(self._model.folder, found, expected)
+        return model_invalid(self._model.folder, found, expected)

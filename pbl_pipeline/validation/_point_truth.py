@@ -17,12 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import marker_set
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit._inputs import undistort_px
-from pbl_pipeline.keypoints import Keypoints
-from pbl_pipeline.keypoints._trc import read_trc
+from pbl_pipeline.keypoints import Keypoints, read_trc
 from pbl_pipeline.render import to_pixels
 from pbl_pipeline.synthetic import Truth
-from pbl_pipeline.video import Camera, CameraPose
+from pbl_pipeline.video import Camera, CameraPose, undistort_px
 
 from ._sources import load_bodies
 

@@ -12,8 +12,8 @@ import pandas as pd
 from markupsafe import Markup
 
 import pbl_pipeline
+from pbl_pipeline.charts import Axes, nice_ticks
 from pbl_pipeline.keypoints import BOUND_TRUNK, ConfidenceCurve
-from pbl_pipeline.report._svg import Axes, nice_ticks
 
 from ._reliability import PointErrors, reliability_table
 

@@ -3,7 +3,7 @@
 from ._attitude import Attitude, camera_in_device, check_attitude
 from ._board import Board
 from ._calibrate import Calibration, calibrate_video
-from ._camera import guess_camera, load_camera, viewing_ray
+from ._camera import guess_camera, load_camera, undistort_px, viewing_ray
 from ._camera_pose import CameraPose, load_camera_poses
 from ._cut import cut_image
 from ._draw_calibration import draw_calibration
@@ -59,5 +59,6 @@ __all__ = [
     "read_phone_log",
     "sha256_of",
     "turned_camera",
+    "undistort_px",
     "viewing_ray",
 ]

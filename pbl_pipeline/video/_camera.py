@@ -195,3 +195,11 @@ def viewing_ray(xy_px: np.ndarray, camera: Camera) -> np.ndarray:
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
     flat = cv2.undistortPoints(points, matrix, distortion, criteria=stop)
     return np.column_stack([flat.reshape(-1, 2), np.ones(len(points))])
+
+
+def undistort_px(xy_px: np.ndarray, camera: Camera) -> np.ndarray:
+    """Pixels (..., 2) of the distorted picture as an ideal pinhole camera with the same matrix would see them."""
+    if not np.any(camera.distortion):
+        return np.asarray(xy_px, float)
+    pinhole = viewing_ray(xy_px.reshape(-1, 2), camera) @ np.asarray(camera.matrix, np.float64).T
+    return pinhole[:, :2].reshape(xy_px.shape)

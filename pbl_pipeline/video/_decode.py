@@ -17,8 +17,8 @@ import av
 from av.container import InputContainer
 from av.error import FFmpegError
 
-from pbl_pipeline._memory import return_large_blocks
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.memory import return_large_blocks
 
 from ._structure import family, missing_end
 

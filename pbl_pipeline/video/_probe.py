@@ -13,9 +13,9 @@ import numpy as np
 
 from pbl_pipeline import progress
 
+from ._container_tags import read_tags
 from ._decode import Decoder, check_file
 from ._orientation import Orientation, orientation_of
-from ._tags import read_tags
 from ._timing import speed_notes
 from ._types import FirstPicture, VideoInfo
 

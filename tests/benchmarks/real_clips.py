@@ -24,11 +24,11 @@ from pathlib import Path
 import click
 import numpy as np
 
+from pbl_pipeline.charts import Axes, nice_ticks
 from pbl_pipeline.fit import DEFAULT, PARAMSETS, TrialFit, fit_session, params_of
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.pipeline import detect_trial
-from pbl_pipeline.report._svg import Axes, nice_ticks
 from pbl_pipeline.validation import BODY_ROTATIONS, fit_angles, fit_angles_sd, reference_of_bodies
 from tests.conftest import SHARED
 

@@ -10,8 +10,8 @@ import numpy as np
 from pbl_pipeline.tracking import AssociationParams, Detection, JoinParams, UncrossParams
 from pbl_pipeline.tracking._associate import Associator, Trail
 from pbl_pipeline.tracking._blazepose import body_box, box_iou
-from pbl_pipeline.tracking._join import join_trails
-from pbl_pipeline.tracking._uncross import uncross
+from pbl_pipeline.tracking._identity_swaps import uncross
+from pbl_pipeline.tracking._reidentify import join_trails
 
 SIZE = (1920, 1080)
 #: Nearer than so many body heights, the noise decides which detection is whose, and nothing follows from it.

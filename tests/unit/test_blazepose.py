@@ -17,10 +17,10 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import BlazePoseLandmarks
 from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES, _same_sides
 from pbl_pipeline.keypoints._flips import leg_points
+from pbl_pipeline.models import LiteModel
+from pbl_pipeline.models._tflite_outputs import keep_outputs
 from pbl_pipeline.tracking import BlazePoseDetector
 from pbl_pipeline.tracking._blazepose import N_ANCHORS, anchor_centres, decode, suppress
-from pbl_pipeline.tracking._litert import LiteModel
-from pbl_pipeline.tracking._prune import keep_outputs
 from pbl_pipeline.tracking._tiles import detect_in, tiles
 from pbl_pipeline.video import Camera, read_frames
 

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import jax
 
-from pbl_pipeline import _jax_setup
+from pbl_pipeline import jax_setup
 
 SHOW = (
     "import pbl_pipeline.body, jax\n"
-    "from pbl_pipeline import _jax_setup\n"
-    "_jax_setup.configure()\n"
+    "from pbl_pipeline import jax_setup\n"
+    "jax_setup.configure()\n"
     "c = jax.config\n"
     "print(c.jax_compilation_cache_dir, c.jax_persistent_cache_min_compile_time_secs,\n"
     "      c.jax_persistent_cache_min_entry_size_bytes, jax.numpy.zeros(1).dtype, sep='|')\n"
@@ -50,9 +50,9 @@ def test_a_compiled_program_is_written(tmp_path):
 
 
 def test_only_the_known_lines_are_dropped():
-    assert _jax_setup._is_absent_warp("Failed to import warp: No module named 'warp'\n")
-    assert _jax_setup._is_absent_warp("Failed to import mujoco_warp: No module named 'warp'\n")
-    assert not _jax_setup._is_absent_warp("Failed to import warp: libcuda.so.1 not found\n")
+    assert jax_setup._is_absent_warp("Failed to import warp: No module named 'warp'\n")
+    assert jax_setup._is_absent_warp("Failed to import mujoco_warp: No module named 'warp'\n")
+    assert not jax_setup._is_absent_warp("Failed to import warp: libcuda.so.1 not found\n")
 
 
 def test_load_body_may_be_called_first_inside_a_trace():

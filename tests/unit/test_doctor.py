@@ -25,7 +25,7 @@ def machine(tmp_path, monkeypatch):
     monkeypatch.setenv("PBL_OFFLINE", "1")
     monkeypatch.delenv("DJ_HOST", raising=False)
     # It acts once per process: the cache folder of this test must not become that of all other tests.
-    monkeypatch.setattr("pbl_pipeline._jax_setup.configure", lambda: None)
+    monkeypatch.setattr("pbl_pipeline.jax_setup.configure", lambda: None)
     programs = tmp_path / "bin"
     programs.mkdir()
     (programs / "mariadbd").write_text("#!/bin/sh\n")

@@ -29,14 +29,14 @@ from pbl_pipeline.fit._costs import (
     project_px,
     scale_prior,
 )
-from pbl_pipeline.fit._inputs import undistort_px
 from pbl_pipeline.fit._place import root_positions
 from pbl_pipeline.fit._prior import prior_of
 from pbl_pipeline.fit._quality import _converged
 from pbl_pipeline.fit._trajectory import fit_ranges, pose_of, raw_of
 from pbl_pipeline.fit.solvers import Solution
-from pbl_pipeline.keypoints._in_view import bridge_gaps, longest_run_s, whole_person_in_view
+from pbl_pipeline.keypoints import bridge_gaps, longest_run_s, whole_person_in_view
 from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.video import undistort_px
 from tests.walker import CAMERA, observe, walking_qpos
 
 TIME_S = np.arange(0, 2.6, 1 / 30)

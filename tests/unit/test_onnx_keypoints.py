@@ -38,9 +38,9 @@ from pbl_pipeline.keypoints._blazepose import NAMES as BLAZEPOSE_NAMES
 from pbl_pipeline.keypoints._decode_2d import from_heatmap, from_simcc
 from pbl_pipeline.keypoints._root import absolute_root
 from pbl_pipeline.keypoints._virtual_camera import crops, look_at
+from pbl_pipeline.models import LiteModel
 from pbl_pipeline.pipeline import _models
 from pbl_pipeline.tracking import PersonTrack, Tracking
-from pbl_pipeline.tracking._litert import LiteModel
 from pbl_pipeline.video import Camera, Frame, probe, read_frames, viewing_ray
 from tests import dot_models
 from tests.command import pbl

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.body import load_body
+from pbl_pipeline.charts import cycle_chart, mean_curve, nice_ticks
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit, TrialFit
 from pbl_pipeline.gait import GaitMetrics, gait_metrics, load_norm
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, PASS, WARN, Check
 from pbl_pipeline.report import Picture, SessionReport, TrialReport, write_report
-from pbl_pipeline.report._svg import cycle_chart, mean_curve, nice_ticks
 from pbl_pipeline.report._words import check_name, number, plural, sentence, significant, size
 from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.video import VideoInfo

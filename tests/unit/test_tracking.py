@@ -24,7 +24,7 @@ from pbl_pipeline.tracking import (
 )
 from pbl_pipeline.tracking._associate import Associator, Trail
 from pbl_pipeline.tracking._blazepose import body_box, box_iou, circle_roi
-from pbl_pipeline.tracking._join import JoinParams, join_trails
+from pbl_pipeline.tracking._reidentify import JoinParams, join_trails
 from pbl_pipeline.tracking._tiles import detect_in, merge, tile_starts, tiles
 from pbl_pipeline.video import probe
 from tests.videos import constant_rate, write_video

@@ -10,8 +10,8 @@ import pytest
 from pbl_pipeline.tracking import JoinParams, UncrossParams, likeness
 from pbl_pipeline.tracking._appearance import look_of
 from pbl_pipeline.tracking._associate import Trail
-from pbl_pipeline.tracking._join import join_trails
-from pbl_pipeline.tracking._uncross import uncross
+from pbl_pipeline.tracking._identity_swaps import uncross
+from pbl_pipeline.tracking._reidentify import join_trails
 from tests.unit.crossings import Walker, clothes, identities, scene
 from tests.unit.test_tracking import person
 

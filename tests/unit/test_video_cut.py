@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from av.video.reformatter import VideoReformatter
 
-from pbl_pipeline._ahead import ahead
+from pbl_pipeline.prefetch import prefetched
 from pbl_pipeline.video import cut_image, read_frames
 from pbl_pipeline.video._cut_planes import cut_planes
 from pbl_pipeline.video._orientation import Orientation
@@ -154,7 +154,7 @@ def test_ahead_gives_all_in_order_and_then_the_error():
         yield from range(20)
         raise OSError("the disk is gone")
 
-    items = ahead(source(), 3)
+    items = prefetched(source(), 3)
     assert [next(items) for _ in range(20)] == list(range(20))
     with pytest.raises(OSError, match="disk is gone"):
         next(items)
@@ -168,7 +168,7 @@ def test_ahead_works_while_nobody_asks_and_no_further_than_told():
             made.append(i)
             yield i
 
-    items = ahead(source(), 3)
+    items = prefetched(source(), 3)
     assert next(items) == 0
     until = time.monotonic() + 10
     while len(made) < 5 and time.monotonic() < until:

@@ -18,9 +18,9 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array
 
-from pbl_pipeline._jax_setup import compile_seconds
 from pbl_pipeline.body import SLIDES, Body
 from pbl_pipeline.body._jacobian import MarkerTable
+from pbl_pipeline.jax_setup import compile_seconds
 
 from .._inputs import Session
 from .._marker_cost import Kinds, kinds_of

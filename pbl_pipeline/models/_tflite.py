@@ -10,7 +10,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 
-from ._prune import keep_outputs
+from ._tflite_outputs import keep_outputs
 
 #: Two threads are the sweet spot of these small models; more only waits. Not a method parameter.
 NUM_THREADS = 2

@@ -14,7 +14,7 @@ import numpy as np
 
 from ._appearance import likeness, mean_look
 from ._associate import Trail, measure
-from ._line import line_near
+from ._local_motion import line_near
 
 
 @dataclasses.dataclass(frozen=True)

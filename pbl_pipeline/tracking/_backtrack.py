@@ -9,9 +9,9 @@ import numpy as np
 
 from ._appearance import look_of
 from ._associate import AssociationParams, Trail, measure, pair_cost
+from ._detection_schedule import window_around
 from ._tiles import detect_in
 from ._types import PersonDetector
-from ._watch import window_around
 
 #: A person may be missed in so many of the kept frames on the way back.
 MAX_MISSES = 1

@@ -12,7 +12,7 @@ _END = object()
 _POLL_S = 0.1
 
 
-def ahead(source: Iterable[T], n: int) -> Generator[T, None, None]:
+def prefetched(source: Iterable[T], n: int) -> Generator[T, None, None]:
     """The items of `source`, of which up to `n` are ready before they are asked for.
 
     What `source` raises is raised here, after the items before it. When the caller stops early, the thread ends before
@@ -41,7 +41,7 @@ def ahead(source: Iterable[T], n: int) -> Generator[T, None, None]:
         finally:
             put(_END)
 
-    thread = threading.Thread(target=work, name="ahead", daemon=True)
+    thread = threading.Thread(target=work, name="prefetch", daemon=True)
     thread.start()
     try:
         while (item := ready.get()) is not _END:
