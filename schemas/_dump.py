@@ -21,12 +21,11 @@ import pymysql
 from pymysql.converters import escape_string
 from pymysql.cursors import SSCursor
 
+from ._catalog import Column, quote
+
 #: A statement of inserts is ended when it is longer than this (characters); the server takes far more.
 STATEMENT = 1_000_000
 _FETCH = 500
-#: Marks a column whose values name files of the store, in the comment that DataJoint gives it.
-STORED = re.compile(r"^:<(object|npy|blob|attach|hash)@")
-
 HEADER = (
     "SET NAMES utf8mb4",
     "SET SESSION time_zone = '+00:00'",
@@ -36,81 +35,38 @@ HEADER = (
 )
 
 
-def tables_of(server: pymysql.Connection[Any], prefix: str) -> list[tuple[str, str]]:
-    """Schema and name of every table under a prefix, also DataJoint's own that begin with `~`, in order."""
-    with server.cursor() as cursor:
-        cursor.execute(
-            "SELECT table_schema, table_name FROM information_schema.tables "
-            "WHERE table_schema LIKE %s AND table_type = 'BASE TABLE' ORDER BY table_schema, table_name",
-            (like(prefix),),
-        )
-        return [(row[0], row[1]) for row in cursor.fetchall()]
-
-
-def schemas_of(server: pymysql.Connection[Any], prefix: str) -> list[str]:
-    """The schemas under a prefix, also empty ones."""
-    with server.cursor() as cursor:
-        cursor.execute(
-            "SELECT schema_name FROM information_schema.schemata WHERE schema_name LIKE %s ORDER BY schema_name",
-            (like(prefix),),
-        )
-        return [row[0] for row in cursor.fetchall()]
-
-
-def like(prefix: str) -> str:
-    """The pattern of the schemas' names: in it an underscore stands for any character unless escaped."""
-    return f"{prefix}_%".replace("_", r"\_")
-
-
-def quote(name: str) -> str:
-    """A name as a statement has it."""
-    return "`" + name.replace("`", "``") + "`"
-
-
-def columns_of(server: pymysql.Connection[Any], schema: str, table: str) -> list[tuple[str, str, str]]:
-    """Name, type and comment of the columns of a table that hold values of their own (none that are generated)."""
-    with server.cursor() as cursor:
-        cursor.execute(
-            "SELECT column_name, data_type, column_comment FROM information_schema.columns "
-            "WHERE table_schema = %s AND table_name = %s AND extra NOT LIKE '%%GENERATED%%' ORDER BY ordinal_position",
-            (schema, table),
-        )
-        return [(row[0], row[1].lower(), row[2]) for row in cursor.fetchall()]
-
-
 def create_statement(server: pymysql.Connection[Any], schema: str, table: str) -> str:
     """The statement that makes the table, on one line (comments have their line breaks written out already)."""
     with server.cursor() as cursor:
-        cursor.execute(f"SHOW CREATE TABLE {quote(schema)}.{quote(table)}")
+        cursor.execute(f"SHOW CREATE TABLE {quote(schema, table)}")
         row = cursor.fetchone()
     assert row is not None
     text = row[1].decode() if isinstance(row[1], bytes) else row[1]
     return re.sub(r"\n\s*", " ", text)
 
 
-def rows_of(
-    server: pymysql.Connection[Any], schema: str, table: str, columns: Sequence[tuple[str, str, str]]
-) -> Iterator[tuple]:
+def rows_of(server: pymysql.Connection[Any], schema: str, table: str, columns: Sequence[Column]) -> Iterator[tuple]:
     """The rows of a table, read from the server as they are needed.
 
     The connection must have been opened with `conv={}`: values are text as the server prints it, or bytes.
     """
     # A single-precision number is printed with six digits; as double precision it is printed to the last one.
-    chosen = ", ".join(f"{quote(c)} + 0e0" if kind == "float" else quote(c) for c, kind, _ in columns)
+    chosen = ", ".join(f"{quote(c.name)} + 0e0" if c.type == "float" else quote(c.name) for c in columns)
     with server.cursor(SSCursor) as cursor:
-        cursor.execute(f"SELECT {chosen} FROM {quote(schema)}.{quote(table)}")  # noqa: S608  names of the server's own
+        cursor.execute(f"SELECT {chosen} FROM {quote(schema, table)}")  # noqa: S608  names of the server's own
         while rows := cursor.fetchmany(_FETCH):
             yield from rows
 
 
-def save_table(server: pymysql.Connection[Any], schema: str, table: str, out: gzip.GzipFile) -> tuple[int, set[str]]:
+def save_table(
+    server: pymysql.Connection[Any], schema: str, table: str, columns: Sequence[Column], out: gzip.GzipFile
+) -> tuple[int, set[str]]:
     """Write the statements that make a table and insert its rows; returns how many rows, and the files they name."""
-    columns = columns_of(server, schema, table)
-    stored = [i for i, (_, _, comment) in enumerate(columns) if STORED.match(comment)]
+    stored = [i for i, column in enumerate(columns) if column.names_files]
     write_line(out, f"USE {quote(schema)}")
     write_line(out, create_statement(server, schema, table))
-    names = ", ".join(quote(c) for c, _, _ in columns)
-    head = f"INSERT INTO {quote(schema)}.{quote(table)} ({names}) VALUES "  # noqa: S608  values are escaped
+    names = ", ".join(quote(c.name) for c in columns)
+    head = f"INSERT INTO {quote(schema, table)} ({names}) VALUES "  # noqa: S608  values are escaped
     n, size, files = 0, 0, set()
     parts: list[str] = []
     for row in rows_of(server, schema, table, columns):

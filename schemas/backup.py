@@ -16,7 +16,7 @@ import datetime
 import gzip
 import hashlib
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import closing
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -26,7 +26,8 @@ import pymysql
 from pbl_pipeline import __version__, progress
 from pbl_pipeline.errors import PblError
 
-from . import _dump, connection
+from . import _catalog, _dump, connection
+from ._catalog import Column, quote
 from ._store import store_error
 
 FORMAT = 1
@@ -72,7 +73,7 @@ def backup(folder: Path, store: bool = True, say: Say = lambda _: None) -> Backu
     try:
         with closing(connection.plain_connection(conv={})) as server:
             version = _snapshot(server)
-            tables = _dump.tables_of(server, prefix)
+            tables = _catalog.tables()
             _check_some(tables, prefix)
             say(f"Saving {len(tables)} tables of {prefix}_* into {folder}")
             rows, files = _save_tables(server, tables, folder / "database.sql.gz")
@@ -172,7 +173,7 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
         )
     try:
         with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-            _make_room(server, cursor, prefix, again)
+            _make_room(cursor, prefix, again)
             if manifest["store"]:
                 say(f"Bringing {manifest['n_files']} files back")
                 _restore_files(folder)
@@ -183,7 +184,7 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
                     n = cursor.execute(statement)
                     update(n if statement.startswith("INSERT") else 0)
             _check_rows(cursor, manifest["rows"])
-            cursor.execute(f"DROP DATABASE {_dump.quote(f'{prefix}_{_MARKER}')}")
+            cursor.execute(f"DROP DATABASE {quote(f'{prefix}_{_MARKER}')}")
     except pymysql.err.Error as error:
         raise _refused(
             str(error.args[-1]),
@@ -206,7 +207,7 @@ def _snapshot(server: pymysql.Connection[Any]) -> str:
 
 
 def _save_tables(
-    server: pymysql.Connection[Any], tables: list[tuple[str, str]], path: Path
+    server: pymysql.Connection[Any], tables: dict[tuple[str, str], list[Column]], path: Path
 ) -> tuple[dict[str, int], set[str]]:
     rows: dict[str, int] = {}
     files: set[str] = set()
@@ -217,9 +218,9 @@ def _save_tables(
         for statement in _dump.HEADER:
             _dump.write_line(out, statement)
         for schema in dict.fromkeys(schema for schema, _ in tables):
-            _dump.write_line(out, f"CREATE DATABASE IF NOT EXISTS {_dump.quote(schema)}")
-        for schema, table in tables:
-            rows[f"{schema}.{table}"], named = _dump.save_table(server, schema, table, out)
+            _dump.write_line(out, f"CREATE DATABASE IF NOT EXISTS {quote(schema)}")
+        for (schema, table), columns in tables.items():
+            rows[f"{schema}.{table}"], named = _dump.save_table(server, schema, table, columns, out)
             files |= named
             update(1)
     return rows, files
@@ -255,29 +256,29 @@ def _save_files(paths: list[str], folder: Path) -> int:
 
 
 # -------------------------------------------------------------------------------------------------------- restoring
-def _make_room(server: pymysql.Connection[Any], cursor: Any, prefix: str, again: bool) -> None:
+def _make_room(cursor: Any, prefix: str, again: bool) -> None:
     """Refuse where there are tables; set the marker. Where the marker stands, an earlier restore left the tables."""
     marker = f"{prefix}_{_MARKER}"
-    if marker in _dump.schemas_of(server, prefix):
+    if marker in _catalog.schemas():
         if not again:
             raise _refused(
-                f"a restore was broken off here and left {len(_dump.tables_of(server, prefix))} tables",
+                f"a restore was broken off here and left {len(_catalog.tables())} tables",
                 "an empty database",
                 "run the same with --again: it removes these tables and begins anew",
             )
         cursor.execute("SET SESSION foreign_key_checks = 0")  # the schemas refer to each other
-        for schema in _dump.schemas_of(server, prefix):
+        for schema in _catalog.schemas():
             if schema != marker:
-                cursor.execute(f"DROP DATABASE {_dump.quote(schema)}")
+                cursor.execute(f"DROP DATABASE {quote(schema)}")
         return
-    tables = _dump.tables_of(server, prefix)
+    tables = _catalog.tables()
     if tables:
         raise _refused(
             f"there are {len(tables)} tables under {prefix}_* already",
             "an empty database: nothing is ever restored over another",
             "start a new server (embedded: another PBL_HOME, then pbl db start) and restore there",
         )
-    cursor.execute(f"CREATE DATABASE {_dump.quote(marker)}")
+    cursor.execute(f"CREATE DATABASE {quote(marker)}")
 
 
 def _restore_files(folder: Path) -> None:
@@ -301,7 +302,7 @@ def _restore_files(folder: Path) -> None:
 def _check_rows(cursor: Any, rows: dict[str, int]) -> None:
     for name, expected in rows.items():
         schema, table = name.split(".", 1)
-        cursor.execute(f"SELECT COUNT(*) FROM {_dump.quote(schema)}.{_dump.quote(table)}")  # noqa: S608
+        cursor.execute(f"SELECT COUNT(*) FROM {quote(schema, table)}")  # noqa: S608
         found = cursor.fetchone()[0]
         if found != expected:
             raise _refused(f"{found} rows in {name} after the restore", f"{expected}", "run the same with --again")
@@ -368,7 +369,7 @@ def _unwritable(path: Path, error: OSError) -> PblError:
     )
 
 
-def _check_some(tables: list[tuple[str, str]], prefix: str) -> None:
+def _check_some(tables: Collection[Any], prefix: str) -> None:
     if not tables:
         raise PblError(
             "DB_NOT_FOUND",

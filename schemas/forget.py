@@ -11,16 +11,18 @@ import dataclasses
 import datetime
 import json
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pbl_pipeline import progress, settings
 from pbl_pipeline.errors import PblError
 
-from . import _dump, connection, fit, lab, session, video
+from . import _catalog, connection, fit, lab, session, video
+from ._catalog import Column, quote
 from ._codes import check_subject
 from ._datajoint import full_path
+from ._files import write_json
 from ._store import files_below, store_error
 from .rows import delete_below
 
@@ -165,77 +167,62 @@ def _find(ids: Ids, earlier: dict[str, Any]) -> Found:
     rows: dict[str, int] = {}
     files: set[str] = set()
     running: list[str] = []
-    for schema, table, columns in _personal_tables(conn):
+    for schema, table, columns in personal_tables():
         where, values = _whose(columns, ids)
         if not where:
             continue
-        name = f"{_dump.quote(schema)}.{_dump.quote(table)}"
+        name = quote(schema, table)
         n = conn.query(f"SELECT COUNT(*) FROM {name} WHERE {where}", args=values).fetchone()[0]  # noqa: S608
         if not n:
             continue
         rows[f"{schema}.{table}"] = int(n)
-        for column in (c for c, comment in columns.items() if _dump.STORED.match(comment)):
-            chosen = f"SELECT {_dump.quote(column)} FROM {name} WHERE {where}"  # noqa: S608
-            found = conn.query(f"{chosen} AND {_dump.quote(column)} IS NOT NULL", args=values)
+        for column in (quote(c.name) for c in columns if c.names_files):
+            found = conn.query(f"SELECT {column} FROM {name} WHERE ({where}) AND {column} IS NOT NULL", args=values)  # noqa: S608
             files.update(json.loads(row[0])["path"] for row in found.fetchall())
         if table.startswith("~~"):
             held = conn.query(f"SELECT host, pid FROM {name} WHERE ({where}) AND status = 'reserved'", args=values)  # noqa: S608
             running += [f"{table.removeprefix('~~')} on {host}, process {pid}" for host, pid in held.fetchall()]
-    files.update(_without_row(conn, ids))
+    files.update(_without_row(ids))
     files.update(path for path in earlier.get("files", []) if path not in files and _exists(path))
     return Found(rows, sorted(files), _videos(ids, earlier), running)
 
 
-def _personal_tables(conn: Any) -> Iterable[tuple[str, str, dict[str, str]]]:
-    """Schema, name and columns (name: comment) of the tables that can hold a row of a person."""
-    rows = conn.query(
-        "SELECT c.table_schema, c.table_name, c.column_name, c.column_comment FROM information_schema.columns c "
-        "JOIN information_schema.tables t USING (table_schema, table_name) "
-        "WHERE c.table_schema LIKE %s AND t.table_type = 'BASE TABLE' "
-        "ORDER BY c.table_schema, c.table_name, c.ordinal_position",
-        args=(_dump.like(connection.prefix()),),
-    )
-    tables: dict[tuple[str, str], dict[str, str]] = {}
-    for schema, table, column, comment in rows.fetchall():
-        tables.setdefault((schema, table), {})[column] = comment
-    for (schema, table), columns in tables.items():
-        if set(columns) & {*IDENTITIES, "job_key"}:
-            yield schema, table, columns
+def personal_tables() -> list[tuple[str, str, list[Column]]]:
+    """Schema, name and columns of the tables that can hold a row of a person."""
+    identifying = {*IDENTITIES, "job_key"}
+    found = _catalog.tables().items()
+    return [(*name, columns) for name, columns in found if identifying & {c.name for c in columns}]
 
 
-def _whose(columns: dict[str, str], ids: Ids) -> tuple[str, tuple]:
+def _whose(columns: Sequence[Column], ids: Ids) -> tuple[str, tuple]:
     """A condition that holds for the person's rows, and its values; empty where the table can hold none."""
+    names = {c.name for c in columns}
     parts, values = [], []
     for name in IDENTITIES:
         marks = ",".join(["%s"] * len(ids[name]))
         if not ids[name]:
             continue
-        if name in columns:
-            parts.append(f"{_dump.quote(name)} IN ({marks})")
+        if name in names:
+            parts.append(f"{quote(name)} IN ({marks})")
             values += ids[name]
-        elif "job_key" in columns:  # a job's key as JSON
+        elif "job_key" in names:  # a job's key as JSON
             parts.append(f"JSON_VALUE(job_key, '$.{name}') IN ({marks})")
             values += [str(v) for v in ids[name]]
     return " OR ".join(parts), tuple(values)
 
 
-def _without_row(conn: Any, ids: Ids) -> list[str]:
+def _without_row(ids: Ids) -> list[str]:
     """Files in the person's folders of the store that no row may name: left by a computation that was killed.
 
     A path is `_schema/<schema>/<table>/<key>=<value>/...`, the key in the order of the table.
     """
-    store = connection.store_backend()
-    root = connection.store_root()
-    tables = conn.query(
-        "SELECT DISTINCT table_schema, table_name FROM information_schema.columns "
-        "WHERE table_schema LIKE %s AND column_comment REGEXP '^:<(object|npy)@'",
-        args=(_dump.like(connection.prefix()),),
-    )
+    store, root = connection.store_backend(), connection.store_root()
     out = []
-    for schema, table in tables.fetchall():
-        for name in IDENTITIES:
-            for value in ids[name]:
-                out += files_below(store, f"{root}/{schema}/{table}/{name}={value}")
+    for (schema, table), columns in _catalog.tables().items():
+        if any(c.names_files for c in columns):
+            for name in IDENTITIES:
+                for value in ids[name]:
+                    out += files_below(store, f"{root}/{schema}/{table}/{name}={value}")
     return out
 
 
@@ -257,8 +244,9 @@ def _delete_rows(subject: str, ids: Ids, say: Say) -> None:
     """Queued jobs (no worker takes one up meanwhile), the person with what depends on it, what depends on nothing."""
     cameras = _cameras(ids)
     conn = connection.connect()
-    tables = list(_personal_tables(conn))
-    _delete_where(conn, [t for t in tables if t[1].startswith("~~") or "job_key" in t[2]], ids)
+    tables = personal_tables()
+    queues = [t for t in tables if t[1].startswith("~~") or any(c.name == "job_key" for c in t[2])]
+    _delete_where(conn, queues, ids)
     counts = delete_below(lab.Subject, (lab.Subject & {"subject": subject}).keys())
     say(f"{sum(counts.values())} rows of {len(counts)} tables were deleted")
     _delete_where(conn, tables, ids)
@@ -266,11 +254,11 @@ def _delete_rows(subject: str, ids: Ids, say: Say) -> None:
     delete_below(lab.CameraCalibration, [{"camera_id": c} for c in unused])
 
 
-def _delete_where(conn: Any, tables: Iterable[tuple[str, str, dict[str, str]]], ids: Ids) -> None:
+def _delete_where(conn: Any, tables: Sequence[tuple[str, str, list[Column]]], ids: Ids) -> None:
     for schema, table, columns in tables:
         where, values = _whose(columns, ids)
         if where:
-            conn.query(f"DELETE FROM {_dump.quote(schema)}.{_dump.quote(table)} WHERE {where}", args=values)  # noqa: S608
+            conn.query(f"DELETE FROM {quote(schema, table)} WHERE {where}", args=values)  # noqa: S608
 
 
 def _cameras(ids: Ids) -> list[int]:
@@ -354,27 +342,24 @@ def _delete_archived(subject: str) -> list[str]:
 def _mentions(subject: str, videos: Sequence[dict[str, Any]]) -> list[str]:
     """Columns anywhere that still hold the subject's code, or the path or checksum of one of the videos."""
     terms = [t for v in videos for t in (v["path"], v["sha256"])]
-    conn = connection.connect()
-    rows = conn.query(
-        "SELECT table_schema, table_name, column_name, data_type FROM information_schema.columns "
-        "WHERE table_schema LIKE %s AND data_type IN ('char', 'varchar', 'text', 'longtext', 'json')",
-        args=(_dump.like(connection.prefix()),),
-    )
-    out = []
-    for schema, table, column, kind in rows.fetchall():
-        name = _dump.quote(column)
-        if column.startswith("subject") and "method" not in column:
-            test, values = f"{name} = %s", [subject]
-        elif not terms:
-            continue
-        elif kind in ("char", "varchar"):
-            test, values = f"{name} IN ({','.join(['%s'] * len(terms))})", terms
-        else:
-            test, values = " OR ".join([f"LOCATE(%s, {name})"] * len(terms)), terms
-        table_name = f"{_dump.quote(schema)}.{_dump.quote(table)}"
-        n = conn.query(f"SELECT COUNT(*) FROM {table_name} WHERE {test}", args=tuple(values)).fetchone()[0]  # noqa: S608
-        if n:
-            out.append(f"{n} rows of {schema}.{table} name it in {column}")
+    conn, out = connection.connect(), []
+    for (schema, table), columns in _catalog.tables().items():
+        for column in columns:
+            name = quote(column.name)
+            if column.type not in ("char", "varchar", "text", "longtext", "json"):
+                continue
+            if column.name.startswith("subject") and "method" not in column.name:
+                test, values = f"{name} = %s", [subject]
+            elif not terms:
+                continue
+            elif column.type in ("char", "varchar"):
+                test, values = f"{name} IN ({','.join(['%s'] * len(terms))})", terms
+            else:
+                test, values = " OR ".join([f"LOCATE(%s, {name})"] * len(terms)), terms
+            counted = f"SELECT COUNT(*) FROM {quote(schema, table)} WHERE {test}"  # noqa: S608
+            n = conn.query(counted, args=tuple(values)).fetchone()[0]
+            if n:
+                out.append(f"{n} rows of {schema}.{table} name it in {column.name}")
     return out
 
 
@@ -396,14 +381,9 @@ def read_manifest(subject: str) -> dict[str, Any]:
 
 def _write(subject: str, manifest: dict[str, Any]) -> None:
     path = manifest_path(subject)
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with os.fdopen(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as out:
-            json.dump(manifest, out, indent=1)
-            out.flush()
-            os.fsync(out.fileno())
-        aside.replace(path)
+        write_json(path, manifest)
     except OSError as error:
         raise PblError(
             "FILE_UNWRITABLE",

@@ -10,7 +10,8 @@ from contextlib import closing
 
 from pymysql.cursors import SSCursor
 
-from . import _dump, connection
+from . import connection
+from ._catalog import quote, tables
 from ._store import files_below
 
 #: A file younger than this may belong to a row that is about to be written (s).
@@ -83,14 +84,9 @@ def _files() -> Iterator[StoredFile]:
 def _named() -> Iterator[str]:
     """The paths of the store that rows name, read through a connection of its own, a row at a time."""
     with closing(connection.plain_connection()) as server:
-        for schema, table in _dump.tables_of(server, connection.prefix()):
-            for name, _, comment in _dump.columns_of(server, schema, table):
-                if not _dump.STORED.match(comment):
-                    continue
+        for (schema, table), columns in tables().items():
+            for column in (quote(c.name) for c in columns if c.names_files):
                 with server.cursor(SSCursor) as cursor:
-                    cursor.execute(
-                        f"SELECT {_dump.quote(name)} FROM {_dump.quote(schema)}.{_dump.quote(table)}"  # noqa: S608
-                        f" WHERE {_dump.quote(name)} IS NOT NULL"
-                    )
+                    cursor.execute(f"SELECT {column} FROM {quote(schema, table)} WHERE {column} IS NOT NULL")  # noqa: S608
                     for (value,) in cursor:
                         yield json.loads(value)["path"]

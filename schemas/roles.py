@@ -27,9 +27,7 @@ from pymysql.converters import escape_string
 from pbl_pipeline.errors import PblError
 
 from . import connection, embedded
-from .embedded import Folder
-from .embedded._folder import ADMIN_USER
-from .embedded._process import admin as embedded_admin
+from ._catalog import pattern
 
 #: Role -> rights in the schemas of the prefix.
 ROLES: dict[str, tuple[str, ...]] = {
@@ -61,7 +59,7 @@ class Account:
                 expected=f"one of {', '.join(ROLES)}; a name of at most 32 letters, digits, '_', '.', '-'; a host or %",
                 next_step="correct it",
             )
-        if self.user in (embedded.APP_USER, ADMIN_USER, "root", "mysql.sys", "mariadb.sys"):
+        if self.user in (embedded.APP_USER, embedded.ADMIN_USER, "root", "mysql.sys", "mariadb.sys"):
             raise PblError(
                 "USAGE",
                 key=self.user,
@@ -83,13 +81,12 @@ def default_account(role: str, host: str) -> Account:
 
 def statements(account: Account, password: str, require_tls: bool = False) -> list[str]:
     """What makes the account exist with this password and exactly the rights of its role. Safe to repeat."""
-    pattern = f"{connection.prefix()}_".replace("_", r"\_")
     literal = f"'{escape_string(password)}'"
     return [
         f"CREATE USER IF NOT EXISTS {account.name} IDENTIFIED BY {literal}",
         f"ALTER USER {account.name} IDENTIFIED BY {literal} REQUIRE {'SSL' if require_tls else 'NONE'}",
         f"REVOKE ALL PRIVILEGES, GRANT OPTION FROM {account.name}",
-        f"GRANT {', '.join(ROLES[account.role])} ON `{pattern}%`.* TO {account.name}",
+        f"GRANT {', '.join(ROLES[account.role])} ON `{pattern()}%`.* TO {account.name}",
     ]
 
 
@@ -172,5 +169,5 @@ def _server_admin() -> pymysql.Connection[Any]:
     """A connection that may manage accounts: the embedded server's administrator, or the login of DJ_USER."""
     if connection.external() is None:
         connection.connect()
-        return embedded_admin(Folder.default())
+        return embedded.admin(embedded.Folder.default())
     return connection.plain_connection()

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from . import computed_tables, connection, keypoints, tracking, video, worker
-from ._dump import quote
+from ._catalog import quote
 from .coded_errors import error_code, error_found, error_next_step
 from .jobs import jobs_of
 
@@ -182,7 +182,7 @@ def queue_name(table: Any) -> tuple[str, str]:
 
 
 def _quoted_queue(table: Any) -> str:
-    return ".".join(quote(part) for part in queue_name(table))
+    return quote(*queue_name(table))
 
 
 def queue_counts(server: Any) -> dict[str, dict[str, int]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import closing
 from pathlib import Path
 
-from schemas import _dump, connection
+from schemas import _catalog, _dump, connection
 from schemas.ingest import Visit, ingest
 
 
@@ -19,11 +19,10 @@ def register(*paths: Path, **visit) -> list[int]:
 def everything() -> dict[str, list[tuple]]:
     """Every row of every table, as the server prints it."""
     with closing(connection.plain_connection(conv={})) as server:
-        found = {}
-        for schema, table in _dump.tables_of(server, connection.prefix()):
-            columns = _dump.columns_of(server, schema, table)
-            found[f"{schema}.{table}"] = sorted(_dump.rows_of(server, schema, table, columns), key=str)
-        return found
+        return {
+            f"{schema}.{table}": sorted(_dump.rows_of(server, schema, table, columns), key=str)
+            for (schema, table), columns in _catalog.tables().items()
+        }
 
 
 def remove_all() -> None:
@@ -35,7 +34,7 @@ def remove_all() -> None:
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute("SET foreign_key_checks = 0")
         server.begin()
-        for schema, table in _dump.tables_of(server, connection.prefix()):
+        for schema, table in _catalog.tables():
             if not table.startswith("#") and (not table.startswith("~") or table.startswith("~~")):
-                cursor.execute(f"DELETE FROM {_dump.quote(schema)}.{_dump.quote(table)}")
+                cursor.execute(f"DELETE FROM {_catalog.quote(schema, table)}")
         server.commit()

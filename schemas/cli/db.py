@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from typing import Any
 
 import click
@@ -85,7 +86,7 @@ def init() -> None:
 
     Example: pbl db init
     """
-    from schemas import _store, connection
+    from schemas import _catalog, _store
     from schemas._declare import declare_all
 
     if not _uses_external():
@@ -94,16 +95,8 @@ def init() -> None:
         embedded.start(click.echo)
     click.echo("Creating the tables as far as they are missing, and the method rows of this version")
     declare_all()
-    prefix = connection.prefix()
-    rows = connection.connect().query(
-        "SELECT table_schema, table_name FROM information_schema.tables WHERE table_schema LIKE %s "
-        "ORDER BY table_schema, table_name",
-        args=(f"{prefix}_%".replace("_", r"\_"),),
-    )
-    tables: dict[str, int] = {}
-    for schema, table in rows.fetchall():
-        # Names that begin with ~ are DataJoint's own bookkeeping.
-        tables[schema] = tables.get(schema, 0) + (not table.startswith("~"))
+    # Names that begin with ~ are DataJoint's own bookkeeping.
+    tables = Counter(schema for schema, table in _catalog.tables() if not table.startswith("~"))
     for schema, count in tables.items():
         click.echo(f"  {schema:<24} {count:>3} table{'' if count == 1 else 's'}")
     click.echo(f"Arrays are kept in {_store.describe()}")

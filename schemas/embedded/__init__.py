@@ -6,17 +6,20 @@ MySQL 8 server is used by naming it in DJ_HOST, DJ_PORT, DJ_USER and DJ_PASS.
 """
 
 from ._binaries import Binaries, find_server, get_server
-from ._folder import APP_USER, Credentials, Folder
+from ._folder import ADMIN_USER, APP_USER, Credentials, Folder
 from ._port import HOST
+from ._process import admin
 from ._server import Status, allow_prefix, not_running, remove, start, status, stop
 
 __all__ = [
+    "ADMIN_USER",
     "APP_USER",
     "HOST",
     "Binaries",
     "Credentials",
     "Folder",
     "Status",
+    "admin",
     "allow_prefix",
     "find_server",
     "get_server",

@@ -15,6 +15,7 @@ from typing import Any
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
+from schemas._files import write_json
 
 from ._account import Account, check_enterable
 
@@ -207,17 +208,9 @@ def folder_error(path: Path, error: OSError) -> PblError:
 
 
 def _write(path: Path, content: dict[str, Any], mode: int) -> None:
-    # Written aside and renamed, so that a reader, or a power cut, never meets half a file.
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with os.fdopen(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "w") as out:
-            os.fchmod(out.fileno(), mode)
-            json.dump(content, out, indent=1)
-            out.flush()
-            os.fsync(out.fileno())
-        aside.replace(path)
+        write_json(path, content, mode)
     except OSError as error:
-        aside.unlink(missing_ok=True)
         raise folder_error(path.parent, error) from error
 
 

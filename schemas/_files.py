@@ -1,0 +1,29 @@
+"""Small files that must never be half written."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+
+def write_json(path: Path, content: dict[str, Any], mode: int = 0o600) -> None:
+    """Write a JSON file with these permissions: aside and renamed, so that a reader or a power cut meets no half file.
+
+    Raises
+    ------
+    OSError
+        It cannot be written; the file that was there is unchanged.
+    """
+    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with os.fdopen(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "w") as out:
+            os.fchmod(out.fileno(), mode)
+            json.dump(content, out, indent=1)
+            out.flush()
+            os.fsync(out.fileno())
+        aside.replace(path)
+    except OSError:
+        aside.unlink(missing_ok=True)
+        raise
