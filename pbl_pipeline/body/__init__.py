@@ -9,6 +9,7 @@ from pbl_pipeline import jax_setup
 # Before anything below makes an array: JAX reads the cache's folder once.
 jax_setup.configure()
 
+from pbl_pipeline.body._angles import angle_of, joint_angles, joint_of  # noqa: E402
 from pbl_pipeline.body._capsules import Capsules, capsules  # noqa: E402
 from pbl_pipeline.body._kinematics import body_poses, marker_positions  # noqa: E402
 from pbl_pipeline.body._markers import MARKER_SETS, MarkerSet, load_marker_set, marker_set  # noqa: E402
@@ -21,8 +22,11 @@ __all__ = [
     "Body",
     "Capsules",
     "MarkerSet",
+    "angle_of",
     "body_poses",
     "capsules",
+    "joint_angles",
+    "joint_of",
     "load_body",
     "load_marker_set",
     "marker_positions",

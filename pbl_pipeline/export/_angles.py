@@ -7,11 +7,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from pbl_pipeline.body import SLIDES
+from pbl_pipeline.body import angle_of, joint_angles
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
-
-#: Joints that slide; all others turn.
 
 
 def angles_table(fit: TrialFit) -> pd.DataFrame:
@@ -36,10 +34,12 @@ def angles_table(fit: TrialFit) -> pd.DataFrame:
             key=fit.name,
         )
     columns: dict[str, np.ndarray] = {"time_s": np.asarray(fit.time_s, float)}
-    for name, values in zip(fit.joint_names, qpos.T, strict=True):
-        columns[name] = values if name in SLIDES else np.degrees(values)
-        if name.startswith("knee_angle_"):
-            columns[name.replace("angle", "flexion")] = -columns[name]
+    angles = joint_angles(fit.joint_names, qpos)
+    for joint, values in zip(fit.joint_names, qpos.T, strict=True):
+        name, sign = angle_of(joint)
+        columns[joint] = sign * angles[name] if name in angles else values
+        if name != joint:
+            columns[name] = angles[name]
     return pd.DataFrame(columns)
 
 

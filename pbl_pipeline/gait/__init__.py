@@ -4,7 +4,7 @@ Each step is a function of its own with a frozen result: `feet_from_fit` or `fee
 `find_cycles`, `spatiotemporal`, `score_gdi`; `gait_metrics` runs them for a session.
 """
 
-from ._angles import ANGLE_NAMES, AngleSeries, angle_series, pelvis_angles
+from ._angles import ANGLE_NAMES, LEG_ANGLES, AngleSeries, angle_series, leg_angles, pelvis_angles
 from ._bands import NormalBands, leg_length_m, normal_bands
 from ._curve_frame import CURVE_FRAME_COLUMNS, curve_frame
 from ._cycles import REPORT_PERCENT, GaitCycle, cycle_curves, find_cycles
@@ -69,6 +69,7 @@ __all__ = [
     "GDI_MODEL",
     "GDI_PARAMSETS",
     "GILLETTE_MODEL",
+    "LEG_ANGLES",
     "MEASURES",
     "MODEL_ANGLES",
     "NINE_ANGLES",
@@ -109,6 +110,7 @@ __all__ = [
     "fit_norm",
     "gait_metrics",
     "gdi_vector",
+    "leg_angles",
     "leg_length_m",
     "load_events",
     "load_norm",

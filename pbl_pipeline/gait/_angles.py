@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .events import RIGHT
+from .events import LEFT, RIGHT, SIDES
 from .motion import BodyPoses, feet_from_fit, trial_poses
 from .normative import BODY_ANGLES
 
@@ -46,33 +46,48 @@ class AngleSeries:
         return self.right if side == RIGHT else self.left
 
 
+#: Angles of a leg -> angles of the body (`body.joint_angles`), without the side.
+LEG_ANGLES = {
+    "hip_flexion": "hip_flexion",
+    "hip_adduction": "hip_adduction",
+    "hip_rotation": "hip_rotation",
+    "knee_flexion": "knee_flexion",
+    "ankle_dorsiflexion": "ankle_angle",
+}
+
+
+def leg_angles(fit: TrialFit) -> dict[str, dict[str, np.ndarray]]:
+    """Side -> name -> (T,) degrees: the body's own angles of hip, knee and ankle; those that the fit's body has."""
+    from pbl_pipeline.body import joint_angles  # JAX loads only where a fit is read
+
+    angles = joint_angles(fit.joint_names, fit.qpos)
+    return {
+        side: {ours: angles[f"{own}_{side[0]}"] for ours, own in LEG_ANGLES.items() if f"{own}_{side[0]}" in angles}
+        for side in SIDES
+    }
+
+
 def angle_series(fit: TrialFit, poses: BodyPoses | None = None) -> AngleSeries:
     """Angles of a fit. Hip, knee and ankle are the model's own; the pelvis is decomposed anew (`pelvis_angles`).
 
     Raises `PblError` GAIT_INPUT (see `feet_from_fit`).
     """
-    column = {name: i for i, name in enumerate(fit.joint_names)}
-    degrees = np.degrees(np.asarray(fit.qpos, float))
     poses = poses or trial_poses(fit)
     feet = feet_from_fit(fit, poses)
     forward = feet.forward
     out = toes_out(feet.toe_m - feet.heel_m, forward)
     # The pelvis frame of the model is forward, up, right.
     tilt, obliquity, rotation = pelvis_angles(poses.rotation[:, poses.index("pelvis")], forward).T
-    sides = {}
-    for i, (side, letter, sign) in enumerate((("left", "l", -1.0), ("right", "r", 1.0))):
+    legs, sides = leg_angles(fit), {}
+    for i, (side, sign) in enumerate(((LEFT, -1.0), (RIGHT, 1.0))):
         sides[side] = {
-            "hip_flexion": degrees[:, column[f"hip_flexion_{letter}"]],
-            "hip_adduction": degrees[:, column[f"hip_adduction_{letter}"]],
-            "hip_rotation": degrees[:, column[f"hip_rotation_{letter}"]],
-            "knee_flexion": -degrees[:, column[f"knee_angle_{letter}"]],
-            "ankle_dorsiflexion": degrees[:, column[f"ankle_angle_{letter}"]],
+            **legs[side],
             "pelvis_tilt": tilt,
             "pelvis_obliquity": sign * obliquity,
             "pelvis_rotation": sign * rotation,
             "foot_progression": -out[:, i],
         }
-    return AngleSeries(np.asarray(fit.time_s, float), sides["left"], sides["right"])
+    return AngleSeries(np.asarray(fit.time_s, float), sides[LEFT], sides[RIGHT])
 
 
 def pelvis_angles(R_world_pelvis: np.ndarray, forward: np.ndarray) -> np.ndarray:

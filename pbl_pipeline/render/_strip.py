@@ -9,6 +9,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from pbl_pipeline.body import joint_angles
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.render._style import SIDE_COLOUR, bgr
 
@@ -64,11 +65,8 @@ class Strip:
 
     def _draw_knees(self, fit: TrialFit, time: np.ndarray) -> None:
         top, bottom = self._plot
-        curves = {
-            side: -np.degrees(np.asarray(fit.qpos, float)[:, fit.joint_names.index(f"knee_angle_{side[0]}")])
-            for side in ("left", "right")
-            if f"knee_angle_{side[0]}" in fit.joint_names
-        }
+        angles = joint_angles(fit.joint_names, fit.qpos)
+        curves = {s: angles[f"knee_flexion_{s[0]}"] for s in ("left", "right") if f"knee_flexion_{s[0]}" in angles}
         seen = np.concatenate([c[np.isfinite(c)] for c in curves.values()] or [np.zeros(0)])
         high = max(70.0, float(seen.max(initial=0.0)))
         low = min(0.0, float(seen.min(initial=0.0)))

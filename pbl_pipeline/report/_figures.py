@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from pbl_pipeline import charts
 from pbl_pipeline.fit import TrialFit
-from pbl_pipeline.gait import GaitCycle, GaitEvents, NormalBands
+from pbl_pipeline.gait import GaitCycle, GaitEvents, NormalBands, leg_angles
 from pbl_pipeline.render import SIDE_COLOUR, stance_spans
 from pbl_pipeline.report._types import Picture
 from pbl_pipeline.report._words import ANGLES, FOOT_ANGLES, PELVIS_ANGLES, number, plural
@@ -26,8 +26,7 @@ def cycle_charts(cycles: Sequence[GaitCycle], bands: NormalBands) -> list[dict]:
     if not usable:
         return []
     foot_off = {s: _foot_off([c for c in usable if c.side == s]) for s in _SIDES}
-    names = {k: (title, positive) for k, (title, _, _, positive) in ANGLES.items()}
-    names |= FOOT_ANGLES | PELVIS_ANGLES
+    names = ANGLES | FOOT_ANGLES | PELVIS_ANGLES
     drawn = []
     for key, (title, positive) in names.items():
         by_side = {s: [c.curves[key] for c in usable if c.side == s and key in c.curves] for s in _SIDES}
@@ -53,18 +52,13 @@ def cycle_charts(cycles: Sequence[GaitCycle], bands: NormalBands) -> list[dict]:
 
 def time_charts(fit: TrialFit, events: GaitEvents | None) -> list[dict]:
     """The joint angles over the recording. Empty where the body was fitted in no frame."""
-    qpos = np.asarray(fit.qpos, float)
-    if not np.isfinite(qpos).any():
+    if not np.isfinite(fit.qpos).any():
         return []
-    column = {name: i for i, name in enumerate(fit.joint_names)}
+    sides = leg_angles(fit)
     spans = {s: stance_spans(events.events, s) for s in _SIDES} if events is not None else {}
     drawn = []
-    for title, joint, sign, positive in ANGLES.values():
-        curves = {
-            side: sign * np.degrees(qpos[:, column[f"{joint}_{side[0]}"]])
-            for side in _SIDES
-            if f"{joint}_{side[0]}" in column
-        }
+    for name, (title, positive) in ANGLES.items():
+        curves = {side: sides[side][name] for side in _SIDES if name in sides[side]}
         label = f"{title} in degrees over the {fit.time_s[-1]:.1f} seconds of the recording."
         drawn.append({"name": title, "note": positive, "svg": charts.time_chart(label, fit.time_s, curves, spans)})
     return drawn

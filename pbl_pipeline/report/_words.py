@@ -26,14 +26,13 @@ MEASURES: dict[str, tuple[str, str, int]] = {
 #: The measures of the tiles, before the GDI.
 HEADLINES = ("cadence_steps_per_min", "stride_time_s", "stance_percent", "double_support_percent")
 
-#: Joint angles: our name -> heading, joint of the body without its side, sign, what positive means where the heading
-#: does not say it.
-ANGLES: dict[str, tuple[str, str, float, str]] = {
-    "hip_flexion": ("Hip flexion", "hip_flexion", 1.0, ""),
-    "hip_adduction": ("Hip adduction", "hip_adduction", 1.0, ""),
-    "hip_rotation": ("Hip rotation", "hip_rotation", 1.0, "internal +"),
-    "knee_flexion": ("Knee flexion", "knee_angle", -1.0, ""),
-    "ankle_dorsiflexion": ("Ankle dorsiflexion", "ankle_angle", 1.0, ""),
+#: Joint angles: our name -> heading, and what positive means where the heading does not say it.
+ANGLES: dict[str, tuple[str, str]] = {
+    "hip_flexion": ("Hip flexion", ""),
+    "hip_adduction": ("Hip adduction", ""),
+    "hip_rotation": ("Hip rotation", "internal +"),
+    "knee_flexion": ("Knee flexion", ""),
+    "ankle_dorsiflexion": ("Ankle dorsiflexion", ""),
 }
 #: Pelvis angles exist over the cycle only (they need the walking direction).
 PELVIS_ANGLES: dict[str, tuple[str, str]] = {

@@ -9,22 +9,15 @@ from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 
-from pbl_pipeline.body import load_body
+from pbl_pipeline.body import joint_of, load_body
+from pbl_pipeline.gait import LEG_ANGLES
 from pbl_pipeline.gait.normative import GRAVITY, gait_norm, harmonic_sum
 
 from ._gait import MIDDLE_CURVES_DEG, OFFSET_SD_DEG, SIDE_CURVES_DEG, harmonics, wander, within
 from ._impair import Style
 from ._plan import GRID_STEP_S, Plan
 
-#: Curves of the norm that drive the legs, and the joints they drive (sign, joint).
-LEGS = {
-    "hip_flexion": (1, "hip_flexion"),
-    "hip_adduction": (1, "hip_adduction"),
-    "hip_rotation": (1, "hip_rotation"),
-    "knee_flexion": (-1, "knee_angle"),
-    "ankle_dorsiflexion": (1, "ankle_angle"),
-}
-#: Those of the pelvis, over the cycle of the right side: the model's tilt and list count the other way.
+#: Curves that drive the pelvis (sign, joint), by the right side's cycle; the model's tilt and list count the other way.
 PELVIS = {"pelvis_tilt": (-1, "tilt"), "pelvis_obliquity": (-1, "list"), "pelvis_rotation": (1, "rotation")}
 #: A person's mean of a curve differs from the norm's by this share of its standard deviation, and its range by this.
 OFFSET_SHARE, RANGE_SD, SIDES_SHARE = 0.6, 0.06, 0.15
@@ -112,7 +105,8 @@ def reference(
     posture = {k: np.broadcast_to(plan.posture_deg.get(k, v), t.shape) for k, v in STANDING_DEG.items()}
     q = np.zeros((len(t), len(body.joint_names)))
 
-    for angle, (sign, joint) in LEGS.items():
+    for angle, of_body in LEG_ANGLES.items():
+        joint, sign = joint_of(of_body)
         z, size = within(rng, 0.0, OFFSET_SHARE, 1.6), within(rng, 1.0, RANGE_SD)
         for side in "rl":
             own = z + within(rng, 0.0, SIDES_SHARE)
@@ -135,7 +129,7 @@ def reference(
         q[:, column[f"pelvis_{joint}"]] = sign * (walks * deg + (1 - walks) * rest)
 
     for joint, (mean, terms) in SIDE_CURVES_DEG.items():
-        if f"{joint}_r" not in column or joint in ("hip_flexion", "hip_adduction", "hip_rotation", "ankle_angle"):
+        if joint in LEG_ANGLES.values():
             continue
         middle, size = within(rng, 0.0, OFFSET_SD_DEG[joint]), within(rng, 1.0, 0.08)
         foot = joint in ("subtalar_angle", "mtp_angle")

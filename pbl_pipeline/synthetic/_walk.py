@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import load_body
+from pbl_pipeline.body import joint_of, load_body
 
 from ._gait import MIDDLE_CURVES_DEG, OFFSET_SD_DEG, SIDE_CURVES_DEG, harmonics, wander, within
 from ._path import choose_path, floor_path
@@ -77,15 +77,13 @@ def walk_qpos(
     body = load_body()
     column = {n: i for i, n in enumerate(body.joint_names)}
     qpos = np.zeros((len(time_s), len(body.joint_names)))
-    for joint, curve in SIDE_CURVES_DEG.items():
-        size, middle = within(rng, 1.0, RANGE_SD), within(rng, 0.0, OFFSET_SD_DEG[joint])
+    for angle, curve in SIDE_CURVES_DEG.items():
+        size, middle = within(rng, 1.0, RANGE_SD), within(rng, 0.0, OFFSET_SD_DEG[angle])
         for side, shift in (("r", 0.0), ("l", np.pi)):
-            own_size, own_middle = within(rng, size, SIDES_SD), middle + within(rng, 0.0, 0.3 * OFFSET_SD_DEG[joint])
+            own_size, own_middle = within(rng, size, SIDES_SD), middle + within(rng, 0.0, 0.3 * OFFSET_SD_DEG[angle])
             deg = _curve(rng, time_s, phase + shift, curve, own_size, own_middle)
-            if joint == "knee_flexion":
-                qpos[:, column[f"knee_angle_{side}"]] = -np.radians(deg)
-            else:
-                qpos[:, column[f"{joint}_{side}"]] = np.radians(deg)
+            joint, sign = joint_of(f"{angle}_{side}")
+            qpos[:, column[joint]] = sign * np.radians(deg)
     pelvis = {}
     for joint, curve in MIDDLE_CURVES_DEG.items():
         size, middle = within(rng, 1.0, RANGE_SD), within(rng, 0.0, OFFSET_SD_DEG[joint])

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import SLIDES, load_body
+from pbl_pipeline.body import angle_of, joint_angles, load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import BodyPoses, trial_poses
@@ -24,17 +24,6 @@ from ._rotations import Y_UP_TO_Z_UP, body_rotation_angles
 _PELVIS_PATH = ("pelvis_tx", "pelvis_ty", "pelvis_tz")
 
 
-def qpos_angles(joint_names: Sequence[str], qpos: np.ndarray) -> dict[str, np.ndarray]:
-    """Degrees of the turning joints from (T, 40) radians; OpenSim's knee becomes `knee_flexion_r/_l`, positive."""
-    out = {}
-    for name, values in zip(joint_names, np.asarray(qpos, float).T, strict=True):
-        if name in SLIDES:
-            continue
-        knee = name.startswith("knee_angle_")
-        out[name.replace("knee_angle", "knee_flexion")] = np.degrees(-values if knee else values)
-    return out
-
-
 def fit_angles(fit: TrialFit, convention: str = QPOS, poses: BodyPoses | None = None) -> dict[str, np.ndarray]:
     """(T,) degrees per joint at the fit's time stamps, NaN where the person is out of view.
 
@@ -42,7 +31,7 @@ def fit_angles(fit: TrialFit, convention: str = QPOS, poses: BodyPoses | None = 
     """
     _check_convention(convention)
     if convention == QPOS:
-        return qpos_angles(fit.joint_names, fit.qpos)
+        return joint_angles(fit.joint_names, fit.qpos)
     poses = poses or trial_poses(fit)
     seen = np.flatnonzero(np.all(np.isfinite(poses.rotation), axis=(1, 2, 3)))
     turned = {n: Rotation.from_matrix(poses.rotation[seen, i]) for i, n in enumerate(poses.body.body_names)}
@@ -59,7 +48,7 @@ def fit_angles_sd(fit: TrialFit, convention: str = QPOS) -> dict[str, np.ndarray
     For "body_rotations" that of the model's own joint of the same name: its axis is not quite the same.
     """
     _check_convention(convention)
-    sd = {k: np.abs(v) for k, v in qpos_angles(fit.joint_names, fit.qpos_sd).items()}
+    sd = {k: np.abs(v) for k, v in joint_angles(fit.joint_names, fit.qpos_sd).items()}
     return sd if convention == QPOS else {k: sd[k] for k in JOINTS_CLIP if k in sd}
 
 
@@ -80,7 +69,7 @@ def reference_of_qpos(
         index = [list(joint_names).index(n) for n in _PELVIS_PATH]
         rest = load_body().mj_model.body("pelvis").pos
         pelvis_m = rest + np.asarray(qpos, float)[:, index] @ Y_UP_TO_Z_UP.T
-    return Reference(name, source, QPOS, time_s, qpos_angles(joint_names, qpos), pelvis_m)
+    return Reference(name, source, QPOS, time_s, joint_angles(joint_names, qpos), pelvis_m)
 
 
 def reference_of_fit(fit: TrialFit, source: str, convention: str = QPOS) -> Reference:
@@ -158,14 +147,13 @@ def reference_of_mot(path: str | Path, source: str = "optical markers", conventi
         raise _unreadable(
             path, error, "an OpenSim motion with `inDegrees=yes` or `no`, `endheader` and `time`"
         ) from error
-    angles, knee_sign = {}, _knee_sign([v for n, v in column.items() if n in ("knee_angle_r", "knee_angle_l")])
+    angles, knee_sign = {}, _knee_sign([v for n, v in column.items() if angle_of(n)[1] < 0])
     for name, series in column.items():
         if name.endswith(("_tx", "_ty", "_tz", "_beta")):
             continue
         degrees = series if in_degrees else np.degrees(series)
-        if name.startswith("knee_angle_"):
-            name, degrees = name.replace("angle", "flexion"), knee_sign * degrees
-        angles[name] = degrees
+        ours, turned = angle_of(name)
+        angles[ours] = degrees if turned > 0 else knee_sign * degrees
     pelvis = None
     if all(n in column for n in _PELVIS_PATH):
         pelvis = np.column_stack([column[n] for n in _PELVIS_PATH]) @ Y_UP_TO_Z_UP.T
