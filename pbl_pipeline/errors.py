@@ -49,6 +49,7 @@ CODES: dict[str, str] = {
     "DB_REFUSED": "the database answers but refuses the login or the operation",
     "DB_NOT_FOUND": "a row that was named does not exist",
     "DB_MIGRATION": "the tables on the server are not as this version of the code declares them",
+    "INPUT_CHANGED": "rows that a computation reads are gone, or changed each time it ran",
     "STORE_UNAVAILABLE": "the object store of the arrays cannot be reached, or refuses",
     "BACKUP_INVALID": "a backup is incomplete or was changed",
     "TIME_LIMIT": "a job took longer than a worker gives it and was ended",

@@ -32,13 +32,15 @@ with warnings.catch_warnings():
             next_step="correct the variable, or unset it",
         ) from error
 from datajoint.adapters import ADAPTERS, MySQLAdapter
-from datajoint.errors import DuplicateError, LostConnectionError
+from datajoint.errors import AccessError, DuplicateError, IntegrityError, LostConnectionError
 from datajoint.hash_registry import get_store_backend
 from datajoint.storage import StorageBackend
 from pymysql.converters import escape_string
 
 __all__ = [
+    "AccessError",
     "DuplicateError",
+    "IntegrityError",
     "LostConnectionError",
     "backend_of",
     "datajoint",

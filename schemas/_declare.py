@@ -6,6 +6,7 @@ import logging
 
 from . import _store, connection
 from ._activate import activate, computed_tables
+from .jobs import jobs_of
 
 
 def declare_all() -> None:
@@ -24,7 +25,7 @@ def declare_all() -> None:
     log.setLevel(logging.ERROR)  # it warns of the types that it takes itself for the keys of a queue
     try:
         for table in computed_tables():
-            _ = table.jobs  # declares it
+            jobs_of(table)  # declares it
     finally:
         log.setLevel(level)
     _store.check_store(connection.store_backend(), create=True)

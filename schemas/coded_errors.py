@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
 from pbl_pipeline.errors import CODES, PblError
 
+#: A code at the beginning of a message, behind the name of the exception where DataJoint writes one.
+_CODE = re.compile(r"(?:\w+: )?([A-Z_0-9]+):")
 #: Longest texts that keep a whole coded error within the 2047 characters of a job's error_message.
 _LIMITS = {"found": 600, "expected": 350, "next_step": 600, "key": 250}
 
@@ -39,10 +42,16 @@ def _cut(text: str, limit: int) -> str:
     return text if len(text) <= limit else text[: limit - 4] + " ..."
 
 
+def error_message(error: BaseException, table: str, key: Mapping[str, Any]) -> str:
+    """What an error row says of an error, always with a code."""
+    coded = fitted(error, key) if isinstance(error, PblError) else internal(error, table, key)
+    return f"PblError: {coded}"
+
+
 def error_code(message: str) -> str:
-    """The code of an error row's message, INTERNAL when it carries none (an error outside `make_compute`)."""
-    head = message.removeprefix("PblError: ").split(":", 1)[0].strip()
-    return head if head in CODES else "INTERNAL"
+    """The code of an error row's message; INTERNAL when it carries none (DataJoint's own populate wrote it)."""
+    found = _CODE.match(message)
+    return found[1] if found and found[1] in CODES else "INTERNAL"
 
 
 def error_next_step(message: str) -> str:

@@ -40,8 +40,10 @@ import pymysql
 from pbl_pipeline.errors import PblError
 
 from . import embedded
-from ._datajoint import DuplicateError as DuplicateError  # for the workers
+from ._datajoint import DuplicateError as DuplicateError  # these four for the workers
+from ._datajoint import IntegrityError as IntegrityError
 from ._datajoint import LostConnectionError, backend_of, datajoint, dj
+from ._datajoint import inserting as inserting
 from ._secrets import secret
 from ._store import store_spec
 from .embedded import APP_USER, HOST, Folder, not_running
@@ -151,7 +153,7 @@ def configure(target: dict[str, Any] | None = None) -> None:
     dj.config.stores.update({"default": STORE, STORE: store_spec()})
     dj.config.jobs.auto_refresh = True
     dj.config.jobs.keep_completed = False  # a result row says that a job is done; queues stay as small as their work
-    dj.config.jobs.add_job_metadata = True
+    dj.config.jobs.add_job_metadata = False  # origin columns say duration, time and version
     dj.config.jobs.version_method = None  # "git" forks three times a make; the code version is a column of ours
 
 

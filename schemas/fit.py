@@ -19,7 +19,7 @@ from ._datajoint import dj
 from .checks import check_columns, check_row, check_values
 from .method_rows import method_arguments, method_columns, stored_paramset
 from .origin import Origin, computes, origin_columns
-from .rows import number
+from .rows import InputChanged, number, one
 from .stored_files import file_ref, new_folder, stored_file
 
 if TYPE_CHECKING:
@@ -79,10 +79,10 @@ class TrialInput(dj.Computed):
         return (keypoints.Keypoints.proj() * FitMethod.proj()) & planned
 
     def make_fetch(self, key: dict) -> tuple:
-        ref = file_ref((keypoints.Keypoints & key).fetch1("keypoints_file"))
+        ref = file_ref(one(keypoints.Keypoints & key, "keypoints_file"))
         return (
             ref,
-            (video.Video & key).fetch1("video_name"),
+            one(video.Video & key, "video_name"),
             method_arguments(FitMethod, "fit", "fit", key["fit_method"]),
         )
 
@@ -183,6 +183,8 @@ class SessionFit(dj.Computed):
         rows = (FitSet.Video * keypoints.Keypoints.proj("keypoints_file") * video.Video & key).to_dicts(
             order_by="video_id"
         )
+        if not rows:
+            raise InputChanged("no video of this set has keypoints any more")
         names = trial_names([(r["video_id"], r["video_name"]) for r in rows])
         trials = [
             (r["video_id"], n, r["camera_motion"], file_ref(r["keypoints_file"]))
@@ -254,7 +256,7 @@ class SessionFit(dj.Computed):
             self.insert1(
                 {
                     **key,
-                    "body_model": (BodyModel & {"body_sha256": body_sha}).fetch1("body_model"),
+                    "body_model": one(BodyModel & {"body_sha256": body_sha}, "body_model"),
                     "solver": result.solver,
                     "fit_loss": float(result.trials[0].loss),
                     "fit_residual_2d": median(residual_2d),

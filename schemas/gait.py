@@ -13,7 +13,7 @@ from ._datajoint import dj
 from .checks import check_columns, check_row
 from .method_rows import method_arguments, method_columns, stored_paramset
 from .origin import Origin, computes, origin_columns
-from .rows import number
+from .rows import number, one
 from .stored_files import file_ref, new_folder, stored_file
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ class GaitEvents(dj.Computed):
         return (fit.SessionFit.Trial.proj() * GaitEventMethod.proj()) & planned
 
     def make_fetch(self, key: dict) -> tuple:
-        ref = file_ref((fit.SessionFit.Trial & key).fetch1("trial_file"))
+        ref = file_ref(one(fit.SessionFit.Trial & key, "trial_file"))
         return ref, method_arguments(GaitEventMethod, "gait", "gait", key["gait_method"])
 
     @computes
@@ -178,7 +178,7 @@ class GaitCycle(dj.Computed):
 
     def make_fetch(self, key: dict) -> tuple:
         events = (GaitEvents.Event & key).to_dicts(order_by="event_no")
-        ref = file_ref((fit.SessionFit.Trial & key).fetch1("trial_file"))
+        ref = file_ref(one(fit.SessionFit.Trial & key, "trial_file"))
         return [{k: v for k, v in e.items() if k.startswith("event_")} for e in events], ref, fit.fit_checks(key)
 
     @computes
@@ -260,7 +260,7 @@ class Spatiotemporal(dj.Computed):
         """
 
     def make_fetch(self, key: dict) -> tuple:
-        name = (fit.SessionFit.Trial & key).fetch1("trial_name")
+        name = one(fit.SessionFit.Trial & key, "trial_name")
         rows = (GaitCycle.Cycle & key).to_dicts(order_by="cycle_no")
         return name, [{k: v for k, v in r.items() if k not in key} for r in rows]
 

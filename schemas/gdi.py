@@ -13,7 +13,7 @@ from ._datajoint import dj
 from .checks import check_columns, check_row
 from .method_rows import method_arguments, method_columns, rebuild_params, resolve_method, stored_paramset
 from .origin import Origin, computes, origin_columns
-from .rows import number, utc_now
+from .rows import number, one, utc_now
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -123,10 +123,10 @@ class GDI(dj.Computed):
         return (gait.GaitCycle.proj() * GdiModel.proj() * NormativeSet.proj()) & planned
 
     def make_fetch(self, key: dict) -> tuple:
-        name = (fit.SessionFit.Trial & key).fetch1("trial_name")
+        name = one(fit.SessionFit.Trial & key, "trial_name")
         rows = (gait.GaitCycle.Cycle & key).to_dicts(order_by="cycle_no")
         cycles = [{k: v for k, v in r.items() if k not in key} for r in rows]
-        curves = file_ref((gait.GaitCycle & key).fetch1("curves"))
+        curves = file_ref(one(gait.GaitCycle & key, "curves"))
         norm = norm_ref(key)
         return name, cycles, curves, norm, method_arguments(GdiModel, "gdi", "gdi", key["gdi_method"])
 
@@ -337,7 +337,7 @@ def norm_row(norm: lib.NormativeSet) -> dict[str, Any]:
 
 def norm_ref(key: Mapping[str, Any]) -> tuple[str, str, dict | None]:
     """What `norm_of_row` takes: name, checksum and, of a set that was built here, its file."""
-    name, sha256, stored = (NormativeSet & key).fetch1("norm_name", "norm_sha256", "norm_file")
+    name, sha256, stored = one(NormativeSet & key, "norm_name", "norm_sha256", "norm_file")
     return name, sha256, None if stored is None else file_ref(stored)
 
 

@@ -13,7 +13,7 @@ from ._datajoint import dj
 from .checks import check_columns, check_row
 from .method_rows import method_arguments, method_columns, method_of_model, rebuild_params, resolve_method
 from .origin import Origin, computes, origin_columns
-from .rows import number
+from .rows import number, one
 from .stored_files import file_ref, new_folder, stored_file
 
 if TYPE_CHECKING:
@@ -77,10 +77,11 @@ class Keypoints(dj.Computed):
         return (chosen.proj() * KeypointSelection.proj()) & video.VideoInfo
 
     def make_fetch(self, key: dict) -> tuple:
-        probed = (video.Video * video.VideoInfo & key).fetch1()
+        probed = one(video.Video * video.VideoInfo & key)
         times = file_ref(probed.pop("frame_time"))
-        person = (tracking.SubjectChoice & key).fetch1("chosen_person_id")
-        tracks, detector, model = (tracking.Tracking & key).fetch1("tracks", "detector", "tracking_model_sha256")
+        chosen = tracking.SubjectChoice & [{"choice_status": s} for s in tracking.CHOSEN]
+        person = one(chosen & key, "chosen_person_id")
+        tracks, detector, model = one(tracking.Tracking & key, "tracks", "detector", "tracking_model_sha256")
         camera = video.camera_of(probed)
         log = (video.PhoneAttitude & key).to_dicts()
         return (

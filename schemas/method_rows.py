@@ -10,7 +10,7 @@ from pbl_pipeline import __version__
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import Paramset
 
-from .rows import plain
+from .rows import one, plain
 
 P = TypeVar("P")
 
@@ -95,7 +95,7 @@ def method_of_model(table: Any, prefix: str, found: Paramset) -> str:
 
 def method_arguments(table: Any, prefix: str, stage: str, method: str) -> dict[str, Any]:
     """A method row as the arguments of `rebuild_params`: what `make_fetch` hands on."""
-    row = (table & {f"{prefix}_method": method}).fetch1()
+    row = one(table & {f"{prefix}_method": method})
     return {
         "stage": stage,
         "name": row[f"{prefix}_method_name"],

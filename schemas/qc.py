@@ -9,6 +9,7 @@ from . import fit, gait, gdi, keypoints
 from ._datajoint import dj
 from .checks import check_values
 from .origin import Origin, computes, origin_columns
+from .rows import one
 
 schema = dj.Schema()
 
@@ -62,7 +63,7 @@ class SessionQc(dj.Computed):
             for row in (table & _of_set(table, key)).to_dicts(order_by="KEY"):
                 values = dict(zip(COLUMNS, check_values(prefix, row), strict=True))
                 found.append({"qc_stage": stage, "qc_video_id": row.get("video_id"), **values})
-        return found, (gdi.SessionGdi & key).fetch1("session_status")
+        return found, one(gdi.SessionGdi & key, "session_status")
 
     @computes
     def make_compute(

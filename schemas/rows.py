@@ -8,7 +8,38 @@ from typing import Any
 
 import numpy as np
 
+from pbl_pipeline.errors import PblError
+
 from ._datajoint import dj
+
+
+class InputChanged(PblError):
+    """Rows that a computation reads are gone or other ones: it is tried again, a few times."""
+
+    def __init__(self, found: str, key: object = None) -> None:
+        super().__init__(
+            "INPUT_CHANGED",
+            found=found,
+            expected="the rows that were there when the job was queued",
+            next_step="`pbl retry` once the row is there again (`pbl db restore`, `pbl ingest`, or another method)",
+            key=key,
+        )
+
+
+def one(query: Any, *columns: str) -> Any:
+    """`query.fetch1(*columns)` for what a computation reads.
+
+    Raises
+    ------
+    InputChanged
+        There is no such row (any more).
+    """
+    try:
+        return query.fetch1(*columns)
+    except dj.DataJointError:
+        if len(query):
+            raise
+        raise InputChanged(f"no row of {query.from_clause()} for this key") from None
 
 
 def utc_now() -> datetime.datetime:

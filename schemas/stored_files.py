@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import tempfile
+import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,25 +28,57 @@ def stored_file(table: Any, ref: Mapping[str, Any]) -> Iterator[Path]:
     """Path to read an object of the store, from the dict that `file_ref` took from a row. Touches no database.
 
     A store in a folder gives the file itself; a remote one a copy that is removed afterwards.
+
+    Raises
+    ------
+    PblError
+        FILE_FORMAT where the store has no such file, another size of it, or what reads it cannot.
     """
     backend = backend_of(ref.get("store") or connection.STORE)
     if backend.protocol == "file":
         path = Path(full_path(backend, ref["path"]))
         if not path.is_file():
             raise _lost(ref)
-        yield path
+        with _readable(path, ref):
+            yield path
         return
     with tempfile.TemporaryDirectory(prefix="pbl-") as folder:
         path = Path(folder) / Path(ref["path"]).name
         if not backend.exists(ref["path"]):
             raise _lost(ref)
         backend.get_file(ref["path"], path)
-        yield path
+        with _readable(path, ref):
+            yield path
+
+
+@contextmanager
+def _readable(path: Path, ref: Mapping[str, Any]) -> Iterator[None]:
+    """What reads a file of the store raises FILE_FORMAT where it is damaged, naming the file."""
+    size = path.stat().st_size
+    if ref.get("size") not in (None, size):
+        raise _damaged(ref, f"{size} bytes where its row says {ref['size']}")
+    try:
+        yield
+    except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
+        if isinstance(error, OSError) and error.filename not in (None, str(path)):
+            raise  # it is about another file, such as one that is written
+        raise _damaged(ref, f"{type(error).__name__}: {error}") from error
 
 
 def file_ref(value: Any) -> dict[str, Any]:
-    """A fetched `<object@...>` value as a small dict: what `make_fetch` may hand on (its fetch is hashed twice)."""
-    return {"path": value.path, "store": value.store, "size": value.size}
+    """A fetched `<object@...>` or `<npy@...>` value as a small dict, which `make_fetch` may hand on. size: bytes, None
+    for an array, whose row does not know how long its file is."""
+    return {"path": value.path, "store": value.store, "size": None if hasattr(value, "dtype") else value.size}
+
+
+def _damaged(ref: Mapping[str, Any], found: str) -> PblError:
+    return PblError(
+        "FILE_FORMAT",
+        found=found,
+        expected="the file that was stored",
+        next_step="restore the object store from the backup, or delete the row so that it is computed again",
+        key=f"{ref['path']} in the object store",
+    )
 
 
 def _lost(ref: Mapping[str, Any]) -> PblError:

@@ -14,7 +14,7 @@ from . import video
 from ._datajoint import dj
 from .method_rows import method_arguments, method_columns, method_of_model, rebuild_params, resolve_method
 from .origin import Origin, computes, origin_columns
-from .rows import delete_below, number, utc_now
+from .rows import delete_below, number, one, utc_now
 from .stored_files import file_ref, new_folder, stored_file
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ class Tracking(dj.Computed):
 
     def make_fetch(self, key: dict) -> tuple:
         method = method_arguments(TrackingMethod, "tracking", "tracking", key["tracking_method"])
-        probed = (video.Video * video.VideoInfo & key).fetch1()
+        probed = one(video.Video * video.VideoInfo & key)
         return probed, file_ref(probed.pop("frame_time")), method
 
     @computes
@@ -147,12 +147,12 @@ class SubjectChoice(dj.Computed):
     """
 
     def make_fetch(self, key: dict) -> tuple:
-        file = (video.Video & key).fetch1("video_path", "video_sha256")
-        tracks, detector, model = (Tracking & key).fetch1("tracks", "detector", "tracking_model_sha256")
-        size = (video.VideoInfo & key).fetch1("width", "height")
+        file = one(video.Video & key, "video_path", "video_sha256")
+        tracks, detector, model = one(Tracking & key, "tracks", "detector", "tracking_model_sha256")
+        size = one(video.VideoInfo & key, "width", "height")
         override = (SubjectOverride & key).to_dicts()
         person = int(override[0]["override_person_id"]) if override else None
-        subject_method = (TrackingSelection & key).fetch1("subject_method")
+        subject_method = one(TrackingSelection & key, "subject_method")
         method = method_arguments(SubjectMethod, "subject", "subject", subject_method)
         elsewhere = None if override else _decided_elsewhere(key)
         return file, file_ref(tracks), (int(size[0]), int(size[1])), (detector, model), person, elsewhere, method

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from . import fit, video  # noqa: F401  a definition refers to video
 from ._datajoint import dj
 from .origin import Origin, computes, origin_columns
-from .rows import number
+from .rows import number, one
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -80,8 +80,8 @@ class KinematicError(dj.Computed):
 
     def make_fetch(self, key: dict) -> tuple:
         return (
-            file_ref((fit.SessionFit.Trial & key).fetch1("trial_file")),
-            file_ref((ReferenceKinematics & key).fetch1("reference_file")),
+            file_ref(one(fit.SessionFit.Trial & key, "trial_file")),
+            file_ref(one(ReferenceKinematics & key, "reference_file")),
         )
 
     @computes

@@ -13,7 +13,7 @@ from pbl_pipeline.errors import PblError
 from . import lab, session  # noqa: F401  the definitions refer to them
 from ._datajoint import dj
 from .origin import Origin, computes, origin_columns
-from .rows import number
+from .rows import number, one
 
 if TYPE_CHECKING:
     from pbl_pipeline import video as lib
@@ -122,7 +122,7 @@ class VideoInfo(dj.Computed):
     """
 
     def make_fetch(self, key: dict) -> tuple:
-        return (Video & key).fetch1("video_path", "video_sha256")
+        return one(Video & key, "video_path", "video_sha256")
 
     @computes
     def make_compute(self, key: dict, path: str, sha256: str) -> tuple[lib.VideoInfo]:
@@ -203,14 +203,14 @@ def camera_of(row: Mapping[str, Any]) -> dict[str, Any] | None:
     from pbl_pipeline.video import phone_lens
 
     if row["camera_id"] is not None:
-        return {**(lab.CameraCalibration & {"camera_id": row["camera_id"]}).fetch1(), "turn_deg": 0}
+        return {**one(lab.CameraCalibration & {"camera_id": row["camera_id"]}), "turn_deg": 0}
     lens = phone_lens(info_of_row(row, np.zeros(0)))
     if lens is None:
         return None
     of_device = (lab.DeviceCalibration & (lab.Device & lab.device_columns(lens)) & lab.mode_columns(lens)).to_dicts()
     if not of_device or not lens.same_focal(number(of_device[0]["device_focal_35mm"])):
         return None
-    found = (lab.CameraCalibration & {"camera_id": of_device[0]["camera_id"]}).fetch1()
+    found = one(lab.CameraCalibration & {"camera_id": of_device[0]["camera_id"]})
     found["camera_note"] += f", of {of_device[0]['device']}"
     return {**found, "turn_deg": int(row["rotation"]) - int(of_device[0]["stored_rotation"])}
 

@@ -43,6 +43,7 @@ class Claim:
     host: str
     pid: int
     connection_id: int
+    attempts: int = 0  # how often it was put back because of its inputs
 
     def __str__(self) -> str:
         return f"{self.table.__name__} " + ", ".join(f"{k}={v}" for k, v in self.key.items())
@@ -129,7 +130,7 @@ def claim(table: Any, n: int = 1) -> list[Claim]:
     """Reserve up to n jobs, the most urgent and oldest first; where many workers draw, nearly so."""
     jobs = jobs_of(table)
     ready = jobs.pending & "scheduled_time <= CURRENT_TIMESTAMP(3)"
-    rows = ready.proj("priority").to_dicts(order_by="priority, scheduled_time", limit=_SPREAD * n)
+    rows = ready.proj("priority", "attempts").to_dicts(order_by="priority, scheduled_time", limit=_SPREAD * n)
     claims: list[Claim] = []
     # Everybody sees the same candidates: a random order within a priority makes two hands on one job rare.
     rows.sort(key=lambda r: (r["priority"], random.random()))  # noqa: S311
@@ -137,7 +138,7 @@ def claim(table: Any, n: int = 1) -> list[Claim]:
         key = {k: row[k] for k in jobs.primary_key}
         if jobs.reserve(key):
             here = (platform.node(), os.getpid(), jobs.connection.connection_id)
-            claims.append(Claim(table, key, int(row["priority"]), *here))
+            claims.append(Claim(table, key, int(row["priority"]), *here, attempts=int(row["attempts"])))
             _held.add((table.__name__, claims[-1].hash))
             if len(claims) == n:
                 break
@@ -157,9 +158,10 @@ def fail(job: Claim, message: str, stack: str = "") -> None:
     let_go(job)
 
 
-def put_back(job: Claim, reason: str = "", delay_s: float = 0.0) -> bool:
-    """Make the job pending again, taken earliest after `delay_s`; `reason` stays in its row. Whether it was ours."""
-    ours = reset(_mine(job), reason, delay_s) == 1
+def put_back(job: Claim, reason: str = "", delay_s: float = 0.0, attempts: int | None = None) -> bool:
+    """Make the job pending again, taken earliest after `delay_s`; `reason` stays in its row, and `attempts` counts how
+    often it was tried in vain (None: as before). Whether it was ours."""
+    ours = reset(_mine(job), reason, delay_s, job.attempts if attempts is None else attempts) == 1
     let_go(job)
     return ours
 
@@ -174,12 +176,12 @@ def let_go_all() -> None:
     _held.clear()
 
 
-def reset(jobs: Any, reason: str = "", delay_s: float = 0.0) -> int:
+def reset(jobs: Any, reason: str = "", delay_s: float = 0.0, attempts: int = 0) -> int:
     """Make all rows of a restricted queue pending, to be taken earliest after `delay_s`; returns how many."""
     cursor = jobs.connection.query(  # the condition is DataJoint's, which escapes values
         f"UPDATE {jobs.full_table_name} SET status='pending', error_message=%s, error_stack=NULL, host='', pid=0,"  # noqa: S608
-        f" scheduled_time=CURRENT_TIMESTAMP(3) + INTERVAL %s MICROSECOND{jobs.where_clause()}",
-        args=(reason[:2000], int(delay_s * 1e6)),
+        f" attempts=%s, scheduled_time=CURRENT_TIMESTAMP(3) + INTERVAL %s MICROSECOND{jobs.where_clause()}",
+        args=(reason[:2000], attempts, int(delay_s * 1e6)),
     )
     return int(cursor.rowcount)
 

@@ -17,17 +17,10 @@ from . import queue
 #: a database that is away for a minute and a process that compiles.
 DEAD_AFTER_S = 180.0
 
-#: How the message of an error begins that says nothing about the job: a signal, a lost server, or inputs that
-#: somebody changed during the computation. Such rows are tried again without being asked.
-INTERRUPTED = (
-    "KeyboardInterrupt",
-    "SystemExit",
-    "LostConnectionError",
-    "OperationalError",
-    "InterfaceError",
-    "DataJointError: Referential integrity failed",
-    "DataJointError: fetch1",
-)
+#: Exceptions that say nothing about the job: a signal, a lost server. DataJoint's own populate makes error rows of them
+#: that begin with the exception's name (a worker puts the job back); they are tried again without being asked.
+INTERRUPTED = ("KeyboardInterrupt", "SystemExit", "LostConnectionError", "OperationalError", "InterfaceError")
+INTERRUPTED_ROWS = f"error_message REGEXP '^({'|'.join(INTERRUPTED)})(:|$)'"
 
 
 def free_dead(table: Any) -> int:
@@ -41,16 +34,13 @@ def free_dead(table: Any) -> int:
     for row in jobs.reserved.proj("host", "pid", "reserved_time").to_dicts():
         if not _alive(row, table):
             n += queue.reset(jobs.reserved & {k: row[k] for k in jobs.primary_key} & {"pid": row["pid"]})
-    for word in INTERRUPTED:
-        n += queue.reset(jobs.errors & f"error_message like '{word}%'")
-    return n
+    return n + queue.reset(jobs.errors & INTERRUPTED_ROWS)
 
 
 def free_own(table: Any) -> int:
     """Put back what this process was computing when a signal ended it."""
     mine = jobs_of(table) & {"host": platform.node(), "pid": os.getpid()}
-    interrupted = [f"error_message like '{word}%'" for word in INTERRUPTED]
-    return queue.reset(mine & {"status": "reserved"}) + queue.reset(mine & {"status": "error"} & interrupted)
+    return queue.reset(mine & {"status": "reserved"}) + queue.reset(mine & {"status": "error"} & INTERRUPTED_ROWS)
 
 
 def _alive(row: dict[str, Any], table: Any) -> bool:

@@ -1,4 +1,4 @@
-"""One reserved job through DataJoint's three-part make: computed once, inserted once, whatever happens in between."""
+"""One reserved job through the three parts of its make: computed once, inserted once, whatever happens in between."""
 
 from __future__ import annotations
 
@@ -8,27 +8,31 @@ import threading
 import time
 import traceback
 from collections.abc import Sequence
-from typing import Any
 
 import deepdiff
 import pymysql
 
 from pbl_pipeline.errors import PblError
 from schemas import connection
-from schemas.coded_errors import error_code
-from schemas.connection import DuplicateError, LostConnectionError
+from schemas.coded_errors import error_code, error_message
+from schemas.connection import DuplicateError, IntegrityError, LostConnectionError, inserting
+from schemas.rows import InputChanged
 
 from . import queue
 from .queue import Claim, ReservationLost
 
 #: What a job can come to.
 DONE, ALREADY, LOST, FAILED, LATER = "done", "already there", "somebody else has it", "failed", "later"
+#: Its key is gone: a row above was deleted, or another selection took its place. Its job is deleted, not tried.
+VANISHED = "no longer asked for"
 
 #: What the driver and DataJoint raise for the database itself, and the numbers that say that it is away (the computed
 #: result is kept and written when it is back) or that the same statement will do next time.
 DATABASE_ERRORS = (LostConnectionError, pymysql.err.OperationalError, pymysql.err.InterfaceError)
 AWAY = (0, 1040, 1053, 1927, 2002, 2003, 2006, 2013, 2055, 4031)
-REPEAT = (1020, 1205, 1213)
+REPEAT, REPEATS = (1020, 1205, 1213), 10
+#: Attempts of a job whose inputs are gone or changed, and how long it waits after each but the last (s).
+ATTEMPTS, RETRY_S = 3, (1.0, 30.0)
 #: Errors of the file system that say nothing about the job: store full, read-only, away.
 STORE_GONE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ESTALE, errno.ENOTCONN, errno.EACCES)
 #: How long a job waits after such an error (s).
@@ -52,15 +56,18 @@ class Outcome:
 class Computed:
     """A result that was computed before its insert, and what it was computed from."""
 
-    fetched: Any
+    fetched: tuple
     result: tuple
 
     def of(self, fetched: tuple) -> bool:
         """Whether these inputs are the same."""
         try:
-            return bool(fetched == self.fetched)
-        except ValueError:  # arrays among them have no one answer; hashing takes milliseconds
-            return deepdiff.DeepHash(fetched)[fetched] == deepdiff.DeepHash(self.fetched)[self.fetched]
+            if bool(fetched == self.fetched):
+                return True
+        except ValueError:  # arrays among them have no one answer
+            pass
+        # A hash takes milliseconds; it also finds two NaN alike.
+        return deepdiff.DeepHash(fetched)[fetched] == deepdiff.DeepHash(self.fetched)[self.fetched]
 
 
 def run(job: Claim, computed: Computed | None = None, stop: threading.Event | None = None) -> Outcome:
@@ -70,72 +77,98 @@ def run(job: Claim, computed: Computed | None = None, stop: threading.Event | No
 
     A result is inserted only while the reservation is ours (`queue.hold`), so that a job which two processes were given
     leaves one row. Where the database goes away after the computation, the result is kept and inserted when it is
-    back, for up to `DATABASE_WAIT_S`. A store that is full or away puts the job back for `STORE_WAIT_S`.
+    back, for up to `DATABASE_WAIT_S`. A store that is full or away puts the job back for `STORE_WAIT_S`. A job whose
+    inputs are gone or changed is put back too, each time for longer; `ATTEMPTS` of these make an error row.
 
     KeyboardInterrupt and SystemExit put the job back and go on up.
     """
-    start, kept = time.monotonic(), [computed] if computed else []
-    table = job.table()
-    make_compute, make_insert = table.make_compute, table.make_insert
-
-    def compute_once(key: dict, *fetched: Any) -> tuple:
-        if kept and kept[0].of(fetched):
-            return kept[0].result
-        kept[:] = [Computed(fetched, make_compute(key, *fetched))]
-        return kept[0].result
-
-    def insert_fenced(key: dict, *result: Any) -> None:
-        queue.hold(job)
-        make_insert(key, *result)
-
-    table.make_compute, table.make_insert = compute_once, insert_fenced
-
-    def ended(what: str, error: BaseException | None = None) -> Outcome:
-        text = f"{type(error).__name__}: {error}" if error is not None else ""
-        return Outcome(job, what, time.monotonic() - start, error_code(text) if error else "", text)
-
-    repeated = 0
+    start, attempt, repeated = time.monotonic(), _Attempt(job, computed), 0
     while True:
         try:
-            made = table._populate1(dict(job.key), None, suppress_errors=True, return_exception_objects=True)
-            error = made[1] if isinstance(made, tuple) else None
-            if error is None:
-                queue.finish(job)
-                return ended(DONE if made is True else ALREADY)
-            if isinstance(error, (KeyboardInterrupt, SystemExit)):
-                raise error
+            outcome = Outcome(job, attempt.make())
+            queue.finish(job)
+            break
         except (KeyboardInterrupt, SystemExit):
             queue.put_back(job)
             raise
-        except DATABASE_ERRORS as lost:  # also DataJoint's own bookkeeping may meet a database that is gone
-            error = lost
-        if is_gone(error):
-            if not wait_for_database(stop):
+        except Exception as error:  # noqa: BLE001  each kind is settled below
+            if is_gone(error):
+                if wait_for_database(stop):
+                    continue
                 queue.let_go(job)  # its reservation is that of a dead process, and is freed as such
-                return ended(LATER, error)
-        elif _number(error) in REPEAT and repeated < 10:
-            repeated += 1
-        else:
-            return _after_error(job, error, ended)
+                outcome = _outcome(job, LATER, error)
+            elif _number(error) in REPEAT and repeated < REPEATS:
+                repeated += 1
+                continue
+            else:
+                outcome = _settle(job, error)
+            break
+    return dataclasses.replace(outcome, seconds=time.monotonic() - start)
 
 
-def _after_error(job: Claim, error: BaseException, ended: Any) -> Outcome:
+@dataclasses.dataclass
+class _Attempt:
+    """Fetch, compute, insert. What was computed is kept for the next attempt, where its inputs are still the same."""
+
+    job: Claim
+    computed: Computed | None = None
+
+    def make(self) -> str:
+        """DONE, ALREADY (the row is there) or VANISHED (nobody asks for it any more); raises what goes wrong."""
+        table, key = self.job.table(), self.job.key
+        if key in table:
+            return ALREADY
+        if not _is_wanted(self.job):
+            return VANISHED
+        fetched = table.make_fetch(dict(key))
+        if self.computed is None or not self.computed.of(fetched):
+            self.computed = Computed(fetched, table.make_compute(dict(key), *fetched))
+        with table.connection.transaction:
+            queue.hold(self.job)
+            if not self.computed.of(table.make_fetch(dict(key))):
+                raise InputChanged("other rows than before the computation", self.job)
+            with inserting(table):
+                table.make_insert(dict(key), *self.computed.result)
+        return DONE
+
+
+def _is_wanted(job: Claim) -> bool:
+    """Whether the key can still be computed: its rows above are there, and it is still asked for."""
+    return bool(len(job.table().key_source & job.key))
+
+
+def _outcome(job: Claim, what: str, error: BaseException) -> Outcome:
+    text = error_message(error, job.table.__name__, job.key)
+    return Outcome(job, what, code=error_code(text), text=text)
+
+
+def _settle(job: Claim, error: Exception) -> Outcome:
+    """End the reservation of a job that failed, by what kind of error it was."""
     if isinstance(error, ReservationLost):
         queue.let_go(job)
-        return ended(LOST, error)
-    if isinstance(error, DuplicateError) and len(job.table() & job.key):
+        return Outcome(job, LOST)
+    if isinstance(error, DuplicateError) and job.key in job.table():
         queue.finish(job)
-        return ended(ALREADY)
-    store = _store_error(error)
-    if store is not None:
+        return Outcome(job, ALREADY)
+    if store := _store_error(error):
         queue.put_back(job, f"STORE: {store}", STORE_WAIT_S)
-        return ended(LATER, error)
-    if "Referential integrity failed" in str(error) or "fetch1" in str(error):
-        queue.put_back(job, "its inputs changed", 1.0)  # a row above was deleted or replaced while we computed
-        return ended(LATER, error)
-    message = f"{type(error).__name__}: {error}"
-    queue.fail(job, message, "".join(traceback.format_exception(error)))
-    return ended(FAILED, error)
+        return _outcome(job, LATER, error)
+    if isinstance(error, IntegrityError):  # a row above was deleted while we computed
+        error = InputChanged(f"a row that the result refers to is gone ({error})", job)
+    if isinstance(error, InputChanged):
+        if not _is_wanted(job):
+            queue.finish(job)
+            return Outcome(job, VANISHED)
+        tried = job.attempts + 1
+        if tried < ATTEMPTS:
+            queue.put_back(job, f"its inputs changed: {error.found}", RETRY_S[job.attempts], tried)
+            return _outcome(job, LATER, error)
+    queue.fail(
+        job,
+        error_message(error, job.table.__name__, job.key),
+        "".join(traceback.format_exception(error)),
+    )
+    return _outcome(job, FAILED, error)
 
 
 def _store_error(error: BaseException) -> str | None:
@@ -150,7 +183,7 @@ def _store_error(error: BaseException) -> str | None:
 
 def _number(error: BaseException) -> int:
     """The server's number of an error, 0 where there is none."""
-    first = error.args[0] if error.args else 0
+    first = error.args[0] if isinstance(error, DATABASE_ERRORS) and error.args else 0
     return first if isinstance(first, int) else 0
 
 
@@ -200,6 +233,7 @@ def compute_batch(jobs: Sequence[Claim], fetched: Sequence[tuple | None]) -> lis
     except Exception:  # noqa: BLE001
         return out
     for i, result in zip(good, results, strict=True):
-        if result is not None:
-            out[i] = Computed(fetched[i], result)
+        inputs = fetched[i]
+        if result is not None and inputs is not None:
+            out[i] = Computed(inputs, result)
     return out

@@ -739,7 +739,8 @@ def test_reservations_of_dead_processes_are_freed_and_others_are_kept(tables: No
     ):
         jobs.update1({**key, "status": "reserved", "host": host, "pid": pid, "reserved_time": now})
     run = populate(["VideoInfo"])
-    assert (run.freed, done(run)) == (2, {"VideoInfo": 2})
+    # A row that was missing may be missing for good: that is counted in its job, not tried again for ever.
+    assert (run.freed, done(run)) == (1, {"VideoInfo": 1})
     left = jobs.reserved.to_arrays("video_id", order_by="video_id")
     assert left.tolist() == [alive["video_id"], elsewhere["video_id"]]
 
@@ -752,8 +753,9 @@ def test_only_errors_that_say_nothing_about_the_video_are_tried_again(tables: No
     for key, message in zip(jobs.keys(order_by="video_id"), messages, strict=True):
         jobs.update1({**key, "status": "error", "error_message": message})
     run = populate(["VideoInfo"])
-    assert (run.freed, done(run)) == (2, {"VideoInfo": 2})
-    assert [e.code for e in pipeline_status().errors] == ["VIDEO_DAMAGED"]
+    # A row that was missing may be missing for good: that is counted in its job, not tried again for ever.
+    assert (run.freed, done(run)) == (1, {"VideoInfo": 1})
+    assert sorted(e.code for e in pipeline_status().errors) == ["INTERNAL", "VIDEO_DAMAGED"]
 
 
 def test_limit_and_unknown_tables(tables: None, tmp_path: Path):

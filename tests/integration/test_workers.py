@@ -231,6 +231,33 @@ def test_the_result_survives_a_database_that_goes_away(tables: None, tmp_path: P
     assert (len(video.VideoInfo()), jobs_left()) == (1, {})
 
 
+def test_the_result_survives_a_database_that_goes_away_in_the_middle_of_its_insert(
+    tables: None, tmp_path: Path, monkeypatch, database: Path
+):
+    register(*videos(tmp_path, "walk"))
+    job = first_job()
+    probe, insert, computed, inserted = pbl_pipeline.video.probe, video.VideoInfo.make_insert, [], []
+    server = embedded.Folder(database / "db")
+
+    def count(path):
+        computed.append(path)
+        return probe(path)
+
+    def make_insert(self, *args):
+        inserted.append(args)
+        if len(inserted) == 1:
+            os.kill(server.state()["pid"], signal.SIGKILL)
+            threading.Timer(1.5, lambda: embedded.start(folder=server)).start()
+        insert(self, *args)
+
+    monkeypatch.setattr(pbl_pipeline.video, "probe", count)
+    monkeypatch.setattr(video.VideoInfo, "make_insert", make_insert)
+    monkeypatch.setattr(run_job, "DATABASE_PAUSE_S", 0.2)
+    assert run_job.run(job).what == run_job.DONE
+    assert (len(computed), len(inserted)) == (1, 2)
+    assert (len(video.VideoInfo()), jobs_left()) == (1, {})
+
+
 def test_inputs_that_changed_meanwhile_are_read_again(tables: None, tmp_path: Path, monkeypatch):
     (number,) = register(*videos(tmp_path, "walk"))
     job = first_job()
@@ -467,7 +494,10 @@ def test_errors_are_tried_again_by_code_table_and_video(tables: None, tmp_path: 
 def test_a_new_method_adds_rows_and_touches_no_old_one(tables: None, tmp_path: Path):
     register(*videos(tmp_path, "walk1", "walk2"))
     work()
-    before = {t.__name__: t.to_dicts() for t in (video.VideoInfo, tracking.Tracking, fit.SessionFit, gait.GaitEvents)}
+    before = {
+        t.__name__: t.to_dicts(order_by="KEY")
+        for t in (video.VideoInfo, tracking.Tracking, fit.SessionFit, gait.GaitEvents)
+    }
     plan = requeue.plan_new_method("SessionFit", "paper-2025")
     assert (len(plan.add), plan.outdated) == (1, [])
     list(requeue.carry_out(plan))
@@ -479,9 +509,9 @@ def test_a_new_method_adds_rows_and_touches_no_old_one(tables: None, tmp_path: P
     assert len(gait.GaitEvents()) == 4
     for table, prefix in ((video.VideoInfo, "video_info"), (tracking.Tracking, "tracking")):
         stamps = [r[f"{prefix}_computed"] for r in before[table.__name__]]
-        assert table.to_arrays(f"{prefix}_computed").tolist() == stamps
+        assert table.to_arrays(f"{prefix}_computed", order_by="KEY").tolist() == stamps
     key = {"fit_method": before["SessionFit"][0]["fit_method"]}
-    assert [r["fit_computed"] for r in (fit.SessionFit & key).to_dicts()] == [
+    assert [r["fit_computed"] for r in (fit.SessionFit & key).to_dicts(order_by="KEY")] == [
         r["fit_computed"] for r in before["SessionFit"]
     ]
     assert requeue.plan_new_method("SessionFit", "paper-2025").add == []

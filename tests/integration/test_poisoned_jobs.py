@@ -1,0 +1,216 @@
+"""A job that cannot succeed ends: deleted where nobody asks for it, else an error row with a code, after 3 attempts."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import pbl_pipeline.video
+import schemas
+from pbl_pipeline.paramset import Paramset
+from schemas import connection, fit, gait, keypoints, tracking, video
+from schemas.coded_errors import error_code, error_found
+from schemas.jobs import jobs_of
+from schemas.method_rows import insert_methods
+from tests.rows import register
+from workers import queue, refresh, run_job
+from workers.heartbeat import Silent
+from workers.loop import Worker
+
+from . import chain
+
+
+def work(*tables: Any) -> Worker:
+    """One worker until nothing is left that can be taken now."""
+    one = Worker(tables or schemas.computed_tables(), Silent())
+    one.run(once=True)
+    return one
+
+
+def above(table: Any) -> list[Any]:
+    """The computed tables before this one."""
+    found = schemas.computed_tables()
+    return found[: found.index(table)]
+
+
+def claimed(table: Any) -> queue.Claim:
+    """The only job of a table; what it waits for is over."""
+    jobs = jobs_of(table)
+    jobs.connection.query(f"UPDATE {jobs.full_table_name} SET scheduled_time = '2020-01-01'")
+    (job,) = queue.claim(table, 1)
+    return job
+
+
+def error(table: Any) -> tuple[str, str]:
+    """Code and finding of the only error row of a table."""
+    message = jobs_of(table).errors.fetch1("error_message")
+    return error_code(message), error_found(message)
+
+
+def test_a_file_whose_name_is_a_word_of_datajoint_is_one_error(tables: None, tmp_path: Path):
+    """Errors were told apart by their text, and "fetch1" in it meant: again, for ever."""
+    path = tmp_path / "fetch1 Referential integrity failed.mp4"
+    path.write_bytes(os.urandom(4096))
+    register(path)
+    assert work().failed == 1
+    assert error(video.VideoInfo)[0] == "VIDEO_NOT_A_VIDEO"
+    assert work().failed == 0
+
+
+def test_a_video_that_was_deleted_while_its_job_was_queued_is_not_tried(tables: None, tmp_path: Path, monkeypatch):
+    (number,) = register(chain.small_video(tmp_path, "walk"))
+    refresh.refresh()
+    video.Video.delete(prompt=False)
+    monkeypatch.setattr(pbl_pipeline.video, "probe", lambda path: pytest.fail("tried"))
+    outcome = run_job.run(claimed(video.VideoInfo))
+    assert (outcome.what, outcome.job.key) == (run_job.VANISHED, {"video_id": number})
+    assert len(jobs_of(video.VideoInfo)) == 0
+
+
+def test_a_video_that_was_deleted_while_it_was_computed_leaves_no_job(tables: None, tmp_path: Path, monkeypatch):
+    register(chain.small_video(tmp_path, "walk"))
+    refresh.refresh()
+    real = pbl_pipeline.video.probe
+
+    def probe(path):
+        video.Video.delete(prompt=False)
+        return real(path)
+
+    monkeypatch.setattr(pbl_pipeline.video, "probe", probe)
+    assert run_job.run(claimed(video.VideoInfo)).what == run_job.VANISHED
+    assert (len(jobs_of(video.VideoInfo)), len(video.VideoInfo())) == (0, 0)
+
+
+def test_a_selection_that_was_withdrawn_is_not_tried(tables: None, tmp_path: Path):
+    register(chain.small_video(tmp_path, "walk"))
+    work(*above(fit.SessionFit))
+    refresh.refresh()
+    (key,) = fit.FitSelection.keys()
+    fit.FitSelection.update1({**key, "fit_current": False})
+    assert run_job.run(claimed(fit.SessionFit)).what == run_job.VANISHED
+    assert len(jobs_of(fit.SessionFit)) == 0
+
+
+def test_a_row_that_a_result_needs_is_gone_for_good(tables: None, tmp_path: Path):
+    register(chain.small_video(tmp_path, "walk"))
+    work(*above(fit.SessionFit))
+    refresh.refresh()
+    body = fit.BodyModel.to_dicts()
+    fit.BodyModel.delete(prompt=False)
+    try:
+        for attempt in range(1, run_job.ATTEMPTS):
+            assert run_job.run(claimed(fit.SessionFit)).what == run_job.LATER
+            job = jobs_of(fit.SessionFit).fetch1()
+            assert (job["status"], job["attempts"]) == ("pending", attempt)
+            now = connection.connect().query("SELECT CURRENT_TIMESTAMP(3)").fetchone()[0]
+            delay = (job["scheduled_time"] - now).total_seconds()
+            assert run_job.RETRY_S[attempt - 1] - 5.0 < delay <= run_job.RETRY_S[attempt - 1]
+            assert "body_model" in job["error_message"]
+        assert run_job.run(claimed(fit.SessionFit)).what == run_job.FAILED
+        code, found = error(fit.SessionFit)
+        assert code == "INPUT_CHANGED"
+        assert "body_model" in found
+        assert work().failed == 0  # and it stays an error row
+        assert len(jobs_of(fit.SessionFit).errors) == 1
+    finally:
+        fit.BodyModel.insert(body)
+    queue.reset(jobs_of(fit.SessionFit).errors)  # `pbl retry` counts from the beginning
+    assert jobs_of(fit.SessionFit).fetch1("attempts") == 0
+    assert run_job.run(claimed(fit.SessionFit)).what == run_job.DONE
+
+
+def test_inputs_that_change_each_time_end_as_an_error(tables: None, tmp_path: Path, monkeypatch):
+    (number,) = register(chain.small_video(tmp_path, "walk"))
+    refresh.refresh()
+    real, names = pbl_pipeline.video.probe, iter("abc")
+
+    def probe(path):
+        # As if somebody renamed the file again and again; it is the same one for the probe.
+        elsewhere = tmp_path / f"{next(names)}.mp4"
+        os.rename(path, elsewhere)
+        video.Video.update1({"video_id": number, "video_path": str(elsewhere)})
+        return real(elsewhere)
+
+    monkeypatch.setattr(pbl_pipeline.video, "probe", probe)
+    ended = [run_job.run(claimed(video.VideoInfo)).what for _ in range(run_job.ATTEMPTS)]
+    assert ended == [run_job.LATER, run_job.LATER, run_job.FAILED]
+    assert error(video.VideoInfo)[0] == "INPUT_CHANGED"
+
+
+def test_a_method_of_another_version_of_the_code_is_an_error_at_once(tables: None, tmp_path: Path):
+    later = {"later": Paramset("tracking", "later", 1, {"a_parameter_of_later": 3})}
+    insert_methods(tracking.TrackingMethod, "tracking", later)
+    (number,) = register(chain.small_video(tmp_path, "walk"))
+    key = tracking.TrackingSelection.fetch1()
+    tracking.TrackingSelection.delete(prompt=False)
+    tracking.TrackingSelection.insert1({**key, "tracking_method": "later-v1"})
+    try:
+        work()
+        assert error(tracking.Tracking)[0] == "SOLVER_UNKNOWN"
+        assert jobs_of(tracking.Tracking).fetch1("video_id") == number
+    finally:
+        tracking.TrackingSelection.delete(prompt=False)
+        (tracking.TrackingMethod & {"tracking_method": "later-v1"}).delete(prompt=False)
+
+
+@pytest.mark.parametrize("damage", ["cut off", "other bytes", "gone"])
+@pytest.mark.parametrize(
+    ("table", "column", "reader"),
+    [
+        (video.VideoInfo, "frame_time", tracking.Tracking),
+        (tracking.Tracking, "tracks", tracking.SubjectChoice),
+        (keypoints.Keypoints, "keypoints_file", fit.TrialInput),
+        (fit.SessionFit.Trial, "trial_file", gait.GaitEvents),
+    ],
+    ids=lambda value: getattr(value, "__name__", value),
+)
+def test_a_damaged_file_of_the_store_is_an_error_that_names_it(tables, tmp_path: Path, table, column, reader, damage):
+    register(chain.small_video(tmp_path, "walk"))
+    work(*above(reader))
+    refresh.refresh()
+    stored = table.fetch1(column).path
+    file = Path(connection.store_backend().spec["location"]) / stored
+    content = file.read_bytes()
+    if damage == "gone":
+        file.unlink()
+    else:
+        half = len(content) // 2
+        # A zip whose size is right and whose content is not has its own check sums.
+        file.write_bytes(content[:half] if damage == "cut off" else b"\x93NUMPY" + os.urandom(len(content) - 6))
+    assert work(reader).failed == 1
+    code, found = error(reader)
+    assert code == "FILE_FORMAT", found
+    assert stored in jobs_of(reader).errors.fetch1("error_message")
+    assert work(reader).failed == 0
+
+
+def test_an_unforeseen_error_outside_of_the_computation_has_a_code(tables: None, tmp_path: Path, monkeypatch):
+    register(chain.small_video(tmp_path, "walk"))
+    refresh.refresh()
+
+    def insert(self, key, info, origin):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(video.VideoInfo, "make_insert", insert)
+    outcome = run_job.run(claimed(video.VideoInfo))
+    assert (outcome.what, outcome.code) == (run_job.FAILED, "INTERNAL")
+    assert error(video.VideoInfo) == ("INTERNAL", "LinAlgError: Singular matrix")
+    assert len(video.VideoInfo()) == 0
+
+
+def test_plain_populate_reports_a_missing_row_with_its_code(tables: None, tmp_path: Path):
+    """DataJoint writes the name of the exception before its text."""
+    register(chain.small_video(tmp_path, "walk"))
+    work(*above(fit.SessionFit))
+    refresh.refresh()
+    body = fit.BodyModel.to_dicts()
+    fit.BodyModel.delete(prompt=False)
+    try:
+        fit.SessionFit.populate(reserve_jobs=True, suppress_errors=True)
+        assert error(fit.SessionFit)[0] == "INPUT_CHANGED"
+    finally:
+        fit.BodyModel.insert(body)

@@ -1,0 +1,87 @@
+"""What `schemas` and `workers` take from DataJoint beyond its public face, and that the installed version has it."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from pathlib import Path
+
+import pytest
+from datajoint import adapters, autopopulate, connection, heading, jobs, storage, table, user_tables
+
+from schemas._datajoint import MySQLOrMariaDB, datajoint
+
+ROOT = Path(__file__).resolve().parents[2]
+FACE = ROOT / "schemas" / "_datajoint.py"
+
+
+def _parameters(function: object) -> list[str]:
+    assert callable(function)
+    return list(inspect.signature(function).parameters)
+
+
+def _private(tree: ast.AST) -> set[str]:
+    """Names with one underscore that are read or written as an attribute."""
+    names = {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
+    return {n for n in names if n.startswith("_") and not n.startswith("__")}
+
+
+def _of_datajoint() -> set[str]:
+    """Every private attribute and method of the installed DataJoint."""
+    found: set[str] = set()
+    for file in Path(datajoint.__file__).parent.rglob("*.py"):
+        tree = ast.parse(file.read_text())
+        defined = {n.name for n in ast.walk(tree) if isinstance(n, (ast.FunctionDef, ast.ClassDef))}
+        stored = {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+        found |= _private(tree) | {n for n in defined | stored if n.startswith("_") and not n.startswith("__")}
+    return found
+
+
+#: Private name of DataJoint -> what has to hold of it in the installed version.
+USED = {
+    "_allow_insert": lambda: (
+        autopopulate.AutoPopulate._allow_insert is False
+        and 'getattr(self, "_allow_insert", True)' in inspect.getsource(table.Table.insert)
+    ),
+    "_full_path": lambda: _parameters(storage.StorageBackend._full_path) == ["self", "path"],
+    "_heading": lambda: (
+        user_tables.UserTable._heading is None
+        and list(inspect.signature(heading.Heading).parameters)[:2] == ["attribute_specs", "table_info"]
+    ),
+}
+
+
+@pytest.mark.parametrize("name", sorted(USED))
+def test_the_installed_version_has_the_private_name(name: str):
+    assert USED[name]()
+
+
+def test_every_private_name_in_use_is_listed_above():
+    assert _private(ast.parse(FACE.read_text())) == set(USED)
+
+
+def test_no_other_file_touches_a_private_name():
+    private, found = _of_datajoint(), []
+    assert {"_config", "_conn", "_populate1", "_full_path"} <= private
+    for file in [f for package in ("schemas", "workers") for f in (ROOT / package).rglob("*.py") if f != FACE]:
+        tree = ast.parse(file.read_text())
+        own = {n.name for n in ast.walk(tree) if isinstance(n, (ast.FunctionDef, ast.ClassDef))}
+        own |= {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store)}
+        own |= {n.target.id for n in ast.walk(tree) if isinstance(n, ast.AnnAssign) and isinstance(n.target, ast.Name)}
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.Attribute) or node.attr not in private:
+                continue
+            of_self = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")
+            if not (of_self and node.attr in own):
+                found.append(f"{file.relative_to(ROOT)}:{node.lineno} {node.attr}")
+    assert not found
+
+
+def test_the_public_names_that_carry_most_are_there():
+    """Not private, but what everything rests on: the registry of adapters, job tables, transactions."""
+    assert adapters.ADAPTERS["mysql"] is MySQLOrMariaDB
+    assert type(adapters.get_adapter("mysql")) is MySQLOrMariaDB
+    assert _parameters(adapters.MySQLAdapter.connect)[:5] == ["self", "host", "port", "user", "password"]
+    assert isinstance(inspect.getattr_static(connection.Connection, "transaction"), property)
+    for name in ("reserve", "error", "pending", "reserved", "errors"):
+        assert hasattr(jobs.Job, name)
