@@ -8,17 +8,17 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import types
-import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
+
+import cattrs
 
 P = TypeVar("P")
 
 
 @dataclasses.dataclass(frozen=True)
 class Paramset:
-    """Name, version and parameters of one method of one stage ("tracking", "keypoints", "fit", "gait", "gdi")."""
+    """Name, version and parameters of one method of one stage (`methods.STAGES`), as a row stores them."""
 
     stage: str
     name: str
@@ -33,9 +33,18 @@ class Paramset:
     def to(self, cls: type[P]) -> P:
         """The parameter dataclass again, the inverse of `of`, also after the parameters went through JSON.
 
-        Raises `TypeError` or `KeyError` where they are not parameters of `cls`.
+        Parameters that are left out have their defaults. Raises `ValueError` for parameters that `cls` lacks, and for
+        values of another type.
         """
-        return _from_plain(cls, self.params)
+        try:
+            return _CONVERTER.structure(self.params, cls)
+        except cattrs.BaseValidationError as error:
+            raise ValueError("; ".join(cattrs.transform_error(error, format_exception=_reason))) from error
+
+    @property
+    def key(self) -> str:
+        """Short readable key: `<name>-v<version>`."""
+        return f"{self.name}-v{self.version}"
 
     @property
     def canonical_json(self) -> str:
@@ -54,26 +63,21 @@ def canonical_json(value: Any) -> str:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
-def _from_plain(target: Any, value: Any) -> Any:
-    """Undo what JSON does to a frozen dataclass: lists back to tuples, dicts to nested dataclasses, 1 to 1.0."""
-    origin = typing.get_origin(target)
-    if origin in (typing.Union, types.UnionType):
-        if value is None:
-            return None
-        return _from_plain(next(a for a in typing.get_args(target) if a is not type(None)), value)
-    if dataclasses.is_dataclass(target) and isinstance(target, type):
-        hints = typing.get_type_hints(target)
-        unknown = set(value) - {f.name for f in dataclasses.fields(target)}
-        if unknown:
-            raise TypeError(f"unknown parameters {sorted(unknown)}")
-        return target(**{k: _from_plain(hints[k], v) for k, v in value.items()})
-    if origin is tuple or target is tuple:
-        args = typing.get_args(target)
-        if len(args) == 2 and args[1] is Ellipsis:
-            args = (args[0],) * len(value)
-        return tuple(_from_plain(a, v) for a, v in zip(args or (Any,) * len(value), value, strict=True))
-    if target is Any and isinstance(value, list):
-        return tuple(_from_plain(Any, v) for v in value)
-    if target is float and type(value) is int:
+def _exactly(value: Any, kind: type) -> Any:
+    """`value`, which must be of this type already; JSON writes 1.0 as 1 in some databases, so an int may be a float."""
+    if kind is float and type(value) is int:
         return float(value)
+    if type(value) is not kind:
+        raise TypeError(f"{value!r} is no {kind.__name__}")
     return value
+
+
+def _reason(error: BaseException, kind: type | None) -> str:
+    """What is wrong with one value, for `cattrs.transform_error`, which adds where it stands."""
+    return str(error) if isinstance(error, TypeError) else cattrs.v.format_exception(error, kind)
+
+
+#: cattrs alone would turn "0.1" into 0.1 and 1.5 into 1.
+_CONVERTER = cattrs.Converter(forbid_extra_keys=True)
+for _kind in (bool, int, float, str):
+    _CONVERTER.register_structure_hook(_kind, _exactly)

@@ -12,9 +12,18 @@ from pbl_pipeline import __version__
 from pbl_pipeline.body import SCALE_NAMES
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import write_angles_csv
-from pbl_pipeline.fit import SessionFit, TrialFit, check_trial, fit_session
+from pbl_pipeline.fit import Params as FitParams
+from pbl_pipeline.fit import SessionFit, TrialFit, check_trial, default_for_points, fit_session
 from pbl_pipeline.gait import DEFAULT_NORM, GaitMetrics, gait_metrics, load_norm
-from pbl_pipeline.keypoints import Keypoints, ModelKeypointParams, check_keypoints, detect_keypoints, params_of
+from pbl_pipeline.keypoints import (
+    BlazePoseLandmarks,
+    KeypointParams,
+    Keypoints,
+    ModelKeypointParams,
+    check_keypoints,
+    detect_keypoints,
+)
+from pbl_pipeline.methods import Method
 from pbl_pipeline.models import find, load_spec
 from pbl_pipeline.names import distinct
 from pbl_pipeline.paramset import Paramset
@@ -68,14 +77,15 @@ class Session:
         return self.metrics.with_checks([*self.checks, *self.fit.qc])
 
 
-def fit_default(keypoints: Paramset) -> str | None:
-    """Name of the fit's paramset where nobody names one: `gauss-newton`, tuned for MeTRAbs' 87 points, for a registered
-    model of these; None, the project's default, for all else."""
-    params = params_of(keypoints)
-    if not isinstance(params, ModelKeypointParams):
-        return None
-    spec = load_spec(find(params.model.name))
-    return "gauss-newton" if (spec.kind, spec.marker_set) == ("crop3d", "bml_movi_87") else None
+def fit_default(keypoints: Method[KeypointParams]) -> str:
+    """Name of the fit's method for the keypoints of that method, where nobody names one (`default_for_points`).
+
+    Raises `PblError` MODEL_MISSING, MODEL_INVALID for a model that is not registered here.
+    """
+    if not isinstance(keypoints.params, ModelKeypointParams):
+        return default_for_points(BlazePoseLandmarks.marker_set, BlazePoseLandmarks.root_relative)
+    spec = load_spec(find(keypoints.params.model.name))
+    return default_for_points(spec.marker_set, spec.kind != "crop3d")
 
 
 def detect_trial(
@@ -83,11 +93,11 @@ def detect_trial(
     sheet: Path,
     camera_file: Path | None = None,
     person: int | None = None,
-    keypoints: Paramset | None = None,
-    people: Paramset | None = None,
+    keypoints: Method[KeypointParams] | None = None,
+    people: Method[TrackingParams] | None = None,
 ) -> Trial:
     """Video to keypoints of the subject. `sheet` is the picture of the people that is written when one must be chosen.
-    `keypoints` and `people` are the methods (`find_method` of keypoints and tracking), None the default.
+    `keypoints` and `people` are the methods, None the default.
 
     Raises
     ------
@@ -97,11 +107,10 @@ def detect_trial(
     """
     info = probe(path)
     camera = find_camera(info, camera_file)
-    tracking = track_people(path, people.to(TrackingParams) if people is not None else None, info=info)
+    tracking = track_people(path, people, info=info)
     choice = choose_subject(tracking, override=person)
     subject = require_subject(choice, tracking, path, sheet)
-    params = params_of(keypoints) if keypoints is not None else None
-    return Trial(path.stem, path, info, choice, detect_keypoints(path, tracking, subject, camera, params=params))
+    return Trial(path.stem, path, info, choice, detect_keypoints(path, tracking, subject, camera, params=keypoints))
 
 
 def run_session(
@@ -109,12 +118,12 @@ def run_session(
     out: Path,
     camera_file: Path | None = None,
     person: int | None = None,
-    paramset: Paramset | None = None,
+    paramset: Method[FitParams] | Paramset | None = None,
     camera_motion: str | None = None,
     norm: str | None = None,
     attitude_files: Sequence[Path] = (),
-    keypoints: Paramset | None = None,
-    people: Paramset | None = None,
+    keypoints: Method[KeypointParams] | None = None,
+    people: Method[TrackingParams] | None = None,
 ) -> Session:
     """Videos of one session to gait measures. A video that fails is left out with its problem, and so is one whose
     bytes were named before, because its steps would count twice; the others go on. Into `out` goes only a picture of

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import isotonic_regression
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.keypoints import BOUND_TRUNK, DEFAULT, PARAMSETS, ConfidenceCurve, KeypointParams, Keypoints
+from pbl_pipeline.keypoints import BOUND_TRUNK, METHODS, ConfidenceCurve, KeypointParams, Keypoints
 from pbl_pipeline.pipeline import detect_trial
 from pbl_pipeline.validation import (
     PointErrors,
@@ -198,7 +198,7 @@ def save_curve(curve: ConfidenceCurve, path: str | Path) -> None:
 def main(data: Path, version: int, keypoints: Path, out: Path, plots: Path | None) -> None:
     """Fit the curve and add it to the file of curves."""
     errors = measured(data, keypoints)
-    curve = fit_curve(errors, f"blazepose-v{version}", curve_params(PARAMSETS[DEFAULT].to(KeypointParams)))
+    curve = fit_curve(errors, f"blazepose-v{version}", curve_params(METHODS.find().params))
     click.echo("\nof a recording, by a curve fitted to the other datasets (stated confidence taken as it is | curve)")
     for s in leave_one_out(errors):
         click.echo(

@@ -48,11 +48,11 @@ def _store() -> None:
 
 
 def _fit() -> None:
-    from pbl_pipeline.fit import PARAMSETS, fit_session
+    from pbl_pipeline.fit import METHODS, fit_session
     from pbl_pipeline.synthetic import SynthSpec, synthesise
 
     made = synthesise(SynthSpec(seed=1, seconds=2.0, noise="none"))
-    fit = fit_session([made.keypoints], ["selftest"], PARAMSETS["gauss-newton"]).trials[0]
+    fit = fit_session([made.keypoints], ["selftest"], METHODS["gauss-newton"]).trials[0]
     error = float(np.nanmedian(np.degrees(np.abs(fit.qpos[:, 6:] - made.truth.qpos[:, 6:]))))
     if not error <= FIT_DEG:
         raise SelfTestFailed(f"the fit of the known walk is {error:.2f} deg off, expected at most {FIT_DEG:g}")

@@ -21,9 +21,9 @@ from ._machine import machine, peak_rss
 from ._plan import PARAMSET_OF, Case, Data
 
 if TYPE_CHECKING:
-    from pbl_pipeline.fit import SessionFit
+    from pbl_pipeline.fit import Params, SessionFit
     from pbl_pipeline.keypoints import Keypoints
-    from pbl_pipeline.paramset import Paramset
+    from pbl_pipeline.methods import Method
 
 Sessions = list["SessionFit | PblError"]
 
@@ -69,26 +69,16 @@ def measure(case: Case, folder: Path, stage: str, started: float) -> dict[str, A
     return out
 
 
-def paramset_of(solver: str, adam_steps: int | None) -> Paramset:
-    """The paramset of a solver. Raises `PblError` SOLVER_UNKNOWN."""
-    from pbl_pipeline.fit import PARAMSETS, params_of
-    from pbl_pipeline.paramset import Paramset
+def paramset_of(solver: str, adam_steps: int | None) -> Method[Params]:
+    """The method of a solver that is measured. Raises `PblError` SOLVER_UNKNOWN."""
+    from pbl_pipeline.fit import METHODS
 
-    name = PARAMSET_OF[solver]
-    if name not in PARAMSETS:
-        raise PblError(
-            "SOLVER_UNKNOWN",
-            found=f"no paramset {name!r} of solver {solver!r}",
-            expected=f"one of {', '.join(PARAMSETS)}",
-            next_step="choose another --solver",
-        )
-    base = PARAMSETS[name]
-    params: Any = params_of(base)
+    base = METHODS.find(PARAMSET_OF[solver])
+    params: Any = base.params
     if adam_steps is None or adam_steps == getattr(params, "steps", None):
         return base
-    return Paramset.of(
-        "fit", f"{name}, {adam_steps} steps", base.version, dataclasses.replace(params, steps=adam_steps)
-    )
+    fewer = dataclasses.replace(params, steps=adam_steps)
+    return METHODS.make(f"{base.name}, {adam_steps} steps", base.version, fewer)
 
 
 def memory() -> dict[str, Any]:
@@ -116,7 +106,7 @@ def _order(case: Case, groups: list[list[int]]) -> list[list[int]]:
     return [*others, *[groups[0]] * again] if case.solver == "implicit-adam" else [*[groups[0]] * again, *others]
 
 
-def _runner(case: Case, paramset: Paramset) -> Callable[[list[list[Keypoints]]], Sessions]:
+def _runner(case: Case, paramset: Method[Params]) -> Callable[[list[list[Keypoints]]], Sessions]:
     """A function from the trials of some sessions to their fits. An error of one session is its result."""
     from pbl_pipeline import fit
 
@@ -167,7 +157,7 @@ def _accuracy(done: dict[int, SessionFit | PblError], loaded: dict[int, Any]) ->
     return {"accuracy": summary(trials), "n_sessions": len(done), "paper_loss": loss, "checks": checks}
 
 
-def _against_one(case: Case, paramset: Paramset, done: dict[int, Any], loaded: dict[int, Any]) -> dict[str, Any]:
+def _against_one(case: Case, paramset: Method[Params], done: dict[int, Any], loaded: dict[int, Any]) -> dict[str, Any]:
     """The largest difference (rad) of the first session of a batch to the same session fitted alone."""
     import numpy as np
 

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,10 @@ import click
 from pbl_pipeline.errors import PblError
 
 if TYPE_CHECKING:
-    from pbl_pipeline.paramset import Paramset
+    from pbl_pipeline.fit import Params
+    from pbl_pipeline.keypoints import KeypointParams
+    from pbl_pipeline.methods import Method
+    from pbl_pipeline.tracking import TrackingParams
 
 
 #: Commands that fit: how the camera was held, and what is meant where nobody says.
@@ -37,37 +41,37 @@ PEOPLE = click.option(
 )
 
 
-def tracking_method(name: str | None) -> Paramset:
+def tracking_method(name: str | None) -> Method[TrackingParams]:
     """The tracking method of `--people`, with its model's licence on the terminal before it is used.
 
     Raises `PblError` SOLVER_UNKNOWN, MODEL_INVALID.
     """
     from pbl_pipeline.models import find, load_spec
-    from pbl_pipeline.tracking import find_method
+    from pbl_pipeline.tracking import METHODS
 
-    method = find_method(name)
-    if model := method.params["model"]:
+    method = METHODS.find(name)
+    if model := method.params.model:
         click.echo(f"people by the model {model}, licence: {load_spec(find(model)).licence}")
     return method
 
 
-def keypoint_method(name: str | None, device: str | None) -> Paramset:
+def keypoint_method(name: str | None, device: str | None) -> Method[KeypointParams]:
     """The keypoint method of `--keypoints`, with its model's licence on the terminal before it is used; ONNX models of
     this process run on `--device`.
 
     Raises `PblError` SOLVER_UNKNOWN, MODEL_INVALID, MARKER_SET_UNKNOWN, DEVICE_UNAVAILABLE.
     """
-    from pbl_pipeline.keypoints import ModelKeypointParams, find_method, params_of
+    from pbl_pipeline.keypoints import METHODS, ModelKeypointParams
 
     if device is not None:
         from pbl_pipeline.models import providers_for
 
         providers_for(device)
         os.environ["PBL_ONNX_DEVICE"] = device
-    method = find_method(name)
-    params = params_of(method)
-    if isinstance(params, ModelKeypointParams):
-        click.echo(f"keypoints by the model {params.model.name}, licence: {params.model.licence}")
+    method = METHODS.find(name)
+    if isinstance(method.params, ModelKeypointParams):
+        model = method.params.model
+        click.echo(f"keypoints by the model {model.name}, licence: {model.licence}")
     return method
 
 
@@ -84,39 +88,39 @@ class Person(click.ParamType):
         return self.fail(f"{value!r} is neither 'auto' nor the number of a person", param, ctx)
 
 
-def fit_paramset(solver: str | None, params: str | None, default: str | None = None) -> Paramset:
-    """The paramset that `--solver` and `--params` ask for; `default` stands in for the project's default paramset.
+def fit_paramset(solver: str | None, params: str | None, default: str | None = None) -> Method[Params]:
+    """The fit's method that `--solver` and `--params` ask for; `default` stands in for the project's default.
 
-    `--params` is a name, or a JSON file of changes to the paramset that its key "base" names. Without either, and
-    without "base", it is the default paramset; with `--solver` alone the default one of that solver.
+    `--params` is a name, or a JSON file of changes to the method that its key "base" names. Without either, and without
+    "base", it is the default method; with `--solver` alone the default one of that solver.
 
-    Raises `PblError` SOLVER_UNKNOWN (also where the paramset is of another solver than `--solver`), FILE_FORMAT.
+    Raises `PblError` SOLVER_UNKNOWN (also where the method is of another solver than `--solver`), FILE_FORMAT.
     """
-    from pbl_pipeline.fit import PARAMSETS, SOLVERS, params_of
+    from pbl_pipeline.fit import METHODS
     from pbl_pipeline.paramset import Paramset
 
-    if solver is not None and solver not in SOLVERS:
-        raise _unknown(f"solver {solver!r}", tuple(SOLVERS))
+    if solver is not None and solver not in METHODS.families:
+        raise _unknown(f"solver {solver!r}", METHODS.families)
+    base = _default_of(solver, default)
     if params is None:
-        return PARAMSETS[_default_of(solver, default)]
-    if params in PARAMSETS:
-        return _of_solver(PARAMSETS[params], solver)
+        return METHODS[base]
+    if params in METHODS:
+        return _of_solver(METHODS[params], solver)
     path = Path(params)
     if not path.is_file():
-        raise _unknown(f"paramset {params!r}, and no such file", tuple(PARAMSETS))
-    base = _default_of(solver, default)
+        raise _unknown(f"paramset {params!r}, and no such file", METHODS)
     try:
         changes = json.loads(path.read_text())
         if not isinstance(changes, dict):
             raise TypeError("not an object")
         base = changes.pop("base", base)
-        if base not in PARAMSETS:
-            raise KeyError(f"base {base!r}; known: {sorted(PARAMSETS)}")
-        before = _of_solver(PARAMSETS[base], solver)
-        merged = _merge(dataclasses.asdict(params_of(before)), changes)
-        if "solver" in changes and changes["solver"] != _solver_of(before):
-            raise ValueError(f"solver {changes['solver']!r}, but {base} is of {_solver_of(before)}: name another base")
-        return Paramset.of("fit", path.stem, 1, params_of(Paramset("fit", path.stem, 1, merged)))
+        if base not in METHODS:
+            raise KeyError(f"base {base!r}; known: {sorted(METHODS)}")
+        before = _of_solver(METHODS[base], solver)
+        if changes.get("solver", before.family.name) != before.family.name:
+            raise ValueError(f"solver {changes['solver']!r}, but {base} is of {before.family.name}: name another base")
+        merged = Paramset("fit", path.stem, 1, _merge(dataclasses.asdict(before.params), changes))
+        return METHODS.make(path.stem, 1, merged.to(before.family.params))
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise PblError(
             "FILE_FORMAT",
@@ -127,29 +131,23 @@ def fit_paramset(solver: str | None, params: str | None, default: str | None = N
         ) from error
 
 
-def _default_of(solver: str | None, default: str | None = None) -> str:
-    """Name of the default paramset, or where that is of another solver, of the first that is of this one."""
-    from pbl_pipeline.fit import DEFAULT, PARAMSETS
+def _default_of(solver: str | None, default: str | None) -> str:
+    """Name of the default method, or where that is of another solver, of the first that is of this one."""
+    from pbl_pipeline.fit import METHODS
 
-    if solver is None:
-        return default or DEFAULT
-    names = [default or DEFAULT, DEFAULT, *PARAMSETS]
-    return next(n for n in names if _solver_of(PARAMSETS[n]) == solver)
+    names = [default or METHODS.default, METHODS.default, *METHODS]
+    return next(n for n in names if solver in (None, METHODS[n].family.name))
 
 
-def _of_solver(paramset: Paramset, solver: str | None) -> Paramset:
-    if solver is not None and solver != _solver_of(paramset):
+def _of_solver(method: Method[Params], solver: str | None) -> Method[Params]:
+    if solver not in (None, method.family.name):
         raise PblError(
             "SOLVER_UNKNOWN",
-            found=f"solver {solver} with paramset {paramset.name}",
-            expected=f"{_solver_of(paramset)}, the solver of {paramset.name}",
+            found=f"solver {solver} with paramset {method.name}",
+            expected=f"{method.family.name}, the solver of {method.name}",
             next_step="leave out --solver, or name a paramset of that solver",
         )
-    return paramset
-
-
-def _solver_of(paramset: Paramset) -> str:
-    return paramset.params["solver"]
+    return method
 
 
 def _merge(base: dict, changes: dict) -> dict:
@@ -177,5 +175,5 @@ def _check_kind(name: str, value: object, default: object) -> None:
         raise ValueError(f"{name} = {json.dumps(value)}; the default is {json.dumps(default)}")
 
 
-def _unknown(found: str, known: tuple[str, ...]) -> PblError:
+def _unknown(found: str, known: Iterable[str]) -> PblError:
     return PblError("SOLVER_UNKNOWN", found=found, expected=f"one of {', '.join(known)}", next_step="pass one of these")

@@ -35,8 +35,8 @@ def detect(
     and the fit then knows where gravity points and how the camera moved.
     """
     from pbl_pipeline.files import check_out_file
-    from pbl_pipeline.keypoints import check_keypoints, confidence_text, detect_keypoints, params_of, visibility
-    from pbl_pipeline.tracking import TrackingParams, choose_subject, require_subject, time_in_view_s, track_people
+    from pbl_pipeline.keypoints import check_keypoints, confidence_text, detect_keypoints, visibility
+    from pbl_pipeline.tracking import choose_subject, require_subject, time_in_view_s, track_people
     from pbl_pipeline.video import check_timing, find_camera, load_attitude, probe
 
     if out.suffix != ".npz":
@@ -46,7 +46,7 @@ def detect(
     check_out_file(out)
     log = load_attitude(attitude, info) if attitude else None
     method, finder = keypoint_method(keypoints, device), tracking_method(people)
-    tracking = track_people(video, finder.to(TrackingParams), info=info)
+    tracking = track_people(video, finder, info=info)
     choice = choose_subject(tracking, override=person)
     for p in tracking.persons:
         seconds = time_in_view_s(p, tracking.time_s)
@@ -54,7 +54,7 @@ def detect(
     click.echo(f"{choice.status}: {choice.reason}")
     sheet = out.with_name(out.name.removesuffix(".npz") + ".persons.png")
     subject = require_subject(choice, tracking, video, sheet)
-    found = detect_keypoints(video, tracking, subject, lens, params=params_of(method))
+    found = detect_keypoints(video, tracking, subject, lens, params=method)
     if log is not None:
         found = found.with_attitude(log)
     found.save(out)

@@ -9,7 +9,7 @@ import click
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_out_file, load_npz
 
-from .gait import EVENT_METHODS, is_c3d
+from .gait import METHOD_HELP, is_c3d
 
 _EPILOG = """\b
 Example: pbl events walk.fit.npz --out walk.events.csv
@@ -19,7 +19,7 @@ Example: pbl events walk.c3d --out walk.events.csv"""
 @click.command(epilog=_EPILOG)
 @click.argument("file", type=click.Path(path_type=Path, readable=False))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="events.csv to write.")
-@click.option("--method", default="phase-transformer", show_default=True, help=EVENT_METHODS)
+@click.option("--method", default="phase-transformer", show_default=True, help=METHOD_HELP)
 def events(file: Path, out: Path, method: str) -> None:
     """Find foot down and foot up in FILE and write them as CSV.
 

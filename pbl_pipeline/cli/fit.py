@@ -48,16 +48,14 @@ def fit(
     """
     from pbl_pipeline.export import write_angles_csv
     from pbl_pipeline.files import check_out_folder
-    from pbl_pipeline.fit import PARAMSETS, fit_session
-    from pbl_pipeline.keypoints import WorldMarkers
+    from pbl_pipeline.fit import default_method, fit_session
     from pbl_pipeline.pipeline import distinct_names, write_session_json
 
     check_out_folder(out)
-    paramset = fit_paramset(solver, params)  # a wrong name is said before anything is read
+    fit_paramset(solver, params)  # a wrong name is said before anything is read
     table = _marker_set(marker_set)
     trials: Sequence[Any] = [_load(path, table, up) for path in files]
-    if all(isinstance(trial, WorldMarkers) for trial in trials) and "markers" in PARAMSETS:
-        paramset = fit_paramset(solver, params, default="markers")
+    paramset = fit_paramset(solver, params, default=default_method(trials))
     stems = [_stem(path) for path in files]
     if cameras:
         trial, name = _views_of_one(trials, stems, cameras)

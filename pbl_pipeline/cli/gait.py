@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pbl_pipeline.gait import LabTrial
     from pbl_pipeline.qc import Check
 
-EVENT_METHODS = "Event method: phase-transformer, zeni-2008 or oconnor-2007."
+METHOD_HELP = "Event method: phase-transformer, zeni-2008 or oconnor-2007."
 _EPILOG = """\b
 Example: pbl gait out/walk1.fit.npz out/walk2.fit.npz --out out/metrics.json
 Example: pbl gait lab/walk1.c3d lab/walk2.c3d --out lab/metrics.json"""
@@ -30,7 +30,7 @@ Example: pbl gait lab/walk1.c3d lab/walk2.c3d --out lab/metrics.json"""
     help="pbl-2025-three-angles (default of fits) or gillette-2008 (nine angles; default of C3D files).",
 )
 @click.option("--norm", help="Normative set of the index: a name, or a .json file (`pbl norm list`).")
-@click.option("--method", default="phase-transformer", show_default=True, help=EVENT_METHODS)
+@click.option("--method", default="phase-transformer", show_default=True, help=METHOD_HELP)
 @click.option(
     "--events",
     "event_files",
@@ -55,8 +55,7 @@ def gait(
     """
     from pbl_pipeline import progress
     from pbl_pipeline.files import check_out_file
-    from pbl_pipeline.gait import GDI_PARAMSETS, GILLETTE_MODEL, GaitParams, GdiParams, gait_metrics
-    from pbl_pipeline.gait.events import resolve_params
+    from pbl_pipeline.gait import EVENT_METHODS, GDI_METHODS, GILLETTE_MODEL, GaitParams, gait_metrics
 
     check_out_file(out)
     laboratory = [is_c3d(path) for path in files]
@@ -66,15 +65,7 @@ def gait(
         raise _usage(f"{len(event_files)} --events for {len(files)} files", "C3D files, and one --events for each")
     if index is None:
         index = GILLETTE_MODEL if all(laboratory) else None
-    elif index not in GDI_PARAMSETS:
-        raise PblError(
-            "SOLVER_UNKNOWN",
-            found=f"index {index!r}",
-            expected=f"one of {', '.join(GDI_PARAMSETS)}",
-            next_step="choose one of the names above",
-        )
-    of_index = GDI_PARAMSETS[index].to(GdiParams) if index else GdiParams()
-    params = GaitParams(events=resolve_params(method), gdi=of_index)
+    params = GaitParams(events=EVENT_METHODS.find(method).paramset, gdi=GDI_METHODS.find(index).params)
     given = event_files or (None,) * len(files)
     pairs = progress.track(list(zip(files, given, strict=True)), "read files", unit="trial")
     trials = [_read(path, events, method) for path, events in pairs]

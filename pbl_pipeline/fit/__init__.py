@@ -1,16 +1,14 @@
 """The session fit: keypoints of 1..N trials to joint angles, one body for all."""
 
+from ._default import default_for_points, default_method
 from ._inputs import LEVEL_CAMERA_R_NC, Trial
 from ._params import (
-    DEFAULT,
-    PARAMSETS,
-    SOLVERS,
+    METHODS,
     CostParams,
     GaussNewtonParams,
     ImplicitAdamParams,
     Params,
     ViewParams,
-    params_of,
 )
 from ._session import (
     LEVEL_CAMERA_QUAT_WXYZ,
@@ -23,11 +21,9 @@ from ._session import (
 from ._types import SessionFit, TrialFit
 
 __all__ = [
-    "DEFAULT",
     "LEVEL_CAMERA_QUAT_WXYZ",
     "LEVEL_CAMERA_R_NC",
-    "PARAMSETS",
-    "SOLVERS",
+    "METHODS",
     "CostParams",
     "GaussNewtonParams",
     "ImplicitAdamParams",
@@ -38,8 +34,9 @@ __all__ = [
     "TrialFit",
     "ViewParams",
     "check_trial",
+    "default_for_points",
+    "default_method",
     "fit_session",
     "fit_sessions",
     "paper_objective",
-    "params_of",
 ]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from pbl_pipeline.errors import PblError
-from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.methods import Stage
 
 
 @dataclasses.dataclass(frozen=True)
@@ -213,38 +212,11 @@ MARKERS = GaussNewtonParams(
 )
 
 Params = GaussNewtonParams | ImplicitAdamParams
-_CLASSES: dict[str, type[GaussNewtonParams] | type[ImplicitAdamParams]] = {
-    "gauss-newton": GaussNewtonParams,
-    "implicit-adam": ImplicitAdamParams,
-}
-#: Every solver there is.
-SOLVERS = tuple(_CLASSES)
 
-PARAMSETS: dict[str, Paramset] = {
-    "paper-2025": Paramset.of("fit", "paper-2025", 1, PAPER_2025),
-    "paper-gauss-newton": Paramset.of("fit", "paper-gauss-newton", 1, PAPER_GAUSS_NEWTON),
-    "gauss-newton": Paramset.of("fit", "gauss-newton", 1, GAUSS_NEWTON),
-    "blazepose": Paramset.of("fit", "blazepose", 1, BLAZEPOSE),
-    "markers": Paramset.of("fit", "markers", 1, MARKERS),
-}
-DEFAULT = "blazepose"
-
-
-def params_of(paramset: Paramset) -> Params:
-    """The parameter object of a stored paramset.
-
-    Raises
-    ------
-    PblError
-        SOLVER_UNKNOWN: the paramset names no solver of this version.
-    """
-    solver = paramset.params.get("solver")
-    if solver not in _CLASSES:
-        raise PblError(
-            "SOLVER_UNKNOWN",
-            found=f"solver {solver!r} in paramset {paramset.name}",
-            expected=f"one of {', '.join(SOLVERS)}",
-            next_step="correct the paramset, or install the version of this software that it was made with",
-            key=paramset.name,
-        )
-    return paramset.to(_CLASSES[solver])
+#: A family is a solver.
+METHODS: Stage[Params] = Stage("fit", "solver", "blazepose")
+METHODS.register("paper-2025", 1, PAPER_2025, "pbl_pipeline.fit.solvers:solve_implicit_adam")
+METHODS.register("paper-gauss-newton", 1, PAPER_GAUSS_NEWTON, "pbl_pipeline.fit.solvers:solve_gauss_newton")
+METHODS.register("gauss-newton", 1, GAUSS_NEWTON)
+METHODS.register("blazepose", 1, BLAZEPOSE)
+METHODS.register("markers", 1, MARKERS)

@@ -13,6 +13,7 @@ import numpy as np
 from pbl_pipeline.body import MarkerSet
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
+from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.video import Camera
 
@@ -22,7 +23,7 @@ from ._inputs import check_trial as _check_trial
 from ._marker_cost import kinds_of
 from ._outcome import Outcome, outcome_one
 from ._paper_objective import paper_objective as _paper_objective
-from ._params import DEFAULT, PARAMSETS, GaussNewtonParams, ImplicitAdamParams, Params, params_of
+from ._params import METHODS, GaussNewtonParams, ImplicitAdamParams, Params
 from ._quality import check_fit
 from ._rotation import matrices_of, quat_wxyz
 from ._types import SessionFit, TrialFit
@@ -49,7 +50,7 @@ class SessionInput:
 def fit_session(
     trials: Sequence[Trial],
     names: Sequence[str],
-    paramset: Paramset | None = None,
+    paramset: Method[Params] | Paramset | Params | str | None = None,
     camera_motion: str | Sequence[str] = "static",
     markers: MarkerSet | None = None,
 ) -> SessionFit:
@@ -61,7 +62,7 @@ def fit_session(
         Trials of one kind and a name for each: `Keypoints` of one camera, `MultiView` of several calibrated cameras, or
         `WorldMarkers` of a laboratory.
     paramset
-        One of `PARAMSETS` or one of the same form (default: `DEFAULT`).
+        What `METHODS.find` takes: the name of a method, a `Paramset`, parameters of a solver; None for the default.
     camera_motion
         "static" or "handheld", for all trials or each. The orientation of a handheld phone that was logged
         (`Keypoints.phone_quat_wxyz`) is part of the fit, together with the offset between its clock and the video's;
@@ -82,7 +83,9 @@ def fit_session(
 
 
 def fit_sessions(
-    sessions: Sequence[SessionInput], paramset: Paramset | None = None, batch: int | None = None
+    sessions: Sequence[SessionInput],
+    paramset: Method[Params] | Paramset | Params | str | None = None,
+    batch: int | None = None,
 ) -> list[SessionFit | PblError]:
     """Fit many sessions; those packed to the same sizes go through the device together, with the same results.
 
@@ -94,8 +97,8 @@ def fit_sessions(
     PblError
         SOLVER_UNKNOWN.
     """
-    paramset = paramset or PARAMSETS[DEFAULT]
-    params = params_of(paramset)
+    method = METHODS.find(paramset)
+    paramset, params = method.paramset, method.params
     if batch is None:
         batch = 1 if jax.default_backend() == "cpu" else BATCH
     out: list[SessionFit | PblError | None] = [None] * len(sessions)
@@ -170,18 +173,21 @@ def _alone(session: Session, params: ImplicitAdamParams) -> Solution | PblError:
 
 
 def check_trial(
-    trial: Trial, name: str, paramset: Paramset | None = None, markers: MarkerSet | None = None
+    trial: Trial,
+    name: str,
+    paramset: Method[Params] | Paramset | Params | str | None = None,
+    markers: MarkerSet | None = None,
 ) -> tuple[np.ndarray, float]:
     """Which frames (T,) bool of a trial the fit would use, and the share of frames with the whole person in view.
 
     Raises `PblError` FIT_INPUT or MARKER_SET_UNKNOWN where the trial cannot be fitted.
     """
-    return _check_trial(trial, name, params_of(paramset or PARAMSETS[DEFAULT]).view, markers)
+    return _check_trial(trial, name, METHODS.find(paramset).params.view, markers)
 
 
 def paper_objective(fit: SessionFit, trials: Sequence[Trial], markers: MarkerSet | None = None) -> float:
     """The paper's own total (section Model Fitting) of a session fit, whatever the fit itself minimised."""
-    view = params_of(PARAMSETS["paper-2025"]).view
+    view = METHODS["paper-2025"].params.view
     motions = [t.camera_motion for t in fit.trials]
     session = make_session(trials, [t.name for t in fit.trials], view, motions, markers)
     qpos = np.zeros((session.obs.weight.shape[0], len(session.body.joint_names)))

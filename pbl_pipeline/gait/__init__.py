@@ -9,8 +9,8 @@ from ._bands import NormalBands, leg_length_m, normal_bands
 from ._curve_frame import CURVE_FRAME_COLUMNS, curve_frame
 from ._cycles import REPORT_PERCENT, GaitCycle, cycle_curves, find_cycles
 from ._gdi import (
+    GDI_METHODS,
     GDI_MODEL,
-    GDI_PARAMSETS,
     GILLETTE_MODEL,
     MODEL_ANGLES,
     Gdi,
@@ -25,9 +25,8 @@ from ._metrics import GaitMetrics, GaitParams, TrialMetrics, cycle_checks, gait_
 from ._own_norm import norm_from_cycles
 from ._profile import MovementProfile, movement_profile, variable_scores
 from ._spatiotemporal import MEASURES, Measure, Spatiotemporal, spatiotemporal
+from .events import METHODS as EVENT_METHODS
 from .events import (
-    DEFAULT_EVENT_PARAMSET,
-    EVENT_PARAMSETS,
     EventParams,
     GaitEvent,
     GaitEvents,
@@ -62,12 +61,11 @@ __all__ = [
     "ANGLE_NAMES",
     "BODY_ANGLES",
     "CURVE_FRAME_COLUMNS",
-    "DEFAULT_EVENT_PARAMSET",
     "DEFAULT_NORM",
-    "EVENT_PARAMSETS",
+    "EVENT_METHODS",
     "FOOT_MARKER_SETS",
+    "GDI_METHODS",
     "GDI_MODEL",
-    "GDI_PARAMSETS",
     "GILLETTE_MODEL",
     "LEG_ANGLES",
     "MEASURES",

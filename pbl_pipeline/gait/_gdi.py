@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.methods import Stage
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
 
@@ -49,10 +50,9 @@ GDI_MODEL, GILLETTE_MODEL = "pbl-2025-three-angles", "gillette-2008"
 #: Angles that an index is made of.
 MODEL_ANGLES: dict[str, tuple[str, ...]] = {GDI_MODEL: THREE_ANGLES, GILLETTE_MODEL: NINE_ANGLES}
 #: Version 1 of the index of three angles had the norm `gillette-166-three-angles`.
-GDI_PARAMSETS: dict[str, Paramset] = {
-    GDI_MODEL: Paramset.of("gdi", GDI_MODEL, 2, GdiParams()),
-    GILLETTE_MODEL: Paramset.of("gdi", GILLETTE_MODEL, 1, GdiParams(norm="gillette-166-nine-angles")),
-}
+GDI_METHODS: Stage[GdiParams] = Stage("gdi", "family", GDI_MODEL)
+GDI_METHODS.register(GDI_MODEL, 2, GdiParams(), "pbl_pipeline.gait:score_gdi")
+GDI_METHODS.register(GILLETTE_MODEL, 1, GdiParams(norm="gillette-166-nine-angles"), "pbl_pipeline.gait:score_gdi")
 _NAMES = {GDI_MODEL: "GDI of three angles", GILLETTE_MODEL: "GDI (Schwartz & Rozumalski 2008)"}
 
 
@@ -132,7 +132,7 @@ def score_gdi(
     params
         None for those of `model`.
     model, version
-        A name of `GDI_PARAMSETS`, which decides the angles, and its version (None: the newest). Without it the norm's
+        A name of `GDI_METHODS`, which decides the angles, and its version (None: the newest). Without it the norm's
         angles decide; a norm of other angles than the two indices have gives an index of its own name.
 
     Raises
@@ -141,15 +141,14 @@ def score_gdi(
         NORM_UNKNOWN; NORM_INVALID where the norm has not the model's angles; SOLVER_UNKNOWN for another model;
         ANGLE_UNITS for curves that are not in degrees.
     """
-    if model is not None and model not in GDI_PARAMSETS:
-        raise _unknown_model(model)
-    if params is None:
-        params = GDI_PARAMSETS[model].to(GdiParams) if model else GdiParams()
+    method = GDI_METHODS.find(model)
+    params = params or method.params
+    model = method.name if model else None
     if norm is None:
         norm = params.norm
     basis = load_norm(norm) if isinstance(norm, str) else norm
     model = _model_of(basis, model)
-    version = version or (GDI_PARAMSETS[model].version if model in GDI_PARAMSETS else 1)
+    version = version or (GDI_METHODS[model].version if model in GDI_METHODS else 1)
     paramset = Paramset.of("gdi", model, version, dataclasses.replace(params, norm=basis.name))
     usable = [c for c in cycles if c.used and all(v in c.curves for v in basis.variables)]
     vectors = [_vector(c, basis) for c in usable]
@@ -211,18 +210,9 @@ def _model_of(norm: NormativeSet, model: str | None) -> str:
             "NORM_INVALID",
             found=f"normative set {norm.name} of {len(norm.variables)} angles for {model}",
             expected=f"a set of {', '.join(MODEL_ANGLES[model])}, in this order",
-            next_step=f"leave the set out ({GDI_PARAMSETS[model].params['norm']} is the model's own), or build one",
+            next_step=f"leave the set out ({GDI_METHODS[model].params.norm} is the model's own), or build one",
         )
     return model
-
-
-def _unknown_model(model: str) -> PblError:
-    return PblError(
-        "SOLVER_UNKNOWN",
-        found=f"index {model!r}",
-        expected=f"one of {', '.join(GDI_PARAMSETS)}",
-        next_step="choose one of the names above",
-    )
 
 
 def _too_few(cycles: Sequence[GaitCycle], n_left: int, n_right: int, params: GdiParams) -> str:

@@ -13,10 +13,10 @@ from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import EMPTY, OUTCOMES, PASS, WARN, Check, in_session, worst
 
 from ._cycles import GaitCycle, find_cycles
-from ._gdi import GDI_MODEL, GDI_PARAMSETS, GILLETTE_MODEL, Gdi, GdiParams, score_gdi
+from ._gdi import GDI_METHODS, GDI_MODEL, GILLETTE_MODEL, Gdi, GdiParams, score_gdi
 from ._laboratory import LabTrial
 from ._spatiotemporal import MEASURES, Spatiotemporal, spatiotemporal
-from .events import GaitEvents, detect_events, resolve_params
+from .events import METHODS, GaitEvents, detect_events
 from .motion import BodyPoses, feet_from_fit, trial_poses
 from .normative import NormativeSet, load_norm
 
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class GaitParams:
-    """Method of the events (`events.resolve_params`) and parameters of the index together."""
+    """Method of the events (a row of `events.METHODS`) and parameters of the index together."""
 
-    events: Paramset = dataclasses.field(default_factory=lambda: resolve_params(None))
+    events: Paramset = dataclasses.field(default_factory=lambda: METHODS.find().paramset)
     gdi: GdiParams = dataclasses.field(default_factory=GdiParams)
 
 
@@ -135,7 +135,7 @@ def gait_metrics(
         raise PblError(
             "GAIT_INPUT", found="no trial", expected="at least one fitted trial", next_step="pass fit.npz files"
         )
-    params = params or GaitParams(gdi=GDI_PARAMSETS[model].to(GdiParams) if model in GDI_PARAMSETS else GdiParams())
+    params = params or GaitParams(gdi=GDI_METHODS.find(model).params)
     wanted = params.gdi.norm if norm is None else norm
     basis = load_norm(wanted) if isinstance(wanted, str) else wanted
     index = {"norm": basis, "params": params.gdi, "model": model, "version": version}

@@ -9,7 +9,7 @@ from ._confidence import (
     confidence_text,
     probability_within,
 )
-from ._detect import DEFAULT, DETECTORS, PARAMSETS, KeypointParams, detect_keypoints
+from ._detect import detect_keypoints
 from ._in_view import (
     SEEN_SHARE,
     Gap,
@@ -20,9 +20,10 @@ from ._in_view import (
     visibility,
     whole_person_in_view,
 )
-from ._methods import find_method, params_class, params_of
+from ._methods import METHODS
 from ._multi_view import SAME_TIME_S, MultiView, cameras_of_files
-from ._onnx_keypoints import ModelKeypointParams, ModelParams, OnnxKeypoints, method_of_model
+from ._onnx_keypoints import ModelKeypointParams, ModelParams, OnnxKeypoints
+from ._params import KeypointParams
 from ._picture import Picture, PictureMeter
 from ._protocol import KeypointDetector, PersonKeypoints
 from ._quality import check_keypoints, side_changes
@@ -33,9 +34,7 @@ from ._world_markers import WorldMarkers
 
 __all__ = [
     "BOUND_TRUNK",
-    "DEFAULT",
-    "DETECTORS",
-    "PARAMSETS",
+    "METHODS",
     "SAME_TIME_S",
     "SEEN_SHARE",
     "BlazePoseLandmarks",
@@ -61,11 +60,7 @@ __all__ = [
     "confidence_curves",
     "confidence_text",
     "detect_keypoints",
-    "find_method",
     "longest_run_s",
-    "method_of_model",
-    "params_class",
-    "params_of",
     "probability_within",
     "read_trc",
     "side_changes",

@@ -7,11 +7,13 @@ GHUM Holistic" for the metric points, and the graph configuration beside the mod
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from scipy.special import expit
 
+from pbl_pipeline import assets
 from pbl_pipeline.models import LiteModel
 from pbl_pipeline.tracking import circle_roi
 from pbl_pipeline.video import Camera, cut_image
@@ -19,6 +21,9 @@ from pbl_pipeline.video import Camera, cut_image
 from ._flips import leg_points, mirror_of
 from ._protocol import PersonKeypoints
 from ._view import crop_matrix, view_rotation
+
+if TYPE_CHECKING:
+    from ._params import KeypointParams
 
 MODEL_SHA256 = "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f"
 INPUT_SIZE = 256
@@ -175,3 +180,8 @@ def _mirrored(
     flip, edge = np.array([-1.0, 1.0]), np.array([float(INPUT_SIZE), 0.0])
     turned = world[MIRROR] * np.array([-1.0, 1.0, 1.0])
     return points[MIRROR] * flip + edge, circle * flip + edge, turned, confidence[MIRROR], presence
+
+
+def blazepose(params: KeypointParams) -> BlazePoseLandmarks:
+    """The detector of the method. Raises the `PblError`s of `assets.fetch`."""
+    return BlazePoseLandmarks(assets.fetch("blazepose_landmarks"), params.agree_mm, params.agree_width_mm)

@@ -8,87 +8,28 @@ somebody else: where the first look contradicts the track, the track wins.
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from pbl_pipeline import assets, progress
+from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.tracking import Tracking, time_in_view_s
 from pbl_pipeline.video import Camera, Frame, read_frames
 
 from ._batched import BatchDetector, BatchedLooks
-from ._blazepose import MODEL_SHA256, BlazePoseLandmarks
 from ._confidence import confidence_curve
 from ._crops import REACH_SD, corrected, first_looks, smooth_at, smooth_rois
-from ._flips import FlipParams, exchange_sides, exchanged, lowered
+from ._flips import exchange_sides, exchanged, lowered
+from ._methods import METHODS
+from ._params import KeypointParams
 from ._passes import Looks, look_twice, n_workers
 from ._picture import Picture, PictureMeter
 from ._protocol import KeypointDetector, PersonKeypoints
 from ._types import Keypoints
-
-
-@dataclasses.dataclass(frozen=True)
-class KeypointParams:
-    """Parameters of `detect_keypoints`.
-
-    passes: 1 cuts along the track only, 2 cuts again where the first look saw the body.
-    first_look_s: the first look is taken once in so many seconds, 0: at every frame.
-    smooth_s: standard deviation of the Gaussian that smooths the crops over time.
-    min_presence: below it a frame has no person and its keypoints are missing.
-    max_drift, max_growth: the first look is believed where its body circle lies within this share of the side from
-    the track's, and differs from it in size by at most this factor.
-    agree_mm, agree_width_mm: how far the answers for the picture and its mirror image may lie apart, see
-    `BlazePoseLandmarks`.
-    sides: where left and right are exchanged back, see `exchange_sides`; None: nowhere.
-    min_time_s: a person in view for less cannot be measured.
-    box_margin: added to the keypoints' box on each side, as a share of its size.
-    confidence_curve: what the confidence is worth (`confidence_curve`), for the detector that the curve is of; empty
-    where none is known.
-    """
-
-    detector: str = "blazepose"
-    model_sha256: str = MODEL_SHA256
-    passes: int = 2
-    first_look_s: float = 0.1
-    smooth_s: float = 0.1
-    min_presence: float = 0.5
-    max_drift: float = 0.3
-    max_growth: float = 1.5
-    agree_mm: float = 100.0
-    agree_width_mm: float = 20.0
-    sides: FlipParams | None = dataclasses.field(default_factory=FlipParams)
-    min_time_s: float = 1.0
-    box_margin: float = 0.1
-    confidence_curve: str = "blazepose-v1"
-
-
-DEFAULT = "blazepose-33"
-PARAMSETS: dict[str, Paramset] = {DEFAULT: Paramset.of("keypoints", DEFAULT, 2, KeypointParams())}
-
-
-def _blazepose(params: KeypointParams) -> KeypointDetector:
-    return BlazePoseLandmarks(assets.fetch("blazepose_landmarks"), params.agree_mm, params.agree_width_mm)
-
-
-def _onnx(params: KeypointParams) -> KeypointDetector:
-    from ._onnx_keypoints import ModelKeypointParams, OnnxKeypoints  # not above: its parameters extend these
-
-    if not isinstance(params, ModelKeypointParams):
-        raise PblError(
-            "SOLVER_UNKNOWN",
-            found="detector 'onnx' without the model that it is to run",
-            expected="the parameters of a registered model (`method_of_model`)",
-            next_step="name a registered model (`pbl models list`)",
-        )
-    return OnnxKeypoints(params.model)
-
-
-#: Detectors by the name that `KeypointParams.detector` uses. Another detector joins here.
-DETECTORS: dict[str, Callable[[KeypointParams], KeypointDetector]] = {"blazepose": _blazepose, "onnx": _onnx}
 
 
 def detect_keypoints(
@@ -96,19 +37,20 @@ def detect_keypoints(
     tracking: Tracking,
     person_id: int,
     camera: Camera,
-    params: KeypointParams | None = None,
+    params: Method[KeypointParams] | Paramset | KeypointParams | str | None = None,
     detector: KeypointDetector | None = None,
 ) -> Keypoints:
     """Keypoints of person `person_id` in every frame; NaN with confidence 0 where she or the point is not in view.
 
-    `detector` replaces the one that `params.detector` names. The video is decoded once, and frames of about half a
-    second are in memory.
+    `params` is what `METHODS.find` takes; `detector` replaces the method's. The video is decoded once, and frames of
+    about half a second are in memory.
 
     Raises `PblError`: SUBJECT_UNKNOWN_PERSON; TRACK_TOO_SHORT when she is in view for less than `min_time_s`;
-    VIDEO_CHANGED when the video has other frames than the tracking; SOLVER_UNKNOWN for an unknown detector name;
+    VIDEO_CHANGED when the video has other frames than the tracking; SOLVER_UNKNOWN for an unknown method or detector;
     those of `video.read_frames` and `assets.fetch`.
     """
-    params = params or KeypointParams()
+    method = METHODS.find(params)
+    params = method.params
     track = next((p for p in tracking.persons if p.person_id == person_id), None)
     if track is None:
         raise PblError(
@@ -128,7 +70,7 @@ def detect_keypoints(
             "person",
             key=str(video_path),
         )
-    detectors = [detector] if detector is not None else _detectors(params)
+    detectors = [detector] if detector is not None else _detectors(method)
     roi = smooth_rois(_rois(track.roi_px, track.box_px), tracking.time_s, params.smooth_s)
     meter = PictureMeter()
     found = _look(detectors, video_path, roi, tracking.time_s, camera, params, meter)
@@ -142,18 +84,11 @@ def _rois(roi: np.ndarray, box: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(roi).all(axis=1, keepdims=True), roi, around)
 
 
-def _detectors(params: KeypointParams) -> list[KeypointDetector]:
-    """The detector that the parameters name; one for each core where it says that this is the fastest."""
-    if params.detector not in DETECTORS:
-        raise PblError(
-            "SOLVER_UNKNOWN",
-            found=f"keypoint detector {params.detector!r}",
-            expected=f"one of {', '.join(DETECTORS)}",
-            next_step="choose one of these names in the keypoint parameters",
-        )
-    first = DETECTORS[params.detector](params)
+def _detectors(method: Method[KeypointParams]) -> list[KeypointDetector]:
+    """The detector of the method; one for each core where it says that this is the fastest."""
+    first = method.function(method.params)
     more = n_workers() - 1 if getattr(first, "per_core", False) else 0
-    return [first, *(DETECTORS[params.detector](params) for _ in range(more))]
+    return [first, *(method.function(method.params) for _ in range(more))]
 
 
 def _look(

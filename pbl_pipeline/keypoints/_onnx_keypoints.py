@@ -10,13 +10,12 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.models import ModelSpec, OnnxModel, find, load_spec
-from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.video import Camera
 
 from ._augment import aligned, augmentations, sd_confidence, spread_mm
 from ._decode_2d import edge_shift, from_heatmap, from_simcc
-from ._detect import KeypointParams
 from ._flips import FlipParams
+from ._params import KeypointParams
 from ._protocol import PersonKeypoints
 from ._root import absolute_root
 from ._virtual_camera import crops, look_at
@@ -182,10 +181,15 @@ class OnnxKeypoints:
         return points, score, None
 
 
-def method_of_model(name: str, version: int = 1) -> Paramset:
-    """The keypoint method of a registered model under its own name. Raises as `model_params`."""
+def model_keypoint_params(name: str) -> ModelKeypointParams:
+    """The parameters of the keypoint method of a registered model. Raises as `model_params`."""
     model = model_params(name)
-    return Paramset.of("keypoints", name, version, ModelKeypointParams(model_sha256=model.sha256, model=model))
+    return ModelKeypointParams(model_sha256=model.sha256, model=model)
+
+
+def onnx(params: ModelKeypointParams) -> OnnxKeypoints:
+    """The detector of the method. Raises what `OnnxKeypoints` raises."""
+    return OnnxKeypoints(params.model)
 
 
 def _person(

@@ -3,24 +3,24 @@
 from ._appearance import likeness, look_of
 from ._associate import AssociationParams
 from ._blazepose import BlazePoseDetector, body_box, box_iou, circle_roi
+from ._choose import choose_subject
 from ._detection_schedule import WatchParams
 from ._identity_swaps import UncrossParams
-from ._methods import find_method, method_of_detector
+from ._methods import METHODS, SUBJECT_METHODS
+from ._params import TrackingParams
+from ._registered import detector_params
 from ._reidentify import JoinParams
 from ._require import require_subject
 from ._sheet import contact_sheet, contact_sheet_jpeg, save_contact_sheet
-from ._subject import SUBJECT_DEFAULT, SUBJECT_PARAMSETS, SubjectParams, choose_subject, time_in_view_s
-from ._track import DEFAULT, DETECTORS, PARAMSETS, TrackingParams, track_people
+from ._subject import SubjectParams, time_in_view_s
+from ._track import track_people
 from ._transfer_choice import carried_choice, same_person
 from ._types import Detection, PersonDetector, PersonTrack, SubjectChoice, Tracking
 from ._yolox import YoloxDetector
 
 __all__ = [
-    "DEFAULT",
-    "DETECTORS",
-    "PARAMSETS",
-    "SUBJECT_DEFAULT",
-    "SUBJECT_PARAMSETS",
+    "METHODS",
+    "SUBJECT_METHODS",
     "AssociationParams",
     "BlazePoseDetector",
     "Detection",
@@ -41,10 +41,9 @@ __all__ = [
     "circle_roi",
     "contact_sheet",
     "contact_sheet_jpeg",
-    "find_method",
+    "detector_params",
     "likeness",
     "look_of",
-    "method_of_detector",
     "require_subject",
     "same_person",
     "save_contact_sheet",

@@ -10,14 +10,19 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from scipy.special import expit
 
+from pbl_pipeline import assets
 from pbl_pipeline.models import LiteModel
 
 from ._types import Detection
+
+if TYPE_CHECKING:
+    from ._params import TrackingParams
 
 MODEL_SHA256 = "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c"
 INPUT_SIZE = 224
@@ -146,3 +151,8 @@ class BlazePoseDetector:
             roi = circle_roi(p[2], p[3])
             detections.append(Detection(box_px=body_box(roi), score=float(score), roi_px=roi))
         return detections
+
+
+def blazepose(params: TrackingParams) -> BlazePoseDetector:
+    """The detector of the method. Raises the `PblError`s of `assets.fetch`."""
+    return BlazePoseDetector(assets.fetch("blazepose_detector"), params.min_score)

@@ -25,7 +25,6 @@ import dataclasses
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.paramset import Paramset
 
 from ._associate import measure
 from ._types import Detection, PersonTrack, SubjectChoice, Tracking
@@ -69,10 +68,6 @@ class SubjectParams:
     focal_share: float = 0.72
 
 
-SUBJECT_DEFAULT = "walker"
-SUBJECT_PARAMSETS: dict[str, Paramset] = {SUBJECT_DEFAULT: Paramset.of("subject", SUBJECT_DEFAULT, 2, SubjectParams())}
-
-
 @dataclasses.dataclass(frozen=True)
 class _Person:
     person_id: int
@@ -87,14 +82,12 @@ class _Person:
     central: float
 
 
-def choose_subject(
-    tracking: Tracking, params: SubjectParams | None = None, override: int | None = None
-) -> SubjectChoice:
-    """Choose the person to measure. `override` is a person's number that a human chose: it wins (status MANUAL).
+def choose_walker(tracking: Tracking, params: SubjectParams, override: int | None = None) -> SubjectChoice:
+    """Choose by a weighted score who walks, is tall, upright, central and long in view. `override` is a person's number
+    that a human chose: it wins (status MANUAL).
 
     Raises `PblError` SUBJECT_UNKNOWN_PERSON when the override is not among the persons.
     """
-    params = params or SubjectParams()
     people = [_describe(p, tracking, params) for p in tracking.persons]
     scores = _scores(people, tracking, params)
     if override is not None:

@@ -4,28 +4,29 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from pbl_pipeline import assets, progress
+from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.models import OnnxModel, find
+from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.prefetch import prefetched
 from pbl_pipeline.video import VideoInfo, probe, read_frames
 
 from ._appearance import look_of
-from ._associate import AssociationParams, Associator, Trail, measure
+from ._associate import Associator, Trail, measure
 from ._backtrack import rewind
-from ._blazepose import MODEL_SHA256, BlazePoseDetector, body_box, box_iou
-from ._detection_schedule import Watch, WatchParams, window_around
-from ._identity_swaps import UncrossParams, uncross
-from ._reidentify import JoinParams, join_trails
+from ._blazepose import body_box, box_iou
+from ._detection_schedule import Watch, window_around
+from ._identity_swaps import uncross
+from ._methods import METHODS
+from ._params import TrackingParams
+from ._reidentify import join_trails
 from ._tiles import detect_in
 from ._types import Detection, PersonDetector, PersonTrack, Tracking
-from ._yolox import YoloxDetector
 
 #: A second look must find a new person with at least this overlap of the boxes; nearer to where somebody known is
 #: expected than so many body heights, it is a poor view of that one.
@@ -34,86 +35,24 @@ CONFIRM_IOU, SAME_BODY = 0.3, 0.25
 FRAMES_AHEAD = 8
 
 
-@dataclasses.dataclass(frozen=True)
-class TrackingParams:
-    """Parameters of `track_people`.
-
-    detector, model_sha256: the person detector and its model file. model, spec_sha256: name of the registered model
-    folder and the hash of what its `model.json` says, both empty for an embedded one. min_score: detections below it
-    are ignored.
-    watch, association, uncross, join: see `WatchParams`, `AssociationParams`, `UncrossParams`, `JoinParams`. Gaps up to
-    the association's `max_gap_s` are bridged (observed=False), after a longer one a new person begins, unless `join`
-    finds that it is the same one; such a gap stays without boxes.
-    min_hits: a person must be seen surely (`sure_score` of the association) this often, and over `min_track_s`, or
-    the track is dropped as false.
-    """
-
-    detector: str = "blazepose"
-    model: str = ""
-    model_sha256: str = MODEL_SHA256
-    spec_sha256: str = ""
-    min_score: float = 0.5
-    min_hits: int = 3
-    min_track_s: float = 0.25
-    watch: WatchParams = dataclasses.field(default_factory=WatchParams)
-    association: AssociationParams = dataclasses.field(default_factory=AssociationParams)
-    uncross: UncrossParams = dataclasses.field(default_factory=UncrossParams)
-    join: JoinParams = dataclasses.field(default_factory=JoinParams)
-
-
-DEFAULT = "blazepose-tiles"
-PARAMSETS: dict[str, Paramset] = {DEFAULT: Paramset.of("tracking", DEFAULT, 2, TrackingParams())}
-
-
-def _blazepose(params: TrackingParams) -> PersonDetector:
-    return BlazePoseDetector(assets.fetch("blazepose_detector"), params.min_score)
-
-
-def _yolox(params: TrackingParams) -> PersonDetector:
-    model = OnnxModel(find(params.model))
-    for what, stated, found in (
-        ("graph", params.model_sha256, model.spec.sha256),
-        ("model.json", params.spec_sha256, model.spec.spec_sha256),
-    ):
-        if stated != found:
-            raise PblError(
-                "MODEL_CHECKSUM",
-                found=f"the {what} of the registered model has SHA-256 {found}",
-                expected=f"SHA-256 {stated}, as the tracking method says",
-                next_step="add the model that the method was made with, or use the method of the one registered now",
-                key=params.model,
-            )
-    return YoloxDetector(model, params.min_score)
-
-
-#: Detectors by the name that `TrackingParams.detector` uses. Another detector joins here.
-DETECTORS: dict[str, Callable[[TrackingParams], PersonDetector]] = {"blazepose": _blazepose, "yolox": _yolox}
-
-
 def track_people(
     video_path: str | Path,
-    params: TrackingParams | None = None,
+    params: Method[TrackingParams] | Paramset | TrackingParams | str | None = None,
     detector: PersonDetector | None = None,
     info: VideoInfo | None = None,
 ) -> Tracking:
     """Find everybody in a video and follow them. Frames stream: memory does not grow with the video.
 
-    `detector` replaces the one that `params.detector` names. `info` is what `video.probe` said of this file; without
-    it the video is probed, which decodes it once more. No person found gives a `Tracking` without persons.
-    Raises the `PblError`s of `video.probe` and `assets.fetch`, SOLVER_UNKNOWN for an unknown detector name, and
+    `params` is what `METHODS.find` takes; `detector` replaces the method's. `info` is what `video.probe` said of this
+    file; without it the video is probed, which decodes it once more. Where nobody is found, the `Tracking` has no
+    persons.
+    Raises the `PblError`s of `video.probe` and `assets.fetch`, SOLVER_UNKNOWN for an unknown method or detector, and
     VIDEO_CHANGED when `info` is of another number of frames; for a registered model MODEL_MISSING, MODEL_INVALID,
     MODEL_CHECKSUM, DEVICE_UNAVAILABLE.
     """
-    params = params or TrackingParams()
-    if detector is None:
-        if params.detector not in DETECTORS:
-            raise PblError(
-                "SOLVER_UNKNOWN",
-                found=f"person detector {params.detector!r}",
-                expected=f"one of {', '.join(DETECTORS)}",
-                next_step="choose one of these names in the tracking parameters",
-            )
-        detector = DETECTORS[params.detector](params)
+    method = METHODS.find(params)
+    params = method.params
+    detector = detector or method.function(params)
     info = info or probe(video_path)
     size = (info.width_px, info.height_px)
     trails = _follow(video_path, params, detector, info)

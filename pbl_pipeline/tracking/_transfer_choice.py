@@ -6,8 +6,12 @@ import dataclasses
 
 import numpy as np
 
+from pbl_pipeline.methods import Method
+from pbl_pipeline.paramset import Paramset
+
 from ._blazepose import box_iou
-from ._subject import SubjectParams, choose_subject
+from ._choose import choose_subject
+from ._subject import SubjectParams
 from ._types import PersonTrack, SubjectChoice, Tracking
 
 #: Mean overlap (intersection over union) of the body boxes, over the frames in which either is in view, from which two
@@ -29,12 +33,16 @@ def same_person(decided: Tracking, person_id: int, tracking: Tracking) -> int | 
 
 
 def carried_choice(
-    decided: Tracking, person_id: int, method: str, tracking: Tracking, params: SubjectParams | None = None
+    decided: Tracking,
+    person_id: int,
+    method: str,
+    tracking: Tracking,
+    params: Method[SubjectParams] | Paramset | SubjectParams | str | None = None,
 ) -> SubjectChoice:
     """The choice in `tracking` after somebody chose `person_id` by hand in `decided`, another tracking (by `method`).
 
     It is the same person (status CHOSEN). Where nobody surely is, a person has to choose again: what the automatic
-    choice would say is not what somebody decided.
+    choice would say is not what somebody decided. `params` as for `choose_subject`.
     """
     found = same_person(decided, person_id, tracking)
     if found is not None:

@@ -8,13 +8,18 @@ corner of the input, the rest is grey (114).
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import cv2
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.models import OnnxModel, model_invalid
+from pbl_pipeline.models import OnnxModel, find, model_invalid
 
 from ._types import Detection
+
+if TYPE_CHECKING:
+    from ._params import TrackingParams
 
 STRIDES = (8, 16, 32)
 GREY = 114
@@ -90,3 +95,25 @@ class YoloxDetector:
 
     def _invalid(self, found: str, expected: str) -> PblError:
         return model_invalid(self._model.folder, found, expected)
+
+
+def yolox(params: TrackingParams) -> YoloxDetector:
+    """The detector of the method.
+
+    Raises `PblError` MODEL_CHECKSUM where the registered model is not the one that the parameters name; what
+    `YoloxDetector` raises.
+    """
+    model = OnnxModel(find(params.model))
+    for what, stated, found in (
+        ("graph", params.model_sha256, model.spec.sha256),
+        ("model.json", params.spec_sha256, model.spec.spec_sha256),
+    ):
+        if stated != found:
+            raise PblError(
+                "MODEL_CHECKSUM",
+                found=f"the {what} of the registered model has SHA-256 {found}",
+                expected=f"SHA-256 {stated}, as the tracking method says",
+                next_step="add the model that the method was made with, or use the method of the one registered now",
+                key=params.model,
+            )
+    return YoloxDetector(model, params.min_score)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline.body import SCALE_NAMES
-from pbl_pipeline.fit import PARAMSETS, SessionInput, params_of
+from pbl_pipeline.fit import METHODS, SessionInput
 from pbl_pipeline.fit._params import POSE_PRIOR_DEG
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
@@ -196,8 +196,8 @@ def factors() -> tuple[Factor, ...]:
 
 def paramset_of(setup: Setup) -> Paramset:
     """The setup's paramset with its parameters changed. Raises `KeyError` where a path names none."""
-    given = PARAMSETS[setup.params]
-    params: Any = params_of(given)
+    given = METHODS[setup.params]
+    params: Any = given.params
     for path, factor in setup.times.items():
         params = _replaced(params, path, lambda old, factor=factor: old * factor)
     for path, value in setup.values.items():

@@ -25,7 +25,8 @@ from collections.abc import Sequence
 import click
 import numpy as np
 
-from pbl_pipeline.fit import PARAMSETS, SessionInput, fit_sessions
+from pbl_pipeline.fit import METHODS as FIT_METHODS
+from pbl_pipeline.fit import SessionInput, fit_sessions
 from pbl_pipeline.gait import (
     FootTrajectories,
     GaitEvents,
@@ -37,8 +38,7 @@ from pbl_pipeline.gait import (
     read_lab_trial,
     spatiotemporal,
 )
-from pbl_pipeline.gait.events import EVENTS, SIDES, GaitEvent
-from pbl_pipeline.gait.events._methods import DEFAULT_EVENT_PARAMSET, EVENT_PARAMSETS
+from pbl_pipeline.gait.events import EVENTS, METHODS, SIDES, GaitEvent
 from pbl_pipeline.gait.events._phase import PhaseParams
 from pbl_pipeline.synthetic import IMPAIRMENTS, Impairment, SynthSpec, Truth, synthesise
 from tests.conftest import SHARED
@@ -116,9 +116,9 @@ def laboratory(method: str, say=click.echo) -> dict[str, Tally]:
     return out
 
 
-def delay_of(walks: Sequence[LabTrial], paramset) -> list[Tally]:
+def delay_of(walks: Sequence[LabTrial], params: PhaseParams) -> list[Tally]:
     """Errors of each child's walk without the delay."""
-    params = dataclasses.replace(paramset.to(PhaseParams), event_delay_s=0.0)
+    params = dataclasses.replace(params, event_delay_s=0.0)
     out = []
     for walk in walks:
         assert walk.feet is not None
@@ -131,7 +131,7 @@ def cross_validated(say=click.echo) -> tuple[float, dict[str, tuple[float, float
     """The delay that fits all children (s), and mean and sd (ms) of the errors of each event where each child's delay
     comes from the others: minus the mean over children of their mean error over all four events. Printed as well: half
     of that delay, which is the rule behind the method's constant."""
-    each = delay_of(lab_walks(), EVENT_PARAMSETS["phase-transformer"])
+    each = delay_of(lab_walks(), METHODS["phase-transformer"].params)
     means = np.array([np.mean([x for e in EVENTS for x in t.errors[e]]) for t in each])
     whole = -float(means.mean())
     left_out = [-float(np.delete(means, i).mean()) for i in range(len(means))]
@@ -194,7 +194,7 @@ def chain(methods: Sequence[str], seeds: int, say=click.echo) -> dict[str, list[
             spec = SynthSpec("walk", 100 * k + n, impairments, view, "handheld", seconds=8.0, ground=ground)
             made.append(synthesise(spec))
         given = [SessionInput([m.keypoints], [m.truth.spec.name], "handheld") for m in made]
-        for one, fit in zip(made, fit_sessions(given, PARAMSETS["gauss-newton"]), strict=True):
+        for one, fit in zip(made, fit_sessions(given, FIT_METHODS["gauss-newton"]), strict=True):
             name = f"{kind}, {one.truth.spec.view}, seed {one.truth.spec.seed}"
             if isinstance(fit, Exception):
                 say(f"chain, {name}: {fit}")
@@ -267,12 +267,12 @@ def how_long(method: str, say=click.echo) -> tuple[float, float]:
 
 @click.command()
 @click.option("--part", "parts", multiple=True, type=click.Choice(["lab", "markers", "chain", "time"]))
-@click.option("--method", "methods", multiple=True, type=click.Choice(sorted(EVENT_PARAMSETS)))
+@click.option("--method", "methods", multiple=True, type=click.Choice(sorted(METHODS)))
 @click.option("--seeds", default=4, show_default=True, help="Walks of each kind in the chain.")
 def main(parts: Sequence[str], methods: Sequence[str], seeds: int) -> None:
     """Print all figures; exit code 1 where the default method misses a bar."""
-    parts, methods = parts or ("lab", "markers", "time", "chain"), methods or tuple(EVENT_PARAMSETS)
-    default = DEFAULT_EVENT_PARAMSET
+    parts, methods = parts or ("lab", "markers", "time", "chain"), methods or tuple(METHODS)
+    default = METHODS.default
     bars: list[tuple[str, bool]] = []
     if "time" in parts:
         for method in methods:

@@ -24,7 +24,7 @@ from scipy.io import loadmat
 from scipy.signal import resample
 
 from pbl_pipeline.gait import (
-    EVENT_PARAMSETS,
+    EVENT_METHODS,
     NINE_ANGLES,
     GaitMetrics,
     LabTrial,
@@ -121,7 +121,7 @@ def conventions(shared: Path, say: Callable[[str], None] = click.echo) -> dict[s
 
 
 @click.command()
-@click.option("--events", type=click.Choice(["labels", *EVENT_PARAMSETS]), default="labels", show_default=True)
+@click.option("--events", type=click.Choice(["labels", *EVENT_METHODS]), default="labels", show_default=True)
 @click.option("--conventions", "others", is_flag=True, help="What other conventions would make of the walks.")
 def main(events: str, others: bool) -> None:
     """Print index and profile score of each child, and their means."""

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import click
 import numpy as np
 
-from pbl_pipeline.fit import PARAMSETS, TrialFit, fit_session
+from pbl_pipeline.fit import METHODS, TrialFit, fit_session
 from pbl_pipeline.gait import GaitEvent, detect_events, feet_from_fit, find_cycles
 from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.synthetic import Synthetic, SynthSpec, synthesise
@@ -56,7 +56,7 @@ def measured(made: Synthetic) -> TrialFit:
     noise = np.random.default_rng(0).normal(0, MARKER_SD_M, truth.markers_world_m.shape)
     xyz = truth.markers_world_m + noise
     markers = WorldMarkers(truth.time_s, k.names, k.marker_set, xyz, np.ones(xyz.shape[:2]))
-    return fit_session([markers], ["walk"], PARAMSETS["markers"]).trials[0]
+    return fit_session([markers], ["walk"], METHODS["markers"]).trials[0]
 
 
 @click.command()

@@ -20,7 +20,7 @@ import click
 import numpy as np
 
 from pbl_pipeline.body import MarkerSet, load_marker_set
-from pbl_pipeline.fit import PARAMSETS, TrialFit, fit_session
+from pbl_pipeline.fit import METHODS, TrialFit, fit_session
 from pbl_pipeline.keypoints import WorldMarkers
 from tests.benchmarks.real_clips import changed
 from tests.conftest import SHARED
@@ -138,7 +138,7 @@ def main(params: str, changes: tuple[str, ...], together: bool) -> None:
     """Print marker RMS and agreement with the experts; exit code 1 where a bar is missed."""
     if not FOLDER.is_dir():
         sys.exit(f"the recording is absent: {FOLDER}")
-    paramset, markers = changed(PARAMSETS[params], changes), marker_table()
+    paramset, markers = changed(METHODS[params], changes), marker_table()
     trials = {walk: markers_of(walk, markers) for walk in WALKS}
     groups = [WALKS] if together else [(walk,) for walk in WALKS]
     good = True

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import capsules, load_body, marker_set
-from pbl_pipeline.fit import PARAMSETS, TrialFit, fit_session
+from pbl_pipeline.fit import METHODS, TrialFit, fit_session
 from pbl_pipeline.keypoints import Keypoints, MultiView
 from pbl_pipeline.render import draw_body, draw_keypoints, to_pixels
 from pbl_pipeline.video import CameraPose, load_camera, read_frames
@@ -135,7 +135,7 @@ def main(params: str, changes: tuple[str, ...], out: Path | None, frames: tuple[
     """Print reprojection and angles; exit code 1 where the bar on the reprojection is missed."""
     if not FOLDER.is_dir():
         sys.exit(f"the recording is absent: {FOLDER}")
-    paramset = changed(PARAMSETS[params], changes)
+    paramset = changed(METHODS[params], changes)
     trial = multi_view()
     views = dict(zip(CAMERAS, trial.views, strict=True))
     poses = dict(zip(CAMERAS, trial.poses, strict=True))

@@ -25,7 +25,7 @@ import click
 import numpy as np
 
 from pbl_pipeline.charts import Axes, nice_ticks
-from pbl_pipeline.fit import DEFAULT, PARAMSETS, TrialFit, fit_session, params_of
+from pbl_pipeline.fit import METHODS, TrialFit, fit_session
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.pipeline import detect_trial
@@ -154,7 +154,7 @@ def keypoints_of(clip: str, fresh: bool = False) -> Keypoints:
 
 def changed(paramset: Paramset, changes: tuple[str, ...]) -> Paramset:
     """The paramset with `name=value` changes; a dot reaches into a group, as in `cost.weight_3d=0.1`."""
-    params = params_of(paramset)
+    params = METHODS.find(paramset).params
     for change in changes:
         name, value = change.split("=", 1)
         *groups, field = name.split(".")
@@ -165,7 +165,7 @@ def changed(paramset: Paramset, changes: tuple[str, ...]) -> Paramset:
 
 
 @click.command()
-@click.option("--params", multiple=True, default=(DEFAULT,), show_default=True, help="Name of a paramset.")
+@click.option("--params", multiple=True, default=(METHODS.default,), show_default=True, help="Name of a paramset.")
 @click.option("--set", "changes", multiple=True, help="A change to it, such as cost.weight_3d=0.1.")
 @click.option("--clip", "clips", multiple=True, type=click.Choice(CLIPS), default=CLIPS, show_default=True)
 @click.option("--fresh", is_flag=True, help="Detect the key points anew.")
@@ -192,7 +192,7 @@ def main(
         }
         rows, fits = {}, {}
         for name in params:
-            paramset = changed(PARAMSETS[name], changes)
+            paramset = changed(METHODS[name], changes)
             fits[paramset.name] = session = fit_session([keypoints_of(clip, fresh)], [clip], paramset)
             rows[f"ours, {paramset.name}"] = score(fitted_angles(session.trials[0]), truth)
         ours = next(iter(rows.values()))

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import click
 import numpy as np
 
-from pbl_pipeline.fit import PARAMSETS, SessionInput, TrialFit, fit_sessions
+from pbl_pipeline.fit import METHODS, SessionInput, TrialFit, fit_sessions
 from pbl_pipeline.synthetic import IMPAIRMENTS, Impairment, SynthSpec, Truth, synthesise
 from pbl_pipeline.validation import JOINTS_PAPER, KinematicErrors, compare, reference_of_qpos
 
@@ -67,7 +67,7 @@ def line(errors: Sequence[KinematicErrors]) -> tuple[float, float, float, float]
 
 @click.command()
 @click.option("--seeds", default=6, show_default=True, help="Recordings of each kind and camera.")
-@click.option("--params", default="gauss-newton", show_default=True, type=click.Choice(sorted(PARAMSETS)))
+@click.option("--params", default="gauss-newton", show_default=True, type=click.Choice(sorted(METHODS)))
 @click.option("--marker-set", default="bml_movi_87", show_default=True)
 def main(seeds: int, params: str, marker_set: str) -> None:
     """Print the errors of each kind; exit code 1 where a bar is missed."""
@@ -77,7 +77,7 @@ def main(seeds: int, params: str, marker_set: str) -> None:
     for camera in ("handheld", "static"):
         for kind in KINDS:
             made = [recording(kind, camera, seed, marker_set) for seed in range(seeds)]
-            fits = fit_sessions([given for given, _ in made], PARAMSETS[params])
+            fits = fit_sessions([given for given, _ in made], METHODS[params])
             errors = []
             for (given, truth), fit in zip(made, fits, strict=True):
                 if isinstance(fit, Exception):

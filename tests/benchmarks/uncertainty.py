@@ -29,7 +29,7 @@ import numpy as np
 
 from pbl_pipeline.body import SLIDES
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import PARAMSETS, SessionInput, fit_sessions, params_of
+from pbl_pipeline.fit import METHODS, SessionInput, fit_sessions
 from pbl_pipeline.fit._params import GaussNewtonParams
 from pbl_pipeline.fit.solvers.gauss_newton import by_joint, floors_of
 from pbl_pipeline.paramset import Paramset
@@ -67,7 +67,7 @@ HELD_OUT = 1000
 
 def bare(paramset: Paramset) -> Paramset:
     """The same fit with every factor 1 and no least standard deviation."""
-    params = dataclasses.replace(params_of(paramset), sd_factor=(), sd_floor=())
+    params = dataclasses.replace(METHODS.find(paramset).params, sd_factor=(), sd_floor=())
     return Paramset.of(paramset.stage, paramset.name, paramset.version, params)
 
 
@@ -185,8 +185,8 @@ def coverage(errors: np.ndarray, sds: np.ndarray, names: Sequence[str], params: 
 @click.option("--params", default="gauss-newton", show_default=True, type=click.Choice(["gauss-newton", "blazepose"]))
 def main(seeds: int, params: str) -> None:
     """Print what calibrates, and coverage; exit code 1 where a group's on other recordings is outside the band."""
-    given = PARAMSETS[params]
-    now = params_of(given)
+    given = METHODS[params]
+    now = given.params
     assert isinstance(now, GaussNewtonParams)
     record = clip if params == "blazepose" else walk
     known, known_sd, names = errors_and_sd(map(record, range(seeds)), bare(given))

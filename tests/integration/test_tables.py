@@ -820,7 +820,7 @@ def test_methods_are_frozen(declared: None):
     before = len(tracking.TrackingMethod()), len(fit.BodyModel()), len(gdi.NormativeSet())
     _methods.insert_all()
     assert (len(tracking.TrackingMethod()), len(fit.BodyModel()), len(gdi.NormativeSet())) == before
-    (known,) = list(pbl_pipeline.tracking.PARAMSETS.values())[:1]
+    (known,) = list(pbl_pipeline.tracking.METHODS.values())[:1]
     edited = chain.dataclasses.replace(known, params={**known.params, "min_score": 0.99})
     with pytest.raises(PblError, match="new version"):
         insert_methods(tracking.TrackingMethod, "tracking", {known.name: edited})

@@ -22,7 +22,7 @@ import pbl_pipeline.fit
 import pbl_pipeline.video
 import schemas
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import PARAMSETS
+from pbl_pipeline.fit import METHODS
 from schemas import connection, embedded, fit, gait, gdi, lab, qc, tracking, video, worker
 from schemas.cli.why import why as why_command
 from schemas.status import live_workers, pipeline_status, queue_counts
@@ -515,7 +515,7 @@ def test_a_new_method_adds_rows_and_touches_no_old_one(tables: None, tmp_path: P
         r["fit_computed"] for r in before["SessionFit"]
     ]
     assert requeue.plan_new_method("SessionFit", "paper-2025").add == []
-    assert PARAMSETS["paper-2025"].name == "paper-2025"
+    assert METHODS["paper-2025"].name == "paper-2025"
     with pytest.raises(PblError, match="USAGE"):
         requeue.plan_new_method("VideoInfo", "paper-2025")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.bench._accuracy import MAIN_JOINTS, PAPER_JOINTS
-from pbl_pipeline.fit import PARAMSETS, params_of
+from pbl_pipeline.fit import METHODS
 from pbl_pipeline.fit._params import GaussNewtonParams
 from pbl_pipeline.keypoints import Keypoints
 from tests.benchmarks.ablation import figures_of, path_error_m, row_of, table
@@ -96,9 +96,9 @@ def test_every_row_is_named_once_and_differs_from_the_default():
 
 
 def test_paramsets_change_in_what_is_asked_and_in_nothing_else():
-    given = params_of(PARAMSETS["gauss-newton"])
+    given = METHODS["gauss-newton"].params
     assert isinstance(given, GaussNewtonParams)
-    made = params_of(paramset_of(Setup(times={"cost.weight_2d": 0.1}, values={"max_iterations": 7})))
+    made = METHODS.find(paramset_of(Setup(times={"cost.weight_2d": 0.1}, values={"max_iterations": 7}))).params
     cost = dataclasses.replace(given.cost, weight_2d=0.1 * given.cost.weight_2d)
     assert made == dataclasses.replace(given, cost=cost, max_iterations=7)
     with pytest.raises(KeyError):

@@ -13,9 +13,7 @@ from scipy.spatial.transform import Rotation
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import (
     BOUND_TRUNK,
-    DEFAULT,
-    PARAMSETS,
-    KeypointParams,
+    METHODS,
     Keypoints,
     confidence_curve,
     confidence_curves,
@@ -70,18 +68,16 @@ def test_curves_that_ship_are_monotone_and_say_where_they_come_from():
 def test_the_default_curve_is_of_what_the_default_method_does():
     """Another detection states other confidences: fit a curve to it, `python -m
     research.confidence`, under the next version."""
-    params = PARAMSETS[DEFAULT].to(KeypointParams)
+    params = METHODS.find().params
     curve = confidence_curve(params.confidence_curve)
     assert curve.detector == params.detector
     assert json.loads(json.dumps(curve_params(params))) == curve.params
 
 
 def test_the_name_of_the_curve_is_part_of_the_method():
-    params = PARAMSETS[DEFAULT].to(KeypointParams)
-    other = dataclasses.replace(
-        PARAMSETS[DEFAULT], params=dataclasses.asdict(dataclasses.replace(params, confidence_curve=""))
-    )
-    assert other.hash != PARAMSETS[DEFAULT].hash
+    params = METHODS.find().params
+    other = METHODS.make(METHODS.default, METHODS.find().version, dataclasses.replace(params, confidence_curve=""))
+    assert other.hash != METHODS.find().hash
 
 
 def test_an_unknown_curve_is_refused_and_none_is_no_curve(tmp_path):

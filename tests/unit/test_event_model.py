@@ -14,7 +14,7 @@ from pbl_pipeline.body import marker_set
 from pbl_pipeline.cli.events import events as events_command
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import FootTrajectories, GaitEvents, detect_events, feet_from_markers, find_cycles
-from pbl_pipeline.gait.events import DEFAULT_EVENT_PARAMSET, EVENT_PARAMSETS, PhaseParams, resolve_params
+from pbl_pipeline.gait.events import METHODS
 from pbl_pipeline.gait.events._phase import double_support_s
 from pbl_pipeline.gait.events.network.predict import load, model_path
 from pbl_pipeline.keypoints import WorldMarkers
@@ -26,7 +26,7 @@ from research.events._scenes import not_walking
 from research.events._sequence import ORDER
 
 SET = marker_set("bml_movi_87")
-PLAIN = dataclasses.replace(resolve_params(None).to(PhaseParams), event_delay_s=0.0)
+PLAIN = dataclasses.replace(METHODS.find().params, event_delay_s=0.0)
 
 
 @functools.cache
@@ -179,7 +179,7 @@ def test_a_leg_that_is_hardly_seen():
     empty(found, "one leg is hardly seen")
 
 
-@pytest.mark.parametrize("method", [*EVENT_PARAMSETS])
+@pytest.mark.parametrize("method", [*METHODS])
 def test_walking_backwards_on_the_ground(method):
     truth = truth_of(seed=1, seconds=6.0)
     empty(detect_events(feet_of(truth, lambda xyz: xyz[::-1]), method), "backwards")
@@ -251,7 +251,7 @@ def test_standing_on_the_spot_and_a_kick_are_no_walk():
         assert found.status == "EMPTY", seed
 
 
-@pytest.mark.parametrize("method", [*EVENT_PARAMSETS])
+@pytest.mark.parametrize("method", [*METHODS])
 @pytest.mark.parametrize("flip", [[1, 1, -1], [1, -1, -1], [1, -1, 1], [-1, 1, 1]])
 def test_upside_down_and_mirrored_points_are_refused(flip, method):
     with pytest.raises(PblError, match="GAIT_INPUT") as error:
@@ -296,15 +296,15 @@ def test_feet_without_legs_are_refused():
 
 
 def test_the_weights_are_those_that_the_method_names():
-    paramset = EVENT_PARAMSETS[DEFAULT_EVENT_PARAMSET]
-    params = paramset.to(PhaseParams)
+    method = METHODS.find()
+    params = method.params
     path = model_path(params.model)
     assert hashlib.sha256(path.read_bytes()).hexdigest() == params.model_sha256
     assert path.stat().st_size < 5e6
     about = load(params.model)[1]
     assert about["train"]["seed"] == 0
     assert about["reliability"]["expected_error"] < 0.01
-    assert resolve_params("phase-transformer-v1") == paramset
+    assert METHODS.find("phase-transformer-v1") == method
 
 
 def test_other_weights_are_refused():

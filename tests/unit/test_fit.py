@@ -13,12 +13,11 @@ import pytest
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import (
     LEVEL_CAMERA_R_NC,
-    PARAMSETS,
+    METHODS,
     ImplicitAdamParams,
     TrialFit,
     check_trial,
     fit_session,
-    params_of,
 )
 from pbl_pipeline.fit._costs import (
     center,
@@ -44,7 +43,7 @@ TIME_S = np.arange(0, 2.6, 1 / 30)
 
 def quick(steps: int = 1500) -> Paramset:
     """`implicit-adam` with the demo's priors and full weight on 3D, because the synthetic points are metric."""
-    cost = dataclasses.replace(params_of(PARAMSETS["blazepose"]).cost, weight_3d=1.0)
+    cost = dataclasses.replace(METHODS["blazepose"].params.cost, weight_3d=1.0)
     params = ImplicitAdamParams(steps=steps, samples_per_trial=64, start="keypoints", cost=cost)
     return Paramset.of("fit", "test", 1, params)
 
@@ -219,7 +218,7 @@ def test_scale_prior_by_hand_leaves_the_whole_body_free():
 
 
 def test_the_papers_cost_has_neither_prior():
-    cost = params_of(PARAMSETS["paper-2025"]).cost
+    cost = METHODS["paper-2025"].params.cost
     assert (cost.weight_pose, cost.weight_scale) == (0.0, 0.0)
     assert (cost.weight_3d, cost.weight_2d, cost.weight_offset_per_m2) == (1.0, 0.1, 100.0)
 
@@ -278,9 +277,9 @@ def test_markers_that_the_detector_never_gives_do_not_hide_the_person():
 def test_paramsets_survive_json_and_name_their_steps():
     import json
 
-    for p in PARAMSETS.values():
-        stored = Paramset(p.stage, p.name, p.version, json.loads(p.canonical_json))
-        assert params_of(stored) == params_of(p)
+    for p in METHODS.values():
+        stored = Paramset(p.stage, p.name, p.version, json.loads(p.paramset.canonical_json))
+        assert METHODS.find(stored).params == p.params
         assert stored.hash == p.hash
 
 

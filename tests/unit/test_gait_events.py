@@ -10,7 +10,7 @@ import pytest
 from pbl_pipeline import gait
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import EventParams, load_events
-from pbl_pipeline.gait.events import EVENT_PARAMSETS, GaitEvent
+from pbl_pipeline.gait.events import METHODS, GaitEvent
 from pbl_pipeline.gait.events._order import Candidate, best_sequence
 
 from .gait_walker import Walker, errors_s, make_feet
@@ -205,7 +205,7 @@ def test_offsets_move_events_and_change_the_hash():
     shift = np.array(moved.times("left", "foot_down")) - plain.times("left", "foot_down")
     np.testing.assert_allclose(shift, 0.03)
     assert moved.times("left", "foot_up") == plain.times("left", "foot_up")
-    assert plain.params_hash == EVENT_PARAMSETS["zeni-2008"].hash != moved.params_hash
+    assert plain.params_hash == METHODS["zeni-2008"].hash != moved.params_hash
 
 
 def test_unknown_method_is_an_error():

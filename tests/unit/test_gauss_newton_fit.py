@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import (
-    PARAMSETS,
+    METHODS,
     SessionFit,
     SessionInput,
     TrialFit,
@@ -26,7 +26,6 @@ from pbl_pipeline.fit import (
     _session,
     fit_session,
     fit_sessions,
-    params_of,
 )
 from pbl_pipeline.fit._gravity import on_their_feet, vertical
 from pbl_pipeline.fit._params import GaussNewtonParams
@@ -37,7 +36,7 @@ from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.synthetic import Noise, Seen, observe, observe_markers, observe_views, person, walk_qpos
 
-PARAMSET = PARAMSETS["gauss-newton"]
+PARAMSET = METHODS["gauss-newton"]
 TIME_S, HALF_S = np.arange(120) / 30, np.arange(60) / 30
 #: Fits that several tests compare with: seeds of persons and walks.
 SEEDS = (5, 6, 7)
@@ -52,7 +51,7 @@ def one_size() -> Iterator[None]:
 
 
 def changed(**changes) -> Paramset:
-    params = dataclasses.replace(params_of(PARAMSET), **changes)
+    params = dataclasses.replace(METHODS.find(PARAMSET).params, **changes)
     return Paramset.of("fit", "changed", 1, params)
 
 
@@ -198,14 +197,14 @@ def test_four_cameras():
 def test_laboratory_markers():
     scale, offset = person(9)
     trial = observe_markers(walk(9), TIME_S, scale=scale, site_offset_m=offset)
-    fit = fit_session([trial], ["a"], PARAMSETS["markers"])
+    fit = fit_session([trial], ["a"], METHODS["markers"])
     assert_near(fit.trials[0], walk(9), deg=1.4, m=0.012)
     assert np.isnan(fit.trials[0].phone_quat_wxyz).all()
 
 
 @pytest.mark.parametrize("name", ["gauss-newton", "blazepose"])
 def test_standard_deviations_of_every_joint_are_calibrated(name):
-    names, params = load_body().joint_names, params_of(PARAMSETS[name])
+    names, params = load_body().joint_names, METHODS[name].params
     assert isinstance(params, GaussNewtonParams)
     floors, factors = floors_of(names, params.sd_floor), by_joint(names, params.sd_factor, 1.0)
     assert np.all((floors > 0) | (factors != 1.0))
@@ -214,7 +213,7 @@ def test_standard_deviations_of_every_joint_are_calibrated(name):
 
 
 def test_a_least_standard_deviation_is_added_in_squares(one_by_one):
-    params = dataclasses.replace(params_of(PARAMSET), sd_floor=(("knee", 10.0), ("pelvis_tx", 3.0)))
+    params = dataclasses.replace(METHODS.find(PARAMSET).params, sd_floor=(("knee", 10.0), ("pelvis_tx", 3.0)))
     given = Paramset.of("fit", "with floors", 1, params)
     fit = fit_session([look(5).keypoints], ["a"], given).trials[0]
     plain = one_by_one[0].trials[0]

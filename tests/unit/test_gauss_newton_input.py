@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import PARAMSETS, SessionInput, _observations, fit_sessions
+from pbl_pipeline.fit import METHODS, SessionInput, _observations, fit_sessions
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.synthetic import observe, observe_markers, walk_qpos
 
@@ -64,7 +64,7 @@ BAD: dict[str, tuple[str, Callable[[Any], dict]]] = {
 def code_of(make: Callable[[], SessionInput]) -> str:
     """The code with which a session is refused: at its construction or as the result of the fit."""
     try:
-        result = fit_sessions([make()], PARAMSETS["gauss-newton"])[0]
+        result = fit_sessions([make()], METHODS["gauss-newton"])[0]
     except PblError as error:
         return error.code
     assert isinstance(result, PblError)

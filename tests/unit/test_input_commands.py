@@ -11,8 +11,9 @@ from pbl_pipeline import pipeline
 from pbl_pipeline.body import load_marker_set
 from pbl_pipeline.cli._options import fit_paramset
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import GaussNewtonParams, ImplicitAdamParams, Params
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
-from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.methods import Stage
 from pbl_pipeline.video import load_attitude
 from tests.command import Done, pbl
 from tests.inputs import (
@@ -151,11 +152,13 @@ def test_events_of_markers(tmp_path):
 
 @pytest.fixture
 def paramsets(monkeypatch: pytest.MonkeyPatch) -> None:
-    kinds = {"paper": "implicit-adam", "usual": "gauss-newton", "other": "gauss-newton", "markers": "gauss-newton"}
-    sets = {name: Paramset("fit", name, 1, {"solver": solver}) for name, solver in kinds.items()}
-    monkeypatch.setattr("pbl_pipeline.fit.PARAMSETS", sets)
-    monkeypatch.setattr("pbl_pipeline.fit.DEFAULT", "usual")
-    monkeypatch.setattr("pbl_pipeline.fit.SOLVERS", ("implicit-adam", "gauss-newton"))
+    methods: Stage[Params] = Stage("fit", "solver", "usual")
+    methods.register("paper", 1, ImplicitAdamParams(), len)
+    methods.register("usual", 1, GaussNewtonParams(), len)
+    methods.register("other", 1, GaussNewtonParams(max_iterations=7))
+    methods.register("markers", 1, GaussNewtonParams(max_iterations=8))
+    for module in ("fit", "fit._default"):
+        monkeypatch.setattr(f"pbl_pipeline.{module}.METHODS", methods)
 
 
 @pytest.mark.usefixtures("paramsets")
@@ -189,10 +192,10 @@ def test_markers_have_a_paramset_of_their_own(fits, tmp_path):
 
 
 def test_changes_to_a_named_paramset(tmp_path):
-    from pbl_pipeline.fit import PARAMSETS, ImplicitAdamParams, params_of
+    from pbl_pipeline.fit import METHODS
 
     (tmp_path / "mine.json").write_text('{"base": "paper-2025", "steps": 8000, "cost": {"weight_2d": 0.05}}')
-    mine, paper = params_of(fit_paramset(None, str(tmp_path / "mine.json"))), params_of(PARAMSETS["paper-2025"])
+    mine, paper = fit_paramset(None, str(tmp_path / "mine.json")).params, METHODS["paper-2025"].params
     assert isinstance(mine, ImplicitAdamParams)
     assert isinstance(paper, ImplicitAdamParams)
     assert (mine.steps, mine.cost.weight_2d) == (8000, 0.05)

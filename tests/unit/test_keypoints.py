@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import (
-    PARAMSETS,
+    METHODS,
     KeypointParams,
     Keypoints,
     PersonKeypoints,
@@ -283,9 +283,9 @@ def test_unknown_person_detector_and_changed_video(case, tmp_path):
 
 
 def test_paramset_names_the_model():
-    paramset = PARAMSETS["blazepose-33"]
-    assert (paramset.stage, paramset.version) == ("keypoints", 2)
-    assert paramset.params["model_sha256"] == KeypointParams().model_sha256
+    method = METHODS["blazepose-33"]
+    assert (method.stage, method.version) == ("keypoints", 2)
+    assert method.params.model_sha256 == KeypointParams().model_sha256
 
 
 # --- quality ----------------------------------------------------------------------------------------------------

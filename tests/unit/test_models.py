@@ -19,11 +19,12 @@ import onnx
 import onnxruntime
 import pytest
 
-from pbl_pipeline import models
+from pbl_pipeline import fit, models
 from pbl_pipeline.body import MARKER_SETS, marker_set
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.keypoints import ModelKeypointParams, find_method, params_of
+from pbl_pipeline.keypoints import METHODS, ModelKeypointParams
 from pbl_pipeline.models import _spec
+from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.pipeline import fit_default
 from tests import dot_models
 from tests.command import pbl
@@ -439,10 +440,10 @@ def test_add_from_an_address(folder, registry, tmp_path, monkeypatch):
 
 
 def test_a_registered_model_is_a_keypoint_method(folder, registry):
-    refused("SOLVER_UNKNOWN", find_method, "dots-crop3d")
+    refused("SOLVER_UNKNOWN", METHODS.find, "dots-crop3d")
     models.add(folder)
-    method = find_method("dots-crop3d")
-    params = params_of(method)
+    method = METHODS.find("dots-crop3d")
+    params = method.params
     assert isinstance(params, ModelKeypointParams)
     assert params.model.licence == "CC0-1.0, a test"
     assert params.model.n_augmentations == 10
@@ -451,19 +452,20 @@ def test_a_registered_model_is_a_keypoint_method(folder, registry):
     assert params.model_sha256 == models.load_spec(folder).sha256
     # What a database hands back: JSON, numbers without their point.
     again = json.loads(
-        method.canonical_json, parse_float=lambda t: int(float(t)) if float(t).is_integer() else float(t)
+        method.paramset.canonical_json, parse_float=lambda t: int(float(t)) if float(t).is_integer() else float(t)
     )
-    assert params_of(type(method)(method.stage, method.name, method.version, again)) == params
+    stored = Paramset(method.stage, method.name, method.version, again)
+    assert METHODS.find(stored) == method
 
 
 def test_another_graph_or_spec_is_another_method(folder, registry):
     models.add(folder)
-    first = find_method("dots-crop3d")
+    first = METHODS.find("dots-crop3d")
     models.add(changed(folder, pixel_origin="edge"), replace=True)
-    second = find_method("dots-crop3d")
+    second = METHODS.find("dots-crop3d")
     assert first.hash != second.hash
     models.add(changed(folder, pixel_origin="centre", comment="as before"), replace=True)
-    assert find_method("dots-crop3d").hash != second.hash
+    assert METHODS.find("dots-crop3d").hash != second.hash
 
 
 def still(kind: str, names: list[str]) -> onnx.ModelProto:
@@ -482,11 +484,15 @@ def still(kind: str, names: list[str]) -> onnx.ModelProto:
 
 @pytest.mark.parametrize(
     ("kind", "markers", "paramset"),
-    [("crop3d", "bml_movi_87", "gauss-newton"), ("crop3d", "mpi_inf_3dhp_17", None), ("simcc", "bml_movi_87", None)],
+    [
+        ("crop3d", "bml_movi_87", "gauss-newton"),
+        ("crop3d", "mpi_inf_3dhp_17", fit.METHODS.default),
+        ("simcc", "bml_movi_87", fit.METHODS.default),
+    ],
 )
 def test_the_fit_that_suits_the_points(registry, tmp_path, kind, markers, paramset):
     names = list(marker_set(markers).names)
     fields = dot_models.spec(kind, (32, 32), name="still", marker_set=markers, joint_names=names)
     models.add(dot_models.write(tmp_path / "still", still(kind, names), fields))
-    assert fit_default(find_method("still")) == paramset
-    assert fit_default(find_method(None)) is None
+    assert fit_default(METHODS.find("still")) == paramset
+    assert fit_default(METHODS.find(None)) == fit.METHODS.default

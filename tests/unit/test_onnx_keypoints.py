@@ -27,8 +27,6 @@ from pbl_pipeline.keypoints import (
     PersonKeypoints,
     _onnx_keypoints,
     detect_keypoints,
-    find_method,
-    params_of,
 )
 from pbl_pipeline.keypoints._augment import Augmentation, aligned, augmentations, sd_confidence, spread_mm
 from pbl_pipeline.keypoints._batched import BatchedLooks
@@ -498,7 +496,7 @@ def registered(tmp_path, monkeypatch) -> None:
 def test_a_video_through_detect_keypoints(video, registered, tmp_path, name):
     path, tracking = video
     xyz, xy = walk()
-    found = detect_keypoints(path, tracking, 1, CAMERA, params_of(find_method(name)))
+    found = detect_keypoints(path, tracking, 1, CAMERA, name)
     assert found.names == NAMES
     # The pictures are compressed, and a pixel of the 2D model's crop is 1.3 of them.
     off = np.linalg.norm(found.xy_px - xy, axis=2)
@@ -552,7 +550,7 @@ def test_pbl_detect_shows_the_licence_before_the_work(video, registered, tmp_pat
 
 def test_the_report_names_the_model(video, registered):
     path, tracking = video
-    found = detect_keypoints(path, tracking, 1, CAMERA, params_of(find_method("dots-simcc")))
+    found = detect_keypoints(path, tracking, 1, CAMERA, "dots-simcc")
     session: Any = SimpleNamespace(trials=[SimpleNamespace(name="walk", keypoints=found)])
     assert _models(session) == {"keypoints of walk": found.origin}
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.body import load_body, marker_positions, marker_set
-from pbl_pipeline.fit import PARAMSETS, fit_session
+from pbl_pipeline.fit import METHODS, fit_session
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from tests.benchmarks import marker_ik, multiview
 
@@ -124,7 +124,7 @@ def test_a_second_of_walking_from_laboratory_markers(walk):
     xyz, confidence = walk.xyz_world_m[WALK_FRAMES], walk.confidence[WALK_FRAMES]
     part = WorldMarkers(walk.time_s[WALK_FRAMES], walk.names, walk.marker_set, xyz, confidence)
     table = marker_ik.marker_table()
-    fit = fit_session([part], ["walkingTI1"], PARAMSETS["markers"], markers=table).trials[0]
+    fit = fit_session([part], ["walkingTI1"], METHODS["markers"], markers=table).trials[0]
     assert marker_ik.marker_rms_mm(fit, part) <= marker_ik.MAX_RMS_MM
     for expert in marker_ik.EXPERTS:
         theirs = marker_ik.expert_angles(marker_ik.FOLDER / f"walkingTI1_ik_{expert}.mot")
@@ -135,7 +135,7 @@ def test_a_second_of_walking_from_laboratory_markers(walk):
 def test_a_second_of_balancing_from_four_cameras(shared_data):
     trial = multiview.multi_view()
     part = MultiView(tuple(cut(view) for view in trial.views), trial.poses)
-    fit = fit_session([part], ["balancing"], PARAMSETS["blazepose"]).trials[0]
+    fit = fit_session([part], ["balancing"], METHODS["blazepose"]).trials[0]
     views = zip(part.views, part.poses, strict=True)
     distance = np.stack([multiview.reprojection_px(fit, view, pose) for view, pose in views])
     assert np.nanmedian(distance) <= multiview.MAX_MEDIAN_PX

@@ -10,7 +10,7 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.tracking import (
-    PARAMSETS,
+    METHODS,
     AssociationParams,
     Detection,
     PersonTrack,
@@ -285,10 +285,10 @@ def test_unknown_detector_is_refused(spots_video):
 
 
 def test_paramset_names_the_model():
-    paramset = PARAMSETS["blazepose-tiles"]
-    assert (paramset.stage, paramset.version) == ("tracking", 2)
-    assert paramset.params["model_sha256"] == TrackingParams().model_sha256
-    assert len(paramset.hash) == 16
+    method = METHODS["blazepose-tiles"]
+    assert (method.stage, method.version) == ("tracking", 2)
+    assert method.params.model_sha256 == TrackingParams().model_sha256
+    assert len(method.hash) == 16
 
 
 def test_contact_sheet_shows_everybody(spots_video, tmp_path):

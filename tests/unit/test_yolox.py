@@ -17,11 +17,10 @@ from pbl_pipeline import models
 from pbl_pipeline.cli.detect import detect
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.tracking import (
-    TrackingParams,
+    METHODS,
     YoloxDetector,
     choose_subject,
-    find_method,
-    method_of_detector,
+    detector_params,
     track_people,
 )
 from pbl_pipeline.tracking._tiles import detect_in
@@ -164,13 +163,12 @@ def changed(folder: Path, **fields) -> Path:
 
 def test_the_walker_of_a_real_clip(folder, registry, shared_data, tmp_path):
     models.add(folder)
-    method = find_method("yolox-nano")
-    assert (method.name, method.version, method.params["model"]) == ("yolox-nano", 1, "yolox-nano")
-    params = method.to(TrackingParams)
+    method = METHODS.find("yolox-nano")
+    assert (method.name, method.version, method.params.model) == ("yolox-nano", 1, "yolox-nano")
     video = shared_data / "real" / "video_mocap" / "walk" / "video.mp4"
     half = (cv2.resize(f.image, (360, 640)) for f in read_frames(video, step=2))
     path = write_video(tmp_path / "half.mp4", half, constant_rate(38))
-    tracking = track_people(path, params)
+    tracking = track_people(path, method)
     choice = choose_subject(tracking)
     assert (tracking.detector, choice.status, choice.person_id) == ("yolox-nano", "CHOSEN", 1)
     box = tracking.persons[0].box_px
@@ -203,7 +201,7 @@ def test_bad_folders_and_changed_models(folder, registry, shared_data):
     del spec["joint_names"]
     (folder / "model.json").write_text(json.dumps(spec))
     models.add(folder)
-    params = method_of_detector("yolox-nano").to(TrackingParams)
+    params = detector_params("yolox-nano")
     # The lab registers another spec under the name: the old method does not run on it.
     models.add(changed(folder, comment="the same numbers"), replace=True)
     track_people(video, params)
@@ -212,5 +210,5 @@ def test_bad_folders_and_changed_models(folder, registry, shared_data):
     assert "model.json" in refused("MODEL_CHECKSUM", track_people, video, params)
     models.remove("yolox-nano")
     refused("MODEL_MISSING", track_people, video, params)
-    refused("MODEL_MISSING", method_of_detector, "yolox-nano")
-    refused("SOLVER_UNKNOWN", find_method, "yolox-nano")
+    refused("MODEL_MISSING", detector_params, "yolox-nano")
+    refused("SOLVER_UNKNOWN", METHODS.find, "yolox-nano")

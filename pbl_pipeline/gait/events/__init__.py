@@ -2,7 +2,7 @@
 
 from ._detect import detect_events
 from ._foot_velocity import FootVelocityParams
-from ._methods import DEFAULT_EVENT_PARAMSET, EVENT_PARAMSETS, resolve_params
+from ._methods import METHODS
 from ._phase import PHASE_ORDER, PhaseParams, candidates
 from ._phase_filter import FilterParams
 from ._preconditions import check_preconditions
@@ -22,12 +22,11 @@ from ._types import (
 from ._walking import WalkingParams
 
 __all__ = [
-    "DEFAULT_EVENT_PARAMSET",
     "EVENTS",
-    "EVENT_PARAMSETS",
     "FOOT_DOWN",
     "FOOT_UP",
     "LEFT",
+    "METHODS",
     "PHASE_ORDER",
     "RIGHT",
     "SIDES",
@@ -43,5 +42,4 @@ __all__ = [
     "detect_events",
     "load_events",
     "no_events",
-    "resolve_params",
 ]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy.signal import find_peaks
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait.motion import FootTrajectories
-from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.methods import Method
 from pbl_pipeline.qc import PASS, WARN, Check
 
 from ._order import Candidate, best_sequence
@@ -30,7 +31,7 @@ from ._types import (
 _HEEL, _TOE = slice(0, 2), slice(2, 4)
 
 
-def detect_by_coordinates(feet: FootTrajectories, paramset: Paramset) -> GaitEvents:
+def detect_by_coordinates(feet: FootTrajectories, method: Method[EventParams]) -> GaitEvents:
     """Foot down and foot up from the forward movement of the feet relative to the pelvis.
 
     Method: Zeni, Richards, Higginson 2008, Gait & Posture 27:710-714. Foot down is where the heel is foremost, foot
@@ -59,20 +60,19 @@ def detect_by_coordinates(feet: FootTrajectories, paramset: Paramset) -> GaitEve
     PblError
         GAIT_INPUT where no frame holds feet, pelvis and heading, or the legs are upside down or mirrored.
     """
-    p = EventParams(**paramset.params)
+    p = method.params
     _, reason, advice = check_preconditions(feet, p.min_segment_s)
     if reason:
-        return no_events(paramset.name, paramset.hash, feet.source, reason, advice)
+        return no_events(method.name, method.hash, feet.source, reason, advice)
     x, leg = forward_signals(feet, p)
     return detect_by_extrema(
-        feet, paramset, p, x, leg, lambda segment: _candidates(segment, leg, p), p.min_excursion_leg * leg
+        feet, method, x, leg, lambda segment: _candidates(segment, leg, p), p.min_excursion_leg * leg
     )
 
 
 def detect_by_extrema(
     feet: FootTrajectories,
-    paramset: Paramset,
-    p: EventParams,
+    method: Method[Any],
     x: np.ndarray,
     leg: float,
     extrema: Callable[[Segment], list[Extremum]],
@@ -80,6 +80,7 @@ def detect_by_extrema(
 ) -> GaitEvents:
     """Events among the `extrema` of each segment of the signals `x` (T, C), whose first two columns are the heels'
     places ahead of the pelvis; `least` is the smallest prominence that counts."""
+    p: EventParams = method.params
     segments = uniform_segments(
         np.asarray(feet.time_s, float),
         x,
@@ -91,7 +92,7 @@ def detect_by_extrema(
     )
     if not segments:
         return no_events(
-            paramset.name, paramset.hash, feet.source, f"the feet are not seen for {p.min_segment_s:g} s at a time"
+            method.name, method.hash, feet.source, f"the feet are not seen for {p.min_segment_s:g} s at a time"
         )
     confidence = _mean_confidence(feet)
     per_segment = [extrema(s) for s in segments]
@@ -109,7 +110,7 @@ def detect_by_extrema(
     swing = max(float(np.ptp(s.values[:, 0] - s.values[:, 1])) for s in segments) / leg
     if not bouts:
         reason = _why_not(swing, n_candidates, p)
-        return no_events(paramset.name, paramset.hash, feet.source, reason, "", n_candidates, breaks)
+        return no_events(method.name, method.hash, feet.source, reason, "", n_candidates, breaks)
     events = tuple(
         GaitEvent(c.time_s + _offset(c.event, p), c.side, c.event, c.weight, number)
         for number, bout in enumerate(bouts)
@@ -119,8 +120,8 @@ def detect_by_extrema(
         status="PASS",
         events=tuple(sorted(events, key=lambda e: (e.time_s, e.bout))),
         reason="",
-        method=paramset.name,
-        params_hash=paramset.hash,
+        method=method.name,
+        params_hash=method.hash,
         source=feet.source,
         walking_s=tuple((b[0].time_s, b[-1].time_s) for b in bouts),
         n_candidates=n_candidates,

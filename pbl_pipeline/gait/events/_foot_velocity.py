@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import find_peaks
 
 from pbl_pipeline.gait.motion import FootTrajectories
-from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.methods import Method
 
 from ._coordinates import Extremum, detect_by_extrema, forward_signals, prominence
 from ._preconditions import check_preconditions
@@ -32,7 +32,7 @@ class FootVelocityParams(EventParams):
     max_heel_share: float = 0.35
 
 
-def detect_by_foot_velocity(feet: FootTrajectories, paramset: Paramset) -> GaitEvents:
+def detect_by_foot_velocity(feet: FootTrajectories, method: Method[FootVelocityParams]) -> GaitEvents:
     """Foot down and foot up from the vertical speed of the middle between heel and toe.
 
     Method: O'Connor, Thorpe, O'Malley, Vaughan 2007, Gait & Posture 25:469-474. Foot up is where the speed is
@@ -43,10 +43,10 @@ def detect_by_foot_velocity(feet: FootTrajectories, paramset: Paramset) -> GaitE
 
     Raises `PblError` GAIT_INPUT as there.
     """
-    p = paramset.to(FootVelocityParams)
+    p = method.params
     _, reason, advice = check_preconditions(feet, p.min_segment_s)
     if reason:
-        return no_events(paramset.name, paramset.hash, feet.source, reason, advice)
+        return no_events(method.name, method.hash, feet.source, reason, advice)
     x, leg = forward_signals(feet, p)
     heel = (np.asarray(feet.heel_m, float) - feet.pelvis_m[:, None]) @ feet.up
     toe = (np.asarray(feet.toe_m, float) - feet.pelvis_m[:, None]) @ feet.up
@@ -70,5 +70,5 @@ def detect_by_foot_velocity(feet: FootTrajectories, paramset: Paramset) -> GaitE
         return found
 
     return detect_by_extrema(
-        feet, paramset, p, np.concatenate([x, heel, toe], axis=1), leg, extrema, p.min_speed_leg_per_s * leg
+        feet, method, np.concatenate([x, heel, toe], axis=1), leg, extrema, p.min_speed_leg_per_s * leg
     )

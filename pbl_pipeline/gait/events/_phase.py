@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline.gait.motion import FootTrajectories
-from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.methods import Method
 from pbl_pipeline.qc import PASS, WARN, Check
 
 from ._phase_filter import FilterParams, SmoothPhases, crossings, smooth_phases
@@ -56,18 +56,18 @@ class PhaseParams:
     event_delay_s: float = 0.008
 
 
-def detect_by_phase(feet: FootTrajectories, paramset: Paramset) -> GaitEvents:
+def detect_by_phase(feet: FootTrajectories, method: Method[PhaseParams]) -> GaitEvents:
     """Events of both feet where the phases of the event model wrap. See `detect_events`.
 
     Raises `PblError` GAIT_INPUT: joints upside down or mirrored, no joints at all; ASSET_MISSING: no weights.
     """
-    p = paramset.to(PhaseParams)
+    p = method.params
     check_model(p.model, p.model_sha256)
     if feet.legs_m is None:
         raise input_error("feet without the joints of the legs", "hips and knees, ankles, heels or toes in 3D")
     grid, reason, advice = check_preconditions(feet, p.min_seen_s)
     if grid is None or reason:
-        return no_events(paramset.name, paramset.hash, feet.source, reason, advice)
+        return no_events(method.name, method.hash, feet.source, reason, advice)
     time = np.asarray(feet.time_s, float)
     phases = predict(grid, p.model)
     curve = load(p.model)[1]["probability"]
@@ -82,14 +82,14 @@ def detect_by_phase(feet: FootTrajectories, paramset: Paramset) -> GaitEvents:
             bouts.append((bout[0].time_s, bout[-1].time_s))
     if not bouts:
         reason, advice = _why_not(grid, phases, len(stretches), half_seen, p)
-        return no_events(paramset.name, paramset.hash, feet.source, reason, advice)
+        return no_events(method.name, method.hash, feet.source, reason, advice)
     turning = float(np.mean(np.abs(turning_deg_per_s(grid)) > p.walking.max_turn_deg_per_s))
     return GaitEvents(
         status=PASS,
         events=tuple(sorted(events, key=lambda e: (e.time_s, e.bout))),
         reason="",
-        method=paramset.name,
-        params_hash=paramset.hash,
+        method=method.name,
+        params_hash=method.hash,
         source=feet.source,
         walking_s=tuple(bouts),
         n_candidates=sum(len(stretch) for stretch in stretches),

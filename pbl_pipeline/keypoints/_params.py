@@ -1,0 +1,43 @@
+"""Parameters of the keypoints."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from ._blazepose import MODEL_SHA256
+from ._flips import FlipParams
+
+
+@dataclasses.dataclass(frozen=True)
+class KeypointParams:
+    """Parameters of `detect_keypoints`.
+
+    passes: 1 cuts along the track only, 2 cuts again where the first look saw the body.
+    first_look_s: the first look is taken once in so many seconds, 0: at every frame.
+    smooth_s: standard deviation of the Gaussian that smooths the crops over time.
+    min_presence: below it a frame has no person and its keypoints are missing.
+    max_drift, max_growth: the first look is believed where its body circle lies within this share of the side from
+    the track's, and differs from it in size by at most this factor.
+    agree_mm, agree_width_mm: how far the answers for the picture and its mirror image may lie apart, see
+    `BlazePoseLandmarks`.
+    sides: where left and right are exchanged back, see `exchange_sides`; None: nowhere.
+    min_time_s: a person in view for less cannot be measured.
+    box_margin: added to the keypoints' box on each side, as a share of its size.
+    confidence_curve: what the confidence is worth (`confidence_curve`), for the detector that the curve is of; empty
+    where none is known.
+    """
+
+    detector: str = "blazepose"
+    model_sha256: str = MODEL_SHA256
+    passes: int = 2
+    first_look_s: float = 0.1
+    smooth_s: float = 0.1
+    min_presence: float = 0.5
+    max_drift: float = 0.3
+    max_growth: float = 1.5
+    agree_mm: float = 100.0
+    agree_width_mm: float = 20.0
+    sides: FlipParams | None = dataclasses.field(default_factory=FlipParams)
+    min_time_s: float = 1.0
+    box_margin: float = 0.1
+    confidence_curve: str = "blazepose-v1"
