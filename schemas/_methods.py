@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+from pbl_pipeline import methods
+
 from . import fit, gait, gdi, keypoints, tracking
 from .method_rows import insert_methods
+
+#: Every table of methods, in the order of the chain.
+METHOD_TABLES = (
+    tracking.TrackingMethod,
+    tracking.SubjectMethod,
+    keypoints.KeypointMethod,
+    fit.FitMethod,
+    gait.GaitEventMethod,
+    gdi.GdiModel,
+)
 
 
 def insert_all() -> None:
     """Insert what the lookup tables lack; nothing is ever edited. Loads the numerical libraries."""
-    from pbl_pipeline import fit as fits
-    from pbl_pipeline import gait as gaits
-    from pbl_pipeline import keypoints as points
-    from pbl_pipeline import tracking as tracks
+    from pbl_pipeline.gait import norm_names
 
-    insert_methods(tracking.TrackingMethod, "tracking", tracks.PARAMSETS)
-    insert_methods(tracking.SubjectMethod, "subject", tracks.SUBJECT_PARAMSETS)
-    insert_methods(keypoints.KeypointMethod, "keypoint", points.PARAMSETS)
-    insert_methods(fit.FitMethod, "fit", fits.PARAMSETS)
-    insert_methods(gait.GaitEventMethod, "gait", gaits.EVENT_PARAMSETS)
-    insert_methods(gdi.GdiModel, "gdi", gaits.GDI_PARAMSETS)
+    for table in METHOD_TABLES:
+        insert_methods(table, methods.of_stage(table.stage).values())
     _body()
-    for name in gaits.norm_names():
+    for name in norm_names():
         _norm(name)
 
 

@@ -11,7 +11,7 @@ from pbl_pipeline.errors import PblError
 
 from . import tracking, video
 from .jobs import jobs_of
-from .method_rows import resolve_method
+from .method_rows import stored_key
 from .results import load_tracking
 from .stored_files import file_ref, stored_file
 
@@ -117,7 +117,7 @@ def _key(video_id: int, tracking_method: str | None) -> dict[str, Any]:
         raise unknown_video(video_id)
     key: dict[str, Any] = {"video_id": video_id}
     if tracking_method is not None:
-        key["tracking_method"] = resolve_method(tracking.TrackingMethod, "tracking", tracking_method)
+        key["tracking_method"] = stored_key(tracking.TrackingMethod, tracking_method)
     return key
 
 

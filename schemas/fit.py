@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
 
 from . import keypoints, session, video  # noqa: F401  a definition refers to session
 from ._datajoint import dj
 from .checks import check_columns, check_row, check_values
-from .method_rows import method_arguments, method_columns, stored_paramset
+from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .rows import InputChanged, number, one
 from .stored_files import file_ref, new_folder, stored_file
@@ -46,6 +47,7 @@ class BodyModel(dj.Lookup):
 
 @schema
 class FitMethod(dj.Lookup):
+    stage = "fit"
     definition = f"""
     # frozen parameters of a session fit
     {method_columns("fit")}
@@ -83,7 +85,7 @@ class TrialInput(dj.Computed):
         return (
             ref,
             one(video.Video & key, "video_name"),
-            method_arguments(FitMethod, "fit", "fit", key["fit_method"]),
+            method_row(FitMethod, key),
         )
 
     @computes
@@ -93,7 +95,7 @@ class TrialInput(dj.Computed):
 
         with stored_file(self, ref) as path:
             found = Keypoints.load(path)
-        used, share = check_trial(found, name, stored_paramset(method))
+        used, share = check_trial(found, name, methods.stored(**method))
         return int(np.sum(used)), float(share), method["sha"]
 
     def make_insert(self, key: dict, n_used: int, share: float, sha: str, origin: Origin) -> None:
@@ -190,7 +192,7 @@ class SessionFit(dj.Computed):
             (r["video_id"], n, r["camera_motion"], file_ref(r["keypoints_file"]))
             for r, n in zip(rows, names, strict=True)
         ]
-        return trials, method_arguments(FitMethod, "fit", "fit", key["fit_method"])
+        return trials, method_row(FitMethod, key)
 
     @computes
     def make_compute(
@@ -199,7 +201,7 @@ class SessionFit(dj.Computed):
         from pbl_pipeline.fit import fit_session
 
         loaded, names, motions = self._loaded(trials)
-        result = fit_session(loaded, names, stored_paramset(method), camera_motion=motions)
+        result = fit_session(loaded, names, methods.stored(**method), camera_motion=motions)
         return result, [t[0] for t in trials], method["sha"]
 
     def make_computes(
@@ -222,7 +224,7 @@ class SessionFit(dj.Computed):
                     places.append(i)
                 except PblError:
                     continue  # make_compute will say it
-            results = fit_sessions(sessions, stored_paramset(fetched[rows[0]][1]))
+            results = fit_sessions(sessions, methods.stored(**fetched[rows[0]][1]))
             origin = Origin.now((time.monotonic() - start) / max(len(results), 1))
             for i, result in zip(places, results, strict=True):
                 if not isinstance(result, PblError):

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pbl_pipeline import methods
+
 from . import fit, session  # noqa: F401  a definition refers to session
 from ._datajoint import dj
 from .checks import check_columns, check_row
-from .method_rows import method_arguments, method_columns, stored_paramset
+from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .rows import number, one
 from .stored_files import file_ref, new_folder, stored_file
@@ -42,6 +44,7 @@ def measure_columns(prefix: str) -> str:
 
 @schema
 class GaitEventMethod(dj.Lookup):
+    stage = "gait"
     definition = f"""
     # frozen parameters of event detection
     {method_columns("gait")}
@@ -101,7 +104,7 @@ class GaitEvents(dj.Computed):
 
     def make_fetch(self, key: dict) -> tuple:
         ref = file_ref(one(fit.SessionFit.Trial & key, "trial_file"))
-        return ref, method_arguments(GaitEventMethod, "gait", "gait", key["gait_method"])
+        return ref, method_row(GaitEventMethod, key)
 
     @computes
     def make_compute(self, key: dict, ref: dict, method: Mapping[str, Any]) -> tuple[lib.GaitEvents, str]:
@@ -110,7 +113,7 @@ class GaitEvents(dj.Computed):
 
         with stored_file(self, ref) as path:
             trial = TrialFit.load(path)
-        return detect_events(feet_from_fit(trial), stored_paramset(method)), method["sha"]
+        return detect_events(feet_from_fit(trial), methods.stored(**method)), method["sha"]
 
     def make_insert(self, key: dict, found: lib.GaitEvents, sha: str, origin: Origin) -> None:
         self.insert1(

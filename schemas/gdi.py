@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
+from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 
 from . import fit, gait, session  # noqa: F401  a definition refers to session
 from ._datajoint import dj
 from .checks import check_columns, check_row
-from .method_rows import method_arguments, method_columns, rebuild_params, resolve_method, stored_paramset
+from .method_rows import method_columns, method_row, resolve_method
 from .origin import Origin, computes, origin_columns
 from .rows import number, one, utc_now
 from .stored_files import file_ref, stored_file
@@ -58,6 +59,7 @@ class NormativeSet(dj.Lookup):
 
 @schema
 class GdiModel(dj.Lookup):
+    stage = "gdi"
     definition = f"""
     # frozen parameters of the index
     {method_columns("gdi")}
@@ -128,20 +130,20 @@ class GDI(dj.Computed):
         cycles = [{k: v for k, v in r.items() if k not in key} for r in rows]
         curves = file_ref(one(gait.GaitCycle & key, "curves"))
         norm = norm_ref(key)
-        return name, cycles, curves, norm, method_arguments(GdiModel, "gdi", "gdi", key["gdi_method"])
+        return name, cycles, curves, norm, method_row(GdiModel, key)
 
     @computes
     def make_compute(
         self, key: dict, name: str, rows: Sequence[Mapping[str, Any]], ref: dict, norm: tuple, method: Mapping[str, Any]
     ) -> tuple[lib.Gdi, str, str]:
-        from pbl_pipeline.gait import GdiParams, score_gdi
+        from pbl_pipeline.gait import score_gdi
 
-        params = rebuild_params(GdiParams, **method)
+        index = methods.stored(**method)
         with stored_file(self, ref) as path:
             curves = gait.load_curves(path)
         cycles = [gait.cycle_of_row(r, name, curves.get(int(r["cycle_no"]))) for r in rows]
-        result = score_gdi(cycles, norm_of_row(*norm), params, method["name"], method["version"])
-        return result, method["sha"], norm[1]
+        result = score_gdi(cycles, norm_of_row(*norm), index.params, index.name, index.version)
+        return result, index.hash, norm[1]
 
     def make_insert(self, key: dict, result: lib.Gdi, sha: str, norm_sha: str, origin: Origin) -> None:
         self.insert1(
@@ -225,8 +227,8 @@ class SessionGdi(dj.Computed):
         return (
             [file_ref(r["trial_file"]) for r in rows],
             norm_ref(key),
-            method_arguments(gait.GaitEventMethod, "gait", "gait", key["gait_method"]),
-            method_arguments(GdiModel, "gdi", "gdi", key["gdi_method"]),
+            method_row(gait.GaitEventMethod, key),
+            method_row(GdiModel, key),
             fit.fit_checks(key),
         )
 
@@ -244,13 +246,14 @@ class SessionGdi(dj.Computed):
         from pbl_pipeline.fit import TrialFit
         from pbl_pipeline.qc import Check
 
-        params = lib.GaitParams(stored_paramset(events), rebuild_params(lib.GdiParams, **index))
+        model = methods.stored(**index)
+        params = lib.GaitParams(methods.stored(**events).paramset, model.params)
         with ExitStack() as stack:
             paths = [stack.enter_context(stored_file(self, ref)) for ref in refs]
             trials = [TrialFit.load(path) for path in paths]
         about_fit = [Check(*check) for check in checks]
-        result = lib.gait_metrics(trials, norm_of_row(*norm), params, about_fit, index["name"], index["version"])
-        return result, index["sha"], norm[1]
+        result = lib.gait_metrics(trials, norm_of_row(*norm), params, about_fit, model.name, model.version)
+        return result, model.hash, norm[1]
 
     def make_insert(self, key: dict, result: lib.GaitMetrics, sha: str, norm_sha: str, origin: Origin) -> None:
         measures, index = result.spatiotemporal, result.gdi
@@ -367,7 +370,7 @@ def resolve(model: str | None, norm: str | None) -> dict[str, str]:
     """
     from pbl_pipeline import gait as lib
 
-    method = resolve_method(GdiModel, "gdi", model or lib.GDI_MODEL)
+    method = resolve_method(GdiModel, model or lib.GDI_METHODS.default)
     name, params = (GdiModel & {"gdi_method": method}).fetch1("gdi_method_name", "gdi_params")
     wanted = norm or params["norm"]
     rows = NormativeSet.proj("norm_name", "norm_version").to_dicts(order_by="norm_version DESC")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from unicodedata import category
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.methods import of_stage
 from pbl_pipeline.paramset import canonical_json
 
 from . import fit, gait, gdi, keypoints, lab, sensors, session, tracking, video
@@ -143,22 +144,19 @@ def ingest(
     return done
 
 
-def resolve(methods: Methods) -> dict[str, str]:
+def resolve(named: Methods) -> dict[str, str]:
     """Keys of the method rows, defaults filled in. Raises SOLVER_UNKNOWN, NORM_UNKNOWN."""
 
-    from pbl_pipeline.fit import DEFAULT as DEFAULT_FIT
-    from pbl_pipeline.gait import DEFAULT_EVENT_PARAMSET
-    from pbl_pipeline.keypoints import DEFAULT as DEFAULT_KEYPOINTS
-    from pbl_pipeline.tracking import DEFAULT as DEFAULT_TRACKING
-    from pbl_pipeline.tracking import SUBJECT_DEFAULT
+    def key(table: Any, name: str | None) -> str:
+        return resolve_method(table, name or of_stage(table.stage).default)
 
     return {
-        "tracking_method": tracking.method_of(methods.tracking or DEFAULT_TRACKING),
-        "subject_method": resolve_method(tracking.SubjectMethod, "subject", methods.subject or SUBJECT_DEFAULT),
-        "keypoint_method": keypoints.method_of(methods.keypoint or DEFAULT_KEYPOINTS),
-        "fit_method": resolve_method(fit.FitMethod, "fit", methods.fit or DEFAULT_FIT),
-        "gait_method": resolve_method(gait.GaitEventMethod, "gait", methods.gait or DEFAULT_EVENT_PARAMSET),
-        **gdi.resolve(methods.gdi, methods.norm),
+        "tracking_method": key(tracking.TrackingMethod, named.tracking),
+        "subject_method": key(tracking.SubjectMethod, named.subject),
+        "keypoint_method": key(keypoints.KeypointMethod, named.keypoint),
+        "fit_method": key(fit.FitMethod, named.fit),
+        "gait_method": key(gait.GaitEventMethod, named.gait),
+        **gdi.resolve(named.gdi, named.norm),
     }
 
 

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pbl_pipeline import methods
+
 from . import tracking, video
 from ._datajoint import dj
 from .checks import check_columns, check_row
-from .method_rows import method_arguments, method_columns, method_of_model, rebuild_params, resolve_method
+from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .rows import number, one
 from .stored_files import file_ref, new_folder, stored_file
@@ -26,6 +28,7 @@ schema = dj.Schema()
 
 @schema
 class KeypointMethod(dj.Lookup):
+    stage = "keypoints"
     definition = f"""
     # frozen parameters of keypoint detection
     {method_columns("keypoint")}
@@ -91,7 +94,7 @@ class Keypoints(dj.Computed):
             (file_ref(tracks), detector, model),
             camera,
             (log[0]["attitude_name"], file_ref(log[0]["attitude_file"])) if log else None,
-            method_arguments(KeypointMethod, "keypoint", "keypoints", key["keypoint_method"]),
+            method_row(KeypointMethod, key),
         )
 
     @computes
@@ -106,11 +109,11 @@ class Keypoints(dj.Computed):
         log: tuple | None,
         method: Mapping[str, Any],
     ) -> tuple[lib.Keypoints, int, str, str | None, tuple[Check, ...], str | None, int | None]:
-        from pbl_pipeline.keypoints import check_keypoints, detect_keypoints, params_class
+        from pbl_pipeline.keypoints import check_keypoints, detect_keypoints
         from pbl_pipeline.video import attitude_of, check_timing, find_camera, read_phone_log
 
         path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
-        params = rebuild_params(params_class(method["params"]), **method)
+        detector = methods.stored(**method)
         with stored_file(self, times) as stored:
             info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
         attitude = None
@@ -120,13 +123,13 @@ class Keypoints(dj.Computed):
         with stored_file(self, tracks[0]) as stored:
             everybody = tracking.load_tracking(stored, (info.width_px, info.height_px), *tracks[1:])
         view = camera_of_row(camera) if camera else find_camera(info)
-        found = detect_keypoints(path, everybody, person, view, params=params)
+        found = detect_keypoints(path, everybody, person, view, params=detector)
         if attitude is not None:
             found = found.with_attitude(attitude)
         checks = (*check_timing(info), *check_keypoints(found))
         source = None if attitude is None else attitude.source
         camera_id = int(camera["camera_id"]) if camera else None
-        return found, person, method["sha"], model_sha256(params), checks, source, camera_id
+        return found, person, detector.hash, model_sha256(detector.params), checks, source, camera_id
 
     def make_insert(
         self,
@@ -162,20 +165,6 @@ class Keypoints(dj.Computed):
                 }
             )
         self.Check.insert({**key, **check_row("keypoints", check)} for check in checks)
-
-
-def method_of(name: str) -> str:
-    """Key of the keypoint method of that name (`resolve_method`), or of the registered model of that name, which
-    becomes a method when it is first asked for. Another graph or `model.json` under the same name is its next version.
-
-    Raises `PblError` SOLVER_UNKNOWN, MODEL_INVALID, MARKER_SET_UNKNOWN.
-    """
-    from pbl_pipeline import keypoints as lib
-    from pbl_pipeline.models import is_registered
-
-    if name in lib.PARAMSETS or not is_registered(name):
-        return resolve_method(KeypointMethod, "keypoint", name)
-    return method_of_model(KeypointMethod, "keypoint", lib.method_of_model(name))
 
 
 def camera_of_row(row: Mapping[str, Any]) -> Camera:

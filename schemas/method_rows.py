@@ -1,18 +1,17 @@
-"""Method rows: one frozen paramset each, never edited."""
+"""Method rows: one frozen method each, never edited.
+
+A method table states its `stage` (`pbl_pipeline.methods.STAGES`); its columns carry a prefix, that of its key.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
-from typing import Any, TypeVar
+from collections.abc import Iterable, Mapping
+from typing import Any
 
-from pbl_pipeline import __version__
+from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.paramset import Paramset
 
 from .rows import one, plain
-
-P = TypeVar("P")
 
 
 def method_columns(prefix: str) -> str:
@@ -28,43 +27,53 @@ def method_columns(prefix: str) -> str:
     """
 
 
-def method_key(paramset: Paramset) -> str:
-    """Short readable key of a paramset: `<name>-v<version>`."""
-    return f"{paramset.name}-v{paramset.version}"
-
-
-def insert_methods(table: Any, prefix: str, paramsets: Mapping[str, Paramset]) -> None:
-    """Insert the paramsets that the method table lacks. A row is never edited.
+def insert_methods(table: Any, found: Iterable[methods.Method[Any]]) -> None:
+    """Insert the methods that the table lacks. A row is never edited.
 
     Raises
     ------
     PblError
         FILE_FORMAT when code holds other parameters under a name and version that the table already knows.
     """
-    for paramset in paramsets.values():
+    prefix = _prefix(table)
+    for method in found:
         row = {
-            f"{prefix}_method": method_key(paramset),
-            f"{prefix}_method_name": paramset.name,
-            f"{prefix}_method_version": paramset.version,
-            f"{prefix}_params": plain(paramset.params),
-            f"{prefix}_method_sha": paramset.hash,
+            f"{prefix}_method": method.key,
+            f"{prefix}_method_name": method.name,
+            f"{prefix}_method_version": method.version,
+            f"{prefix}_params": plain(method.paramset.params),
+            f"{prefix}_method_sha": method.hash,
         }
-        known = (table & {f"{prefix}_method": row[f"{prefix}_method"]}).proj(f"{prefix}_method_sha").to_dicts()
+        known = (table & {f"{prefix}_method": method.key}).proj(f"{prefix}_method_sha").to_dicts()
         if not known:
             table.insert1(row, skip_duplicates=True)
-        elif known[0][f"{prefix}_method_sha"] != paramset.hash:
+        elif known[0][f"{prefix}_method_sha"] != method.hash:
             raise PblError(
                 "FILE_FORMAT",
-                found=f"other parameters under the name {method_key(paramset)} than the database holds",
+                found=f"other parameters under the name {method.key} than the database holds",
                 expected="a method that never changes once it has a name and version",
-                next_step="give the changed parameters a new version in PARAMSETS",
+                next_step="register the changed parameters under a new version (docs/extending.md)",
                 key=table.full_table_name,
             )
 
 
-def resolve_method(table: Any, prefix: str, name: str) -> str:
-    """Key of a method named by key (`demo-v1`) or by name (`demo`: its newest version). Raises SOLVER_UNKNOWN."""
-    # Of one version the shorter key first: a migration may have put an old row aside as `demo-v1-<hash>`.
+def resolve_method(table: Any, name: str) -> str:
+    """Key of the method that is meant: a row by key (`demo-v1`) or name (`demo`: its newest version), or what this
+    machine offers under that name, such as a registered model. That becomes a row when it is first asked for; other
+    parameters (another graph or `model.json`) under the same name are its next version.
+
+    Raises
+    ------
+    PblError
+        SOLVER_UNKNOWN; for a registered model MODEL_INVALID, MARKER_SET_UNKNOWN.
+    """
+    offered = methods.of_stage(table.stage).offered(name)
+    return stored_key(table, name) if offered is None else _key_of_offered(table, offered)
+
+
+def stored_key(table: Any, name: str) -> str:
+    """As `resolve_method`, of the rows alone."""
+    prefix = _prefix(table)
     rows = table.proj(f"{prefix}_method_name", f"{prefix}_method_version").to_dicts(
         order_by=[f"{prefix}_method_version DESC", f"{prefix}_method"]
     )
@@ -79,25 +88,25 @@ def resolve_method(table: Any, prefix: str, name: str) -> str:
     )
 
 
-def method_of_model(table: Any, prefix: str, found: Paramset) -> str:
-    """Key of the method of a registered model, which becomes one when it is first asked for. Other parameters (another
-    graph or `model.json`) under the same name are its next version."""
-    rows = (table & {f"{prefix}_method_name": found.name}).to_dicts(order_by=f"{prefix}_method_version")
+def _key_of_offered(table: Any, offered: methods.Method[Any]) -> str:
+    prefix, stage = _prefix(table), methods.of_stage(table.stage)
+    rows = (table & {f"{prefix}_method_name": offered.name}).to_dicts(order_by=f"{prefix}_method_version")
     versions = [row[f"{prefix}_method_version"] for row in rows]
     for version in versions:
-        known = dataclasses.replace(found, version=version)
+        known = stage.make(offered.name, version, offered.params)
         if table & {f"{prefix}_method_sha": known.hash}:
-            return method_key(known)
-    new = dataclasses.replace(found, version=max(versions, default=0) + 1)
-    insert_methods(table, prefix, {new.name: new})
-    return method_key(new)
+            return known.key
+    new = stage.make(offered.name, max(versions, default=0) + 1, offered.params)
+    insert_methods(table, [new])
+    return new.key
 
 
-def method_arguments(table: Any, prefix: str, stage: str, method: str) -> dict[str, Any]:
-    """A method row as the arguments of `rebuild_params`: what `make_fetch` hands on."""
-    row = one(table & {f"{prefix}_method": method})
+def method_row(table: Any, key: Mapping[str, Any]) -> dict[str, Any]:
+    """The method row of a key as the arguments of `methods.stored`: what `make_fetch` hands on."""
+    prefix = _prefix(table)
+    row = one(table & {f"{prefix}_method": key[f"{prefix}_method"]})
     return {
-        "stage": stage,
+        "stage": table.stage,
         "name": row[f"{prefix}_method_name"],
         "version": row[f"{prefix}_method_version"],
         "params": row[f"{prefix}_params"],
@@ -105,37 +114,5 @@ def method_arguments(table: Any, prefix: str, stage: str, method: str) -> dict[s
     }
 
 
-def stored_paramset(method: Mapping[str, Any]) -> Paramset:
-    """The `Paramset` of a method row (`method_arguments`), checked against its hash. Raises SOLVER_UNKNOWN."""
-    paramset = Paramset(method["stage"], method["name"], method["version"], method["params"])
-    if paramset.hash != method["sha"]:
-        raise PblError(
-            "SOLVER_UNKNOWN",
-            found=f"method {method_key(paramset)} with hash {method['sha']}, whose parameters hash to {paramset.hash}",
-            expected="a method row that nobody edited",
-            next_step="restore the method table from the backup",
-        )
-    return paramset
-
-
-def rebuild_params(cls: type[P], params: Mapping[str, Any], stage: str, name: str, version: int, sha: str) -> P:
-    """The parameter dataclass of a method row, checked against the row's hash.
-
-    Raises
-    ------
-    PblError
-        SOLVER_UNKNOWN when this version of the code no longer has these parameters.
-    """
-    try:
-        value = Paramset(stage, name, version, params).to(cls)
-        same = Paramset.of(stage, name, version, value).hash == sha
-    except (TypeError, KeyError):
-        same, value = False, None
-    if not same or value is None:
-        raise PblError(
-            "SOLVER_UNKNOWN",
-            found=f"method {name}-v{version} with hash {sha}, whose parameters this code does not understand",
-            expected=f"parameters of {cls.__name__} of pbl-pipeline {__version__}",
-            next_step="use the version of pbl-pipeline that wrote the method, or select a newer method",
-        )
-    return value
+def _prefix(table: Any) -> str:
+    return table.primary_key[0].removesuffix("_method")

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 
 from . import video
 from ._datajoint import dj
-from .method_rows import method_arguments, method_columns, method_of_model, rebuild_params, resolve_method
+from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .rows import delete_below, number, one, utc_now
 from .stored_files import file_ref, new_folder, stored_file
@@ -28,6 +29,7 @@ CHOSEN = ("CHOSEN", "MANUAL")
 
 @schema
 class TrackingMethod(dj.Lookup):
+    stage = "tracking"
     definition = f"""
     # frozen parameters of person detection, association and choice
     {method_columns("tracking")}
@@ -36,6 +38,7 @@ class TrackingMethod(dj.Lookup):
 
 @schema
 class SubjectMethod(dj.Lookup):
+    stage = "subject"
     definition = f"""
     # frozen parameters of the automatic choice of the measured person
     {method_columns("subject")}
@@ -97,7 +100,7 @@ class Tracking(dj.Computed):
         return TrackingSelection & video.VideoInfo
 
     def make_fetch(self, key: dict) -> tuple:
-        method = method_arguments(TrackingMethod, "tracking", "tracking", key["tracking_method"])
+        method = method_row(TrackingMethod, key)
         probed = one(video.Video * video.VideoInfo & key)
         return probed, file_ref(probed.pop("frame_time")), method
 
@@ -105,13 +108,13 @@ class Tracking(dj.Computed):
     def make_compute(
         self, key: dict, probed: Mapping[str, Any], times: dict, method: Mapping[str, Any]
     ) -> tuple[lib.Tracking, str]:
-        from pbl_pipeline.tracking import TrackingParams, track_people
+        from pbl_pipeline.tracking import track_people
 
         path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
-        params = rebuild_params(TrackingParams, **method)
+        tracker = methods.stored(**method)
         with stored_file(self, times) as stored:
             info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
-        return track_people(path, params=params, info=info), method["sha"]
+        return track_people(path, params=tracker, info=info), tracker.hash
 
     def make_insert(self, key: dict, tracking: lib.Tracking, sha: str, origin: Origin) -> None:
         with new_folder() as folder:
@@ -152,8 +155,7 @@ class SubjectChoice(dj.Computed):
         size = one(video.VideoInfo & key, "width", "height")
         override = (SubjectOverride & key).to_dicts()
         person = int(override[0]["override_person_id"]) if override else None
-        subject_method = one(TrackingSelection & key, "subject_method")
-        method = method_arguments(SubjectMethod, "subject", "subject", subject_method)
+        method = method_row(SubjectMethod, one(TrackingSelection & key))
         elsewhere = None if override else _decided_elsewhere(key)
         return file, file_ref(tracks), (int(size[0]), int(size[1])), (detector, model), person, elsewhere, method
 
@@ -173,23 +175,23 @@ class SubjectChoice(dj.Computed):
         elsewhere: tuple | None,
         method: Mapping[str, Any],
     ) -> tuple[lib.SubjectChoice, bytes | None, str]:
-        from pbl_pipeline.tracking import SubjectParams, carried_choice, choose_subject, contact_sheet_jpeg
+        from pbl_pipeline.tracking import carried_choice, choose_subject, contact_sheet_jpeg
 
-        params = rebuild_params(SubjectParams, **method)
+        chooser = methods.stored(**method)
         with stored_file(self, ref) as path:
             tracking = load_tracking(path, size, *about)
         if elsewhere is None:
-            choice = choose_subject(tracking, params=params, override=override)
+            choice = choose_subject(tracking, params=chooser, override=override)
         else:
             other_tracks, other_about, number_there, other_method = elsewhere
             with stored_file(self, other_tracks) as path:
                 other = load_tracking(path, size, *other_about)
-            choice = carried_choice(other, number_there, other_method, tracking, params)
+            choice = carried_choice(other, number_there, other_method, tracking, chooser)
         sheet = None
         if choice.status == "NEEDS_CHOICE":
             path = video.registered_file(file[0], file[1], key)
             sheet = contact_sheet_jpeg(path, tracking, choice)
-        return choice, sheet, method["sha"]
+        return choice, sheet, chooser.hash
 
     def make_insert(self, key: dict, choice: lib.SubjectChoice, sheet: bytes | None, sha: str, origin: Origin) -> None:
         with new_folder() as folder:
@@ -210,20 +212,6 @@ class SubjectChoice(dj.Computed):
                     **origin.row("choice", method_hash=sha),
                 }
             )
-
-
-def method_of(name: str) -> str:
-    """Key of the tracking method of that name (`resolve_method`), or of the registered person detector of that name,
-    which becomes a method when it is first asked for (`method_of_model`).
-
-    Raises `PblError` SOLVER_UNKNOWN, MODEL_INVALID.
-    """
-    from pbl_pipeline.models import is_registered
-    from pbl_pipeline.tracking import PARAMSETS, method_of_detector
-
-    if name in PARAMSETS or not is_registered(name):
-        return resolve_method(TrackingMethod, "tracking", name)
-    return method_of_model(TrackingMethod, "tracking", method_of_detector(name))
 
 
 def _decided_elsewhere(key: Mapping[str, Any]) -> tuple | None:

@@ -97,7 +97,7 @@ def plan_new_method(table: str, method: str, since: datetime.date | None = None)
     module = _MODULES[prefix]
     selection, methods = getattr(module, selection_name), getattr(module, method_name)
     column = f"{prefix}_method"
-    chosen = resolve_method(methods, prefix, method)
+    chosen = resolve_method(methods, method)
     rows = selection & (video.Video & _since(since))
     others = [k for k in rows.primary_key if k != column]
     have = {tuple(r[k] for k in others) for r in (selection & {column: chosen}).proj().to_dicts()}

@@ -18,6 +18,7 @@ from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.video import probe
 from schemas import keypoints
 from schemas.ingest import Methods, Visit, ingest
+from schemas.method_rows import resolve_method
 from schemas.stored_files import file_ref, stored_file
 from tests import dot_models
 from tests.rows import remove_all
@@ -86,10 +87,10 @@ def test_a_registered_model_is_a_method_of_the_tables(tables: None, tmp_path: Pa
     assert params["model"]["licence"] == "CC0-1.0, a test"
 
     # The same model again is the same method; another one under the name is the next version.
-    assert keypoints.method_of("dots-crop3d") == "dots-crop3d-v1"
+    assert resolve_method(keypoints.KeypointMethod, "dots-crop3d") == "dots-crop3d-v1"
     dot_models.write(tmp_path / "dots", model, dot_models.spec("crop3d", box_margin=1.2))
     models.add(folder, replace=True)
-    assert keypoints.method_of("dots-crop3d") == "dots-crop3d-v2"
+    assert resolve_method(keypoints.KeypointMethod, "dots-crop3d") == "dots-crop3d-v2"
     # What names the old one is not computed with the new one.
     (keypoints.Keypoints & {"video_id": result.video_id}).delete(prompt=False)
     run = populate()

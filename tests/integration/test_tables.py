@@ -29,6 +29,7 @@ from pbl_pipeline.qc import Check
 from schemas import fit, gait, gdi, keypoints, lab, qc, session, table_map, tracking, video, views
 from schemas.choose import candidates, choose_person, write_sheet
 from schemas.ingest import Methods, Visit, ingest
+from schemas.method_rows import resolve_method
 from schemas.plan import plan_fit_sets
 from schemas.results import load_session
 from schemas.status import pipeline_status
@@ -330,15 +331,19 @@ def test_a_registered_person_detector_becomes_a_method(tables: None, tmp_path: P
     spec = {"name": "crowd", "kind": "person_detector", "sha256": "1" * 64, "licence": "MIT", "source": "a lab"}
     spec |= {"input": {**entry, "colour": "BGR"}, "outputs": {"boxes": "rows"}}
     (folder / "model.json").write_text(json.dumps(spec))
-    assert tracking.method_of("crowd") == tracking.method_of("crowd") == "crowd-v1"
+    assert (
+        resolve_method(tracking.TrackingMethod, "crowd")
+        == resolve_method(tracking.TrackingMethod, "crowd")
+        == "crowd-v1"
+    )
     (folder / "model.json").write_text(json.dumps(spec | {"input": {**entry, "colour": "RGB"}}))
-    assert tracking.method_of("crowd") == "crowd-v2"
+    assert resolve_method(tracking.TrackingMethod, "crowd") == "crowd-v2"
     path = chain.small_video(tmp_path, "walk")
     (row,) = ingest([path], Visit("P001"), Methods(tracking="crowd"))
     assert (tracking.TrackingSelection & {"video_id": row.video_id}).fetch1("tracking_method") == "crowd-v2"
     populate(["VideoInfo", "Tracking"])
     assert len(tracking.Tracking & {"video_id": row.video_id, "tracking_method": "crowd-v2"}) == 1
-    assert tracking.method_of("blazepose-tiles") == "blazepose-tiles-v2"
+    assert resolve_method(tracking.TrackingMethod, "blazepose-tiles") == "blazepose-tiles-v2"
 
 
 def test_unknown_methods_are_refused_with_the_names_there_are(tables: None, tmp_path: Path):
@@ -820,10 +825,11 @@ def test_methods_are_frozen(declared: None):
     before = len(tracking.TrackingMethod()), len(fit.BodyModel()), len(gdi.NormativeSet())
     _methods.insert_all()
     assert (len(tracking.TrackingMethod()), len(fit.BodyModel()), len(gdi.NormativeSet())) == before
-    (known,) = list(pbl_pipeline.tracking.METHODS.values())[:1]
-    edited = chain.dataclasses.replace(known, params={**known.params, "min_score": 0.99})
+    known = pbl_pipeline.tracking.METHODS.find()
+    other = dataclasses.replace(known.params, min_score=0.99)
+    edited = pbl_pipeline.tracking.METHODS.make(known.name, known.version, other)
     with pytest.raises(PblError, match="new version"):
-        insert_methods(tracking.TrackingMethod, "tracking", {known.name: edited})
+        insert_methods(tracking.TrackingMethod, [edited])
 
 
 # ----------------------------------------------------------------------------------------------------- commands
