@@ -213,7 +213,9 @@ class Stage(Mapping[str, Method[P]]):
         family = self._family_of_row(paramset)
         fields = {f.name for f in dataclasses.fields(family.params)}
         try:
-            own = {k: v for k, v in dict(paramset.params).items() if k in fields or k != self.kind}
+            if not isinstance(paramset.params, Mapping):
+                raise TypeError(f"{paramset.params!r} instead of names and values")
+            own = {k: v for k, v in paramset.params.items() if k in fields or k != self.kind}
             params: P = dataclasses.replace(paramset, params=own).to(family.params)
         except (TypeError, ValueError) as error:
             raise self._unknown(

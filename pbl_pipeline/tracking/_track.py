@@ -52,7 +52,8 @@ def track_people(
     """
     method = METHODS.find(params)
     params = method.params
-    detector = detector or method.function(params)
+    if detector is None:
+        detector = method.function(params)
     info = info or probe(video_path)
     size = (info.width_px, info.height_px)
     trails = _follow(video_path, params, detector, info)

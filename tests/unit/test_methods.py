@@ -1,0 +1,185 @@
+"""The registry of methods: from a name, parameters or a stored row to what runs; every stage in the same way."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from pbl_pipeline import methods
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.gait import GaitParams
+from pbl_pipeline.methods import Stage, of_stage, stored
+from pbl_pipeline.paramset import Paramset
+
+#: The hash of every method that ships. Rows of results name them, so none may ever change: other parameters are
+#: another version.
+SHIPPED = {
+    ("tracking", "blazepose-tiles", 2): "0dab616291af7eea",
+    ("subject", "walker", 2): "4a27a14ec961fed1",
+    ("keypoints", "blazepose-33", 2): "8efcb026b6d5256a",
+    ("fit", "paper-2025", 1): "cb777aa5f08f1d04",
+    ("fit", "paper-gauss-newton", 1): "9352bf72dc58b91e",
+    ("fit", "gauss-newton", 1): "c5df362782a452e5",
+    ("fit", "blazepose", 1): "db30893f1acb883f",
+    ("fit", "markers", 1): "055842ad943fce0d",
+    ("gait", "phase-transformer", 1): "9f9ad11a864dcb24",
+    ("gait", "zeni-2008", 1): "b29b1d5b52f512f4",
+    ("gait", "oconnor-2007", 2): "818ff933a9a6365a",
+    ("gdi", "pbl-2025-three-angles", 2): "381dc13a55e5c0c7",
+    ("gdi", "gillette-2008", 1): "a68829dd8731dde1",
+}
+EVERY = [m for name in methods.STAGES for m in of_stage(name).values()]
+
+
+def ids(method: methods.Method[Any]) -> str:
+    return f"{method.stage} {method.name}"
+
+
+def row_of(method: methods.Method[Any], **changes: Any) -> dict[str, Any]:
+    """As a method table keeps it: parameters are JSON."""
+    params = json.loads(method.paramset.canonical_json)
+    row = {"stage": method.stage, "name": method.name, "version": method.version, "params": params, "sha": method.hash}
+    return row | changes
+
+
+def refused(row: dict[str, Any]) -> PblError:
+    with pytest.raises(PblError) as error:
+        stored(**row)
+    assert error.value.code == "SOLVER_UNKNOWN"
+    return error.value
+
+
+def test_hashes_of_shipped_methods_never_change():
+    found = {(m.stage, m.name, m.version): m.hash for m in EVERY}
+    assert found == SHIPPED
+    assert Paramset.of("gait", "gait-metrics", 1, GaitParams()).hash == "38bde6a4d05e9cd2"
+
+
+@pytest.mark.parametrize("method", EVERY, ids=ids)
+def test_a_stored_row_is_the_method_again(method: methods.Method[Any]):
+    again = stored(**row_of(method))
+    assert again == method
+    assert callable(again.function)
+
+
+@pytest.mark.parametrize("method", EVERY, ids=ids)
+def test_whole_numbers_that_lost_their_point_are_the_same_method(method: methods.Method[Any]):
+    text = method.paramset.canonical_json
+    params = json.loads(text, parse_float=lambda t: int(float(t)) if float(t).is_integer() else float(t))
+    assert stored(**row_of(method, params=params)) == method
+
+
+@pytest.mark.parametrize("method", EVERY, ids=ids)
+def test_a_row_of_another_name_keeps_its_function(method: methods.Method[Any]):
+    """A user's own parameters under a name of their own: the row itself says of which family it is."""
+    stage = of_stage(method.stage)
+    own = stage.make("mine", 3, method.params)
+    row = row_of(own)
+    assert row["params"][stage.kind] == own.family.name
+    assert stored(**row) == own
+    assert own.function is method.function
+
+
+@pytest.mark.parametrize("method", EVERY, ids=ids)
+def test_what_this_version_does_not_know_is_refused_by_name(method: methods.Method[Any]):
+    kind, params = of_stage(method.stage).kind, row_of(method)["params"]
+    assert "no-such" in refused(row_of(method, params=params | {kind: "no-such"})).found
+    assert "new_weight" in refused(row_of(method, params=params | {"new_weight": 1.0})).found
+    assert refused(row_of(method, params=[]))
+    assert refused(row_of(method, params=None))
+    assert refused(row_of(method, params=params | {kind: ["gauss-newton"]}))
+
+
+@pytest.mark.parametrize("method", EVERY, ids=ids)
+def test_an_edited_row_is_refused(method: methods.Method[Any]):
+    params = row_of(method)["params"]
+    number = next(k for k, v in params.items() if isinstance(v, (int, float)) and not isinstance(v, bool))
+    assert "hash" in refused(row_of(method, params=params | {number: params[number] + 1})).found
+    assert "is no" in refused(row_of(method, params=params | {number: str(params[number])})).found
+    assert refused(row_of(method, sha="0" * 16))
+
+
+@pytest.mark.parametrize("name", methods.STAGES)
+def test_a_method_is_found_by_whatever_one_has(name: str):
+    stage = of_stage(name)
+    default = stage.find()
+    assert default.name == stage.default
+    for given in (default, default.name, default.key, default.params, default.paramset):
+        assert stage.find(given) == default
+    with pytest.raises(PblError) as error:
+        stage.find("psychic")
+    assert error.value.code == "SOLVER_UNKNOWN"
+    assert default.name in error.value.expected
+
+
+def test_changed_parameters_have_another_name_and_hash_and_the_same_function():
+    stage = of_stage("gait")
+    zeni = stage["zeni-2008"]
+    moved = stage.find(dataclasses.replace(zeni.params, foot_down_offset_s=0.03))
+    assert moved.name == "zeni-2008-custom"
+    assert moved.hash != zeni.hash
+    assert moved.function is zeni.function
+    assert stored(**row_of(moved)) == moved
+
+
+@dataclasses.dataclass(frozen=True)
+class Inner:
+    share: float = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class Params:
+    gain: float = 1.0
+    places: tuple[tuple[str, float], ...] = (("knee", 2.0),)
+    inner: Inner = Inner()
+    other: Inner | None = None
+
+
+class Offers:
+    def names(self) -> list[str]:
+        return ["guest"]
+
+    def params(self, name: str) -> Params | None:
+        return Params(gain=9.0) if name == "guest" else None
+
+
+def test_a_stage_of_ones_own():
+    stage: Stage[Params] = Stage("toy", "family", "first", Offers())
+    first = stage.register("first", 1, Params(), max)
+    with pytest.raises(ValueError, match="first"):
+        stage.register("first", 2, Params(), max)
+    second = stage.register("second", 1, Params(gain=2.0))
+    assert (first.paramset.params.get("family"), second.paramset.params["family"]) == (None, "first")
+    assert list(stage) == ["first", "second"]
+    assert stage.names() == ["first", "second", "guest"]
+    assert stage.find("guest").params == Params(gain=9.0)
+    assert stage.offered("first") is None
+    plain = json.loads(second.paramset.canonical_json)
+    assert stage.find(Paramset("toy", "second", 1, plain)) == second
+    wrong = {
+        "'x' is no float @ $.inner.share": {"inner": {"share": "x"}},
+        "True is no float @ $.gain": {"gain": True},
+        "extra fields found (z) @ $.inner": {"inner": {"z": 1}},
+        "$.places[0]": {"places": [["knee"]]},
+    }
+    for words, change in wrong.items():
+        with pytest.raises(PblError) as error:
+            stage.find(Paramset("toy", "second", 1, plain | change))
+        assert words in error.value.found
+    nested = stage.find(Paramset("toy", "second", 1, plain | {"other": {"share": 1}}))
+    assert nested.params.other == Inner(1.0)
+
+
+def test_asking_for_no_method_loads_no_detector_and_no_jax():
+    code = (
+        "import sys, pbl_pipeline.methods\n"
+        "heavy = {'jax', 'cv2', 'mujoco', 'onnxruntime', 'scipy', 'pbl_pipeline.tracking', 'pbl_pipeline.fit'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.strip() == "[]"
