@@ -52,15 +52,14 @@ def track_people(
     """
     method = METHODS.find(params)
     params = method.params
-    if detector is None:
-        detector = method.function(params)
+    finder: PersonDetector = method.function(params) if detector is None else detector
     info = info or probe(video_path)
     size = (info.width_px, info.height_px)
-    trails = _follow(video_path, params, detector, info)
+    trails = _follow(video_path, params, finder, info)
     people = join_trails(uncross([t for t in trails if _is_real(t, params)], params.uncross), size, params.join)
     longest = params.association.max_gap_s
     persons = tuple(_to_track(i + 1, t, info.time_s, size, longest) for i, t in enumerate(people))
-    return Tracking(info.time_s, size, persons, detector.name, detector.model_sha256)
+    return Tracking(info.time_s, size, persons, finder.name, finder.model_sha256)
 
 
 def _follow(video_path: str | Path, params: TrackingParams, detector: PersonDetector, info: VideoInfo) -> list[Trail]:
