@@ -58,7 +58,7 @@ def backup(folder: Path, store: bool = True, say: Say = lambda _: None) -> Backu
     store
         False leaves the files out, where the object store is saved by other means.
     say
-        Told in a sentence what is being done.
+        Called with a sentence for each step.
 
     Raises
     ------
@@ -81,8 +81,8 @@ def backup(folder: Path, store: bool = True, say: Say = lambda _: None) -> Backu
         raise PblError(
             "DB_REFUSED",
             found=str(error.args[-1]),
-            expected="tables that nobody changes (creates, alters) while they are saved",
-            next_step="run it again; rows may be written at any time, only the tables themselves must stay",
+            expected="tables that are not created or altered while they are saved",
+            next_step="run it again; rows may be written meanwhile, but no table created or altered",
         ) from error
     n_bytes = 0
     if store:
@@ -120,7 +120,7 @@ def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
         if manifest["format"] != FORMAT:
             raise _invalid(folder, f"format {manifest['format']}", f"format {FORMAT}")
     except FileNotFoundError as error:
-        found = "no manifest.json: this is no backup, or one that was broken off"
+        found = "no manifest.json: this is no backup, or an interrupted one"
         raise _invalid(folder, found, "manifest.json, written last") from error
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise _invalid(
@@ -152,9 +152,9 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
     folder
         What `backup` made.
     again
-        After a restore that was broken off: remove the tables it left, then begin anew.
+        After an interrupted restore: remove the tables it left, then start again.
     say
-        Told in a sentence what is being done.
+        Called with a sentence for each step.
 
     Raises
     ------
@@ -189,7 +189,7 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
         raise _refused(
             str(error.args[-1]),
             "a server that takes the tables back",
-            "correct what it says and run the same with --again: what was begun is removed first",
+            "correct the cause and run the same with --again, which first removes what was begun",
         ) from error
     return Backup(folder, manifest["created"], manifest["rows"], manifest["n_files"], manifest["n_bytes"])
 
@@ -262,9 +262,9 @@ def _make_room(cursor: Any, prefix: str, again: bool) -> None:
     if marker in _catalog.schemas():
         if not again:
             raise _refused(
-                f"a restore was broken off here and left {len(_catalog.tables())} tables",
+                f"an interrupted restore left {len(_catalog.tables())} tables",
                 "an empty database",
-                "run the same with --again: it removes these tables and begins anew",
+                "run the same with --again: it removes these tables and starts again",
             )
         cursor.execute("SET SESSION foreign_key_checks = 0")  # the schemas refer to each other
         for schema in _catalog.schemas():

@@ -233,16 +233,16 @@ def plain_connection(**options: Any) -> pymysql.Connection[Any]:
 
 @contextmanager
 def alone(work: str, server: datajoint.Connection) -> Iterator[bool]:
-    """Hold the lock of this installation for some work: one process of all machines at a time.
+    """Hold an installation-wide lock for some work: only one process on any machine has it.
 
-    Gives whether it was had; never waits. A process that dies, or whose connection is lost, has let go of it.
+    Yields whether it was obtained; never waits. It is released when the process or its connection ends.
     """
     name = schema_name(work)  # locks are the server's, which may hold other installations
-    had = server.query("SELECT GET_LOCK(%s, 0)", args=(name,)).fetchone()[0] == 1
+    obtained = server.query("SELECT GET_LOCK(%s, 0)", args=(name,)).fetchone()[0] == 1
     try:
-        yield had
+        yield obtained
     finally:
-        if had:
+        if obtained:
             server.query("SELECT RELEASE_LOCK(%s)", args=(name,))
 
 

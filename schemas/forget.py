@@ -1,8 +1,8 @@
 """Removing a person: every row, every queued job, every stored file, and a list that proves it.
 
-Whose a row is, is read from its columns: a subject's code, or the number of a session, video or set of videos of that
-person. Every table that depends on a person has one of them (a test looks at all foreign keys), also the queues, which
-have no foreign keys at all.
+The columns of a row identify its person: a subject's code, or the number of a session, video or set of videos of that
+person. Every table that depends on a person has one of them (a test checks all foreign keys), also the queues, which
+have no foreign keys at all; DataJoint's cascading delete reaches neither queues nor files.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ._files import write_json
 from ._store import files_below, store_error
 from .rows import delete_below
 
-#: Columns that say whose a row is. `fit_set` is a hash over one session's videos.
+#: Columns that identify the person of a row. `fit_set` is a hash over one session's videos.
 IDENTITIES = ("subject", "session_id", "video_id", "fit_set")
 
 Say = Callable[[str], None]
@@ -51,7 +51,7 @@ class Found:
 
 @dataclasses.dataclass(frozen=True)
 class Forgotten:
-    """What was done. left: what still names the person, empty when all is gone. kept: videos that stay, and why."""
+    """The outcome. left: what still names the person, empty if nothing does. kept: remaining videos, and why."""
 
     manifest: Path
     rows: dict[str, int]
@@ -90,7 +90,7 @@ def find(subject: str) -> tuple[Ids, Found]:
 
 
 def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> Forgotten:
-    """Remove a person. Broken off, it is repeated until done: the list of files is written before the first row goes.
+    """Remove a person. An interrupted run can be repeated: the list of files is written before a row is deleted.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> For
     videos
         Delete the video files as well, where they still are what was registered.
     say
-        Told in a sentence what is being done.
+        Called with a sentence for each step.
 
     Raises
     ------
@@ -155,7 +155,7 @@ def _identities(subject: str) -> Ids:
 
 
 def _still_free(ids: Ids) -> Ids:
-    """The numbers of an earlier run that nobody has now: after a deletion the next person may get the same ones."""
+    """The numbers of an earlier run that are unused now: after a deletion another person may get the same ones."""
     owners = {"session_id": session.Session, "video_id": video.Video, "fit_set": fit.FitSet}
     return {
         name: [v for v in values if name not in owners or not owners[name] & {name: v}] for name, values in ids.items()
@@ -241,7 +241,7 @@ def _videos(ids: Ids, earlier: dict[str, Any]) -> list[dict[str, Any]]:
 
 # --------------------------------------------------------------------------------------------------------- removing
 def _delete_rows(subject: str, ids: Ids, say: Say) -> None:
-    """Queued jobs (no worker takes one up meanwhile), the person with what depends on it, what depends on nothing."""
+    """Delete queued jobs first (no worker takes one then), the person with what depends on it, and the rest."""
     cameras = _cameras(ids)
     conn = connection.connect()
     tables = personal_tables()
@@ -262,7 +262,7 @@ def _delete_where(conn: Any, tables: Sequence[tuple[str, str, list[Column]]], id
 
 
 def _cameras(ids: Ids) -> list[int]:
-    """Calibrations of the person's videos: their note may name a file. They go where nobody else has them."""
+    """Calibrations of the person's videos, whose note may name a file. Deleted if no other video has them."""
     if not ids["video_id"]:
         return []
     rows = video.Video & [{"video_id": v} for v in ids["video_id"]] & "camera_id IS NOT NULL"

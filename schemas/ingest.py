@@ -239,7 +239,7 @@ def _with_sha256(sha256: str) -> dict[str, Any] | None:
 
 
 def in_transaction(work: Callable[[], None], until: Callable[[], bool] = lambda: False) -> None:
-    """Numbers are taken as the highest plus one; where another process took the same one, we try again."""
+    """Run `work` in a transaction; again if another process took the same number (the highest plus one)."""
     for attempt in range(_ATTEMPTS):
         try:
             with video.schema.connection.transaction:  # type: ignore[union-attr]
@@ -254,7 +254,7 @@ def in_transaction(work: Callable[[], None], until: Callable[[], bool] = lambda:
 def _known(
     path: Path, row: dict[str, Any], visit: Visit, chosen: dict[str, str], more: set[str], found: sensors.Read
 ) -> Ingested:
-    """Take over the path where the old one is gone, and the camera, files and methods that were named; say the rest."""
+    """Update a registered video: its path if the old one is gone, and the camera, files and methods that were given."""
     number = int(row["video_id"])
     status, notes = "known", [f"already video_id {number} of subject {row['subject']}, session {row['session_label']}"]
     if str(path) != row["video_path"] and not Path(row["video_path"]).is_file():
@@ -307,7 +307,7 @@ def _new_files(row: dict[str, Any], visit: Visit, found: sensors.Read) -> list[s
 
     def attach() -> None:
         done[:] = sensors.register(number, found)
-        # A phone that was carried counted as standing only as long as nothing told how it turned.
+        # Without a log the camera counted as static; with one it is handheld.
         if done and found.given.has_log and row["camera_motion"] == "static" and visit.camera_motion is None:
             video.Video.update1({"video_id": number, "camera_motion": "handheld"})
             done.append("the camera counts as handheld now")
@@ -358,7 +358,7 @@ def _new_methods(row: dict[str, Any], chosen: dict[str, str], more: set[str]) ->
 
 
 def forget_errors(video_id: int, codes: Sequence[str] | None = None) -> None:
-    """Delete the error rows of a video (with these codes), so that the next populate tries again without being told."""
+    """Delete the error rows of a video (with these codes), so that the next populate tries again."""
     for table in computed_tables():
         if "video_id" not in table.primary_key:
             continue

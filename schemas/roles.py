@@ -91,7 +91,7 @@ def statements(account: Account, password: str, require_tls: bool = False) -> li
 
 
 def password_file(folder: Path, account: Account) -> Path:
-    """The file with the account's password, made with a random one of 190 bits where it is missing (mode 0600).
+    """The file with the account's password, made with a random one of 192 bits where it is missing (mode 0600).
 
     Raises
     ------

@@ -64,7 +64,7 @@ class ErrorRow:
 
 @dataclasses.dataclass(frozen=True)
 class EmptyRow:
-    """A video for which a stage ran well and found nothing to go on with."""
+    """A video for which a stage ended without an error and without a result."""
 
     table: str
     video_id: int
@@ -74,8 +74,8 @@ class EmptyRow:
 
 @dataclasses.dataclass(frozen=True)
 class Waiting:
-    """A video that needs a person's choice, with the command that decides, and the one that writes a picture of the
-    numbered people."""
+    """A video whose person has to be chosen. next_step: the command that chooses; look: the command that writes a
+    picture of the numbered people."""
 
     video_id: int
     about: str
@@ -96,7 +96,7 @@ class Status:
     waiting: list[Waiting]
     workers: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     exact: bool = True
-    #: How the focal length was had (file, measured, metadata, preset, guess) -> keypoints with it.
+    #: Source of the focal length (file, measured, metadata, preset, guess) -> number of keypoints with it.
     cameras: dict[str, int] = dataclasses.field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:

@@ -1,4 +1,8 @@
-"""A worker's heartbeat: that it lives, what it does, and what it has done, written every few seconds by a thread."""
+"""A worker's heartbeat: a thread writes every few seconds that it is alive, its current job, and its finished jobs.
+
+systemd and Kubernetes know whether a process is alive on their machine; this tells it to workers on other machines,
+which free the reservations of dead ones (`recover`), and to `pbl status`.
+"""
 
 from __future__ import annotations
 
@@ -22,17 +26,17 @@ PERIOD_S = 15.0
 
 
 class Listener(Protocol):
-    """What a worker tells of its work."""
+    """What a worker reports its work to."""
 
     def doing(self, what: str) -> None:
-        """What is in hand."""
+        """Report the current job."""
 
     def count(self, stage: str, done: int, failed: int, busy_s: float) -> None:
-        """What was finished."""
+        """Report finished jobs of a stage and the seconds they took."""
 
 
 class Silent:
-    """Nobody listens: a worker without a row of its own."""
+    """Ignores all reports: for a worker without a row of its own."""
 
     def doing(self, what: str) -> None:
         """Nothing."""
@@ -42,10 +46,10 @@ class Silent:
 
 
 class Heartbeat:
-    """Use as a context: the row of `Worker` is there from the first beat to the last.
+    """A context manager that keeps a row of `Worker` up to date.
 
-    The thread has a connection of its own (DataJoint's is not safe between threads). A database that is away costs
-    beats, nothing else: counts are kept until they can be written.
+    The thread has its own connection (DataJoint's is not safe between threads). While the database is unavailable beats
+    are skipped and counts are kept until they can be written.
     """
 
     def __init__(self, resource: str) -> None:
@@ -70,12 +74,12 @@ class Heartbeat:
             self._connection.close()
 
     def doing(self, what: str) -> None:
-        """Say what is in hand; written with the next beat."""
+        """Report the current job; written with the next beat."""
         with self._lock:
             self._doing = what[:500]
 
     def count(self, stage: str, done: int, failed: int, busy_s: float) -> None:
-        """Count what was finished."""
+        """Add finished jobs; written with the next beat."""
         with self._lock:
             row = self._counts[stage]
             row[0], row[1], row[2] = row[0] + done, row[1] + failed, row[2] + busy_s
@@ -85,7 +89,7 @@ class Heartbeat:
             try:
                 self._beat()
             except (pymysql.err.Error, dj.DataJointError, PblError, OSError):
-                self._connection = None  # away: again at the next beat
+                self._connection = None  # unavailable: try again at the next beat
 
     def _beat(self, first: bool = False, last: bool = False) -> None:
         if self._connection is None:
@@ -119,5 +123,5 @@ class Heartbeat:
                 )
                 del counts[stage]
         finally:
-            for stage, (done, failed, busy) in counts.items():  # not written: with the next beat
+            for stage, (done, failed, busy) in counts.items():  # not written yet: with the next beat
                 self.count(stage, int(done), int(failed), float(busy))

@@ -76,11 +76,11 @@ def take_over(url: str | None = None, archive: Path | None = None, settled_s: fl
     """
     url, archive = url or incoming_url(), archive or archive_dir()
     fs, root = fsspec.core.url_to_fs(url, **_login(url))
-    with connection.alone("incoming", video.Video.connection) as had:
-        return _look(fs, str(root), archive, settled_s) if had else Taken()
+    with connection.alone("incoming", video.Video.connection) as obtained:
+        return _take_over(fs, str(root), archive, settled_s) if obtained else Taken()
 
 
-def _look(fs: Any, root: str, archive: Path, settled_s: float) -> Taken:
+def _take_over(fs: Any, root: str, archive: Path, settled_s: float) -> Taken:
     out, seen = Taken(), _load_seen(archive)
     now, still, whole = time.time(), {}, {}
     for path, about in sorted(fs.find(root, detail=True).items()):

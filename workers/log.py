@@ -33,7 +33,7 @@ class JsonLines(logging.Formatter):
 
 
 def event(log: logging.Logger, level: int, what: str, job: Any = None, **fields: Any) -> None:
-    """Log an event; `job`, a Claim, gives the fields table and key. Empty fields are left out."""
+    """Log an event; the fields table and key come from `job`, a Claim. Empty fields are left out."""
     named = {} if job is None else {"table": job.table.__name__, "key": job.key}
     named |= {k: v for k, v in fields.items() if v not in ("", None)}
     log.log(level, what, extra={_FIELDS: named})

@@ -1,4 +1,4 @@
-"""Prometheus metrics of a worker: what it did, and how long the queues are."""
+"""Prometheus metrics of a worker: finished jobs, their duration, and the lengths of the queues."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class Metrics:
         self.seconds.labels(message["table"]).observe(message["seconds"])
 
     def serve(self, port: int, host: str, connect: Callable[[], Any]) -> None:
-        """Start the endpoint in a thread of its own. `connect` gives a database connection for the queue lengths."""
+        """Start the endpoint in a thread. `connect` returns a database connection for the lengths of the queues."""
         self.registry.register(_Queues(connect))
         start_http_server(port, addr=host, registry=self.registry)
 
 
 class _Queues(Collector):
-    """Job rows by table and status, read when asked."""
+    """Job rows by table and status, read at each request."""
 
     def __init__(self, connect: Callable[[], Any]) -> None:
         self._connect, self._connection, self._lock = connect, None, threading.Lock()

@@ -1,9 +1,13 @@
-"""`pbl worker`: working processes under one that only watches.
+"""`pbl worker`: a supervisor and its working processes.
 
-The working processes compute (`workers.loop`) and say over a pipe what they have in hand. The supervisor touches no
-video and no numerical library, so whatever a job does to its process, somebody is left who notices: a process that
-dies is replaced, and the job that killed it is put back, or becomes an error row when it has done so too often; a job
-beyond its time limit is ended with its process.
+The working processes compute (`workers.loop`) and report over a pipe which jobs they work on. The supervisor opens no
+video and loads no numerical library, so it survives whatever a job does to its process: a process that dies is
+replaced, and the job that killed it is put back, or becomes an error row when it has done so too often; a job beyond
+its time limit is ended with its process.
+
+By hand, although systemd and Kubernetes restart processes: they do not know which job a process worked on, so they
+cannot count its crashes, end it at its time limit, or put it back. Where every process dies at its start, the
+supervisor ends, and restarting it is left to them.
 """
 
 from __future__ import annotations
@@ -33,22 +37,22 @@ from .run_job import Outcome
 
 log = logging.getLogger("pbl.worker")
 
-#: How often a job may take its process down before it becomes an error row.
+#: After so many crashes of its process a job becomes an error row.
 CRASHES = 3
-#: Pause before a process that died is replaced: doubled up to the longest while they keep dying (s).
+#: Pause before a process that died is replaced (s): doubled up to the longest while processes keep dying.
 RESTART_S = (0.5, 60.0)
-#: A process that lived for so long was well: the pause begins anew (s).
+#: After a process that lived for so long the pause begins anew (s).
 HEALTHY_S = 60.0
-#: So many processes in a row that died before they lived that long, without a job in hand: the worker gives up.
+#: After so many processes in a row that died earlier and without a job, the supervisor ends with an error.
 HOPELESS = 5
-#: After the grace for the job in hand a process gets this much to put it back, then it is killed (s).
+#: After the grace period a process has this long to put its job back; then it is killed (s).
 LAST_S = 15.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What a worker is asked to do. grace_s: how long a job in hand may go on after SIGTERM. limit_factor: multiplies
-    the time limits of the tables."""
+    """Options of `pbl worker`. grace_s: how long a running job may continue after SIGTERM. limit_factor: multiplies the
+    time limits of the tables."""
 
     resource: str = "all"
     processes: int = 1
@@ -82,10 +86,10 @@ class Supervisor:
     """Keeps `options.processes` working processes alive until told to stop; `run` returns the exit code."""
 
     def __init__(self, options: Options, metrics: Metrics | None = None, target: Callable[..., None] | None = None):
-        """`target` replaces `work` as what the processes run: tests and benchmarks put stand-ins before it."""
+        """`target` replaces `work` as the function that the processes run: tests and benchmarks install stand-ins."""
         self.options, self.metrics, self.target = options, metrics or Metrics(), target or work
         self._children: list[_Child] = []
-        # Looked up, not counted: a process may announce a job twice, and die without ending any.
+        # Read from the processes, not counted: a process may announce a job twice, and die without ending any.
         self.metrics.in_hand.set_function(lambda: sum(len(c.jobs) for c in self._children))
         self._pause = RESTART_S[0]
         self._stillborn = 0
@@ -95,7 +99,7 @@ class Supervisor:
         self._start = multiprocessing.get_context("spawn")
 
     def stop(self, *_: object) -> None:
-        """Let the jobs in hand end; asked again, do not wait for them."""
+        """Let the running jobs end within the grace period; called again, do not wait for them."""
         self._signalled += 1
         now = time.monotonic()
         self._stop_at = now if self._signalled > 1 else now + self.options.grace_s
@@ -105,22 +109,22 @@ class Supervisor:
         before = {s: signal.signal(s, self.stop) for s in (signal.SIGTERM, signal.SIGINT)}
         try:
             self._children = [self._launch() for _ in range(self.options.processes)]
-            told = 0
+            sent = 0
             code = 0
             while self._children:
                 self._listen(0.5)
-                if self._stop_at is not None and told < 1:
-                    told = 1
-                    self._tell(signal.SIGTERM)
+                if self._stop_at is not None and sent < 1:
+                    sent = 1
+                    self._send(signal.SIGTERM)
                     event(log, logging.INFO, "stopping", grace_s=self.options.grace_s)
                 if self._stop_at is not None and time.monotonic() >= self._stop_at:
-                    if told < 2:
-                        told = 2
-                        self._tell(signal.SIGUSR1)
+                    if sent < 2:
+                        sent = 2
+                        self._send(signal.SIGUSR1)
                     if time.monotonic() >= self._stop_at + LAST_S:
-                        self._tell(signal.SIGKILL, "did not stop in time")
+                        self._send(signal.SIGKILL, "did not stop in time")
                 self._end_overdue()
-                code = max(code, self._bury())
+                code = max(code, self._reap())
             return code
         finally:
             for s, handler in before.items():
@@ -134,7 +138,7 @@ class Supervisor:
         there.close()
         return _Child(process, here, time.monotonic())
 
-    def _tell(self, signum: int, why: str = "") -> None:
+    def _send(self, signum: int, why: str = "") -> None:
         for child in self._children:
             if why:
                 child.why = why
@@ -163,19 +167,19 @@ class Supervisor:
                 child.jobs = {k: v for k, v in child.jobs.items() if v[0] in late}
                 os.kill(child.process.pid, signal.SIGKILL)
 
-    def _bury(self) -> int:
-        """Take leave of processes that ended, see to their jobs, and replace those that should not have ended."""
+    def _reap(self) -> int:
+        """Reap exited processes, handle their jobs, and replace those that should not have ended."""
         code = 0
         for child in list(self._children):
             if child.process.is_alive():
                 continue
-            self._listen(0.0)  # what it said last
+            self._listen(0.0)  # its last messages
             child.process.join()
             self._children.remove(child)
             exit_code = child.process.exitcode or 0
             stopping = self._stop_at is not None
             if child.jobs:
-                self._see_to_jobs(child, exit_code, stopping)
+                self._settle_jobs(child, exit_code, stopping)
             elif exit_code and not stopping:
                 event(log, logging.ERROR, "process died", exit_code=exit_code, reason=_death(exit_code))
             if stopping or (exit_code == 0 and not child.jobs):
@@ -186,7 +190,7 @@ class Supervisor:
             healthy = time.monotonic() - child.started > HEALTHY_S
             self._stillborn = 0 if healthy or child.jobs else self._stillborn + 1
             if self._stillborn >= HOPELESS:
-                event(log, logging.CRITICAL, "gives up", why=f"{HOPELESS} processes in a row died at their start")
+                event(log, logging.CRITICAL, "giving up", why=f"{HOPELESS} processes in a row died at their start")
                 self.stop()
                 code = 1
                 continue
@@ -199,12 +203,12 @@ class Supervisor:
                 self._children.append(self._launch())
         return code
 
-    def _see_to_jobs(self, child: _Child, exit_code: int, stopping: bool) -> None:
+    def _settle_jobs(self, child: _Child, exit_code: int, stopping: bool) -> None:
         reason = child.why or _death(exit_code)
         for message, _ in child.jobs.values():
             event(log, logging.ERROR, "job took its process down", reason=reason, about=message["about"])
             if not run_job.wait_for_database():
-                return  # its reservation is freed as a dead one later
+                return  # `recover` frees its reservation later
             job = _claim_of(message, child.process.pid)
             if stopping and not child.why.startswith("time limit"):
                 queue.put_back(job, "the worker was stopped")
@@ -266,9 +270,9 @@ SELFTEST_FAILED = 3
 
 
 def work(options: Options, pipe: Connection) -> None:
-    """The working process: connect, test itself, work."""
+    """Run a working process: connect, run the self-test, work."""
     if options.processes > 1:
-        # Processes that share a GPU take of its memory what they need; JAX gives the first one most of it otherwise.
+        # Without this JAX reserves most of a GPU's memory for the first of several processes that share it.
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     import schemas
 
@@ -280,10 +284,10 @@ def work(options: Options, pipe: Connection) -> None:
         stop.set()
 
     def end_now(*_: object) -> None:
-        raise SystemExit(0)  # the job in hand is put back on the way up
+        raise SystemExit(0)  # handlers above put the running job back
 
     signal.signal(signal.SIGTERM, end)
-    signal.signal(signal.SIGINT, end)  # of a terminal: the supervisor decides
+    signal.signal(signal.SIGINT, end)  # a terminal sends it to all; the supervisor decides
     signal.signal(signal.SIGUSR1, end_now)
     to_stderr()
     try:
@@ -317,7 +321,7 @@ def work(options: Options, pipe: Connection) -> None:
             message |= {"outcome": outcome.what, "seconds": outcome.seconds, "code": outcome.code}
         try:
             pipe.send(message)
-        except OSError:  # the supervisor is gone: go, too
+        except OSError:  # the supervisor has ended: end, too
             stop.set()
 
     with heartbeat.Heartbeat(options.resource) as beats:
@@ -330,7 +334,7 @@ def work(options: Options, pipe: Connection) -> None:
 
 
 def _connected(schemas: Any, stop: threading.Event) -> bool:
-    """Connect and bind the tables, which loads the numerical libraries; wait for a database that is not there yet."""
+    """Connect and bind the tables, which loads the numerical libraries; wait until the database is available."""
     while not stop.is_set():
         try:
             schemas.activate()
@@ -346,5 +350,5 @@ def _connected(schemas: Any, stop: threading.Event) -> bool:
 
 
 def listen_for_metrics(metrics: Metrics, port: int, host: str = "127.0.0.1") -> None:
-    """Serve the metrics; the counts of the queues are read from the database when they are asked for."""
+    """Serve the metrics; the lengths of the queues are read from the database at each request."""
     metrics.serve(port, host, connection.another)

@@ -11,7 +11,7 @@ import click
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("--database-only", is_flag=True, help="Leave the store's files out (where it is saved by other means).")
 def backup(folder: Path, database_only: bool) -> None:
-    """Save all tables and the files they name into the new folder FOLDER, as of one moment. Workers may go on.
+    """Save all tables and the files they name into the new folder FOLDER, as of one moment. Workers may keep running.
 
     It holds data of people: keep it as closed as the database itself. `pbl forget` does not reach into backups.
 
@@ -28,7 +28,7 @@ def backup(folder: Path, database_only: bool) -> None:
 @click.command()
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("--check", "only_check", is_flag=True, help="Compare the backup with its checksums; change nothing.")
-@click.option("--again", is_flag=True, help="After a restore that was broken off: remove what it left, begin anew.")
+@click.option("--again", is_flag=True, help="After an interrupted restore: remove what it left and start again.")
 def restore(folder: Path, only_check: bool, again: bool) -> None:
     """Bring a backup back into an empty database and its store.
 

@@ -12,7 +12,7 @@ def camera() -> None:
     """Calibrations that serve every video of a phone's lens (docs/camera.md): add, list, remove.
 
     A video takes the calibration that was ingested with it (`pbl ingest --camera`); else the one that is registered
-    here for its phone's make, model and lens, the size and the rate of its frames; else what the file says.
+    here for its phone's make, model and lens, the size and the rate of its frames; else the file's metadata.
     """
 
 
@@ -27,7 +27,7 @@ def camera() -> None:
 def add(file: Path, like: Path | None) -> None:
     """Register the calibration in FILE, in the place of an older one of the same lens, size and rate.
 
-    What was computed with another calibration than now counts is deleted, and said; `pbl populate` computes it anew.
+    What was computed with another calibration than now counts is deleted and listed; `pbl populate` computes it anew.
     """
     import schemas
     from schemas import cameras
@@ -59,7 +59,7 @@ def list_() -> None:
 def remove(camera_id: int) -> None:
     """Withdraw calibration NUMBER of `pbl camera list` from the phones that have it.
 
-    What was computed with it is deleted, and said. Videos that were ingested with it keep it.
+    What was computed with it is deleted and listed. Videos that were ingested with it keep it.
     """
     import schemas
     from schemas import cameras

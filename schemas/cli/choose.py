@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def choose(video_id: int, person: int | None, sheet: Path | None, tracking_method: str | None) -> None:
     """Measure PERSON of video VIDEO_ID. The choice wins over the automatic one.
 
-    What was computed for another person is deleted, and said; `pbl populate` computes it anew. Without PERSON nothing
+    What was computed for another person is deleted and listed; `pbl populate` computes it anew. Without PERSON nothing
     changes: the persons, their scores and the reason of the automatic choice are printed, and with --sheet a picture of
     them is written.
 

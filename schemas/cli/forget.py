@@ -17,8 +17,8 @@ def forget(subject: str, yes: bool, videos: bool) -> None:
     """Remove every row and every stored file of the person SUBJECT, and prove it with a list.
 
     A dry run is the default. What goes is written to PBL_HOME/forgotten/SUBJECT.json before the first row is deleted;
-    broken off, run it again until it says that nothing is left (exit code 0). Backups, and reports or exports that
-    somebody made, are not reached. Needs an account that may delete, and a key that may delete from the store.
+    interrupted, run it again until it reports that nothing is left (exit code 0). Backups, and reports or exports that
+    were made, are not reached. Needs an account that may delete, and a key that may delete from the store.
 
     \b
     Example: pbl forget P017

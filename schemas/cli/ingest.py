@@ -76,7 +76,7 @@ def ingest(
     """Register videos of one visit; `pbl populate` then computes them. Nothing is decoded here.
 
     A file whose bytes are registered already is not registered twice, but takes a new camera (what was computed with
-    another is deleted, and said), a sensor log of the phone (the same) and further methods. Logs, depth videos and
+    another is deleted and listed), a sensor log of the phone (the same) and further methods. Logs, depth videos and
     IMU files are copied. Exit code 1 when a file was refused; the others are registered all the same.
 
     \b

@@ -77,7 +77,7 @@ def lines(state: Status) -> list[str]:
 
 
 def span(seconds: float | None) -> str:
-    """A time in the largest unit that gives at least 1: 45 s, 12 min, 3.5 h, 2.1 d."""
+    """A duration in the largest unit of which it has at least 1: 45 s, 12 min, 3.5 h, 2.1 d."""
     if seconds is None:
         return "-"
     for unit, length in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):

@@ -21,7 +21,7 @@ No error of a fit against a reference is in the database yet. What to do:
   pbl validate add VIDEO --reference FILE    for each video that another instrument recorded as well
   pbl populate                               computes the errors of its fits
   pbl validate                               prints the tables
-References are there and populate has run? Then pbl status says what failed.
+References are there and populate has run? Then pbl status lists what failed.
 Without a database: pbl validate FIT.npz --reference FILE"""
 
 _SHIFT = click.option(
@@ -90,7 +90,7 @@ def tables(
     """Print the tables of errors: by dataset and camera, joint, population, activity and view.
 
     Without FITS: of all rows in the database whose fit and reference are current. With FITS (`fit.npz`): of these
-    files, no database needed; references as in docs/files.md. A fit that cannot be compared is said on stderr, the
+    files, no database needed; references as in docs/files.md. A fit that cannot be compared is reported on stderr, the
     others are shown, and the exit code is 1.
     """
     from pbl_pipeline.files import check_out_folder
@@ -149,7 +149,7 @@ def _show(frame: pd.DataFrame, where: Sequence[str], out: Path | None, in_databa
     help="Reference movement: .npz, fit.npz, truth.npz, .json.gz or .mot.",
 )
 @click.option("--dataset", metavar="NAME", help="Collection of recordings to report it with (else: unnamed).")
-@click.option("--source", metavar="TEXT", help="Instrument, such as 'optical markers' (else: what the file says).")
+@click.option("--source", metavar="TEXT", help="Instrument, such as 'optical markers' (default: what the file states).")
 @click.option("--origin", metavar="TEXT", help="Where the file comes from (else: its path).")
 @_SHIFT
 def add(

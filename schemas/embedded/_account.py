@@ -1,4 +1,4 @@
-"""The account the server runs as: the user's own, or an unprivileged one when the user is root."""
+"""The system account the server runs as: the user's own, or an unprivileged one when the user is root (never root)."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def server_account(data: Path) -> Account:
 
 
 def check_enterable(folder: Path, account: Account) -> None:
-    """Make sure `account` can enter `folder`, by trying as that account (permission bits do not tell the whole truth).
+    """Make sure `account` can enter `folder`, by trying as that account (permission bits alone do not decide).
 
     Raises
     ------

@@ -1,4 +1,7 @@
-"""Getting the server's Debian packages: installed by root, or unpacked into a folder by anybody."""
+"""Getting the server's Debian packages: installed by root, or unpacked into a folder by any user.
+
+By hand, because apt installs for root only; for other users its packages are downloaded and unpacked into a folder.
+"""
 
 from __future__ import annotations
 

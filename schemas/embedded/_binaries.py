@@ -20,7 +20,7 @@ Say = Callable[[str], None]
 
 
 def silent(_: str) -> None:
-    """The default of every `say`: the library prints nothing, commands do."""
+    """The default of every `say`: prints nothing."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def get_server(say: Say = silent) -> Binaries:
     Parameters
     ----------
     say
-        Told in a sentence what is being installed and why.
+        Called with a sentence for each step.
 
     Raises
     ------

@@ -26,14 +26,14 @@ ADMIN_USER = "pbl_admin"
 
 @dataclass(frozen=True)
 class Credentials:
-    """The two logins of the server: the application's and the one that stops it and grants rights."""
+    """The two passwords of the server: the application's and the administrator's, who stops it and grants rights."""
 
     app_password: str
     admin_password: str
 
     @staticmethod
     def new() -> Credentials:
-        """Random passwords of 190 bits, in characters that need no quoting."""
+        """Random passwords of 192 bits, in characters that need no quoting."""
         return Credentials(secrets.token_hex(24), secrets.token_hex(24))
 
 
@@ -42,7 +42,7 @@ class Folder:
     """`<home>/db`: `data/` and `run/` belong to the server's account, the rest to the user.
 
     data/              the tables (0700)
-    run/server.log     what the server says
+    run/server.log     the server's log
     run/s.sock         its socket
     credentials.json   passwords (0600)
     server.json        port, process number, version
@@ -135,7 +135,7 @@ class Folder:
                             key=self.path,
                             found=f"another command has been starting or stopping the server for {timeout_s:.0f} s",
                             expected="one command at a time",
-                            next_step="look for a `pbl db` command that hangs, end it and try again",
+                            next_step="find the `pbl db` command that hangs, end it and try again",
                         ) from error
                     time.sleep(0.05)
             yield

@@ -25,7 +25,7 @@ def port_free(port: int) -> bool:
 
 
 def free_port() -> int:
-    """A port nobody listens on, by chance, so that several databases on one machine seldom meet.
+    """A random free port, so that several databases on one machine rarely collide.
 
     Raises
     ------

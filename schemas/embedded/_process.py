@@ -91,7 +91,7 @@ def launch(folder: Folder, binaries: Binaries, account: Account) -> None:
             said = folder.log.read_bytes()[log_start:] if folder.log.exists() else b""
             if child.poll() is None or b"Bind on TCP/IP port" not in said or attempt == 4:
                 raise
-            # Somebody took the port between our look and the server's: choose another.
+            # Another program took the port after it was checked: choose another.
 
 
 def wait_until_answers(folder: Folder) -> None:
@@ -117,7 +117,7 @@ def wait_until_answers(folder: Folder) -> None:
                 what, next_step = "ended instead of starting", _advice(folder)
             else:
                 what = f"runs but does not answer within {START_TIMEOUT_S:.0f} s ({error.args[-1]})"
-                next_step = "a long recovery may still be going on: look again with pbl db status"
+                next_step = "a long recovery may still be going on: check again with pbl db status"
             raise PblError(
                 "DB_UNAVAILABLE",
                 key=folder.path,
@@ -150,7 +150,7 @@ def running_pid(folder: Folder) -> int | None:
 
 
 def alive(pid: int, folder: Folder) -> bool:
-    """True when process `pid` is the server of this folder. A number alone says little: it may be another program's."""
+    """True when process `pid` is the server of this folder; by now the number may be another program's."""
     if pid in _children:
         return _children[pid].poll() is None
     marker = f"--datadir={folder.data}"

@@ -1,4 +1,4 @@
-"""Start, stop and look at the embedded server."""
+"""Start, stop and inspect the embedded server."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def start(say: Say = silent, folder: Folder | None = None) -> Status:
     Parameters
     ----------
     say
-        Told in a sentence what is being done.
+        Called with a sentence for each step.
     folder
         Where; default `settings.home_dir()/db`.
 
@@ -61,7 +61,8 @@ def start(say: Say = silent, folder: Folder | None = None) -> Status:
     Raises
     ------
     PblError
-        DB_UNAVAILABLE: no server to be had, folder unusable, or the server does not start (with its last words).
+        DB_UNAVAILABLE: no server could be obtained, the folder is unusable, or the server does not start (with its last
+        log lines).
     """
     folder = folder or Folder.default()
     account = server_account(folder.data)
@@ -118,7 +119,7 @@ def stop(say: Say = silent, folder: Folder | None = None) -> bool:
                     key=f"process {pid}",
                     found=f"the server did not end within {STOP_TIMEOUT_S:.0f} s",
                     expected="an orderly end within seconds",
-                    next_step=f"see {folder.log}; in need: kill -9 {pid} (committed rows are kept)",
+                    next_step=f"see {folder.log}; as a last resort: kill -9 {pid} (committed rows are kept)",
                 )
             time.sleep(0.05)
         folder.write_state(pid=None)
@@ -127,7 +128,7 @@ def stop(say: Say = silent, folder: Folder | None = None) -> bool:
 
 
 def status(folder: Folder | None = None) -> Status:
-    """Look at the server; changes nothing."""
+    """The server's status; changes nothing."""
     folder = folder or Folder.default()
     if not folder.initialised():
         return Status(False, str(folder.path), False)

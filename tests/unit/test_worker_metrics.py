@@ -41,7 +41,7 @@ def boss(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     """A supervisor of one process whose jobs no database knows, and what was left of each that died."""
     found = Supervisor(Options(), Metrics())
     left: list[int] = []
-    monkeypatch.setattr(found, "_see_to_jobs", lambda child, *_: left.append(len(child.jobs)))
+    monkeypatch.setattr(found, "_settle_jobs", lambda child, *_: left.append(len(child.jobs)))
     monkeypatch.setattr(found, "_launch", lambda: Process().child)
     monkeypatch.setattr("workers.supervisor.time.sleep", lambda _: None)
     process = Process()
@@ -75,7 +75,7 @@ def test_jobs_of_a_process_that_died_are_in_nobodys_hand(boss: SimpleNamespace):
     boss.process.say("end", 1, outcome="done", seconds=2.0, code="")
     assert in_hand(boss) == 2
     boss.process.die(-9)
-    boss.supervisor._bury()
+    boss.supervisor._reap()
     assert boss.left == [2]
     assert in_hand(boss) == 0
     assert len(boss.supervisor._children) == 1  # another took its place

@@ -1,4 +1,4 @@
-"""`pbl cron`: what is to be done regularly; a crontab, systemd timers or a cluster's scheduler call it."""
+"""`pbl cron`: regular jobs, called by a crontab, systemd timers or a cluster's scheduler."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pbl_pipeline.errors import PblError
 
 @click.group()
 def cron() -> None:
-    """Regular jobs; each may run at any time, also twice. See docs/operations.md for a crontab and systemd timers.
+    """Regular jobs; each may run at any time, also twice. docs/deployment.md has a crontab and systemd timers.
 
     Example: pbl cron import && pbl cron refresh
     """
@@ -41,11 +41,9 @@ def import_(settled_s: float) -> None:
 
 
 @cron.command()
-@click.option(
-    "--all", "everything", is_flag=True, help="Look at all rows, and not only what is recent if that is enough."
-)
+@click.option("--all", "everything", is_flag=True, help="Compare all rows, not only recent ones.")
 def refresh(everything: bool) -> None:
-    """Queue what can be computed: new recordings, choices and methods, and once an hour whatever is missing anywhere.
+    """Queue what can be computed: new recordings, choices and methods; once an hour, whatever is missing in any table.
 
     Example: pbl cron refresh
     """
@@ -55,7 +53,7 @@ def refresh(everything: bool) -> None:
     schemas.activate()
     found = look(everything or None)
     if found is None:
-        click.echo("another process is at it")
+        click.echo("another process is doing this now")
         return
     queued = ", ".join(f"{n} of {name}" for name, n in found.queued.items()) or "nothing"
     click.echo(f"queued: {queued}; {found.planned} fits planned, {found.freed} freed, {found.swept} obsolete")
@@ -77,9 +75,9 @@ def release() -> None:
 
 @cron.command()
 def reprocess() -> None:
-    """Put error rows back whose cause was outside of the recording: a model or file that was absent, a crash.
+    """Retry error rows whose cause was outside the recording: a missing model or file, a crash.
 
-    Results are never deleted by a cron job: for another method or newer code see `pbl reprocess`.
+    A cron job never deletes results: for another method or newer code see `pbl reprocess`.
 
     Example: pbl cron reprocess
     """
@@ -97,7 +95,7 @@ def reprocess() -> None:
     "--out", type=click.Path(path_type=Path, file_okay=False), help="Also write summary-DATE.txt and .html there."
 )
 def summary(hours: float, out: Path | None) -> None:
-    """Say what was done in the last hours, what failed and waits, who works, how full the disks are.
+    """Summarise the last hours: finished, failed and waiting work, live workers, free disk space.
 
     Example: pbl cron summary --out /var/www/pbl
     """

@@ -23,7 +23,7 @@ from pbl_pipeline.errors import PblError
 def reprocess(
     table: str, new_method: str | None, method: str | None, since: str | None, before: str | None, go: bool
 ) -> None:
-    """Compute results again, with lower priority than new videos. Says what it would do; --go does it.
+    """Compute results again, with lower priority than new videos. Prints what it would do; --go does it.
 
     With --new-method the old rows stay and the new method's are added beside them. Without, the chosen rows and all
     that was computed from them are deleted, in small steps, and queued again.

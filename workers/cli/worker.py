@@ -1,4 +1,4 @@
-"""`pbl worker`: compute what is queued, until told to stop."""
+"""`pbl worker`: run queued jobs until stopped."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from workers.registry import GROUPS
 @click.option(
     "--batch", type=click.IntRange(1, 256), help="Fits at once on one device (default: 32 with a GPU, else 1)."
 )
-@click.option("--once", is_flag=True, help="End when nothing is left to do.")
+@click.option("--once", is_flag=True, help="End when no job is left.")
 @click.option("--max-jobs", type=click.IntRange(min=1), help="End a process after so many jobs.")
 @click.option(
     "--grace", "grace_s", type=click.FloatRange(min=0), default=60.0, show_default=True,
-    help="After SIGTERM, seconds for the job in hand; then it is put back into the queue.",
+    help="After SIGTERM, seconds for the running job; then it is put back into the queue.",
 )  # fmt: skip
 @click.option(
     "--limit-factor", type=click.FloatRange(min=0.001), default=1.0, show_default=True,
@@ -44,11 +44,11 @@ def worker(
     metrics_host: str,
     no_selftest: bool,
 ) -> None:
-    """Take jobs from the queues of all tables, compute, and wait for more. Run as many as you like, anywhere.
+    """Runs continuously and takes jobs from all queues; start as many as you like, on any machine.
 
-    Ends by SIGTERM or Ctrl-C: the job in hand is finished within --grace, or put back. A job that takes its process
-    down is tried again and becomes an error row the third time; one beyond its time limit at once. Logs are JSON lines
-    on stderr.
+    SIGTERM or Ctrl-C ends it: the running job is finished within --grace, or put back. A job that crashes its process
+    is tried again and becomes an error row the third time; a job beyond its time limit becomes one at once. Logs are
+    JSON lines on stderr.
 
     \b
     Example: pbl worker
@@ -57,7 +57,7 @@ def worker(
     import schemas
     from workers.supervisor import Options, Supervisor, listen_for_metrics, to_stderr
 
-    schemas.activate(methods=False)  # a wrong address or login is said here and not by a process that starts again
+    schemas.activate(methods=False)  # a wrong address or login is reported here, not by a process that is started again
     to_stderr()
     options = Options(
         resource=resource,

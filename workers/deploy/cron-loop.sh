@@ -1,11 +1,11 @@
 #!/bin/sh
-# The cron jobs of the container `cron`, where no cron daemon runs (it would have to be root): every minute look what is
-# due. One job after the other, so that none overtakes itself. On a machine of your own use crontab or the systemd timers.
+# Runs the cron jobs in the container `cron`, which has no cron daemon (that would have to be root): checks every minute
+# which jobs are due and runs them one after the other. On a machine of your own use crontab or the systemd timers.
 set -u
 tick="${PBL_CRON_TICK_S:-60}"
 trap 'exit 0' TERM INT
 
-run() { # name...: a job that fails is said by pbl itself, and comes again
+run() { # name...: pbl itself reports why a job failed; the job runs again at its next time
     pbl --quiet cron "$@" || echo "pbl cron $1 failed with code $?" >&2
 }
 

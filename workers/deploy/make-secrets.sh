@@ -1,5 +1,5 @@
 #!/bin/sh
-# Random passwords of 190 bits, one per file, readable by you only. What is there stays.
+# Random passwords of 192 bits, one per file, readable by you only. Existing files are kept.
 #   sh workers/deploy/make-secrets.sh [DIR]     (default: secrets/, which git ignores)
 set -eu
 folder="${1:-secrets}"
