@@ -114,7 +114,7 @@ def _insert(chunk: list[Recording], chosen: dict[str, str]) -> int:
     keypoints.KeypointSelection.insert({**t, "keypoint_method": chosen["keypoint_method"]} for t in tracked)
     planned = [{"session_id": i} for i in set(sessions.values())]
     for table, names in (
-        (fit.FitPlan, ("fit_method",)),
+        (fit.FitPlan, ("keypoint_method", "fit_method")),
         (gait.GaitPlan, ("gait_method",)),
         (gdi.GdiPlan, ("gdi_method", "norm")),
     ):

@@ -57,8 +57,9 @@ class FitMethod(dj.Lookup):
 @schema
 class FitPlan(dj.Manual):
     definition = """
-    # which sessions are fitted by which method
+    # which keypoints of a session are fitted by which method
     -> session.Session
+    -> keypoints.KeypointMethod
     -> FitMethod
     """
 

@@ -22,6 +22,7 @@ from ._datajoint import DuplicateError, dj
 from .coded_errors import error_code
 from .jobs import jobs_of
 from .method_rows import resolve_method
+from .plan import default_fit
 from .rows import delete_below, utc_now
 
 if TYPE_CHECKING:
@@ -150,11 +151,12 @@ def resolve(named: Methods) -> dict[str, str]:
     def key(table: Any, name: str | None) -> str:
         return resolve_method(table, name or of_stage(table.stage).default)
 
+    points = key(keypoints.KeypointMethod, named.keypoint)
     return {
         "tracking_method": key(tracking.TrackingMethod, named.tracking),
         "subject_method": key(tracking.SubjectMethod, named.subject),
-        "keypoint_method": key(keypoints.KeypointMethod, named.keypoint),
-        "fit_method": key(fit.FitMethod, named.fit),
+        "keypoint_method": points,
+        "fit_method": resolve_method(fit.FitMethod, named.fit) if named.fit else default_fit(points),
         "gait_method": key(gait.GaitEventMethod, named.gait),
         **gdi.resolve(named.gdi, named.norm),
     }
@@ -340,8 +342,10 @@ def _new_methods(row: dict[str, Any], chosen: dict[str, str], more: set[str]) ->
         trackings = [tracked] if "tracking_method" in more else known
         points = {"keypoint_method": chosen["keypoint_method"]}
         new += [(keypoints.KeypointSelection, {**t, **points}) for t in trackings]
-    if "fit_method" in more:
-        new.append((fit.FitPlan, {**of_session, "fit_method": chosen["fit_method"]}))
+    if more & {"keypoint_method", "fit_method"}:
+        plan = {**of_session, "fit_method": chosen["fit_method"]}
+        seen_by = [chosen["keypoint_method"]] if "keypoint_method" in more else _keypoint_methods(of_session)
+        new += [(fit.FitPlan, {**plan, "keypoint_method": points}) for points in seen_by]
     if "gait_method" in more:
         new.append((gait.GaitPlan, {**of_session, "gait_method": chosen["gait_method"]}))
     if more & {"gdi_method", "norm"}:
@@ -355,6 +359,12 @@ def _new_methods(row: dict[str, Any], chosen: dict[str, str], more: set[str]) ->
                 names = [str(v) for k, v in key.items() if k not in ("video_id", "session_id")]
                 added.append(f"{table.__name__} {', '.join(names)} was added")
     return added
+
+
+def _keypoint_methods(of_session: dict[str, Any]) -> list[str]:
+    """Keys of the keypoint methods that are selected for videos of a session."""
+    selected = keypoints.KeypointSelection & (video.Video & of_session)
+    return sorted((dj.U("keypoint_method") & selected).to_arrays("keypoint_method"))
 
 
 def forget_errors(video_id: int, codes: Sequence[str] | None = None) -> None:
@@ -443,7 +453,8 @@ def _select(video_id: int, session_id: int, person: int | None, chosen: dict[str
     if person is not None:
         tracking.set_override(tracked, person)
     planned = {"session_id": session_id}
-    fit.FitPlan.insert1({**planned, "fit_method": chosen["fit_method"]}, skip_duplicates=True)
+    pair = {name: chosen[name] for name in ("keypoint_method", "fit_method")}
+    fit.FitPlan.insert1({**planned, **pair}, skip_duplicates=True)
     gait.GaitPlan.insert1({**planned, "gait_method": chosen["gait_method"]}, skip_duplicates=True)
     gdi.GdiPlan.insert1({**planned, "gdi_method": chosen["gdi_method"], "norm": chosen["norm"]}, skip_duplicates=True)
 

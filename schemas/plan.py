@@ -1,4 +1,4 @@
-"""Which trials of a session are fitted together, decided by query."""
+"""By which method keypoints are fitted, and which trials of a session together, decided by query."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from pbl_pipeline import methods
+
 from . import fit, keypoints, session, tracking, video
 from ._datajoint import dj
 from .jobs import jobs_of
+from .method_rows import method_row, resolve_method
 from .rows import utc_now
 
 #: What one fit is for: a session, seen through one chain of methods.
@@ -19,6 +22,24 @@ GROUP = ("session_id", "tracking_method", "keypoint_method", "fit_method")
 
 #: The tables in which an error row decides that a trial does not take part.
 UNDECIDED = (video.VideoInfo, tracking.Tracking, tracking.SubjectChoice, keypoints.Keypoints, fit.TrialInput)
+
+
+def default_fit(keypoint_method: str) -> str:
+    """Key of the fit method that keypoints of this method (a key) get where nobody names one: as `pbl run` chooses.
+
+    Raises `PblError` MODEL_MISSING, MODEL_INVALID where the method's model is not registered on this machine.
+    """
+    from pbl_pipeline.pipeline import fit_default
+
+    row = method_row(keypoints.KeypointMethod, {"keypoint_method": keypoint_method})
+    return resolve_method(fit.FitMethod, fit_default(methods.stored(**row)))
+
+
+def plan_fits(selected: Sequence[Mapping[str, Any]], fit_method: str) -> None:
+    """Plan this fit for rows of KeypointSelection, in sessions that have no plan for such keypoints."""
+    of_session = keypoints.KeypointSelection.proj() * video.Video.proj("session_id") & list(selected)
+    unplanned = (dj.U("session_id", "keypoint_method") & of_session) - fit.FitPlan.proj()
+    fit.FitPlan.insert(({**row, "fit_method": fit_method} for row in unplanned.to_dicts()), skip_duplicates=True)
 
 
 def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]:

@@ -14,6 +14,7 @@ from schemas.ingest import Methods
 from schemas.ingest import resolve as resolve_ingest
 from schemas.jobs import jobs_of
 from schemas.method_rows import resolve_method
+from schemas.plan import default_fit, plan_fits
 from schemas.rows import delete_below
 
 from . import queue
@@ -55,12 +56,14 @@ def _of_video(table: Any, video_id: int) -> list[dict[str, Any]]:
 # ---------------------------------------------------------------------------------------------------------- reprocess
 @dataclasses.dataclass(frozen=True)
 class Reprocess:
-    """What is to be done again. `selected`: method rows added; `outdated`: keys whose results are deleted."""
+    """What is to be done again. `add`: selections of a method, which is fitted by `fit_method` where it is one of the
+    keypoints; `outdated`: keys whose results are deleted."""
 
     table: str
     add: list[dict[str, Any]]
     outdated: list[dict[str, Any]]
     below: dict[str, int]
+    fit_method: str | None = None
 
 
 #: Where a method is selected: table -> (prefix of its columns, selection, method table).
@@ -83,7 +86,7 @@ def plan_new_method(table: str, method: str, since: datetime.date | None = None)
     Raises
     ------
     PblError
-        USAGE for a table without methods, SOLVER_UNKNOWN for an unknown method.
+        USAGE for a table without methods, SOLVER_UNKNOWN for an unknown method; what `plan.default_fit` raises.
     """
     name = table_named(table).__name__
     if name not in _SELECTIONS:
@@ -108,7 +111,7 @@ def plan_new_method(table: str, method: str, since: datetime.date | None = None)
         key = tuple(row[k] for k in others)
         if key not in have:
             add.setdefault(key, {**row, column: chosen, **beside})
-    return Reprocess(name, list(add.values()), [], {})
+    return Reprocess(name, list(add.values()), [], {}, default_fit(chosen) if name == "Keypoints" else None)
 
 
 def plan_again(
@@ -150,6 +153,8 @@ def carry_out(plan: Reprocess) -> Iterator[int]:
         for i in range(0, len(plan.add), 50 * CHUNK):
             part = plan.add[i : i + 50 * CHUNK]
             getattr(_MODULES[prefix], selection_name).insert(part, skip_duplicates=True)
+            if plan.fit_method is not None:
+                plan_fits(part, plan.fit_method)
             yield min(i + 50 * CHUNK, len(plan.add))
         _queue_at_low_priority(one)
     for i in range(0, len(plan.outdated), CHUNK):

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 @click.option("--person", type=click.IntRange(min=1), help="Measure this person of the tracking (else: automatic).")
 @click.option("--tracking-method", metavar="NAME", help="Method of person tracking (else: the default).")
 @click.option("--keypoint-method", metavar="NAME", help="Keypoint method or model (else: default).")
-@click.option("--fit-method", metavar="NAME", help="Method of the session fit (else: the default).")
+@click.option("--fit-method", metavar="NAME", help="Method of the session fit (else: what suits the keypoints).")
 @click.option("--index", metavar="NAME", help="Gait Deviation Index: pbl-2025-three-angles (default) or gillette-2008.")
 @click.option("--norm", metavar="NAME", help="Normative set of the Gait Deviation Index (else: the index's own).")
 def ingest(

@@ -11,19 +11,25 @@ import pytest
 
 import pbl_pipeline.tracking
 import schemas
-from pbl_pipeline import models
+from pbl_pipeline import methods, models
+from pbl_pipeline.body import marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.video import probe
-from schemas import keypoints
+from schemas import fit, gait, gdi, keypoints, tracking
 from schemas.ingest import Methods, Visit, ingest
 from schemas.method_rows import resolve_method
+from schemas.rows import plain
 from schemas.stored_files import file_ref, stored_file
 from tests import dot_models
 from tests.rows import remove_all
 from tests.videos import constant_rate, write_video
+from workers import queue, requeue
 from workers.populate import populate
+
+from . import chain
 
 N = 36
 
@@ -51,7 +57,8 @@ def tables(database: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> I
     yield
     remove_all()
     # Other tests count the method rows of the project.
-    (keypoints.KeypointMethod & 'keypoint_method_name LIKE "dots-%"').delete(prompt=False)
+    ours = " or ".join(f"keypoint_method_name LIKE '{n}%'" for n in ("dots-", *SEEN_BY))
+    (keypoints.KeypointMethod & ours).delete(prompt=False)
 
 
 def test_a_registered_model_is_a_method_of_the_tables(tables: None, tmp_path: Path):
@@ -95,3 +102,114 @@ def test_a_registered_model_is_a_method_of_the_tables(tables: None, tmp_path: Pa
     (keypoints.Keypoints & {"video_id": result.video_id}).delete(prompt=False)
     run = populate()
     assert {t.table: t.errors for t in run.tables if t.table == "Keypoints"} == {"Keypoints": {"MODEL_CHECKSUM": 1}}
+
+
+def register_spec(folder: Path, kind: str, markers: str, name: str) -> None:
+    """A model of these points, as far as planning asks: nobody runs it here."""
+    names = list(marker_set(markers).names)
+    fields = dot_models.spec(kind, (32, 32), name=name, marker_set=markers, joint_names=names) | {"sha256": "1" * 64}
+    (folder / name).mkdir(parents=True)
+    (folder / name / "model.json").write_text(json.dumps(fields))
+
+
+def plans() -> set[tuple[str, str]]:
+    return {(r["keypoint_method"], r["fit_method"]) for r in fit.FitPlan.to_dicts()}
+
+
+def fitted() -> set[tuple[str, str]]:
+    """Which keypoints the sets that are fitted now hold, and by which method."""
+    current = fit.FitSet.Video * (fit.FitSelection & {"fit_current": True})
+    return {(r["keypoint_method"], r["fit_method"]) for r in current.to_dicts()}
+
+
+SEEN_BY = {
+    "metrabs-87": ("crop3d", "bml_movi_87"),
+    "flat-87": ("simcc", "bml_movi_87"),
+    "few-17": ("crop3d", "mpi_inf_3dhp_17"),
+}
+DEFAULT_FITS = {
+    ("blazepose-33-v2", "blazepose-v1"),
+    ("metrabs-87-v1", "gauss-newton-v1"),
+    ("flat-87-v1", "blazepose-v1"),
+    ("few-17-v1", "blazepose-v1"),
+}
+
+
+def test_the_fit_that_suits_the_points_is_planned(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """As `pbl run` chooses (tests/unit/test_models.py): of one visit each keypoint method has its own fit."""
+    chain.install(monkeypatch)
+    for name, (kind, markers) in SEEN_BY.items():
+        register_spec(tmp_path / "models", kind, markers, name)
+    path = chain.small_video(tmp_path, "walk")
+    notes = [ingest([path], Visit("P001"), Methods(keypoint=name))[0].note for name in SEEN_BY]
+    assert "FitPlan" in notes[-1]
+    ingest([chain.small_video(tmp_path, "again")], Visit("P001"))
+    assert plans() == DEFAULT_FITS
+    populate()
+    assert fitted() == DEFAULT_FITS
+    assert len(fit.SessionFit()) == len(DEFAULT_FITS)
+    # Who names a fit method means all keypoints of the visit, or those that are named with it.
+    ingest([path], Visit("P001"), Methods(keypoint="few-17", fit="paper-2025"))
+    assert plans() == DEFAULT_FITS | {("few-17-v1", "paper-2025-v1")}
+    ingest([path], Visit("P001"), Methods(fit="markers"))
+    assert {p for p in plans() if p[1] == "markers-v1"} == {(p[0], "markers-v1") for p in DEFAULT_FITS}
+
+
+def test_a_new_keypoint_method_for_all_comes_with_its_fit(
+    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    chain.install(monkeypatch)
+    register_spec(tmp_path / "models", "crop3d", "bml_movi_87", "metrabs-87")
+    for subject in ("P001", "P002"):
+        ingest([chain.small_video(tmp_path, subject)], Visit(subject))
+    for _ in requeue.carry_out(requeue.plan_new_method("Keypoints", "metrabs-87")):
+        pass
+    assert plans() == {("blazepose-33-v2", "blazepose-v1"), ("metrabs-87-v1", "gauss-newton-v1")}
+    assert len(fit.FitPlan()) == 4
+    populate()
+    assert fitted() == plans()
+
+
+def test_a_method_that_this_version_does_not_know_is_an_error_row(
+    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Rows of a newer version: each stage ends with the code, at once."""
+    chain.install(monkeypatch)
+    ingest([chain.small_video(tmp_path, "walk")], Visit("P001"))
+    stages = {
+        "Tracking": (tracking.TrackingMethod, {"detector": "newer"}),
+        "SubjectChoice": (tracking.SubjectMethod, {"family": "newer"}),
+        "Keypoints": (keypoints.KeypointMethod, {"detector": "newer"}),
+        "TrialInput": (fit.FitMethod, {"solver": "newer"}),
+        "GaitEvents": (gait.GaitEventMethod, {"family": "newer"}),
+        "GDI": (gdi.GdiModel, {"family": "newer"}),
+    }
+    populate()
+    tracked = tracking.TrackingSelection.fetch1()
+    for name, (table, params) in stages.items():
+        prefix = table.primary_key[0].removesuffix("_method")
+        known = methods.of_stage(table.stage).find()
+        newer = Paramset(table.stage, "newer", 1, plain(known.paramset.params) | params)
+        row = {f"{prefix}_method_name": "newer", f"{prefix}_method_version": 1, f"{prefix}_params": newer.params}
+        table.insert1({f"{prefix}_method": "newer-v1", **row, f"{prefix}_method_sha": newer.hash})
+        if name == "SubjectChoice":
+            tracking.TrackingSelection.update1({**tracked, "subject_method": "newer-v1"})
+            tracking.SubjectChoice.delete(prompt=False, part_integrity="cascade")
+        elif name == "Keypoints":  # whoever plans meets it before
+            with pytest.raises(PblError, match="SOLVER_UNKNOWN"):
+                requeue.plan_new_method(name, "newer")
+            selection = keypoints.KeypointSelection.fetch1()
+            keypoints.KeypointSelection.insert1({**selection, "keypoint_method": "newer-v1"})
+        else:
+            plan = requeue.plan_new_method("SessionFit" if name == "TrialInput" else name, "newer")
+            assert list(requeue.carry_out(plan)) == [1]
+        found = {t.table: t.errors for t in populate([name]).tables if t.errors}
+        assert found == {name: {"SOLVER_UNKNOWN": 1}}
+        if name == "SubjectChoice":
+            tracking.TrackingSelection.update1(tracked)
+            queue.reset(queue.errors_of(tracking.SubjectChoice, None, None))
+            populate()
+    remove_all()
+    for table, _ in stages.values():
+        prefix = table.primary_key[0].removesuffix("_method")
+        (table & {f"{prefix}_method": "newer-v1"}).delete(prompt=False)

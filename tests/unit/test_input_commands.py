@@ -11,7 +11,7 @@ from pbl_pipeline import pipeline
 from pbl_pipeline.body import load_marker_set
 from pbl_pipeline.cli._options import fit_paramset
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import GaussNewtonParams, ImplicitAdamParams, Params
+from pbl_pipeline.fit import GaussNewtonParams, ImplicitAdamParams, Params, default_method
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.methods import Stage
 from pbl_pipeline.video import load_attitude
@@ -189,6 +189,27 @@ def test_markers_have_a_paramset_of_their_own(fits, tmp_path):
     succeeds(pbl("fit", tmp_path / "k.npz", "--out", tmp_path / "out"))
     succeeds(pbl("fit", tmp_path / "walk.trc", *more, "--solver", "implicit-adam"))
     assert [c["paramset"].name for c in fits] == ["markers", "usual", "paper"]
+
+
+@pytest.mark.parametrize(
+    ("markers", "root_relative", "expected"),
+    [
+        ("bml_movi_87", False, "gauss-newton"),
+        ("bml_movi_87", True, "blazepose"),
+        ("blazepose_33", True, "blazepose"),
+        ("mpi_inf_3dhp_17", False, "blazepose"),
+    ],
+)
+def test_the_fit_follows_from_the_points(fits, tmp_path, markers, root_relative, expected):
+    """As in the tables (tests/integration/test_model_tables.py)."""
+    path = tmp_path / "walk.keypoints.npz"
+    seen = keypoints(marker_set=markers, root_relative=root_relative)
+    seen.save(path)
+    succeeds(pbl("fit", path, "--out", tmp_path / "out"))
+    succeeds(pbl("fit", path, "--out", tmp_path / "out", "--params", "markers"))
+    assert [c["paramset"].name for c in fits] == [expected, "markers"]
+    other = keypoints(marker_set="bml_movi_87", root_relative=False)
+    assert default_method([seen, other]) == ("gauss-newton" if expected == "gauss-newton" else "blazepose")
 
 
 def test_changes_to_a_named_paramset(tmp_path):
