@@ -16,15 +16,12 @@ from pbl_pipeline.fit import Params as FitParams
 from pbl_pipeline.fit import SessionFit, TrialFit, check_trial, default_for_points, fit_session
 from pbl_pipeline.gait import DEFAULT_NORM, GaitMetrics, gait_metrics, load_norm
 from pbl_pipeline.keypoints import (
-    BlazePoseLandmarks,
     KeypointParams,
     Keypoints,
-    ModelKeypointParams,
     check_keypoints,
     detect_keypoints,
 )
 from pbl_pipeline.methods import Method
-from pbl_pipeline.models import find, load_spec
 from pbl_pipeline.names import distinct
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import WARN, Check
@@ -82,10 +79,7 @@ def fit_default(keypoints: Method[KeypointParams]) -> str:
 
     Raises `PblError` MODEL_MISSING, MODEL_INVALID for a model that is not registered here.
     """
-    if not isinstance(keypoints.params, ModelKeypointParams):
-        return default_for_points(BlazePoseLandmarks.marker_set, BlazePoseLandmarks.root_relative)
-    spec = load_spec(find(keypoints.params.model.name))
-    return default_for_points(spec.marker_set, spec.kind != "crop3d")
+    return default_for_points(*keypoints.params.points())
 
 
 def detect_trial(

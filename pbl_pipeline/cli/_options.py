@@ -27,7 +27,10 @@ CAMERA_MOTION_HELP = "Default: handheld where the phone's orientation is known, 
 
 
 KEYPOINTS = click.option(
-    "--keypoints", "keypoints", metavar="NAME", help="Keypoint method: blazepose-33, or a model of `pbl models list`."
+    "--keypoints",
+    "keypoints",
+    metavar="NAME",
+    help="Keypoint method, such as blazepose-33, or a model of `pbl models list`.",
 )
 DEVICE = click.option(
     "--device",
@@ -37,7 +40,10 @@ DEVICE = click.option(
 
 
 PEOPLE = click.option(
-    "--people", "people", metavar="NAME", help="Tracking method: blazepose-tiles, or a detector of `pbl models list`."
+    "--people",
+    "people",
+    metavar="NAME",
+    help="Tracking method, such as blazepose-tiles, or a detector of `pbl models list`.",
 )
 
 

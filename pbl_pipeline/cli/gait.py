@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pbl_pipeline.gait import LabTrial
     from pbl_pipeline.qc import Check
 
-METHOD_HELP = "Event method: phase-transformer, zeni-2008 or oconnor-2007."
+METHOD_HELP = "Event method, such as phase-transformer, zeni-2008 or oconnor-2007."
 _EPILOG = """\b
 Example: pbl gait out/walk1.fit.npz out/walk2.fit.npz --out out/metrics.json
 Example: pbl gait lab/walk1.c3d lab/walk2.c3d --out lab/metrics.json"""

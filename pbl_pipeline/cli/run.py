@@ -35,7 +35,7 @@ from ._options import (
 @PEOPLE
 @KEYPOINTS
 @DEVICE
-@click.option("--solver", help="gauss-newton or implicit-adam; without it the solver of the paramset.")
+@click.option("--solver", help="Such as gauss-newton or implicit-adam; without it the solver of the paramset.")
 @click.option("--params", help="Name of a paramset, or a JSON file with changes to one (docs/files.md).")
 @click.option("--norm", help="Normative set of the GDI.")
 @click.option("--subject", default="-", help="Code of the subject on the report; never a name.")

@@ -60,6 +60,11 @@ class ModelKeypointParams(KeypointParams):
     sides: FlipParams | None = None
     model: ModelParams = dataclasses.field(kw_only=True)
 
+    def points(self) -> tuple[str, bool]:
+        """As the registered model has them. Raises `PblError` MODEL_MISSING, MODEL_INVALID."""
+        spec = load_spec(find(self.model.name))
+        return spec.marker_set, root_relative(spec)
+
 
 def model_params(name: str, n_augmentations: int | None = None) -> ModelParams:
     """The parameters of a registered model as it is now: 10 augmentations where it gives 3D, the picture and its mirror
@@ -104,7 +109,7 @@ class OnnxKeypoints:
         self.model_sha256 = spec.sha256
         self.names = spec.joint_names
         self.marker_set = spec.marker_set
-        self.root_relative = spec.kind != "crop3d"
+        self.root_relative = root_relative(spec)
         self.device, self.note = self._model.device, self._model.note
         self.batch = BATCH[self.device]
         self._augmentations = augmentations(params.n_augmentations)
@@ -179,6 +184,11 @@ class OnnxKeypoints:
         if spec.pixel_origin == "edge":
             points = points + edge_shift(heatmap.shape, size) - 0.5
         return points, score, None
+
+
+def root_relative(spec: ModelSpec) -> bool:
+    """Whether 3D points are relative to the root of the body; those of a crop model are put into the camera's frame."""
+    return spec.kind != "crop3d"
 
 
 def model_keypoint_params(name: str) -> ModelKeypointParams:

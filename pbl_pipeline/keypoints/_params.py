@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from ._blazepose import MODEL_SHA256
+from ._blazepose import MODEL_SHA256, BlazePoseLandmarks
 from ._flips import FlipParams
 
 
@@ -41,3 +41,7 @@ class KeypointParams:
     min_time_s: float = 1.0
     box_margin: float = 0.1
     confidence_curve: str = "blazepose-v1"
+
+    def points(self) -> tuple[str, bool]:
+        """Marker set of the keypoints, and whether their 3D is relative to the root of the body."""
+        return BlazePoseLandmarks.marker_set, BlazePoseLandmarks.root_relative
