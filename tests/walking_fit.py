@@ -2,30 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.video import Camera
 
 LEVEL_CAMERA_QUAT_WXYZ = np.array([0.5, -0.5, 0.5, -0.5])
 CYCLE_S, STANCE = 1.1, 0.61
-
-
-def _bump(phase: np.ndarray, centre: float, width: float) -> np.ndarray:
-    distance = (phase - centre + 0.5) % 1.0 - 0.5
-    return np.exp(-0.5 * (distance / width) ** 2)
-
-
-def joint_angles_deg(phase: np.ndarray) -> dict[str, np.ndarray]:
-    """Angles of one side over the phase 0..1 of its gait cycle: sums of bumps with the shape of normal gait."""
-    turn = 2 * np.pi * phase
-    return {
-        "hip_flexion": 12 + 22 * np.cos(turn - 0.2) - 3 * np.cos(2 * turn),
-        "hip_adduction": 1 + 5 * np.sin(turn - 0.4),
-        "hip_rotation": 2 + 4 * np.cos(turn + 1.0),
-        "knee_flexion": 5 + 13 * _bump(phase, 0.14, 0.06) + 55 * _bump(phase, 0.72, 0.085),
-        "ankle_angle": 8 * _bump(phase, 0.45, 0.14) - 16 * _bump(phase, 0.64, 0.05) - 5 * _bump(phase, 0.06, 0.04),
-    }
 
 
 def walking_fit(
@@ -49,27 +35,16 @@ def walking_fit(
     """
     time = np.arange(n_frames) / fps
     first, last = (0, n_frames) if seen is None else seen
-    qpos = np.zeros((n_frames, len(joint_names)))
-    column = {n: i for i, n in enumerate(joint_names)}
-    noise = np.random.default_rng(0)
-    path = (time - time[min(first, n_frames - 1)]) * speed_m_s * walks
-    qpos[:, column["pelvis_tx"]] = start_m[0]
-    qpos[:, column["pelvis_tz"]] = -(start_m[1] + path)  # the pelvis' z points to the right of the person: world -y
-    qpos[:, column["pelvis_ty"]] = start_m[2] - 0.975 + 0.02 * np.cos(4 * np.pi * time / CYCLE_S)
-    qpos[:, column["pelvis_rotation"]] = np.pi / 2
-    for side, shift in (("r", 0.0), ("l", 0.5)):
-        phase = (time / CYCLE_S + shift) % 1.0 if walks else np.full(n_frames, 0.3)
-        angles = joint_angles_deg(phase)
-        tired = 1 - 0.12 * (side == "l")
-        for joint, deg in angles.items():
-            wobble = np.interp(time, time[::20], noise.normal(0, 1.2, len(time[::20]))) if walks else 0.0
-            if joint == "knee_flexion":
-                qpos[:, column[f"knee_angle_{side}"]] = -np.radians(deg * tired + wobble)
-            else:
-                qpos[:, column[f"{joint}_{side}"]] = np.radians(deg + wobble)
-        arm = 22 * np.cos(2 * np.pi * (phase + 0.5))
-        qpos[:, column[f"arm_flex_{side}"]] = np.radians(arm)
-        qpos[:, column[f"elbow_flex_{side}"]] = np.radians(22)
+    # Standing still: one moment of the stance.
+    at_s = time if walks else np.full(n_frames, 0.3 * CYCLE_S)
+    started = start_m[1] - speed_m_s * (time[min(first, n_frames - 1)] if walks else at_s[0])
+    qpos = plain_walk(
+        at_s,
+        stride_s=CYCLE_S,
+        speed_m_per_s=speed_m_s,
+        start_m=(start_m[0], started),
+        camera_height_m=0.95 - start_m[2],
+    )
     away = np.ones(n_frames, bool)
     away[first:last] = False
     qpos[away] = np.nan
@@ -104,6 +79,13 @@ def walking_fit(
         loss=9.5,
         seconds=12.0,
     )
+
+
+def with_level_pelvis(fit: TrialFit) -> TrialFit:
+    """The fit without tilt and obliquity of the pelvis, so that its rotation is a turn about the vertical alone."""
+    qpos = fit.qpos.copy()
+    qpos[:, [fit.joint_names.index(n) for n in ("pelvis_tilt", "pelvis_list")]] *= 0
+    return dataclasses.replace(fit, qpos=qpos)
 
 
 def foot_events(stop_s: float, start_s: float = 0.0) -> list[tuple[float, str, str]]:

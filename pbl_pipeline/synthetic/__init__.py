@@ -3,8 +3,9 @@
 For tests, for `pbl bench fit` and for the calibration of the fit's uncertainties. Everything is a function of a seed.
 World frame: z up, metres, the phone at the origin and 1.2 m above the floor, the walk ahead of it along x.
 
-Two walkers: `walk_qpos` (textbook curves; what the benchmark's figures were measured with) and `synthesise` (published
-curves, feet that stand still, impairments, other tasks; `pbl synth`).
+One walker in three depths: `plain_walk` (textbook curves and nothing else), `walk_qpos` (the same curves, and persons
+who differ and vary; what the benchmark's figures were measured with) and `synthesise` (legs by published curves at any
+speed, feet that stand still, impairments, other tasks; `pbl synth`).
 """
 
 from pbl_pipeline.gait.normative import GaitNorm, gait_norm
@@ -17,7 +18,7 @@ from ._path import PATHS
 from ._person import person, true_markers
 from ._synth import TASKS, Synthetic, SynthSpec, Truth, speed_of_group, synthesise
 from ._views import VIEW_CAMERA, VIEW_SIZE_PX, observe_markers, observe_views
-from ._walk import walk_qpos
+from ._walk import plain_walk, walk_qpos
 
 __all__ = [
     "BLAZEPOSE_NOISE",
@@ -45,6 +46,7 @@ __all__ = [
     "pelvis_positions",
     "person",
     "picture_px",
+    "plain_walk",
     "speed_of_group",
     "synthesise",
     "true_markers",

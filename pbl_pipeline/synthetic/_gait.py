@@ -4,41 +4,43 @@ from __future__ import annotations
 
 import numpy as np
 
+from pbl_pipeline.gait.normative import harmonic_sum
+
 #: Degrees over one gait cycle of one side, its foot contact at phase 0: the mean, then (cosine, sine) of harmonic 1, 2
 #: and so on. The project's own numbers: harmonics through values written down every 5 % of the cycle to follow the
 #: course of textbook curves of healthy adults at their own speed (Perry and Burnfield, Gait Analysis, 2010; the shape
 #: of the group means of Schwartz et al. 2008, J Biomech 41:1639). Hip flexion is taken against a pelvis that is tipped
 #: forward by 10 deg. Subtalar: inversion positive; mtp: extension positive.
-SIDE_CURVES_DEG: dict[str, tuple[float, tuple[tuple[float, float], ...]]] = {
-    "hip_flexion": (18.0, ((21.0, -3.9), (-3.3, -0.9), (-0.1, 1.2), (-0.2, -0.2))),
-    "hip_adduction": (0.0, ((1.7, 5.8), (-0.3, -0.8), (-0.9, 1.1), (-0.1, -0.1))),
-    "hip_rotation": (0.2, ((0.6, 2.8), (-0.3, 0.0), (-0.5, 1.1), (0.2, 0.0))),
-    "knee_flexion": (23.9, ((-1.7, -19.9), (-14.8, 6.4), (-0.8, 3.8), (-0.8, 0.1), (-0.2, 0.6), (0.2, 0.0))),
-    "ankle_angle": (1.0, ((-1.7, 6.2), (2.0, -7.0), (-3.9, -0.1), (1.7, 0.2), (0.0, -1.0), (0.2, 0.3), (0.5, -0.2))),
-    "subtalar_angle": (0.5, ((-0.9, -4.2), (1.1, 0.8), (0.5, -0.9))),
-    "mtp_angle": (8.5, ((-4.0, -7.2), (5.1, 1.7), (-1.2, -4.1), (0.6, 1.2), (0.7, -0.8))),
+SIDE_CURVES_DEG: dict[str, tuple[float, ...]] = {
+    "hip_flexion": (18.0, 21.0, -3.9, -3.3, -0.9, -0.1, 1.2, -0.2, -0.2),
+    "hip_adduction": (0.0, 1.7, 5.8, -0.3, -0.8, -0.9, 1.1, -0.1, -0.1),
+    "hip_rotation": (0.2, 0.6, 2.8, -0.3, 0.0, -0.5, 1.1, 0.2, 0.0),
+    "knee_flexion": (23.9, -1.7, -19.9, -14.8, 6.4, -0.8, 3.8, -0.8, 0.1, -0.2, 0.6, 0.2, 0.0),
+    "ankle_angle": (1.0, -1.7, 6.2, 2.0, -7.0, -3.9, -0.1, 1.7, 0.2, 0.0, -1.0, 0.2, 0.3, 0.5, -0.2),
+    "subtalar_angle": (0.5, -0.9, -4.2, 1.1, 0.8, 0.5, -0.9),
+    "mtp_angle": (8.5, -4.0, -7.2, 5.1, 1.7, -1.2, -4.1, 0.6, 1.2, 0.7, -0.8),
     # The arm swings against the leg of its side and is furthest back at that side's foot contact.
-    "arm_flex": (-7.0, ((-16.0, 2.0), (0.8, 0.3))),
-    "arm_add": (-9.0, ((0.8, 1.2), (0.4, 0.0))),
-    "arm_rot": (4.0, ((-3.0, 1.0),)),
-    "elbow_flex": (28.0, ((-9.0, 1.5), (1.5, -0.5))),
-    "pro_sup": (85.0, ((3.0, 1.0),)),
-    "wrist_flex": (6.0, ((-3.0, 1.0),)),
-    "wrist_dev": (2.0, ((1.0, 0.5),)),
+    "arm_flex": (-7.0, -16.0, 2.0, 0.8, 0.3),
+    "arm_add": (-9.0, 0.8, 1.2, 0.4, 0.0),
+    "arm_rot": (4.0, -3.0, 1.0),
+    "elbow_flex": (28.0, -9.0, 1.5, 1.5, -0.5),
+    "pro_sup": (85.0, 3.0, 1.0),
+    "wrist_flex": (6.0, -3.0, 1.0),
+    "wrist_dev": (2.0, 1.0, 0.5),
 }
 
 #: The same for pelvis and trunk over the cycle of the right side. Pelvis: posterior tilt, right side down and right
 #: side ahead positive, against the walking direction (the signs of the model's axes forward, up, right).
-MIDDLE_CURVES_DEG: dict[str, tuple[float, tuple[tuple[float, float], ...]]] = {
-    "tilt": (-10.0, ((0.0, 0.0), (0.8, 0.9))),
-    "list": (0.0, ((-2.3, -2.8), (0.0, 0.0), (-0.6, 0.5))),
-    "rotation": (0.0, ((4.2, -1.2), (0.0, 0.0), (0.4, 0.3))),
-    "lumbar_extension": (6.0, ((0.0, 0.0), (-0.9, -0.7))),
-    "lumbar_bending": (0.0, ((2.6, 3.3), (0.0, 0.0), (0.5, -0.4))),
-    "lumbar_rotation": (0.0, ((-8.2, 1.6), (0.0, 0.0), (-0.3, -0.2))),
-    "neck_extension": (2.0, ((0.0, 0.0), (0.5, -0.4))),
-    "neck_bending": (0.0, ((-0.4, -0.6),)),
-    "neck_rotation": (0.0, ((3.6, -0.4),)),
+MIDDLE_CURVES_DEG: dict[str, tuple[float, ...]] = {
+    "tilt": (-10.0, 0.0, 0.0, 0.8, 0.9),
+    "list": (0.0, -2.3, -2.8, 0.0, 0.0, -0.6, 0.5),
+    "rotation": (0.0, 4.2, -1.2, 0.0, 0.0, 0.4, 0.3),
+    "lumbar_extension": (6.0, 0.0, 0.0, -0.9, -0.7),
+    "lumbar_bending": (0.0, 2.6, 3.3, 0.0, 0.0, 0.5, -0.4),
+    "lumbar_rotation": (0.0, -8.2, 1.6, 0.0, 0.0, -0.3, -0.2),
+    "neck_extension": (2.0, 0.0, 0.0, 0.5, -0.4),
+    "neck_bending": (0.0, -0.4, -0.6),
+    "neck_rotation": (0.0, 3.6, -0.4),
 }
 
 #: How the means of the curves differ between people (standard deviation, deg), about what Schwartz et al. 2008 give
@@ -70,12 +72,9 @@ OFFSET_SD_DEG: dict[str, float] = {
 }
 
 
-def harmonics(phase_rad: np.ndarray, mean: float, terms: tuple[tuple[float, float], ...]) -> np.ndarray:
-    """The mean and the sum of `cosine * cos(k phase) + sine * sin(k phase)` over k = 1, 2, ..."""
-    out = np.full(np.shape(phase_rad), mean)
-    for k, (cosine, sine) in enumerate(terms, 1):
-        out += cosine * np.cos(k * phase_rad) + sine * np.sin(k * phase_rad)
-    return out
+def swing(curve: tuple[float, ...], phase_rad: np.ndarray) -> np.ndarray:
+    """A curve of `SIDE_CURVES_DEG` or `MIDDLE_CURVES_DEG` at phases, without its mean."""
+    return harmonic_sum(np.array([0.0, *curve[1:]]), phase_rad)
 
 
 def wander(

@@ -13,7 +13,7 @@ from pbl_pipeline.body import joint_of, load_body
 from pbl_pipeline.gait import LEG_ANGLES
 from pbl_pipeline.gait.normative import GRAVITY, gait_norm, harmonic_sum
 
-from ._gait import MIDDLE_CURVES_DEG, OFFSET_SD_DEG, SIDE_CURVES_DEG, harmonics, wander, within
+from ._gait import MIDDLE_CURVES_DEG, OFFSET_SD_DEG, SIDE_CURVES_DEG, swing, wander, within
 from ._impair import Style
 from ._plan import GRID_STEP_S, Plan
 
@@ -128,14 +128,14 @@ def reference(
         rest = sign * posture["tilt"] if angle == "pelvis_tilt" else np.zeros(len(t))
         q[:, column[f"pelvis_{joint}"]] = sign * (walks * deg + (1 - walks) * rest)
 
-    for joint, (mean, terms) in SIDE_CURVES_DEG.items():
+    for joint, curve in SIDE_CURVES_DEG.items():
         if joint in LEG_ANGLES.values():
             continue
         middle, size = within(rng, 0.0, OFFSET_SD_DEG[joint]), within(rng, 1.0, 0.08)
         foot = joint in ("subtalar_angle", "mtp_angle")
         for side in "rl":
             gain = size * (walks if foot else walks * pace * style.arm_swing[side])
-            deg = mean + (0.3 if foot else 1.0) * middle + gain * harmonics(phases[side], 0.0, terms)
+            deg = curve[0] + (0.3 if foot else 1.0) * middle + gain * swing(curve, phases[side])
             deg = deg + wander(rng, t, WALK_MEAN_SD_DEG, *_SLOW_HZ)
             if joint == "elbow_flex":
                 deg = deg + style.elbow[side] * walks
@@ -144,11 +144,11 @@ def reference(
             elif foot:
                 deg = walks * deg
             q[:, column[f"{joint}_{side}"]] = deg
-    for joint, (mean, terms) in MIDDLE_CURVES_DEG.items():
+    for joint, curve in MIDDLE_CURVES_DEG.items():
         if joint not in column:
             continue
         middle, size = within(rng, 0.0, 0.7 * OFFSET_SD_DEG[joint]), within(rng, 1.0, 0.08)
-        deg = mean + middle + walks * size * harmonics(phases["r"], 0.0, terms)
+        deg = curve[0] + middle + walks * size * swing(curve, phases["r"])
         deg = deg + wander(rng, t, WALK_MEAN_SD_DEG, *_SLOW_HZ)
         if joint == "lumbar_bending":
             # Positive to the right: over the right foot in its stance.

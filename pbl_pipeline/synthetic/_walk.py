@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import joint_of, load_body
 
-from ._gait import MIDDLE_CURVES_DEG, OFFSET_SD_DEG, SIDE_CURVES_DEG, harmonics, wander, within
+from ._gait import MIDDLE_CURVES_DEG, OFFSET_SD_DEG, SIDE_CURVES_DEG, swing, wander, within
 from ._path import choose_path, floor_path
 
 #: How people differ: stride time and length of healthy adults (Perry and Burnfield 2010: 1.06 to 1.12 s, 1.3 to 1.5 m).
@@ -21,6 +23,8 @@ WALK_RANGE_SD, WALK_MEAN_SD_DEG, WALK_PHASE_SD = 0.04, 1.0, 0.06
 _SLOW_HZ = (0.05, 0.7)
 #: Way of the pelvis (m) within a stride: up and down, side to side, ahead and back of steady travel.
 BOB_M, SWAY_M, SURGE_M = 0.020, 0.022, 0.012
+#: The pelvis' own angles among `MIDDLE_CURVES_DEG`.
+_PELVIS = ("tilt", "list", "rotation")
 #: Turns the body's frame (x forward, y up, z right) into the world's (z up).
 _UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
@@ -74,44 +78,77 @@ def walk_qpos(
     surge = SURGE_M * np.sin(2 * phase + 0.4) + wander(rng, time_s, 0.03, *_SLOW_HZ)
     floor = floor + surge[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
 
-    body = load_body()
-    column = {n: i for i, n in enumerate(body.joint_names)}
-    qpos = np.zeros((len(time_s), len(body.joint_names)))
+    angles = {}
     for angle, curve in SIDE_CURVES_DEG.items():
         size, middle = within(rng, 1.0, RANGE_SD), within(rng, 0.0, OFFSET_SD_DEG[angle])
         for side, shift in (("r", 0.0), ("l", np.pi)):
             own_size, own_middle = within(rng, size, SIDES_SD), middle + within(rng, 0.0, 0.3 * OFFSET_SD_DEG[angle])
-            deg = _curve(rng, time_s, phase + shift, curve, own_size, own_middle)
-            joint, sign = joint_of(f"{angle}_{side}")
-            qpos[:, column[joint]] = sign * np.radians(deg)
-    pelvis = {}
-    for joint, curve in MIDDLE_CURVES_DEG.items():
-        size, middle = within(rng, 1.0, RANGE_SD), within(rng, 0.0, OFFSET_SD_DEG[joint])
-        rad = np.radians(_curve(rng, time_s, phase, curve, size, middle))
-        if joint in column:
-            qpos[:, column[joint]] = rad
-        else:
-            pelvis[joint] = rad
+            angles[f"{angle}_{side}"] = _curve(rng, time_s, phase + shift, curve, own_size, own_middle)
+    for angle, curve in MIDDLE_CURVES_DEG.items():
+        size, middle = within(rng, 1.0, RANGE_SD), within(rng, 0.0, OFFSET_SD_DEG[angle])
+        angles[angle] = _curve(rng, time_s, phase, curve, size, middle)
+    aside = SWAY_M * np.sin(phase - 0.3) + wander(rng, time_s, 0.008, *_SLOW_HZ)
+    bob = -BOB_M * np.cos(2 * phase - 0.6) + wander(rng, time_s, 0.004, *_SLOW_HZ)
+    return _qpos(angles, floor, heading, aside, pelvis_height_m - camera_height_m + bob)
 
-    angles = np.column_stack([pelvis["tilt"], pelvis["list"], pelvis["rotation"]])
-    for name, rad in zip(("tilt", "list", "rotation"), pelvis_joints(angles, heading).T, strict=True):
+
+def plain_walk(
+    time_s: Float[np.ndarray, " T"],
+    *,
+    stride_s: float = STRIDE_S[0],
+    speed_m_per_s: float = 1.2,
+    heading_rad: float = np.pi / 2,
+    start_m: tuple[float, float] = (6.0, -1.8),
+    camera_height_m: float = 1.2,
+    pelvis_height_m: float = 0.95,
+) -> Float[np.ndarray, "T 40"]:
+    """Joint values (T, 40) of the mean of all walkers of `walk_qpos`, who goes straight ahead and varies in nothing.
+
+    The right foot comes down at whole multiples of `stride_s`, the left one half a stride later; the pelvis is above
+    `start_m` at time 0.
+    """
+    time_s = np.asarray(time_s, np.float64)
+    phase = 2 * np.pi * time_s / stride_s
+    angles = {a: c[0] + swing(c, phase) for a, c in MIDDLE_CURVES_DEG.items()}
+    for side, shift in (("r", 0.0), ("l", np.pi)):
+        angles |= {f"{a}_{side}": c[0] + swing(c, phase + shift) for a, c in SIDE_CURVES_DEG.items()}
+    heading = np.full(len(time_s), float(heading_rad))
+    ahead = np.column_stack([np.cos(heading), np.sin(heading)])
+    floor = np.asarray(start_m) + speed_m_per_s * time_s[:, None] * ahead
+    height = pelvis_height_m - camera_height_m - BOB_M * np.cos(2 * phase - 0.6)
+    return _qpos(angles, floor, heading, SWAY_M * np.sin(phase - 0.3), height)
+
+
+def _qpos(
+    angles_deg: Mapping[str, np.ndarray],
+    floor_m: Float[np.ndarray, "T 2"],
+    heading_rad: Float[np.ndarray, " T"],
+    aside_m: Float[np.ndarray, " T"],
+    height_m: Float[np.ndarray, " T"],
+) -> Float[np.ndarray, "T 40"]:
+    """Joint values from angles and the pelvis' way: `floor_m`, `aside_m` to its right, `height_m` in the world."""
+    body = load_body()
+    column = {n: i for i, n in enumerate(body.joint_names)}
+    qpos = np.zeros((len(heading_rad), len(body.joint_names)))
+    pelvis = [np.radians(angles_deg[name]) for name in _PELVIS]
+    for angle, deg in angles_deg.items():
+        if angle not in _PELVIS:
+            joint, sign = joint_of(angle)
+            qpos[:, column[joint]] = sign * np.radians(deg)
+    for name, rad in zip(_PELVIS, pelvis_joints(np.column_stack(pelvis), heading_rad).T, strict=True):
         qpos[:, column[f"pelvis_{name}"]] = rad
     # Over the standing foot: to the right in the right side's stance; highest in the middle of each stance.
-    right = np.column_stack([np.sin(heading), -np.cos(heading)])
-    floor = floor + (SWAY_M * np.sin(phase - 0.3) + wander(rng, time_s, 0.008, *_SLOW_HZ))[:, None] * right
-    bob = -BOB_M * np.cos(2 * phase - 0.6) + wander(rng, time_s, 0.004, *_SLOW_HZ)
-    height = pelvis_height_m - camera_height_m + bob
+    floor = floor_m + aside_m[:, None] * np.column_stack([np.sin(heading_rad), -np.cos(heading_rad)])
     rest = body.mj_model.body("pelvis").pos
     qpos[:, column["pelvis_tx"]] = floor[:, 0] - rest[0]
     qpos[:, column["pelvis_tz"]] = -(floor[:, 1] - rest[1])
-    qpos[:, column["pelvis_ty"]] = height - rest[2]
+    qpos[:, column["pelvis_ty"]] = height_m - rest[2]
     return qpos
 
 
 def _curve(rng, time_s: np.ndarray, phase: np.ndarray, curve, size: float, middle: float) -> np.ndarray:
-    mean, terms = curve
-    swing = harmonics(phase, 0.0, terms) * size * (1 + wander(rng, time_s, WALK_RANGE_SD, *_SLOW_HZ))
-    return mean + middle + swing + wander(rng, time_s, WALK_MEAN_SD_DEG, *_SLOW_HZ)
+    moving = swing(curve, phase) * size * (1 + wander(rng, time_s, WALK_RANGE_SD, *_SLOW_HZ))
+    return curve[0] + middle + moving + wander(rng, time_s, WALK_MEAN_SD_DEG, *_SLOW_HZ)
 
 
 def pelvis_joints(angles_rad: Float[np.ndarray, "T 3"], heading_rad: Float[np.ndarray, " T"]) -> np.ndarray:

@@ -20,10 +20,11 @@ from pbl_pipeline.body import load_body
 from pbl_pipeline.fit import SessionFit
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.qc import Check
+from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.video import VideoInfo, probe
 from tests.videos import constant_rate, numbered_frames, write_video
-from tests.walker import observe, walking_qpos
+from tests.walker import observe
 from tests.walking_fit import walking_fit
 
 N_FRAMES = 240
@@ -58,7 +59,7 @@ def _person(number: int, x: np.ndarray, height: float) -> PersonTrack:
 def detect_keypoints(video_path, tracking, person_id, camera, params=None) -> Keypoints:
     """The synthetic walker, seen without noise; person 2 is another height in the picture."""
     time = tracking.time_s
-    found = observe(walking_qpos(time, start_m=(7.0 if person_id == 1 else 9.0, -3.0)), time)
+    found = observe(plain_walk(time, start_m=(7.0 if person_id == 1 else 9.0, -3.0)), time)
     return dataclasses.replace(found, camera=camera)
 
 

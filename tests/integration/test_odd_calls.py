@@ -13,9 +13,10 @@ import pytest
 
 import pbl_pipeline.gait
 from pbl_pipeline.body import load_body
+from pbl_pipeline.synthetic import plain_walk
 from tests.command import Done, pbl
 from tests.videos import constant_rate, numbered_frames, write_video
-from tests.walker import observe, walking_qpos
+from tests.walker import observe
 from tests.walking_fit import walking_fit
 
 
@@ -29,7 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "p.jpg").rename(folder / "picture.mp4")
     (folder / "file").touch()
     time_s = np.arange(120) / 30
-    observe(walking_qpos(time_s), time_s).save(folder / "walk.keypoints.npz")
+    observe(plain_walk(time_s), time_s).save(folder / "walk.keypoints.npz")
     body = load_body()
     walking_fit(body.joint_names, body.sha256, name="walk", n_frames=120).save(folder / "walk.fit.npz")
     _damaged(folder)

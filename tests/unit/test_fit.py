@@ -35,8 +35,9 @@ from pbl_pipeline.fit._trajectory import fit_ranges, pose_of, raw_of
 from pbl_pipeline.fit.solvers import Solution
 from pbl_pipeline.keypoints import bridge_gaps, longest_run_s, whole_person_in_view
 from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.video import undistort_px
-from tests.walker import CAMERA, observe, walking_qpos
+from tests.walker import CAMERA, observe
 
 TIME_S = np.arange(0, 2.6, 1 / 30)
 
@@ -53,8 +54,8 @@ def two_trials():
     """Two trials of one person of other size, in opposite directions, with noise; and their fit."""
     scale = np.full(8, 1.06)
     truth = [
-        walking_qpos(TIME_S, heading_rad=np.pi / 2, start_m=(6.0, -1.5)),
-        walking_qpos(TIME_S, heading_rad=-np.pi / 2, start_m=(6.5, 1.5), stride_s=1.25),
+        plain_walk(TIME_S, heading_rad=np.pi / 2, start_m=(6.0, -1.5)),
+        plain_walk(TIME_S, heading_rad=-np.pi / 2, start_m=(6.5, 1.5), stride_s=1.25),
     ]
     seen = [observe(q, TIME_S, noise_px=2.0, noise_m=0.01, scale=scale, seed=i) for i, q in enumerate(truth)]
     return truth, seen, fit_session(seen, ["left", "right"], quick())
@@ -142,14 +143,14 @@ def test_frames_outside_the_view_are_unknown(two_trials):
     ],
 )
 def test_bad_keypoints_are_refused(change, code, text):
-    k = dataclasses.replace(observe(walking_qpos(TIME_S), TIME_S), **change)
+    k = dataclasses.replace(observe(plain_walk(TIME_S), TIME_S), **change)
     with pytest.raises(PblError, match=text) as error:
         fit_session([k], ["a"], quick(250))
     assert error.value.code == code
 
 
 def test_under_a_second_in_view_is_refused():
-    k = observe(walking_qpos(TIME_S), TIME_S)
+    k = observe(plain_walk(TIME_S), TIME_S)
     confidence = np.where(np.arange(len(TIME_S)) < 25, 0.9, 0.0)[:, None].repeat(33, axis=1)
     with pytest.raises(PblError, match=r"0\.80 s") as error:
         fit_session([dataclasses.replace(k, confidence=confidence)], ["a"], quick(250))
@@ -259,14 +260,14 @@ def test_short_gaps_are_bridged_and_long_ones_are_not():
 
 
 def test_person_cut_by_the_border_is_not_in_view():
-    k = observe(walking_qpos(TIME_S), TIME_S)
+    k = observe(plain_walk(TIME_S), TIME_S)
     xy = k.xy_px.copy()
     xy[5, 27:33] += [0, 2000.0]  # feet below the picture
     assert np.flatnonzero(~whole_person_in_view(dataclasses.replace(k, xy_px=xy), 0.3)).tolist() == [5]
 
 
 def test_markers_that_the_detector_never_gives_do_not_hide_the_person():
-    k = observe(walking_qpos(TIME_S), TIME_S)
+    k = observe(plain_walk(TIME_S), TIME_S)
     c = k.confidence.copy()
     c[:, :6] = 0.0
     assert whole_person_in_view(dataclasses.replace(k, confidence=c), 0.3).all()
@@ -284,7 +285,7 @@ def test_paramsets_survive_json_and_name_their_steps():
 
 
 def test_where_nothing_was_seen_nothing_is_known():
-    k = observe(walking_qpos(TIME_S), TIME_S)
+    k = observe(plain_walk(TIME_S), TIME_S)
     confidence = k.confidence.copy()
     confidence[20:23] = 0  # 0.1 s: bridged
     confidence[40:62] = 0  # 0.7 s: left unknown
@@ -319,7 +320,7 @@ def test_convergence_is_judged_by_the_second_half_and_needs_a_trace():
 
 
 def test_an_unmeasured_camera_is_told():
-    k = observe(walking_qpos(TIME_S), TIME_S)
+    k = observe(plain_walk(TIME_S), TIME_S)
     guessed = dataclasses.replace(k, camera=dataclasses.replace(k.camera, source="estimated: by somebody"))
     checks = {c.check: c for c in fit_session([guessed], ["a"], quick(250)).qc}
     assert checks["camera_intrinsics_measured"].outcome == "WARN"

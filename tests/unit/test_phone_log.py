@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import check_trial
+from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.video import Attitude, load_attitude, probe, read_phone_log
 from pbl_pipeline.video._attitude import held_deg
 from pbl_pipeline.video._clock import match_pictures
 from tests.inputs import csv_log
 from tests.phone_film import EPOCH_NS, as_json, as_zip, device_quat, film, hand, sensor_logger
 from tests.unit.test_camera_sources import video
-from tests.walker import observe, walking_qpos
+from tests.walker import observe
 
 BEGIN_S, SECONDS = 3.25, 6.0
 
@@ -291,7 +292,7 @@ def test_a_log_shorter_than_the_video(tmp_path, info):
 
 
 def test_a_log_that_covers_half_the_trial_is_left_out_of_the_session():
-    walk = observe(walking_qpos(np.arange(120) / 30), np.arange(120) / 30)
+    walk = observe(plain_walk(np.arange(120) / 30), np.arange(120) / 30)
     quat = hand(np.arange(3.0)).as_quat(scalar_first=True)
     whole = dataclasses.replace(walk, phone_time_s=np.array([0, 2.0, 4.0]), phone_quat_wxyz=quat)
     used, _ = check_trial(whole, "walk")

@@ -15,10 +15,10 @@ from pbl_pipeline.fit._place import pelvis_path
 from pbl_pipeline.fit._quality import FACING_FAIL_DEG, _depth
 from pbl_pipeline.keypoints import check_keypoints
 from tests.inputs import keypoints
-from tests.walking_fit import LEVEL_CAMERA_QUAT_WXYZ, walking_fit
+from tests.walking_fit import LEVEL_CAMERA_QUAT_WXYZ, walking_fit, with_level_pelvis
 
 BODY = load_body()
-FIT = walking_fit(BODY.joint_names, BODY.sha256, name="walk", n_frames=60)
+FIT = with_level_pelvis(walking_fit(BODY.joint_names, BODY.sha256, name="walk", n_frames=60))
 
 
 def looking(angle_deg: float) -> Any:

@@ -31,10 +31,9 @@ from pbl_pipeline.render import (
     to_camera,
     to_pixels,
 )
-from pbl_pipeline.synthetic import NO_NOISE, observe
+from pbl_pipeline.synthetic import NO_NOISE, observe, plain_walk
 from pbl_pipeline.video import Camera, probe, read_frames
 from tests.videos import write_video
-from tests.walker import walking_qpos
 from tests.walking_fit import LEVEL_CAMERA_QUAT_WXYZ, walking_fit
 
 CAMERA = Camera(np.array([[500.0, 0, 320], [0, 500, 180], [0, 0, 1]]), np.zeros(5), "test")
@@ -293,7 +292,7 @@ def test_the_fit_of_a_tilted_camera_lies_on_the_person(tilt_deg: tuple[float, fl
     """The vertical is estimated from the walk, and the body stays where it is seen, upright in the world."""
     time_s = np.arange(120) / 30
     # A camera 1.2 m above the ground sees her walk from right to left.
-    qpos = walking_qpos(time_s, start_m=(5.0, -2.4))
+    qpos = plain_walk(time_s, start_m=(5.0, -2.4))
     seen = observe(qpos, time_s, noise=NO_NOISE, tilt_deg=tilt_deg)
     fit = fit_session([seen.keypoints], ["walk"]).trials[0]
     assert fit.orientation_source == "estimated: gait"

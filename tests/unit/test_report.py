@@ -103,7 +103,7 @@ def _session(*fits: TrialFit, qc: tuple[Check, ...] = (Check("residual_3d_cm", P
 @pytest.fixture(scope="module")
 def walk() -> TrialFit:
     body = load_body()
-    return walking_fit(body.joint_names, body.sha256, n_frames=N, seen=(10, 190))
+    return walking_fit(body.joint_names, body.sha256, n_frames=N, seen=(10, 190), speed_m_s=0.5)  # her feet slide
 
 
 @pytest.fixture(scope="module")

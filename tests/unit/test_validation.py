@@ -32,7 +32,7 @@ from pbl_pipeline.validation import (
     reference_of_qpos,
     view_classes,
 )
-from tests.walking_fit import walking_fit
+from tests.walking_fit import walking_fit, with_level_pelvis
 
 TIME = np.arange(200) / 100.0
 WAVE = 30 * np.sin(2 * np.pi * 1.1 * TIME) + 5 * np.cos(2 * np.pi * 2.3 * TIME)
@@ -377,6 +377,7 @@ def test_a_tilted_path_is_not_the_same_path():
 
 
 def test_another_world_costs_neither_path_nor_pelvis_angles(fit: TrialFit):
+    fit = with_level_pelvis(fit)
     moved = _turned(fit, 1.2, (2.0, -1.0, 0.5))
     result = compare(moved, reference_of_fit(fit, "x"))
     assert result.rte_m == pytest.approx(0, abs=1e-6)
