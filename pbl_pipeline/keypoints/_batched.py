@@ -1,4 +1,4 @@
-"""Looks at frames for a detector that takes several in one call: what waits goes together, up to its batch."""
+"""Inference by a detector that takes several frames in one call: what waits goes together, up to its batch."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class BatchDetector(Protocol):
     ) -> list[PersonKeypoints]: ...
 
 
-class BatchedLooks:
-    """As `Looks`, with one detector in one thread. Use as a context: leaving it drops what has not begun."""
+class BatchedInference:
+    """As `ParallelInference`, with one detector in one thread. As a context: leaving it drops what has not begun."""
 
     def __init__(self, detector: BatchDetector, camera: Camera) -> None:
         self._detector, self._camera = detector, camera
@@ -37,10 +37,10 @@ class BatchedLooks:
         self._closed = False
         self._thread = Thread(target=self._work, name="keypoints", daemon=True)
         self._thread.start()
-        #: As many looks are kept under way as if there were so many detectors, so that batches fill.
+        #: As many frames are kept under way as if there were so many detectors, so that batches fill.
         self.n_detectors = detector.batch
 
-    def __enter__(self) -> BatchedLooks:
+    def __enter__(self) -> BatchedInference:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -48,8 +48,8 @@ class BatchedLooks:
         self._waiting.put(None)
         self._thread.join()
 
-    def at(self, frame: Frame, roi_px: np.ndarray, *, quick: bool) -> Future[PersonKeypoints]:
-        """Look at the region `roi_px` (4,) of a frame, in the order of the calls."""
+    def submit(self, frame: Frame, roi_px: np.ndarray, *, quick: bool) -> Future[PersonKeypoints]:
+        """Detect in the region `roi_px` (4,) of a frame, in the order of the calls."""
         future: Future[PersonKeypoints] = Future()
         self._waiting.put((frame, np.array(roi_px, np.float64), quick, future))
         return future
@@ -74,9 +74,9 @@ class BatchedLooks:
                     kept = following
                     break
                 batch.append(following)
-            self._look(batch)
+            self._detect(batch)
 
-    def _look(self, batch: list[_Item]) -> None:
+    def _detect(self, batch: list[_Item]) -> None:
         try:
             images, rois = [i[0].image for i in batch], [i[1] for i in batch]
             found = self._detector.detect_many(images, rois, self._camera, quick=batch[0][2])

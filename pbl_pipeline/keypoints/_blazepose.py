@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 MODEL_SHA256 = "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f"
 INPUT_SIZE = 256
-#: The crop is this much larger than the body circle.
+#: The crop is this much larger than the region of interest.
 CROP_MARGIN = 1.25
 NAMES: tuple[str, ...] = (
     "nose",
@@ -65,7 +65,7 @@ NAMES: tuple[str, ...] = (
     "right_foot_index",
 )
 N_POINTS = len(NAMES)
-#: The network adds six points; the first two are the middle of the hips and a point of the body circle.
+#: The network adds six points; the first two are the middle of the hips and a point of the region of interest.
 N_ALL = 39
 #: For each point of the mirrored picture, whose it is: left and right change places.
 MIRROR = np.array(mirror_of(NAMES))

@@ -1,9 +1,10 @@
-"""Where to cut the person out of each frame: regions over time, smoothed, and corrected by a first look."""
+"""Where to cut the person out of each frame: regions over time, smoothed, and corrected by a first pass."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from ._params import KeypointParams
 from ._protocol import PersonKeypoints
 
 #: The Gaussian kernel is cut off at so many standard deviations.
@@ -55,8 +56,8 @@ def corrected(
     return found.roi_px if drift <= max_drift and growth <= np.log(max_growth) else roi
 
 
-def first_looks(rows: np.ndarray, time_s: np.ndarray, interval_s: float) -> np.ndarray:
-    """Those of the frames `rows` (K,) in which a first look corrects the crop: one in each `interval_s`, and the first
+def first_pass_rows(rows: np.ndarray, time_s: np.ndarray, interval_s: float) -> np.ndarray:
+    """Those of the frames `rows` (K,) in which a first pass corrects the crop: one in each `interval_s`, and the first
     and last of each run of frames that has no gap longer than that. 0: all of them."""
     if interval_s <= 0 or len(rows) < 2:
         return rows
@@ -70,3 +71,41 @@ def first_looks(rows: np.ndarray, time_s: np.ndarray, interval_s: float) -> np.n
             keep.append(row)
             next_s = t + interval_s
     return np.array(keep, dtype=rows.dtype)
+
+
+class Regions:
+    """Regions over a track (T, 4): the track's own in the first pass, corrected by its results in the second.
+
+    Attributes
+    ----------
+    track_px : (T, 4)
+        Of the track, NaN where the person is not in view.
+    rows
+        Frames in which the person is in view.
+    first
+        Those of the first pass; empty where `params.passes` is 1, and then the second takes the track's regions.
+    reach_s
+        A region of the second pass depends on results of the first up to so much later.
+    """
+
+    def __init__(self, track_px: np.ndarray, time_s: np.ndarray, params: KeypointParams) -> None:
+        self.track_px, self._time_s, self._params = track_px, time_s, params
+        self.rows = np.flatnonzero(np.isfinite(track_px).all(axis=1))
+        first = first_pass_rows(self.rows, time_s, params.first_look_s) if params.passes > 1 else self.rows[:0]
+        self.first = frozenset(first.tolist())
+        self.reach_s = REACH_SD * params.smooth_s if params.passes > 1 else 0.0
+        self._corrected_s = time_s[first]
+        self._corrected, self._n = np.empty((len(first), 4)), 0
+
+    def correct(self, row: int, found: PersonKeypoints) -> None:
+        """Take the result of the first pass in the next of its frames."""
+        p = self._params
+        self._corrected[self._n] = corrected(self.track_px[row], found, p.min_presence, p.max_drift, p.max_growth)
+        self._n += 1
+
+    def at(self, row: int) -> np.ndarray:
+        """Region (4,) of a frame in the second pass, by the results taken so far."""
+        if not self.first:
+            return self.track_px[row]
+        regions, at_s = self._corrected[: self._n], self._corrected_s[: self._n]
+        return smooth_at(regions, at_s, float(self._time_s[row]), self._params.smooth_s)

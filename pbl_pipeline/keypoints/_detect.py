@@ -1,9 +1,9 @@
 """Keypoints of one tracked person over a video.
 
-Two looks, because the crop decides the quality: the first, at some of the frames, cuts along the person's track, and
-its keypoints say where the body circle really is; the second, at every frame, cuts there, smoothed over time in both
+Two passes, because the crop decides the quality: the first, over some of the frames, cuts along the person's track, and
+its keypoints show the true region of interest; the second, over every frame, cuts there, smoothed over time in both
 directions (nothing is live here). The crop never feeds on itself from frame to frame, so it cannot wander off to
-somebody else: where the first look contradicts the track, the track wins.
+somebody else: where the first pass contradicts the track, the track wins.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.tracking import Tracking, time_in_view_s
 from pbl_pipeline.video import Camera, Frame, read_frames
 
-from ._batched import BatchDetector, BatchedLooks
+from ._batched import BatchDetector, BatchedInference
 from ._confidence import confidence_curve
-from ._crops import REACH_SD, corrected, first_looks, smooth_at, smooth_rois
+from ._crops import Regions, smooth_rois
 from ._flips import exchange_sides, exchanged, lowered
 from ._methods import METHODS
 from ._params import KeypointParams
-from ._passes import Looks, look_twice, n_workers
+from ._passes import ParallelInference, n_workers, two_passes
 from ._picture import Picture, PictureMeter
 from ._protocol import KeypointDetector, PersonKeypoints
 from ._types import Keypoints
@@ -73,12 +73,12 @@ def detect_keypoints(
     detectors = [detector] if detector is not None else _detectors(method)
     roi = smooth_rois(_rois(track.roi_px, track.box_px), tracking.time_s, params.smooth_s)
     meter = PictureMeter()
-    found = _look(detectors, video_path, roi, tracking.time_s, camera, params, meter)
+    found = _detect_all(detectors, video_path, roi, tracking.time_s, camera, params, meter)
     return _assemble(found, detectors[0], tracking, camera, params, meter.result())
 
 
 def _rois(roi: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """The body circles; where a detector gives only boxes, the circle around an upright body in the box."""
+    """The regions of interest; where a detector finds only boxes, the circle around an upright body in the box."""
     x0, y0, x1, y1 = box.T
     around = np.stack([(x0 + x1) / 2, (y0 + y1) / 2, np.maximum(x1 - x0, y1 - y0), np.zeros(len(box))], axis=1)
     return np.where(np.isfinite(roi).all(axis=1, keepdims=True), roi, around)
@@ -91,7 +91,7 @@ def _detectors(method: Method[KeypointParams]) -> list[KeypointDetector]:
     return [first, *(method.function(method.params) for _ in range(more))]
 
 
-def _look(
+def _detect_all(
     detectors: list[KeypointDetector],
     video_path: str | Path,
     roi: np.ndarray,
@@ -100,34 +100,21 @@ def _look(
     params: KeypointParams,
     meter: PictureMeter,
 ) -> list[PersonKeypoints | None]:
-    """What is seen in each frame, of the person whose body circle is `roi` (T, 4), NaN where she is not in view."""
-    rows = np.flatnonzero(np.isfinite(roi).all(axis=1))
-    firsts = first_looks(rows, time_s, params.first_look_s) if params.passes > 1 else rows[:0]
-    better, n_better = np.empty((len(firsts), 4)), 0
-
-    def correct(row: int, person: PersonKeypoints) -> None:
-        nonlocal n_better
-        better[n_better] = corrected(roi[row], person, params.min_presence, params.max_drift, params.max_growth)
-        n_better += 1
-
-    def region(row: int) -> np.ndarray:
-        if params.passes < 2:
-            return roi[row]
-        return smooth_at(better[:n_better], time_s[firsts[:n_better]], float(time_s[row]), params.smooth_s)
-
+    """What is seen in each frame, of the person whose region is `roi` (T, 4), NaN where she is not in view."""
+    regions = Regions(roi, time_s, params)
     found: list[PersonKeypoints | None] = [None] * len(roi)
-    frames = meter.watch(_in_view(video_path, rows), roi)
-    reach_s = REACH_SD * params.smooth_s if params.passes > 1 else 0.0
-    first = detectors[0]
-    with BatchedLooks(first, camera) if isinstance(first, BatchDetector) else Looks(detectors, camera) as looks:
-        seen = look_twice(frames, looks, time_s, reach_s, {int(r): roi[r] for r in firsts}, correct, region)
-        for row, person in progress.track(seen, "keypoints", total=len(rows)):
+    frames = meter.watch(_in_view(video_path, regions.rows), roi)
+    one = detectors[0]
+    batched = isinstance(one, BatchDetector)
+    with BatchedInference(one, camera) if batched else ParallelInference(detectors, camera) as inference:
+        seen = two_passes(frames, inference, time_s, regions)
+        for row, person in progress.track(seen, "keypoints", total=len(regions.rows)):
             found[row] = person
     n_seen = sum(person is not None for person in found)
-    if n_seen != len(rows):
+    if n_seen != len(regions.rows):
         raise PblError(
             "VIDEO_CHANGED",
-            found=f"{n_seen} of the {len(rows)} frames in which the person was tracked",
+            found=f"{n_seen} of the {len(regions.rows)} frames in which the person was tracked",
             expected="the video that was tracked",
             next_step="track the people again in this file",
             key=str(video_path),

@@ -12,17 +12,17 @@ from ._flips import FlipParams
 class KeypointParams:
     """Parameters of `detect_keypoints`.
 
-    passes: 1 cuts along the track only, 2 cuts again where the first look saw the body.
-    first_look_s: the first look is taken once in so many seconds, 0: at every frame.
+    passes: 1 cuts along the track only, 2 cuts again where the first pass found the body.
+    first_look_s: the first pass takes one frame in so many seconds, 0: every frame.
     smooth_s: standard deviation of the Gaussian that smooths the crops over time.
     min_presence: below it a frame has no person and its keypoints are missing.
-    max_drift, max_growth: the first look is believed where its body circle lies within this share of the side from
-    the track's, and differs from it in size by at most this factor.
+    max_drift, max_growth: the first pass is believed where its region lies within this fraction of the side from the
+    track's, and differs from it in size by at most this factor.
     agree_mm, agree_width_mm: how far the answers for the picture and its mirror image may lie apart, see
     `BlazePoseLandmarks`.
     sides: where left and right are exchanged back, see `exchange_sides`; None: nowhere.
     min_time_s: a person in view for less cannot be measured.
-    box_margin: added to the keypoints' box on each side, as a share of its size.
+    box_margin: added to the keypoints' box on each side, as a fraction of its size.
     confidence_curve: what the confidence is worth (`confidence_curve`), for the detector that the curve is of; empty
     where none is known.
     """

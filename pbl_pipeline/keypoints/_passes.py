@@ -1,6 +1,6 @@
-"""Two looks at each frame in one reading of the video, shared out to the cores.
+"""Two passes over the frames in one reading of the video, shared out to the cores.
 
-The second look at a frame needs what the first found up to `reach_s` later, so the frames of that time wait in memory
+The second pass over a frame needs what the first found up to `reach_s` later, so the frames of that time wait in memory
 (not converted, 3 MB each at 1080p) and the video is decoded once. Decoding, converting and the network all leave
 Python's lock, so they run side by side: one detector per core, each with one thread, is faster than one detector with
 several.
@@ -11,7 +11,7 @@ from __future__ import annotations
 import collections
 import os
 import queue
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Protocol
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from pbl_pipeline.video import Camera, Frame
 
+from ._crops import Regions
 from ._protocol import CropDetector, KeypointDetector, PersonKeypoints
 
 #: More detectors than this bring little and cost memory.
@@ -31,15 +32,15 @@ def n_workers() -> int:
     return min(cores, _MAX_WORKERS)
 
 
-class Looker(Protocol):
-    """Whoever takes the looks: `Looks`, or one that gathers them for a detector that wants many at once."""
+class Inference(Protocol):
+    """Runs detectors: `ParallelInference`, or `BatchedInference` for a detector that wants many frames at once."""
 
     n_detectors: int
 
-    def at(self, frame: Frame, roi_px: np.ndarray, *, quick: bool) -> Future[PersonKeypoints]: ...
+    def submit(self, frame: Frame, roi_px: np.ndarray, *, quick: bool) -> Future[PersonKeypoints]: ...
 
 
-class Looks:
+class ParallelInference:
     """Detectors at work in threads, one in each. Use as a context: leaving it drops what has not begun."""
 
     def __init__(self, detectors: Sequence[KeypointDetector], camera: Camera) -> None:
@@ -50,17 +51,17 @@ class Looks:
         self._pool = ThreadPoolExecutor(len(detectors), "keypoints")
         self.n_detectors = len(detectors)
 
-    def __enter__(self) -> Looks:
+    def __enter__(self) -> ParallelInference:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._pool.shutdown(cancel_futures=True)
 
-    def at(self, frame: Frame, roi_px: np.ndarray, *, quick: bool) -> Future[PersonKeypoints]:
-        """Look at the region `roi_px` (4,) of a frame as soon as a detector is idle, in the order of the calls."""
-        return self._pool.submit(self._look, frame, roi_px, quick)
+    def submit(self, frame: Frame, roi_px: np.ndarray, *, quick: bool) -> Future[PersonKeypoints]:
+        """Detect in the region `roi_px` (4,) of a frame as soon as a detector is idle, in the order of the calls."""
+        return self._pool.submit(self._detect, frame, roi_px, quick)
 
-    def _look(self, frame: Frame, roi_px: np.ndarray, quick: bool) -> PersonKeypoints:
+    def _detect(self, frame: Frame, roi_px: np.ndarray, quick: bool) -> PersonKeypoints:
         detector = self._idle.get()
         try:
             if isinstance(detector, CropDetector):
@@ -71,23 +72,16 @@ class Looks:
             self._idle.put(detector)
 
 
-def look_twice(
-    frames: Iterable[Frame],
-    looks: Looker,
-    time_s: np.ndarray,
-    reach_s: float,
-    first: dict[int, np.ndarray],
-    corrected: Callable[[int, PersonKeypoints], None],
-    region: Callable[[int], np.ndarray],
+def two_passes(
+    frames: Iterable[Frame], inference: Inference, time_s: np.ndarray, regions: Regions
 ) -> Iterator[tuple[int, PersonKeypoints]]:
-    """What the second look saw, frame by frame in order.
+    """What the second pass found, frame by frame in order.
 
-    `frames` are the frames to be looked at, of the video with stamps `time_s` (T,). `first` has the regions of those
-    that are looked at a first time: for each, `corrected(index, found)` is called. `region(index)` is the region of
-    the second look, asked for once all first looks up to `reach_s` after that frame were given to `corrected`. Both
-    are called from this thread, in the order of the frames.
+    `frames` are those in which the person is, of the video with stamps `time_s` (T,). The first pass is over those of
+    `regions.first`; a frame's region of the second is asked for once all first results up to `regions.reach_s` after
+    it are known.
     """
-    last_needed = np.searchsorted(time_s, time_s + reach_s, side="right") - 1
+    last_needed = np.searchsorted(time_s, time_s + regions.reach_s, side="right") - 1
     waiting: collections.deque[Frame] = collections.deque()
     early: collections.deque[tuple[int, Future[PersonKeypoints]]] = collections.deque()
     late: collections.deque[tuple[int, Future[PersonKeypoints]]] = collections.deque()
@@ -95,17 +89,17 @@ def look_twice(
     def second(frame: Frame) -> None:
         while early and early[0][0] <= last_needed[frame.index]:
             index, future = early.popleft()
-            corrected(index, future.result())
-        late.append((frame.index, looks.at(frame, region(frame.index), quick=False)))
+            regions.correct(index, future.result())
+        late.append((frame.index, inference.submit(frame, regions.at(frame.index), quick=False)))
 
     for frame in frames:
         waiting.append(frame)
-        if frame.index in first:
-            early.append((frame.index, looks.at(frame, first[frame.index], quick=True)))
+        if frame.index in regions.first:
+            early.append((frame.index, inference.submit(frame, regions.track_px[frame.index], quick=True)))
         while waiting and last_needed[waiting[0].index] <= frame.index:
             second(waiting.popleft())
-        # So many looks may be under way that no detector waits, and no more: each holds its frame.
-        while len(late) > 2 * looks.n_detectors:
+        # So many frames may be under way that no detector waits, and no more: each is held in memory.
+        while len(late) > 2 * inference.n_detectors:
             index, future = late.popleft()
             yield index, future.result()
     while waiting:

@@ -98,7 +98,7 @@ class PictureMeter:
         self._rows: list[tuple[float, np.ndarray, float]] = []
 
     def watch(self, frames: Iterable[Frame], roi_px: np.ndarray) -> Iterator[Frame]:
-        """The frames as they come; `roi_px` (T, 4) the body circle of each frame of the video, NaN where none is."""
+        """The frames as they come; `roi_px` (T, 4) is the region of interest of each frame of the video, or NaN."""
         for frame in frames:
             # A clock that was set back (`time_s` from another video) only measures more.
             if frame.time_s >= self._next_s and np.isfinite(roi_px[frame.index]).all():
@@ -106,7 +106,7 @@ class PictureMeter:
             yield frame
 
     def add(self, time_s: float, image: np.ndarray, roi_px: np.ndarray) -> None:
-        """Measure `image` (H, W, 3) uint8 BGR around the body circle `roi_px` (4,) centre x, y, side, rotation."""
+        """Measure `image` (H, W, 3) uint8 BGR around the region `roi_px` (4,): centre x, y, side, rotation."""
         strip = _strip(image, roi_px)
         if strip is None:
             return

@@ -16,7 +16,7 @@ class PersonKeypoints:
 
     xy_px (J, 2) in the upright, distorted picture; xyz_cam_m (J, 3) camera frame (x right, y down, z forward);
     confidence (J,) in 0..1; presence: how sure the detector is that the crop shows a person at all, 0..1;
-    roi_px (4,) centre x, centre y, side, rotation of the body circle as these keypoints show it (NaN: not known),
+    roi_px (4,) centre x, centre y, side, rotation of the region as these keypoints show it (NaN: not known),
     a better crop for the same frame than the one they were found in.
     """
 
@@ -37,7 +37,7 @@ class KeypointDetector(Protocol):
     root_relative: bool
 
     def detect(self, image: np.ndarray, roi_px: np.ndarray, camera: Camera, *, quick: bool = False) -> PersonKeypoints:
-        """`roi_px` (4,): the body circle as in `tracking.Detection`; the detector adds the margin it needs.
+        """`roi_px` (4,): the region of interest as in `tracking.Detection`; the detector adds the margin it needs.
 
         `quick`: only the better crop is wanted (`roi_px` and `presence`), so accuracy may be spared.
         """
@@ -52,7 +52,7 @@ class CropDetector(Protocol):
     """
 
     def crop_of(self, roi_px: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
-        """The matrix and the size of `video.Frame.cut` for the body circle `roi_px` (4,)."""
+        """The matrix and the size of `video.Frame.cut` for the region of interest `roi_px` (4,)."""
         ...
 
     def detect_crop(

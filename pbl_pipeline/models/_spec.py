@@ -73,7 +73,7 @@ class ModelSpec:
     pixel_origin
         Where coordinates of the crop count from: "centre" of the first pixel, or its "edge".
     box_margin
-        How much larger than the person's box (the body circle) the crop is to be.
+        How much larger than the person's box (the region of interest) the crop is to be.
     spec_sha256
         Over all that changes a result, without names and licences.
     """

@@ -1,6 +1,6 @@
 """People in a video: detection, tracks, choice of the subject."""
 
-from ._appearance import likeness, look_of
+from ._appearance import appearance_of, appearance_similarity
 from ._associate import AssociationParams
 from ._blazepose import BlazePoseDetector, body_box, box_iou, circle_roi
 from ._choose import choose_subject
@@ -34,6 +34,8 @@ __all__ = [
     "UncrossParams",
     "WatchParams",
     "YoloxDetector",
+    "appearance_of",
+    "appearance_similarity",
     "body_box",
     "box_iou",
     "carried_choice",
@@ -42,8 +44,6 @@ __all__ = [
     "contact_sheet",
     "contact_sheet_jpeg",
     "detector_params",
-    "likeness",
-    "look_of",
     "require_subject",
     "same_person",
     "save_contact_sheet",

@@ -1,6 +1,6 @@
 """How a person looks: colours of the trunk and of the legs, to tell people apart who were out of sight or close.
 
-A look is a histogram, not a network: it costs a tenth of a millisecond, needs no model and no licence, and is only ever
+An appearance is a histogram, not a network: it costs a tenth of a millisecond, needs no model and no licence, and is
 compared within one video, in the same light. It says "other clothes" surely and "the same clothes" weakly; so it may
 forbid to join two tracks, and may join them only where nobody else in the video could be meant.
 """
@@ -12,7 +12,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-#: Patches along the body axis in radii of the body circle, from the middle of the hips: (from, to, half width); up > 0.
+#: Patches along the body axis in radii of the region of interest, from the middle of the hips: (from, to, half width),
+#: up positive.
 _PATCHES = ((0.06, 0.46, 0.14), (-0.62, -0.10, 0.16))
 _PATCH_SIZE = (12, 24)
 #: Bins of lightness, and of each of the two colour axes (CIE Lab as 8 bit).
@@ -22,7 +23,7 @@ _SIZE = 2 * (_LIGHT_BINS + _COLOUR_BINS**2)
 _COLOUR_RANGE = (88.0, 168.0)
 
 
-def look_of(image: np.ndarray, state: np.ndarray, turn_rad: float) -> np.ndarray:
+def appearance_of(image: np.ndarray, state: np.ndarray, turn_rad: float) -> np.ndarray:
     """Look (2 * (6 + 64),) of the body whose circle has centre x, centre y (px) and log side `state`, turned by
     `turn_rad` clockwise, in `image` (H, W, 3) uint8 BGR.
 
@@ -52,8 +53,8 @@ def look_of(image: np.ndarray, state: np.ndarray, turn_rad: float) -> np.ndarray
     return np.concatenate(parts)
 
 
-def likeness(a: np.ndarray, b: np.ndarray) -> float:
-    """How alike two looks are: 1 the same, 0 nothing in common; NaN where one is not known.
+def appearance_similarity(a: np.ndarray, b: np.ndarray) -> float:
+    """How alike two appearances are: 1 the same, 0 nothing in common; NaN where one is not known.
 
     The least of the patches' Bhattacharyya coefficients (Bhattacharyya 1943): another pair of trousers is enough to be
     somebody else.
@@ -63,9 +64,9 @@ def likeness(a: np.ndarray, b: np.ndarray) -> float:
     return float(min((shared[:_LIGHT_BINS].sum() + shared[_LIGHT_BINS:size].sum()) / 2, _second(shared, size)))
 
 
-def mean_look(looks: Sequence[np.ndarray | None], least: int = 1) -> np.ndarray:
-    """The mean of the looks that are known; NaN where those are fewer than `least`."""
-    known = [k for k in looks if k is not None and np.isfinite(k).all()]
+def mean_appearance(appearances: Sequence[np.ndarray | None], least: int = 1) -> np.ndarray:
+    """The mean of the appearances that are known; NaN where those are fewer than `least`."""
+    known = [k for k in appearances if k is not None and np.isfinite(k).all()]
     return np.mean(known, axis=0) if len(known) >= max(least, 1) else np.full(_SIZE, np.nan)
 
 

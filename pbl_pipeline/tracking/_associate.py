@@ -101,7 +101,7 @@ class Trail:
 
 
 def measure(detection: Detection) -> np.ndarray:
-    """Centre x, centre y (px) and log height of a detection: of its body circle where known, else of its box."""
+    """Centre x, centre y (px) and log height of a detection: of its region of interest where known, else of its box."""
     x, y, side, _ = detection.roi_px
     if np.isfinite(side) and side > 0:
         return np.array([x, y, np.log(side)])
@@ -157,7 +157,7 @@ class Associator:
         cost = np.array([[pair_cost(t, time_s, d, self._params) for d in detections] for t in trails])
         gate = np.array([self._params.gate + gate_per_s * (time_s - t.last_time) for t in trails])
         # An impossible pair costs more than any number of possible ones, so it is chosen only where nothing else is.
-        # Who is seen where somebody else is expected, looked for or not, does not continue the track of one missed.
+        # A detection near another track's predicted position does not extend a missed track.
         expected = cost <= self._params.gate
         absent = [t for t in self._live if t not in trails]
         of_absent = [

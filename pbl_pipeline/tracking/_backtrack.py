@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ._appearance import look_of
+from ._appearance import appearance_of
 from ._associate import AssociationParams, Trail, measure, pair_cost
 from ._detection_schedule import window_around
 from ._tiles import detect_in
@@ -43,7 +43,7 @@ def rewind(
         excess = [pair_cost(back, -time_s, d, params) - g for d, g in zip(free, gates, strict=True)]
         if excess and min(excess) <= 0:
             seen = free[int(np.argmin(excess))]
-            seen = dataclasses.replace(seen, look=look_of(image, measure(seen), seen.roi_px[3]))
+            seen = dataclasses.replace(seen, appearance=appearance_of(image, measure(seen), seen.roi_px[3]))
             back.add(index, -time_s, seen, params.memory_s)
             misses = 0
             continue

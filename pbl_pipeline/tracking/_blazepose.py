@@ -93,7 +93,7 @@ def box_iou(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
 
 
 def circle_roi(centre: np.ndarray, on_circle: np.ndarray) -> np.ndarray:
-    """Region (4,) centre x, centre y, side, rotation (rad) of the body circle; same unit as the points.
+    """Region (4,) centre x, centre y, side, rotation (rad) of the region of interest; same unit as the points.
 
     The side is the circle's diameter; the rotation is clockwise in the picture and 0 for an upright body, whose
     `on_circle` lies straight above `centre`.
@@ -118,7 +118,7 @@ def body_box(roi: np.ndarray) -> np.ndarray:
 class BlazePoseDetector:
     """`PersonDetector` for one picture, without tiles: people must be at least about a fifth of the picture high.
 
-    `box_px` of the detections is `body_box` of the body circle, not the face and torso box that the network predicts.
+    `box_px` of the detections is `body_box` of the region of interest, not the network's box of face and torso.
     """
 
     name = "blazepose"

@@ -1,4 +1,4 @@
-"""Where to look in which frame: around known people as often as their movement asks for, elsewhere in turn.
+"""Where to detect in which frame: around known people as often as their movement asks for, elsewhere in turn.
 
 One call of a detector costs as much as decoding three frames, so pictures are not searched throughout. A person who
 moves evenly is looked at ten times a second and interpolated between, one who keeps still more rarely; one who
@@ -25,8 +25,8 @@ class WatchParams:
     keeps still (slower than `still` body heights per second). close_interval_s: the same where the person was seen
     fewer than `known_hits` times, was missed, surprised by more than `surprise` body heights, or is nearer to another
     than `near` body heights.
-    window_sizes: side of the window, in body circles. covered: tiles of which such windows cover this share are left
-    out.
+    window_sizes: side of the window, in sides of the region of interest. covered: tiles of which such windows cover
+    this fraction are left out.
     """
 
     tile_fraction: float = 0.7
@@ -88,8 +88,8 @@ class Watch:
                 break
         return out
 
-    def looked(self, time_s: float, due: Sequence[Trail], live: Sequence[Trail]) -> None:
-        """After a look at those who were due, or were found: says when they are due again."""
+    def detected(self, time_s: float, due: Sequence[Trail], live: Sequence[Trail]) -> None:
+        """After detection around those who were due, or were found: when they are due again."""
         p = self._params
         for trail in live:
             if trail not in due and trail.due_s > time_s:
@@ -103,7 +103,7 @@ class Watch:
 
 
 def window_around(state: np.ndarray, sizes: float) -> Window:
-    """The square of `sizes` body circles around a body with this state (`measure`)."""
+    """The square of `sizes` region of interest around a body with this state (`measure`)."""
     half = 0.5 * sizes * float(np.exp(state[2]))
     return round(state[0] - half), round(state[1] - half), round(state[0] + half), round(state[1] + half)
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ._appearance import likeness, mean_look
+from ._appearance import appearance_similarity, mean_appearance
 from ._associate import Trail, measure
 from ._local_motion import line_near
 
@@ -22,7 +22,7 @@ class UncrossParams:
     """near: closer than this many body heights two people are in an encounter; it lasts through `pause_s` apart.
     velocity_s: the straight line through this much of a track on either side says where it was going to and came from.
     gate, gate_per_s: what a miss of that line is measured by, in body heights at once and per second of the encounter.
-    size_gate: the same for the natural logarithm of the ratio of sizes, look_gate for one minus the likeness.
+    size_gate: the same for the natural logarithm of the ratio of sizes, look_gate for one minus the similarity.
     worst: largest cost of each of the three. margin: an exchange must be better by so much, summed over both people.
     """
 
@@ -108,13 +108,15 @@ def _cost(before: Trail, after: Trail, params: UncrossParams) -> float:
         miss = max(np.hypot(*(place + going * gap - next_place)), np.hypot(*(next_place - coming * gap - place))) / unit
         cost += min(miss / (params.gate + params.gate_per_s * gap), params.worst)
         cost += min(abs(np.log(next_height / height)) / params.size_gate, params.worst)
-    alike = likeness(look_near(before, before.times[-1]), look_near(after, after.times[0]))
+    alike = appearance_similarity(appearance_near(before, before.times[-1]), appearance_near(after, after.times[0]))
     return cost + (min((1 - alike) / params.look_gate, params.worst) if np.isfinite(alike) else 0.0)
 
 
-def look_near(trail: Trail, at_s: float, length_s: float = 1.5) -> np.ndarray:
-    """The mean look of the sightings within `length_s` of `at_s`; NaN where it is not known."""
-    return mean_look([d.look for d, t in zip(trail.detections, trail.times, strict=True) if abs(t - at_s) <= length_s])
+def appearance_near(trail: Trail, at_s: float, length_s: float = 1.5) -> np.ndarray:
+    """The mean appearance of the sightings within `length_s` of `at_s`; NaN where it is not known."""
+    return mean_appearance(
+        [d.appearance for d, t in zip(trail.detections, trail.times, strict=True) if abs(t - at_s) <= length_s]
+    )
 
 
 def _exchanged(a: Trail, b: Trail, at_s: float) -> tuple[Trail, Trail]:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ._appearance import likeness, mean_look
+from ._appearance import appearance_similarity, mean_appearance
 from ._associate import Trail
 from ._local_motion import line_near
 
@@ -22,9 +22,9 @@ class JoinParams:
     """max_gap_s: longest time out of sight. velocity_s: the straight line through this much of a track before and after
     the gap says where the person was going to and coming from. gate, gate_per_s: how far these two may miss the other
     track's end, in body heights at once and per second of the gap. max_growth: largest ratio of sizes across the gap.
-    other_clothes: likeness (`likeness`) below which two are never joined.
-    same_clothes, clothes_lead: likeness from which somebody who was out of sight for up to `return_gap_s` is the same,
-    and by how much it must exceed that to everybody else. min_looks: sightings that a likeness needs on either side.
+    other_clothes: similarity (`appearance_similarity`) below which two are never joined.
+    same_clothes, clothes_lead: similarity from which somebody out of sight for up to `return_gap_s` is the same,
+    and by how much it must exceed that to everybody else. min_looks: sightings that a similarity needs on either side.
     return_growth: largest ratio of sizes, who comes back may be nearer.
     Likeness on seven recordings of four people: the same person in two halves of a recording 0.96 to 0.998, but 0.88 of
     a man who jumps on a wall; two people 0.39 to 0.90.
@@ -69,22 +69,27 @@ def _join_by_clothes(trails: Sequence[Trail], params: JoinParams) -> list[Trail]
     people: list[list[Trail]] = []
     known: dict[tuple[int, ...], np.ndarray] = {}  # a corridor sees hundreds, each compared with all others
 
-    def look(*parts: Trail) -> np.ndarray:
+    def appearance(*parts: Trail) -> np.ndarray:
         key = tuple(map(id, parts))
         if key not in known:
-            known[key] = _look(parts, params)
+            known[key] = _appearance(parts, params)
         return known[key]
 
     for trail in sorted(trails, key=lambda t: t.times[0]):
         gone = [p for p in people if 0 < trail.times[0] - p[-1].times[-1] <= params.return_gap_s]
-        ranked = sorted(((likeness(look(*p), look(trail)), p) for p in gone), key=lambda c: -np.nan_to_num(c[0]))
+        ranked = sorted(
+            ((appearance_similarity(appearance(*p), appearance(trail)), p) for p in gone),
+            key=lambda c: -np.nan_to_num(c[0]),
+        )
         if not ranked or not ranked[0][0] >= params.same_clothes:
             people.append([trail])
             continue
         alike, best = ranked[0]
         # Others who left before, and those who are surely somebody else, being there at the same time.
         present = [t for t in trails if t not in best and any(_together(t, mine) for mine in (trail, *best))]
-        rivals = [a for a, _ in ranked[1:]] + [likeness(look(t), look(trail)) for t in present if t is not trail]
+        rivals = [a for a, _ in ranked[1:]] + [
+            appearance_similarity(appearance(t), appearance(trail)) for t in present if t is not trail
+        ]
         lead = alike - max((r for r in rivals if np.isfinite(r)), default=0.0)
         if lead >= params.clothes_lead and _alike_in_size(best[-1], trail, params):
             best.append(trail)
@@ -97,9 +102,9 @@ def _together(a: Trail, b: Trail) -> bool:
     return a.times[0] <= b.times[-1] and b.times[0] <= a.times[-1]
 
 
-def _look(parts: Sequence[Trail], params: JoinParams) -> np.ndarray:
-    """Mean look of a person's trails; NaN where too few sightings know it."""
-    return mean_look([d.look for t in parts for d in t.detections], params.min_looks)
+def _appearance(parts: Sequence[Trail], params: JoinParams) -> np.ndarray:
+    """Mean appearance of a person's trails; NaN where too few sightings know it."""
+    return mean_appearance([d.appearance for t in parts for d in t.detections], params.min_looks)
 
 
 def _alike_in_size(a: Trail, b: Trail, params: JoinParams) -> bool:
@@ -124,7 +129,11 @@ def _one_person(a: Trail, b: Trail, size_px: tuple[int, int], p: JoinParams) -> 
     if not 0 < gap <= p.max_gap_s:
         return False
     before, after = line_near(a, a.times[-1], p.velocity_s), line_near(b, b.times[0], p.velocity_s)
-    if before is None or after is None or likeness(_look([a], p), _look([b], p)) < p.other_clothes:
+    if (
+        before is None
+        or after is None
+        or appearance_similarity(_appearance([a], p), _appearance([b], p)) < p.other_clothes
+    ):
         return False
     (end, going, height), (begin, coming, next_height) = before, after
     if not 1 / p.max_growth <= next_height / height <= p.max_growth:

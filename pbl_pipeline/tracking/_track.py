@@ -16,7 +16,7 @@ from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.prefetch import prefetched
 from pbl_pipeline.video import VideoInfo, probe, read_frames
 
-from ._appearance import look_of
+from ._appearance import appearance_of
 from ._associate import Associator, Trail, measure
 from ._backtrack import rewind
 from ._blazepose import body_box, box_iou
@@ -80,14 +80,14 @@ def _follow(video_path: str | Path, params: TrackingParams, detector: PersonDete
         if not (due or elsewhere):
             continue
         found = detect_in(detector, frame.image, watch.around(now, due), elsewhere)
-        found = [_with_look(d, frame.image) for d in found]
+        found = [_with_appearance(d, frame.image) for d in found]
         for new in associator.step(frame.index, now, found, due):
             sure = _confirmed(new, detector, frame.image, now, associator.live, params)
             if sure is not None:
                 trail = Trail.of(frame.index, now, sure)
                 sizes = params.watch.window_sizes
                 associator.begin(rewind(trail, kept, associator.trails(), detector, sizes, params.association))
-        watch.looked(now, due, associator.live)
+        watch.detected(now, due, associator.live)
         if elsewhere:
             kept.append((frame.index, now, frame.image))
     if n_frames != info.n_frames:
@@ -125,17 +125,17 @@ def _confirmed(
     best = again[int(np.argmax(overlap))]
     if overlap.max() < CONFIRM_IOU or any(_near(measure(best), k) for k in known):
         return None
-    return _with_look(best, image)
+    return _with_appearance(best, image)
 
 
 def _near(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two body circles lie so close, and are so alike in size, that both are of one person."""
+    """Whether two region of interest lie so close, and are so alike in size, that both are of one person."""
     apart = np.hypot(*(a[:2] - b[:2])) / np.exp((a[2] + b[2]) / 2)
     return bool(apart < SAME_BODY)
 
 
-def _with_look(detection: Detection, image: np.ndarray) -> Detection:
-    return dataclasses.replace(detection, look=look_of(image, measure(detection), detection.roi_px[3]))
+def _with_appearance(detection: Detection, image: np.ndarray) -> Detection:
+    return dataclasses.replace(detection, appearance=appearance_of(image, measure(detection), detection.roi_px[3]))
 
 
 def _is_real(trail: Trail, params: TrackingParams) -> bool:

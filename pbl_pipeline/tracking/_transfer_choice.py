@@ -20,7 +20,7 @@ SAME_OVERLAP = 0.4
 
 
 def same_person(decided: Tracking, person_id: int, tracking: Tracking) -> int | None:
-    """Number in `tracking` of the person `person_id` of `decided`, both of the same video; None where nobody surely is.
+    """Number in `tracking` of the person `person_id` of `decided`, both of the same video; None if no match is certain.
 
     Each must be the other's best match: where she was not found, the one beside her is not taken for her.
     """

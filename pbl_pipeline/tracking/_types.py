@@ -13,14 +13,14 @@ class Detection:
     """One person in one frame. `box_px` is x0, y0, x1, y1 in pixels of the upright frame; score in 0..1.
 
     `roi_px` is what the keypoint crop needs where the detector knows it: centre x, centre y, side length in
-    pixels and rotation in radians (clockwise in the picture, 0 = upright); NaN where it does not. `look` is what
-    `look_of` says of the clothes, None where nobody asked.
+    pixels and rotation in radians (clockwise in the picture, 0 = upright); NaN where it does not. `appearance` is
+    `appearance_of` of the clothes, None where nobody asked.
     """
 
     box_px: np.ndarray
     score: float
     roi_px: np.ndarray
-    look: np.ndarray | None = None
+    appearance: np.ndarray | None = None
 
 
 class PersonDetector(Protocol):

@@ -51,7 +51,7 @@ def decode(rows: np.ndarray, width: int, height: int, min_score: float) -> tuple
 
 
 class YoloxDetector:
-    """`PersonDetector` for one picture. Gives boxes and no body circles: `roi_px` is NaN.
+    """`PersonDetector` for one picture. Gives boxes and no region of interest: `roi_px` is NaN.
 
     `min_iou`: of two boxes that overlap more, the less sure one is dropped (OpenCV's non-maximum suppression).
 

@@ -4,8 +4,8 @@
     python -m tests.benchmarks.tracking memory --minutes 10
 
 `accuracy` runs on the demo recording, the two phone clips and the four cameras of `../shared/data/real` (what is absent
-is left out). It compares three ways of looking with the body circle that the landmark network shows in each frame,
-which none of them knows: `watch` is what the pipeline does, `often` the same in every frame, `throughout` the whole
+is left out). It compares three ways of detecting with the region that the landmark network shows in each frame, which
+none of them knows: `watch` is what the pipeline does, `often` the same in every frame, `throughout` the whole
 frame and all tiles in every frame. Printed are the overlap of the body boxes (median and 5th percentile of the frames),
 the distance of the centres in body heights (median, 95th percentile), the share of the frames in which the person is
 tracked, the person's number, detector calls a second and processor time a frame (decoding included).

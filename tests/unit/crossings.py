@@ -16,7 +16,7 @@ from pbl_pipeline.tracking._reidentify import join_trails
 SIZE = (1920, 1080)
 #: Nearer than so many body heights, the noise decides which detection is whose, and nothing follows from it.
 MET = 0.3
-#: Looks of three people: bins of a histogram twice over, as `look_of` gives them (any lengths that sum to 1 in parts).
+#: Appearances of three people: bins of a histogram twice over, as of `appearance_of` (parts that sum to 1).
 _N = 2 * (6 + 64)
 
 
@@ -35,7 +35,7 @@ class Walker:
     height: float = 400.0
     y: float = 540.0
     seen: Callable[[float], bool] = lambda t: True
-    look: np.ndarray | None = None
+    appearance: np.ndarray | None = None
 
 
 def scene(
@@ -68,7 +68,7 @@ def scene(
             front = [body_box(np.array([v.x(float(t)), v.y, v.height, 0.0])) for v in walkers[who + 1 :]]
             if any(_covered(box, f) > hide for f in front):
                 continue
-            look = None if w.look is None else w.look * np.exp(rng.normal(0, 0.2, _N))
+            look = None if w.appearance is None else w.appearance * np.exp(rng.normal(0, 0.2, _N))
             others = [v.x(float(t)) for v in walkers if v is not w and v.seen(float(t))]
             met = any(abs(o - centre) < MET * w.height for o in others)
             found.append((None if met else who, Detection(box, 0.95, roi, look)))

@@ -19,8 +19,8 @@ from pbl_pipeline.keypoints import (
     view_rotation,
 )
 from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES
-from pbl_pipeline.keypoints._crops import corrected, first_looks, smooth_at, smooth_rois
-from pbl_pipeline.keypoints._detect import _look
+from pbl_pipeline.keypoints._crops import corrected, first_pass_rows, smooth_at, smooth_rois
+from pbl_pipeline.keypoints._detect import _detect_all
 from pbl_pipeline.keypoints._picture import PictureMeter
 from pbl_pipeline.keypoints._view import crop_matrix
 from pbl_pipeline.tracking import PersonTrack, Tracking
@@ -128,17 +128,17 @@ def test_smoothing_leaves_gaps_and_turns_through_half_a_circle():
     np.testing.assert_allclose(np.abs(smooth[np.r_[:5, 8:20], 3]), np.pi, atol=1e-6)
 
 
-def test_first_looks_are_spread_evenly_and_begin_and_end_each_run():
+def test_first_pass_rows_are_spread_evenly_and_begin_and_end_each_run():
     time = np.arange(60) / 30
     rows = np.concatenate([np.arange(0, 20), np.arange(31, 60)])
     np.testing.assert_array_equal(
-        first_looks(rows, time, 0.1), [0, 3, 6, 9, 12, 15, 18, 19, 31, 34, 37, 40, 43, 46, 49, 52, 55, 58, 59]
+        first_pass_rows(rows, time, 0.1), [0, 3, 6, 9, 12, 15, 18, 19, 31, 34, 37, 40, 43, 46, 49, 52, 55, 58, 59]
     )
-    np.testing.assert_array_equal(first_looks(rows, time, 0.0), rows)
-    np.testing.assert_array_equal(first_looks(rows[:1], time, 0.1), rows[:1])
+    np.testing.assert_array_equal(first_pass_rows(rows, time, 0.0), rows)
+    np.testing.assert_array_equal(first_pass_rows(rows[:1], time, 0.1), rows[:1])
 
 
-def test_the_track_wins_where_the_first_look_contradicts_it():
+def test_the_track_wins_where_the_first_pass_contradicts_it():
     roi = np.array([500.0, 500.0, 400.0, 0.0])
 
     def seen(x, side, presence=1.0):
@@ -196,7 +196,7 @@ def test_two_passes_and_missing_values(case, tmp_path):
     there[30:35] = there[50:55] = False
     assert np.array_equal(np.isfinite(keypoints.xy_px[:, 0, 0]), there)
     assert np.array_equal(keypoints.confidence[:, 0] > 0, there)
-    # The first look moved the crop by 2 px; around the dark frames the track's crop has a share.
+    # The first pass moved the crop by 2 px; around the dark frames the track's crop has a share.
     np.testing.assert_allclose(keypoints.xy_px[there, 0, 0], 62, atol=1.5)
     np.testing.assert_allclose(keypoints.xy_px[12, 0], [62, 50], atol=1e-3)
     # What lies beyond the picture was not seen.
@@ -212,7 +212,7 @@ def test_two_passes_and_missing_values(case, tmp_path):
 
 
 def test_one_reading_sees_what_two_readings_of_the_video_see(case):
-    """The plain way: all first looks, then all crops, then all second looks. Detectors in threads change nothing."""
+    """The plain way: the whole first pass, all crops, the whole second pass. Detectors in threads change nothing."""
     video, tracking = case
     params = KeypointParams(first_look_s=0.05)
     images = {frame.index: frame.image for frame in read_frames(video)}
@@ -220,13 +220,13 @@ def test_one_reading_sees_what_two_readings_of_the_video_see(case):
     rows = np.flatnonzero(np.isfinite(roi[:, 0]))
     better = np.full_like(roi, np.nan)
     limits = params.min_presence, params.max_drift, params.max_growth
-    for row in first_looks(rows, time, params.first_look_s):
+    for row in first_pass_rows(rows, time, params.first_look_s):
         better[row] = corrected(roi[row], Cross().detect(images[row], roi[row], CAMERA), *limits)
     known = np.flatnonzero(np.isfinite(better[:, 0]))
     plain = {row: smooth_at(better[known], time[known], time[row], params.smooth_s) for row in rows}
 
     for n_detectors in (1, 3):
-        found = _look([Cross() for _ in range(n_detectors)], video, roi, time, CAMERA, params, PictureMeter())
+        found = _detect_all([Cross() for _ in range(n_detectors)], video, roi, time, CAMERA, params, PictureMeter())
         assert [row for row, person in enumerate(found) if person is not None] == rows.tolist()
         for row in rows:
             person = found[row]

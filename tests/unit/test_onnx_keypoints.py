@@ -29,7 +29,7 @@ from pbl_pipeline.keypoints import (
     detect_keypoints,
 )
 from pbl_pipeline.keypoints._augment import Augmentation, aligned, augmentations, sd_confidence, spread_mm
-from pbl_pipeline.keypoints._batched import BatchedLooks
+from pbl_pipeline.keypoints._batched import BatchedInference
 from pbl_pipeline.keypoints._blazepose import CROP_MARGIN, MIRROR, N_ALL, BlazePoseLandmarks
 from pbl_pipeline.keypoints._blazepose import MODEL_SHA256 as BLAZEPOSE_SHA256
 from pbl_pipeline.keypoints._blazepose import NAMES as BLAZEPOSE_NAMES
@@ -434,8 +434,8 @@ def roi(x: float, side: float = 10) -> np.ndarray:
 
 def test_what_waits_goes_together_in_order_and_quick_looks_apart():
     counts, frame = Counts(), Frame(0, 0.0, lambda: np.zeros((2, 2, 3), np.uint8))
-    with BatchedLooks(counts, CAMERA) as looks:
-        futures = [looks.at(frame, roi(x), quick=x in (4, 5)) for x in range(9)]
+    with BatchedInference(counts, CAMERA) as inference:
+        futures = [inference.submit(frame, roi(x), quick=x in (4, 5)) for x in range(9)]
         counts.begin.set()
         assert [f.result(10).roi_px[0] for f in futures] == list(range(9))
     assert [x for xs, _ in counts.calls for x in xs] == list(range(9))
@@ -446,15 +446,15 @@ def test_what_waits_goes_together_in_order_and_quick_looks_apart():
 def test_an_error_goes_to_who_asked_and_leaving_drops_what_waits():
     counts, frame = Counts(), Frame(0, 0.0, lambda: np.zeros((2, 2, 3), np.uint8))
     counts.begin.set()
-    with BatchedLooks(counts, CAMERA) as looks:
-        bad = looks.at(frame, roi(0, 13), quick=False)
+    with BatchedInference(counts, CAMERA) as inference:
+        bad = inference.submit(frame, roi(0, 13), quick=False)
         with pytest.raises(ValueError, match="13"):
             bad.result(10)
-        assert looks.at(frame, roi(1), quick=False).result(10).roi_px[0] == 1
+        assert inference.submit(frame, roi(1), quick=False).result(10).roi_px[0] == 1
         with pytest.raises(ValueError, match="torn"):
-            looks.at(Frame(1, 0.1, torn), roi(2), quick=False).result(10)
+            inference.submit(Frame(1, 0.1, torn), roi(2), quick=False).result(10)
         counts.begin.clear()
-        waiting = [looks.at(frame, roi(x), quick=False) for x in range(50)]
+        waiting = [inference.submit(frame, roi(x), quick=False) for x in range(50)]
         counts.begin.set()
     assert sum(f.done() for f in waiting) < 50
 

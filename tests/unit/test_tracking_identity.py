@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pbl_pipeline.tracking import JoinParams, UncrossParams, likeness
-from pbl_pipeline.tracking._appearance import look_of
+from pbl_pipeline.tracking import JoinParams, UncrossParams, appearance_similarity
+from pbl_pipeline.tracking._appearance import appearance_of
 from pbl_pipeline.tracking._associate import Trail
 from pbl_pipeline.tracking._identity_swaps import uncross
 from pbl_pipeline.tracking._reidentify import join_trails
@@ -47,8 +47,8 @@ def test_two_who_meet_and_turn_back_are_told_by_their_clothes(seed):
     def to_and_fro(side: int):
         return lambda t: 950 + side * (30 + 0.8 * BODY * abs(t - 2.5))
 
-    left = Walker(to_and_fro(-1), look=clothes(1))
-    right = Walker(to_and_fro(1), look=clothes(2))
+    left = Walker(to_and_fro(-1), appearance=clothes(1))
+    right = Walker(to_and_fro(1), appearance=clothes(2))
     assert pure(identities(scene([left, right], 5.0, seed=seed, hide=0.7)), 2)
 
 
@@ -62,9 +62,9 @@ def test_hidden_for_a_second_behind_somebody_or_a_pillar(seed):
 
 
 def test_three_people_in_a_corridor():
-    patient = Walker(lambda t: 300 + 0.5 * BODY * t, look=clothes(1))
-    therapist = Walker(lambda t: 120 + 0.5 * BODY * t, height=440.0, look=clothes(2))
-    passer = Walker(lambda t: 1800 - 0.9 * BODY * t, look=clothes(3))
+    patient = Walker(lambda t: 300 + 0.5 * BODY * t, appearance=clothes(1))
+    therapist = Walker(lambda t: 120 + 0.5 * BODY * t, height=440.0, appearance=clothes(2))
+    passer = Walker(lambda t: 1800 - 0.9 * BODY * t, appearance=clothes(3))
     for seed in range(5):
         assert pure(identities(scene([passer, patient, therapist], 5.0, seed=seed, hide=0.8)), 3)
 
@@ -74,8 +74,8 @@ def away(t: float) -> bool:
 
 
 def test_who_leaves_and_comes_back_is_known_by_the_clothes():
-    patient = Walker(lambda t: 1200 + 500 * t if t < 4.5 else 1200 + 500 * (9 - t), look=clothes(1))
-    other = Walker(lambda t: 300.0, look=clothes(2))
+    patient = Walker(lambda t: 1200 + 500 * t if t < 4.5 else 1200 + 500 * (9 - t), appearance=clothes(1))
+    other = Walker(lambda t: 300.0, appearance=clothes(2))
     frames = scene([patient, other], 9.0)
     assert pure(identities(frames), 2)
     # Without looks nobody knows, and none is joined.
@@ -84,32 +84,32 @@ def test_who_leaves_and_comes_back_is_known_by_the_clothes():
 
 
 def test_somebody_else_who_comes_in_is_somebody_else():
-    first = Walker(lambda t: 1200 + 500 * t, seen=lambda t: t < 2, look=clothes(1))
-    second = Walker(lambda t: 1900 - 500 * (t - 5), seen=lambda t: t > 5, look=clothes(2))
+    first = Walker(lambda t: 1200 + 500 * t, seen=lambda t: t < 2, appearance=clothes(1))
+    second = Walker(lambda t: 1900 - 500 * (t - 5), seen=lambda t: t > 5, appearance=clothes(2))
     assert pure(identities(scene([first, second], 8.0)), 2)
 
 
 def test_two_in_the_same_clothes_are_not_joined():
     """She leaves, and one of two in the same white coats comes in: who is not known."""
     coat = clothes(1)
-    first = Walker(lambda t: 1200 + 500 * t, seen=lambda t: t < 2, look=coat)
-    colleague = Walker(lambda t: 300.0, look=coat)
-    second = Walker(lambda t: 1900 - 500 * (t - 5), seen=lambda t: t > 5, look=coat)
+    first = Walker(lambda t: 1200 + 500 * t, seen=lambda t: t < 2, appearance=coat)
+    colleague = Walker(lambda t: 300.0, appearance=coat)
+    second = Walker(lambda t: 1900 - 500 * (t - 5), seen=lambda t: t > 5, appearance=coat)
     assert pure(identities(scene([first, colleague, second], 8.0)), 3)
 
 
 def test_coming_back_after_too_long_is_somebody_new():
     late = 3.0 + JoinParams().return_gap_s
-    patient = Walker(lambda t: 900.0, seen=lambda t: t < 2 or t > late, look=clothes(1))
+    patient = Walker(lambda t: 900.0, seen=lambda t: t < 2 or t > late, appearance=clothes(1))
     assert len(identities(scene([patient], late + 2))) == 2
 
 
 # --- exchange after an encounter, by hand -------------------------------------------------------------------------
 
 
-def trail(x, look=None, side=BODY, n: int = 41) -> Trail:
+def trail(x, appearance=None, side=BODY, n: int = 41) -> Trail:
     t = [0.1 * i for i in range(n)]
-    return Trail(list(range(n)), t, [replace(person(x(s), 500, side), look=look) for s in t], np.zeros(3))
+    return Trail(list(range(n)), t, [replace(person(x(s), 500, side), appearance=appearance) for s in t], np.zeros(3))
 
 
 def places(t: Trail) -> list[float]:
@@ -171,16 +171,16 @@ def test_look_tells_clothes_and_not_place_size_or_light():
         image = np.full((600, 1200, 3), 128, np.uint8)
         image[300 - size // 4 : 300, x - size // 8 : x + size // 8] = np.array(shirt) * light
         image[300 : 300 + size // 3, x - size // 8 : x + size // 8] = np.array(trousers) * light
-        return look_of(image, np.array([x, 300.0, np.log(size)]), 0.0)
+        return appearance_of(image, np.array([x, 300.0, np.log(size)]), 0.0)
 
     red, blue, dark = (40, 40, 200), (200, 80, 40), (40, 40, 40)
     same = figure(300, 400, red, dark)
     assert same.shape == (140,)
-    assert likeness(same, same) == pytest.approx(1.0)
-    assert likeness(same, figure(800, 300, red, dark)) > 0.97
-    assert likeness(same, figure(800, 400, red, dark, light=0.9)) > 0.8
-    assert likeness(same, figure(300, 400, blue, dark)) < 0.7
-    assert likeness(same, figure(300, 400, red, blue)) < 0.7
-    outside = look_of(np.zeros((50, 50, 3), np.uint8), np.array([-5.0, 20.0, 3.0]), 0.0)
+    assert appearance_similarity(same, same) == pytest.approx(1.0)
+    assert appearance_similarity(same, figure(800, 300, red, dark)) > 0.97
+    assert appearance_similarity(same, figure(800, 400, red, dark, light=0.9)) > 0.8
+    assert appearance_similarity(same, figure(300, 400, blue, dark)) < 0.7
+    assert appearance_similarity(same, figure(300, 400, red, blue)) < 0.7
+    outside = appearance_of(np.zeros((50, 50, 3), np.uint8), np.array([-5.0, 20.0, 3.0]), 0.0)
     assert np.isnan(outside).all()
-    assert np.isnan(likeness(same, outside))
+    assert np.isnan(appearance_similarity(same, outside))
