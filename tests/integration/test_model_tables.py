@@ -14,13 +14,14 @@ import schemas
 from pbl_pipeline import methods, models
 from pbl_pipeline.body import marker_set
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.gait import EVENT_METHODS, EventParams
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.video import probe
 from schemas import fit, gait, gdi, keypoints, tracking
 from schemas.ingest import Methods, Visit, ingest
-from schemas.method_rows import resolve_method
+from schemas.method_rows import insert_methods, resolve_method
 from schemas.rows import plain
 from schemas.stored_files import file_ref, stored_file
 from tests import dot_models
@@ -168,6 +169,21 @@ def test_a_new_keypoint_method_for_all_comes_with_its_fit(
     assert len(fit.FitPlan()) == 4
     populate()
     assert fitted() == plans()
+
+
+def test_own_parameters_under_a_name_of_their_own(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """As docs/extending.md says: the row names its family, so the tables find its function."""
+    chain.install(monkeypatch)
+    ingest([chain.small_video(tmp_path, "walk")], Visit("P001"))
+    mine = EVENT_METHODS.make("mine", 1, EventParams(cutoff_hz=4.0))
+    insert_methods(gait.GaitEventMethod, [mine])
+    assert list(requeue.carry_out(requeue.plan_new_method("GaitEvents", "mine"))) == [1]
+    populate()
+    rows = {r["gait_method"]: r for r in gait.GaitEvents.to_dicts()}
+    assert (rows["mine-v1"]["events_detector"], rows["mine-v1"]["events_method_hash"]) == ("mine", mine.hash)
+    assert rows["mine-v1"]["n_events"] > 0
+    remove_all()
+    (gait.GaitEventMethod & {"gait_method": "mine-v1"}).delete(prompt=False)
 
 
 def test_a_method_that_this_version_does_not_know_is_an_error_row(

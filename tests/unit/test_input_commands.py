@@ -221,11 +221,28 @@ def test_changes_to_a_named_paramset(tmp_path):
     assert isinstance(paper, ImplicitAdamParams)
     assert (mine.steps, mine.cost.weight_2d) == (8000, 0.05)
     assert (mine.samples_per_trial, mine.cost.huber_2d_px) == (paper.samples_per_trial, paper.cost.huber_2d_px)
-    for text in ('{"base": "nobody"}', '{"base": ["paper-2025"]}', '{"base": "paper-2025", "step": 3}'):
+    wrong = {
+        '{"base": "nobody"}': "nobody",
+        '{"base": ["paper-2025"]}': "base",
+        '{"base": "paper-2025", "step": 3}': "step",
+        '{"cost": {"weight_2D": 1.0}}': "weight_2D",
+        '{"cost": {"weight_2d": "0.1"}}': "no float @ $.cost.weight_2d",
+        '{"cost": {"weight_2d": -0.1}}': "weight_2d = -0.1",
+        '{"cost": {"weight_2d": NaN}}': "weight_2d",
+        '{"cost": {"weight_2d": true}}': "no float @ $.cost.weight_2d",
+        '{"cost": 3}': "cost",
+        '{"max_iterations": 0}': "max_iterations",
+        '{"max_iterations": 1.5}': "no int @ $.max_iterations",
+        '{"sd_floor": [["knee"]]}': "sd_floor",
+        '{"solver": "implicit-adam"}': "solver",
+        "[]": "object",
+    }
+    for text, words in wrong.items():
         (tmp_path / "bad.json").write_text(text)
         with pytest.raises(PblError) as error:
             fit_paramset(None, str(tmp_path / "bad.json"))
         assert code_of(error) == "FILE_FORMAT"
+        assert words in error.value.found, text
 
 
 def test_pbl_run_wants_a_log_for_each_video(tmp_path):
