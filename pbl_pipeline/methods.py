@@ -205,7 +205,10 @@ class Stage(Mapping[str, Method[P]]):
         return self._method(f"{family.name}-custom", 1, given, family)
 
     def make(self, name: str, version: int, params: P) -> Method[P]:
-        """A method of one's own: parameters of a family under a name. Raises `PblError` SOLVER_UNKNOWN."""
+        """A method of one's own: parameters of a family under a name.
+
+        Raises `PblError` SOLVER_UNKNOWN, and `ValueError` for a value that is not of its field's type.
+        """
         return self._method(name, version, params, self._family_of(params))
 
     def of(self, paramset: Paramset) -> Method[P]:
@@ -246,6 +249,8 @@ class Stage(Mapping[str, Method[P]]):
         return method
 
     def _method(self, name: str, version: int, params: P, family: Family) -> Method[P]:
+        # As they come back from a row: 4 where a float is meant is 4.0, and hashes as such.
+        params = Paramset.of(self.name, name, version, params).to(type(params))
         paramset = Paramset.of(self.name, name, version, params)
         if self.kind not in paramset.params and name != family.name:
             paramset = dataclasses.replace(paramset, params={self.kind: family.name, **paramset.params})

@@ -64,12 +64,11 @@ def canonical_json(value: Any) -> str:
 
 
 def _exactly(value: Any, kind: type) -> Any:
-    """`value`, which must be of this type already; JSON writes 1.0 as 1 in some databases, so an int may be a float."""
-    if kind is float and type(value) is int:
-        return float(value)
-    if type(value) is not kind:
+    """`value`, which must be of this type already; people and some databases write 1.0 as 1, so an int is a float, too."""
+    wanted = (int, float) if kind is float else kind
+    if not isinstance(value, wanted) or (isinstance(value, bool) and kind is not bool):
         raise TypeError(f"{value!r} is no {kind.__name__}")
-    return value
+    return kind(value)
 
 
 def _reason(error: BaseException, kind: type | None) -> str:

@@ -13,8 +13,10 @@ import pytest
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GaitParams
+from pbl_pipeline.keypoints import ModelKeypointParams, ModelParams
 from pbl_pipeline.methods import Stage, of_stage, stored
 from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.tracking import TrackingParams
 
 #: The hash of every method that ships. Rows of results name them, so none may ever change: other parameters are
 #: another version.
@@ -125,6 +127,23 @@ def test_changed_parameters_have_another_name_and_hash_and_the_same_function():
     assert moved.hash != zeni.hash
     assert moved.function is zeni.function
     assert stored(**row_of(moved)) == moved
+
+
+def test_a_whole_number_for_a_float_is_that_float():
+    stage = of_stage("gait")
+    params = stage["zeni-2008"].params
+    written, meant = (stage.make("mine", 1, dataclasses.replace(params, cutoff_hz=hz)) for hz in (4, 4.0))
+    assert written.hash == meant.hash
+    assert stored(**row_of(written)) == written == meant
+
+
+def test_methods_of_registered_models_keep_their_hash():
+    model = ModelParams("m", "1" * 64, "2" * 64, "MIT", 10)
+    points = of_stage("keypoints").make("m", 1, ModelKeypointParams(model_sha256=model.sha256, model=model))
+    assert points.hash == "a6a4513ebb6ec903"
+    people = TrackingParams(detector="yolox", model="m", model_sha256="1" * 64, spec_sha256="2" * 64, min_score=0.3)
+    assert of_stage("tracking").make("m", 1, people).hash == "30c82bcfebb2a88f"
+    assert stored(**row_of(points)) == points
 
 
 @dataclasses.dataclass(frozen=True)
