@@ -64,7 +64,7 @@ def canonical_json(value: Any) -> str:
 
 
 def _exactly(value: Any, kind: type) -> Any:
-    """`value`, which must be of this type already; people and some databases write 1.0 as 1, so an int is a float, too."""
+    """`value`, which must be of this type already; but people and some databases write 1.0 as 1."""
     wanted = (int, float) if kind is float else kind
     if not isinstance(value, wanted) or (isinstance(value, bool) and kind is not bool):
         raise TypeError(f"{value!r} is no {kind.__name__}")
