@@ -28,6 +28,7 @@ from pbl_pipeline.errors import PblError
 
 from . import _catalog, _dump, connection
 from ._catalog import Column, quote
+from ._files import write_json
 from ._store import store_error
 
 FORMAT = 1
@@ -102,7 +103,10 @@ def backup(folder: Path, store: bool = True, say: Say = lambda _: None) -> Backu
             name: sha256_of(folder / name) for name in ("database.sql.gz", *(["store.sha256"] if store else []))
         },
     }
-    _write_text(folder / "manifest.json", json.dumps(manifest, indent=1) + "\n")
+    try:
+        write_json(folder / "manifest.json", manifest)
+    except OSError as error:
+        raise _unwritable(folder, error) from error
     return Backup(folder, created, rows, manifest["n_files"], n_bytes)
 
 
@@ -350,13 +354,6 @@ def _new_folder(folder: Path) -> None:
             expected="a new or empty folder: no backup is ever written over another",
             next_step="name another folder, such as one with today's date",
         )
-
-
-def _write_text(path: Path, text: str) -> None:
-    try:
-        path.write_text(text)
-    except OSError as error:
-        raise _unwritable(path, error) from error
 
 
 def _unwritable(path: Path, error: OSError) -> PblError:

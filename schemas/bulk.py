@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
 from collections.abc import Iterable, Iterator
 from itertools import islice
 from pathlib import PurePath
 from typing import Any
 
-from . import fit, gait, gdi, keypoints, lab, session, tracking, video
+from . import lab, session, video
 from ._codes import check_subject, day_of
-from ._datajoint import DuplicateError
-from .ingest import Methods, next_id, resolve
+from .ingest import METHOD_FIELDS, Methods, in_transaction, next_id, resolve, selections
 from .rows import utc_now
 
 #: Rows in one transaction.
 CHUNK = 5000
-_ATTEMPTS = 20
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +55,7 @@ def register_many(recordings: Iterable[Recording], methods: Methods | None = Non
     for chunk in _chunks(recordings):
         for one in chunk:
             check_subject(one.subject, "give the person such a code", one.path)
-        new = _register(chunk, chosen)
+        new = in_transaction(functools.partial(_insert, chunk, chosen))
         out.new += new
         out.known += len(chunk) - new
     return out
@@ -66,18 +65,6 @@ def _chunks(recordings: Iterable[Recording]) -> Iterator[list[Recording]]:
     rest = iter(recordings)
     while chunk := list(islice(rest, CHUNK)):
         yield chunk
-
-
-def _register(chunk: list[Recording], chosen: dict[str, str]) -> int:
-    """One chunk in one transaction; numbers another process took meanwhile make it begin again."""
-    for attempt in range(_ATTEMPTS):
-        try:
-            with video.schema.connection.transaction:  # type: ignore[union-attr]
-                return _insert(chunk, chosen)
-        except DuplicateError:
-            if attempt == _ATTEMPTS - 1:
-                raise
-    raise AssertionError("unreachable")
 
 
 def _insert(chunk: list[Recording], chosen: dict[str, str]) -> int:
@@ -109,16 +96,8 @@ def _insert(chunk: list[Recording], chosen: dict[str, str]) -> int:
         for i, r in enumerate(new.values())
     ]
     video.Video.insert(rows)
-    tracked = [{"video_id": r["video_id"], "tracking_method": chosen["tracking_method"]} for r in rows]
-    tracking.TrackingSelection.insert({**t, "subject_method": chosen["subject_method"]} for t in tracked)
-    keypoints.KeypointSelection.insert({**t, "keypoint_method": chosen["keypoint_method"]} for t in tracked)
-    planned = [{"session_id": i} for i in set(sessions.values())]
-    for table, names in (
-        (fit.FitPlan, ("keypoint_method", "fit_method")),
-        (gait.GaitPlan, ("gait_method",)),
-        (gdi.GdiPlan, ("gdi_method", "norm")),
-    ):
-        table.insert(({**p, **{n: chosen[n] for n in names}} for p in planned), skip_duplicates=True)
+    for table, selected in selections([r["video_id"] for r in rows], [*set(sessions.values())], chosen, METHOD_FIELDS):
+        table.insert(selected, skip_duplicates=True)  # a session may have its plans already
     return len(rows)
 
 

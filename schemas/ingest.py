@@ -6,9 +6,9 @@ import dataclasses
 import hashlib
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 from unicodedata import category
 
 from pbl_pipeline.errors import PblError
@@ -27,6 +27,8 @@ from .rows import delete_below, utc_now
 
 if TYPE_CHECKING:
     from pbl_pipeline.video import Camera
+
+T = TypeVar("T")
 
 _ATTEMPTS = 20
 
@@ -240,17 +242,17 @@ def _with_sha256(sha256: str) -> dict[str, Any] | None:
     return rows[0] if rows else None
 
 
-def in_transaction(work: Callable[[], None], until: Callable[[], bool] = lambda: False) -> None:
-    """Run `work` in a transaction; again if another process took the same number (the highest plus one)."""
+def in_transaction(work: Callable[[], T], until: Callable[[], bool] = lambda: False) -> T:
+    """Run `work` in a transaction; again if another process took the same number (the highest plus one), unless
+    `until` holds then."""
     for attempt in range(_ATTEMPTS):
         try:
             with video.schema.connection.transaction:  # type: ignore[union-attr]
-                work()
+                return work()
         except DuplicateError:
             if until() or attempt == _ATTEMPTS - 1:
                 raise
-        else:
-            return
+    raise AssertionError("unreachable")
 
 
 def _known(
@@ -331,39 +333,54 @@ def _new_population(subject: str, population: str | None) -> list[str]:
 
 
 def _new_methods(row: dict[str, Any], chosen: dict[str, str], more: set[str]) -> list[str]:
-    """Add the selections and plans of the methods that were named; those that are new, in words."""
-    of_video, of_session = {"video_id": int(row["video_id"])}, {"session_id": int(row["session_id"])}
-    tracked = {**of_video, "tracking_method": chosen["tracking_method"]}
-    new: list[tuple[Any, dict[str, Any]]] = []
-    if "tracking_method" in more:
-        new.append((tracking.TrackingSelection, {**tracked, "subject_method": chosen["subject_method"]}))
-    if more & {"tracking_method", "keypoint_method"}:
-        known = (tracking.TrackingSelection & of_video).keys()
-        trackings = [tracked] if "tracking_method" in more else known
-        points = {"keypoint_method": chosen["keypoint_method"]}
-        new += [(keypoints.KeypointSelection, {**t, **points}) for t in trackings]
-    if more & {"keypoint_method", "fit_method"}:
-        plan = {**of_session, "fit_method": chosen["fit_method"]}
-        seen_by = [chosen["keypoint_method"]] if "keypoint_method" in more else _keypoint_methods(of_session)
-        new += [(fit.FitPlan, {**plan, "keypoint_method": points}) for points in seen_by]
-    if "gait_method" in more:
-        new.append((gait.GaitPlan, {**of_session, "gait_method": chosen["gait_method"]}))
-    if more & {"gdi_method", "norm"}:
-        new.append((gdi.GdiPlan, {**of_session, "gdi_method": chosen["gdi_method"], "norm": chosen["norm"]}))
+    """Add the selections and plans of the methods that were named; returns those that are new, in words."""
     added = []
     with video.schema.connection.transaction:  # type: ignore[union-attr]
-        for table, values in new:
-            key = {k: v for k, v in values.items() if k in table.primary_key}
-            if not table & key:
-                table.insert1(values)
-                names = [str(v) for k, v in key.items() if k not in ("video_id", "session_id")]
-                added.append(f"{table.__name__} {', '.join(names)} was added")
+        for table, rows in selections([int(row["video_id"])], [int(row["session_id"])], chosen, more):
+            for values in rows:
+                key = {k: v for k, v in values.items() if k in table.primary_key}
+                if not table & key:
+                    table.insert1(values)
+                    names = [str(v) for k, v in key.items() if k not in ("video_id", "session_id")]
+                    added.append(f"{table.__name__} {', '.join(names)} was added")
     return added
 
 
-def _keypoint_methods(of_session: dict[str, Any]) -> list[str]:
+def selections(
+    videos: Sequence[int], sessions: Sequence[int], chosen: dict[str, str], named: Collection[str]
+) -> list[tuple[Any, list[dict[str, Any]]]]:
+    """(table, rows) of the selections and plans that videos and their sessions need for the methods whose keys are
+    `named`.
+
+    Keypoints are selected for the tracking that is selected with them, or else for every tracking the videos have.
+    """
+    named = set(named)
+    trackings: list[Any] = [{"video_id": v, "tracking_method": chosen["tracking_method"]} for v in videos]
+    out: list[tuple[Any, list[dict[str, Any]]]] = []
+    if "tracking_method" in named:
+        subject = {"subject_method": chosen["subject_method"]}
+        out.append((tracking.TrackingSelection, [{**t, **subject} for t in trackings]))
+    elif "keypoint_method" in named:
+        trackings = (tracking.TrackingSelection & [{"video_id": v} for v in videos]).keys()
+    if named & {"tracking_method", "keypoint_method"}:
+        points = {"keypoint_method": chosen["keypoint_method"]}
+        out.append((keypoints.KeypointSelection, [{**t, **points} for t in trackings]))
+    if named & {"keypoint_method", "fit_method"}:
+        fitted = [
+            {"session_id": s, "keypoint_method": points, "fit_method": chosen["fit_method"]}
+            for s in sessions
+            for points in ([chosen["keypoint_method"]] if "keypoint_method" in named else _keypoint_methods(s))
+        ]
+        out.append((fit.FitPlan, fitted))
+    for table, keys in ((gait.GaitPlan, ("gait_method",)), (gdi.GdiPlan, ("gdi_method", "norm"))):
+        if named & set(keys):
+            out.append((table, [{"session_id": s, **{k: chosen[k] for k in keys}} for s in sessions]))
+    return out
+
+
+def _keypoint_methods(session_id: int) -> list[str]:
     """Keys of the keypoint methods that are selected for videos of a session."""
-    selected = keypoints.KeypointSelection & (video.Video & of_session)
+    selected = keypoints.KeypointSelection & (video.Video & {"session_id": session_id})
     return sorted((dj.U("keypoint_method") & selected).to_arrays("keypoint_method"))
 
 
@@ -447,16 +464,10 @@ def _camera_sha256(camera: dict[str, Any]) -> str:
 
 
 def _select(video_id: int, session_id: int, person: int | None, chosen: dict[str, str]) -> None:
-    tracked = {"video_id": video_id, "tracking_method": chosen["tracking_method"]}
-    tracking.TrackingSelection.insert1({**tracked, "subject_method": chosen["subject_method"]})
-    keypoints.KeypointSelection.insert1({**tracked, "keypoint_method": chosen["keypoint_method"]})
+    for table, rows in selections([video_id], [session_id], chosen, METHOD_FIELDS):
+        table.insert(rows, skip_duplicates=True)  # the session may have its plans already
     if person is not None:
-        tracking.set_override(tracked, person)
-    planned = {"session_id": session_id}
-    pair = {name: chosen[name] for name in ("keypoint_method", "fit_method")}
-    fit.FitPlan.insert1({**planned, **pair}, skip_duplicates=True)
-    gait.GaitPlan.insert1({**planned, "gait_method": chosen["gait_method"]}, skip_duplicates=True)
-    gdi.GdiPlan.insert1({**planned, "gdi_method": chosen["gdi_method"], "norm": chosen["norm"]}, skip_duplicates=True)
+        tracking.set_override({"video_id": video_id, "tracking_method": chosen["tracking_method"]}, person)
 
 
 def next_id(table: Any, attribute: str) -> int:

@@ -93,36 +93,26 @@ class Supervisor:
         self.metrics.in_hand.set_function(lambda: sum(len(c.jobs) for c in self._children))
         self._pause = RESTART_S[0]
         self._stillborn = 0
-        self._stop_at: float | None = None
-        self._signalled = 0
+        self._stopping = False
+        self._due: list[tuple[float, signal.Signals]] = []  # signals that are still to be sent, with their time
         # Not fork: threads of the numerical libraries do not survive it.
         self._start = multiprocessing.get_context("spawn")
 
     def stop(self, *_: object) -> None:
         """Let the running jobs end within the grace period; called again, do not wait for them."""
-        self._signalled += 1
-        now = time.monotonic()
-        self._stop_at = now if self._signalled > 1 else now + self.options.grace_s
+        end = time.monotonic() + (0.0 if self._stopping else self.options.grace_s)
+        self._stopping = True
+        self._due = [(0.0, signal.SIGTERM), (end, signal.SIGUSR1), (end + LAST_S, signal.SIGKILL)]
 
     def run(self) -> int:
         """Watch until every process has ended (`once`), or until SIGTERM or SIGINT."""
         before = {s: signal.signal(s, self.stop) for s in (signal.SIGTERM, signal.SIGINT)}
         try:
             self._children = [self._launch() for _ in range(self.options.processes)]
-            sent = 0
             code = 0
             while self._children:
                 self._listen(0.5)
-                if self._stop_at is not None and sent < 1:
-                    sent = 1
-                    self._send(signal.SIGTERM)
-                    event(log, logging.INFO, "stopping", grace_s=self.options.grace_s)
-                if self._stop_at is not None and time.monotonic() >= self._stop_at:
-                    if sent < 2:
-                        sent = 2
-                        self._send(signal.SIGUSR1)
-                    if time.monotonic() >= self._stop_at + LAST_S:
-                        self._send(signal.SIGKILL, "did not stop in time")
+                self._send_due()
                 self._end_overdue()
                 code = max(code, self._reap())
             return code
@@ -138,12 +128,16 @@ class Supervisor:
         there.close()
         return _Child(process, here, time.monotonic())
 
-    def _send(self, signum: int, why: str = "") -> None:
-        for child in self._children:
-            if why:
-                child.why = why
-            if child.process.is_alive():
-                os.kill(child.process.pid, signum)
+    def _send_due(self) -> None:
+        """Ask the processes to end after their job (SIGTERM), then to put it back (SIGUSR1), then kill them."""
+        while self._due and time.monotonic() >= self._due[0][0]:
+            _, signum = self._due.pop(0)
+            event(log, logging.INFO, "stopping", signal=signum.name, grace_s=self.options.grace_s)
+            for child in self._children:
+                if signum == signal.SIGKILL:
+                    child.why = "did not stop in time"
+                if child.process.is_alive():
+                    os.kill(child.process.pid, signum)
 
     def _listen(self, seconds: float) -> None:
         speaking = [c for c in self._children if not c.pipe.closed]
@@ -177,12 +171,11 @@ class Supervisor:
             child.process.join()
             self._children.remove(child)
             exit_code = child.process.exitcode or 0
-            stopping = self._stop_at is not None
             if child.jobs:
-                self._settle_jobs(child, exit_code, stopping)
-            elif exit_code and not stopping:
+                self._settle_jobs(child, exit_code)
+            elif exit_code and not self._stopping:
                 event(log, logging.ERROR, "process died", exit_code=exit_code, reason=_death(exit_code))
-            if stopping or (exit_code == 0 and not child.jobs):
+            if self._stopping or (exit_code == 0 and not child.jobs):
                 code = max(code, 1 if exit_code > 0 else 0)
                 continue
             if exit_code == SELFTEST_FAILED:
@@ -199,18 +192,18 @@ class Supervisor:
             self.metrics.restarts.inc()
             time.sleep(self._pause)
             self._pause = min(2 * self._pause, RESTART_S[1])
-            if self._stop_at is None:
+            if not self._stopping:
                 self._children.append(self._launch())
         return code
 
-    def _settle_jobs(self, child: _Child, exit_code: int, stopping: bool) -> None:
+    def _settle_jobs(self, child: _Child, exit_code: int) -> None:
         reason = child.why or _death(exit_code)
         for message, _ in child.jobs.values():
             event(log, logging.ERROR, "job took its process down", reason=reason, about=message["about"])
             if not run_job.wait_for_database():
                 return  # `recover` frees its reservation later
             job = _claim_of(message, child.process.pid)
-            if stopping and not child.why.startswith("time limit"):
+            if self._stopping and not child.why.startswith("time limit"):
                 queue.put_back(job, "the worker was stopped")
             else:
                 settle_crash(job, reason, at_once=child.why.startswith("time limit"))
