@@ -1,11 +1,10 @@
 """All rows of the database as statements, one a line, and back: what `pbl db backup` and `pbl db restore` rest on.
 
-By hand, and not with mariadb-dump or mysqldump, for three reasons. A backup counts the rows and collects the files
-they name in the transaction that reads them; a dump program has a snapshot of its own, so that a row which is deleted
-in between would be restored without its file. It prints single precision with six digits, which DataJoint uses for
-a column of its own in every computed table (`_job_duration`). And it would have to be installed wherever a backup is
-made; the packages of the embedded server do not include it. The file is plain SQL:
-`zcat database.sql.gz | mariadb -h HOST -u USER -p` restores it without us.
+By hand, and not with mariadb-dump or mysqldump: a backup counts the rows and collects the files they name in the
+transaction that reads them. A dump program has a snapshot of its own, so that a row which is deleted in between would
+be restored without its file, and it would have to be installed wherever a backup is made, which the packages of the
+embedded server do not do. The file is plain SQL: `zcat database.sql.gz | mariadb -h HOST -u USER -p` restores it
+without us.
 """
 
 from __future__ import annotations

@@ -367,7 +367,7 @@ def selections(
         out.append((keypoints.KeypointSelection, [{**t, **points} for t in trackings]))
     if named & {"keypoint_method", "fit_method"}:
         fitted = [
-            {"session_id": s, "keypoint_method": points, "fit_method": chosen["fit_method"]}
+            {"session_id": s, "fit_method": chosen["fit_method"], "keypoint_method": points}
             for s in sessions
             for points in ([chosen["keypoint_method"]] if "keypoint_method" in named else _keypoint_methods(s))
         ]
