@@ -1,4 +1,4 @@
-# make demo: the main job on a real video in an embedded database.   make test: the tests.   Both install what they need.
+# make demo: the main job on a real video in an embedded database.   make test: the tests.   All install what they need.
 
 VENV   := .venv
 BIN    := $(VENV)/bin
@@ -8,7 +8,7 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
             then echo $$p; break; fi; done)
 OUT    ?= pbl_demo
 
-.PHONY: demo test lint format lock clean help
+.PHONY: demo test test-fast lint format lock clean help
 
 help:           ## what can be made
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -18,6 +18,9 @@ demo: $(READY)  ## put the demo recording through every table and show the resul
 
 test: $(READY)  ## the tests
 	$(BIN)/pytest
+
+test-fast: $(READY) ## the tests that take a minute and a half: no database, no fit, no network over a video
+	$(BIN)/pytest -m "not slow and not database and not needs_extra"
 
 lint: $(READY)  ## style, formatting and types
 	$(BIN)/ruff check .

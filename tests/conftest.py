@@ -18,6 +18,13 @@ from tests.database import installation, leave_nothing_of_the_developer
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The marker `database` follows from the fixture of that name."""
+    for item in items:
+        if "database" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.database)
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The development recordings beside the project; tests that need them skip where they are absent."""

@@ -22,6 +22,8 @@ from tests.command import Done, pbl
 from tests.rows import remove_all
 from tests.videos import constant_rate, numbered_frames, write_video
 
+pytestmark = pytest.mark.slow
+
 EMPTY = "niemand ist da, früh.mp4"
 
 

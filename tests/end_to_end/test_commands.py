@@ -13,6 +13,8 @@ import pytest
 from pbl_pipeline.body import load_body
 from tests.command import pbl
 
+pytestmark = pytest.mark.slow
+
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "files.md"
 
 

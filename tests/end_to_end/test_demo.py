@@ -28,6 +28,8 @@ from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.video import probe
 from tests.database import new_home, remove_home
 
+pytestmark = pytest.mark.slow
+
 CONTACTS = {"left": (41, 79, 116, 153, 188), "right": (60, 98, 135, 171)}
 ALL_CONTACTS = np.sort(np.concatenate([*CONTACTS.values()]))
 #: 60 s / (mean step of 18.4 frames / 30): 98 steps/min. One frame at either end of the eight steps is 1 %.

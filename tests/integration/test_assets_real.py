@@ -8,6 +8,8 @@ import pytest
 from pbl_pipeline import assets, settings
 from pbl_pipeline.video import load_camera, probe
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory):

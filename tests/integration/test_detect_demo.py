@@ -26,6 +26,8 @@ from pbl_pipeline.video import guess_camera, load_camera, read_frames
 from tests.unit.test_blazepose import BY_EYE, asset
 from tests.videos import constant_rate, write_video
 
+pytestmark = pytest.mark.slow
+
 SIZE = (1768, 994)
 
 

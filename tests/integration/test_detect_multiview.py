@@ -10,6 +10,8 @@ import pytest
 from tests.benchmarks.detection import MOST_FRAMES, MOST_PX, REFERENCE, compare, detected, read_trc, runs
 from tests.unit.test_blazepose import asset
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("camera", ["cam02", "cam04"])
 def test_points_lie_where_four_cameras_see_them_and_sides_stay(shared_data, camera):

@@ -24,6 +24,8 @@ from schemas.cli.db import db
 from schemas.embedded import _account, _apt, _binaries, _process, _setup
 from tests.database import new_home, remove_home
 
+pytestmark = pytest.mark.database
+
 PBL = [sys.executable, "-c", "from pbl_pipeline.cli import main; main()"]
 
 

@@ -1,7 +1,7 @@
 """The export script of docs/metrabs.md, with a randomly initialised network that has MeTRAbs' interface.
 
 torch is no dependency of the project: without it these tests skip. To run them, install torch, onnx and onnxscript
-beside the project and `pytest -m slow tests/integration/test_export_metrabs.py`.
+beside the project and `pytest -m needs_extra tests/integration/test_export_metrabs.py`.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def random_selection() -> np.ndarray:
     return selection
 
 
-@pytest.mark.slow
+@pytest.mark.needs_extra
 def test_the_folder_is_a_model_that_computes_what_the_network_does(torch, tmp_path, monkeypatch):
     network, selection = make_network(torch), random_selection()
     folder = export(
@@ -145,7 +145,7 @@ def test_the_folder_is_a_model_that_computes_what_the_network_does(torch, tmp_pa
     assert np.median(np.ptp(got["coords2d"], axis=0)) > 0.2
 
 
-@pytest.mark.slow
+@pytest.mark.needs_extra
 def test_weights_that_do_not_add_up(torch, tmp_path):
     with pytest.raises(ExportError, match="add up"):
         export(
@@ -161,7 +161,7 @@ def test_weights_that_do_not_add_up(torch, tmp_path):
         )
 
 
-@pytest.mark.slow
+@pytest.mark.needs_extra
 def test_the_whole_program_on_a_folder_like_the_published_one(torch, tmp_path, monkeypatch):
     """MeTRAbs' package is replaced by modules of the same names that make the random network."""
     network = make_network(torch)
