@@ -26,10 +26,11 @@ def track(items: Iterable[T], label: str, total: int | None = None, unit: str = 
 
 @contextmanager
 def bar(label: str, total: int | None = None, unit: str = "step") -> Iterator[Callable[..., None]]:
-    """A bar for work that is not an iteration: yields `update(n=1, note="")`."""
+    """A bar for work that is not an iteration: yields `update(n=1, note="", total=None)`; a total replaces the last."""
     with tqdm(desc=label, total=total, unit=unit, disable=not _enabled, **_style()) as b:
 
-        def update(n: int = 1, note: str = "") -> None:
+        def update(n: int = 1, note: str = "", total: int | None = None) -> None:
+            b.total = b.total if total is None else total
             if note:
                 b.set_postfix_str(note, refresh=False)
             b.update(n)

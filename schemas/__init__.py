@@ -7,10 +7,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from ._activate import COMPUTED, STAGES, activate, computed_tables
+from ._activate import STAGES, activate
 
 if TYPE_CHECKING:
     from .results import SessionResults
+
+
+def computed_tables() -> list[Any]:
+    """The computed tables in the order of the chain: see `schemas.chain`."""
+    from .chain import computed_tables as tables
+
+    return tables()
 
 
 def load_session(restriction: Any) -> SessionResults:
@@ -20,4 +27,4 @@ def load_session(restriction: Any) -> SessionResults:
     return load(restriction)
 
 
-__all__ = ["COMPUTED", "STAGES", "activate", "computed_tables", "load_session"]
+__all__ = ["STAGES", "activate", "computed_tables", "load_session"]

@@ -4,27 +4,9 @@ from __future__ import annotations
 
 import importlib
 from types import ModuleType
-from typing import Any
 
 #: Modules of tables, each its own schema on the server, in the order of dependency.
 STAGES = ("lab", "session", "video", "tracking", "keypoints", "fit", "gait", "gdi", "qc", "validation", "worker")
-
-#: The computed tables of the chain, in the order in which populate visits them: (module, class).
-COMPUTED = (
-    ("video", "VideoInfo"),
-    ("tracking", "Tracking"),
-    ("tracking", "SubjectChoice"),
-    ("keypoints", "Keypoints"),
-    ("fit", "TrialInput"),
-    ("fit", "SessionFit"),
-    ("gait", "GaitEvents"),
-    ("gait", "GaitCycle"),
-    ("gait", "Spatiotemporal"),
-    ("gdi", "GDI"),
-    ("gdi", "SessionGdi"),
-    ("qc", "SessionQc"),
-    ("validation", "KinematicError"),
-)
 
 _methods_done: set[str] = set()
 
@@ -60,8 +42,3 @@ def activate(start: bool = False, methods: bool = True) -> None:
 
         insert_all()
         _methods_done.add(connection.prefix())
-
-
-def computed_tables() -> list[Any]:
-    """The computed tables in the order of the chain."""
-    return [getattr(importlib.import_module(f"schemas.{module}"), name) for module, name in COMPUTED]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 
 from . import _store, connection
-from ._activate import activate, computed_tables
+from ._activate import activate
+from .chain import computed_tables
 from .jobs import jobs_of
 
 

@@ -182,6 +182,13 @@ class SessionFit(dj.Computed):
     def key_source(self) -> Any:
         return FitSelection & {"fit_current": True}
 
+    def populate(self, *restrictions: Any, **options: Any) -> dict[str, Any]:
+        """DataJoint's own, after the fits of all sessions whose trials are decided have been planned."""
+        from .plan import plan_fit_sets
+
+        plan_fit_sets()
+        return super().populate(*restrictions, **options)
+
     def make_fetch(self, key: dict) -> tuple:
         rows = (FitSet.Video * keypoints.Keypoints.proj("keypoints_file") * video.Video & key).to_dicts(
             order_by="video_id"

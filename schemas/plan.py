@@ -12,16 +12,13 @@ from pbl_pipeline import methods
 
 from . import fit, keypoints, session, tracking, video
 from ._datajoint import dj
+from .chain import before
 from .jobs import jobs_of
 from .method_rows import method_row, resolve_method
 from .rows import utc_now
 
 #: What one fit is for: a session, seen through one chain of methods.
 GROUP = ("session_id", "tracking_method", "keypoint_method", "fit_method")
-
-
-#: The tables in which an error row decides that a trial does not take part.
-UNDECIDED = (video.VideoInfo, tracking.Tracking, tracking.SubjectChoice, keypoints.Keypoints, fit.TrialInput)
 
 
 def default_fit(keypoint_method: str) -> str:
@@ -68,7 +65,9 @@ def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]
     by_method = dj.U("session_id", "fit_method").aggr(current * fit.FitSet.proj("session_id"), n_current="count(*)")
     several = (by_method & "n_current > 1").proj()
     to_plan = sorted({int(s) for found in (new, several) for s in found.to_arrays("session_id")})
-    failed = [jobs_of(table) for table in UNDECIDED]  # declares the job tables, which would end a transaction
+    # An error row before the fit decides that a trial does not take part. (Job tables are declared here, not below:
+    # that would end the transaction.)
+    failed = [jobs_of(table) for table in before(fit.SessionFit)]
     made = []
     for session_id in to_plan:
         with _locked(session_id):

@@ -51,6 +51,8 @@ class SessionQc(dj.Computed):
         qc_advice         : varchar(1000)      # what to do about it
         """
 
+    waits_for = (gait.GaitEvents,)
+
     @property
     def key_source(self) -> Any:
         """Sessions whose trials have all been searched for events: with several workers the measures may come first."""

@@ -33,17 +33,10 @@ def write_session(restriction: Any, out: Path) -> list[Path]:
             next_step="run `pbl populate`, then `pbl status`",
             key=f"subject {found.subject}",
         )
-    trials = []
-    for t in found.fitted:
-        assert t.info is not None, "a foreign key of the fit"
-        assert t.choice is not None, "a foreign key of the fit"
-        assert t.keypoints is not None, "a foreign key of the fit"
-        trials.append(Trial(t.name, t.path, t.info, t.choice, t.keypoints))
+    trials = tuple(Trial(t.name, t.path, t.info, t.choice, t.keypoints) for t in found.fitted)
     return write_results(
         out,
-        Session(
-            tuple(trials), found.fit, found.metrics, left_out={t.name: t.problem for t in found.trials if t.fit is None}
-        ),
+        Session(trials, found.fit, found.metrics, left_out={t.name: t.problem for t in found.trials if t.fit is None}),
         title="Gait report",
         subject_code=found.subject,
         date=str(found.session_date or found.session_label),

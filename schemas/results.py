@@ -13,8 +13,10 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 
 from . import fit, gait, gdi, keypoints, session, tracking, video
+from .chain import before
 from .checks import check_values
 from .coded_errors import error_code, error_found
+from .jobs import jobs_of
 from .rows import number
 from .stored_files import file_ref, stored_file
 
@@ -45,6 +47,22 @@ class TrialResults:
 
 
 @dataclasses.dataclass(frozen=True)
+class FittedTrial:
+    """One video of a session that has a fit, and so everything a fit is computed from."""
+
+    video_id: int
+    name: str
+    path: Path
+    info: VideoInfo
+    tracking: tracking_lib.Tracking
+    choice: tracking_lib.SubjectChoice
+    keypoints: Keypoints
+    fit: TrialFit
+    events: lib.GaitEvents | None
+    cycles: tuple[lib.GaitCycle, ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class SessionResults:
     """A visit: its trials in the order of their numbers, the fit and the measures of the current set."""
 
@@ -58,9 +76,9 @@ class SessionResults:
     key: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
-    def fitted(self) -> tuple[TrialResults, ...]:
+    def fitted(self) -> tuple[FittedTrial, ...]:
         """The trials that have a fit, in the order of `fit.trials` and `metrics.trials`."""
-        return tuple(t for t in self.trials if t.fit is not None)
+        return tuple(_fitted(t) for t in self.trials if t.fit is not None)
 
 
 def load_session(restriction: Any) -> SessionResults:
@@ -392,12 +410,20 @@ def _trial(
     return dataclasses.replace(out, **found, problem=_problem(key, found.get("choice"), fitted))
 
 
+def _fitted(trial: TrialResults) -> FittedTrial:
+    names = [f.name for f in dataclasses.fields(FittedTrial)]
+    values = {name: getattr(trial, name) for name in names}
+    absent = [name for name, value in values.items() if value is None and name != "events"]
+    assert not absent, f"foreign keys of a fit ensure {absent}"
+    return FittedTrial(**values)
+
+
 def _problem(key: Mapping[str, Any], choice: tracking_lib.SubjectChoice | None, fitted: TrialFit | None) -> str:
     """Why a video has no fit, in a sentence."""
     if fitted is not None:
         return ""
-    for table in (video.VideoInfo, tracking.Tracking, tracking.SubjectChoice, keypoints.Keypoints, fit.TrialInput):
-        for row in (table.jobs.errors & key).to_dicts():
+    for table in before(fit.SessionFit):
+        for row in (jobs_of(table).errors & key).to_dicts():
             message = row["error_message"]
             return f"{table.__name__}: {error_code(message)}, {error_found(message)}"
     if choice is not None and choice.status not in tracking.CHOSEN:

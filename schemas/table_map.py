@@ -2,47 +2,22 @@
 
 from __future__ import annotations
 
-import inspect
 import re
 import sys
 from typing import Any
 
 from ._activate import STAGES, modules
 from ._datajoint import dj
+from .chain import references, tables
 
 _ORIGIN = ("code_version", "method_hash", "model_sha256", "host", "seconds", "computed")
 _KINDS = {dj.Manual: "manual", dj.Lookup: "lookup", dj.Computed: "computed", dj.Part: "part"}
 _SHAPES = {"manual": ('["', '"]'), "lookup": ('[/"', '"/]'), "computed": ('(["', '"])')}
 
 
-def tables() -> dict[str, Any]:
-    """Every table class by its name, such as `fit.SessionFit.Trial`, in the order of the modules."""
-    out: dict[str, Any] = {}
-    for stage, module in zip(STAGES, modules(), strict=True):
-        for cls, _ in module.schema.declare_list:
-            out[f"{stage}.{cls.__name__}"] = cls
-            for name, part in vars(cls).items():
-                if inspect.isclass(part) and issubclass(part, dj.Part):
-                    out[f"{stage}.{cls.__name__}.{name}"] = part
-    return out
-
-
 def kind(cls: Any) -> str:
     """manual, lookup, computed or part."""
     return next(word for base, word in _KINDS.items() if issubclass(cls, base))
-
-
-def references(name: str, cls: Any) -> list[str]:
-    """Names of the tables that a table refers to."""
-    stage, master = name.split(".")[0], ".".join(name.split(".")[:2])
-    out = []
-    for line in cls.definition.splitlines():
-        match = re.match(r"\s*->\s*(?:\[[^\]]*\]\s*)?([\w.]+)", line)
-        if match:
-            target = match.group(1)
-            known = master if target == "master" else target
-            out.append(known if known.split(".")[0] in STAGES else f"{stage}.{known}")
-    return out
 
 
 def columns(cls: Any) -> list[tuple[str, str, str, bool]]:

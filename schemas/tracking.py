@@ -94,6 +94,8 @@ class Tracking(dj.Computed):
         box_height      : float64              # (px) median height of the box
         """
 
+    waits_for = (video.VideoInfo,)
+
     @property
     def key_source(self) -> Any:
         """Only what a probe could read: a file that is no video has one error row, in VideoInfo."""

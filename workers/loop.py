@@ -7,6 +7,7 @@ import logging
 import random
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -31,6 +32,7 @@ class Worker:
 
     tables: the computed tables it serves. stop: set when it is to end after the job in hand. say: told of each job
     before ("start") and after ("end") with the claim and the outcome; the supervisor listens. batch: fits per batch.
+    limit: most jobs of each table. found: what its looks at the tables, and its jobs, made computable.
     """
 
     tables: Sequence[Any]
@@ -38,8 +40,11 @@ class Worker:
     stop: threading.Event = dataclasses.field(default_factory=threading.Event)
     say: Callable[[str, Claim | None, Outcome | None], None] = lambda *_: None
     batch: int = 1
+    limit: int | None = None
     done: int = 0
     failed: int = 0
+    found: refresh.Refreshed = dataclasses.field(default_factory=refresh.Refreshed)
+    _taken: Counter[str] = dataclasses.field(default_factory=Counter)
     _refreshed: float = -1e9
     _everything: bool | None = None
 
@@ -83,8 +88,11 @@ class Worker:
         for _, _, table in sorted(ranked, key=lambda r: r[:2]):
             stage = registry.stage_of(table)
             n = self.batch if stage.resource == registry.FIT else stage.batch
-            jobs = queue.claim(table, n)
+            if self.limit is not None:
+                n = min(n, self.limit - self._taken[table.__name__])
+            jobs = queue.claim(table, n) if n > 0 else []
             if jobs:
+                self._taken[table.__name__] += len(jobs)
                 self._do(jobs)
                 return len(jobs)
         return 0
@@ -124,10 +132,10 @@ class Worker:
             self.stop.wait(1.0)  # the cause is outside of the job: the next one would meet it too
         return outcome
 
-    def follow(self, outcomes: Sequence[Outcome]) -> int:
+    def follow(self, outcomes: Sequence[Outcome]) -> None:
         """Queue what the jobs made computable."""
         good = [o.job for o in outcomes if o.what in (run_job.DONE, run_job.ALREADY)]
-        return refresh.after(good, [o.job for o in outcomes if o.what == run_job.FAILED])
+        self.found.add(refresh.after(good, [o.job for o in outcomes if o.what == run_job.FAILED]))
 
     def _refresh(self) -> bool | None:
         """Look at all tables if it is time. Whether something was found; None where another worker is at it."""
@@ -138,6 +146,7 @@ class Worker:
         if found is None:
             return None
         self._refreshed = time.monotonic()
+        self.found.add(found)
         if found.queued or found.freed:
             event(log, logging.INFO, "refreshed", queued=found.queued, freed=found.freed, planned=found.planned)
         mine = {t.__name__ for t in self.tables}

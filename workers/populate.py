@@ -1,19 +1,27 @@
-"""The populate loop: every computed table of the chain, in order, each job reserved, errors left in their rows."""
+"""`pbl populate`: the worker, run once in this process, with a bar and a summary."""
 
 from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from pbl_pipeline import progress
-from schemas import computed_tables
+from schemas import computed_tables, tracking
 from schemas.jobs import jobs_of
 from schemas.status import empty_rows
 
-from . import queue, recover, refresh, run_job
-from .registry import stage_of, table_named
+from . import queue, refresh, run_job
+from .heartbeat import Silent
+from .loop import Worker
+from .queue import Claim
+from .registry import table_named
+from .run_job import Outcome
+
+#: Pause between two looks at how many jobs there are (s): it is a query a table.
+COUNT_EVERY_S = 2.0
 
 
 @dataclasses.dataclass
@@ -45,9 +53,7 @@ class Run:
 
 
 def populate(tables: Sequence[str] | None = None, limit: int | None = None, retry_errors: bool = False) -> Run:
-    """Compute what is missing, table after table in the order of the chain.
-
-    One call is one worker; several processes may run at once. `schemas.activate()` must have been called.
+    """Compute what is missing. One call is one worker; several may run at once. `schemas.activate()` comes before.
 
     Parameters
     ----------
@@ -63,66 +69,56 @@ def populate(tables: Sequence[str] | None = None, limit: int | None = None, retr
     PblError
         USAGE for an unknown table name.
     """
-    from schemas.tracking import drop_outdated_choices
-
-    # DataJoint would print every error row's text into the progress bars; the summary and `pbl status` say it.
-    logging.getLogger("datajoint").setLevel(logging.CRITICAL)
-    chosen = _choose(tables)
-    run = Run([])
-    for table in chosen:
-        run.freed += recover.free_dead(table)
-        if retry_errors:
-            run.retried += queue.reset(jobs_of(table).errors)
-    run.dropped = drop_outdated_choices()
-    names = [t.__name__ for t in chosen]
-    for table in chosen:
-        if table.__name__ == "SessionFit":
-            run.planned += refresh.plan()
-        part = TableRun(table.__name__)
-        run.tables.append(part)
+    for name in ("datajoint", "pbl.worker"):  # they would print into the bar what the summary and `pbl status` say
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    wanted = {table_named(n) for n in tables or ()}
+    chosen = [t for t in computed_tables() if not tables or t in wanted]
+    parts = {t.__name__: TableRun(t.__name__) for t in chosen}
+    run = Run(list(parts.values()))
+    if retry_errors:
+        run.retried = sum(queue.reset(jobs_of(t).errors) for t in chosen)
+    empty_before = {t: len(empty_rows(t)) for t in chosen}
+    found = refresh.refresh(everything=True) or refresh.Refreshed()
+    with progress.bar("populate", total=_ready(chosen, limit), unit="row") as update:
+        worker = Worker(chosen, Silent(), say=_counting(parts, chosen, limit, update), limit=limit)
         try:
-            _populate_table(table, part, limit)
+            worker.run(once=True)
         except (KeyboardInterrupt, SystemExit):
-            recover.free_own(table)
             run.interrupted = True
-            return run
-    if "TrialInput" in names and "SessionFit" not in names:
-        run.planned += refresh.plan()
+    found.add(worker.found)
+    run.freed, run.planned, run.dropped = found.freed, found.planned, found.dropped
+    for table in chosen:
+        part = parts[table.__name__]
+        part.empty = max(0, min(len(empty_rows(table)) - empty_before[table], part.done))
+        if table is tracking.SubjectChoice:
+            part.waiting = len(table & {"choice_status": "NEEDS_CHOICE"})
     return run
 
 
-def _choose(names: Sequence[str] | None) -> list[Any]:
-    wanted = {table_named(n).__name__ for n in names or ()}
-    return [t for t in computed_tables() if not names or t.__name__ in wanted]
-
-
-def _populate_table(table: Any, part: TableRun, limit: int | None) -> None:
-    queue.sweep(table)
-    queue.fill(table)
-    empty_before = len(empty_rows(table))
-    total = ready(table)
-    with progress.bar(table.__name__, total=total if limit is None else min(total, limit), unit="row") as update:
-        calls = 0
-        while limit is None or calls < limit:
-            jobs = queue.claim(table, min(stage_of(table).batch, limit - calls if limit is not None else 1000))
-            if not jobs:
-                break
-            for job in jobs:
-                outcome = run_job.run(job)
-                part.done += outcome.what == run_job.DONE
-                if outcome.code:
-                    part.errors[outcome.code] = part.errors.get(outcome.code, 0) + 1
-                calls += 1
-                update(1)
-    part.empty = max(0, min(len(empty_rows(table)) - empty_before, part.done))
-    part.waiting = count_waiting(table)
-
-
-def ready(table: Any) -> int:
+def _ready(tables: Sequence[Any], limit: int | None) -> int:
     """How many jobs can be taken now."""
-    return len(jobs_of(table).pending & "scheduled_time <= CURRENT_TIMESTAMP(3)")
+    counts = [len(jobs_of(t).pending & "scheduled_time <= CURRENT_TIMESTAMP(3)") for t in tables]
+    return sum(n if limit is None else min(n, limit) for n in counts)
 
 
-def count_waiting(table: Any) -> int:
-    """Videos that wait for a person's choice (only SubjectChoice has them)."""
-    return len(table & {"choice_status": "NEEDS_CHOICE"}) if table.__name__ == "SubjectChoice" else 0
+def _counting(
+    parts: dict[str, TableRun], tables: Sequence[Any], limit: int | None, update: Callable[..., None]
+) -> Callable[[str, Claim | None, Outcome | None], None]:
+    """What the worker tells of each job: counted by table, and drawn."""
+    ended, counted = 0, time.monotonic()
+
+    def say(what: str, job: Claim | None, outcome: Outcome | None) -> None:
+        nonlocal ended, counted
+        if what != "end" or job is None or outcome is None:
+            return
+        part = parts[job.table.__name__]
+        part.done += outcome.what == run_job.DONE
+        if outcome.what in (run_job.FAILED, run_job.LATER) and outcome.code:
+            part.errors[outcome.code] = part.errors.get(outcome.code, 0) + 1
+        ended += 1
+        total = None
+        if time.monotonic() - counted > COUNT_EVERY_S:
+            total, counted = ended + _ready(tables, limit), time.monotonic()
+        update(1, part.table, total)
+
+    return say

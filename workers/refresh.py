@@ -6,12 +6,12 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from schemas import computed_tables, fit, tracking, video, worker
+from schemas import chain, fit, tracking, video, worker
 from schemas.connection import alone
 
 from . import queue, recover
 from .queue import Claim
-from .registry import NEW, stage_of, table_named
+from .registry import NEW
 
 #: Days in which something from outside counts as recent, and seconds after which somebody looks at everything again.
 RECENT_DAYS, ALL_EVERY_S = 2, 3600.0
@@ -19,8 +19,6 @@ RECENT_DAYS, ALL_EVERY_S = 2, 3600.0
 ALL = "all"
 #: With fewer videos every look is at everything: it takes no time.
 FEW = 10_000
-#: A failure here decides that a trial does not take part in the fit of its session.
-DECIDES = ("VideoInfo", "Tracking", "SubjectChoice", "Keypoints", "TrialInput")
 
 
 @dataclasses.dataclass
@@ -33,24 +31,35 @@ class Refreshed:
     planned: int = 0
     dropped: dict[str, int] = dataclasses.field(default_factory=dict)
 
+    def add(self, other: Refreshed) -> None:
+        """Count what another one did too."""
+        self.swept, self.freed, self.planned = (
+            self.swept + other.swept,
+            self.freed + other.freed,
+            self.planned + other.planned,
+        )
+        for mine, more in ((self.queued, other.queued), (self.dropped, other.dropped)):
+            for name, n in more.items():
+                mine[name] = mine.get(name, 0) + n
 
-def after(done: Sequence[Claim], failed: Sequence[Claim] = ()) -> int:
+
+def after(done: Sequence[Claim], failed: Sequence[Claim] = ()) -> Refreshed:
     """Queue what these jobs made computable, by their keys only: milliseconds however large the tables are."""
-    n = 0
+    out = Refreshed()
     touched: list[dict[str, Any]] = []
     for table in {c.table for c in done}:
         of_table = [c for c in done if c.table is table]
-        for name in stage_of(table).followers:
-            follower = table_named(name)
+        for follower in chain.followers(table):
             for priority in {c.priority for c in of_table}:
-                n += queue.fill(follower, [c.key for c in of_table if c.priority == priority], priority)
-        if table.__name__ in ("SubjectChoice", "TrialInput"):
+                n = queue.fill(follower, [c.key for c in of_table if c.priority == priority], priority)
+                out.add(Refreshed({follower.__name__: n}))
+        if table in (tracking.SubjectChoice, fit.TrialInput):
             touched += [c.key for c in of_table]
-    touched += [c.key for c in failed if c.table.__name__ in DECIDES]
+    # A failure before the fit decides that a trial does not take part in it.
+    touched += [c.key for c in failed if c.table in chain.before(fit.SessionFit)]
     if touched:
-        priority = min(c.priority for c in (*done, *failed))
-        n += plan(sessions_of(touched), priority)
-    return n
+        out.planned = plan(sessions_of(touched), min(c.priority for c in (*done, *failed)))
+    return out
 
 
 def sessions_of(keys: Iterable[dict[str, Any]]) -> list[int]:
@@ -66,7 +75,7 @@ def plan(sessions: Sequence[int] | None = None, priority: int = NEW) -> int:
     from schemas.plan import plan_fit_sets
 
     made = plan_fit_sets(sessions)
-    queue.fill(table_named("SessionFit"), made, priority)
+    queue.fill(fit.SessionFit, made, priority)
     return len(made)
 
 
@@ -96,7 +105,7 @@ def refresh(everything: bool | None = None) -> Refreshed | None:
         recent = None if everything else Recent.find()
         if recent is not None and len(recent.videos) > FEW:  # an archive that was just registered
             recent = None
-        out = _refresh(computed_tables(), recent)
+        out = _refresh(chain.computed_tables(), recent)
         if recent is None:
             _note_full_look()
         return out
@@ -134,7 +143,7 @@ def _refresh(tables: Sequence[Any], recent: Recent | None) -> Refreshed:
         out.freed += recover.free_dead(table)
     out.dropped = drop_outdated_choices()
     for table in tables:
-        if table.__name__ == "SessionFit":
+        if table is fit.SessionFit:
             out.planned = plan(None if recent is None else recent.sessions)
         where = None if recent is None else recent.where(table)
         if recent is not None and where is None:

@@ -27,38 +27,35 @@ NEW, AGAIN = 5, 8
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """One computed table. limit_s: after that a job is ended and becomes an error row. batch: jobs reserved at once:
-    1 where a job takes long, so that none waits behind it while other workers are idle."""
+    """What one computed table needs. limit_s: after that a job is ended and becomes an error row. batch: jobs reserved
+    at once: 1 where a job takes long, so that none waits behind it while other workers are idle."""
 
-    table: str
     resource: str
     limit_s: float
     batch: int
-    followers: tuple[str, ...] = ()
 
 
-#: In the order of the chain. `followers`: tables in which a new row can make a key computable.
-STAGES: tuple[Stage, ...] = (
-    Stage("VideoInfo", DECODE, 1800.0, 4, ("Tracking",)),
-    Stage("Tracking", DETECTOR, 4 * 3600.0, 1, ("SubjectChoice",)),
-    Stage("SubjectChoice", LIGHT, 300.0, 16, ("Keypoints",)),
-    Stage("Keypoints", DETECTOR, 4 * 3600.0, 1, ("TrialInput",)),
-    Stage("TrialInput", LIGHT, 300.0, 16),  # what follows is planned: `workers.refresh.after`
-    Stage("SessionFit", FIT, 4 * 3600.0, 1, ("GaitEvents", "SessionGdi", "KinematicError")),
-    Stage("GaitEvents", LIGHT, 600.0, 16, ("GaitCycle", "SessionQc")),
-    Stage("GaitCycle", LIGHT, 600.0, 16, ("Spatiotemporal", "GDI")),
-    Stage("Spatiotemporal", LIGHT, 300.0, 16),
-    Stage("GDI", LIGHT, 300.0, 16),
-    Stage("SessionGdi", LIGHT, 600.0, 16, ("SessionQc",)),
-    Stage("SessionQc", LIGHT, 300.0, 16),
-    Stage("KinematicError", LIGHT, 300.0, 16),
-)
+#: By the name of the table. Their order is not said here: `schemas.chain` reads it from the foreign keys.
+STAGES: dict[str, Stage] = {
+    "VideoInfo": Stage(DECODE, 1800.0, 4),
+    "Tracking": Stage(DETECTOR, 4 * 3600.0, 1),
+    "SubjectChoice": Stage(LIGHT, 300.0, 16),
+    "Keypoints": Stage(DETECTOR, 4 * 3600.0, 1),
+    "TrialInput": Stage(LIGHT, 300.0, 16),
+    "SessionFit": Stage(FIT, 4 * 3600.0, 1),
+    "GaitEvents": Stage(LIGHT, 600.0, 16),
+    "GaitCycle": Stage(LIGHT, 600.0, 16),
+    "Spatiotemporal": Stage(LIGHT, 300.0, 16),
+    "GDI": Stage(LIGHT, 300.0, 16),
+    "SessionGdi": Stage(LIGHT, 600.0, 16),
+    "SessionQc": Stage(LIGHT, 300.0, 16),
+    "KinematicError": Stage(LIGHT, 300.0, 16),
+}
 
 
 def stage_of(table: Any) -> Stage:
     """The entry of a computed table (class or name)."""
-    name = table if isinstance(table, str) else table.__name__
-    return next(s for s in STAGES if s.table == name)
+    return STAGES[table if isinstance(table, str) else table.__name__]
 
 
 def tables_of(resource: str) -> list[Any]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from schemas import connection
 from schemas._datajoint import dj
-from schemas.table_map import tables
+from schemas.chain import tables
 
 
 @dataclasses.dataclass(frozen=True)

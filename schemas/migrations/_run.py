@@ -18,8 +18,8 @@ from schemas import _catalog, connection
 from schemas._activate import STAGES, modules
 from schemas._datajoint import dj, read_heading_again
 from schemas._declare import declare_all
+from schemas.chain import tables
 from schemas.rows import utc_now
-from schemas.table_map import tables
 
 from ._differences import differences
 

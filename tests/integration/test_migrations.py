@@ -112,7 +112,7 @@ def add(
 
 def _unbind(patch: pytest.MonkeyPatch) -> None:
     """The classes as a new process has them: what they know of another server's tables must not count here."""
-    from schemas.table_map import tables
+    from schemas.chain import tables
 
     patch.setattr(jobs, "_jobs", {})
     patch.setattr(schemas._activate, "_methods_done", set())

@@ -14,6 +14,7 @@ from click.testing import CliRunner
 import pbl_pipeline.gait
 import schemas
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.gait import GaitMetrics
 from schemas import fit, gait, gdi, lab, norms, session, views
 from schemas.cli.norm import norm as command
 from schemas.ingest import Methods, Visit, ingest
@@ -86,11 +87,17 @@ def _used_by_a_session(walkers: Path, expected) -> None:
     rows = {r["norm"]: r for r in (gdi.SessionGdi & _sets("P01")).to_dicts()}
     assert set(rows) == {old[1], "our-lab-v1"}
     assert rows[old[1]]["session_gdi"] == pytest.approx(old[0])
-    cycles = load_session({"subject": "P01", "norm": "our-lab-v1"}).metrics.trials[0].cycles
+    cycles = metrics_of({"subject": "P01", "norm": "our-lab-v1"}).trials[0].cycles
     scored = pbl_pipeline.gait.score_gdi(cycles, expected)
     assert rows["our-lab-v1"]["session_gdi"] == pytest.approx(scored.mean, abs=1e-3)
     checks = gdi.SessionGdi.Check & _sets("P01") & {"norm": "our-lab-v1", "gdi_check": "norm_convention"}
     assert checks.fetch1("gdi_check_outcome") == "PASS"
+
+
+def metrics_of(restriction: dict[str, str]) -> GaitMetrics:
+    found = load_session(restriction).metrics
+    assert found is not None
+    return found
 
 
 def _sets(subject: str):
@@ -103,11 +110,12 @@ def test_nine_angles_in_the_tables(walkers: Path):
     populate()
     found = (gdi.SessionGdi & _sets("C01") & {"gdi_method": "gillette-2008-v1"}).to_dicts()[0]
     assert found["norm"] == "gillette-166-nine-angles-v1"
-    metrics = load_session({"subject": "C01", "gdi_method": "gillette-2008-v1"}).metrics
+    metrics = metrics_of({"subject": "C01", "gdi_method": "gillette-2008-v1"})
     fresh = pbl_pipeline.gait.score_gdi(metrics.trials[0].cycles, model="gillette-2008")
     assert found["session_gdi"] == pytest.approx(fresh.mean, abs=1e-3)
     assert fresh.profile is not None
     assert found["session_gps"] == pytest.approx(fresh.profile.gps, abs=1e-3)
+    assert metrics.gdi.profile is not None
     assert metrics.gdi.profile.left == pytest.approx(fresh.profile.left, abs=1e-3)
     assert (gdi.SessionGdi.Check & found & {"gdi_check": "norm_convention"}).fetch1("gdi_check_outcome") == "WARN"
     with pytest.raises(PblError, match="NORM_INVALID"):
@@ -138,7 +146,7 @@ def test_curves_beside_the_bands(walkers: Path):
     assert set(frame["angle"]) == set(pbl_pipeline.gait.ANGLE_NAMES)
     assert len(frame) == 2 * 9 * 51
     knee = frame[(frame["angle"] == "knee_flexion") & (frame["side"] == "right")]
-    cycles = [c for c in load_session({"subject": "C02"}).metrics.trials[0].cycles if c.used and c.side == "right"]
+    cycles = [c for c in metrics_of({"subject": "C02"}).trials[0].cycles if c.used and c.side == "right"]
     np.testing.assert_allclose(knee["mean_deg"], np.mean([c.curves["knee_flexion"] for c in cycles], axis=0), atol=1e-4)
     assert set(knee["n"]) == {len(cycles)}
     assert set(frame["normal_matched"]) == {"cadence"}

@@ -158,6 +158,7 @@ def test_the_lens_of_the_file_and_slow_motion(tmp_path: Path):
     assert stored_keypoints().camera.focal_rel_sd == pytest.approx(0.03)
     assert "intrinsics of the keypoints: 1 metadata" in pbl("status").out
     found = load_session({"subject": "P001"}).trials[0].info
+    assert found is not None
     assert (found.focal_35mm, found.capture_fps) == (27.0, 240.0)
     # Every duration is eight times too long: nobody may take the visit's measures for good.
     assert "time_stretch" in {r["keypoints_check"] for r in keypoints.Keypoints.Check.to_dicts()}

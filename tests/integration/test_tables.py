@@ -26,6 +26,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.pipeline import Session, Trial
 from pbl_pipeline.qc import Check
+from pbl_pipeline.video import Camera
 from schemas import fit, gait, gdi, keypoints, lab, qc, session, table_map, tracking, video, views
 from schemas.choose import candidates, choose_person, write_sheet
 from schemas.ingest import Methods, Visit, ingest
@@ -44,6 +45,13 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def errors(run) -> dict[str, dict[str, int]]:
     return {t.table: t.errors for t in run.tables if t.errors}
+
+
+def camera_of(number: int) -> Camera:
+    """The camera that the keypoints of the session's video of this number (from 0) were computed with."""
+    found = load_session({"subject": "P001"}).trials[number].keypoints
+    assert found is not None
+    return found.camera
 
 
 def done(run) -> dict[str, int]:
@@ -122,6 +130,7 @@ def _everything_comes_back(paths: list[Path]) -> None:
         assert trial.fit.qpos.dtype == np.float32
         assert trial.fit.orientation_source == made.orientation_source
         assert np.isnan(trial.fit.phone_clock_offset_s)
+        assert trial.events is not None
         assert trial.events.status == "PASS"
         assert any(c.used and c.curves for c in trial.cycles)
     assert (results.fit.iterations, results.fit.converged) == (7, True)
@@ -164,7 +173,9 @@ def test_nobody_walks_and_nobody_there(tables: None, tmp_path: Path, monkeypatch
     assert gdi.SessionGdi.fetch1("session_reason")
     assert qc.SessionQc.fetch1("qc_outcome") == "EMPTY"
     assert len(keypoints.Keypoints()) == 1
-    assert load_session({"subject": "P001"}).metrics.status == "EMPTY"
+    found = load_session({"subject": "P001"}).metrics
+    assert found is not None
+    assert found.status == "EMPTY"
     assert not populate().did_something
 
 
@@ -211,6 +222,8 @@ def test_a_failed_fit_gives_no_measures_in_tables_and_files(
     }
     found = load_session({"subject": "P001"})
     trials = tuple(Trial(t.name, t.path, t.info, t.choice, t.keypoints) for t in found.fitted)
+    assert found.fit is not None
+    assert found.metrics is not None
     judged = Session(trials, found.fit, found.metrics).judged
     fresh = pbl_pipeline.gait.gait_metrics(found.fit.trials, fit_checks=found.fit.qc)
     assert judged.to_dict()["session"]["outcome"] == "FAIL"
@@ -252,7 +265,7 @@ def test_a_registered_video_takes_a_camera_and_further_methods(tables: None, tmp
     path = chain.small_video(tmp_path, "walk")
     (number,) = register(path)
     populate()
-    assert load_session({"subject": "P001"}).trials[0].keypoints.camera.source.startswith("guess")
+    assert camera_of(0).source.startswith("guess")
     tracked = tracking.Tracking.fetch1("tracking_computed")
     camera = tmp_path / "phone.json"
     camera.write_text(
@@ -267,7 +280,7 @@ def test_a_registered_video_takes_a_camera_and_further_methods(tables: None, tmp
     assert len(keypoints.Keypoints()) == len(fit.SessionFit()) == len(fit.FitSet()) == len(qc.SessionQc()) == 0
     assert tracking.Tracking.fetch1("tracking_computed") == tracked
     assert not errors(populate())
-    assert load_session({"subject": "P001"}).trials[0].keypoints.camera.matrix[0, 0] == 900
+    assert camera_of(0).matrix[0, 0] == 900
     assert len(qc.SessionQc()) == 1
     # The same camera again changes nothing.
     (result,) = ingest([path], Visit("P001", camera_file=camera))
@@ -364,7 +377,7 @@ def test_a_calibration_is_stored_once_and_used(tables: None, tmp_path: Path):
     register(*paths, camera_file=camera)
     assert lab.CameraCalibration.fetch1("camera_fx", "camera_origin") == (900.0, "measured")
     populate(["VideoInfo", "Tracking", "SubjectChoice", "Keypoints"])
-    stored = load_session({"subject": "P001"}).trials[1].keypoints.camera
+    stored = camera_of(1)
     assert stored.matrix[0, 0] == 900
     assert stored.distortion.tolist() == [0.1, 0, 0, 0, 0]
     assert stored.source.startswith("measured: ")
@@ -760,6 +773,20 @@ def test_only_errors_that_say_nothing_about_the_video_are_tried_again(tables: No
     # A row that was missing may be missing for good: that is counted in its job, not tried again for ever.
     assert (run.freed, done(run)) == (1, {"VideoInfo": 1})
     assert sorted(e.code for e in pipeline_status().errors) == ["INTERNAL", "VIDEO_DAMAGED"]
+
+
+def test_datajoints_own_populate_computes_the_whole_chain(tables: None, tmp_path: Path):
+    """As somebody who knows DataJoint and nothing of ours would do it: no planning by hand, no worker."""
+    register(chain.small_video(tmp_path, "walk1"), chain.small_video(tmp_path, "walk2"))
+    for table in schemas.computed_tables():
+        found = table.populate(reserve_jobs=True, suppress_errors=True)
+        assert found["error_list"] == [], table.__name__
+    assert len(fit.SessionFit()) == len(gdi.SessionGdi()) == 1
+    assert len(fit.SessionFit.Trial()) == 2
+    assert not populate().did_something
+    fit.SessionFit.delete(prompt=False)
+    fit.SessionFit.populate()  # without a queue too
+    assert len(fit.SessionFit()) == 1
 
 
 def test_limit_and_unknown_tables(tables: None, tmp_path: Path):

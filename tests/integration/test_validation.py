@@ -198,6 +198,7 @@ def test_files_of_every_kind_are_references(tmp_path: Path):
     known = read_reference(tmp_path / "e.truth.npz")
     knee = list(walker.truth.joint_names).index("knee_angle_r")
     np.testing.assert_allclose(known.angles_deg["knee_flexion_r"], -np.degrees(walker.truth.qpos[:, knee]))
+    assert known.pelvis_m is not None
     np.testing.assert_allclose(known.pelvis_m, walker.truth.pelvis_m)
     assert known.source == "synthetic"
     lines = ["nRows=3", "nColumns=2", "inDegrees=yes", "endheader", "time\tknee_angle_r"]

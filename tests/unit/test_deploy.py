@@ -249,7 +249,7 @@ def test_manifests_are_what_their_schemas_allow():
 
 def test_the_number_of_workers_follows_every_queue():
     """The query names the queue of each table that the worker serves (the tables are tested with a database)."""
-    from schemas import COMPUTED
+    from schemas.chain import tables
     from workers.registry import GROUPS, STAGES
 
     queries = {
@@ -258,8 +258,10 @@ def test_the_number_of_workers_follows_every_queue():
         if d["kind"] == "ScaledObject"
     }
     for group in ("cpu", "gpu"):
-        served = {s.table for s in STAGES if s.resource in GROUPS[group]}
-        wanted = {f"pbl_{module}.`~~{_snake(name)}`" for module, name in COMPUTED if name in served}
+        served = {name for name, s in STAGES.items() if s.resource in GROUPS[group]}
+        wanted = {
+            f"pbl_{module}.`~~{_snake(name)}`" for module, name in (n.split(".", 1) for n in tables()) if name in served
+        }
         assert set(re.findall(r"FROM (\S+) WHERE", queries[f"worker-{group}"])) == wanted
 
 
