@@ -15,7 +15,6 @@ from pbl_pipeline.paramset import Paramset
 from schemas import connection, fit, gait, keypoints, tracking, video
 from schemas.coded_errors import error_code, error_found
 from schemas.jobs import jobs_of
-from schemas.method_rows import insert_methods
 from tests.rows import register
 from workers import queue, refresh, run_job
 from workers.heartbeat import Silent
@@ -142,8 +141,9 @@ def test_inputs_that_change_each_time_end_as_an_error(tables: None, tmp_path: Pa
 
 
 def test_a_method_of_another_version_of_the_code_is_an_error_at_once(tables: None, tmp_path: Path):
-    later = {"later": Paramset("tracking", "later", 1, {"a_parameter_of_later": 3})}
-    insert_methods(tracking.TrackingMethod, "tracking", later)
+    later = Paramset("tracking", "later", 1, {"a_parameter_of_later": 3})
+    row = {"tracking_method": "later-v1", "tracking_method_name": "later", "tracking_method_version": 1}
+    tracking.TrackingMethod.insert1({**row, "tracking_params": dict(later.params), "tracking_method_sha": later.hash})
     (number,) = register(chain.small_video(tmp_path, "walk"))
     key = tracking.TrackingSelection.fetch1()
     tracking.TrackingSelection.delete(prompt=False)
