@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -94,11 +95,12 @@ def test_the_report_of_a_visit_names_the_recordings_it_lacks(monkeypatch: pytest
     import schemas.report
     from schemas.results import SessionResults, TrialResults
 
+    anything: Any = object()
     trials = (
-        TrialResults(1, "walk", tmp_path / "walk.mp4", fit=object()),
+        TrialResults(1, "walk", tmp_path / "walk.mp4", anything, anything, anything, anything, anything),
         TrialResults(2, "dark", tmp_path / "dark.mp4", problem="SubjectChoice: nobody was found"),
     )
-    found = SessionResults(1, "P1", "visit", None, trials, fit=object(), metrics=object())
+    found = SessionResults(1, "P1", "visit", None, trials, fit=anything, metrics=anything)
     monkeypatch.setattr(schemas.report, "load_session", lambda _: found)
     monkeypatch.setattr(schemas.report, "_methods", lambda _: {})
     written = []
