@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pbl_pipeline import __version__
 from pbl_pipeline.body import SCALE_NAMES
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import write_angles_csv
 from pbl_pipeline.fit import Params as FitParams
@@ -231,7 +232,7 @@ def write_session_json(fit: SessionFit, path: Path) -> None:
         "compile_seconds": round(fit.compile_seconds, 3),
         "device": fit.device,
         "qc": [c.to_dict() for c in fit.qc],
-        "code_version": __version__,
+        "code_version": code_version(),
     }
     path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
 

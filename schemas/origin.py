@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVarTuple, cast
 
-from pbl_pipeline import __version__
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 
 from .coded_errors import fitted, internal
@@ -26,7 +26,7 @@ def origin_columns(prefix: str) -> str:
     The names carry the table's prefix, because DataJoint refuses joins of tables that share a secondary attribute.
     """
     return f"""
-    {prefix}_code_version      : varchar(32)     # version of pbl-pipeline that computed the row
+    {prefix}_code_version      : varchar(64)     # version and commit of pbl-pipeline that computed the row
     {prefix}_method_hash=null  : char(16)        # hash of the frozen parameters, null where the stage has none
     {prefix}_model_sha256=null : char(64)        # SHA-256 of the model file, null where the stage has none
     {prefix}_host              : varchar(64)     # computer
@@ -48,7 +48,7 @@ class Origin:
     @classmethod
     def now(cls, seconds: float) -> Origin:
         """Of a computation that ended now, here, and took `seconds`."""
-        return cls(__version__, platform.node()[:64], round(seconds, 3), utc_now())
+        return cls(code_version(), platform.node()[:64], round(seconds, 3), utc_now())
 
     def row(self, prefix: str, *, method_hash: str | None = None, model_sha256: str | None = None) -> dict[str, Any]:
         """Values of `origin_columns(prefix)`."""

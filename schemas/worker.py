@@ -16,7 +16,7 @@ class Worker(dj.Manual):
     worker_host     : varchar(255)
     worker_pid      : int32
     worker_resource : varchar(64)              # resource classes it serves
-    worker_version  : varchar(32)              # version of pbl-pipeline
+    worker_version  : varchar(64)              # version and commit of pbl-pipeline
     worker_started  : datetime(3)              # clock of the database server
     worker_seen     : datetime(3)              # last heartbeat, clock of the database server
     worker_stopped=null : datetime(3)          # when it ended in order

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 import pymysql
 
-from pbl_pipeline import __version__
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from schemas import connection, worker
 from schemas.connection import dj
@@ -105,7 +105,7 @@ class Heartbeat:
                 run(
                     f"INSERT INTO {table} ({columns}, worker_started, worker_seen, worker_doing)"  # noqa: S608
                     f" VALUES (%s, %s, %s, %s, %s, {now}, {now}, '')",
-                    args=(self.worker, platform.node(), os.getpid(), self.resource, __version__),
+                    args=(self.worker, platform.node(), os.getpid(), self.resource, code_version()),
                 )
             stopped = f", worker_stopped={now}" if last else ""
             run(
