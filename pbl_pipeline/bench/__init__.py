@@ -6,7 +6,7 @@ Importing this package imports no JAX: the process that only starts others must 
 from ._detect import detect_text, run_detect
 from ._plan import MOTIONS, SOLVERS, Case, Data, long_cases, quick_cases, robust_cases, speed_cases
 from ._run import Row, label, run_cases
-from ._table import ratios, text
+from ._table import accuracy, number, rate, solver_name, table, text
 
 __all__ = [
     "MOTIONS",
@@ -14,14 +14,18 @@ __all__ = [
     "Case",
     "Data",
     "Row",
+    "accuracy",
     "detect_text",
     "label",
     "long_cases",
+    "number",
     "quick_cases",
-    "ratios",
+    "rate",
     "robust_cases",
     "run_cases",
     "run_detect",
+    "solver_name",
     "speed_cases",
+    "table",
     "text",
 ]

@@ -44,7 +44,7 @@ def solver_name(row: Row) -> str:
     return row["solver"] + (f" {row['adam_steps']:,} steps" if row.get("adam_steps") else "")
 
 
-def _rate(row: Row) -> float | None:
+def rate(row: Row) -> float | None:
     return row["batch"] / row["warm_seconds"] if row.get("warm_seconds") else None
 
 
@@ -80,7 +80,7 @@ COLUMNS: dict[str, list[Column]] = {
         ("camera", lambda r: r["data"]["motion"]),
         ("batch", lambda r: str(r["batch"])),
         *_TIMES,
-        ("sessions/s", lambda r: number(_rate(r))),
+        ("sessions/s", lambda r: number(rate(r))),
         *_MEMORY,
         *_ERRORS,
     ],
@@ -117,75 +117,13 @@ def _percent(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.3g} %"
 
 
-def ratios(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Pairs of rows that a bar compares: the solvers, held against still, a batch against one, twice the frames.
-
-    Each is {"what", "seconds", "all_error", "main_error", "loss", "memory"}: the first named over the second, None
-    where one of them is missing.
-    """
-    found = []
-    good = [r for r in rows if r.get("warm_seconds")]
-    for a in good:
-        for b in good:
-            what = _compared(a, b)
-            if what:
-                pair = {"what": what, "seconds": _over(a.get("warm_seconds"), b.get("warm_seconds"))}
-                if a["batch"] > 1:
-                    pair = {"what": what, "sessions_per_s": _over(_rate(a), _rate(b))}
-                elif a["section"] == "long" and a["solver"] == b["solver"]:
-                    pair["memory"] = _over(a["host_bytes"], b["host_bytes"])
-                else:
-                    pair["all_error"] = _over(accuracy(a, "all_deg"), accuracy(b, "all_deg"))
-                    pair["main_error"] = _over(accuracy(a, "main_deg"), accuracy(b, "main_deg"))
-                    pair["loss"] = _over(a.get("paper_loss"), b.get("paper_loss"))
-                found.append(pair)
-    return found
-
-
-def _compared(a: Row, b: Row) -> str:
-    """In words what the ratio a / b of two rows is; empty where nobody compares them."""
-    if a["section"] != b["section"]:
-        return ""
-    x, y = a["data"], b["data"]
-    size = f"{x['n_trials']} trial{'s' * (x['n_trials'] > 1)}"
-    differ = {k for k in ("n_trials", "motion", "n_frames", "trouble") if x[k] != y[k]}
-    differ |= {"solver"} if solver_name(a) != solver_name(b) else set()
-    differ |= {"batch"} if a["batch"] != b["batch"] else set()
-    if differ == {"solver"} and a["solver"] == "implicit-adam" and a["batch"] == 1:
-        where = f"{x['n_frames']:,} frames" if a["section"] == "long" else size
-        trouble = f", {x['trouble']}" if a["section"] == "robust" else ""
-        return f"{solver_name(a)} / {solver_name(b)}, {where}, {x['motion']}{trouble}"
-    if differ == {"motion"} and x["motion"] == "handheld" and a["batch"] == 1 and a["section"] == "speed":
-        return f"handheld / static, {solver_name(a)}, {size}"
-    if differ == {"batch"} and b["batch"] == 1:
-        return f"batch {a['batch']} / one by one, {solver_name(a)}, {size}, {x['motion']}"
-    if differ == {"n_frames"} and x["n_frames"] > y["n_frames"]:
-        return f"{x['n_frames']:,} / {y['n_frames']:,} frames, {solver_name(a)}, {x['motion']}"
-    if differ == {"trouble"} and y["trouble"] == "none":
-        return f"{x['trouble']} / none, {solver_name(a)}, {x['motion']}"
-    return ""
-
-
-def _over(a: float | None, b: float | None) -> float | None:
-    return a / b if a is not None and b else None
-
-
 def text(rows: Sequence[Row]) -> str:
-    """All tables, what the columns mean, the ratios, failed checks and errors."""
+    """All tables, what the columns mean, failed checks and errors."""
     parts = []
     for section, columns in COLUMNS.items():
         own = [r for r in rows if r["section"] == section]
         if own:
             parts.append(f"{TITLES[section]}\n{table(own, columns)}")
-    pairs = ratios(rows)
-    if pairs:
-        columns: list[Column] = [("ratio of", lambda r: r["what"])]
-        keys = {"seconds": "warm s", "sessions_per_s": "sessions/s", "memory": "memory"}
-        keys |= {"all_error": "all deg", "main_error": "main deg", "loss": "loss"}
-        for key, title in keys.items():
-            if any(p.get(key) is not None for p in pairs):
-                columns.append((title, lambda r, key=key: number(r.get(key), 3)))
-        parts.append(table(pairs, columns))
     notes = [_note(r) for r in rows]
     parts += [n for n in notes if n]
     return "\n\n".join([*parts, _meaning(rows)])

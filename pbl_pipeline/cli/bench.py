@@ -107,7 +107,7 @@ def fit(
         rows.append(row)
         if json_path is not None:  # after each row: a run of hours may be interrupted
             content = {"benchmark": "fit", "version": __version__, "time_utc": begun, "rows": rows}
-            json_path.write_text(json.dumps(content | {"ratios": b.ratios(rows)}, indent=1) + "\n")
+            json_path.write_text(json.dumps(content, indent=1) + "\n")
     click.echo(b.text(rows))
 
 

@@ -27,6 +27,7 @@ from pbl_pipeline.bench._plan import NEVER_SEEN, UNSEEN_S
 from pbl_pipeline.body import load_body
 from pbl_pipeline.cli.bench import bench as command
 from pbl_pipeline.errors import PblError
+from tests.benchmarks.ratios import ratio_text, ratios
 
 NAMES = load_body().joint_names
 
@@ -161,7 +162,7 @@ def test_ratios_compare_what_the_bars_compare():
         row(motion="handheld", main=1.05),
         row(batch=64, warm=6.4),
     ]
-    found = {r["what"]: r for r in bench.ratios(rows)}
+    found = {r["what"]: r for r in ratios(rows)}
     assert len(found) == 3
     solvers = found["implicit-adam 2,000 steps / gauss-newton, 1 trial, static"]
     assert solvers["seconds"] == pytest.approx(25)
@@ -170,7 +171,7 @@ def test_ratios_compare_what_the_bars_compare():
     held = found["handheld / static, gauss-newton, 1 trial"]
     assert held["all_error"] == pytest.approx(1.05)
     # A figure of the ratio must not be taken for an error code.
-    text = bench.text(rows)
+    text = ratio_text(rows)
     assert sum(line.startswith("handheld / static") and line.endswith("1.000") for line in text.splitlines()) == 1
     batch = found["batch 64 / one by one, gauss-newton, 1 trial, static"]
     assert batch["sessions_per_s"] == pytest.approx((64 / 6.4) / (1 / 2.0))
@@ -178,7 +179,7 @@ def test_ratios_compare_what_the_bars_compare():
 
 def test_ratio_of_twice_the_frames():
     rows = [row(section="long", n_frames=5400, warm=20.0), row(section="long", n_frames=10800, warm=42.0)]
-    (found,) = bench.ratios(rows)
+    (found,) = ratios(rows)
     assert found["seconds"] == pytest.approx(2.1)
     assert found["memory"] == pytest.approx(1.0)
 
