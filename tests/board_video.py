@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.video._board import Board
+from pbl_pipeline.video import Board
 
 #: Rays along and across each pixel.
 _FINE = 2

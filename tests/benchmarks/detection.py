@@ -30,8 +30,8 @@ import click
 import cv2
 import numpy as np
 
-from pbl_pipeline.keypoints import KeypointParams, Keypoints, detect_keypoints
-from pbl_pipeline.keypoints._trc import Trc, read_trc
+from pbl_pipeline.keypoints import KeypointParams, Keypoints, detect_keypoints, read_trc
+from pbl_pipeline.keypoints._trc import Trc
 from pbl_pipeline.render import to_pixels
 from pbl_pipeline.tracking import choose_subject, track_people
 from pbl_pipeline.video import load_camera, load_camera_poses, probe, read_frames

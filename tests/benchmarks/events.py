@@ -38,8 +38,7 @@ from pbl_pipeline.gait import (
     read_lab_trial,
     spatiotemporal,
 )
-from pbl_pipeline.gait.events import EVENTS, METHODS, SIDES, GaitEvent
-from pbl_pipeline.gait.events._phase import PhaseParams
+from pbl_pipeline.gait.events import EVENTS, METHODS, SIDES, GaitEvent, PhaseParams
 from pbl_pipeline.synthetic import IMPAIRMENTS, Impairment, SynthSpec, Truth, synthesise
 from tests.conftest import SHARED
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from pbl_pipeline import assets
 from pbl_pipeline.bench._clip import demo_clip, repeated
-from pbl_pipeline.keypoints._blazepose import BlazePoseLandmarks
+from pbl_pipeline.keypoints import BlazePoseLandmarks
 from pbl_pipeline.keypoints._crops import smooth_rois
 from pbl_pipeline.tracking import (
     BlazePoseDetector,
@@ -35,10 +35,11 @@ from pbl_pipeline.tracking import (
     Tracking,
     TrackingParams,
     WatchParams,
+    body_box,
+    box_iou,
     track_people,
 )
 from pbl_pipeline.tracking import _track as tracks
-from pbl_pipeline.tracking._blazepose import body_box, box_iou
 from pbl_pipeline.video import VideoInfo, find_camera, probe, read_frames
 from tests.conftest import SHARED
 

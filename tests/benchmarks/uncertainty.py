@@ -29,8 +29,7 @@ import numpy as np
 
 from pbl_pipeline.body import SLIDES
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import METHODS, SessionInput, fit_sessions
-from pbl_pipeline.fit._params import GaussNewtonParams
+from pbl_pipeline.fit import METHODS, GaussNewtonParams, SessionInput, fit_sessions
 from pbl_pipeline.fit.solvers.gauss_newton import by_joint, floors_of
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.synthetic import BLAZEPOSE_NOISE, SynthSpec, observe, person, synthesise, walk_qpos

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.bench._accuracy import MAIN_JOINTS, PAPER_JOINTS
-from pbl_pipeline.fit import METHODS
-from pbl_pipeline.fit._params import GaussNewtonParams
+from pbl_pipeline.fit import METHODS, GaussNewtonParams
 from pbl_pipeline.keypoints import Keypoints
 from tests.benchmarks.ablation import figures_of, path_error_m, row_of, table
 from tests.benchmarks.ablation_cases import DEFAULT, Setup, factors, leant, paramset_of, session, slow, squashed

@@ -201,6 +201,7 @@ def test_the_table_shows_every_row_and_the_code_of_one_that_failed():
 # --- real runs
 
 
+@pytest.mark.slow
 def test_a_case_is_measured(tmp_path):
     """In this process and with its cache, so what is tested is that every figure is there, not how fast it was."""
     data = Data(n_frames=64, n_sessions=2)
@@ -221,6 +222,7 @@ def test_a_case_is_measured(tmp_path):
     assert _case.machine()["cores"] >= 1
 
 
+@pytest.mark.slow
 def test_a_batch_is_measured_and_compared_with_the_sessions_alone(tmp_path):
     data = Data(n_frames=64, n_sessions=2, motion="handheld")
     _data.write(tmp_path, data)
@@ -237,6 +239,7 @@ def test_fewer_steps_are_another_paramset():
     assert _case.paramset_of("implicit-adam", 25_000).name == "paper-2025"
 
 
+@pytest.mark.slow
 def test_a_case_in_its_own_process_that_fails_is_a_row_with_its_code(tmp_path):
     """Twenty frames are under a second: the fit refuses them."""
     (got,) = bench.run_cases([Case("speed", "implicit-adam", Data(n_frames=20, n_sessions=1), repeat=1)], 120.0)
@@ -247,6 +250,7 @@ def test_a_case_in_its_own_process_that_fails_is_a_row_with_its_code(tmp_path):
     json.dumps(got, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_a_case_that_hangs_is_ended():
     (got,) = bench.run_cases([Case("speed", "implicit-adam", Data(n_frames=40, n_sessions=1))], 0.5)
     assert got["error"] == "over 0.5 s"

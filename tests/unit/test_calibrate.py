@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.video import Board, load_camera
-from pbl_pipeline.video._calibrate import View, calibrate, calibrate_video, covered, different_views
+from pbl_pipeline.video import Board, calibrate_video, load_camera
+from pbl_pipeline.video._calibrate import View, calibrate, covered, different_views
 from tests.board_video import film, varied_poses
 from tests.command import pbl
 from tests.videos import constant_rate, numbered_frames, write_video
+
+pytestmark = pytest.mark.slow
 
 SIZE = (640, 360)
 MATRIX = np.array([[472.0, 0, 316], [0, 474, 183], [0, 0, 1]])

@@ -43,6 +43,7 @@ def line(result: Result, what: str) -> str:
     return next(text for text in result.output.splitlines() if text.startswith(f"{what} "))
 
 
+@pytest.mark.slow
 def test_the_installed_command(tmp_path):
     """As a user starts it, in a process of its own: the table on stdout, code 1 because the assets are absent."""
     env = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}

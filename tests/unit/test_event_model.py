@@ -25,6 +25,8 @@ from research.events._rhythm import Rhythm, draw_run, leg_phase, schedule
 from research.events._scenes import not_walking
 from research.events._sequence import ORDER
 
+pytestmark = pytest.mark.slow
+
 SET = marker_set("bml_movi_87")
 PLAIN = dataclasses.replace(METHODS.find().params, event_delay_s=0.0)
 

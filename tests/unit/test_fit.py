@@ -39,6 +39,8 @@ from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.video import undistort_px
 from tests.walker import CAMERA, observe
 
+pytestmark = pytest.mark.slow
+
 TIME_S = np.arange(0, 2.6, 1 / 30)
 
 

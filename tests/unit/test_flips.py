@@ -13,6 +13,8 @@ from pbl_pipeline.keypoints import Keypoints, check_keypoints
 from pbl_pipeline.keypoints._flips import Exchange, FlipParams, exchange_sides, exchanged, lowered, mirror_of
 from pbl_pipeline.synthetic import SynthSpec, _synth, synthesise
 
+pytestmark = pytest.mark.slow
+
 _synth_physique = _synth.physique
 
 

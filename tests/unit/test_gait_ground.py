@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pbl_pipeline.gait import FootTrajectories, find_cycles, spatiotemporal
-from pbl_pipeline.gait._ground import FOLLOWS, SLIDES, UNSEEN, cycle_lengths, why_no_lengths
+from pbl_pipeline.gait import FootTrajectories, cycle_lengths, find_cycles, spatiotemporal
+from pbl_pipeline.gait._ground import FOLLOWS, SLIDES, UNSEEN, why_no_lengths
 from pbl_pipeline.gait._spatiotemporal import NO_WIDTH
 from pbl_pipeline.gait.events import GaitEvent
 from pbl_pipeline.synthetic import SynthSpec, synthesise

@@ -11,6 +11,8 @@ from pbl_pipeline.gait import GaitCycle, cycle_checks, find_cycles, spatiotempor
 from pbl_pipeline.gait._outliers import CURVE_ANGLES, without_odd_curves
 from pbl_pipeline.synthetic import Impairment, SynthSpec, synthesise
 
+pytestmark = pytest.mark.slow
+
 PHASE = np.linspace(0, 2 * np.pi, 51)
 
 

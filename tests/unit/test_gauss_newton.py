@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import MarkerSet, body_poses, load_body, marker_set
+from pbl_pipeline.body import MarkerSet, body_poses, load_body, marker_positions, marker_set
 from pbl_pipeline.body._jacobian import MarkerTable, marker_jacobian, table_positions
-from pbl_pipeline.body._kinematics import marker_positions, scaled_body_pos
+from pbl_pipeline.body._kinematics import scaled_body_pos
+from pbl_pipeline.fit import CostParams, GaussNewtonParams, ViewParams
 from pbl_pipeline.fit._costs import (
     beyond_limit_deg,
     distance_2d_px2,
@@ -25,13 +26,14 @@ from pbl_pipeline.fit._costs import (
 )
 from pbl_pipeline.fit._inputs import Session, make_session
 from pbl_pipeline.fit._observations import SAMPLE_S, bend_weights
-from pbl_pipeline.fit._params import CostParams, GaussNewtonParams, ViewParams
 from pbl_pipeline.fit.solvers import _arrow
 from pbl_pipeline.fit.solvers._arrow import Arrow, marginal_variance, solve
 from pbl_pipeline.fit.solvers._contact import _height_cm, _way_cm, sole_positions, standing
 from pbl_pipeline.fit.solvers._normal import State, _phone_error_deg, cost, normal_equations, scale_multipliers
 from pbl_pipeline.fit.solvers.gauss_newton import kinds_of, start_of, weights_of
 from pbl_pipeline.synthetic import observe, observe_markers, observe_views, walk_qpos
+
+pytestmark = pytest.mark.slow
 
 TIME_S = np.arange(24) / 30
 

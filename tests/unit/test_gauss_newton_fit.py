@@ -18,6 +18,7 @@ from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import (
     METHODS,
+    GaussNewtonParams,
     SessionFit,
     SessionInput,
     TrialFit,
@@ -28,13 +29,14 @@ from pbl_pipeline.fit import (
     fit_sessions,
 )
 from pbl_pipeline.fit._gravity import on_their_feet, vertical
-from pbl_pipeline.fit._params import GaussNewtonParams
 from pbl_pipeline.fit._place import placed_poses
 from pbl_pipeline.fit.solvers import Solution, gauss_newton
 from pbl_pipeline.fit.solvers.gauss_newton import by_joint, floors_of
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.synthetic import Noise, Seen, observe, observe_markers, observe_views, person, walk_qpos
+
+pytestmark = pytest.mark.slow
 
 PARAMSET = METHODS["gauss-newton"]
 TIME_S, HALF_S = np.arange(120) / 30, np.arange(60) / 30

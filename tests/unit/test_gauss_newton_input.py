@@ -14,6 +14,8 @@ from pbl_pipeline.fit import METHODS, SessionInput, _observations, fit_sessions
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.synthetic import observe, observe_markers, walk_qpos
 
+pytestmark = pytest.mark.slow
+
 TIME_S = np.arange(60) / 30
 
 

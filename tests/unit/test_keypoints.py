@@ -13,6 +13,7 @@ from pbl_pipeline.keypoints import (
     KeypointParams,
     Keypoints,
     PersonKeypoints,
+    PictureMeter,
     check_keypoints,
     detect_keypoints,
     side_changes,
@@ -21,10 +22,8 @@ from pbl_pipeline.keypoints import (
 from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES
 from pbl_pipeline.keypoints._crops import corrected, first_pass_rows, smooth_at, smooth_rois
 from pbl_pipeline.keypoints._detect import _detect_all
-from pbl_pipeline.keypoints._picture import PictureMeter
 from pbl_pipeline.keypoints._view import crop_matrix
-from pbl_pipeline.tracking import PersonTrack, Tracking
-from pbl_pipeline.tracking._blazepose import body_box
+from pbl_pipeline.tracking import PersonTrack, Tracking, body_box
 from pbl_pipeline.video import Camera, read_frames, viewing_ray
 from tests.videos import constant_rate, write_video
 

@@ -20,6 +20,7 @@ import pbl_pipeline.tracking
 from pbl_pipeline import models
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import (
+    BlazePoseLandmarks,
     KeypointParams,
     Keypoints,
     ModelParams,
@@ -30,7 +31,7 @@ from pbl_pipeline.keypoints import (
 )
 from pbl_pipeline.keypoints._augment import Augmentation, aligned, augmentations, sd_confidence, spread_mm
 from pbl_pipeline.keypoints._batched import BatchedInference
-from pbl_pipeline.keypoints._blazepose import CROP_MARGIN, MIRROR, N_ALL, BlazePoseLandmarks
+from pbl_pipeline.keypoints._blazepose import CROP_MARGIN, MIRROR, N_ALL
 from pbl_pipeline.keypoints._blazepose import MODEL_SHA256 as BLAZEPOSE_SHA256
 from pbl_pipeline.keypoints._blazepose import NAMES as BLAZEPOSE_NAMES
 from pbl_pipeline.keypoints._decode_2d import from_heatmap, from_simcc
@@ -492,6 +493,7 @@ def registered(tmp_path, monkeypatch) -> None:
     models.add(dot_models.write(tmp_path / "b", dot_models.simcc(), dot_models.spec("simcc", (192, 256))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["dots-crop3d", "dots-simcc"])
 def test_a_video_through_detect_keypoints(video, registered, tmp_path, name):
     path, tracking = video
@@ -533,6 +535,7 @@ def test_what_is_wrong_with_the_call_is_found_before_the_work(video, registered,
     assert cuda.error_code == "DEVICE_UNAVAILABLE"
 
 
+@pytest.mark.slow
 def test_pbl_detect_shows_the_licence_before_the_work(video, registered, tmp_path, monkeypatch):
     path, tracking = video
     monkeypatch.setattr(pbl_pipeline.tracking, "track_people", lambda *_, **__: tracking)

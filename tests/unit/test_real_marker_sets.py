@@ -119,6 +119,7 @@ def test_four_cameras_see_one_person(shared_data):
     assert np.all((point[:, 2] > 0.8) & (point[:, 2] < 1.8))
 
 
+@pytest.mark.slow
 def test_a_second_of_walking_from_laboratory_markers(walk):
     """The issue's bars, on a walk whose cluster places were estimated from the other one."""
     xyz, confidence = walk.xyz_world_m[WALK_FRAMES], walk.confidence[WALK_FRAMES]
@@ -132,6 +133,7 @@ def test_a_second_of_walking_from_laboratory_markers(walk):
         assert [n for n in marker_ik.JUDGED if not found[n].passed] == []
 
 
+@pytest.mark.slow
 def test_a_second_of_balancing_from_four_cameras(shared_data):
     trial = multiview.multi_view()
     part = MultiView(tuple(cut(view) for view in trial.views), trial.poses)

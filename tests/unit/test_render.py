@@ -287,6 +287,7 @@ def test_a_camera_that_stands_elsewhere_sees_the_same_body(walk, clip) -> None:
     assert np.mean(left != overlay_frames(clip[0], walk, [10])[0]) > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilt_deg", [(12.0, 5.0), (-8.0, -4.0)])
 def test_the_fit_of_a_tilted_camera_lies_on_the_person(tilt_deg: tuple[float, float]) -> None:
     """The vertical is estimated from the walk, and the body stays where it is seen, upright in the world."""

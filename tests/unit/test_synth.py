@@ -20,8 +20,7 @@ from pbl_pipeline.body import load_body, marker_set
 from pbl_pipeline.cli.synth import synth
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, fit_session
-from pbl_pipeline.gait import detect_events, feet_from_markers
-from pbl_pipeline.gait._angles import pelvis_angles
+from pbl_pipeline.gait import detect_events, feet_from_markers, pelvis_angles
 from pbl_pipeline.gait.events import load_events
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.synthetic import (
@@ -38,6 +37,8 @@ from pbl_pipeline.synthetic import (
     synthesise,
     true_markers,
 )
+
+pytestmark = pytest.mark.slow
 
 NORM, SET = gait_norm(), marker_set("bml_movi_87")
 JOINT = {n: i for i, n in enumerate(load_body().joint_names)}

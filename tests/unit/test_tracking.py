@@ -13,18 +13,21 @@ from pbl_pipeline.tracking import (
     METHODS,
     AssociationParams,
     Detection,
+    JoinParams,
     PersonTrack,
     Tracking,
     TrackingParams,
+    body_box,
+    box_iou,
     choose_subject,
+    circle_roi,
     contact_sheet,
     save_contact_sheet,
     time_in_view_s,
     track_people,
 )
 from pbl_pipeline.tracking._associate import Associator, Trail
-from pbl_pipeline.tracking._blazepose import body_box, box_iou, circle_roi
-from pbl_pipeline.tracking._reidentify import JoinParams, join_trails
+from pbl_pipeline.tracking._reidentify import join_trails
 from pbl_pipeline.tracking._tiles import detect_in, merge, tile_starts, tiles
 from pbl_pipeline.video import probe
 from tests.videos import constant_rate, write_video

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pbl_pipeline.tracking import JoinParams, UncrossParams, appearance_similarity
-from pbl_pipeline.tracking._appearance import appearance_of
+from pbl_pipeline.tracking import JoinParams, UncrossParams, appearance_of, appearance_similarity
 from pbl_pipeline.tracking._associate import Trail
 from pbl_pipeline.tracking._identity_swaps import uncross
 from pbl_pipeline.tracking._reidentify import join_trails
