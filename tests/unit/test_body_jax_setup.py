@@ -8,8 +8,11 @@ import sys
 from pathlib import Path
 
 import jax
+import pytest
 
 from pbl_pipeline import jax_setup
+
+pytestmark = pytest.mark.slow
 
 SHOW = (
     "import pbl_pipeline.body, jax\n"
