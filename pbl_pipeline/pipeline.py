@@ -13,15 +13,12 @@ from pbl_pipeline.body import SCALE_NAMES
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import write_angles_csv
+from pbl_pipeline.fit import METHODS as FIT_METHODS
 from pbl_pipeline.fit import Params as FitParams
 from pbl_pipeline.fit import SessionFit, TrialFit, check_trial, default_for_points, fit_session
 from pbl_pipeline.gait import DEFAULT_NORM, GaitMetrics, gait_metrics, load_norm
-from pbl_pipeline.keypoints import (
-    KeypointParams,
-    Keypoints,
-    check_keypoints,
-    detect_keypoints,
-)
+from pbl_pipeline.keypoints import METHODS as KEYPOINT_METHODS
+from pbl_pipeline.keypoints import KeypointParams, Keypoints, check_keypoints, detect_keypoints
 from pbl_pipeline.methods import Method
 from pbl_pipeline.names import distinct
 from pbl_pipeline.paramset import Paramset
@@ -113,7 +110,7 @@ def run_session(
     out: Path,
     camera_file: Path | None = None,
     person: int | None = None,
-    paramset: Method[FitParams] | Paramset | None = None,
+    paramset: Method[FitParams] | Paramset | str | None = None,
     camera_motion: str | None = None,
     norm: str | None = None,
     attitude_files: Sequence[Path] = (),
@@ -124,8 +121,9 @@ def run_session(
     bytes were named before, because its steps would count twice; the others go on. Into `out` goes only a picture of
     the people of a video in which one must be chosen.
 
-    `attitude_files` holds a sensor log of the phone for each path, or nothing; one that does not belong to its video
-    leaves that out. `camera_motion` None stands for "handheld" where there are logs, else "static".
+    `paramset` is the method of the fit; None: the one that suits the keypoints (`fit_default`). `attitude_files` holds
+    a sensor log of the phone for each path, or nothing; one that does not belong to its video leaves that out.
+    `camera_motion` None stands for "handheld" where there are logs, else "static".
 
     Raises
     ------
@@ -134,6 +132,7 @@ def run_session(
         PHONE_LOG for a log that cannot be read.
     """
     # A wrong name or log must not cost a fit.
+    method = FIT_METHODS.find(paramset or fit_default(KEYPOINT_METHODS.find(keypoints)))
     basis = load_norm(norm or DEFAULT_NORM)
     logs = [(file, read_phone_log(file)) for file in attitude_files] or [None] * len(paths)
     camera_motion = camera_motion or ("handheld" if attitude_files else "static")
@@ -149,14 +148,14 @@ def run_session(
             if log is not None:
                 attitude = attitude_of(log[1], log[0], trial.video)
                 trial = dataclasses.replace(trial, keypoints=trial.keypoints.with_attitude(attitude))
-            check_trial(trial.keypoints, name, paramset)
+            check_trial(trial.keypoints, name, method)
         except PblError as error:
             problems[name] = error
         else:
             trials.append(trial)
     if not trials:
         raise next(iter(problems.values()))
-    fit = fit_session([t.keypoints for t in trials], [t.name for t in trials], paramset, camera_motion)
+    fit = fit_session([t.keypoints for t in trials], [t.name for t in trials], method, camera_motion)
     return Session(tuple(trials), fit, gait_metrics(fit.trials, norm=basis, fit_checks=fit.qc), problems)
 
 

@@ -83,6 +83,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["step-length", "zeni-slow"])
 def test_event_methods(results, name):
     found = results[name]
@@ -91,6 +92,7 @@ def test_event_methods(results, name):
     assert found["worst_s"] < 0.1
 
 
+@pytest.mark.slow
 def test_a_person_detector(results):
     found = results["backdrop"]
     assert (found["people"], found["detector"], found["chosen"], found["stored"]) == (1, "backdrop", 1, True)

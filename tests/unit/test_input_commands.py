@@ -12,7 +12,7 @@ from pbl_pipeline.body import load_marker_set
 from pbl_pipeline.cli._options import fit_paramset
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import GaussNewtonParams, ImplicitAdamParams, Params, default_method
-from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
+from pbl_pipeline.keypoints import METHODS, Keypoints, ModelKeypointParams, ModelParams, MultiView, WorldMarkers
 from pbl_pipeline.methods import Stage
 from pbl_pipeline.video import load_attitude
 from tests.command import Done, pbl
@@ -279,6 +279,19 @@ def test_logs_go_with_their_videos_into_the_fit(fits, monkeypatch, tmp_path):
     with pytest.raises(PblError) as error:
         pipeline.run_session(videos, tmp_path / "out", attitude_files=logs)
     assert code_of(error) == "PHONE_LOG"
+
+
+@pytest.mark.usefixtures("detection")
+@pytest.mark.parametrize(("markers", "expected"), [("bml_movi_87", "gauss-newton"), ("mpi_inf_3dhp_17", "blazepose")])
+def test_a_session_is_fitted_as_its_points_want(fits, monkeypatch, tmp_path, markers, expected):
+    monkeypatch.setattr(pipeline, "check_trial", lambda *_: None)
+    monkeypatch.setattr(ModelKeypointParams, "points", lambda _: (markers, False))
+    model = ModelParams("still", "1" * 64, "2" * 64, "MIT", 10)
+    method = METHODS.make("still", 1, ModelKeypointParams(model_sha256=model.sha256, model=model))
+    video = chain.small_video(tmp_path, "a")
+    pipeline.run_session([video], tmp_path / "out", keypoints=method)
+    pipeline.run_session([video], tmp_path / "out", keypoints=method, paramset="markers")
+    assert [c["paramset"].name for c in fits] == [expected, "markers"]
 
 
 @pytest.mark.usefixtures("detection")
