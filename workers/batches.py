@@ -29,7 +29,7 @@ def run_fits(first: list[Claim], worker: Worker) -> None:
             batch, result = waiting.popleft()
             worker.heartbeat.doing(f"{table.__name__}: batch of {len(batch)}")
             for job in batch:
-                worker.say("start", job, None)  # the time limit counts from here
+                worker.report(job, None)  # the time limit counts from here
             left = list(batch)
             try:
                 ended = []

@@ -30,15 +30,15 @@ REFRESH_EVERY_S = 60.0
 class Worker:
     """One working process.
 
-    tables: the computed tables it serves. stop: set when it is to end after the job in hand. say: told of each job
-    before ("start") and after ("end") with the claim and the outcome; the supervisor listens. batch: fits per batch.
+    tables: the computed tables it serves. stop: set when it is to end after the running job. report: called with each
+    job before it (without an outcome) and after it. batch: fits per batch.
     limit: most jobs of each table. found: what its looks at the tables, and its jobs, made computable.
     """
 
     tables: Sequence[Any]
     heartbeat: Listener
     stop: threading.Event = dataclasses.field(default_factory=threading.Event)
-    say: Callable[[str, Claim | None, Outcome | None], None] = lambda *_: None
+    report: Callable[[Claim, Outcome | None], None] = lambda *_: None
     batch: int = 1
     limit: int | None = None
     done: int = 0
@@ -111,15 +111,15 @@ class Worker:
         self.follow(ended)
 
     def one(self, job: Claim, computed: run_job.Computed | None = None) -> Outcome:
-        """Do one job, with everything that is told about it."""
+        """Do one job, with all its reports."""
         self.heartbeat.doing(str(job))
-        self.say("start", job, None)
+        self.report(job, None)
         try:
             outcome = run_job.run(job, computed, self.stop)
         except (KeyboardInterrupt, SystemExit):  # it was put back
-            self.say("end", job, Outcome(job, run_job.LATER))
+            self.report(job, Outcome(job, run_job.LATER))
             raise
-        self.say("end", job, outcome)
+        self.report(job, outcome)
         good = outcome.what in (run_job.DONE, run_job.ALREADY)
         self.done += good
         self.failed += outcome.what == run_job.FAILED

@@ -10,6 +10,9 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, star
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
+from .queue import Claim
+from .run_job import Outcome
+
 #: Upper ends of the duration classes (s): from a light job to a long video.
 SECONDS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
 
@@ -25,12 +28,11 @@ class Metrics:
         self.in_hand = Gauge("pbl_jobs_in_hand", "Jobs being computed by this worker", registry=here)
         self.restarts = Counter("pbl_process_restarts", "Working processes that died and were replaced", registry=here)
 
-    def heard(self, message: dict[str, Any]) -> None:
-        """Count a job that a working process ended."""
-        if message["what"] != "end":
-            return
-        self.jobs.labels(message["table"], message["outcome"], message["code"]).inc()
-        self.seconds.labels(message["table"]).observe(message["seconds"])
+    def heard(self, job: Claim, outcome: Outcome | None) -> None:
+        """Count a job that a working process ended; None when it began."""
+        if outcome is not None:
+            self.jobs.labels(job.table.__name__, outcome.what, outcome.code).inc()
+            self.seconds.labels(job.table.__name__).observe(outcome.seconds)
 
     def serve(self, port: int, host: str, connect: Callable[[], Any]) -> None:
         """Start the endpoint in a thread. `connect` returns a database connection for the lengths of the queues."""

@@ -80,7 +80,7 @@ def populate(tables: Sequence[str] | None = None, limit: int | None = None, retr
     empty_before = {t: len(empty_rows(t)) for t in chosen}
     found = refresh.refresh(everything=True) or refresh.Refreshed()
     with progress.bar("populate", total=_ready(chosen, limit), unit="row") as update:
-        worker = Worker(chosen, Silent(), say=_counting(parts, chosen, limit, update), limit=limit)
+        worker = Worker(chosen, Silent(), report=_counting(parts, chosen, limit, update), limit=limit)
         try:
             worker.run(once=True)
         except (KeyboardInterrupt, SystemExit):
@@ -103,13 +103,13 @@ def _ready(tables: Sequence[Any], limit: int | None) -> int:
 
 def _counting(
     parts: dict[str, TableRun], tables: Sequence[Any], limit: int | None, update: Callable[..., None]
-) -> Callable[[str, Claim | None, Outcome | None], None]:
-    """What the worker tells of each job: counted by table, and drawn."""
+) -> Callable[[Claim, Outcome | None], None]:
+    """What the worker reports of each job: counted by table, and drawn."""
     ended, counted = 0, time.monotonic()
 
-    def say(what: str, job: Claim | None, outcome: Outcome | None) -> None:
+    def report(job: Claim, outcome: Outcome | None) -> None:
         nonlocal ended, counted
-        if what != "end" or job is None or outcome is None:
+        if outcome is None:
             return
         part = parts[job.table.__name__]
         part.done += outcome.what == run_job.DONE
@@ -121,4 +121,4 @@ def _counting(
             total, counted = ended + _ready(tables, limit), time.monotonic()
         update(1, part.table, total)
 
-    return say
+    return report

@@ -1,21 +1,28 @@
-"""Reservations of processes that are gone, and errors that say nothing about the job."""
+"""Jobs of processes that died: reservations to free, crashes to count; and errors with a cause outside the job."""
 
 from __future__ import annotations
 
 import datetime
+import json
 import os
 import platform
 from pathlib import Path
 from typing import Any
 
+from pbl_pipeline.errors import PblError
 from schemas import worker
 from schemas.jobs import jobs_of
+from schemas.rows import utc_now
 
 from . import queue
+from .queue import Claim
 
 #: A worker that has not been seen for so long is dead. Its heart beats every `heartbeat.PERIOD_S`; this also outlasts
 #: a database that is away for a minute and a process that compiles.
 DEAD_AFTER_S = 180.0
+
+#: After so many crashes of its process a job becomes an error row.
+CRASHES = 3
 
 #: Exceptions that say nothing about the job: a signal, a lost server. DataJoint's own populate makes error rows of them
 #: that begin with the exception's name (a worker puts the job back); they are tried again without being asked.
@@ -41,6 +48,41 @@ def free_own(table: Any) -> int:
     """Put back what this process was computing when a signal ended it."""
     mine = jobs_of(table) & {"host": platform.node(), "pid": os.getpid()}
     return queue.reset(mine & {"status": "reserved"}) + queue.reset(mine & {"status": "error"} & INTERRUPTED_ROWS)
+
+
+def crashed(job: Claim, reason: str, at_once: bool = False) -> bool:
+    """Count a crash of this job; put it back, or make an error row of it after `CRASHES` (or `at_once`).
+
+    Returns whether it became an error row.
+    """
+    known = {"stage": job.table.__name__, "job_hash": job.hash}
+    rows = (worker.Crash & known).to_dicts()
+    n = int(rows[0]["crash_n"]) + 1 if rows else 1
+    plain = json.loads(json.dumps(job.key, default=str))
+    row = {**known, "job_key": plain, "crash_n": n, "crash_reason": reason[:255], "crash_time": utc_now()}
+    worker.Crash.insert1(row, replace=True)
+    if not at_once and n < CRASHES:
+        queue.put_back(job, f"its process died ({reason})", 1.0)
+        return False
+    if at_once:
+        error = PblError(
+            "TIME_LIMIT",
+            found=f"no result within the {reason}",
+            expected="a result in that time",
+            next_step="look at the recording; `pbl worker --limit-factor 4` allows more, then `pbl retry`",
+            key=str(job),
+        )
+    else:
+        error = PblError(
+            "WORKER_CRASH",
+            found=f"the worker's process died {n} times over this job, last: {reason}",
+            expected="a result or a coded error",
+            next_step="check memory (exit by SIGKILL) and the recording; then `pbl retry`, or report it",
+            key=str(job),
+        )
+    (worker.Crash & known).delete_quick()
+    queue.fail(job, f"PblError: {error}")
+    return True
 
 
 def _alive(row: dict[str, Any], table: Any) -> bool:

@@ -13,32 +13,24 @@ supervisor ends, and restarting it is left to them.
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import multiprocessing
 import os
-import platform
 import signal
-import threading
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from pbl_pipeline.errors import PblError
-from schemas import connection
-from schemas.rows import utc_now
-
-from . import queue, registry, run_job
-from .log import event, to_stderr
+from . import queue, recover, registry, run_job
+from .log import event
 from .metrics import Metrics
+from .process import SELFTEST_FAILED, Options, work
 from .queue import Claim
 from .run_job import Outcome
 
 log = logging.getLogger("pbl.worker")
 
-#: After so many crashes of its process a job becomes an error row.
-CRASHES = 3
 #: Pause before a process that died is replaced (s): doubled up to the longest while processes keep dying.
 RESTART_S = (0.5, 60.0)
 #: After a process that lived for so long the pause begins anew (s).
@@ -49,35 +41,19 @@ HOPELESS = 5
 LAST_S = 15.0
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """Options of `pbl worker`. grace_s: how long a running job may continue after SIGTERM. limit_factor: multiplies the
-    time limits of the tables."""
-
-    resource: str = "all"
-    processes: int = 1
-    batch: int = 1
-    once: bool = False
-    max_jobs: int | None = None
-    grace_s: float = 60.0
-    limit_factor: float = 1.0
-    selftest: bool = True
-
-
 @dataclasses.dataclass
 class _Child:
     process: Any
     pipe: Connection
     started: float
-    jobs: dict[str, tuple[dict[str, Any], float]] = dataclasses.field(default_factory=dict)
+    jobs: dict[tuple[str, str], tuple[Claim, float]] = dataclasses.field(default_factory=dict)
     why: str = ""
 
-    def holds(self, message: dict[str, Any], limit_factor: float) -> None:
-        """Note a job that began or ended."""
-        name = f"{message['table']} {message['hash']}"
-        if message["what"] == "start":
-            limit = registry.stage_of(message["table"]).limit_s * limit_factor
-            self.jobs[name] = (message, time.monotonic() + limit)
+    def heard(self, job: Claim, outcome: Outcome | None, limit_factor: float) -> None:
+        """Note a job that began (no outcome yet) or ended."""
+        name = (job.table.__name__, job.hash)
+        if outcome is None:
+            self.jobs[name] = (job, time.monotonic() + _limit_s(job, limit_factor))
         else:
             self.jobs.pop(name, None)
 
@@ -145,20 +121,20 @@ class Supervisor:
         for child in speaking:
             try:
                 while child.pipe.poll():
-                    message = child.pipe.recv()
-                    child.holds(message, self.options.limit_factor)
-                    self.metrics.heard(message)
+                    job, outcome = child.pipe.recv()
+                    child.heard(job, outcome, self.options.limit_factor)
+                    self.metrics.heard(job, outcome)
             except (EOFError, OSError):
                 child.pipe.close()
 
     def _end_overdue(self) -> None:
         now = time.monotonic()
         for child in self._children:
-            late = [m for m, until in child.jobs.values() if now > until]
+            late = {name: (job, until) for name, (job, until) in child.jobs.items() if now > until}
             if late and child.process.is_alive():
-                limit = registry.stage_of(late[0]["table"]).limit_s * self.options.limit_factor
-                child.why = f"time limit of {limit:g} s"
-                child.jobs = {k: v for k, v in child.jobs.items() if v[0] in late}
+                first, _ = next(iter(late.values()))
+                child.why = f"time limit of {_limit_s(first, self.options.limit_factor):g} s"
+                child.jobs = late
                 os.kill(child.process.pid, signal.SIGKILL)
 
     def _reap(self) -> int:
@@ -198,150 +174,21 @@ class Supervisor:
 
     def _settle_jobs(self, child: _Child, exit_code: int) -> None:
         reason = child.why or _death(exit_code)
-        for message, _ in child.jobs.values():
-            event(log, logging.ERROR, "job took its process down", reason=reason, about=message["about"])
+        for job, _ in child.jobs.values():
+            event(log, logging.ERROR, "job took its process down", reason=reason, about=str(job))
             if not run_job.wait_for_database():
                 return  # `recover` frees its reservation later
-            job = _claim_of(message, child.process.pid)
             if self._stopping and not child.why.startswith("time limit"):
                 queue.put_back(job, "the worker was stopped")
             else:
-                settle_crash(job, reason, at_once=child.why.startswith("time limit"))
+                recover.crashed(job, reason, at_once=child.why.startswith("time limit"))
 
 
-def settle_crash(job: Claim, reason: str, at_once: bool = False) -> bool:
-    """Count a crash of this job; put it back, or make an error row of it after `CRASHES` (or `at_once`).
-
-    Returns whether it became an error row.
-    """
-    from schemas.worker import Crash
-
-    known = {"stage": job.table.__name__, "job_hash": job.hash}
-    rows = (Crash & known).to_dicts()
-    n = int(rows[0]["crash_n"]) + 1 if rows else 1
-    plain = json.loads(json.dumps(job.key, default=str))
-    row = {**known, "job_key": plain, "crash_n": n, "crash_reason": reason[:255], "crash_time": utc_now()}
-    Crash.insert1(row, replace=True)
-    if not at_once and n < CRASHES:
-        queue.put_back(job, f"its process died ({reason})", 1.0)
-        return False
-    if at_once:
-        error = PblError(
-            "TIME_LIMIT",
-            found=f"no result within the {reason}",
-            expected="a result in that time",
-            next_step="look at the recording; `pbl worker --limit-factor 4` allows more, then `pbl retry`",
-            key=str(job),
-        )
-    else:
-        error = PblError(
-            "WORKER_CRASH",
-            found=f"the worker's process died {n} times over this job, last: {reason}",
-            expected="a result or a coded error",
-            next_step="check memory (exit by SIGKILL) and the recording; then `pbl retry`, or report it",
-            key=str(job),
-        )
-    (Crash & known).delete_quick()
-    queue.fail(job, f"PblError: {error}")
-    return True
-
-
-def _claim_of(message: dict[str, Any], pid: int) -> Claim:
-    table = registry.table_named(message["table"])
-    return Claim(table, message["key"], message["priority"], platform.node(), pid, message["connection_id"])
+def _limit_s(job: Claim, factor: float) -> float:
+    return registry.stage_of(job.table).limit_s * factor
 
 
 def _death(exit_code: int) -> str:
     if exit_code < 0:
         return f"signal {signal.Signals(-exit_code).name}"
     return f"exit code {exit_code}"
-
-
-# ------------------------------------------------------------------------------------------------ a working process
-#: Exit code of a process whose self-test failed: starting another would not help.
-SELFTEST_FAILED = 3
-
-
-def work(options: Options, pipe: Connection) -> None:
-    """Run a working process: connect, run the self-test, work."""
-    if options.processes > 1:
-        # Without this JAX reserves most of a GPU's memory for the first of several processes that share it.
-        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    import schemas
-
-    from . import heartbeat, loop, selftest
-
-    stop = threading.Event()
-
-    def end(*_: object) -> None:
-        stop.set()
-
-    def end_now(*_: object) -> None:
-        raise SystemExit(0)  # handlers above put the running job back
-
-    signal.signal(signal.SIGTERM, end)
-    signal.signal(signal.SIGINT, end)  # a terminal sends it to all; the supervisor decides
-    signal.signal(signal.SIGUSR1, end_now)
-    to_stderr()
-    try:
-        if not _connected(schemas, stop):
-            return
-    except PblError as error:
-        event(log, logging.CRITICAL, "cannot start", code=error.code, text=error.text())
-        raise SystemExit(1) from error
-    to_stderr()  # connecting set DataJoint's own level
-    tables = registry.tables_of(options.resource)
-    if options.selftest:
-        try:
-            selftest.check(tables)
-        except selftest.SelfTestFailed as error:
-            event(log, logging.CRITICAL, "self-test failed", error=str(error))
-            raise SystemExit(SELFTEST_FAILED) from error
-
-    def say(what: str, job: Claim | None, outcome: Outcome | None) -> None:
-        if job is None:
-            return
-        message: dict[str, Any] = {
-            "what": what,
-            "table": job.table.__name__,
-            "hash": job.hash,
-            "key": job.key,
-            "about": str(job),
-            "priority": job.priority,
-            "connection_id": job.connection_id,
-        }
-        if outcome is not None:
-            message |= {"outcome": outcome.what, "seconds": outcome.seconds, "code": outcome.code}
-        try:
-            pipe.send(message)
-        except OSError:  # the supervisor has ended: end, too
-            stop.set()
-
-    with heartbeat.Heartbeat(options.resource) as beats:
-        worker = loop.Worker(tables, beats, stop, say, options.batch)
-        event(log, logging.INFO, "worker started", resource=options.resource, worker=beats.worker)
-        try:
-            worker.run(once=options.once, max_jobs=options.max_jobs)
-        finally:
-            event(log, logging.INFO, "worker ended", done=worker.done, failed=worker.failed)
-
-
-def _connected(schemas: Any, stop: threading.Event) -> bool:
-    """Connect and bind the tables, which loads the numerical libraries; wait until the database is available."""
-    while not stop.is_set():
-        try:
-            schemas.activate()
-            return True
-        except PblError as error:
-            if error.code != "DB_NOT_RUNNING":
-                raise
-            event(log, logging.WARNING, "database away", error=error.found)
-        except run_job.DATABASE_ERRORS as error:
-            event(log, logging.WARNING, "database away", error=str(error)[:200])
-        stop.wait(run_job.DATABASE_PAUSE_S)
-    return False
-
-
-def listen_for_metrics(metrics: Metrics, port: int, host: str = "127.0.0.1") -> None:
-    """Serve the metrics; the lengths of the queues are read from the database at each request."""
-    metrics.serve(port, host, connection.another)

@@ -195,7 +195,8 @@ def queue_fits(warm_up: int) -> int:
 def run(batch: int, processes: int, folder: Path) -> list[dict[str, Any]]:
     """Have a worker fit what is queued; the device's own readings [(time, percent)] as spans named "smi"."""
     from workers.metrics import Metrics
-    from workers.supervisor import Options, Supervisor
+    from workers.process import Options
+    from workers.supervisor import Supervisor
 
     folder.mkdir()
     os.environ[gpu_worker_watch.NOTES] = str(folder)

@@ -16,18 +16,18 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from workers.supervisor import Options
+from workers.process import Options
 
 #: Variable that names the folder of the notes.
 NOTES = "PBL_BENCH_NOTES"
 
 
 def work(options: Options, pipe: Connection) -> None:
-    """`workers.supervisor.work`, watched."""
-    from workers import supervisor
+    """`workers.process.work`, watched."""
+    from workers import process
 
     watch(Path(os.environ[NOTES]) / f"{os.getpid()}.jsonl")
-    supervisor.work(options, pipe)
+    process.work(options, pipe)
 
 
 def watch(path: Path) -> None:

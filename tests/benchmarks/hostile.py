@@ -126,7 +126,8 @@ def main(inputs: int, seed: int) -> None:
     from schemas.ingest import Visit, ingest
     from schemas.jobs import jobs_of
     from schemas.sensors import Sensors
-    from workers.supervisor import Options, Supervisor
+    from workers.process import Options
+    from workers.supervisor import Supervisor
 
     with installation() as home:
         schemas.activate()

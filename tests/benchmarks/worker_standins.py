@@ -17,8 +17,8 @@ import pbl_pipeline.fit
 import pbl_pipeline.video
 import schemas.video
 from tests.integration import chain
-from workers import heartbeat, selftest, supervisor
-from workers.supervisor import Options
+from workers import heartbeat, process, selftest
+from workers.process import Options
 
 #: Variable that names the recording whose probe every video gives.
 RECORDED = "PBL_BENCH_RECORDED"
@@ -41,7 +41,7 @@ def install(patch: pytest.MonkeyPatch) -> None:
 
 
 def work(options: Options, pipe: Connection) -> None:
-    """`workers.supervisor.work` with recorded results; the self-test, where it is asked for, is the real one."""
+    """`workers.process.work` with recorded results; the self-test, where it is asked for, is the real one."""
     check, fit_session = selftest.check, pbl_pipeline.fit.fit_session
 
     def real_check(tables: Sequence[Any]) -> None:
@@ -53,4 +53,4 @@ def work(options: Options, pipe: Connection) -> None:
     install(patch)
     patch.setattr(selftest, "check", real_check)
     heartbeat.PERIOD_S = 1.0
-    supervisor.work(options, pipe)
+    process.work(options, pipe)

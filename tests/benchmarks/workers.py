@@ -31,7 +31,11 @@ import pytest
 from tests import database
 from tests.benchmarks import worker_replay, worker_standins
 from tests.integration import chain
+from workers.queue import Claim
+from workers.run_job import Outcome
 
+#: What a worker reports of a job (see `workers.loop.Worker`), and when.
+Report = tuple[float, Claim, Outcome | None]
 #: Videos of a session.
 EACH = 6
 #: The command `pbl` of this interpreter.
@@ -66,20 +70,21 @@ def say(what: str, value: float, unit: str, bar: str = "") -> None:
     click.echo(f"{what:<66}{value:>10.3g} {unit:<10}{bar}")
 
 
-def work(processes: int, heard: list[tuple[float, dict[str, Any]]] | None = None, **options: Any) -> float:
+def work(processes: int, heard: list[Report] | None = None, **options: Any) -> float:
     """Work until nothing is left; the seconds from the first job in hand to the last one ended.
 
-    `heard`: takes what the workers say, with the time.
+    `heard`: takes what the workers report, with the time.
     """
     from workers.metrics import Metrics
-    from workers.supervisor import Options, Supervisor
+    from workers.process import Options
+    from workers.supervisor import Supervisor
 
     said = [] if heard is None else heard
 
     class Clock(Metrics):
-        def heard(self, message: dict[str, Any]) -> None:
-            said.append((time.monotonic(), message))
-            super().heard(message)
+        def heard(self, job: Claim, outcome: Outcome | None) -> None:
+            said.append((time.monotonic(), job, outcome))
+            super().heard(job, outcome)
 
     once = {"once": True, "selftest": False, "processes": processes, **options}
     assert Supervisor(Options(**once), Clock(), worker_standins.work).run() == 0
@@ -253,15 +258,15 @@ def speed(keys: int, work_ms: float) -> None:
         alone = 0.0
         for processes in (1, 2, 3, 4):
             begin()
-            heard: list[tuple[float, dict[str, Any]]] = []
+            heard: list[Report] = []
             before = _processor_s(server)
             work(processes, heard, resource="decode")
-            ended = [(t, m) for t, m in heard if m["what"] == "end"]
-            once = {m["hash"]: m["outcome"] for _, m in ended}
+            ended = [(t, outcome) for t, _, outcome in heard if outcome is not None]
+            once = {outcome.job.hash: outcome.what for _, outcome in ended}
             assert len(ended) == len(once) == len(video.VideoInfo()) == keys
             assert set(once.values()) == {"done"}
             # Workers start one after the other: counted from when all of them had begun.
-            begun = max(min(t for t, m in heard if m["connection_id"] == c) for c in _connections(heard, processes))
+            begun = max(min(t for t, job, _ in heard if job.connection_id == c) for c in _connections(heard, processes))
             rate = sum(t > begun for t, _ in ended) / (ended[-1][0] - begun)
             alone = alone or rate
             say(f"{processes} workers, each key done once", rate, "jobs/s", f"{rate / alone:.2f} times one")
@@ -277,9 +282,9 @@ def speed(keys: int, work_ms: float) -> None:
         say("statements of a job", sum(map(len, steps)) / keys, "")
 
 
-def _connections(heard: list[tuple[float, dict[str, Any]]], n: int) -> set[int]:
-    """The workers' connections, from what they said; all of them must have worked."""
-    found = {m["connection_id"] for _, m in heard}
+def _connections(heard: list[Report], n: int) -> set[int]:
+    """The workers' connections, from their reports; all of them must have worked."""
+    found = {job.connection_id for _, job, _ in heard}
     assert len(found) == n, found
     return found
 
@@ -431,7 +436,8 @@ def kills(jobs: int, n_kills: int, server_kills: int, seed: int) -> None:
 
 def _boss() -> None:
     import schemas
-    from workers.supervisor import Options, Supervisor
+    from workers.process import Options
+    from workers.supervisor import Supervisor
 
     schemas.activate(methods=False)
     Supervisor(Options(resource="decode", selftest=False, grace_s=5.0), target=worker_standins.work).run()
@@ -453,18 +459,19 @@ def memory(jobs: int) -> None:
     """Resident memory of one worker, started as in production: after 20 jobs, after all, after as many again."""
     from schemas.bulk import register_many
     from workers.metrics import Metrics
-    from workers.supervisor import Options, Supervisor
+    from workers.process import Options
+    from workers.supervisor import Supervisor
 
     with installation():
         register_many(recordings(0, EACH * math.ceil(2 * jobs / _JOBS_OF_A_SESSION)))
         sizes: list[tuple[str, float]] = []
 
         class Watch(Metrics):
-            def heard(self, message: dict[str, Any]) -> None:
-                if message["what"] == "end":
+            def heard(self, job: Claim, outcome: Outcome | None) -> None:
+                if outcome is not None:
                     (child,) = [c.process.pid for c in boss._children]
                     pages = int(Path(f"/proc/{child}/statm").read_text().split()[1])
-                    sizes.append((message["table"], pages * os.sysconf("SC_PAGE_SIZE") / 2**20))
+                    sizes.append((job.table.__name__, pages * os.sysconf("SC_PAGE_SIZE") / 2**20))
 
         boss = Supervisor(Options(once=True), Watch(), worker_standins.work)
         assert boss.run() == 0

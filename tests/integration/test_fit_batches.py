@@ -68,11 +68,11 @@ def test_told_to_stop_it_ends_what_it_has_and_takes_no_more(sessions):
     computed = []
     worker = sessions(computed.append)
 
-    def stop(what, job, outcome) -> None:
-        if what == "end":
+    def stop(job, outcome) -> None:
+        if outcome is not None:
             worker.stop.set()
 
-    worker.say = stop
+    worker.report = stop
     batches.run_fits(queue.claim(fit.SessionFit, 2), worker)
     # The batch that was written when it was told, and one for each thread.
     assert worker.done == len(fit.SessionFit()) == sum(computed) == 6

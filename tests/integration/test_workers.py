@@ -31,7 +31,9 @@ from tests.rows import register
 from workers import queue, recover, refresh, registry, requeue, run_job
 from workers.heartbeat import Heartbeat, Silent
 from workers.loop import Worker
-from workers.supervisor import CRASHES, Options, Supervisor
+from workers.process import Options
+from workers.recover import CRASHES
+from workers.supervisor import Supervisor
 
 from . import chain, worker_target
 

@@ -15,14 +15,14 @@ from pathlib import Path
 import pytest
 
 import pbl_pipeline.video
-from workers import heartbeat, supervisor
-from workers.supervisor import Options
+from workers import heartbeat, process
+from workers.process import Options
 
 from . import chain
 
 
 def work(options: Options, pipe: Connection) -> None:
-    """`workers.supervisor.work` with stand-ins."""
+    """`workers.process.work` with stand-ins."""
     patch = pytest.MonkeyPatch()
     chain.install(patch)
     real = pbl_pipeline.video.probe
@@ -40,7 +40,7 @@ def work(options: Options, pipe: Connection) -> None:
 
     patch.setattr(pbl_pipeline.video, "probe", probe)
     patch.setattr(heartbeat, "PERIOD_S", 0.2)
-    supervisor.work(options, pipe)
+    process.work(options, pipe)
 
 
 def _note(path: Path, what: str) -> None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import multiprocessing
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
+from schemas import fit
 from workers.metrics import Metrics
-from workers.supervisor import Options, Supervisor, _Child
+from workers.process import Options
+from workers.queue import Claim
+from workers.run_job import DONE, Outcome
+from workers.supervisor import Supervisor, _Child
 
 
 class Process:
@@ -32,8 +35,10 @@ class Process:
         self.exitcode = exit_code
         self._lives.close()
 
-    def say(self, what: str, number: int, **more: Any) -> None:
-        self.says.send({"what": what, "table": "SessionFit", "hash": f"{number:016x}", "about": str(number), **more})
+    def report(self, number: int, seconds: float | None = None) -> None:
+        """A fit begins, or (with its duration) ends."""
+        job = Claim(fit.SessionFit, {"fit_set": str(number)}, 5, "here", self.pid, 1)
+        self.says.send((job, None if seconds is None else Outcome(job, DONE, seconds)))
 
 
 @pytest.fixture
@@ -59,11 +64,11 @@ def in_hand(boss: SimpleNamespace) -> float:
 def test_a_job_that_is_announced_twice_is_in_hand_once(boss: SimpleNamespace):
     """Fits of a batch are begun together, and each again when it is inserted."""
     for number in (1, 2):
-        boss.process.say("start", number)
+        boss.process.report(number)
     assert in_hand(boss) == 2
     for number in (1, 2):
-        boss.process.say("start", number)
-        boss.process.say("end", number, outcome="done", seconds=2.0, code="")
+        boss.process.report(number)
+        boss.process.report(number, seconds=2.0)
     assert in_hand(boss) == 0
     done = {"table": "SessionFit", "outcome": "done", "code": ""}
     assert boss.supervisor.metrics.registry.get_sample_value("pbl_jobs_total", done) == 2
@@ -71,8 +76,8 @@ def test_a_job_that_is_announced_twice_is_in_hand_once(boss: SimpleNamespace):
 
 def test_jobs_of_a_process_that_died_are_in_nobodys_hand(boss: SimpleNamespace):
     for number in (1, 2, 3):
-        boss.process.say("start", number)
-    boss.process.say("end", 1, outcome="done", seconds=2.0, code="")
+        boss.process.report(number)
+    boss.process.report(1, seconds=2.0)
     assert in_hand(boss) == 2
     boss.process.die(-9)
     boss.supervisor._reap()

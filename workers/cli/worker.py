@@ -55,7 +55,10 @@ def worker(
     Example: pbl worker --resource gpu --batch 32 --metrics-port 9108
     """
     import schemas
-    from workers.supervisor import Options, Supervisor, listen_for_metrics, to_stderr
+    from schemas import connection
+    from workers.log import to_stderr
+    from workers.process import Options
+    from workers.supervisor import Supervisor
 
     schemas.activate(methods=False)  # a wrong address or login is reported here, not by a process that is started again
     to_stderr()
@@ -71,7 +74,7 @@ def worker(
     )
     supervisor = Supervisor(options)
     if metrics_port is not None:
-        listen_for_metrics(supervisor.metrics, metrics_port, metrics_host)
+        supervisor.metrics.serve(metrics_port, metrics_host, connection.another)
     raise click.exceptions.Exit(supervisor.run())
 
 

@@ -1,0 +1,105 @@
+"""A working process of `pbl worker`: connects, tests itself, works, and reports its jobs to the supervisor."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import os
+import signal
+import threading
+from multiprocessing.connection import Connection
+from typing import Any
+
+from pbl_pipeline.errors import PblError
+
+from . import registry, run_job
+from .log import event, to_stderr
+from .queue import Claim
+from .run_job import Outcome
+
+log = logging.getLogger("pbl.worker")
+
+#: Exit code of a process whose self-test failed: starting another would not help.
+SELFTEST_FAILED = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of `pbl worker`. grace_s: how long a running job may continue after SIGTERM. limit_factor: multiplies the
+    time limits of the tables."""
+
+    resource: str = "all"
+    processes: int = 1
+    batch: int = 1
+    once: bool = False
+    max_jobs: int | None = None
+    grace_s: float = 60.0
+    limit_factor: float = 1.0
+    selftest: bool = True
+
+
+def work(options: Options, pipe: Connection) -> None:
+    """Run a working process: connect, run the self-test, work."""
+    if options.processes > 1:
+        # Without this JAX reserves most of a GPU's memory for the first of several processes that share it.
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    import schemas
+
+    from . import heartbeat, loop, selftest
+
+    stop = threading.Event()
+
+    def end(*_: object) -> None:
+        stop.set()
+
+    def end_now(*_: object) -> None:
+        raise SystemExit(0)  # handlers above put the running job back
+
+    signal.signal(signal.SIGTERM, end)
+    signal.signal(signal.SIGINT, end)  # a terminal sends it to all; the supervisor decides
+    signal.signal(signal.SIGUSR1, end_now)
+    to_stderr()
+    try:
+        if not _connected(schemas, stop):
+            return
+    except PblError as error:
+        event(log, logging.CRITICAL, "cannot start", code=error.code, text=error.text())
+        raise SystemExit(1) from error
+    to_stderr()  # connecting set DataJoint's own level
+    tables = registry.tables_of(options.resource)
+    if options.selftest:
+        try:
+            selftest.check(tables)
+        except selftest.SelfTestFailed as error:
+            event(log, logging.CRITICAL, "self-test failed", error=str(error))
+            raise SystemExit(SELFTEST_FAILED) from error
+
+    def report(job: Claim, outcome: Outcome | None) -> None:
+        try:
+            pipe.send((job, outcome))
+        except OSError:  # the supervisor has ended: end, too
+            stop.set()
+
+    with heartbeat.Heartbeat(options.resource) as beats:
+        worker = loop.Worker(tables, beats, stop, report, options.batch)
+        event(log, logging.INFO, "worker started", resource=options.resource, worker=beats.worker)
+        try:
+            worker.run(once=options.once, max_jobs=options.max_jobs)
+        finally:
+            event(log, logging.INFO, "worker ended", done=worker.done, failed=worker.failed)
+
+
+def _connected(schemas: Any, stop: threading.Event) -> bool:
+    """Connect and bind the tables, which loads the numerical libraries; wait until the database is available."""
+    while not stop.is_set():
+        try:
+            schemas.activate()
+            return True
+        except PblError as error:
+            if error.code != "DB_NOT_RUNNING":
+                raise
+            event(log, logging.WARNING, "database away", error=error.found)
+        except run_job.DATABASE_ERRORS as error:
+            event(log, logging.WARNING, "database away", error=str(error)[:200])
+        stop.wait(run_job.DATABASE_PAUSE_S)
+    return False
