@@ -169,8 +169,13 @@ class GaitCycle(dj.Computed):
         opposite_foot_down : float64           # (s)
         cycle_foot_up      : float64           # (s)
         cycle_end          : float64           # (s) next foot down of the same side
-        cycle_used         : bool              # false: first or last step, odd length, odd curves, failed fit
-        cycle_excluded     : varchar(100)      # why it is not used
+        cycle_used         : bool              # false where one of the next five says why
+        cycle_first_step   : bool              # touches the first step of its walking bout
+        cycle_last_step    : bool              # touches the last step of its walking bout
+        cycle_length_ratio=null : float64      # (1) length over the typical stride's, null unless left out for it
+        cycle_curve_distance=null : float64    # (deg) from its side's median curves, null unless left out for it
+        cycle_curves_n=null : int16            # cycles of that median, null with it
+        cycle_failed_checks : json             # names of the checks of the fit that FAIL, such as []
         curves_missing     : varchar(100)      # why it has no curves
         cycle_stride_length=null : float64     # (m) over the floor
         cycle_step_length=null   : float64     # (m) of the step that ends the cycle
@@ -221,7 +226,12 @@ class GaitCycle(dj.Computed):
                 "cycle_foot_up": c.foot_up_s,
                 "cycle_end": c.end_s,
                 "cycle_used": c.used,
-                "cycle_excluded": c.excluded[:100],
+                "cycle_first_step": c.exclusion.first_step,
+                "cycle_last_step": c.exclusion.last_step,
+                "cycle_length_ratio": number(c.exclusion.length_ratio),
+                "cycle_curve_distance": number(c.exclusion.curve_distance_deg),
+                "cycle_curves_n": c.exclusion.n_curves,
+                "cycle_failed_checks": list(c.exclusion.failed_checks),
                 "curves_missing": c.curves_missing[:100],
                 "cycle_stride_length": number(c.lengths.stride_length_m),
                 "cycle_step_length": number(c.lengths.step_length_m),
@@ -368,8 +378,14 @@ def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Mapping[str, np.nda
         opposite_foot_down_s=float(row["opposite_foot_down"]),
         foot_up_s=float(row["cycle_foot_up"]),
         end_s=float(row["cycle_end"]),
-        used=bool(row["cycle_used"]),
-        excluded=row["cycle_excluded"],
+        exclusion=lib.Exclusion(
+            first_step=bool(row["cycle_first_step"]),
+            last_step=bool(row["cycle_last_step"]),
+            length_ratio=number(row["cycle_length_ratio"]),
+            curve_distance_deg=number(row["cycle_curve_distance"]),
+            n_curves=None if row["cycle_curves_n"] is None else int(row["cycle_curves_n"]),
+            failed_checks=tuple(row["cycle_failed_checks"]),
+        ),
         curves=dict(curves or {}),
         curves_missing=row["curves_missing"],
         lengths=lib.Lengths(

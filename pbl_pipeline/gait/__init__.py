@@ -8,6 +8,7 @@ from ._angles import ANGLE_NAMES, LEG_ANGLES, AngleSeries, angle_series, leg_ang
 from ._bands import NormalBands, leg_length_m, normal_bands
 from ._curve_frame import CURVE_FRAME_COLUMNS, curve_frame
 from ._cycles import REPORT_PERCENT, GaitCycle, cycle_curves, find_cycles
+from ._exclusion import Exclusion
 from ._gdi import (
     GDI_METHODS,
     GDI_MODEL,
@@ -78,6 +79,7 @@ __all__ = [
     "AngleSeries",
     "BodyPoses",
     "EventParams",
+    "Exclusion",
     "FootTrajectories",
     "GaitCycle",
     "GaitEvent",

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from pbl_pipeline.qc import FIT_FAILED, Check, withheld
+from pbl_pipeline.qc import Check, failed
 
 from ._angles import AngleSeries, angle_series
+from ._exclusion import Exclusion
 from ._ground import Lengths, cycle_lengths, is_metric, why_no_lengths
-from ._outliers import ODD_CURVES, ODD_LENGTH, without_odd_curves, without_odd_lengths
+from ._outliers import without_odd_curves, without_odd_lengths
 from .events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents
 from .motion import BodyPoses, FootTrajectories, feet_from_fit, trial_poses
 from .normative import BODY_ANGLES
@@ -37,7 +38,7 @@ class GaitCycle:
     `foot_up_s`, `end_s`. `number` counts the cycles of a trial in order of time, both sides together, from 0.
     `used` is False for the cycles that touch the first or last step of their walking bout, for those that are far
     longer or shorter than the others (`odd_length`) or whose curves are far from the others' (`odd_curves`), and for
-    all of a fit that failed; `excluded` says why.
+    all of a fit that failed; `exclusion` says why, `excluded` in words.
     `curves` maps names of `ANGLE_NAMES` to (51,) degrees at 0, 2, ..., 100 % of the cycle; empty where there is
     no fit or frames are missing (`curves_missing` says which). `angle_model` says how the angles are defined.
     `lengths` are those on the floor, None with the reason where they are not known.
@@ -52,27 +53,36 @@ class GaitCycle:
     opposite_foot_down_s: float
     foot_up_s: float
     end_s: float
-    used: bool
-    excluded: str = ""
+    exclusion: Exclusion = dataclasses.field(default_factory=Exclusion)
     curves: dict[str, np.ndarray] = dataclasses.field(default_factory=dict, compare=False, repr=False)
     curves_missing: str = ""
     lengths: Lengths = dataclasses.field(default_factory=lambda: Lengths(missing=NO_POSITIONS))
     angle_model: str = BODY_ANGLES
 
     @property
+    def used(self) -> bool:
+        """Whether the cycle takes part in the measures."""
+        return not self.exclusion
+
+    @property
+    def excluded(self) -> str:
+        """Why the cycle is left out, in words; empty where it is used."""
+        return self.exclusion.text
+
+    @property
     def odd_length(self) -> bool:
         """Whether the cycle is left out because of its length."""
-        return ODD_LENGTH in self.excluded
+        return self.exclusion.length_ratio is not None
 
     @property
     def odd_curves(self) -> bool:
         """Whether the cycle is left out because of its curves."""
-        return ODD_CURVES in self.excluded
+        return self.exclusion.curve_distance_deg is not None
 
     @property
     def fit_failed(self) -> bool:
         """Whether the cycle is left out because the fit failed."""
-        return self.excluded.startswith(FIT_FAILED)
+        return bool(self.exclusion.failed_checks)
 
     @property
     def stride_time_s(self) -> float:
@@ -110,7 +120,7 @@ def find_cycles(
     `series` and `feet` stand for the fit's angles and feet where there is none (a laboratory's recording; positions in
     metres in a world that stands still).
 
-    Where one of `fit_checks`, the checks of the session fit, FAILs, no cycle is used (`pbl_pipeline.qc.withheld`).
+    Where one of `fit_checks`, the checks of the session fit, FAILs, no cycle is used (`pbl_pipeline.qc.failed`).
     """
     found = events.events if isinstance(events, GaitEvents) else tuple(events)
     name = trial or (fit.name if fit is not None else "")
@@ -132,11 +142,6 @@ def find_cycles(
             wanted = [(other, FOOT_UP), (other, FOOT_DOWN), (start.side, FOOT_UP)]
             if [(e.side, e.event) for e in inner] != wanted:
                 continue
-            reasons = []
-            if start is downs[0] and not keep_ends:
-                reasons.append("first step of the bout")
-            if end is downs[-1] and not keep_ends:
-                reasons.append("last step of the bout")
             curves, missing = {}, "no fit"
             if series is not None:
                 curves, missing = cycle_curves(series, start.side, start.time_s, end.time_s)
@@ -154,8 +159,9 @@ def find_cycles(
                 opposite_foot_down_s=inner[1].time_s,
                 foot_up_s=inner[2].time_s,
                 end_s=end.time_s,
-                used=not reasons,
-                excluded=" and ".join(reasons),
+                exclusion=Exclusion(
+                    first_step=start is downs[0] and not keep_ends, last_step=end is downs[-1] and not keep_ends
+                ),
                 curves=curves,
                 curves_missing=missing,
                 lengths=lengths,
@@ -163,8 +169,8 @@ def find_cycles(
             )
             cycles.append(cycle)
     cycles = without_odd_curves(without_odd_lengths(cycles))
-    if reason := withheld(fit_checks):
-        cycles = [dataclasses.replace(c, used=False, excluded=reason) for c in cycles]
+    if checks := failed(fit_checks):
+        cycles = [dataclasses.replace(c, exclusion=Exclusion(failed_checks=checks)) for c in cycles]
     cycles.sort(key=lambda c: c.start_s)
     return tuple(dataclasses.replace(c, number=number) for number, c in enumerate(cycles))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 STRIDE_RATIO = 1.35
 #: Fewest cycles of a bout for a typical stride of its own; shorter bouts are compared with the whole trial.
 _OWN_MEDIAN = 5
-ODD_LENGTH = "times the typical stride"
 
 #: Angles whose curves are compared: those that move most and that every source of curves knows.
 CURVE_ANGLES = ("hip_flexion", "knee_flexion", "ankle_dorsiflexion")
@@ -26,7 +25,6 @@ MIN_CURVES = 5
 #: deviations above the usual distance, and at least this far. Both, so that neither a very regular walk nor a very
 #: irregular one loses cycles that are only its own variability: a leg exchanged or a person mistaken is 20 deg off.
 CURVE_SD, CURVE_MIN_DEG = 6.0, 8.0
-ODD_CURVES = "from the median curves"
 
 
 def without_odd_lengths(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
@@ -36,7 +34,7 @@ def without_odd_lengths(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
         own = [o.stride_time_s for o in cycles if o.bout == c.bout]
         typical = np.median(own if len(own) >= _OWN_MEDIAN else [o.stride_time_s for o in cycles])
         ratio = float(c.stride_time_s / typical)
-        out.append(c if 1 / STRIDE_RATIO <= ratio <= STRIDE_RATIO else not_used(c, f"{ratio:.2f} {ODD_LENGTH}"))
+        out.append(c if 1 / STRIDE_RATIO <= ratio <= STRIDE_RATIO else not_used(c, length_ratio=ratio))
     return out
 
 
@@ -60,12 +58,10 @@ def without_odd_curves(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
         limit = max(CURVE_MIN_DEG, float(usual + CURVE_SD * 1.4826 * np.median(np.abs(away - usual))))
         for i, distance in zip(chosen, away, strict=True):
             if distance > limit:
-                out[i] = not_used(out[i], f"{distance:.0f} deg {ODD_CURVES} of {len(chosen)} cycles")
+                out[i] = not_used(out[i], curve_distance_deg=float(distance), n_curves=len(chosen))
     return out
 
 
-def not_used(cycle: GaitCycle, reason: str) -> GaitCycle:
-    """The cycle, not used, with a further reason."""
-    return dataclasses.replace(
-        cycle, used=False, excluded=f"{cycle.excluded} and {reason}" if cycle.excluded else reason
-    )
+def not_used(cycle: GaitCycle, **reasons: Any) -> GaitCycle:
+    """The cycle, not used, with further reasons (fields of `Exclusion`)."""
+    return dataclasses.replace(cycle, exclusion=dataclasses.replace(cycle.exclusion, **reasons))

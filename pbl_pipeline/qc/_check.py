@@ -9,9 +9,6 @@ PASS, WARN, EMPTY, NEEDS_CHOICE, FAIL = "PASS", "WARN", "EMPTY", "NEEDS_CHOICE",
 #: From best to worst. EMPTY: ran well, nothing to produce. NEEDS_CHOICE: waits for a person.
 OUTCOMES = (PASS, WARN, EMPTY, NEEDS_CHOICE, FAIL)
 
-#: How the reason of `withheld` begins.
-FIT_FAILED = "the fit failed its check"
-
 
 @dataclasses.dataclass(frozen=True)
 class Check:
@@ -42,11 +39,10 @@ def in_session(outcome: str, measured: bool) -> str:
     return WARN if measured and outcome == EMPTY else outcome
 
 
-def withheld(fit_checks: Iterable[Check]) -> str:
-    """Why nothing is measured on a fit with these checks: the ones that FAIL. Empty where none does.
+def failed(fit_checks: Iterable[Check]) -> tuple[str, ...]:
+    """Names of the checks that FAIL: nothing is measured on a fit with one of them.
 
     The one rule for files and tables: a body that does not lie on the person says nothing of how she walks, so the
     gait cycles of such a fit are not used.
     """
-    failed = [c.check for c in fit_checks if c.outcome == FAIL]
-    return f"{FIT_FAILED} {', '.join(failed)}" if failed else ""
+    return tuple(c.check for c in fit_checks if c.outcome == FAIL)

@@ -214,7 +214,9 @@ def test_a_failed_fit_gives_no_measures_in_tables_and_files(
     assert gdi.SessionGdi.fetch1("session_gdi_reason") == why
     assert set(gait.Spatiotemporal.to_arrays("measures_reason")) == {why}
     assert set(gdi.GDI.to_arrays("gdi_reason")) == {why}
-    assert set(gait.GaitCycle.Cycle.to_arrays("cycle_excluded")) == {why}
+    rows = gait.GaitCycle.Cycle.to_dicts()
+    assert {gait.cycle_of_row(row, "").excluded for row in rows} == {why}
+    assert not any(row["cycle_used"] for row in rows)
     assert qc.SessionQc.fetch1("qc_outcome") == "FAIL"
     assert {(e.table, e.about): e.reason for e in pipeline_status().empty} == {
         ("Spatiotemporal", "walk1.mp4"): why,

@@ -13,6 +13,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import (
     NINE_ANGLES,
     THREE_ANGLES,
+    Exclusion,
     GaitCycle,
     GdiParams,
     NormativeSet,
@@ -39,7 +40,7 @@ def toy_vectors(n: int = 80, seed: int = 3) -> np.ndarray:
 
 def cycle(vector: np.ndarray, side: str = "left", number: int = 0, **changes) -> GaitCycle:
     curves = {n: np.append(v, v[0]) for n, v in zip(THREE_ANGLES, np.split(vector, 3), strict=True)}
-    made = GaitCycle("t", number, 0, side, 0.0, 0.1, 0.5, 0.6, 1.0, used=True, curves=curves)
+    made = GaitCycle("t", number, 0, side, 0.0, 0.1, 0.5, 0.6, 1.0, curves=curves)
     return dataclasses.replace(made, **changes)
 
 
@@ -116,7 +117,9 @@ def test_deviation_outside_the_components_is_told(toy):
 
 def test_unused_cycles_do_not_count(toy):
     good, bad = toy.mean_deg + 10 * toy.components[0], toy.mean_deg + 90 * toy.components[0]
-    result = score_gdi([cycle(good), cycle(good, "right", 1), cycle(bad, "right", 2, used=False)], toy)
+    result = score_gdi(
+        [cycle(good), cycle(good, "right", 1), cycle(bad, "right", 2, exclusion=Exclusion(first_step=True))], toy
+    )
     assert result.n == 2
     assert result.mean == pytest.approx(toy.index(good)[0])
 

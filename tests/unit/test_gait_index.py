@@ -34,7 +34,7 @@ NINE = "gillette-166-nine-angles"
 
 def nine_cycle(vector: np.ndarray, side: str = "left", model: str = PLUG_IN_GAIT) -> GaitCycle:
     curves = dict(zip(NINE_ANGLES, vector.reshape(9, 51), strict=True))
-    return GaitCycle("c", 0, 0, side, 0.0, 0.1, 0.5, 0.6, 1.0, used=True, curves=curves, angle_model=model)
+    return GaitCycle("c", 0, 0, side, 0.0, 0.1, 0.5, 0.6, 1.0, curves=curves, angle_model=model)
 
 
 def published(shared_data) -> tuple[np.ndarray, np.ndarray]:

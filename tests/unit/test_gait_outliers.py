@@ -27,7 +27,7 @@ def cycles(n: int, sd_deg: float, side: str = "left", seed: int = 0) -> list[Gai
     out = []
     for k in range(n):
         curves = {a: shape[a] + sd_deg * rng.standard_normal() for a in CURVE_ANGLES}
-        out.append(GaitCycle("t", k, 0, side, k, k + 0.1, k + 0.5, k + 0.6, k + 1.0, used=True, curves=curves))
+        out.append(GaitCycle("t", k, 0, side, k, k + 0.1, k + 0.5, k + 0.6, k + 1.0, curves=curves))
     return out
 
 

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.gait import BODY_ANGLES, NINE_ANGLES, PLUG_IN_GAIT, THREE_ANGLES, GaitCycle, norm_from_cycles
+from pbl_pipeline.gait import (
+    BODY_ANGLES,
+    NINE_ANGLES,
+    PLUG_IN_GAIT,
+    THREE_ANGLES,
+    Exclusion,
+    GaitCycle,
+    norm_from_cycles,
+)
 from tests.unit.test_gait_gdi import cycle, index_another_way, toy_vectors
 
 ABOUT = {"name": "own", "version": 1, "source": "made up"}
@@ -34,7 +42,10 @@ def test_it_is_the_set_of_their_vectors():
 
 def test_unused_cycles_do_not_count():
     cycles, people = made()
-    bad = [dataclasses.replace(c, used=False, curves={k: 3 * v for k, v in c.curves.items()}) for c in cycles[:9]]
+    bad = [
+        dataclasses.replace(c, exclusion=Exclusion(first_step=True), curves={k: 3 * v for k, v in c.curves.items()})
+        for c in cycles[:9]
+    ]
     bare = [dataclasses.replace(c, curves={}) for c in cycles[:5]]
     norm, _ = norm_from_cycles([*cycles, *bad, *bare], [*people, *people[:14]], **ABOUT)
     same, _ = norm_from_cycles(cycles, people, **ABOUT)

@@ -1,0 +1,39 @@
+"""Why a gait cycle takes no part in the measures, as facts; the sentence is made from them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class Exclusion:
+    """Reasons against a cycle; none where it is used.
+
+    `first_step`, `last_step`: it touches the first or last step of its walking bout. `length_ratio`: its length over
+    the typical stride's, where that is odd. `curve_distance_deg`: how far its curves are from the median curves of the
+    `n_curves` cycles of its side, where that is far. `failed_checks`: checks of the fit that FAIL.
+    """
+
+    first_step: bool = False
+    last_step: bool = False
+    length_ratio: float | None = None
+    curve_distance_deg: float | None = None
+    n_curves: int | None = None
+    failed_checks: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        """Whether there is a reason."""
+        return self != Exclusion()
+
+    @property
+    def text(self) -> str:
+        """The reasons in words, empty where there is none. A fit that failed is reason enough."""
+        if self.failed_checks:
+            return f"the fit failed its check {', '.join(self.failed_checks)}"
+        reasons = ["first step of the bout"] if self.first_step else []
+        reasons += ["last step of the bout"] if self.last_step else []
+        if self.length_ratio is not None:
+            reasons.append(f"{self.length_ratio:.2f} times the typical stride")
+        if self.curve_distance_deg is not None:
+            reasons.append(f"{self.curve_distance_deg:.0f} deg from the median curves of {self.n_curves} cycles")
+        return " and ".join(reasons)
