@@ -40,7 +40,7 @@ _TRC = "S00_P00_T01_BalancingTrial_0-100.trc"
 #: stood is found from the points: by its poses even the points that the TRC was triangulated from (OpenPose's) lie
 #: 20 px off in cam03, 14 to the right and 13 down in the median, and the embedded detector's with them.
 _CALIBRATION, _CALIBRATED_SIZE_PX = "Calib_qualisys.toml", (1088, 1920)
-#: Points a knot of a curve stands for at least, in shares of all, and what is added to either outcome of each knot.
+#: Points a knot of a curve stands for at least, in fractions of all, and what is added to either outcome of each knot.
 _KNOTS, _PRIOR = 24, 1.0
 
 
@@ -84,7 +84,7 @@ def curve_params(params: KeypointParams) -> dict:
 def fit_curve(
     errors: Sequence[PointErrors], name: str, params: dict | None = None, bound: float = BOUND_TRUNK
 ) -> ConfidenceCurve:
-    """The monotone curve (isotonic regression) through the shares of points within `bound`.
+    """The monotone curve (isotonic regression) through the fractions of points within `bound`.
 
     Every recording weighs the same, however long it is. The points are pooled into `_KNOTS` bins of equal weight, each
     with one point more on either side of the bound (so nothing is ever certain), and the bins made monotone.
@@ -107,10 +107,10 @@ def fit_curve(
     stated, right, weight = stated[order], right[order], weight[order]
     part = np.minimum((np.cumsum(weight) - 0.5 * weight) / weight.sum() * _KNOTS, _KNOTS - 1).astype(int)
     total = np.bincount(part, weight, _KNOTS)
-    share = (np.bincount(part, weight * right, _KNOTS) + _PRIOR) / (total + 2 * _PRIOR)
+    fraction = (np.bincount(part, weight * right, _KNOTS) + _PRIOR) / (total + 2 * _PRIOR)
     middle = np.bincount(part, weight * stated, _KNOTS) / np.maximum(total, 1e-12)
     keep = total > 0
-    probability = isotonic_regression(share[keep], weights=total[keep]).x
+    probability = isotonic_regression(fraction[keep], weights=total[keep]).x
     knots, first = np.unique(np.round(middle[keep], 4), return_index=True)
     source = "; ".join(f"{e.title} ({len(e.stated)} points)" for e in errors)
     return ConfidenceCurve(
@@ -122,7 +122,7 @@ def fit_curve(
 class CurveScore:
     """How well probabilities say what happens in a recording; lower is better.
 
-    brier: mean squared difference of probability and outcome (0 or 1). gap: mean probability less the share within
+    brier: mean squared difference of probability and outcome (0 or 1). gap: mean probability less the fraction within
     the bound. Of the stated confidence taken as a probability, and of a curve that never saw the recording.
     """
 

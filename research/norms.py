@@ -67,7 +67,7 @@ def build_nine_angles(path: str | Path) -> NormativeSet:
         raise _not_gillette(path, f"features of shape {features.shape}")
     mean = vectors.mean(axis=0)
     spread = np.sum(((vectors - mean) @ features.T) ** 2, axis=0) / (len(vectors) - 1)
-    share = float(spread.sum() / np.var(vectors, axis=0, ddof=1).sum())
+    fraction = float(spread.sum() / np.var(vectors, axis=0, ddof=1).sum())
     distance = np.log(np.linalg.norm((vectors - mean) @ features.T, axis=1))
     return NormativeSet(
         name="gillette-166-nine-angles",
@@ -81,7 +81,7 @@ def build_nine_angles(path: str | Path) -> NormativeSet:
         mean_deg=mean,
         components=features,
         explained_variance=spread,
-        explained_share=share,
+        explained_share=fraction,
         ln_mean=float(distance.mean()),
         ln_sd=float(distance.std(ddof=1)),
         curves=_curves(vectors, PLUG_IN_GAIT),

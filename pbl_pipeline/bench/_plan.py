@@ -14,7 +14,7 @@ MOTIONS = ("static", "handheld")
 MARKER_SET = "bml_movi_87"
 FPS = 30.0
 
-#: What `--robust` does to the data: share of outliers, a marker that is never seen, a time with nothing seen.
+#: What `--robust` does to the data: fraction of outliers, a marker that is never seen, a time with nothing seen.
 TROUBLES = ("none", "outliers", "marker", "span", "all")
 OUTLIER_SHARE, NEVER_SEEN, UNSEEN_S = 0.30, "LBigToe", (4.5, 5.5)
 #: The joint that mostly hangs on `NEVER_SEEN`.

@@ -36,7 +36,7 @@ class GdiParams:
     advised_cycles
         Fewer in all give a warning: single cycles vary by several points.
     min_explained
-        A smaller share of a cycle's deviation inside the normative components gives a warning.
+        A smaller fraction of a cycle's deviation inside the normative components gives a warning.
     """
 
     norm: str = DEFAULT_NORM
@@ -58,7 +58,7 @@ _NAMES = {GDI_MODEL: "GDI of three angles", GILLETTE_MODEL: "GDI (Schwartz & Roz
 
 @dataclasses.dataclass(frozen=True)
 class GdiCycle:
-    """The index of one cycle. `z` is the standardised log distance; `explained` the share (0..1) of the squared
+    """The index of one cycle. `z` is the standardised log distance; `explained` the fraction (0..1) of the squared
     deviation from the normative mean that lies in the normative components: what is outside does not count."""
 
     trial: str
@@ -232,7 +232,7 @@ def _checks(
     if reason:
         return (Check("gdi_cycles", EMPTY, float(len(scored)), float(2 * params.min_cycles_per_side), reason),)
     few = len(scored) < params.advised_cycles
-    share = float(np.mean([c.explained for c in scored]))
+    fraction = float(np.mean([c.explained for c in scored]))
     return (
         _convention(angle_models, norm),
         Check(
@@ -244,11 +244,11 @@ def _checks(
         ),
         Check(
             "gdi_explained",
-            PASS if share >= params.min_explained else WARN,
-            round(share, 3),
+            PASS if fraction >= params.min_explained else WARN,
+            round(fraction, 3),
             params.min_explained,
             ""
-            if share >= params.min_explained
+            if fraction >= params.min_explained
             else "most of the deviation is of a kind that healthy walking does not show: the index understates it",
         ),
     )

@@ -13,9 +13,9 @@ from .motion import FootTrajectories
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit
 
-#: The part of a stride after its foot down in which the foot lies flat (share of the stride).
+#: The part of a stride after its foot down in which the foot lies flat (fraction of the stride).
 FLAT_FROM, FLAT_TO = 0.12, 0.27
-#: A standing foot that moves over the floor at more than this share of its speed against the pelvis does not stand:
+#: A standing foot that moves over the floor at more than this fraction of its speed against the pelvis does not stand:
 #: a treadmill's belt carries it, or the camera moves (1 and more for both; 0.2 at most in fits of synthetic walkers,
 #: 0.1 to 0.6 in the demo recording, whose feet are seen less well).
 MAX_SLIDE = 0.6

@@ -14,7 +14,7 @@ from ._cycles import GaitCycle
 from ._gdi import MODEL_ANGLES
 from .normative import MIN_VECTORS, NINE_ANGLES, THREE_ANGLES, NormativeSet, fit_norm
 
-#: Fewer people, or a larger share of the cycles from one person, give a warning.
+#: Fewer people, or a larger fraction of the cycles from one person, give a warning.
 ADVISED_PEOPLE, MAX_SHARE = 20, 0.2
 
 

@@ -166,8 +166,8 @@ def _measure(name: str, values: Sequence[tuple[str, float]]) -> Measure:
     groups = list(by_side.values()) if left is not None or right is not None else [list(numbers)]
     enough = all(len(g) > 1 for g in groups)
     within = float(np.sqrt(np.mean([np.var(g, ddof=1) for g in groups]))) if enough else None
-    share = None if within is None or mean == 0 else 100.0 * within / abs(mean)
+    fraction = None if within is None or mean == 0 else 100.0 * within / abs(mean)
     asymmetry = None
     if name in SIDED and left is not None and right is not None and left + right != 0:
         asymmetry = 100.0 * (right - left) / (0.5 * (right + left))
-    return Measure(left, right, mean, sd, len(numbers), within, share, asymmetry)
+    return Measure(left, right, mean, sd, len(numbers), within, fraction, asymmetry)

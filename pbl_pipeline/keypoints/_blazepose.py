@@ -71,8 +71,8 @@ N_ALL = 39
 MIRROR = np.array(mirror_of(NAMES))
 _OWN = np.arange(N_POINTS)
 _GROUPS = (np.flatnonzero(leg_points(NAMES)), np.flatnonzero(~leg_points(NAMES)))
-#: The answers for picture and mirror image are taken to have other sides where they lie apart by more than this share
-#: of the crop, in the mean, and by less than half of that with the sides exchanged.
+#: The answers for picture and mirror image are taken to have other sides where they lie apart by more than this
+#: fraction of the crop, in the mean, and by less than half of that with the sides exchanged.
 LEAST_APART, MOST_CROSSED = 0.04, 0.5
 #: Factor of the confidence there.
 UNDECIDED = 0.5

@@ -22,7 +22,7 @@ from pbl_pipeline.errors import PblError
 
 from ._types import Keypoints
 
-#: The bound of all curves: a share of the length of the trunk (middle of the shoulders to middle of the hips) in the
+#: The bound of all curves: a fraction of the length of the trunk (middle of the shoulders to middle of the hips) in the
 #: picture, as it would be seen from the side. The "percentage of correct points" of pose estimation at 0.2.
 BOUND_TRUNK = 0.2
 _DATA = "data/confidence_curves.json"
@@ -39,7 +39,7 @@ class ConfidenceCurve:
     detector
         Name of the detector.
     bound_trunk
-        The point counts as right within this share of the trunk's length.
+        The point counts as right within this fraction of the trunk's length.
     stated, probability : (K,)
         Knots; linear between them, constant outside.
     n : int
@@ -110,7 +110,7 @@ def confidence_text(keypoints: Keypoints) -> str:
     if probability is None:
         return f"{stated}; what that is worth was not measured"
     bound = confidence_curve(keypoints.confidence_curve).bound_trunk
-    share = float(np.mean(probability[found]))
+    right = float(np.mean(probability[found]))
     return (
-        f"{stated}; {share:.0%} of the points within {bound:.0%} of the trunk's length ({keypoints.confidence_curve})"
+        f"{stated}; {right:.0%} of the points within {bound:.0%} of the trunk's length ({keypoints.confidence_curve})"
     )

@@ -35,7 +35,7 @@ _BODY_SPREAD_M = 0.5
 class FlipParams:
     """Parameters of `exchange_sides`.
 
-    least_width: a body whose shoulders are less than this share of their usual distance apart is a mean of two that
+    least_width: a body whose shoulders are less than this fraction of their usual distance apart is a mean of two that
     face opposite ways. Such frames do not link others, and the confidence of their points is multiplied by
     `lower_narrow`.
     step_s: frames about so far apart are judged together first, those between them after that; much less, and noise
@@ -227,8 +227,8 @@ class _Shown:
         """The state of a frame whose neighbours `near` (one or two) are known."""
         ends = [self.at(k)[s] for k, s in zip(near, states, strict=True)]
         if len(ends) == 2:
-            share = (time_s[row] - time_s[near[0]]) / (time_s[near[1]] - time_s[near[0]])
-            expected = ends[0] + share * (ends[1] - ends[0])
+            fraction = (time_s[row] - time_s[near[0]]) / (time_s[near[1]] - time_s[near[0]])
+            expected = ends[0] + fraction * (ends[1] - ends[0])
         else:
             expected = ends[0]
         cost = self.distance(self.at(row), expected, self.weight(row, *near))

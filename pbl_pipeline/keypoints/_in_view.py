@@ -11,9 +11,9 @@ import numpy as np
 
 from ._types import Keypoints
 
-#: Share of the markers that must have been detected for a frame to say anything about the pose.
+#: Fraction of the markers that must have been detected for a frame to say anything about the pose.
 SEEN_SHARE = 0.5
-#: Share of the markers that must lie inside the picture.
+#: Fraction of the markers that must lie inside the picture.
 INSIDE_SHARE = 0.95
 #: Mean confidence over the markers of a frame; a gap of partial view that is bridged is shorter than this; longer runs
 #: without sight of the person are left unknown (`fit.ViewParams` has the same, frozen in its paramsets).
@@ -59,7 +59,7 @@ class Visibility:
 
     @property
     def whole_share(self) -> float:
-        """Share of all frames with the whole person in view."""
+        """Fraction of all frames with the whole person in view."""
         return float(np.mean(self.whole)) if len(self.whole) else 0.0
 
     @property
@@ -130,8 +130,8 @@ def whole_person_in_view(keypoints: Keypoints, min_confidence: float) -> np.ndar
     needed = np.tile(given, (len(inside), 1))
     for points, at_border in ends(keypoints):
         needed |= points & at_border[:, None]
-    share = np.sum(inside & needed, axis=1) / np.sum(needed, axis=1)
-    return (share >= INSIDE_SHARE) & (keypoints.confidence[:, given].mean(axis=1) >= min_confidence)
+    fraction = np.sum(inside & needed, axis=1) / np.sum(needed, axis=1)
+    return (fraction >= INSIDE_SHARE) & (keypoints.confidence[:, given].mean(axis=1) >= min_confidence)
 
 
 def ends(keypoints: Keypoints) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:

@@ -21,7 +21,7 @@ from pbl_pipeline.video import Frame
 
 #: Height (px) of the crop in which the picture is measured: about what the landmark networks see.
 SIDE = 256
-#: Share of the crop's width that is looked at: the body and not what is beside it.
+#: Fraction of the crop's width that is looked at: the body and not what is beside it.
 STRIP = 0.4
 #: Of the Gaussian (px of the crop) that takes out the sensor's noise before the blur is measured.
 _CALM_SD = 1.0
@@ -39,7 +39,7 @@ class Picture:
     luma : (P, 3)
         5th, 50th and 95th percentile of the brightness (0..255) where the person is.
     detail : (P,)
-        Length of the finest detail as a share of the person's size, `detail_of`. Blur makes it longer.
+        Length of the finest detail as a fraction of the person's size, `detail_of`. Blur makes it longer.
     """
 
     time_s: np.ndarray
@@ -122,7 +122,7 @@ class PictureMeter:
 
 
 def detail_of(strip: np.ndarray) -> float:
-    """Length of the finest detail of a grey picture (H, W) whose height is the person's size, as a share of it.
+    """Length of the finest detail of a grey picture (H, W) whose height is the person's size, as a fraction of it.
 
     sqrt(variance / variance of the step between neighbouring pixels), along the axis where it is longer: a picture
     that is blurred along one axis, as by movement, is a blurred one. Brightness and contrast do not count. NaN for a

@@ -21,21 +21,21 @@ from ._types import Keypoints
 
 #: Seconds in view: about three strides; what a fit needs at least.
 SECONDS_WARN, SECONDS_FAIL = 3.0, 1.0
-#: Share of the frames between the first and the last sight of the person in which she is not found.
+#: Fraction of the frames between the first and the last sight of the person in which she is not found.
 ABSENT_WARN, ABSENT_FAIL = 0.05, 0.5
-#: Share of the frames in which feet or head are beyond the lower or upper border.
+#: Fraction of the frames in which feet or head are beyond the lower or upper border.
 CUT_WARN, CUT_FAIL = 0.1, 0.5
 #: Head to feet in the picture.
 HEIGHT_WARN_PX, HEIGHT_FAIL_PX = 100.0, 50.0
 #: Brightness (0..255) of the brightest twentieth of the person.
 BRIGHT_WARN, BRIGHT_FAIL = 30.0, 15.0
-#: Finest detail as a share of the person's size.
+#: Finest detail as a fraction of the person's size.
 DETAIL_WARN, DETAIL_FAIL = 0.04, 0.06
 #: Frames a second.
 RATE_WARN_HZ, RATE_FAIL_HZ = 20.0, 10.0
-#: Mean confidence of the legs' points as stated; share of them that is right within the bound of the detector's curve.
+#: Mean confidence of the legs' points as stated; fraction of them that is right by the bound of the detector's curve.
 LEGS_CONFIDENCE_WARN, LEGS_RIGHT_WARN = 0.6, 0.9
-#: Share of the frames in which left and right were exchanged back; where many are, the rest may be the wrong ones.
+#: Fraction of the frames in which left and right were exchanged back; where many are, the rest may be the wrong ones.
 EXCHANGED_WARN, EXCHANGED_FAIL = 0.02, 0.3
 #: Nobody turns by this much between neighbouring frames (deg); single frames of noise stay below.
 _TURN_DEG = 90.0
@@ -170,8 +170,8 @@ def _legs(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
     found = [_low("leg_confidence", mean, LEGS_CONFIDENCE_WARN, 0.0, advice)]
     probability = probability_within(keypoints)
     if probability is not None:
-        share = float(probability[seen][:, legs].mean())
-        found.append(_low("leg_points_right_share", share, LEGS_RIGHT_WARN, 0.0, advice))
+        fraction = float(probability[seen][:, legs].mean())
+        found.append(_low("leg_points_right_share", fraction, LEGS_RIGHT_WARN, 0.0, advice))
     return found
 
 
@@ -182,12 +182,12 @@ def _sides(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
     advice = "left and right change places between frames: look at the overlay; film from the side"
     found = [_high("side_changes", changes, 0.0, 0.02 * float(seen.sum()), advice)]
     if keypoints.sides_changed is not None:
-        share = float(keypoints.sides_changed[seen].any(axis=1).mean())
+        fraction = float(keypoints.sides_changed[seen].any(axis=1).mean())
         advice = (
             "the detector took left for right, or could not tell them, in this share of the frames; their names follow "
             "the movement now: look at the overlay, film in better light or more from the side"
         )
-        found.append(_high("sides_exchanged_share", share, EXCHANGED_WARN, EXCHANGED_FAIL, advice))
+        found.append(_high("sides_exchanged_share", fraction, EXCHANGED_WARN, EXCHANGED_FAIL, advice))
     return found
 
 

@@ -90,8 +90,8 @@ def phone_log(
     video_s = np.arange(start_s - 0.3, stop_s + 0.3, 1 / sensor.rate_hz)
     true = Rotation.from_matrix(R_nc_at(video_s))
     white = Rotation.from_rotvec(np.radians(sensor.white_deg) * rng.standard_normal((len(video_s), 3)))
-    share = np.array([0.2, 0.2, 1.0]) * sensor.drift_deg
-    drift = np.column_stack([wander(rng, video_s, deg, 0.005, 0.1) for deg in share])
+    fraction = np.array([0.2, 0.2, 1.0]) * sensor.drift_deg
+    drift = np.column_stack([wander(rng, video_s, deg, 0.005, 0.1) for deg in fraction])
     # The drift turns the phone's idea of the world; the noise is the sensor's own.
     measured = Rotation.from_rotvec(np.radians(drift)) * true * white
     return video_s + sensor.clock_offset_s, measured.as_quat(scalar_first=True)

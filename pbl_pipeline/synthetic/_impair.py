@@ -67,7 +67,7 @@ class Style:
     swing_hike: dict[str, float] = dataclasses.field(default_factory=lambda: {"r": 0.0, "l": 0.0})
     swing_ankle: dict[str, float] = dataclasses.field(default_factory=lambda: {"r": 0.0, "l": 0.0})
     forefoot: dict[str, float] = dataclasses.field(default_factory=lambda: {"r": 0.0, "l": 0.0})
-    #: Share of the stride by which the foot comes down later: a shorter stance of this side.
+    #: Fraction of the stride by which the foot comes down later: a shorter stance of this side.
     late_down: dict[str, float] = dataclasses.field(default_factory=lambda: {"r": 0.0, "l": 0.0})
     arm_swing: dict[str, float] = dataclasses.field(default_factory=lambda: {"r": 1.0, "l": 1.0})
     elbow: dict[str, float] = dataclasses.field(default_factory=lambda: {"r": 0.0, "l": 0.0})

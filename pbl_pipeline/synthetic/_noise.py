@@ -25,10 +25,10 @@ class Noise:
     xy_px
         Of the pixels, independent from frame to frame.
     outlier_share, outlier_m, outlier_px
-        Share of the points (marker and frame) that are far off, in 3D and in the picture at once: moved by a length
+        Fraction of the points (marker and frame) that are far off, in 3D and in the picture at once: moved by a length
         between these bounds in any direction. Their confidence does not tell.
     drop_share
-        Share of the points that are not found: NaN with confidence 0.
+        Fraction of the points that are not found: NaN with confidence 0.
     confidence, confidence_sd
         Of the points found; kept within 0.5 and 0.99.
     """

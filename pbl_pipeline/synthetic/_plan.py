@@ -46,7 +46,7 @@ class Step:
         return self.ball_s[0], self.up_s
 
 
-#: Roll of the foot in shares of the stance: flat after the heel's contact, heel and ball off before the toes.
+#: Roll of the foot in fractions of the stance: flat after the heel's contact, heel and ball off before the toes.
 FLAT_AFTER, HEEL_OFF_BEFORE, BALL_OFF_BEFORE = 0.13, 0.42, 0.08
 
 

@@ -19,7 +19,7 @@ from ._plan import GRID_STEP_S, Plan
 
 #: Curves that drive the pelvis (sign, joint), by the right side's cycle; the model's tilt and list count the other way.
 PELVIS = {"pelvis_tilt": (-1, "tilt"), "pelvis_obliquity": (-1, "list"), "pelvis_rotation": (1, "rotation")}
-#: A person's mean of a curve differs from the norm's by this share of its standard deviation, and its range by this.
+#: A person's mean of a curve differs from the norm's by this fraction of its standard deviation, and its range by this.
 OFFSET_SHARE, RANGE_SD, SIDES_SHARE = 0.6, 0.06, 0.15
 #: Within a walk: of a curve's range, of its mean (deg), over seconds.
 WALK_RANGE_SD, WALK_MEAN_SD_DEG = 0.02, 0.5
@@ -71,8 +71,8 @@ def swing_bump(plan: Plan, side: str) -> Float[np.ndarray, " N"]:
     out = np.zeros(len(plan.grid_s))
     own = [s for s in plan.steps if s.side == side]
     for before, after in itertools.pairwise(own):
-        share = np.clip((plan.grid_s - before.up_s) / (after.down_s - before.up_s), 0, 1)
-        out += np.sin(np.pi * share) ** 2
+        fraction = np.clip((plan.grid_s - before.up_s) / (after.down_s - before.up_s), 0, 1)
+        out += np.sin(np.pi * fraction) ** 2
     return out
 
 
@@ -172,10 +172,10 @@ def _curve(rng, t, angle: str, phase, speed, z: float, size: float) -> np.ndarra
 
 
 def _knee(deg, plan: Plan, style: Style, side: str, phase, speed, foot_off: float) -> np.ndarray:
-    """The knee's flexion of the swing, above the least of the cycle, multiplied by the style's share."""
+    """The knee's flexion of the swing, above the least of the cycle, multiplied by the style's fraction."""
     if style.swing_knee[side] == 1.0:
         return deg
-    # The norm's own flexion of late stance and swing: what the share takes away.
+    # The norm's own flexion of late stance and swing: what the fraction takes away.
     norm = gait_norm()
     table = norm.coefficients("knee_flexion", speed)
     least = harmonic_sum(table, np.full(np.shape(phase), 2 * np.pi * 0.40))

@@ -278,8 +278,8 @@ class _Soles:
                 for axis_sd, (start, stop) in _holds(point, step):
                     weight[:, i] = np.maximum(weight[:, i], _hold(t, start, stop)[:, None] / np.array(axis_sd))
                 if k:
-                    share = np.clip((t - own[k - 1].up_s) / (step.down_s - own[k - 1].up_s), 0, 1)
-                    floor[:, i] += CLEARANCE_M * np.sin(np.pi * share) ** 2
+                    fraction = np.clip((t - own[k - 1].up_s) / (step.down_s - own[k - 1].up_s), 0, 1)
+                    floor[:, i] += CLEARANCE_M * np.sin(np.pi * fraction) ** 2
         return Contacts(tuple(self.names), target, weight, floor)
 
     def _spot(self, i: int, step: Step) -> np.ndarray:

@@ -47,7 +47,7 @@ NOISES = {"benchmark": Noise(), "none": NO_NOISE}
 GROUNDS = ("overground", "treadmill")
 #: A picture that is wider than high, for a phone that stands and sees people from the side.
 LANDSCAPE_PX = (1920, 1080)
-#: Share of the points that may be outside of the picture.
+#: Fraction of the points that may be outside of the picture.
 OUTSIDE_SHARE = 0.2
 
 

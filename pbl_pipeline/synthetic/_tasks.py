@@ -17,14 +17,14 @@ from ._gait import wander, within
 from ._impair import Style
 from ._plan import GRID_STEP_S, Plan, Step, ease, grid
 
-#: How strides differ within a walk: step time (share), footprint along and across (m). The project's own numbers, of
+#: How strides differ within a walk: step time (fraction), footprint along and across (m). The project's own numbers, of
 #: the size that is usual in healthy adults (a few percent).
 STEP_TIME_SD, ALONG_SD_M, ACROSS_SD_M = 0.018, 0.008, 0.008
 #: Distance between the heels' lines, and by how much the feet point outwards, of a person (mean, sd).
 WIDTH_M, TOE_OUT_DEG = (0.11, 0.015), (6.0, 2.0)
 #: Standing: distance between the heels.
 STANCE_WIDTH_M = 0.20
-#: The pelvis is over the foot at this share of the stride after foot down.
+#: The pelvis is over the foot at this fraction of the stride after foot down.
 OVER_FOOT = 0.29
 #: How the speed differs between people, dimensionless (Schwartz et al. 2008, "free").
 SPEED_SD = 0.026
@@ -57,7 +57,7 @@ class Walker:
         return float(np.sqrt(self.leg_m / GRAVITY) / cadence)
 
     def foot_off(self) -> float:
-        """Share of the stride that a foot stands."""
+        """Fraction of the stride that a foot stands."""
         return gait_norm().foot_off_at(self.speed() / np.sqrt(GRAVITY * self.leg_m))
 
     def base(self) -> tuple[float, float]:
@@ -262,13 +262,13 @@ def _in_place(walker: Walker, t: np.ndarray, posture: dict[str, np.ndarray], wid
 
 def _rise(t, seated: np.ndarray, lean: np.ndarray, at_s: float, length_s: float, *, up: bool) -> None:
     """Add one rise or one sitting down: the hips move in the later (earlier) part, the trunk leans around it."""
-    share = (t - at_s) / length_s
+    fraction = (t - at_s) / length_s
     if up:
-        seated -= ease((share - 0.3) / 0.7)
-        lean += ease(share / 0.45) - ease((share - 0.45) / 0.5)
+        seated -= ease((fraction - 0.3) / 0.7)
+        lean += ease(fraction / 0.45) - ease((fraction - 0.45) / 0.5)
     else:
-        seated += ease(share / 0.75)
-        lean += ease(share / 0.55) - ease((share - 0.55) / 0.45)
+        seated += ease(fraction / 0.75)
+        lean += ease(fraction / 0.55) - ease((fraction - 0.55) / 0.45)
 
 
 def _seat(seated: np.ndarray, lean: np.ndarray) -> dict[str, np.ndarray]:

@@ -19,8 +19,8 @@ from ._tiles import Window, tiles
 
 @dataclasses.dataclass(frozen=True)
 class WatchParams:
-    """tile_fraction, tile_overlap: tiles are squares of this share of the shorter side, overlapping by that share or
-    more. search_interval_s, search_windows: how often how many of the whole frame and the tiles are searched, by turns.
+    """tile_fraction, tile_overlap: tiles are squares of this fraction of the shorter side, overlapping by that or more.
+    search_interval_s, search_windows: how often how many of the whole frame and the tiles are searched, by turns.
     follow_interval_s: how often a window around each known person is searched. rest_interval_s: the same for one who
     keeps still (slower than `still` body heights per second). close_interval_s: the same where the person was seen
     fewer than `known_hits` times, was missed, surprised by more than `surprise` body heights, or is nearer to another
@@ -126,7 +126,7 @@ def _inside(state: np.ndarray, window: Window) -> bool:
 
 
 def _share(window: Window, cover: Window) -> float:
-    """Share of `window` that `cover` covers."""
+    """Fraction of `window` that `cover` covers."""
     width = min(window[2], cover[2]) - max(window[0], cover[0])
     height = min(window[3], cover[3]) - max(window[1], cover[1])
     return max(width, 0) * max(height, 0) / ((window[2] - window[0]) * (window[3] - window[1]))

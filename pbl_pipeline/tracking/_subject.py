@@ -2,10 +2,10 @@
 
 The score of a person is a weighted mean of five shares in 0..1:
 
-- *in view*: share of the video's time in which she is tracked;
+- *in view*: fraction of the video's time in which she is tracked;
 - *walks*: time in which she moves over the ground, upright, at a walking speed, over a time that is enough to measure;
 - *size*: her median height in the picture over that of the tallest candidate, or over a height that is enough;
-- *upright*: share of her frames with the body axis within 30 degrees of the vertical;
+- *upright*: fraction of her frames with the body axis within 30 degrees of the vertical;
 - *central*: 1 in the middle of the picture, 0 at its edge (median over her frames).
 
 Walking is judged without a camera calibration: a person of height h px at (x, y) px stands, in units of her own
@@ -38,12 +38,12 @@ class SubjectParams:
     """Weights of the shares (they are normalised), and when the automatic choice is trusted.
 
     margin: the best person is chosen when her score exceeds every other by this much, else a person must choose.
-    walk_enough_s: longer walking brings no more. size_enough: nor does a height above this share of the picture's.
-    beside: of two the smaller of whom walks, and is tall, at least this share of the other, size decides nothing.
+    walk_enough_s: longer walking brings no more. size_enough: nor does a height above this fraction of the picture's.
+    beside: of two the smaller of whom walks, and is tall, at least this fraction of the other, size decides nothing.
     min_time_s: who is in view for less is no candidate while somebody else is.
     walk_windows_s: movement is judged over these times, the longer one for the slow and for those who walk towards or
     away from the camera. walk_distance: what counts as walking, in body heights: more than one step within a window.
-    walk_steadiness: share of the variance of the position that a steady movement explains (0.75 for one sudden step).
+    walk_steadiness: fraction of the variance of the position that steady movement explains (0.75 for one sudden step).
     walk_speed_max: in body heights per second (a runner has 1.8). size_slack: natural logarithm of the change of the
     apparent size that is not taken for approach: bending, sitting and raising the arms change the size by a third.
     focal_share: focal length over the longer side of the picture (the median phone's, as in `video.guess_camera`).
@@ -181,7 +181,7 @@ def _walking(
     state: np.ndarray, time: np.ndarray, upright: np.ndarray, focal: float, params: SubjectParams
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n,) bool: frames around which the person moves steadily over the ground, upright, at a walking speed; and (n,)
-    the share of that movement that leads to the camera (1 straight to it, -1 straight away, 0 across the picture).
+    the fraction of that movement that leads to the camera (1 straight to it, -1 straight away, 0 across the picture).
 
     In each window a straight line is fitted to the position in body heights; what a step in place, a jump or a
     jitter of the box does has no lasting slope.
@@ -251,9 +251,9 @@ def _scores(people: list[_Person], tracking: Tracking, params: SubjectParams) ->
 
 
 def _words(person: _Person, tracking: Tracking) -> str:
-    share = person.walk_s / person.time_s if person.time_s > 0 else 0.0
-    walks = "walks" if share > 0.5 else "walks part of the time" if share > 0.2 else "stays in place"
-    way = person.direction if share > 0.2 else ""
+    fraction = person.walk_s / person.time_s if person.time_s > 0 else 0.0
+    walks = "walks" if fraction > 0.5 else "walks part of the time" if fraction > 0.2 else "stays in place"
+    way = person.direction if fraction > 0.2 else ""
     posture = "" if person.upright > 0.5 else ", mostly not upright"
     tall = person.height_px / tracking.image_size_px[1]
     times = f" ({person.appearances} times)" if person.appearances > 1 else ""

@@ -10,7 +10,7 @@ import numpy as np
 from ._blazepose import box_iou
 from ._types import Detection, PersonDetector
 
-#: A box that ends within this share of the window's width from its edge is taken as cut by it.
+#: A box that ends within this fraction of the window's width from its edge is taken as cut by it.
 CUT_SHARE = 0.02
 #: x0, y0, x1, y1 in px; it may reach beyond the picture.
 Window = tuple[int, int, int, int]
@@ -103,7 +103,7 @@ def _cut(box: np.ndarray, window: Window, size: tuple[int, int]) -> bool:
 
 
 def _cover(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Share of the smaller of two boxes that lies in the other, for one box (4,) against boxes (N, 4)."""
+    """Fraction of the smaller of two boxes that lies in the other, for one box (4,) against boxes (N, 4)."""
     size = np.minimum(box[2:4], boxes[:, 2:4]) - np.maximum(box[0:2], boxes[:, 0:2])
     intersection = np.prod(np.maximum(size, 0.0), axis=1)
     areas = np.prod(np.maximum(boxes[:, 2:4] - boxes[:, 0:2], 0.0), axis=1)

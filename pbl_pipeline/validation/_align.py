@@ -21,11 +21,11 @@ def at_times(at_s: np.ndarray, time_s: np.ndarray, values: np.ndarray) -> np.nda
         return np.full((len(at_s), values.shape[1]), np.nan)
     left = np.clip(np.searchsorted(time_s, at_s, side="right") - 1, 0, len(time_s) - 2)
     step = time_s[left + 1] - time_s[left]
-    share = ((at_s - time_s[left]) / step)[:, None]
+    fraction = ((at_s - time_s[left]) / step)[:, None]
     # Where a time stamp is met exactly the neighbour does not count, not even its NaN.
     low, high = values[left], values[left + 1]
-    out = np.where(share == 0, low, np.where(share == 1, high, (1 - share) * low + share * high))
-    hole = (step > MAX_GAP_S)[:, None] & (share > 0) & (share < 1)
+    out = np.where(fraction == 0, low, np.where(fraction == 1, high, (1 - fraction) * low + fraction * high))
+    hole = (step > MAX_GAP_S)[:, None] & (fraction > 0) & (fraction < 1)
     outside = ((at_s < time_s[0]) | (at_s > time_s[-1]))[:, None]
     return np.where(hole | outside, np.nan, out)
 

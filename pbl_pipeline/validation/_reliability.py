@@ -44,7 +44,7 @@ class PointErrors:
     stated : (N,)
         Confidence.
     error_px, error_trunk : (N,)
-        Distance in the picture, in pixels and as a share of the trunk's length there.
+        Distance in the picture, in pixels and as a fraction of the trunk's length there.
     error_3d_cm : (N,)
         Distance of the points relative to the middle of the hips, NaN where the detector gives no 3D.
     """
@@ -100,7 +100,7 @@ def reliability_table(
 ) -> pd.DataFrame:
     """Rows of bins of stated confidence with equally many points, for each detector and dataset.
 
-    Columns: `RELIABILITY_COLUMNS`. `within_bound` is the measured share of points within `bound` trunk lengths,
+    Columns: `RELIABILITY_COLUMNS`. `within_bound` is the measured fraction of points within `bound` trunk lengths,
     `probability_mean` what `curve` says of them (NaN without one).
     """
     rows = []

@@ -63,7 +63,7 @@ def reliability_html(table: pd.DataFrame, curve: ConfidenceCurve | None = None) 
 
 
 def reliability_chart(rows: pd.DataFrame, curve: ConfidenceCurve | None = None) -> Markup:
-    """Measured share of points within the bound over stated confidence: dots, with what the curve says as a line. On
+    """Measured fraction of points within the bound over stated confidence: dots, with what the curve says as a line. On
     the grey diagonal a stated confidence is the probability."""
     ticks = [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
     axes = Axes(_SIZE, (0, 1), (0, 1), margin=(40, 10, 10, 26))

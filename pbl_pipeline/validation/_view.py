@@ -10,7 +10,7 @@ from pbl_pipeline.gait import BodyPoses
 FRONT, BACK, IPSILATERAL, CONTRALATERAL, MIXED = "front", "back", "ipsilateral", "contralateral", "mixed"
 #: What a joint of the middle has where the camera stands on one side.
 LATERAL = "lateral"
-#: Share of the frames that one class must hold; below it the view is mixed.
+#: Fraction of the frames that one class must hold; below it the view is mixed.
 SHARE = 0.7
 
 

@@ -30,7 +30,7 @@ from ._types import Camera, VideoInfo
 MOST_CANDIDATES, SHORTEST_PART_S = 160, 0.2
 #: Views that are used: more add time and no knowledge.
 MOST_VIEWS, FEWEST_VIEWS = 40, 8
-#: The picture is cut into so many cells; corners must lie in this share of them, or the lens is known in a part only.
+#: The picture is cut into so many cells; corners must lie in this fraction of them, or the lens is known in part.
 CELLS, LEAST_COVERAGE = (6, 6), 0.5
 #: Views must differ by this much in tilt (deg), or focal length and distance cannot be told apart.
 LEAST_TILT_DEG = 15.0
@@ -56,8 +56,8 @@ class Calibration:
     """A fitted lens.
 
     sd: standard deviations of fx, fy, cx, cy (px) and of k1, k2, p1, p2, k3. rms_px: of all corners of the used views;
-    residual_px: (K, 2) of each view, seen minus fitted. coverage: share of the picture's cells with a corner. tilt_deg:
-    largest angle between two views of the board.
+    residual_px: (K, 2) of each view, seen minus fitted. coverage: fraction of the picture's cells with a corner.
+    tilt_deg: largest angle between two views of the board.
     """
 
     camera: Camera
@@ -213,7 +213,7 @@ def different_views(views: Sequence[View], image_size_px: tuple[int, int], most:
 
 
 def covered(views: Sequence[View], image_size_px: tuple[int, int]) -> float:
-    """Share of the picture's cells in which a corner was seen."""
+    """Fraction of the picture's cells in which a corner was seen."""
     xy = np.concatenate([v.xy_px for v in views])
     cell = np.clip((xy + 0.5) / image_size_px * CELLS, 0, np.array(CELLS) - 1).astype(int)
     return len(np.unique(cell, axis=0)) / (CELLS[0] * CELLS[1])

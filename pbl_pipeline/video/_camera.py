@@ -25,8 +25,8 @@ from ._types import Camera, VideoInfo
 #: Their mean is 0.728, their standard deviation 0.044.
 PHONE_FOCAL_OVER_LONG_SIDE = 0.7169
 PHONE_FOCAL_RANGE = (0.6655, 0.8452)
-#: Root mean square distance of the 25 distinct values from that median, as a share of it (0.067). Other phones, lenses
-#: and zooms may lie further off; nothing measured says how far.
+#: Root mean square distance of the 25 distinct values from that median, as a fraction of it (0.067). Other phones,
+#: lenses and zooms may lie further off; nothing measured says how far.
 PHONE_FOCAL_REL_SD = 0.07
 
 _NEXT = "correct the file, or leave it out: then a phone's field of view is guessed and the result says so"

@@ -23,7 +23,7 @@ from ._types import VideoInfo
 
 #: How far the stated time of recording may be off (s): rounded to seconds, and a recording takes time to start.
 STATED_WITHIN_S = 2.0
-#: Share of the video that a log must cover at a shift.
+#: Fraction of the video that a log must cover at a shift.
 LEAST_COVER = 0.9
 #: The pictures decide where their movement correlates with the log's by so much, and by so much better than at any
 #: shift farther off than `_PEAK_S`.
@@ -158,7 +158,7 @@ def _stated(log: PhoneLog, video: VideoInfo, duration: float) -> list[float]:
 
 
 def _cover(log: PhoneLog, shift: float, duration: float, slack: float) -> float:
-    """Share of the video that the log covers, `slack` seconds allowed at either end."""
+    """Fraction of the video that the log covers, `slack` seconds allowed at either end."""
     first, last = log.time_s[0] + shift - slack, log.time_s[-1] + shift + slack
     return float(np.clip(min(last, duration) - max(first, 0.0), 0, None) / duration)
 

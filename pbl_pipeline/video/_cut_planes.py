@@ -62,7 +62,7 @@ def cut_planes(
 @functools.cache
 def _to_bgr(colorspace: int, full_range: bool) -> np.ndarray:
     """(3, 4) matrix from brightness, blue and red difference (0..255) to blue, green, red. Source: ITU-R BT.601-7,
-    section 2.5, with the shares of the colour space."""
+    section 2.5, with the fractions of the colour space."""
     red, blue = _RED_BLUE.get(colorspace, _BT_601)
     green = 1.0 - red - blue
     matrix = np.array(

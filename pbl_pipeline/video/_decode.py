@@ -29,7 +29,7 @@ _CONTAINERS = "mov,matroska,avi,mpegts,mpeg,asf,flv,ogg,mxf,ivf,h264,hevc"
 FFMPEG_ERRORS = (FFmpegError, MemoryError)
 _OPTIONS = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"}
 
-#: Share of frames whose stamp may repeat or run backwards and be left out; more means the stamps cannot be trusted.
+#: Fraction of frames whose stamp may repeat or run backwards and be left out; more means the stamps cannot be trusted.
 _MAX_UNORDERED = 0.01
 
 _EXPECTED = "an MP4, MOV, WebM, MKV or AVI video as the phone recorded it"

@@ -14,7 +14,7 @@ from ._types import Camera, VideoInfo
 
 #: 35 mm film: width and diagonal of its frame (mm).
 _FILM_WIDTH_MM, _FILM_DIAGONAL_MM = 36.0, math.hypot(36.0, 24.0)
-#: Standard deviation of a focal length from the file's 35 mm figure, as a share of it: 2.3 % for the two readings of
+#: Standard deviation of a focal length from the file's 35 mm figure, as a fraction of it: 2.3 % for the two readings of
 #: such a figure, 1.1 % for its rounding to whole millimetres, and room for a crop that it does not count. Of an iPhone
 #: 13 the figure is 27 mm, from which comes 0.733 of the longer side; its published calibration has 0.732.
 METADATA_REL_SD = 0.03

@@ -19,9 +19,9 @@ import numpy as np
 
 from ._types import Camera, VideoInfo
 
-#: Standard deviation of a preset's focal length as a share of it. The two recording formats that are published of one
-#: phone differ by 1.2 % (iPhone 11) and 0.1 % (iPhone 12 Pro); the rest is for the crop of stabilised video, which the
-#: calibrated recordings did not have. The project's own estimate.
+#: Standard deviation of a preset's focal length as a fraction of it. The two recording formats that are published of
+#: one phone differ by 1.2 % (iPhone 11) and 0.1 % (iPhone 12 Pro); the rest is for the crop of stabilised video, which
+#: the calibrated recordings did not have. The project's own estimate.
 PRESET_REL_SD = 0.04
 #: Lenses shorter than this (mm, the glass itself) are front or ultra-wide cameras; the presets are of the main ones.
 _SHORTEST_MAIN_MM = 3.0

@@ -34,7 +34,7 @@ _SENSORS = {
 }
 #: A member of an archive larger than this is no log of a walk.
 _LARGEST = 512 << 20
-#: Repeated rows are left out; more than this share, and the stamps are not to be trusted.
+#: Repeated rows are left out; more than this fraction, and the stamps are not to be trusted.
 _MOST_REPEATS = 0.1
 #: How far the sine of the stated pitch may lie from the quaternion's.
 _PITCH_TOL = 0.05

@@ -15,7 +15,7 @@ from pbl_pipeline.qc import FAIL, PASS, Check
 
 from ._types import VideoInfo
 
-#: A recorded rate that lies above the stored one by less than this share is rounding or a dropped frame.
+#: A recorded rate that lies above the stored one by less than this fraction is rounding or a dropped frame.
 _MOST_RATIO = 1.1
 #: From this many frames a second on, a phone calls it slow motion.
 _SLOW_MOTION_FPS = 100.0

@@ -123,7 +123,7 @@ class Camera:
 
     `source` says where they come from. Its first word is the kind: "file" and "measured" (a calibration), "metadata"
     (what the phone wrote into the video), "preset" (a phone of that model), "guess". `focal_rel_sd`: standard deviation
-    of the focal length as a share of it, NaN where nothing is known of it.
+    of the focal length as a fraction of it, NaN where nothing is known of it.
     """
 
     matrix: np.ndarray

@@ -127,8 +127,8 @@ def _noise(key, shape):
     u = (at - i).reshape(-1, 1, 1, 1)
     white = (1 - u) * fresh[i] + u * fresh[i + 1]
     slow = [_box(jax.random.normal(q, (t + n - 1, *shape[1:])), n) for q, n in ((k[4], 5), (k[5], 15), (k[6], 45))]
-    share = jax.random.dirichlet(k[7], jnp.array([1.5, 0.8, 0.8, 0.8]))
-    weight = jnp.sqrt(share)
+    fraction = jax.random.dirichlet(k[7], jnp.array([1.5, 0.8, 0.8, 0.8]))
+    weight = jnp.sqrt(fraction)
     noise = weight[0] * white + sum(weight[j + 1] * s for j, s in enumerate(slow))
     deep = jax.random.uniform(k[8], minval=1.0, maxval=3.0)
     per_joint = jnp.array([0.8, 1.0, 1.0, 1.1, 1.2]).reshape(1, 5, 1, 1)

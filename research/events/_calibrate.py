@@ -113,7 +113,7 @@ def probability(x: np.ndarray, curve: dict[str, Any]) -> np.ndarray:
 
 
 def reliability(stated: np.ndarray, real: np.ndarray) -> dict[str, Any]:
-    """How well stated probabilities hold: mean stated and share of real events in each band, Brier score, expected
+    """How well stated probabilities hold: mean stated and fraction of real events in each band, Brier score, expected
     calibration error."""
     edges = np.array([0, 0.2, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 1.0 + 1e-9])
     band = np.digitize(stated, edges) - 1
@@ -128,7 +128,7 @@ def reliability(stated: np.ndarray, real: np.ndarray) -> dict[str, Any]:
 
 
 def score(found: list[Case], p: PhaseParams) -> dict[str, float]:
-    """Share of the true events that are found and of the found ones that are real; mean and sd of their error (ms)."""
+    """Fraction of the true events that are found and of the found ones that are real; mean and sd of the error (ms)."""
     off, n_true, n_found = [], 0, 0
     for case in found:
         times: list[list[float]] = [[], [], [], []]
@@ -164,8 +164,8 @@ def calibrate(found: list[Case], p: PhaseParams, say: Callable[[str], None]) -> 
         f"probability on {measured['events']} held-out events: Brier {measured['brier']:.4f}, "
         f"expected error {measured['expected_error']:.4f}"
     )
-    for stated, share, n in measured["bands"]:
-        say(f"  stated {stated:.3f}  real {share:.3f}  n {n}")
+    for stated, fraction, n in measured["bands"]:
+        say(f"  stated {stated:.3f}  real {fraction:.3f}  n {n}")
     return fit_logistic(*evidence(found, p)), measured
 
 

@@ -78,7 +78,7 @@ def gait_angles(
 
 
 def curve_foot_off(rhythm: Rhythm) -> float:
-    """Share of the stride at which the foot leaves in the curves themselves, whatever the person's rhythm."""
+    """Fraction of the stride at which the foot leaves in the curves themselves, whatever the person's rhythm."""
     return _RUN_FOOT_OFF if rhythm.runs else gait_norm().foot_off_at(rhythm.speed)
 
 
@@ -99,8 +99,8 @@ def _person(rng: np.random.Generator, size: int) -> np.ndarray:
 
 def _swing(phase: np.ndarray, foot_off: float) -> np.ndarray:
     """0 in stance, 1 in the middle of the swing."""
-    share = np.clip((phase - foot_off) / (1 - foot_off), 0, 1)
-    return np.sin(np.pi * share) ** 2
+    fraction = np.clip((phase - foot_off) / (1 - foot_off), 0, 1)
+    return np.sin(np.pi * fraction) ** 2
 
 
 def _impair(rng: np.random.Generator, a: dict[str, np.ndarray], swings: np.ndarray) -> None:

@@ -20,8 +20,8 @@ _SMOOTH_S = 0.015
 
 @dataclasses.dataclass(frozen=True)
 class Rhythm:
-    """A person's rhythm. `speed` (dimensionless) chooses the curves; `step_s` mean step time (s); `foot_off` share of
-    the stride that each foot [left, right] stands; `delay` of the right foot against the left in strides; `jitter`
+    """A person's rhythm. `speed` (dimensionless) chooses the curves; `step_s` mean step time (s); `foot_off` fraction
+    of the stride that each foot [left, right] stands; `delay` of the right foot against the left in strides; `jitter`
     standard deviation of each event in step times; `wander` of the pace over seconds."""
 
     speed: float
@@ -49,7 +49,7 @@ def draw_rhythm(rng: np.random.Generator) -> Rhythm:
     apart = rng.normal(0, 0.035 if uneven else 0.008)
     delay = 0.5 + rng.normal(0, 0.045 if uneven else 0.010)
     foot_off = (stance + apart, stance - apart)
-    room = 0.04  # least share of a stride between two events
+    room = 0.04  # least fraction of a stride between two events
     low, high = max(delay, 1 - delay) + room, min(0.76, 1 - room)
     foot_off = tuple(float(np.clip(f, low, high)) for f in foot_off)
     return Rhythm(

@@ -156,9 +156,9 @@ def _wander(rng: np.random.Generator, time: np.ndarray, columns: int, sd: float)
     return sd / np.sqrt(2) * np.sin(2 * np.pi * time[:, None, None] * f + p).sum(axis=2)
 
 
-def _pulses(rng: np.random.Generator, time: np.ndarray, period: float, share: float) -> np.ndarray:
+def _pulses(rng: np.random.Generator, time: np.ndarray, period: float, fraction: float) -> np.ndarray:
     """0 and 1 in turn, smoothly."""
-    wave = ((time / period + rng.random()) % 1.0 < share).astype(float)
+    wave = ((time / period + rng.random()) % 1.0 < fraction).astype(float)
     return gaussian_filter1d(wave, rng.uniform(0.2, 0.5) * GRID_HZ, mode="nearest")
 
 
@@ -166,9 +166,9 @@ def _lifts(rng: np.random.Generator, time: np.ndarray, step_s: float) -> np.ndar
     """(T, 2): how far each foot is lifted (0..1), left and right in turn."""
     jitter = 0.05 * gaussian_filter1d(rng.standard_normal(len(time)), 10) * np.sqrt(20)
     turns = time / (2 * step_s) + rng.random() + jitter
-    share = rng.uniform(0.35, 0.5)
+    fraction = rng.uniform(0.35, 0.5)
     out = []
     for delay in (0.0, 0.5):
         p = (turns + delay) % 1.0
-        out.append(np.where(p < share, np.sin(np.pi * p / share) ** 2, 0.0))
+        out.append(np.where(p < fraction, np.sin(np.pi * p / fraction) ** 2, 0.0))
     return np.stack(out, axis=1)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ._sequence import GRID_HZ, POINTS, Bout, Sequence
 
-#: What is asked for, and how much of it (share of the sequences).
+#: What is asked for, and how much of it (fraction of the sequences).
 _TASKS = (
     ("walk", 0.72),
     ("tug", 0.14),

@@ -110,8 +110,8 @@ def train(
 def _rate(number: Any, total: Any, params: TrainParams) -> Any:
     """Learning rate: up within the first steps, then down along half a cosine to a hundredth."""
     warm = jnp.minimum(params.warm_up, total // 4 + 1)
-    share = jnp.clip((number - warm) / jnp.maximum(total - warm, 1), 0.0, 1.0)
-    down = 0.01 + 0.99 * 0.5 * (1 + jnp.cos(jnp.pi * share))
+    fraction = jnp.clip((number - warm) / jnp.maximum(total - warm, 1), 0.0, 1.0)
+    down = 0.01 + 0.99 * 0.5 * (1 + jnp.cos(jnp.pi * fraction))
     return params.learning_rate * jnp.minimum(number / warm, down)
 
 
@@ -146,8 +146,8 @@ def _picks(corpus: Corpus, *, held_out: bool, solved_share: float) -> tuple[np.n
     """Sequences to draw from, and how likely each is, cumulated."""
     use = corpus.part(held_out)
     solved = np.char.startswith(corpus.kind[use], "solved")
-    share = np.where(solved, solved_share / max(solved.sum(), 1), (1 - solved_share) / max((~solved).sum(), 1))
-    return use.astype(np.int32), (np.cumsum(share) / share.sum()).astype(np.float32)
+    fraction = np.where(solved, solved_share / max(solved.sum(), 1), (1 - solved_share) / max((~solved).sum(), 1))
+    return use.astype(np.int32), (np.cumsum(fraction) / fraction.sum()).astype(np.float32)
 
 
 def _batch(key: Any, data: Any, picks: tuple[np.ndarray, np.ndarray], n: int) -> dict[str, Any]:
@@ -172,8 +172,8 @@ def _validation(corpus: Corpus, key: Any, n: int) -> Callable[[PhaseTransformer]
     k_cases, *k_parts = jax.random.split(key, 3)
     del k_cases
     cases = {}
-    for name, share, k in (("scenes", 0.0, k_parts[0]), ("solved", 1.0, k_parts[1])):
-        picks = _picks(corpus, held_out=True, solved_share=share)
+    for name, fraction, k in (("scenes", 0.0, k_parts[0]), ("solved", 1.0, k_parts[1])):
+        picks = _picks(corpus, held_out=True, solved_share=fraction)
         if not np.any(np.char.startswith(corpus.kind[picks[0]], "solved")) and name == "solved":
             continue
         own = [np.asarray(p) for p in picks]

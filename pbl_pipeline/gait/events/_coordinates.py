@@ -193,7 +193,7 @@ def prominence(signal: np.ndarray, at: int, left: int, right: int) -> float:
 
 
 def _thresholds(per_segment: list[list[Extremum]], least: float, p: EventParams) -> dict[tuple[str, str], float]:
-    """Per side and event: the larger of the absolute threshold and a share of the typical prominence."""
+    """Per side and event: the larger of the absolute threshold and a fraction of the typical prominence."""
     out = {}
     for side in SIDES:
         for event in (FOOT_DOWN, FOOT_UP):

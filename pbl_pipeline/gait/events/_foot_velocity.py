@@ -24,7 +24,7 @@ class FootVelocityParams(EventParams):
         Smallest extremum of the vertical speed that counts, in leg lengths per second. The foot sinks with only 0.15 to
         0.3 m/s where it meets the floor.
     max_heel_share
-        At foot down the heel is below this share of its range of heights.
+        At foot down the heel is below this fraction of its range of heights.
     """
 
     cutoff_hz: float = 7.0
@@ -58,12 +58,12 @@ def detect_by_foot_velocity(feet: FootTrajectories, method: Method[FootVelocityP
         window = int(2 * 60 / p.min_cadence_per_min * p.grid_hz) | 1
         for s, side in enumerate(SIDES):
             height = segment.values[:, 4 + s]
-            share = (height - lowest[s]) / max(highest[s] - lowest[s], 1e-9)
+            fraction = (height - lowest[s]) / max(highest[s] - lowest[s], 1e-9)
             speed = np.gradient(0.5 * (height + segment.values[:, 6 + s]), step)
             for event, signal in ((FOOT_UP, speed), (FOOT_DOWN, -speed)):
                 at, about = find_peaks(signal, prominence=p.min_speed_leg_per_s * leg, wlen=window)
                 for k, i in enumerate(at):
-                    if event == FOOT_DOWN and share[i] > p.max_heel_share:
+                    if event == FOOT_DOWN and fraction[i] > p.max_heel_share:
                         continue
                     size = prominence(signal, i, int(about["left_bases"][k]), int(about["right_bases"][k]))
                     found.append(Extremum(refine_extremum(segment.time_s, signal, i), side, event, size))

@@ -34,7 +34,7 @@ class PhaseParams:
     min_seen_s
         Shortest time in view that is searched.
     min_leg_share
-        Least share of a stretch in which a leg is seen below the hip.
+        Least fraction of a stretch in which a leg is seen below the hip.
     min_foot_downs
         Fewest foot downs of a walking bout.
     min_probability

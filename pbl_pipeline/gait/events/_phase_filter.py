@@ -115,5 +115,5 @@ def crossings(phase_rad: np.ndarray, time_s: np.ndarray) -> np.ndarray:
     turns = phase_rad / _TURN
     k = np.floor(turns)
     i = np.flatnonzero(np.diff(k) > 0)
-    share = (k[i + 1] - turns[i]) / (turns[i + 1] - turns[i])
-    return time_s[i] + share * (time_s[i + 1] - time_s[i])
+    fraction = (k[i + 1] - turns[i]) / (turns[i + 1] - turns[i])
+    return time_s[i] + fraction * (time_s[i + 1] - time_s[i])

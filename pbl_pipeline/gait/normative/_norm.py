@@ -46,7 +46,7 @@ class NormativeSet:
     explained_variance : (K,)
         deg^2 (n - 1).
     explained_share
-        Share of the variance of the normative vectors in the K components.
+        Fraction of the variance of the normative vectors in the K components.
     ln_mean, ln_sd
         Of the natural logarithm of the distance over the normative vectors (n - 1).
     curves
@@ -138,11 +138,11 @@ def fit_norm(
     spread = singular**2 / (len(everybody) - 1)
     if not spread.sum() > 0:
         raise _invalid("vectors without any variance", "different people")
-    share = np.cumsum(spread) / spread.sum()
-    k = n_components or int(np.searchsorted(share, variance - 1e-12) + 1)
+    fraction = np.cumsum(spread) / spread.sum()
+    k = n_components or int(np.searchsorted(fraction, variance - 1e-12) + 1)
     _enough(len(vectors), k)
-    if k > len(share):
-        raise _invalid(f"{len(share)} components in all", f"at least {k}")
+    if k > len(fraction):
+        raise _invalid(f"{len(fraction)} components in all", f"at least {k}")
     components = rows[:k]
     # The sign of a component is arbitrary: fixed so that two machines write the same file.
     components = components * np.sign(components[np.arange(k), np.abs(components).argmax(axis=1)])[:, None]
@@ -159,7 +159,7 @@ def fit_norm(
         mean_deg=mean,
         components=components,
         explained_variance=spread[:k],
-        explained_share=float(share[k - 1]),
+        explained_share=float(fraction[k - 1]),
         ln_mean=float(distance.mean()),
         ln_sd=float(distance.std(ddof=1)),
         curves=curves or {},

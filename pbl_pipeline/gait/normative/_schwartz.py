@@ -27,7 +27,7 @@ class GaitNorm:
     Attributes
     ----------
     groups, speed, cadence, foot_off
-        Names of the five groups, their mean speed, cadence (steps per sqrt(L / g)) and foot off (share of the cycle).
+        Names of the five groups, their mean speed, cadence (steps per sqrt(L / g)) and foot off (of the cycle).
     mean_deg, sd_deg
         angle -> (5, 1 + 2 K): mean, then (cosine, sine) of harmonics 1, 2, ...; phase 0 is the foot contact of the
         angle's side. Signs: anterior tilt, side up, side ahead, flexion, adduction, internal rotation, dorsiflexion
@@ -73,7 +73,7 @@ class GaitNorm:
         return float(self._at(self.cadence, speed))
 
     def foot_off_at(self, speed: float) -> float:
-        """Share of the cycle at which the foot leaves the floor."""
+        """Fraction of the cycle at which the foot leaves the floor."""
         return float(self._at(self.foot_off, speed))
 
     def _at(self, table: np.ndarray, speed: float | np.ndarray) -> np.ndarray:
