@@ -14,6 +14,8 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import detect_events, feet_from_markers
 from tests.benchmarks.events import Tally, cross_validated, lab_walks, reduced
 
+pytestmark = pytest.mark.slow
+
 MARKERS = ("LASI", "RASI", "LHEE", "RHEE", "LTOE", "RTOE")
 EVENT = {"Foot Strike": "foot_down", "Foot Off": "foot_up"}
 #: An extremum this close to the end of the recording cannot be seen to be one.

@@ -24,6 +24,8 @@ from workers.populate import populate
 
 from . import chain
 
+pytestmark = pytest.mark.database
+
 #: A column that may not be null, for a table that has rows: added, filled with what is true of them, then closed.
 SIZES = '''
 """The size of a video's file, which older versions did not record."""

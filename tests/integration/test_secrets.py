@@ -22,6 +22,8 @@ from schemas import connection, embedded
 from schemas.embedded import Folder, _process
 from tests.database import new_home, remove_home
 
+pytestmark = pytest.mark.database
+
 PBL = [sys.executable, "-c", "from pbl_pipeline.cli import main; main()"]
 WRONG = "wrong-password-5d1e"
 

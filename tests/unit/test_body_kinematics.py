@@ -88,6 +88,7 @@ def test_unscaled_body_matches_the_unchanged_model():
         np.testing.assert_allclose(xmat[t], data.xmat[1:].reshape(-1, 3, 3), atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_gradients_match_finite_differences_of_c_mujoco(seed):
     body, markers = load_body(), marker_set("blazepose_33")

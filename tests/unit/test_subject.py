@@ -26,6 +26,7 @@ def depth(far_m: float, speed: float, height_m: float = 1.7):
     return lambda t: 720 * height_m / np.maximum(far_m - speed * t, 1.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nearer", [1.1, 1.3, 1.6, 1.9])
 @pytest.mark.parametrize("small", [0.15, 0.3, 0.5])
 @pytest.mark.parametrize("beside", [150.0, 300.0])

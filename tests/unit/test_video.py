@@ -225,6 +225,7 @@ def test_frames_that_are_announced_and_cannot_be_counted_are_lost(with_edit_list
     assert error.value.code == "VIDEO_TRUNCATED"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("clip", "n_frames", "n_announced"), [("walk", 75, 271), ("STS", 798, 841)])
 def test_real_clips_with_edit_lists(shared_data, clip, n_frames, n_announced):
     """OpenCV decodes as many (../shared/data/README.md); the header announces more, and the file is whole."""
@@ -237,6 +238,7 @@ def test_real_clips_with_edit_lists(shared_data, clip, n_frames, n_announced):
     assert len(info.notes) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", ["video_mocap/walk/video.mp4", "multiview/cam01.mp4", "multiview/cam02.mp4"])
 def test_real_clips_decode_as_in_opencv(shared_data, file):
     path = shared_data / "real" / file
@@ -419,6 +421,7 @@ def _resident_mb() -> float:
     return pages * 4096 / 1e6
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs /proc")
 def test_memory_does_not_grow_with_the_length(tmp_path):
     """3,000 frames of 58 KB are 173 MB; between the first third and the end the process may grow by 12 MB."""

@@ -161,6 +161,7 @@ def changed(folder: Path, **fields) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_walker_of_a_real_clip(folder, registry, shared_data, tmp_path):
     models.add(folder)
     method = METHODS.find("yolox-nano")
@@ -178,6 +179,7 @@ def test_the_walker_of_a_real_clip(folder, registry, shared_data, tmp_path):
     assert np.isnan(tracking.persons[0].roi_px).all()
 
 
+@pytest.mark.slow
 def test_the_command_takes_a_registered_detector_and_says_its_licence(folder, registry, shared_data, tmp_path):
     models.add(folder)
     video = shared_data / "real" / "video_mocap" / "walk" / "video.mp4"
@@ -190,6 +192,7 @@ def test_the_command_takes_a_registered_detector_and_says_its_licence(folder, re
     assert "yolox-nano" in none.exception.expected
 
 
+@pytest.mark.slow
 def test_bad_folders_and_changed_models(folder, registry, shared_data):
     video = shared_data / "real" / "video_mocap" / "walk" / "video.mp4"
     refused("MODEL_CHECKSUM", models.add, changed(folder, sha256="0" * 64))
