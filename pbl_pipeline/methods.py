@@ -245,7 +245,9 @@ class Stage(Mapping[str, Method[P]]):
         method = found[name] if name in found else self.offered(name)
         if method is None:
             more = ", or add a model with `pbl models add`" if self._provider else ""
-            raise self._unknown(repr(name), f"one of {', '.join(self.names())}", f"choose one of these names{more}")
+            raise self._unknown(
+                f"method {name!r}", f"one of {', '.join(self.names())}", f"choose one of these names{more}"
+            )
         return method
 
     def _method(self, name: str, version: int, params: P, family: Family) -> Method[P]:
@@ -287,4 +289,4 @@ class Stage(Mapping[str, Method[P]]):
         return self.families[name]
 
     def _unknown(self, found: str, expected: str, next_step: str) -> PblError:
-        return PblError("SOLVER_UNKNOWN", found=f"{self.name} method {found}", expected=expected, next_step=next_step)
+        return PblError("SOLVER_UNKNOWN", found=f"{self.name}: {found}", expected=expected, next_step=next_step)

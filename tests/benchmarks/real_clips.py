@@ -20,6 +20,7 @@ import dataclasses
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -27,7 +28,7 @@ import numpy as np
 from pbl_pipeline.charts import Axes, nice_ticks
 from pbl_pipeline.fit import METHODS, TrialFit, fit_session
 from pbl_pipeline.keypoints import Keypoints
-from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.methods import Method
 from pbl_pipeline.pipeline import detect_trial
 from pbl_pipeline.validation import BODY_ROTATIONS, fit_angles, fit_angles_sd, reference_of_bodies
 from tests.conftest import SHARED
@@ -152,16 +153,16 @@ def keypoints_of(clip: str, fresh: bool = False) -> Keypoints:
     return Keypoints.load(cached)
 
 
-def changed(paramset: Paramset, changes: tuple[str, ...]) -> Paramset:
-    """The paramset with `name=value` changes; a dot reaches into a group, as in `cost.weight_3d=0.1`."""
-    params = METHODS.find(paramset).params
+def changed(method: Method[Any], changes: tuple[str, ...]) -> Method[Any]:
+    """The method with `name=value` changes; a dot reaches into a group, as in `cost.weight_3d=0.1`."""
+    params: Any = method.params
     for change in changes:
         name, value = change.split("=", 1)
         *groups, field = name.split(".")
         inner = getattr(params, groups[0]) if groups else params
         inner = dataclasses.replace(inner, **{field: ast.literal_eval(value)})
         params = dataclasses.replace(params, **{groups[0]: inner}) if groups else inner
-    return Paramset.of(paramset.stage, " ".join([paramset.name, *changes]), paramset.version, params)
+    return METHODS.make(" ".join([method.name, *changes]), method.version, params)
 
 
 @click.command()

@@ -23,6 +23,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import click
 import numpy as np
@@ -31,7 +32,7 @@ from pbl_pipeline.body import SLIDES
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, GaussNewtonParams, SessionInput, fit_sessions
 from pbl_pipeline.fit.solvers.gauss_newton import by_joint, floors_of
-from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.methods import Method
 from pbl_pipeline.synthetic import BLAZEPOSE_NOISE, SynthSpec, observe, person, synthesise, walk_qpos
 
 #: Prefixes of joint names, one factor each; of two that fit, the later one counts.
@@ -64,10 +65,11 @@ TIME_S = np.arange(180) / 30
 HELD_OUT = 1000
 
 
-def bare(paramset: Paramset) -> Paramset:
+def bare(method: Method[Any]) -> Method[Any]:
     """The same fit with every factor 1 and no least standard deviation."""
-    params = dataclasses.replace(METHODS.find(paramset).params, sd_factor=(), sd_floor=())
-    return Paramset.of(paramset.stage, paramset.name, paramset.version, params)
+    assert isinstance(method.params, GaussNewtonParams)
+    params = dataclasses.replace(method.params, sd_factor=(), sd_floor=())
+    return METHODS.make(method.name, method.version, params)
 
 
 def group_of(joint: str) -> str:
@@ -129,12 +131,12 @@ def clip(seed: int) -> tuple[SessionInput, np.ndarray]:
 
 
 def errors_and_sd(
-    recordings: Iterable[tuple[SessionInput, np.ndarray]], paramset: Paramset
+    recordings: Iterable[tuple[SessionInput, np.ndarray]], method: Method[Any]
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """|error| and standard deviation (N, 40) of all frames in m and rad, and the joints' names."""
     errors, sds, names = [], [], ()
     recordings = list(recordings)
-    fits = fit_sessions([r for r, _ in recordings], paramset)
+    fits = fit_sessions([r for r, _ in recordings], method)
     for (given, truth), fit in zip(recordings, fits, strict=True):
         if isinstance(fit, PblError):
             click.echo(f"  {given.names[0]} left out: {fit}", err=True)
