@@ -45,7 +45,7 @@ CODES: dict[str, str] = {
     "NORM_UNKNOWN": "no normative set has that name",
     "NORM_INVALID": "the normative data cannot support the index (too few cycles, wrong size)",
     "DB_NOT_RUNNING": "the database does not answer",
-    "DB_UNAVAILABLE": "no database server can be had on this machine",
+    "DB_UNAVAILABLE": "no database server can be obtained on this machine",
     "DB_REFUSED": "the database answers but refuses the login or the operation",
     "DB_NOT_FOUND": "a row that was named does not exist",
     "DB_MIGRATION": "the tables on the server are not as this version of the code declares them",

@@ -116,7 +116,11 @@ def fit(
 @click.option(
     "--minutes", type=click.FloatRange(0, 600, min_open=True), help="Repeat the video until it lasts so long."
 )
-@click.option("--person", type=click.IntRange(1), help="Whom to measure; else the subject, or who is seen longest.")
+@click.option(
+    "--person",
+    type=click.IntRange(1),
+    help="ID of the person; else the subject, or the longest in view.",
+)
 @click.option("--repeat", type=click.IntRange(1), help="Runs; the fastest counts. Default: 3, with --minutes 1.")
 @click.option("--timeout-s", type=click.FloatRange(1), default=7200.0, show_default=True, help="Of the measurement.")
 @click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write all figures to this file.")

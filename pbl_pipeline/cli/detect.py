@@ -14,7 +14,7 @@ from ._options import DEVICE, KEYPOINTS, PEOPLE, Person, keypoint_method, tracki
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="keypoints.npz to write.")
 @click.option("--camera", type=click.Path(path_type=Path), help="Calibration file; without it a phone is guessed.")
 @click.option("--attitude", type=click.Path(path_type=Path), help="Sensor log of the phone (docs/phone_capture.md).")
-@click.option("--person", type=Person(), default="auto", show_default=True, help="Whom to measure.")
+@click.option("--person", type=Person(), default="auto", show_default=True, help="ID of the person to measure.")
 @PEOPLE
 @KEYPOINTS
 @DEVICE

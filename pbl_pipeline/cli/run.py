@@ -31,7 +31,13 @@ from ._options import (
     help="Sensor log of the phone (docs/phone_capture.md), once for each VIDEO, in their order.",
 )
 @click.option("--camera-motion", type=click.Choice(CAMERA_MOTIONS), help=CAMERA_MOTION_HELP)
-@click.option("--person", type=Person(), default="auto", show_default=True, help="Whom to measure, of one video.")
+@click.option(
+    "--person",
+    type=Person(),
+    default="auto",
+    show_default=True,
+    help="ID of the person to measure (single video only).",
+)
 @PEOPLE
 @KEYPOINTS
 @DEVICE

@@ -247,8 +247,8 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
                 WARN if guessed else PASS,
                 None,
                 None,
-                "lengths and speed are as large as the detector takes the person to be (one camera sees no scale): "
-                "compare sessions of one person, not persons"
+                "lengths and speed are scaled by an assumed body size (one camera sees no scale): compare visits of "
+                "one person, not people"
                 if guessed
                 else "",
             )

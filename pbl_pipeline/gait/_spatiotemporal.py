@@ -146,8 +146,9 @@ def _none_used(cycles: Sequence[GaitCycle]) -> str:
         return "no complete gait cycle"
     if failed := next((c.excluded for c in cycles if c.fit_failed), ""):
         return failed
-    odd = " and strides of odd length" if any(c.odd_length for c in cycles) else ""
-    return f"{len(cycles)} gait cycles, none left without the first and last step{odd}"
+    found = "only one gait cycle" if len(cycles) == 1 else f"{len(cycles)} gait cycles"
+    odd = ", and so are strides of odd length" if any(c.odd_length for c in cycles) else ""
+    return f"{found}, and the first and last steps of a walk are excluded{odd}"
 
 
 def _no_length(name: str, used: Sequence[GaitCycle]) -> str:

@@ -357,8 +357,8 @@ def _notes(report: SessionReport, norm: NormativeSet | None) -> list[str]:
     ]
     if any(t.fit is not None and t.fit.orientation_source != "measured: calibration" for t in report.trials):
         notes.append(
-            "Speed and lengths are known only where the camera stands still, and are then as large as the detector "
-            "takes the person to be: one camera sees no scale. On one recording with marker motion capture the speed "
+            "Speed and lengths are known only where the camera stands still, and are then scaled by an assumed body "
+            "size: one camera sees no scale. On one recording with marker motion capture the speed "
             "came out 6 % too high."
         )
     notes.insert(

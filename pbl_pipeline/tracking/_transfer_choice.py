@@ -41,7 +41,7 @@ def carried_choice(
 ) -> SubjectChoice:
     """The choice in `tracking` after somebody chose `person_id` by hand in `decided`, another tracking (by `method`).
 
-    It is the same person (status CHOSEN). Where nobody surely is, a person has to choose again: what the automatic
+    It is the same person (status CHOSEN). If no match is certain, somebody has to choose again: what the automatic
     choice would say is not what somebody decided. `params` as for `choose_subject`.
     """
     found = same_person(decided, person_id, tracking)
