@@ -57,13 +57,14 @@ class Keypoints(dj.Computed):
     root_relative         : bool               # whether 3D points are relative to the root of the body
     n_seen                : int32              # frames with at least one point
     median_confidence=null: float64            # (0..1) median over the points that were seen, null when none was
-    camera_source         : varchar(255)       # where the intrinsics come from
+    camera_kind           : enum('file', 'measured', 'metadata', 'preset', 'guess', 'other')  # where the intrinsics come from
+    camera_source         : varchar(255)       # the same in words
     focal_length          : float64            # (px) mean of fx and fy
     focal_rel_sd=null     : float64            # (1) standard deviation of the focal length as a share of it, null when unknown
     keypoints_camera_id=null : int32           # calibration that was used (lab.CameraCalibration), null where none was there
     phone_log=null        : varchar(255)       # the phone's sensor log and how its clock was brought to the video's, null without
     keypoints_file        : <object@arrays>   # keypoints.npz: time_s (T) s, xy_px (T,J,2) px, xyz_cam_m (T,J,3) m, confidence (T,J) 0..1, box_px (T,4) px, camera; docs/files.md
-    index (camera_source)
+    index (camera_kind)
     {origin_columns("keypoints")}
     """  # noqa: E501
 
@@ -155,6 +156,7 @@ class Keypoints(dj.Computed):
                     "root_relative": found.root_relative,
                     "n_seen": int(seen.any(axis=1).sum()),
                     "median_confidence": number(np.median(found.confidence[seen])) if seen.any() else None,
+                    "camera_kind": found.camera.kind,
                     "camera_source": found.camera.source[:255],
                     "focal_length": found.camera.focal_px,
                     "focal_rel_sd": number(found.camera.focal_rel_sd),

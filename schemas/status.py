@@ -166,11 +166,10 @@ def _side_by_side(questions: Sequence[Callable[[Any], Any]], at_once: int = 4) -
 
 
 def camera_kinds(server: Any) -> dict[str, int]:
-    """Where the intrinsics of the keypoints come from (first word of `camera_source`), and of how many."""
-    sources = f"SELECT camera_source, COUNT(*) AS n FROM {keypoints.Keypoints.full_table_name} GROUP BY camera_source"  # noqa: S608
-    rows = server.query(  # sources first, by their index: there are few
-        f"SELECT SUBSTRING_INDEX(camera_source, ':', 1) AS kind, SUM(n) FROM ({sources}) AS sources"  # noqa: S608
-        " GROUP BY kind ORDER BY SUM(n) DESC, kind"
+    """Where the intrinsics of the keypoints come from, and of how many."""
+    table = keypoints.Keypoints.full_table_name
+    rows = server.query(
+        f"SELECT camera_kind, COUNT(*) FROM {table} GROUP BY camera_kind ORDER BY COUNT(*) DESC, camera_kind"  # noqa: S608
     ).fetchall()
     return {str(kind): int(n) for kind, n in rows}
 

@@ -178,7 +178,7 @@ def _converged(solution: Solution) -> Check:
 
 
 def _intrinsics(trials: Sequence[TrialFit]) -> Check:
-    sources = sorted({t.camera.source for t in trials if not t.camera.source.startswith(("measured", "file"))})
+    sources = sorted({t.camera.source for t in trials if not t.camera.calibrated})
     spread = np.array([t.camera.focal_rel_sd for t in trials])
     worst = float(np.nanmax(spread)) if np.isfinite(spread).any() else None
     unsure = worst is not None and worst > FOCAL_SD_WARN

@@ -22,9 +22,10 @@ from ._phone_log import PhoneLog, Sensor, read_phone_log
 from ._probe import probe, read_first, sha256_of
 from ._read import read_frames
 from ._timing import check_timing
-from ._types import Camera, FirstPicture, Frame, VideoInfo
+from ._types import CAMERA_KINDS, Camera, FirstPicture, Frame, VideoInfo
 
 __all__ = [
+    "CAMERA_KINDS",
     "Attitude",
     "Board",
     "Calibration",

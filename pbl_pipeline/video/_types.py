@@ -117,11 +117,15 @@ class Frame:
         return cut_image(self.image, matrix, size_px) if region is None else region
 
 
+#: Kinds of sources of intrinsics, the best known first; `other` where a source names none of them.
+CAMERA_KINDS = ("file", "measured", "metadata", "preset", "guess", "other")
+
+
 @dataclasses.dataclass(frozen=True)
 class Camera:
     """Intrinsics of the upright frame: `matrix` (3, 3) in px, `distortion` (5,) OpenCV order k1 k2 p1 p2 k3.
 
-    `source` says where they come from. Its first word is the kind: "file" and "measured" (a calibration), "metadata"
+    `source` says where they come from, its first word is the `kind`: "file" and "measured" (a calibration), "metadata"
     (what the phone wrote into the video), "preset" (a phone of that model), "guess". `focal_rel_sd`: standard deviation
     of the focal length as a fraction of it, NaN where nothing is known of it.
     """
@@ -130,6 +134,17 @@ class Camera:
     distortion: np.ndarray
     source: str
     focal_rel_sd: float = math.nan
+
+    @property
+    def kind(self) -> str:
+        """Kind of the source, one of `CAMERA_KINDS`: files keep it as the first word of `source`."""
+        word = self.source.partition(":")[0]
+        return word if word in CAMERA_KINDS else "other"
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the intrinsics were measured with this camera."""
+        return self.kind in ("file", "measured")
 
     @property
     def focal_px(self) -> float:

@@ -165,6 +165,7 @@ def _insert_rows(folder: Path, trials: Sequence[Any]) -> None:
                 "n_points": len(found.names),
                 "root_relative": found.root_relative,
                 "n_seen": n,
+                "camera_kind": found.camera.kind,
                 "camera_source": found.camera.source,
                 "focal_length": found.camera.focal_px,
                 "keypoints_file": folder / f"{len(rows[keypoints.Keypoints])}.npz",

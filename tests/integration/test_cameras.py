@@ -55,8 +55,8 @@ def calibration(path: Path, focal: float = 100.0, **phone) -> Path:
 
 def sources() -> dict[int, str]:
     """First word of the camera's source by video."""
-    rows = keypoints.Keypoints.proj("camera_source").to_dicts()
-    return {r["video_id"]: r["camera_source"].split(":")[0] for r in rows}
+    rows = keypoints.Keypoints.proj("camera_kind").to_dicts()
+    return {r["video_id"]: r["camera_kind"] for r in rows}
 
 
 def matrix_of(video_id: int) -> np.ndarray:

@@ -178,7 +178,7 @@ def test_what_no_migration_removes_is_named(empty: Callable[[], None]):
         )
         cursor.execute("ALTER TABLE pbl_lab.project MODIFY COLUMN project_title VARCHAR(20) NOT NULL DEFAULT ''")
         cursor.execute("ALTER TABLE pbl_session.session ADD COLUMN forgotten INT NOT NULL")
-        cursor.execute("ALTER TABLE pbl_keypoints.__keypoints DROP INDEX camera_source")
+        cursor.execute("ALTER TABLE pbl_keypoints.__keypoints DROP INDEX camera_kind")
     empty()
     named = _named()
     assert {n.split(":")[0] for n in named} == {

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 
 import cv2
 import numpy as np
 import pytest
 
 from pbl_pipeline.keypoints import Keypoints
-from pbl_pipeline.video import Camera, VideoInfo, check_timing, find_camera, probe, read_frames
+from pbl_pipeline.video import CAMERA_KINDS, Camera, VideoInfo, check_timing, find_camera, probe, read_frames
 from pbl_pipeline.video._camera import reaches_corners
 from pbl_pipeline.video._container_tags import read_tags
 from pbl_pipeline.video._presets import preset_camera, presets, quarter_turn
@@ -277,3 +278,28 @@ def test_the_uncertainty_is_kept_with_the_keypoints(tmp_path):
 def _project(points: np.ndarray, camera: Camera) -> np.ndarray:
     flat, _ = cv2.projectPoints(points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)
     return flat.reshape(-1, 2)
+
+
+# --- the kind of a source
+@pytest.mark.parametrize(
+    ("source", "kind", "calibrated"),
+    [
+        ("measured: camera.json, of apple-iphone-13", "measured", True),
+        ("file: camera.json", "file", True),
+        ("metadata: 27 mm on 35 mm film", "metadata", False),
+        ("preset: iPhone 13", "preset", False),
+        ("guess: 70 deg", "guess", False),
+        ("a stand of ours, measured: 2020", "other", False),
+    ],
+)
+def test_the_kind_of_a_source(source: str, kind: str, calibrated: bool):
+    camera = Camera(np.eye(3), np.zeros(5), source)
+    assert (camera.kind, camera.calibrated) == (kind, calibrated)
+    assert camera.kind in CAMERA_KINDS
+
+
+def test_the_column_knows_every_kind():
+    from schemas.keypoints import Keypoints
+
+    line = next(line for line in Keypoints.definition.splitlines() if line.strip().startswith("camera_kind"))
+    assert re.findall(r"'(\w+)'", line) == list(CAMERA_KINDS)
