@@ -59,6 +59,7 @@ def test_the_command_on_a_short_video(tmp_path):
     assert "40 frames in 1.3 s" in result.output
 
 
+@pytest.mark.slow
 def test_a_failure_is_told(tmp_path):
     (tmp_path / "v.mp4").write_bytes(b"no video")
     result = CliRunner().invoke(bench, ["detect", str(tmp_path / "v.mp4")])

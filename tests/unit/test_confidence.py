@@ -172,6 +172,7 @@ def test_errors_are_counted_in_trunks(trial):
     np.testing.assert_allclose(errors.error_trunk, (50 / truth.trunk_px[:, None] * np.ones((1, 33)))[known], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_camera_is_found_from_what_it_saw(trial):
     """Mocap in axes of its own, another clock, a lens that is 12 % longer than guessed, noise and gross outliers."""
     keypoints, world = trial.keypoints, trial.truth.markers_world_m

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -27,6 +28,7 @@ print(len(names))
 """
 
 
+@pytest.mark.slow
 def test_the_library_imports_with_the_tables_blocked():
     done = subprocess.run([sys.executable, "-c", BLOCKED], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-3000:]
@@ -42,6 +44,7 @@ print(*(name for name in ("jax", "mujoco", "cv2", "scipy", "onnxruntime", "ai_ed
 """
 
 
+@pytest.mark.slow
 def test_importing_the_tables_loads_no_numerical_library():
     """Commands that only look at rows answer at once: the library is imported inside the functions that compute."""
     done = subprocess.run([sys.executable, "-c", LIGHT], capture_output=True, text=True, timeout=300)
@@ -69,6 +72,7 @@ def test_no_import_against_the_direction(package: str, forbidden: set[str]):
 REBUILT = ("pbl_pipeline.fit", "pbl_pipeline.body")
 
 
+@functools.cache
 def _rooms() -> dict[str, dict[str, set[str]]]:
     """Room -> room that it imports -> modules imported there. A room is a package's own folder, without its
     subpackages; a module beside the packages (`pbl_pipeline/errors.py`) is a room of its own. All imports count:

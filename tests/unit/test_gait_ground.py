@@ -99,6 +99,7 @@ def test_one_camera_gives_no_width():
     assert "4 cm" in NO_WIDTH
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("camera", "known"), [("static", True), ("handheld", False)])
 def test_what_a_fit_knows_depends_on_its_camera(camera, known):
     """The truth of a synthetic walker as a fit: step and stride are those of its footprints, or null."""

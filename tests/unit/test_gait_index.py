@@ -75,6 +75,7 @@ def test_far_from_the_controls_to_a_millionth(shared_data):
     assert np.abs(found - expected).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_the_sets_are_what_the_command_builds(shared_data):
     source = shared_data / "real" / "gdi_gillette" / "GDI_Calc_Fast_Data.mat"
     for name, (build, digits) in BUILDERS.items():

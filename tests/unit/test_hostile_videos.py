@@ -13,6 +13,7 @@ from tests.benchmarks.hostile import KINDS
 from tests.integration import chain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_damaged_files_give_a_result_or_a_coded_error(tmp_path: Path, kind: str):
     good = chain.small_video(tmp_path, "good", n=40).read_bytes()

@@ -261,6 +261,7 @@ def detection(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pbl_pipeline.pipeline.detect_keypoints", chain.detect_keypoints)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("detection")
 def test_logs_go_with_their_videos_into_the_fit(fits, monkeypatch, tmp_path):
     monkeypatch.setattr(pipeline, "check_trial", lambda *_: None)
@@ -281,6 +282,7 @@ def test_logs_go_with_their_videos_into_the_fit(fits, monkeypatch, tmp_path):
     assert code_of(error) == "PHONE_LOG"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("detection")
 @pytest.mark.parametrize(("markers", "expected"), [("bml_movi_87", "gauss-newton"), ("mpi_inf_3dhp_17", "blazepose")])
 def test_a_session_is_fitted_as_its_points_want(fits, monkeypatch, tmp_path, markers, expected):

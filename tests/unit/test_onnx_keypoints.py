@@ -551,6 +551,7 @@ def test_pbl_detect_shows_the_licence_before_the_work(video, registered, tmp_pat
     assert Keypoints.load(tmp_path / "k.npz").marker_set == "dots_10"
 
 
+@pytest.mark.slow
 def test_the_report_names_the_model(video, registered):
     path, tracking = video
     found = detect_keypoints(path, tracking, 1, CAMERA, "dots-simcc")

@@ -169,6 +169,7 @@ def test_true_markers_are_those_of_the_fit():
 # --- the camera
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", ["static", "handheld"])
 def test_the_whole_person_is_in_the_picture_at_4_to_6_m(motion):
     for seed in range(30):

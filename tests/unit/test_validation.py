@@ -449,6 +449,7 @@ PEERS = {  # mean absolute error, right side: hip flexion, adduction, rotation, 
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("clip", "system"), PEERS)
 def test_peers_on_real_clips(shared_data: Path, clip: str, system: str):
     """The published figures are without alignment in time; with it the knees follow better, never worse."""
