@@ -20,7 +20,7 @@ import pymysql
 from pymysql.converters import escape_string
 from pymysql.cursors import SSCursor
 
-from ._catalog import Column, quote
+from .catalog import Column, quote
 
 #: A statement of inserts is ended when it is longer than this (characters); the server takes far more.
 STATEMENT = 1_000_000

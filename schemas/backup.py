@@ -26,10 +26,10 @@ import pymysql
 from pbl_pipeline import __version__, progress
 from pbl_pipeline.errors import PblError
 
-from . import _catalog, _dump, connection
-from ._catalog import Column, quote
-from ._files import write_json
+from . import _dump, catalog, connection
 from ._store import store_error
+from .catalog import Column, quote
+from .json_files import write_json
 
 FORMAT = 1
 #: Schema (after the prefix) with the marker of a restore that has not ended.
@@ -74,7 +74,7 @@ def backup(folder: Path, store: bool = True, say: Say = lambda _: None) -> Backu
     try:
         with closing(connection.plain_connection(conv={})) as server:
             version = _snapshot(server)
-            tables = _catalog.tables()
+            tables = catalog.tables()
             _check_some(tables, prefix)
             say(f"Saving {len(tables)} tables of {prefix}_* into {folder}")
             rows, files = _save_tables(server, tables, folder / "database.sql.gz")
@@ -263,19 +263,19 @@ def _save_files(paths: list[str], folder: Path) -> int:
 def _make_room(cursor: Any, prefix: str, again: bool) -> None:
     """Refuse where there are tables; set the marker. Where the marker stands, an earlier restore left the tables."""
     marker = f"{prefix}_{_MARKER}"
-    if marker in _catalog.schemas():
+    if marker in catalog.schemas():
         if not again:
             raise _refused(
-                f"an interrupted restore left {len(_catalog.tables())} tables",
+                f"an interrupted restore left {len(catalog.tables())} tables",
                 "an empty database",
                 "run the same with --again: it removes these tables and starts again",
             )
         cursor.execute("SET SESSION foreign_key_checks = 0")  # the schemas refer to each other
-        for schema in _catalog.schemas():
+        for schema in catalog.schemas():
             if schema != marker:
                 cursor.execute(f"DROP DATABASE {quote(schema)}")
         return
-    tables = _catalog.tables()
+    tables = catalog.tables()
     if tables:
         raise _refused(
             f"there are {len(tables)} tables under {prefix}_* already",

@@ -18,12 +18,12 @@ from typing import Any
 from pbl_pipeline import progress, settings
 from pbl_pipeline.errors import PblError
 
-from . import _catalog, connection, fit, lab, session, video
-from ._catalog import Column, quote
+from . import catalog, connection, fit, lab, session, video
 from ._codes import check_subject
 from ._datajoint import full_path
-from ._files import write_json
 from ._store import files_below, store_error
+from .catalog import Column, quote
+from .json_files import write_json
 from .rows import delete_below
 
 #: Columns that identify the person of a row. `fit_set` is a hash over one session's videos.
@@ -190,7 +190,7 @@ def _find(ids: Ids, earlier: dict[str, Any]) -> Found:
 def personal_tables() -> list[tuple[str, str, list[Column]]]:
     """Schema, name and columns of the tables that can hold a row of a person."""
     identifying = {*IDENTITIES, "job_key"}
-    found = _catalog.tables().items()
+    found = catalog.tables().items()
     return [(*name, columns) for name, columns in found if identifying & {c.name for c in columns}]
 
 
@@ -218,7 +218,7 @@ def _without_row(ids: Ids) -> list[str]:
     """
     store, root = connection.store_backend(), connection.store_root()
     out = []
-    for (schema, table), columns in _catalog.tables().items():
+    for (schema, table), columns in catalog.tables().items():
         if any(c.names_files for c in columns):
             for name in IDENTITIES:
                 for value in ids[name]:
@@ -343,7 +343,7 @@ def _mentions(subject: str, videos: Sequence[dict[str, Any]]) -> list[str]:
     """Columns anywhere that still hold the subject's code, or the path or checksum of one of the videos."""
     terms = [t for v in videos for t in (v["path"], v["sha256"])]
     conn, out = connection.connect(), []
-    for (schema, table), columns in _catalog.tables().items():
+    for (schema, table), columns in catalog.tables().items():
         for column in columns:
             name = quote(column.name)
             if column.type not in ("char", "varchar", "text", "longtext", "json"):

@@ -27,7 +27,7 @@ from pymysql.converters import escape_string
 from pbl_pipeline.errors import PblError
 
 from . import connection, embedded
-from ._catalog import pattern
+from .catalog import pattern
 
 #: Role -> rights in the schemas of the prefix.
 ROLES: dict[str, tuple[str, ...]] = {

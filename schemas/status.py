@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from . import computed_tables, connection, keypoints, tracking, video, worker
-from ._catalog import quote
+from .catalog import quote
 from .coded_errors import error_code, error_found, error_next_step
 from .jobs import jobs_of
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import closing
 from pathlib import Path
 
-from schemas import _catalog, _dump, connection
+from schemas import _dump, catalog, connection
 from schemas.ingest import Visit, ingest
 
 
@@ -21,8 +21,13 @@ def everything() -> dict[str, list[tuple]]:
     with closing(connection.plain_connection(conv={})) as server:
         return {
             f"{schema}.{table}": sorted(_dump.rows_of(server, schema, table, columns), key=str)
-            for (schema, table), columns in _catalog.tables().items()
+            for (schema, table), columns in catalog.tables().items()
         }
+
+
+def everything_but_refreshes() -> dict[str, list[tuple]]:
+    """`everything` without the time of the last refresh, which every populate writes."""
+    return {name: rows for name, rows in everything().items() if not name.endswith("_worker.look")}
 
 
 def remove_all() -> None:
@@ -34,7 +39,7 @@ def remove_all() -> None:
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute("SET foreign_key_checks = 0")
         server.begin()
-        for schema, table in _catalog.tables():
+        for schema, table in catalog.tables():
             if not table.startswith("#") and (not table.startswith("~") or table.startswith("~~")):
-                cursor.execute(f"DELETE FROM {_catalog.quote(schema, table)}")
+                cursor.execute(f"DELETE FROM {catalog.quote(schema, table)}")
         server.commit()

@@ -86,7 +86,7 @@ def init() -> None:
 
     Example: pbl db init
     """
-    from schemas import _catalog, _store
+    from schemas import _store, catalog
     from schemas._declare import declare_all
 
     if not _uses_external():
@@ -96,7 +96,7 @@ def init() -> None:
     click.echo("Creating the tables as far as they are missing, and the method rows of this version")
     declare_all()
     # Names that begin with ~ are DataJoint's own bookkeeping.
-    tables = Counter(schema for schema, table in _catalog.tables() if not table.startswith("~"))
+    tables = Counter(schema for schema, table in catalog.tables() if not table.startswith("~"))
     for schema, count in tables.items():
         click.echo(f"  {schema:<24} {count:>3} table{'' if count == 1 else 's'}")
     click.echo(f"Arrays are kept in {_store.describe()}")

@@ -15,7 +15,7 @@ from typing import Any
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
-from schemas._files import write_json
+from schemas.json_files import write_json
 
 from ._account import Account, check_enterable
 

@@ -14,7 +14,7 @@ import pymysql
 
 from pbl_pipeline import __version__
 from pbl_pipeline.errors import PblError
-from schemas import _catalog, connection
+from schemas import catalog, connection
 from schemas._activate import STAGES, modules
 from schemas._datajoint import dj, read_heading_again
 from schemas._declare import declare_all
@@ -81,7 +81,7 @@ def applied() -> list[Applied]:
     """The migrations that this database has seen; empty for one from before there were any."""
     conn = connection.connect()
     lab = connection.schema_name("lab")
-    if (lab, "~migrations") not in _catalog.tables():
+    if (lab, "~migrations") not in catalog.tables():
         return []
     rows = conn.query(f"SELECT number, name, code_version, applied FROM `{lab}`.`~migrations` ORDER BY id")  # noqa: S608
     return [Applied(int(r[0]), r[1], r[2], str(r[3])) for r in rows.fetchall()]
@@ -141,7 +141,7 @@ def _refuse_newer() -> None:
 
 def _bind(create: bool) -> list[str]:
     """Bind the classes to the server's tables; returns what is missing, and creates it if `create`."""
-    there, absent = _catalog.schemas(), []
+    there, absent = catalog.schemas(), []
     with dj.config.override(database__create_tables=False):
         for stage, module in zip(STAGES, modules(), strict=True):
             name = connection.schema_name(stage)

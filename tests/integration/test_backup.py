@@ -22,7 +22,7 @@ from schemas.ingest import Visit, ingest
 from schemas.results import load_session
 from tests.command import pbl
 from tests.database import installation
-from tests.rows import everything, remove_all
+from tests.rows import everything, everything_but_refreshes, remove_all
 from workers.populate import populate
 
 from . import chain
@@ -80,12 +80,13 @@ def test_there_and_back(elsewhere: Any, tmp_path: Path, monkeypatch: pytest.Monk
     results = load_session({"subject": "P001"})
     assert results.fitted
     assert np.isfinite(results.fitted[0].fit.qpos).any()
+    kept = everything_but_refreshes()
     assert not populate().did_something
     # Never over another.
     again = pbl("db", "restore", saved)
     assert again.error_code == "DB_REFUSED"
     assert "nothing is ever restored over another" in again.err
-    assert everything() == before
+    assert everything_but_refreshes() == kept
 
 
 def test_a_restore_that_was_broken_off_is_repeated_on_demand(

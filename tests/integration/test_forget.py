@@ -13,7 +13,7 @@ from schemas import connection, forget, keypoints, lab, session, video
 from schemas._declare import declare_all
 from schemas.ingest import Visit, ingest
 from tests.command import pbl
-from tests.rows import everything, register, remove_all
+from tests.rows import everything_but_refreshes, register, remove_all
 from workers.populate import populate
 
 from . import chain
@@ -43,7 +43,7 @@ def two(database: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iter
     shared, own = camera(tmp_path, "shared", 900), camera(tmp_path, "own", 905)
     ingest([chain.small_video(tmp_path, "other")], Visit(subject="P001", camera_file=shared))
     populate()
-    rows, files = everything(), stored()
+    rows, files = everything_but_refreshes(), stored()
     videos = [chain.small_video(tmp_path, "walk"), chain.small_video(tmp_path, "waits", people="two alike")]
     (tmp_path / "notes.mp4").write_text("not a video")
     videos.append(tmp_path / "notes.mp4")
@@ -81,18 +81,18 @@ def test_nothing_of_the_person_is_left_and_nothing_else_is_touched(
     two: tuple[dict, set[str], list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     rows, files, videos = two
-    full, all_files = everything(), stored()
+    full, all_files = everything_but_refreshes(), stored()
     dry = pbl("forget", "P017", "--videos")
     assert dry.code == 0, dry.err
     assert "this is a dry run" in dry.out
     assert "left_over.npz" in dry.out
     for table in ("subject", "__session_fit", "~~video_info", "crash"):
         assert f".{table}\n" in dry.out
-    assert everything() == full
+    assert everything_but_refreshes() == full
     assert stored() == all_files
     done = pbl("forget", "P017", "--yes")
     assert done.code == 0, done.err + done.out
-    assert everything() == rows
+    assert everything_but_refreshes() == rows
     assert stored() == files
     assert all(v.exists() for v in videos)
     # The proof names what went; folders whose names carried the person's numbers are gone as well.
@@ -112,14 +112,14 @@ def test_nothing_of_the_person_is_left_and_nothing_else_is_touched(
     assert again.code == 0, again.err
     assert not any(v.exists() for v in videos)
     assert [p.name for p in archive.rglob("*")] == ["P0171", "visit", "cd-walk.csv"]
-    assert everything() == rows
+    assert everything_but_refreshes() == rows
     # Numbers are given anew: the next person has those of the one who was forgotten, and keeps what is theirs.
     ingest([chain.small_video(tmp_path, "next")], Visit(subject="P018"))
     assert set(video.Video.to_arrays("video_id")) & set(proof["ids"]["video_id"])
     populate()
-    theirs, their_files = everything(), stored()
+    theirs, their_files = everything_but_refreshes(), stored()
     assert pbl("forget", "P017", "--yes", "--videos").code == 0
-    assert everything() == theirs
+    assert everything_but_refreshes() == theirs
     assert stored() == their_files
 
 
@@ -141,7 +141,7 @@ def test_broken_off_it_is_repeated_until_done(
         patch.setattr(backend, "remove", remove)
         with pytest.raises(KeyboardInterrupt):
             forget.forget("P017")
-    assert everything() == rows
+    assert everything_but_refreshes() == rows
     assert stored() != files
     assert json.loads(forget.manifest_path("P017").read_text())["state"] == "begun"
     # The rows are gone and somebody else has the numbers by now: still the command knows what to remove, and what not.
@@ -159,18 +159,18 @@ def test_broken_off_it_is_repeated_until_done(
 def test_an_unknown_code_removes_nothing_and_a_running_computation_holds_it_up(
     two: tuple[dict, set[str], list[Path]],
 ):
-    before = everything()
+    before = everything_but_refreshes()
     for subject in ("nobody", "P01", "p017"):
         assert pbl("forget", subject, "--yes").error_code == "DB_NOT_FOUND", subject
     for subject in ("../P017", "P017/../x", ""):
         assert pbl("forget", subject, "--yes").error_code == "USAGE", subject
-    assert everything() == before
+    assert everything_but_refreshes() == before
     jobs = keypoints.Keypoints.jobs
     jobs.update1({**jobs.pending.keys()[0], "status": "reserved", "host": "node7", "pid": 4711})
     held = pbl("forget", "P017", "--yes")
     assert held.error_code == "DB_REFUSED"
     assert "node7, process 4711" in held.err
-    assert {t: len(r) for t, r in everything().items()} == {t: len(r) for t, r in before.items()}
+    assert {t: len(r) for t, r in everything_but_refreshes().items()} == {t: len(r) for t, r in before.items()}
 
 
 def test_a_video_in_whose_place_another_lies_stays(two: tuple[dict, set[str], list[Path]]):
