@@ -217,7 +217,8 @@ def errors_of(table: Any, code: str | None = None, keys: Iterable[Mapping[str, A
     if code is not None:
         if not code.replace("_", "").isalnum():
             raise PblError("USAGE", found=f"code {code!r}", expected="an error code", next_step="see docs/errors.md")
-        rows = rows & f"error_message LIKE 'PblError: {code}:%%' OR error_message LIKE '{code}%%'"
+        # DataJoint's own populate writes the name of the exception before its text.
+        rows = rows & f"error_message REGEXP '^([A-Za-z]+: )?{code}:' OR error_message LIKE '{code}%%'"
     if keys is not None:
         rows = rows & [dict(k) for k in keys]
     return rows

@@ -212,5 +212,7 @@ def test_plain_populate_reports_a_missing_row_with_its_code(tables: None, tmp_pa
     try:
         fit.SessionFit.populate(reserve_jobs=True, suppress_errors=True)
         assert error(fit.SessionFit)[0] == "INPUT_CHANGED"
+        assert len(queue.errors_of(fit.SessionFit, "INPUT_CHANGED")) == 1
+        assert len(queue.errors_of(fit.SessionFit, "FILE_FORMAT")) == 0
     finally:
         fit.BodyModel.insert(body)
