@@ -117,16 +117,16 @@ def _packages() -> Iterator[Finding]:
         yield Finding("packages", MISSING, ", ".join(absent), f"pip install {' '.join(repr(a) for a in absent)}")
 
 
-def _loads(what: str, look: Callable[[], Finding], next_step: str) -> Finding:
-    """`look()`, with what a broken or absent installation raises turned into a finding."""
+def _loads(what: str, check: Callable[[], Finding], next_step: str) -> Finding:
+    """`check()`, with what a broken or absent installation raises turned into a finding."""
     try:
-        return look()
+        return check()
     except (ImportError, OSError, RuntimeError, ValueError, PblError) as error:
         return Finding(what, MISSING, f"{type(error).__name__}: {error}".splitlines()[0], next_step)
 
 
 def _jax_device() -> Finding:
-    def look() -> Finding:
+    def check() -> Finding:
         import jax
 
         devices = jax.devices()
@@ -136,11 +136,11 @@ def _jax_device() -> Finding:
             return Finding("JAX device", NOTE, note, "pip install 'pbl-pipeline[gpu]'")
         return Finding("JAX device", OK, detail)
 
-    return _loads("JAX device", look, "pip install --upgrade jax jaxlib")
+    return _loads("JAX device", check, "pip install --upgrade jax jaxlib")
 
 
 def _jax_cache() -> Finding:
-    def look() -> Finding:
+    def check() -> Finding:
         import jax
 
         from pbl_pipeline import jax_setup
@@ -155,11 +155,11 @@ def _jax_cache() -> Finding:
         megabytes = sum(f.stat().st_size for f in files if f.is_file()) / 1e6
         return Finding("compile cache", OK, f"on: {folder} ({len(files)} files, {megabytes:.1f} MB)")
 
-    return _loads("compile cache", look, "pip install --upgrade jax mujoco-mjx")
+    return _loads("compile cache", check, "pip install --upgrade jax mujoco-mjx")
 
 
 def _litert() -> Finding:
-    def look() -> Finding:
+    def check() -> Finding:
         from ai_edge_litert.interpreter import Interpreter
 
         detail = f"ai-edge-litert {version('ai-edge-litert')}"
@@ -174,13 +174,13 @@ def _litert() -> Finding:
         shape = model.get_input_details()[0]["shape"].tolist()
         return Finding("LiteRT", OK, f"{detail}; loads the person detector, input {shape}")
 
-    return _loads("LiteRT", look, "pip install ai-edge-litert")
+    return _loads("LiteRT", check, "pip install ai-edge-litert")
 
 
 def _onnx() -> Finding:
     """Which execution providers there are, and on which of them ONNX models will be run."""
 
-    def look() -> Finding:
+    def check() -> Finding:
         import onnxruntime
 
         from pbl_pipeline import models
@@ -199,7 +199,7 @@ def _onnx() -> Finding:
             return Finding("ONNX runtime", NOTE, f"{detail}; an NVIDIA GPU is not used, models run on the CPU", remedy)
         return Finding("ONNX runtime", OK, f"{detail}; models run on the CPU")
 
-    return _loads("ONNX runtime", look, "pip install onnxruntime, or correct PBL_ONNX_DEVICE")
+    return _loads("ONNX runtime", check, "pip install onnxruntime, or correct PBL_ONNX_DEVICE")
 
 
 def _models() -> Iterator[Finding]:
@@ -216,7 +216,7 @@ def _models() -> Iterator[Finding]:
 
 
 def _codecs() -> Finding:
-    def look() -> Finding:
+    def check() -> Finding:
         import av
         from av.codec.codec import Codec, UnknownCodecError
 
@@ -232,7 +232,7 @@ def _codecs() -> Finding:
             return Finding("video codecs", MISSING, f"{detail} lacks {', '.join(lacking)}", remedy)
         return Finding("video codecs", OK, f"{detail}: reads H.264, HEVC, VP9; writes H.264")
 
-    return _loads("video codecs", look, "pip install av")
+    return _loads("video codecs", check, "pip install av")
 
 
 # --- what lies around it

@@ -104,7 +104,7 @@ def observe(
 
     R_nc = R_nc_at(time_s)
     x_world = true_markers(qpos, markers, scale, site_offset_m)
-    keypoints, outlier = look(
+    keypoints, outlier = seen_by(
         points_rng, noise, time_s, x_world, R_nc, np.zeros(3), markers, camera, image_size_px, root_relative
     )
     hidden = np.isin(markers.names, list(never_seen)) | _within(time_s, unseen_s)[:, None]
@@ -116,7 +116,7 @@ def observe(
     return Seen(keypoints, R_nc, sensor.clock_offset_s if log else float("nan"), x_world, outlier)
 
 
-def look(
+def seen_by(
     rng: np.random.Generator,
     noise: Noise,
     time_s: np.ndarray,

@@ -25,7 +25,7 @@ from . import _tasks
 from ._camera import PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor, phone_log, picture_px
 from ._impair import Impairment, style_of
 from ._noise import NO_NOISE, Noise
-from ._observe import hide, look, pelvis_positions
+from ._observe import hide, pelvis_positions, seen_by
 from ._person import true_markers
 from ._physique import leg_length_m, physique
 from ._plan import Plan
@@ -294,7 +294,7 @@ def synthesise(spec: SynthSpec) -> Synthetic:
     x_world = true_markers(qpos, markers, scale, site_offset)
     points_rng = np.random.default_rng([spec.seed, 4])
     noise = NOISES[spec.noise]
-    seen = look(points_rng, noise, time_s, x_world, R_nc, np.zeros(3), markers, camera, size_px, spec.root_relative)
+    seen = seen_by(points_rng, noise, time_s, x_world, R_nc, np.zeros(3), markers, camera, size_px, spec.root_relative)
     keypoints, outlier = seen
     outside = _outside(x_world, R_nc, camera, size_px)
     _check_in_view(outside, spec)

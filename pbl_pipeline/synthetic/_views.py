@@ -12,7 +12,7 @@ from pbl_pipeline.video import Camera
 
 from ._camera import camera_turn
 from ._noise import Noise
-from ._observe import look, pelvis_positions
+from ._observe import pelvis_positions, seen_by
 from ._person import _set, true_markers
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def observe_views(
         p_nc = np.array([middle[0] + x, middle[1] + y, RAISED_M + 0.1 * i])
         down = np.arctan2(p_nc[2] - middle[2], RING_M)
         R_nc = camera_turn(np.array(around + np.pi), np.array(-down), np.array(0.0))[0]
-        keypoints, _ = look(
+        keypoints, _ = seen_by(
             np.random.default_rng([seed, 6, i]),
             noise,
             np.asarray(time_s, np.float64),

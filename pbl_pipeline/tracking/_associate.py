@@ -6,11 +6,11 @@ near and far people are treated alike.
 
 Why no tracker library, as of November 2026. They take a box in every frame at one rate; here a person is looked at when
 it is worth it (`Watch`), by the container's own time stamps, and both directions of time may be used afterwards
-(`uncross`, `join_trails`). Of those on the package index `trackers` 2.6 (Apache-2.0) is well kept, but brings 25
+(`undo_swaps`, `join_trails`). Of those on the package index `trackers` 2.6 (Apache-2.0) is well kept, but brings 25
 packages, among them `opencv-python`, which overwrites the files of the headless OpenCV; `norfair` 2.3 asks for numpy
 below 2; `motpy` stands at 0.0.10. On 240 made crossings at 15 frames a second (tests/unit/crossings.py: eight pairs of
 speeds, three degrees of hiding, ten seeds) identities were exchanged in 7 (SORT, ByteTrack), 5 (OC-SORT) and 3 (C-BIoU)
-with `trackers`, in none with this module and `uncross`; one person hidden for about a second all kept.
+with `trackers`, in none with this module and `undo_swaps`; one person hidden for about a second all kept.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from ._types import PersonDetector
 MAX_MISSES = 1
 
 
-def rewind(
+def backtrack(
     trail: Trail,
     kept: Sequence[tuple[int, float, np.ndarray]],
     others: Sequence[Trail],

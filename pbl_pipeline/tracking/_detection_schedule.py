@@ -3,7 +3,7 @@
 One call of a detector costs as much as decoding three frames, so pictures are not searched throughout. A person who
 moves evenly is looked at ten times a second and interpolated between, one who keeps still more rarely; one who
 surprises, was missed or comes close to another is looked at more often. The whole frame and its tiles are visited by
-turns: nobody new is overlooked for longer than a turn, and `rewind` then finds the frames between.
+turns: nobody new is overlooked for longer than a turn, and `backtrack` then finds the frames between.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ class UncrossParams:
     margin: float = 0.3
 
 
-def uncross(trails: Sequence[Trail], params: UncrossParams) -> list[Trail]:
+def undo_swaps(trails: Sequence[Trail], params: UncrossParams) -> list[Trail]:
     """The trails, with their ends exchanged after encounters where that fits better."""
     out = list(trails)
     for i in range(len(out)):

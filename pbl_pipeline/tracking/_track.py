@@ -18,10 +18,10 @@ from pbl_pipeline.video import VideoInfo, probe, read_frames
 
 from ._appearance import appearance_of
 from ._associate import Associator, Trail, measure
-from ._backtrack import rewind
+from ._backtrack import backtrack
 from ._blazepose import body_box, box_iou
 from ._detection_schedule import Watch, window_around
-from ._identity_swaps import uncross
+from ._identity_swaps import undo_swaps
 from ._methods import METHODS
 from ._params import TrackingParams
 from ._reidentify import join_trails
@@ -56,7 +56,7 @@ def track_people(
     info = info or probe(video_path)
     size = (info.width_px, info.height_px)
     trails = _follow(video_path, params, finder, info)
-    people = join_trails(uncross([t for t in trails if _is_real(t, params)], params.uncross), size, params.join)
+    people = join_trails(undo_swaps([t for t in trails if _is_real(t, params)], params.uncross), size, params.join)
     longest = params.association.max_gap_s
     persons = tuple(_to_track(i + 1, t, info.time_s, size, longest) for i, t in enumerate(people))
     return Tracking(info.time_s, size, persons, finder.name, finder.model_sha256)
@@ -86,7 +86,7 @@ def _follow(video_path: str | Path, params: TrackingParams, detector: PersonDete
             if sure is not None:
                 trail = Trail.of(frame.index, now, sure)
                 sizes = params.watch.window_sizes
-                associator.begin(rewind(trail, kept, associator.trails(), detector, sizes, params.association))
+                associator.begin(backtrack(trail, kept, associator.trails(), detector, sizes, params.association))
         watch.detected(now, due, associator.live)
         if elsewhere:
             kept.append((frame.index, now, frame.image))

@@ -9,7 +9,7 @@ import numpy as np
 
 from pbl_pipeline.tracking import AssociationParams, Detection, JoinParams, UncrossParams, body_box, box_iou
 from pbl_pipeline.tracking._associate import Associator, Trail
-from pbl_pipeline.tracking._identity_swaps import uncross
+from pbl_pipeline.tracking._identity_swaps import undo_swaps
 from pbl_pipeline.tracking._reidentify import join_trails
 
 SIZE = (1920, 1080)
@@ -89,7 +89,7 @@ def identities(frames: list[tuple[float, list[tuple[int | None, Detection]]]]) -
         for new in associator.step(i, t, [d for _, d in found]):
             associator.begin(Trail.of(i, t, new))
     real = [t for t in associator.trails() if len(t.frames) >= 3]
-    people = join_trails(uncross(real, UncrossParams()), SIZE, JoinParams())
+    people = join_trails(undo_swaps(real, UncrossParams()), SIZE, JoinParams())
     return [[k for d in p.detections if (k := owner[id(d)]) is not None] for p in people]
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from pbl_pipeline.tracking import JoinParams, UncrossParams, appearance_of, appearance_similarity
 from pbl_pipeline.tracking._associate import Trail
-from pbl_pipeline.tracking._identity_swaps import uncross
+from pbl_pipeline.tracking._identity_swaps import undo_swaps
 from pbl_pipeline.tracking._reidentify import join_trails
 from tests.unit.crossings import Walker, clothes, identities, scene
 from tests.unit.test_tracking import person
@@ -122,10 +122,10 @@ def test_a_mistaken_exchange_is_undone_and_a_right_track_is_left_alone():
     def left(t):
         return 1700 - 400 * t
 
-    a, b = uncross([trail(right), trail(left)], PARAMS)
+    a, b = undo_swaps([trail(right), trail(left)], PARAMS)
     assert places(a) == pytest.approx([right(0.1 * i) for i in range(41)])
     mixed = trail(lambda t: right(t) if t < 2 else left(t)), trail(lambda t: left(t) if t < 2 else right(t))
-    a, b = uncross(mixed, PARAMS)
+    a, b = undo_swaps(mixed, PARAMS)
     assert places(a) == pytest.approx([right(0.1 * i) for i in range(41)], abs=45)
     assert places(b)[-1] == pytest.approx(left(4.0))
 
@@ -143,7 +143,7 @@ def test_size_alone_tells_them_apart():
     ]
     for tracks in (mixed, [adult, child]):
         sizes = [
-            {float(d.roi_px[2]) for d in (*t.detections[:15], *t.detections[26:])} for t in uncross(tracks, PARAMS)
+            {float(d.roi_px[2]) for d in (*t.detections[:15], *t.detections[26:])} for t in undo_swaps(tracks, PARAMS)
         ]
         assert sizes == [{500.0}, {300.0}]
 
@@ -151,7 +151,7 @@ def test_size_alone_tells_them_apart():
 def test_an_encounter_without_an_end_changes_nothing():
     """They are together to the last frame: nothing is known of what comes after."""
     a, b = trail(lambda t: 300 + 300 * min(t, 2.0)), trail(lambda t: 1500 - 290 * min(t, 2.0))
-    assert [places(t) for t in uncross([a, b], PARAMS)] == [places(a), places(b)]
+    assert [places(t) for t in undo_swaps([a, b], PARAMS)] == [places(a), places(b)]
 
 
 # --- looks --------------------------------------------------------------------------------------------------------
@@ -160,7 +160,7 @@ def test_an_encounter_without_an_end_changes_nothing():
 def test_clothes_of_which_nothing_is_known_decide_nothing():
     """Of one the look is known, for the other's nobody asked."""
     known, unknown = trail(lambda t: 100 + 400 * t, clothes(1)), trail(lambda t: 1700 - 400 * t)
-    assert [places(t) for t in uncross([known, unknown], PARAMS)] == [places(known), places(unknown)]
+    assert [places(t) for t in undo_swaps([known, unknown], PARAMS)] == [places(known), places(unknown)]
     later = Trail([f + 200 for f in unknown.frames], [t + 20 for t in unknown.times], unknown.detections, np.zeros(3))
     assert len(join_trails([known, later], (1920, 1080), JoinParams())) == 2
 
