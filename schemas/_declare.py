@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 
-from . import _store, connection
+from . import connection, store
 from ._activate import activate
 from .chain import computed_tables
 from .jobs import jobs_of
@@ -29,4 +29,4 @@ def declare_all() -> None:
             jobs_of(table)  # declares it
     finally:
         log.setLevel(level)
-    _store.check_store(connection.store_backend(), create=True)
+    store.check_store(connection.store_backend(), create=True)

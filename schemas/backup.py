@@ -27,9 +27,9 @@ from pbl_pipeline import __version__, progress
 from pbl_pipeline.errors import PblError
 
 from . import _dump, catalog, connection
-from ._store import store_error
 from .catalog import Column, quote
 from .json_files import write_json
+from .store import store_error
 
 FORMAT = 1
 #: Schema (after the prefix) with the marker of a restore that has not ended.

@@ -11,7 +11,7 @@ from pathlib import PurePath
 from typing import Any
 
 from . import lab, session, video
-from ._codes import check_subject, day_of
+from .codes import check_subject, day_of
 from .ingest import METHOD_FIELDS, Methods, in_transaction, next_id, resolve, selections
 from .rows import utc_now
 

@@ -44,9 +44,9 @@ from ._datajoint import DuplicateError as DuplicateError  # these four for the w
 from ._datajoint import IntegrityError as IntegrityError
 from ._datajoint import LostConnectionError, backend_of, datajoint, dj
 from ._datajoint import inserting as inserting
-from ._secrets import secret
-from ._store import store_spec
 from .embedded import APP_USER, HOST, Folder, not_running
+from .secret_files import secret
+from .store import store_spec
 
 #: How long a server may take to answer before it counts as not running.
 CONNECT_TIMEOUT_S = 4.0

@@ -19,12 +19,12 @@ from pbl_pipeline import progress, settings
 from pbl_pipeline.errors import PblError
 
 from . import catalog, connection, fit, lab, session, video
-from ._codes import check_subject
 from ._datajoint import full_path
-from ._store import files_below, store_error
 from .catalog import Column, quote
+from .codes import check_subject
 from .json_files import write_json
 from .rows import delete_below
+from .store import files_below, store_error
 
 #: Columns that identify the person of a row. `fit_set` is a hash over one session's videos.
 IDENTITIES = ("subject", "session_id", "video_id", "fit_set")

@@ -16,10 +16,10 @@ from pbl_pipeline.methods import of_stage
 from pbl_pipeline.paramset import canonical_json
 
 from . import fit, gait, gdi, keypoints, lab, sensors, session, tracking, video
-from ._codes import check_subject, day_of
 from ._datajoint import DuplicateError, dj
 from .chain import computed_tables
 from .coded_errors import error_code
+from .codes import check_subject, day_of
 from .jobs import jobs_of
 from .method_rows import resolve_method
 from .plan import default_fit

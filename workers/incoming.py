@@ -24,7 +24,7 @@ import fsspec
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from schemas import connection, video
-from schemas._codes import check_subject
+from schemas.codes import check_subject
 from schemas.ingest import Visit, ingest
 from schemas.sensors import Sensors
 
@@ -213,7 +213,7 @@ def _login(url: str) -> dict[str, Any]:
     """What fsspec needs for an object store: the same variables as the store of arrays."""
     if not url.startswith("s3://"):
         return {}
-    from schemas._secrets import secret
+    from schemas.secret_files import secret
 
     endpoint = os.environ.get("PBL_S3_ENDPOINT")
     about: dict[str, Any] = {"key": secret("PBL_S3_KEY"), "secret": secret("PBL_S3_SECRET")}

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from schemas._store import check_store
 from schemas.connection import store_backend
+from schemas.store import check_store
 
 from . import registry
 

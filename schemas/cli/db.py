@@ -69,10 +69,10 @@ def status(as_json: bool) -> None:
         version = connection.connect().query("SELECT VERSION()").fetchone()[0]
         _print({"kind": "external", "running": True, "address": connection.external(), "version": version}, as_json)
         return
-    from schemas import _store, embedded
+    from schemas import embedded, store
 
     now = embedded.status()
-    _print({"kind": "embedded", **now.to_dict(), "store": _store.describe()}, as_json)
+    _print({"kind": "embedded", **now.to_dict(), "store": store.describe()}, as_json)
     if not now.running:
         found = "there is no database yet" if not now.initialised else "it is not running"
         if now.pid is not None:
@@ -86,7 +86,7 @@ def init() -> None:
 
     Example: pbl db init
     """
-    from schemas import _store, catalog
+    from schemas import catalog, store
     from schemas._declare import declare_all
 
     if not _uses_external():
@@ -99,7 +99,7 @@ def init() -> None:
     tables = Counter(schema for schema, table in catalog.tables() if not table.startswith("~"))
     for schema, count in tables.items():
         click.echo(f"  {schema:<24} {count:>3} table{'' if count == 1 else 's'}")
-    click.echo(f"Arrays are kept in {_store.describe()}")
+    click.echo(f"Arrays are kept in {store.describe()}")
     click.echo("Next: pbl ingest VIDEO --subject CODE, or pbl demo")
 
 

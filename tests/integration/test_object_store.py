@@ -12,7 +12,7 @@ from moto.server import ThreadedMotoServer
 import pbl_pipeline.video
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import _store, backup, connection, forget, tracking, video
+from schemas import backup, connection, forget, store, tracking, video
 from schemas._declare import declare_all
 from schemas.ingest import Visit, ingest
 from schemas.stored_files import file_ref, stored_file
@@ -55,7 +55,7 @@ def test_arrays_and_files_go_to_the_bucket_and_come_back(remote: None, tmp_path:
     backend = connection.store_backend()
     assert backend.protocol == "s3"
     assert not backend.fs.exists("walks")
-    _store.check_store(backend, create=True)
+    store.check_store(backend, create=True)
     path = chain.small_video(tmp_path, "walk")
     ingest([path], Visit(subject="P001"))
     for table in (video.VideoInfo, tracking.Tracking):
@@ -109,7 +109,7 @@ def test_a_store_that_does_not_answer_is_said_without_the_secret(remote: None, m
     monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
     connection.connect()
     with pytest.raises(PblError) as error:
-        _store.check_store(connection.store_backend())
+        store.check_store(connection.store_backend())
     assert error.value.code == "STORE_UNAVAILABLE"
     assert "127.0.0.1:1" in str(error.value)
     cause: BaseException | None = error.value
@@ -131,6 +131,6 @@ def test_settings_that_cannot_work_are_refused(changes: dict[str, str], code: st
     for name, value in changes.items():
         monkeypatch.setenv(name, value)
     with pytest.raises(PblError) as error:
-        _store.store_spec()
+        store.store_spec()
     assert error.value.code == code
     assert SECRET not in str(error.value)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from schemas._store import check_store
+from schemas.store import check_store
 from workers import selftest
 
 

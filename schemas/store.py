@@ -13,7 +13,7 @@ from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
 from ._datajoint import full_path
-from ._secrets import secret
+from .secret_files import secret
 
 #: Folder of the bucket under which everything of ours lies; the phones' uploads may have another one beside it.
 LOCATION = "arrays"
