@@ -16,12 +16,12 @@ from pbl_pipeline.body import load_body, marker_set
 from pbl_pipeline.body._jacobian import MarkerTable, table_positions
 from pbl_pipeline.body._marker_chain import chained_markers
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import CostParams, ImplicitAdamParams, ViewParams, paper_objective
+from pbl_pipeline.fit import CostParams, ImplicitAdamParams, ViewParams
 from pbl_pipeline.fit._costs import distance_2d_px2, distance_3d_cm2, huber_of_square
 from pbl_pipeline.fit._inputs import Session, make_session
 from pbl_pipeline.fit._marker_cost import MarkerWeights, kinds_of, marker_cost
 from pbl_pipeline.fit._network_start import camera_start, keypoint_start, paper_start
-from pbl_pipeline.fit._paper_objective import PAPER_COST, angle_between_deg
+from pbl_pipeline.fit._paper_objective import PAPER_COST, angle_between_deg, paper_objective
 from pbl_pipeline.fit._params import PAPER_2025
 from pbl_pipeline.fit._trajectory import encode, evaluate, fit_ranges, frequencies, initial_networks
 from pbl_pipeline.fit.solvers import implicit_adam as solver
