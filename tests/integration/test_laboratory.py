@@ -135,6 +135,7 @@ def test_events_may_be_given(walk, tmp_path):
     assert (again.events.method, len(again.events.events)) == ("given", len(shifted))
 
 
+@pytest.mark.slow
 def test_events_of_a_recording_by_command(walk, tmp_path):
     """From its markers, whatever its labels say; then given back to `pbl gait`."""
     csv, out = tmp_path / "events.csv", tmp_path / "metrics.json"

@@ -104,6 +104,7 @@ def test_paramsets_change_in_what_is_asked_and_in_nothing_else():
         paramset_of(Setup(values={"cost.no_such_weight": 1.0}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", factors(), ids=lambda f: f.name)
 def test_every_row_can_be_observed_and_has_a_paramset(factor):
     paramset_of(factor.setup)

@@ -118,6 +118,7 @@ def test_gradients_match_finite_differences_of_c_mujoco(seed):
         np.testing.assert_allclose(np.ravel(gradient), expected, atol=2e-5 * np.abs(expected).max() + 1e-5)
 
 
+@pytest.mark.slow
 def test_forward_mode_and_second_derivatives():
     """The closed-form derivative can itself be differentiated: its change along a line, against differences."""
     body, markers = load_body(), marker_set("mpi_inf_3dhp_17")
@@ -146,6 +147,7 @@ def test_forward_mode_and_second_derivatives():
     assert float(ours[1]) == pytest.approx(second, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_gradient_is_finite_at_zero():
     body, markers = load_body(), marker_set("blazepose_33")
 

@@ -78,6 +78,7 @@ def test_what_is_not_known_does_not_matter():
     assert (a[80:90] == 0).all()
 
 
+@pytest.mark.slow
 def test_features_are_the_same_in_jax():
     joints, known = legs(), np.ones((120, 5, 2), bool)
     known[10:20, 2, 0] = False
@@ -214,6 +215,7 @@ def test_turning_is_positive_to_the_left():
 # --- network
 
 
+@pytest.mark.slow
 def test_the_network_is_saved_and_read_again(tmp_path):
     model = eqx.filter_jit(PhaseTransformer)(SMALL, jax.random.key(3))
     save_model(tmp_path / "m.npz", model, {"seed": 3})

@@ -95,6 +95,7 @@ def test_the_crop_is_centred_upright_in_the_region_and_as_large_as_asked():
     assert enlarged.matrix[0, 0] == pytest.approx(view.matrix[0, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [1, 3])
 def test_the_crop_shows_what_the_virtual_camera_sees(times):
     """Dots lie in the crop where their 3D points are seen, also where the picture is shown three times smaller."""
@@ -246,6 +247,7 @@ def test_root_that_cannot_be_known_is_nan():
 # --- the whole way
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("n", [2, 10])
 def test_crop_model_brings_the_points_back(tmp_path, place, n):
@@ -333,6 +335,7 @@ def test_scores_of_the_mirrored_picture_go_to_their_own_side(tmp_path):
     assert right > 0.7
 
 
+@pytest.mark.slow
 def test_several_frames_in_one_call_are_the_same_as_one_by_one(tmp_path):
     people = [dot_models.turned(person(), a) for a in (0.0, 0.1, 0.25)]
     images = [picture(project(x, CAMERA)) for x in people]
@@ -385,6 +388,7 @@ class BlazePoseAsCropModel:
         }
 
 
+@pytest.mark.slow
 def test_a_real_network_gives_the_same_by_this_way_and_its_own(monkeypatch):
     """Two looks, plain and mirrored, at a woman about 440 px high; the camera is that of the recording."""
     monkeypatch.setattr(_onnx_keypoints, "OnnxModel", BlazePoseAsCropModel)

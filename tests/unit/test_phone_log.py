@@ -277,6 +277,7 @@ def test_a_log_in_another_time_zone(tmp_path, folder, info):
     assert "UTC" in error.found
 
 
+@pytest.mark.slow
 def test_a_log_of_another_day(tmp_path, folder, info):
     """A converted file states when it was converted."""
     assert "3.0 days from" in load_attitude(folder, recorded(info, BEGIN_S + 3 * 86400)).source
@@ -312,6 +313,7 @@ def test_a_phone_on_a_stand(tmp_path):
     assert "stood still" in load_attitude(folder, still).source
 
 
+@pytest.mark.slow
 def test_a_log_of_another_hand_is_not_matched(tmp_path, info):
     """The same time, other movement: the time of recording alone does not do, where a log could lie in two places."""
     other = sensor_logger(tmp_path / "other", 30.0, begin_s=100.0)

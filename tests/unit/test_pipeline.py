@@ -60,6 +60,7 @@ def test_an_unknown_norm_is_refused_before_the_fit(fitted: list[list[str]], tmp_
     assert not fitted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("outcome", ["PASS", "FAIL"])
 def test_report_and_metrics_agree_on_the_outcome(
     fitted: list[list[str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, outcome: str

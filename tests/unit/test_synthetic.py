@@ -40,6 +40,7 @@ def column(qpos: np.ndarray, joint: str) -> np.ndarray:
 # --- the walk
 
 
+@pytest.mark.slow
 def test_joints_stay_within_their_ranges_whatever_the_seed():
     low, high = load_body().joint_range_rad.T
     for seed in range(60):

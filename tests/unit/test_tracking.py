@@ -256,6 +256,7 @@ def test_track_people_numbers_bridges_and_drops(spots_video):
     assert time_in_view_s(a, tracking.time_s) == pytest.approx(4.0)
 
 
+@pytest.mark.slow
 def test_a_long_time_out_of_sight_has_no_boxes(tmp_path):
     def frames():
         for i in range(120):
@@ -294,6 +295,7 @@ def test_paramset_names_the_model():
     assert len(method.hash) == 16
 
 
+@pytest.mark.slow
 def test_contact_sheet_shows_everybody(spots_video, tmp_path):
     import cv2
 
