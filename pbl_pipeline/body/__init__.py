@@ -11,7 +11,16 @@ jax_setup.configure()
 
 from pbl_pipeline.body._angles import angle_of, joint_angles, joint_of  # noqa: E402
 from pbl_pipeline.body._capsules import Capsules, capsules  # noqa: E402
-from pbl_pipeline.body._kinematics import body_poses, marker_positions  # noqa: E402
+from pbl_pipeline.body._chain import chain_frames  # noqa: E402
+from pbl_pipeline.body._frames import Frames, mjx_frames  # noqa: E402
+from pbl_pipeline.body._kinematics import (  # noqa: E402
+    MarkerJacobian,
+    Points,
+    body_poses,
+    marker_jacobian,
+    marker_positions,
+    scale_multipliers,
+)
 from pbl_pipeline.body._markers import MARKER_SETS, MarkerSet, load_marker_set, marker_set  # noqa: E402
 from pbl_pipeline.body._model import SCALE_NAMES, SLIDES, Body, load_body  # noqa: E402
 
@@ -21,14 +30,21 @@ __all__ = [
     "SLIDES",
     "Body",
     "Capsules",
+    "Frames",
+    "MarkerJacobian",
     "MarkerSet",
+    "Points",
     "angle_of",
     "body_poses",
     "capsules",
+    "chain_frames",
     "joint_angles",
     "joint_of",
     "load_body",
     "load_marker_set",
+    "marker_jacobian",
     "marker_positions",
     "marker_set",
+    "mjx_frames",
+    "scale_multipliers",
 ]

@@ -19,13 +19,14 @@ from mujoco import mjx
 _MJCF = Path(__file__).parent / "data" / "pbl_body_40.xml"
 _GROUP_PREFIX = "scale_group/"
 
-#: Joints that slide, along the pelvis' axes x, y and z at `qpos = 0` (m); all others turn (rad).
+#: The slides of the pelvis, along its axes x, y and z at `qpos = 0` (m); all other joints turn (rad).
 SLIDES = ("pelvis_tx", "pelvis_ty", "pelvis_tz")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Body:
-    """A body of B = 21 bodies and Q = 40 degrees of freedom. Index 0 is the pelvis: MuJoCo's world is left out.
+    """A tree of B bodies with Q degrees of freedom (the shipped one: 21 and 40) and S scale groups (8). Index 0 is the
+    root, the pelvis: MuJoCo's world is left out.
 
     Attributes
     ----------
@@ -33,13 +34,20 @@ class Body:
         The model for C MuJoCo and for MJX, and an empty state of the latter to start kinematics from.
     joint_names : Q names
         OpenSim's, in the order of `qpos`. The slides are pelvis_tx (forward), pelvis_tz (right), pelvis_ty (up).
+    joint_body, is_hinge, is_slide : (Q,)
+        Index of the body that a joint belongs to, and its kind.
     joint_range_rad : (Q, 2)
         Limits, radians (metres for slides); -inf, inf where unlimited.
     body_names : B names
     parent_index : (B,)
-        Index of the parent in `body_names`; -1 for the pelvis.
+        Index of the parent in `body_names`; -1 for the root.
+    path : (B, B)
+        1 where the second body is the first one or an ancestor of it.
+    moves : (B, Q)
+        1 where a joint moves a body.
+    scale_names : S names
     scale_index : (B,)
-        Which of `SCALE_NAMES` scales the body.
+        Which of `scale_names` scales the body.
     sha256, name, version
         Hash of the MJCF's bytes, and what the MJCF calls itself.
     """
@@ -49,8 +57,13 @@ class Body:
     mjx_data: mjx.Data
     joint_names: tuple[str, ...]
     joint_range_rad: np.ndarray
+    joint_body: np.ndarray
+    is_hinge: np.ndarray
+    is_slide: np.ndarray
     body_names: tuple[str, ...]
     parent_index: np.ndarray
+    path: np.ndarray
+    moves: np.ndarray
     scale_names: tuple[str, ...]
     scale_index: np.ndarray
     sha256: str
@@ -59,9 +72,13 @@ class Body:
 
 
 @functools.cache
-def load_body() -> Body:
-    """The 40-degree-of-freedom body (cached)."""
-    xml, model = _c_model()
+def load_body(path: Path = _MJCF) -> Body:
+    """The 40-degree-of-freedom body, or that of another MJCF of the same form (cached).
+
+    The MJCF names its scale groups in texts `scale_group/NAME`, whose data are the bodies of the group; `*` stands for
+    those of no other group.
+    """
+    xml, model = _c_model(path)
     texts = _texts(model)
     # Whoever asks first may be tracing: what is cached must be arrays, not that trace's constants.
     with jax.ensure_compile_time_eval():
@@ -69,16 +86,28 @@ def load_body() -> Body:
         mjx_data = mjx.make_data(model, impl="jax")
     limited = np.asarray(model.jnt_limited, bool)[:, None]
     names = tuple(model.body(i).name for i in range(1, model.nbody))
+    groups = _scale_groups(texts)
+    parent = np.asarray(model.body_parentid[1:], np.int32) - 1
+    joint_body = np.asarray(model.jnt_bodyid, np.int32) - 1
+    above = np.eye(len(names))
+    for i, p in enumerate(parent):
+        if p >= 0:
+            above[i] += above[p]
     return Body(
         mj_model=model,
         mjx_model=mjx_model,
         mjx_data=mjx_data,
         joint_names=tuple(model.joint(i).name for i in range(model.njnt)),
         joint_range_rad=_frozen(np.where(limited, model.jnt_range, np.array([-np.inf, np.inf]))),
+        joint_body=_frozen(joint_body),
+        is_hinge=_frozen(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE),
+        is_slide=_frozen(model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE),
         body_names=names,
-        parent_index=_frozen(np.asarray(model.body_parentid[1:], np.int32) - 1),
-        scale_names=SCALE_NAMES,
-        scale_index=_frozen(_scale_index(names, _scale_groups(texts))),
+        parent_index=_frozen(parent),
+        path=_frozen(above),
+        moves=_frozen(above[:, joint_body]),
+        scale_names=tuple(groups),
+        scale_index=_frozen(_scale_index(names, groups)),
         sha256=hashlib.sha256(xml).hexdigest(),
         name=_name(model),
         version=texts["version"],
@@ -86,8 +115,8 @@ def load_body() -> Body:
 
 
 @functools.cache
-def _c_model() -> tuple[bytes, mujoco.MjModel]:
-    xml = _MJCF.read_bytes()
+def _c_model(path: Path) -> tuple[bytes, mujoco.MjModel]:
+    xml = path.read_bytes()
     return xml, mujoco.MjModel.from_xml_string(xml.decode())
 
 
@@ -124,4 +153,4 @@ def _frozen(array: np.ndarray) -> np.ndarray:
 
 
 #: The entries of `scale`, as the MJCF lists them: overall first, then the groups.
-SCALE_NAMES: tuple[str, ...] = tuple(_scale_groups(_texts(_c_model()[1])))
+SCALE_NAMES: tuple[str, ...] = tuple(_scale_groups(_texts(_c_model(_MJCF)[1])))

@@ -1,7 +1,13 @@
 """The session fit: keypoints of 1..N trials to joint angles, one body for all."""
 
 from ._default import default_for_points, default_method
-from ._inputs import LEVEL_CAMERA_R_NC, Trial
+from ._fit_session import (
+    LEVEL_CAMERA_QUAT_WXYZ,
+    SessionInput,
+    check_trial,
+    fit_session,
+    fit_sessions,
+)
 from ._params import (
     METHODS,
     CostParams,
@@ -10,15 +16,9 @@ from ._params import (
     Params,
     ViewParams,
 )
-from ._session import (
-    LEVEL_CAMERA_QUAT_WXYZ,
-    SessionInput,
-    check_trial,
-    fit_session,
-    fit_sessions,
-    paper_objective,
-)
-from ._types import SessionFit, TrialFit
+from .paper_objective import paper_objective
+from .results import SessionFit, TrialFit
+from .session import LEVEL_CAMERA_R_NC, Trial
 
 __all__ = [
     "LEVEL_CAMERA_QUAT_WXYZ",

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from pbl_pipeline.keypoints import MultiView, WorldMarkers
 
-from ._inputs import Trial
 from ._params import METHODS
+from .session import Trial
 
 
 def default_method(trials: Sequence[Trial]) -> str:

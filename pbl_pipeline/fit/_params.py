@@ -215,8 +215,8 @@ Params = GaussNewtonParams | ImplicitAdamParams
 
 #: A family is a solver.
 METHODS: Stage[Params] = Stage("fit", "solver", "blazepose")
-METHODS.register("paper-2025", 1, PAPER_2025, "pbl_pipeline.fit.solvers:solve_implicit_adam")
-METHODS.register("paper-gauss-newton", 1, PAPER_GAUSS_NEWTON, "pbl_pipeline.fit.solvers:solve_gauss_newton")
+METHODS.register("paper-2025", 1, PAPER_2025, "pbl_pipeline.fit.implicit:solve_sessions")
+METHODS.register("paper-gauss-newton", 1, PAPER_GAUSS_NEWTON, "pbl_pipeline.fit.per_frame:solve_per_frame")
 METHODS.register("gauss-newton", 1, GAUSS_NEWTON)
 METHODS.register("blazepose", 1, BLAZEPOSE)
 METHODS.register("markers", 1, MARKERS)

@@ -9,8 +9,8 @@ import numpy as np
 
 from pbl_pipeline.body import SLIDES
 
-from ._inputs import MEASURED, Session
-from ._place import pelvis_path, pelvis_rest
+from .initial_pose import pelvis_path, pelvis_rest
+from .session import MEASURED, Session
 
 #: Standard deviation (deg) of a phone's slow error about the vertical, which nothing holds, and about the level axes,
 #: which gravity holds. Those of the synthetic phone (`synthetic.PhoneSensor`); magnets and cars make it worse.

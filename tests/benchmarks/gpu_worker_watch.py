@@ -35,8 +35,7 @@ def watch(path: Path) -> None:
     import jax
     import numpy as np
 
-    from pbl_pipeline.fit import _session
-    from pbl_pipeline.fit.solvers import gauss_newton
+    from pbl_pipeline.fit import _fit_session, per_frame
     from schemas import fit
     from workers import queue, run_job
 
@@ -54,19 +53,19 @@ def watch(path: Path) -> None:
         (run_job, "fetch_batch", number_of),
         (run_job, "compute_batch", number_of),
         (run_job, "run", None),
-        (_session, "make_session", None),
-        (_session, "start_of", None),
-        (_session, "_session_fit", None),
-        (gauss_newton, "_on_floor", None),
-        (gauss_newton, "_solve", number_of),
+        (_fit_session, "make_session", None),
+        (_fit_session, "start_of", None),
+        (_fit_session, "_session_fit", None),
+        (per_frame, "_on_floor", None),
+        (per_frame, "_solve", number_of),
         (fit.SessionFit, "_loaded", None),
         (fit.SessionFit, "make_compute", None),
         (fit.SessionFit, "make_insert", None),
         (np, "savez_compressed", None),
     ):
         setattr(module, name, notes.noted(getattr(module, name), name.strip("_"), n))
-    for name in ("_minimise_one", "_minimise_many", "_finish_one", "_finish_many"):
-        setattr(gauss_newton, name, notes.noted(waited(getattr(gauss_newton, name)), "device"))
+    for name in ("_one", "_many", "_finish_one", "_finish_many"):
+        setattr(per_frame, name, notes.noted(waited(getattr(per_frame, name)), "device"))
 
 
 class Notes:

@@ -28,10 +28,10 @@ from typing import Any
 import click
 import numpy as np
 
-from pbl_pipeline.body import SLIDES
+from pbl_pipeline.body import SLIDES, load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, GaussNewtonParams, SessionInput, fit_sessions
-from pbl_pipeline.fit.solvers.gauss_newton import by_joint, floors_of
+from pbl_pipeline.fit.per_frame import by_joint, floors_of
 from pbl_pipeline.methods import Method
 from pbl_pipeline.synthetic import BLAZEPOSE_NOISE, SynthSpec, observe, person, synthesise, walk_qpos
 
@@ -176,7 +176,7 @@ def floors_for(errors: np.ndarray, sds: np.ndarray, names: Sequence[str]) -> tup
 
 def coverage(errors: np.ndarray, sds: np.ndarray, names: Sequence[str], params: GaussNewtonParams) -> dict[str, float]:
     """Share of the samples of each group within the interval."""
-    factor, floor = by_joint(names, params.sd_factor, 1.0), floors_of(names, params.sd_floor)
+    factor, floor = by_joint(names, params.sd_factor, 1.0), floors_of(load_body(), params.sd_floor)
     inside = errors < WIDTH_SD * np.sqrt((sds * factor) ** 2 + floor**2)
     return {g: float(np.mean(inside[:, columns(names, g)])) for g in GROUPS}
 

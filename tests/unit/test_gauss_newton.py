@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -12,25 +11,42 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import MarkerSet, body_poses, load_body, marker_positions, marker_set
-from pbl_pipeline.body._jacobian import MarkerTable, marker_jacobian, table_positions
-from pbl_pipeline.body._kinematics import scaled_body_pos
-from pbl_pipeline.fit import CostParams, GaussNewtonParams, ViewParams
-from pbl_pipeline.fit._costs import (
-    beyond_limit_deg,
-    distance_2d_px2,
-    distance_3d_cm2,
-    project_jacobian,
-    project_px,
-    second_difference,
+from pbl_pipeline.body import (
+    MarkerSet,
+    body_poses,
+    chain_frames,
+    load_body,
+    marker_jacobian,
+    marker_positions,
+    marker_set,
+    mjx_frames,
+    scale_multipliers,
 )
-from pbl_pipeline.fit._inputs import Session, make_session
-from pbl_pipeline.fit._observations import SAMPLE_S, bend_weights
-from pbl_pipeline.fit.solvers import _arrow
-from pbl_pipeline.fit.solvers._arrow import Arrow, marginal_variance, solve
-from pbl_pipeline.fit.solvers._contact import _height_cm, _way_cm, sole_positions, standing
-from pbl_pipeline.fit.solvers._normal import State, _phone_error_deg, cost, normal_equations, scale_multipliers
-from pbl_pipeline.fit.solvers.gauss_newton import kinds_of, start_of, weights_of
+from pbl_pipeline.fit import CostParams, GaussNewtonParams, ViewParams, linear
+from pbl_pipeline.fit.linear import BorderedBandedSystem, marginal_variance, solve
+from pbl_pipeline.fit.normal_equations import linearise, linearised, measured_orientation, moved
+from pbl_pipeline.fit.objective import (
+    At,
+    State,
+    in_camera,
+    later,
+    mean_weights,
+    no_phone,
+    offset_m,
+    project_px,
+    residual_2d_px,
+    residual_3d_cm,
+    residual_floor_cm,
+    residual_phone_deg,
+    residual_slide_cm,
+    slide_contact,
+    square,
+    total,
+)
+from pbl_pipeline.fit.per_frame import standing, start_of
+from pbl_pipeline.fit.priors import Weights, bent, beyond_limit_deg
+from pbl_pipeline.fit.problem import SAMPLE_S, bend_weights, point_table
+from pbl_pipeline.fit.session import Session, make_session
 from pbl_pipeline.synthetic import observe, observe_markers, observe_views, walk_qpos
 
 pytestmark = pytest.mark.slow
@@ -57,11 +73,13 @@ def few_markers() -> MarkerSet:
 # --- the structured system ---
 
 
-def random_arrow(frames: int, rng: np.random.Generator, q: int = 5, k: int = 4) -> tuple[Arrow, np.ndarray]:
-    """A positive definite arrow and the same matrix in full."""
+def random_system(
+    frames: int, rng: np.random.Generator, q: int = 5, k: int = 4
+) -> tuple[BorderedBandedSystem, np.ndarray]:
+    """A positive definite system and the same matrix in full."""
     rows = rng.normal(size=(frames, q, q))
     diagonal = rows @ rows.swapaxes(1, 2) + 8 * np.eye(q)
-    next_1, next_2 = rng.normal(size=(2, frames, q))
+    next_1, next_2 = 0.5 * rng.normal(size=(frames, q, q)), rng.normal(size=(frames, q))
     next_1[-1:], next_2[-2:] = 0, 0
     border = rng.normal(size=(frames, q, k))
     corner = rng.normal(size=(k, k))
@@ -72,27 +90,29 @@ def random_arrow(frames: int, rng: np.random.Generator, q: int = 5, k: int = 4) 
         full[at, at] = diagonal[t]
         full[at, -k:] = border[t]
         full[-k:, at] = border[t].T
-        for step, link in ((1, next_1), (2, next_2)):
+        for step, link in ((1, next_1[t]), (2, np.diag(next_2[t]))):
             if t + step < frames:
                 to = slice((t + step) * q, (t + step + 1) * q)
-                full[at, to] = full[to, at] = np.diag(link[t])
+                full[at, to], full[to, at] = link, link.T
     full[-k:, -k:] = corner
     assert np.linalg.eigvalsh(full)[0] > 0.05
-    return Arrow(*(jnp.asarray(a, jnp.float32) for a in (diagonal, next_1, next_2, border, corner))), full
+    return BorderedBandedSystem(
+        *(jnp.asarray(a, jnp.float32) for a in (diagonal, next_1, next_2, border, corner))
+    ), full
 
 
-def solution_and_variance(arrow, g, h):
+def solution_and_variance(system, g, h):
     """Both in one program, which compiles what they share once."""
-    return solve(arrow, g, h), marginal_variance(arrow)
+    return solve(system, g, h), marginal_variance(system)
 
 
 @pytest.mark.parametrize("frames", [2, 4, 6, 10, 14, 24])
-def test_the_arrow_is_solved_as_the_full_matrix(frames):
+def test_a_bordered_system_is_solved_as_the_full_matrix(frames):
     rng = np.random.default_rng(frames)
-    arrow, full = random_arrow(frames, rng)
+    system, full = random_system(frames, rng)
     g, h = rng.normal(size=(frames, 5)), rng.normal(size=4)
     (x, y), (by_frame, shared) = jax.jit(solution_and_variance)(
-        arrow, jnp.asarray(g, jnp.float32), jnp.asarray(h, jnp.float32)
+        system, jnp.asarray(g, jnp.float32), jnp.asarray(h, jnp.float32)
     )
     want = np.linalg.solve(full, np.concatenate([g.ravel(), h]))
     np.testing.assert_allclose(np.concatenate([np.ravel(x), y]), want, atol=2e-5 * np.abs(want).max())
@@ -103,20 +123,20 @@ def test_the_arrow_is_solved_as_the_full_matrix(frames):
 @pytest.mark.parametrize(("k", "columns"), [(4, 3), (4, 32), (6, 3)])
 def test_a_large_border_by_columns_gives_the_same(k, columns, monkeypatch):
     rng = np.random.default_rng(k)
-    arrow, full = random_arrow(10, rng, k=k)
+    system, full = random_system(10, rng, k=k)
     g, h = rng.normal(size=(10, 5)), rng.normal(size=k)
-    monkeypatch.setattr(_arrow, "LARGE_BORDER", 0)
-    monkeypatch.setattr(_arrow, "COLUMNS", columns)
-    (x, y), (by_frame, shared) = solution_and_variance(arrow, jnp.asarray(g, jnp.float32), jnp.asarray(h, jnp.float32))
+    monkeypatch.setattr(linear, "LARGE_BORDER", 0)
+    monkeypatch.setattr(linear, "COLUMNS", columns)
+    (x, y), (by_frame, shared) = solution_and_variance(system, jnp.asarray(g, jnp.float32), jnp.asarray(h, jnp.float32))
     want = np.linalg.solve(full, np.concatenate([g.ravel(), h]))
     np.testing.assert_allclose(np.concatenate([np.ravel(x), y]), want, atol=2e-5 * np.abs(want).max())
     np.testing.assert_allclose(np.concatenate([np.ravel(by_frame), shared]), np.diag(np.linalg.inv(full)), rtol=1e-4)
 
 
-def test_many_arrows_at_once():
+def test_many_systems_at_once():
     rng = np.random.default_rng(7)
-    arrows, fulls = zip(*[random_arrow(6, rng) for _ in range(3)], strict=True)
-    many = jax.tree.map(lambda *a: jnp.stack(a), *arrows)
+    systems, fulls = zip(*[random_system(6, rng) for _ in range(3)], strict=True)
+    many = jax.tree.map(lambda *a: jnp.stack(a), *systems)
     g, h = rng.normal(size=(3, 6, 5)), rng.normal(size=(3, 4))
     (x, y), (by_frame, _) = jax.jit(jax.vmap(solution_and_variance))(
         many, jnp.asarray(g, jnp.float32), jnp.asarray(h, jnp.float32)
@@ -139,14 +159,16 @@ def random_body_state(rng: np.random.Generator, poses: int, markers: int) -> tup
 
 
 def test_derivatives_of_markers_are_those_of_automatic_differentiation():
-    body, table = load_body(), MarkerTable.of(few_markers(), 24)
-    qpos, scale, offset = random_body_state(np.random.default_rng(1), 5, 24)
+    body = load_body()
+    table = point_table(body, few_markers(), 24)
+    n = len(table.body_index)
+    qpos, scale, offset = random_body_state(np.random.default_rng(1), 5, n)
     ours = jax.jit(marker_jacobian, static_argnames="body")(body, table, qpos, scale, offset)
     plain = marker_positions(body, few_markers(), qpos, scale, offset[:20])
     np.testing.assert_allclose(ours.x_world_m[:, :20], plain, atol=1e-5)
 
     def one(q, s, o):
-        return table_positions(body, table, q[None], s, o)[0]
+        return marker_positions(body, table, q, s, o)
 
     by_q, by_s, by_o = jax.jit(jax.vmap(jax.jacfwd(one, (0, 1, 2)), (0, None, None)))(qpos, scale, offset)
     np.testing.assert_allclose(ours.per_qpos, by_q, atol=1e-5)
@@ -163,10 +185,9 @@ def test_bodies_are_where_mujoco_and_mjx_have_them():
     body = load_body()
     qpos, scale, _ = random_body_state(np.random.default_rng(2), 8, 1)
     xpos, xmat = body_poses(body, qpos, scale)
-    positions = np.asarray(scaled_body_pos(body, scale))
-
     model = body.mj_model.__copy__()
-    model.body_pos[1:] = positions
+    for b, parent in enumerate(body.parent_index):
+        model.body_pos[b + 1] *= scale[body.scale_index[parent]] if parent >= 0 else 1.0
     data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
     for t in range(len(qpos)):
         data.qpos[:] = np.asarray(qpos[t], np.float64)
@@ -205,6 +226,20 @@ PARAMS = GaussNewtonParams(
 )
 
 
+def test_the_markers_are_the_same_by_mjx_forward_and_reverse():
+    body, markers = load_body(), few_markers()
+    rng = np.random.default_rng(8)
+    at = random_body_state(rng, 5, 20)
+    pull = jnp.asarray(rng.normal(size=(5, 20, 3)), jnp.float32)
+
+    def both(forward):
+        x, back = jax.vjp(lambda *a: marker_positions(body, markers, *a, forward=forward), *at)
+        return x, *back(pull)
+
+    for ours, theirs in zip(jax.jit(lambda: both(chain_frames))(), jax.jit(lambda: both(mjx_frames))(), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=2e-5 * float(jnp.abs(theirs).max()))
+
+
 def small_session(kind: str) -> Session:
     """Two trials of 24 frames each."""
     few, trials, motion = few_markers(), [], "handheld" if "moving" in kind else "static"
@@ -218,8 +253,9 @@ def small_session(kind: str) -> Session:
             trials.append(observe(qpos, TIME_S, marker_set=few, seed=seed, camera_motion=motion).keypoints)
     session = make_session(trials, ["a", "b"], PARAMS.view, [motion] * 2, few)
     if "floor" in kind:
-        seen = np.random.default_rng(5).random(session.obs.contact.shape) * session.obs.weight[:, None]
-        session = dataclasses.replace(session, obs=dataclasses.replace(session.obs, contact=jnp.asarray(seen)))
+        p = session.problem
+        seen = jnp.asarray(np.random.default_rng(5).random(p.contact.shape) * p.weight[:, None])
+        session = dataclasses.replace(session, problem=dataclasses.replace(p, contact=seen))
     return session
 
 
@@ -231,78 +267,76 @@ def away(session: Session, seed: int = 3) -> State:
     turned = jnp.asarray(np.einsum("fij,fvjk->fvik", turn, state.R_nc), jnp.float32)
     return State(
         qpos=noise(state.qpos, 0.15),
-        R_nc=turned if session.moving else state.R_nc,
+        R_nc=turned if session.problem.moving else state.R_nc,
         s=noise(state.s, 0.05),
-        site_offset_m=noise(state.site_offset_m, 0.01) * session.table.weight[:, None],
+        site_offset_m=noise(state.site_offset_m, 0.01) * (np.arange(len(state.site_offset_m)) < 20)[:, None],
         clock_s=noise(state.clock_s, 0.02) + 0.003,
         floor=noise(state.floor - np.array([1.2, 0.0, 0.0]), 0.03),
     )
 
 
+def cost(session: Session, w: Weights, state: State) -> jax.Array:
+    """The total at a state, without the normal equations."""
+    p, scale = session.problem, scale_multipliers(state.s)
+    x = marker_positions(session.body, p.points, state.qpos, scale, p.point_offsets(state.site_offset_m))
+    markers, soles, _ = p.split(x)
+    phone = no_phone()
+    if p.moving:
+        weights = p.weight * p.has_phone[p.trial] / jnp.sum(p.weight)
+        phone = jaxlie.SO3.from_matrix(state.R_nc[:, 0]), measured_orientation(p, state.clock_s[p.trial]), weights
+    return total(At(p, w, state, markers, soles, phone))
+
+
 @pytest.mark.parametrize("kind", ["static", "moving", "views", "world", "floor", "moving floor"])
 def test_normal_equations_hold_the_gradient_of_the_cost(kind):
     session = small_session(kind)
-    w, state, kinds = weights_of(session, PARAMS), away(session), kinds_of(session)
-    obs, fixed = session.obs, (session.body, session.table, session.obs, w, kinds)
-    assert kinds.moving == ("moving" in kind)
-    assert kinds.contact == ("floor" in kind)
-    n = float(jnp.sum(obs.weight))
-    assert 30 < n < len(obs.weight)  # and padding
+    p, w, state = session.problem, Weights.of(session.body, PARAMS), away(session)
+    assert p.moving == ("moving" in kind)
+    n = float(jnp.sum(p.weight))
+    assert 30 < n < len(p.weight)  # and padding
 
-    def total(change):
-        turn = jaxlie.SO3.exp(change["turn"]).as_matrix()
-        moved = State(
-            qpos=state.qpos + change["qpos"],
-            R_nc=jnp.einsum("fij,fvjk->fvik", turn, state.R_nc, precision="highest"),
-            s=state.s + change["s"],
-            site_offset_m=state.site_offset_m + change["offset"],
-            clock_s=state.clock_s + change["clock"],
-            floor=state.floor + change["floor"],
-        )
-        return n * cost(*fixed, moved)
+    def changed(dx, dy):
+        return n * cost(session, w, moved(state, dx, dy))
 
-    none = {
-        "qpos": jnp.zeros_like(state.qpos),
-        "turn": jnp.zeros((len(state.qpos), 3)),
-        "s": jnp.zeros(8),
-        "offset": jnp.zeros_like(state.site_offset_m),
-        "clock": jnp.zeros_like(state.clock_s),
-        "floor": jnp.zeros_like(state.floor),
-    }
-    want = jax.jit(jax.grad(total))(none)
-    matrix, g, h = jax.jit(lambda s: normal_equations(*fixed, s))(state)
+    at = jax.jit(lambda s: linearise(session.body, p, w, s))(state)
+    want_g, want_h = jax.jit(jax.grad(changed, (0, 1)))(jnp.zeros_like(at.g), jnp.zeros_like(at.h))
+    assert float(at.cost) == pytest.approx(float(cost(session, w, state)), rel=1e-5)
     k = 8 + state.site_offset_m.size
-    ours = {"qpos": g[:, :40], "s": h[:8], "offset": h[8:k].reshape(-1, 3)}
-    if kinds.moving:
-        ours |= {"turn": g[:, 40:], "clock": h[k : k + 2]}
-    if kinds.contact:
-        ours["floor"] = h[-6:].reshape(-1, 3)
-    for name, value in ours.items():
-        w_ = np.asarray(want[name])
-        assert np.abs(w_).max() > 0.1, name
-        np.testing.assert_allclose(-np.asarray(value), w_, atol=1e-3 * np.abs(w_).max(), rtol=1e-3, err_msg=name)
-    assert np.all(np.linalg.eigvalsh(np.asarray(matrix.corner, np.float64)) > -1e-3 * np.abs(matrix.corner).max())
-    np.testing.assert_allclose(matrix.diagonal, np.swapaxes(matrix.diagonal, 1, 2), atol=1e-3 * np.abs(g).max())
+    pairs = {
+        "qpos": (at.g[:, :40], want_g[:, :40]),
+        "s": (at.h[:8], want_h[:8]),
+        "offset": (at.h[8:k], want_h[8:k]),
+        "floor": (at.h[-6:], want_h[-6:]),
+    }
+    if p.moving:
+        pairs |= {"turn": (at.g[:, 40:], want_g[:, 40:]), "clock": (at.h[k : k + 2], want_h[k : k + 2])}
+    for name, (ours, want) in pairs.items():
+        most = np.abs(want).max()
+        assert most > (0.1 if name != "floor" or "floor" in kind else 1e-4), name
+        np.testing.assert_allclose(-np.asarray(ours), want, atol=1e-3 * most, rtol=1e-3, err_msg=name)
+    corner, diagonal = np.asarray(at.system.corner, np.float64), at.system.diagonal
+    assert np.all(np.linalg.eigvalsh(corner) > -1e-3 * np.abs(corner).max())
+    np.testing.assert_allclose(diagonal, np.swapaxes(diagonal, 1, 2), atol=1e-3 * np.abs(at.g).max())
 
 
 def test_curvature_of_the_soles_is_that_of_their_residuals():
     """v' H v of what they add to the matrix against the residuals' change along v (Gauss-Newton, no robust weights)."""
     session = small_session("floor")
     params = dataclasses.replace(PARAMS, huber_floor_cm=1e6, huber_slide_cm=1e6)
-    w, state, obs = weights_of(session, params), away(session), session.obs
-    matrix, nothing = {}, jnp.zeros(())
+    w, state, p = Weights.of(session.body, params), away(session), session.problem
+    nothing = jnp.zeros(())
     without = dataclasses.replace(w, weight_floor=nothing, weight_slide=nothing)
-    for name, weights in (("all", w), ("none", without)):
-        equations = functools.partial(normal_equations, session.body, session.table, obs, weights, kinds_of(session))
-        matrix[name] = jax.jit(equations)(state)[0]
-    own = jax.tree.map(lambda a, b: np.asarray(a - b, np.float64), matrix["all"], matrix["none"])
+    system = [jax.jit(lambda s, w=w: linearise(session.body, p, w, s))(state).system for w in (w, without)]
+    own = jax.tree.map(lambda a, b: np.asarray(a - b, np.float64), *system)
 
     def residuals(qpos, s, floor):
-        x = sole_positions(session.body, qpos, scale_multipliers(s))
-        height, (way, _, share) = _height_cm(x, obs, floor)[0], _way_cm(x, obs)
+        offsets = p.point_offsets(state.site_offset_m)
+        x = p.split(marker_positions(session.body, p.points, qpos, scale_multipliers(s), offsets))[1]
+        height = residual_floor_cm(x, floor[p.trial][:, None])
+        slide = residual_slide_cm(x, later(x), p.rate[:, None])
         return (
-            jnp.sqrt(obs.weight[:, None] * obs.contact * w.weight_floor) * height,
-            jnp.sqrt(share * w.weight_slide)[..., None] * way,
+            jnp.sqrt(p.weight[:, None] * p.contact * w.weight_floor)[..., None] * height,
+            jnp.sqrt(p.weight[:, None] * slide_contact(p) * w.weight_slide)[..., None] * slide,
         )
 
     rng = np.random.default_rng(6)
@@ -347,7 +381,7 @@ def test_second_difference_of_a_parabola_with_uneven_time_stamps():
     # The second derivative, -9 per s^2, for a step of 1/30 s; none of a straight line.
     want = np.zeros((7, 2))
     want[1:-1, 0] = -9 / 900
-    np.testing.assert_allclose(second_difference(q, jnp.asarray(bend, jnp.float32)), want, atol=2e-5)
+    np.testing.assert_allclose(bent(q, jnp.asarray(bend, jnp.float32)), want, atol=2e-5)
     even = bend_weights(np.arange(5) / 30, np.ones(5, bool))
     np.testing.assert_allclose(even[1:-1], [[1, -2, 1]] * 3, atol=1e-9)
 
@@ -359,12 +393,13 @@ def test_second_differences_span_gaps_and_end_with_the_frames_that_count():
 
 
 def test_depth_counts_by_its_ratio():
-    R, c = jnp.eye(3), jnp.ones(2)
+    c = jnp.ones(2)
     model = jnp.array([[0.0, 0.0, 4.0], [0.0, 0.0, 4.0]])
     # Apart by 2 cm across and 6 cm along the camera's axis; centred, each point is off by half of it.
     detected = model + jnp.array([[0.01, 0.0, 0.03], [-0.01, 0.0, -0.03]])
+    away = offset_m(model, detected, mean_weights(c, jnp.ones(2)))
     for ratio in (1.0, 0.5):
-        got = distance_3d_cm2(model, detected, R, c, 1.0, ratio)
+        got = square(residual_3d_cm(model - away, detected, ratio))
         np.testing.assert_allclose(got, [1 + 9 * ratio**2] * 2, rtol=1e-3)
 
 
@@ -372,32 +407,34 @@ def test_distance_in_pixels_of_a_moved_and_turned_camera():
     # 90 deg about world z: the camera's right is world +x, its forward world +y.
     R = jnp.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     K = jnp.array([[1000.0, 0, 500], [0, 1000, 400], [0, 0, 1]])
-    x = jnp.array([[1.0, 5.0, 0.5]]) - jnp.array([0.0, 1.0, 0.0])
+    x = in_camera(jnp.array([[[1.0, 5.0, 0.5]]]), R[None, None], jnp.array([[[0.0, 1.0, 0.0]]]))
     # Ahead by 4 m, right by 1 m, up by 0.5 m: 250 px right and 125 px up of the middle.
-    np.testing.assert_allclose(distance_2d_px2(x, jnp.array([[753.0, 271.0]]), R, K), [9 + 16], rtol=1e-3)
+    np.testing.assert_allclose(residual_2d_px(x, jnp.array([[753.0, 271.0]]), K)[0, 0], [[-3, 4]], rtol=1e-3)
 
 
-def test_derivative_of_the_projection_also_near_and_behind_the_camera():
+def test_derivatives_of_residuals_are_their_own_also_near_and_behind_the_camera():
     K = jnp.array([[900.0, 0, 500], [0, 1100, 400], [0, 0, 1]])
     x = jnp.array([[0.3, -0.2, 4.0], [0.3, 0.1, 0.12], [-0.1, 0.2, -0.05]])
     want = jax.vmap(jax.jacfwd(lambda p: project_px(p[None], K)[0]))(x)
-    np.testing.assert_allclose(project_jacobian(x, K), want, rtol=1e-4, atol=1e-2)
+    value, got = linearised(lambda p: project_px(p, K), x)
+    np.testing.assert_allclose(value, project_px(x, K))
+    np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-2)
 
 
 def test_phone_error_by_hand():
     """A phone that turns by 40 deg/s about z, a fitted camera that is 1.5 deg further, a clock that is 25 ms late."""
-    session = small_session("moving")
-    start_s, obs = float(session.obs.sample_start_s[0]), session.obs
-    at_s = start_s + SAMPLE_S * np.arange(obs.sample_quat_wxyz.shape[1])
+    p = small_session("moving").problem
+    at_s = float(p.sample_start_s[0]) + SAMPLE_S * np.arange(p.sample_quat_wxyz.shape[1])
     z = np.array([0.0, 0, 1])
     quat = Rotation.from_rotvec(np.deg2rad(40 * at_s)[:, None] * z).as_quat(scalar_first=True)
-    quat = jnp.asarray(np.broadcast_to(quat, obs.sample_quat_wxyz.shape), jnp.float32)
-    obs = dataclasses.replace(obs, sample_quat_wxyz=quat)
-    camera = Rotation.from_rotvec(np.deg2rad(40 * np.asarray(obs.time_s) + 1.5)[:, None] * z).as_matrix()
-    state = dataclasses.replace(
-        start_of(session), R_nc=jnp.asarray(camera[:, None], jnp.float32), clock_s=jnp.asarray([0.025, 0.0])
+    p = dataclasses.replace(
+        p, sample_quat_wxyz=jnp.asarray(np.broadcast_to(quat, p.sample_quat_wxyz.shape), jnp.float32)
     )
-    error, rate = _phone_error_deg(obs, state)
-    trial = np.asarray(obs.trial)
-    np.testing.assert_allclose(error, (1.5 - 40 * np.array([0.025, 0.0])[trial])[:, None] * z, atol=2e-3)
-    np.testing.assert_allclose(rate, np.deg2rad(40) * np.broadcast_to(z, rate.shape), atol=1e-3)
+    p = jax.tree.map(jnp.asarray, p)
+    camera = Rotation.from_rotvec(np.deg2rad(40 * np.asarray(p.time_s) + 1.5)[:, None] * z).as_matrix()
+    fitted, clock_s = jaxlie.SO3.from_matrix(jnp.asarray(camera, jnp.float32)), jnp.array([0.025, 0.0])[p.trial]
+    error, rate = linearised(
+        lambda t: residual_phone_deg(fitted, measured_orientation(p, clock_s + t[:, 0])), jnp.zeros((len(clock_s), 1))
+    )
+    np.testing.assert_allclose(error, (1.5 - 40 * np.asarray(clock_s))[:, None] * z, atol=2e-3)
+    np.testing.assert_allclose(rate[..., 0], -40 * np.broadcast_to(z, error.shape), atol=0.06)

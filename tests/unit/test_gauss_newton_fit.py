@@ -22,23 +22,23 @@ from pbl_pipeline.fit import (
     SessionFit,
     SessionInput,
     TrialFit,
-    _inputs,
-    _observations,
-    _session,
+    _fit_session,
     fit_session,
     fit_sessions,
+    per_frame,
+    problem,
 )
-from pbl_pipeline.fit._gravity import on_their_feet, vertical
-from pbl_pipeline.fit._place import placed_poses
-from pbl_pipeline.fit.solvers import Solution, gauss_newton
-from pbl_pipeline.fit.solvers.gauss_newton import by_joint, floors_of
+from pbl_pipeline.fit.initial_pose import placed_poses
+from pbl_pipeline.fit.per_frame import by_joint, floors_of
+from pbl_pipeline.fit.solution import Solution
+from pbl_pipeline.fit.vertical import on_their_feet, vertical
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.synthetic import Noise, Seen, observe, observe_markers, observe_views, person, walk_qpos
 
+PARAMSET = METHODS["gauss-newton"]
 pytestmark = pytest.mark.slow
 
-PARAMSET = METHODS["gauss-newton"]
 TIME_S, HALF_S = np.arange(120) / 30, np.arange(60) / 30
 #: Fits that several tests compare with: seeds of persons and walks.
 SEEDS = (5, 6, 7)
@@ -48,7 +48,7 @@ SEEDS = (5, 6, 7)
 def one_size() -> Iterator[None]:
     """One trial is packed like two."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_observations, "pad_trials", lambda n, coarse=False: max(2, 1 << (n - 1).bit_length()))
+        patch.setattr(problem, "pad_trials", lambda n, coarse=False: max(2, 1 << (n - 1).bit_length()))
         yield
 
 
@@ -206,9 +206,9 @@ def test_laboratory_markers():
 
 @pytest.mark.parametrize("name", ["gauss-newton", "blazepose"])
 def test_standard_deviations_of_every_joint_are_calibrated(name):
-    names, params = load_body().joint_names, METHODS[name].params
+    body, params = load_body(), METHODS.find(METHODS[name]).params
     assert isinstance(params, GaussNewtonParams)
-    floors, factors = floors_of(names, params.sd_floor), by_joint(names, params.sd_factor, 1.0)
+    floors, factors = floors_of(body, params.sd_floor), by_joint(body.joint_names, params.sd_factor, 1.0)
     assert np.all((floors > 0) | (factors != 1.0))
     # Degrees for turns, centimetres for slides.
     assert np.all(floors < np.deg2rad(30))
@@ -240,10 +240,9 @@ def test_neither_company_nor_padding_changes_a_result(walkers, one_by_one, monke
     trial = walkers[0].trials[0]
     assert isinstance(trial, Keypoints)
     bad = SessionInput([dataclasses.replace(trial, confidence=np.zeros_like(trial.confidence))], ["bad"])
-    monkeypatch.setattr(_observations, "pad_frames", lambda n, coarse=False: 192 if n <= 192 else 512)
-    monkeypatch.setattr(_observations, "pad_markers", lambda n: 128)
-    monkeypatch.setattr(_inputs, "pad_markers", lambda n: 128)
-    monkeypatch.setattr(_observations, "pad_trials", lambda n, coarse=False: 4)
+    monkeypatch.setattr(problem, "pad_frames", lambda n, coarse=False: 192 if n <= 192 else 512)
+    monkeypatch.setattr(problem, "pad_markers", lambda n: 128)
+    monkeypatch.setattr(problem, "pad_trials", lambda n, coarse=False: 4)
     together = fit_sessions([walkers[0], bad, *walkers[1:]], PARAMSET, batch=3)
     error = together.pop(1)
     assert isinstance(error, PblError)
@@ -262,7 +261,7 @@ def test_sessions_with_other_terms_are_not_solved_together(walkers, monkeypatch)
     def nothing(part, params) -> list[Solution]:
         sessions = [p.session for p in part]
         asked.append([s.names[0] for s in sessions])
-        f, j = len(sessions[0].obs.weight), len(sessions[0].markers)
+        f, j = len(sessions[0].problem.weight), len(sessions[0].markers)
         names = {"qpos": (f, 40), "R_nc": (f, 1, 3, 3), "s": (8,), "scale": (8,), "site_offset_m": (j, 3)}
         sizes: dict[str, Any] = {**names, "clock_s": (1,), "loss_trace": (1, 2)}
         values: dict[str, Any] = {k: np.full(v, np.nan) for k, v in sizes.items()}
@@ -271,7 +270,7 @@ def test_sessions_with_other_terms_are_not_solved_together(walkers, monkeypatch)
         nan = Solution(**(values | {"seconds": 0.0, "compile_seconds": 0.0, "iterations": 1, "converged": False}))
         return [nan] * len(sessions)
 
-    monkeypatch.setattr(_session, "_solve", nothing)
+    monkeypatch.setattr(_fit_session, "_solve", nothing)
     found = fit_sessions([pixels, *walkers], PARAMSET, batch=8)
     assert asked == [["pixels"], [w.names[0] for w in walkers]]
     assert [e.code for e in found if isinstance(e, PblError)] == ["FIT_DIVERGED"] * 4
@@ -320,7 +319,7 @@ def flipped_first(session, trial: int, flip: bool = False) -> np.ndarray:
 
 
 def test_a_start_that_faces_the_other_way_ends_the_right_way(one_by_one, monkeypatch):
-    monkeypatch.setattr(gauss_newton, "placed_poses", flipped_first)
+    monkeypatch.setattr(per_frame, "placed_poses", flipped_first)
     fit = fit_session([look(5).keypoints], ["a"], PARAMSET)
     assert_near(fit.trials[0], walk(5), deg=2.8, m=0.025)
     e = fit.trials[0].qpos - one_by_one[0].trials[0].qpos
@@ -336,7 +335,7 @@ def test_a_start_far_off_reaches_the_same_fit_or_says_that_it_did_not(one_by_one
         qpos[:, 3:] += np.random.default_rng(seed).normal(0, 1.0, 37)
         return qpos
 
-    monkeypatch.setattr(gauss_newton, "placed_poses", far)
+    monkeypatch.setattr(per_frame, "placed_poses", far)
     fit = fit_session([look(5).keypoints], ["a"], PARAMSET)
     best = one_by_one[0].loss_trace[-1, 1]
     assert fit.converged == (fit.loss_trace[-1, 1] < 1.01 * best)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import METHODS, SessionInput, _observations, fit_sessions
+from pbl_pipeline.fit import METHODS, SessionInput, fit_sessions, problem
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.synthetic import observe, observe_markers, walk_qpos
 
@@ -112,5 +112,5 @@ def test_each_bad_session_has_its_own_error(trial):
     ("frames", "trials", "samples", "sizes"), [(100, 1, 300, (256, 4, 2048)), (700, 5, 3000, (768, 8, 4096))]
 )
 def test_a_gpu_is_given_few_sizes(frames, trials, samples, sizes):
-    pads = _observations.pad_frames, _observations.pad_trials, _observations.pad_samples
+    pads = problem.pad_frames, problem.pad_trials, problem.pad_samples
     assert tuple(pad(n, coarse=True) for pad, n in zip(pads, (frames, trials, samples), strict=True)) == sizes

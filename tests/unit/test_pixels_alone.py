@@ -11,8 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import load_body
-from pbl_pipeline.fit._place import pelvis_path
-from pbl_pipeline.fit._quality import FACING_FAIL_DEG, _depth
+from pbl_pipeline.fit.checks import FACING_FAIL_DEG, _depth
+from pbl_pipeline.fit.initial_pose import pelvis_path
 from pbl_pipeline.keypoints import check_keypoints
 from tests.inputs import keypoints
 from tests.walking_fit import LEVEL_CAMERA_QUAT_WXYZ, walking_fit, with_level_pelvis

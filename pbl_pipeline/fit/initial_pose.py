@@ -1,4 +1,4 @@
-"""Where a Gauss-Newton fit starts: the standing body, placed and turned in each frame by the points of the trunk."""
+"""Where a fit starts: the standing body, placed and turned in each frame by the points of the trunk."""
 
 # MuJoCo is a compiled module without type stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -9,12 +9,13 @@ import functools
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import SLIDES, Body, MarkerSet
 
-from ._inputs import Session
-from ._observations import TrialArrays
+from .problem import TrialArrays
+from .session import Session
 
 #: Bodies whose markers turn with the trunk; limbs would pull the heading towards where they swing.
 TRUNK = ("pelvis", "torso", "head", "humerus_r", "humerus_l")
@@ -171,3 +172,46 @@ def pelvis_values(body: Body, R: np.ndarray, x: np.ndarray) -> dict[str, np.ndar
     slides = stands.T @ (x - rest).T
     turns = {"pelvis_tilt": tilt, "pelvis_list": lean, "pelvis_rotation": np.unwrap(heading)}
     return dict(zip(SLIDES, slides, strict=True)) | turns
+
+
+def paper_pose(session: Session, trial: int, distance_m: float, middle: Float[np.ndarray, " Q"]) -> np.ndarray:
+    """qpos (Q,) with every angle at the middle of its range and the pelvis straight ahead of the trial's camera.
+
+    Ahead of its median orientation where it turns. Trials of several cameras or of markers in the world, for which the
+    paper has no start, take `median_pose`.
+    """
+    arrays = session.arrays[trial]
+    if arrays.c_3d.shape[1] != 1:
+        return median_pose(session, trial)
+    ahead = Rotation.from_rotvec(median_orientation(session, trial)).as_matrix()[:, 2]
+    stands, rest = pelvis_rest(session.body)
+    qpos = np.array(middle)
+    qpos[[session.body.joint_names.index(n) for n in SLIDES]] = stands.T @ (
+        arrays.p_nc[0, 0] + distance_m * ahead - rest
+    )
+    return qpos
+
+
+def median_pose(session: Session, trial: int) -> np.ndarray:
+    """qpos (Q,) of the standing body at the medians over the trial of pelvis position and heading."""
+    body, used = session.body, session.arrays[trial].used
+    poses = placed_poses(session, trial)[used]
+    angle = poses[:, body.joint_names.index("pelvis_rotation")]
+    mean = np.angle(np.mean(np.exp(1j * angle)))  # circular, so that +179 and -179 deg agree
+    heading = mean + np.median(np.angle(np.exp(1j * (angle - mean))))
+    qpos = np.where(body.is_slide, np.median(poses, axis=0), 0.0)
+    qpos[body.joint_names.index("pelvis_rotation")] = np.angle(np.exp(1j * heading))
+    return qpos
+
+
+def median_orientation(session: Session, trial: int) -> np.ndarray:
+    """Rotation vector (3,) in rad of the median orientation R_nc of a trial's camera over the frames that count.
+
+    The median of each component of the rotations away from the mean orientation. Zero where there is no camera.
+    """
+    arrays = session.arrays[trial]
+    if arrays.R_nc.shape[1] == 0:
+        return np.zeros(3)
+    R = Rotation.from_matrix(arrays.R_nc[arrays.used, 0])
+    mean = R.mean()
+    return (Rotation.from_rotvec(np.median((R * mean.inv()).as_rotvec(), axis=0)) * mean).as_rotvec()

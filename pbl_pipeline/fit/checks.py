@@ -12,10 +12,10 @@ from pbl_pipeline.body import SLIDES
 from pbl_pipeline.keypoints import Keypoints, WorldMarkers
 from pbl_pipeline.qc import FAIL, PASS, WARN, Check
 
-from ._inputs import GAIT, LEVEL, Session, has_3d
-from ._place import pelvis_path
-from ._types import TrialFit
-from .solvers import Solution
+from .initial_pose import pelvis_path
+from .results import TrialFit
+from .session import GAIT, LEVEL, Session, has_3d
+from .solution import Solution
 
 #: Median 2D residual as a share of the person's height in the picture: 5 px of a 500 px person is the paper's level.
 RESIDUAL_2D_WARN, RESIDUAL_2D_FAIL = 0.02, 0.06

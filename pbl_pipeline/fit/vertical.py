@@ -8,16 +8,16 @@ one least-squares problem: the vertical is the direction along which the path va
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import Body
 
-from ._inputs import GAIT, LEVEL, Session
-from ._outcome import Outcome
-from ._place import pelvis_path, pelvis_values
-from .solvers import Solution
+from .initial_pose import pelvis_path, pelvis_values
+from .session import GAIT, LEVEL, Session
+from .solution import Solution
 
 #: Least length (m) of a path that tells: from the farthest point to the start of the frames that count.
 MIN_PATH_M = 2.0
@@ -30,9 +30,9 @@ SITTING_RAD = np.deg2rad(30.0)
 MOST_TILT_RAD = np.deg2rad(30.0)
 
 
-def upright(session: Session, solution: Solution, seen: Outcome) -> tuple[Solution, Outcome, tuple[str, ...]]:
-    """The solution and what it shows in a world whose z is up, and where each trial's vertical comes from."""
-    sources = list(session.orientation)
+def upright(session: Session, solution: Solution) -> tuple[Solution, tuple[str, ...]]:
+    """The solution in a world whose z is up, and where each trial's vertical comes from."""
+    sources, seen = list(session.orientation), solution.outcome
     qpos, R_nc, points = solution.qpos.copy(), solution.R_nc.copy(), np.array(seen.x_world_m)
     for i, source in enumerate(sources):
         if source != LEVEL:
@@ -50,8 +50,9 @@ def upright(session: Session, solution: Solution, seen: Outcome) -> tuple[Soluti
         R_nc[frames] = turn @ R_nc[frames]
         points[frames] = points[frames] @ turn.T
         sources[i] = GAIT
-    solution = dataclasses.replace(solution, qpos=qpos, R_nc=R_nc)
-    return solution, dataclasses.replace(seen, x_world_m=points), tuple(sources)
+    shown: Any = points
+    solution = dataclasses.replace(solution, qpos=qpos, R_nc=R_nc, outcome=dataclasses.replace(seen, x_world_m=shown))
+    return solution, tuple(sources)
 
 
 def on_their_feet(body: Body, qpos: np.ndarray, used: np.ndarray) -> np.ndarray:

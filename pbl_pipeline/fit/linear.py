@@ -1,11 +1,11 @@
-"""Linear systems of a session: one small block per frame, coupled to the two frames on either side, and a border.
+"""Bordered block-banded systems: one small block per frame, coupled to the two frames on either side, and a border.
 
-    | A  B | |x|   |g|      A (F Q, F Q): block (t, t) full, (t, t+1) full or diagonal, (t, t+2) diagonal
+    | A  B | |x|   |g|      A (F Q, F Q): block (t, t) full, (t, t+1) full, (t, t+2) diagonal
     | B' C | |y| = |h|      B (F Q, K), C (K, K): what all frames share (scale, marker offsets, clocks, floors)
 
 Solved by block cyclic reduction over pairs of frames (e.g. Golub & Van Loan, Matrix Computations, 4th ed., 4.5.4) and
 the Schur complement of A: work and memory grow linearly with F, and the number of steps one after the other with log F,
-which is what a GPU needs. All matrices are symmetric positive definite.
+which is what a GPU needs. All matrices are symmetric positive definite. No library has this structure.
 """
 
 from __future__ import annotations
@@ -27,14 +27,13 @@ LARGE_BORDER = 2**26
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Arrow:
-    """The matrix. F must be even; `next_1[t]` couples t with t + 1, `next_2[t]` t with t + 2 (0 beyond the end).
-
-    `next_1` may be the diagonals of its blocks (F, Q) or the blocks (F, Q, Q), rows of t and columns of t + 1.
+class BorderedBandedSystem:
+    """The matrix. F must be even; `next_1[t]` couples t (rows) with t + 1 (columns), the diagonal `next_2[t]` t with t
+    + 2 (0 beyond the end).
     """
 
     diagonal: Float[Array, "F Q Q"]
-    next_1: Float[Array, "F Q *Q"]
+    next_1: Float[Array, "F Q Q"]
     next_2: Float[Array, "F Q"]
     border: Float[Array, "F Q K"]
     corner: Float[Array, "K K"]
@@ -43,35 +42,54 @@ class Arrow:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class _Level:
-    """What one level of the reduction leaves: with block = L L', the inverse of L and its products with the links."""
+    """What one level of the reduction leaves: with block = L L', the inverse of L and its product with the links to the
+    blocks before (the first n columns) and after."""
 
     inverse: Float[Array, "M n n"]
-    left: Float[Array, "M n n"]
-    right: Float[Array, "M n n"]
+    sides: Float[Array, "M n 2*n"]
 
 
-def solve(matrix: Arrow, g: Float[Array, "F Q"], h: Float[Array, " K"]) -> tuple[Array, Array]:
+def solve(
+    matrix: BorderedBandedSystem, g: Float[Array, "F Q"], h: Float[Array, " K"]
+) -> tuple[Float[Array, "F Q"], Float[Array, " K"]]:
     """x (F, Q) and y (K,) of the system above."""
     with jax.default_matmul_precision("highest"):
-        levels, schur, reduced = _eliminate(matrix, g)
-        y = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix.corner - schur), True), h - reduced)
-        x = _substitute(levels, (g - matrix.border @ y)[..., None])[..., 0]
-    return x, y
+        levels = _factors(matrix)
+        if matrix.border.size > LARGE_BORDER:
+            reduced = _substitute(levels, g[..., None]).reshape(1, -1) @ matrix.border.reshape(g.size, -1)
+            y = _solve_corner(matrix.corner - _by_columns(levels, matrix.border), h - reduced[0])
+            return _substitute(levels, (g - matrix.border @ y)[..., None])[..., 0], y
+        # The border and g are eliminated together, and what was eliminated serves again for x.
+        rows = _eliminated(levels, jnp.concatenate([matrix.border, g[..., None]], axis=-1))
+        both = _grams(rows)
+        y = _solve_corner(matrix.corner - both[:-1, :-1], h - both[:-1, -1])
+        x = _back_substituted(levels, [r[..., -1:] - r[..., :-1] @ y[:, None] for r in rows], g.shape[0])
+        return x.reshape(g.shape), y
 
 
-def marginal_variance(matrix: Arrow) -> tuple[Float[Array, "F Q"], Float[Array, " K"]]:
+def marginal_variance(matrix: BorderedBandedSystem) -> tuple[Float[Array, "F Q"], Float[Array, " K"]]:
     """Diagonal of the inverse of the whole matrix: that of x and that of y."""
     with jax.default_matmul_precision("highest"):
         shape, k = matrix.border.shape[:2], matrix.border.shape[-1]
-        levels, schur, _ = _eliminate(matrix, jnp.zeros(shape, matrix.border.dtype))
-        inverse = _inverse_of_factor(matrix.corner - schur)
-        rows = jnp.pad(inverse, [(0, -k % COLUMNS), (0, 0)]).reshape(-1, COLUMNS, k)
+        levels = _factors(matrix)
+        large = matrix.border.size > LARGE_BORDER
+        rows = [] if large else _eliminated(levels, matrix.border)
+        inverse = _inverse_of_factor(matrix.corner - (_by_columns(levels, matrix.border) if large else _grams(rows)))
+        groups = jnp.pad(inverse, [(0, -k % COLUMNS), (0, 0)]).reshape(-1, COLUMNS, k)
 
         def add(total: Array, some: Array) -> tuple[Array, None]:
-            return total + jnp.sum(_substitute(levels, matrix.border @ some.T) ** 2, axis=-1), None
+            if large:
+                x = _substitute(levels, matrix.border @ some.T)
+            else:
+                x = _back_substituted(levels, [r @ some.T for r in rows], shape[0])
+            return total + jnp.sum(x.reshape(*shape, -1) ** 2, axis=-1), None
 
-        shared, _ = jax.lax.scan(add, jnp.zeros(shape, inverse.dtype), rows)
+        shared, _ = jax.lax.scan(add, jnp.zeros(shape, inverse.dtype), groups)
         return _inverse_diagonal(levels, shape) + shared, jnp.sum(inverse**2, axis=0)
+
+
+def _solve_corner(schur: Float[Array, "K K"], h: Float[Array, " K"]) -> Float[Array, " K"]:
+    return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(schur), True), h)
 
 
 def _inverse_of_factor(matrix: Float[Array, "*m n n"]) -> Float[Array, "*m n n"]:
@@ -81,8 +99,8 @@ def _inverse_of_factor(matrix: Float[Array, "*m n n"]) -> Float[Array, "*m n n"]
     return triangular_solve(lower, eye, left_side=True, lower=True)
 
 
-def _eliminate(matrix: Arrow, g: Array) -> tuple[list[_Level], Array, Array]:
-    """Factors of A, B' A^-1 B and B' A^-1 g."""
+def _factors(matrix: BorderedBandedSystem) -> list[_Level]:
+    """Factors of A."""
     blocks, links = _pairs(matrix)
     levels: list[_Level] = []
     while True:
@@ -90,14 +108,12 @@ def _eliminate(matrix: Arrow, g: Array) -> tuple[list[_Level], Array, Array]:
         level, blocks, links = _reduce(blocks, links)
         levels.append(level)
         if last:
-            break
-    if matrix.border.size > LARGE_BORDER:
-        reduced = _substitute(levels, g[..., None]).reshape(1, -1) @ matrix.border.reshape(g.size, -1)
-        return levels, _by_columns(levels, matrix.border), reduced[0]
-    border, right = _eliminated(levels, matrix.border), _eliminated(levels, g[..., None])
-    schur = functools.reduce(jnp.add, [jnp.einsum("mnk,mnl->kl", y, y) for y in border])
-    reduced = functools.reduce(jnp.add, [jnp.einsum("mnk,mnr->k", y, z) for y, z in zip(border, right, strict=True)])
-    return levels, schur, reduced
+            return levels
+
+
+def _grams(rows: list[Float[Array, "M n R"]]) -> Float[Array, "R R"]:
+    """r' A^-1 r of a right-hand side r, from its eliminated rows."""
+    return functools.reduce(jnp.add, [jnp.einsum("mnk,mnl->kl", y, y) for y in rows])
 
 
 def _by_columns(levels: list[_Level], border: Float[Array, "F Q K"]) -> Float[Array, "K K"]:
@@ -123,13 +139,12 @@ def _eliminated(levels: list[_Level], rhs: Float[Array, "F Q R"]) -> list[Float[
     return out
 
 
-def _pairs(matrix: Arrow) -> tuple[Array, Array]:
+def _pairs(matrix: BorderedBandedSystem) -> tuple[Array, Array]:
     """Blocks (F/2, 2Q, 2Q) of pairs of frames and the links (F/2, 2Q, 2Q) of each pair with the next one."""
     f, q = matrix.next_2.shape
-    eye = jnp.eye(q, dtype=matrix.next_1.dtype)
+    eye = jnp.eye(q, dtype=matrix.next_2.dtype)
     own = matrix.diagonal.reshape(f // 2, 2, q, q)
-    next_1 = matrix.next_1 if matrix.next_1.ndim == 3 else matrix.next_1[..., None] * eye
-    next_1 = next_1.reshape(f // 2, 2, q, q)
+    next_1 = matrix.next_1.reshape(f // 2, 2, q, q)
     next_2 = matrix.next_2.reshape(f // 2, 2, q, 1) * eye
     blocks = jnp.block([[own[:, 0], next_1[:, 0]], [jnp.swapaxes(next_1[:, 0], -1, -2), own[:, 1]]])
     links = jnp.block([[next_2[:, 0], jnp.zeros_like(next_1[:, 1])], [next_1[:, 1], next_2[:, 1]]])
@@ -170,17 +185,19 @@ def _reduce(blocks: Array, links: Array) -> tuple[_Level, Array, Array]:
     gone, stay = _split(_even(blocks, jnp.eye(n, dtype=blocks.dtype)))
     after, before = _split(_even(links, jnp.zeros((n, n), links.dtype)))
     inverse = _inverse_of_factor(gone)
-    left = inverse @ jnp.swapaxes(_earlier(before), -1, -2)
-    right = inverse @ after
-    stay = stay - _gram(right, right) - _later(_gram(left, left))
-    return _Level(inverse, left, right), stay, -_later(_gram(left, right))
+    sides = inverse @ jnp.concatenate([jnp.swapaxes(_earlier(before), -1, -2), after], axis=-1)
+    both = _gram(sides, sides)
+    stay = stay - both[:, n:, n:] - _later(both[:, :n, :n])
+    return _Level(inverse, sides), stay, -_later(both[:, :n, n:])
 
 
 def _forward(level: _Level, rhs: Float[Array, "M n R"]) -> tuple[Array, Array]:
     """What a level's eliminated rows of the right-hand side become, and the rows that stay."""
+    n = rhs.shape[1]
     gone, stay = _split(_even(rhs, jnp.zeros_like(rhs[0])))
     y = level.inverse @ gone
-    return y, stay - _gram(level.right, y) - _later(_gram(level.left, y))
+    both = _gram(level.sides, y)
+    return y, stay - both[:, n:] - _later(both[:, :n])
 
 
 def _gram(a: Array, b: Array) -> Array:
@@ -189,14 +206,18 @@ def _gram(a: Array, b: Array) -> Array:
 
 def _substitute(levels: list[_Level], rhs: Float[Array, "F Q R"]) -> Float[Array, "F Q R"]:
     """A^-1 rhs with the factors of A."""
-    solved = _eliminated(levels, rhs)
+    return _back_substituted(levels, _eliminated(levels, rhs), rhs.shape[0]).reshape(rhs.shape)
+
+
+def _back_substituted(levels: list[_Level], rows: list[Float[Array, "M n R"]], frames: int) -> Float[Array, "P n R"]:
+    """The solution for pairs of frames, from the eliminated rows of a right-hand side."""
     # How many rows each level began with.
-    counts = [rhs.shape[0] // 2, *(level.inverse.shape[0] for level in levels[:-1])]
-    x = jnp.zeros_like(solved[-1])
-    for level, y, count in zip(reversed(levels), reversed(solved), reversed(counts), strict=True):
-        gone = _gram(level.inverse, y - level.left @ _earlier(x) - level.right @ x)
+    counts = [frames // 2, *(level.inverse.shape[0] for level in levels[:-1])]
+    x = jnp.zeros_like(rows[-1])
+    for level, y, count in zip(reversed(levels), reversed(rows), reversed(counts), strict=True):
+        gone = _gram(level.inverse, y - level.sides @ jnp.concatenate([_earlier(x), x], axis=1))
         x = _join(gone, x)[:count]
-    return x.reshape(rhs.shape)
+    return x
 
 
 def _inverse_diagonal(levels: list[_Level], shape: tuple[int, ...]) -> Float[Array, "F Q"]:
@@ -207,13 +228,13 @@ def _inverse_diagonal(levels: list[_Level], shape: tuple[int, ...]) -> Float[Arr
     for level in reversed(levels):
         count = level.inverse.shape[0]
         own, link = own[:count], link[:count]
+        # Covariance of an eliminated block's two neighbours, of the block with them, then its own.
         left, between = _earlier(own), _earlier(link)
-        to_left, to_right = -_gram(level.inverse, level.left), -_gram(level.inverse, level.right)
-        # Covariance of an eliminated block with its neighbours, then its own.
-        with_left = to_left @ left + to_right @ jnp.swapaxes(between, -1, -2)
-        with_right = to_left @ between + to_right @ own
-        gone = _gram(level.inverse, level.inverse)
-        gone += with_left @ jnp.swapaxes(to_left, -1, -2) + with_right @ jnp.swapaxes(to_right, -1, -2)
+        neighbours = jnp.block([[left, between], [jnp.swapaxes(between, -1, -2), own]])
+        to_sides = -_gram(level.inverse, level.sides)
+        beside = to_sides @ neighbours
+        gone = _gram(level.inverse, level.inverse) + beside @ jnp.swapaxes(to_sides, -1, -2)
+        with_left, with_right = beside[..., :n], beside[..., n:]
         own, link = _join(gone, own), _join(with_right, _later(jnp.swapaxes(with_left, -1, -2)))
     frames = shape[0] // 2
     return jnp.diagonal(own[:frames], axis1=-2, axis2=-1).reshape(shape)

@@ -1,4 +1,5 @@
-"""What was seen in a session, as arrays on the device: the frames of all trials one after another.
+"""A session as arrays: what was seen in the frames of all trials, one after another, and the points that are fitted to
+it.
 
 Frames, markers and trials are padded to a few sizes, so that a worker compiles a handful of programs. Padding has
 weight 0 everywhere and never changes a result. On a GPU the sizes are fewer: there a program takes ten seconds to
@@ -12,9 +13,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.ndimage import gaussian_filter1d
+
+from pbl_pipeline.body import Body, MarkerSet
 
 from ._rotation import quat_wxyz, rotation_matrices
 
@@ -23,25 +27,43 @@ MARKER_SIZES = (24, 40, 64, 96, 128)
 #: Fewest frames of a program, in all trials together; and on a GPU fewest frames, trials and samples of the phone.
 MIN_FRAMES = 64
 COARSE_FRAMES, COARSE_TRIALS, COARSE_SAMPLES = 256, 4, 2048
-#: Points of the soles (`solvers/_contact.py`).
-SOLE_POINTS = 4
+#: Points of the soles: heel and ball of the right foot, then of the left (body; m in its frame), under the lowest
+#: places of the body's capsules there. A body without feet has none.
+SOLES = tuple((f"calcn_{side}", place) for side in ("r", "l") for place in ((0.015, -0.015, 0.0), (0.175, -0.016, 0.0)))
+#: Ends of the body's axis: the head, the heels.
+ENDS = tuple((name, (0.0, 0.0, 0.0)) for name in ("head", "calcn_r", "calcn_l"))
 #: Frame interval (s) for which second differences are stated: 30 Hz.
 FRAME_S = 1 / 30
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Observations:
-    """F frames of all trials, V views, J markers, N trials; P samples of the phone's orientation per trial.
+class PointTable:
+    """Points fixed to bodies, as arrays, so that one compiled program serves every marker set of the same padded size:
+    J markers, then the soles, then the ends of the body's axis."""
 
-    time_s counts from each trial's first frame; `trial` is the number of a frame's trial; `weight` is 1 for a frame
-    that counts and 0 for others. Confidences are 0 where nothing was seen; values there are finite and do not count.
-    `xy_px` are pixels of an ideal pinhole camera (undistorted). `bend` holds the weights of the frames before, at and
-    after a frame in the second difference there (per 1/30 s squared), 0 where it is not formed. `contact`: how surely
-    each of S points of the soles stands (0 to 1), 0 until a first solution tells. `sample_*`: the phone's orientation
-    R_nc as quaternions at a fixed interval, from `sample_start_s` on; there where `has_phone` is 1.
+    body_index: Int[Array, " P"]
+    position_m: Float[Array, "P 3"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """F frames of all trials, V views, J markers, N trials; M samples of the phone's orientation per trial.
+
+    `points`: what is fitted; `weight_3d`: of each marker, as in `MarkerSet`. time_s counts from each trial's first
+    frame; `trial` is the number of a frame's trial; `weight` is 1 for a frame that counts and 0 for others. `c_*` are
+    confidences over the numbers of markers and views, so that a sum over both is the paper's mean; 0 where nothing was
+    seen, where values are finite and do not count. `xy_px` are pixels of an ideal pinhole camera (undistorted). `bend`
+    holds the weights of the frames before, at and after a frame in the second difference there (per 1/30 s squared), 0
+    where it is not formed; `rate` is 1/30 s over the time to the next frame of the trial, 0 where there is none.
+    `contact`: how surely each of the soles' points stands (0 to 1), 0 until a first solution tells. `sample_*`: the
+    phone's orientation R_nc as quaternions at a fixed interval, from `sample_start_s` on; there where `has_phone` is 1.
+    M is 0 where no camera of the session turns.
     """
 
+    points: PointTable
+    weight_3d: Float[Array, " J"]
     time_s: Float[Array, " F"]
     trial: Int[Array, " F"]
     weight: Float[Array, " F"]
@@ -55,18 +77,32 @@ class Observations:
     p_nc: Float[Array, "F V 3"]
     camera_matrix: Float[Array, "F V 3 3"]
     bend: Float[Array, "F 3"]
-    n_markers: Float[Array, ""]
-    n_views: Float[Array, ""]
-    contact: Float[Array, "F S"]
+    rate: Float[Array, " F"]
+    contact: Float[Array, "F P"]
     has_phone: Float[Array, " N"]
-    sample_quat_wxyz: Float[Array, "N P 4"]
+    sample_quat_wxyz: Float[Array, "N M 4"]
     sample_start_s: Float[Array, " N"]
     sample_step_s: Float[Array, ""]
+
+    @property
+    def moving(self) -> bool:
+        """Whether a camera turns and its orientation was measured."""
+        return self.sample_quat_wxyz.shape[-2] > 0
+
+    def split(self, x: Any) -> tuple[Any, Any, Any]:
+        """Markers, soles and ends of the body's axis among the points (..., P, 3)."""
+        j, p = self.weight_3d.shape[-1], self.contact.shape[-1]
+        return x[..., :j, :], x[..., j : j + p, :], x[..., j + p :, :]
+
+    def point_offsets(self, site_offset_m: Float[Array, "J 3"]) -> Float[Array, "P 3"]:
+        """Offsets of all points: those of the markers, 0 for the others."""
+        return jnp.pad(site_offset_m, [(0, self.points.position_m.shape[-2] - site_offset_m.shape[-2]), (0, 0)])
 
 
 @dataclasses.dataclass(frozen=True)
 class TrialArrays:
-    """One trial before padding (NumPy, float64): T frames, V views, J markers. Fields as in `Observations`.
+    """One trial before padding (NumPy, float64): T frames, V views, J markers. Fields as in `Problem`, but `c_*` are
+    plain confidences.
 
     `used` (T,) bool: frames that count. phone_time_s (P,) on the video's clock, phone_quat_wxyz (P, 4): orientation of
     the one camera where it moves, else None.
@@ -133,48 +169,67 @@ def bend_weights(time_s: np.ndarray, used: np.ndarray) -> np.ndarray:
     index = np.flatnonzero(used)
     if index.size == 0:
         return out
-    t = np.arange(max(index[0], 0) + 1, index[-1])
+    t = np.arange(index[0] + 1, index[-1])
     before, after = time_s[t] - time_s[t - 1], time_s[t + 1] - time_s[t]
     scale = 2 * FRAME_S**2 / (before + after)
     out[t] = np.stack([scale / before, -scale * (1 / before + 1 / after), scale / after], axis=1)
     return out
 
 
-def pack(trials: Sequence[TrialArrays]) -> Observations:
-    """All trials of a session as one `Observations`, still on the host."""
+def step_rates(time_s: np.ndarray) -> np.ndarray:
+    """(T,): 1/30 s over the time from each frame to the next one of the trial, 0 at the last one."""
+    return np.append(FRAME_S / np.diff(time_s), 0.0)
+
+
+def point_table(body: Body, markers: MarkerSet, size: int) -> PointTable:
+    """A marker set padded to `size` rows, then the soles and the ends of the axis of a body that has them."""
+    places = [p for p in (*SOLES, *ENDS) if p[0] in body.body_names]
+    pad = size - len(markers)
+    index = np.pad(markers.body_index, (0, pad)), [body.body_names.index(name) for name, _ in places]
+    place = np.pad(markers.position_m, [(0, pad), (0, 0)]), np.reshape([p for _, p in places], (-1, 3))
+    arrays: Any = np.concatenate(index).astype(np.int32), np.concatenate(place).astype(np.float32)
+    return PointTable(*arrays)
+
+
+def pack(trials: Sequence[TrialArrays], body: Body, markers: MarkerSet) -> Problem:
+    """All trials of a session as one `Problem`, still on the host."""
     coarse = jax.default_backend() != "cpu"
     total = sum(len(t.time_s) for t in trials)
-    frames, markers = pad_frames(total, coarse) - total, pad_markers(trials[0].c_world.shape[1])
-    n_markers = trials[0].c_world.shape[1]
+    frames, n_markers = pad_frames(total, coarse) - total, len(markers)
+    size = pad_markers(n_markers)
     n = pad_trials(len(trials), coarse)
+    used = np.concatenate([t.used for t in trials])
 
     def joined(field: str, marker_axis: int | None = None) -> np.ndarray:
         a = np.concatenate([getattr(t, field) for t in trials])
         widths = [(0, 0)] * a.ndim
         widths[0] = (0, frames)
         if marker_axis is not None:
-            widths[marker_axis] = (0, markers - n_markers)
+            widths[marker_axis] = (0, size - n_markers)
         return np.pad(a, widths, mode="constant" if marker_axis is not None else "edge")
 
-    used = np.concatenate([t.used for t in trials])
+    def confidence(field: str) -> np.ndarray:
+        a = joined(field, getattr(trials[0], field).ndim - 1) / (n_markers * max(trials[0].c_3d.shape[1], 1))
+        return a * np.pad(used, (0, frames)).reshape(-1, *[1] * (a.ndim - 1))
+
     quats, starts = _phone_samples(trials, n, coarse)
     bend = np.concatenate([bend_weights(t.time_s, t.used) for t in trials])
     arrays = {
+        "weight_3d": np.pad(markers.weight_3d, (0, size - n_markers)),
         "time_s": np.concatenate([t.time_s - t.time_s[0] for t in trials] + [np.zeros(frames)]),
         "weight": np.pad(used.astype(float), (0, frames)),
         "x_cam": joined("x_cam", 2),
-        "c_3d": joined("c_3d", 2) * _padded(used, frames)[:, None, None],
+        "c_3d": confidence("c_3d"),
         "xy_px": joined("xy_px", 2),
-        "c_2d": joined("c_2d", 2) * _padded(used, frames)[:, None, None],
+        "c_2d": confidence("c_2d"),
         "x_world": joined("x_world", 1),
-        "c_world": joined("c_world", 1) * _padded(used, frames)[:, None],
+        "c_world": confidence("c_world"),
         "R_nc": joined("R_nc"),
         "p_nc": joined("p_nc"),
         "camera_matrix": joined("camera_matrix"),
         "bend": np.pad(bend, [(0, frames), (0, 0)]),
-        "contact": np.zeros((total + frames, SOLE_POINTS)),
-        "n_markers": np.asarray(n_markers),
-        "n_views": np.asarray(max(trials[0].c_3d.shape[1], 1)),
+        "rate": np.pad(np.concatenate([step_rates(t.time_s) for t in trials]), (0, frames)),
+        "contact": np.zeros((total + frames, sum(name in body.body_names for name, _ in SOLES))),
         "has_phone": np.pad([float(t.phone_time_s is not None) for t in trials], (0, n - len(trials))),
         "sample_quat_wxyz": quats,
         "sample_start_s": starts,
@@ -183,18 +238,14 @@ def pack(trials: Sequence[TrialArrays]) -> Observations:
     number = np.concatenate([np.full(len(t.time_s), i) for i, t in enumerate(trials)])
     f32: dict[str, Any] = {k: np.asarray(v, np.float32) for k, v in arrays.items()}
     f32["trial"] = np.pad(number, (0, frames), mode="edge").astype(np.int32)
-    return Observations(**f32)
-
-
-def _padded(used: np.ndarray, frames: int) -> np.ndarray:
-    return np.pad(used.astype(float), (0, frames))
+    return Problem(points=point_table(body, markers, size), **f32)
 
 
 def _phone_samples(trials: Sequence[TrialArrays], n: int, coarse: bool) -> tuple[np.ndarray, np.ndarray]:
     """Orientations (n, P, 4) every `SAMPLE_S` and the time (n,) of the first, on each trial's own clock."""
     moving = [i for i, t in enumerate(trials) if t.phone_time_s is not None]
     if not moving:
-        return np.tile([1.0, 0, 0, 0], (n, 2, 1)), np.zeros(n)
+        return np.zeros((n, 0, 4)), np.zeros(n)
     longest = max(t.time_s[-1] - t.time_s[0] for t in trials) + 2 * CLOCK_RANGE_S
     needed = int(np.ceil(longest / SAMPLE_S)) + 2
     out = np.tile([1.0, 0, 0, 0], (n, pad_samples(needed, coarse), 1))
@@ -208,3 +259,13 @@ def _phone_samples(trials: Sequence[TrialArrays], n: int, coarse: bool) -> tuple
         out[i, :needed] = smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
         out[i, needed:] = out[i, needed - 1]
     return out, np.full(n, -CLOCK_RANGE_S)
+
+
+#: Fields of `Problem` with one row per frame that a keypoint's cost depends on.
+PER_FRAME = ("weight", "trial", "x_cam", "c_3d", "xy_px", "c_2d", "x_world", "c_world", "R_nc", "p_nc", "camera_matrix")
+
+
+def frames_at(p: Problem, index: Int[Array, " K"]) -> Problem:
+    """The keypoints and cameras of some frames, by their numbers; other fields are left as they are."""
+    take = lambda a: a.at[index].get(mode="promise_in_bounds")  # noqa: E731
+    return dataclasses.replace(p, **{k: take(getattr(p, k)) for k in PER_FRAME})

@@ -17,18 +17,17 @@ from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.video import Camera
 
-from ._gravity import upright
-from ._inputs import Session, Trial, make_session
-from ._inputs import check_trial as _check_trial
-from ._marker_cost import kinds_of
-from ._outcome import Outcome, outcome_one
-from ._paper_objective import paper_objective as _paper_objective
-from ._params import METHODS, GaussNewtonParams, ImplicitAdamParams, Params
-from ._quality import check_fit
-from ._rotation import matrices_of, quat_wxyz
-from ._types import SessionFit, TrialFit
-from .solvers import Solution, solve_gauss_newton, solve_implicit_adam, start_of
-from .solvers._normal import State
+from ._params import METHODS, Params
+from ._rotation import quat_wxyz
+from .checks import check_fit
+from .objective import State
+from .per_frame import start_of
+from .priors import pixels_alone
+from .results import SessionFit, TrialFit
+from .session import Session, Trial, make_session
+from .session import check_trial as _check_trial
+from .solution import Solution
+from .vertical import upright
 
 #: `LEVEL_CAMERA_R_NC` as a quaternion (w, x, y, z).
 LEVEL_CAMERA_QUAT_WXYZ = np.array([0.5, -0.5, 0.5, -0.5])
@@ -98,12 +97,12 @@ def fit_sessions(
         SOLVER_UNKNOWN.
     """
     method = METHODS.find(paramset)
-    paramset, params = method.paramset, method.params
+    paramset = method.paramset
     if batch is None:
         batch = 1 if jax.default_backend() == "cpu" else BATCH
     out: list[SessionFit | PblError | None] = [None] * len(sessions)
-    for part in _made_ahead(_batches(sessions, params, batch, out)):
-        for packed, solution in zip(part, _solve(part, params), strict=True):
+    for part in _made_ahead(_batches(sessions, method.params, batch, out)):
+        for packed, solution in zip(part, _solve(part, method), strict=True):
             motions = _motions(sessions[packed.index])
             try:
                 if isinstance(solution, PblError):
@@ -116,11 +115,11 @@ def fit_sessions(
 
 @dataclasses.dataclass(frozen=True)
 class _Packed:
-    """A session ready for a solver. `start`: of `gauss-newton`, else None; `seconds`: what it took to get here."""
+    """A session ready for a solver, with where to start; `seconds`: what it took to get here."""
 
     index: int
     session: Session
-    start: State | None
+    start: State
     seconds: float
 
 
@@ -136,10 +135,9 @@ def _batches(
         except PblError as error:
             out[i] = error
             continue
-        start = start_of(session) if isinstance(params, GaussNewtonParams) else None
-        shapes = tuple(a.shape for a in jax.tree.leaves(session.obs))
-        key = (shapes, kinds_of(session), type(session.trials[0]))
-        waiting.setdefault(key, []).append(_Packed(i, session, start, time.perf_counter() - begin))
+        shapes = tuple(a.shape for a in jax.tree.leaves(session.problem))
+        key = (shapes, pixels_alone(session.problem), type(session.trials[0]))
+        waiting.setdefault(key, []).append(_Packed(i, session, start_of(session), time.perf_counter() - begin))
         if len(waiting[key]) == batch:
             yield waiting.pop(key)
     yield from waiting.values()
@@ -159,17 +157,8 @@ def _motions(given: SessionInput) -> list[str]:
     return [motion] * len(given.trials) if isinstance(motion, str) else list(motion)
 
 
-def _solve(part: Sequence[_Packed], params: Params) -> Sequence[Solution | PblError]:
-    if isinstance(params, GaussNewtonParams):
-        return solve_gauss_newton([p.session for p in part], params, [p.start for p in part if p.start])
-    return [_alone(p.session, params) for p in part]
-
-
-def _alone(session: Session, params: ImplicitAdamParams) -> Solution | PblError:
-    try:
-        return solve_implicit_adam(session, params)
-    except PblError as error:
-        return error
+def _solve(part: Sequence[_Packed], method: Method[Params]) -> Sequence[Solution | PblError]:
+    return method.function([p.session for p in part], method.params, [p.start for p in part])
 
 
 def check_trial(
@@ -185,27 +174,11 @@ def check_trial(
     return _check_trial(trial, name, METHODS.find(paramset).params.view, markers)
 
 
-def paper_objective(fit: SessionFit, trials: Sequence[Trial], markers: MarkerSet | None = None) -> float:
-    """The paper's own total (section Model Fitting) of a session fit, whatever the fit itself minimised."""
-    view = METHODS["paper-2025"].params.view
-    motions = [t.camera_motion for t in fit.trials]
-    session = make_session(trials, [t.name for t in fit.trials], view, motions, markers)
-    qpos = np.zeros((session.obs.weight.shape[0], len(session.body.joint_names)))
-    R_nc = np.array(session.obs.R_nc, np.float64)
-    for i, trial in enumerate(fit.trials):
-        qpos[session.frames(i)] = trial.qpos
-        if isinstance(trials[i], Keypoints):
-            R_nc[session.frames(i), 0] = matrices_of(trial.phone_quat_wxyz)
-    overall = fit.scale[0] - 1
-    s = np.concatenate([[overall], fit.scale[1:] - 1 - overall])
-    return _paper_objective(session, qpos, R_nc, s, fit.site_offset_m)
-
-
 def _session_fit(
     session: Session, solution: Solution, paramset: Paramset, motions: Sequence[str], packing: float
 ) -> SessionFit:
     begin = time.perf_counter()
-    used = np.asarray(session.obs.weight) > 0
+    used = np.asarray(session.problem.weight) > 0
     finite = np.all(np.isfinite(solution.qpos[used])) and np.all(np.isfinite(solution.scale))
     if not finite or not np.isfinite(solution.loss_trace[-1, 1]):
         raise PblError(
@@ -215,12 +188,10 @@ def _session_fit(
             next_step="check the keypoints and the camera matrix",
             key=", ".join(session.names),
         )
-    seen = jax.device_get(solution.outcome or _outcome(session, solution))
-    solution, seen, sources = upright(session, solution, seen)
+    solution, sources = upright(session, solution)
     seconds = packing + solution.seconds + time.perf_counter() - begin
     fits = tuple(
-        _trial_fit(session, i, solution, seen, sources[i], paramset, motions[i], seconds)
-        for i in range(len(session.trials))
+        _trial_fit(session, i, solution, sources[i], paramset, motions[i], seconds) for i in range(len(session.trials))
     )
     return SessionFit(
         trials=fits,
@@ -238,25 +209,17 @@ def _session_fit(
     )
 
 
-def _outcome(session: Session, solution: Solution) -> Outcome:
-    offset = np.zeros((session.table.weight.shape[0], 3))
-    offset[: len(session.markers)] = solution.site_offset_m
-    given = (solution.qpos, solution.R_nc, solution.scale, offset)
-    return outcome_one(session.body, session.table, session.obs, *(np.asarray(a, np.float32) for a in given))
-
-
 def _trial_fit(
     session: Session,
     i: int,
     solution: Solution,
-    seen: Outcome,
     source: str,
     paramset: Paramset,
     camera_motion: str,
     seconds: float,
 ) -> TrialFit:
     trial, arrays, at = session.trials[i], session.arrays[i], session.frames(i)
-    hide = ~arrays.used[:, None]
+    hide, seen = ~arrays.used[:, None], solution.outcome
     n, q, j = len(arrays.time_s), solution.qpos.shape[1], len(session.markers)
     sd = np.full((n, q), np.nan) if solution.qpos_sd is None else solution.qpos_sd[at]
     view = trial.views[0] if isinstance(trial, MultiView) else trial

@@ -1,4 +1,4 @@
-"""A session to fit: trials of every kind, validated at the door and packed into arrays."""
+"""A session to fit: trials of every kind, validated and packed into arrays."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from pbl_pipeline.body import Body, MarkerSet, load_body, marker_set
-from pbl_pipeline.body._jacobian import MarkerTable
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import (
     SEEN_SHARE,
@@ -22,9 +21,9 @@ from pbl_pipeline.keypoints import (
 )
 from pbl_pipeline.video import undistort_px
 
-from ._observations import CLOCK_RANGE_S, Observations, TrialArrays, pack, pad_markers
 from ._params import ViewParams
 from ._rotation import mean_rotation, rotation_matrices
+from .problem import CLOCK_RANGE_S, Problem, TrialArrays, pack
 
 #: R_nc of a level camera that looks along world +x: columns are the camera's x (right), y (down), z (forward).
 LEVEL_CAMERA_R_NC = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -45,18 +44,12 @@ class Session:
 
     body: Body
     markers: MarkerSet
-    table: MarkerTable
     names: tuple[str, ...]
     trials: tuple[Trial, ...]
     arrays: tuple[TrialArrays, ...]
     in_view_share: tuple[float, ...]
     orientation: tuple[str, ...]
-    obs: Observations
-
-    @property
-    def moving(self) -> bool:
-        """Whether a camera turns and its orientation was measured."""
-        return any(a.phone_time_s is not None for a in self.arrays)
+    problem: Problem
 
     def frames(self, i: int) -> slice:
         """Where trial `i` lies in the packed frames."""
@@ -98,16 +91,16 @@ def make_session(
         packed, source = _arrays(trial, name, motion, used)
         arrays.append(packed)
         orientation.append(source)
+    body = load_body()
     return Session(
-        body=load_body(),
+        body=body,
         markers=table,
-        table=MarkerTable.of(table, pad_markers(len(table))),
         names=tuple(names),
         trials=tuple(trials),
         arrays=tuple(arrays),
         in_view_share=tuple(share for _, share in checked),
         orientation=tuple(orientation),
-        obs=pack(arrays),
+        problem=pack(arrays, body, table),
     )
 
 

@@ -1,0 +1,245 @@
+"""Method `gauss-newton`: robust least squares over per-frame poses, with everything the session shares in the same
+system. Deterministic, bounded, compiled once per size of session.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.ndimage import gaussian_filter1d
+
+from pbl_pipeline.body import Body, scale_multipliers
+from pbl_pipeline.jax_setup import compile_seconds
+
+from ._params import GaussNewtonParams
+from ._phone_error import phone_variance
+from ._threads import one_blas_thread
+from .initial_pose import placed_poses
+from .linear import marginal_variance
+from .normal_equations import Linearised, linearise, moved
+from .objective import State
+from .priors import Weights, pixels_alone
+from .problem import Problem, power_of_2
+from .session import Session
+from .solution import Outcome, Solution, outcome
+from .solvers.gauss_newton import Limits, Progress, minimise
+
+#: A point that stands is slower than this fraction of its own fastest, or than this (m/s); speeds are means over some
+#: time (s, standard deviation).
+STANDING_FRACTION, STANDING_M_PER_S, STANDING_S = 0.25, 0.2, 0.03
+#: Knees at their straight end in more than this fraction of the frames may belong to a body that faces the wrong way.
+BACKWARDS_FRACTION = 0.2
+
+
+@dataclasses.dataclass(frozen=True)
+class _Found:
+    """Where an iteration ended, on the host, with the points there; of the last one also the variances (F, U) of the
+    frames' unknowns and the outcome."""
+
+    end: Progress
+    x: np.ndarray  # (F, P, 3)
+    variance: np.ndarray | None = None
+    outcome: Outcome | None = None
+
+    @property
+    def trace(self) -> np.ndarray:
+        """(K, 2): iteration and cost after it."""
+        n = int(self.end.iteration)
+        return np.stack([np.arange(1, n + 1), np.asarray(self.end.trace)[:n]], axis=1).astype(np.float64)
+
+
+def solve_per_frame(sessions: Sequence[Session], params: GaussNewtonParams, starts: Sequence[State]) -> list[Solution]:
+    """Fit sessions that are packed to the same sizes from `start_of` each: one as it is, several at once on the device.
+
+    The result does not depend on which sessions are fitted together. A session whose result is suspicious is solved
+    again from a start that faces the other way, and the better one of the two is kept. Where the paramset has feet on
+    the floor, a first solution tells when each foot stands, and a second one uses it.
+
+    Raises
+    ------
+    PblError
+        FIT_INPUT: the paramset has a prior of no joint.
+    """
+    begin, compiled = time.perf_counter(), compile_seconds()
+    on_floor = params.weight_floor > 0 or params.weight_slide > 0
+    solve = functools.partial(_solve, params=params, last=not on_floor)
+    found = solve(sessions, [s.problem for s in sessions], starts)
+    again = [i for i, f in enumerate(found) if suspicious(sessions[i], f.end.state.qpos)]
+    if again:
+        part = [sessions[i] for i in again]
+        turned = solve(part, [s.problem for s in part], [start_of(s, flip=True) for s in part])
+        for i, other in zip(again, turned, strict=True):
+            found[i] = min(found[i], other, key=lambda f: float(f.end.cost))
+    traces = [f.trace for f in found]
+    if on_floor:
+        problems, starts = zip(*map(_on_floor, sessions, found), strict=True)
+        found = _solve(sessions, problems, starts, params, last=True)
+        # The cost of the second one has a term more.
+        traces = [np.concatenate([t, f.trace + np.array([len(t), 0.0])]) for t, f in zip(traces, found, strict=True)]
+    n = len(sessions)
+    spent = (time.perf_counter() - begin) / n, (compile_seconds() - compiled) / n
+    return [_solution(s, params, f, t, *spent) for s, f, t in zip(sessions, found, traces, strict=True)]
+
+
+def start_of(session: Session, flip: bool = False) -> State:
+    """The standing body placed by the keypoints, unscaled; `flip`: facing the other way."""
+    p, n_markers = session.problem, session.problem.weight_3d.shape[0]
+    qpos = np.concatenate([placed_poses(session, i, flip) for i in range(len(session.arrays))])
+    qpos = np.pad(qpos, [(0, p.weight.shape[0] - len(qpos)), (0, 0)], mode="edge")
+    zeros = functools.partial(np.zeros, dtype=np.float32)
+    n_trials = p.has_phone.shape[0]
+    values: dict[str, Any] = {
+        "qpos": np.asarray(qpos, np.float32),
+        "R_nc": p.R_nc,
+        "s": zeros(len(session.body.scale_names)),
+        "site_offset_m": zeros((n_markers, 3)),
+        "clock_s": zeros(n_trials),
+        "floor": zeros((n_trials, 3)),
+    }
+    return State(**values)
+
+
+def fit_problem(body: Body, p: Problem, w: Weights, start: State, limits: Limits) -> Progress:
+    """Minimise the total of `objective.py` over per-frame poses."""
+    return minimise(lambda state: linearise(body, p, w, state), moved, start, p.weight, limits)
+
+
+def finish(p: Problem, latest: Linearised, R_nc: Array) -> tuple[Float[Array, "F U"], Outcome]:
+    """Variances of the frames' unknowns as far as the residuals tell (dispersion times the inverse curvature's
+    diagonal), and the outcome."""
+    system = latest.system
+    own = jnp.diagonal(system.diagonal, axis1=-2, axis2=-1)
+    # What nothing holds gets a variance that is large, not infinite: each joint on its own scale, so that the pelvis'
+    # curvature does not make the toes look sure.
+    held = system.diagonal + jnp.diag(1e-6 * jnp.max(own, axis=0))
+    corner = system.corner + 1e-6 * jnp.max(jnp.diagonal(system.corner)) * jnp.eye(system.corner.shape[0])
+    variance, _ = marginal_variance(dataclasses.replace(system, diagonal=held, corner=corner))
+    return variance * latest.dispersion, outcome(p, latest.x, R_nc)
+
+
+_one = jax.jit(fit_problem, static_argnames="body")
+_finish_one = jax.jit(finish)
+_finish_many = jax.jit(jax.vmap(finish))
+
+
+@functools.partial(jax.jit, static_argnames="body")
+def _many(body: Body, p: Problem, w: Weights, start: State, limits: Limits) -> Progress:
+    return jax.vmap(functools.partial(fit_problem, body), in_axes=(0, None, 0, None))(p, w, start, limits)
+
+
+def _solve(
+    sessions: Sequence[Session],
+    problems: Sequence[Problem],
+    starts: Sequence[State],
+    params: GaussNewtonParams,
+    last: bool,
+) -> list[_Found]:
+    body, alone = sessions[0].body, len(sessions) == 1
+    w = Weights.of(body, params, size_unseen=pixels_alone(sessions[0].problem))
+    limits = limits_of(params)
+    given = list(zip(problems, starts, strict=True))
+    if not alone:
+        # The last one stands in for those that are missing, so that a worker compiles a program for few sizes.
+        given += [given[-1]] * (power_of_2(len(given)) - len(given))
+    # Stacked on the host, so that each array goes to the device once.
+    p, start = jax.device_put(given[0] if alone else jax.tree.map(lambda *a: np.stack(a), *given))
+    with one_blas_thread():
+        end = (_one if alone else _many)(body, p, w, start, limits)
+        rest = (_finish_one if alone else _finish_many)(p, end.latest, end.state.R_nc) if last else ()
+        found = jax.device_get((dataclasses.replace(end, latest=None, candidate=None), end.latest.x, *rest))
+    each = [found] if alone else [jax.tree.map(lambda a, i=i: a[i], found) for i in range(len(sessions))]
+    return [_Found(*f) for f in each]
+
+
+def _on_floor(session: Session, found: _Found) -> tuple[Problem, State]:
+    """The problem with the frames in which feet stand, as a solution shows them, and that solution to start from."""
+    p, state = session.problem, found.end.state
+    soles = p.split(found.x)[1]
+    contact, floor = np.zeros(p.contact.shape, np.float32), np.zeros(state.floor.shape, np.float32)
+    for i, arrays in enumerate(session.arrays):
+        first, last = np.flatnonzero(arrays.used)[[0, -1]]  # frames beside them stay where they started
+        at = slice(session.frames(i).start + first, session.frames(i).start + last + 1)
+        contact[at] = standing(arrays.time_s[first : last + 1], soles[at]) * arrays.used[first : last + 1, None]
+        floor[i, 0] = np.average(soles[at][..., 2], weights=contact[at] + 1e-9)
+    seen: Any = contact, floor
+    return dataclasses.replace(p, contact=seen[0]), dataclasses.replace(state, floor=seen[1])
+
+
+def standing(time_s: Float[np.ndarray, " T"], x: Float[np.ndarray, "T P 3"]) -> Float[np.ndarray, "T P"]:
+    """How surely (0 to 1) each point of the soles stands: one half where it is just slow enough."""
+    smooth = gaussian_filter1d(x, STANDING_S / np.median(np.diff(time_s)), axis=0, mode="nearest")
+    speed = np.linalg.norm(np.gradient(smooth, time_s, axis=0), axis=-1)
+    limit = np.maximum(STANDING_FRACTION * np.percentile(speed, 95, axis=0), STANDING_M_PER_S)
+    return 1 / (1 + np.exp(np.minimum((speed / limit - 1) / 0.15, 50.0)))
+
+
+def _solution(
+    session: Session,
+    params: GaussNewtonParams,
+    found: _Found,
+    trace: np.ndarray,
+    seconds: float,
+    compiled: float,
+) -> Solution:
+    state, names = jax.tree.map(lambda a: np.asarray(a, np.float64), found.end.state), session.body.joint_names
+    assert found.variance is not None
+    assert found.outcome is not None
+    factor, floor = by_joint(names, params.sd_factor, 1.0), floors_of(session.body, params.sd_floor)
+    variance = np.maximum(found.variance[:, : len(names)], 0.0)
+    return Solution(
+        qpos=state.qpos,
+        R_nc=state.R_nc,
+        s=state.s,
+        scale=np.asarray(scale_multipliers(found.end.state.s), np.float64),
+        site_offset_m=state.site_offset_m[: len(session.markers)],
+        clock_s=state.clock_s[: len(session.arrays)],
+        loss_trace=trace,
+        compile_seconds=compiled,
+        seconds=seconds,
+        iterations=len(trace),
+        converged=bool(found.end.converged),
+        outcome=found.outcome,
+        # The phone's part was in the recordings on which the factors were found, so they are of both.
+        qpos_sd=np.sqrt((variance + phone_variance(session, state.qpos)) * factor**2 + floor**2),
+    )
+
+
+def limits_of(params: GaussNewtonParams) -> Limits:
+    """When to end, on the device."""
+    return Limits(
+        jnp.asarray(params.tolerance_rad, jnp.float32),
+        jnp.asarray(params.tolerance_cost, jnp.float32),
+        jnp.asarray(params.max_iterations, jnp.int32),
+    )
+
+
+def by_joint(joint_names: Sequence[str], values: Sequence[tuple[str, float]], other: float) -> np.ndarray:
+    """(Q,) values; a name stands for every joint that begins with it, later ones win, `other` where none does."""
+    out = np.full(len(joint_names), other)
+    for prefix, value in values:
+        out[[n.startswith(prefix) for n in joint_names]] = value
+    return out
+
+
+def floors_of(body: Body, sd_floor: Sequence[tuple[str, float]]) -> np.ndarray:
+    """(Q,) least standard deviations in rad and m, from degrees and (slides) centimetres."""
+    return by_joint(body.joint_names, sd_floor, 0.0) * np.where(body.is_slide, 0.01, np.deg2rad(1.0))
+
+
+def suspicious(session: Session, qpos: Float[np.ndarray, "F Q"]) -> bool:
+    """Whether the body may face the wrong way: pixels alone do not tell, and knees then stay at their straight end."""
+    if pixels_alone(session.problem):
+        return True
+    used = np.asarray(session.problem.weight) > 0
+    high = np.asarray(session.body.joint_range_rad)[:, 1]
+    knees = [i for i, n in enumerate(session.body.joint_names) if n.startswith("knee_angle")]
+    straight = [np.mean(qpos[used, i] > high[i] - np.deg2rad(1.0)) for i in knees]
+    return bool(np.mean(straight) > BACKWARDS_FRACTION) if straight else False
