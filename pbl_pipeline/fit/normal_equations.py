@@ -216,10 +216,12 @@ def _marker_blocks(p: Problem, w: Weights, jac: MarkerJacobian, R_nc: Array) -> 
     q = A.shape[-1] - n_s
     frame = p.weight[:, None]
 
-    r, D = linearised(lambda x: residual_3d_cm(x, p.x_world), x)
-    c = w.weight_3d * frame * p.c_world * p.weight_3d * huber_weight(r, w.huber_3d_cm)
-    f = jnp.einsum("fm,fmij,fmi->fmj", c, D, r)
-    M = jnp.einsum("fm,fmik,fmil->fmkl", c, D, D)
+    f, M = jnp.zeros_like(x), jnp.zeros((*x.shape, 3), x.dtype)
+    if p.c_world.shape[1]:
+        r, D = linearised(lambda x: residual_3d_cm(x, p.x_world), x)
+        c = w.weight_3d * frame * p.c_world * p.weight_3d * huber_weight(r, w.huber_3d_cm)
+        f += jnp.einsum("fm,fmij,fmi->fmj", c, D, r)
+        M += jnp.einsum("fm,fmik,fmil->fmkl", c, D, D)
 
     r, D = linearised(lambda x: residual_2d_px(in_camera(x, R_nc, p.p_nc), p.xy_px, p.camera_matrix), x)
     c = w.weight_2d * frame[..., None] * p.c_2d * huber_weight(r, w.huber_2d_px)

@@ -49,7 +49,8 @@ class PointTable:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """F frames of all trials, V views, J markers, N trials; M samples of the phone's orientation per trial.
+    """F frames of all trials, V views, J markers, N trials; M samples of the phone's orientation per trial. W is J where
+    markers were measured in the world, which have no views, and 0 otherwise.
 
     `points`: what is fitted; `weight_3d`: of each marker, as in `MarkerSet`. time_s counts from each trial's first
     frame; `trial` is the number of a frame's trial; `weight` is 1 for a frame that counts and 0 for others. `c_*` are
@@ -71,8 +72,8 @@ class Problem:
     c_3d: Float[Array, "F V J"]
     xy_px: Float[Array, "F V J 2"]
     c_2d: Float[Array, "F V J"]
-    x_world: Float[Array, "F J 3"]
-    c_world: Float[Array, "F J"]
+    x_world: Float[Array, "F W 3"]
+    c_world: Float[Array, "F W"]
     R_nc: Float[Array, "F V 3 3"]
     p_nc: Float[Array, "F V 3"]
     camera_matrix: Float[Array, "F V 3 3"]
@@ -205,7 +206,7 @@ def pack(trials: Sequence[TrialArrays], body: Body, markers: MarkerSet) -> Probl
         widths = [(0, 0)] * a.ndim
         widths[0] = (0, frames)
         if marker_axis is not None:
-            widths[marker_axis] = (0, size - n_markers)
+            widths[marker_axis] = (0, (size - n_markers) * (a.shape[marker_axis] > 0))
         return np.pad(a, widths, mode="constant" if marker_axis is not None else "edge")
 
     def confidence(field: str) -> np.ndarray:

@@ -62,7 +62,8 @@ def outcome(p: Problem, x: Float[Array, "F P 3"], R_nc: Float[Array, "F V 3 3"])
         centred = mean_weights(p.c_3d, p.weight_3d)
         r = residual_3d_cm(x_cam - offset_m(x_cam, p.x_cam, centred), p.x_cam)
         m = 0.01 * _mean_seen(square(r), p.c_3d)
-    m = jnp.where(p.c_world > 0, 0.01 * jnp.sqrt(square(residual_3d_cm(markers, p.x_world))), m)
+    if p.c_world.shape[1]:
+        m = jnp.where(p.c_world > 0, 0.01 * jnp.sqrt(square(residual_3d_cm(markers, p.x_world))), jnp.nan)
     axis = ends[:, 0] - 0.5 * (ends[:, 1] + ends[:, 2]) if ends.shape[1] else jnp.full((x.shape[0], 3), jnp.nan)
     return Outcome(markers, px, m, axis)
 
