@@ -220,9 +220,7 @@ def _l3d(at: At) -> Array:
     centred = mean_weights(p.c_3d, p.weight_3d)
     per_view = L3D(x_cam, p.x_cam, p.c_3d * p.weight_3d, centred, w.depth_ratio, w.huber_3d_cm)
     n = p.c_world.shape[1]
-    in_world = L3D(
-        at.x[:, :n], p.x_world, p.c_world * p.weight_3d[:n], jnp.zeros_like(p.c_world), 1.0, w.huber_3d_cm
-    )
+    in_world = L3D(at.x[:, :n], p.x_world, p.c_world * p.weight_3d[:n], jnp.zeros_like(p.c_world), 1.0, w.huber_3d_cm)
     return at.mean(jnp.sum(per_view, axis=-1) + in_world)
 
 

@@ -49,8 +49,8 @@ class PointTable:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """F frames of all trials, V views, J markers, N trials; M samples of the phone's orientation per trial. W is J where
-    markers were measured in the world, which have no views, and 0 otherwise.
+    """F frames of all trials, V views, J markers, N trials; M samples of the phone's orientation per trial. W is J
+    where markers were measured in the world, which have no views, and 0 otherwise.
 
     `points`: what is fitted; `weight_3d`: of each marker, as in `MarkerSet`. time_s counts from each trial's first
     frame; `trial` is the number of a frame's trial; `weight` is 1 for a frame that counts and 0 for others. `c_*` are
