@@ -8,8 +8,8 @@ from ._fit_session import (
     fit_session,
     fit_sessions,
 )
+from ._methods import METHODS
 from ._params import (
-    METHODS,
     CostParams,
     GaussNewtonParams,
     ImplicitAdamParams,

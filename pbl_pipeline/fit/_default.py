@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from pbl_pipeline.keypoints import MultiView, WorldMarkers
 
-from ._params import METHODS
+from ._methods import METHODS
 from .session import Trial
 
 

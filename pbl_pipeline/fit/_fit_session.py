@@ -17,7 +17,8 @@ from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.video import Camera
 
-from ._params import METHODS, Params
+from ._methods import METHODS
+from ._params import Params
 from ._rotation import quat_wxyz
 from .checks import check_fit
 from .objective import State

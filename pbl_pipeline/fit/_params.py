@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-from pbl_pipeline.methods import Stage
-
 
 @dataclasses.dataclass(frozen=True)
 class CostParams:
@@ -212,11 +210,3 @@ MARKERS = GaussNewtonParams(
 )
 
 Params = GaussNewtonParams | ImplicitAdamParams
-
-#: A family is a solver.
-METHODS: Stage[Params] = Stage("fit", "solver", "blazepose")
-METHODS.register("paper-2025", 1, PAPER_2025, "pbl_pipeline.fit.implicit:solve_sessions")
-METHODS.register("paper-gauss-newton", 1, PAPER_GAUSS_NEWTON, "pbl_pipeline.fit.per_frame:solve_per_frame")
-METHODS.register("gauss-newton", 1, GAUSS_NEWTON)
-METHODS.register("blazepose", 1, BLAZEPOSE)
-METHODS.register("markers", 1, MARKERS)

@@ -18,8 +18,10 @@ RUN = """
 import json, sys
 from pathlib import Path
 import numpy as np
+from pbl_pipeline.fit import fit_session
 from pbl_pipeline.gait import detect_events
 from pbl_pipeline.methods import of_stage, stored
+from pbl_pipeline.synthetic import SynthSpec, synthesise
 from pbl_pipeline.tracking import choose_subject, track_people
 from tests.unit.gait_walker import Walker, make_feet
 from tests.videos import constant_rate, write_video
@@ -49,6 +51,12 @@ tracking = track_people(path, again(method))
 choice = choose_subject(tracking)
 out["backdrop"] = {"people": len(tracking.persons), "detector": tracking.detector, "chosen": choice.person_id,
                    "box": [float(v) for v in tracking.persons[0].box_px[30]], "stored": again(method) == method}
+made = synthesise(SynthSpec(seed=1, seconds=2.0, noise="none"))
+method = of_stage("fit")["placed"]
+fit = fit_session([made.keypoints], ["walk"], again(method))
+off = np.linalg.norm(fit.trials[0].qpos[:, :3] - made.truth.qpos[:, :3], axis=1)
+out["placed"] = {"solver": fit.solver, "hash": fit.params_hash == method.hash, "pelvis_m": float(np.nanmedian(off)),
+                 "stored": again(method) == method, "checks": [c.check for c in fit.qc]}
 print(json.dumps(out))
 """
 
@@ -97,6 +105,14 @@ def test_a_person_detector(results):
     found = results["backdrop"]
     assert (found["people"], found["detector"], found["chosen"], found["stored"]) == (1, "backdrop", 1, True)
     assert found["box"] == pytest.approx([270, 80, 330, 280], abs=10)
+
+
+@pytest.mark.slow
+def test_a_solver(results):
+    found = results["placed"]
+    assert (found["solver"], found["hash"], found["stored"]) == ("placed", True, True)
+    assert found["pelvis_m"] < 0.03
+    assert "residual_3d_cm" in found["checks"]
 
 
 def test_a_registration_is_one_line():
