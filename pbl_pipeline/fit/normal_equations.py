@@ -22,7 +22,6 @@ from jaxtyping import Array, Float
 
 from pbl_pipeline.body import Body, MarkerJacobian, marker_jacobian, scale_multipliers
 
-from .linear import BorderedBandedSystem
 from .objective import (
     At,
     Loffset,
@@ -45,6 +44,7 @@ from .objective import (
 )
 from .priors import Weights, bent, beyond_limit_deg, pose_z, shift
 from .problem import Problem, frames_at
+from .solvers.linear import BorderedBandedSystem
 
 #: Frames whose markers are differentiated at once: bounds the memory of long sessions.
 CHUNK = 512

@@ -23,7 +23,6 @@ from ._params import GaussNewtonParams
 from ._phone_error import phone_variance
 from ._threads import one_blas_thread
 from .initial_pose import placed_poses
-from .linear import marginal_variance
 from .normal_equations import Linearised, linearise, moved
 from .objective import State
 from .priors import Weights, pixels_alone
@@ -31,6 +30,7 @@ from .problem import Problem, power_of_2
 from .session import Session
 from .solution import Outcome, Solution, outcome
 from .solvers.gauss_newton import Limits, Progress, minimise
+from .solvers.linear import marginal_variance
 
 #: A point that stands is slower than this fraction of its own fastest, or than this (m/s); speeds are means over some
 #: time (s, standard deviation).

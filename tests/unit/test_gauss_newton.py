@@ -22,8 +22,7 @@ from pbl_pipeline.body import (
     mjx_frames,
     scale_multipliers,
 )
-from pbl_pipeline.fit import CostParams, GaussNewtonParams, ViewParams, linear
-from pbl_pipeline.fit.linear import BorderedBandedSystem, marginal_variance, solve
+from pbl_pipeline.fit import CostParams, GaussNewtonParams, ViewParams
 from pbl_pipeline.fit.normal_equations import linearise, linearised, measured_orientation, moved
 from pbl_pipeline.fit.objective import (
     At,
@@ -43,10 +42,12 @@ from pbl_pipeline.fit.objective import (
     square,
     total,
 )
-from pbl_pipeline.fit.per_frame import standing, start_of
+from pbl_pipeline.fit.per_frame import finish, fit_problem, limits_of, standing, start_of
 from pbl_pipeline.fit.priors import Weights, bent, beyond_limit_deg
-from pbl_pipeline.fit.problem import SAMPLE_S, bend_weights, point_table
+from pbl_pipeline.fit.problem import SAMPLE_S, TrialArrays, bend_weights, pack, point_table
 from pbl_pipeline.fit.session import Session, make_session
+from pbl_pipeline.fit.solvers import linear
+from pbl_pipeline.fit.solvers.linear import BorderedBandedSystem, marginal_variance, solve
 from pbl_pipeline.synthetic import observe, observe_markers, observe_views, walk_qpos
 
 pytestmark = pytest.mark.slow
@@ -438,3 +439,80 @@ def test_phone_error_by_hand():
     )
     np.testing.assert_allclose(error, (1.5 - 40 * np.asarray(clock_s))[:, None] * z, atol=2e-3)
     np.testing.assert_allclose(rate[..., 0], -40 * np.broadcast_to(z, error.shape), atol=0.06)
+
+
+# --- another body ---
+
+ARM = """
+<mujoco model="arm">
+  <compiler angle="radian"/>
+  <custom>
+    <text name="version" data="1"/>
+    <text name="scale_group/overall" data="*"/>
+    <text name="scale_group/forearm" data="hand"/>
+  </custom>
+  <worldbody>
+    <body name="base" pos="4 0 0">
+      <joint name="along" type="slide" axis="0 1 0"/>
+      <joint name="lift" type="hinge" axis="0 1 0" range="-1 1" limited="true"/>
+      <geom size="0.01"/>
+      <body name="hand" pos="0 0 0.4">
+        <joint name="bend" type="hinge" axis="1 0 0"/>
+        <geom size="0.01"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_a_body_of_three_joints_goes_through_the_same_code(tmp_path):
+    """Other joints, other scale groups, no feet: its movement and the size of its forearm are found again."""
+    (tmp_path / "arm.xml").write_text(ARM)
+    body = load_body(tmp_path / "arm.xml")
+    assert body.joint_names == ("along", "lift", "bend")
+    assert body.scale_names == ("overall", "forearm")
+    t = np.arange(40) / 30
+    truth = np.stack([0.3 * np.sin(2 * t), 0.5 * np.cos(3 * t), 0.8 * np.sin(4 * t)], axis=1)
+    places = np.array([[0, 0.1, 0], [0, -0.1, 0.1], [0.1, 0, 0.2], [0, 0.05, 0.1], [0.05, 0, 0.2], [-0.05, -0.05, 0.3]])
+    markers = MarkerSet(
+        name="arm",
+        names=tuple("abcdef"),
+        body_names=("base",) * 3 + ("hand",) * 3,
+        body_index=np.array([0, 0, 0, 1, 1, 1]),
+        position_m=places,
+        weight_3d=np.ones(6),
+    )
+    scale = np.array([1.0, 1.2])
+    x = np.asarray(marker_positions(body, markers, truth, scale, np.zeros((6, 3))))
+    trial = TrialArrays(
+        time_s=t,
+        used=np.ones(40, bool),
+        x_cam=np.zeros((40, 0, 6, 3)),
+        c_3d=np.zeros((40, 0, 6)),
+        xy_px=np.zeros((40, 0, 6, 2)),
+        c_2d=np.zeros((40, 0, 6)),
+        x_world=x,
+        c_world=np.ones((40, 6)),
+        R_nc=np.zeros((40, 0, 3, 3)),
+        p_nc=np.zeros((40, 0, 3)),
+        camera_matrix=np.zeros((40, 0, 3, 3)),
+    )
+    p = jax.tree.map(jnp.asarray, pack([trial], body, markers))
+    params = GaussNewtonParams(smooth_per_rad2=0.01, smooth_per_m2=0.01, cost=CostParams(weight_offset_per_m2=1e6))
+    frames, n_markers = len(p.weight), len(p.weight_3d)
+    start = State(
+        qpos=jnp.zeros((frames, 3)),
+        R_nc=p.R_nc,
+        s=jnp.zeros(2),
+        site_offset_m=jnp.zeros((n_markers, 3)),
+        clock_s=jnp.zeros(1),
+        floor=jnp.zeros((1, 3)),
+    )
+    end = fit_problem(body, p, Weights.of(body, params), start, limits_of(params))
+    assert bool(end.converged)
+    np.testing.assert_allclose(end.state.qpos[:40], truth, atol=5e-3)
+    np.testing.assert_allclose(scale_multipliers(end.state.s), scale, atol=5e-3)
+    variance, seen = finish(p, end.latest, end.state.R_nc)
+    assert variance.shape == (frames, 3)
+    assert float(np.nanmax(seen.residual_3d_m[:40, :6])) < 5e-3

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..linear import BorderedBandedSystem, solve
+from .linear import BorderedBandedSystem, solve
 
 #: A step of a frame's unknown is cut to this.
 LONGEST_STEP = 0.5
