@@ -147,6 +147,7 @@ def test_trajectories_use_the_encoding_again_and_do_not_depend_on_their_number()
     two, four = initial_trajectories(3, 2, *shape), initial_trajectories(3, 4, *shape)
     assert [a.weight.shape for a in two.layers] == [(2, 12, 16), (2, 12, 28), (2, 12, 28), (2, 12, 12), (2, 43, 12)]
     for a, b in zip(two.layers, four.layers, strict=True):
+        assert b.bias is not None
         np.testing.assert_array_equal(a.weight, b.weight[:2])
         np.testing.assert_array_equal(a.bias, b.bias[:2])
     last = two.layers[-1].bias
