@@ -52,18 +52,18 @@ class Limits:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """Where the iteration stands: the best state with its cost, and `latest`, what was evaluated last, which is at that
-    state when the loop ends. trace: the cost after each iteration."""
+    """Where the iteration stands: the best state with its cost and quadratic model (`latest`), and the state to try
+    next. trace: the cost after each iteration.
+    """
 
     state: Any
     cost: Array
     latest: Any
     candidate: Any
-    #: The candidate is the state itself, evaluated again because the step from it was refused.
-    again: Array
     #: Longest step of an unknown from the state to the candidate.
     step: Array
     damping: Array
+    #: Candidates tried, the start not counted (-1 before it was evaluated).
     iteration: Array
     #: Accepted steps in a row that gained next to nothing.
     idle: Array
@@ -87,51 +87,47 @@ def minimise(
     """
 
     def step(p: Progress) -> Progress:
-        now = evaluate(p.candidate)
+        now, first = evaluate(p.candidate), p.iteration < 0
         # Single precision: a change below the rounding of the sum is no reason to go back.
-        better = ~p.again & (now.cost <= p.cost * (1 + 1e-6))
-        stands = better | p.again
-        keep = lambda new, old: jnp.where(stands, new, old)  # noqa: E731
-        state, cost = jax.tree.map(keep, p.candidate, p.state), keep(now.cost, p.cost)
-        damping = jnp.where(p.again, p.damping, jnp.where(better, p.damping / 10, p.damping * 10))
+        accepted = now.cost <= p.cost * (1 + 1e-6)
+        better = accepted & ~first
+        keep = lambda new, old: jnp.where(accepted, new, old)  # noqa: E731
+        state, latest, cost = jax.tree.map(keep, (p.candidate, now, now.cost), (p.state, p.latest, p.cost))
+        damping = jnp.where(first, p.damping, jnp.where(accepted, p.damping / 10, p.damping * 10))
         damping = jnp.clip(damping, DAMPING_LEAST, DAMPING_MOST)
         gained = p.cost - now.cost > limits.gain * p.cost
         # A step that was refused says nothing of the minimum: the next one is damped more.
         idle = jnp.where(better, jnp.where(gained, 0, p.idle + 1), p.idle)
-        dx, dy = solve(_damped(now.system, damping), now.g, now.h)
+        dx, dy = solve(_damped(latest.system, damping), latest.g, latest.h)
         dx = jnp.clip(dx, -LONGEST_STEP, LONGEST_STEP)
-        following = jax.tree.map(lambda new, old: jnp.where(stands, new, old), move(state, dx, dy), state)
         return Progress(
             state=state,
             cost=cost,
-            latest=now,
-            candidate=following,
-            again=~stands,
+            latest=latest,
+            candidate=move(state, dx, dy),
             step=jnp.max(jnp.abs(dx) * counts[:, None]),
             damping=damping,
-            iteration=p.iteration + ~p.again,
+            iteration=p.iteration + 1,
             idle=idle,
             converged=(better & (p.step < limits.step)) | (idle >= 2),
-            trace=p.trace.at[jnp.where(p.again, MOST_ITERATIONS, p.iteration)].set(cost, mode="drop"),
+            trace=p.trace.at[jnp.where(first, MOST_ITERATIONS, p.iteration)].set(cost, mode="drop"),
         )
 
     shapes = jax.eval_shape(evaluate, start)
-    first = Progress(
+    before = Progress(
         state=start,
         cost=jnp.asarray(jnp.inf),
         latest=jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes),
         candidate=start,
-        again=jnp.asarray(True),
         step=jnp.asarray(jnp.inf),
         damping=jnp.asarray(DAMPING_START),
-        iteration=jnp.asarray(0),
+        iteration=jnp.asarray(-1),
         idle=jnp.asarray(0),
         converged=jnp.asarray(False),
         trace=jnp.full(MOST_ITERATIONS, jnp.nan),
     )
     most = jnp.minimum(limits.iterations, MOST_ITERATIONS)
-    # `again` also ends the loop at an evaluated state: at the start, and after a last step that was refused.
-    return jax.lax.while_loop(lambda p: ~p.converged & ((p.iteration < most) | p.again), step, first)
+    return jax.lax.while_loop(lambda p: ~p.converged & (p.iteration < most), step, before)
 
 
 def _damped(system: BorderedBandedSystem, damping: Array) -> BorderedBandedSystem:
