@@ -72,8 +72,9 @@ def test_it_ends_well_and_shows_rows_paths_and_progress(demo, out):
         assert word in done.stdout
     for name in ("report.html", "demo.overlay.mp4", "demo.angles.csv", "metrics.json"):
         assert str(out / name) in done.stdout
-    for step in ("people", "keypoints", "SessionFit", "overlay demo"):
+    for step in ("people", "keypoints", "populate", "overlay demo"):
         assert f"{step}: 100%" in done.stderr
+    assert "SessionFit]" in done.stderr  # the bar names the table in hand
     assert "Traceback" not in done.stdout + done.stderr
     assert "The database is stopped" in done.stdout
 
