@@ -16,6 +16,7 @@ from ._noise import BLAZEPOSE_NOISE, NO_NOISE, Noise
 from ._observe import Seen, observe, pelvis_positions
 from ._path import PATHS
 from ._person import person, true_markers
+from ._solve import SOLE_POINTS, sole_points
 from ._synth import TASKS, Synthetic, SynthSpec, Truth, speed_of_group, synthesise
 from ._views import VIEW_CAMERA, VIEW_SIZE_PX, observe_markers, observe_views
 from ._walk import plain_walk, walk_qpos
@@ -28,6 +29,7 @@ __all__ = [
     "PATHS",
     "PHONE_CAMERA",
     "PHONE_SIZE_PX",
+    "SOLE_POINTS",
     "TASKS",
     "VIEW_CAMERA",
     "VIEW_SIZE_PX",
@@ -47,6 +49,7 @@ __all__ = [
     "person",
     "picture_px",
     "plain_walk",
+    "sole_points",
     "speed_of_group",
     "synthesise",
     "true_markers",

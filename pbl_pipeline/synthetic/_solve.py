@@ -21,7 +21,7 @@ from jaxtyping import Float
 from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
 
-from pbl_pipeline.body import load_body
+from pbl_pipeline.body import SCALE_NAMES, load_body
 
 from ._physique import SOLE_M, scaled_model
 from ._plan import GRID_STEP_S, Plan, Step
@@ -115,6 +115,14 @@ def solve(
             tried = q
         q = tried
     return q
+
+
+def sole_points(
+    qpos: Float[np.ndarray, "T 40"], scale: Float[np.ndarray, " 8"] | None = None
+) -> dict[str, Float[np.ndarray, "T P 3"]]:
+    """The five points of the right ("r") and left ("l") sole in the world (m), in the order of `SOLE_POINTS`."""
+    points = _Soles(np.ones(len(SCALE_NAMES)) if scale is None else scale).points(np.asarray(qpos, np.float64))
+    return {"r": points[:, : len(SOLE_POINTS)], "l": points[:, len(SOLE_POINTS) :]}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

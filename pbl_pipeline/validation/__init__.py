@@ -5,6 +5,7 @@ from ._compare import JointError, KinematicErrors, compare, compare_angles, comp
 from ._curves import CURVE_COLUMNS, cycle_curves, save_curves
 from ._frame import COLUMNS, TrialErrors, error_frame
 from ._joints import JOINTS_CLIP, JOINTS_OPENCAP, JOINTS_PAPER
+from ._motions import ACTIVITIES, Motion, read_index, read_motion, read_motions, stride_s, turned
 from ._paper import paper_figures
 from ._paper_tables import paper_tables
 from ._point_truth import PointTruth, resect, truth_of_bodies, truth_of_synthetic, truth_of_trc
@@ -31,6 +32,7 @@ from ._view import view_classes
 from ._write import html, latex, print_tables, write_tables
 
 __all__ = [
+    "ACTIVITIES",
     "BODY_ROTATIONS",
     "COLUMNS",
     "CONVENTIONS",
@@ -44,6 +46,7 @@ __all__ = [
     "Cell",
     "JointError",
     "KinematicErrors",
+    "Motion",
     "PointErrors",
     "PointTruth",
     "Reference",
@@ -67,6 +70,9 @@ __all__ = [
     "paper_tables",
     "point_errors",
     "print_tables",
+    "read_index",
+    "read_motion",
+    "read_motions",
     "reference_of_bodies",
     "reference_of_fit",
     "reference_of_mot",
@@ -74,9 +80,11 @@ __all__ = [
     "reliability_table",
     "resect",
     "save_curves",
+    "stride_s",
     "truth_of_bodies",
     "truth_of_synthetic",
     "truth_of_trc",
+    "turned",
     "view_classes",
     "write_reliability",
     "write_tables",
