@@ -1,4 +1,4 @@
-"""Calling `pbl` as its script does, but in this process: exit code and what was printed."""
+"""Calling `pbl` as its script does, but in this process: exit code and what was printed; programs of a test's own."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import io
 import sys
+from pathlib import Path
 from unittest import mock
 
 from pbl_pipeline.cli import main
@@ -41,3 +42,11 @@ def pbl(*arguments: object) -> Done:
         else:
             code = 0
     return Done(code, out.getvalue(), err.getvalue())
+
+
+def program(folder: Path, name: str, text: str) -> Path:
+    """A shell script that stands in for a program of this name."""
+    path = folder / name
+    path.write_text("#!/bin/sh\n" + text)
+    path.chmod(0o755)
+    return path

@@ -18,11 +18,13 @@ from tests.database import installation, leave_nothing_of_the_developer
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The marker `database` follows from the fixture of that name."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """The marker `database` follows from the fixture of that name; `machine` runs only where it is asked for."""
     for item in items:
         if "database" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.database)
+        if item.get_closest_marker("machine") and "machine" not in config.option.markexpr:
+            item.add_marker(pytest.mark.skip(reason="takes minutes and starts services: pytest -m machine"))
 
 
 @pytest.fixture(scope="session")

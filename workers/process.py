@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 import os
 import signal
 import threading
@@ -13,6 +14,7 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 
 from . import registry, run_job
+from .devices import VISIBLE
 from .log import event, to_stderr
 from .queue import Claim
 from .run_job import Outcome
@@ -26,7 +28,7 @@ SELFTEST_FAILED = 3
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Options of `pbl worker`. grace_s: how long a running job may continue after SIGTERM. limit_factor: multiplies the
-    time limits of the tables."""
+    time limits of the tables. gpus: dealt to the processes in turn, one to each."""
 
     resource: str = "all"
     processes: int = 1
@@ -36,10 +38,20 @@ class Options:
     grace_s: float = 60.0
     limit_factor: float = 1.0
     selftest: bool = True
+    gpus: tuple[str, ...] = ()
+
+    def of_process(self, number: int) -> Options:
+        """The options of one of the processes: its GPU, and how many processes share that."""
+        if not self.gpus:
+            return self
+        n = len(self.gpus)
+        return dataclasses.replace(self, gpus=(self.gpus[number % n],), processes=math.ceil(self.processes / n))
 
 
 def work(options: Options, pipe: Connection) -> None:
-    """Run a working process: connect, run the self-test, work."""
+    """Run a working process (`Options.of_process`): connect, run the self-test, work."""
+    if options.gpus:
+        os.environ[VISIBLE] = options.gpus[0]
     if options.processes > 1:
         # Without this JAX reserves most of a GPU's memory for the first of several processes that share it.
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")

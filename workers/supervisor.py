@@ -48,6 +48,7 @@ class _Child:
     started: float
     jobs: dict[tuple[str, str], tuple[Claim, float]] = dataclasses.field(default_factory=dict)
     why: str = ""
+    number: int = 0  # which of the worker's processes it is: its replacement gets the same GPU
 
     def heard(self, job: Claim, outcome: Outcome | None, limit_factor: float) -> None:
         """Note a job that began (no outcome yet) or ended."""
@@ -84,7 +85,7 @@ class Supervisor:
         """Watch until every process has ended (`once`), or until SIGTERM or SIGINT."""
         before = {s: signal.signal(s, self.stop) for s in (signal.SIGTERM, signal.SIGINT)}
         try:
-            self._children = [self._launch() for _ in range(self.options.processes)]
+            self._children = [self._launch(number) for number in range(self.options.processes)]
             code = 0
             while self._children:
                 self._listen(0.5)
@@ -97,12 +98,13 @@ class Supervisor:
                 signal.signal(s, handler)
 
     # ------------------------------------------------------------------------------------------------- processes
-    def _launch(self) -> _Child:
+    def _launch(self, number: int) -> _Child:
         here, there = self._start.Pipe(duplex=False)
-        process = self._start.Process(target=self.target, args=(self.options, there), name="pbl-worker")
+        options = self.options.of_process(number)
+        process = self._start.Process(target=self.target, args=(options, there), name="pbl-worker")
         process.start()
         there.close()
-        return _Child(process, here, time.monotonic())
+        return _Child(process, here, time.monotonic(), number=number)
 
     def _send_due(self) -> None:
         """Ask the processes to end after their job (SIGTERM), then to put it back (SIGUSR1), then kill them."""
@@ -169,7 +171,7 @@ class Supervisor:
             time.sleep(self._pause)
             self._pause = min(2 * self._pause, RESTART_S[1])
             if not self._stopping:
-                self._children.append(self._launch())
+                self._children.append(self._launch(child.number))
         return code
 
     def _settle_jobs(self, child: _Child, exit_code: int) -> None:

@@ -195,13 +195,14 @@ def queue_fits(warm_up: int) -> int:
 # ------------------------------------------------------------------------------------------------------------ one run
 def run(batch: int, processes: int, folder: Path) -> list[dict[str, Any]]:
     """Have a worker fit what is queued; the device's own readings [(time, percent)] as spans named "smi"."""
+    from workers.devices import given_gpus
     from workers.metrics import Metrics
     from workers.process import Options
     from workers.supervisor import Supervisor
 
     folder.mkdir()
     os.environ[gpu_worker_watch.NOTES] = str(folder)
-    options = Options(resource="gpu", once=True, selftest=False, batch=batch, processes=processes)
+    options = Options(resource="gpu", once=True, selftest=False, batch=batch, processes=processes, gpus=given_gpus())
     with device_readings() as readings:
         code = Supervisor(options, Metrics(), gpu_worker_watch.work).run()
     if code:
@@ -331,7 +332,7 @@ def lines(batch: int, processes: int, f: dict[str, Any]) -> list[str]:
 @click.option("--sessions", default=256, show_default=True, help="That are measured.")
 @click.option("--warm-up", default=64, show_default=True, help="Sessions before them, so that programs are compiled.")
 @click.option("--batch", "batches", default="32", show_default=True, help="Sessions that are reserved together; a,b,c.")
-@click.option("--processes", default="1", show_default=True, help="Working processes that share the device; a,b,c.")
+@click.option("--processes", default="1", show_default=True, help="Working processes, of all devices; a,b,c.")
 @click.option("--seconds", default="5,7.5,10", show_default=True, help="That a trial may last; a,b,c.")
 @click.option("--alike", is_flag=True, help="All sessions of one size: a single program.")
 @click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write the figures there.")

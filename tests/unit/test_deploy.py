@@ -15,11 +15,15 @@ import pytest
 import yaml
 
 from pbl_pipeline.cli._main import cli
+from tests.command import program
+from workers.supervisor import LAST_S
 
 ROOT = Path(__file__).resolve().parents[2]
 DEPLOY = ROOT / "workers" / "deploy"
 KUBERNETES = sorted((DEPLOY / "kubernetes").glob("*.yaml"))
 SCRIPTS = [*sorted(DEPLOY.rglob("*.sh")), DEPLOY / "slurm" / "worker.sbatch"]
+#: Slurm's default KillWait: seconds from the SIGTERM of scancel to SIGKILL.
+SLURM_KILL_WAIT_S = 30.0
 CRON = ("import", "refresh", "release", "disk", "reprocess", "summary")
 
 
@@ -29,13 +33,6 @@ def compose() -> dict[str, Any]:
 
 def documents(path: Path) -> list[dict[str, Any]]:
     return list(yaml.safe_load_all(path.read_text()))
-
-
-def program(folder: Path, name: str, text: str) -> Path:
-    path = folder / name
-    path.write_text("#!/bin/sh\n" + text)
-    path.chmod(0o755)
-    return path
 
 
 # ------------------------------------------------------------------------------------------------------------- compose
@@ -204,7 +201,9 @@ def test_the_slurm_script_ends_its_worker_in_order(tmp_path: Path):
     environment["PBL_SETTINGS"] = str(settings)
     job = subprocess.Popen(start, env=environment, stdout=subprocess.PIPE, text=True)
     assert job.stdout is not None
-    assert job.stdout.readline() == "db.example worker --resource gpu --grace 90\n"
+    host, *words = job.stdout.readline().split()
+    assert (host, words[:-1]) == ("db.example", ["worker", "--resource", "gpu", "--grace"])
+    assert float(words[-1]) + LAST_S < SLURM_KILL_WAIT_S
     job.send_signal(signal.SIGTERM)
     said, _ = job.communicate(timeout=10)
     assert said == "ended\n"

@@ -47,7 +47,7 @@ def boss(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     found = Supervisor(Options(), Metrics())
     left: list[int] = []
     monkeypatch.setattr(found, "_settle_jobs", lambda child, *_: left.append(len(child.jobs)))
-    monkeypatch.setattr(found, "_launch", lambda: Process().child)
+    monkeypatch.setattr(found, "_launch", lambda _: Process().child)
     monkeypatch.setattr("workers.supervisor.time.sleep", lambda _: None)
     process = Process()
     found._children = [process.child]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from workers.registry import GROUPS
+from workers.registry import FIT, GROUPS
 
 
 @click.command()
@@ -15,9 +15,14 @@ from workers.registry import GROUPS
     show_default=True,
     help="What this machine serves: cpu is everything but the fit, gpu the fit.",
 )
-@click.option("--processes", type=click.IntRange(1, 256), default=1, show_default=True, help="Working processes.")
 @click.option(
-    "--batch", type=click.IntRange(1, 256), help="Fits at once on one device (default: 32 with a GPU, else 1)."
+    "--processes", type=click.IntRange(1, 256),
+    help="Working processes (default: one for each GPU where the fit is served, else 1).",
+)  # fmt: skip
+@click.option(
+    "--batch",
+    type=click.IntRange(1, 256),
+    help="Fits reserved together by a process (default: 128 with a GPU, else 1).",
 )
 @click.option("--once", is_flag=True, help="End when no job is left.")
 @click.option("--max-jobs", type=click.IntRange(min=1), help="End a process after so many jobs.")
@@ -34,7 +39,7 @@ from workers.registry import GROUPS
 @click.option("--no-selftest", is_flag=True, help="Skip the known jobs that each process does first.")
 def worker(
     resource: str,
-    processes: int,
+    processes: int | None,
     batch: int | None,
     once: bool,
     max_jobs: int | None,
@@ -56,16 +61,21 @@ def worker(
     """
     import schemas
     from schemas import connection
+    from workers.devices import given_gpus
     from workers.log import to_stderr
     from workers.process import Options
     from workers.supervisor import Supervisor
 
     schemas.activate(methods=False)  # a wrong address or login is reported here, not by a process that is started again
     to_stderr()
+    gpus = given_gpus()
+    n_fit = len(gpus) if FIT in GROUPS[resource] else 0
     options = Options(
         resource=resource,
-        processes=processes,
-        batch=batch or default_batch(resource),
+        processes=processes or n_fit or 1,
+        # Among so many sessions are enough of one size to be solved together.
+        batch=batch or (128 if n_fit else 1),
+        gpus=gpus,
         once=once,
         max_jobs=max_jobs,
         grace_s=grace_s,
@@ -76,13 +86,3 @@ def worker(
     if metrics_port is not None:
         supervisor.metrics.serve(metrics_port, metrics_host, connection.another)
     raise click.exceptions.Exit(supervisor.run())
-
-
-def default_batch(resource: str) -> int:
-    """128 where a GPU fits, else 1: among so many are enough of one size to be solved together.
-
-    Asked without loading the numerical library, which would take the device.
-    """
-    import shutil
-
-    return 128 if "fit" in GROUPS[resource] and shutil.which("nvidia-smi") else 1

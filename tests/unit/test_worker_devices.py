@@ -1,0 +1,86 @@
+"""A worker uses every GPU that it was given: one process each, and more processes share them evenly."""
+
+from __future__ import annotations
+
+import os
+from multiprocessing import Pipe
+from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
+
+import pytest
+
+from tests.command import program
+from workers import process
+from workers.devices import VISIBLE, given_gpus
+from workers.process import Options
+from workers.supervisor import Supervisor
+
+#: Variable by which JAX does not reserve a GPU's memory for one process.
+MEMORY = "XLA_PYTHON_CLIENT_PREALLOCATE"
+
+
+@pytest.mark.parametrize(
+    ("listed", "expected"),
+    [("2,5", ("2", "5")), ("GPU-8f3a, MIG-77", ("GPU-8f3a", "MIG-77")), ("", ()), ("-1", ()), ("NoDevFiles", ())],
+)
+def test_a_batch_system_says_which_gpus_are_ours(listed: str, expected: tuple, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv(VISIBLE, listed)
+    assert given_gpus() == expected
+
+
+@pytest.mark.parametrize(("answer", "expected"), [("echo 0\necho 1", ("0", "1")), ("exit 9", ()), (None, ())])
+def test_otherwise_the_driver_lists_them(answer: str | None, expected: tuple, tmp_path: Path, monkeypatch):
+    monkeypatch.delenv(VISIBLE, raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    if answer is not None:
+        program(tmp_path, "nvidia-smi", answer)
+    assert given_gpus() == expected
+
+
+def test_processes_are_dealt_to_the_gpus_evenly():
+    options = Options(processes=5, gpus=("a", "b"))
+    assert [options.of_process(i).gpus for i in range(5)] == [("a",), ("b",), ("a",), ("b",), ("a",)]
+    assert {options.of_process(i).processes for i in range(5)} == {3}  # that share a device, at most
+    alone = Options(processes=2, gpus=("a", "b")).of_process(1)
+    assert (alone.gpus, alone.processes) == (("b",), 1)
+    assert Options(processes=2).of_process(1) == Options(processes=2)
+
+
+def test_a_process_sees_its_own_gpu_only(monkeypatch: pytest.MonkeyPatch):
+    """What JAX finds in the environment of the two processes of two GPUs, and of the fourth of four."""
+    for name in ("_connected", "to_stderr", "signal.signal"):
+        monkeypatch.setattr(f"workers.process.{name}", lambda *_: False)  # it ends where it would connect
+    seen = []
+    for number, processes in ((0, 2), (1, 2), (3, 4)):
+        for name in (VISIBLE, MEMORY):
+            monkeypatch.setenv(name, "")
+            monkeypatch.delenv(name)
+        process.work(Options(processes=processes, gpus=("4", "7")).of_process(number), mock.Mock())
+        seen.append((os.environ.get(VISIBLE), os.environ.get(MEMORY)))
+    assert seen == [("4", None), ("7", None), ("7", "false")]
+
+
+def test_a_process_that_died_is_replaced_by_one_with_the_same_gpu(monkeypatch: pytest.MonkeyPatch):
+    started: list[Options] = []
+
+    class Process:
+        """A process that has ended at once; the second one died."""
+
+        def __init__(self, args: tuple, **_: object) -> None:
+            self.sentinel, self._other_end = Pipe()
+            self.exitcode = 1 if len(started) == 1 else 0
+            started.append(args[0])
+
+        def start(self) -> None: ...
+
+        def join(self) -> None: ...
+
+        def is_alive(self) -> bool:
+            return False
+
+    boss = Supervisor(Options(processes=2, gpus=("4", "7"), once=True))
+    monkeypatch.setattr(boss, "_start", SimpleNamespace(Process=Process, Pipe=Pipe))
+    monkeypatch.setattr("workers.supervisor.time.sleep", lambda _: None)
+    assert boss.run() == 0
+    assert [options.gpus for options in started] == [("4",), ("7",), ("7",)]
