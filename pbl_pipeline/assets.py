@@ -1,8 +1,7 @@
-"""Model and demo files that are too large for the package: fetched once with pip, checked, kept in the user's cache.
+"""Model and demo files that are too large for the package: fetched once, checked, kept in the user's cache.
 
-Each file travels inside a wheel of a public package. Pip downloads exactly that wheel (pinned version, platform and
-SHA-256) through the package index this machine is configured for; nothing of it is installed or run. Only the named
-files are taken out, and every use checks them against their own SHA-256.
+Each file travels inside a public package, which its registry's client downloads (`packages.py`): pinned version,
+platform and SHA-256. Only the named files are taken out, and every use checks them against their own SHA-256.
 """
 
 from __future__ import annotations
@@ -10,53 +9,44 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
-import importlib.util
 import os
-import shlex
 import shutil
 import subprocess
-import sys
 import tempfile
 import threading
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
 from . import progress, settings
 from .errors import PblError
+from .packages import NpmPackage, Package, Wheel
 
-#: Longest that a download may take (s); the largest wheel has 36 MB.
+#: Longest that a download may take (s); the largest package has 51 MB.
 _TIMEOUT_S = 1200.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Wheel:
-    """A pinned wheel: what to ask pip for, and how to know that it came."""
-
-    requirement: str
-    filename: str
-    sha256: str
-    size_bytes: int
-    pip_options: tuple[str, ...]
-
-
-@dataclasses.dataclass(frozen=True)
 class Asset:
-    """One file of a wheel, with its licence and where it comes from."""
+    """One file of a package, with its licence and where it comes from.
+
+    `optional`: neither the default methods nor the demo need it. `file`: the name it is kept under; empty: its own.
+    """
 
     name: str
     what: str
-    wheel: Wheel
+    package: Package
     member: str
     sha256: str
     size_bytes: int
     licence: str
     source: str
+    optional: bool = False
+    file: str = ""
 
     @property
     def path(self) -> Path:
         """Where the file is kept on this machine, present or not."""
-        return folder() / Path(self.member).name
+        return folder() / (self.file or Path(self.member).name)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,11 +77,17 @@ _SPORTS2D = Wheel(
     # Named so that pip takes the wheel whatever Python asks; 311 is within the range the package declares.
     pip_options=("--only-binary=:all:", "--python-version", "311"),
 )
+_MEDIAPIPE_POSE = NpmPackage(
+    requirement="@mediapipe/pose@0.5.1675469404",
+    filename="mediapipe-pose-0.5.1675469404.tgz",
+    sha256="8bb349a7b3a3ba699df23be804ddd3b3eab810b50b15406894be257859388a84",
+    size_bytes=40_985_403,
+)
 
 _BLAZEPOSE = ("Apache-2.0", "MediaPipe 0.10.21, Google LLC; Bazarevsky et al. 2020, arXiv:2006.10204")
 _DEMO = ("BSD-3-Clause", "Sports2D 0.8.34, David Pagnon; doi:10.21105/joss.06849")
 
-#: Every asset by name.
+#: Every asset by name, optional ones included (`needed`).
 ASSETS: dict[str, Asset] = {
     asset.name: asset
     for asset in (
@@ -112,6 +108,17 @@ ASSETS: dict[str, Asset] = {
             "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f",
             6_440_512,
             *_BLAZEPOSE,
+        ),
+        Asset(
+            "blazepose_landmarks_heavy",
+            "33 body landmarks (BlazePose, heavy)",
+            _MEDIAPIPE_POSE,
+            "package/pose_landmark_heavy.tflite",
+            "59e42d71bcd44cbdbabc419f0ff76686595fd265419566bd4009ef703ea8e1fe",
+            27_709_200,
+            "Apache-2.0",
+            "@mediapipe/pose 0.5.1675469404, Google LLC; Bazarevsky et al. 2020, arXiv:2006.10204",
+            optional=True,
         ),
         Asset(
             "demo_video",
@@ -135,6 +142,11 @@ ASSETS: dict[str, Asset] = {
 }
 
 
+def needed() -> list[str]:
+    """Names of the assets that the default methods and the demo use."""
+    return [name for name, asset in ASSETS.items() if not asset.optional]
+
+
 def folder() -> Path:
     """Where assets are kept: `assets` in the user's cache folder (PBL_CACHE), created when absent.
 
@@ -154,12 +166,12 @@ def folder() -> Path:
 def fetch(name: str) -> Path:
     """The checked file of an asset, fetched on first use (and again when its bytes have changed).
 
-    Several processes may ask at once. A wheel that lies in `folder()` under its own name is used without network.
+    Several processes may ask at once. A package that lies in `folder()` under its own name is used without network.
 
     Raises
     ------
     PblError
-        ASSET_MISSING: it is not here and cannot be fetched (PBL_OFFLINE, no network, no pip, no space).
+        ASSET_MISSING: it is not here and cannot be fetched (PBL_OFFLINE, no network, no pip or npm, no space).
         ASSET_CHECKSUM: what came, or what was put there, is not the pinned file.
     KeyError
         No asset has that name.
@@ -187,43 +199,34 @@ def status() -> list[AssetStatus]:
     return found
 
 
-def pip_command(wheel: Wheel, into: str | Path) -> list[str]:
-    """The pip call that downloads exactly this wheel into a folder, with the index pip is configured for."""
-    quiet = ("--quiet", "--no-input", "--disable-pip-version-check")
-    return [
-        *(sys.executable, "-m", "pip", "download", "--no-deps", *quiet),
-        *("--dest", str(into), *wheel.pip_options, wheel.requirement),
-    ]
-
-
 def _bring(asset: Asset) -> None:
-    wheel, here = asset.wheel, folder() / asset.wheel.filename
+    package, here = asset.package, folder() / asset.package.filename
     if here.is_file():
-        _check_wheel(here, wheel, f"delete {here}, or replace it by the file that this makes: {_remedy(wheel)}")
-        _extract(here, wheel)
+        _check_package(here, package, f"delete {here}, or replace it by the file that this makes: {package.remedy()}")
+        _extract(here, package)
         return
     if settings.offline():
         state = "other bytes than pinned, and" if asset.path.is_file() else "not on this machine, and"
         raise _missing(asset, f"{asset.path} is {state} PBL_OFFLINE forbids fetching")
     with tempfile.TemporaryDirectory(dir=folder(), prefix="fetch-") as temporary:
         path = _download(asset, Path(temporary))
-        _check_wheel(path, wheel, "try again; if it stays so, the package index in use does not serve the public file")
-        _extract(path, wheel)
+        again = "try again; if it stays so, the registry or mirror in use does not serve the public file"
+        _check_package(path, package, again)
+        _extract(path, package)
 
 
 def _download(asset: Asset, into: Path) -> Path:
-    wheel = asset.wheel
-    if importlib.util.find_spec("pip") is None:
-        raise _missing(asset, "this Python has no pip; `python -m ensurepip` adds it")
-    # Pip collects the download in its temporary folder: placed here, its growth is the progress.
+    package = asset.package
+    if absent := package.absent():
+        raise _missing(asset, absent)
+    # The client collects the download in a temporary folder: placed here, its growth is the progress.
     scratch = into / "scratch"
     scratch.mkdir()
-    command = pip_command(wheel, into)
-    with _watch(into, f"fetching {wheel.requirement}", wheel.size_bytes):
+    with _watch(into, f"fetching {package.requirement}", package.size_bytes):
         try:
             done = subprocess.run(
-                command,
-                env=os.environ | {"TMPDIR": str(scratch)},
+                package.command(into),
+                env=os.environ | package.environment(scratch),
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 text=True,
@@ -231,41 +234,32 @@ def _download(asset: Asset, into: Path) -> Path:
                 check=False,
             )
         except subprocess.TimeoutExpired as error:
-            raise _missing(asset, f"no answer from the package index within {_TIMEOUT_S:.0f} s") from error
-    path = into / wheel.filename
+            raise _missing(asset, f"no answer from the package registry within {_TIMEOUT_S:.0f} s") from error
+    path = into / package.filename
     if done.returncode != 0 or not path.is_file():
-        raise _missing(asset, f"{wheel.requirement} could not be downloaded: {_pip_reason(done)}")
+        raise _missing(asset, f"{package.requirement} could not be downloaded: {package.reason(done)}")
     return path
 
 
-def _pip_reason(done: subprocess.CompletedProcess[str]) -> str:
-    """Pip's last error; without a connection it only says that nothing matches, so that is said first."""
-    errors = [line.strip() for line in done.stderr.splitlines() if line.strip().startswith("ERROR")]
-    reason = errors[-1] if errors else f"pip ended with code {done.returncode} and brought another file"
-    unreachable = "connection broken" in done.stderr or "ConnectionError" in done.stderr
-    return f"no connection to the package index ({reason})" if unreachable else reason
+def _extract(path: Path, package: Package) -> None:
+    """Take all assets of a checked package out of it; each appears complete or not at all."""
+    for asset in ASSETS.values():
+        if asset.package is not package or _is_pinned(asset.path, asset.sha256):
+            continue
+        data = package.read(path, asset.member)
+        found = hashlib.sha256(data).hexdigest()
+        if found != asset.sha256:
+            raise _checksum(f"{asset.member} in {path.name}", found, asset.sha256, "report this: the pins disagree")
+        with tempfile.NamedTemporaryFile(dir=asset.path.parent, prefix="fetch-", delete=False) as file:
+            file.write(data)
+        os.chmod(file.name, 0o644)  # readable for the account a worker runs under
+        os.replace(file.name, asset.path)
 
 
-def _extract(path: Path, wheel: Wheel) -> None:
-    """Take all assets of a checked wheel out of it; each appears complete or not at all."""
-    with zipfile.ZipFile(path) as archive:
-        for asset in ASSETS.values():
-            if asset.wheel is not wheel or _is_pinned(asset.path, asset.sha256):
-                continue
-            data = archive.read(asset.member)
-            found = hashlib.sha256(data).hexdigest()
-            if found != asset.sha256:
-                raise _checksum(f"{asset.member} in {path.name}", found, asset.sha256, "report this: the pins disagree")
-            with tempfile.NamedTemporaryFile(dir=asset.path.parent, prefix="fetch-", delete=False) as file:
-                file.write(data)
-            os.chmod(file.name, 0o644)  # readable for the account a worker runs under
-            os.replace(file.name, asset.path)
-
-
-def _check_wheel(path: Path, wheel: Wheel, next_step: str) -> None:
+def _check_package(path: Path, package: Package, next_step: str) -> None:
     found = _sha256(path)
-    if found != wheel.sha256:
-        raise _checksum(wheel.filename, found, wheel.sha256, next_step)
+    if found != package.sha256:
+        raise _checksum(package.filename, found, package.sha256, next_step)
 
 
 def _is_pinned(path: Path, sha256: str) -> bool:
@@ -277,17 +271,13 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _remedy(wheel: Wheel) -> str:
-    return shlex.join(["python", *pip_command(wheel, ".")[1:]])
-
-
 def _missing(asset: Asset, found: str) -> PblError:
     return PblError(
         "ASSET_MISSING",
         found=found,
-        expected=f"{asset.what}, from the wheel {asset.wheel.requirement} ({asset.licence})",
-        next_step=f"with network, run this again; without, run `{_remedy(asset.wheel)}` on a machine that has it and "
-        f"copy {asset.wheel.filename} into {folder()} (or set PBL_CACHE to a folder whose assets/ holds the files)",
+        expected=f"{asset.what}, from the {asset.package.kind} {asset.package.requirement} ({asset.licence})",
+        next_step=f"with network, run this again; without, run `{asset.package.remedy()}` on a machine that has it and "
+        f"copy {asset.package.filename} into {folder()} (or set PBL_CACHE to a folder whose assets/ holds the files)",
         key=asset.name,
     )
 
@@ -296,7 +286,7 @@ def _unwritable(error: OSError) -> PblError:
     return PblError(
         "ASSET_MISSING",
         found=f"the cache folder cannot be written ({error})",
-        expected="a folder for model and demo files with 60 MB free",
+        expected="a folder for model and demo files with 200 MB free",
         next_step="set PBL_CACHE to a folder of your own with free space",
     )
 
@@ -349,5 +339,5 @@ def _watch(path: Path, label: str, size_bytes: int) -> Iterator[None]:
 def _size(path: Path) -> int:
     try:
         return path.stat().st_size
-    except OSError:  # pip removes its own files while we look
+    except OSError:  # the client removes its own files while we look
         return 0

@@ -1,7 +1,7 @@
-"""Fit the curve of the embedded detector's confidence: `python -m research.confidence DATA`.
+"""Fit the curve of a BlazePose network's confidence: `python -m research.confidence DATA [--method blazepose-heavy]`.
 
 DATA is the folder of the development recordings (`real/multiview`, `real/video_mocap`; its README has sources and
-licences). Detects the points in the six videos with the default parameters (or takes them from `--keypoints`, where
+licences). Detects the points in the six videos with the method (or takes them from `--keypoints`, where
 they were detected by the same parameters), compares them with what is true, fits a curve, says how well a curve fitted
 without a recording speaks of it, and adds it to `pbl_pipeline/keypoints/data/confidence_curves.json`. Nothing is drawn
 at random, so the same recordings and parameters give the same curve.
@@ -20,6 +20,7 @@ from scipy.optimize import isotonic_regression
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import BOUND_TRUNK, METHODS, ConfidenceCurve, KeypointParams, Keypoints
+from pbl_pipeline.methods import Method
 from pbl_pipeline.pipeline import detect_trial
 from pbl_pipeline.validation import (
     PointErrors,
@@ -61,18 +62,18 @@ def truth_of(name: str, keypoints: Keypoints, data: Path) -> tuple[PointTruth, s
     return truth_of_trc(keypoints, folder / _TRC, lens), "Pose2Sim balancing trial"
 
 
-def measured(data: Path, keypoints_folder: Path) -> list[PointErrors]:
-    """The errors of the embedded detector on all recordings; its keypoints are kept in `keypoints_folder`."""
+def measured(data: Path, keypoints_folder: Path, method: Method[KeypointParams]) -> list[PointErrors]:
+    """The method's errors on all recordings; its keypoints are kept in `keypoints_folder`."""
     errors = []
     for name, video in recordings(data).items():
         kept = keypoints_folder / f"{name}.keypoints.npz"
         if not kept.exists():
             keypoints_folder.mkdir(parents=True, exist_ok=True)
-            detect_trial(video, kept.with_suffix(".png")).keypoints.save(kept)
+            detect_trial(video, kept.with_suffix(".png"), keypoints=method).keypoints.save(kept)
         keypoints = Keypoints.load(kept)
         truth, dataset = truth_of(name, keypoints, data)
         click.echo(f"{name}: {truth.note}")
-        errors.append(point_errors(keypoints, truth, KeypointParams().detector, dataset, name))
+        errors.append(point_errors(keypoints, truth, method.params.detector, dataset, name))
     return errors
 
 
@@ -186,6 +187,7 @@ def save_curve(curve: ConfidenceCurve, path: str | Path) -> None:
 @click.command()
 @click.argument("data", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option("--version", type=click.IntRange(1), required=True, help="Of the curve; one that is there never changes.")
+@click.option("--method", default=METHODS.default, show_default=True, help="Keypoint method whose confidence it is.")
 @click.option(
     "--keypoints",
     type=click.Path(path_type=Path, file_okay=False),
@@ -195,10 +197,12 @@ def save_curve(curve: ConfidenceCurve, path: str | Path) -> None:
 )
 @click.option("--out", type=click.Path(path_type=Path), default=CURVES, show_default=True, help="File of curves.")
 @click.option("--plots", type=click.Path(path_type=Path, file_okay=False), help="Folder for table and page.")
-def main(data: Path, version: int, keypoints: Path, out: Path, plots: Path | None) -> None:
+def main(data: Path, version: int, method: str, keypoints: Path, out: Path, plots: Path | None) -> None:
     """Fit the curve and add it to the file of curves."""
-    errors = measured(data, keypoints)
-    curve = fit_curve(errors, f"blazepose-v{version}", curve_params(METHODS.find().params))
+    of = METHODS.find(method)
+    errors = measured(data, keypoints, of)
+    name = of.params.detector if of.name == METHODS.default else of.name
+    curve = fit_curve(errors, f"{name}-v{version}", curve_params(of.params))
     click.echo("\nof a recording, by a curve fitted to the other datasets (stated confidence taken as it is | curve)")
     for s in leave_one_out(errors):
         click.echo(

@@ -6,7 +6,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from ._run import Row
@@ -20,8 +20,10 @@ def run_detect(
     repeat: int,
     timeout_s: float,
     note: Callable[[str], None] = lambda _: None,
-) -> Row:
-    """Figures of probe, tracking and keypoints on `video` (None: `demo_clip`), repeated until it lasts `minutes`.
+    keypoints: Sequence[str] = (),
+) -> Iterator[Row]:
+    """Figures of probe, tracking and keypoints on `video` (None: `demo_clip`), repeated until it lasts `minutes`: a row
+    for each keypoint method of `keypoints` (none: the default), one after the other.
 
     The measured process does nothing else, and a failure in it is a row with `error`. Raises the `PblError`s of
     `demo_clip` and `repeated`, and VIDEO_MISSING.
@@ -40,18 +42,24 @@ def run_detect(
             path = video
         if minutes is not None:
             path = repeated(path, folder / f"long{path.suffix}", 60 * minutes)
-        note("measuring")
-        spec = {"video": str(path), "person": person, "repeat": repeat, "result": str(folder / "result.json")}
-        command = [sys.executable, "-m", "pbl_pipeline.bench._detect_case", json.dumps(spec)]
-        row: Row = {"label": str(video) if video else "demo recording at 1080p"}
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s)
-        except subprocess.TimeoutExpired:
-            return row | {"error": f"over {timeout_s:g} s"}
-        result = Path(spec["result"])
-        if not result.exists():
-            return row | {"error": f"died, exit {done.returncode}", "error_text": done.stderr[-2000:]}
-        return row | json.loads(result.read_text())
+        for method in keypoints or [""]:
+            note(f"measuring {method}".strip())
+            label = (str(video) if video else "demo recording at 1080p") + (f", {method}" if method else "")
+            spec = {"video": str(path), "person": person, "repeat": repeat, "keypoints": method or None}
+            yield {"label": label} | _measure(spec | {"result": str(folder / f"{method}.json")}, timeout_s)
+
+
+def _measure(spec: dict, timeout_s: float) -> Row:
+    """What a process of its own writes of one case."""
+    command = [sys.executable, "-m", "pbl_pipeline.bench._detect_case", json.dumps(spec)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s)
+    except subprocess.TimeoutExpired:
+        return {"error": f"over {timeout_s:g} s"}
+    result = Path(spec["result"])
+    if not result.exists():
+        return {"error": f"died, exit {done.returncode}", "error_text": done.stderr[-2000:]}
+    return json.loads(result.read_text())
 
 
 def detect_text(row: Row) -> str:

@@ -26,7 +26,7 @@ def main() -> None:
     """Entry of the process."""
     spec = json.loads(sys.argv[1])
     try:
-        result = measure(Path(spec["video"]), spec["person"], spec["repeat"])
+        result = measure(Path(spec["video"]), spec["person"], spec["repeat"], spec["keypoints"])
     except PblError as error:
         result = {"error": error.code, "error_text": error.text()}
     except Exception as error:  # noqa: BLE001 - the caller shows what went wrong
@@ -34,14 +34,14 @@ def main() -> None:
     Path(spec["result"]).write_text(json.dumps(result | machine()))
 
 
-def measure(video: Path, person: int | None, repeat: int) -> dict[str, Any]:
+def measure(video: Path, person: int | None, repeat: int, keypoints: str | None) -> dict[str, Any]:
     """The figures of docs/benchmarks.md, section detect: of the fastest of `repeat` runs; memory over all of them."""
-    runs = [_run(video, person) for _ in range(repeat)]
+    runs = [_run(video, person, keypoints) for _ in range(repeat)]
     best = min(runs, key=lambda r: r["seconds"])
     return best | {"runs_seconds": [r["seconds"] for r in runs], "host_bytes": peak_rss()}
 
 
-def _run(video: Path, person: int | None) -> dict[str, Any]:
+def _run(video: Path, person: int | None, keypoints: str | None) -> dict[str, Any]:
     from pbl_pipeline.keypoints import detect_keypoints
     from pbl_pipeline.tracking import choose_subject, time_in_view_s, track_people
     from pbl_pipeline.video import guess_camera, probe
@@ -53,7 +53,10 @@ def _run(video: Path, person: int | None) -> dict[str, Any]:
     if subject is None and tracking.persons:  # a benchmark measures somebody: whoever is in view for longest
         subject = max(tracking.persons, key=lambda p: time_in_view_s(p, tracking.time_s)).person_id
     # Nobody: number 0 is unknown, and the error says so.
-    found = _timed(stages, "keypoints", lambda: detect_keypoints(video, tracking, subject or 0, guess_camera(info)))
+    camera = guess_camera(info)
+    found = _timed(
+        stages, "keypoints", lambda: detect_keypoints(video, tracking, subject or 0, camera, params=keypoints)
+    )
     return {
         "frames": info.n_frames,
         "frames_in_view": int((found.confidence.max(axis=1) > 0).sum()),

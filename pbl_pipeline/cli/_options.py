@@ -30,7 +30,7 @@ KEYPOINTS = click.option(
     "--keypoints",
     "keypoints",
     metavar="NAME",
-    help="Keypoint method, such as blazepose-33, or a model of `pbl models list`.",
+    help="Keypoint method, such as blazepose-heavy, or a model of `pbl models list`.",
 )
 DEVICE = click.option(
     "--device",

@@ -121,6 +121,7 @@ def fit(
     type=click.IntRange(1),
     help="ID of the person; else the subject, or the longest in view.",
 )
+@click.option("--keypoints", multiple=True, metavar="NAME", help="Keypoint method; repeat it to compare several.")
 @click.option("--repeat", type=click.IntRange(1), help="Runs; the fastest counts. Default: 3, with --minutes 1.")
 @click.option("--timeout-s", type=click.FloatRange(1), default=7200.0, show_default=True, help="Of the measurement.")
 @click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write all figures to this file.")
@@ -128,6 +129,7 @@ def detect(
     video: Path | None,
     minutes: float | None,
     person: int | None,
+    keypoints: tuple[str, ...],
     repeat: int | None,
     timeout_s: float,
     json_path: Path | None,
@@ -144,10 +146,12 @@ def detect(
         check_out_file(json_path)
     begun = datetime.now(UTC).isoformat(timespec="seconds")
     runs = repeat or (3 if minutes is None else 1)
-    row = b.run_detect(video, minutes, person, runs, timeout_s, note=lambda what: click.echo(what, err=True))
-    if json_path is not None:
-        content = {"benchmark": "detect", "version": __version__, "time_utc": begun, "rows": [row]}
-        json_path.write_text(json.dumps(content, indent=1) + "\n")
-    click.echo(b.detect_text(row))
-    if "error" in row:
+    rows: list[b.Row] = []
+    for row in b.run_detect(video, minutes, person, runs, timeout_s, lambda w: click.echo(w, err=True), keypoints):
+        rows.append(row)
+        if json_path is not None:
+            content = {"benchmark": "detect", "version": __version__, "time_utc": begun, "rows": rows}
+            json_path.write_text(json.dumps(content, indent=1) + "\n")
+    click.echo("\n\n".join(b.detect_text(row) for row in rows))
+    if any("error" in row for row in rows):
         raise SystemExit(1)

@@ -270,12 +270,15 @@ def _assets(errors: dict[str, PblError]) -> Iterator[Finding]:
             yield Finding(asset.name, OK, f"{where} ({asset.licence})")
             continue
         error = errors.get(asset.name)
+        state = NOTE if asset.optional else MISSING
         detail = f"{where} has other bytes than pinned" if item.state == "changed" else f"{asset.what}: not fetched yet"
+        if asset.optional:
+            detail += ", not needed by the default methods"
         if error is not None:
-            yield Finding(asset.name, MISSING, error.found, error.next_step)
+            yield Finding(asset.name, state, error.found, error.next_step)
         else:
-            size = asset.wheel.size_bytes / 1e6
-            yield Finding(asset.name, MISSING, detail, f"`pbl doctor --fetch` ({size:.0f} MB from the package index)")
+            size = asset.package.size_bytes / 1e6
+            yield Finding(asset.name, state, detail, f"`pbl doctor --fetch` ({size:.0f} MB from the package registry)")
 
 
 def _folder(what: str, where: Callable[[], Path], variable: str) -> Finding:

@@ -1,4 +1,4 @@
-"""BlazePose's landmark network: 33 body points in the picture and, in metres, around the middle of the hips.
+"""BlazePose's landmark networks, full and heavy: 33 body points in the picture and, in metres, around the mid-hip.
 
 Layout: Bazarevsky et al. 2020, "BlazePose: On-device Real-time Body Pose tracking", Grishchenko et al. 2022, "BlazePose
 GHUM Holistic" for the metric points, and the graph configuration beside the model in the mediapipe 0.10.21 wheel.
@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import expit
 
 from pbl_pipeline import assets
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.models import LiteModel
 from pbl_pipeline.tracking import circle_roi
 from pbl_pipeline.video import Camera, cut_image
@@ -25,7 +26,9 @@ from ._view import crop_matrix, view_rotation
 if TYPE_CHECKING:
     from ._params import KeypointParams
 
-MODEL_SHA256 = "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f"
+#: The networks by their SHA-256: the asset that each is. They have the same inputs and outputs.
+_NETWORKS = {assets.ASSETS[name].sha256: name for name in ("blazepose_landmarks", "blazepose_landmarks_heavy")}
+MODEL_SHA256, HEAVY_SHA256 = _NETWORKS
 INPUT_SIZE = 256
 #: The crop is this much larger than the region of interest.
 CROP_MARGIN = 1.25
@@ -103,9 +106,14 @@ class BlazePoseLandmarks:
     per_core = True
 
     def __init__(
-        self, model_path: str | Path, agree_mm: float = 100.0, agree_width_mm: float = 20.0, num_threads: int = 1
+        self,
+        model_path: str | Path,
+        agree_mm: float = 100.0,
+        agree_width_mm: float = 20.0,
+        num_threads: int = 1,
+        sha256: str = MODEL_SHA256,
     ) -> None:
-        self._model = LiteModel(model_path, MODEL_SHA256, (N_ALL * 5, N_ALL * 3, 1), num_threads)
+        self._model = LiteModel(model_path, sha256, (N_ALL * 5, N_ALL * 3, 1), num_threads)
         self.model_sha256 = self._model.sha256
         self._agree_mm, self._agree_width_mm = agree_mm, agree_width_mm
 
@@ -183,5 +191,17 @@ def _mirrored(
 
 
 def blazepose(params: KeypointParams) -> BlazePoseLandmarks:
-    """The detector of the method. Raises the `PblError`s of `assets.fetch`."""
-    return BlazePoseLandmarks(assets.fetch("blazepose_landmarks"), params.agree_mm, params.agree_width_mm)
+    """The detector of the method, with the network that its parameters name by hash.
+
+    Raises `PblError` SOLVER_UNKNOWN for another network, and those of `assets.fetch`.
+    """
+    sha256 = params.model_sha256
+    if sha256 not in _NETWORKS:
+        raise PblError(
+            "SOLVER_UNKNOWN",
+            found=f"a BlazePose network with SHA-256 {sha256}",
+            expected=f"one of {', '.join(f'{s} ({n})' for s, n in _NETWORKS.items())}",
+            next_step="use the version of pbl-pipeline that the method was made with, or select another method",
+        )
+    path = assets.fetch(_NETWORKS[sha256])
+    return BlazePoseLandmarks(path, params.agree_mm, params.agree_width_mm, sha256=sha256)

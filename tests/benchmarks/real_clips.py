@@ -3,6 +3,7 @@
     python -m tests.benchmarks.real_clips                                  # the default paramset
     python -m tests.benchmarks.real_clips --params blazepose --params paper-2025 --clip walk
     python -m tests.benchmarks.real_clips --plots clips                    # angles over time, one page per clip
+    python -m tests.benchmarks.real_clips --keypoints blazepose-heavy
     python -m tests.benchmarks.real_clips --set steps=12000 --set cost.weight_3d=0.1
 
 Reads `../shared/data/real/video_mocap/{walk,STS}`; see the README there for its source, licence and conventions. Key
@@ -27,6 +28,7 @@ import numpy as np
 
 from pbl_pipeline.charts import Axes, nice_ticks
 from pbl_pipeline.fit import METHODS, TrialFit, fit_session
+from pbl_pipeline.keypoints import METHODS as KEYPOINT_METHODS
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.methods import Method
 from pbl_pipeline.pipeline import detect_trial
@@ -143,13 +145,15 @@ def table(rows: dict[str, Score]) -> str:
     return "\n".join(lines)
 
 
-def keypoints_of(clip: str, fresh: bool = False) -> Keypoints:
-    """Key points of a clip, from the temporary folder where they were detected before."""
-    cached = Path(tempfile.gettempdir()) / "pbl_real_clips" / f"{clip}.keypoints.npz"
+def keypoints_of(clip: str, fresh: bool = False, method: str | None = None) -> Keypoints:
+    """Key points of a clip by a keypoint method, from the temporary folder where they were detected before."""
+    detector = KEYPOINT_METHODS.find(method)
+    name = clip if detector == KEYPOINT_METHODS.find() else f"{clip}.{detector.name}"
+    cached = Path(tempfile.gettempdir()) / "pbl_real_clips" / f"{name}.keypoints.npz"
     if fresh or not cached.exists():
         cached.parent.mkdir(exist_ok=True)
         video, people = SHARED / "real" / "video_mocap" / clip / "video.mp4", cached.with_suffix(".png")
-        detect_trial(video, people).keypoints.save(cached)
+        detect_trial(video, people, keypoints=detector).keypoints.save(cached)
     return Keypoints.load(cached)
 
 
@@ -169,6 +173,7 @@ def changed(method: Method[Any], changes: tuple[str, ...]) -> Method[Any]:
 @click.option("--params", multiple=True, default=(METHODS.default,), show_default=True, help="Name of a paramset.")
 @click.option("--set", "changes", multiple=True, help="A change to it, such as cost.weight_3d=0.1.")
 @click.option("--clip", "clips", multiple=True, type=click.Choice(CLIPS), default=CLIPS, show_default=True)
+@click.option("--keypoints", "detector", help="Keypoint method; default: the project's.")
 @click.option("--fresh", is_flag=True, help="Detect the key points anew.")
 @click.option("--save", type=click.Path(path_type=Path, file_okay=False), help="Folder for the fits.")
 @click.option("--plots", type=click.Path(path_type=Path, file_okay=False), help="Folder for pages with the curves.")
@@ -176,6 +181,7 @@ def main(
     params: tuple[str, ...],
     changes: tuple[str, ...],
     clips: tuple[str, ...],
+    detector: str | None,
     fresh: bool,
     save: Path | None,
     plots: Path | None,
@@ -194,7 +200,7 @@ def main(
         rows, fits = {}, {}
         for name in params:
             paramset = changed(METHODS[name], changes)
-            fits[paramset.name] = session = fit_session([keypoints_of(clip, fresh)], [clip], paramset)
+            fits[paramset.name] = session = fit_session([keypoints_of(clip, fresh, detector)], [clip], paramset)
             rows[f"ours, {paramset.name}"] = score(fitted_angles(session.trials[0]), truth)
         ours = next(iter(rows.values()))
         rows |= {name: score(angles, truth) for name, angles in peers.items()}

@@ -14,9 +14,9 @@ from . import clips
 
 @pytest.fixture(scope="session")
 def demo_files() -> dict[str, Path]:
-    """All assets. Without network these tests skip only where PBL_OFFLINE says that this is meant."""
+    """The assets of chain and demo. Without network these tests skip only where PBL_OFFLINE says that this is meant."""
     try:
-        return {name: assets.fetch(name) for name in assets.ASSETS}
+        return {name: assets.fetch(name) for name in assets.needed()}
     except PblError as error:
         if settings.offline() and error.code == "ASSET_MISSING":
             pytest.skip(f"PBL_OFFLINE is set and {error.key} is not in the cache")

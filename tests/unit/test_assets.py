@@ -1,21 +1,25 @@
-"""Assets without network: pip is replaced by a copy of a small wheel made here, pinned like the real ones."""
+"""Assets without network: pip and npm are replaced by copies of small packages made here, pinned like real ones."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
+import io
 import os
 import re
 import subprocess
 import sys
+import tarfile
 import threading
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from pbl_pipeline import assets
+from pbl_pipeline import assets, packages
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.packages import NpmPackage, Wheel
 
 CONTENT = {"carrier/models/one.bin": b"one" * 5000, "carrier/demo/two.txt": b"two\n"}
 NAME = "carrier-1.0-py3-none-any.whl"
@@ -48,7 +52,7 @@ def index(tmp_path, monkeypatch) -> Index:
         for member, data in {**CONTENT, "carrier/__init__.py": b"raise SystemExit('never run')"}.items():
             archive.writestr(member, data)
     made = path.read_bytes()
-    wheel = assets.Wheel("carrier==1.0", NAME, sha256(made), len(made), ("--only-binary=:all:",))
+    wheel = Wheel("carrier==1.0", NAME, sha256(made), len(made), ("--only-binary=:all:",))
     pinned = {
         name: assets.Asset(
             name, f"asset {name}", wheel, member, sha256(CONTENT[member]), len(CONTENT[member]), "MIT", "here"
@@ -144,7 +148,7 @@ def test_pip_failures_are_told(index):
 
 
 def test_no_pip(index, monkeypatch):
-    monkeypatch.setattr(assets.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(packages.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(PblError, match="ensurepip"):
         assets.fetch("one")
 
@@ -191,14 +195,16 @@ def test_leftovers_of_a_killed_process_are_removed(index):
 
 def test_pins_are_complete():
     """The real list: every hash is a hash, every file name is one of its own, every asset says its licence."""
-    assert set(assets.ASSETS) == {"blazepose_detector", "blazepose_landmarks", "demo_video", "demo_camera"}
-    files = [Path(a.member).name for a in assets.ASSETS.values()]
+    default = ["blazepose_detector", "blazepose_landmarks", "demo_video", "demo_camera"]
+    assert assets.needed() == default
+    assert set(assets.ASSETS) == {*default, "blazepose_landmarks_heavy"}
+    files = [a.path.name for a in assets.ASSETS.values()]
     assert len(set(files)) == len(files)
     for name, asset in assets.ASSETS.items():
         assert asset.name == name
         assert re.fullmatch("[0-9a-f]{64}", asset.sha256)
-        assert re.fullmatch("[0-9a-f]{64}", asset.wheel.sha256)
-        assert "==" in asset.wheel.requirement
+        assert re.fullmatch("[0-9a-f]{64}", asset.package.sha256)
+        assert re.search(r"(==|.@)\d", asset.package.requirement)
         assert asset.licence in ("Apache-2.0", "BSD-3-Clause")
         assert asset.source
         assert asset.size_bytes > 0
@@ -206,10 +212,79 @@ def test_pins_are_complete():
 
 def test_pip_is_asked_for_one_wheel_and_no_index():
     """Which index is asked is pip's own configuration; the platform of the models' wheel is the same everywhere."""
-    command = assets.pip_command(assets.ASSETS["blazepose_detector"].wheel, "there")
+    command = assets.ASSETS["blazepose_detector"].package.command("there")
     assert command[:5] == [sys.executable, "-m", "pip", "download", "--no-deps"]
     assert command[-1] == "mediapipe==0.10.21"
     for option in ("--platform", "manylinux_2_28_x86_64", "--abi", "cp311", "--python-version", "311"):
         assert option in command
     assert not any("index" in part or "http" in part for part in command)
     assert os.environ.get("PIP_INDEX_URL", "no index given") not in command
+
+
+# --- npm --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def npm(tmp_path, monkeypatch) -> Index:
+    """A registry that serves one tarball, and a machine with npm."""
+    data, file = b"heavy" * 999, "carrier-1.0.tgz"
+    with tarfile.open(tmp_path / file, "w:gz") as archive:
+        entry = tarfile.TarInfo("package/heavy.bin")
+        entry.size = len(data)
+        archive.addfile(entry, io.BytesIO(data))
+    made = (tmp_path / file).read_bytes()
+    package = NpmPackage("@made/carrier@1.0", file, sha256(made), len(made))
+    asset = assets.Asset(
+        "heavy", "asset", package, "package/heavy.bin", sha256(data), len(data), "MIT", "here", True, "own-name.bin"
+    )
+    monkeypatch.setattr(assets, "ASSETS", {"heavy": asset})
+    monkeypatch.setenv("PBL_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv("PBL_OFFLINE", raising=False)
+    monkeypatch.setattr(packages.shutil, "which", lambda name: f"/usr/bin/{name}")
+    served = Index(made)
+
+    def run(command: list[str], **given: Any) -> subprocess.CompletedProcess[str]:
+        served.calls += 1
+        if served.error:
+            return subprocess.CompletedProcess(command, 1, "", served.error)
+        into = Path(command[command.index("--pack-destination") + 1])
+        assert Path(given["env"]["npm_config_cache"]).parent == into  # nothing is left in the user's npm cache
+        (into / file).write_bytes(served.wheel)
+        return subprocess.CompletedProcess(command, 0, f"{file}\n", "")
+
+    monkeypatch.setattr(assets.subprocess, "run", run)
+    return served
+
+
+def test_a_file_of_an_npm_package(npm):
+    path = assets.fetch("heavy")
+    assert (path.name, path.read_bytes()) == ("own-name.bin", b"heavy" * 999)
+    assert names_in_folder() == {"own-name.bin"}
+    assert assets.fetch("heavy") == path
+    assert npm.calls == 1
+    assert assets.needed() == []
+    path.unlink()
+    npm.wheel = npm.wheel + b" "
+    with pytest.raises(PblError, match="ASSET_CHECKSUM"):
+        assets.fetch("heavy")
+
+
+def test_npm_offline_absent_and_without_connection(npm, monkeypatch):
+    npm.error = "npm error code ENOTFOUND\nnpm error syscall getaddrinfo\nnpm error network request failed\n"
+    with pytest.raises(PblError, match=r"no connection to the package registry \(network request failed\)"):
+        assets.fetch("heavy")
+    npm.error = "npm error code E404\nnpm error 404 No match found for version 1.0\n"
+    with pytest.raises(PblError, match=r"@made/carrier@1\.0 could not be downloaded: 404 No match found"):
+        assets.fetch("heavy")
+    monkeypatch.setattr(packages.shutil, "which", lambda name: None)
+    with pytest.raises(PblError, match="apt-get install npm"):
+        assets.fetch("heavy")
+    monkeypatch.setenv("PBL_OFFLINE", "1")
+    with pytest.raises(PblError, match="PBL_OFFLINE") as error:
+        assets.fetch("heavy")
+    remedy = error.value.next_step
+    assert "npm pack --ignore-scripts --loglevel=error --pack-destination . @made/carrier@1.0" in remedy
+    assert f"copy carrier-1.0.tgz into {assets.folder()}" in remedy
+    (assets.folder() / "carrier-1.0.tgz").write_bytes(npm.wheel)
+    assert assets.fetch("heavy").is_file()
+    assert not any("registry" in part or "http" in part for part in assets.ASSETS["heavy"].package.command("there"))

@@ -14,7 +14,7 @@ import pytest
 
 from pbl_pipeline import assets
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.keypoints import BlazePoseLandmarks
+from pbl_pipeline.keypoints import METHODS, BlazePoseLandmarks, KeypointParams
 from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES, _same_sides
 from pbl_pipeline.keypoints._flips import leg_points
 from pbl_pipeline.models import LiteModel
@@ -55,9 +55,14 @@ def detector() -> BlazePoseDetector:
     return BlazePoseDetector(asset("blazepose_detector"))
 
 
-@pytest.fixture(scope="module")
-def landmarks() -> BlazePoseLandmarks:
-    return BlazePoseLandmarks(asset("blazepose_landmarks"))
+@pytest.fixture(scope="module", params=["blazepose-33", "blazepose-heavy"])
+def landmarks(request: pytest.FixtureRequest) -> BlazePoseLandmarks:
+    method = METHODS[request.param]
+    network = next(name for name, a in assets.ASSETS.items() if a.sha256 == method.params.model_sha256)
+    asset(network)
+    detector = method.function(method.params)
+    assert detector.model_sha256 == assets.ASSETS[network].sha256
+    return detector
 
 
 # --- by hand ----------------------------------------------------------------------------------------------------
@@ -96,6 +101,13 @@ def test_another_file_than_the_pinned_model_is_refused(tmp_path):
     with pytest.raises(PblError) as error:
         BlazePoseDetector(tmp_path / "model.tflite")
     assert error.value.code == "ASSET_CHECKSUM"
+
+
+def test_a_network_that_this_version_does_not_know_is_refused():
+    params = KeypointParams(model_sha256="0" * 64)
+    with pytest.raises(PblError, match="blazepose_landmarks_heavy") as error:
+        METHODS.find(params).function(params)
+    assert error.value.code == "SOLVER_UNKNOWN"
 
 
 # --- with the models --------------------------------------------------------------------------------------------

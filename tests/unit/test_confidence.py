@@ -65,10 +65,11 @@ def test_curves_that_ship_are_monotone_and_say_where_they_come_from():
         assert curve.n > 1000
 
 
-def test_the_default_curve_is_of_what_the_default_method_does():
+@pytest.mark.parametrize("name", list(METHODS))
+def test_a_methods_curve_is_of_what_it_does(name: str):
     """Another detection states other confidences: fit a curve to it, `python -m
     research.confidence`, under the next version."""
-    params = METHODS.find().params
+    params = METHODS[name].params
     curve = confidence_curve(params.confidence_curve)
     assert curve.detector == params.detector
     assert json.loads(json.dumps(curve_params(params))) == curve.params

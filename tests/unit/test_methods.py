@@ -24,6 +24,7 @@ SHIPPED = {
     ("tracking", "blazepose-tiles", 2): "0dab616291af7eea",
     ("subject", "walker", 2): "4a27a14ec961fed1",
     ("keypoints", "blazepose-33", 2): "8efcb026b6d5256a",
+    ("keypoints", "blazepose-heavy", 1): "d7bcddbcb77d553e",
     ("fit", "paper-2025", 1): "cb777aa5f08f1d04",
     ("fit", "paper-gauss-newton", 1): "9352bf72dc58b91e",
     ("fit", "gauss-newton", 1): "c5df362782a452e5",

@@ -56,7 +56,7 @@ def _run(out: Path) -> None:
     connection.connect()
     schemas.activate()
     _step(2, "models and the demo recording")
-    files = {name: assets.fetch(name) for name in assets.ASSETS}
+    files = {name: assets.fetch(name) for name in assets.needed()}
     for name, path in files.items():
         click.echo(f"{name}: {path}")
     _step(3, "ingest")

