@@ -2,37 +2,49 @@
 
 from __future__ import annotations
 
-import lzma
 import os
-import zipfile
-import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pbl_pipeline.bounded import npz_fields, read_npz
 from pbl_pipeline.errors import PblError
 
-#: What the readers of zip archives raise for a damaged one; RuntimeError: one with a password, or packed in a way that
-#: is not known.
-DAMAGED_ZIP = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, RuntimeError)
 #: A shape; None stands for any length.
 Shape = tuple[int | None, ...]
 
 
-def load_npz(path: str | Path) -> dict[str, Any]:
-    """All arrays of an .npz file. Never unpickles.
+#: Largest width or height (px) of a picture that a file names.
+_WIDEST_PX = 100_000
+
+
+def load_npz(path: str | Path, fields: Collection[str]) -> dict[str, Any]:
+    """Those of `fields` that an .npz file has. Reads no other array and never unpickles.
 
     Raises
     ------
     PblError
-        FILE_MISSING: no such file, or it cannot be read. FILE_FORMAT: not an .npz, damaged, or with pickled objects.
+        FILE_MISSING: no such file, or it cannot be read. FILE_FORMAT: not an .npz, damaged, with pickled objects, or
+        more than `bounded.MAX_ARRAYS`.
     """
+    with _coded(path):
+        return read_npz(path, fields)
+
+
+def fields_of(path: str | Path) -> frozenset[str]:
+    """Names of the arrays of an .npz file; no array is read. Raises as `load_npz`."""
+    with _coded(path):
+        return frozenset(npz_fields(path))
+
+
+@contextmanager
+def _coded(path: str | Path) -> Iterator[None]:
     try:
-        with np.load(path, allow_pickle=False) as f:
-            return {k: f[k] for k in f.files}
-    except (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError) as error:
+        yield
+    except OSError as error:
         raise PblError(
             "FILE_MISSING",
             found=error.strerror or str(error),
@@ -40,11 +52,10 @@ def load_npz(path: str | Path) -> dict[str, Any]:
             next_step="check the path, and that you may read the file",
             key=str(path),
         ) from error
-    # A plain .npy gives an array, which is no context manager (TypeError); the rest is what damage looks like.
-    except (OSError, ValueError, EOFError, TypeError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+    except ValueError as error:
         raise PblError(
             "FILE_FORMAT",
-            found=f"no readable .npz file ({type(error).__name__})",
+            found=f"no readable .npz file ({error})",
             expected="an .npz file without pickled objects, as docs/files.md describes it",
             next_step="make one with `pbl detect` or `pbl fit`, or copy it again",
             key=str(path),
@@ -69,6 +80,19 @@ def check_numbers(path: str | Path, data: Mapping[str, np.ndarray], shapes: Mapp
             next_step="write the field as docs/files.md describes it",
             key=str(path),
         )
+
+
+def picture_size(path: str | Path, size_px: np.ndarray) -> tuple[int, int]:
+    """Width and height (px) of a picture from the field `image_size_px` of a file. Raises `PblError` FILE_FORMAT."""
+    if np.all((size_px >= 1) & (size_px <= _WIDEST_PX)):  # False for NaN
+        return int(size_px[0]), int(size_px[1])
+    raise PblError(
+        "FILE_FORMAT",
+        found=f"image_size_px {size_px.tolist()}",
+        expected=f"width and height in px, 1 to {_WIDEST_PX}",
+        next_step="write the field as docs/files.md describes it",
+        key=str(path),
+    )
 
 
 def check_out_folder(path: Path) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import load_npz
+from pbl_pipeline.files import fields_of
 from pbl_pipeline.paramset import canonical_json
 
 from . import validation, video
@@ -96,7 +96,7 @@ def read_reference(path: str | Path, source: str | None = None, shift_s: float =
 def _read_npz(path: Path) -> lib.Reference:
     from pbl_pipeline import validation as lib
 
-    fields = load_npz(path)
+    fields = fields_of(path)
     if "qpos" not in fields:
         return lib.Reference.load(path)
     if "event_time_s" in fields:

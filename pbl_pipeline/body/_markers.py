@@ -11,10 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from pbl_pipeline.body._model import load_body
+from pbl_pipeline.bounded import read_text
 from pbl_pipeline.errors import PblError
 
 _DATA = Path(__file__).parent / "data"
 _COLUMNS = ("name", "body", "x", "y", "z")
+#: Of a table of markers (bytes): a thousand.
+_LARGEST = 1 << 17
 
 #: Names of the marker sets that ship with the project.
 MARKER_SETS: tuple[str, ...] = tuple(sorted(p.stem.removeprefix("markers_") for p in _DATA.glob("markers_*.csv")))
@@ -93,8 +96,8 @@ def load_marker_set(path: str | Path, name: str | None = None) -> MarkerSet:
     path = Path(path)
     known = load_body().body_names
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_text(path, _LARGEST)
+    except (OSError, ValueError) as error:
         raise _format_error(path, str(error)) from error
     numbered = [(i, t) for i, t in enumerate(text.splitlines(), 1) if t.strip() and not t.lstrip().startswith("#")]
     table = csv.DictReader((t for _, t in numbered), skipinitialspace=True)

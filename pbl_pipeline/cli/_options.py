@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import os
 from collections.abc import Iterable
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pbl_pipeline.bounded import read_json
 from pbl_pipeline.errors import PblError
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def fit_paramset(solver: str | None, params: str | None, default: str | None = N
     if not path.is_file():
         raise _unknown(f"paramset {params!r}, and no such file", METHODS)
     try:
-        changes = json.loads(path.read_text())
+        changes = read_json(path)
         if not isinstance(changes, dict):
             raise TypeError("not an object")
         base = changes.pop("base", base)
@@ -127,7 +127,7 @@ def fit_paramset(solver: str | None, params: str | None, default: str | None = N
             raise ValueError(f"solver {changes['solver']!r}, but {base} is of {before.family.name}: name another base")
         merged = Paramset("fit", path.stem, 1, _merge(dataclasses.asdict(before.params), changes))
         return METHODS.make(path.stem, 1, merged.to(before.family.params))
-    except (OSError, ValueError, TypeError, KeyError) as error:
+    except (OSError, ValueError, TypeError, KeyError, OverflowError) as error:
         raise PblError(
             "FILE_FORMAT",
             found=f"{type(error).__name__}: {error}",

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import check_out_file, load_npz
+from pbl_pipeline.files import check_out_file, fields_of
 
 from .gait import METHOD_HELP, is_c3d
 
@@ -48,7 +48,7 @@ def _feet(path: Path):
 
     if is_c3d(path):
         return read_lab_feet(path)
-    fields = set(load_npz(path))
+    fields = fields_of(path)
     if "qpos" in fields:
         from pbl_pipeline.fit import TrialFit  # loads the fit's libraries
 

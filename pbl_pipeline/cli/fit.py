@@ -91,7 +91,7 @@ def _load(path: Path, table: MarkerSet | None, up: str) -> Keypoints | WorldMark
     import dataclasses
 
     from pbl_pipeline.body import marker_set
-    from pbl_pipeline.files import load_npz
+    from pbl_pipeline.files import fields_of
     from pbl_pipeline.keypoints import Keypoints, WorldMarkers
 
     if path.suffix.lower() == ".trc":
@@ -104,7 +104,7 @@ def _load(path: Path, table: MarkerSet | None, up: str) -> Keypoints | WorldMark
                 key=str(path),
             )
         seen = WorldMarkers.from_trc(path, table.name, up)
-    elif "xyz_world_m" in load_npz(path):
+    elif "xyz_world_m" in fields_of(path):
         seen = WorldMarkers.load(path)
     else:
         keypoints = Keypoints.load(path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -94,6 +93,7 @@ def fit_checks(paths: Sequence[Path], trials: Sequence[TrialFit | LabTrial]) -> 
     A file counts where it names the trial and has the paramset of its fit. Raises `PblError` FILE_FORMAT for one that
     `pbl fit` did not write.
     """
+    from pbl_pipeline.bounded import read_json
     from pbl_pipeline.qc import WARN, Check
 
     found: dict[Path, tuple[list[str], str, list[Check]]] = {}
@@ -101,7 +101,7 @@ def fit_checks(paths: Sequence[Path], trials: Sequence[TrialFit | LabTrial]) -> 
         if not path.is_file():
             continue
         try:
-            content = json.loads(path.read_text())
+            content = read_json(path)
             found[path] = content["trials"], content["params_hash"], [Check(**c) for c in content["qc"]]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise PblError(

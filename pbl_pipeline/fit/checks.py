@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import SLIDES
-from pbl_pipeline.keypoints import Keypoints, WorldMarkers
+from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.qc import FAIL, PASS, WARN, Check
 
 from .initial_pose import pelvis_path
@@ -46,7 +46,7 @@ def check_fit(session: Session, trials: Sequence[TrialFit], solution: Solution) 
     checks += [_converged(solution)]
     if not isinstance(session.trials[0], WorldMarkers):
         checks = [_residual_2d(session, trials), *checks, _intrinsics(trials), _orientation(trials)]
-        checks += _depth(session, trials)
+        checks += [*_depth(session, trials), *_assumed(session)]
     if solution.qpos_sd is not None:
         checks += [_observed(trials)]
     if np.any(np.isfinite([t.phone_clock_offset_s for t in trials])):
@@ -189,6 +189,19 @@ def _intrinsics(trials: Sequence[TrialFit]) -> Check:
     )
     # The value is the standard deviation of the focal length as a share of it.
     return Check("camera_intrinsics_measured", WARN if sources or unsure else PASS, worst, FOCAL_SD_WARN, advice)
+
+
+def _assumed(session: Session) -> list[Check]:
+    """Fields of keypoints files for which a default stands; nothing where all are stated."""
+    views = [v for t in session.trials for v in (t.views if isinstance(t, MultiView) else [t])]
+    fields = sorted({f for v in views if isinstance(v, Keypoints) for f in v.assumed})
+    if not fields:
+        return []
+    advice = (
+        f"the keypoints do not state {', '.join(fields)}: a lens without distortion, a camera that nobody measured and "
+        "the box around the points stand for them; write the fields (docs/files.md)"
+    )
+    return [Check("keypoints_fields_assumed", WARN, float(len(fields)), 0.0, advice)]
 
 
 def _orientation(trials: Sequence[TrialFit]) -> Check:

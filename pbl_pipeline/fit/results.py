@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import check_numbers, load_npz
+from pbl_pipeline.files import check_numbers, load_npz, picture_size
 from pbl_pipeline.qc import Check
-from pbl_pipeline.video import Camera
+from pbl_pipeline.video import Camera, check_lens
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,10 +62,11 @@ class TrialFit:
 
     @classmethod
     def load(cls, path: str | Path) -> TrialFit:
-        """Read `<name>.fit.npz`. Raises `PblError` FILE_MISSING, FILE_FORMAT. Never unpickles."""
-        data = load_npz(path)
+        """Read `<name>.fit.npz`. Raises `PblError` FILE_MISSING, FILE_FORMAT, CAMERA_INVALID. Never unpickles."""
         wanted = [f.name for f in dataclasses.fields(cls) if f.name != "camera"]
-        missing = [k for k in [*wanted, "camera_matrix", "distortion", "camera_source"] if k not in data]
+        fields = [*wanted, "camera_matrix", "distortion", "camera_source"]
+        data = load_npz(path, fields)
+        missing = [k for k in fields if k not in data]
         if missing:
             raise _format_error(f"{path} lacks {', '.join(missing)}", "a file that `pbl fit` wrote")
         check_numbers(path, data, _shapes(data["time_s"].size, data["joint_names"].size, data["marker_names"].size))
@@ -76,8 +77,11 @@ class TrialFit:
             values[k] = str(values[k])
         for k in ("loss", "seconds", "phone_clock_offset_s"):
             values[k] = float(values[k])
-        values["image_size_px"] = (int(data["image_size_px"][0]), int(data["image_size_px"][1]))
         camera = Camera(data["camera_matrix"], data["distortion"], str(data["camera_source"]))
+        values["image_size_px"] = (0, 0)
+        if not np.isnan(camera.matrix).all():  # as of markers of a laboratory
+            values["image_size_px"] = picture_size(path, data["image_size_px"])
+            check_lens(camera.matrix, camera.distortion, values["image_size_px"], str(path))
         return cls(**values, camera=camera)
 
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import gzip
 import io
+import itertools
+import math
 import warnings
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pbl_pipeline.bounded import MIB, count_rows, read_bytes
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import EMPTY, PASS
 
@@ -30,6 +33,8 @@ from .events import (
 from .motion import FootTrajectories, feet_from_markers
 from .normative import PLUG_IN_GAIT, check_degrees
 
+#: Of a recording, unpacked (bytes).
+_LARGEST = 96 * MIB
 #: Our angle -> the marker model's point after L or R, and its component. Both count the same directions as positive.
 PLUG_IN_GAIT_POINTS: dict[str, tuple[str, int]] = {
     "pelvis_tilt": ("PelvisAngles", 0),
@@ -76,9 +81,10 @@ def read_lab_trial(path: str | Path, events_csv: str | Path | None = None, metho
         nor foot markers; markers upside down or mirrored).
     """
     path = Path(path)
-    points, labels, time, table = _read(path)
+    angle_points = [s + p for p, _ in PLUG_IN_GAIT_POINTS.values() for s in "LR"]
+    points, labels, time, table = _read(path, [*angle_points, *_FOOT_MARKERS, *_LEG_MARKERS])
     column = {name: i for i, name in enumerate(labels)}
-    missing = [s + p for p, _ in PLUG_IN_GAIT_POINTS.values() for s in "LR" if s + p not in column]
+    missing = [p for p in angle_points if p not in column]
     if missing:
         raise _format_error(path, f"no points {', '.join(dict.fromkeys(missing))}", "the angles of Plug-in Gait")
     angles = {
@@ -102,7 +108,7 @@ def read_lab_feet(path: str | Path) -> FootTrajectories:
         FILE_MISSING, FILE_FORMAT (not a C3D), GAIT_INPUT (a foot marker is missing).
     """
     path = Path(path)
-    points, labels, time, table = _read(path)
+    points, labels, time, table = _read(path, [*_FOOT_MARKERS, *_LEG_MARKERS])
     if missing := [m for m in _FOOT_MARKERS if m not in labels]:
         raise PblError(
             "GAIT_INPUT",
@@ -120,8 +126,9 @@ def _feet(path: Path, points: np.ndarray, labels: list[str], time: np.ndarray, t
     return feet_from_markers(time, there, "plug_in_gait", xyz)
 
 
-def _read(path: Path) -> tuple[np.ndarray, list[str], np.ndarray, Any]:
-    """Points (T, P, 3), their names, time stamps (T,) in s from frame 1, and the reader with the parameters."""
+def _read(path: Path, wanted: Collection[str]) -> tuple[np.ndarray, list[str], np.ndarray, Any]:
+    """Those of the `wanted` points that are there (T, P, 3), their names, time stamps (T,) in s from frame 1, and the
+    reader with the parameters."""
     import c3d
 
     if not path.is_file():
@@ -129,8 +136,8 @@ def _read(path: Path) -> tuple[np.ndarray, list[str], np.ndarray, Any]:
             "FILE_MISSING", found="no such file", expected="a C3D file", next_step="check the path", key=str(path)
         )
     try:
-        data = path.read_bytes()
-        reader = c3d.Reader(io.BytesIO(gzip.decompress(data) if path.suffix == ".gz" else data))
+        data = read_bytes(path, _LARGEST)
+        reader = c3d.Reader(io.BytesIO(data))
         names: list[str] = []
         # A parameter holds 255 names at most.
         for key in ("POINT:LABELS", "POINT:LABELS2", "POINT:LABELS3"):
@@ -138,15 +145,33 @@ def _read(path: Path) -> tuple[np.ndarray, list[str], np.ndarray, Any]:
                 names += [str(s).strip() for s in np.ravel(values.string_array)]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # a file without analog channels is none of our concern
-            rows = np.array([points for _, points, _ in reader.read_frames()], float)
+            column = {name: i for i, name in enumerate(names[: reader.point_used]) if name in wanted}
+            frames = _frames(reader, len(data))
+            rows = np.full((frames, len(column), 4), np.nan, np.float32)
+            kept = list(column.values())
+            read = reader.read_frames(copy=False)
+            got = 0
+            for got, (_, points, _) in enumerate(itertools.islice(read, frames), 1):
+                rows[got - 1] = points[kept, :4]
+            rows = rows[:got].astype(float)
         rate = float(reader.point_rate)
     # The package raises whatever it stumbles over.
     except Exception as error:
         raise _format_error(path, f"{type(error).__name__}: {error}", "a C3D file") from error
-    if rows.ndim != 3 or not rate > 0:
+    if not len(rows) or not 0 < rate < math.inf:
         raise _format_error(path, "no frames", "points over time")
     xyz = np.where(rows[..., 3:4] < 0, np.nan, rows[..., :3])
-    return xyz, names, (reader.first_frame - 1 + np.arange(len(xyz))) / rate, reader
+    return xyz, list(column), (reader.first_frame - 1 + np.arange(len(xyz))) / rate, reader
+
+
+def _frames(reader: Any, n_bytes: int) -> int:
+    """How many frames to read: those that the header counts, as far as the file holds them."""
+    words = 4 * int(reader.point_used) + int(reader.analog_used) * reader.analog_per_frame
+    if reader.point_used < 1 or reader.analog_per_frame < 0:
+        raise ValueError("no points")
+    frames = min(reader.frame_count, n_bytes // (words * (4 if reader.point_scale < 0 else 2)))
+    count_rows(frames)
+    return max(frames, 0)
 
 
 def _metres(reader: Any, path: Path) -> float:

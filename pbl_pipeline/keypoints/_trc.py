@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pbl_pipeline.bounded import MAX_TEXT, count_rows, read_bytes
 from pbl_pipeline.errors import PblError
 
 _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -41,7 +42,10 @@ def read_trc(path: str | Path) -> Trc:
     """
     try:
         # Only names matter: a path in the first line may be in any encoding.
-        lines = Path(path).read_bytes().decode("utf-8-sig", errors="replace").splitlines()
+        lines = read_bytes(path, MAX_TEXT).decode("utf-8-sig", errors="replace").splitlines()
+        count_rows(len(lines))
+    except ValueError as error:
+        raise _damaged(path, str(error), "some minutes of some hundred markers") from error
     except OSError as error:
         raise PblError(
             "FILE_MISSING",
@@ -82,13 +86,13 @@ def _count(path: str | Path, header: dict[str, str], name: str) -> int:
         raise _damaged(path, f"{name} {header.get(name, '')!r}", "a whole number") from error
 
 
-def _numbers(path: str | Path, number: int, line: str, n_cells: int) -> list[float]:
+def _numbers(path: str | Path, number: int, line: str, n_cells: int) -> np.ndarray:
     """One row; empty cells are NaN."""
     cells = _cells(line)
     if len(cells) < n_cells or any(cells[n_cells:]):
         raise _damaged(path, f"line {number}: {len(cells)} cells", f"{n_cells} cells between tabs")
     try:
-        values = [float(cell) if cell else np.nan for cell in cells[:n_cells]]
+        values = np.array([float(cell) if cell else np.nan for cell in cells[:n_cells]])
     except ValueError as error:
         raise _damaged(path, f"line {number}: {error}", "numbers, or empty cells where a marker is missing") from error
     if np.isinf(values).any():

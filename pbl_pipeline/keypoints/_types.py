@@ -9,10 +9,22 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import check_numbers, load_npz
-from pbl_pipeline.video import Attitude, Camera, check_attitude
+from pbl_pipeline.files import check_numbers, load_npz, picture_size
+from pbl_pipeline.video import Attitude, Camera, check_attitude, check_lens
 
 from ._picture import Picture
+
+_NEEDED = (
+    *("time_s", "names", "marker_set", "xy_px", "xyz_cam_m", "root_relative", "confidence", "image_size_px"),
+    "camera_matrix",
+)
+#: Fields that files of other programs may lack.
+_ASSUMED = ("distortion", "camera_source", "box_px")
+_OPTIONAL = (
+    *("focal_rel_sd", "sides_changed", "phone_time_s", "phone_quat_wxyz", "confidence_curve", "origin"),
+    *("picture_time_s", "picture_luma", "picture_detail"),
+)
+_NO_SOURCE = "not stated in the keypoints file"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +57,8 @@ class Keypoints:
     sides_changed : (T, 3) bool or None
         Frames in which left and right of the legs, and of the rest of the body, are not as the detector said but were
         exchanged, and those in which its body has no width, so that the sides cannot be told; None: nobody looked.
+    assumed
+        Fields that the file did not have, for which a default stands (`load`).
     picture
         How light and sharp the picture of the person is, or None where no video was seen.
 
@@ -70,6 +84,7 @@ class Keypoints:
     picture: Picture | None = None
     origin: str = ""
     sides_changed: np.ndarray | None = None
+    assumed: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n, j = len(self.time_s), len(self.names)
@@ -89,21 +104,7 @@ class Keypoints:
                 raise _format_error(f"{name} has shape {np.shape(array)}", f"shape {shape} for {n} frames, {j} names")
         if np.any(~np.isfinite(self.confidence)) or np.any(self.confidence < 0) or np.any(self.confidence > 1):
             raise _format_error("confidence outside 0..1 or not finite", "0 for a missing point, at most 1")
-        matrix = self.camera.matrix
-        if not np.all(np.isfinite(matrix)) or matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or matrix[2, 2] != 1:
-            raise PblError(
-                "CAMERA_INVALID",
-                found=f"camera matrix {np.asarray(matrix).tolist()}",
-                expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels with positive focal lengths",
-                next_step="pass a camera file with --camera, or leave it out to use the stated guess",
-            )
-        if not np.all(np.isfinite(self.camera.distortion)):
-            raise PblError(
-                "CAMERA_INVALID",
-                found=f"distortion {np.asarray(self.camera.distortion).tolist()}",
-                expected="k1, k2, p1, p2, k3, finite; zeros for a lens without distortion",
-                next_step="pass a camera file with --camera, or leave it out to use the stated guess",
-            )
+        check_lens(self.camera.matrix, self.camera.distortion, self.image_size_px)
         self._check_phone()
 
     def _check_phone(self) -> None:
@@ -160,35 +161,28 @@ class Keypoints:
     def load(cls, path: str | Path) -> Keypoints:
         """Read `keypoints.npz`; never unpickles.
 
+        Files of other programs may lack the fields of `_ASSUMED`: no distortion, a camera whose source is not stated,
+        and the box around the points that were seen, stand for them, and `assumed` names them.
+
         Raises `PblError` FILE_MISSING, FILE_FORMAT, CAMERA_INVALID, PHONE_LOG.
         """
-        data = load_npz(path)
-        needed = [
-            "time_s",
-            "names",
-            "marker_set",
-            "xy_px",
-            "xyz_cam_m",
-            "root_relative",
-            "confidence",
-            "image_size_px",
-            "camera_matrix",
-            "distortion",
-            "camera_source",
-            "box_px",
-        ]
-        missing = [k for k in needed if k not in data]
+        data = load_npz(path, (*_NEEDED, *_ASSUMED, *_OPTIONAL))
+        missing = [k for k in _NEEDED if k not in data]
         if missing:
-            raise _format_error(f"{path} lacks {', '.join(missing)}", f"the fields {', '.join(needed)}")
+            raise _format_error(f"{path} lacks {', '.join(missing)}", f"the fields {', '.join(_NEEDED)}")
+        assumed = tuple(k for k in _ASSUMED if k not in data)
         n, j = data["time_s"].size, data["names"].size
-        arrays = {"time_s": (n,), "xy_px": (n, j, 2), "xyz_cam_m": (n, j, 3), "confidence": (n, j), "box_px": (n, 4)}
-        arrays |= {"image_size_px": (2,), "camera_matrix": (3, 3), "distortion": (5,), "root_relative": ()}
+        arrays = {"time_s": (n,), "xy_px": (n, j, 2), "xyz_cam_m": (n, j, 3), "confidence": (n, j)}
+        arrays |= {"image_size_px": (2,), "camera_matrix": (3, 3), "root_relative": ()}
+        arrays |= {k: s for k, s in {"distortion": (5,), "box_px": (n, 4)}.items() if k in data}
         if "focal_rel_sd" in data:
             arrays["focal_rel_sd"] = ()
         if "sides_changed" in data:
             arrays["sides_changed"] = (n, 3)
         check_numbers(path, data, arrays)
         rel_sd = float(data.get("focal_rel_sd", np.nan))
+        distortion, source = data.get("distortion", np.zeros(5)), str(data.get("camera_source", _NO_SOURCE))
+        box_px = data["box_px"] if "box_px" in data else _box(data["xy_px"], data["confidence"])
         return cls(
             time_s=data["time_s"].astype(np.float64),
             names=tuple(str(n) for n in data["names"]),
@@ -197,9 +191,10 @@ class Keypoints:
             xyz_cam_m=data["xyz_cam_m"],
             root_relative=bool(data["root_relative"]),
             confidence=data["confidence"],
-            image_size_px=(int(data["image_size_px"][0]), int(data["image_size_px"][1])),
-            camera=Camera(data["camera_matrix"], data["distortion"], str(data["camera_source"]), rel_sd),
-            box_px=data["box_px"],
+            image_size_px=picture_size(path, data["image_size_px"]),
+            camera=Camera(data["camera_matrix"], distortion, source, rel_sd),
+            box_px=box_px,
+            assumed=assumed,
             phone_time_s=data.get("phone_time_s"),
             phone_quat_wxyz=data.get("phone_quat_wxyz"),
             confidence_curve=str(data.get("confidence_curve", "")),
@@ -207,6 +202,14 @@ class Keypoints:
             origin=str(data.get("origin", "")),
             sides_changed=data["sides_changed"].astype(bool) if "sides_changed" in data else None,
         )
+
+
+def _box(xy_px: np.ndarray, confidence: np.ndarray) -> np.ndarray:
+    """(T, 4) x0, y0, x1, y1 around the points of each frame that were seen, NaN where none was."""
+    seen = (confidence > 0)[..., None] & np.isfinite(xy_px)
+    low, high = (np.where(seen, xy_px, fill).astype(float) for fill in (np.inf, -np.inf))
+    box = np.concatenate([low.min(axis=1, initial=np.inf), high.max(axis=1, initial=-np.inf)], axis=1)
+    return np.where(np.isfinite(box).all(axis=1, keepdims=True), box, np.nan)
 
 
 def _there(value: object) -> str:

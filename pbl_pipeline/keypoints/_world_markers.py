@@ -91,7 +91,7 @@ class WorldMarkers:
     @classmethod
     def load(cls, path: str | Path) -> WorldMarkers:
         """Read the .npz of docs/files.md. Raises `PblError` FILE_MISSING, FILE_FORMAT. Never unpickles."""
-        data = load_npz(path)
+        data = load_npz(path, _FIELDS)
         missing = [k for k in _FIELDS if k not in data]
         if missing:
             raise _format_error(f"no {', '.join(missing)}", f"the fields {', '.join(_FIELDS)}", path)

@@ -15,8 +15,8 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from pbl_pipeline import progress, settings
+from pbl_pipeline.bounded import DAMAGED, opened_zip
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import DAMAGED_ZIP
 
 from ._spec import GRAPH_FILE, SPEC_FILE, model_invalid
 
@@ -100,7 +100,7 @@ def _extract(archive: Path, folder: Path, source: str) -> None:
     try:
         with contextlib.ExitStack() as stack:
             if zipfile.is_zipfile(archive):
-                packed = stack.enter_context(zipfile.ZipFile(archive))
+                packed = stack.enter_context(opened_zip(archive))
                 members = [(i.filename, i.file_size) for i in packed.infolist() if not i.is_dir()]
                 opened = packed.open
             else:
@@ -121,7 +121,7 @@ def _extract(archive: Path, folder: Path, source: str) -> None:
                     with data, (folder / plain).open("wb") as file:
                         while chunk := data.read(_CHUNK):
                             file.write(chunk)
-    except (*DAMAGED_ZIP, tarfile.TarError, EOFError, OSError) as error:
+    except (*DAMAGED, tarfile.TarError, ValueError, OSError) as error:
         what = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
         raise model_invalid(
             source, f"no readable archive ({what})", f"a folder with {SPEC_FILE}, or its archive"

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pbl_pipeline.bounded import read_json
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import canonical_json
 
@@ -105,7 +105,7 @@ def load_spec(folder: str | Path) -> ModelSpec:
     """
     path = Path(folder) / SPEC_FILE
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
     except OSError as error:
         raise PblError(
             "MODEL_MISSING",
@@ -114,7 +114,7 @@ def load_spec(folder: str | Path) -> ModelSpec:
             next_step="see docs/models.md for what a model's folder holds",
             key=str(path),
         ) from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise model_invalid(path, f"no JSON text ({error})", "a JSON object") from error
     if not isinstance(content, dict):
         raise model_invalid(path, "no named fields", "a JSON object")

@@ -14,8 +14,9 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
 
 from pbl_pipeline.body import load_body, marker_set
+from pbl_pipeline.bounded import parse_json
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import check_out_folder, load_npz
+from pbl_pipeline.files import check_numbers, check_out_folder, load_npz
 from pbl_pipeline.gait.events import GaitEvent, GaitEvents
 from pbl_pipeline.gait.normative import gait_norm
 from pbl_pipeline.keypoints import Keypoints
@@ -199,9 +200,15 @@ class Truth:
     @classmethod
     def load(cls, path: str | Path) -> Truth:
         """Read `truth.npz`. Raises `PblError` FILE_MISSING, FILE_FORMAT."""
-        data = load_npz(path)
+        data = load_npz(path, _FIELDS)
         try:
-            raw = json.loads(str(data["spec"]))
+            n, j = data["time_s"].size, data["outlier"].shape[-1]
+            check_numbers(
+                path,
+                data,
+                {k: tuple(n if d == "T" else j if d == "J" else int(d) for d in s) for k, s in _ARRAYS.items()},
+            )
+            raw = parse_json(str(data["spec"]))
             raw["impairments"] = tuple(Impairment(**i) for i in raw["impairments"])
             raw["sensor"] = None if raw["sensor"] is None else PhoneSensor(**raw["sensor"])
             rows = zip(data["event_time_s"], data["event_side"], data["event"], strict=True)
@@ -212,20 +219,32 @@ class Truth:
                 clock_offset_s=float(data["clock_offset_s"]),
                 **{k: data[k] for k in _ARRAYS},
             )
-        except (KeyError, ValueError, TypeError) as error:
+        except (KeyError, ValueError, TypeError, IndexError, PblError) as error:
             raise PblError(
                 "FILE_FORMAT",
-                found=f"{type(error).__name__}: {error}",
+                found=error.found if isinstance(error, PblError) else f"{type(error).__name__}: {error}",
                 expected="a truth.npz as docs/files.md describes it",
                 next_step="make one with `pbl synth`",
                 key=str(path),
             ) from error
 
 
-_ARRAYS = (
-    *("time_s", "qpos", "scale", "site_offset_m", "R_nc", "phone_position_m", "pelvis_m", "markers_world_m"),
-    *("floor_height_m", "heel_on_floor", "ball_on_floor", "belt_m_per_s", "outlier"),
-)
+_ARRAYS: dict[str, tuple[int | str, ...]] = {
+    "time_s": ("T",),
+    "qpos": ("T", 40),
+    "scale": (8,),
+    "site_offset_m": ("J", 3),
+    "R_nc": ("T", 3, 3),
+    "phone_position_m": ("T", 3),
+    "pelvis_m": ("T", 3),
+    "markers_world_m": ("T", "J", 3),
+    "floor_height_m": ("T",),
+    "heel_on_floor": ("T", 2),
+    "ball_on_floor": ("T", 2),
+    "belt_m_per_s": (2,),
+    "outlier": ("T", "J"),
+}
+_FIELDS = (*_ARRAYS, "event_time_s", "event_side", "event", "spec", "joint_names", "clock_offset_s")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ QPOS = "qpos"
 #: Hip, knee and ankle from the rotations of bodies (`body_rotation_angles`), for models that are not ours.
 BODY_ROTATIONS = "body_rotations"
 CONVENTIONS = (QPOS, BODY_ROTATIONS)
+_FIELDS = ("time_s", "names", "angles_deg", "pelvis_m", "name", "source", "convention")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,10 +92,8 @@ class Reference:
 
         Raises `PblError` FILE_MISSING, FILE_FORMAT, REFERENCE_INPUT.
         """
-        data = load_npz(path)
-        missing = [
-            k for k in ("time_s", "names", "angles_deg", "pelvis_m", "name", "source", "convention") if k not in data
-        ]
+        data = load_npz(path, _FIELDS)
+        missing = [k for k in _FIELDS if k not in data]
         if missing:
             raise PblError(
                 "FILE_FORMAT",

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import gzip
-import json
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import angle_of, joint_angles, load_body
+from pbl_pipeline.bounded import count_rows, read_json, read_text
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import BodyPoses, trial_poses
@@ -112,8 +110,7 @@ def load_bodies(path: str | Path) -> Bodies:
     """The bodies of a file as `reference_of_bodies` reads it. Raises `PblError` FILE_MISSING, FILE_FORMAT."""
     path = Path(path)
     try:
-        with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as file:
-            data = json.load(file)
+        data = read_json(path)
         bodies = data["bodies"]
         return Bodies(
             np.asarray(data["time"], float),
@@ -121,7 +118,7 @@ def load_bodies(path: str | Path) -> Bodies:
             {n: np.asarray(b["translation"], float) for n, b in bodies.items()},
             {n: np.asarray(b.get("scaleFactors", (1.0, 1.0, 1.0)), float) for n, b in bodies.items()},
         )
-    except (OSError, EOFError, zlib.error, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise _unreadable(path, error, _BODIES) from error
 
 
@@ -135,15 +132,16 @@ def reference_of_mot(path: str | Path, source: str = "optical markers", conventi
     """
     path = Path(path)
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_text(path).splitlines()
+        count_rows(len(lines))
         end = next(i for i, line in enumerate(lines) if line.strip().lower() == "endheader")
         header = dict(line.split("=", 1) for line in lines[:end] if "=" in line)
         in_degrees = {"yes": True, "no": False}[{k.strip(): v.strip().lower() for k, v in header.items()}["inDegrees"]]
-        rows = [line.split() for line in lines[end + 1 :] if line.strip()]
-        names, values = rows[0], np.asarray(rows[1:], float)
+        rows = [line for line in lines[end + 1 :] if line.strip()]
+        names, values = rows[0].split(), np.loadtxt(rows[1:], ndmin=2, comments=None)
         column = {n: values[:, i] for i, n in enumerate(names)}
         time = column.pop("time")
-    except (OSError, UnicodeDecodeError, StopIteration, KeyError, ValueError, IndexError) as error:
+    except (OSError, StopIteration, KeyError, ValueError, IndexError) as error:
         raise _unreadable(
             path, error, "an OpenSim motion with `inDegrees=yes` or `no`, `endheader` and `time`"
         ) from error

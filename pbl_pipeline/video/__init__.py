@@ -3,7 +3,7 @@
 from ._attitude import Attitude, camera_in_device, check_attitude
 from ._board import Board
 from ._calibrate import Calibration, calibrate_video
-from ._camera import guess_camera, load_camera, undistort_px, viewing_ray
+from ._camera import check_lens, guess_camera, load_camera, undistort_px, viewing_ray
 from ._camera_pose import CameraPose, load_camera_poses
 from ._cut import cut_image
 from ._draw_calibration import draw_calibration
@@ -44,6 +44,7 @@ __all__ = [
     "calibrated_camera",
     "camera_in_device",
     "check_attitude",
+    "check_lens",
     "check_timing",
     "cut_image",
     "draw_calibration",

@@ -5,9 +5,7 @@ Pixel coordinates have (0, 0) at the centre of the top-left pixel, as in OpenCV.
 
 from __future__ import annotations
 
-import json
 import math
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from pbl_pipeline.bounded import read_json, read_toml
 from pbl_pipeline.errors import PblError
 
 from ._types import Camera, VideoInfo
@@ -28,6 +27,11 @@ PHONE_FOCAL_RANGE = (0.6655, 0.8452)
 #: Root mean square distance of the 25 distinct values from that median, as a fraction of it (0.067). Other phones,
 #: lenses and zooms may lie further off; nothing measured says how far.
 PHONE_FOCAL_REL_SD = 0.07
+
+#: Focal lengths over the longer side of the picture: a view of 175 to one of 0.06 degrees.
+_FOCAL_RANGE = (0.02, 1000.0)
+#: How far the distortion of a lens may move a corner outwards.
+_MOST_STRETCH = 2.0
 
 _NEXT = "correct the file, or leave it out: then a phone's field of view is guessed and the result says so"
 
@@ -77,9 +81,6 @@ def load_camera(path: str | Path, image_size_px: tuple[int, int], name: str | No
     width, height = _array(path, fields, "size", (2,)).tolist()
     if fields.get("fisheye"):
         raise _invalid(path, "a fisheye model", "a pinhole camera with k1 k2 p1 p2 k3 distortion")
-    plain = matrix[0, 1] == matrix[1, 0] == matrix[2, 0] == matrix[2, 1] == 0 and matrix[2, 2] == 1
-    if not plain or min(matrix[0, 0], matrix[1, 1]) <= 0:
-        raise _invalid(path, f"matrix {matrix.tolist()}", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx and fy positive")
     if min(width, height) <= 0 or not (0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height):
         raise _invalid(
             path,
@@ -87,6 +88,7 @@ def load_camera(path: str | Path, image_size_px: tuple[int, int], name: str | No
             "a principal point inside the picture",
         )
     distortion = np.concatenate([distortion, np.zeros(5 - len(distortion))])
+    check_lens(matrix, distortion, (width, height), path)
     rel_sd, spread = math.nan, ""
     if fields.get("focal_sd") is not None:
         rel_sd = float(_array(path, fields, "focal_sd", (1,))[0]) * 2 / (matrix[0, 0] + matrix[1, 1])
@@ -94,18 +96,16 @@ def load_camera(path: str | Path, image_size_px: tuple[int, int], name: str | No
             raise _invalid(path, f"focal_sd_px = {fields['focal_sd']!r}", "a standard deviation in px, 0 or more")
         spread = f", focal length within {100 * rel_sd:.2g} % (sd)"
     matrix, scaled = _scale(path, matrix, (width, height), image_size_px)
-    check_distortion(path, matrix, distortion, image_size_px)
     return Camera(matrix, distortion, f"file: {label}{scaled}{spread}", rel_sd)
 
 
 def _read(path: Path, name: str | None) -> tuple[str, Mapping[str, Any]]:
     """The label of the camera and its fields under the names matrix, distortion, size, fisheye."""
     try:
-        text = path.read_text(encoding="utf-8")
-        content = tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
+        content = read_toml(path) if path.suffix.lower() == ".toml" else read_json(path)
     except OSError as error:
         raise _invalid(path, f"the file cannot be read ({error.strerror})", "a calibration file") from error
-    except (ValueError, RecursionError) as error:  # also TOML's, JSON's and the text decoder's errors
+    except ValueError as error:
         raise _invalid(path, f"the text cannot be parsed ({error})", "a TOML or JSON calibration") from error
     if not isinstance(content, dict):
         raise _invalid(path, "no named fields", "a table of fields")
@@ -131,10 +131,10 @@ def _array(path: Path, fields: Mapping[str, Any], name: str, lengths: tuple[int,
         raise _invalid(path, f"no field {name}", expected)
     try:
         value = np.asarray(fields[name], dtype=np.float64).ravel()
-    except (TypeError, ValueError) as error:
-        raise _invalid(path, f"{name} = {fields[name]!r}", expected) from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise _invalid(path, f"{name} = {_shown(fields[name])}", expected) from error
     if len(value) not in lengths or not np.isfinite(value).all():
-        raise _invalid(path, f"{name} = {fields[name]!r}", expected)
+        raise _invalid(path, f"{name} = {_shown(fields[name])}", expected)
     return value
 
 
@@ -159,31 +159,73 @@ def _scale(
     return scaled, f", scaled by {factor:.4g} from {width:g}x{height:g} px"
 
 
-def check_distortion(path: Path, matrix: np.ndarray, distortion: np.ndarray, image_size_px: tuple[int, int]) -> None:
-    """Refuse a lens whose radial model turns back before the corners of the picture (`reaches_corners`)."""
-    if not reaches_corners(matrix, distortion, image_size_px):
-        k1, k2, _, _, k3 = distortion
+def check_lens(matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float, float], key: object = None) -> None:
+    """Refuse a lens that no camera has: `matrix` (3, 3) px and `distortion` (5,) of an upright picture (width, height).
+
+    Raises
+    ------
+    PblError
+        CAMERA_INVALID: not finite, a skew, a focal length that is no plausible part of the picture's longer side
+        (`_FOCAL_RANGE`), or a distortion that folds back before the corners of the picture or moves them by more than
+        `_MOST_STRETCH`.
+    """
+    m, d = np.asarray(matrix, np.float64), np.asarray(distortion, np.float64)
+    plain = m[0, 1] == m[1, 0] == m[2, 0] == m[2, 1] == 0 and m[2, 2] == 1
+    if not np.isfinite(m).all() or not plain or min(m[0, 0], m[1, 1]) <= 0:
+        raise _invalid(key, f"matrix {m.tolist()}", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx and fy positive")
+    low, high = (f * max(size_px) for f in _FOCAL_RANGE)
+    if not (low <= m[0, 0] <= high and low <= m[1, 1] <= high):
+        found = f"focal lengths {m[0, 0]:g} and {m[1, 1]:g} px of a {size_px[0]:g}x{size_px[1]:g} px picture"
+        raise _invalid(key, found, f"{low:g} to {high:g} px")
+    if not np.isfinite(d).all():
+        raise _invalid(key, f"distortion {d.tolist()}", "k1, k2, p1, p2, k3, finite; zeros for no distortion")
+    radial = f"{d[0]:g}, {d[1]:g}, {d[4]:g}"
+    if not reaches_corners(m, d, size_px):
         raise _invalid(
-            path,
-            f"radial distortion {k1:g}, {k2:g}, {k3:g} folds back before the corner of the picture",
+            key,
+            f"radial distortion {radial} folds back before the corner of the picture",
             "coefficients k1 k2 p1 p2 k3 that hold over the whole picture",
+        )
+    corner, r, distorted = _to_corner(m, d, size_px)
+    straight = max(float(np.interp(corner, distorted, r)), 1e-9)
+    if corner > _MOST_STRETCH * straight or 3 * np.hypot(d[2], d[3]) * straight > _MOST_STRETCH - 1:
+        raise _invalid(
+            key,
+            f"distortion {radial} (radial), {d[2]:g}, {d[3]:g} (tangential) that moves the corner of the picture "
+            f"more than {_MOST_STRETCH:g} times as far out",
+            "coefficients k1 k2 p1 p2 k3 as a calibration finds them",
         )
 
 
-def reaches_corners(matrix: np.ndarray, distortion: np.ndarray, image_size_px: tuple[int, int]) -> bool:
+def reaches_corners(matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float, float]) -> bool:
     """Whether the radial model reaches the corners before it turns back: beyond that, undistorting has no answer."""
+    corner, _, distorted = _to_corner(matrix, distortion, size_px)
+    return bool(distorted[-1] >= corner)
+
+
+def _to_corner(
+    matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float, float]
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Distance of the farthest corner from the axis (focal lengths), distances (N,) of an ideal camera, and where the
+    radial model puts them, up to where it turns back."""
     k1, k2, _, _, k3 = distortion
-    width, height = image_size_px
+    width, height = size_px
     x = (np.array([0, width - 1, 0, width - 1]) - matrix[0, 2]) / matrix[0, 0]
     y = (np.array([0, 0, height - 1, height - 1]) - matrix[1, 2]) / matrix[1, 1]
     corner = float(np.hypot(x, y).max())
     r = np.linspace(0.0, 3.0 * max(corner, 1.0), 4000)
     distorted = r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6)
     turns = np.flatnonzero(np.diff(distorted) <= 0)
-    return float(distorted[turns[0]] if len(turns) else distorted[-1]) >= corner
+    end = int(turns[0]) + 1 if len(turns) else len(r)
+    return corner, r[:end], distorted[:end]
 
 
-def _invalid(path: Path, found: str, expected: str) -> PblError:
+def _shown(value: object) -> str:
+    """A field's value as it stands in the file, its beginning where it is long."""
+    return repr(value)[:200]
+
+
+def _invalid(path: object, found: str, expected: str) -> PblError:
     return PblError("CAMERA_INVALID", found=found, expected=expected, next_step=_NEXT, key=path)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pbl_pipeline.bounded import read_toml
 from pbl_pipeline.errors import PblError
 
 #: How far R R^T may be from 1: float32 poses pass, a scaled or mistyped matrix does not.
@@ -70,10 +70,10 @@ def load_camera_poses(path: str | Path) -> dict[str, CameraPose]:
     """
     path = Path(path)
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = read_toml(path)
     except OSError as error:
         raise _invalid(path, f"the file cannot be read ({error.strerror})", "a TOML calibration") from error
-    except ValueError as error:  # TOML's and the text decoder's errors
+    except ValueError as error:
         raise _invalid(path, f"the text cannot be parsed ({error})", "a TOML calibration") from error
     cameras = {name: table for name, table in content.items() if isinstance(table, dict) and "matrix" in table}
     if not cameras:
@@ -86,10 +86,10 @@ def _pose(path: Path, name: str, table: Mapping[str, Any]) -> CameraPose:
     for field in ("rotation", "translation"):
         try:
             vector = np.asarray(table[field], np.float64)
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, OverflowError):
             vector = np.full(3, np.nan)
         if vector.shape != (3,) or not np.isfinite(vector).all():
-            raise _invalid(path, f"[{name}] {field} = {table.get(field)!r}", f"{field}: 3 finite numbers")
+            raise _invalid(path, f"[{name}] {field} = {table.get(field)!r}"[:200], f"{field}: 3 finite numbers")
         vectors.append(vector)
     R_cn = Rotation.from_rotvec(vectors[0]).as_matrix()
     return CameraPose(R_cn.T, -R_cn.T @ vectors[1])

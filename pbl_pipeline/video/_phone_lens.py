@@ -9,12 +9,12 @@ phone reads another part of its sensor, or zooms.
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeGuard
 
+from pbl_pipeline.bounded import read_json
 from pbl_pipeline.errors import PblError
 
 from ._camera import load_camera
@@ -211,8 +211,8 @@ def _read(path: Path) -> tuple[PhoneLens, tuple[int, int], int]:
 def _content(path: Path) -> dict[str, Any]:
     """The fields of a JSON file; none where it is no such file."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        content = read_json(path)
+    except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}
 

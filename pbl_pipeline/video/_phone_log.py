@@ -9,15 +9,16 @@ from __future__ import annotations
 import csv
 import dataclasses
 import datetime
-import json
+import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pbl_pipeline import bounded
 from pbl_pipeline.errors import PblError
 
 from ._attitude import CAMERA, DEVICE, check_attitude, log_error
@@ -89,15 +90,16 @@ def read_phone_log(path: str | Path) -> PhoneLog:
         log = read_sensor_logger(path)
     else:
         text = read_text(path)
-        log = _read_json(path, text) if text.lstrip()[:1] in ("{", "[") else _read_csv(path, text)
+        is_json = text[:1000].lstrip()[:1] in ("{", "[")
+        log = _read_json(path, text) if is_json else _read_csv(path, text)
     _check_gravity(path, log)
     return log
 
 
 def read_text(path: Path) -> str:
-    """Text of a file. Raises `PblError` FILE_MISSING, PHONE_LOG (no text)."""
+    """Text of a file. Raises `PblError` FILE_MISSING, PHONE_LOG (no text, or too long)."""
     try:
-        return path.read_bytes().decode("utf-8-sig")
+        return bounded.read_text(path)
     except OSError as error:
         raise PblError(
             "FILE_MISSING",
@@ -106,32 +108,36 @@ def read_text(path: Path) -> str:
             next_step="check the path, and that you may read the file",
             key=str(path),
         ) from error
-    except UnicodeDecodeError as error:
-        raise log_error("no text", "CSV or JSON with " + ", ".join(_COLUMNS), path) from error
+    except ValueError as error:
+        raise log_error(f"no text to read ({error})", "CSV or JSON with " + ", ".join(_COLUMNS), path) from error
 
 
-def read_table(path: Path, text: str) -> tuple[list[str], list[dict[str, str | None]]]:
-    """Column names and rows of a CSV text; empty lines and lines that start with # left out. Raises PHONE_LOG."""
-    rows = csv.DictReader((t for t in text.splitlines() if t.strip() and t[0] != "#"), skipinitialspace=True)
+def read_table(path: Path, text: str, wanted: Collection[str]) -> tuple[list[str], list[dict[str, str | None]]]:
+    """Column names of a CSV text and its rows, of which the `wanted` columns are kept; empty lines and lines that start
+    with # left out. Raises PHONE_LOG."""
+    rows = csv.reader((t for t in io.StringIO(text, newline=None) if t.strip() and t[0] != "#"), skipinitialspace=True)
     try:
-        table = list(rows)
-        names = [(n or "").strip() for n in rows.fieldnames or ()]
-    except csv.Error as error:
+        bounded.count_rows(max(text.count("\n"), text.count("\r")))
+        names = [n.strip() for n in next(rows, ())]
+        kept = [(i, n) for i, n in enumerate(names) if n in wanted]
+        table = [{n: row[i] if i < len(row) else None for i, n in kept} for row in rows if row]
+    except (csv.Error, ValueError) as error:
         raise log_error(f"no CSV ({error})", "CSV with the columns " + ", ".join(_COLUMNS), path) from error
-    return names, [{(k or "").strip(): v for k, v in row.items()} for row in table]
+    return names, table
 
 
 def numbers(path: Path, table: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
     """(N,) float64 of one column. Raises `PblError` PHONE_LOG."""
     try:
         return np.array([float(row[name]) for row in table], np.float64)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise log_error(f"column {name}: {error}", "a number in each row", path) from error
 
 
 # -------------------------------------------------------------------------------------------------- the project's own
 def _read_csv(path: Path, text: str) -> PhoneLog:
-    names, table = read_table(path, text)
+    axes = {axis for columns, _ in SENSORS.values() for axis in columns}
+    names, table = read_table(path, text, {*_COLUMNS, *_SETTINGS, *axes})
     _check_names(path, names)
     columns = [numbers(path, table, name) for name in _COLUMNS]
     settings: dict[str, object] = {}
@@ -153,8 +159,8 @@ def _read_csv(path: Path, text: str) -> PhoneLog:
 
 def _read_json(path: Path, text: str) -> PhoneLog:
     try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        content = bounded.parse_json(text)
+    except ValueError as error:
         raise log_error(f"no JSON ({error})", "an object with " + ", ".join(_COLUMNS), path) from error
     if not isinstance(content, dict):
         raise log_error("JSON that is no object", "an object with " + ", ".join(_COLUMNS), path)

@@ -9,9 +9,6 @@ of `pitch`, which Android counts the other way. A file in which it does not is r
 
 from __future__ import annotations
 
-import io
-import json
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -19,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.files import DAMAGED_ZIP
+from pbl_pipeline import bounded
 
 from ._attitude import DEVICE, check_attitude, log_error
 from ._phone_log import OWN_CLOCK, QUATERNION, UTC_CLOCK, PhoneLog, Sensor, numbers, read_table, read_text
@@ -32,14 +29,15 @@ _SENSORS = {
     "Gyroscope": "gyroscope",
     "Magnetometer": "magnetometer",
 }
-#: A member of an archive larger than this is no log of a walk.
-_LARGEST = 512 << 20
 #: Repeated rows are left out; more than this fraction, and the stamps are not to be trusted.
 _MOST_REPEATS = 0.1
 #: How far the sine of the stated pitch may lie from the quaternion's.
 _PITCH_TOL = 0.05
 #: Stamps before this (s since 1970; 2015) are of a clock that does not know the date.
 _EARLIEST_UTC_S = 1.42e9
+
+#: The columns that are read of any sensor.
+_COLUMNS = {"time", *QUATERNION, "pitch", "x", "y", "z", "device name", "platform"}
 
 _Rows = Sequence[Mapping[str, Any]]
 
@@ -93,8 +91,8 @@ def _tables(path: Path) -> tuple[Callable[[str], _Rows], str]:
     text = read_text(path)
     if text.lstrip()[:1] == "[":
         try:
-            content = json.loads(text)
-        except (ValueError, RecursionError) as error:
+            content = bounded.parse_json(text)
+        except ValueError as error:
             raise log_error(f"no JSON ({error})", "a list of rows, as Sensor Logger exports it", path) from error
         rows = [r for r in content if isinstance(r, dict)]
         return lambda name: [r for r in rows if r.get("sensor") == name], "JSON"
@@ -102,7 +100,7 @@ def _tables(path: Path) -> tuple[Callable[[str], _Rows], str]:
 
 
 def _csv(path: Path, text: str | None) -> _Rows:
-    return [] if text is None else read_table(path, text)[1]
+    return [] if text is None else read_table(path, text, _COLUMNS)[1]
 
 
 def _member(folder: Path, name: str) -> str | None:
@@ -112,15 +110,13 @@ def _member(folder: Path, name: str) -> str | None:
 
 def _unzipped(path: Path, name: str) -> str | None:
     try:
-        with zipfile.ZipFile(path) as archive:
+        with bounded.opened_zip(path) as archive:
             wanted = f"{name}.csv".lower()
             member = next((m for m in archive.infolist() if PurePosixPath(m.filename).name.lower() == wanted), None)
-            if member is None:
-                return None
-            if member.file_size > _LARGEST:
-                raise log_error(f"{member.filename} of {member.file_size >> 20} MB", "a log of some minutes", path)
-            return io.TextIOWrapper(archive.open(member), "utf-8-sig").read()
-    except (OSError, EOFError, UnicodeDecodeError, *DAMAGED_ZIP) as error:
+            return (
+                None if member is None else bounded.read_member(archive, member, bounded.MAX_TEXT).decode("utf-8-sig")
+            )
+    except (OSError, ValueError) as error:
         if isinstance(error, FileNotFoundError):
             read_text(path)  # says so
         raise log_error(f"no readable archive ({error})", "the zip that Sensor Logger exports", path) from error

@@ -123,7 +123,7 @@ def test_no_file_from_outside_is_unpickled(tmp_path: Path):
     (tmp_path / "bomb.npy").rename(tmp_path / "array.npz")
     for name in ("bomb.npz", "plain.npz", "array.npz"):
         with pytest.raises(PblError) as error:
-            load_npz(tmp_path / name)
+            load_npz(tmp_path / name, ("time_s", "names"))
         assert error.value.code == "FILE_FORMAT"
         for command in (
             ["fit", "--out", tmp_path / "o"],

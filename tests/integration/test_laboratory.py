@@ -160,8 +160,8 @@ def test_events_of_a_recording_by_command(walk, tmp_path):
 def test_labels_do_not_make_up_for_odd_markers(walk, tmp_path, monkeypatch, axes, signs, words):
     """The labels and angles of the recording are right, its markers are turned: no lengths, no cycles by them."""
 
-    def turned(path):
-        points, names, time, table = _read(path)
+    def turned(path, wanted):
+        points, names, time, table = _read(path, wanted)
         at = [i for i, n in enumerate(names) if not n.endswith(("Angles", "Angle"))]
         points[:, at] = points[:, at][..., axes] * signs
         return points, names, time, table
@@ -179,10 +179,9 @@ def test_labels_do_not_make_up_for_odd_markers(walk, tmp_path, monkeypatch, axes
 
 def test_without_labels_the_method_finds_the_events(walk, tmp_path):
     """Angles and foot markers of a child, written without events."""
-    points, names, _, _ = _read(walk)
-    wanted = [n for n in names if n in MARKERS or n[1:] in {p for p, _ in PLUG_IN_GAIT_POINTS.values()}]
-    own = points[:, [names.index(n) for n in wanted]]
-    path = write_c3d(tmp_path / "own.c3d", own, wanted)
+    angles = {side + point for point, _ in PLUG_IN_GAIT_POINTS.values() for side in "LR"}
+    points, names, _, _ = _read(walk, {*MARKERS, *angles})
+    path = write_c3d(tmp_path / "own.c3d", points, names)
     for method in ("phase-transformer", "zeni-2008"):
         assert read_lab_trial(path, method=method).events.method == method
         out = tmp_path / f"{method}.json"

@@ -335,10 +335,13 @@ def test_convergence_is_judged_by_the_second_half_and_needs_a_trace():
 
 def test_an_unmeasured_camera_is_told():
     k = observe(plain_walk(TIME_S), TIME_S)
-    guessed = dataclasses.replace(k, camera=dataclasses.replace(k.camera, source="estimated: by somebody"))
+    camera = dataclasses.replace(k.camera, source="estimated: by somebody")
+    guessed = dataclasses.replace(k, camera=camera, assumed=("distortion",))
     checks = {c.check: c for c in fit_session([guessed], ["a"], quick(250)).qc}
     assert checks["camera_intrinsics_measured"].outcome == "WARN"
     assert "by somebody" in checks["camera_intrinsics_measured"].advice
+    assert checks["keypoints_fields_assumed"].outcome == "WARN"
+    assert "do not state distortion:" in checks["keypoints_fields_assumed"].advice
     assert checks["camera_orientation_known"].outcome == "WARN"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -9,10 +10,10 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.keypoints import MultiView, WorldMarkers, cameras_of_files
-from pbl_pipeline.video import CameraPose, load_camera, load_camera_poses
+from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers, cameras_of_files
+from pbl_pipeline.video import Camera, CameraPose, load_camera, load_camera_poses
 from tests.conftest import SHARED
-from tests.inputs import CALIBRATION, NAMES, POSE, ROWS, J, T, changed, keypoints, markers, trc_text
+from tests.inputs import CALIBRATION, LENS, NAMES, POSE, ROWS, J, T, changed, keypoints, markers, trc_text
 
 
 def code_of(error: pytest.ExceptionInfo[PblError]) -> str:
@@ -333,3 +334,76 @@ def test_poses_of_a_real_calibration_triangulate_to_its_markers():
     met = points[..., :3] / points[..., 3:]
     assert used.mean() > 0.9
     assert np.median(np.linalg.norm(met - in_world, axis=-1)[used]) < 1e-3
+
+
+# --- keypoints of other programs
+
+
+def test_keypoints_of_another_program_need_only_what_is_needed(tmp_path):
+    rng = np.random.default_rng(0)
+    whole = keypoints(xy_px=rng.uniform(0, 1000, (T, J, 2)), confidence=changed(np.ones((T, J)), 0.0))
+    whole.save(tmp_path / "whole.npz")
+    assert Keypoints.load(tmp_path / "whole.npz").assumed == ()
+    with np.load(tmp_path / "whole.npz") as f:
+        fields = {k: f[k] for k in f.files if k not in ("box_px", "distortion", "camera_source")}
+    np.savez(tmp_path / "other.npz", **fields, note="written by another program")
+    found = Keypoints.load(tmp_path / "other.npz")
+    assert found.assumed == ("distortion", "camera_source", "box_px")
+    assert not found.camera.distortion.any()
+    assert not found.camera.calibrated
+    seen = whole.xy_px[0, [0, 2]]  # the second point of the first frame has no confidence
+    np.testing.assert_allclose(found.box_px[0], [*seen.min(axis=0), *seen.max(axis=0)], rtol=1e-6)
+    for name in fields:
+        np.savez(tmp_path / "less.npz", **{k: v for k, v in fields.items() if k != name})
+        with pytest.raises(PblError, match="FILE_FORMAT"):
+            Keypoints.load(tmp_path / "less.npz")
+
+
+def test_a_frame_without_points_has_no_box(tmp_path):
+    keypoints(confidence=np.zeros((T, J))).save(tmp_path / "k.npz")
+    with np.load(tmp_path / "k.npz") as f:
+        np.savez(tmp_path / "other.npz", **{k: f[k] for k in f.files if k != "box_px"})
+    assert np.isnan(Keypoints.load(tmp_path / "other.npz").box_px).all()
+
+
+@pytest.mark.parametrize("size", [[np.nan, 100], [0, 100], [-5, 100], [100, np.inf], [1e9, 1]])
+def test_sizes_of_pictures_that_cannot_be(tmp_path, size):
+    keypoints().save(tmp_path / "k.npz")
+    with np.load(tmp_path / "k.npz") as f:
+        np.savez(tmp_path / "bad.npz", **{**{k: f[k] for k in f.files}, "image_size_px": np.array(size, float)})
+    with pytest.raises(PblError, match="FILE_FORMAT"):
+        Keypoints.load(tmp_path / "bad.npz")
+
+
+# --- lenses that no camera has
+
+
+@pytest.mark.parametrize(
+    ("matrix", "distortion"),
+    [
+        ([[1000, 0, 500], [0, 1000, 500], [0, 0, 1]], [1e9, 0, 0, 0, 0]),
+        ([[1000, 0, 500], [0, 1000, 500], [0, 0, 1]], [0, 0, 0, 0, 1e9]),
+        ([[1000, 0, 500], [0, 1000, 500], [0, 0, 1]], [0, 0, 1e9, 0, 0]),
+        ([[1000, 0, 500], [0, 1000, 500], [0, 0, 1]], [-1e9, 0, 0, 0, 0]),
+        ([[1000, 0, 500], [0, 1000, 500], [0, 0, 1]], [np.nan, 0, 0, 0, 0]),
+        ([[1000, 9, 500], [0, 1000, 500], [0, 0, 1]], [0, 0, 0, 0, 0]),
+        ([[1000, 0, 500], [9, 1000, 500], [0, 0, 1]], [0, 0, 0, 0, 0]),
+        ([[1e-3, 0, 500], [0, 1e-3, 500], [0, 0, 1]], [0, 0, 0, 0, 0]),
+        ([[1e12, 0, 500], [0, 1e12, 500], [0, 0, 1]], [0, 0, 0, 0, 0]),
+        ([[np.inf, 0, 500], [0, 1000, 500], [0, 0, 1]], [0, 0, 0, 0, 0]),
+    ],
+)
+def test_lenses_that_no_camera_has_are_refused_wherever_they_stand(tmp_path, matrix, distortion):
+    lens = Camera(np.array(matrix, float), np.array(distortion, float), "test")
+    with pytest.raises(PblError, match="CAMERA_INVALID"):
+        keypoints(camera=lens)
+    if np.isfinite([*np.ravel(matrix), *distortion]).all():
+        fields = {"camera_matrix": matrix, "distortion": distortion, "image_size_px": [1000, 1000]}
+        (tmp_path / "c.json").write_text(json.dumps(fields))
+        with pytest.raises(PblError, match="CAMERA_INVALID"):
+            load_camera(tmp_path / "c.json", (1000, 1000))
+
+
+@pytest.mark.parametrize("distortion", [[-0.3, 0.1, 1e-3, -1e-3, 0], [0.25, -0.8, 0, 0, 1.0], [0.1, 0, 0.01, 0.01, 0]])
+def test_lenses_of_cameras_are_taken(distortion):
+    keypoints(camera=Camera(LENS.matrix, np.array(distortion), "test"))

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import io
 import math
 from pathlib import Path
 
+from pbl_pipeline.bounded import MIB, read_text
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
 
@@ -15,6 +17,8 @@ FOOT_DOWN, FOOT_UP = "foot_down", "foot_up"
 SIDES = (LEFT, RIGHT)
 EVENTS = (FOOT_DOWN, FOOT_UP)
 COLUMNS = ("time_s", "side", "event", "probability")
+#: Of a file of events (bytes): some ten thousand.
+_LARGEST = MIB
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,15 +148,14 @@ def load_events(path: str | Path) -> tuple[GaitEvent, ...]:
     Raises `PblError` FILE_FORMAT.
     """
     try:
-        with Path(path).open(newline="") as f:
-            rows = csv.DictReader(f)
-            if tuple(rows.fieldnames or ()) != COLUMNS:
-                raise ValueError(f"columns {rows.fieldnames}")
-            found = [GaitEvent(float(r["time_s"]), r["side"], r["event"], float(r["probability"])) for r in rows]
-            if not all(math.isfinite(e.time_s) and 0.0 <= e.probability <= 1.0 for e in found):
-                raise ValueError("a time that is not finite, or a probability outside 0..1")
-            return tuple(sorted(found, key=lambda e: e.time_s))
-    except (OSError, ValueError, TypeError) as error:
+        rows = csv.DictReader(io.StringIO(read_text(path, _LARGEST), newline=""))
+        if tuple(rows.fieldnames or ()) != COLUMNS:
+            raise ValueError(f"columns {rows.fieldnames}"[:200])
+        found = [GaitEvent(float(r["time_s"]), r["side"], r["event"], float(r["probability"])) for r in rows]
+        if not all(math.isfinite(e.time_s) and 0.0 <= e.probability <= 1.0 for e in found):
+            raise ValueError("a time that is not finite, or a probability outside 0..1")
+        return tuple(sorted(found, key=lambda e: e.time_s))
+    except (OSError, ValueError, TypeError, csv.Error) as error:
         raise PblError(
             "FILE_FORMAT",
             found=str(error),

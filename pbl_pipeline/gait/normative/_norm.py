@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from pbl_pipeline.bounded import parse_json, read_json
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import canonical_json
 
@@ -194,21 +195,18 @@ def load_norm(name: str = DEFAULT_NORM) -> NormativeSet:
     ANGLE_UNITS.
     """
     if name.endswith(".json"):
-        path = Path(name)
-        if not path.is_file():
+        if not Path(name).is_file():
             raise _unknown(name)
-        text = path.read_text()
-    elif name in norm_names():
-        text = _FOLDER.joinpath(name + ".json").read_text()
-    else:
+    elif name not in norm_names():
         raise _unknown(name)
     try:
-        data = json.loads(text)
+        shipped = not name.endswith(".json")
+        data = parse_json(_FOLDER.joinpath(name + ".json").read_text()) if shipped else read_json(name)
         checksum = data.pop("sha256")
         if _checksum(data) != checksum:
             raise ValueError("the numbers are not those the checksum was made of")
         return _from_json(data, checksum)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise _invalid(f"{name}: {error}", "a file that build_norm wrote, unchanged") from error
 
 

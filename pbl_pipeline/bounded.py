@@ -1,0 +1,235 @@
+"""Reading of files from outside with bounds: what a file claims of its own size is not believed.
+
+A small file can unpack to gigabytes, and few bytes of text become large objects. Whatever its content, a file that is
+read here takes less than 1 GiB; what takes the most is `MAX_ARRAYS`, whose numbers are copied once or twice by those
+who convert them.
+
+All functions raise OSError where a file cannot be opened or read, and ValueError, in words, where its content is
+refused. Who reads a format adds the code.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import gzip
+import io
+import json
+import lzma
+import math
+import os
+import re
+import stat
+import tomllib
+import zipfile
+import zlib
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+MIB = 1 << 20
+#: Bytes of a text (JSON, CSV, TRC, MOT), unpacked: an hour of a sensor at 100 Hz.
+MAX_TEXT = 32 * MIB
+#: Rows of a table: 83 minutes at 100 Hz. A row of one letter takes a hundred times its bytes.
+MAX_ROWS = 500_000
+#: Bytes of a TOML file: its reader takes the square of a name's length.
+MAX_TOML = MIB // 4
+#: Lists and objects of a JSON text, and how deeply they are nested.
+MAX_CONTAINERS, MAX_DEPTH = 1_000_000, 32
+#: Bytes of the arrays that are read from one .npz, each number counted as 8: 87 markers and 40 joints for 16 minutes at
+#: 60 Hz.
+MAX_ARRAYS = 256 * MIB
+#: Bytes of a text in an array as an object of its own, at least.
+_STRING = 128
+#: Bytes of an archive's directory: some ten thousand members.
+_MAX_DIRECTORY = MIB
+#: Bytes of an array's header, as NumPy's own limit.
+_MAX_HEADER = 10_000
+#: Digits of a number: a float has 309 at most.
+_LONG_NUMBER = re.compile(r"\d{310}")
+_HALF_LETTER = re.compile(r"\\u[dD][89a-fA-F]")
+
+#: What the readers of packed files raise for damaged ones; RuntimeError: one with a password.
+DAMAGED = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, RuntimeError, EOFError, gzip.BadGzipFile)
+
+
+def read_bytes(path: str | Path, at_most: int) -> bytes:
+    """The content of a regular file of up to `at_most` bytes, of a name that ends in .gz unpacked."""
+    with _opened(path) as file:
+        packed = str(path).lower().endswith(".gz")
+        least = at_most if packed else min(at_most, os.fstat(file.fileno()).st_size)
+        try:
+            data = (gzip.GzipFile(fileobj=file) if packed else file).read(least + 1)
+        except DAMAGED as error:
+            raise ValueError(f"damaged: {error}") from error
+    if len(data) > at_most:
+        raise ValueError(f"more than {_size(at_most)}")
+    return data
+
+
+def read_text(path: str | Path, at_most: int = MAX_TEXT) -> str:
+    """The UTF-8 text of a file as `read_bytes` reads it."""
+    return read_bytes(path, at_most).decode("utf-8-sig")
+
+
+def read_json(path: str | Path, at_most: int = MAX_TEXT) -> Any:
+    """The content of a JSON file (also gzipped), as `parse_json` takes it."""
+    return parse_json(read_text(path, at_most))
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """The content of a TOML file of up to `MAX_TOML`."""
+    try:
+        return tomllib.loads(read_text(path, MAX_TOML))
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+
+
+def parse_json(text: str) -> Any:
+    """The content of a JSON text; not nested beyond `MAX_DEPTH`, all integers fit a float, all texts are Unicode."""
+    if text.count("[") + text.count("{") > MAX_CONTAINERS:
+        raise ValueError(f"more than {MAX_CONTAINERS:,} lists and objects")
+    if _LONG_NUMBER.search(text):
+        raise ValueError("a number of more than 309 digits")
+    try:
+        content = json.loads(text)
+    except RecursionError as error:
+        raise ValueError(f"nested more than {MAX_DEPTH} deep") from error
+    halves = _HALF_LETTER.search(text) is not None
+    level: list[Any] = [[content]]
+    for _ in range(MAX_DEPTH + 1):
+        if halves:
+            _check_letters(level)
+        inner = ((v.values() if isinstance(v, dict) else v) for v in level)
+        level = [v for values in inner for v in values if isinstance(v, (dict, list))]
+        if not level:
+            return content
+    raise ValueError(f"nested more than {MAX_DEPTH} deep")
+
+
+def _check_letters(level: Sequence[Any]) -> None:
+    """Refuse texts that no file can hold: halves of a letter of UTF-16. UnicodeEncodeError is a ValueError."""
+    for inner in level:
+        for value in [*inner, *inner.values()] if isinstance(inner, dict) else inner:
+            if isinstance(value, str) and not value.isascii():
+                value.encode()
+
+
+def count_rows(n: int) -> None:
+    """Refuse a table of more than `MAX_ROWS` rows."""
+    if n > MAX_ROWS:
+        raise ValueError(f"more than {MAX_ROWS:,} rows")
+
+
+@contextlib.contextmanager
+def opened_zip(path: str | Path) -> Iterator[zipfile.ZipFile]:
+    """A zip archive to read members of (`read_member`), whose directory is small."""
+    with _opened(path) as file:
+        _check_directory(file)
+        try:
+            with zipfile.ZipFile(file) as archive:
+                yield archive
+        except DAMAGED as error:
+            raise ValueError(f"no readable archive: {error}") from error
+
+
+def read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, at_most: int) -> bytearray:
+    """The content of a member of up to `at_most` bytes; call it within `opened_zip`."""
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{member.filename} is packed in another way than by deflate")
+    if member.file_size > at_most:
+        raise ValueError(f"{member.filename} has {_size(member.file_size)}, at most {_size(at_most)} are read")
+    data = bytearray()
+    with archive.open(member) as file:
+        while piece := file.read(MIB):
+            data += piece
+    if len(data) != member.file_size:
+        raise ValueError(f"{member.filename} has {len(data)} bytes, the directory names {member.file_size}")
+    return data
+
+
+def _check_directory(file: BinaryIO) -> None:
+    """The end of a zip archive (APPNOTE 4.3.16) names a small directory, before anything reads that."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(0, size - 65557))  # the record and the longest comment
+    end = file.read(65557)
+    file.seek(0)
+    at = end.rfind(b"PK\5\6")
+    if at < 0 or at + 22 > len(end):
+        raise ValueError("no zip archive, or one that is cut off")
+    length = int.from_bytes(end[at + 12 : at + 16], "little")
+    if length > _MAX_DIRECTORY or b"PK\6\7" in end[max(0, at - 20) : at]:
+        raise ValueError(f"an archive whose directory has more than {_size(_MAX_DIRECTORY)}")
+
+
+def npz_fields(path: str | Path) -> tuple[str, ...]:
+    """Names of the arrays of an .npz file; no array is read."""
+    with opened_zip(path) as archive:
+        return tuple(m.filename.removesuffix(".npy") for m in archive.infolist())
+
+
+def read_npz(path: str | Path, fields: Collection[str] | None = None) -> dict[str, np.ndarray]:
+    """Those of `fields` that an .npz file has (None: all), up to `MAX_ARRAYS` together. Others are not unpacked, and
+    nothing is unpickled."""
+    arrays, room = {}, MAX_ARRAYS
+    with opened_zip(path) as archive:
+        for member in archive.infolist():
+            name = member.filename.removesuffix(".npy")
+            if fields is None or name in fields:
+                try:
+                    arrays[name] = _array(read_member(archive, member, room), room)
+                except ValueError as error:
+                    raise ValueError(f"{name}: {error}") from error
+                room -= _cost(arrays[name])
+    return arrays
+
+
+def _array(data: bytearray, room: int) -> np.ndarray:
+    """An array of numbers or texts in the form of .npy, over `data`."""
+    shape, fortran, dtype, start = _npy_header(data)
+    count = math.prod(shape)
+    if dtype.hasobject or dtype.kind not in "biufcSU" or not dtype.itemsize:
+        raise ValueError(f"values of type {dtype}")
+    if count * dtype.itemsize != len(data) - start:
+        raise ValueError(f"{len(data) - start} bytes for shape {shape} of {dtype}")
+    if count * max(dtype.itemsize, 8 if dtype.kind in "biufc" else _STRING) > room:
+        raise ValueError(f"shape {shape}: more than {_size(MAX_ARRAYS)} in all arrays of the file")
+    return np.ndarray(shape, dtype, data, start, order="F" if fortran else "C")
+
+
+def _npy_header(data: bytearray) -> tuple[tuple[int, ...], bool, np.dtype, int]:
+    """Shape, order, type and the place where the values begin."""
+    if data[:6] != b"\x93NUMPY" or data[6] not in (1, 2):
+        raise ValueError("no array of .npy version 1 or 2")
+    size = 2 if data[6] == 1 else 4
+    start = 8 + size + int.from_bytes(data[8 : 8 + size], "little")
+    if not 8 + size < start <= min(len(data), _MAX_HEADER):
+        raise ValueError("a header that is cut off or too long")
+    read = np.lib.format.read_array_header_1_0 if size == 2 else np.lib.format.read_array_header_2_0
+    try:
+        shape, fortran, dtype = read(io.BytesIO(bytes(data[8:start])))
+    # NumPy reads it as Python's own syntax: whatever that stumbles over.
+    except Exception as error:
+        raise ValueError(f"a header that makes no sense ({type(error).__name__})") from error
+    if len(shape) > 8 or any(isinstance(n, bool) or n < 0 for n in shape) or max(shape, default=0) > MAX_ARRAYS:
+        raise ValueError(f"shape {shape}"[:100])
+    return shape, fortran, dtype, start
+
+
+def _cost(array: np.ndarray) -> int:
+    return array.size * max(array.itemsize, 8 if array.dtype.kind in "biufc" else _STRING)
+
+
+@contextlib.contextmanager
+def _opened(path: str | Path) -> Iterator[BinaryIO]:
+    """A regular file; a pipe or device is refused and not waited for."""
+    with open(path, "rb", opener=lambda p, flags: os.open(p, flags | getattr(os, "O_NONBLOCK", 0))) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise OSError(errno.EINVAL, "it is not a regular file", str(path))
+        yield file
+
+
+def _size(n: int) -> str:
+    return f"{n / MIB:.3g} MiB"
