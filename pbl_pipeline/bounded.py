@@ -56,9 +56,10 @@ DAMAGED = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, RuntimeError, EOFErro
 
 
 def read_bytes(path: str | Path, at_most: int) -> bytes:
-    """The content of a regular file of up to `at_most` bytes, of a name that ends in .gz unpacked."""
+    """The content of a regular file of up to `at_most` bytes, gzipped or not."""
     with _opened(path) as file:
-        packed = str(path).lower().endswith(".gz")
+        packed = file.read(2) == b"\x1f\x8b"
+        file.seek(0)
         least = at_most if packed else min(at_most, os.fstat(file.fileno()).st_size)
         try:
             data = (gzip.GzipFile(fileobj=file) if packed else file).read(least + 1)
@@ -75,7 +76,7 @@ def read_text(path: str | Path, at_most: int = MAX_TEXT) -> str:
 
 
 def read_json(path: str | Path, at_most: int = MAX_TEXT) -> Any:
-    """The content of a JSON file (also gzipped), as `parse_json` takes it."""
+    """The content of a JSON file, as `parse_json` takes it."""
     return parse_json(read_text(path, at_most))
 
 

@@ -16,6 +16,7 @@ CODES: dict[str, str] = {
     "VIDEO_TRUNCATED": "decoding breaks off before the end the container announces",
     "VIDEO_DAMAGED": "frames inside the recording do not decode cleanly, or the picture size changes",
     "VIDEO_TIMESTAMPS": "the frames carry no usable time stamps",
+    "VIDEO_TOO_LARGE": "the pictures of the video are larger than are decoded here",
     "VIDEO_CHANGED": "the file's bytes are no longer those that were registered",
     "TRACK_NO_PERSON": "no person was found in the video",
     "TRACK_TOO_SHORT": "the person is in view for less than the shortest time that can be fitted",

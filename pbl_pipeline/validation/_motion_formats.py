@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import gzip
 import io
 import re
-import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -14,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from pbl_pipeline.body import load_body
+from pbl_pipeline.bounded import read_text
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait.normative import BODY_ANGLES, PLUG_IN_GAIT, offset_deg
 
@@ -185,15 +184,14 @@ def _pig_name(column: str) -> str:
 def _table(path: Path) -> tuple[pd.DataFrame, bool | None]:
     """The columns of a .mot or .csv, gzipped or not, and what its header says of degrees (None: nothing)."""
     try:
-        raw = path.read_bytes()
-        text = (gzip.decompress(raw) if raw[:2] == b"\x1f\x8b" else raw).decode("utf-8-sig")
+        text = read_text(path)
         head, found, body = text.partition("endheader")
         if not found:
             return pd.read_csv(io.StringIO(text)), None
         stated = re.search(r"inDegrees\s*=\s*(yes|no)", head, re.IGNORECASE)
         table = pd.read_csv(io.StringIO(body), sep=r"\s+")
         return table, None if stated is None else stated[1].lower() == "yes"
-    except (OSError, EOFError, zlib.error, UnicodeDecodeError, ValueError) as error:
+    except (OSError, ValueError) as error:
         absent = isinstance(error, FileNotFoundError | IsADirectoryError | NotADirectoryError | PermissionError)
         raise PblError(
             "FILE_MISSING" if absent else "FILE_FORMAT",

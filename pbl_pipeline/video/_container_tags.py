@@ -12,10 +12,12 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-from ._structure import family
+from ._structure import family, top_boxes
 
 #: An index larger than this is not read: hours of video have some MB.
 _LARGEST_MOOV = 64 << 20
+#: Items of a file, edits of a track, and boxes in each other, that are read; phones write some dozens.
+_MOST_ITEMS, _DEEPEST = 1000, 8
 _CONTAINERS = (b"moov", b"trak", b"udta", b"edts", b"mdia")
 
 
@@ -47,28 +49,16 @@ def read_tags(path: Path) -> Tags:
     return Tags(items | tracks, speeds)
 
 
-def _moov(path: Path) -> bytes:
-    size = path.stat().st_size
-    at = 0
+def _moov(path: Path) -> memoryview:
     with path.open("rb") as file:
-        while at + 8 <= size:
-            file.seek(at)
-            length, name = struct.unpack(">I4s", file.read(8))
-            head = 8
-            if length == 1:
-                wide = file.read(8)
-                length, head = (int.from_bytes(wide, "big"), 16) if len(wide) == 8 else (0, 16)
-            elif length == 0:
-                length = size - at
-            if length < head:
-                break
-            if name == b"moov":
-                return file.read(length - head) if length <= _LARGEST_MOOV else b""
-            at += length
-    return b""
+        for name, at, length, head in top_boxes(file, path.stat().st_size):
+            if name == b"moov" and length <= _LARGEST_MOOV:
+                file.seek(at + head)
+                return memoryview(file.read(length - head))
+    return memoryview(b"")
 
 
-def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+def _boxes(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
     """Names and contents of the boxes in `data`; ends where a length makes no sense."""
     at = 0
     while at + 8 <= len(data):
@@ -84,46 +74,46 @@ def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
         at += length
 
 
-def _find(data: bytes, *names: bytes) -> bytes:
+def _find(data: memoryview, *names: bytes) -> memoryview:
     """Content of the first box at this path; empty where there is none."""
     for wanted in names:
-        data = next((box for name, box in _boxes(data) if name == wanted), b"")
+        data = next((box for name, box in _boxes(data) if name == wanted), data[:0])
     return data
 
 
-def _is_video(trak: bytes) -> bool:
+def _is_video(trak: memoryview) -> bool:
     return _find(trak, b"mdia", b"hdlr")[8:12] == b"vide"
 
 
-def _items(data: bytes) -> dict[str, str]:
-    """The items of all `meta` boxes directly in these containers."""
+def _items(data: memoryview, depth: int = _DEEPEST) -> dict[str, str]:
+    """The items of all `meta` boxes in these containers, some boxes deep."""
     found: dict[str, str] = {}
     for name, box in _boxes(data):
         if name == b"meta":
             found |= _meta(box)
-        elif name in _CONTAINERS:
-            found |= _items(box)
+        elif name in _CONTAINERS and depth:
+            found |= _items(box, depth - 1)
     return found
 
 
-def _meta(box: bytes) -> dict[str, str]:
+def _meta(box: memoryview) -> dict[str, str]:
     # ISO writes version and flags before the boxes, QuickTime does not.
     if box[4:8] != b"hdlr" and box[8:12] == b"hdlr":
         box = box[4:]
     keys, listed = _find(box, b"keys"), _find(box, b"ilst")
     names, at = [], 8
-    while at + 8 <= len(keys):
+    while at + 8 <= len(keys) and len(names) < _MOST_ITEMS:
         (length,) = struct.unpack_from(">I", keys, at)
         if length < 8 or at + length > len(keys):
             break
-        names.append(keys[at + 8 : at + length].decode("utf-8", "replace"))
+        names.append(bytes(keys[at + 8 : at + length]).decode("utf-8", "replace"))
         at += length
     found = {}
     for number, item in _boxes(listed):
         index = int.from_bytes(number, "big")
         data = _find(item, b"data")
         if 1 <= index <= len(names) and len(data) > 8:
-            value = _value(int.from_bytes(data[1:4], "big"), data[8:])
+            value = _value(int.from_bytes(data[1:4], "big"), bytes(data[8:]))
             if value is not None:
                 found[names[index - 1].lower()] = value
     return found
@@ -140,14 +130,14 @@ def _value(kind: int, raw: bytes) -> str | None:
     return None
 
 
-def _speeds(trak: bytes) -> tuple[float, ...]:
+def _speeds(trak: memoryview) -> tuple[float, ...]:
     table = _find(trak, b"edts", b"elst")
     if len(table) < 8:
         return ()
     layout = ">QqhH" if table[0] == 1 else ">IihH"
     size = struct.calcsize(layout)
     speeds = []
-    for i in range(min(int.from_bytes(table[4:8], "big"), (len(table) - 8) // size)):
+    for i in range(min(int.from_bytes(table[4:8], "big"), (len(table) - 8) // size, _MOST_ITEMS)):
         _, start, whole, part = struct.unpack_from(layout, table, 8 + i * size)
         if start >= 0:
             speeds.append(whole + part / 65536)

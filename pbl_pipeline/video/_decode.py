@@ -27,7 +27,12 @@ from ._structure import family, missing_end
 _CONTAINERS = "mov,matroska,avi,mpegts,mpeg,asf,flv,ogg,mxf,ivf,h264,hevc"
 #: What reading a file can raise. Memory: a header that lies about sizes asks for more than there is.
 FFMPEG_ERRORS = (FFmpegError, MemoryError)
-_OPTIONS = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"}
+#: Of a decoded picture (bytes): 4K in 10 bits, 5.3K in 8. A decoder keeps up to 16 pictures that others are drawn from,
+#: and one for each thread; 16 of 5.3K with 5 threads take 760 MiB.
+_MAX_PICTURE, _MAX_IN_THREADS = 26 << 20, 128 << 20
+#: Pixels of a picture in the format with the fewest bytes for each (8 bits, colour at half the resolution).
+_MAX_PIXELS = {"max_pixels": str(_MAX_PICTURE * 2 // 3)}
+_OPTIONS = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "file", **_MAX_PIXELS}
 
 #: Fraction of frames whose stamp may repeat or run backwards and be left out; more means the stamps cannot be trusted.
 _MAX_UNORDERED = 0.01
@@ -86,12 +91,14 @@ class Decoder:
     def __init__(self, path: Path, threads: int | None = None, exact: bool = False) -> None:
         return_large_blocks()
         self.path = path
+        self.notes: list[str] = []
         self.container = _open(path)
         self.stream = self._pick_stream()
         self.stream.thread_type = "SLICE" if exact else "AUTO"
-        self.stream.codec_context.thread_count = threads or decode_threads()
+        room = max(1, _MAX_IN_THREADS // max(1, _picture_bytes(self.stream)))
+        self.stream.codec_context.thread_count = min(threads or decode_threads(), room)
+        self.stream.codec_context.options = _MAX_PIXELS  # also for pictures that are larger than announced
         self.time_base: Fraction = self.stream.time_base or Fraction(1, av.time_base)
-        self.notes: list[str] = []
         self.n_frames = 0
         self._first_pts: int | None = None
         self._last_pts: int | None = None
@@ -283,10 +290,19 @@ class Decoder:
         )
 
     def _pick_stream(self) -> av.VideoStream:
-        for stream in self.container.streams.video:
-            cover = stream.disposition & stream.disposition.__class__.attached_pic
-            if not cover and stream.codec_context is not None:
-                return stream
+        """The stream with the largest picture: phones store a preview beside it."""
+        found = [
+            stream
+            for stream in self.container.streams.video
+            if stream.codec_context is not None and not stream.disposition & stream.disposition.__class__.attached_pic
+        ]
+        if found:
+            stream = max(found, key=lambda s: s.codec_context.width * s.codec_context.height)
+            self._check_size(stream)
+            if len(found) > 1:
+                size = f"{stream.codec_context.width}x{stream.codec_context.height} px"
+                self.notes.append(f"{len(found)} video streams: the one with the largest picture is used ({size})")
+            return stream
         kinds = sorted({s.type for s in self.container.streams})
         unknown = any(s.type == "video" and s.codec_context is None for s in self.container.streams)
         self.container.close()
@@ -299,6 +315,26 @@ class Decoder:
             next_step="choose the file that holds the pictures; convert it to MP4 (H.264) if its codec is unusual",
             key=self.path,
         )
+
+    def _check_size(self, stream: av.VideoStream) -> None:
+        """Refuse pictures beyond `_MAX_PICTURE` before the first is decoded."""
+        size = _picture_bytes(stream)
+        if size <= _MAX_PICTURE:
+            return
+        self.container.close()
+        raise PblError(
+            "VIDEO_TOO_LARGE",
+            found=f"pictures of {stream.codec_context.width}x{stream.codec_context.height} px ({size >> 20} MiB each)",
+            expected=f"at most {_MAX_PICTURE >> 20} MiB each: 4K in 10 bits, 5.3K in 8",
+            next_step='make it smaller ("ffmpeg -i large.mp4 -vf scale=3840:-2 small.mp4")',
+            key=self.path,
+        )
+
+
+def _picture_bytes(stream: av.VideoStream) -> int:
+    """Bytes of a decoded picture as announced; those of 8 bits where the format is not known before decoding."""
+    codec = stream.codec_context
+    return codec.width * codec.height * (codec.format.padded_bits_per_pixel if codec.format is not None else 12) // 8
 
 
 def _words(error: BaseException) -> str:

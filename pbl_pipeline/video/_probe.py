@@ -41,7 +41,7 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
     Raises
     ------
     PblError
-        VIDEO_MISSING, VIDEO_EMPTY, VIDEO_NOT_A_VIDEO, VIDEO_NO_FRAMES, VIDEO_TRUNCATED, VIDEO_DAMAGED,
+        VIDEO_MISSING, VIDEO_EMPTY, VIDEO_NOT_A_VIDEO, VIDEO_TOO_LARGE, VIDEO_NO_FRAMES, VIDEO_TRUNCATED, VIDEO_DAMAGED,
         VIDEO_TIMESTAMPS.
     """
     path = check_file(path)

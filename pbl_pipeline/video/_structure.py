@@ -8,11 +8,14 @@ chunk of AVI. It says nothing about a file whose writer never knew its length (a
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 #: Boxes that may be the first of an MP4 or MOV file.
 _FIRST_BOXES = {b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot", b"styp"}
+#: Boxes of a file that are looked at: an hour in fragments of one picture has some hundred thousand.
+_MOST_BOXES = 1_000_000
 _EBML, _SEGMENT = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"
 
 
@@ -43,25 +46,34 @@ def missing_end(path: Path) -> str | None:
     return None
 
 
-def _mp4(file: BinaryIO, size: int) -> str | None:
-    at, boxes = 0, []
-    while at + 8 <= size:
+def top_boxes(file: BinaryIO, size: int) -> Iterator[tuple[bytes, int, int, int]]:
+    """Name, place, length and head of the boxes of an MP4 of `size` bytes; ends where a length makes no sense, and
+    after `_MOST_BOXES`."""
+    at = 0
+    for _ in range(_MOST_BOXES):
+        if at + 8 > size:
+            return
         file.seek(at)
         length, name = struct.unpack(">I4s", file.read(8))
+        head = 8
         if length == 1:
             wide = file.read(8)
-            if len(wide) < 8:
-                break
-            (length,) = struct.unpack(">Q", wide)
+            length, head = (int.from_bytes(wide, "big"), 16) if len(wide) == 8 else (0, 16)
         elif length == 0:  # "to the end of the file"
             length = size - at
-        if length < 8:
-            break
-        boxes.append(name)
+        if length < head:
+            return
+        yield name, at, length, head
+        at += length
+
+
+def _mp4(file: BinaryIO, size: int) -> str | None:
+    boxes = set()
+    for name, at, length, _ in top_boxes(file, size):
+        boxes.add(name)
         # Only boxes that hold pictures or their index: some writers end with an odd, harmless metadata box.
         if at + length > size and name in (b"mdat", b"moov", b"moof"):
             return f"the '{name.decode()}' box ends at byte {at + length}, the file at {size}"
-        at += length
     if b"moov" not in boxes:
         return "the index of the recording (the 'moov' box) is not in the file"
     return None
@@ -72,6 +84,8 @@ def _matroska(file: BinaryIO, size: int) -> str | None:
     length = _vint(file)
     if length is None:
         return "the file ends within its header"
+    if file.tell() + length > size:
+        return f"its header ends at byte {file.tell() + length}, the file at {size}"
     file.seek(length, 1)
     if file.read(4) != _SEGMENT:
         return "the file ends before its recording begins" if file.tell() >= size else None

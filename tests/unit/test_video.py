@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import struct
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -15,7 +16,19 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.video import Frame, VideoInfo, _decode, guess_camera, load_camera, probe, read_frames, sha256_of
+from pbl_pipeline.video import (
+    Frame,
+    VideoInfo,
+    _decode,
+    guess_camera,
+    load_camera,
+    probe,
+    read_first,
+    read_frames,
+    sha256_of,
+)
+from tests.guard import guarded
+from tests.quicktime import box
 from tests.videos import constant_rate, numbered_frames, write_video
 
 VARIABLE_S = np.cumsum(np.r_[0.0, np.random.default_rng(0).uniform(0.01, 0.05, 39)])
@@ -423,6 +436,62 @@ def _resident_mb() -> float:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs /proc")
+def test_pictures_that_are_too_large_are_refused_before_one_is_decoded(tmp_path):
+    large = write_video(tmp_path / "large.mp4", numbered_frames(1, 4352, 4352), [0.0])
+    for read in (probe, read_first, lambda path: next(read_frames(path))):
+        with guarded() as peak, pytest.raises(PblError) as error:
+            read(large)
+        assert error.value.code == "VIDEO_TOO_LARGE"
+        assert "4352x4352" in error.value.found
+        assert peak.grown_mib < 50
+    # The container names another size than the pictures have.
+    data, size = large.read_bytes(), struct.pack(">HH", 4352, 4352)
+    assert data.count(size) == 1
+    (tmp_path / "lying.mp4").write_bytes(data.replace(size, struct.pack(">HH", 64, 64)))
+    with guarded() as peak, pytest.raises(PblError) as error:
+        probe(tmp_path / "lying.mp4")
+    assert error.value.code.startswith("VIDEO_")
+    assert peak.grown_mib < 50
+
+
+@pytest.mark.parametrize("large_first", [True, False])
+def test_of_two_video_streams_the_largest_is_taken_and_said(tmp_path, large_first):
+    path = tmp_path / "two.mkv"
+    with av.open(str(path), "w") as container:
+        streams = []
+        for side in (128, 64) if large_first else (64, 128):
+            stream = container.add_stream("libx264", rate=30)
+            assert isinstance(stream, av.VideoStream)
+            stream.width, stream.height, stream.pix_fmt = side, side, "yuv420p"
+            streams.append(stream)
+        for i in range(5):
+            for stream in streams:
+                frame = av.VideoFrame.from_ndarray(np.zeros((stream.height, stream.width, 3), np.uint8), format="bgr24")
+                frame.pts = i
+                container.mux(stream.encode(frame))
+        for stream in streams:
+            container.mux(stream.encode(None))
+    info = probe(path)
+    assert (info.width_px, info.n_frames) == (128, 5)
+    assert "2 video streams: the one with the largest picture is used (128x128 px)" in info.notes
+    assert next(read_frames(path)).image.shape == (128, 128, 3)
+
+
+@pytest.mark.parametrize(
+    "length", [b"\x01" + b"\xff" * 6 + b"\xfe", b"\x08\xff\xff\xff\xff", b"\x01" + bytes(7), b"\0"]
+)
+def test_a_webm_with_an_odd_length(tmp_path, length):
+    path = tmp_path / "v.webm"
+    path.write_bytes(b"\x1a\x45\xdf\xa3" + length + bytes(100))
+    assert code_of(path) in ("VIDEO_TRUNCATED", "VIDEO_NOT_A_VIDEO")
+
+
+def test_a_file_of_millions_of_boxes(tmp_path):
+    many = box(b"ftyp", b"isom" + bytes(4)) + box(b"free", b"") * 2_000_000
+    (tmp_path / "many.mp4").write_bytes(many)
+    assert code_of(tmp_path / "many.mp4").startswith("VIDEO_")
+
+
 def test_memory_does_not_grow_with_the_length(tmp_path):
     """3,000 frames of 58 KB are 173 MB; between the first third and the end the process may grow by 12 MB."""
     pictures = list(numbered_frames(30, 120, 160))
