@@ -83,8 +83,16 @@ _MEDIAPIPE_POSE = NpmPackage(
     sha256="8bb349a7b3a3ba699df23be804ddd3b3eab810b50b15406894be257859388a84",
     size_bytes=40_985_403,
 )
+_POSE2SIM = Wheel(
+    requirement="pose2sim==0.10.49",
+    filename="pose2sim-0.10.49-py3-none-any.whl",
+    sha256="403e0dc4065898ba6a595e72a8970950310979253d60e24c2e00b16b36bf21e1",
+    size_bytes=51_189_031,
+    pip_options=("--only-binary=:all:", "--python-version", "311"),
+)
 
 _BLAZEPOSE = ("Apache-2.0", "MediaPipe 0.10.21, Google LLC; Bazarevsky et al. 2020, arXiv:2006.10204")
+_AUGMENTER = ("BSD-3-Clause", "Pose2Sim 0.10.49, David Pagnon; OpenCap 0.3, Falisse et al. 2025, IEEE TBME 72:2013")
 _DEMO = ("BSD-3-Clause", "Sports2D 0.8.34, David Pagnon; doi:10.21105/joss.06849")
 
 #: Every asset by name, optional ones included (`needed`).
@@ -119,6 +127,39 @@ ASSETS: dict[str, Asset] = {
             "Apache-2.0",
             "@mediapipe/pose 0.5.1675469404, Google LLC; Bazarevsky et al. 2020, arXiv:2006.10204",
             optional=True,
+        ),
+        Asset(
+            "augmenter_network",
+            "marker augmenter (OpenCap, 35 markers)",
+            _POSE2SIM,
+            "Pose2Sim/MarkerAugmenter/LSTM/v0.3_lower/model.onnx",
+            "8dbd686784f6c6e3b42fdfe968a8808a789bdcaff284e3dd9e8c321bbca4e52c",
+            2_080_428,
+            *_AUGMENTER,
+            optional=True,
+            file="marker_augmenter.onnx",
+        ),
+        Asset(
+            "augmenter_mean",
+            "mean of the marker augmenter's inputs",
+            _POSE2SIM,
+            "Pose2Sim/MarkerAugmenter/LSTM/v0.3_lower/mean.npy",
+            "e8783601a37f827c728bb1f2bbb143d66f59c92a3268306697cfc2932e99888f",
+            504,
+            *_AUGMENTER,
+            optional=True,
+            file="marker_augmenter_mean.npy",
+        ),
+        Asset(
+            "augmenter_std",
+            "standard deviation of the marker augmenter's inputs",
+            _POSE2SIM,
+            "Pose2Sim/MarkerAugmenter/LSTM/v0.3_lower/std.npy",
+            "e7bcbe84f460666696fb500663a281c418ed20205aab9d8e1b18fd8568c77436",
+            504,
+            *_AUGMENTER,
+            optional=True,
+            file="marker_augmenter_std.npy",
         ),
         Asset(
             "demo_video",

@@ -20,6 +20,7 @@ from ._in_view import (
     visibility,
     whole_person_in_view,
 )
+from ._marker_augmenter import AnatomicalMarkers, AugmenterParams, MarkerAugmenter
 from ._methods import METHODS
 from ._multi_view import SAME_TIME_S, MultiView, cameras_of_files
 from ._onnx_keypoints import ModelKeypointParams, ModelParams, OnnxKeypoints
@@ -37,12 +38,15 @@ __all__ = [
     "METHODS",
     "SAME_TIME_S",
     "SEEN_SHARE",
+    "AnatomicalMarkers",
+    "AugmenterParams",
     "BlazePoseLandmarks",
     "ConfidenceCurve",
     "Gap",
     "KeypointDetector",
     "KeypointParams",
     "Keypoints",
+    "MarkerAugmenter",
     "ModelKeypointParams",
     "ModelParams",
     "MultiView",

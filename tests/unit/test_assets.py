@@ -197,7 +197,10 @@ def test_pins_are_complete():
     """The real list: every hash is a hash, every file name is one of its own, every asset says its licence."""
     default = ["blazepose_detector", "blazepose_landmarks", "demo_video", "demo_camera"]
     assert assets.needed() == default
-    assert set(assets.ASSETS) == {*default, "blazepose_landmarks_heavy"}
+    assert set(assets.ASSETS) == {
+        *default,
+        *("blazepose_landmarks_heavy", "augmenter_network", "augmenter_mean", "augmenter_std"),
+    }
     files = [a.path.name for a in assets.ASSETS.values()]
     assert len(set(files)) == len(files)
     for name, asset in assets.ASSETS.items():
