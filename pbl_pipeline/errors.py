@@ -18,6 +18,8 @@ CODES: dict[str, str] = {
     "VIDEO_TIMESTAMPS": "the frames carry no usable time stamps",
     "VIDEO_TOO_LARGE": "the pictures of the video are larger than are decoded here",
     "VIDEO_CHANGED": "the file's bytes are no longer those that were registered",
+    "VIDEO_DUPLICATE": "the same bytes are registered for another person",
+    "UPLOAD_REFUSED": "what lies in the drop folder is no file that may be taken over",
     "TRACK_NO_PERSON": "no person was found in the video",
     "TRACK_TOO_SHORT": "the person is in view for less than the shortest time that can be fitted",
     "SUBJECT_NEEDS_CHOICE": "several people, none clearly the subject: a person has to choose",
@@ -88,8 +90,8 @@ class PblError(Exception):
         """One line per part; the form stored in error rows and printed on stderr."""
         lines = [f"{self.code}: {CODES[self.code]}"]
         if self.key is not None:
-            lines.append(f"  about:    {_harmless(str(self.key), lines=False)}")
-        lines.append(f"  found:    {_harmless(self.found)}")
+            lines.append(f"  about:    {harmless(str(self.key), lines=False)}")
+        lines.append(f"  found:    {harmless(self.found)}")
         lines += [f"  expected: {self.expected}", f"  next:     {self.next_step}"]
         return "\n".join(lines)
 
@@ -102,7 +104,7 @@ class PblError(Exception):
         return (_rebuild, parts)
 
 
-def _harmless(text: str, lines: bool = True) -> str:
+def harmless(text: str, lines: bool = True) -> str:
     """Text with control characters written out: a name from outside must not move the reader's cursor, nor (without
     `lines`) begin a line that looks like ours."""
     kept = "\n" if lines else ""

@@ -28,6 +28,7 @@ from pbl_pipeline.errors import PblError
 
 from . import _dump, catalog, connection
 from .catalog import Column, quote
+from .folders import make_private, private_folder
 from .json_files import write_json
 from .store import store_error
 
@@ -342,8 +343,10 @@ def sha256_of(path: Path) -> str:
 
 def _new_folder(folder: Path) -> None:
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        private_folder(folder)
         empty = not any(folder.iterdir())
+        if empty:
+            make_private(folder)
     except OSError as error:
         raise _unwritable(folder, error) from error
     if not empty:

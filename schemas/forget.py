@@ -1,5 +1,8 @@
 """Removing a person: every row, every queued job, every stored file, and a list that proves it.
 
+Recordings (in the archive, the drop folder and where they were registered) go only where that is asked for; copies and
+temporary files that killed processes left go in any case.
+
 The columns of a row identify its person: a subject's code, or the number of a session, video or set of videos of that
 person. Every table that depends on a person has one of them (a test checks all foreign keys), also the queues, which
 have no foreign keys at all; DataJoint's cascading delete reaches neither queues nor files.
@@ -7,6 +10,7 @@ have no foreign keys at all; DataJoint's cascading delete reaches neither queues
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime
 import json
@@ -18,13 +22,17 @@ from typing import Any
 from pbl_pipeline import progress, settings
 from pbl_pipeline.errors import PblError
 
-from . import catalog, connection, fit, lab, session, video
+from . import archive, catalog, connection, fit, lab, session, video
 from ._datajoint import full_path
+from .archive import archive_dir
 from .catalog import Column, quote
 from .codes import check_subject
+from .folders import remove_empty
 from .json_files import write_json
 from .rows import delete_below
 from .store import files_below, store_error
+from .stored_files import remove_left_folders
+from .uploads import Bucket, Folder, Upload, drop_folder
 
 #: Columns that identify the person of a row. `fit_set` is a hash over one session's videos.
 IDENTITIES = ("subject", "session_id", "video_id", "fit_set")
@@ -36,12 +44,14 @@ Ids = dict[str, list[Any]]
 @dataclasses.dataclass(frozen=True)
 class Found:
     """What there is of a person. rows: table -> how many. files: paths in the store, those without a row as well.
-    videos: path, SHA-256 and size of the video files themselves. running: jobs in a worker's hands."""
+    videos: path, SHA-256 and size of the registered video files. running: jobs in a worker's hands. recordings: files
+    in the person's folders of the archive and, where PBL_INCOMING is set, of the drop folder."""
 
     rows: dict[str, int]
     files: list[str]
     videos: list[dict[str, Any]]
     running: list[str]
+    recordings: list[str]
 
     @property
     def nothing(self) -> bool:
@@ -76,7 +86,8 @@ def find(subject: str) -> tuple[Ids, Found]:
         DB_NOT_FOUND when neither the database nor a list of an earlier run knows the subject.
     """
     ids, earlier = _identities(subject), read_manifest(subject)
-    if not lab.Subject & {"subject": subject} and not earlier:
+    recordings = _recordings(subject)
+    if not lab.Subject & {"subject": subject} and not earlier and not recordings:
         raise PblError(
             "DB_NOT_FOUND",
             key=subject,
@@ -86,7 +97,7 @@ def find(subject: str) -> tuple[Ids, Found]:
         )
     for name, values in _still_free(earlier.get("ids", {})).items():
         ids[name] = list(dict.fromkeys([*ids[name], *values]))
-    return ids, _find(ids, earlier)
+    return ids, _find(ids, earlier, recordings)
 
 
 def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> Forgotten:
@@ -104,8 +115,22 @@ def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> For
     Raises
     ------
     PblError
-        DB_NOT_FOUND; DB_REFUSED while a worker computes something of this person; STORE_UNAVAILABLE.
+        DB_NOT_FOUND; DB_REFUSED while a worker computes something of this person or uploads are taken over;
+        STORE_UNAVAILABLE.
     """
+    with connection.alone(archive.LOCK, connection.connect()) as obtained:
+        if not obtained:
+            raise PblError(
+                "DB_REFUSED",
+                key=subject,
+                found="`pbl cron import` is running",
+                expected="no import, so that no recording appears after it was deleted",
+                next_step="repeat this when it has ended",
+            )
+        return _forget(subject, videos, say)
+
+
+def _forget(subject: str, videos: bool, say: Say) -> Forgotten:
     ids, found = find(subject)
     if found.running:
         raise PblError(
@@ -124,14 +149,19 @@ def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> For
     say(f"The list of what goes is in {manifest_path(subject)}")
     _delete_rows(subject, ids, say)
     _delete_files(found.files, say)
-    gone, kept = _delete_videos(found.videos) if videos else ([], {v["path"]: "not asked for" for v in found.videos})
+    gone, kept = [], {}
+    left = _delete_left_over(subject)
     if videos:
-        gone += _delete_archived(subject)
-    else:
-        kept |= {str(p): "not asked for" for p in archived(subject)}
+        gone, kept = _delete_videos(found.videos)
+        more, named = _delete_archived(subject)
+        gone, kept = gone + more + _delete_uploads(subject), kept | named
     _, after = find(subject)
-    left = [f"{n} rows of {table}" for table, n in after.rows.items()] + after.files
+    if not videos:
+        there = [v["path"] for v in found.videos if os.path.lexists(v["path"])]
+        kept = dict.fromkeys(there + after.recordings, "not asked for")
+    left += [f"{n} rows of {table}" for table, n in after.rows.items()] + after.files
     left += _mentions(subject, found.videos)
+    left += [path for path in after.recordings if path not in kept]
     manifest.update(state="left over" if left else "done", ended=_now(), kept=kept, left=left)
     manifest["videos_deleted"] = sorted({*manifest.get("videos_deleted", []), *gone})
     _write(subject, manifest)
@@ -162,7 +192,7 @@ def _still_free(ids: Ids) -> Ids:
     }
 
 
-def _find(ids: Ids, earlier: dict[str, Any]) -> Found:
+def _find(ids: Ids, earlier: dict[str, Any], recordings: list[str]) -> Found:
     conn = connection.connect()
     rows: dict[str, int] = {}
     files: set[str] = set()
@@ -184,7 +214,7 @@ def _find(ids: Ids, earlier: dict[str, Any]) -> Found:
             running += [f"{table.removeprefix('~~')} on {host}, process {pid}" for host, pid in held.fetchall()]
     files.update(_without_row(ids))
     files.update(path for path in earlier.get("files", []) if path not in files and _exists(path))
-    return Found(rows, sorted(files), _videos(ids, earlier), running)
+    return Found(rows, sorted(files), _videos(ids, earlier), running, recordings)
 
 
 def personal_tables() -> list[tuple[str, str, list[Column]]]:
@@ -279,18 +309,9 @@ def _delete_files(files: Sequence[str], say: Say) -> None:
             except Exception as error:
                 raise store_error(error) from error
             if store.protocol == "file":
-                _remove_empty(Path(full_path(store, path)).parent, len(PurePosixPath(path).parts) - 4)
+                # The names of the folders carry the person's numbers.
+                remove_empty(Path(full_path(store, path)).parent, len(PurePosixPath(path).parts) - 4)
             update(1)
-
-
-def _remove_empty(folder: Path, levels: int) -> None:
-    """Remove empty folders upwards: their names carry the person's numbers."""
-    for _ in range(max(levels, 0)):
-        try:
-            folder.rmdir()
-        except OSError:
-            return
-        folder = folder.parent
 
 
 def _delete_videos(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict[str, str]]:
@@ -316,26 +337,53 @@ def _delete_videos(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict[st
     return gone, kept
 
 
-def archived(subject: str) -> list[Path]:
-    """All files of the person's own folder in the archive of `pbl cron import`: videos and the logs beside them."""
-    folder = _archive(subject)
-    return [] if folder.is_symlink() else sorted(p for p in folder.rglob("*") if p.is_symlink() or p.is_file())
+def _recordings(subject: str) -> list[str]:
+    parts = ("", archive.REFUSED, archive.COPIES)
+    return [str(p) for p in archive.of_person(archive_dir(), subject, parts)] + list(_uploads(subject))
 
 
-def _archive(subject: str) -> Path:
-    return Path(os.environ.get("PBL_ARCHIVE") or settings.home_dir() / "recordings") / subject
+def _drop() -> Folder | Bucket | None:
+    url = os.environ.get("PBL_INCOMING")
+    return drop_folder(url) if url else None
 
 
-def _delete_archived(subject: str) -> list[str]:
-    gone = []
-    for path in archived(subject):
-        if not video.Video & {"video_path": str(path)}:  # somebody else's row may name a file that was moved here
-            path.unlink(missing_ok=True)
-            gone.append(str(path))
-    for folder in sorted({p for p in _archive(subject).rglob("*") if p.is_dir()} | {_archive(subject)}, reverse=True):
-        if folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir()):
-            folder.rmdir()
+def _uploads(subject: str) -> dict[str, Upload]:
+    drop = _drop()
+    return {} if drop is None else {f"{drop.root}/{upload.name}": upload for upload in drop.uploads(subject)}
+
+
+def _delete_uploads(subject: str) -> list[str]:
+    gone, drop = [], _drop()
+    if drop is None:
+        return gone
+    for name, upload in _uploads(subject).items():
+        with contextlib.suppress(OSError):  # what cannot be removed is found again, and named
+            drop.remove(upload)
+            gone.append(name)
+    drop.remove_folders(subject)
     return gone
+
+
+def _delete_archived(subject: str) -> tuple[list[str], dict[str, str]]:
+    gone, kept = [], {}
+    for path in archive.of_person(archive_dir(), subject):
+        if video.Video & {"video_path": str(path)}:  # a file that was moved here
+            kept[str(path)] = "another row names this path"
+            continue
+        path.unlink(missing_ok=True)
+        gone.append(str(path))
+    archive.remove_folders(archive_dir(), subject)
+    return gone, kept
+
+
+def _delete_left_over(subject: str) -> list[str]:
+    """Remove what killed processes left; returns what may still hold something of the person."""
+    archive.remove_copies(archive_dir(), subject)
+    seen = archive.load_seen(archive_dir())
+    others = {name: about for name, about in seen.items() if not name.startswith(f"{subject}/")}
+    if others != seen:
+        archive.save_seen(archive_dir(), others)
+    return [f"{path}, of a process that was killed" for path in remove_left_folders()]
 
 
 # ------------------------------------------------------------------------------------------------------------- proof

@@ -9,7 +9,6 @@ import os
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
-from unicodedata import category
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import of_stage
@@ -19,7 +18,7 @@ from . import fit, gait, gdi, keypoints, lab, sensors, session, tracking, video
 from ._datajoint import DuplicateError, dj
 from .chain import computed_tables
 from .coded_errors import error_code
-from .codes import check_subject, day_of
+from .codes import check_label, check_subject, day_of, has_control_characters
 from .jobs import jobs_of
 from .method_rows import resolve_method
 from .plan import default_fit
@@ -114,13 +113,7 @@ def ingest(
         ("activity", visit.activity or "", 32),
         ("population", visit.population or "", 32),
     ):
-        if len(text) > longest:
-            raise PblError(
-                "USAGE",
-                found=f"--{what} of {len(text)} characters",
-                expected=f"at most {longest}",
-                next_step="choose a shorter one",
-            )
+        check_label(what, text, longest)
     if visit.person is not None and len(paths) > 1:
         raise PblError(
             "USAGE",
@@ -175,7 +168,7 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
             next_step="check the path",
             key=path,
         )
-    if any(category(c) in ("Cc", "Cs", "Zl", "Zp") for c in str(path)):  # Cs: bytes that are no text
+    if has_control_characters(str(path)):
         raise PblError(
             "USAGE",
             found="a path with line breaks, other control characters, or bytes that are no UTF-8",
@@ -260,6 +253,14 @@ def _known(
 ) -> Ingested:
     """Update a registered video: its path if the old one is gone, and the camera, files and methods that were given."""
     number = int(row["video_id"])
+    if row["subject"] != visit.subject:
+        raise PblError(
+            "VIDEO_DUPLICATE",
+            found=f"video_id {number} of subject {row['subject']}, session {row['session_label']}, has these bytes",
+            expected=f"a recording of subject {visit.subject} (session {visit.session_label}) and of nobody else",
+            next_step=f"find out whose recording it is; if not {row['subject']}'s, delete that video before",
+            key=path,
+        )
     status, notes = "known", [f"already video_id {number} of subject {row['subject']}, session {row['session_label']}"]
     if str(path) != row["video_path"] and not Path(row["video_path"]).is_file():
         video.Video.update1({"video_id": number, "video_path": str(path), "video_name": path.name[-255:]})

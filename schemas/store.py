@@ -13,6 +13,7 @@ from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
 from ._datajoint import full_path
+from .folders import private_folder
 from .secret_files import secret
 
 #: Folder of the bucket under which everything of ours lies; the phones' uploads may have another one beside it.
@@ -49,7 +50,7 @@ def store_spec() -> dict[str, Any]:
         return _bucket_spec()
     folder = settings.store_dir()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        private_folder(folder)
     except OSError as error:
         raise _folder_error(folder, str(error)) from error
     if not os.access(folder, os.W_OK | os.X_OK):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import tempfile
 import zipfile
 import zlib
@@ -15,12 +17,41 @@ from pbl_pipeline.errors import PblError
 from . import connection
 from ._datajoint import backend_of, full_path
 
+#: How the names of temporary folders begin; the number of the process follows.
+_PREFIX = "pbl-files-"
+
 
 @contextmanager
 def new_folder() -> Iterator[Path]:
     """A folder for a file that is about to enter the object store; gone afterwards."""
-    with tempfile.TemporaryDirectory(prefix="pbl-") as folder:
+    with _temporary() as folder:
         yield Path(folder)
+
+
+def _temporary() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory(prefix=f"{_PREFIX}{os.getpid()}-")
+
+
+def remove_left_folders() -> list[Path]:
+    """Remove such folders of processes that were killed; returns those that this account may not remove."""
+    left = []
+    for path in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        pid = path.name.removeprefix(_PREFIX).split("-")[0]
+        if pid.isdecimal() and not _alive(int(pid)) and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+            if path.exists():
+                left.append(path)
+    return left
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # another account's
+        pass
+    return True
 
 
 @contextmanager
@@ -42,7 +73,7 @@ def stored_file(table: Any, ref: Mapping[str, Any]) -> Iterator[Path]:
         with _readable(path, ref):
             yield path
         return
-    with tempfile.TemporaryDirectory(prefix="pbl-") as folder:
+    with _temporary() as folder:
         path = Path(folder) / Path(ref["path"]).name
         if not backend.exists(ref["path"]):
             raise _lost(ref)

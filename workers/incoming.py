@@ -1,109 +1,151 @@
-"""Recordings that phones upload: taken over from a folder or an object store's prefix when they are whole.
+"""Recordings that phones upload: taken over from the drop folder when they are whole.
 
 Layout: SUBJECT/SESSION/FILE under the place that `PBL_INCOMING` names. Beside a video may lie the phone's sensor log of
-the same name (.csv, .json, .zip; docs/phone_capture.md), which is taken with it. A file is taken when its size and
-time were the same at two looks at least `SETTLED_S` apart. It is copied into the archive and checked there, registered,
-and only then removed from where it came: whatever breaks off in between, the bytes are in at least one place, and the
-next look goes on. What cannot be registered is moved into the folder `_refused` of the archive, with the reason beside
-it.
+the same name (.csv, .json, .zip; docs/phone_capture.md), which is taken with it. A file is taken when it was the same
+in two runs at least `SETTLED_S` apart. It is copied into the archive and checked there, registered, and only then
+removed from where it came: whatever breaks off in between, the bytes are in at least one place, and the next run goes
+on. What cannot be registered is moved into the folder `_refused` of the archive, with the reason beside it.
+
+Uploads are taken in random order: whatever one of them does to the run, no other waits behind it for ever.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 import os
+import random
 import secrets
+import shutil
 import time
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any
 
-import fsspec
+import pymysql
 
-from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.video import read_phone_log, sha256_of
 from schemas import connection, video
+from schemas.archive import COPIES, LOCK, REFUSED, archive_dir, folder_of, load_seen, remove_copies, save_seen
 from schemas.codes import check_subject
+from schemas.connection import dj
+from schemas.folders import private_folder, remove_empty, sync_folder
 from schemas.ingest import Visit, ingest
 from schemas.sensors import Sensors
+from schemas.uploads import LOG_ENDINGS, Bucket, Folder, StillChanging, Upload, drop_folder, incoming_url
+
+from .limited import LimitExceeded, limited
 
 #: Seconds in which a file must not have changed.
 SETTLED_S = 60.0
-#: What is a recording and what its log, by the ending; everything else is left alone and counted.
+#: What is a recording, by the ending; what is neither that nor a log is left alone and named.
 VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi", ".3gp")
-LOG_ENDINGS = (".csv", ".json", ".zip")
+#: After this time a run begins no further upload, and gives up one that is still being copied (s).
+RUN_S, UPLOAD_S = 600.0, 600.0
+#: What reading a sensor log may take (s, bytes).
+LOG_S, LOG_BYTES = 60.0, 2**30
+#: Space on the archive's disk that uploads do not fill (bytes).
+KEPT_FREE = 10**9
 _BLOCK = 2**20
+#: Errors of the installation, which end a run: other uploads would meet them as well.
+_OURS = ("DB_NOT_RUNNING", "DB_UNAVAILABLE", "DB_REFUSED", "STORE_UNAVAILABLE")
 
 
 @dataclasses.dataclass
 class Taken:
-    """What one look did: paths of what was registered or had been before; of what was refused, with the reason; how
-    many are still being uploaded or have no place in the layout."""
+    """What one run did, by the uploads' names.
+
+    registered, known: taken; the latter are registered already, with what `ingest` notes of them. refused: moved aside,
+    with the reason. left: whole, but not taken this time, with the reason. ignored: no SUBJECT/SESSION/FILE of a video,
+    or a log without its video. uploading: how many are not whole yet. later: how many the time did not suffice for.
+    """
 
     registered: list[str] = dataclasses.field(default_factory=list)
-    known: list[str] = dataclasses.field(default_factory=list)
-    refused: dict[str, str] = dataclasses.field(default_factory=dict)
+    known: dict[str, str] = dataclasses.field(default_factory=dict)
+    refused: dict[str, PblError] = dataclasses.field(default_factory=dict)
+    left: dict[str, PblError] = dataclasses.field(default_factory=dict)
+    ignored: list[str] = dataclasses.field(default_factory=list)
     uploading: int = 0
-    ignored: int = 0
+    later: int = 0
 
 
-def incoming_url() -> str:
-    """Where phones upload to: PBL_INCOMING, a folder or s3://BUCKET/PREFIX. Raises USAGE where it is not set."""
-    value = os.environ.get("PBL_INCOMING")
-    if not value:
-        raise PblError(
-            "USAGE",
-            found="PBL_INCOMING is not set",
-            expected="the folder or s3://BUCKET/PREFIX into which recordings are uploaded, as SUBJECT/SESSION/FILE",
-            next_step="set it, or leave `pbl cron import` out",
-        )
-    return value
+@dataclasses.dataclass
+class _Copy:
+    """A copy in the archive, with its SHA-256."""
+
+    path: Path
+    sha256: str
 
 
-def archive_dir() -> Path:
-    """Where recordings are kept: PBL_ARCHIVE (default: recordings/ in PBL_HOME)."""
-    return Path(os.environ.get("PBL_ARCHIVE") or settings.home_dir() / "recordings").absolute()
+def take_over(
+    url: str | None = None, archive: Path | None = None, settled_s: float = SETTLED_S, run_s: float = RUN_S
+) -> Taken | None:
+    """List the drop folder, and take what is whole. Safe to break off and to repeat.
 
-
-def take_over(url: str | None = None, archive: Path | None = None, settled_s: float = SETTLED_S) -> Taken:
-    """Look once, and take what is whole. Safe to break off and to repeat; one process at a time.
+    Returns None where another process does it now.
 
     Raises
     ------
     PblError
-        USAGE, or FILE_UNWRITABLE when the archive cannot be written (disk full): nothing is removed then.
+        USAGE; FILE_MISSING: no drop folder; FILE_UNWRITABLE: no archive; DB_..., STORE_UNAVAILABLE. What was not taken
+        until then stays in the drop folder.
     """
-    url, archive = url or incoming_url(), archive or archive_dir()
-    fs, root = fsspec.core.url_to_fs(url, **_login(url))
-    with connection.alone("incoming", video.Video.connection) as obtained:
-        return _take_over(fs, str(root), archive, settled_s) if obtained else Taken()
-
-
-def _take_over(fs: Any, root: str, archive: Path, settled_s: float) -> Taken:
-    out, seen = Taken(), _load_seen(archive)
-    now, still, whole = time.time(), {}, {}
-    for path, about in sorted(fs.find(root, detail=True).items()):
-        name = PurePosixPath(str(path).removeprefix(root).lstrip("/"))
-        if not _has_place(name):
-            out.ignored += 1
-            continue
-        state = [int(about["size"] or 0), str(about.get("mtime") or about.get("LastModified") or "")]
-        before = seen.get(str(name))
-        first_seen = before[2] if before is not None and before[:2] == state else now
-        still[str(name)] = [*state, first_seen]
-        if before is None or before[:2] != state or now - first_seen < settled_s:
-            out.uploading += 1
-        else:
-            whole[name] = _File(path, state)
-    for name, file in whole.items():
-        if name.suffix.lower() not in VIDEO_ENDINGS:
-            continue
-        logs = [PurePosixPath(n) for n in still if _is_log_of(PurePosixPath(n), name)]
-        if all(n in whole for n in logs):  # else its log is still on its way
-            _take(fs, name, file, [whole[n] for n in logs[:1]], archive, out)
-    _save_seen(archive, still)
+    drop, archive = drop_folder(url or incoming_url()), archive or archive_dir()
+    with connection.alone(LOCK, video.Video.connection) as obtained:
+        if not obtained:
+            return None
+        out = Taken()
+        try:
+            remove_copies(archive)
+            whole = _listed(drop, archive, settled_s, out)
+        except OSError as error:
+            raise _unwritable(archive, error) from error
+        end = time.monotonic() + run_s
+        random.shuffle(whole)
+        for i, (recording, logs) in enumerate(whole):
+            if time.monotonic() > end:
+                out.later = len(whole) - i
+                break
+            _take(drop, recording, logs, archive, out)
+    out.registered.sort()
     return out
+
+
+# ------------------------------------------------------------------------------------------------------------- listing
+def _listed(drop: Folder | Bucket, archive: Path, settled_s: float, out: Taken) -> list[tuple[Upload, list[Upload]]]:
+    """Recordings that have not changed for `settled_s`, each with its logs."""
+    seen, now = load_seen(archive), time.time()
+    still: dict[str, list] = {}
+    settled: set[PurePosixPath] = set()
+    recordings: list[Upload] = []
+    logs: dict[PurePosixPath, list[Upload]] = {}
+    for upload in drop.uploads():
+        name = upload.name
+        if not upload.file or not _has_place(name):
+            out.ignored.append(str(name))
+            continue
+        state, before = [upload.size, upload.stamp], seen.get(str(name), [])
+        # A clock that was set back does not make anything wait.
+        first_seen = min(before[2], now) if before[:2] == state else now
+        still[str(name)] = [*state, first_seen]
+        if before[:2] == state and now - first_seen >= settled_s:
+            settled.add(name)
+        else:
+            out.uploading += 1
+        if name.suffix.lower() in VIDEO_ENDINGS:
+            recordings.append(upload)
+        else:
+            logs.setdefault(name.with_suffix(""), []).append(upload)
+    save_seen(archive, still)
+    whole = []
+    for recording in recordings:
+        own = sorted(logs.get(recording.name.with_suffix(""), []), key=lambda log: log.name)
+        if recording.name in settled and all(log.name in settled for log in own):  # else its log is still on its way
+            whole.append((recording, own[:1]))
+    alone = set(logs).difference(r.name.with_suffix("") for r in recordings)
+    out.ignored += [str(log.name) for stem in alone for log in logs[stem] if log.name in settled]
+    out.ignored.sort()
+    return whole
 
 
 def _has_place(name: PurePosixPath) -> bool:
@@ -114,122 +156,174 @@ def _has_place(name: PurePosixPath) -> bool:
     )
 
 
-def _is_log_of(name: PurePosixPath, video_name: PurePosixPath) -> bool:
-    return name.with_suffix("") == video_name.with_suffix("") and name.suffix.lower() in LOG_ENDINGS
-
-
-@dataclasses.dataclass(frozen=True)
-class _File:
-    """A file as it was listed: path, and [size, time]."""
-
-    path: str
-    state: list
-
-
-def _take(fs: Any, name: PurePosixPath, given: _File, logs: list[_File], archive: Path, out: Taken) -> None:
+# -------------------------------------------------------------------------------------------------------------- taking
+def _take(drop: Folder | Bucket, recording: Upload, logs: list[Upload], archive: Path, out: Taken) -> None:
     """Copy, check, register, remove; what is refused is moved aside with its reason."""
-    subject, session, file = name.parts
+    name, given, copies = str(recording.name), [recording, *logs], []
     try:
-        copy, sha256 = _copy(fs, given, archive)
         try:
-            log = _copy(fs, logs[0], archive)[0] if logs else None
-        except BaseException:
-            copy.unlink()
+            end = time.monotonic() + UPLOAD_S
+            for upload in given:
+                copies.append(_copy(drop, upload, archive, end))
+            note = _register(recording.name, copies, archive)
+        except (OSError, StillChanging, pymysql.err.Error, dj.DataJointError):
             raise
-    except _StillChanging:
+        except Exception as error:  # whatever it is, one upload never stops the others
+            coded = _named(name, error)
+            if coded.code in _OURS:
+                raise
+            out.refused[name] = coded
+            _set_aside(drop, given, copies, archive, coded)
+        else:
+            if note:
+                out.known[name] = note
+            else:
+                out.registered.append(name)
+        copies, done = [], len(copies)
+        for upload in given[:done]:
+            drop.remove(upload)
+    except StillChanging:
         out.uploading += 1
-        return
-    target = copy
-    try:
-        check_subject(subject, "rename the folder and upload again", name)
-        target = archive / subject / _plain(session) / f"{sha256[:12]}-{_plain(file)}"
-        target.parent.mkdir(parents=True, exist_ok=True)
-        os.replace(copy, target)
-        if log is not None:
-            log = log.replace(target.with_suffix(PurePosixPath(logs[0].path).suffix.lower()))
-        sensors = [Sensors(attitude=log)] if log is not None else []
-        (result,) = ingest([target], Visit(subject=subject, session_label=session), files=sensors)
-        if result.error is not None:
-            raise result.error
-    except PblError as error:
-        aside = archive / "_refused" / f"{sha256[:12]}-{_plain(file)}"
-        aside.parent.mkdir(parents=True, exist_ok=True)
-        os.replace(copy if copy.exists() else target, aside)
-        if log is not None and log.exists():
-            log.replace(aside.with_name(aside.name + ".log" + log.suffix))
-        aside.with_name(aside.name + ".txt").write_text(f"{name}\n{error.text()}\n")
-        fs.rm([given.path, *(f.path for f in logs)])
-        out.refused[str(name)] = error.code
-        return
-    (out.registered if result.status == "registered" else out.known).append(str(name))
-    if result.status == "known":
-        # The same bytes lie in the archive under the path that is registered.
-        registered = Path((video.Video & {"video_id": result.video_id}).fetch1("video_path"))
-        if registered != target and registered.is_file():
-            target.unlink()
-    fs.rm([given.path, *(f.path for f in logs)])
+    except OSError as error:
+        out.left[name] = _named(name, _unwritable(archive, error))
+    finally:
+        for copy in copies:
+            if COPIES in copy.path.parts:  # what has its place in the archive already may have its row
+                copy.path.unlink(missing_ok=True)
 
 
-class _StillChanging(Exception):
-    """The file is not what it was when it was listed."""
+def _copy(drop: Folder | Bucket, upload: Upload, archive: Path, end: float) -> _Copy:
+    """Copy into the archive under a name of its own, on disk when this returns.
 
-
-def _copy(fs: Any, given: _File, archive: Path) -> tuple[Path, str]:
-    """Copy into the archive under a name of its own, on disk when this returns; the copy and its SHA-256."""
-    path, (size, _) = given.path, given.state
+    Raises
+    ------
+    PblError
+        UPLOAD_REFUSED.
+    OSError, StillChanging
+        Nothing is left behind.
+    """
     digest, n = hashlib.sha256(), 0
-    part = archive / ".incoming" / f"{secrets.token_hex(6)}{PurePosixPath(path).suffix.lower()}"
+    folder = folder_of(archive, COPIES, upload.name.parts[0])
+    part = folder / f"{secrets.token_hex(6)}{upload.name.suffix.lower()}"
+    if shutil.disk_usage(folder).free < upload.size + KEPT_FREE:
+        raise OSError(f"{upload.size / 1e9:.1f} GB do not fit beside {KEPT_FREE / 1e9:.0f} GB that are kept free")
     try:
-        part.parent.mkdir(parents=True, exist_ok=True)
-        with fs.open(path, "rb") as source, part.open("wb") as target:
-            while block := source.read(_BLOCK):
+        with (
+            drop.open(upload) as source,
+            open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as target,
+        ):
+            while n <= upload.size and (block := source.read(_BLOCK)):
                 digest.update(block)
                 target.write(block)
                 n += len(block)
+                if time.monotonic() > end:
+                    raise OSError(f"{n >> 20} MiB were copied in {UPLOAD_S:.0f} s")
             target.flush()
             os.fsync(target.fileno())
-    except OSError as error:
+        if n != upload.size or not drop.unchanged(upload):
+            raise StillChanging
+    except BaseException as error:
         part.unlink(missing_ok=True)
-        raise PblError(
-            "FILE_UNWRITABLE",
-            found=f"{type(error).__name__}: {error}",
-            expected=f"room and rights in {archive}",
-            next_step="make room; the recording is still where it was uploaded, and the next look takes it",
-            key=path,
-        ) from error
-    if n != size or int(fs.info(path)["size"] or 0) != n:
-        part.unlink()
-        raise _StillChanging
-    return part, digest.hexdigest()
+        if isinstance(error, Exception) and not isinstance(error, (OSError, PblError, StillChanging)):
+            raise OSError(f"{type(error).__name__}: {error}") from error  # the client of an object store
+        raise
+    return _Copy(part, digest.hexdigest())
 
 
-def _plain(text: str) -> str:
-    """A name for a file or folder of ours from one that came from outside: no separator, no leading dot."""
-    kept = "".join(c if c.isalnum() or c in "-_. " else "_" for c in text).lstrip(". ").rstrip()
+def _register(name: PurePosixPath, copies: Sequence[_Copy], archive: Path) -> str:
+    """Move the copies to their place and register them; "" where the recording is new, else what is known of it.
+
+    Raises
+    ------
+    PblError
+        What is wrong with the recording.
+    """
+    subject, session, file = name.parts
+    recording, *logs = copies
+    check_subject(subject, "rename the folder and upload again", name)
+    for log in logs:
+        try:
+            limited(read_phone_log, log.path, seconds=LOG_S, n_bytes=LOG_BYTES)
+        except LimitExceeded as error:
+            raise PblError(
+                "PHONE_LOG",
+                found=f"a sensor log that takes {error} to read",
+                expected="the log of some minutes",
+                next_step="upload the recording without it, or with the log as its app wrote it",
+            ) from error
+    folder = private_folder(folder_of(archive, "", subject) / plain_name(session))
+    target = folder / f"{recording.sha256[:12]}-{plain_name(file)}"
+    for copy, to in zip(copies, (target, *(target.with_suffix(log.path.suffix) for log in logs)), strict=True):
+        copy.path = copy.path.replace(to)
+    sync_folder(folder)
+    sensors = [Sensors(attitude=log.path) for log in logs]
+    (result,) = ingest([target], Visit(subject=subject, session_label=session), files=sensors)
+    if result.error is not None:
+        raise result.error
+    if result.status == "registered":
+        return ""
+    registered = Path((video.Video & {"video_id": result.video_id}).fetch1("video_path"))
+    if registered != target and registered.is_file() and sha256_of(registered) == recording.sha256:
+        target.unlink()
+    return result.note
+
+
+def _set_aside(
+    drop: Folder | Bucket, given: Sequence[Upload], copies: Sequence[_Copy], archive: Path, why: PblError
+) -> None:
+    """Move what is refused into the archive's folder for it, the reason first. What was copied is moved as the copy.
+
+    Raises
+    ------
+    OSError
+        It cannot be moved: it stays in the drop folder.
+    """
+    name = given[0].name
+    folder = folder_of(archive, REFUSED, name.parts[0])
+    mark = copies[0].sha256 if copies else hashlib.sha256(os.fsencode(str(name))).hexdigest()
+    aside = folder / f"{mark[:12]}-{plain_name(name.name)}"
+    reason = os.open(aside.with_name(aside.name + ".txt"), os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    with open(reason, "w", encoding="utf-8") as text:
+        text.write(why.text() + "\n")
+    for i, upload in enumerate(given):
+        to = aside if i == 0 else aside.with_name(f"{aside.name}.log{upload.name.suffix.lower()}")
+        if i < len(copies):
+            was = copies[i].path
+            if video.Video & {"video_path": str(was)}:  # the same recording was registered before
+                shutil.copyfile(was, to)
+            else:
+                copies[i].path = was.replace(to)
+                remove_empty(was.parent, 2)
+        else:
+            drop.move(upload, to)
+    sync_folder(folder)
+
+
+def plain_name(text: str) -> str:
+    """A name for a file or folder of ours from one that came from outside: ASCII, no separator, no leading dot."""
+    kept = "".join(c if c.isascii() and (c.isalnum() or c in "-_. ") else "_" for c in text).lstrip(". ").rstrip()
     return kept[-100:] or "_"
 
 
-def _login(url: str) -> dict[str, Any]:
-    """What fsspec needs for an object store: the same variables as the store of arrays."""
-    if not url.startswith("s3://"):
-        return {}
-    from schemas.secret_files import secret
-
-    endpoint = os.environ.get("PBL_S3_ENDPOINT")
-    about: dict[str, Any] = {"key": secret("PBL_S3_KEY"), "secret": secret("PBL_S3_SECRET")}
-    return about | ({"client_kwargs": {"endpoint_url": endpoint}} if endpoint else {})
-
-
-def _load_seen(archive: Path) -> dict[str, list]:
-    try:
-        return dict(json.loads((archive / ".incoming" / "seen.json").read_text()))
-    except (OSError, ValueError):
-        return {}
+def _unwritable(archive: Path, error: OSError) -> PblError:
+    return PblError(
+        "FILE_UNWRITABLE",
+        key=archive,
+        found=f"{error.strerror or error}" + (f" ({error.filename})" if error.filename else ""),
+        expected="room and rights in the archive, and the right to remove uploads from the drop folder",
+        next_step="see to it; the recording is still where it was uploaded, and the next run takes it",
+    )
 
 
-def _save_seen(archive: Path, seen: dict[str, list]) -> None:
-    path = archive / ".incoming" / "seen.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(seen))
-    os.replace(part, path)
+def _named(name: str, error: Exception) -> PblError:
+    """The coded error about what was uploaded, by its name there and not by that of our copy."""
+    if isinstance(error, PblError):
+        key = error.key if error.code == "UPLOAD_REFUSED" else name
+        return PblError(error.code, found=error.found, expected=error.expected, next_step=error.next_step, key=key)
+    return PblError(
+        "INTERNAL",
+        found=f"{type(error).__name__}: {error}",
+        expected="a recording that can be registered, or a coded error",
+        next_step="report this; the recording is kept",
+        key=name,
+    )

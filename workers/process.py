@@ -56,6 +56,7 @@ def work(options: Options, pipe: Connection) -> None:
         # Without this JAX reserves most of a GPU's memory for the first of several processes that share it.
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     import schemas
+    from schemas import stored_files
 
     from . import heartbeat, loop, selftest
 
@@ -78,6 +79,7 @@ def work(options: Options, pipe: Connection) -> None:
         event(log, logging.CRITICAL, "cannot start", code=error.code, text=error.text())
         raise SystemExit(1) from error
     to_stderr()  # connecting set DataJoint's own level
+    stored_files.remove_left_folders()  # of processes that were killed here
     tables = registry.tables_of(options.resource)
     if options.selftest:
         try:

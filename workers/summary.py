@@ -10,9 +10,8 @@ from pathlib import Path
 
 from pbl_pipeline import __version__, settings
 from schemas import computed_tables, session, video
+from schemas.archive import archive_dir
 from schemas.status import Status, pipeline_status
-
-from .incoming import archive_dir
 
 
 @dataclasses.dataclass(frozen=True)

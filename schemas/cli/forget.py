@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import click
 
 
@@ -11,7 +13,8 @@ import click
 @click.option(
     "--videos",
     is_flag=True,
-    help="Delete the video files (where they still are what was registered) and the person's folder of the archive.",
+    help="Delete the recordings: registered video files (where they still are what was registered), and the person's "
+    "folders of the archive and the drop folder.",
 )
 def forget(subject: str, yes: bool, videos: bool) -> None:
     """Remove every row and every stored file of the person SUBJECT, and prove it with a list.
@@ -25,6 +28,7 @@ def forget(subject: str, yes: bool, videos: bool) -> None:
     Example: pbl forget P017 --yes --videos
     """
     import schemas
+    from schemas import archive
     from schemas import forget as lib
 
     schemas.activate(methods=False)
@@ -36,8 +40,9 @@ def forget(subject: str, yes: bool, videos: bool) -> None:
             click.echo(f"    file {path}")
         for item in found.videos:
             click.echo(f"   video {item['path']}{'' if videos else ' (stays, without --videos)'}")
-        for path in lib.archived(subject):
-            click.echo(f" archive {path}{'' if videos else ' (stays, without --videos)'}")
+        for path in found.recordings:
+            stays = not videos and archive.COPIES not in path.split("/")
+            click.echo(f"recorded {path}{' (stays, without --videos)' if stays else ''}")
         for job in found.running:
             click.echo(f" running {job}")
         click.echo(
@@ -57,4 +62,7 @@ def forget(subject: str, yes: bool, videos: bool) -> None:
     click.echo(" built from their walks holds their share of its means.")
     if done.left:
         raise click.exceptions.Exit(1)
-    click.echo("Looked up again: no row, no queued job and no stored file is left.")
+    click.echo("Looked up again: no row, no queued job and no stored file is left", nl=False)
+    click.echo(f"; {len(done.kept)} recordings stay, as listed." if done.kept else ", and no recording.")
+    if "PBL_INCOMING" not in os.environ:
+        click.echo("PBL_INCOMING is not set here: uploads that were not taken over yet were not searched.")

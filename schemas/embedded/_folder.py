@@ -97,7 +97,10 @@ class Folder:
             DB_UNAVAILABLE when they cannot be made, or when `account` cannot enter them.
         """
         try:
+            missing = [p for p in (self.path, *self.path.parents) if not p.exists()]
             self.path.mkdir(parents=True, exist_ok=True)
+            for folder in missing:  # whatever the umask: the server's account enters, nobody else writes
+                folder.chmod(0o755)
         except OSError as error:
             raise folder_error(self.path, error) from error
         check_enterable(self.path, account)

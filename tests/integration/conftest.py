@@ -25,3 +25,11 @@ def tables(declared: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     chain.install(monkeypatch)
     yield
     remove_all()
+
+
+@pytest.fixture
+def drop(tables: None, tmp_path: Path) -> Path:
+    """An empty drop folder."""
+    folder = tmp_path / "uploads"
+    folder.mkdir()
+    return folder

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import re
@@ -13,42 +14,17 @@ from click.testing import CliRunner
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection, lab, session, tracking, video
+from schemas import connection, lab, session, tracking, uploads, video
 from schemas.bulk import Recording, register_many
 from schemas.orphans import orphans, remove
 from tests.rows import register
 from workers import incoming
 from workers.cli.cron import cron
 from workers.heartbeat import Silent
-from workers.incoming import take_over
 from workers.loop import Worker
 
 from . import chain
-
-
-@pytest.fixture
-def drop(tables: None, tmp_path: Path) -> Path:
-    folder = tmp_path / "uploads"
-    folder.mkdir()
-    return folder
-
-
-def upload(drop: Path, where: str, name: str = "walk") -> Path:
-    path = drop / where
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return chain.small_video(path.parent, name, n=60).rename(path)
-
-
-def twice(drop: Path, archive: Path) -> incoming.Taken:
-    """The look that sees a file for the first time, and the one that may take it."""
-    first = take_over(str(drop), archive, settled_s=0.05)
-    assert not first.registered
-    time.sleep(0.1)
-    return take_over(str(drop), archive, settled_s=0.05)
-
-
-def files(folder: Path) -> list[str]:
-    return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file() and ".incoming" not in p.parts)
+from .drop import codes, files, look, twice, upload
 
 
 def test_whole_files_are_taken_checked_and_registered(drop: Path, tmp_path: Path):
@@ -59,7 +35,8 @@ def test_whole_files_are_taken_checked_and_registered(drop: Path, tmp_path: Path
     (drop / "P001/2026-11-20/.walk2.mp4.part").write_bytes(b"hidden: still being uploaded")
     taken = twice(drop, archive)
     assert taken.registered == ["P001/2026-11-20/walk.mp4", "P002/2026-11-20/walk.MOV"]
-    assert (taken.ignored, taken.refused) == (2, {})
+    assert taken.ignored == ["P001/2026-11-20/.walk2.mp4.part", "notes.txt"]
+    assert not taken.refused
     rows = (video.Video * session.Session).to_dicts(order_by="subject")
     assert [(r["subject"], r["session_label"]) for r in rows] == [("P001", "2026-11-20"), ("P002", "2026-11-20")]
     assert Path(rows[0]["video_path"]).read_bytes() == content
@@ -75,13 +52,13 @@ def test_a_file_that_grows_is_left_until_it_is_whole(drop: Path, tmp_path: Path)
     path = upload(drop, "P001/1/walk.mp4")
     content = path.read_bytes()
     path.write_bytes(content[:1000])
-    assert take_over(str(drop), archive, settled_s=0.05).uploading == 1
+    assert look(drop, archive, settled_s=0.05).uploading == 1
     time.sleep(0.1)
     path.write_bytes(content)
-    assert take_over(str(drop), archive, settled_s=0.05).uploading == 1
-    assert take_over(str(drop), archive, settled_s=60.0).uploading == 1
+    assert look(drop, archive, settled_s=0.05).uploading == 1
+    assert look(drop, archive, settled_s=60.0).uploading == 1
     time.sleep(0.1)
-    assert take_over(str(drop), archive, settled_s=0.05).registered == ["P001/1/walk.mp4"]
+    assert look(drop, archive, settled_s=0.05).registered == ["P001/1/walk.mp4"]
 
 
 def test_the_phones_log_comes_along(drop: Path, tmp_path: Path):
@@ -100,10 +77,10 @@ def test_the_phones_log_comes_along(drop: Path, tmp_path: Path):
 def test_a_video_waits_for_the_log_that_is_on_its_way(drop: Path, tmp_path: Path):
     archive = tmp_path / "archive"
     upload(drop, "P001/1/walk.mp4")
-    take_over(str(drop), archive, settled_s=0.0)
+    look(drop, archive, settled_s=0.0)
     log = drop / "P001/1/walk.csv"
     log.write_text("time_s,qw,qx,qy,qz\n")  # still being uploaded
-    assert take_over(str(drop), archive, settled_s=0.0).registered == []
+    assert look(drop, archive, settled_s=0.0).registered == []
     log.write_text("time_s,qw,qx,qy,qz\n" + "".join(f"{0.02 * i},1,0,0,0\n" for i in range(200)))
     assert twice(drop, archive).registered == ["P001/1/walk.mp4"]
     assert len(video.PhoneAttitude()) == 1
@@ -113,7 +90,7 @@ def test_a_log_that_cannot_be_read_is_kept_aside_with_its_video(drop: Path, tmp_
     archive = tmp_path / "archive"
     upload(drop, "P001/1/walk.mp4")
     (drop / "P001/1/walk.csv").write_text("time_s,qw,qx,qy,qz\nnan,1,0,0,0\n")
-    assert twice(drop, archive).refused == {"P001/1/walk.mp4": "PHONE_LOG"}
+    assert codes(twice(drop, archive)) == {"P001/1/walk.mp4": "PHONE_LOG"}
     assert (files(drop), len(video.Video())) == ([], 0)
     assert [Path(name).suffix for name in files(archive)] == [".mp4", ".csv", ".txt"]
 
@@ -121,17 +98,19 @@ def test_a_log_that_cannot_be_read_is_kept_aside_with_its_video(drop: Path, tmp_
 def test_what_grows_while_it_is_copied_is_left(drop: Path, tmp_path: Path, monkeypatch):
     archive = tmp_path / "archive"
     path = upload(drop, "P001/1/walk.mp4")
-    take_over(str(drop), archive, settled_s=0.0)
-    real = incoming._has_place
+    look(drop, archive, settled_s=0.0)
+    real = uploads.Folder.open
 
-    def grows(name):  # asked after the files were listed, before one is copied
-        with path.open("ab") as file:
-            file.write(b"more")
-        return real(name)
+    @contextlib.contextmanager
+    def grows(self, upload):  # asked after the files were listed
+        with real(self, upload) as source:
+            with path.open("ab") as file:
+                file.write(b"more")
+            yield source
 
     with monkeypatch.context() as patch:
-        patch.setattr(incoming, "_has_place", grows)
-        taken = take_over(str(drop), archive, settled_s=0.0)
+        patch.setattr(uploads.Folder, "open", grows)
+        taken = look(drop, archive)
     assert (taken.registered, taken.uploading) == ([], 1)
     assert (files(drop), len(video.Video())) == (["P001/1/walk.mp4"], 0)
     assert [p.name for p in archive.rglob("*") if p.is_file()] == ["seen.json"]
@@ -143,7 +122,9 @@ def test_the_same_bytes_under_another_name_are_kept_once(drop: Path, tmp_path: P
     twice(drop, archive)
     (drop / "P001/2").mkdir()
     (drop / "P001/2/again.mp4").write_bytes(content)
-    assert twice(drop, archive).known == ["P001/2/again.mp4"]
+    known = twice(drop, archive).known
+    assert list(known) == ["P001/2/again.mp4"]
+    assert "subject P001, session 1" in known["P001/2/again.mp4"]
     assert (len(video.Video()), len(files(archive))) == (1, 1)
     assert Path(video.Video.fetch1("video_path")).read_bytes() == content
     assert files(drop) == []
@@ -164,47 +145,32 @@ def test_breaking_off_anywhere_loses_nothing_and_registers_once(drop: Path, tmp_
             twice(drop, archive)
     assert files(drop) == ["P001/1/walk.mp4"]
     assert len(video.Video()) == 1
-    again = take_over(str(drop), archive, settled_s=0.05)
-    assert again.known == ["P001/1/walk.mp4"]
+    again = look(drop, archive, settled_s=0.05)
+    assert list(again.known) == ["P001/1/walk.mp4"]
     assert (len(video.Video()), files(drop), len(files(archive))) == (1, [], 1)
 
 
-def test_a_full_archive_leaves_the_upload(drop: Path, tmp_path: Path, monkeypatch):
+@pytest.mark.parametrize("n", [2, 3], ids=["at the video", "at its log"])  # the first is the list of what lies there
+def test_an_archive_that_is_full_leaves_the_upload_and_keeps_no_half(drop: Path, tmp_path: Path, monkeypatch, n: int):
     archive = tmp_path / "archive"
     upload(drop, "P001/1/walk.mp4")
-    take_over(str(drop), archive, settled_s=0.0)
-
-    def full(_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
-        with pytest.raises(PblError, match="FILE_UNWRITABLE"):
-            take_over(str(drop), archive, settled_s=0.0)
-    assert files(drop) == ["P001/1/walk.mp4"]
-    assert files(archive) == []
-    assert take_over(str(drop), archive, settled_s=0.0).registered == ["P001/1/walk.mp4"]
-
-
-def test_an_archive_that_is_full_at_the_log_keeps_no_half(drop: Path, tmp_path: Path, monkeypatch):
-    archive = tmp_path / "archive"
-    upload(drop, "P001/1/walk.mp4")
-    (drop / "P001/1/walk.csv").write_text("time_s,qw,qx,qy,qz\n0,1,0,0,0\n1,1,0,0,0\n")
-    take_over(str(drop), archive, settled_s=0.0)
+    (drop / "P001/1/walk.csv").write_text("time_s,qw,qx,qy,qz\n" + "".join(f"{0.02 * i},1,0,0,0\n" for i in range(200)))
+    look(drop, archive)
     calls = []
 
-    def full_at_second(number: int) -> None:
+    def full(number: int) -> None:
         calls.append(number)
-        if len(calls) == 2:
+        if len(calls) == n:
             raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full_at_second)
-        with pytest.raises(PblError, match="FILE_UNWRITABLE"):
-            take_over(str(drop), archive, settled_s=0.0)
-    assert len(calls) == 2
+        patch.setattr(os, "fsync", full)
+        taken = look(drop, archive)
+    assert "No space left" in taken.left["P001/1/walk.mp4"].found
+    assert len(calls) == n
     assert files(drop) == ["P001/1/walk.csv", "P001/1/walk.mp4"]
-    assert files(archive) == []
+    assert [p.name for p in archive.rglob("*") if p.is_file()] == ["seen.json"]
+    assert look(drop, archive).registered == ["P001/1/walk.mp4"]
 
 
 def test_what_cannot_be_registered_is_kept_with_its_reason(drop: Path, tmp_path: Path):
@@ -213,7 +179,7 @@ def test_what_cannot_be_registered_is_kept_with_its_reason(drop: Path, tmp_path:
     (drop / "P001/1").mkdir(parents=True)
     (drop / "P001/1/empty.mp4").touch()
     taken = twice(drop, archive)
-    assert taken.refused == {"Jane Doe/1/walk.mp4": "USAGE", "P001/1/empty.mp4": "VIDEO_EMPTY"}
+    assert codes(taken) == {"Jane Doe/1/walk.mp4": "USAGE", "P001/1/empty.mp4": "VIDEO_EMPTY"}
     assert files(drop) == []
     assert len(video.Video()) == 0
     names = files(archive)

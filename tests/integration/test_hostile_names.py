@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import html.parser
 import os
 import pickle
@@ -102,6 +103,15 @@ def test_names_go_through_tables_and_report_as_text(tables: None, tmp_path: Path
     assert "49" not in [t.strip() for t in page.texts]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in", "out"]
     assert not list(tmp_path.rglob("hacked"))
+
+
+@pytest.mark.parametrize("label", ["a\nb", "\x1b[2J", "\u2028", b"\xff".decode(errors="surrogateescape"), "v" * 65])
+@pytest.mark.parametrize("field", ["session_label", "project", "activity", "population"])
+def test_labels_hold_no_control_characters(tables: None, tmp_path: Path, field: str, label: str):
+    with pytest.raises(PblError) as error:
+        ingest([tmp_path / "any.mp4"], dataclasses.replace(Visit(subject="P001"), **{field: label}))
+    assert error.value.code == "USAGE"
+    assert str(error.value).replace("\n", "").isascii()
 
 
 class Bomb:

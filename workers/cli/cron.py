@@ -6,7 +6,10 @@ from pathlib import Path
 
 import click
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, harmless
+
+#: How many names of ignored files `pbl cron import` prints.
+_MOST_IGNORED = 100
 
 
 @click.group()
@@ -23,6 +26,8 @@ def cron() -> None:
 def import_(settled_s: float) -> None:
     """Take over recordings that were uploaded to PBL_INCOMING as SUBJECT/SESSION/FILE, and register them.
 
+    Exit code 1 when an upload was refused or could not be taken, 75 when another process takes uploads over now.
+
     Example: PBL_INCOMING=/srv/uploads pbl cron import
     """
     import schemas
@@ -30,13 +35,22 @@ def import_(settled_s: float) -> None:
 
     schemas.activate()
     taken = take_over(settled_s=settled_s)
+    if taken is None:
+        click.echo("another process takes uploads over now", err=True)
+        raise click.exceptions.Exit(75)
     click.echo(
         f"{len(taken.registered)} registered, {len(taken.known)} known, {len(taken.refused)} refused, "
-        f"{taken.uploading} not whole yet, {taken.ignored} not SUBJECT/SESSION/FILE of a video"
+        f"{len(taken.left)} left, {taken.later} for the next run, {taken.uploading} not whole yet, "
+        f"{len(taken.ignored)} ignored"
     )
-    for name, code in taken.refused.items():
-        click.echo(f"{code}: {name}", err=True)
-    if taken.refused:
+    for name, note in sorted(taken.known.items()):
+        click.echo(harmless(f"known: {name}: {note}", lines=False))
+    for name in taken.ignored[:_MOST_IGNORED]:
+        click.echo(harmless(f"ignored, no SUBJECT/SESSION/FILE of a video or its log: {name}", lines=False))
+    for what in ("refused", "left"):
+        for _, error in sorted(getattr(taken, what).items()):
+            click.echo(f"{what}: {error.text()}", err=True)
+    if taken.refused or taken.left:
         raise click.exceptions.Exit(1)
 
 

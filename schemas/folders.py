@@ -1,0 +1,62 @@
+"""Folders whose content only their account may read."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import struct
+from pathlib import Path
+
+#: POSIX access control list (version 2, then tag, rights and no id of each entry) by which whatever is made in a folder
+#: belongs to its owner alone: owner rwx, group and others nothing.
+_OWNER_ONLY = struct.pack("<I", 2) + b"".join(
+    struct.pack("<HHI", tag, rights, 0xFFFFFFFF) for tag, rights in ((0x01, 7), (0x04, 0), (0x20, 0))
+)
+
+
+def private_folder(path: Path) -> Path:
+    """Make a folder (0700) as far as it is missing, in which new files are 0600 and new folders 0700 under any umask.
+
+    A folder that is there is not changed: who made it decided who may read it.
+
+    Raises
+    ------
+    OSError
+        It cannot be made.
+    """
+    if not path.is_dir():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.mkdir(mode=0o700, exist_ok=True)
+        make_private(path)
+    return path
+
+
+def make_private(path: Path) -> None:
+    """Make a folder 0700, and by default 0600 and 0700 what is made in it later.
+
+    A default access control list, which takes the umask's place, does the latter on the file systems of Linux that
+    have them; on others the folder's own mode keeps everybody else out.
+    """
+    path.chmod(0o700)
+    if hasattr(os, "setxattr"):
+        with contextlib.suppress(OSError):  # a file system without such lists
+            os.setxattr(path, "system.posix_acl_default", _OWNER_ONLY)
+
+
+def sync_folder(path: Path) -> None:
+    """Have the names in a folder on disk when this returns."""
+    handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def remove_empty(folder: Path, levels: int) -> None:
+    """Remove this folder and at most `levels - 1` above it, as far as they are empty."""
+    for _ in range(max(levels, 0)):
+        try:
+            folder.rmdir()
+        except OSError:
+            return
+        folder = folder.parent

@@ -1,0 +1,283 @@
+"""The drop folder: what phones upload, in a folder of this machine or under a prefix of an object store.
+
+Whoever uploads decides what lies there and when it changes. A folder is therefore read through handles of its folders,
+no link is followed, and only a regular file of the account that owns the drop folder is opened.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import errno
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import Any, BinaryIO
+
+import fsspec
+
+from pbl_pipeline.errors import PblError
+
+from .secret_files import secret
+from .store import store_error
+
+#: What is a sensor log, by the ending.
+LOG_ENDINGS = (".csv", ".json", ".zip")
+#: A larger recording or log is not taken (bytes).
+LARGEST, LARGEST_LOG = 20 * 10**9, 4 * 10**8
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
+#: O_NONBLOCK: what became a pipe since it was looked at does not wait for its writer.
+_FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+
+
+class StillChanging(Exception):
+    """A file is not what it was when it was listed."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Upload:
+    """What lies at a place: name below the drop folder, size (bytes), a stamp that changes with the content; `file` is
+    False for what cannot be a recording (a folder, a name that leads elsewhere)."""
+
+    name: PurePosixPath
+    size: int = 0
+    stamp: str = ""
+    file: bool = True
+
+
+def incoming_url() -> str:
+    """Where phones upload to: PBL_INCOMING, a folder or s3://BUCKET/PREFIX. Raises USAGE where it is not set."""
+    value = os.environ.get("PBL_INCOMING")
+    if not value:
+        raise PblError(
+            "USAGE",
+            found="PBL_INCOMING is not set",
+            expected="the folder or s3://BUCKET/PREFIX into which recordings are uploaded, as SUBJECT/SESSION/FILE",
+            next_step="set it, or leave `pbl cron import` out",
+        )
+    return value
+
+
+def drop_folder(url: str) -> Folder | Bucket:
+    """The drop folder at a path or URL. Raises `PblError` FILE_MISSING where it is no folder."""
+    return Bucket(url) if "://" in url else Folder(Path(url).absolute())
+
+
+class Folder:
+    """A drop folder of this machine. Files lie three levels deep; nothing below them is looked at."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        try:
+            with self._open(()) as handle:
+                self.owner = os.fstat(handle).st_uid
+        except OSError as error:
+            raise PblError(
+                "FILE_MISSING",
+                key=root,
+                found=error.strerror or str(error),
+                expected="the folder into which recordings are uploaded",
+                next_step="create it, or correct PBL_INCOMING",
+            ) from error
+
+    def uploads(self, subject: str | None = None) -> Iterator[Upload]:
+        """Everything that lies there or in the folder of one person: of two levels what is no folder, of the third
+        everything."""
+        yield from self._below((subject,) if subject else ())
+
+    def _below(self, parts: tuple[str, ...]) -> Iterator[Upload]:
+        try:
+            with self._open(parts) as handle, os.scandir(handle) as entries:
+                for entry in entries:
+                    name = (*parts, entry.name)
+                    is_folder = entry.is_dir(follow_symlinks=False)
+                    if is_folder and len(name) < 3:
+                        yield from self._below(name)
+                        continue
+                    about = entry.stat(follow_symlinks=False)
+                    yield Upload(PurePosixPath(*name), about.st_size, _stamp(about), not is_folder)
+        except OSError as error:
+            if not parts:
+                raise
+            if error.errno != errno.ENOENT:  # a folder that may not be entered, or is none any more
+                yield Upload(PurePosixPath(*parts), file=False)
+
+    @contextlib.contextmanager
+    def open(self, upload: Upload) -> Iterator[BinaryIO]:
+        """Open a file for reading.
+
+        Raises
+        ------
+        PblError
+            UPLOAD_REFUSED: it is no regular file of the folder's owner, or too large.
+        StillChanging
+            It is another one than was listed.
+        """
+        with contextlib.ExitStack() as stack:
+            try:
+                handle = stack.enter_context(self._open(upload.name.parts[:-1]))
+                self._check(upload, os.stat(upload.name.name, dir_fd=handle, follow_symlinks=False), handle)
+                file = os.open(upload.name.name, _FILE, dir_fd=handle)
+            except PermissionError as error:
+                raise _refused(upload, "a file that may not be read") from error
+            except (FileNotFoundError, NotADirectoryError) as error:
+                raise StillChanging from error
+            source = stack.enter_context(open(file, "rb"))
+            self._check(upload, os.fstat(file), handle)
+            yield source
+
+    def _check(self, upload: Upload, about: os.stat_result, folder: int) -> None:
+        mode = about.st_mode
+        if stat.S_ISLNK(mode):
+            raise _refused(upload, f"a symbolic link to {os.readlink(upload.name.name, dir_fd=folder)}")
+        if not stat.S_ISREG(mode):
+            kinds = ((stat.S_ISFIFO, "a named pipe"), (stat.S_ISSOCK, "a socket"), (stat.S_ISDIR, "a folder"))
+            raise _refused(upload, next((what for is_it, what in kinds if is_it(mode)), "a device"))
+        if about.st_uid != self.owner:
+            raise _refused(
+                upload,
+                f"a file of account {about.st_uid}; the drop folder belongs to {self.owner}",
+                "upload with the account that owns the drop folder, or make the account that uploads its owner",
+            )
+        if about.st_nlink != 1:
+            raise _refused(upload, f"a file with {about.st_nlink} names (hard links)")
+        _check_size(upload, about.st_size)
+        if (about.st_size, _stamp(about)) != (upload.size, upload.stamp):
+            raise StillChanging
+
+    def unchanged(self, upload: Upload) -> bool:
+        """Whether the same file still lies there."""
+        try:
+            with self._open(upload.name.parts[:-1]) as handle:
+                about = os.stat(upload.name.name, dir_fd=handle, follow_symlinks=False)
+        except FileNotFoundError:
+            return False
+        return (about.st_size, _stamp(about)) == (upload.size, upload.stamp)
+
+    def remove(self, upload: Upload) -> None:
+        """Remove a file; one that took its place meanwhile stays. Raises OSError."""
+        if self.unchanged(upload):
+            with self._open(upload.name.parts[:-1]) as handle:
+                os.unlink(upload.name.name, dir_fd=handle)
+
+    def remove_folders(self, subject: str) -> None:
+        """Remove the folders of one person as far as they are empty."""
+        with contextlib.suppress(OSError), self._open((subject,)) as handle:
+            for session in os.listdir(handle):
+                with contextlib.suppress(OSError):
+                    os.rmdir(session, dir_fd=handle)
+            with self._open(()) as root:
+                os.rmdir(subject, dir_fd=root)
+
+    def move(self, upload: Upload, to: Path) -> None:
+        """Move a file out of the drop folder without opening it. What holds no bytes of its own (it is no regular file,
+        or has another name) is removed.
+
+        Raises
+        ------
+        OSError
+            It cannot be moved: another disk, no right.
+        """
+        with self._open(upload.name.parts[:-1]) as handle:
+            about = os.stat(upload.name.name, dir_fd=handle, follow_symlinks=False)
+            if stat.S_ISREG(about.st_mode) and about.st_nlink == 1:
+                os.rename(upload.name.name, to, src_dir_fd=handle)
+                with contextlib.suppress(OSError):  # it may belong to somebody else; the folder is closed to others
+                    to.chmod(0o600)
+            elif not stat.S_ISDIR(about.st_mode):
+                os.unlink(upload.name.name, dir_fd=handle)
+
+    @contextlib.contextmanager
+    def _open(self, parts: tuple[str, ...]) -> Iterator[int]:
+        """A handle of a folder below the drop folder; no link is followed on the way."""
+        handle = os.open(self.root, _FOLDER)
+        try:
+            for part in parts:
+                below = os.open(part, _FOLDER | os.O_NOFOLLOW, dir_fd=handle)
+                os.close(handle)
+                handle = below
+            yield handle
+        finally:
+            os.close(handle)
+
+
+class Bucket:
+    """A drop folder under a prefix of an object store, s3://BUCKET/PREFIX. Raises `PblError` STORE_UNAVAILABLE."""
+
+    def __init__(self, url: str) -> None:
+        endpoint = os.environ.get("PBL_S3_ENDPOINT")
+        login: dict[str, Any] = {"key": secret("PBL_S3_KEY"), "secret": secret("PBL_S3_SECRET")}
+        login |= {"client_kwargs": {"endpoint_url": endpoint}} if endpoint else {}
+        try:
+            fs, root = fsspec.core.url_to_fs(url, **(login if url.startswith("s3://") else {}))
+        except Exception as error:
+            raise store_error(error) from error
+        self.fs, self.root = fs, str(root).rstrip("/")
+
+    def uploads(self, subject: str | None = None) -> Iterator[Upload]:
+        """Every object below the prefix, or in the folder of one person."""
+        try:
+            self.fs.invalidate_cache()
+            found = self.fs.find(f"{self.root}/{subject}" if subject else self.root, detail=True)
+        except Exception as error:
+            raise store_error(error) from error
+        for path, about in found.items():
+            name = PurePosixPath(str(path).removeprefix(self.root).lstrip("/"))
+            # A key with empty parts or dots is another one than its name.
+            yield Upload(name, int(about["size"] or 0), _object_stamp(about), self._path(name) == str(path))
+
+    @contextlib.contextmanager
+    def open(self, upload: Upload) -> Iterator[BinaryIO]:
+        """Open an object for reading. Raises `PblError` UPLOAD_REFUSED (too large), OSError."""
+        _check_size(upload, upload.size)
+        with self.fs.open(self._path(upload.name), "rb") as source:
+            yield source
+
+    def unchanged(self, upload: Upload) -> bool:
+        """Whether the same object still lies there."""
+        self.fs.invalidate_cache()
+        try:
+            about = self.fs.info(self._path(upload.name))
+        except FileNotFoundError:
+            return False
+        return (int(about["size"] or 0), _object_stamp(about)) == (upload.size, upload.stamp)
+
+    def remove(self, upload: Upload) -> None:
+        """Remove an object; one that took its place meanwhile stays. Raises OSError."""
+        if self.unchanged(upload):
+            self.fs.rm(self._path(upload.name))
+
+    def remove_folders(self, subject: str) -> None:
+        """An object store has none."""
+
+    def move(self, upload: Upload, to: Path) -> None:
+        """An object that is not read stays where it is. Raises OSError."""
+        raise OSError(errno.EXDEV, "it stays in the object store", str(to))
+
+    def _path(self, name: PurePosixPath) -> str:
+        return f"{self.root}/{name}"
+
+
+def _stamp(about: os.stat_result) -> str:
+    return f"{about.st_mtime_ns}-{about.st_ino}"
+
+
+def _object_stamp(about: dict[str, Any]) -> str:
+    return str(about.get("LastModified") or about.get("mtime") or "")
+
+
+def _check_size(upload: Upload, size: int) -> None:
+    most = LARGEST_LOG if upload.name.suffix.lower() in LOG_ENDINGS else LARGEST
+    if size > most:
+        raise _refused(upload, f"a file of {size / 1e9:.1f} GB", f"upload what is smaller than {most / 1e9:g} GB")
+
+
+def _refused(upload: Upload, found: str, next_step: str = "upload the recording itself") -> PblError:
+    return PblError(
+        "UPLOAD_REFUSED",
+        key=upload.name,
+        found=found,
+        expected="a regular file of the drop folder's owner, with one name and not too large",
+        next_step=next_step,
+    )

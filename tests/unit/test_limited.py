@@ -1,0 +1,32 @@
+"""A function that takes too long or too much is ended; what it raises arrives."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import pytest
+
+from workers.limited import LimitExceeded, limited
+
+
+@pytest.mark.parametrize(
+    ("function", "argument", "said"),
+    [
+        (time.sleep, 60.0, "more than 3 s"),
+        (bytearray, 2**31, "more than 256 MiB of memory"),
+        (os._exit, 3, "ended with code 3"),
+    ],
+    ids=["time", "memory", "death"],
+)
+def test_what_takes_too_much_is_ended(function, argument, said: str):
+    begun = time.monotonic()
+    with pytest.raises(LimitExceeded, match=said):
+        limited(function, argument, seconds=3.0 if function is time.sleep else 60.0, n_bytes=2**28)
+    assert time.monotonic() - begun < 30.0
+
+
+def test_what_is_raised_there_is_raised_here():
+    with pytest.raises(ValueError, match="invalid literal"):
+        limited(int, "x", seconds=60.0, n_bytes=2**28)
+    limited(int, "1", seconds=60.0, n_bytes=2**28)

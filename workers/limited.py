@@ -1,0 +1,71 @@
+"""A function in a process of its own, which is ended when it takes too long or too much memory."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+
+class LimitExceeded(Exception):
+    """The function took more time or memory than it was given, or its process died."""
+
+
+def limited(function: Callable[..., object], *args: Any, seconds: float, n_bytes: int) -> None:
+    """Call a function for what it raises; its result is dropped.
+
+    Parameters
+    ----------
+    function, args
+        Importable by name; arguments and exceptions that can be pickled.
+    seconds
+        Time it may take, the start of the process (about a second) included.
+    n_bytes
+        Memory the process may allocate beside what its imports take.
+
+    Raises
+    ------
+    LimitExceeded
+        In words what it took too much of. Whatever `function` raises is raised here.
+    """
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_call, args=(theirs, n_bytes, function, args), daemon=True)
+    process.start()
+    theirs.close()
+    try:
+        if not ours.poll(seconds):
+            raise LimitExceeded(f"more than {seconds:g} s")
+        try:
+            error = ours.recv()
+        except EOFError:
+            process.join(5.0)
+            raise LimitExceeded(f"its process ended with code {process.exitcode}") from None
+    finally:
+        process.kill()
+        process.join()
+        ours.close()
+    if isinstance(error, MemoryError):
+        raise LimitExceeded(f"more than {n_bytes / 2**20:.0f} MiB of memory")
+    if error is not None:
+        raise error
+
+
+def _call(pipe: Connection, n_bytes: int, function: Callable[..., object], args: tuple) -> None:
+    try:
+        import resource
+
+        # What the imports took does not count: with many cores numpy alone reserves a gigabyte for its threads.
+        pages = int(Path("/proc/self/statm").read_text().split()[5])
+        most = pages * resource.getpagesize() + n_bytes
+        resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    except (ImportError, OSError, ValueError):  # another system than Linux, or a lower limit that may not be raised
+        pass
+    try:
+        function(*args)
+    except Exception as error:  # noqa: BLE001  raised where the function was called
+        pipe.send(error)
+    else:
+        pipe.send(None)
