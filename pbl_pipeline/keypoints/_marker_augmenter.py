@@ -27,14 +27,15 @@ POINTS: tuple[str, ...] = (
         for side in ("right", "left")
     ),
 )
-#: What it predicts, in its order, under OpenCap's names.
+#: What it predicts, in its order: the marker set `opencap_35`. OpenCap's names, with `l_` for its `L` and without
+#: "_study".
 MARKERS: tuple[str, ...] = (
-    *("r.ASIS", "L.ASIS", "r.PSIS", "L.PSIS"),
+    *("r_ASIS", "l_ASIS", "r_PSIS", "l_PSIS"),
     *("r_knee", "r_mknee", "r_ankle", "r_mankle", "r_toe", "r_5meta", "r_calc"),
-    *("L_knee", "L_mknee", "L_ankle", "L_mankle", "L_toe", "L_calc", "L_5meta"),
-    *("r_shoulder", "L_shoulder", "C7"),
-    *("r_thigh1", "r_thigh2", "r_thigh3", "L_thigh1", "L_thigh2", "L_thigh3"),
-    *("r_sh1", "r_sh2", "r_sh3", "L_sh1", "L_sh2", "L_sh3", "RHJC", "LHJC"),
+    *("l_knee", "l_mknee", "l_ankle", "l_mankle", "l_toe", "l_calc", "l_5meta"),
+    *("r_shoulder", "l_shoulder", "C7"),
+    *("r_thigh1", "r_thigh2", "r_thigh3", "l_thigh1", "l_thigh2", "l_thigh3"),
+    *("r_sh1", "r_sh2", "r_sh3", "l_sh1", "l_sh2", "l_sh3", "r_HJC", "l_HJC"),
 )
 _HIPS = [POINTS.index("right_hip"), POINTS.index("left_hip")]
 _KNEES = [POINTS.index("right_knee"), POINTS.index("left_knee")]
@@ -78,10 +79,13 @@ class AnatomicalMarkers:
 
 
 class MarkerAugmenter:
-    """The loaded network. Not to be shared by threads.
+    """The loaded network; `points`, `markers`: names of what it sees and predicts. Not to be shared by threads.
 
     Raises those of `assets.fetch`, and `PblError` SOLVER_UNKNOWN where `params` name another network.
     """
+
+    points = POINTS
+    markers = MARKERS
 
     def __init__(self, params: AugmenterParams | None = None) -> None:
         self.params = params or AugmenterParams()

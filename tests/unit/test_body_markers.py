@@ -9,6 +9,7 @@ import pytest
 
 from pbl_pipeline.body import MARKER_SETS, load_body, load_marker_set, marker_positions, marker_set
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.keypoints import MarkerAugmenter
 
 _BLAZEPOSE_TEXT = (
     "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer left_ear right_ear "
@@ -44,17 +45,21 @@ def other_side(set_name: str, name: str) -> str | None:
         return {"l": "r", "r": "l", "L": "R", "R": "L"}[name[0]] + name[1:]
     if set_name == "body25b":
         return {"L": "R", "R": "L"}[name[0]] + name[1:] if name[0] in "LR" else None
+    if set_name == "opencap_35":
+        return {"l": "r", "r": "l"}[name[0]] + name[1:] if name[1] == "_" else None
     if "left" in name:
         return name.replace("left", "right")
     return name.replace("right", "left") if "right" in name else None
 
 
 def test_names():
-    assert set(MARKER_SETS) == {"bml_movi_87", "blazepose_33", "body25b", "halpe_26", "mpi_inf_3dhp_17"}
+    assert set(MARKER_SETS) == {"bml_movi_87", "blazepose_33", "body25b", "halpe_26", "mpi_inf_3dhp_17", "opencap_35"}
     assert list(marker_set("blazepose_33").names) == BLAZEPOSE
     assert list(marker_set("mpi_inf_3dhp_17").names) == MPI_INF_3DHP
     assert list(marker_set("body25b").names) == BODY_25B
     assert len(marker_set("bml_movi_87")) == 87
+    assert marker_set("opencap_35").names == MarkerAugmenter.markers
+    assert set(MarkerAugmenter.points) <= set(marker_set("halpe_26").names)
 
 
 def test_bml_movi_is_the_figures(shared_data):
