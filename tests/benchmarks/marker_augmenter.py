@@ -3,16 +3,17 @@
     python -m tests.benchmarks.marker_augmenter                       # laboratories and motions
     python -m tests.benchmarks.marker_augmenter --fits FOLDER         # and fits: real_clips --save FOLDER
 
-Reads `../shared/data/real/{marker_ik,motions,video_mocap}`; the README there has sources and licences. The 15 points are
-those of a body that was fitted to all of a laboratory's markers, of recorded joint angles put on our body, or of our
-fit of a video. The pelvis is turned onto the augmenter's four iliac spines (least squares, sites of `opencap_35`).
+Reads `../shared/data/real/{marker_ik,motions,video_mocap}`; the README there has sources and licences. The 15 points
+are those of a body that was fitted to all of a laboratory's markers, of recorded joint angles put on our body, or of
+our fit of a video. The pelvis is turned onto the augmenter's four iliac spines (least squares, sites of `opencap_35`).
 
 1. Laboratories: distance of the augmenter's markers from the recorded ones, and error of the pelvis' tilt.
 2. Motions, a row a person and activity: tilt as recorded and as the augmenter has it, mean and standard deviation over
    time; correlation over time; the slope over the persons who walk. The body is that of the recording: this is the
    network alone.
 3. Clips: error of hip flexion with the fit's own pelvis and with the augmenter's, the femurs being the fit's: sd of the
-   error (no constant counts), its mean, and the mean absolute error. `--headings 1` asks for one heading as OpenCap does.
+   error (no constant counts), its mean, and the mean absolute error. `--headings 1` asks for one heading, as OpenCap
+   does.
 """
 
 from __future__ import annotations
