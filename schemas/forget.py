@@ -30,7 +30,7 @@ from .codes import check_subject
 from .folders import remove_empty
 from .json_files import write_json
 from .rows import delete_below
-from .store import files_below, store_error
+from .store import files_below, purge, store_error
 from .stored_files import remove_left_folders
 from .uploads import Bucket, Folder, Upload, drop_folder
 
@@ -148,7 +148,7 @@ def _forget(subject: str, videos: bool, say: Say) -> Forgotten:
     _write(subject, manifest)
     say(f"The list of what goes is in {manifest_path(subject)}")
     _delete_rows(subject, ids, say)
-    _delete_files(found.files, say)
+    _delete_files(found.files, ids, say)
     gone, kept = [], {}
     left = _delete_left_over(subject)
     if videos:
@@ -246,14 +246,21 @@ def _without_row(ids: Ids) -> list[str]:
 
     A path is `_schema/<schema>/<table>/<key>=<value>/...`, the key in the order of the table.
     """
-    store, root = connection.store_backend(), connection.store_root()
-    out = []
-    for (schema, table), columns in catalog.tables().items():
-        if any(c.names_files for c in columns):
-            for name in IDENTITIES:
-                for value in ids[name]:
-                    out += files_below(store, f"{root}/{schema}/{table}/{name}={value}")
-    return out
+    store = connection.store_backend()
+    return [path for folder in _folders(ids) for path in files_below(store, folder)]
+
+
+def _folders(ids: Ids) -> list[str]:
+    """The person's folders of the store."""
+    root = connection.store_root()
+    return [
+        f"{root}/{schema}/{table}/{name}={value}"
+        for (schema, table), columns in catalog.tables().items()
+        if any(c.names_files for c in columns)
+        for name in IDENTITIES
+        if name in {c.name for c in columns}
+        for value in ids[name]
+    ]
 
 
 def _exists(path: str) -> bool:
@@ -299,7 +306,7 @@ def _cameras(ids: Ids) -> list[int]:
     return sorted({int(c) for c in rows.to_arrays("camera_id")})
 
 
-def _delete_files(files: Sequence[str], say: Say) -> None:
+def _delete_files(files: Sequence[str], ids: Ids, say: Say) -> None:
     store = connection.store_backend()
     say(f"Removing {len(files)} files from the store")
     with progress.bar("files", total=len(files), unit="file") as update:
@@ -312,6 +319,9 @@ def _delete_files(files: Sequence[str], say: Say) -> None:
                 # The names of the folders carry the person's numbers.
                 remove_empty(Path(full_path(store, path)).parent, len(PurePosixPath(path).parts) - 4)
             update(1)
+    if store.protocol == "s3":
+        for folder in _folders(ids):
+            purge(store.fs, full_path(store, folder))
 
 
 def _delete_videos(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict[str, str]]:

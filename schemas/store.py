@@ -142,6 +142,35 @@ def files_below(backend: Any, folder: str = "") -> dict[str, dict[str, Any]]:
     return {str(path).removeprefix(base).lstrip("/"): about for path, about in found.items()}
 
 
+def purge(fs: Any, folder: str) -> None:
+    """Remove what a bucket holds below a folder (`bucket/path`), older versions and the parts of uploads that broke off
+    included.
+
+    Raises
+    ------
+    PblError
+        STORE_UNAVAILABLE with what the store said.
+    """
+    name, _, path = folder.partition("/")
+    where = {"Bucket": name, "Prefix": f"{path.strip('/')}/"}
+    try:
+        while found := _kept(fs, where):
+            for command, item in found:
+                fs.call_s3(command, Bucket=name, **item)
+    except Exception as error:
+        raise store_error(error) from error
+
+
+def _kept(fs: Any, where: dict[str, str]) -> list[tuple[str, dict[str, str]]]:
+    """The commands that remove the next thousand versions and the next thousand unfinished uploads."""
+    versions = fs.call_s3("list_object_versions", **where)
+    parts = fs.call_s3("list_multipart_uploads", **where)
+    listed = [*versions.get("Versions", []), *versions.get("DeleteMarkers", [])]
+    return [("delete_object", {k: item[k] for k in ("Key", "VersionId")}) for item in listed] + [
+        ("abort_multipart_upload", {k: item[k] for k in ("Key", "UploadId")}) for item in parts.get("Uploads", [])
+    ]
+
+
 def store_error(error: BaseException) -> PblError:
     """The coded error for a store that does not do what it is asked. The clients' messages hold no secret."""
     return PblError(

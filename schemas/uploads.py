@@ -20,7 +20,7 @@ import fsspec
 from pbl_pipeline.errors import PblError
 
 from .secret_files import secret
-from .store import store_error
+from .store import purge, store_error
 
 #: What is a sensor log, by the ending.
 LOG_ENDINGS = (".csv", ".json", ".zip")
@@ -249,7 +249,9 @@ class Bucket:
             self.fs.rm(self._path(upload.name))
 
     def remove_folders(self, subject: str) -> None:
-        """An object store has none."""
+        """An object store has none, but may keep older versions."""
+        if self.fs.protocol[0] == "s3":
+            purge(self.fs, f"{self.root}/{subject}")
 
     def move(self, upload: Upload, to: Path) -> None:
         """An object that is not read stays where it is. Raises OSError."""

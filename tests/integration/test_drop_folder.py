@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from schemas import archive as layout
-from schemas import connection, forget, lab, session, uploads, video
+from schemas import backup, connection, forget, lab, session, uploads, video
 from schemas.ingest import Visit, ingest
 from tests.command import pbl
 from workers import incoming
@@ -325,4 +325,18 @@ def test_store_and_archive_are_private_under_any_umask(
     connection.connect()
     made = [p for folder in (archive, store) for p in (folder, *folder.rglob("*"))]
     assert len([p for p in made if p.is_file()]) == 6
+    assert not [(p, oct(p.stat().st_mode)) for p in made if p.stat().st_mode & 0o077]
+
+
+def test_a_backup_is_private_under_any_umask(tables: None, tmp_path: Path):
+    folder = tmp_path / "backup"
+    folder.mkdir()  # an administrator's, open to all as they usually are
+    folder.chmod(0o755)
+    before = os.umask(0)
+    try:
+        backup.backup(folder, store=False)
+    finally:
+        os.umask(before)
+    made = [folder, *folder.rglob("*")]
+    assert {"manifest.json", "database.sql.gz"} < {p.name for p in made}
     assert not [(p, oct(p.stat().st_mode)) for p in made if p.stat().st_mode & 0o077]

@@ -298,6 +298,22 @@ def test_a_folder_the_server_cannot_enter_is_named():
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root drops to another account")
+@pytest.mark.parametrize("umask", [0o000, 0o077], ids=oct)
+def test_the_server_enters_its_folder_and_nobody_else_writes_there_under_any_umask(umask: int):
+    home, before = new_home(), os.umask(umask)
+    folder = embedded.Folder(home / "deeper/db")
+    try:
+        folder.create(_account.server_account(folder.data))
+        assert [stat.S_IMODE(p.stat().st_mode) for p in (folder.path.parent, folder.path, folder.data)] == [
+            0o755,
+            0o755,
+            0o700,
+        ]
+    finally:
+        os.umask(before)
+        remove_home(home)
+
+
 def test_root_leaves_a_database_with_its_owner(tmp_path: Path):
     data = tmp_path / "data"
     assert _account.server_account(data).name in _account.UNPRIVILEGED

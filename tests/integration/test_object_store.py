@@ -17,6 +17,7 @@ from schemas._declare import declare_all
 from schemas.ingest import Visit, ingest
 from schemas.stored_files import file_ref, stored_file
 from tests.rows import remove_all
+from workers.incoming import take_over
 
 from . import chain
 
@@ -94,7 +95,18 @@ def test_a_backup_and_a_person_who_is_forgotten(remote: None, tmp_path: Path):
     assert saved.n_files == 2
     assert backup.check(tmp_path / "backup")["n_files"] == 2
     backend.put_buffer(b"x", f"_schema/pbl_keypoints/__keypoints/video_id={number}/left_over.npz")
+    # What a bucket keeps unseen: an older version, and the parts of an upload that broke off. Somebody else's stay.
+    fs, folder = backend.fs, "arrays/_schema/pbl_keypoints/__keypoints/video_id="
+    fs.call_s3("put_bucket_versioning", Bucket="walks", VersioningConfiguration={"Status": "Enabled"})
+    for key in (f"{folder}{number}/left_over.npz", f"{folder}{number}9/other.npz"):
+        fs.pipe_file(f"walks/{key}", b"a newer one")
+        fs.call_s3("create_multipart_upload", Bucket="walks", Key=key)
     done = forget.forget("P002")
+    kept = fs.call_s3("list_object_versions", Bucket="walks", Prefix=folder)
+    assert [v["Key"] for v in kept["Versions"]] == [f"{folder}{number}9/other.npz"]
+    assert not kept.get("DeleteMarkers")
+    (upload,) = fs.call_s3("list_multipart_uploads", Bucket="walks")["Uploads"]
+    assert upload["Key"] == f"{folder}{number}9/other.npz"
     assert done.left == []
     assert {p.rpartition("/")[2].split("_")[0] for p in done.files} == {"left", "tracks", "frame"}
     assert [p for p in backend.fs.find("walks") if f"video_id={number}/" in p] == []
@@ -102,6 +114,32 @@ def test_a_backup_and_a_person_who_is_forgotten(remote: None, tmp_path: Path):
     backup._restore_files(tmp_path / "backup")
     assert len([p for p in backend.fs.find("walks") if f"video_id={number}/" in p]) == 2
     forget.manifest_path("P002").unlink()
+
+
+def test_phones_may_upload_into_a_bucket(remote: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    fs = connection.store_backend().fs
+    if not fs.exists("phones"):
+        fs.mkdir("phones")
+    content = chain.small_video(tmp_path, "walk", n=5).read_bytes()
+    for name in ("P001/1/walk.mp4", "P017/1/walk.mp4", "P001//1/walk.mp4", "P001/1/empty.mp4"):
+        fs.pipe_file(f"phones/in/{name}", b"" if "empty" in name else content)
+    monkeypatch.setenv("PBL_INCOMING", "s3://phones/in")
+    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+    take_over(settled_s=0.0)
+    taken = take_over(settled_s=0.0)
+    assert taken is not None
+    first = video.Video.fetch1("video_path")
+    assert Path(first).read_bytes() == content
+    assert sorted(e.code for e in taken.refused.values()) == ["VIDEO_DUPLICATE", "VIDEO_EMPTY"]
+    assert taken.ignored == ["P001/1/walk.mp4"]  # with an empty part in its key: another object
+    fs.invalidate_cache()
+    assert [p for p in fs.find("phones") if "//" not in p] == []
+    # A person who is forgotten leaves nothing there either.
+    fs.pipe_file("phones/in/P020/1/walk.mp4", b"not whole yet")
+    assert forget.forget("P020", videos=True).left == []
+    fs.invalidate_cache()
+    assert not fs.find("phones/in/P020")
+    forget.manifest_path("P020").unlink()
 
 
 def test_a_store_that_does_not_answer_is_said_without_the_secret(remote: None, monkeypatch: pytest.MonkeyPatch):

@@ -185,6 +185,7 @@ def test_the_cron_loop_goes_on_after_a_job_that_fails_and_ends_when_told(tmp_pat
     assert names[:3] == ["import", "refresh", "release"]
     assert names.count("import") > 2 * names.count("refresh") > 2
     assert "pbl cron import failed with code 1" in said
+    assert ran.stat().st_mode & 0o077 == 0
 
 
 def test_the_slurm_script_ends_its_worker_in_order(tmp_path: Path):

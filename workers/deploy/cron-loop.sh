@@ -2,6 +2,7 @@
 # Runs the cron jobs in the container `cron`, which has no cron daemon (that would have to be root): checks every minute
 # which jobs are due and runs them one after the other. On a machine of your own use crontab or the systemd timers.
 set -u
+umask 077
 tick="${PBL_CRON_TICK_S:-60}"
 trap 'exit 0' TERM INT
 
