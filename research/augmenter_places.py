@@ -30,8 +30,8 @@ PERSONS = ("Camargo2021", "Kirsten DLS01", "GaitDynamics", "Falisse2019", "Dembi
 #: Part of a marker's name -> its bone.
 _BONES = {"SIS": "pelvis", "HJC": "pelvis", "knee": "femur", "thigh": "femur", "ankle": "tibia", "_sh": "tibia"}
 _BONES |= {"toe": "calcn", "5meta": "calcn", "calc": "calcn", "C7": "torso"}
-#: Longest part of a recording that counts (s), and the unscaled body's height and usual mass.
-_LONGEST_S, _SIZE = 8.0, (1.75, 70.0)
+#: Longest part of a recording that counts (s).
+_LONGEST_S = 8.0
 _HEAD = """\
 # opencap_35: the 35 markers of OpenCap's marker augmenter 0.3 (`l_` for its L)
 # source: `python -m research.augmenter_places`: recorded walks and squats of {n} persons of other laboratories put on
@@ -63,7 +63,7 @@ def places(motions: Iterable[Motion], augmenter: MarkerAugmenter) -> dict[str, n
         rows = motion.time_s <= motion.time_s[0] + _LONGEST_S
         qpos = np.asarray(motion.qpos)[rows]
         x = np.asarray(marker_positions(body, points, qpos, np.ones(8), np.zeros((len(points), 3))))[:, seen]
-        found = augmenter(np.asarray(motion.time_s)[rows], x, *_SIZE).xyz_world_m
+        found = augmenter(np.asarray(motion.time_s)[rows], x).xyz_world_m
         position, rotation = (np.asarray(a)[:, bones] for a in body_poses(body, qpos, np.ones(8)))
         local = np.einsum("tpji,tpj->tpi", rotation, found - position)
         of_person[motion.person].append(np.nanmean(local, axis=0))

@@ -42,11 +42,14 @@ _KNEES = [POINTS.index("right_knee"), POINTS.index("left_knee")]
 _ANKLES = [POINTS.index("right_ankle"), POINTS.index("left_ankle")]
 #: From z up to y up: (x, y, z) to (x, z, -y).
 _Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-#: Hip to knee and knee to ankle as fractions of the height: 0.245 and 0.246 (Drillis and Contini 1966, in Winter,
-#: "Biomechanics and Motor Control of Human Movement", 2009, figure 4.1).
-_LEG_OF_HEIGHT = 0.245 + 0.246
+#: Hip to knee and knee to ankle as a fraction of the height: 0.824 of 1.783 m on the body of this project (figures of
+#: Hamner, Seth and Delp 2010, J Biomech 43:2709), whose points go in. OpenCap's points of a man of 1.79 m have 0.45 to
+#: 0.46; the 0.491 of Drillis and Contini 1966 count from the trochanter to the ankle joint.
+_LEG_OF_HEIGHT = 0.462
 #: Heights (m) of the people that the network is meant for; outside, positions are taken to be in another unit.
 _ADULT_M, _PERSON_M = (1.35, 2.15), (0.5, 2.6)
+#: Legs that imply another height than the stated one by more than this fraction are told.
+_MISMATCH = 0.08
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,8 +126,10 @@ class MarkerAugmenter:
         points_world_m : (T, 15, 3)
             `POINTS` in a world with z up, metres; NaN where unknown. A frame counts where all 15 are known.
         height_m, mass_kg
-            Of the person. None: the height that the legs imply (Drillis and Contini), and the mass of that height by
-            the mean body mass index of the network's people; `assumed` says so.
+            Of the person. None: the height that the legs imply, and the mass of that height by
+            the mean body mass index of the network's people; `assumed` says so. Give the height only with positions
+            of the person's own size: one camera hardly knows it, and each centimetre by which height and positions
+            disagree tips the pelvis by 0.2 to 0.5 deg (docs/models.md).
 
         Raises
         ------
@@ -177,6 +182,8 @@ class MarkerAugmenter:
                 raise _unsuitable(f"a person whose {what} {value:.3g} m", "metres", "convert positions and height")
         if height_m is None:
             assumed.append(f"height not known: {height:.2f} m from the length of the legs")
+        elif abs(implied / height - 1) > _MISMATCH:
+            assumed.append(f"stated height {height:.2f} m, but legs of {implied:.2f} m: the pelvis is tipped by it")
         if mass_kg is None:
             mass = float(self._mean[-1] / self._mean[-2] ** 2) * height**2
             assumed.append(f"mass not known: {mass:.0f} kg, usual at {height:.2f} m")

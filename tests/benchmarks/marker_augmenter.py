@@ -87,7 +87,7 @@ def motions(augmenter: MarkerAugmenter) -> None:
     for motion in read_motions(SHARED / "real" / "motions"):
         part = motion.time_s <= motion.time_s[0] + LONGEST_S
         qpos = np.asarray(motion.qpos)[part]
-        found = augmenter(np.asarray(motion.time_s)[part], points(qpos, np.ones(8)), 1.75, 70.0).xyz_world_m
+        found = augmenter(np.asarray(motion.time_s)[part], points(qpos, np.ones(8))).xyz_world_m
         true, has = (
             tilt_deg(np.asarray(body_poses(BODY, qpos, np.ones(8))[1])[:, PELVIS]),
             tilt_deg(pelvis_of(found)),

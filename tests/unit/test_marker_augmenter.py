@@ -63,7 +63,7 @@ def squats(shared_data, tmp_path_factory) -> tuple[np.ndarray, np.ndarray, np.nd
 
 def standing(n: int = 60) -> np.ndarray:
     """(n, 15, 3) a person of 1.75 m who stands and looks along +x."""
-    half = {"shoulder": (0, 0.19, 1.43), "hip": (0, 0.09, 0.93), "knee": (0.01, 0.09, 0.5), "ankle": (0, 0.09, 0.08)}
+    half = {"shoulder": (0, 0.19, 1.43), "hip": (0, 0.09, 0.91), "knee": (0.01, 0.09, 0.49), "ankle": (0, 0.09, 0.1)}
     half |= {"heel": (-0.05, 0.09, 0.03), "small_toe": (0.16, 0.14, 0.02), "big_toe": (0.2, 0.08, 0.02)}
     rows = [(0, 0, 1.45)]
     for point in POINTS[1:]:
@@ -151,6 +151,9 @@ def test_what_is_not_known_is_assumed_and_told(augmenter):
     assert known.assumed == ()
     assert "BSD-3-Clause" in known.origin
     assert np.abs(known.xyz_world_m - found.xyz_world_m).max() < 0.01
+    small = augmenter(times(60), standing() * 0.85, 1.75, 70.0)
+    assert len(small.assumed) == 1
+    assert "stated height 1.75 m, but legs of 1.4" in small.assumed[0]
     child = augmenter(times(60), standing() * 0.7)
     assert any("adults only" in a for a in child.assumed)
     asis = known.xyz_world_m[-1, [MARKERS.index(n) for n in PELVIS]]
