@@ -132,7 +132,7 @@ def opened_zip(path: str | Path) -> Iterator[zipfile.ZipFile]:
         try:
             with zipfile.ZipFile(file) as archive:
                 yield archive
-        except DAMAGED as error:
+        except (*DAMAGED, OSError) as error:  # OSError: places that no file has
             raise ValueError(f"no readable archive: {error}") from error
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from pbl_pipeline.bounded import npz_fields, read_npz
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import is_plain
 
 #: A shape; None stands for any length.
 Shape = tuple[int | None, ...]
@@ -80,6 +81,39 @@ def check_numbers(path: str | Path, data: Mapping[str, np.ndarray], shapes: Mapp
             next_step="write the field as docs/files.md describes it",
             key=str(path),
         )
+
+
+def text_of(path: str | Path, data: Mapping[str, np.ndarray], name: str) -> str:
+    """A field of a file that is one text. Raises `PblError` FILE_FORMAT."""
+    if data[name].ndim == 0:
+        return _texts(path, data, name)[0]
+    raise _not_text(path, name, f"shape {data[name].shape}", "one text")
+
+
+def texts_of(path: str | Path, data: Mapping[str, np.ndarray], name: str) -> tuple[str, ...]:
+    """A field of a file that is a list of texts, such as names. Raises `PblError` FILE_FORMAT."""
+    if data[name].ndim == 1:
+        return _texts(path, data, name)
+    raise _not_text(path, name, f"shape {data[name].shape}", "texts of shape (any)")
+
+
+def _texts(path: str | Path, data: Mapping[str, np.ndarray], name: str) -> tuple[str, ...]:
+    if data[name].size and data[name].dtype.kind != "U":
+        raise _not_text(path, name, f"type {data[name].dtype}", "text")
+    texts = tuple(map(str, data[name].ravel()))
+    if odd := next((t for t in texts if not is_plain(t)), None):
+        raise _not_text(path, name, ascii(odd)[:80], "texts of one line without control characters")
+    return texts
+
+
+def _not_text(path: str | Path, name: str, found: str, expected: str) -> PblError:
+    return PblError(
+        "FILE_FORMAT",
+        found=f"{name}: {found}",
+        expected=expected,
+        next_step="write the field as docs/files.md describes it",
+        key=str(path),
+    )
 
 
 def picture_size(path: str | Path, size_px: np.ndarray) -> tuple[int, int]:

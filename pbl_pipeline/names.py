@@ -1,8 +1,35 @@
-"""Names of the recordings of a session, all different: files and rows are told apart by them."""
+"""Names and labels: without control characters, and those of the recordings of a session all different."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from unicodedata import category
+
+from pbl_pipeline.errors import PblError
+
+#: Control characters, halves of letters (bytes that are no text), and what ends a line or paragraph.
+_ODD = ("Cc", "Cs", "Zl", "Zp")
+
+
+def is_plain(text: str) -> bool:
+    """Whether a text is one line that can be stored and printed."""
+    return not any(category(c) in _ODD for c in text)
+
+
+def check_label(what: str, text: str, longest: int, least: int = 0) -> None:
+    """Refuse a label with control characters, or of another length. `what` names it in the error.
+
+    Raises `PblError` USAGE.
+    """
+    plain = is_plain(text)
+    if plain and least <= len(text) <= longest:
+        return
+    raise PblError(
+        "USAGE",
+        found=f"{what} of {len(text)} characters" if plain else f"{what} {ascii(text)[:80]}",
+        expected=f"{least} to {longest} characters" if plain else "one line without control characters",
+        next_step="choose another one",
+    )
 
 
 def distinct(stems: Sequence[str], numbers: Sequence[int]) -> list[str]:

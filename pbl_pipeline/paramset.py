@@ -36,10 +36,7 @@ class Paramset:
         Parameters that are left out have their defaults. Raises `ValueError` for parameters that `cls` lacks, and for
         values of another type.
         """
-        try:
-            return _CONVERTER.structure(self.params, cls)
-        except cattrs.BaseValidationError as error:
-            raise ValueError("; ".join(cattrs.transform_error(error, format_exception=_reason))) from error
+        return structured(self.params, cls)
 
     @property
     def key(self) -> str:
@@ -56,6 +53,14 @@ class Paramset:
         """First 16 hex digits of the SHA-256 over stage, name, version and canonical JSON."""
         text = "\n".join([self.stage, self.name, str(self.version), self.canonical_json])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def structured(values: Any, cls: type[P]) -> P:
+    """A frozen dataclass from plain values, such as those of JSON. Raises `ValueError` as `Paramset.to`."""
+    try:
+        return _CONVERTER.structure(values, cls)
+    except cattrs.BaseValidationError as error:
+        raise ValueError("; ".join(cattrs.transform_error(error, format_exception=_reason))) from error
 
 
 def canonical_json(value: Any) -> str:

@@ -20,7 +20,7 @@ from pbl_pipeline.gait import DEFAULT_NORM, GaitMetrics, gait_metrics, load_norm
 from pbl_pipeline.keypoints import METHODS as KEYPOINT_METHODS
 from pbl_pipeline.keypoints import KeypointParams, Keypoints, check_keypoints, detect_keypoints
 from pbl_pipeline.methods import Method
-from pbl_pipeline.names import distinct
+from pbl_pipeline.names import check_label, distinct
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import WARN, Check
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
@@ -242,7 +242,9 @@ def _known(value: float) -> float | None:
 
 
 def distinct_names(paths: Sequence[Path]) -> list[str]:
-    """A name for each path: its stem, numbered where stems repeat."""
+    """A name for each path: its stem, numbered where stems repeat. Raises `PblError` USAGE for control characters."""
+    for path in paths:
+        check_label("file name", path.stem, 255, least=1)
     return distinct([p.stem for p in paths], range(1, len(paths) + 1))
 
 

@@ -1,10 +1,9 @@
-"""Pseudonymous codes of people and labels of sessions: what both must look like."""
+"""Pseudonymous codes of people, and the day that a session's label names."""
 
 from __future__ import annotations
 
 import datetime
 import re
-from unicodedata import category
 
 from pbl_pipeline.errors import PblError
 
@@ -21,22 +20,6 @@ def check_subject(code: str, next_step: str, key: object = None) -> None:
             expected="a pseudonymous code of letters, digits, '-', '_' and '.', at most 32 long (never a name)",
             next_step=next_step,
             key=key,
-        )
-
-
-def has_control_characters(text: str) -> bool:
-    """Whether a text holds line breaks, other control characters, or bytes that are no UTF-8."""
-    return any(category(c) in ("Cc", "Cs", "Zl", "Zp") for c in text)
-
-
-def check_label(what: str, text: str, longest: int) -> None:
-    """Raise USAGE for a label (of a session, project, ...) that is too long or holds control characters."""
-    if len(text) > longest or has_control_characters(text):
-        raise PblError(
-            "USAGE",
-            found=f"--{what} {text[:50]!a} of {len(text)} characters",
-            expected=f"at most {longest} characters, without line breaks and other control characters",
-            next_step="choose another one",
         )
 
 

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import of_stage
+from pbl_pipeline.names import check_label, is_plain
 from pbl_pipeline.paramset import canonical_json
 
 from . import fit, gait, gdi, keypoints, lab, sensors, session, tracking, video
 from ._datajoint import DuplicateError, dj
 from .chain import computed_tables
 from .coded_errors import error_code
-from .codes import check_label, check_subject, day_of, has_control_characters
+from .codes import check_subject, day_of
 from .jobs import jobs_of
 from .method_rows import resolve_method
 from .plan import default_fit
@@ -113,7 +114,7 @@ def ingest(
         ("activity", visit.activity or "", 32),
         ("population", visit.population or "", 32),
     ):
-        check_label(what, text, longest)
+        check_label(f"--{what}", text, longest)
     if visit.person is not None and len(paths) > 1:
         raise PblError(
             "USAGE",
@@ -168,7 +169,7 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
             next_step="check the path",
             key=path,
         )
-    if has_control_characters(str(path)):
+    if not is_plain(str(path)):
         raise PblError(
             "USAGE",
             found="a path with line breaks, other control characters, or bytes that are no UTF-8",

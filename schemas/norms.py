@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import check_label
 
 from . import fit, gait, gdi, lab, session
 from .rows import plain
@@ -75,6 +76,7 @@ def build_norm(
 
     if not _NAME.fullmatch(name) or name in lib.norm_names():
         raise _usage(f"the name {name!r}", "2 to 40 small letters, digits and hyphens, and no name that ships")
+    check_label("--source", source, 255)
     if not populations and not subjects:
         raise _usage("neither populations nor subjects", "whose cycles make the norm")
     _must_exist(lab.Population, "population", [*populations, *pooled_populations])

@@ -11,6 +11,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import fields_of
+from pbl_pipeline.names import check_label
 from pbl_pipeline.paramset import canonical_json
 
 from . import validation, video
@@ -147,13 +148,8 @@ def add_reference(
     from pbl_pipeline.video import sha256_of
 
     for what, text in (("dataset", dataset), ("source", source), ("origin", origin)):
-        if text is not None and not 0 < len(text) <= _LONGEST[what]:
-            raise PblError(
-                "USAGE",
-                found=f"--{what} of {len(text)} characters",
-                expected=f"1 to {_LONGEST[what]}",
-                next_step="choose another one",
-            )
+        if text is not None:
+            check_label(f"--{what}", text, _LONGEST[what], least=1)
     video_id = find_video(about)
     path = Path(path).absolute()
     truth = read_reference(path, source, shift_s)

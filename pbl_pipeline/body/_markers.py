@@ -13,6 +13,7 @@ import numpy as np
 from pbl_pipeline.body._model import load_body
 from pbl_pipeline.bounded import read_text
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import is_plain
 
 _DATA = Path(__file__).parent / "data"
 _COLUMNS = ("name", "body", "x", "y", "z")
@@ -113,6 +114,8 @@ def load_marker_set(path: str | Path, name: str | None = None) -> MarkerSet:
         marker, body = (row["name"] or "").strip(), (row["body"] or "").strip()
         if not marker or marker in names:
             raise _format_error(path, f"{where}: {'no name' if not marker else f'marker {marker} a second time'}")
+        if not is_plain(marker):
+            raise _format_error(path, f"{where}: a name with control characters")
         if body not in known:
             raise _format_error(path, f"{where}: body {body!r}", f"one of {', '.join(known)}")
         try:

@@ -94,6 +94,7 @@ def fit_checks(paths: Sequence[Path], trials: Sequence[TrialFit | LabTrial]) -> 
     `pbl fit` did not write.
     """
     from pbl_pipeline.bounded import read_json
+    from pbl_pipeline.paramset import structured
     from pbl_pipeline.qc import WARN, Check
 
     found: dict[Path, tuple[list[str], str, list[Check]]] = {}
@@ -102,8 +103,9 @@ def fit_checks(paths: Sequence[Path], trials: Sequence[TrialFit | LabTrial]) -> 
             continue
         try:
             content = read_json(path)
-            found[path] = content["trials"], content["params_hash"], [Check(**c) for c in content["qc"]]
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            names, params_hash = list(content["trials"]), str(content["params_hash"])
+            found[path] = names, params_hash, [structured(c, Check) for c in content["qc"]]
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise PblError(
                 "FILE_FORMAT",
                 found=f"{type(error).__name__}: {error}",

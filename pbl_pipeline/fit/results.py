@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pbl_pipeline.body import SCALE_NAMES
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import check_numbers, load_npz, picture_size
+from pbl_pipeline.files import check_numbers, load_npz, picture_size, text_of, texts_of
 from pbl_pipeline.qc import Check
 from pbl_pipeline.video import Camera, check_lens
 
@@ -72,12 +73,12 @@ class TrialFit:
         check_numbers(path, data, _shapes(data["time_s"].size, data["joint_names"].size, data["marker_names"].size))
         values = {k: data[k] for k in wanted}
         for k in ("joint_names", "marker_names"):
-            values[k] = tuple(str(n) for n in values[k])
+            values[k] = texts_of(path, data, k)
         for k in ("name", "marker_set", "camera_motion", "orientation_source", "solver", "params_hash", "body_sha256"):
-            values[k] = str(values[k])
+            values[k] = text_of(path, data, k)
         for k in ("loss", "seconds", "phone_clock_offset_s"):
             values[k] = float(values[k])
-        camera = Camera(data["camera_matrix"], data["distortion"], str(data["camera_source"]))
+        camera = Camera(data["camera_matrix"], data["distortion"], text_of(path, data, "camera_source"))
         values["image_size_px"] = (0, 0)
         if not np.isnan(camera.matrix).all():  # as of markers of a laboratory
             values["image_size_px"] = picture_size(path, data["image_size_px"])
@@ -108,7 +109,7 @@ def _shapes(n: int, q: int, j: int) -> dict[str, tuple[int | None, ...]]:
     shapes: dict[str, tuple[int | None, ...]] = dict.fromkeys(("qpos", "qpos_sd"), (n, q))
     shapes |= dict.fromkeys(("residual_2d_px", "residual_3d_m"), (n, j))
     shapes |= {"time_s": (n,), "markers_world_m": (n, j, 3), "phone_quat_wxyz": (n, 4), "site_offset_m": (j, 3)}
-    shapes |= {"scale": (None,), "image_size_px": (2,), "camera_matrix": (3, 3), "distortion": (5,)}
+    shapes |= {"scale": (len(SCALE_NAMES),), "image_size_px": (2,), "camera_matrix": (3, 3), "distortion": (5,)}
     return shapes | {"loss": (), "seconds": (), "camera_position_m": (3,), "phone_clock_offset_s": ()}
 
 

@@ -153,9 +153,10 @@ def _picture(keypoints: Keypoints) -> list[Check | None]:
 
 
 def _rate(time_s: np.ndarray) -> Check | None:
-    if len(time_s) < 2:
+    interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    if not interval_s > 0:
         return None
-    rate = 1.0 / float(np.median(np.diff(time_s)))
+    rate = 1.0 / interval_s
     advice = "too few frames a second for fast movements and the moment of a step: film with 30 or 60"
     return _low("frame_rate_hz", rate, RATE_WARN_HZ, RATE_FAIL_HZ, advice)
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import check_numbers, load_npz, picture_size
+from pbl_pipeline.files import check_numbers, load_npz, picture_size, text_of, texts_of
 from pbl_pipeline.video import Attitude, Camera, check_attitude, check_lens
 
 from ._picture import Picture
@@ -181,12 +181,14 @@ class Keypoints:
             arrays["sides_changed"] = (n, 3)
         check_numbers(path, data, arrays)
         rel_sd = float(data.get("focal_rel_sd", np.nan))
-        distortion, source = data.get("distortion", np.zeros(5)), str(data.get("camera_source", _NO_SOURCE))
+        distortion, source = data.get("distortion", np.zeros(5)), _NO_SOURCE
+        if "camera_source" in data:
+            source = text_of(path, data, "camera_source")
         box_px = data["box_px"] if "box_px" in data else _box(data["xy_px"], data["confidence"])
         return cls(
             time_s=data["time_s"].astype(np.float64),
-            names=tuple(str(n) for n in data["names"]),
-            marker_set=str(data["marker_set"]),
+            names=texts_of(path, data, "names"),
+            marker_set=text_of(path, data, "marker_set"),
             xy_px=data["xy_px"],
             xyz_cam_m=data["xyz_cam_m"],
             root_relative=bool(data["root_relative"]),
@@ -197,9 +199,9 @@ class Keypoints:
             assumed=assumed,
             phone_time_s=data.get("phone_time_s"),
             phone_quat_wxyz=data.get("phone_quat_wxyz"),
-            confidence_curve=str(data.get("confidence_curve", "")),
+            confidence_curve=text_of(path, data, "confidence_curve") if "confidence_curve" in data else "",
             picture=Picture.from_arrays(path, data),
-            origin=str(data.get("origin", "")),
+            origin=text_of(path, data, "origin") if "origin" in data else "",
             sides_changed=data["sides_changed"].astype(bool) if "sides_changed" in data else None,
         )
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import check_numbers, load_npz
+from pbl_pipeline.files import check_numbers, load_npz, text_of, texts_of
+from pbl_pipeline.names import is_plain
 
 from ._trc import read_trc
 
@@ -61,6 +62,8 @@ class WorldMarkers:
             if getattr(self, field).shape != shape:
                 found = f"{field} has shape {getattr(self, field).shape}"
                 raise _format_error(found, f"shape {shape} for {n} frames, {j} names")
+        if not all(map(is_plain, (*names, self.marker_set))):
+            raise _format_error("names with control characters", "one line each")
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice or "" in names:
             raise _format_error(
@@ -97,8 +100,8 @@ class WorldMarkers:
             raise _format_error(f"no {', '.join(missing)}", f"the fields {', '.join(_FIELDS)}", path)
         n, j = data["time_s"].size, data["names"].size
         check_numbers(path, data, {"time_s": (n,), "xyz_world_m": (n, j, 3), "confidence": (n, j)})
-        names = tuple(str(name) for name in np.ravel(data["names"]))
-        values = (data["time_s"], names, str(data["marker_set"]), data["xyz_world_m"], data["confidence"])
+        names, marker_set = texts_of(path, data, "names"), text_of(path, data, "marker_set")
+        values = (data["time_s"], names, marker_set, data["xyz_world_m"], data["confidence"])
         return _about(path, *values)
 
     @classmethod

@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 from pbl_pipeline.body import load_body, marker_set
 from pbl_pipeline.bounded import parse_json
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import check_numbers, check_out_folder, load_npz
+from pbl_pipeline.files import check_numbers, check_out_folder, load_npz, text_of, texts_of
 from pbl_pipeline.gait.events import GaitEvent, GaitEvents
 from pbl_pipeline.gait.normative import gait_norm
 from pbl_pipeline.keypoints import Keypoints
@@ -208,14 +208,17 @@ class Truth:
                 data,
                 {k: tuple(n if d == "T" else j if d == "J" else int(d) for d in s) for k, s in _ARRAYS.items()},
             )
-            raw = parse_json(str(data["spec"]))
+            joint_names = texts_of(path, data, "joint_names")
+            if len(joint_names) != data["qpos"].shape[1]:
+                raise ValueError(f"{len(joint_names)} joint_names")
+            raw = parse_json(text_of(path, data, "spec"))
             raw["impairments"] = tuple(Impairment(**i) for i in raw["impairments"])
             raw["sensor"] = None if raw["sensor"] is None else PhoneSensor(**raw["sensor"])
             rows = zip(data["event_time_s"], data["event_side"], data["event"], strict=True)
             return cls(
                 events=tuple(GaitEvent(float(t), str(s), str(e), 1.0) for t, s, e in rows),
                 spec=SynthSpec(**raw),
-                joint_names=tuple(map(str, data["joint_names"])),
+                joint_names=joint_names,
                 clock_offset_s=float(data["clock_offset_s"]),
                 **{k: data[k] for k in _ARRAYS},
             )

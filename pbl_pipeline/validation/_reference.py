@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import check_numbers, load_npz
+from pbl_pipeline.files import check_numbers, load_npz, text_of, texts_of
 
 #: The joints of our body, by its own axes.
 QPOS = "qpos"
@@ -104,9 +104,10 @@ class Reference:
             )
         t, a = data["time_s"].size, data["names"].size
         check_numbers(path, data, {"time_s": (t,), "angles_deg": (t, a), "pelvis_m": (t, 3)})
-        angles = {str(n): data["angles_deg"][:, i] for i, n in enumerate(np.atleast_1d(data["names"]))}
+        angles = {n: data["angles_deg"][:, i] for i, n in enumerate(texts_of(path, data, "names"))}
         pelvis = data["pelvis_m"] if np.any(np.isfinite(data["pelvis_m"])) else None
-        return cls(str(data["name"]), str(data["source"]), str(data["convention"]), data["time_s"], angles, pelvis)
+        name, source, convention = (text_of(path, data, k) for k in ("name", "source", "convention"))
+        return cls(name, source, convention, data["time_s"], angles, pelvis)
 
 
 def _refused(name: str, found: str, expected: str) -> PblError:

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline import bounded
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import is_plain
 
 from ._attitude import CAMERA, DEVICE, check_attitude, log_error
 
@@ -92,6 +93,8 @@ def read_phone_log(path: str | Path) -> PhoneLog:
         text = read_text(path)
         is_json = text[:1000].lstrip()[:1] in ("{", "[")
         log = _read_json(path, text) if is_json else _read_csv(path, text)
+    if not is_plain(log.device):
+        raise log_error(f"a phone called {ascii(log.device)[:80]}", "a name without control characters", path)
     _check_gravity(path, log)
     return log
 

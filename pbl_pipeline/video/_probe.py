@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline import progress
+from pbl_pipeline.names import is_plain
 
 from ._container_tags import read_tags
 from ._decode import Decoder, check_file
@@ -159,7 +160,7 @@ def _recorded_utc(metadata: Mapping[str, str]) -> str | None:
 
 
 def _first(metadata: Mapping[str, str], *names: str) -> str | None:
-    lower = {key.lower(): value.strip() for key, value in metadata.items()}
+    lower = {key.lower(): value.strip() for key, value in metadata.items() if is_plain(value.strip())}
     return next((lower[name] for name in names if lower.get(name)), None)
 
 

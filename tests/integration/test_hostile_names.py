@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import html.parser
+import json
 import os
 import pickle
 import re
@@ -20,7 +21,9 @@ from pbl_pipeline.video import read_phone_log
 from schemas import fit, video
 from schemas.coded_errors import error_next_step
 from schemas.ingest import Visit, ingest
+from schemas.references import add_reference
 from schemas.report import write_session
+from tests.benchmarks import mutated_files as files
 from tests.command import pbl
 from workers.populate import populate
 
@@ -107,11 +110,28 @@ def test_names_go_through_tables_and_report_as_text(tables: None, tmp_path: Path
 
 @pytest.mark.parametrize("label", ["a\nb", "\x1b[2J", "\u2028", b"\xff".decode(errors="surrogateescape"), "v" * 65])
 @pytest.mark.parametrize("field", ["session_label", "project", "activity", "population"])
-def test_labels_hold_no_control_characters(tables: None, tmp_path: Path, field: str, label: str):
+def test_labels_hold_no_control_characters(tmp_path: Path, field: str, label: str):
     with pytest.raises(PblError) as error:
         ingest([tmp_path / "any.mp4"], dataclasses.replace(Visit(subject="P001"), **{field: label}))
     assert error.value.code == "USAGE"
     assert str(error.value).replace("\n", "").isascii()
+
+
+@pytest.mark.parametrize("field", ["dataset", "source", "origin"])
+def test_so_are_those_of_references(field: str, tmp_path: Path):
+    for label in (*REFUSED, "", "x" * 2000):
+        with pytest.raises(PblError) as error:
+            add_reference("a.mp4", tmp_path / "a.mot", **{field: label})  # type: ignore[arg-type]
+        assert error.value.code == "USAGE"
+
+
+def test_a_log_of_a_phone_with_a_hostile_name(tmp_path: Path):
+    files.log_json(tmp_path / "log.json")
+    content = json.loads((tmp_path / "log.json").read_text())
+    for name in ("\x1b[2J", "a\nb"):
+        (tmp_path / "log.json").write_text(json.dumps(content | {"phone": {"model": name}}))
+        with pytest.raises(PblError, match="PHONE_LOG"):
+            read_phone_log(tmp_path / "log.json")
 
 
 class Bomb:

@@ -14,6 +14,8 @@ from .network.predict import GRID_HZ, MAX_GAP_S, Grid, on_grid
 
 #: Somebody who sits has the hips at half of this length above the feet and more; below it the legs lie.
 MIN_HIP_HEIGHT = 0.3
+#: Longest recording (s): what lies between its time stamps is put on an even grid.
+LONGEST_S = 3600.0
 #: Cosine between where the pelvis faces and where it goes, below which the person walks backwards.
 BACKWARDS = -0.5
 
@@ -22,7 +24,8 @@ def check_preconditions(feet: FootTrajectories, least_s: float) -> tuple[Grid | 
     """The legs on an even grid, and why they are not searched: reason and advice, both empty where they are.
 
     The grid is None where the legs' joints are not known (`legs_m` None; then only the way on the ground is looked at)
-    or are in view for less than `least_s`. Raises `PblError` GAIT_INPUT: joints upside down or mirrored.
+    or are in view for less than `least_s`. Raises `PblError` GAIT_INPUT: joints upside down, mirrored or all
+    at one place, or more than `LONGEST_S`.
     """
     grid, reason, advice = _grid(feet, least_s)
     if not reason and feet.heading_agreement < BACKWARDS:
@@ -38,6 +41,9 @@ def _grid(feet: FootTrajectories, least_s: float) -> tuple[Grid | None, str, str
     if len(time) < 4 or time[-1] - time[0] < least_s:
         return None, f"the person is in view for less than {least_s:g} s", "film at least three steps"
     step_s = float(np.median(np.diff(time)))
+    if time[-1] - time[0] > LONGEST_S:
+        said = f"{time[-1] - time[0]:.3g} s from the first to the last time stamp"
+        raise input_error(said, f"at most {LONGEST_S:g} s of one recording: are the time stamps in seconds?")
     if step_s > MAX_GAP_S:
         said = f"frames {step_s:.3g} s apart: gait events cannot be seen in these"
         return None, said, "check that the time stamps are in seconds"
@@ -45,6 +51,8 @@ def _grid(feet: FootTrajectories, least_s: float) -> tuple[Grid | None, str, str
     hips = grid.known[:, 0].all(axis=1)
     if np.count_nonzero(hips) < least_s * GRID_HZ or not math.isfinite(grid.leg_m):
         return None, f"hips and feet are seen for less than {least_s:g} s", "film the whole person"
+    if not grid.leg_m > 0:
+        raise input_error("hips, knees and feet at one place", "the joints of a person, in metres")
     for s, side in enumerate(SIDES):
         if not np.any(grid.known[hips, 2:, s]):
             return grid, f"the {side} foot is never seen", "film from where both legs are in view"

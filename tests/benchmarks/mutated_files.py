@@ -1,0 +1,377 @@
+"""One sound file of each kind that is read, and what the commands do with it: for `mutated`."""
+
+from __future__ import annotations
+
+import functools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.body import joint_angles, load_body, load_marker_set
+from tests.inputs import CALIBRATION, csv_log
+from tests.walking_fit import walking_fit
+
+N, FPS = 90, 30.0
+SIZE_PX = (1920, 1080)
+
+
+@functools.cache
+def _fit():
+    body = load_body()
+    return walking_fit(body.joint_names, body.sha256, n_frames=N, fps=FPS)
+
+
+@functools.cache
+def _synthetic():
+    from pbl_pipeline.synthetic import SynthSpec, synthesise
+
+    return synthesise(SynthSpec(seconds=3.0, marker_set="blazepose_33", camera="panned"))
+
+
+# --------------------------------------------------------------------------------------------------------------- videos
+def video(path: Path) -> None:
+    from tests.videos import constant_rate, numbered_frames, write_video
+
+    codec = {".mp4": "libx264", ".webm": "libvpx", ".avi": "mpeg4"}[path.suffix]
+    write_video(
+        path, numbered_frames(12), constant_rate(12), codec, ticks_per_s=30 if path.suffix == ".avi" else 90_000
+    )
+
+
+def phone_video(path: Path) -> None:
+    from tests.quicktime import edit_list, insert, meta
+    from tests.videos import constant_rate, numbered_frames, write_video
+
+    write_video(path, numbered_frames(12), constant_rate(12), rotation_deg=90, b_frames=2)
+    tags = {"com.apple.quicktime.camera.focal_length.35mm_equivalent": 27, "com.apple.quicktime.camera.lens_model": "x"}
+    insert(path, of_track=meta(tags), of_file=meta({"com.apple.quicktime.model": "iPhone 13"}))
+    insert(path, of_track=edit_list([(400, 0, 1.0)]))
+
+
+def use_video(path: Path) -> None:
+    from pbl_pipeline.video import check_timing, find_camera, phone_lens, probe, read_first, read_frames
+
+    read_first(path)
+    info = probe(path)
+    check_timing(info)
+    phone_lens(info)
+    find_camera(info)
+    for frame in read_frames(path, step=5):
+        assert frame.image.shape[:2] == (info.height_px, info.width_px)
+
+
+# ------------------------------------------------------------------------------------------------ keypoints and markers
+def keypoints(path: Path) -> None:
+    _synthetic().keypoints.save(path)
+
+
+def use_keypoints(path: Path) -> None:
+    from pbl_pipeline.fit import check_trial
+    from pbl_pipeline.gait import detect_events, feet_from_keypoints
+    from pbl_pipeline.keypoints import Keypoints, check_keypoints, visibility
+
+    found = Keypoints.load(path)
+    check_keypoints(found)
+    visibility(found)
+    check_trial(found, "walk")
+    _pack(found)
+    detect_events(feet_from_keypoints(found), "zeni-2008")
+
+
+def _pack(trial: Any) -> None:
+    """What a fit does before it solves."""
+    from pbl_pipeline.fit import METHODS
+    from pbl_pipeline.fit.session import make_session
+
+    motion = "handheld" if getattr(trial, "phone_time_s", None) is not None else "static"
+    make_session([trial], ["walk"], METHODS.find(None).params.view, [motion])
+
+
+def markers(path: Path) -> None:
+    from pbl_pipeline.body import marker_set
+    from pbl_pipeline.keypoints import WorldMarkers
+
+    truth = _synthetic().truth
+    seen = np.ones(truth.markers_world_m.shape[:2])
+    WorldMarkers(truth.time_s, marker_set("blazepose_33").names, "blazepose_33", truth.markers_world_m, seen).save(path)
+
+
+def use_markers(path: Path) -> None:
+    from pbl_pipeline.fit import check_trial
+    from pbl_pipeline.gait import detect_events, feet_from_markers
+    from pbl_pipeline.keypoints import WorldMarkers
+
+    seen = WorldMarkers.load(path)
+    check_trial(seen, "walk", "markers")
+    _pack(seen)
+    feet = feet_from_markers(seen.time_s, seen.names, seen.marker_set, seen.xyz_world_m, seen.confidence)
+    detect_events(feet, "oconnor-2007")
+
+
+def trc(path: Path) -> None:
+    rows = []
+    for i in range(60):
+        points = [100.0 + i, 900.0, 200.0, 110.0 + i, 1600.0, 210.0]
+        rows.append("\t".join(map(str, [i + 1, round(i / 100, 2), *points])))
+    from tests.inputs import trc_text
+
+    path.write_text(trc_text(rows))
+
+
+def use_trc(path: Path) -> None:
+    from pbl_pipeline.keypoints import WorldMarkers
+
+    WorldMarkers.from_trc(path, "lab").select(["Hip", "Head"])
+
+
+def marker_set(path: Path) -> None:
+    names = ["name,body,x,y,z,weight_3d", *(f"m{i},{b},0.01,0.0{i},0,1" for i, b in enumerate(["pelvis", "femur_r"]))]
+    path.write_text("\n".join(["# a table", *names]) + "\n")
+
+
+def use_marker_set(path: Path) -> None:
+    load_marker_set(path)
+
+
+# ------------------------------------------------------------------------------------------- fits, truths, references
+def fit(path: Path) -> None:
+    _fit().save(path)
+
+
+def use_fit(path: Path) -> None:
+    from pbl_pipeline.export import write_angles_csv
+    from pbl_pipeline.fit import TrialFit
+    from pbl_pipeline.gait import gait_metrics
+    from pbl_pipeline.validation import compare
+
+    found = TrialFit.load(path)
+    metrics = gait_metrics([found])
+    metrics.table()
+    metrics.save(path.with_suffix(".json"))
+    write_angles_csv(found, path.with_suffix(".csv"))
+    compare(found, _reference())
+    use_reference(path)
+
+
+def truth(path: Path) -> None:
+    _synthetic().truth.save(path)
+
+
+@functools.cache
+def _reference():
+    from pbl_pipeline.validation import QPOS, Reference
+
+    found = _fit()
+    angles = joint_angles(found.joint_names, found.qpos)
+    kept = {n: angles[n] for n in ("knee_flexion_r", "knee_flexion_l", "hip_flexion_r", "pelvis_tilt")}
+    return Reference("walk", "synthetic", QPOS, found.time_s, kept, np.zeros((N, 3)))
+
+
+def reference(path: Path) -> None:
+    _reference().save(path)
+
+
+def use_reference(path: Path) -> None:
+    from pbl_pipeline.validation import QPOS, compare
+    from schemas.references import read_reference
+
+    found = read_reference(path)
+    if found.convention == QPOS:
+        compare(_fit(), found)
+
+
+def mot(path: Path) -> None:
+    names = ["time", "knee_angle_r", "knee_angle_l", "hip_flexion_r", "pelvis_tx", "pelvis_ty", "pelvis_tz"]
+    rows = [[i / FPS, -20 - 15 * np.sin(i), -20 + 15 * np.sin(i), 5.0, i / FPS, 0.9, 0.0] for i in range(N)]
+    lines = [
+        "Coordinates",
+        "inDegrees=yes",
+        "endheader",
+        " ".join(names),
+        *(" ".join(f"{v:.4f}" for v in r) for r in rows),
+    ]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def bodies(path: Path) -> None:
+    import gzip
+
+    names = ("pelvis", "femur_r", "tibia_r", "talus_r", "calcn_r", "femur_l", "tibia_l", "talus_l", "calcn_l", "torso")
+    one = {"rotation": [[0.1, 0.2, 0.01 * i] for i in range(N)], "translation": [[0.0, 1.0, i / FPS] for i in range(N)]}
+    text = json.dumps({"time": [i / FPS for i in range(N)], "bodies": dict.fromkeys(names, one)})
+    path.write_bytes(gzip.compress(text.encode()) if path.suffix == ".gz" else text.encode())
+
+
+# ------------------------------------------------------------------------------------------------------- laboratories
+def c3d(path: Path) -> None:
+    import gzip
+    import io
+
+    import c3d as package
+
+    from pbl_pipeline.gait import PLUG_IN_GAIT_POINTS
+
+    points = dict.fromkeys(side + p for p, _ in PLUG_IN_GAIT_POINTS.values() for side in "LR")
+    places = {"ASI": (100, 950), "HEE": (-50, 50), "TOE": (150, 40), "KNE": (50, 500), "ANK": (0, 100)}
+    names = [*points, *(side + m for m in places for side in "LR")]
+    writer = package.Writer(point_rate=100.0, analog_rate=100.0)
+    writer.set_point_labels(names)
+    for i in range(120):
+        frame = np.zeros((len(names), 5))
+        frame[:, :3] = 20 + 15 * np.sin(i / 15 + np.arange(3 * len(names)).reshape(-1, 3))
+        for k, n in enumerate(names):
+            if n[1:] in places:
+                x, z = places[n[1:]]
+                swing = 250 * np.sin(i / 17 + (np.pi if n[0] == "L" else 0)) * (z < 600)
+                frame[k, :3] = [x + 12 * i + swing, 100 if n[0] == "L" else -100, z]
+        writer.add_frames([(frame, np.zeros((0, 1)))])
+    out = io.BytesIO()
+    writer.write(out)
+    path.write_bytes(gzip.compress(out.getvalue()) if path.suffix == ".gz" else out.getvalue())
+
+
+def use_c3d(path: Path) -> None:
+    from pbl_pipeline.gait import GILLETTE_MODEL, detect_events, gait_metrics, read_lab_feet, read_lab_trial
+
+    detect_events(read_lab_feet(path), "zeni-2008")
+    gait_metrics([read_lab_trial(path, method="zeni-2008")], model=GILLETTE_MODEL)
+
+
+def events(path: Path) -> None:
+    rows = [f"{i / 4:.3f},{'left' if i % 2 else 'right'},foot_{'down' if i % 4 < 2 else 'up'},0.9" for i in range(20)]
+    path.write_text("\n".join(["time_s,side,event,probability", *rows]) + "\n")
+
+
+def use_events(path: Path) -> None:
+    from pbl_pipeline.gait import load_events
+
+    load_events(path)
+
+
+# --------------------------------------------------------------------------------------------------- cameras and phones
+def camera(path: Path) -> None:
+    content = {
+        "camera_matrix": [[1500, 0, 960], [0, 1500, 540], [0, 0, 1]],
+        "distortion": [0.1, -0.2, 0.001, 0.001, 0.05],
+        "image_size_px": list(SIZE_PX),
+        "focal_sd_px": 3.0,
+        "phone": {"make": "Apple", "model": "iPhone 13", "lens": "back", "focal_35mm": 27.0, "rate": 30},
+        "video": {"name": "a.mov", "sha256": "0" * 64, "rotation_deg": 90},
+    }
+    path.write_text(json.dumps(content))
+
+
+def use_camera(path: Path) -> None:
+    from pbl_pipeline.video import FirstPicture, calibrated_camera, load_camera, load_lens_calibration
+
+    load_camera(path, SIZE_PX)
+    load_lens_calibration(path)
+    calibrated_camera(path, FirstPicture("a.mov", 1080, 1920, 0, "Apple", "iPhone 13", "back", 27.0))
+
+
+def cameras(path: Path) -> None:
+    path.write_text(CALIBRATION)
+
+
+def use_cameras(path: Path) -> None:
+    from pbl_pipeline.keypoints import cameras_of_files
+    from pbl_pipeline.video import load_camera, load_camera_poses
+
+    load_camera_poses(path)
+    cameras_of_files(["walk.cam_01", "walk.cam_02"], path)
+    load_camera(path, (1000, 1000), "cam_01")
+
+
+def log(path: Path) -> None:
+    csv_log(path, [0.5, -0.5, 0.5, -0.5], {"ax": 0.0, "ay": 9.81, "az": 0.0, "start_utc": "2026-03-01T09:15:30Z"}, n=60)
+
+
+def log_json(path: Path) -> None:
+    time_s = [round(0.02 * i, 3) for i in range(60)]
+    content = {name: [value] * 60 for name, value in zip(("qw", "qx", "qy", "qz"), (0.5, -0.5, 0.5, -0.5), strict=True)}
+    gravity = {"time_s": time_s, "x": [0.0] * 60, "y": [9.81] * 60, "z": [0.0] * 60}
+    more = {"frame": "camera", "start_utc": "2026-03-01T09:15:30Z", "phone": {"make": "A", "model": "B"}}
+    path.write_text(json.dumps({"time_s": time_s, **content, "accelerometer": gravity, **more}))
+
+
+def sensor_logger(path: Path) -> None:
+    import tempfile
+
+    from tests.phone_film import as_zip
+    from tests.phone_film import sensor_logger as export
+
+    with tempfile.TemporaryDirectory() as folder:
+        as_zip(export(Path(folder) / "walk", 0.6)).replace(path)
+
+
+def use_log(path: Path) -> None:
+    from pbl_pipeline.video import load_attitude
+
+    load_attitude(path)
+
+
+# ------------------------------------------------------------------------------------------------- parameters and norms
+def params(path: Path) -> None:
+    path.write_text(json.dumps({"base": "blazepose", "max_iterations": 20, "cost": {"weight_2d": 0.05}}))
+
+
+def use_params(path: Path) -> None:
+    from pbl_pipeline.cli._options import fit_paramset
+
+    method = fit_paramset(None, str(path))
+    assert method.hash
+    method.paramset.canonical_json.encode()
+
+
+def norm(path: Path) -> None:
+    from pbl_pipeline.gait import load_norm
+
+    load_norm().save(path)
+
+
+def use_norm(path: Path) -> None:
+    from pbl_pipeline.gait import gait_metrics, load_norm
+
+    metrics = gait_metrics([_fit()], load_norm(str(path)))
+    metrics.table()
+
+
+def session(path: Path) -> None:
+    found = _fit()
+    check = {"check": "residual_3d_cm", "outcome": "WARN", "value": 7.0, "threshold": 6.0, "advice": "see"}
+    path.write_text(json.dumps({"trials": [found.name], "params_hash": found.params_hash, "qc": [check]}))
+
+
+def use_session(path: Path) -> None:
+    from pbl_pipeline.cli.gait import fit_checks
+    from pbl_pipeline.gait import gait_metrics
+
+    if path.name != "session.json":
+        path = path.rename(path.with_name("session.json"))
+    checks = fit_checks([path.parent / "walk.fit.npz"], [_fit()])
+    gait_metrics([_fit()], fit_checks=checks).with_checks(checks).save(path.with_name("metrics.json"))
+
+
+def model(path: Path) -> None:
+    from tests import dot_models
+
+    folder = dot_models.write(path.parent / "dots", _graph(), dot_models.spec("crop3d", (64, 64)))
+    path.write_bytes((folder / "model.json").read_bytes())
+
+
+@functools.cache
+def _graph():
+    from tests import dot_models
+
+    return dot_models.crop3d(dot_models.person(), (64, 64))
+
+
+def use_model(path: Path) -> None:
+    from pbl_pipeline.models import load_spec
+
+    folder = path.parent / "spec"
+    folder.mkdir(exist_ok=True)
+    (folder / "model.json").write_bytes(path.read_bytes())
+    load_spec(folder)

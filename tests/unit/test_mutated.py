@@ -1,0 +1,99 @@
+"""A few files of each kind of `tests.benchmarks.mutated`, and those whose fault chance seldom finds."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pbl_pipeline.errors import PblError
+from tests.benchmarks import mutated_files as files
+from tests.benchmarks.mutated import kinds, outcomes
+from tests.guard import guarded
+
+KINDS = {kind.name: kind for kind in kinds()}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_mutated_files_have_a_result_or_a_code(tmp_path: Path, name: str):
+    n = 2 if name in ("walk.fit.npz", "session.json", "norm.json") else 5
+    found = list(outcomes(KINDS[name], range(n), tmp_path))
+    assert not [o for o in found if o.what.startswith("!")]
+
+
+def changed(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+    with np.load(path) as f:
+        arrays = {k: f[k] for k in f.files}
+    change(arrays)
+    np.savez(path, **arrays)
+    return path
+
+
+def last_stamp(value: float) -> Callable[[dict[str, Any]], object]:
+    def change(arrays: dict[str, Any]) -> None:
+        arrays["time_s"][-1] = value
+
+    return change
+
+
+def put(**values: Any) -> Callable[[dict[str, Any]], object]:
+    return lambda arrays: arrays.update(values)
+
+
+def scaled(name: str, by: float) -> Callable[[dict[str, Any]], object]:
+    return lambda arrays: arrays.update({name: arrays[name] * by})
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "code"),
+    [
+        ("walk.keypoints.npz", scaled("xyz_cam_m", 0.0), "GAIT_INPUT"),  # all joints at one place: a leg of length 0
+        ("walk.keypoints.npz", scaled("time_s", 0.0), "FIT_INPUT"),
+        ("walk.keypoints.npz", put(image_size_px=np.array([np.nan, 1.0])), "FILE_FORMAT"),
+        ("walk.keypoints.npz", put(names=np.asarray(["a\x1b[2J"] * 33)), "FILE_FORMAT"),
+        ("walk.keypoints.npz", put(marker_set=np.asarray(["blazepose_33"])), "FILE_FORMAT"),
+        ("lab.markers.npz", scaled("xyz_world_m", 0.0), "GAIT_INPUT"),
+        ("lab.markers.npz", last_stamp(1e5), "GAIT_INPUT"),  # its even grid would have ten million moments
+        ("lab.markers.npz", last_stamp(1e9), "GAIT_INPUT"),
+        ("walk.fit.npz", put(scale=np.ones(3)), "FILE_FORMAT"),
+        ("walk.fit.npz", put(scale=np.zeros(8)), "GAIT_INPUT"),
+        ("walk.fit.npz", last_stamp(1e9), "GAIT_INPUT"),
+        ("walk.fit.npz", put(name=np.asarray("a\nb")), "FILE_FORMAT"),
+        ("walk.fit.npz", put(joint_names=np.asarray("a")), "FILE_FORMAT"),
+        ("walk.fit.npz", put(camera_matrix=np.array([[9.0, 1, 1], [0, 9, 1], [0, 0, 1]])), "CAMERA_INVALID"),
+        ("walk.truth.npz", put(joint_names=np.asarray(["a"] * 30)), "FILE_FORMAT"),
+        ("walk.truth.npz", put(qpos=np.zeros((90, 39))), "FILE_FORMAT"),
+        ("walk.truth.npz", put(pelvis_m=np.zeros((90, 2))), "FILE_FORMAT"),
+        ("walk.truth.npz", put(outlier=np.asarray(1)), "FILE_FORMAT"),
+        ("walk.truth.npz", put(spec=np.asarray('{"a":' * 5000)), "FILE_FORMAT"),
+        ("walk.reference.npz", put(source=np.asarray("\x1b[2J")), "FILE_FORMAT"),
+        ("walk.reference.npz", put(names=np.asarray([["a", "b"], ["c", "d"]])), "FILE_FORMAT"),
+    ],
+)
+def test_faults_in_arrays(tmp_path: Path, kind: str, change: Callable[[dict[str, Any]], object], code: str):
+    KINDS[kind].write(tmp_path / kind)
+    path = changed(tmp_path / kind, change)
+    with guarded() as peak, pytest.raises(PblError) as error:
+        KINDS[kind].use(path)
+    assert error.value.code == code
+    assert peak.grown_mib < 256
+
+
+def test_of_an_hour_the_legs_on_an_even_grid_stay_small(tmp_path: Path):
+    files.fit(tmp_path / "a.fit.npz")
+    path = changed(tmp_path / "a.fit.npz", last_stamp(3590.0))
+    with guarded() as peak:
+        files.use_fit(path)
+    assert peak.grown_mib < 512
+
+
+@pytest.mark.parametrize("value", [None, 3, "text", [1], {"trials": 3}, {"trials": None, "params_hash": 1, "qc": []}])
+def test_a_session_file_that_makes_no_sense(tmp_path: Path, value: object):
+    path = tmp_path / "session.json"
+    path.write_text(json.dumps(value))
+    with pytest.raises(PblError, match="FILE_FORMAT"):
+        files.use_session(path)
