@@ -12,27 +12,34 @@ from pbl_pipeline.gait.normative import GaitNorm, gait_norm
 
 from ._camera import LEVEL_R_NC, PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor, picture_px
 from ._impair import IMPAIRMENTS, Impairment
-from ._noise import BLAZEPOSE_NOISE, NO_NOISE, Noise
+from ._noise import BLAZEPOSE_MEASURED, BLAZEPOSE_NOISE, DETECTORS, METRABS_MEMORY, NO_NOISE, DetectorModel, Noise
 from ._observe import Seen, observe, pelvis_positions
 from ._path import PATHS
 from ._person import person, true_markers
+from ._physique import physique
+from ._scene import VIEWS_DEG
 from ._solve import SOLE_POINTS, sole_points
-from ._synth import TASKS, Synthetic, SynthSpec, Truth, speed_of_group, synthesise
+from ._synth import TASKS, Synthetic, SynthSpec, Truth, lens, speed_of_group, synthesise
 from ._views import VIEW_CAMERA, VIEW_SIZE_PX, observe_markers, observe_views
-from ._walk import plain_walk, walk_qpos
+from ._walk import plain_walk, turned, walk_qpos
 
 __all__ = [
+    "BLAZEPOSE_MEASURED",
     "BLAZEPOSE_NOISE",
+    "DETECTORS",
     "IMPAIRMENTS",
     "LEVEL_R_NC",
+    "METRABS_MEMORY",
     "NO_NOISE",
     "PATHS",
     "PHONE_CAMERA",
     "PHONE_SIZE_PX",
     "SOLE_POINTS",
     "TASKS",
+    "VIEWS_DEG",
     "VIEW_CAMERA",
     "VIEW_SIZE_PX",
+    "DetectorModel",
     "GaitNorm",
     "Impairment",
     "Noise",
@@ -42,16 +49,19 @@ __all__ = [
     "Synthetic",
     "Truth",
     "gait_norm",
+    "lens",
     "observe",
     "observe_markers",
     "observe_views",
     "pelvis_positions",
     "person",
+    "physique",
     "picture_px",
     "plain_walk",
     "sole_points",
     "speed_of_group",
     "synthesise",
     "true_markers",
+    "turned",
     "walk_qpos",
 ]

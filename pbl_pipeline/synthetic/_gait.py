@@ -9,10 +9,11 @@ from pbl_pipeline.gait.normative import harmonic_sum
 #: Degrees over one gait cycle of one side, its foot contact at phase 0: the mean, then (cosine, sine) of harmonic 1, 2
 #: and so on. The project's own numbers: harmonics through values written down every 5 % of the cycle to follow the
 #: course of textbook curves of healthy adults at their own speed (Perry and Burnfield, Gait Analysis, 2010; the shape
-#: of the group means of Schwartz et al. 2008, J Biomech 41:1639). Hip flexion is taken against a pelvis that is tipped
-#: forward by 10 deg. Subtalar: inversion positive; mtp: extension positive.
+#: of the group means of Schwartz et al. 2008, J Biomech 41:1639). Hip flexion is that of the fitted body, whose pelvis
+#: is level where Plug-in Gait's tips forward by 12 deg (`normative.offset_deg`). Subtalar: inversion positive; mtp:
+#: extension positive.
 SIDE_CURVES_DEG: dict[str, tuple[float, ...]] = {
-    "hip_flexion": (18.0, 21.0, -3.9, -3.3, -0.9, -0.1, 1.2, -0.2, -0.2),
+    "hip_flexion": (6.0, 21.0, -3.9, -3.3, -0.9, -0.1, 1.2, -0.2, -0.2),
     "hip_adduction": (0.0, 1.7, 5.8, -0.3, -0.8, -0.9, 1.1, -0.1, -0.1),
     "hip_rotation": (0.2, 0.6, 2.8, -0.3, 0.0, -0.5, 1.1, 0.2, 0.0),
     "knee_flexion": (23.9, -1.7, -19.9, -14.8, 6.4, -0.8, 3.8, -0.8, 0.1, -0.2, 0.6, 0.2, 0.0),
@@ -32,10 +33,10 @@ SIDE_CURVES_DEG: dict[str, tuple[float, ...]] = {
 #: The same for pelvis and trunk over the cycle of the right side. Pelvis: posterior tilt, right side down and right
 #: side ahead positive, against the walking direction (the signs of the model's axes forward, up, right).
 MIDDLE_CURVES_DEG: dict[str, tuple[float, ...]] = {
-    "tilt": (-10.0, 0.0, 0.0, 0.8, 0.9),
+    "tilt": (2.0, 0.0, 0.0, 0.8, 0.9),
     "list": (0.0, -2.3, -2.8, 0.0, 0.0, -0.6, 0.5),
     "rotation": (0.0, 4.2, -1.2, 0.0, 0.0, 0.4, 0.3),
-    "lumbar_extension": (6.0, 0.0, 0.0, -0.9, -0.7),
+    "lumbar_extension": (-6.0, 0.0, 0.0, -0.9, -0.7),
     "lumbar_bending": (0.0, 2.6, 3.3, 0.0, 0.0, 0.5, -0.4),
     "lumbar_rotation": (0.0, -8.2, 1.6, 0.0, 0.0, -0.3, -0.2),
     "neck_extension": (2.0, 0.0, 0.0, 0.5, -0.4),

@@ -10,7 +10,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 
 from pbl_pipeline.body import joint_of, load_body
-from pbl_pipeline.gait import LEG_ANGLES
+from pbl_pipeline.gait import BODY_ANGLES, LEG_ANGLES, PLUG_IN_GAIT, offset_deg
 from pbl_pipeline.gait.normative import GRAVITY, gait_norm, harmonic_sum
 
 from ._gait import MIDDLE_CURVES_DEG, OFFSET_SD_DEG, SIDE_CURVES_DEG, swing, wander, within
@@ -19,17 +19,20 @@ from ._plan import GRID_STEP_S, Plan
 
 #: Curves that drive the pelvis (sign, joint), by the right side's cycle; the model's tilt and list count the other way.
 PELVIS = {"pelvis_tilt": (-1, "tilt"), "pelvis_obliquity": (-1, "list"), "pelvis_rotation": (1, "rotation")}
-#: A person's mean of a curve differs from the norm's by this fraction of its standard deviation, and its range by this.
-OFFSET_SHARE, RANGE_SD, SIDES_SHARE = 0.6, 0.06, 0.15
+#: How people differ, as fractions of the norm's standard deviation: the mean of a curve, each coefficient of its first
+#: harmonics, the mean of one side against the other; and of its range. With these, healthy people of many seeds spread
+#: about the norm as the norm's own people do: an index of about 100, standard deviation about 10 (docs/synth.md).
+OFFSET_SHARE, SHAPE_SHARE, SIDES_SHARE, RANGE_SD = 1.0, 0.5, 0.2, 0.1
+SHAPE_HARMONICS = 2
 #: Within a walk: of a curve's range, of its mean (deg), over seconds.
 WALK_RANGE_SD, WALK_MEAN_SD_DEG = 0.02, 0.5
 _SLOW_HZ = (0.05, 0.7)
-#: Standing upright, both sides (deg).
+#: Standing upright, both sides (deg), as the body's joints count: the pelvis is level (`BODY_ANGLES`).
 STANDING_DEG = {
-    "hip_flexion": 13.0,
+    "hip_flexion": 1.0,
     "knee_flexion": 4.0,
     "ankle_angle": 2.0,
-    "tilt": -11.0,
+    "tilt": 1.0,
     "lumbar_extension": 0.0,
     "arm_flex": -5.0,
     "elbow_flex": 15.0,
@@ -94,7 +97,7 @@ def reference(
     whatever the style: severity 0 is the healthy walk of the seed.
     """
     norm, body = gait_norm(), load_body()
-    rng = np.random.default_rng([seed, 20])
+    rng, shape_rng = np.random.default_rng([seed, 20]), np.random.default_rng([seed, 24])
     column = {n: i for i, n in enumerate(body.joint_names)}
     t = plan.grid_s
     speed = plan.speed_m_per_s / np.sqrt(GRAVITY * leg_m)
@@ -108,12 +111,13 @@ def reference(
     for angle, of_body in LEG_ANGLES.items():
         joint, sign = joint_of(of_body)
         z, size = within(rng, 0.0, OFFSET_SHARE, 1.6), within(rng, 1.0, RANGE_SD)
+        shape = _shape(shape_rng)
         for side in "rl":
             own = z + within(rng, 0.0, SIDES_SHARE)
             if angle == "hip_rotation":
                 # The shank of the body has no torsion: the foot's direction on the floor is the hip's rotation.
                 own = (HIP_ROTATION_DEG - np.degrees(toe_out_rad)) / norm.sd_deg[angle][2, 0]
-            deg = _curve(rng, t, angle, phases[side], speed, own, size)
+            deg = _curve(rng, t, angle, phases[side], speed, own, size, shape)
             if angle == "knee_flexion":
                 deg = _knee(deg, plan, style, side, phases[side], speed, foot_off)
             deg = _impaired(deg, angle, style, side, swings[side])
@@ -161,12 +165,21 @@ def reference(
     return np.radians(q), sway
 
 
-def _curve(rng, t, angle: str, phase, speed, z: float, size: float) -> np.ndarray:
-    """A person's curve: the norm's, its mean moved by z standard deviations, its range stretched."""
+def _shape(rng) -> tuple[float, ...]:
+    """How a person's curve differs in shape: a harmonic sum without a mean, in standard deviations of the norm."""
+    return (0.0, *(within(rng, 0.0, SHAPE_SHARE) for _ in range(2 * SHAPE_HARMONICS)))
+
+
+def _curve(rng, t, angle: str, phase, speed, z: float, size: float, shape: tuple[float, ...] = (0.0,)) -> np.ndarray:
+    """A person's curve: the norm's, its mean moved by z standard deviations, its range stretched, as the body counts.
+
+    The norm's curves are Plug-in Gait's.
+    """
     norm = gait_norm()
     mean = norm.curve(angle, phase, speed)
     middle = norm.coefficients(angle, speed)[..., 0]
-    offset = z * norm.coefficients(angle, speed, sd=True)[..., 0]
+    sd = norm.coefficients(angle, speed, sd=True)[..., 0]
+    offset = sd * (z + swing(shape, phase)) + offset_deg(angle, PLUG_IN_GAIT, BODY_ANGLES)
     stretch = size * (1 + wander(rng, t, WALK_RANGE_SD, *_SLOW_HZ))
     return middle + offset + stretch * (mean - middle) + wander(rng, t, WALK_MEAN_SD_DEG, *_SLOW_HZ)
 

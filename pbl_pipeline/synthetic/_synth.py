@@ -23,11 +23,10 @@ from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.video import Camera
 
 from . import _tasks
-from ._camera import PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor, phone_log, picture_px
+from ._camera import PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor
 from ._impair import Impairment, style_of
 from ._noise import NO_NOISE, Noise
-from ._observe import hide, pelvis_positions, seen_by
-from ._person import true_markers
+from ._observe import film, outside_picture, pelvis_positions
 from ._physique import leg_length_m, physique
 from ._plan import Plan
 from ._reference import reference
@@ -311,21 +310,25 @@ def synthesise(spec: SynthSpec) -> Synthetic:
     phone_m = CubicSpline(scene.plan.grid_s, phone)(time_s)
     pelvis = pelvis_positions(qpos)
 
-    R_nc_at = orientation(spec.camera, scene.carried, time_s, pelvis, spec.seed)
-    R_nc, camera, size_px = R_nc_at(time_s), *_lens(spec)
-    x_world = true_markers(qpos, markers, scale, site_offset)
-    points_rng = np.random.default_rng([spec.seed, 4])
-    noise = NOISES[spec.noise]
-    seen = seen_by(points_rng, noise, time_s, x_world, R_nc, np.zeros(3), markers, camera, size_px, spec.root_relative)
-    keypoints, outlier = seen
-    outside = _outside(x_world, R_nc, camera, size_px)
-    _check_in_view(outside, spec)
-    keypoints = hide(keypoints, outside)
+    camera, size_px = lens(spec.view, spec.camera)
     sensor = spec.sensor or (PhoneSensor() if spec.camera != "static" else None)
-    if sensor is not None:
-        rng = np.random.default_rng([spec.seed, 23])
-        stamps, quat = phone_log(rng, sensor, R_nc_at, float(time_s[0]), float(time_s[-1]))
-        keypoints = dataclasses.replace(keypoints, phone_time_s=stamps, phone_quat_wxyz=quat)
+    seen = film(
+        qpos,
+        time_s,
+        orientation(spec.camera, scene.carried, time_s, pelvis, spec.seed),
+        markers=markers,
+        scale=scale,
+        site_offset_m=site_offset,
+        noise=NOISES[spec.noise],
+        rng=np.random.default_rng([spec.seed, 4]),
+        camera=camera,
+        image_size_px=size_px,
+        sensor=sensor,
+        sensor_rng=np.random.default_rng([spec.seed, 23]),
+        root_relative=spec.root_relative,
+        only_in_picture=True,
+    )
+    _check_in_view(outside_picture(seen.markers_world_m, seen.R_nc, camera, size_px), spec)
     truth = Truth(
         time_s=time_s,
         joint_names=body.joint_names,
@@ -333,39 +336,32 @@ def synthesise(spec: SynthSpec) -> Synthetic:
         events=_events(scene.plan, float(time_s[-1])),
         scale=scale,
         site_offset_m=site_offset,
-        R_nc=R_nc,
+        R_nc=seen.R_nc,
         phone_position_m=phone_m,
         pelvis_m=pelvis,
-        markers_world_m=x_world,
+        markers_world_m=seen.markers_world_m,
         floor_height_m=-scene.height_m - phone_m[:, 2],
         heel_on_floor=_on_floor(scene.plan, time_s, "heel_s"),
         ball_on_floor=_on_floor(scene.plan, time_s, "ball_s"),
         belt_m_per_s=belt,
-        clock_offset_s=sensor.clock_offset_s if sensor is not None else float("nan"),
-        outlier=outlier & ~outside,
+        clock_offset_s=seen.clock_offset_s,
+        outlier=seen.outlier,
         spec=spec,
     )
-    return Synthetic(keypoints, truth)
+    return Synthetic(seen.keypoints, truth)
 
 
 #: From the pelvis' origin to the origin of the calcaneus, standing upright (m, unscaled).
 HEEL_AHEAD_M = -0.128
 
 
-def _lens(spec: SynthSpec) -> tuple[Camera, tuple[int, int]]:
+def lens(view: str, camera: str) -> tuple[Camera, tuple[int, int]]:
     """An upright picture, or one on its side where a standing phone sees a person go by."""
-    if spec.camera != "static" or spec.view not in ("sagittal", "oblique"):
+    if camera != "static" or view not in ("sagittal", "sagittal_right", "oblique"):
         return PHONE_CAMERA, PHONE_SIZE_PX
     matrix = PHONE_CAMERA.matrix.copy()
     matrix[:2, 2] = (LANDSCAPE_PX[0] - 1) / 2, (LANDSCAPE_PX[1] - 1) / 2
     return Camera(matrix, PHONE_CAMERA.distortion, PHONE_CAMERA.source), LANDSCAPE_PX
-
-
-def _outside(x_world, R_nc, camera: Camera, size_px: tuple[int, int]) -> np.ndarray:
-    x_cam = np.einsum("tba,tjb->tja", R_nc, x_world)
-    behind = x_cam[..., 2] < 0.2
-    px = picture_px(np.where(behind[..., None], [0.0, 0.0, 1.0], x_cam), camera)
-    return behind | np.any((px < 0) | (px > np.array(size_px) - 1), axis=-1)
 
 
 def _check_in_view(outside: np.ndarray, spec: SynthSpec) -> None:

@@ -81,7 +81,7 @@ def standing(walker: Walker, seconds: float) -> Plan:
     rng = np.random.default_rng([walker.seed, 14])
     sway = {
         "ankle_angle": wander(rng, t, 0.5, 0.05, 0.8),
-        "hip_flexion": 11.0 + wander(rng, t, 0.5, 0.05, 0.8),
+        "hip_flexion": -1.0 + wander(rng, t, 0.5, 0.05, 0.8),
         "lumbar_extension": wander(rng, t, 0.7, 0.05, 0.8),
     }
     sway["ankle_angle"] += 2.0
@@ -115,13 +115,13 @@ def squat(walker: Walker, seconds: float) -> Plan:
         depth += deep * (ease((t - at) / one_way) - ease((t - at - one_way) / one_way))
         at += 2 * one_way + within(rng, 0.4, 0.1)
     thigh, shank = 2 + 83 * depth, 2 + 28 * depth
-    tilt = -11 - 16 * depth
+    tilt = 1 - 16 * depth
     angles = {
         "hip_flexion": thigh - tilt,
         "knee_flexion": thigh + shank,
         "ankle_angle": shank,
         "tilt": tilt,
-        "lumbar_extension": -12 * depth,
+        "lumbar_extension": -24 * depth,
         "arm_flex": -5 + 85 * depth,
         "elbow_flex": 15 + 0 * depth,
     }
@@ -273,13 +273,13 @@ def _rise(t, seated: np.ndarray, lean: np.ndarray, at_s: float, length_s: float,
 
 def _seat(seated: np.ndarray, lean: np.ndarray) -> dict[str, np.ndarray]:
     thigh, shank = 2 + 83 * seated, 2 + 4 * seated + 12 * lean * (1 - seated)
-    tilt = -11 + 9 * seated - 22 * lean
+    tilt = 1 + 9 * seated - 22 * lean
     return {
         "hip_flexion": thigh - tilt,
         "knee_flexion": thigh + shank,
         "ankle_angle": shank,
         "tilt": tilt,
-        "lumbar_extension": -6 * seated - 16 * lean,
+        "lumbar_extension": -6 * seated - 16 * lean - 12 * (1 - (1 - seated) * (1 - lean)),
         "arm_flex": -5 + 30 * seated + 12 * lean,
         "elbow_flex": 15 + 35 * seated,
     }

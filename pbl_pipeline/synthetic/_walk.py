@@ -164,3 +164,19 @@ def pelvis_joints(angles_rad: Float[np.ndarray, "T 3"], heading_rad: Float[np.nd
     rotation = np.unwrap(joints[:, 2])
     whole = np.round((np.median(heading_rad) - np.median(rotation)) / (2 * np.pi))
     return np.column_stack([joints[:, 0], joints[:, 1], rotation + 2 * np.pi * whole])
+
+
+def turned(qpos: Float[np.ndarray, "T 40"], by_rad: float) -> Float[np.ndarray, "T 40"]:
+    """The same motion, turned about the world's vertical axis (counter-clockwise seen from above)."""
+    body = load_body()
+    column = [body.joint_names.index(n) for n in ("pelvis_tilt", "pelvis_list", "pelvis_rotation")]
+    x, z = body.joint_names.index("pelvis_tx"), body.joint_names.index("pelvis_tz")
+    out = np.array(qpos, float)
+    # In the model's ground y is up: x ahead, z right. A turn about y has the same sign as one about the world's z.
+    joints = Rotation.from_rotvec([0.0, by_rad, 0.0]) * Rotation.from_euler("ZXY", out[:, column])
+    angles = joints.as_euler("ZXY")
+    angles[:, 2] = np.unwrap(angles[:, 2])
+    out[:, column] = angles
+    c, s = np.cos(by_rad), np.sin(by_rad)
+    out[:, x], out[:, z] = c * qpos[:, x] + s * qpos[:, z], -s * qpos[:, x] + c * qpos[:, z]
+    return out

@@ -2,10 +2,12 @@
 
 from ._align import align_path, best_lag
 from ._compare import JointError, KinematicErrors, compare, compare_angles, compare_references
+from ._corpus import Case, Walk, corpus, is_held_out, lasting, recorded_walks, synthetic_walk
+from ._corpus_errors import corpus_errors, corpus_tables, print_corpus, responsiveness, write_corpus
 from ._curves import CURVE_COLUMNS, cycle_curves, save_curves
 from ._frame import COLUMNS, TrialErrors, error_frame
 from ._joints import JOINTS_CLIP, JOINTS_OPENCAP, JOINTS_PAPER
-from ._motions import ACTIVITIES, Motion, read_index, read_motion, read_motions, stride_s, turned
+from ._motions import ACTIVITIES, Motion, read_index, read_motion, read_motions, stride_s
 from ._paper import paper_figures
 from ._paper_tables import paper_tables
 from ._point_truth import PointTruth, resect, truth_of_bodies, truth_of_synthetic, truth_of_trc
@@ -28,6 +30,7 @@ from ._sources import (
 )
 from ._statistics import NIQR_FACTOR, median_niqr, niqr
 from ._table import Cell, Table
+from ._true_fit import fit_of_qpos
 from ._view import view_classes
 from ._write import html, latex, print_tables, write_tables
 
@@ -43,6 +46,7 @@ __all__ = [
     "NIQR_FACTOR",
     "QPOS",
     "RELIABILITY_COLUMNS",
+    "Case",
     "Cell",
     "JointError",
     "KinematicErrors",
@@ -52,40 +56,51 @@ __all__ = [
     "Reference",
     "Table",
     "TrialErrors",
+    "Walk",
     "align_path",
     "best_lag",
     "body_rotation_angles",
     "compare",
     "compare_angles",
     "compare_references",
+    "corpus",
+    "corpus_errors",
+    "corpus_tables",
     "cycle_curves",
     "error_frame",
     "fit_angles",
     "fit_angles_sd",
+    "fit_of_qpos",
     "html",
+    "is_held_out",
+    "lasting",
     "latex",
     "median_niqr",
     "niqr",
     "paper_figures",
     "paper_tables",
     "point_errors",
+    "print_corpus",
     "print_tables",
     "read_index",
     "read_motion",
     "read_motions",
+    "recorded_walks",
     "reference_of_bodies",
     "reference_of_fit",
     "reference_of_mot",
     "reference_of_qpos",
     "reliability_table",
     "resect",
+    "responsiveness",
     "save_curves",
     "stride_s",
+    "synthetic_walk",
     "truth_of_bodies",
     "truth_of_synthetic",
     "truth_of_trc",
-    "turned",
     "view_classes",
+    "write_corpus",
     "write_reliability",
     "write_tables",
 ]

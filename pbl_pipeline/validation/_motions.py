@@ -185,22 +185,6 @@ def activity_of(label: str) -> str:
     return next((k for k, words in ACTIVITIES.items() if any(w in label.lower() for w in words)), OTHER)
 
 
-def turned(qpos: Float[np.ndarray, "T 40"], by_rad: float) -> Float[np.ndarray, "T 40"]:
-    """The same motion, turned about the world's vertical axis (counter-clockwise seen from above)."""
-    body = load_body()
-    column = [body.joint_names.index(n) for n in ("pelvis_tilt", "pelvis_list", "pelvis_rotation")]
-    x, z = body.joint_names.index("pelvis_tx"), body.joint_names.index("pelvis_tz")
-    out = np.array(qpos, float)
-    # In the model's ground y is up: x ahead, z right. A turn about y has the same sign as one about the world's z.
-    joints = Rotation.from_rotvec([0.0, by_rad, 0.0]) * Rotation.from_euler("ZXY", out[:, column])
-    angles = joints.as_euler("ZXY")
-    angles[:, 2] = np.unwrap(angles[:, 2])
-    out[:, column] = angles
-    c, s = np.cos(by_rad), np.sin(by_rad)
-    out[:, x], out[:, z] = c * qpos[:, x] + s * qpos[:, z], -s * qpos[:, x] + c * qpos[:, z]
-    return out
-
-
 def _is_motion(row: Mapping[str, str]) -> bool:
     """Whether a row is angles over time: a rate in Hz, or gait cycles of single trials."""
     if row["units"].split("/")[0] not in ("deg", "rad"):

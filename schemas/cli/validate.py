@@ -10,6 +10,7 @@ import click
 
 from pbl_pipeline.errors import PblError
 
+from ._gdi import gdi
 from ._reliability import reliability
 
 if TYPE_CHECKING:
@@ -59,6 +60,7 @@ def validate() -> None:
 
 
 validate.add_command(reliability)
+validate.add_command(gdi)
 
 
 @validate.command(epilog="Example: pbl validate --dataset OURLAB --where population=healthy --out accuracy")

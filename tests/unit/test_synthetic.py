@@ -126,7 +126,7 @@ def test_pelvis_angles_hold_against_the_heading():
         assert np.rad2deg(np.std(off)) < 10
         assert abs(np.rad2deg(np.mean(off))) < 5
         pitch = np.rad2deg(np.arcsin(forward[:, 2]))
-        assert -20 < pitch.mean() < 0  # tipped forward
+        assert -8 < pitch.mean() < 12  # the body's pelvis is level in walking: 2 deg, persons differ by 4
         assert pitch.std() < 3
         assert np.abs(np.diff(q[:, JOINT["pelvis_rotation"]])).max() < 0.3  # no jump by a turn
 

@@ -1,0 +1,245 @@
+"""Errors of the index, the gait measures and the joint angles over a corpus of known walks."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pbl_pipeline.body import joint_angles
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import SessionFit, SessionInput, TrialFit, fit_sessions
+from pbl_pipeline.gait import GaitCycle, find_cycles, gait_metrics, score_gdi, spatiotemporal
+from pbl_pipeline.paramset import Paramset
+
+from ._corpus import HEALTHY, Case
+
+#: Column -> measure of `gait.MEASURES`.
+MEASURES = {
+    "cadence": "cadence_steps_per_min",
+    "stance": "stance_percent",
+    "stride_m": "stride_length_m",
+    "speed": "speed_m_per_s",
+}
+#: Angles whose errors are reported, per side.
+ANGLES = ("hip_flexion", "hip_adduction", "hip_rotation", "knee_flexion", "ankle_angle")
+#: A 90 % interval of a normal error, in standard deviations.
+_Z90 = 1.6449
+
+
+def corpus_errors(
+    cases: Sequence[Case],
+    method: Paramset | str | None = None,
+    fit: Callable[..., Sequence[SessionFit | PblError]] = fit_sessions,
+) -> pd.DataFrame:
+    """Fit every case as a session of one trial, all at once, and compare with its truth: one row per case.
+
+    Columns: what the case is; `error`, a code where the fit failed; index and measures of the truth (`gdi_true`,
+    `cadence_true` ...), of the fit with the true events (`gdi`) and with detected ones (`gdi_detected`,
+    `cadence` ...); of each of `ANGLES`, mean over the sides: `_offset` (deg), `_sd` without it, `_ratio` of the ranges
+    and `_in90`, the fraction of the samples that lie in their 90 % intervals. NaN where there is none.
+
+    Raises `PblError` SOLVER_UNKNOWN.
+    """
+    sessions = [SessionInput([c.keypoints()], [f"case{i}"], c.camera) for i, c in enumerate(cases)]
+    fits = fit(sessions, method)
+    return pd.DataFrame([_row(case, result) for case, result in zip(cases, fits, strict=True)])
+
+
+def _row(case: Case, result: SessionFit | PblError) -> dict[str, Any]:
+    walk, truth = case.walk, case.walk.fit()
+    row: dict[str, Any] = {
+        "person": walk.person,
+        "source": walk.source,
+        "held_out": walk.held_out,
+        "condition": walk.condition,
+        "severity": walk.severity,
+        "view": case.view,
+        "camera": case.camera,
+        "detector": case.detector,
+        "error": result.code if isinstance(result, PblError) else "",
+    }
+    cycles = find_cycles(walk.events, truth)
+    row |= {f"{k}_true": v for k, v in _measured(cycles).items()}
+    if isinstance(result, PblError):
+        return row
+    fit = result.trials[0]
+    row["gdi"] = _measured(find_cycles(walk.events, fit))["gdi"]
+    metrics = gait_metrics(result.trials, fit_checks=result.qc)
+    row["gdi_detected"] = _number(metrics.gdi.mean)
+    row |= {k: _value(metrics.spatiotemporal.measures.get(n)) for k, n in MEASURES.items()}
+    return row | _angle_errors(fit, truth)
+
+
+def _measured(cycles: Sequence[GaitCycle]) -> dict[str, float]:
+    measures = spatiotemporal(cycles).measures
+    return {"gdi": _number(score_gdi(cycles).mean)} | {k: _value(measures.get(n)) for k, n in MEASURES.items()}
+
+
+def _value(measure: Any) -> float:
+    return float("nan") if measure is None else float(measure.mean)
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else float(value)
+
+
+def _angle_errors(fit: TrialFit, truth: TrialFit) -> dict[str, float]:
+    found, true = joint_angles(fit.joint_names, fit.qpos), joint_angles(truth.joint_names, truth.qpos)
+    spread = joint_angles(fit.joint_names, fit.qpos_sd)
+    out = {}
+    for angle in ANGLES:
+        sides = []
+        for side in "rl":
+            name = f"{angle}_{side}"
+            seen = np.isfinite(found[name])
+            off = (found[name] - true[name])[seen]
+            if len(off) < 10:
+                continue
+            a, b = (np.subtract(*np.percentile(x[name][seen], [97.5, 2.5])) for x in (found, true))
+            inside = np.abs(off) <= _Z90 * np.abs(spread[name][seen])
+            known = np.isfinite(spread[name][seen])
+            in90 = float(inside[known].mean()) if known.any() else float("nan")
+            sides.append((off.mean(), off.std(), a / b if b > 1 else np.nan, in90))
+        for end, values in zip(("offset", "sd", "ratio", "in90"), np.transpose(sides), strict=False):
+            out[f"{angle}_{end}"] = float(np.mean(values))
+    return out
+
+
+# ---- tables
+
+
+def corpus_tables(errors: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """The tables of a report, by title."""
+    return {
+        "index: error by view (true events)": _by_group(errors, "gdi", "gdi_true"),
+        "index: error by view (detected events)": _by_group(errors, "gdi_detected", "gdi_true"),
+        "gait measures: error": measure_table(errors),
+        "joint angles: error by view (deg)": angle_table(errors),
+        "samples in their 90 % intervals": coverage_table(errors),
+        "fraction of a true change of the index that survives": responsiveness(errors),
+    }
+
+
+def _groups(errors: pd.DataFrame) -> dict[str, Any]:
+    """Name -> rows. (pandas' own types say less of a selection than this code needs.)"""
+    groups: dict[str, Any] = {"all": errors}
+    if len(set(errors["held_out"])) > 1:
+        groups |= {"held out": errors[errors["held_out"]], "tuning": errors[~errors["held_out"]]}
+    for column in ("source", "view", "camera"):
+        groups |= {str(k): g for k, g in errors.groupby(column, sort=False)}
+    return groups
+
+
+def _by_group(errors: pd.DataFrame, found: str, true: str) -> pd.DataFrame:
+    rows = []
+    for name, group in _groups(errors).items():
+        off, known = group[found] - group[true], group[[found, true]].dropna()
+        rows.append(
+            {
+                "cases": name,
+                "n": len(group),
+                "none": int(group[found].isna().sum()),
+                "true mean": group[true].mean(),
+                "bias": off.mean(),
+                "sd": off.std(),
+                "rms": float(np.sqrt((off**2).mean())),
+                "correlation": known.corr().iloc[0, 1] if len(known) > 2 else np.nan,
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def measure_table(errors: pd.DataFrame) -> pd.DataFrame:
+    """Bias, standard deviation and correlation of the gait measures; the stride also as a ratio."""
+    rows = []
+    for name in MEASURES:
+        known: Any = errors[[name, f"{name}_true"]].dropna()
+        off = known[name] - known[f"{name}_true"]
+        rows.append(
+            {
+                "measure": MEASURES[name],
+                "n": len(known),
+                "true mean": known[f"{name}_true"].mean(),
+                "bias": off.mean(),
+                "sd": off.std(),
+                "ratio": (known[name] / known[f"{name}_true"]).median(),
+                "correlation": known.corr().iloc[0, 1] if len(known) > 2 else np.nan,
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def angle_table(errors: pd.DataFrame) -> pd.DataFrame:
+    """Hip, knee and ankle by view: mean offset, its spread between cases, the rest within a case, ratio of ranges."""
+    rows = []
+    for name, group in _groups(errors).items():
+        row: dict[str, Any] = {"cases": name}
+        for angle, short in zip(ANGLES, ("hip", "add", "rot", "knee", "ankle"), strict=True):
+            row[f"{short} off"] = group[f"{angle}_offset"].mean()
+            row[f"{short} off sd"] = group[f"{angle}_offset"].std()
+            row[f"{short} sd"] = group[f"{angle}_sd"].median()
+            row[f"{short} range"] = group[f"{angle}_ratio"].median()
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def coverage_table(errors: pd.DataFrame) -> pd.DataFrame:
+    """Fraction of the samples of each angle inside of its 90 % intervals."""
+    rows = [
+        {"cases": name} | {angle: group[f"{angle}_in90"].mean() for angle in ANGLES}
+        for name, group in _groups(errors).items()
+    ]
+    return pd.DataFrame(rows)
+
+
+def responsiveness(errors: pd.DataFrame, found: str = "gdi", true: str = "gdi_true") -> pd.DataFrame:
+    """How much of the change of the index between two visits of a person is found again, per impairment.
+
+    Two visits: healthy and impaired, or two severities, seen from the same view. The fraction is the sum of the changes
+    found over the sum of the true ones, so that small changes do not dominate; `sd` is that of its error.
+    """
+    rows = []
+    synthetic: Any = errors[errors["source"] == "synthetic"]
+    visit = ["person", "view", "camera"]
+    healthy = synthetic[synthetic["condition"] == HEALTHY]
+    for name, impaired in synthetic[synthetic["condition"] != HEALTHY].groupby("condition", sort=False):
+        low, high = impaired["severity"].min(), impaired["severity"].max()
+        first, last = (impaired[impaired["severity"] == s] for s in (low, high))
+        row: dict[str, Any] = {"impairment": name}
+        for label, before in ((f"healthy to {high:g}", healthy), (f"{low:g} to {high:g}", first)):
+            both = before.merge(last, on=visit, suffixes=("_before", "_after"))
+            change = both[f"{found}_after"] - both[f"{found}_before"]
+            real = both[f"{true}_after"] - both[f"{true}_before"]
+            known = change.notna() & real.notna()
+            total = real[known].sum()
+            row |= {
+                f"{label}: n": int(known.sum()),
+                f"{label}: true": real[known].mean(),
+                f"{label}: survives": change[known].sum() / total if abs(total) > 1e-9 else np.nan,
+                f"{label}: sd": (change - real)[known].std(),
+            }
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def print_corpus(tables: dict[str, pd.DataFrame]) -> str:
+    """The tables as text."""
+    parts = [f"{title}\n{t.to_string(index=False, float_format=lambda v: f'{v:.2f}')}" for title, t in tables.items()]
+    return "\n\n".join(parts)
+
+
+def write_corpus(out: str | Path, errors: pd.DataFrame, about: dict[str, Any]) -> list[Path]:
+    """Write `cases.csv`, a row per case, and `gdi.json`, the tables with what was run; their paths."""
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / "cases.csv", folder / "gdi.json"]
+    errors.to_csv(paths[0], index=False, float_format="%.5g")
+    # Through JSON's own numbers: NaN is null.
+    tables = {k: json.loads(str(t.to_json(orient="records"))) for k, t in corpus_tables(errors).items()}
+    paths[1].write_text(json.dumps({"about": about, "tables": tables}, indent=1) + "\n")
+    return paths
