@@ -220,7 +220,7 @@ def disturb(
 
 
 #: Time (s) over which the place of a point against the body is a stride's, not a step's; distance of the hips (m).
-_STRIDE_S, _HIPS_M = 0.4, 0.17
+_STRIDE_S, _HIPS_M = 0.6, 0.17
 
 
 def far_side(time_s: np.ndarray, x_cam: np.ndarray, sides: np.ndarray) -> Float[np.ndarray, "T J"]:
