@@ -64,5 +64,5 @@ def forget(subject: str, yes: bool, videos: bool) -> None:
         raise click.exceptions.Exit(1)
     click.echo("Looked up again: no row, no queued job and no stored file is left", nl=False)
     click.echo(f"; {len(done.kept)} recordings stay, as listed." if done.kept else ", and no recording.")
-    if "PBL_INCOMING" not in os.environ:
-        click.echo("PBL_INCOMING is not set here: uploads that were not taken over yet were not searched.")
+    drop = os.environ.get("PBL_INCOMING") or "none (PBL_INCOMING is not set here)"
+    click.echo(f"Searched for recordings: the archive {archive.archive_dir()}, the drop folder: {drop}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import secrets
+import signal
 import socket
 import stat
 import subprocess
@@ -170,6 +171,13 @@ def test_a_lock_that_is_held_is_reported(drop: Path, tmp_path: Path, monkeypatch
     assert pbl("cron", "import").code == 0
 
 
+def test_a_run_that_hangs_is_ended():
+    """Also where nothing answers: whatever it was doing, the next run goes on."""
+    hangs = "import schemas, time; schemas.activate = lambda: time.sleep(60)"
+    run = [sys.executable, "-c", f"{hangs}; from workers.cli import cron; cron.AT_MOST_S = 1; cron.cron(['import'])"]
+    assert subprocess.run(run, timeout=50, check=False).returncode == -signal.SIGALRM
+
+
 def test_a_run_has_a_time_limit_and_the_next_one_goes_on(drop: Path, tmp_path: Path):
     archive = tmp_path / "archive"
     names = {str(upload(drop, f"P00{i}/1/walk.mp4", f"v{i}").relative_to(drop)) for i in range(3)}
@@ -284,6 +292,7 @@ def test_what_a_killed_import_left_goes_with_the_next_run_and_with_the_person(
     done = pbl("forget", "P017", "--yes", "--videos")
     assert done.code == 0, done.err + done.out
     assert "and no recording" in done.out
+    assert f"the archive {archive}, the drop folder: {drop}" in done.out
     assert not [p for p in [*drop.rglob("*"), *archive.rglob("*")] if "P017" in str(p.relative_to(tmp_path))]
     assert "P017" not in (archive / ".incoming" / "seen.json").read_text()
     assert [p.name for p in tmp_path.glob("pbl-files-*")] == [f"pbl-files-{os.getpid()}-abc"]

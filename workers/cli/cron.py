@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import click
 
 from pbl_pipeline.errors import PblError, harmless
 
+#: How long `pbl cron import` may take (s): a database or a file system that hangs holds it no longer.
+AT_MOST_S = 1800
 #: How many names of ignored files `pbl cron import` prints.
 _MOST_IGNORED = 100
 
@@ -26,15 +29,20 @@ def cron() -> None:
 def import_(settled_s: float) -> None:
     """Take over recordings that were uploaded to PBL_INCOMING as SUBJECT/SESSION/FILE, and register them.
 
-    Exit code 1 when an upload was refused or could not be taken, 75 when another process takes uploads over now.
+    Exit code 1 when an upload was refused or could not be taken, 75 when another process takes uploads over now. After
+    30 minutes the process is ended by SIGALRM, whatever it waits for; the next run goes on.
 
     Example: PBL_INCOMING=/srv/uploads pbl cron import
     """
     import schemas
     from workers.incoming import take_over
 
-    schemas.activate()
-    taken = take_over(settled_s=settled_s)
+    signal.alarm(AT_MOST_S)
+    try:
+        schemas.activate()
+        taken = take_over(settled_s=settled_s)
+    finally:
+        signal.alarm(0)
     if taken is None:
         click.echo("another process takes uploads over now", err=True)
         raise click.exceptions.Exit(75)
