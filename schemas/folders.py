@@ -43,13 +43,14 @@ def make_private(path: Path) -> None:
             os.setxattr(path, "system.posix_acl_default", _OWNER_ONLY)
 
 
-def sync_folder(path: Path) -> None:
-    """Have the names in a folder on disk when this returns."""
-    handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+def sync_folders(path: Path, root: Path) -> None:
+    """Have the names in a folder, and in those above it up to `root`, on disk when this returns."""
+    for folder in (path, *(p for p in path.parents if p.is_relative_to(root))):
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 def remove_empty(folder: Path, levels: int) -> None:

@@ -29,7 +29,7 @@ from schemas import connection, video
 from schemas.archive import COPIES, LOCK, REFUSED, archive_dir, folder_of, load_seen, remove_copies, save_seen
 from schemas.codes import check_subject
 from schemas.connection import dj
-from schemas.folders import private_folder, remove_empty, sync_folder
+from schemas.folders import private_folder, remove_empty, sync_folders
 from schemas.ingest import Visit, ingest
 from schemas.sensors import Sensors
 from schemas.uploads import LOG_ENDINGS, Bucket, Folder, StillChanging, Upload, drop_folder, incoming_url
@@ -188,7 +188,7 @@ def _take(drop: Folder | Bucket, recording: Upload, logs: list[Upload], archive:
         out.left[name] = _named(name, _unwritable(archive, error))
     finally:
         for copy in copies:
-            if COPIES in copy.path.parts:  # what has its place in the archive already may have its row
+            if copy.path.is_relative_to(archive / COPIES):  # what has its place in the archive already may have its row
                 copy.path.unlink(missing_ok=True)
 
 
@@ -255,7 +255,7 @@ def _register(name: PurePosixPath, copies: Sequence[_Copy], archive: Path) -> st
     target = folder / f"{recording.sha256[:12]}-{plain_name(file)}"
     for copy, to in zip(copies, (target, *(target.with_suffix(log.path.suffix) for log in logs)), strict=True):
         copy.path = copy.path.replace(to)
-    sync_folder(folder)
+    sync_folders(folder, archive)
     sensors = [Sensors(attitude=log.path) for log in logs]
     (result,) = ingest([target], Visit(subject=subject, session_label=session), files=sensors)
     if result.error is not None:
@@ -296,7 +296,7 @@ def _set_aside(
                 remove_empty(was.parent, 2)
         else:
             drop.move(upload, to)
-    sync_folder(folder)
+    sync_folders(folder, archive)
 
 
 def plain_name(text: str) -> str:
