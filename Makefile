@@ -34,11 +34,13 @@ format: $(READY) ## rewrite the source in the project's format
 LOCK := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 	  --no-emit-find-links --upgrade --custom-compile-command "make lock"
 
-lock: $(READY)  ## choose the newest allowed version of every dependency and write requirements.lock and the images' two
+lock: $(READY)  ## choose the newest allowed version of every dependency and write requirements.lock and the images' three
 	$(BIN)/pip install --quiet uv
 	$(LOCK) --extra dev --output-file requirements.lock pyproject.toml
 	$(LOCK) --extra s3 --output-file workers/deploy/requirements-cpu.lock pyproject.toml
 	$(LOCK) --extra s3 --extra gpu --output-file workers/deploy/requirements-gpu.lock pyproject.toml
+	$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"])' \
+	  | $(LOCK) --output-file workers/deploy/requirements-build.lock -
 
 # Debian splits `venv` off; without it the environment cannot hold pip, so it is installed once (root or sudo).
 $(READY): pyproject.toml requirements.lock

@@ -18,6 +18,7 @@ VARIABLES: dict[str, str] = {
     "PBL_STORE": "folder of the object store that holds arrays (default: store/ in PBL_HOME)",
     "PBL_INCOMING": "folder or s3://BUCKET/PREFIX into which phones upload, for pbl cron import",
     "PBL_ARCHIVE": "folder in which uploaded recordings are kept (default: recordings/ in PBL_HOME)",
+    "PBL_BACKUP": "folder of the regular backups (database, store, recordings), for pbl cron backup",
     "PBL_S3_ENDPOINT": "address of an object store (S3, MinIO) that holds arrays instead of a folder",
     "PBL_S3_BUCKET": "its bucket (default: pbl)",
     "PBL_S3_KEY": "its access key; or PBL_S3_KEY_FILE, a file with it",

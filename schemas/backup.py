@@ -4,6 +4,7 @@
     database.sql.gz      every table and row, in the state of one moment
     store.sha256         SHA-256 and path of every file of `store/`, as `sha256sum -c` reads it
     store/               the files that rows of that moment name; files that no row names are not kept
+    recordings.sha256, recordings/    where asked for: the registered videos (`backup_files.py`)
 
 The rows are read in one transaction, then the files they name are copied. A file never changes once its row is there,
 so both are of the same moment while workers go on.
@@ -16,9 +17,9 @@ import datetime
 import gzip
 import hashlib
 import json
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection
 from contextlib import closing
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import pymysql
@@ -26,7 +27,8 @@ import pymysql
 from pbl_pipeline import __version__, progress
 from pbl_pipeline.errors import PblError
 
-from . import _dump, catalog, connection
+from . import _dump, backup_files, catalog, connection
+from .backup_files import PARTS, listed, safe_path, sha256_of, unwritable
 from .catalog import Column, quote
 from .folders import make_private, private_folder
 from .json_files import write_json
@@ -41,17 +43,25 @@ Say = Callable[[str], None]
 
 @dataclasses.dataclass(frozen=True)
 class Backup:
-    """What was saved or brought back. rows: `schema.table` -> how many."""
+    """What was saved or brought back. rows: `schema.table` -> how many. left: recordings that were not, and why."""
 
     folder: Path
     created: str
     rows: dict[str, int]
     n_files: int
     n_bytes: int
+    n_recordings: int = 0
+    left: dict[str, str] = dataclasses.field(default_factory=dict)
 
 
-def backup(folder: Path, store: bool = True, say: Say = lambda _: None) -> Backup:
-    """Save the database and the store into a new folder.
+def backup(
+    folder: Path,
+    store: bool = True,
+    say: Say = lambda _: None,
+    with_recordings: bool = False,
+    previous: Path | None = None,
+) -> Backup:
+    """Save the database and the store into a new folder, where asked for with the recordings.
 
     Parameters
     ----------
@@ -61,6 +71,10 @@ def backup(folder: Path, store: bool = True, say: Say = lambda _: None) -> Backu
         False leaves the files out, where the object store is saved by other means.
     say
         Called with a sentence for each step.
+    with_recordings
+        Save the registered videos, too. One that is gone or changed is left out and named.
+    previous
+        An earlier backup, of whose recordings links are made in place of copies.
 
     Raises
     ------
@@ -79,6 +93,7 @@ def backup(folder: Path, store: bool = True, say: Say = lambda _: None) -> Backu
             _check_some(tables, prefix)
             say(f"Saving {len(tables)} tables of {prefix}_* into {folder}")
             rows, files = _save_tables(server, tables, folder / "database.sql.gz")
+            videos = _videos(server, prefix) if with_recordings else []
     except pymysql.err.Error as error:
         raise PblError(
             "DB_REFUSED",
@@ -90,6 +105,11 @@ def backup(folder: Path, store: bool = True, say: Say = lambda _: None) -> Backu
     if store:
         say(f"Saving {len(files)} files of the store")
         n_bytes = _save_files(sorted(files), folder)
+    copied = backup_files.Recordings()
+    if with_recordings:
+        say(f"Saving {len(videos)} recordings")
+        copied = backup_files.save_recordings(videos, folder, previous)
+    listings = [f"{part}.sha256" for part in PARTS if (folder / f"{part}.sha256").exists()]
     manifest = {
         "format": FORMAT,
         "pbl_pipeline": __version__,
@@ -99,16 +119,16 @@ def backup(folder: Path, store: bool = True, say: Say = lambda _: None) -> Backu
         "rows": rows,
         "store": store,
         "n_files": len(files) if store else 0,
-        "n_bytes": n_bytes,
-        "sha256": {
-            name: sha256_of(folder / name) for name in ("database.sql.gz", *(["store.sha256"] if store else []))
-        },
+        "n_bytes": n_bytes + copied.n_bytes,
+        "n_recordings": len(copied.paths),
+        "recordings_left": copied.left,
+        "sha256": {name: sha256_of(folder / name) for name in ("database.sql.gz", *listings)},
     }
     try:
         write_json(folder / "manifest.json", manifest)
     except OSError as error:
-        raise _unwritable(folder, error) from error
-    return Backup(folder, created, rows, manifest["n_files"], n_bytes)
+        raise unwritable(folder, error) from error
+    return Backup(folder, created, rows, manifest["n_files"], manifest["n_bytes"], len(copied.paths), copied.left)
 
 
 def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
@@ -134,18 +154,21 @@ def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
     for name, sha in parts.items():
         if not (folder / name).is_file() or sha256_of(folder / name) != sha:
             raise _invalid(folder, f"{name} is missing or was changed", f"SHA-256 {sha}")
-    listed = list(_listed(folder)) if manifest["store"] else []
-    say(f"Checking {len(listed)} files of the backup")
+    files = [(part, *file) for part in PARTS if f"{part}.sha256" in parts for file in listed(folder, part)]
+    say(f"Checking {len(files)} files of the backup")
     wrong = []
-    with progress.bar("check", total=len(listed), unit="file") as update:
-        for sha, path in listed:
-            file = folder / "store" / path
+    with progress.bar("check", total=len(files), unit="file") as update:
+        for part, sha, path in files:
+            file = folder / part / path
             if not file.is_file() or sha256_of(file) != sha:
-                wrong.append(path)
+                wrong.append(f"{part}/{path}")
             update(1)
-    if wrong or len(listed) != manifest["n_files"]:
-        found = f"{len(wrong)} files of the store are missing or were changed: {', '.join(wrong[:5])}"
-        raise _invalid(folder, found, f"{manifest['n_files']} files as listed in store.sha256")
+    expected = manifest["n_files"] + manifest["n_recordings"]
+    if wrong or len(files) != expected:
+        found = f"{len(wrong)} files are missing or were changed: {', '.join(wrong[:5])}"
+        raise _invalid(
+            folder, found, f"{expected} files as listed in {', '.join(p for p in parts if p.endswith('256'))}"
+        )
     return manifest
 
 
@@ -196,7 +219,10 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
             "a server that takes the tables back",
             "correct the cause and run the same with --again, which first removes what was begun",
         ) from error
-    return Backup(folder, manifest["created"], manifest["rows"], manifest["n_files"], manifest["n_bytes"])
+    say(f"Bringing {manifest['n_recordings']} recordings back to where they were registered")
+    copied = backup_files.restore_recordings(folder)
+    about = (manifest["created"], manifest["rows"], manifest["n_files"], manifest["n_bytes"])
+    return Backup(folder, *about, len(copied.paths), copied.left)
 
 
 # ----------------------------------------------------------------------------------------------------------- saving
@@ -209,6 +235,13 @@ def _snapshot(server: pymysql.Connection[Any]) -> str:
         cursor.execute("SET SESSION TRANSACTION ISOLATION LEVEL REPEATABLE READ")
         cursor.execute("START TRANSACTION WITH CONSISTENT SNAPSHOT, READ ONLY")
     return version
+
+
+def _videos(server: pymysql.Connection[Any], prefix: str) -> list[tuple[str, str]]:
+    """Path and SHA-256 of the registered videos."""
+    with server.cursor() as cursor:
+        cursor.execute(f"SELECT video_path, video_sha256 FROM {quote(f'{prefix}_video', 'video')}")  # noqa: S608
+        return [(str(path), str(sha)) for path, sha in cursor.fetchall()]
 
 
 def _save_tables(
@@ -244,7 +277,7 @@ def _save_files(paths: list[str], folder: Path) -> int:
             except FileNotFoundError:
                 lost.append(path)
             except OSError as error:
-                raise _unwritable(target, error) from error
+                raise unwritable(target, error) from error
             except Exception as error:
                 raise store_error(error) from error
             update(1)
@@ -287,9 +320,9 @@ def _make_room(cursor: Any, prefix: str, again: bool) -> None:
 
 
 def _restore_files(folder: Path) -> None:
-    store, listed = connection.store_backend(), list(_listed(folder))
-    with progress.bar("store", total=len(listed), unit="file") as update:
-        for sha, path in listed:
+    store, files = connection.store_backend(), list(listed(folder, "store"))
+    with progress.bar("store", total=len(files), unit="file") as update:
+        for sha, path in files:
             try:
                 if not store.exists(path):
                     store.put_file(folder / "store" / path, path)
@@ -314,33 +347,6 @@ def _check_rows(cursor: Any, rows: dict[str, int]) -> None:
 
 
 # ------------------------------------------------------------------------------------------------------------ files
-def safe_path(path: str) -> PurePosixPath:
-    """A path of the store, refused where it would leave it. Raises BACKUP_INVALID."""
-    parts = PurePosixPath(path)
-    if parts.is_absolute() or ".." in parts.parts or not parts.parts or "\n" in path or "\\" in path:
-        raise PblError(
-            "BACKUP_INVALID",
-            key=repr(path)[:200],
-            found="a path that leaves the store",
-            expected="a relative path without ..",
-            next_step="the row was not written by this pipeline: find it and delete it",
-        )
-    return parts
-
-
-def _listed(folder: Path) -> Iterable[tuple[str, str]]:
-    """SHA-256 and path of the files of a backup."""
-    for line in (folder / "store.sha256").read_text().splitlines():
-        sha, _, path = line.partition("  ")
-        yield sha, str(safe_path(path))
-
-
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file, in hex."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def _new_folder(folder: Path) -> None:
     try:
         private_folder(folder)
@@ -348,7 +354,7 @@ def _new_folder(folder: Path) -> None:
         if empty:
             make_private(folder)
     except OSError as error:
-        raise _unwritable(folder, error) from error
+        raise unwritable(folder, error) from error
     if not empty:
         raise PblError(
             "FILE_UNWRITABLE",
@@ -357,16 +363,6 @@ def _new_folder(folder: Path) -> None:
             expected="a new or empty folder: no backup is ever written over another",
             next_step="name another folder, such as one with today's date",
         )
-
-
-def _unwritable(path: Path, error: OSError) -> PblError:
-    return PblError(
-        "FILE_UNWRITABLE",
-        key=path,
-        found=error.strerror or str(error),
-        expected="a folder with room for the whole backup",
-        next_step="free space, remove what was begun, and run it again",
-    )
 
 
 def _check_some(tables: Collection[Any], prefix: str) -> None:

@@ -17,6 +17,15 @@ ATTEMPTS = "attempts"
 _THERE_ALREADY = 1060
 
 _jobs: dict[Any, Any] = {}
+_sources: dict[Any, Any] = {}
+
+
+def keys_of(table: Any) -> Any:
+    """Query of the keys that can be computed for a table (class), made once: DataJoint reads the columns of the tables
+    above for it."""
+    if table not in _sources:
+        _sources[table] = table().key_source
+    return _sources[table]
 
 
 def jobs_of(table: Any) -> Any:

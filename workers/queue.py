@@ -20,7 +20,7 @@ import pymysql
 
 from pbl_pipeline.errors import PblError
 from schemas.connection import dj
-from schemas.jobs import jobs_of
+from schemas.jobs import jobs_of, keys_of
 
 from .registry import NEW
 
@@ -76,7 +76,7 @@ def fill(
     if keys is not None and not keys:
         return 0
     jobs, quote = jobs_of(table), table.connection.adapter.quote_identifier
-    source = table().key_source
+    source = keys_of(table)
     if keys is not None:
         source = source & [dict(k) for k in keys]
     if where is not None:
@@ -110,7 +110,7 @@ def sweep(table: Any) -> int:
     n = (jobs & "status != 'reserved'").restrict(table.proj(), semantic_check=False).delete_quick(get_count=True)
     waiting = jobs & "status != 'reserved'"
     if len(waiting):
-        vanished = waiting.restrict(dj.Not(table().key_source.proj()), semantic_check=False)
+        vanished = waiting.restrict(dj.Not(keys_of(table).proj()), semantic_check=False)
         n += vanished.delete_quick(get_count=True)
     return int(n)
 

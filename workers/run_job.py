@@ -16,6 +16,7 @@ from pbl_pipeline.errors import PblError
 from schemas import connection
 from schemas.coded_errors import error_code, error_message
 from schemas.connection import DuplicateError, IntegrityError, LostConnectionError, inserting
+from schemas.jobs import keys_of
 from schemas.rows import InputChanged
 
 from . import queue
@@ -134,7 +135,7 @@ class _Attempt:
 
 def _is_wanted(job: Claim) -> bool:
     """Whether the key can still be computed: its rows above are there, and it is still asked for."""
-    return bool(len(job.table().key_source & job.key))
+    return bool(keys_of(job.table) & job.key)
 
 
 def _outcome(job: Claim, what: str, error: BaseException) -> Outcome:

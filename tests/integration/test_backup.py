@@ -16,13 +16,14 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import _dump, backup, connection, lab, video, views
+from schemas import _dump, backup, backup_files, connection, lab, video, views
 from schemas._declare import declare_all
 from schemas.ingest import Visit, ingest
 from schemas.results import load_session
 from tests.command import pbl
 from tests.database import installation
 from tests.rows import everything, everything_but_refreshes, remove_all
+from workers import backups
 from workers.populate import populate
 
 from . import chain
@@ -58,8 +59,12 @@ def test_there_and_back(elsewhere: Any, tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(_dump, "STATEMENT", 500)  # several inserts of a table
     saved = tmp_path / "backup"
     before = everything()
-    done = pbl("db", "backup", saved)
+    done = pbl("db", "backup", "--recordings", saved)
     assert done.code == 0, done.err
+    films = registered()
+    content = films[0].read_bytes()
+    films[0].unlink()
+    films[1].write_text("another film")
     assert before["pbl_video.~~video_info"]
     assert f"{sum(map(len, before.values()))} rows of {len(before)} tables" in done.out
     assert saved.stat().st_mode & 0o077 == 0
@@ -72,6 +77,11 @@ def test_there_and_back(elsewhere: Any, tmp_path: Path, monkeypatch: pytest.Monk
     done = pbl("db", "restore", saved)
     assert done.code == 0, done.err
     assert everything() == before
+    # Recordings are where they were registered, and what is there is not touched.
+    assert "1 recordings" in done.out
+    assert (films[0].read_bytes(), films[0].stat().st_mode & 0o077) == (content, 0)
+    assert f"left out: {films[1]}: another file is there" in done.err
+    assert films[1].read_text() == "another film"
     # The tables work: what was computed is there, with its arrays, and nothing is computed anew.
     schemas.activate()
     assert lab.Subject.fetch1("subject_height") == HEIGHT
@@ -161,7 +171,7 @@ def test_a_changed_backup_is_refused_before_anything_is_written(elsewhere: Any, 
     (saved / "outside").write_bytes((saved / "store" / path).read_bytes())
     (saved / "store.sha256").write_text(listing.replace(path, "../outside", 1))
     manifest = json.loads((saved / "manifest.json").read_text())
-    manifest["sha256"]["store.sha256"] = backup.sha256_of(saved / "store.sha256")
+    manifest["sha256"]["store.sha256"] = backup_files.sha256_of(saved / "store.sha256")
     (saved / "manifest.json").write_text(json.dumps(manifest))
     assert pbl("db", "restore", saved).error_code == "BACKUP_INVALID"
     (saved / "manifest.json").unlink()
@@ -227,5 +237,38 @@ def test_a_backup_of_another_prefix_and_other_bytes_in_the_store_are_refused(
 @pytest.mark.parametrize("path", ["/etc/passwd", "../x", "a/../../x", "", "a\nb", "..\\x"])
 def test_paths_that_leave_the_store_are_refused(path: str):
     with pytest.raises(PblError) as error:
-        backup.safe_path(path)
+        backup_files.safe_path(path)
     assert error.value.code == "BACKUP_INVALID"
+
+
+def test_regular_backups_hold_recordings_once_and_the_oldest_go(
+    filled: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    films, root = registered(), tmp_path / "backups"
+    monkeypatch.setenv("PBL_BACKUP", str(root))
+    for name in ("notes", "2026-01-01T000000Z"):  # somebody's, and an interrupted one
+        (root / name).mkdir(parents=True)
+    for second in range(3):
+        monkeypatch.setattr(backups, "_NAME", f"2099-01-01T00000{second}Z")
+        done = pbl("cron", "backup", "--keep", "2")
+        assert done.code == 0, done.err
+        assert "2 recordings" in done.out
+    first, second, notes = sorted(root.iterdir())
+    assert [first.name, second.name, notes.name] == ["2099-01-01T000001Z", "2099-01-01T000002Z", "notes"]
+    names = [Path("recordings") / film.relative_to("/") for film in films]
+    assert all((first / name).samefile(second / name) for name in names)  # takes room once
+    # One is gone, one is another file: both are named, and the rest is saved.
+    films[0].unlink()
+    films[1].write_text("another film")
+    done = pbl("db", "backup", "--recordings", tmp_path / "third")
+    assert done.code == 0
+    assert all(f"left out: {film}: " in done.err for film in films)
+    assert pbl("db", "restore", "--check", tmp_path / "third").code == 0
+    # A recording that was changed in the backup is found.
+    (second / names[0]).write_bytes(b"x")
+    assert pbl("db", "restore", "--check", second).error_code == "BACKUP_INVALID"
+
+
+def registered() -> list[Path]:
+    """The video files of `filled`."""
+    return [Path(path) for path in video.Video.to_arrays("video_path")]

@@ -27,6 +27,7 @@ from schemas import connection, embedded, fit, gait, gdi, lab, qc, tracking, vid
 from schemas.cli.why import why as why_command
 from schemas.status import live_workers, pipeline_status, queue_counts
 from schemas.why import why
+from tests.benchmarks import worker_replay
 from tests.rows import register
 from workers import queue, recover, refresh, registry, requeue, run_job
 from workers.heartbeat import Heartbeat, Silent
@@ -117,6 +118,16 @@ def test_a_batch_that_fails_is_computed_one_by_one(tables: None, tmp_path: Path,
         register(*videos(tmp_path, f"walk{i}"), session_label=str(i))
     assert work(batch=2).failed == 0
     assert len(fit.SessionFit()) == 2
+
+
+def test_a_job_asks_the_database_for_rows_only_and_for_few(tables: None, tmp_path: Path):
+    """Not for columns of tables, which do not change while a worker runs."""
+    register(*videos(tmp_path, *(f"walk{i}" for i in range(8))))
+    refresh.refresh()
+    _, *steps = worker_replay.record([video.VideoInfo])
+    asked = [text for step in steps for text, _ in step]
+    assert not [text for text in asked if "information_schema" in text or "SHOW " in text]
+    assert len(asked) / 4 <= 13  # four jobs a step; docs/operations.md
 
 
 # ------------------------------------------------------------------------------------------------- one job, one result

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,10 @@ import click
 import pytest
 import yaml
 
+from pbl_pipeline import __version__
 from pbl_pipeline.cli._main import cli
 from tests.command import program
+from tests.image import sent_to_builder
 from workers.supervisor import LAST_S
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -24,7 +27,7 @@ KUBERNETES = sorted((DEPLOY / "kubernetes").glob("*.yaml"))
 SCRIPTS = [*sorted(DEPLOY.rglob("*.sh")), DEPLOY / "slurm" / "worker.sbatch"]
 #: Slurm's default KillWait: seconds from the SIGTERM of scancel to SIGKILL.
 SLURM_KILL_WAIT_S = 30.0
-CRON = ("import", "refresh", "release", "disk", "reprocess", "summary")
+CRON = ("import", "refresh", "release", "disk", "reprocess", "backup", "summary")
 
 
 def compose() -> dict[str, Any]:
@@ -65,9 +68,50 @@ def test_services_listen_on_this_machine_only_and_have_no_password_of_their_own(
     assert services["worker-gpu"]["deploy"]["resources"]["reservations"]["devices"][0]["capabilities"] == ["gpu"]
 
 
+def test_images_are_named_to_the_last_digit():
+    """A tag that moves would change what runs, and a node that has an older image of that name would keep it."""
+    images = {service["image"] for service in compose()["services"].values()}
+    (base,) = re.findall(r"^ARG PYTHON=(\S+)", (DEPLOY / "Dockerfile").read_text(), re.MULTILINE)
+    for name in (*images, f"python:{base}"):
+        assert re.search(r":(\d+\.\d+\.\d+|RELEASE\.[\dTZ-]+)(-\w+)*$", name), name
+    ours = {f"pbl:{__version__}-cpu", f"pbl:{__version__}-gpu"}
+    assert {name for name in images if name.startswith("pbl:")} == ours
+    kustomization = documents(DEPLOY / "kubernetes" / "kustomization.yaml")[0]
+    assert {f"pbl:{i['newTag']}" for i in kustomization["images"]} == ours
+
+
+def test_registered_models_proofs_and_backups_outlive_a_container():
+    for name, service in compose()["services"].items():
+        if service["image"].startswith("pbl:"):
+            assert "home:/var/lib/pbl" in service["volumes"], name
+            assert not [entry for entry in service["tmpfs"] if "/var/lib" in entry], name
+    assert any(entry.endswith(":/var/backups/pbl") for entry in compose()["services"]["cron"]["volumes"])
+    for path in KUBERNETES:
+        for document in documents(path):
+            if document["kind"] in ("Deployment", "CronJob", "Job"):
+                (home,) = (v for v in pod(document)["volumes"] if v["name"] == "home")
+                assert home["persistentVolumeClaim"] == {"claimName": "home"}, document["metadata"]["name"]
+
+
+def test_the_builder_gets_what_the_image_takes_and_every_package_has_a_hash():
+    text = (DEPLOY / "Dockerfile").read_text().replace("${FLAVOUR}", "cpu")
+    copied = [word for line in re.findall(r"^COPY (?!--from)(.*)$", text, re.MULTILINE) for word in line.split()[:-1]]
+    assert "hatch_build.py" in copied
+    for source in copied:
+        assert source.startswith("--") or (sent_to_builder(source) and (ROOT / source).exists()), source
+    # Whatever pip fetches comes from a lock file with hashes; what builds our wheel as well.
+    for line in re.findall(r"pip (?:install|wheel) .*", text):
+        assert "--require-hashes" in line or "--no-deps --no-index" in line or "--no-build-isolation" in line, line
+    build = tomllib.loads((ROOT / "pyproject.toml").read_text())["build-system"]["requires"]
+    lock = (DEPLOY / "requirements-build.lock").read_text()
+    for requirement in build:
+        assert re.search(rf"^{re.split('[<>=]', requirement)[0]}==\S+ \\\n    --hash=sha256:", lock, re.MULTILINE)
+
+
 def test_a_worker_has_longer_to_end_than_it_takes():
     grace: Any = next(p for p in command(["worker"]).params if p.name == "grace_s").default
-    assert int(compose()["services"]["worker-cpu"]["stop_grace_period"].removesuffix("s")) > grace
+    for name in ("worker-cpu", "cron"):  # Docker's own 10 s are too short for an import
+        assert int(compose()["services"][name]["stop_grace_period"].removesuffix("s")) > grace
     for name in ("worker-cpu", "worker-gpu"):
         (deployment,) = documents(DEPLOY / "kubernetes" / f"{name}.yaml")
         assert deployment["spec"]["template"]["spec"]["terminationGracePeriodSeconds"] > grace
@@ -109,7 +153,7 @@ def calls() -> list[list[str]]:
     """Every call of pbl in the files of the deployment."""
     out = []
     for service in compose()["services"].values():
-        if "image" in service and service["image"].startswith("pbl:") and "command" in service:
+        if service["image"].startswith("pbl:") and "command" in service:
             out.append([str(w) for w in service["command"]])
     for path in KUBERNETES:
         for document in documents(path):
@@ -139,7 +183,7 @@ def test_all_files_call_commands_and_options_that_exist():
 
 def test_the_loop_and_the_timers_run_every_cron_job():
     loop = (DEPLOY / "cron-loop.sh").read_text()
-    assert set(re.findall(r"run (\w+)$", loop, re.MULTILINE)) == set(CRON)
+    assert set(re.findall(r"&& run (\w+)$", loop, re.MULTILINE)) == set(CRON)
     timers = {p.name.split("@")[1].removesuffix(".timer") for p in (DEPLOY / "systemd").glob("*.timer")}
     assert timers == set(CRON)
     jobs = {d["metadata"]["name"].removeprefix("cron-") for d in documents(DEPLOY / "kubernetes" / "cron.yaml")}
@@ -170,20 +214,28 @@ def test_the_entrypoint_seeds_an_empty_cache_and_runs_pbl(tmp_path: Path):
     assert found == {"model.tflite": "model", "other": "there already"}
 
 
-def test_the_cron_loop_goes_on_after_a_job_that_fails_and_ends_when_told(tmp_path: Path):
+def test_the_cron_loop_goes_by_the_clock_and_on_after_a_job_that_fails(tmp_path: Path):
     program(tmp_path, "pbl", f'echo "$3" >> {tmp_path}/ran\n[ "$3" != import ]\n')
+    # Each look at the clock is a quarter of an hour later; the first is 01:55 of some day.
+    program(
+        tmp_path,
+        "date",
+        f"echo x >> {tmp_path}/looks\necho $((86400 * 20000 + 6000 + 900 * $(wc -l < {tmp_path}/looks)))\n",
+    )
     environment = {"PATH": f"{tmp_path}:/usr/bin:/bin", "PBL_CRON_TICK_S": "0.02"}
     loop = subprocess.Popen(["sh", DEPLOY / "cron-loop.sh"], env=environment, stderr=subprocess.PIPE, text=True)
     ran = tmp_path / "ran"
     deadline = time.monotonic() + 30
-    while not (ran.exists() and ran.read_text().count("refresh") >= 3) and time.monotonic() < deadline:
+    while not (ran.exists() and "summary" in ran.read_text()) and time.monotonic() < deadline:
         time.sleep(0.05)
     loop.send_signal(signal.SIGTERM)
     _, said = loop.communicate(timeout=10)
     assert loop.returncode == 0
     names = ran.read_text().split()
-    assert names[:3] == ["import", "refresh", "release"]
-    assert names.count("import") > 2 * names.count("refresh") > 2
+    upto = names[: names.index("summary") + 1]
+    assert [n for n in upto if n in ("reprocess", "backup", "summary")] == ["reprocess", "backup", "summary"]
+    assert upto.count("import") == upto.count("refresh") == upto.count("release") == 9  # 02:10 to 04:10
+    assert upto.count("disk") == 2
     assert "pbl cron import failed with code 1" in said
     assert ran.stat().st_mode & 0o077 == 0
 
@@ -212,6 +264,12 @@ def test_the_slurm_script_ends_its_worker_in_order(tmp_path: Path):
 
 
 # ---------------------------------------------------------------------------------------------------------- kubernetes
+def pod(document: dict[str, Any]) -> dict[str, Any]:
+    """The pod of a Deployment, Job or CronJob."""
+    spec = document["spec"]
+    return spec.get("jobTemplate", {"spec": spec})["spec"]["template"]["spec"]
+
+
 def test_pods_run_as_nobody_special_and_read_secrets_from_files():
     pods = 0
     for path in KUBERNETES:
@@ -219,8 +277,7 @@ def test_pods_run_as_nobody_special_and_read_secrets_from_files():
             if document["kind"] not in ("Deployment", "CronJob", "Job"):
                 continue
             pods += 1
-            spec = document["spec"]
-            spec = (spec.get("jobTemplate", {"spec": spec})["spec"])["template"]["spec"]
+            spec = pod(document)
             assert spec["securityContext"]["runAsNonRoot"] is True
             assert spec["automountServiceAccountToken"] is False
             (container,) = spec["containers"]
@@ -233,7 +290,7 @@ def test_pods_run_as_nobody_special_and_read_secrets_from_files():
             assert wanted <= mounted
             if document["kind"] != "Job":
                 assert not any("owner" in m for m in mounted)
-    assert pods == 9
+    assert pods == 10
     assert not [d for p in KUBERNETES for d in documents(p) if d["kind"] == "Secret"]
     kustomization = documents(DEPLOY / "kubernetes" / "kustomization.yaml")[0]
     assert {p.name for p in KUBERNETES} == {"kustomization.yaml", *kustomization["resources"]}

@@ -112,6 +112,25 @@ def reprocess() -> None:
 
 
 @cron.command()
+@click.option("--keep", type=click.IntRange(min=1), default=7, show_default=True, help="Backups that are kept.")
+def backup(keep: int) -> None:
+    """Save database, store and recordings into a new folder of PBL_BACKUP, and remove the oldest.
+
+    A person who was forgotten is gone from the backups, too, when the last one from before that is removed.
+
+    Example: PBL_BACKUP=/backup pbl cron backup --keep 7
+    """
+    from schemas.cli._db_backup import say
+    from workers.backups import backup_folder, backup_regularly
+
+    made = backup_regularly(backup_folder(), keep, click.echo)
+    if made is None:
+        click.echo("another process is doing this now")
+    else:
+        say(made)
+
+
+@cron.command()
 @click.option("--hours", type=click.FloatRange(min=0.01), default=24.0, show_default=True)
 @click.option(
     "--out", type=click.Path(path_type=Path, file_okay=False), help="Also write summary-DATE.txt and .html there."

@@ -10,15 +10,25 @@ run() { # name...: pbl itself reports why a job failed; the job runs again at it
     pbl --quiet cron "$@" || echo "pbl cron $1 failed with code $?" >&2
 }
 
-minute=0
+minutes() { # since 1970: by the clock, so that a container that is started again does not begin its day anew
+    echo $(($(date +%s) / 60))
+}
+
+due() { # period offset: whether such a minute has passed since the last round, which may have taken long
+    [ $(((now - $2) / $1)) -gt $(((last - $2) / $1)) ]
+}
+
+last=$(($(minutes) - 1))
 while :; do
-    run import
-    [ $((minute % 5)) -eq 0 ] && run refresh
-    [ $((minute % 10)) -eq 0 ] && run release
-    [ $((minute % 60)) -eq 30 ] && run disk
-    [ $((minute % 1440)) -eq 120 ] && run reprocess
-    [ $((minute % 1440)) -eq 240 ] && run summary
-    minute=$((minute + 1))
+    now=$(minutes)
+    due 1 0 && run import
+    due 5 0 && run refresh
+    due 10 0 && run release
+    due 60 30 && run disk
+    due 1440 120 && run reprocess
+    due 1440 180 && run backup
+    due 1440 240 && run summary
+    last=$now
     sleep "$tick" &
     wait $!
 done

@@ -1,0 +1,163 @@
+"""Files of a backup: listings with checksums; recordings, each at its own path below `recordings/`, and back."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import os
+import shutil
+from collections.abc import Iterable, Iterator
+from pathlib import Path, PurePosixPath
+
+from pbl_pipeline import progress
+from pbl_pipeline.errors import PblError
+
+#: Folders of a backup, each with a listing: files of the store, and registered videos.
+PARTS = STORE, RECORDINGS = "store", "recordings"
+
+
+def safe_path(path: str) -> PurePosixPath:
+    """A path of the store, refused where it would leave it. Raises BACKUP_INVALID."""
+    parts = PurePosixPath(path)
+    if parts.is_absolute() or ".." in parts.parts or not parts.parts or "\n" in path or "\\" in path:
+        raise PblError(
+            "BACKUP_INVALID",
+            key=repr(path)[:200],
+            found="a path that leaves the store",
+            expected="a relative path without ..",
+            next_step="the row was not written by this pipeline: find it and delete it",
+        )
+    return parts
+
+
+def listed(folder: Path, part: str) -> Iterable[tuple[str, str]]:
+    """SHA-256 and path of the files of a part of a backup. Raises BACKUP_INVALID for a path that leaves it."""
+    for line in (folder / f"{part}.sha256").read_text().splitlines():
+        sha, _, path = line.partition("  ")
+        yield sha, str(safe_path(path))
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, in hex."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def unwritable(path: Path, error: OSError) -> PblError:
+    """What a folder without room or rights is reported as."""
+    return PblError(
+        "FILE_UNWRITABLE",
+        key=path,
+        found=error.strerror or str(error),
+        expected="a folder with room for the whole backup",
+        next_step="free space, remove what was begun, and run it again",
+    )
+
+
+@dataclasses.dataclass
+class Recordings:
+    """What was copied. paths: registered paths, n_bytes: of their files. left: what was not copied, and why."""
+
+    paths: list[str] = dataclasses.field(default_factory=list)
+    n_bytes: int = 0
+    left: dict[str, str] = dataclasses.field(default_factory=dict)
+
+
+def save_recordings(videos: Iterable[tuple[str, str]], folder: Path, previous: Path | None = None) -> Recordings:
+    """Copy videos, given as (path, SHA-256), into a backup, and list them in `recordings.sha256`.
+
+    What an earlier backup has is linked, which takes no room. A video that is gone or changed is left out, with why.
+
+    Raises
+    ------
+    PblError
+        FILE_UNWRITABLE: the backup.
+    """
+    done, before = Recordings(), set()
+    if previous is not None and (previous / f"{RECORDINGS}.sha256").is_file():
+        before = set(listed(previous, RECORDINGS))
+    with (folder / f"{RECORDINGS}.sha256").open("w") as listing, progress.bar(RECORDINGS, unit="file") as update:
+        for path, sha in videos:
+            update(1)
+            name = path.lstrip("/")
+            target = folder / RECORDINGS / name
+            old = previous / RECORDINGS / name if previous is not None and (sha, name) in before else None
+            try:
+                why = _save_recording(Path(path), sha, target, old)
+            except OSError as error:
+                raise unwritable(target, error) from error
+            if why:
+                done.left[path] = why
+                continue
+            listing.write(f"{sha}  {name}\n")
+            done.paths.append(path)
+            done.n_bytes += target.stat().st_size
+    return done
+
+
+def _save_recording(path: Path, sha: str, target: Path, old: Path | None) -> str:
+    """Link or copy one recording; why it was left out, "" where it was not."""
+    try:
+        safe_path(str(path).lstrip("/"))
+        with path.open("rb"):
+            pass
+    except PblError as error:
+        return error.found
+    except OSError as error:
+        return error.strerror or str(error)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if old is not None:
+        with contextlib.suppress(OSError):  # another disk, or a file system without links
+            os.link(old, target)
+            return ""
+    shutil.copyfile(path, target)
+    if sha256_of(target) != sha:
+        target.unlink()
+        return "not the bytes that were registered"
+    return ""
+
+
+def restore_recordings(folder: Path) -> Recordings:
+    """Copy the recordings of a backup back to where they were registered. A file that is there is never changed.
+
+    Raises
+    ------
+    PblError
+        FILE_UNWRITABLE.
+    """
+    done = Recordings()
+    if not (folder / f"{RECORDINGS}.sha256").exists():
+        return done
+    for sha, name in listed(folder, RECORDINGS):
+        path = Path("/") / name
+        if path.exists():
+            if sha256_of(path) != sha:
+                done.left[str(path)] = "another file is there"
+            continue
+        try:
+            with _private():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(folder / RECORDINGS / name, part := path.with_name(f".{path.name}.part"))
+                os.replace(part, path)
+        except OSError as error:
+            raise PblError(
+                "FILE_UNWRITABLE",
+                key=path,
+                found=error.strerror or str(error),
+                expected="the place where this recording was registered",
+                next_step="make it writable, with room, then copy recordings/ of the backup there by hand (cp -n -r)",
+            ) from error
+        done.paths.append(str(path))
+        done.n_bytes += path.stat().st_size
+    return done
+
+
+@contextlib.contextmanager
+def _private() -> Iterator[None]:
+    """New files and folders are for their owner only."""
+    before = os.umask(0o077)
+    try:
+        yield
+    finally:
+        os.umask(before)
