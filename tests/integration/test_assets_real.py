@@ -1,4 +1,4 @@
-"""The real assets from the package registries this machine uses (86 MB): the pins hold and the files are usable."""
+"""The real assets from the package registries this machine uses (137 MB): the pins hold and the files are usable."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pbl_pipeline import assets, settings
+from pbl_pipeline.keypoints import MarkerAugmenter
 from pbl_pipeline.video import load_camera, probe
 
 pytestmark = pytest.mark.slow
@@ -24,10 +25,16 @@ def cache(tmp_path_factory):
 def test_models_and_demo_are_fetched_and_usable(cache):
     from ai_edge_litert.interpreter import Interpreter
 
-    for name, size in (("blazepose_detector", 224), ("blazepose_landmarks", 256), ("blazepose_landmarks_heavy", 256)):
+    # All but what this machine has no client for (npm).
+    there = {name for name, asset in assets.ASSETS.items() if not asset.package.absent()}
+    sizes = {"blazepose_detector": 224, "blazepose_landmarks": 256, "blazepose_landmarks_heavy": 256}
+    for name, size in sizes.items():
+        if name not in there:
+            continue
         model = Interpreter(model_path=str(assets.fetch(name)), num_threads=1)
         model.allocate_tensors()
         assert model.get_input_details()[0]["shape"].tolist() == [1, size, size, 3]
+    MarkerAugmenter()
     info = probe(assets.fetch("demo_video"), threads=2)
     assert (info.width_px, info.height_px, info.n_frames, info.codec) == (1768, 994, 230, "vp9")
     assert info.fps == pytest.approx(30.0)
@@ -37,6 +44,7 @@ def test_models_and_demo_are_fetched_and_usable(cache):
     camera = load_camera(assets.fetch("demo_camera"), (info.width_px, info.height_px))
     assert camera.matrix[0, 0] == pytest.approx(2520.09, abs=0.01)
     assert camera.source == "file: Calib_demo.toml [demo]"
-    assert {item.state for item in assets.status()} == {"ok"}
-    assert {item.path.stat().st_size for item in assets.status()} == {a.size_bytes for a in assets.ASSETS.values()}
+    found = [item for item in assets.status() if item.asset.name in there]
+    assert {item.state for item in found} == {"ok"}
+    assert [item.path.stat().st_size for item in found] == [item.asset.size_bytes for item in found]
     assert not [*assets.folder().glob("*.whl"), *assets.folder().glob("*.tgz")]
