@@ -35,7 +35,9 @@ def compose() -> dict[str, Any]:
 
 
 def documents(path: Path) -> list[dict[str, Any]]:
-    return list(yaml.safe_load_all(path.read_text()))
+    """The objects of a file; those of a list one by one."""
+    found = yaml.safe_load_all(path.read_text())
+    return [item for d in found for item in (d["items"] if d["kind"] == "List" else [d])]
 
 
 # ------------------------------------------------------------------------------------------------------------- compose
