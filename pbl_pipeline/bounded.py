@@ -34,6 +34,8 @@ MIB = 1 << 20
 MAX_TEXT = 32 * MIB
 #: Rows of a table: 83 minutes at 100 Hz. A row of one letter takes a hundred times its bytes.
 MAX_ROWS = 500_000
+#: From the first to the last time stamp of a recording (s): what lies between them is put on even grids.
+MAX_SECONDS = 3600.0
 #: Bytes of a TOML file: its reader takes the square of a name's length.
 MAX_TOML = MIB // 4
 #: Lists and objects of a JSON text, and how deeply they are nested.
@@ -116,6 +118,13 @@ def _check_letters(level: Sequence[Any]) -> None:
         for value in [*inner, *inner.values()] if isinstance(inner, dict) else inner:
             if isinstance(value, str) and not value.isascii():
                 value.encode()
+
+
+def span_s(time_s: np.ndarray) -> float:
+    """From the earliest to the latest of these time stamps that are finite (s), to compare with `MAX_SECONDS`."""
+    known = np.asarray(time_s, np.float64)
+    known = known[np.isfinite(known)]
+    return float(np.ptp(known)) if known.size else 0.0
 
 
 def count_rows(n: int) -> None:

@@ -171,7 +171,8 @@ def _copy(path: Path, copy: Path) -> None:
         for file in sorted(f for f in path.iterdir() if f.suffix.lower() in (".csv", ".json") and f.is_file()):
             member = zipfile.ZipInfo(file.name)
             member.compress_type = zipfile.ZIP_DEFLATED
-            archive.writestr(member, file.read_bytes())
+            with file.open("rb") as source, archive.open(member, "w") as target:
+                shutil.copyfileobj(source, target)
 
 
 def _check_there(path: Path) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pbl_pipeline.bounded import MAX_SECONDS, span_s
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_numbers, load_npz, picture_size, text_of, texts_of
 from pbl_pipeline.video import Attitude, Camera, check_attitude, check_lens
@@ -102,6 +103,8 @@ class Keypoints:
         for name, (array, shape) in shapes.items():
             if np.shape(array) != shape:
                 raise _format_error(f"{name} has shape {np.shape(array)}", f"shape {shape} for {n} frames, {j} names")
+        if span_s(self.time_s) > MAX_SECONDS:
+            raise _format_error(f"time stamps that span {span_s(self.time_s):.3g} s", f"at most {MAX_SECONDS:g} s")
         if np.any(~np.isfinite(self.confidence)) or np.any(self.confidence < 0) or np.any(self.confidence > 1):
             raise _format_error("confidence outside 0..1 or not finite", "0 for a missing point, at most 1")
         check_lens(self.camera.matrix, self.camera.distortion, self.image_size_px)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pbl_pipeline.bounded import MAX_SECONDS, span_s
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_numbers, load_npz, text_of, texts_of
 from pbl_pipeline.names import is_plain
@@ -71,6 +72,8 @@ class WorldMarkers:
             )
         if not np.isfinite(self.time_s).all():
             raise _format_error("time stamps that are not finite", "seconds")
+        if span_s(self.time_s) > MAX_SECONDS:
+            raise _format_error(f"time stamps that span {span_s(self.time_s):.3g} s", f"at most {MAX_SECONDS:g} s")
         if np.isinf(self.xyz_world_m).any():
             raise _format_error("infinite positions", "metres, NaN where a marker was not seen")
         c = self.confidence

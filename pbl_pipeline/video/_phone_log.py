@@ -35,6 +35,8 @@ SENSORS = {
     "gyroscope": (("gx", "gy", "gz"), "rad/s"),
     "magnetometer": (("mx", "my", "mz"), "uT"),
 }
+#: Latest time in a log (s), on whichever clock, and years in which one may begin.
+_LATEST_S, _YEARS = 1e10, range(1990, 2200)
 #: An accelerometer shows gravity where its typical length (m/s^2) lies in this range; it then must agree with the log's
 #: way up within this angle.
 _GRAVITY, _MOST_TILT_DEG = (8.8, 10.8), 25.0
@@ -95,6 +97,9 @@ def read_phone_log(path: str | Path) -> PhoneLog:
         log = _read_json(path, text) if is_json else _read_csv(path, text)
     if not is_plain(log.device):
         raise log_error(f"a phone called {ascii(log.device)[:80]}", "a name without control characters", path)
+    if np.abs(log.time_s).max() > _LATEST_S or bounded.span_s(log.time_s) > bounded.MAX_SECONDS:
+        found = f"times from {log.time_s[0]:.6g} to {log.time_s[-1]:.6g} s"
+        raise log_error(found, f"seconds, {bounded.MAX_SECONDS:g} at most", path)
     _check_gravity(path, log)
     return log
 
@@ -245,6 +250,8 @@ def _utc(path: Path, value: object) -> float | None:
         when = datetime.datetime.fromisoformat(str(value))
     except ValueError as error:
         raise log_error(f"start_utc {value!r}", "a time such as 2026-03-01T09:15:30.250Z", path) from error
+    if when.year not in _YEARS:
+        raise log_error(f"start_utc {value!r}", f"a year from {_YEARS.start} to {_YEARS.stop - 1}", path)
     if when.tzinfo is None:
         raise log_error(f"start_utc {value!r} without a time zone", "a time such as 2026-03-01T09:15:30.250Z", path)
     return when.timestamp()

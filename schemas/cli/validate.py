@@ -96,7 +96,10 @@ def tables(
     others are shown, and the exit code is 1.
     """
     from pbl_pipeline.files import check_out_folder
+    from pbl_pipeline.names import check_label
 
+    for what, text in (("--dataset", dataset), ("--source", source)):
+        check_label(what, text or "", 64)
     if out is not None:
         check_out_folder(out)
     refused: list[PblError] = []

@@ -57,8 +57,8 @@ def scaled(name: str, by: float) -> Callable[[dict[str, Any]], object]:
         ("walk.keypoints.npz", put(names=np.asarray(["a\x1b[2J"] * 33)), "FILE_FORMAT"),
         ("walk.keypoints.npz", put(marker_set=np.asarray(["blazepose_33"])), "FILE_FORMAT"),
         ("lab.markers.npz", scaled("xyz_world_m", 0.0), "GAIT_INPUT"),
-        ("lab.markers.npz", last_stamp(1e5), "GAIT_INPUT"),  # its even grid would have ten million moments
-        ("lab.markers.npz", last_stamp(1e9), "GAIT_INPUT"),
+        ("walk.keypoints.npz", last_stamp(1e9), "FILE_FORMAT"),  # its even grid would have 10^11 moments
+        ("lab.markers.npz", last_stamp(1e5), "FILE_FORMAT"),
         ("walk.fit.npz", put(scale=np.ones(3)), "FILE_FORMAT"),
         ("walk.fit.npz", put(scale=np.zeros(8)), "GAIT_INPUT"),
         ("walk.fit.npz", last_stamp(1e9), "GAIT_INPUT"),
@@ -89,6 +89,18 @@ def test_of_an_hour_the_legs_on_an_even_grid_stay_small(tmp_path: Path):
     with guarded() as peak:
         files.use_fit(path)
     assert peak.grown_mib < 512
+
+
+@pytest.mark.parametrize(
+    ("time_s", "start_utc"),
+    [([0, 0.02, 1e9], ""), ([1e12, 1e12 + 1, 1e12 + 2], ""), ([0, 1, 2], "9999-12-31T23:59:59Z"), ([-1e300, 0, 1], "")],
+)
+def test_logs_of_times_that_cannot_be(tmp_path: Path, time_s: list[float], start_utc: str):
+    path = tmp_path / "log.csv"
+    rows = [f"{t!r},0.5,-0.5,0.5,-0.5,{start_utc}" for t in time_s]
+    path.write_text("\n".join(["time_s,qw,qx,qy,qz,start_utc", *rows]))
+    with pytest.raises(PblError, match="PHONE_LOG"):
+        files.use_log(path)
 
 
 @pytest.mark.parametrize("value", [None, 3, "text", [1], {"trials": 3}, {"trials": None, "params_hash": 1, "qc": []}])

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from pbl_pipeline.bounded import MAX_SECONDS, span_s
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait.motion import FootTrajectories
 
@@ -14,8 +15,6 @@ from .network.predict import GRID_HZ, MAX_GAP_S, Grid, on_grid
 
 #: Somebody who sits has the hips at half of this length above the feet and more; below it the legs lie.
 MIN_HIP_HEIGHT = 0.3
-#: Longest recording (s): what lies between its time stamps is put on an even grid.
-LONGEST_S = 3600.0
 #: Cosine between where the pelvis faces and where it goes, below which the person walks backwards.
 BACKWARDS = -0.5
 
@@ -25,7 +24,7 @@ def check_preconditions(feet: FootTrajectories, least_s: float) -> tuple[Grid | 
 
     The grid is None where the legs' joints are not known (`legs_m` None; then only the way on the ground is looked at)
     or are in view for less than `least_s`. Raises `PblError` GAIT_INPUT: joints upside down, mirrored or all
-    at one place, or more than `LONGEST_S`.
+    at one place, or more than `MAX_SECONDS`.
     """
     grid, reason, advice = _grid(feet, least_s)
     if not reason and feet.heading_agreement < BACKWARDS:
@@ -41,9 +40,9 @@ def _grid(feet: FootTrajectories, least_s: float) -> tuple[Grid | None, str, str
     if len(time) < 4 or time[-1] - time[0] < least_s:
         return None, f"the person is in view for less than {least_s:g} s", "film at least three steps"
     step_s = float(np.median(np.diff(time)))
-    if time[-1] - time[0] > LONGEST_S:
-        said = f"{time[-1] - time[0]:.3g} s from the first to the last time stamp"
-        raise input_error(said, f"at most {LONGEST_S:g} s of one recording: are the time stamps in seconds?")
+    if span_s(time) > MAX_SECONDS:
+        said = f"{span_s(time):.3g} s from the first to the last time stamp"
+        raise input_error(said, f"at most {MAX_SECONDS:g} s of one recording: are the time stamps in seconds?")
     if step_s > MAX_GAP_S:
         said = f"frames {step_s:.3g} s apart: gait events cannot be seen in these"
         return None, said, "check that the time stamps are in seconds"
