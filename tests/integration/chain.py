@@ -17,12 +17,13 @@ import pbl_pipeline.fit
 import pbl_pipeline.keypoints
 import pbl_pipeline.tracking
 from pbl_pipeline.body import load_body
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.qc import Check
 from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.tracking import PersonTrack, Tracking
-from pbl_pipeline.video import VideoInfo, probe
+from pbl_pipeline.video import VideoInfo, check_lens, probe
 from tests.videos import constant_rate, numbered_frames, write_video
 from tests.walker import observe
 from tests.walking_fit import walking_fit
@@ -60,7 +61,9 @@ def detect_keypoints(video_path, tracking, person_id, camera, params=None) -> Ke
     """The synthetic walker, seen without noise; person 2 is another height in the picture."""
     time = tracking.time_s
     found = observe(plain_walk(time, start_m=(7.0 if person_id == 1 else 9.0, -3.0)), time)
-    if camera.kind in ("metadata", "preset"):  # a lens of the small video: in the walker's picture it would fold back
+    try:
+        check_lens(camera.matrix, camera.distortion, found.image_size_px)
+    except PblError:  # the lens of a small video: over the walker's picture its distortion cannot be
         camera = dataclasses.replace(camera, distortion=np.zeros(5))
     return dataclasses.replace(found, camera=camera)
 
