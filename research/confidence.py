@@ -201,6 +201,9 @@ def main(data: Path, version: int, method: str, keypoints: Path, out: Path, plot
     """Fit the curve and add it to the file of curves."""
     of = METHODS.find(method)
     errors = measured(data, keypoints, of)
+    for e in errors:
+        median, most = 100 * np.percentile(e.error_trunk, [50, 90])
+        click.echo(f"  {e.title:44} error in the picture: median {median:.1f} %, 90 % within {most:.1f} % of the trunk")
     name = of.params.detector if of.name == METHODS.default else of.name
     curve = fit_curve(errors, f"{name}-v{version}", curve_params(of.params))
     click.echo("\nof a recording, by a curve fitted to the other datasets (stated confidence taken as it is | curve)")
