@@ -34,15 +34,17 @@ with warnings.catch_warnings():
 from datajoint.adapters import ADAPTERS, MySQLAdapter
 from datajoint.errors import AccessError, DuplicateError, IntegrityError, LostConnectionError
 from datajoint.hash_registry import get_store_backend
-from datajoint.storage import StorageBackend
+from datajoint.storage import StorageBackend, build_object_path
 from pymysql.converters import escape_string
 
 __all__ = [
+    "UTC",
     "AccessError",
     "DuplicateError",
     "IntegrityError",
     "LostConnectionError",
     "backend_of",
+    "build_object_path",
     "datajoint",
     "dj",
     "full_path",
@@ -55,8 +57,12 @@ dj: Any = datajoint
 
 
 # ------------------------------------------------------------------------------------------------------------ MariaDB
+#: What makes CURRENT_TIMESTAMP a time that never goes back in autumn.
+UTC = "SET SESSION time_zone = '+00:00'"
+
+
 class MySQLOrMariaDB(MySQLAdapter):
-    """DataJoint's adapter for MySQL, which makes each new connection (also a later one) work on MariaDB too.
+    """DataJoint's adapter for MySQL, which makes each new connection (also a later one) work on MariaDB too, in UTC.
 
     Two things differ there. MariaDB does not see that a primary key determines the other columns of its table, so that
     with ONLY_FULL_GROUP_BY `A.aggr(B)` fails with error 1055; and its JSON type is text, for which DataJoint hands a
@@ -64,12 +70,13 @@ class MySQLOrMariaDB(MySQLAdapter):
     """
 
     def connect(self, *args: Any, **kwargs: Any) -> Any:
-        """The driver's connection, repaired where the server is MariaDB."""
+        """The driver's connection in UTC, repaired where the server is MariaDB."""
         connection = super().connect(*args, **kwargs)
-        if "MariaDB" in connection.get_server_info():
-            with connection.cursor() as cursor:
+        with connection.cursor() as cursor:
+            cursor.execute(UTC)
+            if "MariaDB" in connection.get_server_info():
                 cursor.execute("SET SESSION sql_mode = REPLACE(@@SESSION.sql_mode, 'ONLY_FULL_GROUP_BY', '')")
-            connection.encoders = {**connection.encoders, dict: _json_literal}
+                connection.encoders = {**connection.encoders, dict: _json_literal}
         return connection
 
 

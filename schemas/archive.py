@@ -22,7 +22,7 @@ from .codes import SUBJECT_CODE
 from .folders import private_folder, remove_empty
 from .json_files import write_json
 
-#: Name of the installation-wide lock that whoever changes the archive holds (`connection.alone`).
+#: Name of the installation-wide lock that whoever changes the archive holds (`worker.alone`).
 LOCK = "incoming"
 REFUSED, COPIES = "_refused", ".incoming"
 

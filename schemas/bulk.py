@@ -79,7 +79,7 @@ def _insert(chunk: list[Recording], chosen: dict[str, str]) -> int:
     )
     lab.Subject.insert(subjects, skip_duplicates=True)
     sessions = _sessions({(r.subject, r.session_label) for r in new.values()}, now)
-    first = next_id(video.Video, "video_id")
+    first = next_id(video.Video, "video_id", len(new))
     rows: list[dict[str, Any]] = [
         {
             "video_id": first + i,
@@ -106,7 +106,7 @@ def _sessions(wanted: set[tuple[str, str]], now: datetime.datetime) -> dict[tupl
     asked = [{"subject": s, "session_label": label} for s, label in wanted]
     found = {(r["subject"], r["session_label"]): int(r["session_id"]) for r in (session.Session & asked).to_dicts()}
     missing = sorted(wanted - set(found))
-    first = next_id(session.Session, "session_id")
+    first = next_id(session.Session, "session_id", len(missing))
     session.Session.insert(
         {
             "session_id": first + i,

@@ -31,8 +31,6 @@ from __future__ import annotations
 import os
 import socket
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import pymysql
@@ -40,9 +38,9 @@ import pymysql
 from pbl_pipeline.errors import PblError
 
 from . import embedded
+from ._datajoint import UTC, LostConnectionError, backend_of, datajoint, dj
 from ._datajoint import DuplicateError as DuplicateError  # these four for the workers
 from ._datajoint import IntegrityError as IntegrityError
-from ._datajoint import LostConnectionError, backend_of, datajoint, dj
 from ._datajoint import inserting as inserting
 from .embedded import APP_USER, HOST, Folder, not_running
 from .secret_files import secret
@@ -146,7 +144,6 @@ def configure(target: dict[str, Any] | None = None) -> None:
         dj.config["database.user"] = target["user"]
         dj.config["database.password"] = target["password"]
         dj.config["database.use_tls"] = None if target["use_tls"] is None else bool(target["use_tls"])
-    dj.config["safemode"] = False  # commands ask before they delete; DataJoint's own prompt hangs without a terminal
     dj.config["database.reconnect"] = True
     dj.config["loglevel"] = os.environ["DJ_LOG_LEVEL"]
     dj.config.stores.clear()
@@ -226,24 +223,9 @@ def plain_connection(**options: Any) -> pymysql.Connection[Any]:
     tls: dict[str, Any] = {"ssl_disabled": True} if target["use_tls"] is False else {"ssl": target["use_tls"]}
     login = {name: target[name] for name in ("host", "port", "user", "password")}
     try:
-        return pymysql.connect(**login, **tls, charset="utf8mb4", autocommit=True, **options)
+        return pymysql.connect(**login, **tls, charset="utf8mb4", autocommit=True, init_command=UTC, **options)
     except pymysql.err.OperationalError as error:
         raise _login_error(target, error) from error
-
-
-@contextmanager
-def alone(work: str, server: datajoint.Connection) -> Iterator[bool]:
-    """Hold an installation-wide lock for some work: only one process on any machine has it.
-
-    Yields whether it was obtained; never waits. It is released when the process or its connection ends.
-    """
-    name = schema_name(work)  # locks are the server's, which may hold other installations
-    obtained = server.query("SELECT GET_LOCK(%s, 0)", args=(name,)).fetchone()[0] == 1
-    try:
-        yield obtained
-    finally:
-        if obtained:
-            server.query("SELECT RELEASE_LOCK(%s)", args=(name,))
 
 
 def store_backend() -> Any:

@@ -22,7 +22,7 @@ from typing import Any
 from pbl_pipeline import progress, settings
 from pbl_pipeline.errors import PblError
 
-from . import archive, catalog, connection, fit, lab, session, video
+from . import archive, catalog, connection, fit, lab, session, video, worker
 from ._datajoint import full_path
 from .archive import archive_dir
 from .catalog import Column, quote
@@ -118,7 +118,7 @@ def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> For
         DB_NOT_FOUND; DB_REFUSED while a worker computes something of this person or uploads are taken over;
         STORE_UNAVAILABLE.
     """
-    with connection.alone(archive.LOCK, connection.connect()) as obtained:
+    with worker.alone(archive.LOCK, connection.connect()) as obtained:
         if not obtained:
             raise PblError(
                 "DB_REFUSED",
@@ -185,7 +185,7 @@ def _identities(subject: str) -> Ids:
 
 
 def _still_free(ids: Ids) -> Ids:
-    """The numbers of an earlier run that are unused now: after a deletion another person may get the same ones."""
+    """The numbers of an earlier run that are unused now: in a rebuilt database another person may have them."""
     owners = {"session_id": session.Session, "video_id": video.Video, "fit_set": fit.FitSet}
     return {
         name: [v for v in values if name not in owners or not owners[name] & {name: v}] for name, values in ids.items()

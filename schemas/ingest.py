@@ -237,8 +237,8 @@ def _with_sha256(sha256: str) -> dict[str, Any] | None:
 
 
 def in_transaction(work: Callable[[], T], until: Callable[[], bool] = lambda: False) -> T:
-    """Run `work` in a transaction; again if another process took the same number (the highest plus one), unless
-    `until` holds then."""
+    """Run `work` in a transaction; again where another process inserted the same at that moment, unless `until` holds
+    then."""
     for attempt in range(_ATTEMPTS):
         try:
             with video.schema.connection.transaction:  # type: ignore[union-attr]
@@ -472,7 +472,12 @@ def _select(video_id: int, session_id: int, person: int | None, chosen: dict[str
         tracking.set_override({"video_id": video_id, "tracking_method": chosen["tracking_method"]}, person)
 
 
-def next_id(table: Any, attribute: str) -> int:
-    """The highest number in use plus one."""
-    highest = dj.U().aggr(table, highest=f"max({attribute})").fetch1("highest")
-    return 1 if highest is None else int(highest) + 1
+def next_id(table: Any, attribute: str, n: int = 1) -> int:
+    """The first of n numbers that no row of the table has or has had. Inside a transaction others wait for its end."""
+    highest = dj.U().aggr(table, highest=f"max({attribute})").fetch1("highest") or 0
+    table.connection.query(
+        f"INSERT INTO {lab.Numbered.full_table_name} VALUES (%s, %s)"  # noqa: S608
+        " ON DUPLICATE KEY UPDATE numbered_last = GREATEST(numbered_last, %s) + %s",
+        args=(attribute, int(highest) + n, int(highest), n),
+    )
+    return int((lab.Numbered & {"numbered": attribute}).fetch1("numbered_last")) - n + 1

@@ -1,4 +1,4 @@
-"""Job tables: DataJoint's queue of each computed table, with a column of ours that counts attempts."""
+"""Job tables: DataJoint's queue of each computed table, with columns of ours that count attempts."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ from pbl_pipeline.errors import PblError
 
 from ._datajoint import AccessError
 
-#: Counts how often a job was put back because of its own inputs; DataJoint's job table has no such column.
-ATTEMPTS = "attempts"
+#: Columns that DataJoint's job table lacks, 0 for each new job, and what they count.
+COUNTS = {
+    "attempts": "how often its inputs changed or it took its process down",
+    "deaths": "how often the worker that held it died, whatever the reason",
+}
 
 #: The server's number of "duplicate column name": another process was quicker.
 _THERE_ALREADY = 1060
@@ -31,29 +34,29 @@ def keys_of(table: Any) -> Any:
 def jobs_of(table: Any) -> Any:
     """The job table of a computed table (class), made once: DataJoint reads every foreign key of the server for it.
 
-    It is declared where it is missing, and gets its column `attempts` (0 for each new job); an account that may not
-    declare relies on `schemas._declare.declare_all`. Both end a transaction that is open.
+    It is declared where it is missing, and gets the columns of `COUNTS`; an account that may not declare relies on
+    `schemas._declare.declare_all`. Both end a transaction that is open.
     """
     if table not in _jobs:
         jobs = table.jobs
-        if ATTEMPTS not in jobs.heading.names:
-            _add_attempts(jobs)
+        if missing := [name for name in COUNTS if name not in jobs.heading.names]:
+            _add(jobs, missing)
             jobs = table.jobs
         _jobs[table] = jobs
     return _jobs[table]
 
 
-def _add_attempts(jobs: Any) -> None:
-    column = f"`{ATTEMPTS}` tinyint NOT NULL DEFAULT 0 COMMENT 'how often its inputs were missing or changed'"
+def _add(jobs: Any, names: list[str]) -> None:
+    columns = ", ".join(f"ADD COLUMN `{n}` tinyint NOT NULL DEFAULT 0 COMMENT '{COUNTS[n]}'" for n in names)
     try:
-        jobs.connection.query(f"ALTER TABLE {jobs.full_table_name} ADD COLUMN {column}")
+        jobs.connection.query(f"ALTER TABLE {jobs.full_table_name} {columns}")
     except pymysql.err.OperationalError as error:
         if error.args[0] != _THERE_ALREADY:
             raise
     except AccessError as error:
         raise PblError(
             "DB_MIGRATION",
-            found=f"the queue {jobs.full_table_name} has no column {ATTEMPTS}, and this account may not add it",
+            found=f"the queue {jobs.full_table_name} lacks {', '.join(names)}, which this account may not add",
             expected="queues as `pbl db init` makes them",
             next_step="run `pbl db init` once with an account that may change tables",
         ) from error

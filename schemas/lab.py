@@ -10,6 +10,16 @@ schema = dj.Schema()
 
 
 @schema
+class Numbered(dj.Manual):
+    definition = """
+    # highest number ever given, which outlives the row that had it: no number is given twice
+    numbered        : varchar(32)              # column, such as video_id
+    ---
+    numbered_last   : int32
+    """
+
+
+@schema
 class Project(dj.Manual):
     definition = """
     # a study or clinic

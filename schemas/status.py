@@ -209,7 +209,7 @@ def throughput(server: Any, minutes: int = 60) -> dict[str, float]:
     return {str(stage): 3600.0 * float(n) / max(float(seconds), 60.0) for stage, n, seconds in rows}
 
 
-def live_workers(seen_within_s: float = 180.0) -> list[dict[str, Any]]:
+def live_workers(seen_within_s: float = 60.0) -> list[dict[str, Any]]:
     """Workers whose heart beat lately: host, process, resource, what they do."""
     alive = worker.Worker & "worker_stopped IS NULL"
     alive = alive & f"worker_seen > CURRENT_TIMESTAMP(3) - INTERVAL {float(seen_within_s)} SECOND"

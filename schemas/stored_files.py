@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import glob
 import os
 import shutil
 import tempfile
@@ -15,7 +17,7 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 
 from . import connection
-from ._datajoint import backend_of, full_path
+from ._datajoint import backend_of, build_object_path, full_path
 
 #: How the names of temporary folders begin; the number of the process follows.
 _PREFIX = "pbl-files-"
@@ -94,6 +96,31 @@ def _readable(path: Path, ref: Mapping[str, Any]) -> Iterator[None]:
         if isinstance(error, OSError) and error.filename not in (None, str(path)):
             raise  # it is about another file, such as one that is written
         raise _damaged(ref, f"{type(error).__name__}: {error}") from error
+
+
+def remove_left_over(table: Any, key: Mapping[str, Any], since_s: float) -> None:
+    """Remove the files of the store that attempts to insert this key into a table (instance) left since a time of the
+    clock. Call it while no other worker may insert the key.
+
+    Only in a store that is a folder: a worker may not delete from a bucket (`pbl cron disk` finds them there). Older
+    files belong to a row that was deleted, which a backup that is being made may name.
+    """
+    backend = backend_of(connection.STORE)
+    if backend.protocol != "file":
+        return
+    ordered, name = {n: key[n] for n in table.primary_key}, table.table_name
+    path, _ = build_object_path(table.database, name, "", ordered, None, schema_prefix=connection.store_root())
+    schema = Path(full_path(backend, f"{connection.store_root()}/{table.database}"))
+    of_key = Path(full_path(backend, path)).parent.relative_to(schema / name)
+    folders = [schema / name / of_key, *schema.glob(f"{name}__*/{glob.escape(str(of_key))}")]  # parts as well
+    left = [f for folder in folders for f in folder.rglob("*") if f.is_file() and f.stat().st_mtime >= since_s]
+    # FOR UPDATE: a populate without reservations that is inserting the key is waited for.
+    if not left or table.connection.query(f"{(table & ordered).proj().make_sql()} FOR UPDATE").fetchone():
+        return
+    for file in left:
+        file.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            file.parent.rmdir()
 
 
 def file_ref(value: Any) -> dict[str, Any]:

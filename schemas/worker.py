@@ -1,6 +1,11 @@
-"""Who works on the queues: processes with their heartbeats, what they did by the minute, jobs that killed them."""
+"""Who works on the queues: processes with their heartbeats, what they did by the minute."""
 
 from __future__ import annotations
+
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
 
 from ._datajoint import dj
 
@@ -39,20 +44,6 @@ class Throughput(dj.Manual):
 
 
 @schema
-class Crash(dj.Manual):
-    definition = """
-    # jobs in whose hands a worker process died or was ended at its time limit; too often makes an error row
-    stage           : varchar(64)              # computed table
-    job_hash        : char(16)                 # of the job's key
-    ---
-    job_key         : json
-    crash_n         : int16                    # how often
-    crash_reason    : varchar(255)             # of the last time
-    crash_time      : datetime                 # of the last time, UTC
-    """
-
-
-@schema
 class Look(dj.Manual):
     definition = """
     # when somebody last looked at all tables for what can be computed
@@ -60,3 +51,42 @@ class Look(dj.Manual):
     ---
     look_time   : datetime(3)                  # clock of the database server
     """
+
+
+@schema
+class Turn(dj.Manual):
+    definition = """
+    # work that one process of the installation does at a time, and whose turn it is
+    work            : varchar(32)
+    ---
+    turn_lock       : char(32)                 # random name of a lock of the server
+    turn_connection : int64                    # connection whose turn it is while it has that lock
+    """
+
+
+@contextmanager
+def alone(work: str, server: Any) -> Iterator[bool]:
+    """Hold an installation-wide lock for some work: only one process on any machine has it.
+
+    Yields whether it was obtained; never waits. It ends with the process or its connection, as the server's named locks
+    do. Those are anybody's to take, also an analyst's; so one counts only together with a row that names it and its
+    connection, which takes the right to write.
+
+    Parameters
+    ----------
+    server
+        A connection of DataJoint.
+    """
+    lock, table = secrets.token_hex(16), Turn.full_table_name
+    server.query("SELECT GET_LOCK(%s, 0)", args=(lock,))
+    try:
+        server.query(f"INSERT IGNORE INTO {table} VALUES (%s, '-', 0)", args=(work,))  # noqa: S608
+        mine = server.query(
+            f"UPDATE {table} SET turn_lock=%s, turn_connection=CONNECTION_ID()"  # noqa: S608
+            " WHERE work=%s AND NOT (IS_USED_LOCK(turn_lock) <=> turn_connection)",
+            args=(lock, work),
+        )
+        yield mine.rowcount == 1
+    finally:
+        server.query(f"DELETE FROM {table} WHERE work=%s AND turn_lock=%s", args=(work, lock))  # noqa: S608
+        server.query("SELECT RELEASE_LOCK(%s)", args=(lock,))

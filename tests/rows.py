@@ -26,8 +26,9 @@ def everything() -> dict[str, list[tuple]]:
 
 
 def everything_but_refreshes() -> dict[str, list[tuple]]:
-    """`everything` without the time of the last refresh, which every populate writes."""
-    return {name: rows for name, rows in everything().items() if not name.endswith("_worker.look")}
+    """`everything` without what is nobody's: the last refresh, which every populate writes, and the numbers given."""
+    nobodys = ("_worker.look", "_lab.numbered")
+    return {name: rows for name, rows in everything().items() if not name.endswith(nobodys)}
 
 
 def remove_all() -> None:

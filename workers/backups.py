@@ -9,7 +9,7 @@ import shutil
 from pathlib import Path
 
 from pbl_pipeline.errors import PblError
-from schemas import connection
+from schemas import connection, worker
 from schemas.backup import Backup, Say, backup
 
 #: Names of the backups that are made here; nothing else in the folder is touched.
@@ -40,7 +40,7 @@ def backup_regularly(root: Path, keep: int, say: Say = lambda _: None) -> Backup
     PblError
         What `schemas.backup.backup` raises; nothing is removed then.
     """
-    with connection.alone("backup", connection.connect()) as obtained:
+    with worker.alone("backup", connection.connect()) as obtained:
         if not obtained:
             return None
         before = sorted(p for p in root.glob("*") if _PATTERN.fullmatch(p.name))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from . import queue, run_job
 from .queue import Claim
-from .run_job import Computed
+from .run_job import Computed, Outcome
 
 if TYPE_CHECKING:
     from .loop import Worker
@@ -36,8 +36,10 @@ def run_fits(first: list[Claim], worker: Worker) -> None:
                 for job, made in zip(batch, result.result(), strict=True):
                     left.remove(job)
                     ended.append(worker.one(job, made))
-            except (KeyboardInterrupt, SystemExit):  # told to end at once
+            except BaseException:  # told to end at once, or the database does not answer
                 device.shutdown(wait=False, cancel_futures=True)
+                for job in left:
+                    worker.report(job, Outcome(job, run_job.LATER))
                 for job in (*left, *(job for jobs, _ in waiting for job in jobs)):
                     queue.put_back(job)
                 raise

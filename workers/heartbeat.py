@@ -60,9 +60,10 @@ class Heartbeat:
         self._lock, self._stop = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
         self._connection: Any = None
+        self._registered = False
 
     def __enter__(self) -> Heartbeat:
-        self._beat(first=True)
+        self._try_to_beat()
         self._thread.start()
         return self
 
@@ -86,12 +87,15 @@ class Heartbeat:
 
     def _run(self) -> None:
         while not self._stop.wait(PERIOD_S):
-            try:
-                self._beat()
-            except (pymysql.err.Error, dj.DataJointError, PblError, OSError):
-                self._connection = None  # unavailable: try again at the next beat
+            self._try_to_beat()
 
-    def _beat(self, first: bool = False, last: bool = False) -> None:
+    def _try_to_beat(self) -> None:
+        try:
+            self._beat()
+        except (pymysql.err.Error, dj.DataJointError, PblError, OSError):
+            self._connection = None  # unavailable: try again at the next beat
+
+    def _beat(self, last: bool = False) -> None:
         if self._connection is None:
             self._connection = connection.another()
         run, now = self._connection.query, "CURRENT_TIMESTAMP(3)"
@@ -100,13 +104,14 @@ class Heartbeat:
             doing, counts = self._doing, {k: tuple(v) for k, v in self._counts.items()}
             self._counts.clear()
         try:
-            if first:
+            if not self._registered:
                 columns = "worker, worker_host, worker_pid, worker_resource, worker_version"
                 run(
                     f"INSERT INTO {table} ({columns}, worker_started, worker_seen, worker_doing)"  # noqa: S608
                     f" VALUES (%s, %s, %s, %s, %s, {now}, {now}, '')",
                     args=(self.worker, platform.node(), os.getpid(), self.resource, code_version()),
                 )
+                self._registered = True
             stopped = f", worker_stopped={now}" if last else ""
             run(
                 f"UPDATE {table} SET worker_seen={now}, worker_doing=%s{stopped} WHERE worker=%s",  # noqa: S608

@@ -25,7 +25,7 @@ import pymysql
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import read_phone_log, sha256_of
-from schemas import connection, video
+from schemas import video, worker
 from schemas.archive import COPIES, LOCK, REFUSED, archive_dir, folder_of, load_seen, remove_copies, save_seen
 from schemas.codes import check_subject
 from schemas.connection import dj
@@ -91,7 +91,7 @@ def take_over(
         until then stays in the drop folder.
     """
     drop, archive = drop_folder(url or incoming_url()), archive or archive_dir()
-    with connection.alone(LOCK, video.Video.connection) as obtained:
+    with worker.alone(LOCK, video.Video.connection) as obtained:
         if not obtained:
             return None
         out = Taken()

@@ -31,7 +31,7 @@ class Worker:
     """One working process.
 
     tables: the computed tables it serves. stop: set when it is to end after the running job. report: called with each
-    job before it (without an outcome) and after it. batch: fits per batch.
+    job before it and while it waits for the database (without an outcome), and after it. batch: fits per batch.
     limit: most jobs of each table. found: what its looks at the tables, and its jobs, made computable.
     """
 
@@ -51,23 +51,25 @@ class Worker:
     def run(self, once: bool = False, max_jobs: int | None = None) -> None:
         """Work until `stop`; with `once` until nothing is left to do anywhere."""
         self._everything = True if once else None
-        idle = IDLE_S[0]
+        idle, troubled = IDLE_S[0], 0
         while not self.stop.is_set() and (max_jobs is None or self.done + self.failed < max_jobs):
             try:
                 n = self.step()
+                found = bool(n) or self._refresh()
             except run_job.DATABASE_ERRORS as error:
-                if not run_job.is_gone(error):
+                troubled += 1
+                if troubled * run_job.DATABASE_PAUSE_S > run_job.DATABASE_WAIT_S:
                     raise
-                self.heartbeat.doing("waits for the database")
+                self.heartbeat.doing(f"waits for the database: {error}")
                 event(log, logging.WARNING, "database away", error=str(error)[:200])
-                run_job.wait_for_database(self.stop)
+                run_job.wait_for_database(self.stop, pause=not run_job.is_gone(error))
                 queue.let_go_all()  # what was reserved for later; a job in hand has waited for the database itself
                 self._refreshed = -1e9
                 continue
+            troubled = 0
             if n:
                 idle = IDLE_S[0]
                 continue
-            found = self._refresh()
             if found:
                 continue
             if once and found is not None:
@@ -115,8 +117,8 @@ class Worker:
         self.heartbeat.doing(str(job))
         self.report(job, None)
         try:
-            outcome = run_job.run(job, computed, self.stop)
-        except (KeyboardInterrupt, SystemExit):  # it was put back
+            outcome = run_job.run(job, computed, self.stop, lambda: self.report(job, None))
+        except BaseException:  # it was put back, or the database would not take how it ended
             self.report(job, Outcome(job, run_job.LATER))
             raise
         self.report(job, outcome)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -15,6 +17,9 @@ from .run_job import Outcome
 
 #: Upper ends of the duration classes (s): from a light job to a long video.
 SECONDS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
+
+#: Seconds between two looks at the lengths of the queues, and after which a look counts as too old: the database hangs.
+READ_EVERY_S, FRESH_S = 15.0, 45.0
 
 
 class Metrics:
@@ -41,25 +46,35 @@ class Metrics:
 
 
 class _Queues(Collector):
-    """Job rows by table and status, read at each request."""
+    """Job rows by table and status, as a thread last read them: a request never waits for the database."""
 
     def __init__(self, connect: Callable[[], Any]) -> None:
-        self._connect, self._connection, self._lock = connect, None, threading.Lock()
+        self._connect = connect
+        self._counts: dict[str, dict[str, int]] = {}
+        self._read = -math.inf  # time of the last answer
+        threading.Thread(target=self._run, name="queues", daemon=True).start()
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
-        from schemas.status import queue_counts
-
+        """The counts, while they are not too old, and whether they are."""
         rows = GaugeMetricFamily("pbl_queue_jobs", "Jobs by table and status", labels=["table", "status"])
         up = GaugeMetricFamily("pbl_database_up", "1 when the database answers")
-        with self._lock:
-            try:
-                self._connection = self._connection or self._connect()
-                for table, counts in queue_counts(self._connection).items():
-                    for status, n in counts.items():
-                        rows.add_metric([table, status], n)
-                up.add_metric([], 1)
-            except Exception:  # noqa: BLE001  an endpoint that fails would hide all other figures
-                self._connection = None
-                up.add_metric([], 0)
+        answers = time.monotonic() - self._read < FRESH_S
+        if answers:
+            for table, counts in self._counts.items():
+                for status, n in counts.items():
+                    rows.add_metric([table, status], n)
+        up.add_metric([], int(answers))
         yield rows
         yield up
+
+    def _run(self) -> None:
+        from schemas.status import queue_counts
+
+        connection = None
+        while True:
+            try:
+                connection = connection or self._connect()
+                self._counts, self._read = queue_counts(connection), time.monotonic()
+            except Exception:  # noqa: BLE001  away: it is asked again, for as long as the process lives
+                connection, self._read = None, -math.inf
+            time.sleep(READ_EVERY_S)

@@ -76,7 +76,7 @@ def populate(tables: Sequence[str] | None = None, limit: int | None = None, retr
     parts = {t.__name__: TableRun(t.__name__) for t in chosen}
     run = Run(list(parts.values()))
     if retry_errors:
-        run.retried = sum(queue.reset(jobs_of(t).errors) for t in chosen)
+        run.retried = sum(queue.reset_to_new(jobs_of(t).errors) for t in chosen)
     empty_before = {t: len(empty_rows(t)) for t in chosen}
     found = refresh.refresh(everything=True) or refresh.Refreshed()
     with progress.bar("populate", total=_ready(chosen, limit), unit="row") as update:

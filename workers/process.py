@@ -8,6 +8,7 @@ import math
 import os
 import signal
 import threading
+from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -83,7 +84,8 @@ def work(options: Options, pipe: Connection) -> None:
     tables = registry.tables_of(options.resource)
     if options.selftest:
         try:
-            selftest.check(tables)
+            if not _tested(tables, stop):
+                return
         except selftest.SelfTestFailed as error:
             event(log, logging.CRITICAL, "self-test failed", error=str(error))
             raise SystemExit(SELFTEST_FAILED) from error
@@ -116,4 +118,21 @@ def _connected(schemas: Any, stop: threading.Event) -> bool:
         except run_job.DATABASE_ERRORS as error:
             event(log, logging.WARNING, "database away", error=str(error)[:200])
         stop.wait(run_job.DATABASE_PAUSE_S)
+    return False
+
+
+def _tested(tables: Sequence[Any], stop: threading.Event) -> bool:
+    """Run the self-test; wait while the store is full or away."""
+    from . import selftest
+
+    while not stop.is_set():
+        try:
+            selftest.check(tables)
+            return True
+        except selftest.SelfTestFailed as error:
+            cause = run_job.cause_outside(error)
+            if cause is None:
+                raise
+            event(log, logging.WARNING, "store away", error=cause)
+        stop.wait(run_job.STORE_WAIT_S)
     return False

@@ -8,6 +8,7 @@ heartbeat of that process (`workers.heartbeat`).
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import hashlib
 import json
 import os
@@ -20,7 +21,7 @@ import pymysql
 
 from pbl_pipeline.errors import PblError
 from schemas.connection import dj
-from schemas.jobs import jobs_of, keys_of
+from schemas.jobs import COUNTS, jobs_of, keys_of
 
 from .registry import NEW
 
@@ -29,6 +30,8 @@ _AGAIN = (1205, 1213)
 _ATTEMPTS = 8
 #: Candidates looked at for each job that is wanted: others look at the same ones.
 _SPREAD = 4
+#: The longest that a job which was put back waits (s).
+LONGEST_WAIT_S = 60.0
 #: Jobs that this process holds: table and hash of the key.
 _held: set[tuple[str, str]] = set()
 
@@ -43,7 +46,7 @@ class Claim:
     host: str
     pid: int
     connection_id: int
-    attempts: int = 0  # how often it was put back because of its inputs
+    attempts: int = 0  # a column of `schemas.jobs.COUNTS`
 
     def __str__(self) -> str:
         return f"{self.table.__name__} " + ", ".join(f"{k}={v}" for k, v in self.key.items())
@@ -104,11 +107,11 @@ def _repeated(connection: Any, statement: str) -> int:
     raise AssertionError("unreachable")
 
 
-def sweep(table: Any) -> int:
+def sweep(table: Any, which: str = "status != 'reserved'") -> int:
     """Delete jobs that nobody needs any more: done by another route, or no longer asked for; returns how many."""
-    jobs = jobs_of(table)
-    n = (jobs & "status != 'reserved'").restrict(table.proj(), semantic_check=False).delete_quick(get_count=True)
-    waiting = jobs & "status != 'reserved'"
+    waiting = jobs_of(table) & which
+    n = waiting.restrict(table.proj(), semantic_check=False).delete_quick(get_count=True)
+    waiting = jobs_of(table) & which
     if len(waiting):
         vanished = waiting.restrict(dj.Not(keys_of(table).proj()), semantic_check=False)
         n += vanished.delete_quick(get_count=True)
@@ -151,17 +154,19 @@ def finish(job: Claim) -> None:
     let_go(job)
 
 
-def fail(job: Claim, message: str, stack: str = "") -> None:
-    """Make an error row of the job; it is tried again only when somebody asks (`pbl retry`)."""
-    if len(_mine(job)):
+def fail(job: Claim, message: str, stack: str = "") -> bool:
+    """Make an error row of the job; it is tried again only when somebody asks (`pbl retry`). Whether it was ours."""
+    ours = len(_mine(job)) == 1
+    if ours:
         jobs_of(job.table).error(job.key, error_message=message, error_stack=stack or None)
     let_go(job)
+    return ours
 
 
-def put_back(job: Claim, reason: str = "", delay_s: float = 0.0, attempts: int | None = None) -> bool:
-    """Make the job pending again, taken earliest after `delay_s`; `reason` stays in its row, and `attempts` counts how
-    often it was tried in vain (None: as before). Whether it was ours."""
-    ours = reset(_mine(job), reason, delay_s, job.attempts if attempts is None else attempts) == 1
+def put_back(job: Claim, reason: str = "", delay_s: float = 0.0, **counts: int) -> bool:
+    """Make the job pending again, taken earliest after `delay_s`; `reason` stays in its row, and `counts` are values of
+    columns of `schemas.jobs.COUNTS`. Whether it was ours."""
+    ours = reset(_mine(job), reason, delay_s, **counts) == 1
     let_go(job)
     return ours
 
@@ -176,12 +181,29 @@ def let_go_all() -> None:
     _held.clear()
 
 
-def reset(jobs: Any, reason: str = "", delay_s: float = 0.0, attempts: int = 0) -> int:
+def reset(jobs: Any, reason: str = "", delay_s: float = 0.0, **counts: int) -> int:
     """Make all rows of a restricted queue pending, to be taken earliest after `delay_s`; returns how many."""
+    columns = "".join(f"{name}=%s, " for name in counts)
     cursor = jobs.connection.query(  # the condition is DataJoint's, which escapes values
-        f"UPDATE {jobs.full_table_name} SET status='pending', error_message=%s, error_stack=NULL, host='', pid=0,"  # noqa: S608
-        f" attempts=%s, scheduled_time=CURRENT_TIMESTAMP(3) + INTERVAL %s MICROSECOND{jobs.where_clause()}",
-        args=(reason[:2000], attempts, int(delay_s * 1e6)),
+        f"UPDATE {jobs.full_table_name} SET {columns}status='pending', host='', pid=0, error_stack=NULL,"  # noqa: S608
+        f" error_message=%s, scheduled_time=CURRENT_TIMESTAMP(3) + INTERVAL %s MICROSECOND{jobs.where_clause()}",
+        args=(*counts.values(), reason[:2000], int(delay_s * 1e6)),
+    )
+    return int(cursor.rowcount)
+
+
+def reset_to_new(jobs: Any) -> int:
+    """`reset`, and forget earlier attempts: somebody asked for it."""
+    return reset(jobs, "", 0.0, **dict.fromkeys(COUNTS, 0))
+
+
+def wake(table: Any) -> int:
+    """Make jobs ready that would wait for longer than any is put back for: the server's clock was set back."""
+    jobs = jobs_of(table)
+    cursor = jobs.connection.query(
+        f"UPDATE {jobs.full_table_name} SET scheduled_time=CURRENT_TIMESTAMP(3) WHERE status='pending'"  # noqa: S608
+        " AND scheduled_time > CURRENT_TIMESTAMP(3) + INTERVAL %s SECOND",
+        args=(LONGEST_WAIT_S,),
     )
     return int(cursor.rowcount)
 
@@ -195,8 +217,9 @@ class ReservationLost(Exception):
     """Somebody else holds the job by now: its result must not be written twice."""
 
 
-def hold(job: Claim) -> None:
-    """Inside the transaction that inserts: go on only while the reservation is ours, and let nobody else take it.
+def hold(job: Claim) -> float:
+    """Inside the transaction that inserts: go on only while the reservation is ours, and let nobody else take it;
+    returns when the job was queued (s since 1970).
 
     The job's row is locked until the transaction ends, so a second holder of the same job waits here and then finds
     either that its reservation is gone or that the result is there.
@@ -204,11 +227,13 @@ def hold(job: Claim) -> None:
     jobs = jobs_of(job.table)
     where = " AND ".join(f"`{name}`=%s" for name in job.key)
     row = jobs.connection.query(
-        f"SELECT status, host, pid, connection_id FROM {jobs.full_table_name} WHERE {where} FOR UPDATE",  # noqa: S608
+        f"SELECT status, host, pid, connection_id, created_time FROM {jobs.full_table_name}"  # noqa: S608
+        f" WHERE {where} FOR UPDATE",
         args=tuple(job.key.values()),
     ).fetchone()
-    if row is None or tuple(row) != ("reserved", job.host, job.pid, job.connection_id):
+    if row is None or tuple(row[:4]) != ("reserved", job.host, job.pid, job.connection_id):
         raise ReservationLost(str(job))
+    return row[4].replace(tzinfo=datetime.UTC).timestamp()
 
 
 def errors_of(table: Any, code: str | None = None, keys: Iterable[Mapping[str, Any]] | None = None) -> Any:

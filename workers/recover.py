@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import json
 import os
 import platform
 from pathlib import Path
@@ -12,7 +11,6 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 from schemas import worker
 from schemas.jobs import jobs_of
-from schemas.rows import utc_now
 
 from . import queue
 from .queue import Claim
@@ -21,8 +19,9 @@ from .queue import Claim
 #: a database that is away for a minute and a process that compiles.
 DEAD_AFTER_S = 180.0
 
-#: After so many crashes of its process a job becomes an error row.
-CRASHES = 3
+#: After so many crashes of its process a job becomes an error row; and after so many deaths of the whole worker that
+#: held it, which may have had another cause.
+CRASHES, DEATHS = 3, 10
 
 #: Exceptions that say nothing about the job: a signal, a lost server. DataJoint's own populate makes error rows of them
 #: that begin with the exception's name (a worker puts the job back); they are tried again without being asked.
@@ -31,58 +30,58 @@ INTERRUPTED_ROWS = f"error_message REGEXP '^({'|'.join(INTERRUPTED)})(:|$)'"
 
 
 def free_dead(table: Any) -> int:
-    """Put jobs back that a dead process left: reserved by it, or in error because it was interrupted.
+    """Put jobs back that a dead process left: reserved by it, or in error because it was interrupted. Jobs that wait
+    for a time of a clock that was set back become ready.
 
     A process of this host is judged by its number and age. A process of another host is dead when no heartbeat of it
     was seen for `DEAD_AFTER_S`; one that never had a heartbeat (a populate by hand) when its reservation is older than
-    the time limit of its table.
+    the time limit of its table. A job whose processes died `DEATHS` times becomes an error row.
     """
-    jobs, n = jobs_of(table), 0
-    for row in jobs.reserved.proj("host", "pid", "reserved_time").to_dicts():
+    jobs, n = jobs_of(table), queue.wake(table)
+    for row in jobs.reserved.to_dicts():
         if not _alive(row, table):
-            n += queue.reset(jobs.reserved & {k: row[k] for k in jobs.primary_key} & {"pid": row["pid"]})
+            key = {k: row[k] for k in jobs.primary_key}
+            job = Claim(table, key, int(row["priority"]), row["host"], int(row["pid"]), int(row["connection_id"]))
+            deaths = int(row["deaths"]) + (job.connection_id != jobs.connection.connection_id)  # or we let it go
+            if deaths < DEATHS:
+                n += queue.put_back(job, deaths=deaths)
+            else:
+                n += queue.fail(job, _crash(job, deaths, "with its supervisor"))
     return n + queue.reset(jobs.errors & INTERRUPTED_ROWS)
 
 
-def free_own(table: Any) -> int:
-    """Put back what this process was computing when a signal ended it."""
-    mine = jobs_of(table) & {"host": platform.node(), "pid": os.getpid()}
-    return queue.reset(mine & {"status": "reserved"}) + queue.reset(mine & {"status": "error"} & INTERRUPTED_ROWS)
+def crashed(job: Claim, reason: str) -> bool:
+    """Count a crash of the job's process: put it back, or make an error row of it the third time (`CRASHES`).
 
-
-def crashed(job: Claim, reason: str, at_once: bool = False) -> bool:
-    """Count a crash of this job; put it back, or make an error row of it after `CRASHES` (or `at_once`).
-
-    Returns whether it became an error row.
+    Returns whether the job was still that process's.
     """
-    known = {"stage": job.table.__name__, "job_hash": job.hash}
-    rows = (worker.Crash & known).to_dicts()
-    n = int(rows[0]["crash_n"]) + 1 if rows else 1
-    plain = json.loads(json.dumps(job.key, default=str))
-    row = {**known, "job_key": plain, "crash_n": n, "crash_reason": reason[:255], "crash_time": utc_now()}
-    worker.Crash.insert1(row, replace=True)
-    if not at_once and n < CRASHES:
-        queue.put_back(job, f"its process died ({reason})", 1.0)
-        return False
-    if at_once:
-        error = PblError(
-            "TIME_LIMIT",
-            found=f"no result within the {reason}",
-            expected="a result in that time",
-            next_step="look at the recording; `pbl worker --limit-factor 4` allows more, then `pbl retry`",
-            key=str(job),
-        )
-    else:
-        error = PblError(
-            "WORKER_CRASH",
-            found=f"the worker's process died {n} times over this job, last: {reason}",
-            expected="a result or a coded error",
-            next_step="check memory (exit by SIGKILL) and the recording; then `pbl retry`, or report it",
-            key=str(job),
-        )
-    (worker.Crash & known).delete_quick()
-    queue.fail(job, f"PblError: {error}")
-    return True
+    n = job.attempts + 1
+    if n < CRASHES:
+        return queue.put_back(job, f"its process died ({reason})", 1.0, attempts=n)
+    return queue.fail(job, _crash(job, n, reason))
+
+
+def _crash(job: Claim, n: int, reason: str) -> str:
+    error = PblError(
+        "WORKER_CRASH",
+        found=f"the worker's process died {n} times over this job, last: {reason}",
+        expected="a result or a coded error",
+        next_step="check memory (exit by SIGKILL) and the recording; then `pbl retry`, or report it",
+        key=str(job),
+    )
+    return f"PblError: {error}"
+
+
+def overdue(job: Claim, limit_s: float) -> bool:
+    """Make a job the error row TIME_LIMIT. Returns whether it was still that process's."""
+    error = PblError(
+        "TIME_LIMIT",
+        found=f"no result within the time limit of {limit_s:g} s",
+        expected="a result in that time",
+        next_step="look at the recording; `pbl worker --limit-factor 4` allows more, then `pbl retry`",
+        key=str(job),
+    )
+    return queue.fail(job, f"PblError: {error}")
 
 
 def _alive(row: dict[str, Any], table: Any) -> bool:
@@ -96,9 +95,10 @@ def _alive(row: dict[str, Any], table: Any) -> bool:
     same = (worker.Worker & {"worker_host": row["host"], "worker_pid": row["pid"]}).to_dicts()
     if same:
         beating = [w["worker_seen"] for w in same if w["worker_stopped"] is None]
-        return bool(beating) and (now - max(beating)).total_seconds() < DEAD_AFTER_S
+        # abs: where the server's clock was set back, what was before is in the future.
+        return any(abs((now - seen).total_seconds()) < DEAD_AFTER_S for seen in beating)
     reserved = row["reserved_time"]
-    return reserved is None or (now - reserved).total_seconds() < stage_of(table).limit_s
+    return reserved is None or abs((now - reserved).total_seconds()) < stage_of(table).limit_s
 
 
 def _alive_here(pid: int, reserved: datetime.datetime | None, now: datetime.datetime) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from schemas import chain, fit, tracking, video, worker
-from schemas.connection import alone
+from schemas.worker import alone
 
 from . import queue, recover
 from .queue import Claim
@@ -147,6 +147,7 @@ def _refresh(tables: Sequence[Any], recent: Recent | None) -> Refreshed:
             out.planned = plan(None if recent is None else recent.sessions)
         where = None if recent is None else recent.where(table)
         if recent is not None and where is None:
+            out.swept += queue.sweep(table, "status = 'error'")  # few: those of a deleted row go at once
             continue
         out.swept += queue.sweep(table)
         n = queue.fill(table, where=where)
@@ -166,7 +167,7 @@ def _age_of_full_look() -> float:
         f"SELECT TIMESTAMPDIFF(SECOND, look_time, CURRENT_TIMESTAMP(3)) FROM {table} WHERE look=%s",  # noqa: S608
         args=(ALL,),
     ).fetchone()
-    return float("inf") if row is None else float(row[0])
+    return float("inf") if row is None or row[0] < 0 else float(row[0])  # in the future: the clock was set back
 
 
 def _note_full_look() -> None:

@@ -38,7 +38,7 @@ def retry(code: str | None = None, table: str | None = None, video_id: int | Non
     out = {}
     for one in tables:
         keys = None if video_id is None else _of_video(one, video_id)
-        n = queue.reset(queue.errors_of(one, code, keys)) if keys is None or keys else 0
+        n = queue.reset_to_new(queue.errors_of(one, code, keys)) if keys is None or keys else 0
         if n:
             out[one.__name__] = n
     return out

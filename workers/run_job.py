@@ -7,7 +7,7 @@ import errno
 import threading
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import deepdiff
 import pymysql
@@ -18,6 +18,7 @@ from schemas.coded_errors import error_code, error_message
 from schemas.connection import DuplicateError, IntegrityError, LostConnectionError, inserting
 from schemas.jobs import keys_of
 from schemas.rows import InputChanged
+from schemas.stored_files import remove_left_over
 
 from . import queue
 from .queue import Claim, ReservationLost
@@ -27,17 +28,23 @@ DONE, ALREADY, LOST, FAILED, LATER = "done", "already there", "somebody else has
 #: Its key is gone: a row above was deleted, or another selection took its place. Its job is deleted, not tried.
 VANISHED = "no longer asked for"
 
-#: What the driver and DataJoint raise for the database itself, and the numbers that say that it is away (the computed
-#: result is kept and written when it is back) or that the same statement will do next time.
-DATABASE_ERRORS = (LostConnectionError, pymysql.err.OperationalError, pymysql.err.InterfaceError)
+#: What the driver and DataJoint raise for the database itself, and the numbers that say that it is away, or full, or
+#: read-only (the computed result is kept and written later), or that the same statement will do next time.
+DATABASE_ERRORS = (
+    LostConnectionError,
+    pymysql.err.OperationalError,
+    pymysql.err.InterfaceError,
+    pymysql.err.InternalError,
+)
 AWAY = (0, 1040, 1053, 1927, 2002, 2003, 2006, 2013, 2055, 4031)
+FULL = (3, 1021, 1026, 1030, 1114, 1290, 1836)
 REPEAT, REPEATS = (1020, 1205, 1213), 10
 #: Attempts of a job whose inputs are gone or changed, and how long it waits after each but the last (s).
 ATTEMPTS, RETRY_S = 3, (1.0, 30.0)
 #: Errors of the file system that say nothing about the job: store full, read-only, away.
 STORE_GONE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ESTALE, errno.ENOTCONN, errno.EACCES)
 #: How long a job waits after such an error (s).
-STORE_WAIT_S = 60.0
+STORE_WAIT_S = queue.LONGEST_WAIT_S
 #: How long a result is kept for a database that is away, and the pause between two attempts to reach it (s).
 DATABASE_WAIT_S, DATABASE_PAUSE_S = 3600.0, 2.0
 
@@ -71,15 +78,22 @@ class Computed:
         return deepdiff.DeepHash(fetched)[fetched] == deepdiff.DeepHash(self.fetched)[self.fetched]
 
 
-def run(job: Claim, computed: Computed | None = None, stop: threading.Event | None = None) -> Outcome:
+def run(
+    job: Claim,
+    computed: Computed | None = None,
+    stop: threading.Event | None = None,
+    waiting: Callable[[], None] = lambda: None,
+) -> Outcome:
     """Compute and insert one reserved job, and end its reservation.
 
-    `computed`: a result from a batch; it is used if the inputs are still those it was computed from.
+    `computed`: a result from a batch; it is used if the inputs are still those it was computed from. `waiting`: called
+    again and again while the job waits for the database.
 
     A result is inserted only while the reservation is ours (`queue.hold`), so that a job which two processes were given
-    leaves one row. Where the database goes away after the computation, the result is kept and inserted when it is
-    back, for up to `DATABASE_WAIT_S`. A store that is full or away puts the job back for `STORE_WAIT_S`. A job whose
-    inputs are gone or changed is put back too, each time for longer; `ATTEMPTS` of these make an error row.
+    leaves one row. Where the database goes away after the computation, or its disk is full, the result is kept and
+    inserted when it is back, for up to `DATABASE_WAIT_S`. A store that is full or away puts the job back for
+    `STORE_WAIT_S`. A job whose inputs are gone or changed is put back too, each time for longer; `ATTEMPTS` of these
+    make an error row.
 
     KeyboardInterrupt and SystemExit put the job back and go on up.
     """
@@ -93,13 +107,14 @@ def run(job: Claim, computed: Computed | None = None, stop: threading.Event | No
             queue.put_back(job)
             raise
         except Exception as error:  # noqa: BLE001  each kind is settled below
-            if is_gone(error):
-                if wait_for_database(stop):
+            repeated += 1
+            if is_gone(error) or number_of(error) in FULL:
+                kept = repeated * DATABASE_PAUSE_S < DATABASE_WAIT_S
+                if kept and wait_for_database(stop, waiting, pause=not is_gone(error)):
                     continue
                 queue.let_go(job)  # its reservation is that of a dead process, and is freed as such
                 outcome = _outcome(job, LATER, error)
-            elif _number(error) in REPEAT and repeated < REPEATS:
-                repeated += 1
+            elif number_of(error) in REPEAT and repeated < REPEATS:
                 continue
             else:
                 outcome = _settle(job, error)
@@ -125,11 +140,17 @@ class _Attempt:
         if self.computed is None or not self.computed.of(fetched):
             self.computed = Computed(fetched, table.make_compute(dict(key), *fetched))
         with table.connection.transaction:
-            queue.hold(self.job)
+            queued_s = queue.hold(self.job)
             if not self.computed.of(table.make_fetch(dict(key))):
                 raise InputChanged("other rows than before the computation", self.job)
-            with inserting(table):
-                table.make_insert(dict(key), *self.computed.result)
+            remove_left_over(table, key, queued_s)
+            try:
+                with inserting(table):
+                    table.make_insert(dict(key), *self.computed.result)
+            except BaseException as error:
+                if not is_gone(error):  # then the job may be somebody else's; who inserts next removes them
+                    remove_left_over(table, key, queued_s)
+                raise
         return DONE
 
 
@@ -151,8 +172,8 @@ def _settle(job: Claim, error: Exception) -> Outcome:
     if isinstance(error, DuplicateError) and job.key in job.table():
         queue.finish(job)
         return Outcome(job, ALREADY)
-    if store := _store_error(error):
-        queue.put_back(job, f"STORE: {store}", STORE_WAIT_S)
+    if cause := cause_outside(error):
+        queue.put_back(job, cause, STORE_WAIT_S)
         return _outcome(job, LATER, error)
     if isinstance(error, IntegrityError):  # a row above was deleted while we computed
         error = InputChanged(f"a row that the result refers to is gone ({error})", job)
@@ -162,7 +183,7 @@ def _settle(job: Claim, error: Exception) -> Outcome:
             return Outcome(job, VANISHED)
         tried = job.attempts + 1
         if tried < ATTEMPTS:
-            queue.put_back(job, f"its inputs changed: {error.found}", RETRY_S[job.attempts], tried)
+            queue.put_back(job, f"its inputs changed: {error.found}", RETRY_S[job.attempts], attempts=tried)
             return _outcome(job, LATER, error)
     queue.fail(
         job,
@@ -172,17 +193,19 @@ def _settle(job: Claim, error: Exception) -> Outcome:
     return _outcome(job, FAILED, error)
 
 
-def _store_error(error: BaseException) -> str | None:
-    """What the file system said where it is the store's fault and not the job's."""
+def cause_outside(error: BaseException) -> str | None:
+    """What the file system or the database said where it is the store's or the server's fault and not the job's."""
+    if number_of(error) in REPEAT:
+        return f"DATABASE: {type(error).__name__}: {error}"
     seen: BaseException | None = error
     while seen is not None:
         if isinstance(seen, OSError) and seen.errno in STORE_GONE and not isinstance(error, PblError):
-            return f"{type(seen).__name__}: {seen}"
+            return f"STORE: {type(seen).__name__}: {seen}"
         seen = seen.__cause__ or seen.__context__
     return None
 
 
-def _number(error: BaseException) -> int:
+def number_of(error: BaseException) -> int:
     """The server's number of an error, 0 where there is none."""
     first = error.args[0] if isinstance(error, DATABASE_ERRORS) and error.args else 0
     return first if isinstance(first, int) else 0
@@ -190,21 +213,28 @@ def _number(error: BaseException) -> int:
 
 def is_gone(error: BaseException) -> bool:
     """Whether an error says that the database cannot be reached."""
-    return isinstance(error, LostConnectionError) or (isinstance(error, DATABASE_ERRORS) and _number(error) in AWAY)
+    return isinstance(error, LostConnectionError) or (isinstance(error, DATABASE_ERRORS) and number_of(error) in AWAY)
 
 
-def wait_for_database(stop: threading.Event | None = None, longest_s: float = DATABASE_WAIT_S) -> bool:
-    """Return True when the server answers (again); False after `longest_s`, or where we are to stop."""
-    until = time.monotonic() + longest_s
+def wait_for_database(
+    stop: threading.Event | None = None, waiting: Callable[[], None] = lambda: None, pause: bool = False
+) -> bool:
+    """Return True when the server answers (again); False after `DATABASE_WAIT_S`, or where we are to stop.
+
+    `waiting` is called before each pause, of which there is one at least with `pause`.
+    """
+    stop, until = stop or threading.Event(), time.monotonic() + DATABASE_WAIT_S
     while time.monotonic() < until:
-        try:
-            connection.connect()
-            return True
-        except (PblError, *DATABASE_ERRORS):
-            if stop is None:
-                time.sleep(DATABASE_PAUSE_S)
-            elif stop.wait(DATABASE_PAUSE_S):
-                return False
+        if not pause:
+            try:
+                connection.connect()
+                return True
+            except (PblError, *DATABASE_ERRORS):
+                pass
+        pause = False
+        waiting()
+        if stop.wait(DATABASE_PAUSE_S):
+            return False
     return False
 
 

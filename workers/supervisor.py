@@ -19,8 +19,12 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from typing import Any
+
+from pbl_pipeline.errors import PblError
+from schemas import connection
 
 from . import queue, recover, registry, run_job
 from .log import event
@@ -49,6 +53,7 @@ class _Child:
     jobs: dict[tuple[str, str], tuple[Claim, float]] = dataclasses.field(default_factory=dict)
     why: str = ""
     number: int = 0  # which of the worker's processes it is: its replacement gets the same GPU
+    overdue: bool = False
 
     def heard(self, job: Claim, outcome: Outcome | None, limit_factor: float) -> None:
         """Note a job that began (no outcome yet) or ended."""
@@ -72,6 +77,8 @@ class Supervisor:
         self._stillborn = 0
         self._stopping = False
         self._due: list[tuple[float, signal.Signals]] = []  # signals that are still to be sent, with their time
+        self._unsettled: list[Callable[[], Any]] = []  # what is to become of jobs of processes that died
+        self._settle_at = 0.0
         # Not fork: threads of the numerical libraries do not survive it.
         self._start = multiprocessing.get_context("spawn")
 
@@ -92,6 +99,7 @@ class Supervisor:
                 self._send_due()
                 self._end_overdue()
                 code = max(code, self._reap())
+                self._settle()
             return code
         finally:
             for s, handler in before.items():
@@ -136,7 +144,7 @@ class Supervisor:
             if late and child.process.is_alive():
                 first, _ = next(iter(late.values()))
                 child.why = f"time limit of {_limit_s(first, self.options.limit_factor):g} s"
-                child.jobs = late
+                child.jobs, child.overdue = late, True
                 os.kill(child.process.pid, signal.SIGKILL)
 
     def _reap(self) -> int:
@@ -178,12 +186,24 @@ class Supervisor:
         reason = child.why or _death(exit_code)
         for job, _ in child.jobs.values():
             event(log, logging.ERROR, "job took its process down", reason=reason, about=str(job))
-            if not run_job.wait_for_database():
-                return  # `recover` frees its reservation later
-            if self._stopping and not child.why.startswith("time limit"):
-                queue.put_back(job, "the worker was stopped")
+            if child.overdue:
+                self._unsettled.append(partial(recover.overdue, job, _limit_s(job, self.options.limit_factor)))
+            elif self._stopping:
+                self._unsettled.append(partial(queue.put_back, job, "the worker was stopped"))
             else:
-                recover.crashed(job, reason, at_once=child.why.startswith("time limit"))
+                self._unsettled.append(partial(recover.crashed, job, reason))
+        self._settle()
+
+    def _settle(self) -> None:
+        """Do what is unsettled; what the database does not take at the moment is done later, or left to `recover`."""
+        while self._unsettled and time.monotonic() >= self._settle_at:
+            try:
+                connection.connect()
+                self._unsettled[0]()
+            except (PblError, *run_job.DATABASE_ERRORS):
+                self._settle_at = time.monotonic() + run_job.DATABASE_PAUSE_S
+            else:
+                self._unsettled.pop(0)
 
 
 def _limit_s(job: Claim, factor: float) -> float:

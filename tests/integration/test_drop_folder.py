@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from schemas import archive as layout
-from schemas import backup, connection, forget, lab, session, uploads, video
+from schemas import backup, connection, forget, lab, session, uploads, video, worker
 from schemas.ingest import Visit, ingest
 from tests.command import pbl
 from workers import incoming
@@ -160,7 +160,7 @@ def test_a_lock_that_is_held_is_reported(drop: Path, tmp_path: Path, monkeypatch
     monkeypatch.setenv("PBL_INCOMING", str(drop))
     monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
     other = connection.another()
-    with connection.alone(layout.LOCK, other) as obtained:
+    with worker.alone(layout.LOCK, other) as obtained:
         assert obtained
         held = pbl("cron", "import")
         assert (held.code, held.out) == (75, "")

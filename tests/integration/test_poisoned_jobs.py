@@ -16,7 +16,7 @@ from schemas import connection, fit, gait, keypoints, tracking, video
 from schemas.coded_errors import error_code, error_found
 from schemas.jobs import jobs_of
 from tests.rows import register
-from workers import queue, refresh, run_job
+from workers import queue, refresh, requeue, run_job
 from workers.heartbeat import Silent
 from workers.loop import Worker
 
@@ -117,7 +117,7 @@ def test_a_row_that_a_result_needs_is_gone_for_good(tables: None, tmp_path: Path
         assert len(jobs_of(fit.SessionFit).errors) == 1
     finally:
         fit.BodyModel.insert(body)
-    queue.reset(jobs_of(fit.SessionFit).errors)  # `pbl retry` counts from the beginning
+    assert requeue.retry(table="SessionFit") == {"SessionFit": 1}  # counts from the beginning
     assert jobs_of(fit.SessionFit).fetch1("attempts") == 0
     assert run_job.run(claimed(fit.SessionFit)).what == run_job.DONE
 

@@ -13,11 +13,12 @@ import yaml
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection, embedded, lab, roles, views
+from schemas import connection, embedded, lab, roles, views, worker
 from schemas._declare import declare_all
 from schemas.ingest import Visit, ingest
 from tests.command import pbl
 from tests.rows import remove_all
+from workers import refresh
 from workers.populate import populate
 
 from . import chain
@@ -99,6 +100,20 @@ def test_a_worker_fills_every_table_and_changes_none(login: Login, tmp_path: Pat
     assert not refused("DROP DATABASE pbl_more")
     assert refused("CREATE DATABASE elsewhere")
     assert refused("CREATE USER 'x'@'%' IDENTIFIED BY 'long-enough-1'")
+
+
+def test_an_analyst_cannot_hold_what_a_refresh_needs(login: Login):
+    login("analyst")
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        login("worker")
+        schemas.activate()
+        worker.Turn.insert1({"work": "refresh", "turn_lock": "of one that was killed", "turn_connection": 1})
+        for name in ("pbl_refresh", "refresh", "of one that was killed"):
+            cursor.execute("SELECT GET_LOCK(%s, 0)", (name,))
+            assert cursor.fetchone() == (1,)
+        assert refresh.refresh() is not None
+        login("analyst")
+        assert refused("UPDATE pbl_worker.turn SET turn_connection = CONNECTION_ID()")
 
 
 def test_the_queries_that_scale_workers_count_the_queues(login: Login):

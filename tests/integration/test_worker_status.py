@@ -11,6 +11,7 @@ import pytest
 import schemas
 from schemas import connection, status, video
 from schemas.jobs import jobs_of
+from schemas.worker import alone
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +60,7 @@ def test_counting_reads_narrow_indexes_and_no_rows(server: Any, monkeypatch: pyt
 
 
 def test_two_processes_do_not_do_the_same_work_at_once(server: Any):
-    with connection.alone("refresh", server) as first, connection.alone("refresh", video.Video.connection) as second:
+    with alone("refresh", server) as first, alone("refresh", video.Video.connection) as second:
         assert (first, second) == (True, False)
-    with connection.alone("refresh", video.Video.connection) as third:
+    with alone("refresh", video.Video.connection) as third:
         assert third

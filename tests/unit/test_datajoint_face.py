@@ -77,6 +77,17 @@ def test_no_other_file_touches_a_private_name():
     assert not found
 
 
+def test_no_delete_of_ours_asks():
+    """DataJoint asks at a terminal before it deletes, which is left on for people; without one it would end us."""
+    found = []
+    for file in [f for package in ("schemas", "workers") for f in (ROOT / package).rglob("*.py")]:
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "delete":
+                said = {k.arg: ast.unparse(k.value) for k in node.keywords}
+                found += [] if said.get("prompt") == "False" else [f"{file.relative_to(ROOT)}:{node.lineno}"]
+    assert not found
+
+
 def test_the_public_names_that_carry_most_are_there():
     """Not private, but what everything rests on: the registry of adapters, job tables, transactions."""
     assert adapters.ADAPTERS["mysql"] is MySQLOrMariaDB

@@ -1,13 +1,20 @@
-"""The supervisor's figures: jobs in hand are those of processes that live, whatever these said, however they ended."""
+"""The supervisor and its figures: jobs in hand are those of processes that live, whatever these said, however they
+ended; and neither waits for a database that does not answer."""
 
 from __future__ import annotations
 
 import multiprocessing
+import socket
+import threading
+import time
+import urllib.request
 from types import SimpleNamespace
 
+import pymysql
 import pytest
 
-from schemas import fit
+from schemas import connection, fit, status
+from workers import recover
 from workers.metrics import Metrics
 from workers.process import Options
 from workers.queue import Claim
@@ -84,3 +91,63 @@ def test_jobs_of_a_process_that_died_are_in_nobodys_hand(boss: SimpleNamespace):
     assert boss.left == [2]
     assert in_hand(boss) == 0
     assert len(boss.supervisor._children) == 1  # another took its place
+
+
+def test_jobs_of_a_process_that_died_while_the_database_is_away_are_settled_later(
+    boss: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+):
+    """The supervisor goes on listening, and ends when it is told to."""
+    supervisor, crashed, away = boss.supervisor, [], [True, True]
+
+    def connect() -> None:
+        if away:
+            away.pop()
+            raise pymysql.err.OperationalError(2003, "Can't connect")
+
+    monkeypatch.undo()
+    monkeypatch.setattr(connection, "connect", connect)
+    monkeypatch.setattr(recover, "crashed", lambda job, reason: crashed.append(job.key))
+    monkeypatch.setattr("workers.run_job.DATABASE_PAUSE_S", 0.05)
+    boss.process.report(1)
+    supervisor._listen(0.0)
+    supervisor._settle_jobs(boss.process.child, -9)
+    assert crashed == []
+    until = time.monotonic() + 5.0
+    while not crashed and time.monotonic() < until:
+        supervisor._settle()
+    assert crashed == [{"fit_set": "1"}]
+    assert not away
+
+
+def test_metrics_answer_while_the_database_hangs(monkeypatch: pytest.MonkeyPatch):
+    answers = threading.Event()
+    answers.set()
+
+    def queue_counts(_: object) -> dict[str, dict[str, int]]:
+        assert answers.wait(30)
+        return {"SessionFit": {"pending": 7}}
+
+    monkeypatch.setattr(status, "queue_counts", queue_counts)
+    monkeypatch.setattr("workers.metrics.READ_EVERY_S", 0.01)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    Metrics().serve(port, "127.0.0.1", object)
+
+    def asked(line: str) -> bool:
+        """Whether the answer comes to have this line within five seconds, each time at once."""
+        until = time.monotonic() + 5.0
+        while time.monotonic() < until:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=1.0) as answer:
+                if line in answer.read().decode().splitlines():
+                    return True
+            time.sleep(0.02)
+        return False
+
+    assert asked("pbl_database_up 1.0")
+    assert asked('pbl_queue_jobs{status="pending",table="SessionFit"} 7.0')
+    monkeypatch.setattr("workers.metrics.FRESH_S", 0.2)
+    answers.clear()
+    assert asked("pbl_database_up 0.0")
+    answers.set()
+    assert asked("pbl_database_up 1.0")

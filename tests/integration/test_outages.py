@@ -1,0 +1,290 @@
+"""A full database, a full store, a clock that goes back, workers that die: nothing is lost, nothing is left behind."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import errno
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pymysql
+import pytest
+
+import pbl_pipeline.video
+import schemas
+from schemas import connection, fit, session, tracking, video, worker
+from schemas.coded_errors import error_code
+from schemas.jobs import jobs_of
+from schemas.orphans import orphans
+from schemas.stored_files import remove_left_over
+from tests.rows import register
+from workers import queue, recover, refresh, run_job
+from workers.heartbeat import Heartbeat, Silent
+from workers.loop import Worker
+
+from . import chain
+
+FULL = pymysql.err.OperationalError(1114, "The table '__video_info' is full")
+
+
+def work(*tables: Any) -> Worker:
+    """One worker until nothing is left that can be taken now."""
+    one = Worker(tables or schemas.computed_tables(), Silent())
+    one.run(once=True)
+    return one
+
+
+def first_job(folder: Path, name: str = "walk") -> queue.Claim:
+    """The reserved job of a new video."""
+    register(chain.small_video(folder, name), session_label=name)
+    refresh.refresh()
+    (job,) = queue.claim(video.VideoInfo, 1)
+    return job
+
+
+def failing(monkeypatch: pytest.MonkeyPatch, where: Any, name: str, *errors: Exception) -> list[Any]:
+    """Let a function raise these before it does what it does; the calls."""
+    real, left, calls = getattr(where, name), list(errors), []
+
+    def fails(*args, **options):
+        calls.append(args)
+        if left:
+            raise left.pop(0)
+        return real(*args, **options)
+
+    monkeypatch.setattr(where, name, fails)
+    return calls
+
+
+@pytest.fixture(autouse=True)
+def quick(tables: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Short pauses, and a store that is as empty as the tables."""
+    monkeypatch.setattr(run_job, "DATABASE_PAUSE_S", 0.01)
+    shutil.rmtree(Path(connection.store_backend().spec["location"]) / connection.store_root(), ignore_errors=True)
+
+
+# ------------------------------------------------------------------------------------------------------------- database
+def test_a_result_is_kept_while_the_disk_of_the_database_is_full(tmp_path: Path, monkeypatch):
+    job = first_job(tmp_path)
+    probed = failing(monkeypatch, pbl_pipeline.video, "probe")
+    inserted = failing(monkeypatch, video.VideoInfo, "make_insert", FULL, FULL, FULL)
+    announced: list[int] = []
+    assert run_job.run(job, waiting=lambda: announced.append(1)).what == run_job.DONE
+    assert (len(probed), len(inserted), len(announced)) == (1, 4, 3)
+    assert (len(video.VideoInfo()), len(jobs_of(video.VideoInfo))) == (1, 0)
+    assert orphans(young_s=0.0).orphans == []
+
+
+def test_a_database_that_stays_full_makes_no_error_row(tmp_path: Path, monkeypatch):
+    job = first_job(tmp_path)
+    monkeypatch.setattr(run_job, "DATABASE_WAIT_S", 0.05)
+    failing(monkeypatch, video.VideoInfo, "make_insert", *[FULL] * 1000)
+    assert run_job.run(job).what == run_job.LATER
+    assert recover.free_dead(video.VideoInfo) == 1  # what it let go
+    assert video.VideoInfo.jobs.fetch1("status", "deaths") == ("pending", 0)
+
+
+def test_a_deadlock_that_does_not_end_puts_the_job_back(tmp_path: Path, monkeypatch):
+    job = first_job(tmp_path)
+    deadlock = pymysql.err.OperationalError(1213, "Deadlock found when trying to get lock")
+    failing(monkeypatch, video.VideoInfo, "make_insert", *[deadlock] * 1000)
+    assert run_job.run(job).what == run_job.LATER
+    assert video.VideoInfo.jobs.fetch1("status") == "pending"
+    assert "Deadlock" in video.VideoInfo.jobs.fetch1("error_message")
+
+
+@pytest.mark.parametrize("place", [(refresh, "refresh"), (queue, "most_urgent"), (queue, "finish"), (refresh, "after")])
+def test_no_statement_beside_a_job_ends_the_worker(tmp_path: Path, monkeypatch, place):
+    register(chain.small_video(tmp_path, "walk"))
+    locked = pymysql.err.OperationalError(1205, "Lock wait timeout exceeded")
+    write = pymysql.err.InternalError(3, "Error writing file (Errcode: 28 No space left on device)")
+    failing(monkeypatch, *place, FULL, locked, write)
+    assert work(video.VideoInfo).failed == 0
+    assert (len(video.VideoInfo()), len(jobs_of(video.VideoInfo))) == (1, 0)
+
+
+def test_a_worker_starts_while_the_database_takes_nothing(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("workers.heartbeat.PERIOD_S", 0.02)
+    failing(monkeypatch, connection, "another", FULL)
+    with Heartbeat("cpu") as beats:
+        beats.count("VideoInfo", 1, 0, 0.1)
+    assert worker.Worker.fetch1("worker") == beats.worker
+
+
+# ---------------------------------------------------------------------------------------------------------------- store
+def test_a_full_store_keeps_no_half_a_file(tmp_path: Path, monkeypatch):
+    job = first_job(tmp_path)
+    write = Path.write_bytes
+
+    def full(self: Path, content: bytes) -> int:
+        write(self, content[: len(content) // 2])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", full)
+        assert run_job.run(job).what == run_job.LATER
+    assert left_in_the_store(video.VideoInfo) == []
+
+
+class Killed(BaseException):
+    """In place of SIGKILL."""
+
+
+def run_and_die(job: queue.Claim, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave what a process leaves that is killed after its insert's last statement: a reservation and files, no row."""
+    real = job.table.make_insert
+
+    def insert(self: Any, *args: Any) -> None:
+        real(self, *args)
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(job.table, "make_insert", insert)
+        patch.setattr(run_job, "remove_left_over", lambda *_: None)
+        with pytest.raises(Killed):
+            run_job.run(job)
+    queue.let_go_all()
+
+
+@pytest.mark.parametrize("table", [tracking.Tracking, fit.SessionFit])
+def test_who_does_the_job_of_a_dead_process_removes_its_files(tmp_path: Path, monkeypatch, table: Any):
+    """Also those of its parts."""
+    register(chain.small_video(tmp_path, "walk"))
+    computed = schemas.computed_tables()
+    work(*computed[: computed.index(table)])
+    refresh.refresh()
+    run_and_die(queue.claim(table, 1)[0], monkeypatch)
+    left = left_in_the_store(table)
+    assert left
+    recover.free_dead(table)
+    work(table)
+    assert orphans(young_s=0.0).orphans == []
+    assert len(left_in_the_store(table)) == len(left)
+
+
+def left_in_the_store(table: Any) -> list[Path]:
+    """Files of a table and its parts."""
+    root = Path(connection.store_backend().spec["location"]) / connection.store_root() / table.database
+    return [f for folder in root.glob(f"{table.table_name}*") for f in folder.rglob("*") if f.is_file()]
+
+
+def test_only_files_of_this_key_and_this_time_are_removed(tmp_path: Path):
+    ids = register(*(chain.small_video(tmp_path, name) for name in ("walk1", "walk2")))
+    work(video.VideoInfo)
+    before = left_in_the_store(video.VideoInfo)
+    for number in ids:  # they have rows
+        remove_left_over(video.VideoInfo(), {"video_id": number}, 0.0)
+    assert left_in_the_store(video.VideoInfo) == before
+    (video.VideoInfo & {"video_id": ids[0]}).delete(prompt=False)
+    # Files of a row that was deleted are older than its new job: they stay for a backup that is being made.
+    remove_left_over(video.VideoInfo(), {"video_id": ids[0]}, before[0].stat().st_mtime + 3600)
+    assert left_in_the_store(video.VideoInfo) == before
+    remove_left_over(video.VideoInfo(), {"video_id": ids[0]}, 0.0)
+    assert [f"video_id={ids[1]}" in str(f) for f in left_in_the_store(video.VideoInfo)] == [True]
+
+
+# ---------------------------------------------------------------------------------------------------------------- clock
+def test_jobs_do_not_wait_for_a_clock_that_was_set_back(tmp_path: Path):
+    job = first_job(tmp_path)
+    queue.put_back(job, "the store was full", run_job.STORE_WAIT_S)
+    assert work(video.VideoInfo).done == 0  # it waits, as long as it should
+    connection.connect().query("SET SESSION timestamp = UNIX_TIMESTAMP() - 3600")
+    try:
+        assert work(video.VideoInfo).done == 1
+    finally:
+        connection.connect().query("SET SESSION timestamp = DEFAULT")
+
+
+def test_no_hour_comes_twice_in_autumn():
+    """The server counts in the zone of its machine; every connection of ours in UTC."""
+    with contextlib.closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        cursor.execute("SELECT CURRENT_TIMESTAMP = UTC_TIMESTAMP")
+        assert cursor.fetchone() == (1,)
+    assert connection.connect().query("SELECT CURRENT_TIMESTAMP = UTC_TIMESTAMP").fetchone() == (1,)
+    assert connection.connect().query("SELECT @@session.time_zone").fetchone() == ("+00:00",)
+
+
+def test_a_worker_whose_heart_beats_in_the_future_is_dead(tmp_path: Path):
+    """It beat for the last time before the clock was set back."""
+    (number,) = register(chain.small_video(tmp_path, "walk"))
+    refresh.refresh()
+    now = connection.connect().query("SELECT CURRENT_TIMESTAMP(3)").fetchone()[0]
+    row = {"worker": "w", "worker_host": "there", "worker_pid": 1, "worker_resource": "all", "worker_version": "0"}
+    seen = now + datetime.timedelta(hours=1)
+    worker.Worker.insert1({**row, "worker_started": now, "worker_seen": seen, "worker_doing": ""})
+    held = {"video_id": number, "status": "reserved", "host": "there", "pid": 1, "reserved_time": now}
+    video.VideoInfo.jobs.update1(held)
+    assert recover.free_dead(video.VideoInfo) == 1
+
+
+# -------------------------------------------------------------------------------------------------------------- crashes
+def test_crashes_do_not_outlive_success(tmp_path: Path):
+    job = first_job(tmp_path)
+    recover.crashed(job, "signal SIGKILL")
+    assert video.VideoInfo.jobs.fetch1("attempts") == 1
+    assert "SIGKILL" in video.VideoInfo.jobs.fetch1("error_message")
+    video.VideoInfo.jobs.update1({**job.key, "scheduled_time": datetime.datetime(2020, 1, 1)})
+    assert work(video.VideoInfo).done == 1
+    video.VideoInfo.delete(prompt=False)
+    refresh.refresh()
+    (again,) = queue.claim(video.VideoInfo, 1)
+    assert again.attempts == 0
+    for _ in range(recover.CRASHES - 1):
+        assert recover.crashed(again, "signal SIGKILL")
+        assert video.VideoInfo.jobs.fetch1("status") == "pending"
+        video.VideoInfo.jobs.update1({**job.key, "scheduled_time": datetime.datetime(2020, 1, 1)})
+        (again,) = queue.claim(video.VideoInfo, 1)
+    assert recover.crashed(again, "signal SIGKILL")
+    assert error_code(video.VideoInfo.jobs.errors.fetch1("error_message")) == "WORKER_CRASH"
+
+
+def test_a_job_that_takes_its_whole_worker_down_is_not_tried_for_ever(tmp_path: Path):
+    """As where a container is ended for its memory: no supervisor is left that could count."""
+    job = first_job(tmp_path)
+    queue.let_go_all()
+    with subprocess.Popen(["true"]) as dead:
+        pass
+    held = {"status": "reserved", "host": job.host, "pid": dead.pid, "connection_id": 0}
+    for n in range(1, recover.DEATHS):
+        video.VideoInfo.jobs.update1({**job.key, **held})
+        assert recover.free_dead(video.VideoInfo) == 1
+        assert video.VideoInfo.jobs.fetch1("status", "deaths") == ("pending", n)
+    video.VideoInfo.jobs.update1({**job.key, **held})
+    assert recover.free_dead(video.VideoInfo) == 1
+    assert error_code(video.VideoInfo.jobs.errors.fetch1("error_message")) == "WORKER_CRASH"
+
+
+# -------------------------------------------------------------------------------------------------------------- numbers
+def test_a_number_is_never_given_twice(tmp_path: Path):
+    """The next video had the number of the last one that was deleted, and with it its error row."""
+    bad = tmp_path / "bad.mp4"
+    bad.write_bytes(os.urandom(4096))
+    (first,) = register(bad)
+    visit = session.Session.fetch1("session_id")
+    assert work(video.VideoInfo).failed == 1
+    session.Session.delete(prompt=False)
+    (second,) = register(chain.small_video(tmp_path, "walk"))
+    assert second > first
+    assert session.Session.fetch1("session_id") > visit
+    assert work(video.VideoInfo).done == 1
+    assert len(jobs_of(video.VideoInfo)) == 0
+
+
+def test_jobs_of_a_deleted_key_go_whatever_a_refresh_looks_at(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(refresh, "FEW", 0)  # as with very many videos
+    job = first_job(tmp_path)
+    queue.fail(job, "PblError: VIDEO_DAMAGED: x")
+    refresh.refresh(everything=False)
+    assert len(jobs_of(video.VideoInfo).errors) == 1
+    video.Video.delete(prompt=False)
+    found = refresh.refresh(everything=False)
+    assert found is not None
+    assert (found.swept, len(jobs_of(video.VideoInfo))) == (1, 0)
+
+
+def test_people_who_use_datajoint_are_asked_before_rows_go():
+    assert connection.dj.config["safemode"]
