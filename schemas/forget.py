@@ -10,7 +10,6 @@ have no foreign keys at all; DataJoint's cascading delete reaches neither queues
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import datetime
 import json
@@ -24,15 +23,13 @@ from pbl_pipeline.errors import PblError
 
 from . import archive, catalog, connection, fit, lab, session, video, worker
 from ._datajoint import full_path
-from .archive import archive_dir
 from .catalog import Column, quote
 from .codes import check_subject
 from .folders import remove_empty
 from .json_files import write_json
+from .recordings import delete_archived, delete_left_over, delete_registered, delete_uploads, find_recordings
 from .rows import delete_below
 from .store import files_below, purge, store_error
-from .stored_files import remove_left_folders
-from .uploads import Bucket, Folder, Upload, drop_folder
 
 #: Columns that identify the person of a row. `fit_set` is a hash over one session's videos.
 IDENTITIES = ("subject", "session_id", "video_id", "fit_set")
@@ -86,7 +83,7 @@ def find(subject: str) -> tuple[Ids, Found]:
         DB_NOT_FOUND when neither the database nor a list of an earlier run knows the subject.
     """
     ids, earlier = _identities(subject), read_manifest(subject)
-    recordings = _recordings(subject)
+    recordings = find_recordings(subject)
     if not lab.Subject & {"subject": subject} and not earlier and not recordings:
         raise PblError(
             "DB_NOT_FOUND",
@@ -150,11 +147,11 @@ def _forget(subject: str, videos: bool, say: Say) -> Forgotten:
     _delete_rows(subject, ids, say)
     _delete_files(found.files, ids, say)
     gone, kept = [], {}
-    left = _delete_left_over(subject)
+    left = delete_left_over(subject)
     if videos:
-        gone, kept = _delete_videos(found.videos)
-        more, named = _delete_archived(subject)
-        gone, kept = gone + more + _delete_uploads(subject), kept | named
+        gone, kept = delete_registered(found.videos)
+        more, named = delete_archived(subject)
+        gone, kept = gone + more + delete_uploads(subject), kept | named
     _, after = find(subject)
     if not videos:
         there = [v["path"] for v in found.videos if os.path.lexists(v["path"])]
@@ -322,78 +319,6 @@ def _delete_files(files: Sequence[str], ids: Ids, say: Say) -> None:
     if store.protocol == "s3":
         for folder in _folders(ids):
             purge(store.fs, full_path(store, folder))
-
-
-def _delete_videos(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict[str, str]]:
-    from pbl_pipeline.video import sha256_of
-
-    gone, kept = [], {}
-    for item in videos:
-        path = Path(item["path"])
-        if not os.path.lexists(path):
-            continue
-        if path.is_symlink() or not path.is_file():
-            kept[str(path)] = "it is no plain file"
-        elif video.Video & {"video_path": str(path)}:
-            kept[str(path)] = "another row names this path"
-        elif path.stat().st_size != item["size"] or sha256_of(path) != item["sha256"]:
-            kept[str(path)] = "it holds other bytes than were registered: another file took its place"
-        else:
-            try:
-                path.unlink()
-                gone.append(str(path))
-            except OSError as error:
-                kept[str(path)] = error.strerror or str(error)
-    return gone, kept
-
-
-def _recordings(subject: str) -> list[str]:
-    parts = ("", archive.REFUSED, archive.COPIES)
-    return [str(p) for p in archive.of_person(archive_dir(), subject, parts)] + list(_uploads(subject))
-
-
-def _drop() -> Folder | Bucket | None:
-    url = os.environ.get("PBL_INCOMING")
-    return drop_folder(url) if url else None
-
-
-def _uploads(subject: str) -> dict[str, Upload]:
-    drop = _drop()
-    return {} if drop is None else {f"{drop.root}/{upload.name}": upload for upload in drop.uploads(subject)}
-
-
-def _delete_uploads(subject: str) -> list[str]:
-    gone, drop = [], _drop()
-    if drop is None:
-        return gone
-    for name, upload in _uploads(subject).items():
-        with contextlib.suppress(OSError):  # what cannot be removed is found again, and named
-            drop.remove(upload)
-            gone.append(name)
-    drop.remove_folders(subject)
-    return gone
-
-
-def _delete_archived(subject: str) -> tuple[list[str], dict[str, str]]:
-    gone, kept = [], {}
-    for path in archive.of_person(archive_dir(), subject):
-        if video.Video & {"video_path": str(path)}:  # a file that was moved here
-            kept[str(path)] = "another row names this path"
-            continue
-        path.unlink(missing_ok=True)
-        gone.append(str(path))
-    archive.remove_folders(archive_dir(), subject)
-    return gone, kept
-
-
-def _delete_left_over(subject: str) -> list[str]:
-    """Remove what killed processes left; returns what may still hold something of the person."""
-    archive.remove_copies(archive_dir(), subject)
-    seen = archive.load_seen(archive_dir())
-    others = {name: about for name, about in seen.items() if not name.startswith(f"{subject}/")}
-    if others != seen:
-        archive.save_seen(archive_dir(), others)
-    return [f"{path}, of a process that was killed" for path in remove_left_folders()]
 
 
 # ------------------------------------------------------------------------------------------------------------- proof
