@@ -49,8 +49,8 @@ _STRING = 128
 _MAX_DIRECTORY = MIB
 #: Bytes of an array's header, as NumPy's own limit.
 _MAX_HEADER = 10_000
-#: Digits of a number: a float has 309 at most.
-_LONG_NUMBER = re.compile(r"\d{310}")
+#: Digits of a number: all integers of 308 are finite floats.
+_LONG_NUMBER = re.compile(r"\d{309}")
 _HALF_LETTER = re.compile(r"\\u[dD][89a-fA-F]")
 
 #: What the readers of packed files raise for damaged ones; RuntimeError: one with a password.
@@ -70,6 +70,12 @@ def read_bytes(path: str | Path, at_most: int) -> bytes:
     if len(data) > at_most:
         raise ValueError(f"more than {_size(at_most)}")
     return data
+
+
+def read_start(path: str | Path, n: int) -> bytes:
+    """The first `n` bytes of a regular file, fewer where it has no more."""
+    with _opened(path) as file:
+        return file.read(n)
 
 
 def read_text(path: str | Path, at_most: int = MAX_TEXT) -> str:
@@ -95,7 +101,7 @@ def parse_json(text: str) -> Any:
     if text.count("[") + text.count("{") > MAX_CONTAINERS:
         raise ValueError(f"more than {MAX_CONTAINERS:,} lists and objects")
     if _LONG_NUMBER.search(text):
-        raise ValueError("a number of more than 309 digits")
+        raise ValueError("a number of more than 308 digits")
     try:
         content = json.loads(text)
     except RecursionError as error:

@@ -47,8 +47,7 @@ def is_sensor_logger(path: Path) -> bool:
     if path.is_dir() or path.suffix.lower() == ".zip":
         return True
     try:
-        with path.open("rb") as file:
-            head = file.read(4096).decode("utf-8-sig", "replace")
+        head = bounded.read_start(path, 4096).decode("utf-8-sig", "replace")
     except OSError:
         return False
     first = head.lstrip().split("\n", 1)[0]

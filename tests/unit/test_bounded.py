@@ -270,6 +270,7 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path):
     refused("FILE_MISSING", read_trc, tmp_path / "a.trc")
     refused("CAMERA_INVALID", load_camera, tmp_path / "a.json", (100, 100))
     refused("FILE_FORMAT", load_events, tmp_path / "a.csv")
+    refused("FILE_MISSING", read_phone_log, tmp_path / "a.csv")
 
 
 def test_a_file_that_grows_while_it_is_read(tmp_path: Path):
