@@ -36,7 +36,7 @@ from pbl_pipeline.synthetic import (
     synthesise,
 )
 
-from ._motions import Motion, read_motions, stride_s
+from ._motions import Motion, read_motions
 from ._true_fit import fit_of_qpos
 
 #: A trial of the corpus (s, frames a second).
@@ -46,6 +46,8 @@ CAMERAS = ("static", "handheld")
 HEALTHY = "healthy"
 #: Severities of an impairment at two visits.
 SEVERITIES = (0.3, 0.8)
+#: How long a walking stride can be (s).
+_STRIDES_S = (0.8, 1.8)
 #: A recorded walk that turns by more has no view (deg).
 _STRAIGHT_DEG = 45.0
 #: Half of what a standing phone sees beside its line of sight, as a fraction of the distance, with a margin (m).
@@ -239,12 +241,12 @@ def lasting(motion: Motion, time_s: Float[np.ndarray, " N"]) -> Float[np.ndarray
     """
     place = _columns("pelvis_tx", "pelvis_tz")
     if motion.cycle or motion.time_s[-1] < time_s[-1]:
-        knee = motion.qpos[:, _columns("knee_angle_r")[0]]
         step = float(np.median(np.diff(motion.time_s)))
-        stride = motion.time_s[-1] + step if motion.cycle else stride_s(motion.time_s, knee)
-        grid = np.linspace(0, stride, 101)
         spline = CubicSpline(motion.time_s, motion.qpos)
-        start = 0.0 if motion.cycle else _best_start(spline, stride, motion.time_s[-1])
+        start, stride = (
+            (0.0, float(motion.time_s[-1]) + step) if motion.cycle else _stride(spline, float(motion.time_s[-1]))
+        )
+        grid = np.linspace(0, stride, 101)
         if motion.cycle:
             spline = CubicSpline(np.append(motion.time_s, stride), _closed(motion.qpos, place))
         one = spline(start + grid)
@@ -262,12 +264,21 @@ def lasting(motion: Motion, time_s: Float[np.ndarray, " N"]) -> Float[np.ndarray
     return spline(starts[best] + time_s) if np.degrees(straight[best]) < _STRAIGHT_DEG else None
 
 
-def _best_start(spline: CubicSpline, stride: float, end: float) -> float:
-    """Where a stride's end is most like its beginning."""
-    angles = load_body().is_hinge
-    starts = np.linspace(0, max(end - stride, 0), 40)
-    apart = [np.linalg.norm((spline(s + stride) - spline(s))[angles]) for s in starts]
-    return float(starts[int(np.argmin(apart))])
+def _stride(spline: CubicSpline, end_s: float) -> tuple[float, float]:
+    """Begin (s) and length (s) of the stride whose end is most like its beginning, in all joints that turn."""
+    turns = load_body().is_hinge & ~np.isin(load_body().joint_names, ["pelvis_rotation"])
+    best: tuple[float, float, float] | None = None
+    for length in np.arange(_STRIDES_S[0], min(_STRIDES_S[1], end_s), 0.01):
+        starts = np.arange(0, end_s - length + 1e-9, 0.02)
+        apart = np.linalg.norm((spline(starts + length) - spline(starts))[:, turns], axis=1)
+        i = int(np.argmin(apart))
+        if best is None or apart[i] < best[0]:
+            best = (float(apart[i]), float(starts[i]), float(length))
+    if best is None:
+        raise PblError(
+            "REFERENCE_INPUT", found=f"{end_s:.2f} s of walking", expected="a stride", next_step="leave it out"
+        )
+    return best[1:]
 
 
 def _closed(qpos: np.ndarray, place: Sequence[int]) -> np.ndarray:
