@@ -96,9 +96,12 @@ class Case:
         return f"{w.person}|{w.condition}|{w.severity:g}|{self.view}|{self.camera}|{self.detector}"
 
     def keypoints(self, noise: Noise | None = None) -> Keypoints:
-        """What the detector gives, by its error model of `DETECTORS` or another noise; the same at each call."""
+        """What the detector gives, by its error model of `DETECTORS` or another noise; the same at each call.
+
+        The random errors belong to person, view, camera and detector: two visits of a person differ by the walk alone.
+        """
         model = DETECTORS[self.detector]
-        seed = _number(self.name)
+        seed = _number(f"{self.walk.person}|{self.view}|{self.camera}|{self.detector}")
         camera, size = lens(self.view, self.camera)
         reach = np.ptp(self.walk.qpos[:, _columns("pelvis_tx", "pelvis_tz")], axis=0)
         aside = float(np.hypot(*reach)) if self.camera == "static" and "sagittal" in self.view else 0.0

@@ -27,6 +27,10 @@ MEASURES = {
 }
 #: Angles whose errors are reported, per side.
 ANGLES = ("hip_flexion", "hip_adduction", "hip_rotation", "knee_flexion", "ankle_angle")
+#: A mean true change of the index below this is too small for a fraction of it.
+LEAST_CHANGE = 3.0
+#: What two visits of one person have in common.
+_VISIT = ["person", "view", "camera"]
 #: A 90 % interval of a normal error, in standard deviations.
 _Z90 = 1.6449
 
@@ -198,30 +202,36 @@ def coverage_table(errors: pd.DataFrame) -> pd.DataFrame:
 
 
 def responsiveness(errors: pd.DataFrame, found: str = "gdi", true: str = "gdi_true") -> pd.DataFrame:
-    """How much of the change of the index between two visits of a person is found again, per impairment.
+    """How much of the change of the index between two visits of a person is found again, per impairment and over all.
 
     Two visits: healthy and impaired, or two severities, seen from the same view. The fraction is the sum of the changes
-    found over the sum of the true ones, so that small changes do not dominate; `sd` is that of its error.
+    found over the sum of the true ones, so that small changes do not dominate; NaN where the true mean change is below
+    `LEAST_CHANGE`. `sd` is that of the error of a change, `se` the standard error of the fraction.
     """
-    rows = []
     synthetic: Any = errors[errors["source"] == "synthetic"]
-    visit = ["person", "view", "camera"]
     healthy = synthetic[synthetic["condition"] == HEALTHY]
-    for name, impaired in synthetic[synthetic["condition"] != HEALTHY].groupby("condition", sort=False):
-        low, high = impaired["severity"].min(), impaired["severity"].max()
-        first, last = (impaired[impaired["severity"] == s] for s in (low, high))
+    impaired = synthetic[synthetic["condition"] != HEALTHY]
+    rows = []
+    for name, own in [*impaired.groupby("condition", sort=False), ("all", impaired)]:
+        low, high = own["severity"].min(), own["severity"].max()
+        first, last = own[own["severity"] == low], own[own["severity"] == high]
         row: dict[str, Any] = {"impairment": name}
-        for label, before in ((f"healthy to {high:g}", healthy), (f"{low:g} to {high:g}", first)):
-            both = before.merge(last, on=visit, suffixes=("_before", "_after"))
+        for label, before, on in (
+            (f"healthy to {high:g}", healthy, _VISIT),
+            (f"{low:g} to {high:g}", first, [*_VISIT, "condition"]),
+        ):
+            both = before.merge(last, on=on, suffixes=("_before", "_after"))
             change = both[f"{found}_after"] - both[f"{found}_before"]
             real = both[f"{true}_after"] - both[f"{true}_before"]
             known = change.notna() & real.notna()
-            total = real[known].sum()
+            n, total, off = int(known.sum()), float(real[known].sum()), (change - real)[known]
+            enough = n > 0 and abs(total / n) >= LEAST_CHANGE
             row |= {
-                f"{label}: n": int(known.sum()),
+                f"{label}: n": n,
                 f"{label}: true": real[known].mean(),
-                f"{label}: survives": change[known].sum() / total if abs(total) > 1e-9 else np.nan,
-                f"{label}: sd": (change - real)[known].std(),
+                f"{label}: survives": change[known].sum() / total if enough else np.nan,
+                f"{label}: se": off.std() * np.sqrt(n) / abs(total) if enough else np.nan,
+                f"{label}: sd": off.std(),
             }
         rows.append(row)
     return pd.DataFrame(rows)
