@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -104,7 +105,10 @@ def fit_checks(paths: Sequence[Path], trials: Sequence[TrialFit | LabTrial]) -> 
         try:
             content = read_json(path)
             names, params_hash = list(content["trials"]), str(content["params_hash"])
-            found[path] = names, params_hash, [structured(c, Check) for c in content["qc"]]
+            checks = [structured(c, Check) for c in content["qc"]]
+            if not all(v is None or math.isfinite(v) for c in checks for v in (c.value, c.threshold)):
+                raise ValueError("a check whose value is not finite")
+            found[path] = names, params_hash, checks
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise PblError(
                 "FILE_FORMAT",

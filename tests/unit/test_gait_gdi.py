@@ -186,6 +186,10 @@ def test_a_changed_file_is_refused(toy, tmp_path):
         ({"ln_sd": 0.0}, "NORM_INVALID", "spread"),
         ({"angle_model": "another"}, "NORM_INVALID", "another"),
         ({"curves": 3}, "NORM_INVALID", ""),
+        ({"curves": {"a": {"percent": [0.0], "mean_deg": [0.0, 1.0], "sd_deg": [1.0]}}}, "NORM_INVALID", ""),
+        ({"ln_mean": [0.0] * 9}, "NORM_INVALID", "ln_mean"),
+        ({"name": 3}, "NORM_INVALID", "name"),
+        ({"percent": 3.0}, "NORM_INVALID", ""),
         ({"explained_variance": [1.0]}, "NORM_INVALID", "sizes"),
     ],
 )

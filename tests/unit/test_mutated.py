@@ -103,7 +103,20 @@ def test_logs_of_times_that_cannot_be(tmp_path: Path, time_s: list[float], start
         files.use_log(path)
 
 
-@pytest.mark.parametrize("value", [None, 3, "text", [1], {"trials": 3}, {"trials": None, "params_hash": 1, "qc": []}])
+CHECK = {"check": "a", "outcome": "WARN", "value": 1.0, "threshold": None, "advice": ""}
+WITH_CHECKS = {"trials": ["walk"], "params_hash": ""}
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        *(None, 3, "text", [1], {"trials": 3}, {"trials": None, "params_hash": 1, "qc": []}),
+        *(
+            WITH_CHECKS | {"qc": [CHECK | change]}
+            for change in ({"value": np.inf}, {"threshold": np.nan}, {"value": "x"})
+        ),
+    ],
+)
 def test_a_session_file_that_makes_no_sense(tmp_path: Path, value: object):
     path = tmp_path / "session.json"
     path.write_text(json.dumps(value))

@@ -238,6 +238,14 @@ def _checksum(data: dict) -> str:
     return hashlib.sha256(canonical_json({k: v for k, v in data.items() if k != "sha256"}).encode()).hexdigest()
 
 
+#: Fields that are no arrays, and what they are.
+_PLAIN = {
+    **dict.fromkeys(("name", "source", "licence", "convention", "source_sha256", "angle_model", "mapped_from"), str),
+    **dict.fromkeys(("version", "n"), int),
+    **dict.fromkeys(("explained_share", "ln_mean", "ln_sd"), (int, float)),
+}
+
+
 def _from_json(data: dict, checksum: str) -> NormativeSet:
     values: dict[str, Any] = dict(data, sha256=checksum, variables=tuple(data["variables"]))
     for name in ("percent", "mean_deg", "components", "explained_variance"):
@@ -245,7 +253,14 @@ def _from_json(data: dict, checksum: str) -> NormativeSet:
     values["curves"] = {
         name: {key: np.asarray(v, float) for key, v in band.items()} for name, band in data["curves"].items()
     }
+    for name, kind in _PLAIN.items():
+        if name in values and not isinstance(values[name], kind):
+            raise TypeError(f"{name} is {values[name]!r}"[:80])
     norm = NormativeSet(**values)
+    bands = [np.stack([band[key] for key in ("percent", "mean_deg", "sd_deg")]) for band in norm.curves.values()]
+    numbers = [norm.percent, norm.mean_deg, norm.components, norm.explained_variance, *bands]
+    if norm.percent.ndim != 1 or not all(np.isfinite(n).all() for n in [*numbers, norm.ln_mean, norm.ln_sd]):
+        raise ValueError("numbers that are not finite, or percent that is no list")
     length = len(norm.variables) * len(norm.percent)
     k = len(norm.components)
     if (
