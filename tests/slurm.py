@@ -76,7 +76,8 @@ class Cluster:
 
     def accounting(self) -> list[dict[str, str]]:
         """The jobs that ended, each as Slurm recorded it (`JobId`, `JobState`, `ExitCode`, ...)."""
-        lines = (self.folder / "finished").read_text().splitlines()
+        path = self.folder / "finished"
+        lines = path.read_text().splitlines() if path.exists() else []
         return [dict(word.split("=", 1) for word in line.split() if "=" in word) for line in lines]
 
 
