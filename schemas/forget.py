@@ -216,9 +216,8 @@ def _find(ids: Ids, earlier: dict[str, Any], recordings: list[str]) -> Found:
 
 def personal_tables() -> list[tuple[str, str, list[Column]]]:
     """Schema, name and columns of the tables that can hold a row of a person."""
-    identifying = {*IDENTITIES, "job_key"}
     found = catalog.tables().items()
-    return [(*name, columns) for name, columns in found if identifying & {c.name for c in columns}]
+    return [(*name, columns) for name, columns in found if {*IDENTITIES} & {c.name for c in columns}]
 
 
 def _whose(columns: Sequence[Column], ids: Ids) -> tuple[str, tuple]:
@@ -227,14 +226,9 @@ def _whose(columns: Sequence[Column], ids: Ids) -> tuple[str, tuple]:
     parts, values = [], []
     for name in IDENTITIES:
         marks = ",".join(["%s"] * len(ids[name]))
-        if not ids[name]:
-            continue
-        if name in names:
+        if ids[name] and name in names:
             parts.append(f"{quote(name)} IN ({marks})")
             values += ids[name]
-        elif "job_key" in names:  # a job's key as JSON
-            parts.append(f"JSON_VALUE(job_key, '$.{name}') IN ({marks})")
-            values += [str(v) for v in ids[name]]
     return " OR ".join(parts), tuple(values)
 
 
@@ -279,7 +273,7 @@ def _delete_rows(subject: str, ids: Ids, say: Say) -> None:
     cameras = _cameras(ids)
     conn = connection.connect()
     tables = personal_tables()
-    queues = [t for t in tables if t[1].startswith("~~") or any(c.name == "job_key" for c in t[2])]
+    queues = [t for t in tables if t[1].startswith("~~")]
     _delete_where(conn, queues, ids)
     counts = delete_below(lab.Subject, (lab.Subject & {"subject": subject}).keys())
     say(f"{sum(counts.values())} rows of {len(counts)} tables were deleted")

@@ -122,7 +122,7 @@ class Site:
 
     def children(self) -> list[int]:
         """The working processes."""
-        return [child for b in self.bosses if (child := workers._child_of(b.pid))]
+        return [child for b in self.bosses if (child := _child_of(b.pid))]
 
     def kill_worker(self) -> None:
         if pids := self.children():
@@ -175,6 +175,15 @@ class Site:
         time.sleep(self.draw.uniform(2.0, 8.0))
         ballast.unlink()
         self.done[f"disk of the {disk} full"] += 1
+
+
+def _child_of(pid: int) -> int:
+    """The working process under a supervisor; 0 where it has none at the moment."""
+    with contextlib.suppress(OSError):
+        for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+            if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
+                return int(child)
+    return 0
 
 
 def _faults(site: Site, can_fill: bool) -> list[tuple[float, Any]]:

@@ -1,9 +1,8 @@
-"""What the queue costs, and what it survives: figures of docs/operations.md.
+"""What the queue costs: figures of docs/operations.md. What it survives: `tests.benchmarks.chaos`.
 
     python -m tests.benchmarks.workers scale              # 300,000 videos: register, status, refresh, cost per job
     python -m tests.benchmarks.workers speed              # jobs a second of 1 to 4 workers on 5,000 keys
     python -m tests.benchmarks.workers method             # a new parameter set over 10,000 fitted sessions
-    python -m tests.benchmarks.workers kills              # kill -9 of workers and of the database during 2,000 jobs
     python -m tests.benchmarks.workers memory             # a worker's memory over 500 jobs
 
 Heavy stages give a recorded result: the point is the queue. Each command starts a database of its own in a temporary
@@ -16,8 +15,6 @@ import contextlib
 import hashlib
 import math
 import os
-import random
-import signal
 import subprocess
 import sys
 import time
@@ -353,103 +350,6 @@ def _contents(table: Any, but: str = "") -> tuple[int, int]:
     else:
         n, total = table.connection.query(query).fetchone()
     return int(n), int(total)
-
-
-# --------------------------------------------------------------------------------------------------------------- kills
-@main.command()
-@click.option("--jobs", default=2000, show_default=True)
-@click.option("--kills", "n_kills", default=200, show_default=True)
-@click.option("--server-kills", default=5, show_default=True)
-@click.option("--seed", default=0, show_default=True)
-def kills(jobs: int, n_kills: int, server_kills: int, seed: int) -> None:
-    """kill -9 of working processes, whole workers and the database at random moments; then count."""
-    import multiprocessing
-
-    from schemas import embedded, video
-    from schemas.bulk import register_many
-    from workers import refresh
-
-    with installation() as home:
-        register_many(recordings(0, jobs))
-        os.environ[worker_standins.SLEEP] = "0.2"  # so that kills meet jobs in hand
-        context = multiprocessing.get_context("spawn")
-        draw = random.Random(seed)
-        folder = embedded.Folder(home / "db")
-        bosses: list[Any] = []
-
-        def boss() -> Any:
-            process = context.Process(target=_boss)
-            process.start()
-            return process
-
-        bosses = [boss() for _ in range(4)]
-        killed = {"worker": 0, "supervisor": 0, "server": 0}
-        t = time.monotonic()
-        while True:
-            time.sleep(draw.uniform(0.05, 0.6))
-            with contextlib.suppress(Exception):
-                if len(video.VideoInfo()) >= jobs:
-                    break
-            if time.monotonic() - t > 1500:
-                break
-            bosses = [b if b.is_alive() else boss() for b in bosses]
-            if killed["server"] < server_kills and sum(killed.values()) >= (killed["server"] + 1) * n_kills / (
-                server_kills + 1
-            ):
-                os.kill(folder.state()["pid"], signal.SIGKILL)
-                time.sleep(draw.uniform(0.2, 2.0))
-                embedded.start(folder=folder)
-                killed["server"] += 1
-                import schemas
-
-                schemas.activate(methods=False)
-            if killed["worker"] + killed["supervisor"] >= n_kills:
-                continue
-            with_child = [b for b in bosses if _child_of(b.pid)]
-            if not with_child:
-                continue  # all of them are just starting
-            victim = draw.choice(with_child)
-            if draw.random() < 0.2:
-                victim.kill()
-                killed["supervisor"] += 1
-            elif child := _child_of(victim.pid):
-                os.kill(child, signal.SIGKILL)
-                killed["worker"] += 1
-        seconds = time.monotonic() - t
-        for b in bosses:
-            b.terminate()
-        for b in bosses:
-            b.join(60)
-        refresh.refresh()
-        done = len(video.VideoInfo())
-        left = {s: n for s, n in video.VideoInfo.jobs.progress().items() if n and s != "total"}
-        click.echo(f"killed {killed}; {done} of {jobs} done in {seconds:.0f} s; job rows left: {left or 'none'}")
-        errors = video.VideoInfo.jobs.errors.to_arrays("error_message")
-        click.echo("\n".join(sorted({str(e)[:200] for e in errors})))
-        from schemas.orphans import orphans
-
-        found = orphans()
-        click.echo(f"files of the store: {found.n_files}, without a row: {len(found.orphans)} (reported)")
-        if done != jobs or left:
-            raise SystemExit(1)
-
-
-def _boss() -> None:
-    import schemas
-    from workers.process import Options
-    from workers.supervisor import Supervisor
-
-    schemas.activate(methods=False)
-    Supervisor(Options(resource="decode", selftest=False, grace_s=5.0), target=worker_standins.work).run()
-
-
-def _child_of(pid: int) -> int:
-    """The working process under a supervisor; 0 where it has none at the moment."""
-    with contextlib.suppress(OSError):
-        for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
-            if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
-                return int(child)
-    return 0
 
 
 # -------------------------------------------------------------------------------------------------------------- memory
