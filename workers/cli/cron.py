@@ -120,9 +120,11 @@ def backup(keep: int) -> None:
 
     Example: PBL_BACKUP=/backup pbl cron backup --keep 7
     """
+    import schemas
     from schemas.cli._db_backup import say
     from workers.backups import backup_folder, backup_regularly
 
+    schemas.activate(methods=False)
     made = backup_regularly(backup_folder(), keep, click.echo)
     if made is None:
         click.echo("another process is doing this now")
