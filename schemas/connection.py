@@ -125,7 +125,12 @@ def bind(stage: str, schema: datajoint.Schema) -> None:
 
     Call it in the order of dependency: a table can only refer to tables that are bound.
     """
-    schema.activate(schema_name(stage), connection=connect())
+    server = connect()
+    try:
+        schema.activate(schema_name(stage), connection=server)
+    except Exception:
+        schema.database = None  # else DataJoint would take it for bound the next time
+        raise
 
 
 def external() -> str | None:

@@ -52,8 +52,7 @@ def main_of_boss(number: int) -> None:
     _pass_for_a_machine()
     import schemas
 
-    with contextlib.suppress(Exception):
-        schemas.activate(methods=False)
+    schemas.activate(methods=False)  # without a database it ends, and is started again
     raise SystemExit(Supervisor(Options(resource="cpu", selftest=False, grace_s=5.0), target=work).run())
 
 

@@ -115,6 +115,26 @@ def test_a_worker_starts_while_the_database_takes_nothing(monkeypatch: pytest.Mo
     assert worker.Worker.fetch1("worker") == beats.worker
 
 
+def test_tables_are_bound_after_a_database_that_went_away_while_they_were(monkeypatch: pytest.MonkeyPatch):
+    schema, stage = connection.dj.Schema(), "outage"
+
+    class Thing(connection.dj.Manual):
+        definition = "thing : int32"
+
+    schema(Thing)
+    server = connection.connect()
+    try:
+        with monkeypatch.context() as patch:
+            failing(patch, server, "register", FULL)  # after the schema has its name, before its tables
+            with pytest.raises(pymysql.err.OperationalError):
+                connection.bind(stage, schema)
+        connection.bind(stage, schema)
+        Thing.insert1({"thing": 1})
+        assert len(Thing()) == 1
+    finally:
+        schema.drop(prompt=False)
+
+
 # ---------------------------------------------------------------------------------------------------------------- store
 def test_a_full_store_keeps_no_half_a_file(tmp_path: Path, monkeypatch):
     job = first_job(tmp_path)
