@@ -3,15 +3,18 @@
     | A  B | |x|   |g|      A (F Q, F Q): block (t, t) full, (t, t+1) full, (t, t+2) diagonal
     | B' C | |y| = |h|      B (F Q, K), C (K, K): what all frames share (scale, marker offsets, clocks, floors)
 
-Solved by block cyclic reduction over pairs of frames (e.g. Golub & Van Loan, Matrix Computations, 4th ed., 4.5.4) and
-the Schur complement of A: work and memory grow linearly with F, and the number of steps one after the other with log F,
-which is what a GPU needs. All matrices are symmetric positive definite. No library has this structure.
+Solved by the Schur complement of A, whose pairs of frames form a block tridiagonal matrix: block cyclic reduction (e.g.
+Golub & Van Loan, Matrix Computations, 4th ed., 4.5.4) halves their number until at most `CHAIN` are left, and block
+Cholesky elimination takes these one after the other. Work and memory grow linearly with F. On a CPU the chain takes all
+pairs: one loop, which compiles once and needs half of the operations. On a GPU it is short, and the number of steps one
+after the other grows with log F. All matrices are symmetric positive definite. No library has this structure.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +24,8 @@ from jaxtyping import Array, Float
 
 #: Columns of the border that are worked on at once where memory counts: for the variances, and in long sessions.
 COLUMNS = 32
+#: Most pairs of frames that are eliminated one after the other, by JAX platform.
+CHAIN = {"cpu": 2**31, "gpu": 8}
 #: Numbers of a border above which it is eliminated some columns at a time, which takes less than half of the memory.
 LARGE_BORDER = 2**26
 
@@ -49,21 +54,38 @@ class _Level:
     sides: Float[Array, "M n 2*n"]
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class _Chain:
+    """Blocks eliminated one after the other: with block = L L' when its predecessors are gone, the inverse of L and its
+    product with the link to the block after."""
+
+    inverse: Float[Array, "M n n"]
+    after: Float[Array, "M n n"]
+
+
+class _Factors(NamedTuple):
+    """Factors of A: the levels of the reduction, then the chain of what they leave."""
+
+    levels: list[_Level]
+    chain: _Chain
+
+
 def solve(
     matrix: BorderedBandedSystem, g: Float[Array, "F Q"], h: Float[Array, " K"]
 ) -> tuple[Float[Array, "F Q"], Float[Array, " K"]]:
     """x (F, Q) and y (K,) of the system above."""
     with jax.default_matmul_precision("highest"):
-        levels = _factors(matrix)
+        factors = _factors(matrix)
         if matrix.border.size > LARGE_BORDER:
-            reduced = _substitute(levels, g[..., None]).reshape(1, -1) @ matrix.border.reshape(g.size, -1)
-            y = _solve_corner(matrix.corner - _by_columns(levels, matrix.border), h - reduced[0])
-            return _substitute(levels, (g - matrix.border @ y)[..., None])[..., 0], y
+            reduced = _substitute(factors, g[..., None]).reshape(1, -1) @ matrix.border.reshape(g.size, -1)
+            y = _solve_corner(matrix.corner - _by_columns(factors, matrix.border), h - reduced[0])
+            return _substitute(factors, (g - matrix.border @ y)[..., None])[..., 0], y
         # The border and g are eliminated together, and what was eliminated serves again for x.
-        rows = _eliminated(levels, jnp.concatenate([matrix.border, g[..., None]], axis=-1))
+        rows = _eliminated(factors, jnp.concatenate([matrix.border, g[..., None]], axis=-1))
         both = _grams(rows)
         y = _solve_corner(matrix.corner - both[:-1, :-1], h - both[:-1, -1])
-        x = _back_substituted(levels, [r[..., -1:] - r[..., :-1] @ y[:, None] for r in rows], g.shape[0])
+        x = _back_substituted(factors, [r[..., -1:] - r[..., :-1] @ y[:, None] for r in rows], g.shape[0])
         return x.reshape(g.shape), y
 
 
@@ -71,21 +93,21 @@ def marginal_variance(matrix: BorderedBandedSystem) -> tuple[Float[Array, "F Q"]
     """Diagonal of the inverse of the whole matrix: that of x and that of y."""
     with jax.default_matmul_precision("highest"):
         shape, k = matrix.border.shape[:2], matrix.border.shape[-1]
-        levels = _factors(matrix)
+        factors = _factors(matrix)
         large = matrix.border.size > LARGE_BORDER
-        rows = [] if large else _eliminated(levels, matrix.border)
-        inverse = _inverse_of_factor(matrix.corner - (_by_columns(levels, matrix.border) if large else _grams(rows)))
+        rows = [] if large else _eliminated(factors, matrix.border)
+        inverse = _inverse_of_factor(matrix.corner - (_by_columns(factors, matrix.border) if large else _grams(rows)))
         groups = jnp.pad(inverse, [(0, -k % COLUMNS), (0, 0)]).reshape(-1, COLUMNS, k)
 
         def add(total: Array, some: Array) -> tuple[Array, None]:
             if large:
-                x = _substitute(levels, matrix.border @ some.T)
+                x = _substitute(factors, matrix.border @ some.T)
             else:
-                x = _back_substituted(levels, [r @ some.T for r in rows], shape[0])
+                x = _back_substituted(factors, [r @ some.T for r in rows], shape[0])
             return total + jnp.sum(x.reshape(*shape, -1) ** 2, axis=-1), None
 
         shared, _ = jax.lax.scan(add, jnp.zeros(shape, inverse.dtype), groups)
-        return _inverse_diagonal(levels, shape) + shared, jnp.sum(inverse**2, axis=0)
+        return _inverse_diagonal(factors, shape) + shared, jnp.sum(inverse**2, axis=0)
 
 
 def _solve_corner(schur: Float[Array, "K K"], h: Float[Array, " K"]) -> Float[Array, " K"]:
@@ -99,16 +121,21 @@ def _inverse_of_factor(matrix: Float[Array, "*m n n"]) -> Float[Array, "*m n n"]
     return triangular_solve(lower, eye, left_side=True, lower=True)
 
 
-def _factors(matrix: BorderedBandedSystem) -> list[_Level]:
-    """Factors of A."""
+def _factors(matrix: BorderedBandedSystem) -> _Factors:
     blocks, links = _pairs(matrix)
+    most = CHAIN.get(jax.default_backend(), CHAIN["gpu"])
     levels: list[_Level] = []
-    while True:
-        last = blocks.shape[0] == 1
+    while blocks.shape[0] > most:
         level, blocks, links = _reduce(blocks, links)
         levels.append(level)
-        if last:
-            return levels
+
+    def eliminate(after: Array, block_and_link: tuple[Array, Array]) -> tuple[Array, _Chain]:
+        block, link = block_and_link
+        inverse = _inverse_of_factor(block - after.T @ after)
+        after = inverse @ link
+        return after, _Chain(inverse, after)
+
+    return _Factors(levels, jax.lax.scan(eliminate, jnp.zeros_like(blocks[0]), (blocks, links))[1])
 
 
 def _grams(rows: list[Float[Array, "M n R"]]) -> Float[Array, "R R"]:
@@ -116,27 +143,33 @@ def _grams(rows: list[Float[Array, "M n R"]]) -> Float[Array, "R R"]:
     return functools.reduce(jnp.add, [jnp.einsum("mnk,mnl->kl", y, y) for y in rows])
 
 
-def _by_columns(levels: list[_Level], border: Float[Array, "F Q K"]) -> Float[Array, "K K"]:
+def _by_columns(factors: _Factors, border: Float[Array, "F Q K"]) -> Float[Array, "K K"]:
     """B' A^-1 B."""
     k = border.shape[-1]
     width = min(COLUMNS, k)
     starts = np.minimum(np.arange(0, k, width), k - width)  # the last ones overlap
 
     def some(start: Array) -> Array:
-        x = _substitute(levels, jax.lax.dynamic_slice_in_dim(border, start, width, axis=2))
+        x = _substitute(factors, jax.lax.dynamic_slice_in_dim(border, start, width, axis=2))
         return x.reshape(-1, width).T @ border.reshape(-1, k)
 
     rows = jax.lax.map(some, jnp.asarray(starts)).reshape(-1, k)
     return rows[np.unique(starts[:, None] + np.arange(width), return_index=True)[1]]
 
 
-def _eliminated(levels: list[_Level], rhs: Float[Array, "F Q R"]) -> list[Float[Array, "M n R"]]:
-    """The eliminated rows of a right-hand side, level by level."""
+def _eliminated(factors: _Factors, rhs: Float[Array, "F Q R"]) -> list[Float[Array, "M n R"]]:
+    """The eliminated rows of a right-hand side, level by level and last those of the chain."""
     part, out = _in_pairs(rhs), []
-    for level in levels:
+    for level in factors.levels:
         y, part = _forward(level, part)
         out.append(y)
-    return out
+
+    def eliminate(from_before: Array, block_and_rows: tuple[_Chain, Array]) -> tuple[Array, Array]:
+        block, rows = block_and_rows
+        y = block.inverse @ (rows - from_before)
+        return block.after.T @ y, y
+
+    return [*out, jax.lax.scan(eliminate, jnp.zeros_like(part[0]), (factors.chain, part))[1]]
 
 
 def _pairs(matrix: BorderedBandedSystem) -> tuple[Array, Array]:
@@ -204,28 +237,41 @@ def _gram(a: Array, b: Array) -> Array:
     return jnp.einsum("mkn,mkr->mnr", a, b)
 
 
-def _substitute(levels: list[_Level], rhs: Float[Array, "F Q R"]) -> Float[Array, "F Q R"]:
+def _substitute(factors: _Factors, rhs: Float[Array, "F Q R"]) -> Float[Array, "F Q R"]:
     """A^-1 rhs with the factors of A."""
-    return _back_substituted(levels, _eliminated(levels, rhs), rhs.shape[0]).reshape(rhs.shape)
+    return _back_substituted(factors, _eliminated(factors, rhs), rhs.shape[0]).reshape(rhs.shape)
 
 
-def _back_substituted(levels: list[_Level], rows: list[Float[Array, "M n R"]], frames: int) -> Float[Array, "P n R"]:
+def _back_substituted(factors: _Factors, rows: list[Float[Array, "M n R"]], frames: int) -> Float[Array, "P n R"]:
     """The solution for pairs of frames, from the eliminated rows of a right-hand side."""
-    # How many rows each level began with.
-    counts = [frames // 2, *(level.inverse.shape[0] for level in levels[:-1])]
-    x = jnp.zeros_like(rows[-1])
-    for level, y, count in zip(reversed(levels), reversed(rows), reversed(counts), strict=True):
+
+    def substitute(later: Array, block_and_rows: tuple[_Chain, Array]) -> tuple[Array, Array]:
+        block, y = block_and_rows
+        x = block.inverse.T @ (y - block.after @ later)
+        return x, x
+
+    x = jax.lax.scan(substitute, jnp.zeros_like(rows[-1][0]), (factors.chain, rows[-1]), reverse=True)[1]
+    for level, y in zip(reversed(factors.levels), reversed(rows[:-1]), strict=True):
+        x = x[: y.shape[0]]  # an odd number of blocks was filled up
         gone = _gram(level.inverse, y - level.sides @ jnp.concatenate([_earlier(x), x], axis=1))
-        x = _join(gone, x)[:count]
-    return x
+        x = _join(gone, x)
+    return x[: frames // 2]
 
 
-def _inverse_diagonal(levels: list[_Level], shape: tuple[int, ...]) -> Float[Array, "F Q"]:
+def _inverse_diagonal(factors: _Factors, shape: tuple[int, ...]) -> Float[Array, "F Q"]:
     """Diagonal of A^-1 by the same recursion backwards, which needs only the blocks between neighbours."""
-    n = levels[0].inverse.shape[-1]
-    own = jnp.zeros((1, n, n), levels[0].inverse.dtype)
-    link = own  # link[i]: covariance of block i with block i + 1
-    for level in reversed(levels):
+    n = factors.chain.inverse.shape[-1]
+
+    def invert(later: Array, block: _Chain) -> tuple[Array, tuple[Array, Array]]:
+        to_later = -block.inverse.T @ block.after
+        link = to_later @ later
+        own = block.inverse.T @ block.inverse + link @ to_later.T
+        return own, (own, link)
+
+    # link[i]: covariance of block i with block i + 1
+    none = jnp.zeros_like(factors.chain.inverse[0])
+    _, (own, link) = jax.lax.scan(invert, none, factors.chain, reverse=True)
+    for level in reversed(factors.levels):
         count = level.inverse.shape[0]
         own, link = own[:count], link[:count]
         # Covariance of an eliminated block's two neighbours, of the block with them, then its own.
