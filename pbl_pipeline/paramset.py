@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import cattrs
 
 P = TypeVar("P")
+_LATER = "later"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,8 +28,8 @@ class Paramset:
 
     @classmethod
     def of(cls, stage: str, name: str, version: int, params: Any) -> Paramset:
-        """From a frozen parameter dataclass."""
-        return cls(stage, name, version, dataclasses.asdict(params))
+        """From a frozen parameter dataclass; fields of `later` only where they differ from their default."""
+        return cls(stage, name, version, _plain(params))
 
     def to(self, cls: type[P]) -> P:
         """The parameter dataclass again, the inverse of `of`, also after the parameters went through JSON.
@@ -53,6 +54,23 @@ class Paramset:
         """First 16 hex digits of the SHA-256 over stage, name, version and canonical JSON."""
         text = "\n".join([self.stage, self.name, str(self.version), self.canonical_json])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def later(default: Any) -> Any:
+    """A field that parameters have got since methods with them were shipped. Left out at its default, which must be
+    what the methods did before it, so that their hashes stay."""
+    return dataclasses.field(default=default, metadata={_LATER: True})
+
+
+def _plain(params: Any) -> dict[str, Any]:
+    out = dataclasses.asdict(params)
+    for field in dataclasses.fields(params):
+        value = getattr(params, field.name)
+        if field.metadata.get(_LATER) and value == field.default:
+            del out[field.name]
+        elif dataclasses.is_dataclass(value):
+            out[field.name] = _plain(value)
+    return out
 
 
 def structured(values: Any, cls: type[P]) -> P:

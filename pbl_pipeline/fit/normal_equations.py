@@ -5,7 +5,8 @@ so its derivative is that of a function of three numbers (`linearised`) times th
 as weighted squares (iteratively reweighted least squares).
 
 Unknowns of a frame: qpos (Q) and, where the camera moves, a small rotation of it (3, world axes, from the left).
-Shared: s (S), marker offsets (3 J), clocks (N, where the camera moves) and floors (3 N).
+Shared: s (S), marker offsets (3 J), clocks (N, where the camera moves), floors (3 N) and, where the paramset asks for
+them, what the detector gets wrong in all frames of a trial (lean 3, depth J; N times).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Float
 
 from pbl_pipeline.body import Body, MarkerJacobian, marker_jacobian, scale_multipliers
@@ -26,6 +28,8 @@ from .objective import (
     At,
     Loffset,
     State,
+    corrected,
+    detector_prior,
     frame_count,
     huber_weight,
     in_camera,
@@ -42,7 +46,7 @@ from .objective import (
     slide_contact,
     weighted,
 )
-from .priors import Weights, bent, beyond_limit_deg, pose_z, shift
+from .priors import Weights, bent, beyond_limit_deg, inclination, pose_z, responsibilities, shift
 from .problem import Problem, frames_at
 from .solvers.linear import BorderedBandedSystem
 
@@ -103,6 +107,7 @@ def moved(state: State, dx: Float[Array, "F U"], dy: Float[Array, " K"]) -> Stat
     sizes = _columns_of(state, dx.shape[1] > state.qpos.shape[1])
     turn = jaxlie.SO3.exp(dx[:, state.qpos.shape[1] :]).as_matrix() if sizes.clock else None
     R_nc = state.R_nc if turn is None else jnp.einsum("fij,fvjk->fvik", turn, state.R_nc, precision="highest")
+    detector = dy[sizes.detector].reshape(state.lean.shape[0], 3 + state.depth_m.shape[1])
     return State(
         qpos=state.qpos + dx[:, : state.qpos.shape[1]],
         R_nc=R_nc,
@@ -110,6 +115,8 @@ def moved(state: State, dx: Float[Array, "F U"], dy: Float[Array, " K"]) -> Stat
         site_offset_m=state.site_offset_m + dy[sizes.offset].reshape(-1, 3),
         clock_s=state.clock_s + dy[sizes.clock] if sizes.clock else state.clock_s,
         floor=state.floor + dy[sizes.floor].reshape(-1, 3),
+        lean=state.lean + detector[:, :3],
+        depth_m=state.depth_m + detector[:, 3:],
     )
 
 
@@ -140,15 +147,17 @@ class _Columns(NamedTuple):
     offset: slice
     clock: slice | None
     floor: slice
+    detector: slice
     frame: int  # unknowns of a frame
     size: int
 
 
 def _columns_of(state: State, moving: bool) -> _Columns:
-    sizes = [state.s.size, state.site_offset_m.size, state.clock_s.size * moving, state.floor.size]
-    ends = [sum(sizes[: i + 1]) for i in range(4)]
-    s, offset, clock, floor = (slice(end - size, end) for end, size in zip(ends, sizes, strict=True))
-    return _Columns(s, offset, clock if moving else None, floor, state.qpos.shape[1] + 3 * moving, ends[-1])
+    of_detector = state.lean.size + state.depth_m.size
+    sizes = [state.s.size, state.site_offset_m.size, state.clock_s.size * moving, state.floor.size, of_detector]
+    ends = [sum(sizes[: i + 1]) for i in range(5)]
+    s, offset, clock, floor, detector = (slice(end - size, end) for end, size in zip(ends, sizes, strict=True))
+    return _Columns(s, offset, clock if moving else None, floor, detector, state.qpos.shape[1] + 3 * moving, ends[-1])
 
 
 def _phone(p: Problem, state: State) -> tuple[jaxlie.SO3, jaxlie.SO3, Array]:
@@ -188,7 +197,7 @@ def _keypoint_terms(
         at = slice(first_sole, first_sole + n_soles)
         soles = _Soles(jac.x_world_m[:, at], jac.per_qpos[:, at], jac.per_scale[:, at])
         markers: MarkerJacobian = jax.tree.map(lambda a: a[:, :first_sole], jac)
-        (H, g, B), shared = _marker_blocks(part, w, markers, R_nc)
+        (H, g, B), shared = _marker_blocks(part, w, markers, R_nc, _detector_terms(part, state, R_nc))
         return (jac.x_world_m, soles, H, g, B), shared
 
     if size == frames:
@@ -199,21 +208,48 @@ def _keypoint_terms(
         out, (C, h) = some(frames_at(p, index), state.qpos[index], state.R_nc[index])
         return (carry[0] + C, carry[1] + h), out
 
-    k = state.s.size + state.site_offset_m.size
+    k = state.s.size + state.site_offset_m.size + state.lean.size + state.depth_m.size
     (C, h), out = jax.lax.scan(step, (jnp.zeros((k, k)), jnp.zeros(k)), jnp.arange(frames).reshape(-1, size))
     x, soles, H, g, B = jax.tree.map(lambda a: a.reshape(frames, *a.shape[2:]), out)
     return x, soles, _with_room(H, g, B, C, h, columns)
 
 
-def _marker_blocks(p: Problem, w: Weights, jac: MarkerJacobian, R_nc: Array) -> tuple[tuple, tuple]:
-    """Blocks of the keypoint terms: H (F, U, U), g (F, U), B (F, U, K) and C (K, K), h (K,), of s and offsets alone."""
+class _Detector(NamedTuple):
+    """The corrected 3D points; how a marker less its detected point (world axes) moves with the lean of its trial and
+    with its own depth; and the trial of each frame as rows of 0 and 1. L is 3 and D the number of trials, or both are 0
+    without these unknowns."""
+
+    x_cam: Array  # (F, V, M, 3)
+    by_lean: Array  # (F, M, 3, L)
+    by_depth: Array  # (F, 3)
+    trials: Array  # (F, D)
+
+
+def _detector_terms(p: Problem, state: State, R_nc: Array) -> _Detector:
+    n = state.lean.shape[0]
+    trials = jax.nn.one_hot(p.trial, n, dtype=R_nc.dtype)
+    if n == 0:
+        frames, _, markers, _ = p.x_cam.shape
+        none = jnp.zeros((frames, markers, 3, 0), R_nc.dtype)
+        return _Detector(p.x_cam, none, jnp.zeros((frames, 3), R_nc.dtype), trials)
+    lean = jnp.broadcast_to(state.lean[p.trial][:, None], p.x_cam[:, 0].shape)
+    depth_m = state.depth_m[p.trial]
+    x_cam, by_lean = linearised(lambda z: corrected(p.x_cam[:, 0, :, None], z, depth_m[..., None])[..., 0, :], lean)
+    return _Detector(x_cam[:, None], -_times(R_nc, by_lean), -R_nc[:, 0, :, 2], trials)
+
+
+def _marker_blocks(
+    p: Problem, w: Weights, jac: MarkerJacobian, R_nc: Array, detector: _Detector
+) -> tuple[tuple, tuple]:
+    """Blocks of the keypoint terms: H (F, U, U), g (F, U), B (F, U, K) and C (K, K), h (K,), of s, offsets and what the
+    detector gets wrong."""
     x, U = jac.x_world_m, jac.per_offset
     by_frame = [jac.per_qpos]
     if p.moving:
         by_frame.append(_cross_matrix(x))  # a camera that turns sees every point turn the other way
     A = jnp.concatenate([*by_frame, jac.per_scale], axis=-1)
-    n_s = jac.per_scale.shape[-1]
-    q = A.shape[-1] - n_s
+    n_s, n = jac.per_scale.shape[-1], A.shape[-1]
+    q = n - n_s
     frame = p.weight[:, None]
 
     f, M = jnp.zeros_like(x), jnp.zeros((*x.shape, 3), x.dtype)
@@ -229,19 +265,24 @@ def _marker_blocks(p: Problem, w: Weights, jac: MarkerJacobian, R_nc: Array) -> 
     M += jnp.einsum("fvm,fvmik,fvmil->fmkl", c, D, D)
 
     centred = mean_weights(p.c_3d, p.weight_3d)
-    away = offset_m(in_camera(x, R_nc, p.p_nc), p.x_cam, centred)
-    r, D = linearised(lambda x: residual_3d_cm(in_camera(x, R_nc, p.p_nc) - away, p.x_cam, w.depth_ratio), x)
+    away = offset_m(in_camera(x, R_nc, p.p_nc), detector.x_cam, centred)
+    r, D = linearised(lambda x: residual_3d_cm(in_camera(x, R_nc, p.p_nc) - away, detector.x_cam, w.depth_ratio), x)
     c = w.weight_3d * frame[..., None] * p.c_3d * p.weight_3d * huber_weight(r, w.huber_3d_cm)
     force = jnp.einsum("fvm,fvmij,fvmi->fvmj", c, D, r)
-    f += jnp.sum(force - centred[..., None] * jnp.sum(force, axis=2, keepdims=True), axis=1)
+    f_3d = jnp.sum(force - centred[..., None] * jnp.sum(force, axis=2, keepdims=True), axis=1)
     W = jnp.einsum("fvm,fvmik,fvmil->fvmkl", c, D, D)
-    M += jnp.sum(W, axis=1)
 
     frames, markers = x.shape[:2]
     flat = lambda a: a.reshape(frames, markers * 3, -1)  # noqa: E731
-    cross = _times(M, A)
-    G = jnp.einsum("fkq,fkr->fqr", flat(A), flat(cross))
-    own = jnp.sum(_times(jnp.swapaxes(U, -1, -2), _times(M, U)), axis=0)
+    W_all = jnp.sum(W, axis=1)
+    # What the detector gets wrong moves the 3D residuals alone.
+    wide = lambda a: jnp.pad(a, [(0, 0)] * 3 + [(0, detector.by_lean.shape[-1])])  # noqa: E731
+    of_2d = wide(_times(M, A))
+    A = jnp.concatenate([A, detector.by_lean], axis=-1)
+    cross = _times(W_all, A)
+    G = jnp.einsum("fkq,fkr->fqr", flat(A), flat(cross + of_2d))
+    G = G.at[:, n:, :n].set(jnp.swapaxes(G[:, :n, n:], -1, -2))
+    own = jnp.sum(_times(jnp.swapaxes(U, -1, -2), _times(M + W_all, U)), axis=0)
     C_oo = jnp.einsum("mij,mn->minj", own, jnp.eye(markers, dtype=x.dtype)).reshape(3 * markers, 3 * markers)
     # A centred residual moves with its marker less the mean over the markers, which all of them move.
     for b, Wv in zip(jnp.moveaxis(centred, 1, 0), jnp.moveaxis(W, 1, 0), strict=True):
@@ -256,21 +297,76 @@ def _marker_blocks(p: Problem, w: Weights, jac: MarkerJacobian, R_nc: Array) -> 
         Y = jnp.swapaxes(b[..., None, None] * U, 1, 2).reshape(frames, 3, 3 * markers)
         one = jnp.einsum("fik,fil->kl", X - 0.5 * whole @ Y, Y)
         C_oo -= one + one.T
-    by_offset = _times(jnp.swapaxes(U, -1, -2), cross)
-    by_offset = by_offset.reshape(frames, 3 * markers, q + n_s).swapaxes(1, 2)
-    C_so = jnp.sum(by_offset[:, q:], axis=0)
-    C = jnp.block([[jnp.sum(G[:, q:, q:], axis=0), C_so], [C_so.T, C_oo]])
-    B = jnp.concatenate([G[:, :q, q:], by_offset[:, :q]], axis=-1)
-    pulled = jnp.einsum("fmiq,fmi->fq", A, f)
-    h = jnp.concatenate([jnp.sum(pulled[:, q:], axis=0), jnp.einsum("fmik,fmi->mk", U, f).reshape(-1)])
+    U_t = jnp.swapaxes(U, -1, -2)
+    by_offset = _times(U_t, cross + of_2d).reshape(frames, 3 * markers, A.shape[-1]).swapaxes(1, 2)
+    C_so = jnp.sum(by_offset[:, q:n], axis=0)
+    C = jnp.block([[jnp.sum(G[:, q:n, q:n], axis=0), C_so], [C_so.T, C_oo]])
+    B = jnp.concatenate([G[:, :q, q:n], by_offset[:, :q]], axis=-1)
+    pulled = jnp.einsum("fmiq,fmi->fq", A[..., :n], f + f_3d)
+    pulled_o = jnp.einsum("fmik,fmi->mk", U, f + f_3d)
+    h = jnp.concatenate([jnp.sum(pulled[:, q:], axis=0), pulled_o.reshape(-1)])
+    if detector.trials.shape[1]:
+        by_detector, of_offsets, own_of_detector = _detector_blocks(detector, centred[:, 0], W_all, U_t, cross, G, n)
+        each = detector.trials
+        to_trials = lambda a: (a[:, :, None] * each[:, None, :, None]).reshape(*a.shape[:2], -1)  # noqa: E731
+        C_d = jnp.concatenate([jnp.sum(to_trials(by_detector[:, q:]), axis=0), of_offsets], axis=0)
+        pulled_d = jnp.concatenate(
+            [jnp.einsum("fmil,fmi->fl", detector.by_lean, f_3d), jnp.einsum("fi,fmi->fm", detector.by_depth, f_3d)],
+            axis=1,
+        )
+        C = jnp.block([[C, C_d], [C_d.T, own_of_detector]])
+        B = jnp.concatenate([B, to_trials(by_detector[:, :q])], axis=-1)
+        h = jnp.concatenate([h, (each.T @ pulled_d).reshape(-1)])
     return (G[:, :q, :q], -pulled[:, :q], B), (C, -h)
+
+
+def _detector_blocks(
+    detector: _Detector, b: Array, W: Array, U_t: Array, cross: Array, G: Array, n: int
+) -> tuple[Array, Array, Array]:
+    """What the E = 3 + M unknowns of a trial's detector share with the n of frames and scale (F, n, E), with the
+    offsets (3 M, D E) and with each other (D E, D E).
+
+    `b`: weights of the mean that is removed; `W`: curvature of each marker's 3D residual; `cross`: force on each marker
+    in 3D where the unknowns of A move, the mean removed; G: A's own products, the lean's in its last 3 columns. A depth
+    moves its own marker alone, so its products are those of `cross` with one direction.
+    """
+    u, each = detector.by_depth, detector.trials
+    frames, markers = b.shape
+    by_depth = jnp.einsum("fi,fmia->fam", u, cross)
+    Wu = jnp.einsum("fmij,fj->fmi", W, u)
+    own = jnp.einsum("fmi,fi->fm", Wu, u)
+    mixed = b[:, :, None] * own[:, None]
+    depths = own[:, :, None] * jnp.eye(markers, dtype=b.dtype) - mixed - jnp.swapaxes(mixed, 1, 2)
+    depths += b[:, :, None] * b[:, None] * jnp.sum(own, axis=1)[:, None, None]
+    by_detector = jnp.concatenate([G[:, :n, n:], by_depth[:, :n]], axis=-1)
+    all_own = jnp.concatenate(
+        [
+            jnp.concatenate([G[:, n:, n:], by_depth[:, n:]], axis=-1),
+            jnp.concatenate([jnp.swapaxes(by_depth[:, n:], 1, 2), depths], axis=-1),
+        ],
+        axis=1,
+    )
+    own_of_detector = jnp.einsum("fde,ft,tu->tdue", all_own, each, jnp.eye(each.shape[1], dtype=b.dtype))
+
+    by_lean = _times(U_t, cross[..., n:]).reshape(frames, 3 * markers, -1)
+    offset_and_lean = jnp.einsum("fol,ft->otl", by_lean, each)
+    to_offset = jnp.einsum("fmki,fmi->fmk", U_t, Wu)
+    whole = jnp.einsum("fmki,fi->fmk", b[..., None, None] * U_t, jnp.sum(Wu, axis=1))
+    offset_and_depth = jnp.einsum("fmk,fj,ft->mktj", whole - to_offset, b, each)
+    offset_and_depth -= jnp.einsum("fmki,fji,ft->mktj", b[..., None, None] * U_t, Wu, each)
+    offset_and_depth += jnp.einsum("fmk,ft,mj->mktj", to_offset, each, jnp.eye(markers, dtype=b.dtype))
+    offset_and_depth = offset_and_depth.reshape(3 * markers, each.shape[1], markers)
+    of_offsets = jnp.concatenate([offset_and_lean, offset_and_depth], axis=-1)
+    size = own_of_detector.shape[0] * own_of_detector.shape[1]
+    return by_detector, of_offsets.reshape(3 * markers, size), own_of_detector.reshape(size, size)
 
 
 def _with_room(H: Array, g: Array, B: Array, C: Array, h: Array, columns: _Columns) -> _Blocks:
     """The keypoints' blocks with room for all shared unknowns and no links yet."""
-    more = columns.size - C.shape[0]
-    B, C, h = jnp.pad(B, [(0, 0), (0, 0), (0, more)]), jnp.pad(C, (0, more)), jnp.pad(h, (0, more))
-    return _Blocks(H, g, jnp.zeros_like(H), B, C, h)
+    at, size = np.r_[columns.s, columns.offset, columns.detector], columns.size
+    C = jnp.zeros((size, size)).at[at[:, None], at].set(C)
+    B = jnp.zeros((*B.shape[:2], size)).at[..., at].set(B)
+    return _Blocks(H, g, jnp.zeros_like(H), B, C, jnp.zeros(size).at[at].set(h))
 
 
 def _cross_matrix(x: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
@@ -291,13 +387,21 @@ def _add_joints(sum_: _Blocks, p: Problem, w: Weights, state: State) -> tuple[_B
     """Limits, pose prior and smoothness, and the diagonals (F, U) of the links with the frame after the next. Frames
     that count for nothing stay where they are.
     """
-    diagonal, force = jnp.zeros_like(state.qpos), jnp.zeros_like(state.qpos)
-    limits = lambda q: beyond_limit_deg(q, w.low, w.high)  # noqa: E731
-    pose = lambda q: pose_z(q, w.neutral, w.inverse_sd)  # noqa: E731
-    for residual, weight in ((limits, w.weight_limit), (pose, w.weight_pose)):
-        r, D = linearised(lambda q, residual=residual: residual(q[..., 0])[..., None], state.qpos[..., None])
-        diagonal += weight * p.weight[:, None] * D[..., 0, 0] ** 2
-        force += weight * p.weight[:, None] * D[..., 0, 0] * r[..., 0]
+    r, D = linearised(lambda q: beyond_limit_deg(q[..., 0], w.low, w.high)[..., None], state.qpos[..., None])
+    each = w.weight_limit * p.weight[:, None]
+    diagonal, force = each * D[..., 0, 0] ** 2, each * D[..., 0, 0] * r[..., 0]
+    each = w.weight_pose * p.weight[:, None]
+    pose, by_pelvis = _posture(state.qpos, w)
+    z = pose_z(pose, w.neutral, w.whitener)
+    own = each * responsibilities(z, w.pose_log_weight)
+    towards = jnp.einsum("fc,fcp,cpq->fq", own, z, w.whitener)
+    curvature = jnp.einsum("fc,cqr->fqr", own, jnp.einsum("cpq,cpr->cqr", w.whitener, w.whitener))
+    if by_pelvis is not None:
+        # Only the pelvis' own three joints are seen through its tilt and list.
+        through = lambda a: _through(a, by_pelvis, w.pelvis)  # noqa: E731
+        towards = through(towards[:, None])[:, 0]
+        curvature = jnp.swapaxes(through(jnp.swapaxes(through(curvature), 1, 2)), 1, 2)
+    force += towards
     r, transposed = jax.vjp(lambda q: bent(q, p.bend), state.qpos)
     force += transposed(w.smooth * r)[0]
     # The difference at t involves t - 1, t and t + 1; that at t + 1 the following three.
@@ -310,24 +414,49 @@ def _add_joints(sum_: _Blocks, p: Problem, w: Weights, state: State) -> tuple[_B
     wide = lambda a: jnp.pad(a, [(0, 0), (0, sum_.g.shape[-1] - a.shape[-1])])  # noqa: E731
     empty = (p.weight == 0) & (around == 0)
     on_diagonal = lambda a: a[..., None] * jnp.eye(a.shape[-1], dtype=a.dtype)  # noqa: E731
-    H = sum_.H + on_diagonal(wide(diagonal) + empty[:, None])
+    q = state.qpos.shape[1]
+    H = (sum_.H + on_diagonal(wide(diagonal) + empty[:, None])).at[:, :q, :q].add(curvature)
     link = sum_.link + on_diagonal(wide(next_1))
     return sum_._replace(H=H, g=sum_.g - wide(force), link=link), wide(next_2)
+
+
+def _posture(qpos: Float[Array, "F Q"], w: Weights) -> tuple[Float[Array, "F Q"], Float[Array, "F 2 3"] | None]:
+    """`posture`, and the derivative of the pelvis' tilt and list by its three joints; None where the posture is the
+    joint values themselves."""
+    if not w.pelvis.shape[0]:
+        return qpos, None
+    upright, by_pelvis = linearised(inclination, qpos[:, w.pelvis])
+    return qpos.at[:, w.pelvis[:2]].set(upright), by_pelvis
+
+
+def _through(a: Float[Array, "F R Q"], by_pelvis: Float[Array, "F 2 3"], pelvis: Array) -> Float[Array, "F R Q"]:
+    """Rows by a posture's values as rows by the joint values."""
+    of_pelvis = _times_2(a[..., pelvis[:2]], by_pelvis)
+    return a.at[..., pelvis].set(of_pelvis.at[..., 2].add(a[..., pelvis[2]]))
+
+
+def _times_2(a: Float[Array, "F R 2"], b: Float[Array, "F 2 3"]) -> Float[Array, "F R 3"]:
+    return a[..., :1] * b[:, :1] + a[..., 1:] * b[:, 1:]
 
 
 # --- shared unknowns, phone, soles
 
 
 def _add_shared(sum_: _Blocks, p: Problem, w: Weights, state: State, columns: _Columns) -> _Blocks:
-    """Marker offsets and the priors of scale, clocks and floors, all quadratic."""
+    """Marker offsets and the priors of scale, clocks, floors and the detector's errors, all quadratic."""
 
     def cost(y: Array) -> Array:
         clock = y[columns.clock] if columns.clock else jnp.zeros(1)
         floor = y[columns.floor].reshape(-1, 3)
+        lean, depth_m = jnp.split(
+            y[columns.detector].reshape(state.lean.shape[0], 3 + state.depth_m.shape[1]), [3], axis=1
+        )
         offset = w.weight_offset_per_m2 * Loffset(y[columns.offset].reshape(-1, 3))
-        return frame_count(p) * (offset + shared_prior(p, w, y[columns.s], clock, floor))
+        detector = w.weight_detector * detector_prior(p, w, lean, depth_m)
+        return frame_count(p) * (offset + detector + shared_prior(p, w, y[columns.s], clock, floor))
 
-    parts = [state.s, state.site_offset_m, *([state.clock_s] if columns.clock else []), state.floor]
+    detector = jnp.concatenate([state.lean, state.depth_m], axis=1)
+    parts = [state.s, state.site_offset_m, *([state.clock_s] if columns.clock else []), state.floor, detector]
     y = jnp.concatenate([a.reshape(-1) for a in parts])
     return sum_._replace(C=sum_.C + jax.hessian(cost)(y), h=sum_.h - jax.grad(cost)(y))
 

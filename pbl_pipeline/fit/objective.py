@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, ArrayLike, Float
 
-from .priors import Weights, bent, beyond_limit_deg, pose_z
+from .priors import Weights, bent, beyond_limit_deg, pose_cost, pose_z, posture
 from .problem import Problem
 
 #: Depth below which a point is treated as if it were this far away: keeps projections and gradients finite.
@@ -30,7 +30,12 @@ SOFT_M = 0.5 * NEAR_M
 @dataclasses.dataclass(frozen=True)
 class State:
     """The unknowns of a session at F frames. `s`: the paper's scale parameters; `clock_s`: sensor time minus video time
-    of each trial; `floor`: its height (m) and slopes along the world's x and y, of each trial."""
+    of each trial; `floor`: its height (m) and slopes along the world's x and y, of each trial.
+
+    What a detector's 3D points are wrong by in all frames of a trial, where the paramset asks for it (D is N, else 0):
+    `lean`, the rotation (rotation vector in rad, camera axes) that sets them upright, and `depth_m`, what must be added
+    to each marker's depth.
+    """
 
     qpos: Float[Array, "F Q"]
     R_nc: Float[Array, "F V 3 3"]
@@ -38,6 +43,8 @@ class State:
     site_offset_m: Float[Array, "J 3"]
     clock_s: Float[Array, " N"]
     floor: Float[Array, "N 3"]
+    lean: Float[Array, "D 3"] = dataclasses.field(default_factory=lambda: jnp.zeros((0, 3)))
+    depth_m: Float[Array, "D J"] = dataclasses.field(default_factory=lambda: jnp.zeros((0, 0)))
 
 
 # --- robust cost
@@ -98,6 +105,15 @@ def residual_3d_cm(
     one across it (1: the paper's)."""
     per_m = 100.0 * jnp.concatenate([jnp.ones(2), jnp.reshape(jnp.asarray(depth_ratio, x.dtype), 1)])
     return (x - detected) * per_m
+
+
+def corrected(
+    x_cam: Float[Array, "*n J 3"], lean: Float[Array, "*n 3"], depth_m: Float[Array, "*n J"]
+) -> Float[Array, "*n J 3"]:
+    """A detector's points without what it gets wrong in every frame: turned by `lean` about their origin, each moved by
+    its `depth_m`."""
+    turned = jaxlie.SO3.exp(lean[..., None, :]) @ x_cam
+    return turned + depth_m[..., None] * jnp.array([0.0, 0.0, 1.0], x_cam.dtype)
 
 
 def mean_weights(c: Float[Array, "*n J"], marker_weight: Float[Array, " J"]) -> Float[Array, "*n J"]:
@@ -218,10 +234,18 @@ def _l3d(at: At) -> Array:
     p, w = at.problem, at.weights
     x_cam = in_camera(at.x, at.state.R_nc, p.p_nc)
     centred = mean_weights(p.c_3d, p.weight_3d)
-    per_view = L3D(x_cam, p.x_cam, p.c_3d * p.weight_3d, centred, w.depth_ratio, w.huber_3d_cm)
+    detected = corrected_points(p, at.state)
+    per_view = L3D(x_cam, detected, p.c_3d * p.weight_3d, centred, w.depth_ratio, w.huber_3d_cm)
     n = p.c_world.shape[1]
     in_world = L3D(at.x[:, :n], p.x_world, p.c_world * p.weight_3d[:n], jnp.zeros_like(p.c_world), 1.0, w.huber_3d_cm)
     return at.mean(jnp.sum(per_view, axis=-1) + in_world)
+
+
+def corrected_points(p: Problem, state: State) -> Float[Array, "F V J 3"]:
+    """The detector's points of all views without the errors that a state says they have in every frame."""
+    if not state.lean.shape[0]:
+        return p.x_cam
+    return corrected(p.x_cam, state.lean[p.trial][:, None], state.depth_m[p.trial][:, None])
 
 
 def _l2d(at: At) -> Array:
@@ -233,6 +257,11 @@ def _l2d(at: At) -> Array:
 def _lphone(at: At) -> Array:
     fitted, measured, weights = at.phone
     return jnp.sum(weights * Lphone(fitted, measured, at.weights.huber_phone_deg))
+
+
+def pose_prior_cost(qpos: Float[Array, "F Q"], w: Weights) -> Float[Array, " F"]:
+    """Negative logarithm of the pose prior's density at each frame."""
+    return pose_cost(pose_z(posture(qpos, w.pelvis), w.neutral, w.whitener), w.pose_log_weight)
 
 
 def _lfloor(at: At) -> Array:
@@ -250,6 +279,13 @@ def slide_contact(p: Problem) -> Float[Array, "F P"]:
     return p.contact * later(p.contact) * ((p.rate > 0) * later(p.weight))[:, None]
 
 
+def detector_prior(problem: Problem, w: Weights, lean: Array, depth_m: Array) -> Float[Array, ""]:
+    """Half squares of what a detector gets wrong in all frames of a trial, in standard deviations; each trial counts as
+    much as its frames do."""
+    z2 = jnp.sum((lean / w.lean_sd) ** 2, axis=-1) + jnp.sum((depth_m / w.depth_sd_m) ** 2, axis=-1)
+    return 0.5 * jnp.sum(problem.weight * z2[problem.trial]) / frame_count(problem) if lean.shape[0] else jnp.zeros(())
+
+
 def shared_prior(problem: Problem, w: Weights, s: Array, clock_s: Array, floor: Array) -> Float[Array, ""]:
     """Half squares of what all frames share: scale parameters, clocks and floors, in standard deviations."""
     clock = 0.5 * jnp.sum((clock_s / w.clock_sd_s) ** 2)
@@ -265,7 +301,7 @@ TERMS: dict[str, tuple[Callable[[Weights], ArrayLike], Callable[[At], Array]]] =
     "Loffset": (lambda w: w.weight_offset_per_m2, lambda at: Loffset(at.state.site_offset_m)),
     "pose prior": (
         lambda w: w.weight_pose,
-        lambda at: at.mean(0.5 * square(pose_z(at.state.qpos, at.weights.neutral, at.weights.inverse_sd))),
+        lambda at: at.mean(pose_prior_cost(at.state.qpos, at.weights)),
     ),
     "joint limits": (
         lambda w: w.weight_limit,
@@ -279,6 +315,10 @@ TERMS: dict[str, tuple[Callable[[Weights], ArrayLike], Callable[[At], Array]]] =
     ),
     "Lfloor": (lambda w: w.weight_floor, _lfloor),
     "Lslide": (lambda w: w.weight_slide, _lslide),
+    "detector prior": (
+        lambda w: w.weight_detector,
+        lambda at: detector_prior(at.problem, at.weights, at.state.lean, at.state.depth_m),
+    ),
     "shared prior": (
         lambda w: 1.0,
         lambda at: shared_prior(at.problem, at.weights, at.state.s, at.state.clock_s, at.state.floor),

@@ -71,11 +71,12 @@ def solve_per_frame(sessions: Sequence[Session], params: GaussNewtonParams, star
     begin, compiled = time.perf_counter(), compile_seconds()
     on_floor = params.weight_floor > 0 or params.weight_slide > 0
     solve = functools.partial(_solve, params=params, last=not on_floor)
+    starts = [_with_detector(s, params) for s in starts]
     found = solve(sessions, [s.problem for s in sessions], starts)
     again = [i for i, f in enumerate(found) if suspicious(sessions[i], f.end.state.qpos)]
     if again:
         part = [sessions[i] for i in again]
-        turned = solve(part, [s.problem for s in part], [start_of(s, flip=True) for s in part])
+        turned = solve(part, [s.problem for s in part], [_with_detector(start_of(s, flip=True), params) for s in part])
         for i, other in zip(again, turned, strict=True):
             found[i] = min(found[i], other, key=lambda f: float(f.end.cost))
     traces = [f.trace for f in found]
@@ -105,6 +106,16 @@ def start_of(session: Session, flip: bool = False) -> State:
         "floor": zeros((n_trials, 3)),
     }
     return State(**values)
+
+
+def _with_detector(start: State, params: GaussNewtonParams) -> State:
+    """With what the detector of a single camera may get wrong among the unknowns, where the paramset asks for it."""
+    if params.weight_detector == 0 or start.R_nc.shape[1] != 1:
+        return start
+    trials, markers = start.floor.shape[0], start.site_offset_m.shape[0]
+    lean, depth_m = np.zeros((trials, 3), np.float32), np.zeros((trials, markers), np.float32)
+    seen: Any = lean, depth_m
+    return dataclasses.replace(start, lean=seen[0], depth_m=seen[1])
 
 
 def fit_problem(body: Body, p: Problem, w: Weights, start: State, limits: Limits) -> Progress:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from pbl_pipeline.body import Body
 from pbl_pipeline.errors import PblError
@@ -17,6 +19,10 @@ from pbl_pipeline.errors import PblError
 from ._params import CostParams, GaussNewtonParams, ImplicitAdamParams
 from .problem import Problem
 
+#: Priors that were learned from people (`research/poses.py`).
+DATA = Path(__file__).parent / "data"
+#: Joints that turn the pelvis, in the order in which they do.
+PELVIS = ("pelvis_tilt", "pelvis_list", "pelvis_rotation")
 #: Below this angle (deg) the paper's Lphone, which is not smooth, counts as smooth: nothing in single precision.
 PAPER_PHONE_DEG = 1e-4
 #: Cost of a floor's slope one standard deviation from level: that of a marker 3 px off in one frame.
@@ -31,9 +37,10 @@ PIXELS_WEIGHT_SIZE = 0.1 / 0.05**2
 class Weights:
     """The numbers of a paramset as arrays, so that another paramset runs the same compiled program.
 
-    Fields are named as in the paramset. `neutral`, `inverse_sd`: the pose prior; `smooth`: per (rad per frame^2 at 30
-    Hz)^2, of slides per (m per frame^2)^2; `low`, `high`: joint limits; `scale_precision`, `floor_precision`: inverse
-    variances of the scale parameters and of a floor's height and slopes.
+    Fields are named as in the paramset. `neutral`, `whitener`, `pose_log_weight`: the pose prior, of C components;
+    `pelvis`: as in `posture`;
+    `smooth`: per (rad per frame^2 at 30 Hz)^2, of slides per (m per frame^2)^2; `low`, `high`: joint limits;
+    `scale_precision`, `floor_precision`: inverse variances of the scale parameters and of a floor's height and slopes.
     """
 
     weight_3d: Float[Array, ""]
@@ -51,8 +58,13 @@ class Weights:
     weight_slide: Float[Array, ""]
     huber_floor_cm: Float[Array, ""]
     huber_slide_cm: Float[Array, ""]
-    neutral: Float[Array, " Q"]
-    inverse_sd: Float[Array, " Q"]
+    neutral: Float[Array, "C Q"]
+    whitener: Float[Array, "C Q Q"]
+    pose_log_weight: Float[Array, " C"]
+    pelvis: Int[Array, " P"]
+    weight_detector: Float[Array, ""]
+    lean_sd: Float[Array, ""]
+    depth_sd_m: Float[Array, ""]
     smooth: Float[Array, " Q"]
     low: Float[Array, " Q"]
     high: Float[Array, " Q"]
@@ -69,7 +81,7 @@ class Weights:
             FIT_INPUT: the paramset has a prior of no joint.
         """
         c, own = params.cost, params if isinstance(params, GaussNewtonParams) else None
-        neutral, inverse_sd = pose_prior(body.joint_names, c.pose_prior_deg)
+        neutral, whitener, pose_log_weight = pose_prior(body.joint_names, c.pose_prior_deg, c.pose_prior)
         scale = c.weight_scale * scale_precision(body.scale_names, c.scale_sd, c.scale_sides_sd)
         scale[0, 0] += PIXELS_WEIGHT_SIZE * size_unseen
         low, high = np.asarray(body.joint_range_rad).T
@@ -83,7 +95,11 @@ class Weights:
             "huber_floor_cm": own.huber_floor_cm if own else 1.0,
             "huber_slide_cm": own.huber_slide_cm if own else 1.0,
             "neutral": neutral,
-            "inverse_sd": inverse_sd,
+            "whitener": whitener,
+            "pose_log_weight": pose_log_weight,
+            "weight_detector": own.weight_detector if own else 0.0,
+            "lean_sd": np.deg2rad(own.lean_sd_deg) if own else 1.0,
+            "depth_sd_m": own.depth_sd_m if own else 1.0,
             "smooth": np.where(body.is_slide, own.smooth_per_m2, own.smooth_per_rad2) if own else np.zeros(len(low)),
             "low": low,
             "high": high,
@@ -92,7 +108,9 @@ class Weights:
             "floor_precision": np.array([1e-6, slope, slope]),
         }
         values |= {f.name: getattr(c, f.name) for f in dataclasses.fields(CostParams) if f.name in _FIELDS}
-        return cls(**{k: jnp.asarray(v, jnp.float32) for k, v in values.items()})
+        names = [n for n in PELVIS if n in body.joint_names] if c.pose_prior else []
+        pelvis = jnp.asarray([body.joint_names.index(n) for n in names], jnp.int32)
+        return cls(pelvis=pelvis, **{k: jnp.asarray(v, jnp.float32) for k, v in values.items()})
 
 
 _FIELDS = {f.name for f in dataclasses.fields(Weights)}
@@ -114,12 +132,42 @@ def beyond_limit_deg(
     return jnp.rad2deg(jnp.maximum(qpos - high, 0.0) + jnp.minimum(qpos - low, 0.0))
 
 
+def inclination(pelvis: Float[Array, "*n 3"]) -> Float[Array, "*n 2"]:
+    """Tilt (backwards positive) and list of a pelvis against the vertical, whichever way it faces, from its three
+    joints: tilt, list and rotation (rad), which turn about the axes of the ground one after the other."""
+    tilt, list_, rotation = (pelvis[..., i] for i in range(3))
+    forward = jnp.sin(tilt) * jnp.cos(rotation) + jnp.cos(tilt) * jnp.sin(list_) * jnp.sin(rotation)
+    right = jnp.sin(tilt) * jnp.sin(rotation) - jnp.cos(tilt) * jnp.sin(list_) * jnp.cos(rotation)
+    # Just short of 1, where the derivative of the arc is infinite.
+    return jnp.arcsin(0.999 * jnp.stack([forward, -right], axis=-1))
+
+
+def posture(qpos: Float[Array, "*n Q"], pelvis: Int[Array, " P"]) -> Float[Array, "*n Q"]:
+    """Joint values with the tilt and list of the pelvis (`pelvis`: its tilt, list and rotation among the joints; none
+    in a body without it) against the vertical."""
+    if not pelvis.shape[0]:
+        return qpos
+    return qpos.at[..., pelvis[:2]].set(inclination(qpos[..., pelvis]))
+
+
 def pose_z(
-    qpos: Float[Array, "*n Q"], neutral: Float[Array, " Q"], inverse_sd: Float[Array, " Q"]
-) -> Float[Array, "*n Q"]:
-    """Distance from the neutral pose in standard deviations; half its square is the negative logarithm of independent
-    normal distributions. `inverse_sd` is 0 where a joint has no prior."""
-    return (qpos - neutral) * inverse_sd
+    pose: Float[Array, "*n Q"], neutral: Float[Array, "C Q"], whitener: Float[Array, "C Q Q"]
+) -> Float[Array, "*n C Q"]:
+    """Distance of a posture from the middle of each component in standard deviations: half its square is the negative
+    logarithm of a normal distribution. The columns of `whitener` are 0 where a joint has no prior."""
+    return jnp.einsum("...cq,cpq->...cp", pose[..., None, :] - neutral, whitener)
+
+
+def pose_cost(z: Float[Array, "*n C Q"], log_weight: Float[Array, " C"]) -> Float[Array, "*n"]:
+    """Negative logarithm of the mixture's density, without its constant: half the square of z where there is one
+    component."""
+    return -jax.nn.logsumexp(log_weight - 0.5 * jnp.sum(z**2, axis=-1), axis=-1)
+
+
+def responsibilities(z: Float[Array, "*n C Q"], log_weight: Float[Array, " C"]) -> Float[Array, "*n C"]:
+    """How much of the density at a pose is each component's; the gradient of `pose_cost` is the components' own,
+    weighted so."""
+    return jax.nn.softmax(log_weight - 0.5 * jnp.sum(z**2, axis=-1), axis=-1)
 
 
 def bent(qpos: Float[Array, "F Q"], bend: Float[Array, "F 3"]) -> Float[Array, "F Q"]:
@@ -138,19 +186,21 @@ def shift(a: Array, by: int) -> Array:
 
 
 def pose_prior(
-    joint_names: Sequence[str], pose_prior_deg: Sequence[tuple[str, float, float]]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Neutral angle (Q,) in rad and 1 / standard deviation (Q,) in 1/rad of each joint, 0 where there is no prior.
+    joint_names: Sequence[str], pose_prior_deg: Sequence[tuple[str, float, float]], learned: str = ""
+) -> tuple[Float[np.ndarray, "C Q"], Float[np.ndarray, "C Q Q"], Float[np.ndarray, " C"]]:
+    """Middle (C, Q) in rad, whitening matrix (C, Q, Q) in 1/rad, rows of 0 where there is no prior, and logarithmic
+    weight (C,) of each component.
 
-    A name means the joint of that name, or both sides of it (`hip_rotation` for `hip_rotation_r` and `_l`); the later
-    entry wins.
+    A name of `pose_prior_deg` means the joint of that name, or both sides of it (`hip_rotation` for `hip_rotation_r`
+    and `_l`); the later entry wins. `learned`: a mixture of `data/`, whose normal distributions with their full
+    covariance take the place of the independent ones of their joints.
 
     Raises
     ------
     PblError
-        FIT_INPUT: no such joint, or a standard deviation that is not positive.
+        FIT_INPUT: no such joint or prior, or a standard deviation that is not positive.
     """
-    neutral, inverse_sd = np.zeros(len(joint_names)), np.zeros(len(joint_names))
+    neutral, precision = np.zeros(len(joint_names)), np.zeros((len(joint_names),) * 2)
     for name, mean_deg, sd_deg in pose_prior_deg:
         index = [i for i, n in enumerate(joint_names) if n in (name, f"{name}_r", f"{name}_l")]
         if not index or not sd_deg > 0:
@@ -161,8 +211,49 @@ def pose_prior(
                 next_step="correct the paramset",
                 key=name,
             )
-        neutral[index], inverse_sd[index] = np.deg2rad(mean_deg), 1 / np.deg2rad(sd_deg)
-    return neutral, inverse_sd
+        neutral[index], precision[index, index] = np.deg2rad(mean_deg), np.deg2rad(sd_deg) ** -2
+    if not learned:
+        return neutral[None], square_root(precision)[None], np.zeros(1)
+    poses = learned_poses(learned)
+    index = [list(joint_names).index(n) for n in poses["joints"]]
+    middles, whiteners, log_weights = [], [], []
+    for component in poses["components"]:
+        own_neutral, own_precision = neutral.copy(), precision.copy()
+        inverse = np.linalg.inv(np.array(component["covariance_deg2"]) * np.deg2rad(1.0) ** 2)
+        own_neutral[index] = np.deg2rad(component["mean_deg"])
+        own_precision[index] = 0.0
+        own_precision[np.ix_(index, index)] = inverse
+        middles.append(own_neutral)
+        whiteners.append(square_root(own_precision))
+        log_weights.append(np.log(component["weight"]) + 0.5 * np.linalg.slogdet(inverse)[1])
+    return np.array(middles), np.array(whiteners), np.array(log_weights) - max(log_weights)
+
+
+def square_root(precision: Float[np.ndarray, "Q Q"]) -> Float[np.ndarray, "Q Q"]:
+    """The symmetric matrix W of a positive semidefinite one with W W = precision."""
+    values, vectors = np.linalg.eigh(precision)
+    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+
+
+def learned_poses(name: str) -> dict[str, Any]:
+    """A mixture that was learned from people: `joints`, and `components` with `weight`, `mean_deg` and
+    `covariance_deg2` of these joints.
+
+    Raises
+    ------
+    PblError
+        FIT_INPUT: there is no such prior.
+    """
+    path = DATA / f"{name}.json"
+    if not path.is_file():
+        raise PblError(
+            "FIT_INPUT",
+            found=f"pose prior {name!r}",
+            expected=", ".join(sorted(p.stem for p in DATA.glob("*.json"))),
+            next_step="correct the paramset",
+            key=name,
+        )
+    return json.loads(path.read_text())
 
 
 def scale_precision(scale_names: Sequence[str], sd: float, sd_sides: float) -> Float[np.ndarray, "S S"]:

@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
 
 from pbl_pipeline.body import SCALE_NAMES, load_body
 from pbl_pipeline.errors import PblError
@@ -32,7 +34,7 @@ from pbl_pipeline.fit.objective import (
     residual_3d_cm,
     square,
 )
-from pbl_pipeline.fit.priors import pose_prior, pose_z, scale_precision
+from pbl_pipeline.fit.priors import inclination, learned_poses, pose_cost, pose_prior, pose_z, posture, scale_precision
 from pbl_pipeline.fit.solution import Outcome, Solution
 from pbl_pipeline.fit.trajectory import fit_ranges, pose_of, raw_of
 from pbl_pipeline.keypoints import bridge_gaps, longest_run_s, whole_person_in_view
@@ -206,13 +208,49 @@ def test_markers_without_weight_do_not_move_the_centre_of_the_others():
 
 def test_pose_prior_by_hand():
     names = ["hip_rotation_r", "knee_angle_r", "hip_rotation_l", "pro_sup_r", "lumbar_bending"]
-    neutral, inverse_sd = pose_prior(names, [("hip_rotation", 0, 10), ("pro_sup", 90, 30), ("lumbar_bending", 0, 5)])
-    np.testing.assert_allclose(np.rad2deg(neutral), [0, 0, 0, 90, 0])
-    np.testing.assert_allclose(inverse_sd * np.deg2rad(1), [1 / 10, 0, 1 / 10, 1 / 30, 1 / 5])
+    prior = pose_prior(names, [("hip_rotation", 0, 10), ("pro_sup", 90, 30), ("lumbar_bending", 0, 5)])
+    neutral, whitener, log_weight = (jnp.asarray(a, jnp.float32) for a in prior)
+    np.testing.assert_allclose(np.rad2deg(neutral), [[0, 0, 0, 90, 0]])
+    np.testing.assert_allclose(whitener[0] * np.deg2rad(1), np.diag([1 / 10, 0, 1 / 10, 1 / 30, 1 / 5]), atol=1e-7)
     # 2 sd, free, 1 sd, 1 sd, 0; the second frame is at the neutral pose.
     q = jnp.deg2rad(jnp.array([[20.0, 77, -10, 60, 0], [0, 0, 0, 90, 0]]))
-    z = pose_z(q, jnp.asarray(neutral), jnp.asarray(inverse_sd))
-    np.testing.assert_allclose(z, [[2, 0, -1, -1, 0], [0, 0, 0, 0, 0]], atol=1e-6)
+    z = pose_z(q, neutral, whitener)
+    np.testing.assert_allclose(z[:, 0], [[2, 0, -1, -1, 0], [0, 0, 0, 0, 0]], atol=1e-6)
+    np.testing.assert_allclose(pose_cost(z, log_weight), [3, 0], atol=1e-6)
+
+
+def test_a_learned_prior_is_the_density_of_its_mixture():
+    names = load_body().joint_names
+    neutral, whitener, log_weight = pose_prior(names, [("pro_sup", 90, 30)], "people")
+    learned = learned_poses("people")
+    index = [names.index(n) for n in learned["joints"]]
+    rng = np.random.default_rng(4)
+    pose = np.zeros((6, len(names)))
+    pose[:, index] = rng.normal(0, 0.3, (6, len(index)))
+    pose[:, [names.index(f"pro_sup_{s}") for s in "rl"]] = np.pi / 2
+    cost = pose_cost(pose_z(jnp.asarray(pose), jnp.asarray(neutral), jnp.asarray(whitener)), jnp.asarray(log_weight))
+    density = sum(
+        c["weight"] * multivariate_normal(c["mean_deg"], c["covariance_deg2"]).pdf(np.degrees(pose[:, index]))
+        for c in learned["components"]
+    )
+    want = -np.log(density)
+    np.testing.assert_allclose(cost - cost[0], want - want[0], rtol=1e-3, atol=1e-3)
+
+
+def test_the_pelvis_of_the_prior_is_against_the_vertical_whichever_way_it_faces():
+    for tilt, list_ in ((12.0, 0.0), (0.0, -5.0)):
+        ahead = Rotation.from_euler("ZXY", [tilt, list_, 0.0], degrees=True)
+        for turn in (0.0, 90.0, 180.0, -60.0):
+            pelvis = (Rotation.from_euler("Y", turn, degrees=True) * ahead).as_euler("ZXY")
+            np.testing.assert_allclose(np.degrees(inclination(jnp.asarray(pelvis))), [tilt, list_], atol=0.02)
+    assert posture(jnp.zeros(7), jnp.zeros(0, jnp.int32)).shape == (7,)  # a body without these joints
+
+
+def test_a_pose_prior_that_does_not_exist_is_refused():
+    with pytest.raises(PblError, match="nobody") as error:
+        pose_prior(load_body().joint_names, [], "nobody")
+    assert error.value.code == "FIT_INPUT"
+    assert "people" in error.value.expected
 
 
 @pytest.mark.parametrize("entry", [("hip_rotatoin", 0, 10), ("hip_rotation", 0, 0)])

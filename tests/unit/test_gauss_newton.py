@@ -224,9 +224,11 @@ PARAMS = GaussNewtonParams(
         depth_ratio=0.6,
         huber_3d_cm=4.0,
         weight_pose=0.3,
-        pose_prior_deg=(("hip_rotation", 3.0, 8.0), ("knee_angle", -5.0, 20.0)),
+        pose_prior_deg=(("hip_rotation", 3.0, 8.0), ("knee_angle", -5.0, 20.0), ("arm_flex", 0.0, 20.0)),
+        pose_prior="people",
         weight_scale=0.4,
     ),
+    weight_detector=0.2,
 )
 
 
@@ -263,9 +265,10 @@ def small_session(kind: str) -> Session:
     return session
 
 
-def away(session: Session, seed: int = 3) -> State:
+def away(session: Session, seed: int = 3, detector: bool = False) -> State:
     """A state away from the start in every unknown, some joints beyond their limits."""
     rng, state = np.random.default_rng(seed), start_of(session)
+    d, markers = len(state.floor) * detector, len(state.site_offset_m)
     turn = Rotation.from_rotvec(rng.normal(0, 0.01, (len(state.qpos), 3))).as_matrix()
     noise = lambda a, sd: jnp.asarray(a + rng.normal(0, sd, a.shape), jnp.float32)  # noqa: E731
     turned = jnp.asarray(np.einsum("fij,fvjk->fvik", turn, state.R_nc), jnp.float32)
@@ -276,6 +279,8 @@ def away(session: Session, seed: int = 3) -> State:
         site_offset_m=noise(state.site_offset_m, 0.01) * (np.arange(len(state.site_offset_m)) < 20)[:, None],
         clock_s=noise(state.clock_s, 0.02) + 0.003,
         floor=noise(state.floor - np.array([1.2, 0.0, 0.0]), 0.03),
+        lean=noise(np.zeros((d, 3)), 0.1),
+        depth_m=noise(np.zeros((d, markers)), 0.05),
     )
 
 
@@ -291,10 +296,10 @@ def cost(session: Session, w: Weights, state: State) -> jax.Array:
     return total(At(p, w, state, markers, soles, phone))
 
 
-@pytest.mark.parametrize("kind", ["static", "moving", "views", "world", "floor", "moving floor"])
+@pytest.mark.parametrize("kind", ["static", "moving", "views", "world", "floor", "moving floor", "moving detector"])
 def test_normal_equations_hold_the_gradient_of_the_cost(kind):
-    session = small_session(kind)
-    p, w, state = session.problem, Weights.of(session.body, PARAMS), away(session)
+    session, detector = small_session(kind), "detector" in kind
+    p, w, state = session.problem, Weights.of(session.body, PARAMS), away(session, detector=detector)
     assert p.moving == ("moving" in kind)
     n = float(jnp.sum(p.weight))
     assert 30 < n < len(p.weight)  # and padding
@@ -310,10 +315,14 @@ def test_normal_equations_hold_the_gradient_of_the_cost(kind):
         "qpos": (at.g[:, :40], want_g[:, :40]),
         "s": (at.h[:8], want_h[:8]),
         "offset": (at.h[8:k], want_h[8:k]),
-        "floor": (at.h[-6:], want_h[-6:]),
     }
     if p.moving:
         pairs |= {"turn": (at.g[:, 40:], want_g[:, 40:]), "clock": (at.h[k : k + 2], want_h[k : k + 2])}
+        k += 2
+    pairs["floor"] = (at.h[k : k + 6], want_h[k : k + 6])
+    if detector:
+        own, want = (h[k + 6 :].reshape(2, -1) for h in (at.h, want_h))
+        pairs |= {"lean": (own[:, :3], want[:, :3]), "depth": (own[:, 3:], want[:, 3:])}
     for name, (ours, want) in pairs.items():
         most = np.abs(want).max()
         assert most > (0.1 if name != "floor" or "floor" in kind else 1e-4), name

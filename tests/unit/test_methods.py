@@ -28,7 +28,7 @@ SHIPPED = {
     ("fit", "paper-2025", 1): "cb777aa5f08f1d04",
     ("fit", "paper-gauss-newton", 1): "9352bf72dc58b91e",
     ("fit", "gauss-newton", 1): "c5df362782a452e5",
-    ("fit", "blazepose", 1): "db30893f1acb883f",
+    ("fit", "blazepose", 2): "7dbedb7fd2e19331",
     ("fit", "markers", 1): "055842ad943fce0d",
     ("gait", "phase-transformer", 1): "9f9ad11a864dcb24",
     ("gait", "zeni-2008", 1): "b29b1d5b52f512f4",

@@ -1,0 +1,156 @@
+"""The pose prior of the fit: postures of people who walk, squat, stand up and lift, recorded by other laboratories.
+
+    python -m research.poses ../shared/data/real/motions
+    python -m research.poses ../shared/data/real/motions --everybody --out all.json
+
+A mixture of two normal distributions over the joints of pelvis, lumbar spine and legs, the pelvis against the vertical
+(`fit.priors.posture`). The covariance of each is that within a recording (around the person's own mean, by expectation
+maximisation, because no laboratory measured all joints) plus that between people, which so few of them cannot tell and
+which is set by anatomy: a pelvis that is tilted stands under an upright trunk and over upright legs. Left and right are
+alike: every recording counts once as it is and once mirrored. The spine of the LBMC recordings is another joint than
+the body's and counts as unknown. Persons whom `pbl validate gdi` holds out are left out.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping
+from pathlib import Path
+
+import click
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from pbl_pipeline.body import load_body
+from pbl_pipeline.fit.priors import DATA, PELVIS
+from pbl_pipeline.validation import Motion, is_held_out, read_motions
+
+MIDDLE = ("pelvis_tilt", "pelvis_list", "lumbar_extension", "lumbar_bending", "lumbar_rotation")
+SIDED = ("hip_flexion", "hip_adduction", "hip_rotation", "knee_angle", "ankle_angle", "subtalar_angle")
+JOINTS = (*MIDDLE, *(f"{name}_{side}" for name in SIDED for side in "rl"))
+#: Joints whose sign turns in a mirror.
+ODD = ("pelvis_list", "lumbar_bending", "lumbar_rotation")
+#: Frames that are taken of a recording.
+FRAMES = 60
+#: What the spine of these persons' recordings is not.
+OTHER_SPINE = "LBMC"
+#: The two components: weight, activities, pseudo-recordings of independent joints that stand beside the recorded ones,
+#: their standard deviations (deg) in the order of `MIDDLE` and `SIDED`, and between people: the standard deviation of
+#: the tilt, how far hips and lumbar spine go with it, and how large the other joints' are against `BETWEEN_DEG`.
+WALKING = (0.6, ("walk",), 1.0, (2, 3, 3, 5, 5, 14, 5, 5, 19, 9, 6), 7.0, (-1.0, -0.7), 1.0)
+OTHERWISE = (
+    0.4,
+    ("squat", "sit_to_stand", "lift"),
+    1.5,
+    (10, 3, 12, 5, 5, 30, 5, 5, 35, 9, 6),
+    15.0,
+    (-1.0, -0.4),
+    1.5,
+)
+BETWEEN_DEG = (0, 2, 7, 3, 3, 5, 4, 8, 6, 5, 6)
+#: Means (deg): in walking they count as those of two persons more, otherwise they are all.
+MEANS_DEG = {
+    "walk": (0, 0, -7, 0, 0, 10, 0, 0, -25, 3, 0),
+    "otherwise": (0, 0, -7, 0, 0, 30, 0, 0, -40, 5, 0),
+}
+
+
+def of_joints(values: Collection[float]) -> np.ndarray:
+    """One value per joint of `JOINTS` from one per name of `MIDDLE` and `SIDED`."""
+    middle, sided = np.split(np.asarray(list(values), float), [len(MIDDLE)])
+    return np.concatenate([middle, np.repeat(sided, 2)])
+
+
+def postures_deg(motion: Motion) -> Float[np.ndarray, "T J"]:
+    """Joints of a recording, the pelvis against the vertical; NaN where they were not recorded."""
+    names = list(load_body().joint_names)
+    q, known = motion.qpos.copy(), motion.known.copy()
+    pelvis = [names.index(n) for n in PELVIS]
+    R = Rotation.from_euler("ZXY", q[:, pelvis]).as_matrix()
+    q[:, pelvis[:2]] = np.arcsin(np.stack([R[:, 1, 0], -R[:, 1, 2]], axis=1))
+    if motion.person.startswith(OTHER_SPINE):
+        known[[names.index(n) for n in MIDDLE if n.startswith("lumbar")]] = False
+    index = [names.index(n) for n in JOINTS]
+    step = max(1, len(q) // FRAMES)
+    return np.degrees(np.where(known, q, np.nan)[::step, index])
+
+
+def mirrored(x: Float[np.ndarray, "T J"]) -> Float[np.ndarray, "T J"]:
+    """The same postures in a mirror."""
+    other = {"_r": "_l", "_l": "_r"}
+    order = [JOINTS.index(n[:-2] + other[n[-2:]]) if n[-2:] in other else i for i, n in enumerate(JOINTS)]
+    return x[:, order] * np.where(np.isin(JOINTS, ODD), -1.0, 1.0)
+
+
+def recordings(motions: Collection[Motion], activities: Collection[str]) -> Mapping[tuple[str, str], np.ndarray]:
+    """Postures (deg) of each person in each activity, with those in a mirror."""
+    out: dict[tuple[str, str], list[np.ndarray]] = {}
+    for m in motions:
+        if m.activity in activities:
+            out.setdefault((m.person, m.activity), []).append(postures_deg(m))
+    return {k: np.concatenate([x := np.concatenate(v), mirrored(x)]) for k, v in out.items()}
+
+
+def covariance_within(
+    groups: Collection[np.ndarray], sd: np.ndarray, pseudo: float, rounds: int = 60
+) -> Float[np.ndarray, "J J"]:
+    """Covariance (deg^2) around each group's own mean, joints that were not recorded filled in by what the others tell
+    of them; each group counts as one and `pseudo` groups of independent joints stand beside them."""
+    S = np.diag(sd**2)
+    for _ in range(rounds):
+        total = pseudo * np.diag(sd**2)
+        for x in groups:
+            x = x - x.mean(axis=0)
+            seen = np.isfinite(x[0])
+            gain = S[np.ix_(~seen, seen)] @ np.linalg.inv(S[np.ix_(seen, seen)])
+            full = np.where(seen, x, 0.0)
+            full[:, ~seen] = x[:, seen] @ gain.T
+            total += full.T @ full / len(x)
+            total[np.ix_(~seen, ~seen)] += S[np.ix_(~seen, ~seen)] - gain @ S[np.ix_(seen, ~seen)]
+        S = total / (len(groups) + pseudo)
+    return S
+
+
+def covariance_between(tilt_sd: float, along: tuple[float, float], factor: float) -> Float[np.ndarray, "J J"]:
+    """Covariance (deg^2) of people's own means."""
+    way = of_joints([1, 0, along[1], 0, 0, along[0], *[0] * 5])
+    return np.diag((factor * of_joints(BETWEEN_DEG)) ** 2) + tilt_sd**2 * np.outer(way, way)
+
+
+def learn(motions: Collection[Motion]) -> dict:
+    """The mixture, as the file has it."""
+    components = []
+    for weight, activities, pseudo, sd, tilt_sd, along, factor in (WALKING, OTHERWISE):
+        groups = recordings(motions, activities)
+        mean = of_joints(MEANS_DEG["walk" if "walk" in activities else "otherwise"])
+        if "walk" in activities:
+            mean = np.nanmedian([*(x.mean(axis=0) for x in groups.values()), mean, mean], axis=0)
+        S = covariance_within(list(groups.values()), of_joints(sd), pseudo)
+        S += covariance_between(tilt_sd, along, factor)
+        components.append(
+            {"weight": weight, "mean_deg": mean.round(3).tolist(), "covariance_deg2": S.round(3).tolist()}
+        )
+    used = {a for c in (WALKING, OTHERWISE) for a in c[1]}
+    return {
+        "persons": sorted({m.person for m in motions if m.activity in used}),
+        "sources": sorted({m.source for m in motions if m.activity in used}),
+        "joints": list(JOINTS),
+        "components": components,
+    }
+
+
+@click.command(help=__doc__)
+@click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--everybody", is_flag=True, help="Also the persons who are held out.")
+@click.option("--out", type=click.Path(path_type=Path), default=DATA / "people.json", help="Default: the shipped file.")
+def main(folder: Path, everybody: bool, out: Path) -> None:
+    motions = [m for m in read_motions(folder) if everybody or not is_held_out(m.person)]
+    prior = learn(motions)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(json.dumps(prior, separators=(",", ":")).replace('],"', '],\n"').replace("],[", "],\n[") + "\n")
+    click.echo(f"{out}: {len(prior['persons'])} persons")
+
+
+if __name__ == "__main__":
+    main()
