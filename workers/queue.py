@@ -14,7 +14,7 @@ import json
 import os
 import platform
 import random
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import pymysql
@@ -91,16 +91,17 @@ def fill(
     # IGNORE: another process may queue the same key between the two halves of the statement. Nothing in it comes from
     # outside: names are DataJoint's own, quoted by its adapter.
     statement = f"INSERT IGNORE INTO {jobs.full_table_name} ({names}) SELECT {values} FROM ({todo.make_sql()}) AS todo"  # noqa: S608
-    return _repeated(table.connection, statement)
+    return _repeated(table.connection, lambda: int(table.connection.query(statement).rowcount))
 
 
-def _repeated(connection: Any, statement: str) -> int:
-    """Run one statement that reads much and writes little: without locks on what it reads, again after a deadlock."""
+def _repeated(connection: Any, statement: Callable[[], int]) -> int:
+    """Run one statement that reads much and writes little: without locks on what it reads, again after a deadlock.
+    Returns how many rows it changed."""
     for attempt in range(_ATTEMPTS):
         try:
             connection.query("SET TRANSACTION ISOLATION LEVEL READ COMMITTED")
             with connection.transaction:
-                return int(connection.query(statement).rowcount)
+                return statement()
         except pymysql.err.OperationalError as error:
             if error.args[0] not in _AGAIN or attempt == _ATTEMPTS - 1:
                 raise
@@ -109,13 +110,13 @@ def _repeated(connection: Any, statement: str) -> int:
 
 def sweep(table: Any, which: str = "status != 'reserved'") -> int:
     """Delete jobs that nobody needs any more: done by another route, or no longer asked for; returns how many."""
-    waiting = jobs_of(table) & which
-    n = waiting.restrict(table.proj(), semantic_check=False).delete_quick(get_count=True)
+    done = (jobs_of(table) & which).restrict(table.proj(), semantic_check=False)
+    n = _repeated(table.connection, lambda: int(done.delete_quick(get_count=True)))
     waiting = jobs_of(table) & which
     if len(waiting):
         vanished = waiting.restrict(dj.Not(keys_of(table).proj()), semantic_check=False)
-        n += vanished.delete_quick(get_count=True)
-    return int(n)
+        n += _repeated(table.connection, lambda: int(vanished.delete_quick(get_count=True)))
+    return n
 
 
 # --------------------------------------------------------------------------------------------------- reserving, ending

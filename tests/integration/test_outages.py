@@ -97,6 +97,14 @@ def test_a_deadlock_that_does_not_end_puts_the_job_back(tmp_path: Path, monkeypa
     assert "Deadlock" in video.VideoInfo.jobs.fetch1("error_message")
 
 
+def test_a_deadlock_while_jobs_are_swept_is_tried_again(tmp_path: Path, monkeypatch):
+    first_job(tmp_path)
+    deadlock = pymysql.err.OperationalError(1213, "Deadlock found when trying to get lock")
+    tried = failing(monkeypatch, type(jobs_of(video.VideoInfo)), "delete_quick", deadlock, deadlock)
+    assert queue.sweep(video.VideoInfo) == 0  # the one job is reserved
+    assert len(tried) == 3
+
+
 @pytest.mark.parametrize("place", [(refresh, "refresh"), (queue, "most_urgent"), (queue, "finish"), (refresh, "after")])
 def test_no_statement_beside_a_job_ends_the_worker(tmp_path: Path, monkeypatch, place):
     register(chain.small_video(tmp_path, "walk"))
