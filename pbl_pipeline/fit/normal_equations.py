@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -24,11 +23,12 @@ from jaxtyping import Array, Float
 
 from pbl_pipeline.body import Body, MarkerJacobian, marker_jacobian, scale_multipliers
 
+from .detector_error import DetectorError, detector_blocks, detector_error
+from .linearised import linearised, times
 from .objective import (
     At,
     Loffset,
     State,
-    corrected,
     detector_prior,
     frame_count,
     huber_weight,
@@ -120,15 +120,6 @@ def moved(state: State, dx: Float[Array, "F U"], dy: Float[Array, " K"]) -> Stat
     )
 
 
-def linearised(residual: Callable[[Array], Array], x: Float[Array, "*n D"]) -> tuple[Array, Array]:
-    """Residuals (..., E) of points (..., D) that each depend on their own point alone, and their derivatives (..., E,
-    D) by its D numbers.
-    """
-    r, push = jax.linearize(residual, x)
-    along = lambda e: push(jnp.broadcast_to(e, x.shape))  # noqa: E731
-    return r, jax.vmap(along, out_axes=-1)(jnp.eye(x.shape[-1], dtype=x.dtype))
-
-
 def measured_orientation(p: Problem, clock_s: Float[Array, " F"]) -> jaxlie.SO3:
     """The phone's logged orientation (F,) at the frames, with its trial's clock ahead of the video's by `clock_s`."""
     quats = p.sample_quat_wxyz[p.trial]
@@ -197,7 +188,7 @@ def _keypoint_terms(
         at = slice(first_sole, first_sole + n_soles)
         soles = _Soles(jac.x_world_m[:, at], jac.per_qpos[:, at], jac.per_scale[:, at])
         markers: MarkerJacobian = jax.tree.map(lambda a: a[:, :first_sole], jac)
-        (H, g, B), shared = _marker_blocks(part, w, markers, R_nc, _detector_terms(part, state, R_nc))
+        (H, g, B), shared = _marker_blocks(part, w, markers, R_nc, detector_error(part, state, R_nc))
         return (jac.x_world_m, soles, H, g, B), shared
 
     if size == frames:
@@ -214,32 +205,8 @@ def _keypoint_terms(
     return x, soles, _with_room(H, g, B, C, h, columns)
 
 
-class _Detector(NamedTuple):
-    """The corrected 3D points; how a marker less its detected point (world axes) moves with the lean of its trial and
-    with its own depth; and the trial of each frame as rows of 0 and 1. L is 3 and D the number of trials, or both are 0
-    without these unknowns."""
-
-    x_cam: Array  # (F, V, M, 3)
-    by_lean: Array  # (F, M, 3, L)
-    by_depth: Array  # (F, 3)
-    trials: Array  # (F, D)
-
-
-def _detector_terms(p: Problem, state: State, R_nc: Array) -> _Detector:
-    n = state.lean.shape[0]
-    trials = jax.nn.one_hot(p.trial, n, dtype=R_nc.dtype)
-    if n == 0:
-        frames, _, markers, _ = p.x_cam.shape
-        none = jnp.zeros((frames, markers, 3, 0), R_nc.dtype)
-        return _Detector(p.x_cam, none, jnp.zeros((frames, 3), R_nc.dtype), trials)
-    lean = jnp.broadcast_to(state.lean[p.trial][:, None], p.x_cam[:, 0].shape)
-    depth_m = state.depth_m[p.trial]
-    x_cam, by_lean = linearised(lambda z: corrected(p.x_cam[:, 0, :, None], z, depth_m[..., None])[..., 0, :], lean)
-    return _Detector(x_cam[:, None], -_times(R_nc, by_lean), -R_nc[:, 0, :, 2], trials)
-
-
 def _marker_blocks(
-    p: Problem, w: Weights, jac: MarkerJacobian, R_nc: Array, detector: _Detector
+    p: Problem, w: Weights, jac: MarkerJacobian, R_nc: Array, detector: DetectorError
 ) -> tuple[tuple, tuple]:
     """Blocks of the keypoint terms: H (F, U, U), g (F, U), B (F, U, K) and C (K, K), h (K,), of s, offsets and what the
     detector gets wrong."""
@@ -277,28 +244,28 @@ def _marker_blocks(
     W_all = jnp.sum(W, axis=1)
     # What the detector gets wrong moves the 3D residuals alone.
     wide = lambda a: jnp.pad(a, [(0, 0)] * 3 + [(0, detector.by_lean.shape[-1])])  # noqa: E731
-    of_2d = wide(_times(M, A))
+    of_2d = wide(times(M, A))
     A = jnp.concatenate([A, detector.by_lean], axis=-1)
-    cross = _times(W_all, A)
+    cross = times(W_all, A)
     G = jnp.einsum("fkq,fkr->fqr", flat(A), flat(cross + of_2d))
     G = G.at[:, n:, :n].set(jnp.swapaxes(G[:, :n, n:], -1, -2))
-    own = jnp.sum(_times(jnp.swapaxes(U, -1, -2), _times(M + W_all, U)), axis=0)
+    own = jnp.sum(times(jnp.swapaxes(U, -1, -2), times(M + W_all, U)), axis=0)
     C_oo = jnp.einsum("mij,mn->minj", own, jnp.eye(markers, dtype=x.dtype)).reshape(3 * markers, 3 * markers)
     # A centred residual moves with its marker less the mean over the markers, which all of them move.
     for b, Wv in zip(jnp.moveaxis(centred, 1, 0), jnp.moveaxis(W, 1, 0), strict=True):
         moves = jnp.einsum("fm,fmiq->fiq", b, A)
-        pull = jnp.sum(_times(Wv, A), axis=1)
+        pull = jnp.sum(times(Wv, A), axis=1)
         whole = jnp.sum(Wv, axis=1)
         both = jnp.einsum("fiq,fir->fqr", pull, moves)
         G += jnp.einsum("fiq,fij,fjr->fqr", moves, whole, moves) - both - jnp.swapaxes(both, -1, -2)
         loose = pull - whole @ moves
-        cross = cross - _times(Wv, moves[:, None]) - b[..., None, None] * loose[:, None]
-        X = jnp.swapaxes(_times(Wv, U), 1, 2).reshape(frames, 3, 3 * markers)
+        cross = cross - times(Wv, moves[:, None]) - b[..., None, None] * loose[:, None]
+        X = jnp.swapaxes(times(Wv, U), 1, 2).reshape(frames, 3, 3 * markers)
         Y = jnp.swapaxes(b[..., None, None] * U, 1, 2).reshape(frames, 3, 3 * markers)
         one = jnp.einsum("fik,fil->kl", X - 0.5 * whole @ Y, Y)
         C_oo -= one + one.T
     U_t = jnp.swapaxes(U, -1, -2)
-    by_offset = _times(U_t, cross + of_2d).reshape(frames, 3 * markers, A.shape[-1]).swapaxes(1, 2)
+    by_offset = times(U_t, cross + of_2d).reshape(frames, 3 * markers, A.shape[-1]).swapaxes(1, 2)
     C_so = jnp.sum(by_offset[:, q:n], axis=0)
     C = jnp.block([[jnp.sum(G[:, q:n, q:n], axis=0), C_so], [C_so.T, C_oo]])
     B = jnp.concatenate([G[:, :q, q:n], by_offset[:, :q]], axis=-1)
@@ -306,7 +273,7 @@ def _marker_blocks(
     pulled_o = jnp.einsum("fmik,fmi->mk", U, f + f_3d)
     h = jnp.concatenate([jnp.sum(pulled[:, q:], axis=0), pulled_o.reshape(-1)])
     if detector.trials.shape[1]:
-        by_detector, of_offsets, own_of_detector = _detector_blocks(detector, centred[:, 0], W_all, U_t, cross, G, n)
+        by_detector, of_offsets, own_of_detector = detector_blocks(detector, centred[:, 0], W_all, U_t, cross, G, n)
         each = detector.trials
         to_trials = lambda a: (a[:, :, None] * each[:, None, :, None]).reshape(*a.shape[:2], -1)  # noqa: E731
         C_d = jnp.concatenate([jnp.sum(to_trials(by_detector[:, q:]), axis=0), of_offsets], axis=0)
@@ -318,47 +285,6 @@ def _marker_blocks(
         B = jnp.concatenate([B, to_trials(by_detector[:, :q])], axis=-1)
         h = jnp.concatenate([h, (each.T @ pulled_d).reshape(-1)])
     return (G[:, :q, :q], -pulled[:, :q], B), (C, -h)
-
-
-def _detector_blocks(
-    detector: _Detector, b: Array, W: Array, U_t: Array, cross: Array, G: Array, n: int
-) -> tuple[Array, Array, Array]:
-    """What the E = 3 + M unknowns of a trial's detector share with the n of frames and scale (F, n, E), with the
-    offsets (3 M, D E) and with each other (D E, D E).
-
-    `b`: weights of the mean that is removed; `W`: curvature of each marker's 3D residual; `cross`: force on each marker
-    in 3D where the unknowns of A move, the mean removed; G: A's own products, the lean's in its last 3 columns. A depth
-    moves its own marker alone, so its products are those of `cross` with one direction.
-    """
-    u, each = detector.by_depth, detector.trials
-    frames, markers = b.shape
-    by_depth = jnp.einsum("fi,fmia->fam", u, cross)
-    Wu = jnp.einsum("fmij,fj->fmi", W, u)
-    own = jnp.einsum("fmi,fi->fm", Wu, u)
-    mixed = b[:, :, None] * own[:, None]
-    depths = own[:, :, None] * jnp.eye(markers, dtype=b.dtype) - mixed - jnp.swapaxes(mixed, 1, 2)
-    depths += b[:, :, None] * b[:, None] * jnp.sum(own, axis=1)[:, None, None]
-    by_detector = jnp.concatenate([G[:, :n, n:], by_depth[:, :n]], axis=-1)
-    all_own = jnp.concatenate(
-        [
-            jnp.concatenate([G[:, n:, n:], by_depth[:, n:]], axis=-1),
-            jnp.concatenate([jnp.swapaxes(by_depth[:, n:], 1, 2), depths], axis=-1),
-        ],
-        axis=1,
-    )
-    own_of_detector = jnp.einsum("fde,ft,tu->tdue", all_own, each, jnp.eye(each.shape[1], dtype=b.dtype))
-
-    by_lean = _times(U_t, cross[..., n:]).reshape(frames, 3 * markers, -1)
-    offset_and_lean = jnp.einsum("fol,ft->otl", by_lean, each)
-    to_offset = jnp.einsum("fmki,fmi->fmk", U_t, Wu)
-    whole = jnp.einsum("fmki,fi->fmk", b[..., None, None] * U_t, jnp.sum(Wu, axis=1))
-    offset_and_depth = jnp.einsum("fmk,fj,ft->mktj", whole - to_offset, b, each)
-    offset_and_depth -= jnp.einsum("fmki,fji,ft->mktj", b[..., None, None] * U_t, Wu, each)
-    offset_and_depth += jnp.einsum("fmk,ft,mj->mktj", to_offset, each, jnp.eye(markers, dtype=b.dtype))
-    offset_and_depth = offset_and_depth.reshape(3 * markers, each.shape[1], markers)
-    of_offsets = jnp.concatenate([offset_and_lean, offset_and_depth], axis=-1)
-    size = own_of_detector.shape[0] * own_of_detector.shape[1]
-    return by_detector, of_offsets.reshape(3 * markers, size), own_of_detector.reshape(size, size)
 
 
 def _with_room(H: Array, g: Array, B: Array, C: Array, h: Array, columns: _Columns) -> _Blocks:
@@ -373,11 +299,6 @@ def _cross_matrix(x: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
     zero = jnp.zeros_like(x[..., 0])
     a, b, c = x[..., 0], x[..., 1], x[..., 2]
     return jnp.stack([zero, -c, b, c, zero, -a, -b, a, zero], axis=-1).reshape(*x.shape, 3)
-
-
-def _times(a: Float[Array, "*m 3 3"], b: Float[Array, "*m 3 R"]) -> Float[Array, "*m 3 R"]:
-    """Products of many small matrices, written out: a library would be called once for each."""
-    return functools.reduce(jnp.add, [a[..., :, k : k + 1] * b[..., k : k + 1, :] for k in range(3)])
 
 
 # --- joints
@@ -431,12 +352,8 @@ def _posture(qpos: Float[Array, "F Q"], w: Weights) -> tuple[Float[Array, "F Q"]
 
 def _through(a: Float[Array, "F R Q"], by_pelvis: Float[Array, "F 2 3"], pelvis: Array) -> Float[Array, "F R Q"]:
     """Rows by a posture's values as rows by the joint values."""
-    of_pelvis = _times_2(a[..., pelvis[:2]], by_pelvis)
+    of_pelvis = a[..., pelvis[:1]] * by_pelvis[:, :1] + a[..., pelvis[1:2]] * by_pelvis[:, 1:]
     return a.at[..., pelvis].set(of_pelvis.at[..., 2].add(a[..., pelvis[2]]))
-
-
-def _times_2(a: Float[Array, "F R 2"], b: Float[Array, "F 2 3"]) -> Float[Array, "F R 3"]:
-    return a[..., :1] * b[:, :1] + a[..., 1:] * b[:, 1:]
 
 
 # --- shared unknowns, phone, soles

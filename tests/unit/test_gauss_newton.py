@@ -23,7 +23,8 @@ from pbl_pipeline.body import (
     scale_multipliers,
 )
 from pbl_pipeline.fit import CostParams, GaussNewtonParams, ViewParams
-from pbl_pipeline.fit.normal_equations import linearise, linearised, measured_orientation, moved
+from pbl_pipeline.fit.linearised import linearised
+from pbl_pipeline.fit.normal_equations import linearise, measured_orientation, moved
 from pbl_pipeline.fit.objective import (
     At,
     State,
@@ -330,6 +331,25 @@ def test_normal_equations_hold_the_gradient_of_the_cost(kind):
     corner, diagonal = np.asarray(at.system.corner, np.float64), at.system.diagonal
     assert np.all(np.linalg.eigvalsh(corner) > -1e-3 * np.abs(corner).max())
     np.testing.assert_allclose(diagonal, np.swapaxes(diagonal, 1, 2), atol=1e-3 * np.abs(at.g).max())
+
+
+def test_curvature_of_the_detectors_depths_is_the_change_of_the_gradient():
+    """Residuals are linear in the depths where no robust cost bends them, so both agree whatever the step."""
+    session = small_session("static")
+    cost = dataclasses.replace(PARAMS.cost, huber_3d_cm=1e6)
+    w, p = Weights.of(session.body, dataclasses.replace(PARAMS, cost=cost)), session.problem
+    state = away(session, detector=True)
+    step = np.random.default_rng(9).normal(0, 0.05, state.depth_m.shape)
+    linear = jax.jit(lambda s: linearise(session.body, p, w, s))
+    one, other = (
+        linear(state),
+        linear(dataclasses.replace(state, depth_m=state.depth_m + jnp.asarray(step, jnp.float32))),
+    )
+    unknown = np.zeros(one.h.shape)
+    unknown[-2 * (3 + step.shape[1]) :].reshape(2, -1)[:, 3:] = step
+    for before, after, rows in ((one.g, other.g, one.system.border), (one.h, other.h, one.system.corner)):
+        want = np.asarray(before, np.float64) - np.asarray(rows, np.float64) @ unknown
+        np.testing.assert_allclose(after, want, atol=2e-4 * np.abs(want).max(), rtol=1e-3)
 
 
 def test_curvature_of_the_soles_is_that_of_their_residuals():

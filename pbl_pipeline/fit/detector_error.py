@@ -1,0 +1,78 @@
+"""What a detector's 3D points are wrong by in all frames of a trial, as unknowns of the normal equations."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .linearised import linearised, times
+from .objective import State, corrected
+from .problem import Problem
+
+
+class DetectorError(NamedTuple):
+    """The corrected 3D points; how a marker less its detected point (world axes) moves with the lean of its trial and
+    with its own depth; and the trial of each frame as rows of 0 and 1. L is 3 and D the number of trials, or both are 0
+    without these unknowns."""
+
+    x_cam: Array  # (F, V, M, 3)
+    by_lean: Array  # (F, M, 3, L)
+    by_depth: Array  # (F, 3)
+    trials: Array  # (F, D)
+
+
+def detector_error(p: Problem, state: State, R_nc: Array) -> DetectorError:
+    n = state.lean.shape[0]
+    trials = jax.nn.one_hot(p.trial, n, dtype=R_nc.dtype)
+    if n == 0:
+        frames, _, markers, _ = p.x_cam.shape
+        none = jnp.zeros((frames, markers, 3, 0), R_nc.dtype)
+        return DetectorError(p.x_cam, none, jnp.zeros((frames, 3), R_nc.dtype), trials)
+    lean = jnp.broadcast_to(state.lean[p.trial][:, None], p.x_cam[:, 0].shape)
+    depth_m = state.depth_m[p.trial]
+    x_cam, by_lean = linearised(lambda z: corrected(p.x_cam[:, 0, :, None], z, depth_m[..., None])[..., 0, :], lean)
+    return DetectorError(x_cam[:, None], -times(R_nc, by_lean), -R_nc[:, 0, :, 2], trials)
+
+
+def detector_blocks(
+    detector: DetectorError, b: Array, W: Array, U_t: Array, cross: Array, G: Array, n: int
+) -> tuple[Array, Array, Array]:
+    """What the E = 3 + M unknowns of a trial's detector share with the n of frames and scale (F, n, E), with the
+    offsets (3 M, D E) and with each other (D E, D E).
+
+    `b`: weights of the mean that is removed; `W`: curvature of each marker's 3D residual; `cross`: force on each marker
+    in 3D where the unknowns of A move, the mean removed; G: A's own products, the lean's in its last 3 columns. A depth
+    moves its own marker alone, so its products are those of `cross` with one direction.
+    """
+    u, each = detector.by_depth, detector.trials
+    frames, markers = b.shape
+    by_depth = jnp.einsum("fi,fmia->fam", u, cross)
+    Wu = jnp.einsum("fmij,fj->fmi", W, u)
+    own = jnp.einsum("fmi,fi->fm", Wu, u)
+    mixed = b[:, :, None] * own[:, None]
+    depths = own[:, :, None] * jnp.eye(markers, dtype=b.dtype) - mixed - jnp.swapaxes(mixed, 1, 2)
+    depths += b[:, :, None] * b[:, None] * jnp.sum(own, axis=1)[:, None, None]
+    by_detector = jnp.concatenate([G[:, :n, n:], by_depth[:, :n]], axis=-1)
+    all_own = jnp.concatenate(
+        [
+            jnp.concatenate([G[:, n:, n:], by_depth[:, n:]], axis=-1),
+            jnp.concatenate([jnp.swapaxes(by_depth[:, n:], 1, 2), depths], axis=-1),
+        ],
+        axis=1,
+    )
+    own_of_detector = jnp.einsum("fde,ft,tu->tdue", all_own, each, jnp.eye(each.shape[1], dtype=b.dtype))
+
+    by_lean = times(U_t, cross[..., n:]).reshape(frames, 3 * markers, -1)
+    offset_and_lean = jnp.einsum("fol,ft->otl", by_lean, each)
+    to_offset = jnp.einsum("fmki,fmi->fmk", U_t, Wu)
+    whole = jnp.einsum("fmki,fi->fmk", b[..., None, None] * U_t, jnp.sum(Wu, axis=1))
+    offset_and_depth = jnp.einsum("fmk,fj,ft->mktj", whole - to_offset, b, each)
+    offset_and_depth -= jnp.einsum("fmki,fji,ft->mktj", b[..., None, None] * U_t, Wu, each)
+    offset_and_depth += jnp.einsum("fmk,ft,mj->mktj", to_offset, each, jnp.eye(markers, dtype=b.dtype))
+    offset_and_depth = offset_and_depth.reshape(3 * markers, each.shape[1], markers)
+    of_offsets = jnp.concatenate([offset_and_lean, offset_and_depth], axis=-1)
+    size = own_of_detector.shape[0] * own_of_detector.shape[1]
+    return by_detector, of_offsets.reshape(3 * markers, size), own_of_detector.reshape(size, size)
