@@ -24,9 +24,9 @@ _sources: dict[Any, Any] = {}
 
 
 def keys_of(table: Any) -> Any:
-    """Query of the keys that can be computed for a table (class), made once: DataJoint reads the columns of the tables
-    above for it."""
-    if table not in _sources:
+    """Query of the keys that can be computed for a table (class), made once for a connection: DataJoint reads the
+    columns of the tables above for it."""
+    if table not in _sources or _sources[table].connection is not table().connection:
         _sources[table] = table().key_source
     return _sources[table]
 
@@ -37,7 +37,7 @@ def jobs_of(table: Any) -> Any:
     It is declared where it is missing, and gets the columns of `COUNTS`; an account that may not declare relies on
     `schemas._declare.declare_all`. Both end a transaction that is open.
     """
-    if table not in _jobs:
+    if table not in _jobs or _jobs[table].connection is not table().connection:
         jobs = table.jobs
         if missing := [name for name in COUNTS if name not in jobs.heading.names]:
             _add(jobs, missing)

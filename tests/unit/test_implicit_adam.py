@@ -197,8 +197,8 @@ def packed_larger(monkeypatch, *trials, motion: str) -> Session:
     return session_of(*trials, motion=motion)
 
 
-@pytest.mark.parametrize("motion", ["static", "handheld"])
-def test_padding_changes_nothing(motion, monkeypatch):
+def test_padding_changes_nothing(monkeypatch):
+    motion = "handheld"  # which has all that a standing camera has
     trials = [observe(walk_qpos(TIME_S, seed=i), TIME_S, seed=i, camera_motion=motion).keypoints for i in (3, 4)]
     session = session_of(*trials, motion=motion)
     # One step moves every unknown by the learning rate, so a few show whatever differs before rounding adds up.
