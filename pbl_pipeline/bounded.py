@@ -198,7 +198,7 @@ def read_npz(path: str | Path, fields: Collection[str] | None = None) -> dict[st
                     arrays[name] = _array(read_member(archive, member, room), room)
                 except ValueError as error:
                     raise ValueError(f"{name}: {error}") from error
-                room -= _cost(arrays[name])
+                room -= _cost(arrays[name].size, arrays[name].dtype)
     return arrays
 
 
@@ -210,7 +210,7 @@ def _array(data: bytearray, room: int) -> np.ndarray:
         raise ValueError(f"values of type {dtype}")
     if count * dtype.itemsize != len(data) - start:
         raise ValueError(f"{len(data) - start} bytes for shape {shape} of {dtype}")
-    if count * max(dtype.itemsize, 8 if dtype.kind in "biufc" else _STRING) > room:
+    if _cost(count, dtype) > room:
         raise ValueError(f"shape {shape}: more than {_size(MAX_ARRAYS)} in all arrays of the file")
     return np.ndarray(shape, dtype, data, start, order="F" if fortran else "C")
 
@@ -234,8 +234,9 @@ def _npy_header(data: bytearray) -> tuple[tuple[int, ...], bool, np.dtype, int]:
     return shape, fortran, dtype, start
 
 
-def _cost(array: np.ndarray) -> int:
-    return array.size * max(array.itemsize, 8 if array.dtype.kind in "biufc" else _STRING)
+def _cost(count: int, dtype: np.dtype) -> int:
+    """Bytes that so many values take once they are in use: numbers as float64, texts as Python's own."""
+    return count * max(dtype.itemsize, 8 if dtype.kind in "biufc" else _STRING)
 
 
 @contextlib.contextmanager

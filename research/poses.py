@@ -16,14 +16,15 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import click
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import load_body
-from pbl_pipeline.fit.priors import DATA, PELVIS
+from pbl_pipeline.body import PELVIS_TURNS, load_body
+from pbl_pipeline.fit.priors import DATA, rises
 from pbl_pipeline.validation import Motion, is_held_out, read_motions
 
 MIDDLE = ("pelvis_tilt", "pelvis_list", "lumbar_extension", "lumbar_bending", "lumbar_rotation")
@@ -35,25 +36,55 @@ ODD = ("pelvis_list", "lumbar_bending", "lumbar_rotation")
 FRAMES = 60
 #: What the spine of these persons' recordings is not.
 OTHER_SPINE = "LBMC"
-#: The two components: weight, activities, pseudo-recordings of independent joints that stand beside the recorded ones,
-#: their standard deviations (deg) in the order of `MIDDLE` and `SIDED`, and between people: the standard deviation of
-#: the tilt, how far hips and lumbar spine go with it, and how large the other joints' are against `BETWEEN_DEG`.
-WALKING = (0.6, ("walk",), 1.0, (2, 3, 3, 5, 5, 14, 5, 5, 19, 9, 6), 7.0, (-1.0, -0.7), 1.0)
-OTHERWISE = (
-    0.4,
-    ("squat", "sit_to_stand", "lift"),
-    1.5,
-    (10, 3, 12, 5, 5, 30, 5, 5, 35, 9, 6),
-    15.0,
-    (-1.0, -0.4),
-    1.5,
-)
+#: Standard deviations (deg) between people of the joints of `MIDDLE` and `SIDED`, without what goes with the tilt.
 BETWEEN_DEG = (0, 2, 7, 3, 3, 5, 4, 8, 6, 5, 6)
-#: Means (deg): in walking they count as those of two persons more, otherwise they are all.
-MEANS_DEG = {
-    "walk": (0, 0, -7, 0, 0, 10, 0, 0, -25, 3, 0),
-    "otherwise": (0, 0, -7, 0, 0, 30, 0, 0, -40, 5, 0),
-}
+
+
+class Component(NamedTuple):
+    """What a component of the mixture is made of. `sd_deg` and `mean_deg`: a value for each of `MIDDLE` and `SIDED`."""
+
+    weight: float
+    activities: tuple[str, ...]
+    #: Recordings of independent joints that stand beside the recorded ones, and their standard deviations.
+    pseudo: float
+    sd_deg: tuple[float, ...]
+    #: The mean: it counts as that of so many persons more in their median, or is all there is (None).
+    mean_deg: tuple[float, ...]
+    mean_persons: int | None
+    #: Between people: standard deviation of the tilt (deg), how far hips and lumbar spine go with it, and how large the
+    #: other joints' are against `BETWEEN_DEG`.
+    tilt_sd_deg: float
+    hips: float
+    lumbar: float
+    factor: float
+
+
+COMPONENTS = (
+    Component(
+        weight=0.6,
+        activities=("walk",),
+        pseudo=1.0,
+        sd_deg=(2, 3, 3, 5, 5, 14, 5, 5, 19, 9, 6),
+        mean_deg=(0, 0, -7, 0, 0, 10, 0, 0, -25, 3, 0),
+        mean_persons=2,
+        tilt_sd_deg=7.0,
+        hips=-1.0,
+        lumbar=-0.7,
+        factor=1.0,
+    ),
+    Component(
+        weight=0.4,
+        activities=("squat", "sit_to_stand", "lift"),
+        pseudo=1.5,
+        sd_deg=(10, 3, 12, 5, 5, 30, 5, 5, 35, 9, 6),
+        mean_deg=(0, 0, -7, 0, 0, 30, 0, 0, -40, 5, 0),
+        mean_persons=None,
+        tilt_sd_deg=15.0,
+        hips=-1.0,
+        lumbar=-0.4,
+        factor=1.5,
+    ),
+)
 
 
 def of_joints(values: Collection[float]) -> np.ndarray:
@@ -66,9 +97,8 @@ def postures_deg(motion: Motion) -> Float[np.ndarray, "T J"]:
     """Joints of a recording, the pelvis against the vertical; NaN where they were not recorded."""
     names = list(load_body().joint_names)
     q, known = motion.qpos.copy(), motion.known.copy()
-    pelvis = [names.index(n) for n in PELVIS]
-    R = Rotation.from_euler("ZXY", q[:, pelvis]).as_matrix()
-    q[:, pelvis[:2]] = np.arcsin(np.stack([R[:, 1, 0], -R[:, 1, 2]], axis=1))
+    pelvis = [names.index(n) for n in PELVIS_TURNS]
+    q[:, pelvis[:2]] = np.arcsin(rises(jnp.asarray(q[:, pelvis])))
     if motion.person.startswith(OTHER_SPINE):
         known[[names.index(n) for n in MIDDLE if n.startswith("lumbar")]] = False
     index = [names.index(n) for n in JOINTS]
@@ -112,26 +142,24 @@ def covariance_within(
     return S
 
 
-def covariance_between(tilt_sd: float, along: tuple[float, float], factor: float) -> Float[np.ndarray, "J J"]:
+def covariance_between(c: Component) -> Float[np.ndarray, "J J"]:
     """Covariance (deg^2) of people's own means."""
-    way = of_joints([1, 0, along[1], 0, 0, along[0], *[0] * 5])
-    return np.diag((factor * of_joints(BETWEEN_DEG)) ** 2) + tilt_sd**2 * np.outer(way, way)
+    way = of_joints([1, 0, c.lumbar, 0, 0, c.hips, *[0] * 5])
+    return np.diag((c.factor * of_joints(BETWEEN_DEG)) ** 2) + c.tilt_sd_deg**2 * np.outer(way, way)
 
 
 def learn(motions: Collection[Motion]) -> dict:
     """The mixture, as the file has it."""
     components = []
-    for weight, activities, pseudo, sd, tilt_sd, along, factor in (WALKING, OTHERWISE):
-        groups = recordings(motions, activities)
-        mean = of_joints(MEANS_DEG["walk" if "walk" in activities else "otherwise"])
-        if "walk" in activities:
-            mean = np.nanmedian([*(x.mean(axis=0) for x in groups.values()), mean, mean], axis=0)
-        S = covariance_within(list(groups.values()), of_joints(sd), pseudo)
-        S += covariance_between(tilt_sd, along, factor)
+    for c in COMPONENTS:
+        groups, mean = recordings(motions, c.activities), of_joints(c.mean_deg)
+        if c.mean_persons is not None:
+            mean = np.nanmedian([*(x.mean(axis=0) for x in groups.values()), *[mean] * c.mean_persons], axis=0)
+        S = covariance_within(list(groups.values()), of_joints(c.sd_deg), c.pseudo) + covariance_between(c)
         components.append(
-            {"weight": weight, "mean_deg": mean.round(3).tolist(), "covariance_deg2": S.round(3).tolist()}
+            {"weight": c.weight, "mean_deg": mean.round(3).tolist(), "covariance_deg2": S.round(3).tolist()}
         )
-    used = {a for c in (WALKING, OTHERWISE) for a in c[1]}
+    used = {a for c in COMPONENTS for a in c.activities}
     return {
         "persons": sorted({m.person for m in motions if m.activity in used}),
         "sources": sorted({m.source for m in motions if m.activity in used}),

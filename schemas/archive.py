@@ -25,6 +25,7 @@ from .json_files import write_json
 #: Name of the installation-wide lock that whoever changes the archive holds (`worker.alone`).
 LOCK = "incoming"
 REFUSED, COPIES = "_refused", ".incoming"
+_SEEN = "seen.json"
 
 
 def archive_dir() -> Path:
@@ -60,9 +61,7 @@ def remove_folders(archive: Path, subject: str) -> None:
     """Remove the folders of a person as far as they are empty."""
     for part in ("", REFUSED):
         folder = archive / part / subject
-        for path in sorted(
-            [p for p in folder.rglob("*") if p.is_dir() and not p.is_symlink()] + [folder], reverse=True
-        ):
+        for path in (*sorted(folder.rglob("*"), reverse=True), folder):
             remove_empty(path, 1)
 
 
@@ -72,14 +71,14 @@ def remove_copies(archive: Path, subject: str | None = None) -> None:
     for path in [kept / subject] if subject else sorted(kept.glob("*")):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
-        elif path.name != "seen.json":
+        elif path.name != _SEEN:
             path.unlink(missing_ok=True)
 
 
 def load_seen(archive: Path) -> dict[str, list[Any]]:
     """What `save_seen` wrote; empty where there is nothing to read."""
     try:
-        return dict(json.loads((archive / COPIES / "seen.json").read_text()))
+        return dict(json.loads((archive / COPIES / _SEEN).read_text()))
     except (OSError, ValueError):
         return {}
 
@@ -93,4 +92,4 @@ def save_seen(archive: Path, seen: dict[str, list[Any]]) -> None:
         It cannot be written.
     """
     private_folder(archive)
-    write_json(private_folder(archive / COPIES) / "seen.json", seen)
+    write_json(private_folder(archive / COPIES) / _SEEN, seen)

@@ -14,7 +14,8 @@ from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
 
 #: Folders of a backup, each with a listing: files of the store, and registered videos.
-PARTS = STORE, RECORDINGS = "store", "recordings"
+RECORDINGS = "recordings"
+PARTS = ("store", RECORDINGS)
 
 
 def safe_path(path: str) -> PurePosixPath:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import pymysql
@@ -26,9 +27,7 @@ _sources: dict[Any, Any] = {}
 def keys_of(table: Any) -> Any:
     """Query of the keys that can be computed for a table (class), made once for a connection: DataJoint reads the
     columns of the tables above for it."""
-    if table not in _sources or _sources[table].connection is not table().connection:
-        _sources[table] = table().key_source
-    return _sources[table]
+    return _kept(_sources, table, lambda: table().key_source)
 
 
 def jobs_of(table: Any) -> Any:
@@ -37,13 +36,22 @@ def jobs_of(table: Any) -> Any:
     It is declared where it is missing, and gets the columns of `COUNTS`; an account that may not declare relies on
     `schemas._declare.declare_all`. Both end a transaction that is open.
     """
-    if table not in _jobs or _jobs[table].connection is not table().connection:
+
+    def declared() -> Any:
         jobs = table.jobs
         if missing := [name for name in COUNTS if name not in jobs.heading.names]:
             _add(jobs, missing)
             jobs = table.jobs
-        _jobs[table] = jobs
-    return _jobs[table]
+        return jobs
+
+    return _kept(_jobs, table, declared)
+
+
+def _kept(made: dict[Any, Any], table: Any, make: Callable[[], Any]) -> Any:
+    """What was made for a table; made anew where the tables have another connection since."""
+    if table not in made or made[table].connection is not table().connection:
+        made[table] = make()
+    return made[table]
 
 
 def _add(jobs: Any, names: list[str]) -> None:

@@ -41,7 +41,7 @@ def delete_registered(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict
 def find_recordings(subject: str) -> list[str]:
     """The person's files in the archive, copies of a killed import included, and in the drop folder."""
     parts = ("", archive.REFUSED, archive.COPIES)
-    return [str(p) for p in archive.of_person(archive_dir(), subject, parts)] + list(_uploads(subject))
+    return [str(p) for p in archive.of_person(archive_dir(), subject, parts)] + list(_uploads(_drop(), subject))
 
 
 def _drop() -> Folder | Bucket | None:
@@ -49,8 +49,7 @@ def _drop() -> Folder | Bucket | None:
     return drop_folder(url) if url else None
 
 
-def _uploads(subject: str) -> dict[str, Upload]:
-    drop = _drop()
+def _uploads(drop: Folder | Bucket | None, subject: str) -> dict[str, Upload]:
     return {} if drop is None else {f"{drop.root}/{upload.name}": upload for upload in drop.uploads(subject)}
 
 
@@ -59,7 +58,7 @@ def delete_uploads(subject: str) -> list[str]:
     gone, drop = [], _drop()
     if drop is None:
         return gone
-    for name, upload in _uploads(subject).items():
+    for name, upload in _uploads(drop, subject).items():
         with contextlib.suppress(OSError):  # what cannot be removed is found again, and named
             drop.remove(upload)
             gone.append(name)

@@ -25,13 +25,9 @@ _PREFIX = "pbl-files-"
 
 @contextmanager
 def new_folder() -> Iterator[Path]:
-    """A folder for a file that is about to enter the object store; gone afterwards."""
-    with _temporary() as folder:
+    """A folder for a file that is about to enter the object store or was taken from it; gone afterwards."""
+    with tempfile.TemporaryDirectory(prefix=f"{_PREFIX}{os.getpid()}-") as folder:
         yield Path(folder)
-
-
-def _temporary() -> tempfile.TemporaryDirectory[str]:
-    return tempfile.TemporaryDirectory(prefix=f"{_PREFIX}{os.getpid()}-")
 
 
 def remove_left_folders() -> list[Path]:
@@ -75,8 +71,8 @@ def stored_file(table: Any, ref: Mapping[str, Any]) -> Iterator[Path]:
         with _readable(path, ref):
             yield path
         return
-    with _temporary() as folder:
-        path = Path(folder) / Path(ref["path"]).name
+    with new_folder() as folder:
+        path = folder / Path(ref["path"]).name
         if not backend.exists(ref["path"]):
             raise _lost(ref)
         backend.get_file(ref["path"], path)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
 import hashlib
 import json
 import os
@@ -110,12 +111,11 @@ def _repeated(connection: Any, statement: Callable[[], int]) -> int:
 
 def sweep(table: Any, which: str = "status != 'reserved'") -> int:
     """Delete jobs that nobody needs any more: done by another route, or no longer asked for; returns how many."""
-    done = (jobs_of(table) & which).restrict(table.proj(), semantic_check=False)
-    n = _repeated(table.connection, lambda: int(done.delete_quick(get_count=True)))
-    waiting = jobs_of(table) & which
-    if len(waiting):
-        vanished = waiting.restrict(dj.Not(keys_of(table).proj()), semantic_check=False)
-        n += _repeated(table.connection, lambda: int(vanished.delete_quick(get_count=True)))
+    n = 0
+    for needless in (table.proj(), dj.Not(keys_of(table).proj())):
+        if jobs := jobs_of(table) & which:  # most often there are none
+            gone = jobs.restrict(needless, semantic_check=False)
+            n += int(_repeated(table.connection, functools.partial(gone.delete_quick, get_count=True)))
     return n
 
 

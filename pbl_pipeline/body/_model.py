@@ -21,6 +21,8 @@ _GROUP_PREFIX = "scale_group/"
 
 #: The slides of the pelvis, along its axes x, y and z at `qpos = 0` (m); all other joints turn (rad).
 SLIDES = ("pelvis_tx", "pelvis_ty", "pelvis_tz")
+#: The joints that turn the pelvis, one after the other about z, x and y of the model's ground.
+PELVIS_TURNS = ("pelvis_tilt", "pelvis_list", "pelvis_rotation")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

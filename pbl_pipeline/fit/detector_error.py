@@ -38,41 +38,42 @@ def detector_error(p: Problem, state: State, R_nc: Array) -> DetectorError:
 
 
 def detector_blocks(
-    detector: DetectorError, b: Array, W: Array, U_t: Array, cross: Array, G: Array, n: int
-) -> tuple[Array, Array, Array]:
-    """What the E = 3 + M unknowns of a trial's detector share with the n of frames and scale (F, n, E), with the
-    offsets (3 M, D E) and with each other (D E, D E).
+    detector: DetectorError, b: Array, W: Array, U_t: Array, cross: Array, G: Array, f: Array, q: int
+) -> tuple[Array, Array, Array, Array]:
+    """What the E = 3 + M unknowns of each of D trials add to the normal equations: products with the q unknowns of a
+    frame (F, q, D E), with scale and offsets (S + 3 M, D E) and with each other (D E, D E), and the gradient (D E,).
 
-    `b`: weights of the mean that is removed; `W`: curvature of each marker's 3D residual; `cross`: force on each marker
-    in 3D where the unknowns of A move, the mean removed; G: A's own products, the lean's in its last 3 columns. A depth
-    moves its own marker alone, so its products are those of `cross` with one direction.
+    `b`: weights of the mean that is removed; `W`: curvature of each marker's 3D residual; `U_t`: each marker by its
+    offset, transposed; `cross`: force on each marker in 3D where the unknowns of frame, scale and lean move, the mean
+    removed; `G`: products of those; `f`: force on each marker in 3D now. A depth moves its own marker alone, so its
+    products are those of `cross` with one direction.
     """
     u, each = detector.by_depth, detector.trials
     frames, markers = b.shape
+    eye, n = jnp.eye(markers, dtype=b.dtype), G.shape[-1] - detector.by_lean.shape[-1]
     by_depth = jnp.einsum("fi,fmia->fam", u, cross)
     Wu = jnp.einsum("fmij,fj->fmi", W, u)
     own = jnp.einsum("fmi,fi->fm", Wu, u)
     mixed = b[:, :, None] * own[:, None]
-    depths = own[:, :, None] * jnp.eye(markers, dtype=b.dtype) - mixed - jnp.swapaxes(mixed, 1, 2)
+    depths = own[:, :, None] * eye - mixed - jnp.swapaxes(mixed, 1, 2)
     depths += b[:, :, None] * b[:, None] * jnp.sum(own, axis=1)[:, None, None]
-    by_detector = jnp.concatenate([G[:, :n, n:], by_depth[:, :n]], axis=-1)
-    all_own = jnp.concatenate(
-        [
-            jnp.concatenate([G[:, n:, n:], by_depth[:, n:]], axis=-1),
-            jnp.concatenate([jnp.swapaxes(by_depth[:, n:], 1, 2), depths], axis=-1),
-        ],
-        axis=1,
-    )
-    own_of_detector = jnp.einsum("fde,ft,tu->tdue", all_own, each, jnp.eye(each.shape[1], dtype=b.dtype))
+    # Rows: unknowns of a frame, scale, lean, depths; columns: lean, depths.
+    upper = jnp.concatenate([G[:, :, n:], by_depth], axis=-1)
+    rows = jnp.concatenate([upper, jnp.concatenate([jnp.swapaxes(by_depth[:, n:], 1, 2), depths], axis=-1)], axis=1)
+    of_trials = jnp.einsum("fre,ft->frte", rows[:, :n], each).reshape(frames, n, -1)
+    with_each_other = jnp.einsum("fde,ft,tu->tdue", rows[:, n:], each, jnp.eye(each.shape[1], dtype=b.dtype))
 
     by_lean = times(U_t, cross[..., n:]).reshape(frames, 3 * markers, -1)
     offset_and_lean = jnp.einsum("fol,ft->otl", by_lean, each)
-    to_offset = jnp.einsum("fmki,fmi->fmk", U_t, Wu)
-    whole = jnp.einsum("fmki,fi->fmk", b[..., None, None] * U_t, jnp.sum(Wu, axis=1))
+    b_U_t, to_offset = b[..., None, None] * U_t, jnp.einsum("fmki,fmi->fmk", U_t, Wu)
+    whole = jnp.einsum("fmki,fi->fmk", b_U_t, jnp.sum(Wu, axis=1))
     offset_and_depth = jnp.einsum("fmk,fj,ft->mktj", whole - to_offset, b, each)
-    offset_and_depth -= jnp.einsum("fmki,fji,ft->mktj", b[..., None, None] * U_t, Wu, each)
-    offset_and_depth += jnp.einsum("fmk,ft,mj->mktj", to_offset, each, jnp.eye(markers, dtype=b.dtype))
+    offset_and_depth -= jnp.einsum("fmki,fji,ft->mktj", b_U_t, Wu, each)
+    offset_and_depth += jnp.einsum("fmk,ft,mj->mktj", to_offset, each, eye)
     offset_and_depth = offset_and_depth.reshape(3 * markers, each.shape[1], markers)
-    of_offsets = jnp.concatenate([offset_and_lean, offset_and_depth], axis=-1)
-    size = own_of_detector.shape[0] * own_of_detector.shape[1]
-    return by_detector, of_offsets.reshape(3 * markers, size), own_of_detector.reshape(size, size)
+    with_offsets = jnp.concatenate([offset_and_lean, offset_and_depth], axis=-1).reshape(3 * markers, -1)
+
+    pulled = jnp.concatenate([jnp.einsum("fmil,fmi->fl", detector.by_lean, f), jnp.einsum("fi,fmi->fm", u, f)], axis=1)
+    with_shared = jnp.concatenate([jnp.sum(of_trials[:, q:], axis=0), with_offsets])
+    size = with_shared.shape[1]
+    return of_trials[:, :q], with_shared, with_each_other.reshape(size, size), (each.T @ pulled).reshape(-1)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import SLIDES, Body, MarkerSet
+from pbl_pipeline.body import PELVIS_TURNS, SLIDES, Body, MarkerSet
 
 from .problem import TrialArrays
 from .session import Session
@@ -155,7 +155,7 @@ def pelvis_path(body: Body, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     column = {n: k for k, n in enumerate(body.joint_names)}
     stands, rest = pelvis_rest(body)
     slides = qpos[:, [column[n] for n in SLIDES]]
-    turns = qpos[:, [column[n] for n in ("pelvis_tilt", "pelvis_list", "pelvis_rotation")]]
+    turns = qpos[:, [column[n] for n in PELVIS_TURNS]]
     return slides @ stands.T + rest, stands @ Rotation.from_euler("ZXY", turns).as_matrix()
 
 

@@ -46,7 +46,7 @@ from .objective import (
     slide_contact,
     weighted,
 )
-from .priors import Weights, bent, beyond_limit_deg, inclination, pose_z, responsibilities, shift
+from .priors import Weights, bent, beyond_limit_deg, inclination, pose_z, posture, responsibilities, shift
 from .problem import Problem, frames_at
 from .solvers.linear import BorderedBandedSystem
 
@@ -249,7 +249,8 @@ def _marker_blocks(
     cross = times(W_all, A)
     G = jnp.einsum("fkq,fkr->fqr", flat(A), flat(cross + of_2d))
     G = G.at[:, n:, :n].set(jnp.swapaxes(G[:, :n, n:], -1, -2))
-    own = jnp.sum(times(jnp.swapaxes(U, -1, -2), times(M + W_all, U)), axis=0)
+    U_t = jnp.swapaxes(U, -1, -2)
+    own = jnp.sum(times(U_t, times(M + W_all, U)), axis=0)
     C_oo = jnp.einsum("mij,mn->minj", own, jnp.eye(markers, dtype=x.dtype)).reshape(3 * markers, 3 * markers)
     # A centred residual moves with its marker less the mean over the markers, which all of them move.
     for b, Wv in zip(jnp.moveaxis(centred, 1, 0), jnp.moveaxis(W, 1, 0), strict=True):
@@ -264,7 +265,6 @@ def _marker_blocks(
         Y = jnp.swapaxes(b[..., None, None] * U, 1, 2).reshape(frames, 3, 3 * markers)
         one = jnp.einsum("fik,fil->kl", X - 0.5 * whole @ Y, Y)
         C_oo -= one + one.T
-    U_t = jnp.swapaxes(U, -1, -2)
     by_offset = times(U_t, cross + of_2d).reshape(frames, 3 * markers, A.shape[-1]).swapaxes(1, 2)
     C_so = jnp.sum(by_offset[:, q:n], axis=0)
     C = jnp.block([[jnp.sum(G[:, q:n, q:n], axis=0), C_so], [C_so.T, C_oo]])
@@ -273,17 +273,9 @@ def _marker_blocks(
     pulled_o = jnp.einsum("fmik,fmi->mk", U, f + f_3d)
     h = jnp.concatenate([jnp.sum(pulled[:, q:], axis=0), pulled_o.reshape(-1)])
     if detector.trials.shape[1]:
-        by_detector, of_offsets, own_of_detector = detector_blocks(detector, centred[:, 0], W_all, U_t, cross, G, n)
-        each = detector.trials
-        to_trials = lambda a: (a[:, :, None] * each[:, None, :, None]).reshape(*a.shape[:2], -1)  # noqa: E731
-        C_d = jnp.concatenate([jnp.sum(to_trials(by_detector[:, q:]), axis=0), of_offsets], axis=0)
-        pulled_d = jnp.concatenate(
-            [jnp.einsum("fmil,fmi->fl", detector.by_lean, f_3d), jnp.einsum("fi,fmi->fm", detector.by_depth, f_3d)],
-            axis=1,
-        )
-        C = jnp.block([[C, C_d], [C_d.T, own_of_detector]])
-        B = jnp.concatenate([B, to_trials(by_detector[:, :q])], axis=-1)
-        h = jnp.concatenate([h, (each.T @ pulled_d).reshape(-1)])
+        B_d, C_d, C_dd, h_d = detector_blocks(detector, centred[:, 0], W_all, U_t, cross, G, f_3d, q)
+        B, h = jnp.concatenate([B, B_d], axis=-1), jnp.concatenate([h, h_d])
+        C = jnp.block([[C, C_d], [C_d.T, C_dd]])
     return (G[:, :q, :q], -pulled[:, :q], B), (C, -h)
 
 
@@ -312,13 +304,13 @@ def _add_joints(sum_: _Blocks, p: Problem, w: Weights, state: State) -> tuple[_B
     each = w.weight_limit * p.weight[:, None]
     diagonal, force = each * D[..., 0, 0] ** 2, each * D[..., 0, 0] * r[..., 0]
     each = w.weight_pose * p.weight[:, None]
-    pose, by_pelvis = _posture(state.qpos, w)
-    z = pose_z(pose, w.neutral, w.whitener)
+    z = pose_z(posture(state.qpos, w.pelvis), w.neutral, w.whitener)
     own = each * responsibilities(z, w.pose_log_weight)
     towards = jnp.einsum("fc,fcp,cpq->fq", own, z, w.whitener)
     curvature = jnp.einsum("fc,cqr->fqr", own, jnp.einsum("cpq,cpr->cqr", w.whitener, w.whitener))
-    if by_pelvis is not None:
+    if w.pelvis.shape[0]:
         # Only the pelvis' own three joints are seen through its tilt and list.
+        by_pelvis = linearised(inclination, state.qpos[:, w.pelvis])[1]
         through = lambda a: _through(a, by_pelvis, w.pelvis)  # noqa: E731
         towards = through(towards[:, None])[:, 0]
         curvature = jnp.swapaxes(through(jnp.swapaxes(through(curvature), 1, 2)), 1, 2)
@@ -339,15 +331,6 @@ def _add_joints(sum_: _Blocks, p: Problem, w: Weights, state: State) -> tuple[_B
     H = (sum_.H + on_diagonal(wide(diagonal) + empty[:, None])).at[:, :q, :q].add(curvature)
     link = sum_.link + on_diagonal(wide(next_1))
     return sum_._replace(H=H, g=sum_.g - wide(force), link=link), wide(next_2)
-
-
-def _posture(qpos: Float[Array, "F Q"], w: Weights) -> tuple[Float[Array, "F Q"], Float[Array, "F 2 3"] | None]:
-    """`posture`, and the derivative of the pelvis' tilt and list by its three joints; None where the posture is the
-    joint values themselves."""
-    if not w.pelvis.shape[0]:
-        return qpos, None
-    upright, by_pelvis = linearised(inclination, qpos[:, w.pelvis])
-    return qpos.at[:, w.pelvis[:2]].set(upright), by_pelvis
 
 
 def _through(a: Float[Array, "F R Q"], by_pelvis: Float[Array, "F 2 3"], pelvis: Array) -> Float[Array, "F R Q"]:

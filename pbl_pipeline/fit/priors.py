@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from pbl_pipeline.body import Body
+from pbl_pipeline.body import PELVIS_TURNS, Body
 from pbl_pipeline.errors import PblError
 
 from ._params import CostParams, GaussNewtonParams, ImplicitAdamParams
@@ -21,8 +21,6 @@ from .problem import Problem
 
 #: Priors that were learned from people (`research/poses.py`).
 DATA = Path(__file__).parent / "data"
-#: Joints that turn the pelvis, in the order in which they do.
-PELVIS = ("pelvis_tilt", "pelvis_list", "pelvis_rotation")
 #: Below this angle (deg) the paper's Lphone, which is not smooth, counts as smooth: nothing in single precision.
 PAPER_PHONE_DEG = 1e-4
 #: Cost of a floor's slope one standard deviation from level: that of a marker 3 px off in one frame.
@@ -108,7 +106,7 @@ class Weights:
             "floor_precision": np.array([1e-6, slope, slope]),
         }
         values |= {f.name: getattr(c, f.name) for f in dataclasses.fields(CostParams) if f.name in _FIELDS}
-        names = [n for n in PELVIS if n in body.joint_names] if c.pose_prior else []
+        names = [n for n in PELVIS_TURNS if n in body.joint_names] if c.pose_prior else []
         pelvis = jnp.asarray([body.joint_names.index(n) for n in names], jnp.int32)
         return cls(pelvis=pelvis, **{k: jnp.asarray(v, jnp.float32) for k, v in values.items()})
 
@@ -132,14 +130,19 @@ def beyond_limit_deg(
     return jnp.rad2deg(jnp.maximum(qpos - high, 0.0) + jnp.minimum(qpos - low, 0.0))
 
 
-def inclination(pelvis: Float[Array, "*n 3"]) -> Float[Array, "*n 2"]:
-    """Tilt (backwards positive) and list of a pelvis against the vertical, whichever way it faces, from its three
-    joints: tilt, list and rotation (rad), which turn about the axes of the ground one after the other."""
+def rises(pelvis: Float[Array, "*n 3"]) -> Float[Array, "*n 2"]:
+    """How far the pelvis' forward axis rises and its right axis falls, from its three turns (`PELVIS_TURNS`, rad): the
+    sines of its tilt (backwards positive) and list against the vertical, whichever way it faces."""
     tilt, list_, rotation = (pelvis[..., i] for i in range(3))
     forward = jnp.sin(tilt) * jnp.cos(rotation) + jnp.cos(tilt) * jnp.sin(list_) * jnp.sin(rotation)
     right = jnp.sin(tilt) * jnp.sin(rotation) - jnp.cos(tilt) * jnp.sin(list_) * jnp.cos(rotation)
+    return jnp.stack([forward, -right], axis=-1)
+
+
+def inclination(pelvis: Float[Array, "*n 3"]) -> Float[Array, "*n 2"]:
+    """Tilt and list (rad) of a pelvis against the vertical from its three turns."""
     # Just short of 1, where the derivative of the arc is infinite.
-    return jnp.arcsin(0.999 * jnp.stack([forward, -right], axis=-1))
+    return jnp.arcsin(0.999 * rises(pelvis))
 
 
 def posture(qpos: Float[Array, "*n Q"], pelvis: Int[Array, " P"]) -> Float[Array, "*n Q"]:

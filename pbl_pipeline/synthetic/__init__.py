@@ -21,7 +21,7 @@ from ._scene import VIEWS_DEG
 from ._solve import SOLE_POINTS, sole_points
 from ._synth import TASKS, Synthetic, SynthSpec, Truth, lens, speed_of_group, synthesise
 from ._views import VIEW_CAMERA, VIEW_SIZE_PX, observe_markers, observe_views
-from ._walk import plain_walk, turned, walk_qpos
+from ._walk import facing, plain_walk, turned, walk_qpos
 
 __all__ = [
     "BLAZEPOSE_MEASURED",
@@ -48,6 +48,7 @@ __all__ = [
     "SynthSpec",
     "Synthetic",
     "Truth",
+    "facing",
     "gait_norm",
     "lens",
     "observe",

@@ -16,7 +16,7 @@ from pbl_pipeline.video import Camera
 from ._camera import PHONE_CAMERA, PHONE_SIZE_PX, HeldPhone, PhoneSensor, camera_turn, phone_log, picture_px
 from ._noise import Noise, disturb, exchanged
 from ._person import _set, true_markers
-from ._scene import stage
+from ._scene import CAMERAS, stage
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Seen:
     """Keypoints of a trial and what is true of it.
 
     R_nc (T, 3, 3): camera to world at each frame; clock_offset_s: the phone's clock against the video's, NaN without a
-    log; markers_world_m (T, J, 3): the true points; outlier (T, J): which points were thrown far off; qpos (T, 40): the
-    motion where the phone saw it.
+    log; markers_world_m (T, J, 3): the true points; outlier (T, J): which points were thrown far off; outside (T, J):
+    which were missing because they are not in the picture; qpos (T, 40): the motion where the phone saw it.
     """
 
     keypoints: Keypoints
@@ -33,6 +33,7 @@ class Seen:
     clock_offset_s: float
     markers_world_m: Float[np.ndarray, "T J 3"]
     outlier: np.ndarray
+    outside: np.ndarray
     qpos: Float[np.ndarray, "T 40"]
 
 
@@ -100,7 +101,7 @@ def observe(
     markers, noise, sensor = _set(marker_set), noise or Noise(), sensor or PhoneSensor()
     time_s = np.asarray(time_s, np.float64)
     unknown = sorted(set(never_seen) - set(markers.names))
-    if unknown or camera_motion not in ("static", "panned", "handheld"):
+    if unknown or camera_motion not in CAMERAS:
         raise PblError(
             "FIT_INPUT",
             found=f"camera motion {camera_motion!r}, markers that are not in the set: {', '.join(unknown) or 'none'}",
@@ -167,6 +168,7 @@ def film(
     keypoints, outlier = seen_by(
         rng, noise, time_s, x_world, R_nc, np.zeros(3), markers, camera, image_size_px, root_relative
     )
+    outside = np.zeros(outlier.shape, bool)
     if only_in_picture:
         outside = outside_picture(x_world, R_nc, camera, image_size_px)
         keypoints, outlier = hide(keypoints, outside), outlier & ~outside
@@ -174,7 +176,7 @@ def film(
         stamps, quat = phone_log(sensor_rng, sensor, R_nc_at, float(time_s[0]), float(time_s[-1]))
         keypoints = dataclasses.replace(keypoints, phone_time_s=stamps, phone_quat_wxyz=quat)
     clock = sensor.clock_offset_s if sensor is not None else float("nan")
-    return Seen(keypoints, R_nc, clock, x_world, outlier, qpos)
+    return Seen(keypoints, R_nc, clock, x_world, outlier, outside, qpos)
 
 
 def outside_picture(

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
@@ -18,7 +17,7 @@ from ._camera import HeldPhone, camera_turn
 from ._gait import wander, within
 from ._plan import GRID_STEP_S, Plan
 from ._solve import sole_points
-from ._walk import turned
+from ._walk import facing, turned
 
 #: Direction that the person faces at the start, against the phone's line of sight (deg): 180 comes towards it, 90 shows
 #: the left side. With "follow" the phone is carried behind the person.
@@ -30,7 +29,6 @@ VIEWS_DEG = {
     "rear": 0.0,
     "follow": 0.0,
 }
-_PELVIS = ("tilt", "list", "rotation")
 CAMERAS = ("static", "panned", "handheld")
 #: Nearest point of a frontal walk, distance of the middle of all other motions, distance of a carried phone (m).
 NEAREST_M, MIDDLE_M, BEHIND_M = 2.5, 4.5, 3.2
@@ -99,8 +97,7 @@ def stage(
     column = [body.joint_names.index(f"pelvis_t{axis}") for axis in "xzy"]
     way = qpos[-1, column[:2]] - qpos[0, column[:2]]
     if np.linalg.norm(way) < 1.0:
-        turn = Rotation.from_euler("ZXY", qpos[:, [body.joint_names.index(f"pelvis_{n}") for n in _PELVIS]])
-        way = turn.apply([1.0, 0.0, 0.0]).mean(axis=0)[[0, 2]]
+        way = facing(qpos)[[0, 2]]
     out = turned(qpos, np.radians(VIEWS_DEG[view]) + slant - np.arctan2(-way[1], way[0]))
     xy = out[:, column[:2]] * [1, -1]
     low, high = xy.min(axis=0), xy.max(axis=0)

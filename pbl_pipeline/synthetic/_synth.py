@@ -26,7 +26,7 @@ from . import _tasks
 from ._camera import PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor
 from ._impair import Impairment, style_of
 from ._noise import NO_NOISE, Noise
-from ._observe import film, outside_picture, pelvis_positions
+from ._observe import film, pelvis_positions
 from ._physique import leg_length_m, physique
 from ._plan import Plan
 from ._reference import reference
@@ -328,7 +328,7 @@ def synthesise(spec: SynthSpec) -> Synthetic:
         root_relative=spec.root_relative,
         only_in_picture=True,
     )
-    _check_in_view(outside_picture(seen.markers_world_m, seen.R_nc, camera, size_px), spec)
+    _check_in_view(seen.outside, spec)
     truth = Truth(
         time_s=time_s,
         joint_names=body.joint_names,

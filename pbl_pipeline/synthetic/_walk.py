@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import joint_of, load_body
+from pbl_pipeline.body import PELVIS_TURNS, joint_of, load_body
 
 from ._gait import MIDDLE_CURVES_DEG, OFFSET_SD_DEG, SIDE_CURVES_DEG, swing, wander, within
 from ._path import choose_path, floor_path
@@ -166,10 +166,17 @@ def pelvis_joints(angles_rad: Float[np.ndarray, "T 3"], heading_rad: Float[np.nd
     return np.column_stack([joints[:, 0], joints[:, 1], rotation + 2 * np.pi * whole])
 
 
+def facing(qpos: Float[np.ndarray, "T 40"]) -> Float[np.ndarray, " 3"]:
+    """Mean direction of the pelvis' forward axis in the model's ground (x ahead, y up, z right)."""
+    names = load_body().joint_names
+    turns = qpos[:, [names.index(n) for n in PELVIS_TURNS]]
+    return Rotation.from_euler("ZXY", turns).apply([1.0, 0.0, 0.0]).mean(axis=0)
+
+
 def turned(qpos: Float[np.ndarray, "T 40"], by_rad: float) -> Float[np.ndarray, "T 40"]:
     """The same motion, turned about the world's vertical axis (counter-clockwise seen from above)."""
     body = load_body()
-    column = [body.joint_names.index(n) for n in ("pelvis_tilt", "pelvis_list", "pelvis_rotation")]
+    column = [body.joint_names.index(n) for n in PELVIS_TURNS]
     x, z = body.joint_names.index("pelvis_tx"), body.joint_names.index("pelvis_tz")
     out = np.array(qpos, float)
     # In the model's ground y is up: x ahead, z right. A turn about y has the same sign as one about the world's z.

@@ -7,12 +7,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from pbl_pipeline.body import PELVIS_TURNS
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import trial_poses
 
 from ._align import MIN_COMMON, about_vertical, align_path, at_times, best_lag, unwrapped, vertical_turn, wrapped
-from ._joints import JOINTS_OPENCAP, JOINTS_PAPER, PELVIS
+from ._joints import JOINTS_OPENCAP, JOINTS_PAPER
 from ._reference import Reference
 from ._rotations import pelvis_angles_deg, pelvis_rotations
 from ._sources import fit_angles, fit_angles_sd
@@ -169,14 +170,14 @@ def compare_angles(
     ours = np.column_stack([np.asarray(angles_deg[n], float) for n in names])
     theirs = unwrapped(np.column_stack([reference.angles_deg[n] for n in names]))
     # Angles of the pelvis depend on the world's heading, so the lag is found by the joints wherever there are any.
-    moving = [i for i, n in enumerate(names) if n not in PELVIS] or list(range(len(names)))
+    moving = [i for i, n in enumerate(names) if n not in PELVIS_TURNS] or list(range(len(names)))
     _check_overlap(trial, time_s, ours, reference, max_lag_s)
     lag = best_lag(time_s, unwrapped(ours[:, moving]), reference.time_s, theirs[:, moving], max_lag_s)
     if not np.isfinite(lag):
         raise _refused(trial, "too few frames in which both know a joint", f"at least {MIN_COMMON}")
     there = at_times(time_s - lag, reference.time_s, theirs)
-    if not same_world and all(n in names for n in PELVIS):
-        ours = _headed_alike(ours, there, [names.index(n) for n in PELVIS])
+    if not same_world and all(n in names for n in PELVIS_TURNS):
+        ours = _headed_alike(ours, there, [names.index(n) for n in PELVIS_TURNS])
     difference = wrapped(ours - there)
     known = np.isfinite(difference)
     n = int(np.count_nonzero(known.any(axis=1)))

@@ -243,28 +243,33 @@ def lasting(motion: Motion, time_s: Float[np.ndarray, " N"]) -> Float[np.ndarray
     None where no part is straight.
     """
     place = _columns("pelvis_tx", "pelvis_tz")
-    if motion.cycle or motion.time_s[-1] < time_s[-1]:
-        step = float(np.median(np.diff(motion.time_s)))
-        spline = CubicSpline(motion.time_s, motion.qpos)
-        start, stride = (
-            (0.0, float(motion.time_s[-1]) + step) if motion.cycle else _stride(spline, float(motion.time_s[-1]))
-        )
-        grid = np.linspace(0, stride, 101)
-        if motion.cycle:
-            spline = CubicSpline(np.append(motion.time_s, stride), _closed(motion.qpos, place))
-        one = spline(start + grid)
-        gone = one[-1] - one[0]
-        one = one - np.linspace(0, 1, 101)[:, None] * gone
-        periodic = CubicSpline(grid, np.concatenate([one[:-1], one[:1]]), bc_type="periodic")
-        out = periodic(time_s % stride)
-        out[:, place] += (time_s / stride)[:, None] * gone[place]
-        return out
+    end = float(motion.time_s[-1])
+    if motion.cycle:
+        stride = end + float(np.median(np.diff(motion.time_s)))
+        whole = CubicSpline(np.append(motion.time_s, stride), _closed(motion.qpos, place))
+        return _repeated(whole, 0.0, stride, time_s, place)
     spline = CubicSpline(motion.time_s, motion.qpos)
+    if end < time_s[-1]:
+        return _repeated(spline, *_stride(spline, end), time_s, place)
     starts = np.arange(0, motion.time_s[-1] - time_s[-1] + 1e-9, 0.5)
     turn = _columns("pelvis_rotation")[0]
     straight = [float(np.ptp(spline(s + time_s)[:, turn])) for s in starts]
     best = int(np.argmin(straight))
     return spline(starts[best] + time_s) if np.degrees(straight[best]) < _STRAIGHT_DEG else None
+
+
+def _repeated(
+    spline: CubicSpline, start_s: float, stride_s: float, time_s: np.ndarray, place: Sequence[int]
+) -> Float[np.ndarray, "N 40"]:
+    """One stride again and again, each as far ahead as the one before went."""
+    grid = np.linspace(0, stride_s, 101)
+    one = spline(start_s + grid)
+    gone = one[-1] - one[0]
+    one = one - np.linspace(0, 1, 101)[:, None] * gone
+    periodic = CubicSpline(grid, np.concatenate([one[:-1], one[:1]]), bc_type="periodic")
+    out = periodic(time_s % stride_s)
+    out[:, place] += (time_s / stride_s)[:, None] * gone[place]
+    return out
 
 
 def _stride(spline: CubicSpline, end_s: float) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +51,16 @@ def corpus_errors(
     """
     sessions = [SessionInput([c.keypoints()], [f"case{i}"], c.camera) for i, c in enumerate(cases)]
     fits = fit(sessions, method)
-    return pd.DataFrame([_row(case, result) for case, result in zip(cases, fits, strict=True)])
+    # Several cases are of one walk.
+    truths = {walk: walk.fit() for walk in dict.fromkeys(c.walk for c in cases)}
+    measured = {walk: _measured(find_cycles(walk.events, truth)) for walk, truth in truths.items()}
+    return pd.DataFrame(
+        [_row(c, truths[c.walk], measured[c.walk], result) for c, result in zip(cases, fits, strict=True)]
+    )
 
 
-def _row(case: Case, result: SessionFit | PblError) -> dict[str, Any]:
-    walk, truth = case.walk, case.walk.fit()
+def _row(case: Case, truth: TrialFit, measured: dict[str, float], result: SessionFit | PblError) -> dict[str, Any]:
+    walk = case.walk
     row: dict[str, Any] = {
         "person": walk.person,
         "source": walk.source,
@@ -67,8 +72,7 @@ def _row(case: Case, result: SessionFit | PblError) -> dict[str, Any]:
         "detector": case.detector,
         "error": result.code if isinstance(result, PblError) else "",
     }
-    cycles = find_cycles(walk.events, truth)
-    row |= {f"{k}_true": v for k, v in _measured(cycles).items()}
+    row |= {f"{k}_true": v for k, v in measured.items()}
     if isinstance(result, PblError):
         return row
     fit = result.trials[0]
@@ -243,13 +247,15 @@ def print_corpus(tables: dict[str, pd.DataFrame]) -> str:
     return "\n\n".join(parts)
 
 
-def write_corpus(out: str | Path, errors: pd.DataFrame, about: dict[str, Any]) -> list[Path]:
-    """Write `cases.csv`, a row per case, and `gdi.json`, the tables with what was run; their paths."""
+def write_corpus(
+    out: str | Path, errors: pd.DataFrame, tables: Mapping[str, pd.DataFrame], about: dict[str, Any]
+) -> list[Path]:
+    """Write `cases.csv`, a row per case, and `gdi.json`, their `corpus_tables` with what was run; returns the paths."""
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / "cases.csv", folder / "gdi.json"]
     errors.to_csv(paths[0], index=False, float_format="%.5g")
     # Through JSON's own numbers: NaN is null.
-    tables = {k: json.loads(str(t.to_json(orient="records"))) for k, t in corpus_tables(errors).items()}
-    paths[1].write_text(json.dumps({"about": about, "tables": tables}, indent=1) + "\n")
+    rows = {k: json.loads(str(t.to_json(orient="records"))) for k, t in tables.items()}
+    paths[1].write_text(json.dumps({"about": about, "tables": rows}, indent=1) + "\n")
     return paths

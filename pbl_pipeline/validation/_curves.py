@@ -9,12 +9,13 @@ import numpy as np
 import pandas as pd
 from scipy.interpolate import CubicSpline
 
+from pbl_pipeline.body import PELVIS_TURNS
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import GaitCycle
 
 from ._align import MAX_GAP_S, unwrapped
 from ._compare import KinematicErrors, compare
-from ._joints import PELVIS, split_side
+from ._joints import split_side
 from ._reference import Reference
 from ._sources import fit_angles
 
@@ -52,7 +53,7 @@ def cycle_curves(
         at = cycle.start_s + CURVE_PERCENT / 100.0 * (cycle.end_s - cycle.start_s)
         for name, theirs in reference.angles_deg.items():
             joint, side = split_side(name)
-            if name not in ours or name in PELVIS or side not in ("", cycle.side[0]):
+            if name not in ours or name in PELVIS_TURNS or side not in ("", cycle.side[0]):
                 continue
             here = _curve(fit.time_s, ours[name], at)
             there = _curve(reference.time_s, theirs, at - lag)

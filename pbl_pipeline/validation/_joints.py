@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from pbl_pipeline.body import PELVIS_TURNS
+
 _SIDES = ("r", "l")
 _HIPS = tuple(f"hip_{n}_{s}" for n in ("flexion", "adduction", "rotation") for s in _SIDES)
 _KNEES = tuple(f"knee_flexion_{s}" for s in _SIDES)
 _ANKLES = tuple(f"ankle_angle_{s}" for s in _SIDES)
 _LUMBAR = tuple(f"lumbar_{n}" for n in ("extension", "bending", "rotation"))
 
-#: The turns of the pelvis against the world.
-PELVIS = ("pelvis_tilt", "pelvis_list", "pelvis_rotation")
 #: The joints of the paper's median absolute error (Supplementary Methods, Validation Metrics).
 JOINTS_PAPER: tuple[str, ...] = (
     *_HIPS,
@@ -24,7 +24,7 @@ JOINTS_PAPER: tuple[str, ...] = (
 )
 #: The joints of OpenCap's mean absolute error (Uhlrich et al. 2023, as the paper lists them).
 JOINTS_OPENCAP: tuple[str, ...] = (
-    *PELVIS,
+    *PELVIS_TURNS,
     *_HIPS,
     *_KNEES,
     *_ANKLES,

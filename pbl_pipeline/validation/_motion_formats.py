@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from pbl_pipeline.body import load_body
+from pbl_pipeline.body import SLIDES, load_body
 from pbl_pipeline.bounded import read_text
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait.normative import BODY_ANGLES, PLUG_IN_GAIT, offset_deg
@@ -98,13 +98,17 @@ def read_recorded(path: Path, row: Mapping[str, str]) -> list[Recorded]:
     )
 
 
+def _turning(table: pd.DataFrame, rad: float) -> dict[str, np.ndarray]:
+    """The body's joints that turn, as far as the table has them (rad)."""
+    names = [n for n in load_body().joint_names if n in table.columns and n not in SLIDES]
+    return {n: rad * table[n].to_numpy(float) for n in names}
+
+
 def _opensim(table: pd.DataFrame, rad: float, row: Mapping[str, str], path: Path) -> list[Recorded]:
-    known = [n for n in load_body().joint_names if n in table.columns and not n.startswith("pelvis_t")]
-    joints = {n: rad * table[n].to_numpy(float) for n in [*known, "pelvis_tilt"]}
+    joints = _turning(table, rad)
     sign = _knee_sign(row, path)
     joints |= {n: -sign * v for n, v in joints.items() if n.startswith("knee_angle")}
-    way = ["pelvis_tx", "pelvis_ty", "pelvis_tz"]
-    path_m = table[way].to_numpy(float) if set(way) <= set(table.columns) else None
+    path_m = table[list(SLIDES)].to_numpy(float) if set(SLIDES) <= set(table.columns) else None
     return [Recorded(table["time"].to_numpy(float), _moving(joints), path_m)]
 
 
@@ -156,11 +160,10 @@ def _cycles(table: pd.DataFrame, rad: float, row: Mapping[str, str], path: Path)
     sign = _knee_sign(row, path)
     out = []
     for _, trial in table.groupby("trial", sort=False):
-        joints = {n: rad * trial[n].to_numpy(float) for n in load_body().joint_names if n in trial.columns}
-        joints = {n: v for n, v in joints.items() if not n.startswith("pelvis_t") or n == "pelvis_tilt"}
+        joints = _turning(trial, rad)
         joints |= {f"{n}_r": rad * trial[n].to_numpy(float) for n in (*right, *arm) if n in trial.columns}
         joints["knee_angle_r"] = -sign * joints["knee_angle_r"]
-        way = trial[["pelvis_tx", "pelvis_ty", "pelvis_tz"]].to_numpy(float)
+        way = trial[list(SLIDES)].to_numpy(float)
         n = len(way)
         seconds = abs(way[-1, 0] - way[0, 0]) * n / (n - 1) / float(speed[1])
         out.append(Recorded(seconds * np.arange(n) / n, _moving(joints), way, cycle=True))

@@ -16,11 +16,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import load_body
+from pbl_pipeline.body import SLIDES, load_body
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.synthetic import SOLE_POINTS, sole_points
+from pbl_pipeline.synthetic import SOLE_POINTS, facing, sole_points
 
 from ._motion_formats import Recorded, read_recorded
 
@@ -215,15 +214,15 @@ def _motion(name: str, recorded: Recorded, row: Mapping[str, str]) -> Motion:
         qpos[:, [column[f"{joint}_{s}"] for s in "rl"]] = np.radians(deg)
     for joint, values in (_left_as_right(time, joints, recorded.cycle, activity) | joints).items():
         qpos[:, column[joint]] = values
+    soles = sole_points(qpos)
     if not quality:
-        check_motion(qpos, known, activity, name)
-    feet = _Feet(qpos, time)
+        check_motion(qpos, known, soles, activity, name)
+    feet = _Feet(soles, time)
     in_place = recorded.path_m is None or (activity in STRIDING and "treadmill" in row["activity"])
     way = None if in_place else recorded.path_m
     _place(qpos, feet, way, grounded=activity in GROUNDED, cycle=recorded.cycle)
-    known[[column[f"pelvis_t{axis}"] for axis in "xyz"]] = way is not None
-    ahead = Rotation.from_euler("ZXY", qpos[:, [column[f"pelvis_{n}"] for n in ("tilt", "list", "rotation")]])
-    forward = ahead.apply([1.0, 0.0, 0.0]).mean(axis=0)
+    known[[column[n] for n in SLIDES]] = way is not None
+    forward = facing(qpos)
     person = row["person"]
     return Motion(
         name=name,
@@ -305,7 +304,9 @@ def stride_s(time_s: np.ndarray, knee: np.ndarray, bounds_s: tuple[float, float]
     return float(lags[next((i for i in peaks if like[i] > best - 0.1), int(np.argmax(like)))] * step)
 
 
-def check_motion(qpos: np.ndarray, known: np.ndarray, activity: str, name: str) -> None:
+def check_motion(
+    qpos: np.ndarray, known: np.ndarray, soles: Mapping[str, np.ndarray], activity: str, name: str
+) -> None:
     """Refuse joint values that contradict the convention they were read with.
 
     Radians that were taken for degrees move no knee; degrees taken for radians turn in circles (ANGLE_UNITS). A knee
@@ -345,7 +346,6 @@ def check_motion(qpos: np.ndarray, known: np.ndarray, activity: str, name: str) 
             "correct the convention in index.csv, or write there that the pelvis has an offset",
             name,
         )
-    soles = sole_points(qpos)
     heel, toe = (list(SOLE_POINTS).index(n) for n in ("heel", "ball"))
     lower = np.argmin([soles[s][:, :, 2].min(axis=1) for s in "rl"], axis=0)
     rise = np.where(lower == 0, *(_pitch(soles[s][:, heel], soles[s][:, toe]) for s in "rl"))
@@ -366,9 +366,8 @@ def _pitch(heel: np.ndarray, toe: np.ndarray) -> np.ndarray:
 class _Feet:
     """The soles of a motion whose pelvis is where the body's is at rest, and which of their points carry it."""
 
-    def __init__(self, qpos: np.ndarray, time_s: np.ndarray) -> None:
-        both = sole_points(qpos)
-        self.points = np.concatenate([both["r"], both["l"]], axis=1)
+    def __init__(self, soles: Mapping[str, np.ndarray], time_s: np.ndarray) -> None:
+        self.points = np.concatenate([soles["r"], soles["l"]], axis=1)
         self.time_s = time_s
         self._sigma = _SMOOTH_S / float(np.median(np.diff(time_s)))
 
@@ -392,7 +391,7 @@ class _Feet:
 def _place(qpos: np.ndarray, feet: _Feet, path_m: np.ndarray | None, *, grounded: bool, cycle: bool) -> None:
     """Set the pelvis' place in `qpos`: on the floor z = 0, beginning over the origin."""
     body = load_body()
-    x, y, z = (body.joint_names.index(f"pelvis_t{axis}") for axis in "xyz")
+    x, y, z = (body.joint_names.index(n) for n in SLIDES)
     rest = body.mj_model.body("pelvis").pos[2]
     lowest = feet.lowest_m(cycle)
     if path_m is None:

@@ -180,13 +180,13 @@ def check_lens(matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float,
     if not np.isfinite(d).all():
         raise _invalid(key, f"distortion {d.tolist()}", "k1, k2, p1, p2, k3, finite; zeros for no distortion")
     radial = f"{d[0]:g}, {d[1]:g}, {d[4]:g}"
-    if not reaches_corners(m, d, size_px):
+    corner, r, distorted = _to_corner(m, d, size_px)
+    if not distorted[-1] >= corner:  # also where it overflows
         raise _invalid(
             key,
             f"radial distortion {radial} folds back before the corner of the picture",
             "coefficients k1 k2 p1 p2 k3 that hold over the whole picture",
         )
-    corner, r, distorted = _to_corner(m, d, size_px)
     straight = max(float(np.interp(corner, distorted, r)), 1e-9)
     if corner > _MOST_STRETCH * straight or 3 * np.hypot(d[2], d[3]) * straight > _MOST_STRETCH - 1:
         raise _invalid(

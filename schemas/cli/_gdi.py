@@ -53,7 +53,7 @@ def gdi(motions: Path | None, method: str | None, detector: str, quick: bool, ou
         "motions": motions is not None,
         "seconds": round(time.perf_counter() - start, 1),
     }
-    paths = write_corpus(out, errors, about)
+    paths = write_corpus(out, errors, tables, about)
     failed = sum(code != "" for code in errors["error"])
     click.echo(
         f"\n{len(cases)} cases ({failed} not fitted): walks {made - start:.0f} s, fits and measures "

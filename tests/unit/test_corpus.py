@@ -172,7 +172,7 @@ def test_a_case_that_cannot_be_fitted_keeps_its_code(tmp_path):
     tables: Any = corpus_tables(errors)
     assert tables["index: error by view (true events)"]["none"][0] == 1
     assert "index" in print_corpus(tables)
-    paths = write_corpus(tmp_path / "out", errors, {"detector": "blazepose"})
+    paths = write_corpus(tmp_path / "out", errors, tables, {"detector": "blazepose"})
     assert all(p.stat().st_size > 100 for p in paths)
     assert "NaN" not in paths[1].read_text()
 

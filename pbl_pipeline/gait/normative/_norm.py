@@ -194,13 +194,10 @@ def load_norm(name: str = DEFAULT_NORM) -> NormativeSet:
     Raises `PblError` NORM_UNKNOWN; NORM_INVALID where the file is damaged or its people are too few for its components;
     ANGLE_UNITS.
     """
-    if name.endswith(".json"):
-        if not Path(name).is_file():
-            raise _unknown(name)
-    elif name not in norm_names():
+    shipped = not name.endswith(".json")
+    if name not in norm_names() if shipped else not Path(name).is_file():
         raise _unknown(name)
     try:
-        shipped = not name.endswith(".json")
         data = parse_json(_FOLDER.joinpath(name + ".json").read_text()) if shipped else read_json(name)
         checksum = data.pop("sha256")
         if _checksum(data) != checksum:
