@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -281,10 +282,19 @@ def _marker_blocks(
 
 def _with_room(H: Array, g: Array, B: Array, C: Array, h: Array, columns: _Columns) -> _Blocks:
     """The keypoints' blocks with room for all shared unknowns and no links yet."""
-    at, size = np.r_[columns.s, columns.offset, columns.detector], columns.size
-    C = jnp.zeros((size, size)).at[at[:, None], at].set(C)
-    B = jnp.zeros((*B.shape[:2], size)).at[..., at].set(B)
-    return _Blocks(H, g, jnp.zeros_like(H), B, C, jnp.zeros(size).at[at].set(h))
+    among_all = functools.partial(_spread, at=(columns.s, columns.offset, columns.detector), size=columns.size)
+    return _Blocks(H, g, jnp.zeros_like(H), among_all(B), among_all(among_all(C).T).T, among_all(h))
+
+
+def _spread(a: Float[Array, "*n A"], at: Sequence[slice], size: int) -> Float[Array, "*n {size}"]:
+    """Values of some of the shared unknowns, one slice after the other in `a`, among all of them, zeros elsewhere. (A
+    scatter would do the same; on a GPU it took a quarter of a fit.)"""
+    zeros = lambda n: jnp.zeros((*a.shape[:-1], n), a.dtype)  # noqa: E731
+    parts, end = [], 0
+    for part, where in zip(jnp.split(a, np.cumsum([s.stop - s.start for s in at])[:-1], axis=-1), at, strict=True):
+        parts += [zeros(where.start - end), part]
+        end = where.stop
+    return jnp.concatenate([*parts, zeros(size - end)], axis=-1)
 
 
 def _cross_matrix(x: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
@@ -417,14 +427,14 @@ def _add_soles(sum_: _Blocks, p: Problem, w: Weights, state: State, soles: _Sole
     h = h.at[:n_s].add(jnp.sum(force[:, both], axis=0))
 
     # The shared unknowns of the soles are s and the floors, which do not lie side by side.
-    at = jnp.r_[columns.s, columns.floor]
+    among_all = functools.partial(_spread, at=(columns.s, columns.floor), size=columns.size)
     return sum_._replace(
         H=sum_.H.at[:, :q, :q].add(H),
         g=sum_.g.at[:, :q].add(-g),
         link=sum_.link.at[:, :q, :q].add(K[:, first, second]),
-        B=sum_.B.at[:, :q, at].add(B),
-        C=sum_.C.at[at[:, None], at].add(C),
-        h=sum_.h.at[at].add(-h),
+        B=sum_.B.at[:, :q].add(among_all(B)),
+        C=sum_.C + among_all(among_all(C).T).T,
+        h=sum_.h - among_all(h),
     )
 
 
