@@ -119,6 +119,12 @@ class Site:
                 alive[i].start()
         self.bosses = [alive[i] for i in range(n)]
 
+    def end_bosses(self) -> None:
+        for boss in self.bosses:
+            boss.terminate()
+        for boss in self.bosses:
+            boss.join(60)
+
     def children(self) -> list[int]:
         """The working processes."""
         return [child for b in self.bosses if (child := _child_of(b.pid))]
@@ -216,9 +222,11 @@ def main(minutes: float, seed: int, supervisors: int) -> None:
         patch.setenv(worker_standins.RECORDED, str(chain.small_video(home, "recorded")))
         patch.setenv(worker_standins.SLEEP, "0.1")
         _pass_for_a_machine()
+        site = Site(home, random.Random(seed))
         try:
-            wrong = _run(Site(home, random.Random(seed)), minutes, supervisors, can_fill)
+            wrong = _run(site, minutes, supervisors, can_fill)
         finally:
+            site.end_bosses()
             database.remove_home(home / "nothing")
             from schemas import embedded
 
@@ -268,10 +276,7 @@ def _run(site: Site, minutes: float, supervisors: int, can_fill: bool) -> list[s
     wrong = _status(site, supervisors, ended + STATUS_S)
     wrong += _drain(site, supervisors, ended + DRAIN_S)
     click.echo(f"all done {time.monotonic() - ended:.0f} s after the last fault; {registered} recordings")
-    for boss in site.bosses:
-        boss.terminate()
-    for boss in site.bosses:
-        boss.join(60)
+    site.end_bosses()
     return wrong + _left(registered)
 
 
