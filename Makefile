@@ -7,6 +7,8 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
             if command -v $$p >/dev/null && $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; \
             then echo $$p; break; fi; done)
 OUT    ?= pbl_demo
+JOBS   ?= 2# test processes, a file of tests at a time
+PYTEST := $(BIN)/pytest --numprocesses $(JOBS) --dist loadfile
 
 .PHONY: demo test test-fast lint format lock clean help
 
@@ -17,10 +19,10 @@ demo: $(READY)  ## put the demo recording through every table and show the resul
 	$(BIN)/pbl demo --out $(OUT)
 
 test: $(READY)  ## the tests
-	$(BIN)/pytest
+	$(PYTEST)
 
 test-fast: $(READY) ## the tests that take a minute and a half: no database, no fit, no network over a video
-	$(BIN)/pytest -m "not slow and not database and not needs_extra"
+	$(PYTEST) -m "not slow and not database and not needs_extra"
 
 lint: $(READY)  ## style, formatting and types
 	$(BIN)/ruff check .

@@ -142,6 +142,7 @@ def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
     try:
         manifest = json.loads((folder / "manifest.json").read_text())
         parts = manifest["sha256"]
+        manifest.setdefault("n_recordings", 0)  # a backup of before they were saved
         if manifest["format"] != FORMAT:
             raise _invalid(folder, f"format {manifest['format']}", f"format {FORMAT}")
     except FileNotFoundError as error:

@@ -12,7 +12,7 @@ from typing import Any
 
 from . import lab, session, video
 from .codes import check_subject, day_of
-from .ingest import METHOD_FIELDS, Methods, in_transaction, next_id, resolve, selections
+from .ingest import METHOD_FIELDS, Methods, check_owner, in_transaction, next_id, resolve, selections
 from .rows import utc_now
 
 #: Rows in one transaction.
@@ -48,7 +48,8 @@ def register_many(recordings: Iterable[Recording], methods: Methods | None = Non
     Raises
     ------
     PblError
-        USAGE for a subject code that could be a name; SOLVER_UNKNOWN, NORM_UNKNOWN.
+        USAGE for a subject code that could be a name; SOLVER_UNKNOWN, NORM_UNKNOWN; VIDEO_DUPLICATE where another
+        subject has the same bytes (earlier transactions stay).
     """
     chosen = resolve(methods or Methods())
     out = Registered()
@@ -69,7 +70,11 @@ def _chunks(recordings: Iterable[Recording]) -> Iterator[list[Recording]]:
 
 def _insert(chunk: list[Recording], chosen: dict[str, str]) -> int:
     here = [{"video_sha256": r.sha256} for r in chunk]
-    known = set((video.Video & here).to_arrays("video_sha256"))
+    owned = video.Video * session.Session.proj("subject", "session_label") & here
+    known = {row["video_sha256"]: row for row in owned.proj("video_sha256", "subject", "session_label").to_dicts()}
+    for r in chunk:
+        if r.sha256 in known:
+            check_owner(known[r.sha256], r.subject, r.session_label, r.path)
     new = {r.sha256: r for r in chunk if r.sha256 not in known}
     if not new:
         return 0

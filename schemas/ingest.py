@@ -249,19 +249,25 @@ def in_transaction(work: Callable[[], T], until: Callable[[], bool] = lambda: Fa
     raise AssertionError("unreachable")
 
 
+def check_owner(row: dict[str, Any], subject: str, session_label: str, path: str | Path) -> None:
+    """Raise `PblError` VIDEO_DUPLICATE where the bytes of `path` are registered (`row`) for another subject."""
+    if row["subject"] != subject:
+        owner = f"subject {row['subject']}, session {row['session_label']}"
+        raise PblError(
+            "VIDEO_DUPLICATE",
+            found=f"video_id {row['video_id']} of {owner}, has these bytes",
+            expected=f"a recording of subject {subject} (session {session_label}) and of nobody else",
+            next_step=f"find out whose recording it is; if not {row['subject']}'s, delete that video before",
+            key=path,
+        )
+
+
 def _known(
     path: Path, row: dict[str, Any], visit: Visit, chosen: dict[str, str], more: set[str], found: sensors.Read
 ) -> Ingested:
     """Update a registered video: its path if the old one is gone, and the camera, files and methods that were given."""
+    check_owner(row, visit.subject, visit.session_label, path)
     number = int(row["video_id"])
-    if row["subject"] != visit.subject:
-        raise PblError(
-            "VIDEO_DUPLICATE",
-            found=f"video_id {number} of subject {row['subject']}, session {row['session_label']}, has these bytes",
-            expected=f"a recording of subject {visit.subject} (session {visit.session_label}) and of nobody else",
-            next_step=f"find out whose recording it is; if not {row['subject']}'s, delete that video before",
-            key=path,
-        )
     status, notes = "known", [f"already video_id {number} of subject {row['subject']}, session {row['session_label']}"]
     if str(path) != row["video_path"] and not Path(row["video_path"]).is_file():
         video.Video.update1({"video_id": number, "video_path": str(path), "video_name": path.name[-255:]})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import glob
 import os
+import secrets
 import shutil
 import tempfile
 import zipfile
@@ -19,14 +20,15 @@ from pbl_pipeline.errors import PblError
 from . import connection
 from ._datajoint import backend_of, build_object_path, full_path
 
-#: How the names of temporary folders begin; the number of the process follows.
-_PREFIX = "pbl-files-"
+#: How the names of temporary folders begin; the number of the process follows, then its own word, because a container
+#: that is started again has processes of the same numbers.
+_PREFIX, _OWN = "pbl-files-", secrets.token_hex(4)
 
 
 @contextmanager
 def new_folder() -> Iterator[Path]:
     """A folder for a file that is about to enter the object store or was taken from it; gone afterwards."""
-    with tempfile.TemporaryDirectory(prefix=f"{_PREFIX}{os.getpid()}-") as folder:
+    with tempfile.TemporaryDirectory(prefix=f"{_PREFIX}{os.getpid()}-{_OWN}-") as folder:
         yield Path(folder)
 
 
@@ -34,8 +36,9 @@ def remove_left_folders() -> list[Path]:
     """Remove such folders of processes that were killed; returns those that this account may not remove."""
     left = []
     for path in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
-        pid = path.name.removeprefix(_PREFIX).split("-")[0]
-        if pid.isdecimal() and not _alive(int(pid)) and not path.is_symlink():
+        pid, own, *_ = [*path.name.removeprefix(_PREFIX).split("-"), ""]
+        used = own == _OWN if pid == str(os.getpid()) else not pid.isdecimal() or _alive(int(pid))
+        if not used and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)
             if path.exists():
                 left.append(path)

@@ -7,6 +7,8 @@ import subprocess
 
 #: Variable by which a process sees only some of the GPUs; batch systems set it for a job.
 VISIBLE = "CUDA_VISIBLE_DEVICES"
+#: After so long a driver that does not answer counts as none.
+QUERY_S = 30.0
 
 
 def given_gpus() -> tuple[str, ...]:
@@ -16,7 +18,8 @@ def given_gpus() -> tuple[str, ...]:
     if listed is None:
         query = ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]
         try:
-            listed = ",".join(subprocess.run(query, capture_output=True, text=True, check=True).stdout.split())
-        except (OSError, subprocess.CalledProcessError):
+            done = subprocess.run(query, capture_output=True, text=True, check=True, timeout=QUERY_S)
+            listed = ",".join(done.stdout.split())
+        except (OSError, subprocess.SubprocessError):
             return ()
     return tuple(name for name in map(str.strip, listed.split(",")) if name not in ("", "-1", "NoDevFiles"))

@@ -10,6 +10,7 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 from schemas import worker
+from schemas.coded_errors import error_message
 from schemas.jobs import jobs_of
 
 from . import queue
@@ -69,7 +70,7 @@ def _crash(job: Claim, n: int, reason: str) -> str:
         next_step="check memory (exit by SIGKILL) and the recording; then `pbl retry`, or report it",
         key=str(job),
     )
-    return f"PblError: {error}"
+    return error_message(error, job.table.__name__, job.key)
 
 
 def overdue(job: Claim, limit_s: float) -> bool:
@@ -81,7 +82,7 @@ def overdue(job: Claim, limit_s: float) -> bool:
         next_step="look at the recording; `pbl worker --limit-factor 4` allows more, then `pbl retry`",
         key=str(job),
     )
-    return queue.fail(job, f"PblError: {error}")
+    return queue.fail(job, error_message(error, job.table.__name__, job.key))
 
 
 def _alive(row: dict[str, Any], table: Any) -> bool:

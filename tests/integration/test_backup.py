@@ -178,6 +178,12 @@ def test_a_changed_backup_is_refused_before_anything_is_written(elsewhere: Any, 
     (saved / "manifest.json").unlink()
     assert pbl("db", "restore", saved).error_code == "BACKUP_INVALID"
     assert everything() == {}
+    # One of before recordings were saved is whole without their number.
+    (saved / "store.sha256").write_text(listing)
+    manifest["sha256"]["store.sha256"] = backup_files.sha256_of(saved / "store.sha256")
+    del manifest["n_recordings"]
+    (saved / "manifest.json").write_text(json.dumps(manifest))
+    assert backup.check(saved)["n_recordings"] == 0
 
 
 def test_a_lost_file_and_a_full_folder_are_said(filled: None, tmp_path: Path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import errno
 import os
 import re
@@ -213,6 +214,17 @@ def test_the_command_says_what_it_needs(tables: None, monkeypatch):
     result = CliRunner().invoke(cron, ["import"])
     assert isinstance(result.exception, PblError)
     assert result.exception.code == "USAGE"
+
+
+def test_another_persons_bytes_are_refused_among_many(tables: None):
+    one = Recording("a.mp4", "1" * 64, 9, "P001", "2026-01-02")
+    assert register_many([one, one]).new == 1
+    with pytest.raises(PblError, match=r"(?s)P001, session 2026-01-02.*subject P002") as error:
+        register_many(
+            [dataclasses.replace(one, path="b.mp4", subject="P002"), dataclasses.replace(one, sha256="2" * 64)]
+        )
+    assert error.value.code == "VIDEO_DUPLICATE"
+    assert len(video.Video()) == 1
 
 
 def test_all_other_jobs_run(tables: None, tmp_path: Path):

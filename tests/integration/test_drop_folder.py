@@ -19,6 +19,7 @@ import pytest
 from schemas import archive as layout
 from schemas import backup, connection, forget, lab, session, uploads, video, worker
 from schemas.ingest import Visit, ingest
+from schemas.stored_files import new_folder, remove_left_folders
 from tests.command import pbl
 from workers import incoming
 
@@ -282,6 +283,7 @@ def test_what_a_killed_import_left_goes_with_the_next_run_and_with_the_person(
     ended.wait()
     (tmp_path / f"pbl-files-{ended.pid}-abc").mkdir()
     (tmp_path / f"pbl-files-{ended.pid}-abc" / "keypoints.npz").write_bytes(b"a person")
+    # A container that was started again has a process of the number that left this one.
     (tmp_path / f"pbl-files-{os.getpid()}-abc").mkdir()
     dry = pbl("forget", "P017", "--videos")
     assert dry.code == 0, dry.err
@@ -295,10 +297,12 @@ def test_what_a_killed_import_left_goes_with_the_next_run_and_with_the_person(
     done = pbl("forget", "P017", "--yes", "--videos")
     assert done.code == 0, done.err + done.out
     assert "and no recording" in done.out
+    with new_folder() as used:
+        assert not remove_left_folders()
+        assert [p.name for p in tmp_path.glob("pbl-files-*")] == [used.name]
     assert f"the archive {archive}, the drop folder: {drop}" in done.out
     assert not [p for p in [*drop.rglob("*"), *archive.rglob("*")] if "P017" in str(p.relative_to(tmp_path))]
     assert "P017" not in (archive / ".incoming" / "seen.json").read_text()
-    assert [p.name for p in tmp_path.glob("pbl-files-*")] == [f"pbl-files-{os.getpid()}-abc"]
     proof = json.loads(forget.manifest_path("P017").read_text())
     assert (proof["state"], proof["kept"], proof["left"]) == ("done", {}, [])
     forget.manifest_path("P017").unlink()

@@ -242,8 +242,7 @@ def test_frames_and_phone_samples_are_drawn_from_those_that_count(handheld):
 
 def test_a_held_phone_is_recovered(handheld):
     qpos, seen, session = handheld
-    params = dataclasses.replace(PAPER_2025, steps=1500, samples_per_trial=32, hidden=(128, 128), start="keypoints")
-    solution = solve_implicit(session, params)
+    solution = solve_implicit(session, quick(1500, start="keypoints"))
     names = list(session.body.joint_names)
     columns = [names.index(f"{j}_{s}") for j in ("hip_flexion", "knee_angle") for s in "rl"]
     for i, (q, one) in enumerate(zip(qpos, seen, strict=True)):

@@ -11,7 +11,7 @@ from unittest import mock
 import pytest
 
 from tests.command import program
-from workers import process
+from workers import devices, process
 from workers.devices import VISIBLE, given_gpus
 from workers.process import Options
 from workers.supervisor import Supervisor
@@ -29,10 +29,13 @@ def test_a_batch_system_says_which_gpus_are_ours(listed: str, expected: tuple, m
     assert given_gpus() == expected
 
 
-@pytest.mark.parametrize(("answer", "expected"), [("echo 0\necho 1", ("0", "1")), ("exit 9", ()), (None, ())])
+@pytest.mark.parametrize(
+    ("answer", "expected"), [("echo 0\necho 1", ("0", "1")), ("exit 9", ()), ("exec /bin/sleep 60", ()), (None, ())]
+)
 def test_otherwise_the_driver_lists_them(answer: str | None, expected: tuple, tmp_path: Path, monkeypatch):
     monkeypatch.delenv(VISIBLE, raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(devices, "QUERY_S", 0.5)
     if answer is not None:
         program(tmp_path, "nvidia-smi", answer)
     assert given_gpus() == expected

@@ -68,13 +68,12 @@ def worker(
 
     schemas.activate(methods=False)  # a wrong address or login is reported here, not by a process that is started again
     to_stderr()
-    gpus = given_gpus()
-    n_fit = len(gpus) if FIT in GROUPS[resource] else 0
+    gpus = given_gpus() if FIT in GROUPS[resource] else ()
     options = Options(
         resource=resource,
-        processes=processes or n_fit or 1,
+        processes=processes or len(gpus) or 1,
         # Among so many sessions are enough of one size to be solved together.
-        batch=batch or (128 if n_fit else 1),
+        batch=batch or (128 if gpus else 1),
         gpus=gpus,
         once=once,
         max_jobs=max_jobs,
