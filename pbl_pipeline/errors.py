@@ -48,6 +48,7 @@ CODES: dict[str, str] = {
     "ANGLE_UNITS": "joint angles are not in degrees",
     "NORM_UNKNOWN": "no normative set has that name",
     "NORM_INVALID": "the normative data cannot support the index (too few cycles, wrong size)",
+    "STATS_INPUT": "the values do not support the statistic: too few, missing, without variation, or of another shape",
     "DB_NOT_RUNNING": "the database does not answer",
     "DB_UNAVAILABLE": "no database server can be obtained on this machine",
     "DB_REFUSED": "the database answers but refuses the login or the operation",

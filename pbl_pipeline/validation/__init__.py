@@ -28,7 +28,7 @@ from ._sources import (
     reference_of_mot,
     reference_of_qpos,
 )
-from ._statistics import NIQR_FACTOR, median_niqr, niqr
+from ._statistics import median_niqr, niqr
 from ._table import Cell, Table
 from ._true_fit import fit_of_qpos
 from ._view import view_classes
@@ -43,7 +43,6 @@ __all__ = [
     "JOINTS_CLIP",
     "JOINTS_OPENCAP",
     "JOINTS_PAPER",
-    "NIQR_FACTOR",
     "QPOS",
     "RELIABILITY_COLUMNS",
     "Case",

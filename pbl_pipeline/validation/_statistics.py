@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-#: IQR to the standard deviation of a normal distribution.
-NIQR_FACTOR = 0.7413
+from pbl_pipeline.stats import niqr as niqr_of_all
 
 
 def median_niqr(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
@@ -26,10 +25,7 @@ def median_niqr(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
 def niqr(values: Sequence[float] | np.ndarray) -> float:
     """IQR * 0.7413 of the finite values; NaN with fewer than two."""
     v = _finite(values)
-    if v.size < 2:
-        return float("nan")
-    low, high = np.percentile(v, [25, 75])
-    return float(NIQR_FACTOR * (high - low))
+    return niqr_of_all(v) if v.size >= 2 else float("nan")
 
 
 def pearson(a: Sequence[float] | np.ndarray, b: Sequence[float] | np.ndarray) -> tuple[float, float, int]:

@@ -1,0 +1,283 @@
+"""Permutation inference over curves of the gait cycle."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from ._input import fraction, numbers, one_of, refuse, same_length
+
+CURVE_METHODS = ("max-t", "cluster")
+
+
+@dataclasses.dataclass(frozen=True)
+class Phase:
+    """A part of the cycle in which the curves differ.
+
+    Attributes
+    ----------
+    first, last
+        Its first and last point, in percent of the cycle.
+    sign
+        1 where a is larger than b, else -1.
+    p
+        Corrected for the whole cycle: of the cluster, or ("max-t") the smallest of its points.
+    """
+
+    first: float
+    last: float
+    sign: int
+    p: float
+
+
+@dataclasses.dataclass(frozen=True)
+class CurveTest:
+    """A test of two sets of curves.
+
+    Attributes
+    ----------
+    method, paired, alpha
+        As asked.
+    percent, difference, t, p : (P,)
+        Points of the cycle; mean of a - b over persons, in the unit of the curves; its t; p corrected for the whole
+        cycle ("cluster": that of the cluster a point is in, 1 outside).
+    threshold
+        "max-t": |t| above it is significant. "cluster": |t| above it belongs to a cluster.
+    p_value
+        Of the hypothesis that the curves differ nowhere: the smallest of `p`.
+    phases
+        Where they differ, p <= alpha.
+    n_a, n_b
+        Persons (not curves).
+    permutations, exact
+        How many, the data's own among them; whether these are all there are.
+    smallest_p
+        No smaller p is possible with so few persons and permutations.
+    """
+
+    method: str
+    paired: bool
+    alpha: float
+    percent: np.ndarray
+    difference: np.ndarray
+    t: np.ndarray
+    p: np.ndarray
+    threshold: float
+    p_value: float
+    phases: tuple[Phase, ...]
+    n_a: int
+    n_b: int
+    permutations: int
+    exact: bool
+    smallest_p: float
+
+
+def curve_test(
+    a: Any,
+    b: Any,
+    *,
+    paired: bool,
+    persons_a: Any = None,
+    persons_b: Any = None,
+    method: str = "max-t",
+    alpha: float = 0.05,
+    cluster_p: float = 0.01,
+    n_permutations: int = 10_000,
+    seed: int = 0,
+) -> CurveTest:
+    """Where over the gait cycle curves of two conditions, or of two groups of persons, differ. Two-sided.
+
+    Nonparametric mapping (Nichols & Holmes 2002, Hum Brain Mapp 15:1-25; for gait curves Pataky et al. 2015, J Biomech
+    48:1277-1285). A person's curves are averaged first and persons are permuted, never repeats, so that persons may
+    have any number of curves. Paired: the signs of the persons' differences are flipped; t is that of paired values.
+    Unpaired: the persons' group labels are permuted; t is Welch's, which holds the error rate also where the groups
+    differ in variance and size (Janssen 1997, Stat Probab Lett 36:9-21).
+    "max-t" compares each |t| with the largest over the cycle, and judges each point. "cluster" compares the sum of |t|
+    over neighbouring points of one sign with |t| above its quantile at `cluster_p` (Maris & Oostenveld 2007, J Neurosci
+    Methods 164:177-190): it finds long weak phases and judges no single point.
+
+    Parameters
+    ----------
+    a, b : (N, P), (M, P)
+        Curves at the same P points from 0 to 100 % of the cycle, in one unit.
+    persons_a, persons_b : (N,), (M,)
+        Whose curve each is. Without them each row is a person of its own ("paired": the same in both, in order).
+    n_permutations
+        At most; all there are where these are no more.
+
+    Raises
+    ------
+    PblError
+        STATS_INPUT: NaN, other shapes, a point at which no curve differs, persons with one condition only (paired) or
+        in both groups (unpaired), so few persons or permutations that no p could be as small as `alpha`.
+    """
+    one_of(method, CURVE_METHODS, "method")
+    for value, name in ((alpha, "alpha"), (cluster_p, "cluster_p")):
+        fraction(value, name)
+    x, names_a = _per_person(a, persons_a, "a")
+    y, names_b = _per_person(b, persons_b, "b")
+    if x.shape[1] != y.shape[1]:
+        raise refuse(f"curves of {x.shape[1]} and {y.shape[1]} points", "one length", "resample to the same points")
+    generator = np.random.default_rng(seed)
+    if paired:
+        _same_persons(names_a, names_b)
+        t, exact = _flipped(_scaled(x - y), n_permutations, generator)
+        df, mirrored = len(x) - 1, True
+    else:
+        _other_persons(persons_a, persons_b, names_a, names_b)
+        t, exact = _relabelled(_scaled(np.vstack([x, y])), len(x), n_permutations, generator)
+        df, mirrored = len(x) + len(y) - 2, len(x) == len(y)
+    # The data's own order is the first; in a complete list its mirror image has the same |t|.
+    smallest = (2 if exact and mirrored else 1) / len(t)
+    if smallest > alpha:
+        raise refuse(
+            f"{len(x)} and {len(y)} persons, {len(t)} permutations: no p is smaller than {smallest:.2g}",
+            f"enough for p = {alpha:g} (paired 6 persons, unpaired 4 and 4 at 0.05)",
+            "record more persons, or raise n_permutations",
+        )
+    if method == "max-t":
+        threshold, p = _by_maximum(np.abs(t), alpha)
+    else:
+        threshold = float(stats.t.isf(cluster_p / 2, df))
+        p = _by_cluster(t, threshold)
+    runs = _runs(np.where(p <= alpha, np.sign(t[0]), 0))
+    percent = np.linspace(0, 100, len(p))
+    return CurveTest(
+        method=method,
+        paired=paired,
+        alpha=alpha,
+        percent=percent,
+        difference=x.mean(axis=0) - y.mean(axis=0),
+        t=t[0],
+        p=p,
+        threshold=threshold,
+        p_value=float(p.min()),
+        phases=tuple(
+            Phase(float(percent[i]), float(percent[j - 1]), int(np.sign(t[0, i])), float(p[i:j].min())) for i, j in runs
+        ),
+        n_a=len(x),
+        n_b=len(y),
+        permutations=len(t),
+        exact=exact,
+        smallest_p=smallest,
+    )
+
+
+def _per_person(curves: Any, persons: Any, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """(persons, P) mean curves and the persons' labels."""
+    values = numbers(curves, name, ndim=2)
+    if values.shape[1] < 2:
+        raise refuse(f"{name}: curves of {values.shape[1]} point(s)", "several", "pass curves (N, points)")
+    if persons is None:
+        return values, np.arange(len(values))
+    labels = np.asarray(persons)
+    same_length(values, labels)
+    names, index, counts = np.unique(labels, return_inverse=True, return_counts=True)
+    sums = np.zeros((len(names), values.shape[1]))
+    np.add.at(sums, index, values)
+    return sums / counts[:, None], names
+
+
+def _same_persons(a: np.ndarray, b: np.ndarray) -> None:
+    if odd := sorted({str(v) for v in a} ^ {str(v) for v in b}):
+        raise refuse(
+            f"{len(odd)} person(s) with curves of one condition only: {', '.join(odd[:5])}",
+            "both conditions of every person",
+            "leave these persons out and report them",
+        )
+
+
+def _other_persons(persons_a: Any, persons_b: Any, a: np.ndarray, b: np.ndarray) -> None:
+    if persons_a is not None and persons_b is not None and (both := sorted({str(v) for v in a} & {str(v) for v in b})):
+        raise refuse(
+            f"{len(both)} person(s) in both groups: {', '.join(both[:5])}",
+            "two groups of different persons",
+            "pass paired=True",
+        )
+
+
+def _scaled(curves: np.ndarray) -> np.ndarray:
+    """The curves in units of their root mean square at each point, which leaves t as it is."""
+    spread = np.ptp(curves, axis=0) if len(curves) else np.zeros(curves.shape[1])
+    flat = np.flatnonzero(~(spread > 1e-12 * np.maximum(np.abs(curves).max(axis=0, initial=0.0), 1e-300)))
+    if len(flat):
+        raise refuse(
+            f"no difference between persons at {len(flat)} point(s), the first {flat[0]} (counted from 0)",
+            "several persons whose curves differ at every point",
+            "leave points out that are the same by definition, or record more persons",
+        )
+    return curves / np.sqrt((curves**2).mean(axis=0))
+
+
+def _flipped(d: np.ndarray, most: int, generator: np.random.Generator) -> tuple[np.ndarray, bool]:
+    """(B, P) t of (n, P) differences under sign flips, the data's own first; whether B is all there are."""
+    n = len(d)
+    exact = 2**n <= most
+    if exact:
+        signs = 1.0 - 2.0 * ((np.arange(2**n)[:, None] >> np.arange(n)) & 1)
+    else:
+        signs = 1.0 - 2.0 * generator.integers(2, size=(most, n))
+        signs[0] = 1.0
+    mean = signs @ d / n
+    variance = ((d**2).sum(axis=0) / n - mean**2) / (n - 1)  # of the mean; a sign changes no square
+    return mean / np.sqrt(np.maximum(variance, 1e-18)), exact
+
+
+def _relabelled(x: np.ndarray, n_a: int, most: int, generator: np.random.Generator) -> tuple[np.ndarray, bool]:
+    """(B, P) Welch's t of (n, P) curves, of which the first `n_a` are group a, under permuted labels; as `_flipped`."""
+    n, n_b = len(x), len(x) - n_a
+    if min(n_a, n_b) < 2:
+        raise refuse(f"{n_a} and {n_b} persons", "two persons at least in each group", "record more persons")
+    exact = math.comb(n, n_a) <= most
+    if exact:
+        chosen = np.array(list(itertools.combinations(range(n), n_a)))
+    else:
+        chosen = np.argsort(generator.random((most, n)), axis=1)[:, :n_a]
+        chosen[0] = np.arange(n_a)
+    in_a = np.zeros((len(chosen), n))
+    np.put_along_axis(in_a, chosen, 1.0, axis=1)
+    centred = x - x.mean(axis=0)
+    mean_a = in_a @ centred / n_a
+    mean_b = -mean_a * n_a / n_b
+    squares_a = in_a @ centred**2
+    squares_b = (centred**2).sum(axis=0) - squares_a
+    variance = (squares_a / n_a - mean_a**2) / (n_a - 1) + (squares_b / n_b - mean_b**2) / (n_b - 1)
+    return (mean_a - mean_b) / np.sqrt(np.maximum(variance, 1e-18)), exact
+
+
+def _by_maximum(size: np.ndarray, alpha: float) -> tuple[float, np.ndarray]:
+    """Critical |t|, and p of each point: the fraction of permutations whose largest |t| is no smaller."""
+    largest = np.sort(size.max(axis=1))
+    p = _share(largest, size[0])
+    return float(largest[len(largest) - 1 - int(alpha * len(largest) + 1e-9)]), p
+
+
+def _by_cluster(t: np.ndarray, threshold: float) -> np.ndarray:
+    """p of each point: the fraction of permutations with a cluster of no smaller mass than its own; 1 outside."""
+    sign = np.sign(t) * (np.abs(t) > threshold)
+    largest, mass = np.zeros(len(t)), np.zeros(len(t))
+    for i in range(t.shape[1]):
+        goes_on = i > 0 and sign[:, i] == sign[:, i - 1]
+        mass = (np.where(goes_on, mass, 0.0) + np.abs(t[:, i])) * (sign[:, i] != 0)
+        largest = np.maximum(largest, mass)
+    largest.sort()
+    p = np.ones(t.shape[1])
+    for i, j in _runs(sign[0]):
+        p[i:j] = _share(largest, np.abs(t[0, i:j]).sum())
+    return p
+
+
+def _share(ordered: np.ndarray, values: Any) -> Any:
+    """Fraction of `ordered` that is no smaller than each value; equal ones differ in the last digits."""
+    return 1 - np.searchsorted(ordered, np.asarray(values) * (1 - 1e-9)) / len(ordered)
+
+
+def _runs(sign: np.ndarray) -> list[tuple[int, int]]:
+    """Begin and end (excluded) of the runs of one sign other than 0."""
+    edges = np.flatnonzero(np.diff(sign, prepend=0, append=0))
+    return [(int(i), int(j)) for i, j in itertools.pairwise(edges) if sign[i] != 0]

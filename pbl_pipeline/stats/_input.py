@@ -1,0 +1,78 @@
+"""What every statistic asks of its values before it computes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+
+
+def refuse(found: str, expected: str, next_step: str) -> PblError:
+    """A `PblError` STATS_INPUT."""
+    return PblError("STATS_INPUT", found=found, expected=expected, next_step=next_step)
+
+
+def numbers(values: Any, name: str, ndim: int = 1, missing: bool = False) -> np.ndarray:
+    """`values` as a float array of `ndim` dimensions without infinite values and, unless `missing`, without NaN.
+
+    Raises `PblError` STATS_INPUT.
+    """
+    try:
+        array = np.asarray(values, float)
+    except (TypeError, ValueError) as error:
+        raise refuse(f"{name}: {error}", "numbers", "convert the column to numbers") from None
+    if array.ndim != ndim:
+        raise refuse(f"{name} of shape {array.shape}", f"{ndim} dimension(s)", "pass an array of that shape")
+    if np.isinf(array).any():
+        raise refuse(f"{name}: {np.isinf(array).sum()} infinite values", "finite numbers", "look where they come from")
+    if not missing and np.isnan(array).any():
+        raise refuse(
+            f"{name}: {np.isnan(array).sum()} of {array.size} values missing (NaN)",
+            "a number everywhere",
+            "leave out the persons, visits or cycles concerned and report how many",
+        )
+    return array
+
+
+def sample(values: Any, name: str, at_least: int) -> np.ndarray:
+    """(N,) finite values of which there are `at_least` and not all the same. Raises `PblError` STATS_INPUT."""
+    array = numbers(values, name)
+    if len(array) < at_least:
+        raise refuse(f"{name}: {len(array)} values", f"at least {at_least}", "record more persons")
+    if not np.ptp(array) > 1e-12 * np.abs(array).max():
+        raise refuse(f"{name}: all {len(array)} values are {array[0]:g}", "values that differ", "check the column")
+    return array
+
+
+def same_length(a: np.ndarray, b: np.ndarray) -> None:
+    """Raises `PblError` STATS_INPUT where `a` and `b` cannot be pairs."""
+    if len(a) != len(b):
+        raise refuse(f"{len(a)} and {len(b)} values", "pairs", "pass both values of each person, in the same order")
+
+
+def changes(pre: Any, post: Any, at_least: int) -> np.ndarray:
+    """(N,) differences post - pre, or `pre` itself as the differences where `post` is None.
+
+    Raises `PblError` STATS_INPUT, also where all changes are the same.
+    """
+    if post is None:
+        return sample(pre, "changes", at_least)
+    before, after = numbers(pre, "pre"), numbers(post, "post")
+    same_length(before, after)
+    return sample(after - before, "changes (post - pre)", at_least)
+
+
+def fraction(value: float, name: str) -> float:
+    """A number between 0 and 1, both excluded. Raises `PblError` STATS_INPUT."""
+    if not 0 < value < 1:
+        raise refuse(f"{name} {value}", "a number between 0 and 1", f"correct {name}")
+    return float(value)
+
+
+def one_of(value: str, names: tuple[str, ...], what: str) -> str:
+    """Raises `PblError` STATS_INPUT where `value` is none of `names`."""
+    if value not in names:
+        raise refuse(f"{what} {value!r}", f"one of {', '.join(names)}", "choose one of these")
+    return value
