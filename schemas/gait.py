@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -153,7 +153,7 @@ class GaitCycle(dj.Computed):
     ---
     n_cycles        : int16                    # all complete cycles
     n_cycles_used   : int16                    # without first and last steps, odd lengths and odd curves
-    curves          : <object@arrays>          # npz: cycle_no (N), names (A), percent (P) of the cycle, curve (N,A,P) deg
+    curves          : <object@arrays>          # npz: cycle_no (N), names (A), percent (P) of the cycle, curve and curve_sd (N,A,P) deg
     {origin_columns("cycles")}
     """  # noqa: E501
 
@@ -364,7 +364,7 @@ def event_of_row(row: Mapping[str, Any]) -> lib.GaitEvent:
     )
 
 
-def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Mapping[str, np.ndarray] | None = None) -> lib.GaitCycle:
+def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Curves | None = None) -> lib.GaitCycle:
     """The library's `GaitCycle`."""
     from pbl_pipeline import gait as lib
 
@@ -386,8 +386,9 @@ def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Mapping[str, np.nda
             n_curves=None if row["cycle_curves_n"] is None else int(row["cycle_curves_n"]),
             failed_checks=tuple(row["cycle_failed_checks"]),
         ),
-        curves=dict(curves or {}),
+        curves=dict(curves.deg if curves else {}),
         curves_missing=row["curves_missing"],
+        curves_sd=dict(curves.sd_deg if curves else {}),
         lengths=lib.Lengths(
             number(row["cycle_stride_length"]),
             number(row["cycle_step_length"]),
@@ -407,26 +408,42 @@ def load_cycles(key: Mapping[str, Any], trial: str = "") -> list[lib.GaitCycle]:
 
 
 def save_curves(cycles: Sequence[lib.GaitCycle], path: Path) -> None:
-    """Write the curves of all cycles to one npz; a cycle without curves is NaN."""
+    """Write the curves of all cycles and their sd to one npz; what a cycle has not is NaN."""
     from pbl_pipeline.gait import REPORT_PERCENT
 
     percent = np.asarray(REPORT_PERCENT, np.float32)
     names = sorted({name for c in cycles for name in c.curves})
-    curve = np.full((len(cycles), len(names), len(percent)), np.nan, np.float32)
-    for i, cycle in enumerate(cycles):
-        for j, name in enumerate(names):
-            if name in cycle.curves:
-                curve[i, j] = cycle.curves[name]
-    numbers = np.asarray([c.number for c in cycles], np.int16)
-    np.savez_compressed(path, cycle_no=numbers, names=np.asarray(names, dtype=str), percent=percent, curve=curve)
+    unknown = np.full(len(percent), np.nan, np.float32)
+
+    def table(of: Callable[[lib.GaitCycle], Mapping[str, np.ndarray]]) -> np.ndarray:
+        rows = [[of(c).get(name, unknown) for name in names] for c in cycles]
+        return np.asarray(rows, np.float32).reshape(len(cycles), len(names), len(percent))
+
+    np.savez_compressed(
+        path,
+        cycle_no=np.asarray([c.number for c in cycles], np.int16),
+        names=np.asarray(names, dtype=str),
+        percent=percent,
+        curve=table(lambda c: c.curves),
+        curve_sd=table(lambda c: c.curves_sd),
+    )
 
 
-def load_curves(path: Path) -> dict[int, dict[str, np.ndarray]]:
-    """Curves by cycle number and name, (P,) degrees; cycles without curves have none."""
+class Curves(NamedTuple):
+    """Curves of one cycle and their standard deviations by name, each (P,) degrees; those that are known."""
+
+    deg: dict[str, np.ndarray]
+    sd_deg: dict[str, np.ndarray]
+
+
+def load_curves(path: Path) -> dict[int, Curves]:
+    """Curves by cycle number; cycles without curves have none."""
     with np.load(path, allow_pickle=False) as f:
         data = {k: f[k] for k in f.files}
-    out: dict[int, dict[str, np.ndarray]] = {}
-    for i, n in enumerate(data["cycle_no"]):
-        named = {str(name): data["curve"][i, j] for j, name in enumerate(data["names"])}
-        out[int(n)] = {name: c for name, c in named.items() if np.isfinite(c).all()}
-    return out
+    names = [str(name) for name in data["names"]]
+
+    def known(rows: np.ndarray) -> dict[str, np.ndarray]:
+        return {name: curve for name, curve in zip(names, rows, strict=True) if np.isfinite(curve).all()}
+
+    sd = data.get("curve_sd", np.full_like(data["curve"], np.nan))  # rows of before it was kept
+    return {int(n): Curves(known(a), known(b)) for n, a, b in zip(data["cycle_no"], data["curve"], sd, strict=True)}

@@ -89,6 +89,8 @@ class GDI(dj.Computed):
     gdi=null        : float64                  # (-) mean over all used cycles
     gdi_left=null   : float64                  # (-)
     gdi_right=null  : float64                  # (-)
+    gdi_sd=null     : float64                  # (-) standard deviation of the error of gdi
+    gdi_minimal_change=null : float64          # (-) minimal detectable change (90 percent) between two such visits
     gdi_n           : int16                    # cycles with an index
     gdi_gps=null       : float64               # (deg) Gait Profile Score of the person; null unless the norm has nine angles
     gdi_gps_left=null  : float64               # (deg)
@@ -154,6 +156,8 @@ class GDI(dj.Computed):
                 "gdi": number(result.mean),
                 "gdi_left": number(result.left),
                 "gdi_right": number(result.right),
+                "gdi_sd": number(result.sd),
+                "gdi_minimal_change": number(result.minimal_change),
                 "gdi_n": result.n,
                 **gps_row(result.profile, "gdi"),
                 **origin.row("gdi", method_hash=sha, model_sha256=norm_sha),
@@ -182,6 +186,8 @@ class SessionGdi(dj.Computed):
     session_gdi=null            : float64      # (-) mean over all used cycles
     session_gdi_left=null       : float64      # (-)
     session_gdi_right=null      : float64      # (-)
+    session_gdi_sd=null         : float64      # (-) standard deviation of the error of session_gdi
+    session_gdi_minimal_change=null : float64  # (-) minimal detectable change (90 percent) between two such visits
     session_gdi_n               : int16        # cycles with an index
     session_gps=null            : float64      # (deg) Gait Profile Score of the person; null unless the norm has nine angles
     session_gps_left=null       : float64      # (deg)
@@ -268,6 +274,8 @@ class SessionGdi(dj.Computed):
                 "session_gdi": number(index.mean),
                 "session_gdi_left": number(index.left),
                 "session_gdi_right": number(index.right),
+                "session_gdi_sd": number(index.sd),
+                "session_gdi_minimal_change": number(index.minimal_change),
                 "session_gdi_n": index.n,
                 **gps_row(index.profile, "session"),
                 "session_cycles": measures.n_cycles_used,

@@ -45,6 +45,8 @@ def session_summary(restriction: Any = True) -> pd.DataFrame:
         "session_gdi",
         "session_gdi_left",
         "session_gdi_right",
+        "session_gdi_sd",
+        "session_gdi_minimal_change",
         "session_gdi_n",
     )
     quality = qc.SessionQc.proj("qc_outcome", "qc_worst")
@@ -92,7 +94,7 @@ def trial_summary(restriction: Any = True) -> pd.DataFrame:
     events = gait.GaitEvents.proj("events_status", "events_reason", "n_events")
     cycles = gait.GaitCycle.proj("n_cycles", "n_cycles_used")
     measures = gait.Spatiotemporal.proj("cadence", "stride_time", "step_time", "stance", "swing", "double_support")
-    index = gdi.GDI.proj("gdi", "gdi_left", "gdi_right", "gdi_n")
+    index = gdi.GDI.proj("gdi", "gdi_left", "gdi_right", "gdi_sd", "gdi_minimal_change", "gdi_n")
     joined = current_sets() * trials * events * cycles * measures * index
     return (joined & restriction).to_pandas(order_by="video_id").reset_index()
 

@@ -33,13 +33,15 @@ ANGLE_NAMES: dict[str, str] = {
 class AngleSeries:
     """Angles over a trial: `time_s` (T,), `left` and `right` map `ANGLE_NAMES` to (T,) degrees, NaN where unseen.
 
-    `angle_model` says how pelvis and hip are defined (`normative.ANGLE_MODELS`).
+    `angle_model` says how pelvis and hip are defined (`normative.ANGLE_MODELS`). `sd` maps sides to names to the
+    standard deviation (T,) deg of the angles whose uncertainty is known.
     """
 
     time_s: np.ndarray
     left: dict[str, np.ndarray]
     right: dict[str, np.ndarray]
     angle_model: str = BODY_ANGLES
+    sd: dict[str, dict[str, np.ndarray]] = dataclasses.field(default_factory=dict)
 
     def of_side(self, side: str) -> dict[str, np.ndarray]:
         """The angles of "left" or "right"."""
@@ -58,9 +60,18 @@ LEG_ANGLES = {
 
 def leg_angles(fit: TrialFit) -> dict[str, dict[str, np.ndarray]]:
     """Side -> name -> (T,) degrees: the body's own angles of hip, knee and ankle; those that the fit's body has."""
+    return _of_legs(fit, fit.qpos)
+
+
+def leg_angles_sd(fit: TrialFit) -> dict[str, dict[str, np.ndarray]]:
+    """The standard deviation (deg) of each of `leg_angles`, NaN where the fit knows none."""
+    return {side: {k: np.abs(v) for k, v in own.items()} for side, own in _of_legs(fit, fit.qpos_sd).items()}
+
+
+def _of_legs(fit: TrialFit, qpos: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
     from pbl_pipeline.body import joint_angles  # JAX loads only where a fit is read
 
-    angles = joint_angles(fit.joint_names, fit.qpos)
+    angles = joint_angles(fit.joint_names, qpos)
     return {
         side: {ours: angles[f"{own}_{side[0]}"] for ours, own in LEG_ANGLES.items() if f"{own}_{side[0]}" in angles}
         for side in SIDES
@@ -87,7 +98,7 @@ def angle_series(fit: TrialFit, poses: BodyPoses | None = None) -> AngleSeries:
             "pelvis_rotation": sign * rotation,
             "foot_progression": -out[:, i],
         }
-    return AngleSeries(np.asarray(fit.time_s, float), sides[LEFT], sides[RIGHT])
+    return AngleSeries(np.asarray(fit.time_s, float), sides[LEFT], sides[RIGHT], sd=leg_angles_sd(fit))
 
 
 def pelvis_angles(R_world_pelvis: np.ndarray, forward: np.ndarray) -> np.ndarray:

@@ -40,7 +40,8 @@ class GaitCycle:
     longer or shorter than the others (`odd_length`) or whose curves are far from the others' (`odd_curves`), and for
     all of a fit that failed; `exclusion` says why, `excluded` in words.
     `curves` maps names of `ANGLE_NAMES` to (51,) degrees at 0, 2, ..., 100 % of the cycle; empty where there is
-    no fit or frames are missing (`curves_missing` says which). `angle_model` says how the angles are defined.
+    no fit or frames are missing (`curves_missing` says which); `curves_sd` maps them to their standard deviation (deg),
+    where it is known. `angle_model` says how the angles are defined.
     `lengths` are those on the floor, None with the reason where they are not known.
     """
 
@@ -56,6 +57,7 @@ class GaitCycle:
     exclusion: Exclusion = dataclasses.field(default_factory=Exclusion)
     curves: dict[str, np.ndarray] = dataclasses.field(default_factory=dict, compare=False, repr=False)
     curves_missing: str = ""
+    curves_sd: dict[str, np.ndarray] = dataclasses.field(default_factory=dict, compare=False, repr=False)
     lengths: Lengths = dataclasses.field(default_factory=lambda: Lengths(missing=NO_POSITIONS))
     angle_model: str = BODY_ANGLES
 
@@ -142,9 +144,10 @@ def find_cycles(
             wanted = [(other, FOOT_UP), (other, FOOT_DOWN), (start.side, FOOT_UP)]
             if [(e.side, e.event) for e in inner] != wanted:
                 continue
-            curves, missing = {}, "no fit"
+            curves, missing, curves_sd = {}, "no fit", {}
             if series is not None:
                 curves, missing = cycle_curves(series, start.side, start.time_s, end.time_s)
+                curves_sd = _curves_sd(series, start, end) if curves else {}
             lengths = Lengths(missing=no_lengths)
             if feet is not None and not no_lengths:
                 times = (start.time_s, inner[1].time_s, end.time_s)
@@ -164,6 +167,7 @@ def find_cycles(
                 ),
                 curves=curves,
                 curves_missing=missing,
+                curves_sd=curves_sd,
                 lengths=lengths,
                 angle_model=series.angle_model if series is not None else BODY_ANGLES,
             )
@@ -197,3 +201,10 @@ def cycle_curves(
     at = start_s + percent / 100.0 * (end_s - start_s)
     curves = PchipInterpolator(time[part], values[part], axis=0)(at)
     return dict(zip(table, curves.T, strict=True)), ""
+
+
+def _curves_sd(series: AngleSeries, start: GaitEvent, end: GaitEvent) -> dict[str, np.ndarray]:
+    """Standard deviations (deg) at `REPORT_PERCENT` of the angles that have one."""
+    at = start.time_s + REPORT_PERCENT / 100.0 * (end.time_s - start.time_s)
+    own = {name: (sd, np.isfinite(sd)) for name, sd in series.sd.get(start.side, {}).items()}
+    return {name: np.interp(at, series.time_s[seen], sd[seen]) for name, (sd, seen) in own.items() if seen.any()}

@@ -9,7 +9,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Stage
-from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.paramset import Paramset, later
 from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
 
 from ._cycles import GaitCycle
@@ -37,14 +37,20 @@ class GdiParams:
         Fewer in all give a warning: single cycles vary by several points.
     min_explained
         A smaller fraction of a cycle's deviation inside the normative components gives a warning.
+    repeated
+        Fraction of the variance of the angles' error that two visits of one person have in common, filmed alike
+        (`pbl validate gdi`: 0.75 and more keep 9 of 10 errors of a change within `Gdi.minimal_change`).
     """
 
     norm: str = DEFAULT_NORM
     min_cycles_per_side: int = 1
     advised_cycles: int = 10
     min_explained: float = 0.5
+    repeated: float = later(0.75)
 
 
+#: A 90 % interval of a normal error, in standard deviations.
+Z90 = 1.6449
 #: The paper's index, and the original one (Schwartz & Rozumalski 2008).
 GDI_MODEL, GILLETTE_MODEL = "pbl-2025-three-angles", "gillette-2008"
 #: Angles that an index is made of.
@@ -74,7 +80,8 @@ class Gdi:
     """The index of one trial or session: means over used cycles, None where too few (`reason`).
 
     `mean` is over all cycles of both sides, `n` of them. Status PASS or EMPTY. `profile` says which angle deviates by
-    how much, None where there is no index.
+    how much, None where there is no index. `sd` is the standard deviation of the error of `mean`, None where the
+    angles' is not known; `minimal_change` what two visits filmed alike differ by, beyond chance in 9 of 10 cases.
     """
 
     status: str
@@ -91,6 +98,15 @@ class Gdi:
     cycles: tuple[GdiCycle, ...]
     qc: tuple[Check, ...]
     profile: MovementProfile | None = None
+    sd: float | None = None
+    minimal_change: float | None = None
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """That holds the true index in 9 of 10 cases; None where `sd` is not known."""
+        if self.mean is None or self.sd is None:
+            return None
+        return self.mean - Z90 * self.sd, self.mean + Z90 * self.sd
 
     @property
     def title(self) -> str:
@@ -99,8 +115,9 @@ class Gdi:
 
     def to_dict(self) -> dict:
         """`gdi` of metrics.json."""
-        left, right, mean = (None if v is None else round(v, 3) for v in (self.left, self.right, self.mean))
-        return {"left": left, "right": right, "mean": mean, "n": self.n, "norm": self.norm}
+        rounded = {k: _rounded(getattr(self, k)) for k in ("left", "right", "mean", "sd", "minimal_change")}
+        interval = None if self.interval is None else [_rounded(v) for v in self.interval]
+        return {**rounded, "interval": interval, "n": self.n, "norm": self.norm}
 
 
 def score_gdi(
@@ -158,8 +175,9 @@ def score_gdi(
     n_left, n_right = len(by_side[LEFT]), len(by_side[RIGHT])
     enough = min(n_left, n_right) >= params.min_cycles_per_side
     reason = "" if enough else _too_few(cycles, n_left, n_right, params)
-    profile = None
+    profile, sd, change_sd = None, None, None
     if enough:
+        sd, change_sd = _errors(usable, vectors, [c.gdi for c in scored], basis, params)
         scores = variable_scores(np.array(vectors), basis)
         sides = np.array([c.side for c in usable])
         profile = movement_profile({s: scores[sides == s] for s in (LEFT, RIGHT)}, basis)
@@ -178,13 +196,47 @@ def score_gdi(
         cycles=scored,
         qc=_checks(scored, {c.angle_model for c in usable}, basis, reason, params),
         profile=profile,
+        sd=sd,
+        minimal_change=None if change_sd is None else Z90 * change_sd,
     )
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)
+
+
+def _errors(
+    cycles: Sequence[GaitCycle],
+    vectors: Sequence[np.ndarray],
+    scores: Sequence[float],
+    norm: NormativeSet,
+    params: GdiParams,
+) -> tuple[float | None, float | None]:
+    """Standard deviation of the error of the mean index, and of the change between two such visits.
+
+    To first order in the angles' errors. What a fit is unsure of (`curves_sd`: the detector's errors, the lean) is the
+    same in all cycles, and on both sides, of an angle; what differs from cycle to cycle is in the spread of `scores`.
+    """
+    if not all(v in c.curves_sd for c in cycles for v in norm.variables):
+        return None, None
+    change = np.zeros(len(norm.variables))
+    for cycle, vector in zip(cycles, vectors, strict=True):
+        inside = norm.components @ (vector - norm.mean_deg)
+        slope = -10.0 / norm.ln_sd * (inside @ norm.components) / max(float(inside @ inside), 1e-12)
+        each = slope * _at_percent(cycle.curves_sd, norm)
+        change += each.reshape(len(change), -1).sum(axis=1) / len(cycles)
+    fit, walk = float(change @ change), float(np.var(scores, ddof=min(1, len(scores) - 1))) / len(scores)
+    return float(np.sqrt(fit + walk)), float(np.sqrt(2.0 * ((1.0 - params.repeated) * fit + walk)))
 
 
 def gdi_vector(cycle: GaitCycle, norm: NormativeSet) -> np.ndarray:
     """The feature vector of a cycle: the norm's angles one after another, each at the norm's percents."""
-    phase = np.linspace(0.0, 100.0, len(next(iter(cycle.curves.values()))))
-    return np.concatenate([np.interp(norm.percent, phase, cycle.curves[v]) for v in norm.variables])
+    return _at_percent(cycle.curves, norm)
+
+
+def _at_percent(curves: dict[str, np.ndarray], norm: NormativeSet) -> np.ndarray:
+    phase = np.linspace(0.0, 100.0, len(next(iter(curves.values()))))
+    return np.concatenate([np.interp(norm.percent, phase, curves[v]) for v in norm.variables])
 
 
 def _vector(cycle: GaitCycle, norm: NormativeSet) -> np.ndarray:

@@ -197,8 +197,16 @@ def _gdi_tile(gdi: Gdi) -> dict:
         "unit": "",
         "left": number(gdi.left, 1),
         "right": number(gdi.right, 1),
-        "note": f"sd {number(_gdi_sd(gdi), 1)}, n {gdi.n}",
+        "note": _interval(gdi) or f"sd {number(_gdi_sd(gdi), 1)}, n {gdi.n}",
     }
+
+
+def _interval(gdi: Gdi) -> str:
+    """The index's 90 % interval and its minimal change; empty where the angles' error is not known."""
+    if gdi.interval is None or gdi.minimal_change is None:
+        return ""
+    low, high = (number(v, 0) for v in gdi.interval)
+    return f"90 % interval {low} to {high}, minimal change {number(gdi.minimal_change, 0)}"
 
 
 def _measure_row(key: str, m: Measure | None, reason: str) -> dict:
@@ -242,6 +250,8 @@ def _index(gdi: Gdi) -> dict:
             f"Mean {number(gdi.mean, 1)} over {plural(gdi.n, 'cycle')}: left {number(gdi.left, 1)} "
             f"(n {gdi.n_left}), right {number(gdi.right, 1)} (n {gdi.n_right})"
         )
+        if interval := _interval(gdi):
+            text += f"; {interval}: less between two visits filmed alike may be chance"
     which = (
         "This is the original Gait Deviation Index of nine angles."
         if gdi.model == GILLETTE_MODEL

@@ -10,7 +10,7 @@ import numpy as np
 from pbl_pipeline.body import PELVIS_TURNS
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
-from pbl_pipeline.gait import trial_poses
+from pbl_pipeline.gait import Z90, trial_poses
 
 from ._align import MIN_COMMON, about_vertical, align_path, at_times, best_lag, unwrapped, vertical_turn, wrapped
 from ._joints import JOINTS_OPENCAP, JOINTS_PAPER
@@ -18,9 +18,6 @@ from ._reference import Reference
 from ._rotations import pelvis_angles_deg, pelvis_rotations
 from ._sources import fit_angles, fit_angles_sd
 from ._view import MIXED, view_of_fit
-
-#: Half width of a 90 % interval in standard deviations.
-Z_90 = 1.645
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,7 +214,7 @@ def _joint_error(
     if sd is not None:
         given = known & np.isfinite(sd)
         if given.any():
-            inside = float(np.mean(np.abs(difference[given]) <= Z_90 * np.asarray(sd)[given]))
+            inside = float(np.mean(np.abs(difference[given]) <= Z90 * np.asarray(sd)[given]))
     return JointError(
         joint=name,
         n=n,

@@ -13,7 +13,7 @@ import pandas as pd
 from pbl_pipeline.body import joint_angles
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit, SessionInput, TrialFit, fit_sessions
-from pbl_pipeline.gait import GaitCycle, find_cycles, gait_metrics, score_gdi, spatiotemporal
+from pbl_pipeline.gait import Z90, GaitCycle, find_cycles, gait_metrics, score_gdi, spatiotemporal
 from pbl_pipeline.paramset import Paramset
 
 from ._corpus import HEALTHY, Case
@@ -31,8 +31,6 @@ ANGLES = ("hip_flexion", "hip_adduction", "hip_rotation", "knee_flexion", "ankle
 LEAST_CHANGE = 3.0
 #: What two visits of one person have in common.
 _VISIT = ["person", "view", "camera"]
-#: A 90 % interval of a normal error, in standard deviations.
-_Z90 = 1.6449
 
 
 def corpus_errors(
@@ -43,9 +41,10 @@ def corpus_errors(
     """Fit every case as a session of one trial, all at once, and compare with its truth: one row per case.
 
     Columns: what the case is; `error`, a code where the fit failed; index and measures of the truth (`gdi_true`,
-    `cadence_true` ...), of the fit with the true events (`gdi`) and with detected ones (`gdi_detected`,
-    `cadence` ...); of each of `ANGLES`, mean over the sides: `_offset` (deg), `_sd` without it, `_ratio` of the ranges
-    and `_in90`, the fraction of the samples that lie in their 90 % intervals. NaN where there is none.
+    `cadence_true` ...), of the fit with the true events (`gdi`, with its `gdi_sd` and `gdi_minimal_change`) and with
+    detected ones (`gdi_detected`, `cadence` ...); of each of `ANGLES`, mean over the sides: `_offset` (deg), `_sd`
+    without it, `_ratio` of the ranges and `_in90`, the fraction of the samples that lie in their 90 % intervals. NaN
+    where there is none.
 
     Raises `PblError` SOLVER_UNKNOWN.
     """
@@ -76,7 +75,12 @@ def _row(case: Case, truth: TrialFit, measured: dict[str, float], result: Sessio
     if isinstance(result, PblError):
         return row
     fit = result.trials[0]
-    row["gdi"] = _measured(find_cycles(walk.events, fit))["gdi"]
+    index = score_gdi(find_cycles(walk.events, fit))
+    row |= {
+        "gdi": _number(index.mean),
+        "gdi_sd": _number(index.sd),
+        "gdi_minimal_change": _number(index.minimal_change),
+    }
     metrics = gait_metrics(result.trials, fit_checks=result.qc)
     row["gdi_detected"] = _number(metrics.gdi.mean)
     row |= {k: _value(metrics.spatiotemporal.measures.get(n)) for k, n in MEASURES.items()}
@@ -109,7 +113,7 @@ def _angle_errors(fit: TrialFit, truth: TrialFit) -> dict[str, float]:
             if len(off) < 10:
                 continue
             a, b = (np.subtract(*np.percentile(x[name][seen], [97.5, 2.5])) for x in (found, true))
-            inside = np.abs(off) <= _Z90 * np.abs(spread[name][seen])
+            inside = np.abs(off) <= Z90 * np.abs(spread[name][seen])
             known = np.isfinite(spread[name][seen])
             in90 = float(inside[known].mean()) if known.any() else float("nan")
             sides.append((off.mean(), off.std(), a / b if b > 1 else np.nan, in90))
@@ -197,11 +201,13 @@ def angle_table(errors: pd.DataFrame) -> pd.DataFrame:
 
 
 def coverage_table(errors: pd.DataFrame) -> pd.DataFrame:
-    """Fraction of the samples of each angle inside of its 90 % intervals."""
-    rows = [
-        {"cases": name} | {angle: group[f"{angle}_in90"].mean() for angle in ANGLES}
-        for name, group in _groups(errors).items()
-    ]
+    """Fraction of the samples of each angle, and of the cases' indices, inside of their 90 % intervals."""
+    rows = []
+    for name, group in _groups(errors).items():
+        known: Any = group[["gdi", "gdi_true", "gdi_sd"]].dropna()
+        inside = (known["gdi"] - known["gdi_true"]).abs() <= Z90 * known["gdi_sd"]
+        angles = {angle: group[f"{angle}_in90"].mean() for angle in ANGLES}
+        rows.append({"cases": name, **angles, "index": inside.mean(), "index sd": known["gdi_sd"].mean()})
     return pd.DataFrame(rows)
 
 
@@ -210,7 +216,8 @@ def responsiveness(errors: pd.DataFrame, found: str = "gdi", true: str = "gdi_tr
 
     Two visits: healthy and impaired, or two severities, seen from the same view. The fraction is the sum of the changes
     found over the sum of the true ones, so that small changes do not dominate; NaN where the true mean change is below
-    `LEAST_CHANGE`. `sd` is that of the error of a change, `se` the standard error of the fraction.
+    `LEAST_CHANGE`. `sd` is that of the error of a change, `se` the standard error of the fraction, `within` the
+    fraction of the errors that are below the minimal change of the first visit's index.
     """
     synthetic: Any = errors[errors["source"] == "synthetic"]
     healthy = synthetic[synthetic["condition"] == HEALTHY]
@@ -236,6 +243,7 @@ def responsiveness(errors: pd.DataFrame, found: str = "gdi", true: str = "gdi_tr
                 f"{label}: survives": change[known].sum() / total if enough else np.nan,
                 f"{label}: se": off.std() * np.sqrt(n) / abs(total) if enough else np.nan,
                 f"{label}: sd": off.std(),
+                f"{label}: within": (off.abs() <= both["gdi_minimal_change_before"][known]).mean(),
             }
         rows.append(row)
     return pd.DataFrame(rows)

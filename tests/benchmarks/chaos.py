@@ -38,8 +38,8 @@ from workers.process import Options
 HOST, INSERTS = "PBL_BENCH_HOST", "PBL_BENCH_INSERTS"
 #: Seconds until a process without a heartbeat counts as dead here, and the longest pause of one.
 DEAD_S, PAUSE_S = 8.0, 20.0
-#: Sizes of the two disks (MiB).
-DISKS = {"db": 700, "store": 96}
+#: Sizes of the two disks (MiB): of what is recorded while it runs, and room.
+DISKS = {"db": lambda minutes: 600 + 20 * minutes, "store": lambda minutes: 40 + 12 * minutes}
 #: After so long `pbl status` has to be right (s), and everything is to be done (s).
 STATUS_S, DRAIN_S = 120.0, 900.0
 
@@ -212,7 +212,7 @@ def _faults(site: Site, can_fill: bool) -> list[tuple[float, Any]]:
 def main(minutes: float, seed: int, supervisors: int) -> None:
     """Let things fail for some minutes, then count."""
     home = database.new_home()
-    with _disks(home) as can_fill, pytest.MonkeyPatch.context() as patch:
+    with _disks(home, minutes) as can_fill, pytest.MonkeyPatch.context() as patch:
         database.leave_nothing_of_the_developer(patch)
         (home / "inserts").mkdir()
         patch.setenv("PBL_HOME", str(home))
@@ -237,13 +237,13 @@ def main(minutes: float, seed: int, supervisors: int) -> None:
 
 
 @contextlib.contextmanager
-def _disks(home: Path) -> Iterator[bool]:
+def _disks(home: Path, minutes: float) -> Iterator[bool]:
     """Mount the small disks; whether that was allowed."""
     mounted: list[Path] = []
     try:
         for name, size in DISKS.items():
             (home / name).mkdir()
-            command = ["mount", "-t", "tmpfs", "-o", f"size={size}m,mode=755", "none", str(home / name)]
+            command = ["mount", "-t", "tmpfs", "-o", f"size={size(minutes):.0f}m,mode=755", "none", str(home / name)]
             if subprocess.run(command, check=False, capture_output=True).returncode == 0:
                 mounted.append(home / name)
         yield len(mounted) == len(DISKS)

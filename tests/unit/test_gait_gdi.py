@@ -124,12 +124,37 @@ def test_unused_cycles_do_not_count(toy):
     assert result.mean == pytest.approx(toy.index(good)[0])
 
 
+def test_the_index_is_as_unsure_as_its_angles_and_its_cycles(toy):
+    vectors = toy_vectors(6, seed=9) + 5.0
+    sd = dict(zip(THREE_ANGLES, (3.0, 1.0, 2.0), strict=True))
+    cycles = [
+        cycle(v, ("left", "right")[i % 2], i, curves_sd={k: np.full(51, s) for k, s in sd.items()})
+        for i, v in enumerate(vectors)
+    ]
+    result = score_gdi(cycles, toy)
+    # What all cycles have wrong alike, an angle at a time; and what differs from cycle to cycle.
+    step = 1e-3
+    moved = [(toy.index(vectors + step * np.repeat(np.eye(3)[k], 50)).mean() - result.mean) / step for k in range(3)]
+    fit = float(np.sum((np.array(moved) * list(sd.values())) ** 2))
+    walk = np.var([c.gdi for c in result.cycles], ddof=1) / 6
+    assert result.sd == pytest.approx(np.sqrt(fit + walk), rel=1e-3)
+    assert result.interval == pytest.approx(
+        (result.mean - 1.645 * result.sd, result.mean + 1.645 * result.sd), rel=1e-4
+    )
+    assert result.minimal_change == pytest.approx(1.645 * np.sqrt(2 * (0.25 * fit + walk)), rel=1e-3)
+    assert result.to_dict()["interval"] == pytest.approx(result.interval, abs=1e-3)
+    # Where the fit does not know how sure it is, the index does not either.
+    unknown = score_gdi([dataclasses.replace(c, curves_sd={}) if c.number == 0 else c for c in cycles], toy)
+    assert (unknown.mean, unknown.sd, unknown.interval, unknown.minimal_change) == (result.mean, None, None, None)
+
+
 @pytest.mark.parametrize("n_left", [0, 2])
 def test_too_few_cycles_give_none_with_a_reason(toy, n_left):
     result = score_gdi([cycle(toy.mean_deg + 1.0, number=i) for i in range(n_left)], toy)
     assert (result.status, result.mean, result.left) == ("EMPTY", None, None)
     assert f"{n_left} left and 0 right" in result.reason
-    assert result.to_dict() == {"left": None, "right": None, "mean": None, "n": n_left, "norm": "toy"}
+    none = dict.fromkeys(("left", "right", "mean", "sd", "minimal_change", "interval"))
+    assert result.to_dict() == {**none, "n": n_left, "norm": "toy"}
 
 
 def test_cycles_without_curves_are_named(toy):
