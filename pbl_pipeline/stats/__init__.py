@@ -10,7 +10,7 @@ from ._change import MIN_PERSONS, Srm, Wilcoxon, cohens_dz, effect_size, srm, wi
 from ._correlation import CORRELATIONS, Correlation, correlation
 from ._curves import CURVE_METHODS, CurveTest, Phase, curve_test
 from ._groups import MannWhitney, Test, compare_groups, hedges_g, mann_whitney, shapiro_wilk
-from ._icc import ICC_KINDS, Icc, icc, minimal_detectable_change, ratings_table
+from ._icc import ICC_INTERVALS, ICC_KINDS, Icc, icc, minimal_detectable_change, ratings_table
 from ._many import CORRECTIONS, adjust
 from ._paper import NIQR_FACTOR, median_of_medians, niqr
 from ._sample_size import DESIGNS, SampleSize, sample_size
@@ -21,6 +21,7 @@ __all__ = [
     "CORRELATIONS",
     "CURVE_METHODS",
     "DESIGNS",
+    "ICC_INTERVALS",
     "ICC_KINDS",
     "LIMIT_SD",
     "MIN_PERSONS",

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
-import numpy as np
 from scipy import stats
 
 from ._input import changes, fraction
@@ -52,10 +52,10 @@ def bland_altman(a: Any, b: Any, confidence: float = 0.95) -> BlandAltman:
     difference = changes(b, a, 3)
     fraction(confidence, "confidence")
     n, bias, sd = len(difference), float(difference.mean()), float(difference.std(ddof=1))
-    error = sd / np.sqrt(n)
+    error = sd / math.sqrt(n)
     # A limit mean + c sd, c standard errors of it: the noncentrality of (sample mean - limit) / error is -1.96 sqrt(n).
     tail = (1 - confidence) / 2
-    near, far = (float(stats.nct.ppf(q, n - 1, LIMIT_SD * np.sqrt(n))) * error for q in (tail, 1 - tail))
+    near, far = (float(stats.nct.ppf(q, n - 1, LIMIT_SD * math.sqrt(n))) * error for q in (tail, 1 - tail))
     half = float(stats.t.isf(tail, n - 1)) * error
     return BlandAltman(
         bias=Estimate(bias, bias - half, bias + half, confidence),

@@ -6,12 +6,13 @@ Everywhere change is post - pre, one value per person; without `post`, `pre` hol
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
-from ._input import changes, fraction, refuse
+from ._input import changes, count, fraction, refuse
 from ._types import Estimate, noncentrality
 
 #: Fewest persons whose change is judged: with fewer a jackknife or bootstrap has nothing to vary.
@@ -108,7 +109,7 @@ def cohens_dz(pre: Any, post: Any = None, confidence: float = 0.95) -> Estimate:
     `srm`.
     """
     change = changes(pre, post, MIN_PERSONS)
-    root_n = np.sqrt(len(change))
+    root_n = math.sqrt(len(change))
     value = float(change.mean() / change.std(ddof=1))
     low, high = noncentrality(value * root_n, len(change) - 1, fraction(confidence, "confidence"))
     return Estimate(value, low / root_n, high / root_n, confidence)
@@ -144,7 +145,7 @@ def effect_size(
     if change.min() >= 0 or change.max() <= 0:
         return Estimate(value, np.nan, np.nan, confidence)
     generator = np.random.default_rng(seed)
-    resampled = np.empty(n_resamples)
+    resampled = np.empty(count(n_resamples, "n_resamples"))
     for start in range(0, n_resamples, _CHUNK):
         rows = resampled[start : start + _CHUNK]
         rows[:] = _effect(change[generator.integers(n, size=(len(rows), n))])

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from scipy import optimize
 
-from ._input import refuse
+from ._input import differ, refuse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +58,7 @@ def mean_squares(ratings: np.ndarray, model: int) -> MeanSquares:
                 f"leave that {what} out and report it",
             )
     known = ratings[seen]
-    if not np.ptp(known) > 1e-12 * np.abs(known).max():
+    if not differ(known):
         raise refuse(f"all ratings are {known[0]:g}", "ratings that differ", "check the column")
     df_error = int(seen.sum()) - n - (k - 1 if model > 1 else 0)
     if df_error < 1:

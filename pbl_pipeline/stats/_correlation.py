@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from ._input import fraction, one_of, refuse, same_length, sample
+from ._input import fraction, labels, one_of, refuse, same_length, sample
 from ._types import Estimate, fisher_z
 
 CORRELATIONS = ("pearson", "spearman", "repeated")
@@ -81,9 +81,7 @@ def _within(a: np.ndarray, b: np.ndarray, persons: Any) -> tuple[np.ndarray, np.
     """The values less the person's mean, and how many persons."""
     if persons is None:
         raise refuse('kind "repeated" without persons', "the person of each pair", "pass persons")
-    labels = np.asarray(persons)
-    same_length(a, labels)
-    names, index = np.unique(labels, return_inverse=True)
+    index, names = labels(persons, "persons", len(a))
     if len(names) < 2 or len(a) - len(names) - 1 < 2:
         raise refuse(
             f"{len(a)} pairs of {len(names)} person(s)", "several pairs of several persons", "record more visits"

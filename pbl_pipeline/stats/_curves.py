@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from ._input import fraction, numbers, one_of, refuse, same_length
+from ._input import count, differ, fraction, labels, numbers, one_of, refuse
 
 CURVE_METHODS = ("max-t", "cluster")
 
@@ -123,13 +123,16 @@ def curve_test(
     y, names_b = _per_person(b, persons_b, "b")
     if x.shape[1] != y.shape[1]:
         raise refuse(f"curves of {x.shape[1]} and {y.shape[1]} points", "one length", "resample to the same points")
+    count(n_permutations, "n_permutations")
     generator = np.random.default_rng(seed)
     if paired:
         _same_persons(names_a, names_b)
+        y = y[[names_b.index(name) for name in names_a]]
         t, exact = _flipped(_scaled(x - y), n_permutations, generator)
         df, mirrored = len(x) - 1, True
     else:
-        _other_persons(persons_a, persons_b, names_a, names_b)
+        if persons_a is not None and persons_b is not None:
+            _other_persons(names_a, names_b)
         t, exact = _relabelled(_scaled(np.vstack([x, y])), len(x), n_permutations, generator)
         df, mirrored = len(x) + len(y) - 2, len(x) == len(y)
     # The data's own order is the first; in a complete list its mirror image has the same |t|.
@@ -168,23 +171,21 @@ def curve_test(
     )
 
 
-def _per_person(curves: Any, persons: Any, name: str) -> tuple[np.ndarray, np.ndarray]:
+def _per_person(curves: Any, persons: Any, name: str) -> tuple[np.ndarray, list[Any]]:
     """(persons, P) mean curves and the persons' labels."""
     values = numbers(curves, name, ndim=2)
     if values.shape[1] < 2:
         raise refuse(f"{name}: curves of {values.shape[1]} point(s)", "several", "pass curves (N, points)")
     if persons is None:
-        return values, np.arange(len(values))
-    labels = np.asarray(persons)
-    same_length(values, labels)
-    names, index, counts = np.unique(labels, return_inverse=True, return_counts=True)
-    sums = np.zeros((len(names), values.shape[1]))
-    np.add.at(sums, index, values)
+        return values, list(range(len(values)))
+    index, names = labels(persons, f"persons_{name}", len(values))
+    counts = np.bincount(index)
+    sums = np.add.reduceat(values[np.argsort(index, kind="stable")], np.cumsum(counts) - counts)
     return sums / counts[:, None], names
 
 
-def _same_persons(a: np.ndarray, b: np.ndarray) -> None:
-    if odd := sorted({str(v) for v in a} ^ {str(v) for v in b}):
+def _same_persons(a: list[Any], b: list[Any]) -> None:
+    if odd := sorted(str(v) for v in set(a) ^ set(b)):
         raise refuse(
             f"{len(odd)} person(s) with curves of one condition only: {', '.join(odd[:5])}",
             "both conditions of every person",
@@ -192,8 +193,8 @@ def _same_persons(a: np.ndarray, b: np.ndarray) -> None:
         )
 
 
-def _other_persons(persons_a: Any, persons_b: Any, a: np.ndarray, b: np.ndarray) -> None:
-    if persons_a is not None and persons_b is not None and (both := sorted({str(v) for v in a} & {str(v) for v in b})):
+def _other_persons(a: list[Any], b: list[Any]) -> None:
+    if both := sorted(str(v) for v in set(a) & set(b)):
         raise refuse(
             f"{len(both)} person(s) in both groups: {', '.join(both[:5])}",
             "two groups of different persons",
@@ -203,8 +204,7 @@ def _other_persons(persons_a: Any, persons_b: Any, a: np.ndarray, b: np.ndarray)
 
 def _scaled(curves: np.ndarray) -> np.ndarray:
     """The curves in units of their root mean square at each point, which leaves t as it is."""
-    spread = np.ptp(curves, axis=0) if len(curves) else np.zeros(curves.shape[1])
-    flat = np.flatnonzero(~(spread > 1e-12 * np.maximum(np.abs(curves).max(axis=0, initial=0.0), 1e-300)))
+    flat = [i for i, values in enumerate(curves.T) if not len(values) or not differ(values)]
     if len(flat):
         raise refuse(
             f"no difference between persons at {len(flat)} point(s), the first {flat[0]} (counted from 0)",

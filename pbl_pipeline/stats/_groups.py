@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import optimize, special, stats
 
-from ._input import fraction, refuse, sample
+from ._input import differ, fraction, numbers, refuse, sample
 from ._types import Estimate, noncentrality
 
 
@@ -76,7 +76,7 @@ def hedges_g(a: Any, b: Any, confidence: float = 0.95) -> Estimate:
     x, y = _two(a, b)
     df = len(x) + len(y) - 2
     pooled = np.sqrt((((x - x.mean()) ** 2).sum() + ((y - y.mean()) ** 2).sum()) / df)
-    if not pooled > 1e-12 * max(np.abs(x).max(), np.abs(y).max()):
+    if not differ(x) and not differ(y):
         raise refuse("no spread within the groups", "values that differ", "check the columns")
     correction = np.exp(special.gammaln(df / 2) - special.gammaln((df - 1) / 2)) / np.sqrt(df / 2)
     scale = np.sqrt(len(x) * len(y) / (len(x) + len(y)))
@@ -101,7 +101,7 @@ def compare_groups(a: Any, b: Any, alpha: float = 0.05) -> Test:
 
 def _two(a: Any, b: Any) -> tuple[np.ndarray, np.ndarray]:
     """Two groups of at least two values, not all the same over both."""
-    groups = [np.atleast_1d(np.asarray(g)) for g in (a, b)]
+    groups = [numbers(g, name) for g, name in ((a, "a"), (b, "b"))]
     for group, name in zip(groups, "ab", strict=True):
         if len(group) < 2:
             raise refuse(f"{len(group)} value(s) in group {name}", "at least 2", "record more persons")

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from scipy import stats
 
-from ._input import fraction, one_of, refuse
+from ._input import fraction, numbers, one_of, refuse
 
 DESIGNS = ("paired", "parallel", "parallel-change")
 #: Beyond this a study is not one of a laboratory.
@@ -78,6 +78,7 @@ def sample_size(
         fraction(value, name)
     if power <= alpha:
         raise refuse(f"power {power}, alpha {alpha}", "a power above alpha", "correct power, 0.8 is usual")
+    change, sd, change_sd, dropout = map(float, numbers([change, sd, change_sd, dropout], "change, sd, ..."))
     positive = (abs(change), sd)
     if not all(0 < v < math.inf for v in positive) or not 0 <= change_sd < math.inf or not 0 <= dropout < 1:
         raise refuse(

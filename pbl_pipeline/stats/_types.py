@@ -7,6 +7,11 @@ import dataclasses
 import numpy as np
 from scipy import optimize, stats
 
+from ._input import refuse
+
+#: scipy's noncentral t has six correct digits up to here.
+_LARGEST_T = 1e4
+
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
@@ -35,7 +40,12 @@ def fisher_z(r: float, standard_error: float, confidence: float) -> Estimate:
 
 
 def noncentrality(t: float, df: float, confidence: float) -> tuple[float, float]:
-    """Interval of the noncentrality of which `t` is one draw (exact; Steiger & Fouladi 1997)."""
+    """Interval of the noncentrality of which `t` is one draw (exact; Steiger & Fouladi 1997).
+
+    Raises `PblError` STATS_INPUT for |t| beyond what is computed with certainty.
+    """
+    if abs(t) > _LARGEST_T:
+        raise refuse(f"a mean of {abs(t):.0f} standard errors", "values that differ among persons", "check the column")
     tail = (1 - confidence) / 2
     width = 10 * np.sqrt(1 + t**2 / (2 * df))
 

@@ -16,6 +16,7 @@ import numpy as np
 from scipy import stats
 
 from pbl_pipeline.stats import (
+    ICC_INTERVALS,
     Estimate,
     bland_altman,
     cohens_dz,
@@ -87,8 +88,8 @@ def cases() -> dict[str, tuple[float, Study]]:
     """Name -> truth and study."""
     found: dict[str, tuple[float, Study]] = {}
     fixed, none = np.array([0, CHANGE, CHANGE]), np.zeros(3)
-    visit_sd = 2.0
-    with_visits = PERSON_SD**2 / (PERSON_SD**2 + VISIT_SD**2 + visit_sd**2)
+    small_sd = 2.0
+    with_visits = PERSON_SD**2 / (PERSON_SD**2 + VISIT_SD**2 + small_sd**2)
     for n in (80, 20):
         for dropouts in (False, True):
             words = f"{n} persons{', drop-outs' if dropouts else ''}"
@@ -96,10 +97,16 @@ def cases() -> dict[str, tuple[float, Study]]:
                 f"icc 1,1: {words}": (RELIABILITY, lambda g, n=n, d=dropouts: icc(visits(g, n, d, none), "1,1")),
                 f"icc 2,1: {words}": (
                     with_visits,
-                    lambda g, n=n, d=dropouts: icc(visits(g, n, d, g.normal(0, visit_sd, 3)), "2,1"),
+                    lambda g, n=n, d=dropouts: icc(visits(g, n, d, g.normal(0, small_sd, 3)), "2,1"),
                 ),
                 f"icc 3,1: {words}": (RELIABILITY, lambda g, n=n, d=dropouts: icc(visits(g, n, d, fixed), "3,1")),
             }
+    for visit_sd in (4.0, 8.0):
+        for interval in ICC_INTERVALS:
+            found[f"icc 2,1 {interval}: 80 persons, visits of sd {visit_sd:.0f}"] = (
+                PERSON_SD**2 / (PERSON_SD**2 + VISIT_SD**2 + visit_sd**2),
+                lambda g, i=interval, sd=visit_sd: icc(visits(g, 80, False, g.normal(0, sd, 3)), "2,1", interval=i),
+            )
     found["icc 3,k: 80 persons"] = (
         3 * RELIABILITY / (1 + 2 * RELIABILITY),
         lambda g: icc(visits(g, 80, False, fixed), "3,k"),
@@ -155,7 +162,7 @@ def held(truth: float, study: Study, studies: int, seed: int) -> float:
 def main(studies: int, seed: int, only: str) -> None:
     for name, (truth, study) in cases().items():
         if only in name:
-            click.echo(f"{name:45s} truth {truth:7.3f}  {100 * held(truth, study, studies, seed):6.2f} %")
+            click.echo(f"{name:52s} truth {truth:7.3f}  {100 * held(truth, study, studies, seed):6.2f} %")
 
 
 if __name__ == "__main__":

@@ -110,6 +110,17 @@ def test_perfect_agreement_and_none():
     assert icc(opposite, "1,1").value == pytest.approx(-1)
 
 
+def test_drawn_interval_is_near_that_of_f_for_the_published_table():
+    for kind in ICC_KINDS:
+        by_f, drawn = icc(TABLE, kind), icc(TABLE, kind, interval="generalized")
+        assert drawn.value == by_f.value
+        assert drawn.high == pytest.approx(by_f.high, abs=0.02)
+        assert drawn.low == pytest.approx(max(by_f.low, 0), abs=0.03)  # draws leave no variance below zero
+    assert icc(TABLE, "2,1", interval="generalized") == icc(TABLE, "2,1", interval="generalized")
+    with pytest.raises(PblError, match="interval"):
+        icc(TABLE, "2,1", interval="bootstrap")
+
+
 def test_long_form():
     values = [1.0, 2.0, 3.0, 4.0, 5.0]
     np.testing.assert_array_equal(ratings_table(values, ["b", "b", "a", "a", "a"]), [[1, 2, np.nan], [3, 4, 5]])

@@ -33,6 +33,7 @@ def test_interval_holds_the_truth(name):
 @pytest.mark.parametrize(
     "name",
     [
+        "icc 2,1 generalized: 80 persons, visits of sd 8",
         "icc 2,1: 80 persons, drop-outs",
         "icc 1,1: 80 persons, drop-outs",
         "effect_size: 17 patients",
