@@ -135,6 +135,7 @@ def cycle_chart(
     cycles: Mapping[str, Sequence[np.ndarray]],
     foot_off_percent: Mapping[str, float],
     norm: tuple[np.ndarray, np.ndarray, np.ndarray] | None,
+    faint: str = "",
 ) -> Markup:
     """One joint angle over the gait cycle: each cycle thin, the mean of a side thick, the norm as a grey band.
 
@@ -148,7 +149,10 @@ def cycle_chart(
         side -> mean percent of the cycle at which the foot leaves the ground.
     norm
         percent (Q,), mean (Q,), sd (Q,) in degrees; None where there is none.
+    faint
+        The side whose curves are less certain.
     """
+    opacity = {side: 0.4 if side == faint else 1.0 for side in cycles}
     values = [np.asarray(c, float) for curves in cycles.values() for c in curves]
     if norm is not None:
         values += [norm[1] - norm[2], norm[1] + norm[2]]
@@ -161,11 +165,11 @@ def cycle_chart(
     for side, curves in cycles.items():
         colour = SIDE_COLOUR[side]
         for c in curves:
-            axes.curve(percent, c, colour, 0.9, 0.38)
+            axes.curve(percent, c, colour, 0.9, 0.38 * opacity[side])
     for side, curves in cycles.items():
         if not curves:
             continue
-        axes.curve(percent, mean_curve(curves), SIDE_COLOUR[side], 2.4, 1.0, _DASH[side])
+        axes.curve(percent, mean_curve(curves), SIDE_COLOUR[side], 2.4, opacity[side], _DASH[side])
         off = foot_off_percent.get(side, np.nan)
         if np.isfinite(off):
             x = float(axes.x(off))

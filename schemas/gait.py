@@ -177,6 +177,7 @@ class GaitCycle(dj.Computed):
         cycle_curves_n=null : int16            # cycles of that median, null with it
         cycle_failed_checks : json             # names of the checks of the fit that FAIL, such as []
         curves_missing     : varchar(100)      # why it has no curves
+        cycle_far_leg=null : enum('left', 'right')  # the leg that one camera saw behind the other, if one
         cycle_stride_length=null : float64     # (m) over the floor
         cycle_step_length=null   : float64     # (m) of the step that ends the cycle
         cycle_step_width=null    : float64     # (m) null unless the metres were measured
@@ -233,6 +234,7 @@ class GaitCycle(dj.Computed):
                 "cycle_curves_n": c.exclusion.n_curves,
                 "cycle_failed_checks": list(c.exclusion.failed_checks),
                 "curves_missing": c.curves_missing[:100],
+                "cycle_far_leg": c.far_leg or None,
                 "cycle_stride_length": number(c.lengths.stride_length_m),
                 "cycle_step_length": number(c.lengths.step_length_m),
                 "cycle_step_width": number(c.lengths.step_width_m),
@@ -389,6 +391,7 @@ def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Curves | None = Non
         curves=dict(curves.deg if curves else {}),
         curves_missing=row["curves_missing"],
         curves_sd=dict(curves.sd_deg if curves else {}),
+        far_leg=row["cycle_far_leg"] or "",
         lengths=lib.Lengths(
             number(row["cycle_stride_length"]),
             number(row["cycle_step_length"]),

@@ -6,6 +6,7 @@ Each step is a function of its own with a frozen result: `feet_from_fit` or `fee
 
 from ._angles import ANGLE_NAMES, LEG_ANGLES, AngleSeries, angle_series, leg_angles, pelvis_angles
 from ._bands import NormalBands, leg_length_m, normal_bands
+from ._camera_side import camera_side, mostly
 from ._curve_frame import CURVE_FRAME_COLUMNS, curve_frame
 from ._cycles import REPORT_PERCENT, GaitCycle, cycle_curves, find_cycles
 from ._exclusion import Exclusion
@@ -26,7 +27,7 @@ from ._laboratory import PLUG_IN_GAIT_POINTS, LabTrial, read_lab_feet, read_lab_
 from ._metrics import GaitMetrics, GaitParams, TrialMetrics, cycle_checks, gait_metrics
 from ._own_norm import norm_from_cycles
 from ._profile import MovementProfile, movement_profile, variable_scores
-from ._spatiotemporal import MEASURES, Measure, Spatiotemporal, spatiotemporal
+from ._spatiotemporal import MEASURES, Measure, Spatiotemporal, far_leg_of, spatiotemporal
 from .events import METHODS as EVENT_METHODS
 from .events import (
     EventParams,
@@ -100,11 +101,13 @@ __all__ = [
     "Spatiotemporal",
     "TrialMetrics",
     "angle_series",
+    "camera_side",
     "curve_frame",
     "cycle_checks",
     "cycle_curves",
     "cycle_lengths",
     "detect_events",
+    "far_leg_of",
     "feet_from_fit",
     "feet_from_keypoints",
     "feet_from_markers",
@@ -116,6 +119,7 @@ __all__ = [
     "leg_length_m",
     "load_events",
     "load_norm",
+    "mostly",
     "movement_profile",
     "norm_from_cycles",
     "norm_names",

@@ -12,6 +12,7 @@ from scipy.interpolate import PchipInterpolator
 from pbl_pipeline.qc import Check, failed
 
 from ._angles import AngleSeries, angle_series
+from ._camera_side import far_leg, mostly
 from ._exclusion import Exclusion
 from ._ground import Lengths, cycle_lengths, is_metric, why_no_lengths
 from ._outliers import without_odd_curves, without_odd_lengths
@@ -42,7 +43,8 @@ class GaitCycle:
     `curves` maps names of `ANGLE_NAMES` to (51,) degrees at 0, 2, ..., 100 % of the cycle; empty where there is
     no fit or frames are missing (`curves_missing` says which); `curves_sd` maps them to their standard deviation (deg),
     where it is known. `angle_model` says how the angles are defined.
-    `lengths` are those on the floor, None with the reason where they are not known.
+    `lengths` are those on the floor, None with the reason where they are not known. `far_leg`: "left" or "right" where
+    one camera saw that leg behind the other, else empty.
     """
 
     trial: str
@@ -60,6 +62,7 @@ class GaitCycle:
     curves_sd: dict[str, np.ndarray] = dataclasses.field(default_factory=dict, compare=False, repr=False)
     lengths: Lengths = dataclasses.field(default_factory=lambda: Lengths(missing=NO_POSITIONS))
     angle_model: str = BODY_ANGLES
+    far_leg: str = ""
 
     @property
     def used(self) -> bool:
@@ -126,11 +129,11 @@ def find_cycles(
     """
     found = events.events if isinstance(events, GaitEvents) else tuple(events)
     name = trial or (fit.name if fit is not None else "")
-    no_lengths, metric = "" if feet is not None else NO_POSITIONS, True
+    no_lengths, metric, far = "" if feet is not None else NO_POSITIONS, True, None
     if fit is not None:
         poses = poses or trial_poses(fit)
         series, feet = angle_series(fit, poses), feet_from_fit(fit, poses)
-        no_lengths, metric = why_no_lengths(fit), is_metric(fit)
+        no_lengths, metric, far = why_no_lengths(fit), is_metric(fit), far_leg(fit, poses)
     cycles = []
     for bout in sorted({e.bout for e in found}):
         inside = sorted((e for e in found if e.bout == bout), key=lambda e: e.time_s)
@@ -170,6 +173,7 @@ def find_cycles(
                 curves_sd=curves_sd,
                 lengths=lengths,
                 angle_model=series.angle_model if series is not None else BODY_ANGLES,
+                far_leg="" if fit is None or far is None else mostly(_during(far, fit.time_s, start, end)),
             )
             cycles.append(cycle)
     cycles = without_odd_curves(without_odd_lengths(cycles))
@@ -201,6 +205,10 @@ def cycle_curves(
     at = start_s + percent / 100.0 * (end_s - start_s)
     curves = PchipInterpolator(time[part], values[part], axis=0)(at)
     return dict(zip(table, curves.T, strict=True)), ""
+
+
+def _during(values: np.ndarray, time_s: np.ndarray, start: GaitEvent, end: GaitEvent) -> np.ndarray:
+    return values[(time_s >= start.time_s) & (time_s <= end.time_s)]
 
 
 def _curves_sd(series: AngleSeries, start: GaitEvent, end: GaitEvent) -> dict[str, np.ndarray]:

@@ -11,6 +11,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Stage
 from pbl_pipeline.paramset import Paramset, later
 from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
+from pbl_pipeline.stats import minimal_detectable_change
 
 from ._cycles import GaitCycle
 from ._profile import MovementProfile, movement_profile, variable_scores
@@ -38,8 +39,8 @@ class GdiParams:
     min_explained
         A smaller fraction of a cycle's deviation inside the normative components gives a warning.
     repeated
-        Fraction of the variance of the angles' error that two visits of one person have in common, filmed alike
-        (`pbl validate gdi`: 0.75 and more keep 9 of 10 errors of a change within `Gdi.minimal_change`).
+        Fraction of the variance of the angles' error that two visits of one person have in common, filmed alike: what
+        the body's places and the priors get wrong of this person, not the detector's chance.
     """
 
     norm: str = DEFAULT_NORM
@@ -175,9 +176,9 @@ def score_gdi(
     n_left, n_right = len(by_side[LEFT]), len(by_side[RIGHT])
     enough = min(n_left, n_right) >= params.min_cycles_per_side
     reason = "" if enough else _too_few(cycles, n_left, n_right, params)
-    profile, sd, change_sd = None, None, None
+    profile, sd, minimal_change = None, None, None
     if enough:
-        sd, change_sd = _errors(usable, vectors, [c.gdi for c in scored], basis, params)
+        sd, minimal_change = _errors(usable, vectors, [c.gdi for c in scored], basis, params)
         scores = variable_scores(np.array(vectors), basis)
         sides = np.array([c.side for c in usable])
         profile = movement_profile({s: scores[sides == s] for s in (LEFT, RIGHT)}, basis)
@@ -197,7 +198,7 @@ def score_gdi(
         qc=_checks(scored, {c.angle_model for c in usable}, basis, reason, params),
         profile=profile,
         sd=sd,
-        minimal_change=None if change_sd is None else Z90 * change_sd,
+        minimal_change=minimal_change,
     )
 
 
@@ -212,7 +213,8 @@ def _errors(
     norm: NormativeSet,
     params: GdiParams,
 ) -> tuple[float | None, float | None]:
-    """Standard deviation of the error of the mean index, and of the change between two such visits.
+    """Standard deviation of the error of the mean index, and the change that two such visits exceed by chance in one of
+    ten cases.
 
     To first order in the angles' errors. What a fit is unsure of (`curves_sd`: the detector's errors, the lean) is the
     same in all cycles, and on both sides, of an angle; what differs from cycle to cycle is in the spread of `scores`.
@@ -226,7 +228,8 @@ def _errors(
         each = slope * _at_percent(cycle.curves_sd, norm)
         change += each.reshape(len(change), -1).sum(axis=1) / len(cycles)
     fit, walk = float(change @ change), float(np.var(scores, ddof=min(1, len(scores) - 1))) / len(scores)
-    return float(np.sqrt(fit + walk)), float(np.sqrt(2.0 * ((1.0 - params.repeated) * fit + walk)))
+    anew = float(np.sqrt((1.0 - params.repeated) * fit + walk))
+    return float(np.sqrt(fit + walk)), minimal_detectable_change(anew, 0.9)
 
 
 def gdi_vector(cycle: GaitCycle, norm: NormativeSet) -> np.ndarray:

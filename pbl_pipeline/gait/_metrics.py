@@ -15,7 +15,7 @@ from pbl_pipeline.qc import EMPTY, OUTCOMES, PASS, WARN, Check, in_session, wors
 from ._cycles import GaitCycle, find_cycles
 from ._gdi import GDI_METHODS, GDI_MODEL, GILLETTE_MODEL, Gdi, GdiParams, score_gdi
 from ._laboratory import LabTrial
-from ._spatiotemporal import MEASURES, Spatiotemporal, spatiotemporal
+from ._spatiotemporal import MEASURES, Spatiotemporal, far_leg_of, spatiotemporal
 from .events import METHODS, GaitEvents, detect_events
 from .motion import BodyPoses, feet_from_fit, trial_poses
 from .normative import NormativeSet, load_norm
@@ -194,7 +194,7 @@ def _distinct(trials: Sequence[TrialMetrics]) -> list[GaitCycle]:
 
 def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple[Check, ...]:
     """Checks of the cycles that `measures` were made of: `cycles_used`, `cycles_of_odd_length`,
-    `cycles_of_odd_curves`, `cadence_plausible`, `lengths_scale`."""
+    `cycles_of_odd_curves`, `legs_seen_alike`, `cadence_plausible`, `lengths_scale`."""
     odd = sum(c.odd_length for c in cycles)
     lengths = Check(
         "cycles_of_odd_length",
@@ -227,6 +227,21 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
         lengths,
         curves,
     ]
+    if any(c.used for c in cycles):
+        far = far_leg_of(cycles)
+        near = "left" if far == "right" else "right"
+        checks.append(
+            Check(
+                "legs_seen_alike",
+                WARN if far else PASS,
+                None,
+                None,
+                f"the {far} leg was behind the {near} one: its curves and measures are less certain, and the sides are "
+                "not to be compared. Film from the front or the back, or a pass in each direction"
+                if far
+                else "",
+            )
+        )
     cadence = measures["cadence_steps_per_min"]
     if cadence is not None:
         plausible = 60.0 <= cadence.mean <= 150.0

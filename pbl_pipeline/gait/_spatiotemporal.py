@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ._camera_side import mostly
 from ._cycles import GaitCycle
 from .events import LEFT, RIGHT
 
@@ -48,7 +49,8 @@ class Measure:
 
     `variability` is the sd within a side, both sides together: the root of the mean of their variances (n - 1), which
     an asymmetry does not touch; None with fewer than two values of a side. `cv_percent` is that in percent of the mean.
-    `asymmetry_percent` is 100 (right - left) / ((right + left) / 2), None for measures that are not `SIDED`.
+    `asymmetry_percent` is 100 (right - left) / ((right + left) / 2), None for measures that are not `SIDED` and where
+    one camera saw the same leg behind the other in most cycles (`far_leg_of`).
     """
 
     left: float | None
@@ -110,11 +112,17 @@ def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
         steps[c.trial, other, c.opposite_foot_down_s] = c.opposite_foot_down_s - c.start_s
         steps[c.trial, c.side, c.end_s] = c.end_s - c.opposite_foot_down_s
     by_cycle["step_time_s"] = [(side, value) for (_, side, _), value in steps.items()]
-    measures.update({name: _measure(name, values) for name, values in by_cycle.items() if values})
+    alike = not far_leg_of(used)
+    measures.update({name: _measure(name, values, alike) for name, values in by_cycle.items() if values})
     for name in LENGTHS:
         if measures[name] is None:
             reasons[name] = _no_length(name, used)
     return Spatiotemporal("PASS", "", measures, reasons, len(cycles), len(used), len(steps))
+
+
+def far_leg_of(cycles: Sequence[GaitCycle]) -> str:
+    """The leg that was behind the other in most of the used cycles; empty where both were seen alike."""
+    return mostly(np.array([c.far_leg for c in cycles if c.used]))
 
 
 def _of_cycle(c: GaitCycle) -> dict[str, float]:
@@ -157,7 +165,7 @@ def _no_length(name: str, used: Sequence[GaitCycle]) -> str:
     return "; ".join(sorted({c.lengths.missing for c in used if c.lengths.missing})) or "not known"
 
 
-def _measure(name: str, values: Sequence[tuple[str, float]]) -> Measure:
+def _measure(name: str, values: Sequence[tuple[str, float]], alike: bool) -> Measure:
     numbers = np.array([v for _, v in values])
     by_side = {side: [v for s, v in values if s == side] for side in (LEFT, RIGHT)}
     left, right = (float(np.mean(by_side[s])) if by_side[s] else None for s in (LEFT, RIGHT))
@@ -169,6 +177,6 @@ def _measure(name: str, values: Sequence[tuple[str, float]]) -> Measure:
     within = float(np.sqrt(np.mean([np.var(g, ddof=1) for g in groups]))) if enough else None
     fraction = None if within is None or mean == 0 else 100.0 * within / abs(mean)
     asymmetry = None
-    if name in SIDED and left is not None and right is not None and left + right != 0:
+    if alike and name in SIDED and left is not None and right is not None and left + right != 0:
         asymmetry = 100.0 * (right - left) / (0.5 * (right + left))
     return Measure(left, right, mean, sd, len(numbers), within, fraction, asymmetry)

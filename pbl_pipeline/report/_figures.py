@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from pbl_pipeline import charts
 from pbl_pipeline.fit import TrialFit
-from pbl_pipeline.gait import GaitCycle, GaitEvents, NormalBands, leg_angles
+from pbl_pipeline.gait import GaitCycle, GaitEvents, NormalBands, far_leg_of, leg_angles
 from pbl_pipeline.render import SIDE_COLOUR, stance_spans
 from pbl_pipeline.report._types import Picture
 from pbl_pipeline.report._words import ANGLES, FOOT_ANGLES, PELVIS_ANGLES, number, plural
@@ -25,7 +25,7 @@ def cycle_charts(cycles: Sequence[GaitCycle], bands: NormalBands) -> list[dict]:
     usable = [c for c in cycles if c.used and c.curves]
     if not usable:
         return []
-    foot_off = {s: _foot_off([c for c in usable if c.side == s]) for s in _SIDES}
+    foot_off, faint = {s: _foot_off([c for c in usable if c.side == s]) for s in _SIDES}, far_leg_of(usable)
     names = ANGLES | FOOT_ANGLES | PELVIS_ANGLES
     drawn = []
     for key, (title, positive) in names.items():
@@ -44,7 +44,7 @@ def cycle_charts(cycles: Sequence[GaitCycle], bands: NormalBands) -> list[dict]:
             {
                 "name": title,
                 "note": ", ".join(x for x in (positive, "" if band is not None else "no norm") if x),
-                "svg": charts.cycle_chart(label, percent, by_side, foot_off, band),
+                "svg": charts.cycle_chart(label, percent, by_side, foot_off, band, faint),
             }
         )
     return drawn

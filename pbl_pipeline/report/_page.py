@@ -15,6 +15,7 @@ from pbl_pipeline.gait import (
     NormalBands,
     NormativeSet,
     TrialMetrics,
+    far_leg_of,
     leg_length_m,
     load_norm,
     norm_names,
@@ -83,7 +84,7 @@ def page_of(report: SessionReport) -> dict:
         )
         bands = _bands(report)
         page["cycle_charts"] = _figures.cycle_charts(cycles, bands)
-        page["cycles_note"] = _cycles_note(bands)
+        page["cycles_note"] = _cycles_note(bands, far_leg_of(cycles))
         page["index"] = _index(metrics.gdi)
     return page
 
@@ -326,8 +327,9 @@ def _check_row(c: Check) -> dict:
     }
 
 
-def _cycles_note(bands: NormalBands) -> str:
-    return (
+def _cycles_note(bands: NormalBands, far: str) -> str:
+    far_note = f"The {far} leg, which was behind the other, is less certain and drawn faintly. " if far else ""
+    return far_note + (
         "0 % is foot down, 100 % the next foot down of the same foot. Left is dashed. Thin lines are the single "
         f"cycles that count, thick ones their mean. Norm: typically developing children {bands.words()}; mapped to "
         f"this body's pelvis; {bands.source}."

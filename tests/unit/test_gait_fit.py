@@ -222,6 +222,31 @@ def test_a_session_pools_its_trials_and_an_empty_one_takes_no_part():
     assert together.gdi.mean == pytest.approx(np.average(means, weights=n))
 
 
+@pytest.mark.parametrize(
+    ("camera_m", "heading_deg", "far"),
+    [((6.0, 40.0, 1.0), 0.0, "right"), ((6.0, -40.0, 1.0), 0.0, "left"), ((-6.0, 40.0, 1.0), 180.0, "left"),
+     ((40.0, 0.0, 1.0), 0.0, ""), ((-40.0, 0.0, 1.0), 0.0, "")],
+)  # fmt: skip
+def test_legs_that_one_camera_does_not_see_alike_are_not_compared(camera_m, heading_deg, far):
+    time_s = np.arange(0, 10, 1 / 30)
+    fit = make_fit(time_s, walking(time_s, heading_deg), camera_position_m=np.array(camera_m))
+    metrics = gait_metrics([fit])
+    assert {c.far_leg for c in metrics.trials[0].cycles if c.used} == {far}
+    step = metrics.spatiotemporal["step_time_s"]
+    assert step is not None
+    assert (step.left is None, step.asymmetry_percent is None) == (False, bool(far))
+    check = next(c for c in metrics.qc if c.check == "legs_seen_alike")
+    assert (check.outcome, f"the {far} leg was behind" in check.advice) == (("WARN", True) if far else ("PASS", False))
+    # Several cameras see both; so do two passes in opposite directions.
+    measured = gait_metrics([dataclasses.replace(fit, orientation_source="measured: calibration")])
+    assert {c.far_leg for c in measured.trials[0].cycles} == {""}
+    if far:
+        there = dataclasses.replace(fit, camera_position_m=np.array(camera_m) * [1, -1, 1])
+        both = gait_metrics([fit, there])
+        assert next(c for c in both.qc if c.check == "legs_seen_alike").outcome == "PASS"
+        assert both.spatiotemporal["step_time_s"].asymmetry_percent is not None
+
+
 def test_standing_gives_nulls_with_reasons(tmp_path):
     time = np.arange(0, 6, 1 / 30)
     metrics = gait_metrics([make_fit(time, {"pelvis_tx": 0.01 * np.sin(time)})])
