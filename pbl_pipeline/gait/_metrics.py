@@ -102,6 +102,9 @@ class GaitMetrics:
                 lines.append(f"{name:<24}{_cell(m.left)}{_cell(m.right)}{_cell(m.mean)}{_cell(m.sd, 8)}{m.n:>5}")
         g = self.gdi
         lines.append(f"{_short(g):<24}{_cell(g.left)}{_cell(g.right)}{_cell(g.mean)}{'':>8}{g.n:>5}  {g.reason}")
+        if g.interval is not None:
+            low, high = g.interval
+            lines.append(f"{'its 90 % interval':<24}{low:>9.1f} to {high:.1f}, minimal change {g.minimal_change:.1f}")
         if g.profile is not None and g.profile.gps is not None:
             p = g.profile
             lines.append(f"{'GPS (deg)':<24}{_cell(p.gps_left)}{_cell(p.gps_right)}{_cell(p.gps)}")

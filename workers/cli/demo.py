@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -98,7 +99,7 @@ def rows_text(sessions, trials) -> str:
         (
             "GDI of three angles",
             f"{_number(row['session_gdi'], 1)} (left {_number(row['session_gdi_left'], 1)}, "
-            f"right {_number(row['session_gdi_right'], 1)}; {n} cycles)",
+            f"right {_number(row['session_gdi_right'], 1)}; {n} cycles){_interval(row)}",
         ),
         ("residuals of the fit", f"{row['fit_residual_2d']:.1f} px, {row['fit_residual_3d']:.1f} cm (median)"),
         ("QC", f"{row['qc_outcome']}: {row['qc_worst']}".rstrip(": ")),
@@ -108,6 +109,15 @@ def rows_text(sessions, trials) -> str:
     text = "\n".join(f"{name:<22}{value}" for name, value in lines)
     columns = ["trial_name", "n_events", "n_cycles", "n_cycles_used", "cadence", "stride_time", "gdi"]
     return text + "\n\n" + trials[columns].to_string(index=False, float_format=lambda v: f"{v:.3g}")
+
+
+def _interval(row: Any) -> str:
+    from pbl_pipeline.gait import Z90
+
+    index, sd = row["session_gdi"], row["session_gdi_sd"]
+    if sd is None or sd != sd:
+        return ""
+    return f", 90 % interval {_number(index - Z90 * sd, 0)} to {_number(index + Z90 * sd, 0)}"
 
 
 def _number(value: float | None, digits: int) -> str:
