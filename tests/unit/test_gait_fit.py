@@ -244,7 +244,9 @@ def test_legs_that_one_camera_does_not_see_alike_are_not_compared(camera_m, head
         there = dataclasses.replace(fit, camera_position_m=np.array(camera_m) * [1, -1, 1])
         both = gait_metrics([fit, there])
         assert next(c for c in both.qc if c.check == "legs_seen_alike").outcome == "PASS"
-        assert both.spatiotemporal["step_time_s"].asymmetry_percent is not None
+        step = both.spatiotemporal["step_time_s"]
+        assert step is not None
+        assert step.asymmetry_percent is not None
 
 
 def test_standing_gives_nulls_with_reasons(tmp_path):
