@@ -287,8 +287,8 @@ def _with_room(H: Array, g: Array, B: Array, C: Array, h: Array, columns: _Colum
 
 
 def _spread(a: Float[Array, "*n A"], at: Sequence[slice], size: int) -> Float[Array, "*n {size}"]:
-    """Values of some of the shared unknowns, one slice after the other in `a`, among all of them, zeros elsewhere. (A
-    scatter would do the same; on a GPU it took a quarter of a fit.)"""
+    """Values of some of the shared unknowns, one slice after the other in `a`, among all of them, zeros elsewhere. Not
+    as a scatter, whose indices a batch multiplies."""
     zeros = lambda n: jnp.zeros((*a.shape[:-1], n), a.dtype)  # noqa: E731
     parts, end = [], 0
     for part, where in zip(jnp.split(a, np.cumsum([s.stop - s.start for s in at])[:-1], axis=-1), at, strict=True):
