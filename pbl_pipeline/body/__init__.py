@@ -9,7 +9,7 @@ from pbl_pipeline import jax_setup
 # Before anything below makes an array: JAX reads the cache's folder once.
 jax_setup.configure()
 
-from pbl_pipeline.body._angles import angle_of, joint_angles, joint_of  # noqa: E402
+from pbl_pipeline.body._angles import angle_of, joint_angles, joint_angles_sd, joint_of  # noqa: E402
 from pbl_pipeline.body._capsules import Capsules, capsules  # noqa: E402
 from pbl_pipeline.body._chain import chain_frames  # noqa: E402
 from pbl_pipeline.body._frames import Frames, mjx_frames  # noqa: E402
@@ -40,6 +40,7 @@ __all__ = [
     "capsules",
     "chain_frames",
     "joint_angles",
+    "joint_angles_sd",
     "joint_of",
     "load_body",
     "load_marker_set",

@@ -35,6 +35,11 @@ def joint_angles(joint_names: Sequence[str], qpos: np.ndarray) -> dict[str, np.n
     return out
 
 
+def joint_angles_sd(joint_names: Sequence[str], qpos_sd: np.ndarray) -> dict[str, np.ndarray]:
+    """Standard deviations (T,) in degrees of `joint_angles`, from those of qpos (T, N) in radians."""
+    return {name: np.abs(sd) for name, sd in joint_angles(joint_names, qpos_sd).items()}
+
+
 def _other_name(name: str, names: dict[str, str]) -> tuple[str, float]:
     for one, other in names.items():
         if name == one or name.startswith(f"{one}_"):

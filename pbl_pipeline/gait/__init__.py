@@ -20,6 +20,7 @@ from ._gdi import (
     GdiCycle,
     GdiParams,
     gdi_vector,
+    interval_90,
     score_gdi,
 )
 from ._ground import Lengths, cycle_lengths
@@ -115,6 +116,7 @@ __all__ = [
     "fit_norm",
     "gait_metrics",
     "gdi_vector",
+    "interval_90",
     "leg_angles",
     "leg_length_m",
     "load_events",

@@ -60,18 +60,19 @@ LEG_ANGLES = {
 
 def leg_angles(fit: TrialFit) -> dict[str, dict[str, np.ndarray]]:
     """Side -> name -> (T,) degrees: the body's own angles of hip, knee and ankle; those that the fit's body has."""
-    return _of_legs(fit, fit.qpos)
+    from pbl_pipeline.body import joint_angles  # JAX loads only where a fit is read
+
+    return _of_legs(joint_angles(fit.joint_names, fit.qpos))
 
 
 def leg_angles_sd(fit: TrialFit) -> dict[str, dict[str, np.ndarray]]:
     """The standard deviation (deg) of each of `leg_angles`, NaN where the fit knows none."""
-    return {side: {k: np.abs(v) for k, v in own.items()} for side, own in _of_legs(fit, fit.qpos_sd).items()}
+    from pbl_pipeline.body import joint_angles_sd
+
+    return _of_legs(joint_angles_sd(fit.joint_names, fit.qpos_sd))
 
 
-def _of_legs(fit: TrialFit, qpos: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
-    from pbl_pipeline.body import joint_angles  # JAX loads only where a fit is read
-
-    angles = joint_angles(fit.joint_names, qpos)
+def _of_legs(angles: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
     return {
         side: {ours: angles[f"{own}_{side[0]}"] for ours, own in LEG_ANGLES.items() if f"{own}_{side[0]}" in angles}
         for side in SIDES

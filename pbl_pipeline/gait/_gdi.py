@@ -11,7 +11,6 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Stage
 from pbl_pipeline.paramset import Paramset, later
 from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
-from pbl_pipeline.stats import minimal_detectable_change
 
 from ._cycles import GaitCycle
 from ._profile import MovementProfile, movement_profile, variable_scores
@@ -105,9 +104,7 @@ class Gdi:
     @property
     def interval(self) -> tuple[float, float] | None:
         """That holds the true index in 9 of 10 cases; None where `sd` is not known."""
-        if self.mean is None or self.sd is None:
-            return None
-        return self.mean - Z90 * self.sd, self.mean + Z90 * self.sd
+        return interval_90(self.mean, self.sd)
 
     @property
     def title(self) -> str:
@@ -119,6 +116,13 @@ class Gdi:
         rounded = {k: _rounded(getattr(self, k)) for k in ("left", "right", "mean", "sd", "minimal_change")}
         interval = None if self.interval is None else [_rounded(v) for v in self.interval]
         return {**rounded, "interval": interval, "n": self.n, "norm": self.norm}
+
+
+def interval_90(mean: float | None, sd: float | None) -> tuple[float, float] | None:
+    """The 90 % interval of an index whose error has the standard deviation `sd`; None where one is not known."""
+    if mean is None or sd is None or not np.isfinite(sd):
+        return None
+    return mean - Z90 * sd, mean + Z90 * sd
 
 
 def score_gdi(
@@ -219,6 +223,8 @@ def _errors(
     To first order in the angles' errors. What a fit is unsure of (`curves_sd`: the detector's errors, the lean) is the
     same in all cycles, and on both sides, of an angle; what differs from cycle to cycle is in the spread of `scores`.
     """
+    from pbl_pipeline.stats import minimal_detectable_change  # loads pandas, which every command would wait for
+
     if not all(v in c.curves_sd for c in cycles for v in norm.variables):
         return None, None
     change = np.zeros(len(norm.variables))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from ._input import numbers, one_of, refuse
 
@@ -23,11 +24,9 @@ def adjust(p: Any, method: str = "holm") -> np.ndarray:
     values = numbers(p, "p")
     if not len(values) or values.min() < 0 or values.max() > 1:
         raise refuse(f"{len(values)} values of p, not all of them between 0 and 1", "p values", "pass p")
+    if method == "benjamini-hochberg":
+        return stats.false_discovery_control(values)
     order, n = np.argsort(values, kind="stable"), len(values)
-    if method == "holm":
-        stepped = np.maximum.accumulate(values[order] * np.arange(n, 0, -1))
-    else:
-        stepped = np.minimum.accumulate((values[order] * n / np.arange(1, n + 1))[::-1])[::-1]
     adjusted = np.empty(n)
-    adjusted[order] = np.minimum(stepped, 1.0)
+    adjusted[order] = np.minimum(np.maximum.accumulate(values[order] * np.arange(n, 0, -1)), 1.0)
     return adjusted

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pbl_pipeline.body import joint_angles
+from pbl_pipeline.body import joint_angles, joint_angles_sd
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit, SessionInput, TrialFit, fit_sessions
 from pbl_pipeline.gait import Z90, GaitCycle, find_cycles, gait_metrics, score_gdi, spatiotemporal
@@ -102,7 +102,7 @@ def _number(value: float | None) -> float:
 
 def _angle_errors(fit: TrialFit, truth: TrialFit) -> dict[str, float]:
     found, true = joint_angles(fit.joint_names, fit.qpos), joint_angles(truth.joint_names, truth.qpos)
-    spread = joint_angles(fit.joint_names, fit.qpos_sd)
+    spread = joint_angles_sd(fit.joint_names, fit.qpos_sd)
     out = {}
     for angle in ANGLES:
         sides = []
@@ -113,7 +113,7 @@ def _angle_errors(fit: TrialFit, truth: TrialFit) -> dict[str, float]:
             if len(off) < 10:
                 continue
             a, b = (np.subtract(*np.percentile(x[name][seen], [97.5, 2.5])) for x in (found, true))
-            inside = np.abs(off) <= Z90 * np.abs(spread[name][seen])
+            inside = np.abs(off) <= Z90 * spread[name][seen]
             known = np.isfinite(spread[name][seen])
             in90 = float(inside[known].mean()) if known.any() else float("nan")
             sides.append((off.mean(), off.std(), a / b if b > 1 else np.nan, in90))

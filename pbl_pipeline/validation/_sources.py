@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import angle_of, joint_angles, load_body
+from pbl_pipeline.body import angle_of, joint_angles, joint_angles_sd, load_body
 from pbl_pipeline.bounded import count_rows, read_json, read_text
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
@@ -46,7 +46,7 @@ def fit_angles_sd(fit: TrialFit, convention: str = QPOS) -> dict[str, np.ndarray
     For "body_rotations" that of the model's own joint of the same name: its axis is not quite the same.
     """
     _check_convention(convention)
-    sd = {k: np.abs(v) for k, v in joint_angles(fit.joint_names, fit.qpos_sd).items()}
+    sd = joint_angles_sd(fit.joint_names, fit.qpos_sd)
     return sd if convention == QPOS else {k: sd[k] for k in JOINTS_CLIP if k in sd}
 
 

@@ -112,12 +112,10 @@ def rows_text(sessions, trials) -> str:
 
 
 def _interval(row: Any) -> str:
-    from pbl_pipeline.gait import Z90
+    from pbl_pipeline.gait import interval_90
 
-    index, sd = row["session_gdi"], row["session_gdi_sd"]
-    if sd is None or sd != sd:
-        return ""
-    return f", 90 % interval {_number(index - Z90 * sd, 0)} to {_number(index + Z90 * sd, 0)}"
+    interval = interval_90(row["session_gdi"], row["session_gdi_sd"])
+    return "" if interval is None else ", 90 % interval {:.0f} to {:.0f}".format(*interval)
 
 
 def _number(value: float | None, digits: int) -> str:
