@@ -12,6 +12,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pbl_pipeline.render import SIDE_COLOUR
+from pbl_pipeline.runs import runs
 
 _INK, _FAINT, _GRID, _BAND = "#2a2e33", "#687078", "#e3e6e9", "#dfe3e8"
 _DASH = {"right": "none", "left": "7 3"}  # sides differ in print without colour too
@@ -96,14 +97,12 @@ class Axes:
     ) -> None:
         """A curve; it is broken where a value is NaN."""
         points = np.stack([self.x(x), self.y(y)], axis=-1)
-        ok = np.isfinite(points).all(axis=1)
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], ok, [False]]).astype(int)))
-        for a, b in zip(edges[::2], edges[1::2], strict=True):
+        for run in runs(np.isfinite(points).all(axis=1)):
             self.add(
                 Markup(
                     '<polyline points="{}" fill="none" stroke="{}" stroke-width="{}" stroke-opacity="{}"'
                     ' stroke-dasharray="{}" stroke-linejoin="round"/>'
-                ).format(_points(points[a:b]), colour, width, opacity, dash)
+                ).format(_points(points[run]), colour, width, opacity, dash)
             )
 
     def box(self, x0: float, x1: float, y0: float, y1: float, colour: str, opacity: float = 1.0) -> None:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline import assets
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.runs import runs
 
 #: What the network sees, in its order: names of the marker set `halpe_26`, whose hips, knees and ankles are joints.
 POINTS: tuple[str, ...] = (
@@ -141,7 +142,7 @@ class MarkerAugmenter:
         time_s = np.asarray(time_s, float)
         _check(time_s, points)
         known = np.asarray(np.isfinite(points).all(axis=(1, 2)))
-        stretches = [s for s in _stretches(known) if time_s[s][-1] - time_s[s][0] >= self.params.min_time_s]
+        stretches = [s for s in runs(known) if time_s[s][-1] - time_s[s][0] >= self.params.min_time_s]
         if not stretches:
             raise _unsuitable(
                 f"no stretch of {self.params.min_time_s:g} s in which all points are known",
@@ -215,11 +216,6 @@ def _check(time_s: np.ndarray, points: np.ndarray) -> None:
         )
     if np.nanmedian(points[:, 0, 2] - points[:, _ANKLES, 2].mean(axis=1)) <= 0:
         raise _unsuitable("a neck below the ankles", "a world with z up", "turn the positions")
-
-
-def _stretches(known: np.ndarray) -> list[slice]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
-    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _resampled(to_s: np.ndarray, from_s: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 from pbl_pipeline.body import joint_angles
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.render._style import SIDE_COLOUR, bgr
+from pbl_pipeline.runs import runs
 
 _INK, _FAINT, _GRID, _PAPER = (51, 46, 42), (120, 112, 104), (232, 228, 224), (255, 255, 255)
 _FONT_NAME = "sans"  # OpenCV carries this font itself
@@ -86,7 +87,7 @@ class Strip:
             end = self._text(self._picture, side, (end + self._text_px, title_row), bgr(SIDE_COLOUR[side]), weight=600)
         for side, curve in curves.items():
             points = np.stack([self._x(time), y(curve)], axis=-1)
-            for run in _finite_runs(points):
+            for run in runs(np.isfinite(points).all(axis=1)):
                 corners = np.rint(points[run] * 16).astype(np.int32)
                 cv2.polylines(self._picture, [corners], False, bgr(SIDE_COLOUR[side]), 2, cv2.LINE_AA, 4)
 
@@ -126,10 +127,3 @@ class Strip:
         flags = cv2.PUT_TEXT_ALIGN_RIGHT if right else cv2.PUT_TEXT_ALIGN_LEFT
         end, _ = cv2.putText(picture, text, at, colour, self._font, self._text_px, weight, flags)
         return int(end[0])
-
-
-def _finite_runs(points: np.ndarray) -> list[slice]:
-    """Stretches of rows without NaN, longest possible."""
-    ok = np.isfinite(points).all(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], ok, [False]]).astype(int)))
-    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

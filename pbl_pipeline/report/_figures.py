@@ -15,6 +15,7 @@ from pbl_pipeline.gait import GaitCycle, GaitEvents, NormalBands, far_leg_of, le
 from pbl_pipeline.render import SIDE_COLOUR, stance_spans
 from pbl_pipeline.report._types import Picture
 from pbl_pipeline.report._words import ANGLES, FOOT_ANGLES, PELVIS_ANGLES, number, plural
+from pbl_pipeline.runs import runs
 
 _SIDES = ("left", "right")
 _JPEG_QUALITY = 84
@@ -84,8 +85,7 @@ def contact_chart(fit: TrialFit, events: GaitEvents) -> Markup | None:
 def known_spans(fit: TrialFit) -> list[tuple[float, float]]:
     """Stretches (start, stop) in s in which the body is fitted."""
     known = np.isfinite(np.asarray(fit.qpos, float)).all(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
-    return [(float(fit.time_s[a]), float(fit.time_s[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return [(float(fit.time_s[run][0]), float(fit.time_s[run][-1])) for run in runs(known)]
 
 
 def index_chart(values: dict[str, list[float]], title: str) -> Markup | None:

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from pbl_pipeline.runs import runs
+
 from ._input import count, differ, fraction, labels, numbers, one_of, refuse
 
 CURVE_METHODS = ("max-t", "cluster")
@@ -148,7 +150,6 @@ def curve_test(
     else:
         threshold = float(stats.t.isf(cluster_p / 2, df))
         p = _by_cluster(t, threshold)
-    runs = _runs(np.where(p <= alpha, np.sign(t[0]), 0))
     percent = np.linspace(0, 100, len(p))
     return CurveTest(
         method=method,
@@ -161,7 +162,8 @@ def curve_test(
         threshold=threshold,
         p_value=float(p.min()),
         phases=tuple(
-            Phase(float(percent[i]), float(percent[j - 1]), int(np.sign(t[0, i])), float(p[i:j].min())) for i, j in runs
+            Phase(float(percent[run][0]), float(percent[run][-1]), int(np.sign(t[0, run.start])), float(p[run].min()))
+            for run in runs(np.where(p <= alpha, np.sign(t[0]), 0))
         ),
         n_a=len(x),
         n_b=len(y),
@@ -267,17 +269,11 @@ def _by_cluster(t: np.ndarray, threshold: float) -> np.ndarray:
         largest = np.maximum(largest, mass)
     largest.sort()
     p = np.ones(t.shape[1])
-    for i, j in _runs(sign[0]):
-        p[i:j] = _share(largest, np.abs(t[0, i:j]).sum())
+    for run in runs(sign[0]):
+        p[run] = _share(largest, np.abs(t[0, run]).sum())
     return p
 
 
 def _share(ordered: np.ndarray, values: Any) -> Any:
     """Fraction of `ordered` that is no smaller than each value; equal ones differ in the last digits."""
     return 1 - np.searchsorted(ordered, np.asarray(values) * (1 - 1e-9)) / len(ordered)
-
-
-def _runs(sign: np.ndarray) -> list[tuple[int, int]]:
-    """Begin and end (excluded) of the runs of one sign other than 0."""
-    edges = np.flatnonzero(np.diff(sign, prepend=0, append=0))
-    return [(int(i), int(j)) for i, j in itertools.pairwise(edges) if sign[i] != 0]

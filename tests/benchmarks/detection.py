@@ -33,6 +33,7 @@ import numpy as np
 from pbl_pipeline.keypoints import KeypointParams, Keypoints, detect_keypoints, read_trc
 from pbl_pipeline.keypoints._trc import Trc
 from pbl_pipeline.render import to_pixels
+from pbl_pipeline.runs import runs as stretches
 from pbl_pipeline.tracking import choose_subject, track_people
 from pbl_pipeline.video import load_camera, load_camera_poses, probe, read_frames
 from tests.benchmarks.multiview import CALIBRATION, CAMERAS, FOLDER, IMAGE_SIZE_PX, view_of
@@ -130,8 +131,7 @@ def compare(keypoints: Keypoints, camera: str, trc: Trc) -> Result:
 
 def runs(frames: np.ndarray) -> list[tuple[int, int]]:
     """(first frame, length) of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], frames.astype(int), [0]])))
-    return [(int(a), int(b - a)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return [(run.start, run.stop - run.start) for run in stretches(frames)]
 
 
 def _other_side(name: str) -> str:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.ndimage import uniform_filter1d
+
+from pbl_pipeline.runs import runs
 
 from .network.features import GRID_HZ
 from .network.predict import Grid, Phases
@@ -49,7 +51,7 @@ def walking_stretches(grid: Grid, phases: Phases, params: WalkingParams) -> list
     walks &= ~(np.abs(turning_deg_per_s(grid)) > params.max_turn_deg_per_s)
     walks = _without_short(walks, True, round(params.shortest_s * GRID_HZ))
     swing = swing_leg(grid)
-    return [(a, b) for a, b in _runs(walks) if reach_leg(swing[a : b + 1]) >= params.min_swing_leg]
+    return [(run.start, run.stop - 1) for run in runs(walks) if reach_leg(swing[run]) >= params.min_swing_leg]
 
 
 def turning_deg_per_s(grid: Grid) -> Float[np.ndarray, " N"]:
@@ -77,16 +79,11 @@ def reach_leg(swing: np.ndarray) -> float:
     return float(np.diff(np.percentile(seen, [5, 95]))[0]) if len(seen) > 1 else 0.0
 
 
-def _runs(flags: Bool[np.ndarray, " N"]) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
-    return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
 def _without_short(flags: np.ndarray, value: bool, frames: int) -> np.ndarray:
     """Runs of `value` shorter than `frames` are turned over; at the ends of the trial, too."""
     out = flags.copy()
-    for a, b in _runs(flags == value):
-        inside = value or (a > 0 and b < len(flags) - 1)
-        if b - a + 1 < frames and inside:
-            out[a : b + 1] = not value
+    for run in runs(flags == value):
+        inside = value or (run.start > 0 and run.stop < len(flags))
+        if run.stop - run.start < frames and inside:
+            out[run] = not value
     return out
