@@ -49,6 +49,7 @@ CODES: dict[str, str] = {
     "NORM_UNKNOWN": "no normative set has that name",
     "NORM_INVALID": "the normative data cannot support the index (too few cycles, wrong size)",
     "STATS_INPUT": "the values do not support the statistic: too few, missing, without variation, or of another shape",
+    "STUDY_INVALID": "the parts of a study contradict each other, or one lacks what it must have",
     "DB_NOT_RUNNING": "the database does not answer",
     "DB_UNAVAILABLE": "no database server can be obtained on this machine",
     "DB_REFUSED": "the database answers but refuses the login or the operation",

@@ -17,18 +17,24 @@ from pbl_pipeline.errors import PblError
 EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
 
 
-class _Commands(click.Group):
+class Commands(click.Group):
+    """Its own commands, and those that packages above the library register under an entry-point group."""
+
+    entries = "pbl.commands"
+
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return sorted(e.name for e in entry_points(group="pbl.commands"))
+        return sorted({*self.commands, *(e.name for e in entry_points(group=self.entries))})
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        for entry in entry_points(group="pbl.commands"):
+        if cmd_name in self.commands:
+            return self.commands[cmd_name]
+        for entry in entry_points(group=self.entries):
             if entry.name == cmd_name:
                 return entry.load()
         return None
 
 
-@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="pbl")
 @click.option("--quiet", is_flag=True, help="No progress bars.")
 @click.option("--debug", is_flag=True, help="Print the traceback of an error, too.")

@@ -1,0 +1,24 @@
+"""A study of visits and clinical scores as frames and as one folder, without a database (docs/study.md)."""
+
+from ._codes import deidentified
+from ._columns import CURVE_PERCENT, CURVE_POINTS, FRAMES, KEYS, SIDES, Column
+from ._folder import content_hash, data_dictionary, read_study, write_study
+from ._types import FIRST_ROLES, StudyData, StudyDescription, classes_of
+
+__all__ = [
+    "CURVE_PERCENT",
+    "CURVE_POINTS",
+    "FIRST_ROLES",
+    "FRAMES",
+    "KEYS",
+    "SIDES",
+    "Column",
+    "StudyData",
+    "StudyDescription",
+    "classes_of",
+    "content_hash",
+    "data_dictionary",
+    "deidentified",
+    "read_study",
+    "write_study",
+]

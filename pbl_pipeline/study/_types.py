@@ -1,0 +1,260 @@
+"""The data of a study."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import is_plain
+
+from ._columns import FRAMES, KEYS, SIDES, Column
+
+#: Roles before the event of a study: no other visit of the person may be earlier.
+FIRST_ROLES = ("baseline", "pre")
+_LONGEST = 200
+
+
+@dataclasses.dataclass(frozen=True)
+class StudyDescription:
+    """What a study is and how it was made.
+
+    Attributes
+    ----------
+    name, hash
+        Of the frozen slice; the hash covers its rows. "" where there is no slice.
+    methods
+        Stage -> method, such as {"fit": "blazepose-2"}.
+    code_version
+        Of the code that made the values.
+    event
+        What the days of the visits count from, such as "surgery".
+    change_from, change_to, change_group
+        Roles between which change is judged, and the group that is expected to change. "": the first and the last role
+        by their days, and the group with the most persons who have both.
+    note
+        Shown on the report.
+    """
+
+    name: str = ""
+    hash: str = ""
+    methods: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    code_version: str = ""
+    event: str = ""
+    change_from: str = ""
+    change_to: str = ""
+    change_group: str = ""
+    note: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class StudyData:
+    """A study as pandas frames, without a database; docs/study.md names the columns (`FRAMES` in code).
+
+    Columns are put in order and given their types when it is made; an absent frame is an empty one. Persons are codes.
+
+    Attributes
+    ----------
+    visits
+        One row per visit, also those that do not count (`included` false, with `reason`).
+    measures
+        Long: one row per visit, side and gait measure.
+    scores, instruments
+        Long: one row per visit and clinical score; range and direction of each score.
+    cycles
+        Long: one row per gait cycle and measure, for the repeatability of cycles. May be empty.
+    curves
+        One row per visit, side and joint angle: the mean curve at 0, 1, ..., 100 % of the cycle. May hold NaN.
+    description
+        Of the study.
+
+    Raises
+    ------
+    PblError
+        STUDY_INVALID: no visit, a column absent or of another kind, infinite values, the same row twice, a row of a
+        visit that is not there, a person in two groups, a role twice among the visits of a person that count, an
+        excluded visit without a reason, a first visit (`FIRST_ROLES`) after another, a measure or curve with two
+        units, an unknown score or one outside its range.
+    """
+
+    visits: pd.DataFrame
+    measures: pd.DataFrame = dataclasses.field(default_factory=pd.DataFrame)
+    scores: pd.DataFrame = dataclasses.field(default_factory=pd.DataFrame)
+    instruments: pd.DataFrame = dataclasses.field(default_factory=pd.DataFrame)
+    cycles: pd.DataFrame = dataclasses.field(default_factory=pd.DataFrame)
+    curves: pd.DataFrame = dataclasses.field(default_factory=pd.DataFrame)
+    description: StudyDescription = dataclasses.field(default_factory=StudyDescription)
+
+    def __post_init__(self) -> None:
+        for name in FRAMES:
+            object.__setattr__(self, name, typed(name, getattr(self, name)))
+        _check_visits(self.visits)
+        visits: Any = self.visits
+        known = pd.MultiIndex.from_frame(visits[["subject", "visit"]])
+        for name, key in KEYS.items():
+            frame: Any = getattr(self, name)
+            if (twice := frame.duplicated(list(key))).any():
+                raise invalid(name, f"{_row(frame, twice, key)} twice", "one row of each", "remove or correct one")
+            if "visit" in key:
+                lost = ~pd.MultiIndex.from_frame(frame[["subject", "visit"]]).isin(known)
+                if lost.any():
+                    raise invalid(
+                        name, f"{_row(frame, lost, key)}, a visit that is not in visits", "visits of visits", "add it"
+                    )
+            if "side" in key and (odd := ~frame["side"].isin(SIDES)).any():
+                raise invalid(name, f"side {frame.loc[odd, 'side'].iloc[0]!r}", ", ".join(SIDES), "correct the side")
+        _check_units(self.measures, "measures", "measure")
+        _check_units(self.curves, "curves", "variable")
+        _check_index(self.measures)
+        _check_scores(self.scores, self.instruments)
+
+    @property
+    def n_subjects(self) -> int:
+        """Persons, also those without a visit that counts."""
+        return len(set(self.visits["subject"]))
+
+    @property
+    def n_visits(self) -> int:
+        """Visits, also those that do not count."""
+        return len(self.visits)
+
+
+def typed(name: str, frame: pd.DataFrame) -> pd.DataFrame:
+    """A copy of a frame with its columns in order and of their kinds. Raises `PblError` STUDY_INVALID."""
+    columns = FRAMES[name]
+    if not len(frame) and not len(frame.columns):
+        frame = pd.DataFrame({c.name: [] for c in columns})
+    if absent := [c.name for c in columns if c.name not in frame]:
+        raise invalid(name, f"no column {', '.join(absent[:5])}", "the columns of docs/study.md", "add them")
+    more = [c for c in frame.columns if c not in {k.name for k in columns}]
+    if more and name != "visits":
+        raise invalid(name, f"unknown column {more[0]!r}", "the columns of docs/study.md", "remove it")
+    known = pd.DataFrame({c.name: _values(name, c, frame[c.name]) for c in columns}, index=frame.index)
+    return known.join(frame[more]).reset_index(drop=True)
+
+
+def _values(name: str, column: Column, values: Any) -> Any:
+    try:
+        if column.kind == "number":
+            numbers: Any = pd.Series(pd.to_numeric(values), index=values.index, dtype=float)
+            if np.isinf(numbers).any():
+                raise ValueError("an infinite value")
+            return numbers
+        if column.kind == "flag":
+            return values.map(_flag).astype(bool)
+    except (TypeError, ValueError) as error:
+        raise invalid(name, f"{column.name}: {error}", f"a column of kind {column.kind}", "correct it") from None
+    texts = values.astype(object).where(values.notna(), "").astype(str).str.strip()
+    odd = [t for t in texts.unique() if len(t) > _LONGEST or not is_plain(t) or (not t and column.kind == "label")]
+    if odd:
+        found = f"{column.name}: {ascii(odd[0])[:80]}" if odd[0] else f"{column.name}: empty"
+        raise invalid(
+            name, found, f"one line of {'1' if column.kind == 'label' else '0'} to {_LONGEST} characters", "correct it"
+        )
+    return texts
+
+
+def _flag(value: Any) -> bool:
+    text = str(value).strip().lower()
+    if text in ("true", "yes", "1", "1.0"):
+        return True
+    if text in ("false", "no", "0", "0.0"):
+        return False
+    raise ValueError(f"{value!r} is neither true nor false")
+
+
+def _check_visits(visits: Any) -> None:
+    if not len(visits):
+        raise invalid("visits", "no visit", "one at least", "put visits into the study")
+    by_person = visits.groupby("subject", sort=False)
+    if len(odd := by_person["group"].nunique().loc[lambda n: n > 1]):
+        raise invalid("visits", f"subject {odd.index[0]} in {odd.iloc[0]} groups", "one group per person", "correct it")
+    excluded = visits[~visits["included"]]
+    if (bare := excluded["reason"] == "").any():
+        raise invalid(
+            "visits", f"{_row(excluded, bare, KEYS['visits'])} does not count, without a reason", "a reason", "write it"
+        )
+    counted = visits[visits["included"]]
+    if (twice := counted.duplicated(["subject", "role"])).any():
+        raise invalid(
+            "visits",
+            f"{_row(counted, twice, ('subject', 'role'))} twice among the visits that count",
+            "each role once per person",
+            "exclude one of them with the reason, or give it another role",
+        )
+    first = counted[counted["role"].isin(FIRST_ROLES)].groupby("subject")["days"].max()
+    others = counted[~counted["role"].isin(FIRST_ROLES)]
+    if (late := others["days"] < others["subject"].map(first)).any():
+        raise invalid(
+            "visits",
+            f"{_row(others, late, ('subject', 'visit', 'role'))} before the visit {' or '.join(FIRST_ROLES)}",
+            "days that fit the roles",
+            "correct role or date",
+        )
+
+
+def _check_units(frame: Any, name: str, what: str) -> None:
+    units = frame.groupby(what, sort=False)["unit"].nunique()
+    if len(odd := units[units > 1]):
+        raise invalid(name, f"{what} {odd.index[0]} in {odd.iloc[0]} units", "one unit", "convert the values")
+
+
+def _check_index(measures: Any) -> None:
+    if ((measures["measure"] == "gdi") & (measures["side"] == "both")).any():
+        raise invalid("measures", "gdi of both sides", "that index in visits only", "remove it here")
+
+
+def _check_scores(scores: Any, instruments: Any) -> None:
+    table = instruments.set_index("instrument")
+    if (odd := ~scores["instrument"].isin(table.index)).any():
+        raise invalid(
+            "scores", f"instrument {scores.loc[odd, 'instrument'].iloc[0]!r}", "a row of instruments", "add its row"
+        )
+    if (table["low"] >= table["high"]).any() or (table["mic"] <= 0).any():
+        raise invalid(
+            "instruments",
+            "a range whose low is not below its high, or a minimal important change that is not positive",
+            "low < high, mic > 0",
+            "correct the row",
+        )
+    for text in table["classes"]:
+        classes_of(text)
+    low, high = (scores["instrument"].map(table[c]) for c in ("low", "high"))
+    if (outside := (scores["value"] < low) | (scores["value"] > high)).any():
+        row = scores[outside].iloc[0]
+        raise invalid(
+            "scores",
+            f"{row['instrument']} {row['value']:g} of {row['subject']}, {row['visit']}",
+            f"{low[outside].iloc[0]:g} to {high[outside].iloc[0]:g}",
+            "correct the score at its source",
+        )
+
+
+def classes_of(text: str) -> list[tuple[float, str]]:
+    """Classes of an instrument, lowest first: (lowest value, name). Raises `PblError` STUDY_INVALID."""
+    found = []
+    for part in filter(None, (p.strip() for p in text.split(";"))):
+        number, _, word = part.partition(" ")
+        try:
+            found.append((float(number), word.strip() or number))
+        except ValueError:
+            raise invalid(
+                "instruments", f"classes {text!r}", "such as: 0 high risk; 21 low risk", "correct it"
+            ) from None
+    if [v for v, _ in found] != sorted({v for v, _ in found}):
+        raise invalid("instruments", f"classes {text!r}", "lowest values that increase", "put them in order")
+    return found
+
+
+def _row(frame: Any, where: Any, key: tuple[str, ...]) -> str:
+    row = frame[np.asarray(where)].iloc[0]
+    return ", ".join(f"{k} {row[k]}" for k in key)
+
+
+def invalid(frame: str, found: str, expected: str, next_step: str) -> PblError:
+    """A `PblError` STUDY_INVALID about a frame."""
+    return PblError("STUDY_INVALID", found=found, expected=expected, next_step=next_step, key=frame)
