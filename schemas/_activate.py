@@ -6,7 +6,20 @@ import importlib
 from types import ModuleType
 
 #: Modules of tables, each its own schema on the server, in the order of dependency.
-STAGES = ("lab", "session", "video", "tracking", "keypoints", "fit", "gait", "gdi", "qc", "validation", "worker")
+STAGES = (
+    "lab",
+    "session",
+    "video",
+    "tracking",
+    "keypoints",
+    "fit",
+    "gait",
+    "gdi",
+    "qc",
+    "validation",
+    "study",
+    "worker",
+)
 
 _methods_done: set[str] = set()
 
