@@ -130,10 +130,11 @@ def marker_jacobian(
     return MarkerJacobian(at.x, jnp.stack(per_qpos, axis=-2), at.per_scale, at.per_offset)
 
 
-def scale_multipliers(s: Float[Array, " S"]) -> Float[Array, " S"]:
+def scale_multipliers(s: Float[Array, "*n S"]) -> Float[Array, "*n S"]:
     """Multipliers of the scale groups from the paper's parameters, which add to 1: 1 + overall for the first group
     ("overall"), 1 + overall + own for the others."""
-    return 1.0 + s[0] + jnp.concatenate([jnp.zeros(1, s.dtype), s[1:]])
+    overall = s[..., :1]
+    return 1.0 + overall + jnp.concatenate([jnp.zeros_like(overall), s[..., 1:]], axis=-1)
 
 
 def scaled_body_pos(body: Body, scale: Float[Array, " S"]) -> Float[Array, "B 3"]:

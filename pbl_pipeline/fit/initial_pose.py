@@ -76,9 +76,9 @@ def root_positions(x_cam: np.ndarray, xy_px: np.ndarray, c: np.ndarray, matrix: 
     total = np.sum(c, axis=1)
     normal[:, 0, 0] = normal[:, 1, 1] = total
     weighted = c[..., None] * d
-    normal[:, :2, 2] = normal[:, 2, :2] = -np.sum(weighted, axis=1)
-    normal[:, 2, 2] = np.sum(weighted * d, axis=(1, 2))
-    right = np.concatenate([(c[:, None] @ b)[:, 0], -np.sum(weighted * b, axis=(1, 2))[:, None]], axis=1)
+    normal[:, :2, 2] = normal[:, 2, :2] = -(c[:, None] @ d)[:, 0]
+    normal[:, 2, 2] = np.einsum("tjk,tjk->t", weighted, d)
+    right = np.concatenate([(c[:, None] @ b)[:, 0], -np.einsum("tjk,tjk->t", weighted, b)[:, None]], axis=1)
     enough = np.count_nonzero(c > 0, axis=1) >= 4
     out = np.full((len(c), 3), np.nan)
     out[enough] = np.linalg.solve(normal[enough] + 1e-9 * np.eye(3), right[enough][..., None])[..., 0]

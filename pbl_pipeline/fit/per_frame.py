@@ -86,8 +86,10 @@ def solve_per_frame(sessions: Sequence[Session], params: GaussNewtonParams, star
         # The cost of the second one has a term more.
         traces = [np.concatenate([t, f.trace + np.array([len(t), 0.0])]) for t, f in zip(traces, found, strict=True)]
     n = len(sessions)
+    scales = np.asarray(scale_multipliers(jnp.asarray(np.stack([f.end.state.s for f in found]))), np.float64)
     spent = (time.perf_counter() - begin) / n, (compile_seconds() - compiled) / n
-    return [_solution(s, params, f, t, *spent) for s, f, t in zip(sessions, found, traces, strict=True)]
+    each = zip(sessions, found, scales, traces, strict=True)
+    return [_solution(session, params, f, scale, trace, *spent) for session, f, scale, trace in each]
 
 
 def start_of(session: Session, flip: bool = False) -> State:
@@ -104,6 +106,9 @@ def start_of(session: Session, flip: bool = False) -> State:
         "site_offset_m": zeros((n_markers, 3)),
         "clock_s": zeros(n_trials),
         "floor": zeros((n_trials, 3)),
+        # On the host as all of it: what lies on a device comes back one by one before a batch is stacked.
+        "lean": zeros((0, 3)),
+        "depth_m": zeros((0, 0)),
     }
     return State(**values)
 
@@ -196,6 +201,7 @@ def _solution(
     session: Session,
     params: GaussNewtonParams,
     found: _Found,
+    scale: np.ndarray,
     trace: np.ndarray,
     seconds: float,
     compiled: float,
@@ -209,7 +215,7 @@ def _solution(
         qpos=state.qpos,
         R_nc=state.R_nc,
         s=state.s,
-        scale=np.asarray(scale_multipliers(found.end.state.s), np.float64),
+        scale=scale,
         site_offset_m=state.site_offset_m[: len(session.markers)],
         clock_s=state.clock_s[: len(session.arrays)],
         loss_trace=trace,
