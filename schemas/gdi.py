@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 
-from . import fit, gait, session  # noqa: F401  a definition refers to session
+from . import fit, gait, session, video  # noqa: F401  a definition refers to session
 from ._datajoint import dj
 from .checks import check_columns, check_row
 from .method_rows import method_columns, method_row, resolve_method
@@ -144,7 +144,7 @@ class GDI(dj.Computed):
         with stored_file(self, ref) as path:
             curves = gait.load_curves(path)
         cycles = [gait.cycle_of_row(r, name, curves.get(int(r["cycle_no"]))) for r in rows]
-        result = score_gdi(cycles, norm_of_row(*norm), index.params, index.name, index.version)
+        result = score_gdi(cycles, norm_of_row(*norm), index.params, index)
         return result, index.hash, norm[1]
 
     def make_insert(self, key: dict, result: lib.Gdi, sha: str, norm_sha: str, origin: Origin) -> None:
@@ -174,7 +174,7 @@ class GDI(dj.Computed):
 @schema
 class SessionGdi(dj.Computed):
     definition = f"""
-    # all used cycles of all trials of a set together: measures and index of the visit, as in metrics.json
+    # all used cycles of the trials of a set that are walked at the pace of the index: measures and index of the visit
     -> fit.SessionFit
     -> gait.GaitEventMethod
     -> GdiModel
@@ -236,6 +236,7 @@ class SessionGdi(dj.Computed):
             method_row(gait.GaitEventMethod, key),
             method_row(GdiModel, key),
             fit.fit_checks(key),
+            [(c.activity, c.pace) for c in video.conditions([{"video_id": r["video_id"]} for r in rows]).values()],
         )
 
     @computes
@@ -247,6 +248,7 @@ class SessionGdi(dj.Computed):
         events: Mapping[str, Any],
         index: Mapping[str, Any],
         checks: Sequence[tuple],
+        conditions: Sequence[tuple[str, str]],
     ) -> tuple[lib.GaitMetrics, str, str]:
         from pbl_pipeline import gait as lib
         from pbl_pipeline.fit import TrialFit
@@ -258,7 +260,8 @@ class SessionGdi(dj.Computed):
             paths = [stack.enter_context(stored_file(self, ref)) for ref in refs]
             trials = [TrialFit.load(path) for path in paths]
         about_fit = [Check(*check) for check in checks]
-        result = lib.gait_metrics(trials, norm_of_row(*norm), params, about_fit, model.name, model.version)
+        done = [lib.Condition(*c) for c in conditions]
+        result = lib.gait_metrics(trials, norm_of_row(*norm), params, about_fit, model, conditions=done)
         return result, model.hash, norm[1]
 
     def make_insert(self, key: dict, result: lib.GaitMetrics, sha: str, norm_sha: str, origin: Origin) -> None:
@@ -326,6 +329,13 @@ def profile_of_rows(
     }
     gps = (number(master[f"{prefix}_{k}"]) for k in ("gps_left", "gps_right", "gps"))
     return MovementProfile(sides["left"], sides["right"], *gps)
+
+
+def pace_of(gdi_method: str) -> str:
+    """The pace that an index pools, by the key of its method."""
+    from pbl_pipeline.gait import SELF_SELECTED
+
+    return one(GdiModel & {"gdi_method": gdi_method}, "gdi_params").get("pace", SELF_SELECTED)
 
 
 def norm_row(norm: lib.NormativeSet) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from ._datajoint import DuplicateError, dj
 from .chain import computed_tables
 from .coded_errors import error_code
 from .codes import check_subject, day_of
+from .conditions import set_condition
 from .jobs import jobs_of
 from .method_rows import resolve_method
 from .plan import default_fit
@@ -61,7 +62,7 @@ class Ingested:
 @dataclasses.dataclass(frozen=True)
 class Visit:
     """What all files of one call share. None: camera motion handheld where the phone's log is known, else static;
-    activity walking; population unchanged."""
+    activity walking; pace unknown; population unchanged."""
 
     subject: str
     session_label: str = session.UNLABELLED
@@ -71,6 +72,7 @@ class Visit:
     activity: str | None = None
     person: int | None = None
     population: str | None = None
+    pace: str | None = None
 
 
 #: Key of a selection or plan -> field of `Methods` that names it.
@@ -112,6 +114,7 @@ def ingest(
         ("session", visit.session_label, 64),
         ("project", visit.project or "", 32),
         ("activity", visit.activity or "", 32),
+        ("pace", visit.pace or "", 32),
         ("population", visit.population or "", 32),
     ):
         check_label(f"--{what}", text, longest)
@@ -217,6 +220,7 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
         row["camera_id"] = camera_id_of(camera) if camera else None
         row["video_id"] = next_id(video.Video, "video_id")
         video.Video.insert1(row)
+        set_condition(row["video_id"], pace=visit.pace)
         _select(row["video_id"], row["session_id"], visit.person, chosen)
         notes[:] = sensors.register(row["video_id"], found)
 
@@ -277,12 +281,12 @@ def _known(
     changes = _new_camera(path, row, visit.camera_file) if visit.camera_file else []
     changes += _new_files(row, visit, found)
     changes += _new_methods(row, chosen, more)
+    changes += in_transaction(lambda: set_condition(number, visit.activity, visit.pace))
     changes += _new_population(row["subject"], visit.population)
     if changes and status == "known":
         status = "updated"
-    for what, given in (("activity", visit.activity), ("camera_motion", visit.camera_motion)):
-        if given is not None and given != row[what]:
-            changes.append(f"{what.replace('_', ' ')} {given} was ignored, it stays {row[what]}")
+    if visit.camera_motion not in (None, row["camera_motion"]):
+        changes.append(f"camera motion {visit.camera_motion} was ignored, it stays {row['camera_motion']}")
     if status == "known" and not changes:
         changes = ["nothing was inserted"]
     return Ingested(path, status, number, "; ".join(notes + changes))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 
-from . import fit, gait, gdi, lab, session
+from . import fit, gait, gdi, lab, session, video
 from .rows import plain
 from .stored_files import new_folder
 
@@ -46,6 +46,7 @@ def build_norm(
     nine_angles: bool = False,
     variance: float = 0.95,
     source: str = "",
+    pace: str = "self_selected",
 ) -> BuiltNorm:
     """Build a normative set from the used cycles of the current fits and register it as the next version of its name.
 
@@ -65,6 +66,8 @@ def build_norm(
         `{"fit_method": "blazepose-v1"}`: needed where the tables hold several chains of methods.
     nine_angles
         All nine angles (for `gillette-2008`) and not three.
+    pace
+        Cycles of videos that are walked at this pace; one of unknown pace counts as self-selected.
 
     Raises
     ------
@@ -82,12 +85,13 @@ def build_norm(
     _must_exist(lab.Population, "population", [*populations, *pooled_populations])
     _must_exist(lab.Subject, "subject", subjects)
     chosen = [{"population": p} for p in populations] + [{"subject": s} for s in subjects]
-    keys = _cycle_keys(chosen, restriction)
-    patients = _cycle_keys([{"population": p} for p in pooled_populations], restriction) if pooled_populations else []
+    keys = _cycle_keys(chosen, restriction, pace)
+    others = [{"population": p} for p in pooled_populations]
+    patients = _cycle_keys(others, restriction, pace) if others else []
     if not keys:
         raise PblError(
             "DB_NOT_FOUND",
-            found=f"no gait cycles of {', '.join([*populations, *subjects])}",
+            found=f"no gait cycles of {', '.join([*populations, *subjects])} at the pace {pace!r}",
             expected="fitted sessions of these people (`pbl ingest --population`, `pbl populate`)",
             next_step="`pbl status` shows what is done",
         )
@@ -100,6 +104,7 @@ def build_norm(
         "fit_sets": sorted({k["fit_set"] for k in keys}),
         "methods": {k: keys[0][k] for k in _CHAIN},
         "variance": variance,
+        "pace": pace,
     }
     newest = _newest(name)
     made: dict[str, Any] = {}
@@ -143,8 +148,8 @@ def load_norm(norm: str) -> lib.NormativeSet:
     return gdi.norm_of_row(*gdi.norm_ref({"norm": found}))
 
 
-def _cycle_keys(people: Sequence[dict], restriction: Any) -> list[dict[str, Any]]:
-    """Keys of GaitCycle of the current fits of these people, with subject and methods."""
+def _cycle_keys(people: Sequence[dict], restriction: Any, pace: str) -> list[dict[str, Any]]:
+    """Keys of GaitCycle of the current fits of these people who walk at this pace, with subject and methods."""
     found = (
         (fit.FitSelection & {"fit_current": True}).proj()
         * fit.FitSet.proj("session_id")
@@ -153,7 +158,9 @@ def _cycle_keys(people: Sequence[dict], restriction: Any) -> list[dict[str, Any]
         * fit.FitSet.Video.proj("tracking_method", "keypoint_method")
         * gait.GaitCycle.proj()
     )
-    return (found & list(people) & restriction).to_dicts(order_by="KEY")
+    keys = (found & list(people) & restriction).to_dicts(order_by="KEY")
+    done = video.conditions(f"video_id IN ({','.join(str(k['video_id']) for k in keys)})") if keys else {}
+    return [k for k in keys if done[k["video_id"]].pooled(pace)]
 
 
 def _cycles(keys: Sequence[dict[str, Any]]) -> tuple[list[lib.GaitCycle], list[str]]:

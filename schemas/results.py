@@ -258,7 +258,12 @@ def load_metrics(key: Any) -> lib.GaitMetrics:
 
     row = (gdi.SessionGdi & key).fetch1()
     row_key = {k: row[k] for k in gdi.SessionGdi.primary_key}
-    trials = tuple(_trial_metrics({**row_key, "video_id": v}) for v in _videos(row_key))
+    done, pace = video.conditions(fit.SessionFit.Trial & row_key), gdi.pace_of(row_key["gdi_method"])
+    trials = tuple(
+        dataclasses.replace(_trial_metrics({**row_key, "video_id": v}), pooled=done[v].pooled(pace))
+        for v in _videos(row_key)
+    )
+    pooled = [t for t in trials if t.pooled]
     norm_name, model = _names(row_key)
     index = lib.Gdi(
         status="PASS" if row["session_gdi"] is not None else "EMPTY",
@@ -269,12 +274,12 @@ def load_metrics(key: Any) -> lib.GaitMetrics:
         sd=number(row["session_gdi_sd"]),
         minimal_change=number(row["session_gdi_minimal_change"]),
         n=int(row["session_gdi_n"]),
-        n_left=sum(t.gdi.n_left for t in trials),
-        n_right=sum(t.gdi.n_right for t in trials),
+        n_left=sum(t.gdi.n_left for t in pooled),
+        n_right=sum(t.gdi.n_right for t in pooled),
         norm=norm_name,
         model=model,
         params_hash=row["session_gdi_method_hash"],
-        cycles=tuple(c for t in trials for c in t.gdi.cycles),
+        cycles=tuple(c for t in pooled for c in t.gdi.cycles),
         qc=tuple(c for c in _checks(gdi.SessionGdi.Check & row_key, "gdi") if c.check in _INDEX_CHECKS),
         profile=gdi.profile_of_rows((gdi.SessionGdi.Profile & row_key).to_dicts(), row, "session"),
     )
@@ -283,9 +288,9 @@ def load_metrics(key: Any) -> lib.GaitMetrics:
         "session_measure",
         status=row["session_status"],
         reason=row["session_reason"],
-        n_cycles_found=sum(t.spatiotemporal.n_cycles_found for t in trials),
+        n_cycles_found=sum(t.spatiotemporal.n_cycles_found for t in pooled),
         n_cycles_used=int(row["session_cycles"]),
-        n_steps_used=sum(t.spatiotemporal.n_steps_used for t in trials),
+        n_steps_used=sum(t.spatiotemporal.n_steps_used for t in pooled),
     )
     return lib.GaitMetrics(
         trials=trials,

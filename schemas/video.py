@@ -17,6 +17,7 @@ from .rows import number, one
 
 if TYPE_CHECKING:
     from pbl_pipeline import video as lib
+    from pbl_pipeline.gait import Condition
 
 schema = dj.Schema()
 
@@ -39,6 +40,16 @@ class Video(dj.Manual):
     camera_motion   : enum('static', 'handheld', 'one of several')
     video_created   : datetime                 # when registered, UTC
     unique index (video_sha256)
+    """
+
+
+@schema
+class Pace(dj.Manual):
+    definition = """
+    # how fast a video is walked; one without a row counts as the pace that the person chose
+    -> Video
+    ---
+    pace            : varchar(32)              # self_selected, fast, slow, dual_task, or the study's own word
     """
 
 
@@ -192,6 +203,16 @@ def info_of_row(row: Mapping[str, Any], time_s: np.ndarray) -> lib.VideoInfo:
         focal_35mm=number(row["focal_35mm"]),
         capture_fps=number(row["capture_fps"]),
     )
+
+
+def conditions(videos: Any) -> dict[int, Condition]:
+    """The library's `Condition` of each video of a query or restriction, by its number."""
+    from pbl_pipeline.gait import Condition
+
+    found = (Video & videos).proj("activity")
+    paces = {int(r["video_id"]): r["pace"] for r in (Pace & found.proj()).to_dicts()}
+    rows = found.to_dicts(order_by="video_id")
+    return {(v := int(r["video_id"])): Condition(r["activity"], paces.get(v, "")) for r in rows}
 
 
 def camera_of(row: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -75,7 +75,9 @@ def cycle_curves(restriction: Any = True) -> pd.DataFrame:
         }
         leg_m = lib.leg_length_m(row["fit_scale"])
         bands = lib.normal_bands(lib.Spatiotemporal("PASS", "", measures, {}, 0, 0, 0), leg_m)
-        cycles = [c for k in (gait.GaitCycle & key).keys() for c in gait.load_cycles(k)]  # noqa: SIM118 a query
+        done, pace = video.conditions(fit.SessionFit.Trial & key), gdi.pace_of(key["gdi_method"])
+        keys = (gait.GaitCycle & key).keys()
+        cycles = [c for k in keys if done[k["video_id"]].pooled(pace) for c in gait.load_cycles(k)]
         frame = lib.curve_frame(cycles, bands).assign(normal_matched=bands.matched)
         parts.append(pd.DataFrame({n: [row[n]] * len(frame) for n in names}).join(frame))
     return pd.concat([p for p in parts if len(p)] or parts, ignore_index=True)

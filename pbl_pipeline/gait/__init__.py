@@ -7,6 +7,7 @@ Each step is a function of its own with a frozen result: `feet_from_fit` or `fee
 from ._angles import ANGLE_NAMES, LEG_ANGLES, AngleSeries, angle_series, leg_angles, pelvis_angles
 from ._bands import NormalBands, leg_length_m, normal_bands
 from ._camera_side import camera_side, mostly
+from ._condition import ACTIVITIES, ANY_PACE, PACES, SELF_SELECTED, UNKNOWN, Condition
 from ._curve_frame import CURVE_FRAME_COLUMNS, curve_frame
 from ._cycles import REPORT_PERCENT, GaitCycle, cycle_curves, find_cycles
 from ._exclusion import Exclusion
@@ -61,8 +62,10 @@ from .normative import (
 )
 
 __all__ = [
+    "ACTIVITIES",
     "ANGLE_MODELS",
     "ANGLE_NAMES",
+    "ANY_PACE",
     "BODY_ANGLES",
     "CURVE_FRAME_COLUMNS",
     "DEFAULT_NORM",
@@ -75,13 +78,17 @@ __all__ = [
     "MEASURES",
     "MODEL_ANGLES",
     "NINE_ANGLES",
+    "PACES",
     "PLUG_IN_GAIT",
     "PLUG_IN_GAIT_POINTS",
     "REPORT_PERCENT",
+    "SELF_SELECTED",
     "THREE_ANGLES",
+    "UNKNOWN",
     "Z90",
     "AngleSeries",
     "BodyPoses",
+    "Condition",
     "EventParams",
     "Exclusion",
     "FootTrajectories",

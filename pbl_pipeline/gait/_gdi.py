@@ -8,10 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.methods import Stage
+from pbl_pipeline.methods import Method, Stage
 from pbl_pipeline.paramset import Paramset, later
 from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
 
+from ._condition import SELF_SELECTED
 from ._cycles import GaitCycle
 from ._profile import MovementProfile, movement_profile, variable_scores
 from .events import LEFT, RIGHT
@@ -40,6 +41,9 @@ class GdiParams:
     repeated
         Fraction of the variance of the angles' error that two visits of one person have in common, filmed alike: what
         the body's places and the priors get wrong of this person, not the detector's chance.
+    pace
+        Measures and index of a session pool the trials that are walked at this pace: one of `PACES`, a word of one's
+        own, or "any".
     """
 
     norm: str = DEFAULT_NORM
@@ -47,6 +51,7 @@ class GdiParams:
     advised_cycles: int = 10
     min_explained: float = 0.5
     repeated: float = later(0.75)
+    pace: str = later(SELF_SELECTED)
 
 
 #: A 90 % interval of a normal error, in standard deviations.
@@ -129,7 +134,7 @@ def score_gdi(
     cycles: Sequence[GaitCycle],
     norm: NormativeSet | str | None = None,
     params: GdiParams | None = None,
-    model: str | None = None,
+    model: Method[GdiParams] | str | None = None,
     version: int | None = None,
 ) -> Gdi:
     """Gait Deviation Index over the used cycles of one or several trials.
@@ -154,8 +159,8 @@ def score_gdi(
     params
         None for those of `model`.
     model, version
-        A name of `GDI_METHODS`, which decides the angles, and its version (None: the newest). Without it the norm's
-        angles decide; a norm of other angles than the two indices have gives an index of its own name.
+        A method of `GDI_METHODS`, or its name, which decides the angles, and its version (None: the newest). Without it
+        the norm's angles decide; a norm of other angles than the two indices have gives an index of its own name.
 
     Raises
     ------
@@ -165,13 +170,16 @@ def score_gdi(
     """
     method = GDI_METHODS.find(model)
     params = params or method.params
-    model = method.name if model else None
     if norm is None:
         norm = params.norm
     basis = load_norm(norm) if isinstance(norm, str) else norm
-    model = _model_of(basis, model)
-    version = version or (GDI_METHODS[model].version if model in GDI_METHODS else 1)
+    family = _model_of(basis, method.family.name if model else None)
+    known = method if model else GDI_METHODS.get(family)
+    model = method.name if model else family
+    version = version or (known.version if known else 1)
     paramset = Paramset.of("gdi", model, version, dataclasses.replace(params, norm=basis.name))
+    if model != family:  # a method of one's own names its family, as its row does
+        paramset = dataclasses.replace(paramset, params={GDI_METHODS.kind: family, **paramset.params})
     usable = [c for c in cycles if c.used and all(v in c.curves for v in basis.variables)]
     vectors = [_vector(c, basis) for c in usable]
     scored = tuple(_score(c, v, basis) for c, v in zip(usable, vectors, strict=True))

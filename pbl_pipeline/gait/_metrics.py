@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import EMPTY, OUTCOMES, PASS, WARN, Check, in_session, worst
 
+from ._condition import Condition
 from ._cycles import GaitCycle, find_cycles
 from ._gdi import GDI_METHODS, GDI_MODEL, GILLETTE_MODEL, Gdi, GdiParams, score_gdi
 from ._laboratory import LabTrial
@@ -34,7 +36,8 @@ class GaitParams:
 
 @dataclasses.dataclass(frozen=True)
 class TrialMetrics:
-    """Everything of one trial."""
+    """Everything of one trial. `pooled` is false where the session's measures leave it out: no walking, or walking at
+    another pace than that of the method."""
 
     name: str
     status: str
@@ -44,6 +47,7 @@ class TrialMetrics:
     spatiotemporal: Spatiotemporal
     gdi: Gdi
     qc: tuple[Check, ...]
+    pooled: bool = True
 
     def to_dict(self) -> dict:
         return {"name": self.name, **_measures(self)}
@@ -51,7 +55,7 @@ class TrialMetrics:
 
 @dataclasses.dataclass(frozen=True)
 class GaitMetrics:
-    """A session: its trials, and the measures over all their cycles together.
+    """A session: its trials, and the measures over all cycles of the pooled trials together.
 
     `qc` are the checks of its measures and index, `before` those of the stages before (`with_checks`).
     """
@@ -68,6 +72,11 @@ class GaitMetrics:
     def with_checks(self, checks: Sequence[Check]) -> GaitMetrics:
         """The same measures, judged together with the checks of keypoints and fit."""
         return dataclasses.replace(self, before=tuple(checks))
+
+    @property
+    def cycles(self) -> list[GaitCycle]:
+        """The cycles of the pooled trials, those that are not used as well."""
+        return [c for t in self.trials if t.pooled for c in t.cycles]
 
     @property
     def checks(self) -> tuple[Check, ...]:
@@ -122,13 +131,15 @@ def gait_metrics(
     norm: NormativeSet | str | None = None,
     params: GaitParams | None = None,
     fit_checks: Sequence[Check] = (),
-    model: str | None = None,
+    model: Method[GdiParams] | str | None = None,
     version: int | None = None,
+    conditions: Sequence[Condition] | None = None,
 ) -> GaitMetrics:
-    """Measures of the trials of one session and of the session (all used cycles of all trials pooled).
+    """Measures of the trials of one session and of the session (all used cycles of its pooled trials).
 
     Trials are fits, or recordings of a laboratory, whose first and last steps in view count. `model` and `version` are
-    those of `score_gdi`.
+    those of `score_gdi`. `conditions` says what is done in each trial (None: unknown): the session pools walking at the
+    pace of `params.gdi`, the other trials have measures of their own alone.
 
     A trial without walking has status EMPTY and takes no part in the session; the session is EMPTY where no trial
     has a used cycle. Where one of `fit_checks`, the checks of the session fit, FAILs, there is none: measures and index
@@ -142,12 +153,22 @@ def gait_metrics(
     wanted = params.gdi.norm if norm is None else norm
     basis = load_norm(wanted) if isinstance(wanted, str) else wanted
     index = {"norm": basis, "params": params.gdi, "model": model, "version": version}
-    done = tuple(_trial(t, params.events, index, fit_checks) for t in trials)
-    cycles = [c for t in done for c in t.cycles]
+    given = [Condition()] * len(trials) if conditions is None else conditions
+    done = tuple(
+        dataclasses.replace(_trial(t, params.events, index, fit_checks), pooled=c.pooled(params.gdi.pace))
+        for t, c in zip(trials, given, strict=True)
+    )
+    pooled = [t for t in done if t.pooled]
+    cycles = [c for t in pooled for c in t.cycles]
     # Two trials may carry one name; their cycles are told apart by it.
-    measures, gdi = spatiotemporal(_distinct(done)), score_gdi(cycles, **index)
+    measures, gdi = spatiotemporal(_distinct(pooled)), score_gdi(cycles, **index)
     status = PASS if measures.status == PASS else EMPTY
-    reason = "" if status == PASS else "; ".join(dict.fromkeys(f"{t.name}: {t.reason}" for t in done))
+    reason = "" if status == PASS else "; ".join(dict.fromkeys(f"{t.name}: {t.reason}" for t in pooled))
+    if not pooled:
+        there = "; ".join(dict.fromkeys(map(str, given)))
+        reason = f"no trial of walking at the pace {params.gdi.pace!r} (there are: {there})"
+        measures = dataclasses.replace(measures, reason=reason, reasons=dict.fromkeys(measures.reasons, reason))
+        gdi = dataclasses.replace(gdi, reason=reason)
     return GaitMetrics(
         trials=done,
         status=status,

@@ -72,7 +72,7 @@ def page_of(report: SessionReport) -> dict:
     if report.metrics is not None and not empty:
         metrics = report.metrics
         values = metrics.spatiotemporal
-        cycles = [c for t in metrics.trials for c in t.cycles]
+        cycles = metrics.cycles
         page["tiles"] = [*(_tile(k, values[k], values.reasons.get(k, "")) for k in HEADLINES), _gdi_tile(metrics.gdi)]
         page["measures"] = [_measure_row(k, values[k], values.reasons.get(k, "")) for k in MEASURES]
         page["measures"].append(_gdi_row(metrics.gdi))

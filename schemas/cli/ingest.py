@@ -46,7 +46,10 @@ if TYPE_CHECKING:
     metavar="FILE",
     help="Files of wearable IMUs, of one video.",
 )
-@click.option("--activity", help="What the person does (else: walking).")
+@click.option("--activity", help="What the person does, such as tug or sit_to_stand (else: walking).")
+@click.option(
+    "--pace", help="How fast: self_selected, fast, slow, dual_task, ... (else: unknown, which counts as self_selected)."
+)
 @click.option("--population", metavar="NAME", help="Group of the subject, such as healthy (else: as it was).")
 @click.option("--person", type=click.IntRange(min=1), help="Measure this person of the tracking (else: automatic).")
 @click.option("--tracking-method", metavar="NAME", help="Method of person tracking (else: the default).")
@@ -65,6 +68,7 @@ def ingest(
     depth: tuple[Path, ...],
     imu: tuple[Path, ...],
     activity: str | None,
+    pace: str | None,
     population: str | None,
     person: int | None,
     tracking_method: str | None,
@@ -76,8 +80,8 @@ def ingest(
     """Register videos of one visit; `pbl populate` then computes them. Nothing is decoded here.
 
     A file whose bytes are registered already is not registered twice, but takes a new camera (what was computed with
-    another is deleted and listed), a sensor log of the phone (the same) and further methods. Logs, depth videos and
-    IMU files are copied. Exit code 1 when a file was refused; the others are registered all the same.
+    another is deleted and listed), a sensor log of the phone (the same), activity, pace and further methods. Logs,
+    depth videos and IMU files are copied. Exit code 1 when a file was refused; the others are registered all the same.
 
     \b
     Example: pbl ingest walk1.mp4 walk2.mp4 --subject P017 --session 2026-03-01
@@ -90,7 +94,7 @@ def ingest(
 
     files = _files(len(videos), attitude, depth, imu)
     schemas.activate()
-    visit = Visit(subject, session_label, project, camera, camera_motion, activity, person, population)
+    visit = Visit(subject, session_label, project, camera, camera_motion, activity, person, population, pace)
     methods = Methods(tracking=tracking_method, keypoint=keypoint_method, fit=fit_method, gdi=index, norm=norm)
     results = register(videos, visit, methods, files)
     for result in results:

@@ -103,6 +103,7 @@ def show(name: str, out: Path | None) -> None:
 @click.option("--keypoints", "keypoint_method", help="Keypoint method, where the tables hold several.")
 @click.option("--nine-angles", is_flag=True, help="All nine angles, for gillette-2008.")
 @click.option("--variance", type=click.FloatRange(0.5, 0.999), default=0.95, show_default=True)
+@click.option("--pace", default="self_selected", show_default=True, help="Videos walked at this pace; any for all.")
 @click.option("--source", default="", help="Who measured whom, to be kept with the set.")
 def build(
     name: str,
@@ -114,6 +115,7 @@ def build(
     keypoint_method: str | None,
     nine_angles: bool,
     variance: float,
+    pace: str,
     source: str,
 ) -> None:
     """Build the set NAME from the gait cycles of people in the database and register it as a new version.
@@ -134,6 +136,7 @@ def build(
         nine_angles=nine_angles,
         variance=variance,
         source=source,
+        pace=pace,
     )
     kind = "registered" if built.new else "known already, nothing was changed"
     click.echo(f"{built.norm}: {kind}; {built.n_cycles} cycles of {built.n_people} people")

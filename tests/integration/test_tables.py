@@ -278,7 +278,7 @@ def test_a_registered_video_takes_a_camera_and_further_methods(tables: None, tmp
     assert (result.status, result.video_id) == ("updated", number)
     assert "1 of" in result.note
     assert "keypoints" in result.note.lower()
-    assert "activity running was ignored, it stays walking" in result.note
+    assert "activity is running now" in result.note
     assert len(keypoints.Keypoints()) == len(fit.SessionFit()) == len(fit.FitSet()) == len(qc.SessionQc()) == 0
     assert tracking.Tracking.fetch1("tracking_computed") == tracked
     assert not errors(populate())

@@ -1,0 +1,51 @@
+"""What is done in a video and at which pace: how it is changed, and what a change makes outdated."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pbl_pipeline.errors import PblError
+
+from . import fit, gdi, video
+from .rows import delete_below
+
+
+def set_condition(video_id: int, activity: str | None = None, pace: str | None = None) -> list[str]:
+    """State activity or pace of a registered video (None: as it is); returns what changed, in words.
+
+    Where a session's measures pool the video now and did not before, or the other way round, they are deleted, so that
+    the next populate computes them anew. Call it inside a transaction.
+
+    Raises
+    ------
+    PblError
+        DB_NOT_FOUND for a number that no video has; USAGE for labels of more than 32 characters.
+    """
+    from pbl_pipeline.gait import Condition
+
+    key = {"video_id": video_id}
+    before = video.conditions(key).get(video_id)
+    if before is None:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no video_id {video_id}",
+            expected="a registered video",
+            next_step="`pbl ingest` prints the numbers of videos",
+        )
+    changes = []
+    after = Condition(before.activity if activity is None else activity, before.pace if pace is None else pace)
+    if activity is not None and after.activity != before.activity:
+        video.Video.update1({**key, "activity": activity})
+        changes.append(f"activity is {activity} now")
+    if after.pace != before.pace:
+        video.Pace.insert1({**key, "pace": after.pace}, replace=True)
+        changes.append(f"pace is {after.pace} now")
+    if after.pool != before.pool and (deleted := _delete_pooled(key)):
+        rows = ", ".join(f"{n} of {name}" for name, n in deleted.items())
+        changes.append(f"what pooled it was deleted: {rows}")
+    return changes
+
+
+def _delete_pooled(key: dict[str, Any]) -> dict[str, int]:
+    sets = (fit.FitSet.Video & key).proj()
+    return delete_below(gdi.SessionGdi, (gdi.SessionGdi & (fit.FitSet & sets)).keys())

@@ -1,0 +1,79 @@
+"""Activity and pace of a video decide which measures it is pooled in, and a change computes those anew."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.gait import GDI_METHODS
+from pbl_pipeline.paramset import Paramset
+from schemas import gait, gdi, norms, video, views
+from schemas.conditions import set_condition
+from schemas.ingest import Methods, Visit, ingest
+from schemas.method_rows import insert_methods
+from schemas.results import load_session
+from tests.command import pbl
+from tests.rows import register
+from workers.populate import populate
+
+from . import chain
+
+
+def measured() -> dict[str, tuple[str, int]]:
+    """Index -> status and used cycles of the visit."""
+    rows = gdi.SessionGdi().to_dicts()
+    return {r["gdi_method"]: (r["session_status"], int(r["session_cycles"])) for r in rows}
+
+
+def test_only_walking_at_one_pace_is_pooled(tables: None, tmp_path: Path):
+    slow, fast, tug = (chain.small_video(tmp_path, n, n=340 + i) for i, n in enumerate(("slow", "fast", "tug")))
+    assert pbl("ingest", slow, "--subject", "P001").code == 0
+    assert pbl("ingest", fast, "--subject", "P001", "--pace", "Fast").code == 0
+    assert pbl("ingest", tug, "--subject", "P001", "--activity", "TUG").code == 0
+    ids = {r["video_name"][:4]: int(r["video_id"]) for r in video.Video().to_dicts()}
+    assert video.Pace().to_dicts() == [{"video_id": ids["fast"], "pace": "fast"}]
+    at_fast = {"family": GDI_METHODS.find().name, **GDI_METHODS.find().paramset.params, "pace": "fast"}
+    insert_methods(gdi.GdiModel, [GDI_METHODS.of(Paramset("gdi", "fast-walk", 1, at_fast))])
+    try:
+        assert ingest([slow], Visit("P001"), Methods(gdi="fast-walk"))[0].status == "updated"
+        populate()
+        used = {r["video_id"]: int(r["n_cycles_used"]) for r in gait.GaitCycle().to_dicts()}
+        plain = GDI_METHODS.find().key
+        assert measured() == {plain: ("PASS", used[ids["slow"]]), "fast-walk-v1": ("PASS", used[ids["fast"]])}
+        # Every trial has its own measures all the same.
+        assert len(gait.Spatiotemporal & {"measures_status": "PASS"}) == 3
+        assert len(gdi.GDI & {"gdi_status": "PASS"}) == 6
+        shown = load_session({"subject": "P001", "gdi_method": plain})
+        assert shown.metrics is not None
+        assert [t.pooled for t in shown.metrics.trials] == [True, False, False]
+        assert shown.metrics.gdi.n == shown.metrics.gdi.n_left + shown.metrics.gdi.n_right == used[ids["slow"]]
+        curves = views.cycle_curves({"gdi_method": plain})
+        assert curves["n"].max() <= used[ids["slow"]]
+        # What is changed is computed anew, and nothing else is.
+        events = gait.GaitEvents().to_arrays("events_computed", order_by="KEY")
+        (result,) = ingest([fast], Visit("P001", pace="self_selected"))
+        assert "pace is self_selected now" in result.note
+        assert not len(gdi.SessionGdi())
+        populate()
+        assert measured()[plain] == ("PASS", used[ids["slow"]] + used[ids["fast"]])
+        assert measured()["fast-walk-v1"] == ("EMPTY", 0)
+        assert "tug" in (gdi.SessionGdi & {"session_status": "EMPTY"}).fetch1("session_reason")
+        np.testing.assert_array_equal(events, gait.GaitEvents().to_arrays("events_computed", order_by="KEY"))
+    finally:
+        (gdi.GdiModel & {"gdi_method": "fast-walk-v1"}).delete(prompt=False)
+
+
+def test_a_change_that_pools_the_same_deletes_nothing(tables: None, tmp_path: Path):
+    (number,) = register(chain.small_video(tmp_path, "walk"))
+    populate()
+    assert set_condition(number, pace="self selected") == ["pace is self_selected now"]
+    assert set_condition(number, activity="overground walking") == ["activity is overground walking now"]
+    assert set_condition(number, activity="overground walking", pace="self_selected") == []
+    assert len(gdi.SessionGdi()) == 1
+    with pytest.raises(PblError, match="DB_NOT_FOUND"):
+        set_condition(number + 1, pace="fast")
+    with pytest.raises(PblError, match="at the pace 'fast'"):
+        norms.build_norm("fast-lab", populations=(), subjects=("P001",), pace="fast")
