@@ -48,6 +48,8 @@ CODES: dict[str, str] = {
     "ANGLE_UNITS": "joint angles are not in degrees",
     "NORM_UNKNOWN": "no normative set has that name",
     "NORM_INVALID": "the normative data cannot support the index (too few cycles, wrong size)",
+    "EXPORT_INPUT": "the fit cannot be exported in that form",
+    "PACKAGE_MISSING": "a package that this step needs is not installed",
     "STATS_INPUT": "the values do not support the statistic: too few, missing, without variation, or of another shape",
     "STUDY_INVALID": "the parts of a study contradict each other, or one lacks what it must have",
     "SHEET_FORMAT": "a sheet of a study has columns or cells that cannot be read",

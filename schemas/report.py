@@ -40,17 +40,14 @@ def write_session(restriction: Any, out: Path) -> list[Path]:
         title="Gait report",
         subject_code=found.subject,
         date=str(found.session_date or found.session_label),
-        origin={"Methods": _methods(found.key)},
+        origin={"Methods": methods_of(found.key)},
     )
 
 
-def _methods(key: Any) -> dict[str, str]:
-    """Name and version of the method behind each stage."""
+def methods_of(key: Any) -> dict[str, str]:
+    """Name and version of the method behind each stage, of a key of `SessionResults`; of those that it names."""
     member = (fit.FitSet.Video & {"fit_set": key["fit_set"]}).to_dicts(limit=1)[0]
-    return {
-        "Tracking": member["tracking_method"],
-        "Keypoints": member["keypoint_method"],
-        "Fit": key["fit_method"],
-        "Gait events": key["gait_method"],
-        "Index": f"{key['gdi_method']}, norm {key['norm']}",
-    }
+    found = {"Tracking": member["tracking_method"], "Keypoints": member["keypoint_method"], "Fit": key["fit_method"]}
+    if "gdi_method" in key:
+        found |= {"Gait events": key["gait_method"], "Index": f"{key['gdi_method']}, norm {key['norm']}"}
+    return found

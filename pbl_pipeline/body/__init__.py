@@ -22,13 +22,21 @@ from pbl_pipeline.body._kinematics import (  # noqa: E402
     scale_multipliers,
 )
 from pbl_pipeline.body._markers import MARKER_SETS, MarkerSet, load_marker_set, marker_set  # noqa: E402
-from pbl_pipeline.body._model import PELVIS_TURNS, SCALE_NAMES, SLIDES, Body, load_body  # noqa: E402
+from pbl_pipeline.body._model import (  # noqa: E402
+    PELVIS_TURNS,
+    SCALE_NAMES,
+    SLIDES,
+    Y_UP_TO_Z_UP,
+    Body,
+    load_body,
+)
 
 __all__ = [
     "MARKER_SETS",
     "PELVIS_TURNS",
     "SCALE_NAMES",
     "SLIDES",
+    "Y_UP_TO_Z_UP",
     "Body",
     "Capsules",
     "Frames",

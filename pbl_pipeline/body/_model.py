@@ -23,6 +23,8 @@ _GROUP_PREFIX = "scale_group/"
 SLIDES = ("pelvis_tx", "pelvis_ty", "pelvis_tz")
 #: The joints that turn the pelvis, one after the other about z, x and y of the model's ground.
 PELVIS_TURNS = ("pelvis_tilt", "pelvis_list", "pelvis_rotation")
+#: Turns vectors of OpenSim's ground (x forward, y up, z right) into the z-up world of this project.
+Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

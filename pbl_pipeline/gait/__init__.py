@@ -29,7 +29,7 @@ from ._laboratory import PLUG_IN_GAIT_POINTS, LabTrial, read_lab_feet, read_lab_
 from ._metrics import GaitMetrics, GaitParams, TrialMetrics, cycle_checks, gait_metrics
 from ._own_norm import norm_from_cycles
 from ._profile import MovementProfile, movement_profile, variable_scores
-from ._spatiotemporal import MEASURES, Measure, Spatiotemporal, far_leg_of, spatiotemporal
+from ._spatiotemporal import MEASURES, Measure, Spatiotemporal, cycle_measures, far_leg_of, spatiotemporal
 from .events import METHODS as EVENT_METHODS
 from .events import (
     EventParams,
@@ -114,6 +114,7 @@ __all__ = [
     "cycle_checks",
     "cycle_curves",
     "cycle_lengths",
+    "cycle_measures",
     "detect_events",
     "far_leg_of",
     "feet_from_fit",

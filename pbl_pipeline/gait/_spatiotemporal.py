@@ -106,7 +106,7 @@ def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
     by_cycle: dict[str, list[tuple[str, float]]] = {name: [] for name in MEASURES}
     steps: dict[tuple[str, str, float], float] = {}
     for c in used:
-        for name, value in _of_cycle(c).items():
+        for name, value in cycle_measures(c).items():
             by_cycle[name].append(("" if name == "cadence_steps_per_min" else c.side, value))
         other = RIGHT if c.side == LEFT else LEFT
         steps[c.trial, other, c.opposite_foot_down_s] = c.opposite_foot_down_s - c.start_s
@@ -125,8 +125,9 @@ def far_leg_of(cycles: Sequence[GaitCycle]) -> str:
     return mostly(np.array([c.far_leg for c in cycles if c.used]))
 
 
-def _of_cycle(c: GaitCycle) -> dict[str, float]:
-    """All measures of one cycle but its step times; what is not known is left out."""
+def cycle_measures(c: GaitCycle) -> dict[str, float]:
+    """The measures of one cycle by name (`MEASURES`) but its step times, which belong to two cycles; those that are not
+    known are left out."""
     stride, stance = c.stride_time_s, c.foot_up_s - c.start_s
     both = (c.opposite_foot_up_s - c.start_s) + (c.foot_up_s - c.opposite_foot_down_s)
     alone = c.opposite_foot_down_s - c.opposite_foot_up_s

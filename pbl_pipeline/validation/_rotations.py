@@ -7,6 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pbl_pipeline.body import Y_UP_TO_Z_UP
+
 
 def body_rotation_angles(rotation: Mapping[str, Rotation]) -> dict[str, np.ndarray]:
     """(T,) degrees of `JOINTS_CLIP` from body rotations whose axes are OpenSim's (forward, up, right).
@@ -43,10 +45,6 @@ def pelvis_rotations(tilt_deg: np.ndarray, list_deg: np.ndarray, rotation_deg: n
 def pelvis_angles_deg(R_world_pelvis: np.ndarray) -> np.ndarray:
     """(T, 3) tilt, list, rotation in degrees: the inverse of `pelvis_rotations`."""
     return Rotation.from_matrix(Y_UP_TO_Z_UP.T @ R_world_pelvis).as_euler("ZXY", degrees=True)
-
-
-#: Turns vectors of OpenSim's ground (x forward, y up, z right) into the z-up world of this project.
-Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def _relative(rotation: Mapping[str, Rotation], parent: str, child: str) -> np.ndarray:

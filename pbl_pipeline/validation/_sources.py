@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import angle_of, joint_angles, joint_angles_sd, load_body
+from pbl_pipeline.body import Y_UP_TO_Z_UP, angle_of, joint_angles, joint_angles_sd, load_body
 from pbl_pipeline.bounded import count_rows, read_json, read_text
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
@@ -17,7 +17,7 @@ from pbl_pipeline.gait import BodyPoses, trial_poses
 
 from ._joints import JOINTS_CLIP
 from ._reference import BODY_ROTATIONS, CONVENTIONS, QPOS, Reference
-from ._rotations import Y_UP_TO_Z_UP, body_rotation_angles
+from ._rotations import body_rotation_angles
 
 _PELVIS_PATH = ("pelvis_tx", "pelvis_ty", "pelvis_tz")
 

@@ -18,7 +18,7 @@ from ._phone_lens import (
     phone_lens,
     turned_camera,
 )
-from ._phone_log import PhoneLog, Sensor, read_phone_log
+from ._phone_log import SENSORS, VIDEO_CLOCK, PhoneLog, Sensor, read_phone_log
 from ._probe import probe, read_first, sha256_of
 from ._read import read_frames
 from ._timing import check_timing
@@ -26,6 +26,8 @@ from ._types import CAMERA_KINDS, Camera, FirstPicture, Frame, VideoInfo
 
 __all__ = [
     "CAMERA_KINDS",
+    "SENSORS",
+    "VIDEO_CLOCK",
     "Attitude",
     "Board",
     "Calibration",

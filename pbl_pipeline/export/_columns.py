@@ -1,0 +1,146 @@
+"""Tables of columns that know their units, and the two ways to write them: CSV and Parquet."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.extras import needed
+
+from ._text import column
+
+
+@dataclasses.dataclass(frozen=True)
+class Labels:
+    """(N,) texts of which few differ: `texts[codes]`. A categorical in Parquet, pandas and R."""
+
+    codes: np.ndarray
+    texts: tuple[str, ...]
+
+    @classmethod
+    def of(cls, values: Sequence[str]) -> Labels:
+        texts = tuple(dict.fromkeys(values))
+        place = {t: i for i, t in enumerate(texts)}
+        return cls(np.array([place[v] for v in values], np.int32), texts)
+
+    @classmethod
+    def constant(cls, text: str, n: int) -> Labels:
+        return cls(np.zeros(n, np.int32), (text,))
+
+    def __len__(self) -> int:
+        return len(self.codes)
+
+
+@dataclasses.dataclass(frozen=True)
+class Column:
+    """One column: its name, (N,) values (float with NaN for missing, int, bool or `Labels`), unit and meaning."""
+
+    name: str
+    values: np.ndarray | Labels
+    unit: str
+    meaning: str
+
+    @property
+    def kind(self) -> str:
+        """ "text", "integer", "boolean" or "number"."""
+        if isinstance(self.values, Labels):
+            return "text"
+        return {"i": "integer", "b": "boolean"}.get(self.values.dtype.kind, "number")
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """Columns of the same length under a name, which becomes that of the file."""
+
+    name: str
+    columns: tuple[Column, ...]
+
+    def __len__(self) -> int:
+        return len(self.columns[0].values)
+
+    def __getitem__(self, name: str) -> np.ndarray | Labels:
+        return next(c.values for c in self.columns if c.name == name)
+
+
+def joined(parts: Sequence[Table]) -> Table:
+    """Tables of the same name and columns, one below the other. A column that a part lacks is missing there."""
+    if len(parts) == 1:
+        return parts[0]
+    named = {c.name: c for part in parts for c in part.columns}
+    columns = []
+    for name, like in named.items():
+        pieces = [next((c.values for c in part.columns if c.name == name), None) for part in parts]
+        columns.append(dataclasses.replace(like, values=_stacked(pieces, [len(p) for p in parts])))
+    return Table(parts[0].name, tuple(columns))
+
+
+def write_csv(table: Table, path: Path) -> None:
+    """UTF-8, comma, point; header of names; empty cells for what is missing; true and false in words."""
+    cells = [_cells(c) for c in table.columns]
+    lines = [",".join(_quoted(c.name) for c in table.columns), *map(",".join, zip(*cells, strict=True))]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+
+
+def write_parquet(table: Table, path: Path, about: Mapping[str, str]) -> None:
+    """Missing numbers are null; each field's metadata has `unit` and `meaning`, the table's has `about`.
+
+    Raises `PblError` PACKAGE_MISSING without pyarrow.
+    """
+    pa: Any = needed("pyarrow", "export", "writing Parquet files")
+    parquet: Any = needed("pyarrow.parquet", "export", "writing Parquet files")
+    arrays, fields = [], []
+    for c in table.columns:
+        if isinstance(c.values, Labels):
+            array = pa.DictionaryArray.from_arrays(pa.array(c.values.codes), pa.array(c.values.texts, pa.string()))
+        else:
+            array = pa.array(c.values, from_pandas=True)
+        arrays.append(array)
+        fields.append(pa.field(c.name, array.type, metadata={"unit": c.unit, "meaning": c.meaning}))
+    made = pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=dict(about)))
+    parquet.write_table(
+        made, path, compression="zstd", write_statistics=False
+    )  # statistics double the size of few rows
+
+
+def dictionary(tables: Sequence[Table]) -> Table:
+    """The data dictionary: one row for each column of each table."""
+    found = [(t.name, c) for t in tables for c in t.columns]
+    texts = {
+        "table": ([n for n, _ in found], "file without its ending"),
+        "column": ([c.name for _, c in found], "name in the header"),
+        "type": ([c.kind for _, c in found], "text, integer, boolean or number"),
+        "unit": ([c.unit for _, c in found], "empty where there is none"),
+        "meaning": ([c.meaning for _, c in found], "what it holds, and which direction is positive"),
+    }
+    return Table("data_dictionary", tuple(Column(k, Labels.of(v), "", m) for k, (v, m) in texts.items()))
+
+
+def _stacked(pieces: Sequence[np.ndarray | Labels | None], lengths: Sequence[int]) -> np.ndarray | Labels:
+    first = next(p for p in pieces if p is not None)
+    if not isinstance(first, Labels):
+        filled = [p if isinstance(p, np.ndarray) else np.full(n, np.nan) for p, n in zip(pieces, lengths, strict=True)]
+        return np.concatenate(filled)
+    texts: dict[str, int] = {}
+    codes = []
+    for piece, n in zip(pieces, lengths, strict=True):
+        own = piece if isinstance(piece, Labels) else Labels.constant("", n)
+        number = np.array([texts.setdefault(t, len(texts)) for t in own.texts], np.int32)
+        codes.append(number[own.codes] if len(own) else np.zeros(0, np.int32))
+    return Labels(np.concatenate(codes), tuple(texts))
+
+
+def _cells(c: Column) -> list[str]:
+    if isinstance(c.values, Labels):
+        texts = [_quoted(t) for t in c.values.texts]
+        return [texts[i] for i in c.values.codes.tolist()]
+    if c.kind == "boolean":
+        return ["true" if v else "false" for v in c.values.tolist()]
+    return column(c.values, "%d" if c.kind == "integer" else "%.6f")
+
+
+def _quoted(text: str) -> str:
+    return f'"{text.replace(chr(34), chr(34) * 2)}"' if any(c in text for c in ',"\n\r') else text

@@ -1,0 +1,107 @@
+"""`pbl export`: fits in the formats of other programs, from files or from the tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from pbl_pipeline.errors import PblError
+
+if TYPE_CHECKING:
+    from pbl_pipeline.export import ExportSession
+
+_EPILOG = """\b
+Example: pbl export walk1.fit.npz walk2.fit.npz --to osim --to trc --to mot --out for_opensim
+Example: pbl export --subject P017 --session 2026-03-01 --to c3d --to parquet --out P017"""
+
+
+@click.command(epilog=_EPILOG)
+@click.argument("files", nargs=-1, type=click.Path(path_type=Path, readable=False))
+@click.option(
+    "--to",
+    "formats",
+    multiple=True,
+    required=True,
+    metavar="FORMAT",
+    help="trc, mot, osim, c3d, dlc, csv or parquet; once for each.",
+)
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder; one below it for each trial.")
+@click.option("--subject", help="Code of the subject, in place of FILES: from the tables.")
+@click.option("--session", "label", help="Date or label of the visit; needed where the subject has several.")
+@click.option("--fit-method", help="Name of the fit method; needed where several were used.")
+@click.option(
+    "--attitude",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    help="Sensor log of the phone, once for each of FILES: its sensors become analog channels of the C3D.",
+)
+@click.option("--marker-set", type=click.Path(path_type=Path), help="Table (CSV) that FILES were fitted with.")
+@click.option("--name", default="", help="Name of the person or trial for the headers; without it they name nobody.")
+@click.option("--number-trials", is_flag=True, help="trial_1, trial_2, ... in place of the recordings' names.")
+@click.option("--markers-only", is_flag=True, help="No further points on each body in .trc and .osim.")
+@click.option("--allow-failed", is_flag=True, help="Export a fit that failed a check; the files say so.")
+@click.option("--overwrite", is_flag=True, help="Write into a folder that has files; those of the same name go.")
+def export(
+    files: tuple[Path, ...],
+    formats: tuple[str, ...],
+    out: Path,
+    subject: str | None,
+    label: str | None,
+    fit_method: str | None,
+    attitude: tuple[Path, ...],
+    marker_set: Path | None,
+    name: str,
+    number_trials: bool,
+    markers_only: bool,
+    allow_failed: bool,
+    overwrite: bool,
+) -> None:
+    """Write the trials of one visit for OpenSim, Visual3D, Mokka, R, pandas or movement.
+
+    FILES are fits (fit.npz) of `pbl fit` or `pbl run`, with their keypoints.npz and session.json beside them. Axes,
+    units and signs of each format: docs/export.md. c3d and parquet need the extra `export`.
+    """
+    from pbl_pipeline.export import ExportOptions, check_export, write_export
+
+    if not files and subject is None:
+        raise _usage("neither FILES nor --subject", "one of them")
+    if files and (subject or label or fit_method):
+        raise _usage("FILES with --subject, --session or --fit-method", "FILES, or a visit of the tables")
+    if subject is not None and (attitude or marker_set):
+        raise _usage("--attitude or --marker-set with --subject", "them with FILES: the tables have the log")
+    options = ExportOptions(name, number_trials, not markers_only, allow_failed, overwrite)
+    check_export(formats, out, options)
+    if files:
+        session = _of_files(files, formats, attitude, marker_set)
+    else:
+        session = _of_tables({"subject": subject, "session_label": label, "fit_method": fit_method}, formats)
+    for path in write_export(session, formats, out, options):
+        click.echo(path)
+
+
+def _of_files(
+    files: tuple[Path, ...], formats: tuple[str, ...], attitude: tuple[Path, ...], marker_set: Path | None
+) -> ExportSession:
+    from pbl_pipeline.body import load_marker_set
+    from pbl_pipeline.cli.gait import fit_checks
+    from pbl_pipeline.export import GAIT_FORMATS, session_of_files
+    from pbl_pipeline.fit import TrialFit
+
+    markers = None if marker_set is None else load_marker_set(marker_set)
+    checks = fit_checks(files, [TrialFit.load(path) for path in files])
+    gait = bool(GAIT_FORMATS & set(formats))
+    return session_of_files(files, attitude=attitude, markers=markers, gait=gait, fit_checks=checks)
+
+
+def _of_tables(restriction: dict[str, str | None], formats: tuple[str, ...]) -> ExportSession:
+    import schemas
+    from schemas.export import session_of_tables
+
+    schemas.activate(methods=False)
+    return session_of_tables({k: v for k, v in restriction.items() if v is not None}, sensors="c3d" in formats)
+
+
+def _usage(found: str, expected: str) -> PblError:
+    return PblError("USAGE", found=found, expected=expected, next_step="see `pbl export --help`")

@@ -1,0 +1,32 @@
+"""A fit with markers, as exports want it: a walk of a body with scales and marker offsets of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from pbl_pipeline.body import load_body, marker_positions, marker_set
+from pbl_pipeline.fit import TrialFit
+from tests.walking_fit import walking_fit
+
+
+def marked_fit(
+    markers: str = "blazepose_33", *, n_frames: int = 150, seen: tuple[int, int] | None = None, seed: int = 0
+) -> TrialFit:
+    """`walking_fit` in a scaled body with displaced markers; every joint moves."""
+    body, places, rng = load_body(), marker_set(markers), np.random.default_rng(seed)
+    fit = walking_fit(body.joint_names, body.sha256, n_frames=n_frames, seen=seen, marker_names=places.names)
+    scale, offset = rng.uniform(0.9, 1.1, 8), rng.normal(0, 0.005, (len(places), 3))
+    time = np.asarray(fit.time_s)[:, None]
+    sway = np.radians(4.0) * np.sin(2 * np.pi * time * rng.uniform(0.3, 0.9, 40) + rng.uniform(0, 6, 40))
+    qpos = fit.qpos + sway * body.is_hinge
+    return with_markers(dataclasses.replace(fit, qpos=qpos, marker_set=markers, scale=scale, site_offset_m=offset))
+
+
+def with_markers(fit: TrialFit) -> TrialFit:
+    """The fit with the markers that belong to its joint values."""
+    known = np.isfinite(fit.qpos).all(axis=1)
+    x = np.full((len(fit.time_s), len(fit.marker_names), 3), np.nan)
+    x[known] = marker_positions(load_body(), marker_set(fit.marker_set), fit.qpos[known], fit.scale, fit.site_offset_m)
+    return dataclasses.replace(fit, markers_world_m=x)

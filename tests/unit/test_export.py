@@ -1,0 +1,652 @@
+"""Exports read back by other readers, and against truths that no exporter knows."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.spatial.transform import Rotation
+
+import pbl_pipeline.body
+from pbl_pipeline.body import Y_UP_TO_Z_UP, load_body, load_marker_set
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.export import FORMATS, ExportOptions, ExportSession, ExportTrial, session_of_files, write_export
+from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.gait import GaitMetrics, gait_metrics, trial_poses
+from pbl_pipeline.keypoints import Keypoints, WorldMarkers
+from pbl_pipeline.qc import FAIL, Check
+from pbl_pipeline.validation import reference_of_mot
+from pbl_pipeline.video import Camera, PhoneLog, Sensor
+from tests.command import pbl
+from tests.exported import marked_fit, with_markers
+from tests.walking_fit import foot_events
+
+SCALAR = ("scope", "trial", "measure", "statistic")
+
+
+@pytest.fixture(scope="module")
+def fit() -> TrialFit:
+    """Six seconds; the person comes into view after ten frames and leaves five before the end."""
+    return marked_fit(n_frames=180, seen=(10, 175))
+
+
+@pytest.fixture(scope="module")
+def keypoints(fit: TrialFit) -> Keypoints:
+    rng, (n, j) = np.random.default_rng(1), fit.markers_world_m.shape[:2]
+    confidence = rng.uniform(0.3, 1.0, (n, j))
+    xy = rng.uniform(0, 300, (n, j, 2))
+    xy[4, 3], confidence[4, 3] = np.nan, 0.0
+    return Keypoints(
+        time_s=fit.time_s,
+        names=fit.marker_names,
+        marker_set=fit.marker_set,
+        xy_px=xy,
+        xyz_cam_m=np.full((n, j, 3), np.nan),
+        root_relative=True,
+        confidence=confidence,
+        image_size_px=(640, 360),
+        camera=Camera(fit.camera.matrix, np.zeros(5), "guess: a test"),
+        box_px=np.zeros((n, 4)),
+        origin="a detector, licence Apache-2.0",
+    )
+
+
+@pytest.fixture(scope="module")
+def metrics(fit: TrialFit) -> GaitMetrics:
+    return gait_metrics([fit])
+
+
+@pytest.fixture(scope="module")
+def trial(fit: TrialFit, keypoints: Keypoints, metrics: GaitMetrics) -> ExportTrial:
+    return ExportTrial("walk", fit, keypoints=keypoints, measured=metrics.trials[0])
+
+
+@pytest.fixture(scope="module")
+def out(trial: ExportTrial, metrics: GaitMetrics, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One export of everything."""
+    folder = tmp_path_factory.mktemp("export") / "visit"
+    write_export(ExportSession((trial,), metrics), list(FORMATS), folder)
+    return folder
+
+
+def written(trial: ExportTrial, folder: Path, *formats: str, **options: Any) -> Path:
+    """A trial alone, in some formats; its folder."""
+    write_export(ExportSession((trial,)), formats, folder, ExportOptions(**options))
+    return folder / trial.name
+
+
+# ----------------------------------------------------------------------------------------------------- markers, angles
+def test_our_own_reader_finds_the_markers_in_the_trc(out, fit):
+    seen = WorldMarkers.from_trc(out / "walk" / "walk.trc", fit.marker_set)
+    np.testing.assert_allclose(seen.time_s, fit.time_s[10:175], atol=1e-6)
+    own = [seen.names.index(n) for n in fit.marker_names]
+    np.testing.assert_allclose(seen.xyz_world_m[:, own], fit.markers_world_m[10:175], atol=1e-6)
+    # Three points on each of 21 bodies: the origins and 10 cm along x and y.
+    assert len(seen.names) == len(fit.marker_names) + 3 * 21
+    o, x, y = (seen.xyz_world_m[:, seen.names.index(f"tibia_l_{a}")] for a in "oxy")
+    poses = trial_poses(fit)
+    np.testing.assert_allclose(o, poses.position_m[10:175, poses.index("tibia_l")], atol=1e-5)
+    np.testing.assert_allclose(x - o, 0.1 * poses.rotation[10:175, poses.index("tibia_l"), :, 0], atol=1e-5)
+    np.testing.assert_allclose(y - o, 0.1 * poses.rotation[10:175, poses.index("tibia_l"), :, 1], atol=1e-5)
+
+
+def test_the_trc_is_in_opensims_ground_and_in_millimetres(fit, tmp_path):
+    path = written(ExportTrial("walk", fit), tmp_path / "a", "trc", body_points=False) / "walk.trc"
+    lines = path.read_text().splitlines()
+    assert lines[2].split("\t") == ["30", "30", "165", "33", "mm", "30", "1", "165"]
+    first = [float(v) for v in lines[6].split("\t")]
+    x, y, z = fit.markers_world_m[10, 0]
+    assert first[:2] == [1.0, pytest.approx(10 / 30, abs=1e-6)]
+    assert first[2:5] == pytest.approx([1e3 * x, 1e3 * z, -1e3 * y], abs=1e-3)  # y up, z to the right
+    assert all(len(line.split("\t")) == 2 + 3 * 33 for line in lines[6:])
+
+
+def test_a_gap_is_empty_cells_in_the_trc_and_left_out_of_the_mot(fit, tmp_path):
+    qpos = fit.qpos.copy()
+    qpos[50:53] = np.nan
+    gap = with_markers(dataclasses.replace(fit, qpos=qpos))
+    folder = written(ExportTrial("walk", gap), tmp_path / "a", "trc", "mot")
+    rows = (folder / "walk.trc").read_text().splitlines()[6:]
+    assert rows[40].rstrip("\t").split("\t") == ["41", f"{50 / 30:.6f}"]
+    assert np.isnan(WorldMarkers.from_trc(folder / "walk.trc", gap.marker_set).xyz_world_m[40:43]).all()
+    angles = reference_of_mot(folder / "walk.mot")
+    assert len(angles.time_s) == 162
+    assert all(np.isfinite(v).all() for v in angles.angles_deg.values())
+
+
+def test_the_reader_of_references_finds_the_angles_and_the_pelvis_in_the_mot(out, fit):
+    found = reference_of_mot(out / "walk" / "walk.mot")
+    poses = trial_poses(fit)
+    assert found.pelvis_m is not None
+    np.testing.assert_allclose(found.pelvis_m, poses.position_m[10:175, poses.index("pelvis")], atol=1e-5)
+    assert len(found.angles_deg) == 37
+    for name in ("hip_flexion_r", "pelvis_list", "pro_sup_l", "mtp_angle_r"):
+        own = np.degrees(fit.qpos[10:175, fit.joint_names.index(name)])
+        np.testing.assert_allclose(found.angles_deg[name], own, atol=1e-5)
+    knee = -np.degrees(fit.qpos[10:175, fit.joint_names.index("knee_angle_l")])
+    np.testing.assert_allclose(found.angles_deg["knee_flexion_l"], knee, atol=1e-5)
+
+
+# ---------------------------------------------------------------------------------------------------------------- osim
+def opensim_kinematics(osim: Path, mot: Path) -> tuple[list[str], np.ndarray]:
+    """Markers (T, J, 3) by a reading of the model's XML that knows OpenSim's definition of a CustomJoint only: in the
+    parent's offset frame, the translations, then the three rotations one in the frame of the other."""
+    lines = mot.read_text().splitlines()
+    head = lines.index("endheader") + 1
+    table = dict(
+        zip(lines[head].split("\t"), np.array([r.split("\t") for r in lines[head + 1 :]], float).T, strict=True)
+    )
+    model = ET.parse(osim).getroot()[0]
+
+    def vector(element: ET.Element, name: str) -> np.ndarray:
+        return np.array([float(v) for v in str(element.findtext(name)).split()])
+
+    n = len(table["time"])
+    position, rotation = {"/ground": np.zeros((n, 3))}, {"/ground": Rotation.identity(n)}
+    for joint in model.findall("JointSet/objects/CustomJoint"):
+        frame = joint.find("frames/PhysicalOffsetFrame")
+        assert frame is not None
+        assert frame.get("name") == joint.findtext("socket_parent_frame")
+        parent, child = str(frame.findtext("socket_parent")), str(joint.findtext("socket_child_frame"))
+        base = rotation[parent] * Rotation.from_euler("XYZ", vector(frame, "orientation"))
+        place = position[parent] + rotation[parent].apply(vector(frame, "translation"))
+        turn, shift = Rotation.identity(n), np.zeros((n, 3))
+        for axis in joint.findall("SpatialTransform/TransformAxis"):
+            coordinate = axis.findtext("coordinates")
+            value = table[coordinate] if coordinate else np.zeros(n)
+            if str(axis.get("name")).startswith("rotation"):
+                turn = turn * Rotation.from_rotvec(np.radians(value)[:, None] * vector(axis, "axis"))
+            else:
+                shift += value[:, None] * vector(axis, "axis")
+        position[child], rotation[child] = place + base.apply(shift), base * turn
+    markers = model.findall("MarkerSet/objects/Marker")
+    frames = [str(m.findtext("socket_parent_frame")) for m in markers]
+    xyz = [position[f] + rotation[f].apply(vector(m, "location")) for m, f in zip(markers, frames, strict=True)]
+    return [str(m.get("name")) for m in markers], np.stack(xyz, axis=1)
+
+
+@pytest.mark.parametrize("markers", ["blazepose_33", "bml_movi_87"])
+def test_model_and_motion_give_the_fitted_markers(markers, tmp_path):
+    fit = marked_fit(markers, n_frames=60, seed=3)
+    folder = written(ExportTrial("walk", fit), tmp_path / "a", "osim", "mot")
+    names, xyz = opensim_kinematics(folder / "walk.osim", folder / "walk.mot")
+    assert names[: len(fit.marker_names)] == list(fit.marker_names)
+    np.testing.assert_allclose(xyz[:, : len(fit.marker_names)] @ Y_UP_TO_Z_UP.T, fit.markers_world_m, atol=1e-5)
+
+
+def test_masses_move_and_swing_as_scaled_bodies_of_the_same_mass(tmp_path):
+    fit = dataclasses.replace(marked_fit(n_frames=3), scale=np.full(8, 1.2))
+    path = written(ExportTrial("walk", with_markers(fit)), tmp_path / "a", "osim") / "walk.osim"
+    bodies = {b.get("name"): b for b in ET.parse(path).getroot().iter("Body")}
+    assert len(bodies) == 21
+    femur = bodies["femur_l"]  # MJCF: 10.7199 kg, 0 -0.15451 0, 0.139448 0.0343037 0.139448
+    assert float(str(femur.findtext("mass"))) == pytest.approx(10.7199)
+    assert [float(v) for v in str(femur.findtext("mass_center")).split()] == pytest.approx([0, -0.15451 * 1.2, 0])
+    inertia = [float(v) for v in str(femur.findtext("inertia")).split()]
+    assert inertia == pytest.approx([0.139448 * 1.44, 0.0343037 * 1.44, 0.139448 * 1.44, 0, 0, 0])
+
+
+def test_every_joint_is_one_with_opensims_name_and_the_mjcfs_limits(out):
+    model = ET.parse(out / "walk" / "walk.osim").getroot()[0]
+    joints = {j.get("name"): j for j in model.iter("CustomJoint")}
+    assert {"ground_pelvis", "hip_r", "knee_l", "subtalar_r", "back", "neck", "radius_hand_l"} <= set(joints)
+    assert [c.get("name") for c in joints["hip_l"].iter("Coordinate")] == [
+        "hip_flexion_l",
+        "hip_adduction_l",
+        "hip_rotation_l",
+    ]
+    knee = next(joints["knee_r"].iter("Coordinate"))
+    assert [float(v) for v in str(knee.findtext("range")).split()] == pytest.approx(np.radians([-160, 10]))
+    assert sum(1 for _ in model.iter("Coordinate")) == 40
+    for joint in joints.values():  # no two axes in line, else OpenSim refuses the joint
+        axes = [np.array(str(a.findtext("axis")).split(), float) for a in joint.iter("TransformAxis")][:3]
+        assert abs(np.linalg.det(axes)) > 0.5
+
+
+# ----------------------------------------------------------------------------------------------------------------- c3d
+def test_ezc3d_reads_points_poses_and_events(out, fit, metrics):
+    ezc3d = pytest.importorskip("ezc3d")
+    file = ezc3d.c3d(str(out / "walk" / "walk.c3d"))
+    points, parameters = file["data"]["points"], file["parameters"]
+    assert parameters["POINT"]["LABELS"]["value"] == list(fit.marker_names)
+    assert parameters["POINT"]["UNITS"]["value"] == ["mm"]
+    assert parameters["POINT"]["RATE"]["value"][0] == pytest.approx(30)
+    np.testing.assert_allclose(points[:3].transpose(2, 1, 0), 1e3 * fit.markers_world_m, atol=2e-3)  # z up, as ours
+    poses, found = trial_poses(fit), file["data"]["rotations"]
+    assert parameters["ROTATION"]["LABELS"]["value"][:2] == ["pelvis_4X4", "femur_r_4X4"]
+    assert parameters["ROTATION"]["USED"]["value"][0] == 21
+    np.testing.assert_allclose(found[:3, :3].transpose(3, 2, 0, 1), poses.rotation, atol=1e-6)
+    np.testing.assert_allclose(found[:3, 3].transpose(2, 1, 0), 1e3 * poses.position_m, atol=2e-3)
+    seen = np.isfinite(fit.qpos[:, 0])
+    np.testing.assert_allclose(found[3, :, 0][:, seen], np.tile([[0.0], [0], [0], [1]], seen.sum()))
+    events = metrics.trials[0].events.events
+    assert len(events) > 8
+    group = parameters["EVENT"]
+    assert group["USED"]["value"][0] == len(events)
+    np.testing.assert_allclose(group["TIMES"]["value"][1], [e.time_s for e in events], atol=1e-5)
+    assert group["CONTEXTS"]["value"] == [e.side.capitalize() for e in events]
+    assert group["LABELS"]["value"] == ["Foot Strike" if e.event == "foot_down" else "Foot Off" for e in events]
+    assert list(group["ICON_IDS"]["value"]) == [1 if e.event == "foot_down" else 2 for e in events]
+    assert parameters["PBL"]["TIMES"]["value"] == ["as filmed"]
+
+
+def test_py_c3d_reads_the_same(out, fit, metrics):
+    import c3d
+
+    with (out / "walk" / "walk.c3d").open("rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # it does not know the poses that follow the points
+        reader: Any = c3d.Reader(file)
+        frames = [points for _, points, _ in reader.read_frames()]
+        labels = [str(name).strip() for name in reader.point_labels]
+        contexts, kinds = (np.ravel(reader.get(f"EVENT:{k}").string_array) for k in ("CONTEXTS", "LABELS"))
+        times = reader.get("EVENT:TIMES").float_array
+    assert labels == list(fit.marker_names)
+    assert reader.first_frame == 1
+    own = metrics.trials[0].events.events
+    assert [str(c).strip().lower() for c in contexts] == [e.side for e in own]
+    assert [{"Foot Strike": "foot_down", "Foot Off": "foot_up"}[str(k).strip()] for k in kinds] == [
+        e.event for e in own
+    ]
+    np.testing.assert_allclose(times @ [60, 1], [e.time_s for e in own], atol=1e-5)
+    xyz = np.array([f[:, :3] for f in frames])
+    np.testing.assert_allclose(xyz[10:175], 1e3 * fit.markers_world_m[10:175], atol=2e-3)
+    assert np.all(np.array([f[:, 3] for f in frames])[:10] < 0)  # not seen: invalid
+
+
+def test_uneven_frames_are_brought_to_one_rate(tmp_path):
+    ezc3d = pytest.importorskip("ezc3d")
+    even = marked_fit(n_frames=121)
+    kept = np.sort(np.random.default_rng(5).permutation(121)[:110])
+    kept[0], kept[-1] = 0, 120
+    kept = np.unique(kept)
+    fields = {f: getattr(even, f)[kept] for f in ("time_s", "qpos", "qpos_sd", "markers_world_m", "phone_quat_wxyz")}
+    uneven = dataclasses.replace(even, **fields)
+    file = ezc3d.c3d(str(written(ExportTrial("walk", uneven), tmp_path / "a", "c3d") / "walk.c3d"))
+    assert file["parameters"]["PBL"]["TIMES"]["value"] == ["interpolated to an even rate"]
+    points = file["data"]["points"][:3].transpose(2, 1, 0)
+    assert points.shape == (121, 33, 3)
+    np.testing.assert_allclose(points, 1e3 * even.markers_world_m, atol=15)  # mm, where frames were dropped
+    assert np.median(np.abs(points - 1e3 * even.markers_world_m)) < 0.01
+    # The poses follow the interpolated joints, not the interpolated matrices: they stay rotations.
+    turns = file["data"]["rotations"][:3, :3].transpose(3, 2, 0, 1)
+    np.testing.assert_allclose(turns @ turns.swapaxes(-1, -2), np.broadcast_to(np.eye(3), turns.shape), atol=1e-5)
+
+
+def test_a_recording_that_starts_later_keeps_its_times(tmp_path):
+    ezc3d = pytest.importorskip("ezc3d")
+    fit = marked_fit(n_frames=60)
+    late = dataclasses.replace(fit, time_s=fit.time_s + 2.0)
+    path = written(ExportTrial("walk", late), tmp_path / "a", "c3d") / "walk.c3d"
+    assert ezc3d.c3d(str(path))["header"]["points"]["first_frame"] == 60  # from 0: the 61st, 2 s after the first
+
+
+def test_sensors_of_the_phone_are_analog_channels_on_the_videos_clock(fit, tmp_path):
+    ezc3d = pytest.importorskip("ezc3d")
+    time = np.arange(0.0, 5.0, 0.01)
+    xyz = np.column_stack([time, 2 * time, np.full_like(time, 9.81)])  # straight lines: interpolation is exact
+    log = PhoneLog(time, np.tile([1.0, 0, 0, 0], (len(time), 1)), "camera", None, "own", None, {}, "CSV")
+    log = dataclasses.replace(log, sensors={"accelerometer": Sensor(time, xyz), "gyroscope": Sensor(time, xyz)})
+    file = ezc3d.c3d(str(written(ExportTrial("w", fit, log=log, log_shift_s=0.5), tmp_path / "a", "c3d") / "w.c3d"))
+    analog = file["parameters"]["ANALOG"]
+    assert analog["LABELS"]["value"][:4] == [*(f"phone_accelerometer_{a}" for a in "xyz"), "phone_gyroscope_x"]
+    assert analog["UNITS"]["value"][:4] == ["m/s^2"] * 3 + ["rad/s"]
+    assert analog["RATE"]["value"][0] == 120  # the multiple of 30 Hz that is not below the sensor's 100
+    values = file["data"]["analogs"][0]
+    at = np.arange(values.shape[1]) / 120
+    inside = (at >= 0.5) & (at <= 5.49)
+    np.testing.assert_allclose(values[1, inside], 2 * (at[inside] - 0.5), atol=1e-5)
+    assert np.isnan(values[:, at < 0.49]).all()
+    assert np.isnan(values[:, at > 5.51]).all()
+
+
+# -------------------------------------------------------------------------------------------------------------- tables
+def table(path: Path, **options: Any) -> Any:
+    """(pandas' own types say less of a column than these tests need.)"""
+    return pd.read_csv(path, **options)
+
+
+def test_long_and_wide_tables_hold_the_same(out, fit, metrics):
+    wide, long = (table(out / f"angles_{form}.csv") for form in ("wide", "long"))
+    assert len(wide) == 180
+    np.testing.assert_allclose(wide["hip_flexion_r_deg"], np.degrees(fit.qpos[:, 6]), atol=1e-5)
+    assert wide["hip_flexion_r_deg"][:10].isna().all()
+    part = long[(long.angle == "hip_flexion") & (long.side == "right")]
+    assert set(part.unit) == {"deg"}
+    np.testing.assert_allclose(part.value, wide["hip_flexion_r_deg"].dropna(), atol=1e-9)
+    assert len(long) == 165 * 42  # 40 joints and both knees with the other sign; frames without a pose are left out
+    assert set(long[long.angle == "pelvis_tx"].unit) == {"m"}
+    cycles, cycle_values = table(out / "cycles_wide.csv"), table(out / "cycles_long.csv")
+    own = metrics.trials[0].cycles
+    np.testing.assert_allclose(cycles.stride_time_s, [c.stride_time_s for c in own], atol=1e-6)
+    assert list(cycles.used) == [c.used for c in own]
+    strides = cycle_values[cycle_values.measure == "stride_time_s"]
+    np.testing.assert_allclose(strides.value, cycles.stride_time_s, atol=1e-9)
+    curves, points = table(out / "curves_wide.csv"), table(out / "curves_long.csv")
+    assert len(curves) == 51 * len(own)
+    first = own[0].curves["knee_flexion"]
+    np.testing.assert_allclose(curves["knee_flexion_deg"][:51], first, atol=1e-6)
+    np.testing.assert_allclose(
+        points[(points.cycle == 0) & (points.angle == "knee_flexion")].value_deg, first, atol=1e-6
+    )
+    measures = table(out / "measures_long.csv", keep_default_na=False, na_values=[""]).set_index(list(SCALAR))
+    wide = table(out / "measures_wide.csv").set_index("scope")
+    stride = metrics.spatiotemporal["stride_time_s"]
+    assert stride is not None
+    assert wide.loc["session", "stride_time_s_mean"] == pytest.approx(stride.mean, abs=1e-6)
+    left = measures.xs(("session", "stride_time_s", "left"), level=("scope", "measure", "statistic"))
+    assert left["value"].item() == pytest.approx(stride.left, abs=1e-6)
+    assert left["unit"].item() == "s"
+    width = measures.xs(("session", "step_width_m", "mean"), level=("scope", "measure", "statistic"))
+    assert np.isnan(width["value"].item())
+    assert "one camera" in width["reason"].item()
+
+
+def test_parquet_has_the_numbers_of_the_csv_with_units_and_origin(out):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    for path in sorted(out.glob("*.parquet")):
+        frame = parquet.read_table(path).to_pandas()
+        text = table(path.with_suffix(".csv"), keep_default_na=False, na_values=[""])
+        assert list(frame.columns) == list(text.columns), path.name
+        for name in frame.columns:
+            if frame[name].dtype.kind == "f":
+                np.testing.assert_allclose(frame[name], text[name], atol=1e-6, err_msg=f"{path.name} {name}")
+    wide = parquet.read_table(out / "angles_wide.parquet")
+    assert wide.schema.metadata[b"model"].startswith(b"pbl_body_40 version 1")
+    field = wide.schema.field("knee_angle_r_deg")
+    assert field.metadata == {b"unit": b"deg", b"meaning": b"positive: extension: flexion is negative, as in OpenSim"}
+    assert wide["knee_angle_r_deg"].null_count == 15  # missing is null, R's NA, not NaN
+    assert str(wide.schema.field("trial").type).startswith("dictionary")  # a factor in R
+
+
+def test_the_dictionary_explains_every_column(out):
+    rows = list(csv.DictReader((out / "data_dictionary.csv").open(newline="")))
+    listed = {(r["table"], r["column"]) for r in rows}
+    there = {
+        (path.stem, name)
+        for path in out.glob("*.csv")
+        if path.stem != "data_dictionary"
+        for name in next(csv.reader(path.open(newline="")))
+    }
+    assert listed == there
+    assert [r["column"] for r in rows if not r["meaning"]] == []
+    for row in rows:
+        end = row["column"].rsplit("_", 1)[-1]
+        if end in ("deg", "m", "s") and row["table"].endswith("wide"):
+            assert row["unit"].split("/")[-1] == end, row
+
+
+def test_several_trials_share_their_tables(fit, tmp_path):
+    other = marked_fit(n_frames=40, seed=9)
+    session = ExportSession((ExportTrial("one", fit), ExportTrial("two", other)))
+    write_export(session, ["csv"], tmp_path / "a")
+    frame = table(tmp_path / "a" / "angles_wide.csv")
+    assert frame.groupby("trial").size().to_dict() == {"one": 180, "two": 40}
+    two = frame[frame.trial == "two"]
+    np.testing.assert_allclose(
+        two["arm_add_l_deg"], np.degrees(other.qpos[:, other.joint_names.index("arm_add_l")]), atol=1e-5
+    )
+
+
+# ----------------------------------------------------------------------------------------------------------- keypoints
+def test_keypoints_are_as_deeplabcut_writes_them(out, keypoints):
+    path = out / "walk" / "walk.dlc.csv"
+    frame = table(path, header=[0, 1, 2], index_col=0)
+    assert frame.columns.names == ["scorer", "bodyparts", "coords"]
+    ankle = frame["pbl_blazepose_33"]["left_ankle"]
+    j = keypoints.names.index("left_ankle")
+    np.testing.assert_allclose(ankle[["x", "y"]], keypoints.xy_px[:, j], atol=1e-3)
+    np.testing.assert_allclose(ankle["likelihood"], keypoints.confidence[:, j], atol=1e-4)
+    missed = frame["pbl_blazepose_33"][keypoints.names[3]].loc[4]
+    assert np.isnan(missed["x"])
+    assert missed["likelihood"] == 0
+
+
+@pytest.mark.needs_extra
+def test_movement_loads_the_keypoints(out, keypoints):
+    load_poses: Any = pytest.importorskip("movement.io.load_poses")
+    found = load_poses.from_dlc_file(out / "walk" / "walk.dlc.csv", fps=30)
+    assert list(found.coords["keypoints"].values) == list(keypoints.names)
+    xy = found.position.squeeze("individual" if "individual" in found.dims else "individuals")
+    np.testing.assert_allclose(xy.transpose("time", ..., "space").values.shape, (180, 33, 2))
+    np.testing.assert_allclose(
+        xy.transpose("time", xy.dims[[d.startswith("keypoint") for d in xy.dims].index(True)], "space").values,
+        keypoints.xy_px,
+        atol=1e-3,
+    )
+    assert np.nanmax(np.abs(np.squeeze(found.confidence.values) - keypoints.confidence)) < 1e-4
+
+
+# ------------------------------------------------------------------------------------------------------------- OpenSim
+@pytest.mark.needs_extra
+@pytest.mark.parametrize("markers", ["blazepose_33", "bml_movi_87", "mpi_inf_3dhp_17"])
+def test_opensim_agrees(markers, tmp_path, monkeypatch):
+    """Forward kinematics of 100 poses within 1 mm, inverse kinematics of our TRC within 1 deg of our angles, with
+    OpenSim's default settings."""
+    monkeypatch.chdir(tmp_path)  # OpenSim writes a log where it starts
+    opensim: Any = pytest.importorskip("opensim")
+    opensim.Logger.setLevelString("error")
+    fit = marked_fit(markers, n_frames=100, seed=2)
+    folder = written(ExportTrial("walk", fit), tmp_path / "a", "osim", "mot", "trc")
+    model = opensim.Model(str(folder / "walk.osim"))
+    state = model.initSystem()
+    motion = opensim.TimeSeriesTable(str(folder / "walk.mot"))
+    assert motion.getTableMetaDataString("inDegrees") == "yes"
+    names = list(motion.getColumnLabels())
+    values = motion.getMatrix().to_numpy()
+    assert len(names) == 40
+    coordinates, places = model.getCoordinateSet(), model.getMarkerSet()
+    worst = 0.0
+    for row, expected in zip(values, fit.markers_world_m, strict=True):
+        for name, value in zip(names, row, strict=True):
+            is_length = name in ("pelvis_tx", "pelvis_ty", "pelvis_tz")
+            coordinates.get(name).setValue(state, float(value if is_length else np.radians(value)), False)
+        model.realizePosition(state)
+        found = [places.get(n).getLocationInGround(state).to_numpy() for n in fit.marker_names]
+        worst = max(worst, float(np.abs(np.array(found) - expected @ Y_UP_TO_Z_UP).max()))
+    assert worst < 1e-3
+    tool = opensim.InverseKinematicsTool()
+    tool.setModel(model)
+    tool.setMarkerDataFileName(str(folder / "walk.trc"))
+    tool.setOutputMotionFileName(str(tmp_path / "ik.mot"))
+    tool.setStartTime(0.0)
+    tool.setEndTime(100.0)
+    tool.set_report_errors(False)
+    assert tool.run()
+    solved = opensim.TimeSeriesTable(str(tmp_path / "ik.mot"))
+    column = list(solved.getColumnLabels())
+    angles = solved.getMatrix().to_numpy()[:, [column.index(n) for n in names]]
+    assert angles.shape == values.shape
+    off = np.abs(angles - values).max(axis=0)
+    assert dict(zip(names, off, strict=True)) == {n: pytest.approx(0, abs=1.0) for n in names}
+    assert off[[names.index(f"pelvis_t{a}") for a in "xyz"]].max() < 1e-3
+
+
+# ------------------------------------------------------------------------------------------------- origin, identity
+def test_an_export_says_what_made_it(out):
+    content = json.loads((out / "export.json").read_text())
+    about = content["trials"]["walk"]
+    assert content["software"].startswith("pbl-pipeline 0.")
+    assert about["model"].startswith("pbl_body_40 version 1")
+    assert about["fit_method"] == "gauss-newton, parameters 0123456789abcdef"
+    assert about["keypoints_by"] == "a detector, licence Apache-2.0"
+    assert (about["frames"], about["frames_with_a_pose"]) == (180, 165)
+    assert sorted(content["files"]) == sorted(
+        p.relative_to(out).as_posix() for p in out.rglob("*.*") if p.name != "export.json"
+    )
+    for ending in ("mot", "osim", "c3d"):
+        assert about["model"].encode() in (out / "walk" / f"walk.{ending}").read_bytes(), ending
+
+
+def test_nobody_is_named_unless_asked(trial, metrics, tmp_path):
+    named = dataclasses.replace(trial, name="Doe-Jane", fit=dataclasses.replace(trial.fit, name="Doe-Jane"))
+    write_export(ExportSession((named,), metrics), list(FORMATS), tmp_path / "a", ExportOptions(number_trials=True))
+    files = [p for p in (tmp_path / "a").rglob("*") if p.is_file()]
+    assert len(files) > 10
+    assert [p.name for p in files if b"Doe" in p.read_bytes() or "Doe" in str(p.relative_to(tmp_path))] == []
+    asked = written(trial, tmp_path / "b", "trc", "mot", "osim", "c3d", name="Jane Doe")
+    assert [p.name for p in asked.iterdir() if b"Jane Doe" not in p.read_bytes()] == []
+
+
+# ---------------------------------------------------------------------------------------------------------- bad input
+def refused(code: str, trial: ExportTrial, folder: Path, *formats: str, **options: Any) -> str:
+    """The text of the error; nothing was written."""
+    with pytest.raises(PblError) as caught:
+        written(trial, folder, *formats, **options)
+    assert caught.value.code == code
+    assert not folder.exists() or not any(folder.rglob("*.???"))
+    return caught.value.text()
+
+
+def test_a_fit_that_failed_is_refused_unless_asked(trial, tmp_path):
+    bad = ExportSession((trial,), None, (Check("residual_3d_cm", FAIL, 20.0, 6.0, "look"),))
+    with pytest.raises(PblError, match="residual_3d_cm") as caught:
+        write_export(bad, ["mot"], tmp_path / "a")
+    assert caught.value.code == "EXPORT_INPUT"
+    assert not (tmp_path / "a").exists()
+    write_export(bad, ["mot"], tmp_path / "a", ExportOptions(allow_failed=True))
+    assert "failed_checks=residual_3d_cm" in (tmp_path / "a" / "walk" / "walk.mot").read_text()
+
+
+def test_a_fit_without_a_pose_or_of_another_body_is_refused(fit, tmp_path):
+    empty = dataclasses.replace(fit, qpos=np.full_like(fit.qpos, np.nan))
+    assert "without one pose" in refused("EXPORT_INPUT", ExportTrial("w", empty), tmp_path / "a", "mot")
+    other = dataclasses.replace(fit, body_sha256="0" * 64)
+    assert "000000000000" in refused("EXPORT_INPUT", ExportTrial("w", other), tmp_path / "a", "osim")
+    blind = dataclasses.replace(fit, markers_world_m=np.full_like(fit.markers_world_m, np.nan))
+    assert "without one marker" in refused("EXPORT_INPUT", ExportTrial("w", blind), tmp_path / "a", "trc")
+
+
+def test_markers_that_the_body_lacks_are_refused_and_a_table_helps(fit, tmp_path):
+    own = dataclasses.replace(fit, marker_set="our_lab")
+    text = refused("MARKER_SET_UNKNOWN", ExportTrial("w", own), tmp_path / "a", "osim")
+    assert "--marker-set" in text
+    table = tmp_path / "our_lab.csv"
+    shipped = Path(pbl_pipeline.body.__file__).parent / "data" / "markers_blazepose_33.csv"
+    table.write_text(shipped.read_text())
+    folder = written(ExportTrial("w", own, markers=load_marker_set(table)), tmp_path / "b", "osim", "mot")
+    _, xyz = opensim_kinematics(folder / "w.osim", folder / "w.mot")
+    np.testing.assert_allclose(xyz[:, :33] @ Y_UP_TO_Z_UP.T, fit.markers_world_m[10:175], atol=1e-5)
+    fewer = dataclasses.replace(fit, marker_names=("snout", *fit.marker_names[1:]))
+    assert "snout" in refused("MARKER_SET_UNKNOWN", ExportTrial("w", fewer), tmp_path / "a", "osim")
+
+
+def test_names_that_a_format_cannot_hold_are_refused(fit, keypoints, tmp_path):
+    text = refused("EXPORT_INPUT", ExportTrial("gäng", fit), tmp_path / "a", "c3d")
+    assert "--number-trials" in text
+    assert written(ExportTrial("gäng", fit, keypoints=keypoints), tmp_path / "b", "csv", "dlc").is_dir()
+    refused("USAGE", ExportTrial("w", fit), tmp_path / "a", "c3d", name="Jürgen")
+    refused("USAGE", ExportTrial("w", fit), tmp_path / "a", "mot", name="two\nlines")
+    refused("EXPORT_INPUT", ExportTrial("../w", fit), tmp_path / "a", "csv")
+    spaced = dataclasses.replace(fit, marker_names=("left eye", *fit.marker_names[1:]))
+    assert "left eye" in refused("EXPORT_INPUT", ExportTrial("w", spaced), tmp_path / "a", "trc", body_points=False)
+
+
+def test_other_refusals(fit, tmp_path, monkeypatch):
+    assert "svg" in refused("USAGE", ExportTrial("w", fit), tmp_path / "a", "svg")
+    assert "keypoints" in refused("EXPORT_INPUT", ExportTrial("w", fit), tmp_path / "a", "dlc")
+    long = dataclasses.replace(fit, time_s=fit.time_s + 3000.0)
+    assert "65535" in refused("EXPORT_INPUT", ExportTrial("w", long), tmp_path / "a", "c3d")
+    for module, form in (("ezc3d", "c3d"), ("pyarrow", "parquet")):
+        monkeypatch.setitem(sys.modules, module, None)
+        assert "pbl-pipeline[export]" in refused("PACKAGE_MISSING", ExportTrial("w", fit), tmp_path / "a", form)
+
+
+def test_a_folder_with_files_is_kept_unless_asked(fit, tmp_path):
+    note = tmp_path / "a" / "note.txt"
+    note.parent.mkdir()
+    note.write_text("mine")
+    with pytest.raises(PblError) as caught:
+        written(ExportTrial("w", fit), tmp_path / "a", "mot")
+    assert caught.value.code == "FILE_UNWRITABLE"
+    assert "--overwrite" in caught.value.text()
+    written(ExportTrial("w", fit), tmp_path / "a", "mot", overwrite=True)
+    written(ExportTrial("w", fit), tmp_path / "a", "mot", overwrite=True)
+    assert note.read_text() == "mine"
+    assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) == ["export.json", "note.txt", "w.mot"]
+
+
+# ------------------------------------------------------------------------------------------------------------- command
+@pytest.fixture(scope="module")
+def files(fit: TrialFit, keypoints: Keypoints, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`walk.fit.npz` with keypoints and session.json beside it."""
+    folder = tmp_path_factory.mktemp("fits")
+    fit.save(folder / "walk.fit.npz")
+    time = np.arange(0.0, 8.0, 0.02)
+    seen = dataclasses.replace(
+        keypoints, phone_time_s=time - 1.25, phone_quat_wxyz=np.tile([0.5, -0.5, 0.5, -0.5], (len(time), 1))
+    )
+    seen.save(folder / "walk.keypoints.npz")
+    content = {"trials": ["walk"], "params_hash": fit.params_hash, "qc": [], "code_version": "0.1.0+gabc"}
+    (folder / "session.json").write_text(json.dumps(content))
+    log = {"time_s": time, "qw": 0.5, "qx": -0.5, "qy": 0.5, "qz": -0.5, "ax": 0.0, "ay": 9.81, "az": time}
+    pd.DataFrame(log).to_csv(folder / "log.csv", index=False)
+    return folder
+
+
+def test_the_command_on_files(files, tmp_path):
+    done = pbl("export", files / "walk.fit.npz", "--to", "mot", "--to", "dlc", "--out", tmp_path / "a")
+    assert done.code == 0, done.err
+    assert [Path(p).name for p in done.out.splitlines()] == ["walk.mot", "walk.dlc.csv", "export.json"]
+    assert "fitted_with=0.1.0+gabc" in (tmp_path / "a" / "walk" / "walk.mot").read_text()
+    again = pbl("export", files / "walk.fit.npz", "--to", "mot", "--out", tmp_path / "a")
+    assert (again.code, again.error_code) == (1, "FILE_UNWRITABLE")
+
+
+def test_the_command_with_events_and_the_phones_log(files, tmp_path):
+    ezc3d = pytest.importorskip("ezc3d")
+    log = ("--attitude", files / "log.csv")
+    done = pbl("export", files / "walk.fit.npz", "--to", "c3d", *log, "--out", tmp_path / "a")
+    assert done.code == 0, done.err
+    file = ezc3d.c3d(str(tmp_path / "a" / "walk" / "walk.c3d"))
+    truth = [t for t, side, event in foot_events(5.5, 0.6) if (side, event) == ("right", "foot_down")]
+    group = file["parameters"]["EVENT"]
+    kinds = zip(group["CONTEXTS"]["value"], group["LABELS"]["value"], group["TIMES"]["value"][1], strict=True)
+    found = np.array([t for side, label, t in kinds if (side, label) == ("Right", "Foot Strike")])
+    assert all(np.abs(found - t).min() < 0.06 for t in truth[1:-1])
+    z = file["data"]["analogs"][0][file["parameters"]["ANALOG"]["LABELS"]["value"].index("phone_accelerometer_z")]
+    at = np.arange(len(z)) / file["parameters"]["ANALOG"]["RATE"]["value"][0]
+    np.testing.assert_allclose(z, at + 1.25, atol=1e-4)  # the keypoints say where the log lies on the video's clock
+
+
+def test_a_log_of_another_recording_is_refused(files, tmp_path):
+    lines = (files / "log.csv").read_text().splitlines()
+    (tmp_path / "log.csv").write_text("\n".join(lines[:-20]) + "\n")
+    log = ("--attitude", tmp_path / "log.csv")
+    done = pbl("export", files / "walk.fit.npz", "--to", "c3d", *log, "--out", tmp_path / "a")
+    assert done.error_code == "PHONE_LOG"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["--to", "mot"], "USAGE"),
+        (["walk.fit.npz", "--to", "mot", "--subject", "P1"], "USAGE"),
+        (["--subject", "P1", "--to", "c3d", "--attitude", "log.csv"], "USAGE"),
+        (["walk.fit.npz", "--to", "bvh"], "USAGE"),
+        (["nothing.fit.npz", "--to", "mot"], "FILE_MISSING"),
+        (["walk.keypoints.npz", "--to", "mot"], "FILE_FORMAT"),
+        (["walk.fit.npz", "--to", "mot", "--attitude", "log.csv", "--attitude", "log.csv"], "USAGE"),
+    ],
+)
+def test_wrong_calls(files, tmp_path, monkeypatch, arguments, code):
+    monkeypatch.chdir(files)
+    done = pbl("export", *arguments, "--out", tmp_path / "a")
+    assert (done.code, done.error_code) == (1, code), done.err
+
+
+def test_keypoints_of_another_recording_are_not_taken(files, fit, tmp_path):
+    shorter = marked_fit(n_frames=90)
+    shorter.save(tmp_path / "walk.fit.npz")
+    (tmp_path / "walk.keypoints.npz").write_bytes((files / "walk.keypoints.npz").read_bytes())
+    session = session_of_files([tmp_path / "walk.fit.npz"], gait=False)
+    assert session.trials[0].keypoints is None
+    assert load_body().sha256 == fit.body_sha256
