@@ -1,0 +1,243 @@
+"""Sheets of a study: what is imported, what is refused, and that a second import changes nothing."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from openpyxl import Workbook
+
+import schemas
+from pbl_pipeline.errors import PblError
+from schemas import lab, session, sheets, study, study_import, video
+from schemas.cli.study import import_
+from tests.rows import everything_but_refreshes, register, remove_all
+
+from . import chain
+
+VISITS = """\
+subject,visit,date,role,intervention,intervention_date,assistive_device,population,cohort,group,included,mJOA
+P001,pre,2026-01-10,pre,surgery,2026-02-01,cane,patient,dcm,surgery,yes,11
+P001,after,2026-03-15,6_weeks,surgery,2026-02-01,none,,dcm,,,13
+C001,2026-01-11,,baseline,,,,healthy,dcm,control,yes,18
+X001,,,,,,,,dcm,surgery,no,
+"""
+SCORES = "subject;visit;instrument;value\nP001;pre;10MWT_s;12.5\nP001;after;10MWT_s;10\n"
+
+
+@pytest.fixture
+def empty(database: Path) -> Iterator[None]:
+    schemas.activate()
+    yield
+    remove_all()
+
+
+def sheet(folder: Path, text: str, name: str = "visits.csv") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8-sig")
+    return path
+
+
+def run(*paths: Path, **options: bool) -> study_import.Imported:
+    return study_import.import_sheets(paths, **options)
+
+
+def stored() -> dict[tuple[str, str], dict]:
+    rows = (study.Visit * session.Session).to_dicts()
+    return {(r["subject"], r["session_label"]): r for r in rows}
+
+
+def test_a_study_from_two_sheets(empty: None, tmp_path: Path):
+    paths = sheet(tmp_path, VISITS), sheet(tmp_path, SCORES, "scores.csv")
+    before = everything_but_refreshes()
+    dry = run(*paths, dry_run=True)
+    assert everything_but_refreshes() == before
+    done = run(*paths)
+    assert (dry.done, done.done) == (False, True)
+    assert [line.changes for line in dry.lines] == [line.changes for line in done.lines]
+    assert done.lines[0].where == "visits.csv, row 2"
+    assert done.lines[0].changes == [
+        "new person P001",
+        "new session pre of P001",
+        "new visit pre of P001 (pre)",
+        "new member P001 of cohort dcm",
+        "mJOA 11",
+    ]
+    assert done.lines[3].changes == ["new person X001", "new member X001 of cohort dcm"]
+    assert done.lines[4].changes == ["10MWT_s 12.5"]
+    visit = stored()["P001", "after"]
+    assert visit["visit_days"] == 42
+    assert visit["session_date"] == datetime.date(2026, 3, 15)
+    assert (visit["assistive_device"], visit["orthosis"], visit["visit_age"]) == ("none", "", None)
+    assert stored()["C001", "2026-01-11"]["session_date"] == datetime.date(2026, 1, 11)
+    members = {r["subject"]: (r["member_included"], r["member_group"]) for r in study.CohortMember().to_dicts()}
+    assert members == {"P001": (1, "surgery"), "C001": (1, "control"), "X001": (0, "surgery")}
+    assert len(study.ClinicalScore()) == 5
+    assert (lab.Subject & {"subject": "C001"}).fetch1("population") == "healthy"
+    # Again: nothing. Then one cell.
+    rows = everything_but_refreshes()
+    again = run(*paths)
+    assert not any(line.changes for line in again.lines)
+    assert everything_but_refreshes() == rows
+    changed = run(sheet(tmp_path, VISITS.replace("cane", "walker").replace(",13\n", ",-\n")), paths[1])
+    assert [line.changes for line in changed.lines if line.changes] == [
+        ["assistive_device cane -> walker"],
+        ["mJOA 13 -> nothing"],
+    ]
+    assert len(study.ClinicalScore()) == 4
+    # An empty cell leaves what is stored.
+    left = run(sheet(tmp_path, VISITS.replace("walker", "").replace("cane", "").replace(",13\n", ",\n")))
+    assert not any(line.changes for line in left.lines)
+    assert stored()["P001", "pre"]["assistive_device"] == "walker"
+
+
+HEAD = "subject,visit,date,role,intervention_date,birth_date,record,mJOA\n"
+
+
+@pytest.mark.parametrize(
+    ("rows", "code", "words"),
+    [
+        ("P001,a,03/04/2026,pre,,,,\n", "SHEET_FORMAT", "YYYY-MM-DD"),
+        ("P001,a,2026-02-30,pre,,,,\n", "SHEET_FORMAT", "YYYY-MM-DD"),
+        ("P001,a,2026-01-01,pre,,2026-05-01,,\n", "SHEET_CONFLICT", "before the birth"),
+        ("P001,a,1950-01-01,pre,,1960,,\n", "SHEET_CONFLICT", "before the birth"),
+        ("P001,a,2026-01-01,pre,,,,19\n", "SCORE_RANGE", "at most 18"),
+        ('P001,a,2026-01-01,pre,,,,"12,5"\n', "SHEET_FORMAT", "decimal point"),
+        ("P001,a,2026-01-01,pre,,,,\nP001,a,2026-01-01,pre,,,,\n", "SHEET_CONFLICT", "also in visits.csv, row 2"),
+        ("P001,a,2026-05-01,pre,,,,\nP001,b,2026-01-01,6_weeks,,,,\n", "SHEET_CONFLICT", "order of their dates"),
+        ("P001,a,2026-05-01,pre,2026-04-01,,,\n", "SHEET_CONFLICT", "before the intervention"),
+        ("P001,a,2026-03-01,6_weeks,2026-04-01,,,\n", "SHEET_CONFLICT", "before the intervention"),
+        ("P001,a,2026-01-01,pre,,,4711,\nP002,a,2026-01-01,pre,,,4711,\n", "SHEET_CONFLICT", "P001 and P002"),
+        ("P001,a,2026-01-01,pre,,,,\np-1,a,2026-01-01,pre,,,,\n", "SHEET_CONFLICT", "--distinct-codes"),
+        ("P001,2026-01-01,2026-01-02,pre,,,,\n", "SHEET_CONFLICT", "date of the visit"),
+        ("P001,a,,Pre Op,,,,\n", "SHEET_FORMAT", "small letters"),
+        ("P001,a,,,2026-01-01,,,\n", "SHEET_FORMAT", "no role"),
+        ("Ann Smith,a,,pre,,,,\n", "USAGE", "pseudonymous"),
+        (",a,,pre,,,,\n", "SHEET_FORMAT", "no subject"),
+    ],
+)
+def test_a_row_that_is_refused_keeps_all_others_out(empty: None, tmp_path: Path, rows: str, code: str, words: str):
+    found = run(sheet(tmp_path, HEAD + rows + "Q9,good,,pre,,,,\n"))
+    assert not found.done
+    assert {e.code for e in found.errors} == {code}
+    assert any(words in e.text() for e in found.errors), found.errors[0].text()
+    assert all("visits.csv, row " in str(e.key) for e in found.errors)
+    assert not len(lab.Subject())
+
+
+def test_what_is_registered_counts_as_well(empty: None, tmp_path: Path):
+    assert run(sheet(tmp_path, HEAD + "P001,a,2026-05-01,pre,,1950-05-01,,\n")).done
+    assert stored()["P001", "a"]["visit_age"] == 76.0
+    late = run(sheet(tmp_path, HEAD + "P001,b,2026-01-01,6_weeks,,,,\n"))
+    assert late.errors[0].code == "SHEET_CONFLICT"
+    alike = HEAD + "P-001,b,2026-06-01,6_weeks,,,,\n"
+    assert run(sheet(tmp_path, alike)).errors[0].code == "SHEET_CONFLICT"
+    assert run(sheet(tmp_path, alike), distinct_codes=True).done
+    text = str(everything_but_refreshes())
+    assert "1950" not in text
+
+
+def test_activity_and_pace_from_a_sheet(empty: None, tmp_path: Path):
+    a, b = chain.small_video(tmp_path, "a"), chain.small_video(tmp_path, "b")
+    first, second = register(a, b, session_label="pre")
+    text = f"video,subject,visit,activity,pace\na.mp4,P001,pre,,fast\n{second},,,TUG,\n"
+    done = run(sheet(tmp_path, text))
+    assert done.done, done.errors
+    assert [line.changes for line in done.lines] == [["pace unknown -> fast"], ["activity walking -> tug"]]
+    assert {k: (c.activity, c.pace) for k, c in video.conditions(True).items()} == {
+        first: ("walking", "fast"),
+        second: ("tug", "unknown"),
+    }
+    assert not any(line.changes for line in run(sheet(tmp_path, text)).lines)
+    assert run(sheet(tmp_path, "video,pace\nabsent.mp4,fast\n")).errors[0].code == "DB_NOT_FOUND"
+
+
+def book(path: Path, change=None) -> Path:
+    made = Workbook()
+    page = made.active
+    assert page is not None
+    page.append(["subject", "visit", "date", "role", "mJOA"])
+    page.append(["P001", "pre", datetime.date(2026, 1, 10), "pre", 12])
+    if change is not None:
+        change(made, page)
+    made.save(path)
+    return path
+
+
+def test_a_workbook(empty: None, tmp_path: Path):
+    def more(made: Workbook, _: object) -> None:
+        scores = made.create_sheet("scores")
+        scores.append(["subject", "visit", "instrument", "value"])
+        scores.append(["P001", "pre", "TUG", 9.25])
+        made.create_sheet("empty")
+
+    done = run(book(tmp_path / "study.xlsx", more))
+    assert done.done, done.errors
+    assert [line.where for line in done.lines] == ["study.xlsx, sheet Sheet, row 2", "study.xlsx, sheet scores, row 2"]
+    assert stored()["P001", "pre"]["session_date"] == datetime.date(2026, 1, 10)
+    assert {(r["instrument"], r["score_value"]) for r in study.ClinicalScore().to_dicts()} == {
+        ("mJOA", 12),
+        ("TUG", 9.25),
+    }
+
+
+def _merge(_: Workbook, page) -> None:
+    page.merge_cells("A2:A3")
+
+
+def _formula(_: Workbook, page) -> None:
+    page["E2"] = "=6*2"
+
+
+def _error(_: Workbook, page) -> None:
+    page["E2"] = "#N/A"
+
+
+@pytest.mark.parametrize(("change", "words"), [(_merge, "A2:A3"), (_formula, "cell E2"), (_error, "#N/A")])
+def test_workbooks_that_hide_values(tmp_path: Path, change, words: str):
+    with pytest.raises(PblError, match="SHEET_FORMAT") as error:
+        sheets.read_sheets(book(tmp_path / "study.xlsx", change))
+    assert words in error.value.text()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.csv", b"subject,visit,subject\n", "twice"),
+        ("a.csv", b"subject,,visit\nP,1,2\n", "without a name"),
+        ("a.csv", b"subject,visit\nP001,a,b\n", "3 cells under 2 columns"),
+        ("a.csv", b"subject,visit\n\xff\xfe\n", "UTF-8"),
+        ("a.csv", b'subject,visit\n"P001,a\n', "CSV"),
+        ("a.xlsx", b"subject,visit\n", "zip"),
+        ("b.xlsx", b"PK\5\6" + bytes(18), "xlsx"),
+    ],
+)
+def test_files_that_are_no_sheet(tmp_path: Path, name: str, content: bytes, words: str):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(PblError, match="SHEET_FORMAT") as error:
+        sheets.read_sheets(tmp_path / name)
+    assert words in error.value.text()
+
+
+def test_columns_that_are_unknown(empty: None, tmp_path: Path):
+    with pytest.raises(PblError, match="SHEET_FORMAT") as error:
+        run(sheet(tmp_path, "subject,visit,mJOAA\nP001,a,3\n"))
+    assert "'mJOAA'" in error.value.found
+    with pytest.raises(PblError, match="FILE_MISSING"):
+        run(tmp_path / "absent.csv")
+
+
+def test_the_command_says_row_by_row(empty: None, tmp_path: Path):
+    visits = str(sheet(tmp_path, VISITS))
+    dry = CliRunner().invoke(import_, [visits, "--dry-run"])
+    assert (dry.exit_code, len(lab.Subject())) == (0, 0)
+    assert "visits.csv, row 4: new person C001" in dry.output
+    assert "4 rows would be imported, 0 unchanged, 0 refused" in dry.output
+    assert "4 rows imported" in CliRunner().invoke(import_, [visits]).output
+    wrong = CliRunner().invoke(import_, [str(sheet(tmp_path, VISITS.replace(",11\n", ",44\n")))])
+    assert wrong.exit_code == 1
+    assert "SCORE_RANGE" in wrong.output
+    assert "0 rows not imported, 3 unchanged, 1 refused" in wrong.output
