@@ -121,11 +121,23 @@ class Axes:
             )
         )
 
-    def svg(self, label: str) -> Markup:
-        """The chart; `label` is what a screen reader says."""
+    def svg(self, label: str, footer: Sequence[str] = (), key: Mapping[str, str] | None = None) -> Markup:
+        """The chart; `label` is what a screen reader says. Below it stand a `key` (words -> colour) and the lines of a
+        `footer`."""
+        width, y = self.size
+        below: list[Markup] = []
+        for word, colour in (key or {}).items():
+            y += 12
+            below.append(Markup('<circle cx="8" cy="{:.1f}" r="3.5" fill="{}"/>').format(y - 3, colour))
+            below.append(Markup('<text x="16" y="{:.1f}" fill="{}">{}</text>').format(y, _INK, word))
+        for line in footer:
+            y += 11
+            below.append(
+                Markup('<text x="4" y="{:.1f}" fill="{}" style="font-size:8px">{}</text>').format(y, _FAINT, line)
+            )
         return Markup(
             '<svg viewBox="0 0 {:g} {:g}" role="img" aria-label="{}" preserveAspectRatio="xMidYMid meet">{}</svg>'
-        ).format(*self.size, label, Markup("").join(self._parts))
+        ).format(width, y + (6 if below else 0), label, Markup("").join([*self._parts, *below]))
 
 
 def cycle_chart(

@@ -33,3 +33,23 @@ def check(folder: Path) -> None:
         f"curves of {data.curves['variable'].nunique()} angles, {len(data.cycles)} values of cycles"
     )
     click.echo(f"slice {data.description.name or '-'} {data.description.hash or '-'}, content {content_hash(data)}")
+
+
+@study.command(epilog="Example: pbl study report spine2026 --out spine2026_report")
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for report.html, figures, tables.")
+@click.option(
+    "--from", "change_from", default="", metavar="ROLE", help="Change from this visit (default: the study's)."
+)
+@click.option("--to", "change_to", default="", metavar="ROLE", help="Last visit of the change.")
+@click.option("--group", default="", metavar="GROUP", help="The group whose change is judged.")
+def report(folder: Path, out: Path, change_from: str, change_to: str, group: str) -> None:
+    """One page of a study's FOLDER: who is in and out, repeatability, correlation with scores, change, curves.
+
+    Figures are written as SVG, tables as CSV and LaTeX. What the values do not support is a code with its reason.
+    """
+    from pbl_pipeline.study import read_study
+    from pbl_pipeline.study_report import write_study_report
+
+    paths = write_study_report(read_study(folder), out, change_from, change_to, group)
+    click.echo(f"written: {paths[0]}, {len(paths) - 1} figures and tables")

@@ -26,12 +26,8 @@ from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, OUTCOMES, PASS, WARN, Che
 from pbl_pipeline.report import _figures
 from pbl_pipeline.report._types import SessionReport, TrialReport
 from pbl_pipeline.report._words import (
-    ANGLES,
-    FOOT_ANGLES,
     HEADLINES,
-    MEASURES,
     OUTCOME_WORDS,
-    PELVIS_ANGLES,
     VERDICT_WORDS,
     check_name,
     number,
@@ -40,6 +36,7 @@ from pbl_pipeline.report._words import (
     significant,
     size,
 )
+from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES
 
 _CONVERGED = {True: "converged", False: "not converged", None: "convergence not recorded"}
 

@@ -21,7 +21,7 @@ from ._columns import FRAMES
 from ._types import StudyData, StudyDescription
 
 FORMAT = "pbl-study-1"
-_ABOUT, _DICTIONARY = "study.json", "dictionary.csv"
+_ABOUT, _DICTIONARY, _SCRIPT = "study.json", "dictionary.csv", "make_report.py"
 #: Bytes of a file that is read; curves are wide.
 _MAX_BYTES = {"curves": 128 * MIB}
 _MAX_HEADER = 64 * 1024
@@ -30,7 +30,7 @@ _DIGITS = {"curves": "%.6g"}
 
 
 def write_study(study: StudyData, folder: str | Path) -> list[Path]:
-    """Write a study as `<frame>.csv`, `dictionary.csv` and `study.json`; returns the paths.
+    """Write a study as `<frame>.csv`, `dictionary.csv`, `study.json` and `make_report.py`; returns the paths.
 
     Numbers have 8 digits, curves 6. The folder is made; files of these names in it are replaced.
 
@@ -51,6 +51,7 @@ def write_study(study: StudyData, folder: str | Path) -> list[Path]:
         "files": {name: _sha256(data) for name, data in contents.items()},
     }
     contents[_DICTIONARY] = _to_csv(data_dictionary(study)).encode()
+    contents[_SCRIPT] = (Path(__file__).with_name("templates") / "make_report.py.txt").read_bytes()
     contents[_ABOUT] = (json.dumps(about, indent=1, ensure_ascii=False) + "\n").encode()
     paths = []
     for name, data in contents.items():

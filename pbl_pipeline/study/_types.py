@@ -125,7 +125,7 @@ class StudyData:
 
 def typed(name: str, frame: pd.DataFrame) -> pd.DataFrame:
     """A copy of a frame with its columns in order and of their kinds. Raises `PblError` STUDY_INVALID."""
-    columns = FRAMES[name]
+    columns, frame = FRAMES[name], frame.reset_index(drop=True)
     if not len(frame) and not len(frame.columns):
         frame = pd.DataFrame({c.name: [] for c in columns})
     if absent := [c.name for c in columns if c.name not in frame]:
@@ -134,7 +134,7 @@ def typed(name: str, frame: pd.DataFrame) -> pd.DataFrame:
     if more and name != "visits":
         raise invalid(name, f"unknown column {more[0]!r}", "the columns of docs/study.md", "remove it")
     known = pd.DataFrame({c.name: _values(name, c, frame[c.name]) for c in columns}, index=frame.index)
-    return known.join(frame[more]).reset_index(drop=True)
+    return known.join(frame[more])
 
 
 def _values(name: str, column: Column, values: Any) -> Any:
@@ -188,7 +188,7 @@ def _check_visits(visits: Any) -> None:
         )
     first = counted[counted["role"].isin(FIRST_ROLES)].groupby("subject")["days"].max()
     others = counted[~counted["role"].isin(FIRST_ROLES)]
-    if (late := others["days"] < others["subject"].map(first)).any():
+    if (late := others["days"] < others["subject"].map(first).astype(float)).any():
         raise invalid(
             "visits",
             f"{_row(others, late, ('subject', 'visit', 'role'))} before the visit {' or '.join(FIRST_ROLES)}",
@@ -223,7 +223,7 @@ def _check_scores(scores: Any, instruments: Any) -> None:
         )
     for text in table["classes"]:
         classes_of(text)
-    low, high = (scores["instrument"].map(table[c]) for c in ("low", "high"))
+    low, high = (scores["instrument"].map(table[c]).astype(float) for c in ("low", "high"))
     if (outside := (scores["value"] < low) | (scores["value"] > high)).any():
         row = scores[outside].iloc[0]
         raise invalid(

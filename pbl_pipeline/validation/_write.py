@@ -10,26 +10,10 @@ import click
 import jinja2
 
 import pbl_pipeline
+from pbl_pipeline.latex import tex_escape
 
 from ._paper import paper_figures
 from ._table import Table
-
-#: Characters that mean something to LaTeX.
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "&": r"\&",
-    "%": r"\%",
-    "$": r"\$",
-    "#": r"\#",
-    "_": r"\_",
-    "{": r"\{",
-    "}": r"\}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "<": r"$<$",
-    ">": r"$>$",
-    "|": r"$|$",
-}
 
 
 def write_tables(tables: Mapping[str, Table], folder: str | Path) -> list[Path]:
@@ -106,11 +90,6 @@ def html(tables: Mapping[str, Table]) -> str:
         version=pbl_pipeline.__version__,
         has_values=_has_values,
     )
-
-
-def tex_escape(text: str) -> str:
-    """Text that LaTeX prints as it is."""
-    return "".join(_LATEX.get(c, c) for c in text)
 
 
 def _caption(table: Table) -> str:

@@ -201,6 +201,12 @@ def test_codes_are_new_and_nothing_else_changes():
     assert (merged["value_x"] == merged["value_y"]).all()
 
 
+def test_the_index_of_a_frame_does_not_matter():
+    study = small_study()
+    halves = pd.concat([study.scores.iloc[:3], study.scores.iloc[3:].reset_index(drop=True)])
+    pd.testing.assert_frame_equal(dataclasses.replace(study, scores=halves).scores, study.scores)
+
+
 def test_classes():
     assert classes_of("0 high risk; 21 low risk") == [(0.0, "high risk"), (21.0, "low risk")]
     assert classes_of("") == []

@@ -1,0 +1,20 @@
+"""The report of a study: statistics, figures, tables, one page (docs/study.md)."""
+
+from ._page import write_study_report
+from ._results import CurveResult, StudyResults, study_results
+from ._tables import PageTable, all_tables
+from ._values import Plan, mean_curves, pairs, plan, visit_table
+
+__all__ = [
+    "CurveResult",
+    "PageTable",
+    "Plan",
+    "StudyResults",
+    "all_tables",
+    "mean_curves",
+    "pairs",
+    "plan",
+    "study_results",
+    "visit_table",
+    "write_study_report",
+]

@@ -1,0 +1,153 @@
+"""What a study's statistics are made of: one row per visit, and what is compared with what."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.study import CURVE_POINTS, FIRST_ROLES, StudyData
+from pbl_pipeline.words import MEASURES
+
+INDEX = "gdi"
+_KEY = ["subject", "visit"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """What is compared.
+
+    Attributes
+    ----------
+    roles, groups
+        In order: by the days of the visits; the group that changes first, then by name.
+    measures, scores, angles
+        Names of gait measures (the index first), clinical scores and joint angles.
+    change_from, change_to, change_group
+        As `StudyDescription`, resolved. `change_to` is "" in a study of one role.
+    """
+
+    roles: tuple[str, ...]
+    groups: tuple[str, ...]
+    measures: tuple[str, ...]
+    scores: tuple[str, ...]
+    angles: tuple[str, ...]
+    change_from: str
+    change_to: str
+    change_group: str
+
+
+def visit_table(study: StudyData) -> pd.DataFrame:
+    """One row per visit that counts: `subject, visit, role, days, group`, then a column per measure and score.
+
+    A measure is that of both sides where the study has it, else the mean of left and right. What a visit lacks is NaN.
+    A score that is named like a measure has " (score)" behind its name.
+    """
+    visits: Any = study.visits[study.visits["included"]]
+    table = visits[[*_KEY, "role", "days", "group", INDEX]]
+    if visits[INDEX].isna().all():
+        table = table.drop(columns=INDEX)
+    measures: Any = study.measures
+    sided = measures[measures["side"] != "both"].groupby([*_KEY, "measure"], sort=False)["value"]
+    both = measures[measures["side"] == "both"].set_index([*_KEY, "measure"])["value"]
+    # Of one leg alone there is no mean of both.
+    means = sided.mean()[sided.count() == 2]
+    wide = both.combine_first(means).unstack()
+    order = [m for m in (*MEASURES, *dict.fromkeys(measures["measure"])) if m in wide]
+    table = table.merge(wide[list(dict.fromkeys(order))].reset_index(), on=_KEY, how="left")
+    scores: Any = study.scores
+    named = scores.assign(instrument=[score_column(study, name) for name in scores["instrument"]])
+    marks = named.pivot(index=_KEY, columns="instrument", values="value")
+    marks = marks[[c for i in study.instruments["instrument"] if (c := score_column(study, i)) in marks]]
+    return table.merge(marks.reset_index(), on=_KEY, how="left")
+
+
+def score_column(study: StudyData, instrument: str) -> str:
+    """The column of a score in `visit_table`."""
+    taken = {INDEX, *study.measures["measure"]}
+    return f"{instrument} (score)" if instrument in taken else instrument
+
+
+def plan(study: StudyData, change_from: str = "", change_to: str = "", change_group: str = "") -> Plan:
+    """What is compared in a study; what is "" is that of its description, or follows from its visits.
+
+    Raises `PblError` USAGE: a role or group that no visit that counts has. STUDY_INVALID: no visit counts.
+    """
+    table: Any = visit_table(study)
+    if not len(table):
+        raise PblError(
+            "STUDY_INVALID",
+            found="no visit that counts",
+            expected="one at least",
+            next_step="see the reasons in visits.csv",
+            key="visits",
+        )
+    days = table.groupby("role", sort=False)["days"].median()
+    first = {role: role not in FIRST_ROLES for role in days.index}
+    roles = tuple(sorted(days.index, key=lambda r: (np.nan_to_num(days[r], nan=1e9), first[r])))
+    given = study.description
+    start = _known(change_from or given.change_from or roles[0], roles, "role")
+    end = _known(change_to or given.change_to or (roles[-1] if len(roles) > 1 else ""), (*roles, ""), "role")
+    if start == end:
+        raise PblError("USAGE", found=f"change from {start} to {end}", expected="two roles", next_step="name another")
+    both = table[table["role"].isin([start, end])].groupby(["group", "subject"]).size()
+    names = sorted(set(table["group"]))
+    paired = {g: int((both.loc[g] == 2).sum()) if g in both.index.get_level_values(0) else 0 for g in names}
+    group = _known(change_group or given.change_group or max(names, key=lambda g: paired[g]), tuple(names), "group")
+    scores = tuple(c for i in study.instruments["instrument"] if (c := score_column(study, i)) in table)
+    fixed = {*_KEY, "role", "days", "group", *scores}
+    angles = tuple(dict.fromkeys(study.curves["variable"]))
+    measures = tuple(c for c in table.columns if c not in fixed)
+    return Plan(roles, (group, *(g for g in names if g != group)), measures, scores, angles, start, end, group)
+
+
+def _known(name: str, names: tuple[str, ...], what: str) -> str:
+    if name in names:
+        return name
+    raise PblError(
+        "USAGE",
+        found=f"{what} {name!r}",
+        expected=f"one of {', '.join(n for n in names if n)}",
+        next_step="pass a name of visits.csv (visits that count)",
+    )
+
+
+def at_role(table: pd.DataFrame, role: str, column: str, group: str = "") -> pd.Series:
+    """Values of a column at the visit of a role, by subject; those that are known."""
+    frame: Any = table
+    rows = frame[(frame["role"] == role) & ((frame["group"] == group) | (group == ""))]
+    return rows.set_index("subject")[column].dropna()
+
+
+def pairs(table: pd.DataFrame, to_compare: Plan, column: str) -> pd.DataFrame:
+    """`pre, post` of a column by subject, for the persons of the changing group who have both."""
+    group = to_compare.change_group
+    pre, post = (at_role(table, r, column, group) for r in (to_compare.change_from, to_compare.change_to))
+    return pd.concat({"pre": pre, "post": post}, axis=1, join="inner")
+
+
+def mean_curves(study: StudyData, angle: str) -> pd.DataFrame:
+    """(visits that count, 101) mean of the sides of a visit, by subject, role and group; NaN where one is unknown."""
+    curves: Any = study.curves[study.curves["variable"] == angle]
+    visits: Any = study.visits[study.visits["included"]]
+    rows = curves.merge(visits[[*_KEY, "role", "group"]], on=_KEY)
+    keys = [rows["subject"], rows["role"], rows["group"]]
+    points = list(CURVE_POINTS)
+    unknown = rows[points].isna().groupby(keys, sort=False).any()
+    return rows[points].groupby(keys, sort=False).mean().mask(unknown)
+
+
+def cycle_values(study: StudyData, to_compare: Plan, measure: str, group: str = "") -> pd.DataFrame:
+    """`subject, value` of the cycles of one visit per person, in order: that of `change_from`, else the first that
+    counts."""
+    visits: Any = study.visits[study.visits["included"]]
+    if group:
+        visits = visits[visits["group"] == group]
+    order = {r: i for i, r in enumerate([to_compare.change_from, *to_compare.roles])}
+    cycles: Any = study.cycles[study.cycles["measure"] == measure]
+    rows = cycles.merge(visits.assign(rank=visits["role"].map(order).astype(float))[[*_KEY, "rank"]], on=_KEY)
+    rows = rows[rows["rank"] == rows.groupby("subject")["rank"].transform("min")]
+    return rows.sort_values(["subject", "cycle", "side"])[["subject", "value"]].dropna()
