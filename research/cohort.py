@@ -279,16 +279,25 @@ def _cycles(
 ) -> tuple[pd.DataFrame, dict[str, np.ndarray]]:
     """Single cycles whose mean is the visit's value, and their standard deviation by visit."""
     n_cycles = drawn.n_cycles[person, visit]
-    row = np.repeat(np.arange(len(n_cycles)), n_cycles)
-    number = np.arange(len(row)) - np.repeat(np.cumsum(n_cycles) - n_cycles, n_cycles)
-    base = keys.iloc[row].assign(side=np.array(["left", "right"])[number % 2], cycle=number // 2 + 1)
     parts, spread = [], {}
-    for name, m in MEASURES.items():
-        own = m.cycle_sd * g.normal(size=len(row))
-        own = own - (np.bincount(row, own) / n_cycles)[row]
-        spread[name] = np.sqrt(np.bincount(row, own**2) / (n_cycles - 1))
-        parts.append(base.assign(measure=name, value=drawn.measures[name][person, visit][row] + own))
+    for name in MEASURES:
+        mean = drawn.measures[name][person, visit]
+        row, values = cycles_of(name, mean, n_cycles, g)
+        number = np.arange(len(row)) - np.repeat(np.cumsum(n_cycles) - n_cycles, n_cycles)
+        base = keys.iloc[row].assign(side=np.array(["left", "right"])[number % 2], cycle=number // 2 + 1)
+        parts.append(base.assign(measure=name, value=values))
+        spread[name] = np.sqrt(np.bincount(row, (values - mean[row]) ** 2) / (n_cycles - 1))
     return pd.concat(parts), spread
+
+
+def cycles_of(
+    name: str, mean: np.ndarray, n_cycles: np.ndarray, g: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """(C,) visit of each cycle, and its value, of (N,) visits of a measure; a visit's cycles have its `mean`."""
+    row = np.repeat(np.arange(len(n_cycles)), n_cycles)
+    own = MEASURES[name].cycle_sd * g.normal(size=len(row))
+    own = own - (np.bincount(row, own) / n_cycles)[row]
+    return row, mean[row] + own
 
 
 def _curves(

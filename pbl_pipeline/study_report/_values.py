@@ -59,9 +59,9 @@ def visit_table(study: StudyData) -> pd.DataFrame:
     order = [m for m in (*MEASURES, *dict.fromkeys(measures["measure"])) if m in wide]
     table = table.merge(wide[list(dict.fromkeys(order))].reset_index(), on=_KEY, how="left")
     scores: Any = study.scores
-    named = scores.assign(instrument=[score_column(study, name) for name in scores["instrument"]])
-    marks = named.pivot(index=_KEY, columns="instrument", values="value")
-    marks = marks[[c for i in study.instruments["instrument"] if (c := score_column(study, i)) in marks]]
+    marks = scores.pivot(index=_KEY, columns="instrument", values="value")
+    marks = marks[[i for i in study.instruments["instrument"] if i in marks]]
+    marks = marks.rename(columns={i: score_column(study, i) for i in marks})
     return table.merge(marks.reset_index(), on=_KEY, how="left")
 
 

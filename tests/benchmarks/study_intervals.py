@@ -4,7 +4,8 @@
     python -m tests.benchmarks.study_intervals --studies 4000 --only icc
 
 Three visits of each person, of whom 15 % miss each of the later two where it says "drop-outs"; person sd 8, visit sd 4
-(points of an index). Prints for each statistic its truth and the percentage of studies whose 95 % interval holds it.
+(points of an index). What begins with "cohort" is of whole studies of `research.cohort`, with its drop-outs and
+excluded visits. Prints for each statistic its truth and the percentage of studies whose 95 % interval holds it.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ from pbl_pipeline.stats import (
     hedges_g,
     icc,
     mann_whitney,
+    ratings_table,
     srm,
 )
+from research.cohort import DROP_OUT, INDEX, MEASURES, SCORES, Drawn, cycles_of, draw, score_truth
 
-PERSON_SD, VISIT_SD = 8.0, 4.0
-RELIABILITY = PERSON_SD**2 / (PERSON_SD**2 + VISIT_SD**2)
+PERSON_SD, VISIT_SD, RELIABILITY = INDEX.person_sd, INDEX.visit_sd, INDEX.icc
 #: Mean change of the patients from the first visit to the later ones, and sd of their true change.
-CHANGE, CHANGE_SD = 5.0, 6.0
-SRM = CHANGE / np.hypot(CHANGE_SD, np.sqrt(2) * VISIT_SD)
+CHANGE, CHANGE_SD, SRM = INDEX.change, INDEX.change_sd, INDEX.srm
 #: One simulated study: its interval.
 Study = Callable[[np.random.Generator], Estimate]
 
@@ -41,7 +42,7 @@ def visits(g: np.random.Generator, n: int, dropouts: bool, shift: np.ndarray) ->
     """(n, 3) scores with a `shift` (3,) of the visits; NaN where a person missed a later visit."""
     table = g.normal(0, PERSON_SD, (n, 1)) + shift + g.normal(0, VISIT_SD, (n, 3))
     if dropouts:
-        table[:, 1:][g.random((n, 2)) < 0.15] = np.nan
+        table[:, 1:][g.random((n, 2)) < DROP_OUT] = np.nan
     return table
 
 
@@ -63,9 +64,8 @@ def change(g: np.random.Generator, n: int) -> np.ndarray:
     return g.normal(CHANGE, np.hypot(CHANGE_SD, np.sqrt(2) * VISIT_SD), n)
 
 
-def ordinal(x: np.ndarray) -> np.ndarray:
-    """A score of 0 to 18 points with a ceiling, from a standard normal measure."""
-    return np.clip(np.round(14 + 2.5 * x), 0, 18)
+#: A score of 0 to 18 points with a ceiling, from a standard normal measure.
+ordinal = SCORES["mJOA"].of
 
 
 def _spearman_of_scores(r: float) -> float:
@@ -82,6 +82,59 @@ def _repeated(g: np.random.Generator, r: float) -> Estimate:
 
 def _agreement(g: np.random.Generator, n: int, which: str) -> Estimate:
     return getattr(bland_altman(g.normal(1, 3, n), np.zeros(n)), which)
+
+
+def _cohort_change(g: np.random.Generator, name: str) -> Estimate:
+    """SRM of the cohort's patients from the first to the last visit."""
+    drawn = draw(g)
+    values = drawn.scores[name] if name in drawn.scores else drawn.measures[name]
+    both = drawn.patient & drawn.counts[:, 0] & drawn.counts[:, 2]
+    return srm(values[both, 0], values[both, 2])
+
+
+def _cohort_correlation(g: np.random.Generator, score: str) -> Estimate:
+    """Of the index with a score, patients at the first visit."""
+    drawn = draw(g)
+    there = drawn.patient & drawn.counts[:, 0]
+    kind = "spearman" if SCORES[score].ordinal else "pearson"
+    return correlation(drawn.measures["gdi"][there, 0], drawn.scores[score][there, 0], kind)
+
+
+def _cohort_visits(g: np.random.Generator, name: str, kind: str, interval: str) -> Estimate:
+    """ICC of the visits of the controls."""
+    drawn = draw(g)
+    table = np.where(drawn.counts, drawn.measures[name], np.nan)[~drawn.patient]
+    return icc(table[np.isfinite(table).any(axis=1)], kind, interval=interval)
+
+
+def _cohort_cycles(g: np.random.Generator, name: str) -> Estimate:
+    """ICC of one cycle, patients at the first visit."""
+    drawn: Drawn = draw(g)
+    there = np.flatnonzero(drawn.patient & drawn.counts[:, 0])
+    row, values = cycles_of(name, drawn.measures[name][there, 0], drawn.n_cycles[there, 0], g)
+    return icc(ratings_table(values, row), "1,1")
+
+
+def cohort_cases() -> dict[str, tuple[float, Study]]:
+    """Statistics of whole studies of the cohort."""
+    found: dict[str, tuple[float, Study]] = {}
+    for name, m in MEASURES.items():
+        found |= {
+            f"cohort srm: {name}": (m.srm, lambda g, n=name: _cohort_change(g, n)),
+            f"cohort icc 3,1 controls: {name}": (m.icc, lambda g, n=name: _cohort_visits(g, n, "3,1", "f")),
+            f"cohort icc 2,1 generalized controls: {name}": (
+                m.icc,
+                lambda g, n=name: _cohort_visits(g, n, "2,1", "generalized"),
+            ),
+            f"cohort icc 1,1 cycles: {name}": (m.icc_cycle, lambda g, n=name: _cohort_cycles(g, n)),
+        }
+    for name in SCORES:
+        truth = score_truth(name)
+        found |= {
+            f"cohort srm: {name}": (truth["srm"], lambda g, n=name: _cohort_change(g, n)),
+            f"cohort correlation: gdi, {name}": (truth["correlation"], lambda g, n=name: _cohort_correlation(g, n)),
+        }
+    return found
 
 
 def cases() -> dict[str, tuple[float, Study]]:
@@ -145,7 +198,7 @@ def cases() -> dict[str, tuple[float, Study]]:
         lambda g: mann_whitney(g.normal(1, 1, 60), g.normal(0, 1, 20)).rank_biserial,
     )
     found["hedges_g: 60 and 20, 1 sd"] = (1.0, lambda g: hedges_g(g.normal(1, 1, 60), g.normal(0, 1, 20)))
-    return found
+    return found | cohort_cases()
 
 
 def held(truth: float, study: Study, studies: int, seed: int) -> float:
