@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -66,6 +66,12 @@ def plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     return value
+
+
+def inside(column: str, values: Iterable[str | int]) -> Any:
+    """A restriction to values that hold no quotes (codes and numbers), quick for thousands."""
+    listed = ", ".join(f"'{v}'" if isinstance(v, str) else str(v) for v in values)
+    return f"{column} IN ({listed})" if listed else False
 
 
 def delete_below(table: Any, keys: Sequence[Mapping[str, Any]]) -> dict[str, int]:

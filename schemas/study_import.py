@@ -8,7 +8,7 @@ import datetime
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from . import lab, session, study, video
 from .codes import check_subject, day_of
 from .conditions import set_condition
 from .ingest import in_transaction, next_id
-from .rows import utc_now
+from .rows import inside, utc_now
 from .sheets import Row, Sheet, read_sheets, refused
 
 #: Column of a sheet -> column of `study.Visit`.
@@ -255,18 +255,18 @@ class _Plan:
     # ------------------------------------------------------------------------------------------------------- the tables
     def _load(self) -> None:
         codes = {*self.people, *(c for _, c in self.members)}
-        inside = _inside("subject", codes)
+        of_people = inside("subject", codes)
         self.known = {r["subject"]: r for r in lab.Subject.proj("population").to_dicts()}
-        rows = (session.Session & inside).to_dicts()
+        rows = (session.Session & of_people).to_dicts()
         self.registered = {(r["subject"], r["session_label"]): r for r in rows}
-        ids = session.Session & inside
+        ids = session.Session & of_people
         labels = {int(r["session_id"]): key for key, r in self.registered.items()}
         self.stored_visits = {labels[int(r["session_id"])]: r for r in (study.Visit & ids.proj()).to_dicts()}
         self.stored_scores = {
             (*labels[int(r["session_id"])], r["instrument"]): r["score_value"]
             for r in (study.ClinicalScore & ids.proj()).to_dicts()
         }
-        members = (study.CohortMember & inside).to_dicts()
+        members = (study.CohortMember & of_people).to_dicts()
         self.stored_members = {(r["cohort"], r["subject"]): r for r in members}
         self.cohorts = set(study.Cohort().to_arrays("cohort"))
 
@@ -397,7 +397,7 @@ class _Plan:
                     stated, f"{key[2]} {_shown(old)} -> {_shown(new)}" if old is not None else f"{key[2]} {new:g}"
                 )
         numbers = [t.values["video_id"] for t in self.trials]
-        now = video.conditions(_inside("video_id", numbers)) if numbers else {}
+        now = video.conditions(inside("video_id", numbers)) if numbers else {}
         for stated in list(self.trials):
             number = stated.values["video_id"]
             if numbers.count(number) > 1:
@@ -486,12 +486,6 @@ def _split(stated: Mapping[Any, _Stated], known: Mapping[Any, Any]) -> tuple[dic
 
 def _default(column: str) -> Any:
     return None if column in ("visit_days", "visit_age", "intervention_date") else ""
-
-
-def _inside(column: str, values: Iterable[str | int]) -> Any:
-    """A restriction to values that hold no quotes (codes and numbers), quick for thousands."""
-    listed = ", ".join(f"'{v}'" if isinstance(v, str) else str(v) for v in values)
-    return f"{column} IN ({listed})" if listed else False
 
 
 def _folded(code: str) -> str:

@@ -6,13 +6,33 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from . import fit, gait, gdi, lab, qc, session, tracking, validation, video
+from . import fit, gait, gdi, lab, qc, session, study, tracking, validation, video
+from ._datajoint import dj
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from pbl_pipeline.validation import TrialErrors
+
+
+_SESSION_COLUMNS = (
+    "session_status",
+    "session_reason",
+    "session_cycles",
+    "session_cadence",
+    "session_stride_time",
+    "session_step_time",
+    "session_stance",
+    "session_swing",
+    "session_double_support",
+    "session_gdi",
+    "session_gdi_left",
+    "session_gdi_right",
+    "session_gdi_sd",
+    "session_gdi_minimal_change",
+    "session_gdi_n",
+)
 
 
 def current_sets() -> Any:
@@ -32,25 +52,84 @@ def session_summary(restriction: Any = True) -> pd.DataFrame:
     residuals px and cm.
     """
     fits = fit.SessionFit.proj("fit_residual_2d", "fit_residual_3d", "fit_outcome")
-    measures = gdi.SessionGdi.proj(
-        "session_status",
-        "session_reason",
-        "session_cycles",
-        "session_cadence",
-        "session_stride_time",
-        "session_step_time",
-        "session_stance",
-        "session_swing",
-        "session_double_support",
-        "session_gdi",
-        "session_gdi_left",
-        "session_gdi_right",
-        "session_gdi_sd",
-        "session_gdi_minimal_change",
-        "session_gdi_n",
-    )
+    measures = gdi.SessionGdi.proj(*_SESSION_COLUMNS)
     quality = qc.SessionQc.proj("qc_outcome", "qc_worst")
     return (current_sets() * fits * measures * quality & restriction).to_pandas(order_by="session_id").reset_index()
+
+
+def visit_frame(restriction: Any = True, chain: Any = True) -> pd.DataFrame:
+    """One row per visit of a study and chain of methods, also visits that have no measures: what it is in the study,
+    measures and index of the current set of videos, and every clinical score as a column of its instrument's name.
+
+    Parameters
+    ----------
+    restriction
+        Of the visits: `study.Visit`, subject, session label and date, population.
+    chain
+        Of the methods, such as `{"fit_method": "blazepose-v2"}`, where the tables hold several chains.
+    """
+    visits = study.Visit * session.Session.proj("subject", "session_label", "session_date")
+    visits = visits * lab.Subject.proj("population") & restriction
+    sets = fit.FitSet.proj("session_id") * (fit.FitSelection & {"fit_current": True}).proj()
+    if restriction is not True:
+        sets = sets & visits.proj()
+    measures = sets * gdi.SessionGdi.proj(*_SESSION_COLUMNS, "session_gps", "session_gdi_reason") & chain
+    rows = frame_of(visits).merge(frame_of(measures), how="left", on="session_id")
+    rows = rows.merge(score_frame(restriction), how="left", on="session_id")
+    return rows.sort_values(["subject", "session_date", "session_id"], ignore_index=True)
+
+
+def score_frame(restriction: Any = True) -> pd.DataFrame:
+    """Clinical scores as one row per visit (`session_id`) and a column per instrument that any visit has.
+
+    The rows are turned by the server. `restriction`: of sessions, subjects and visits.
+    """
+    visits = session.Session.proj("subject", "session_label", "session_date") * lab.Subject.proj("population")
+    scores = study.ClinicalScore()
+    if restriction is not True:
+        scores = scores & (visits * study.Visit & restriction).proj()
+    names = sorted((dj.U("instrument") & scores).to_arrays("instrument"))
+    # DataJoint's names have no capitals and begin with a letter: numbers there, the instruments' names here.
+    wide = {f"score_{i}": f"max(if(instrument = {_literal(n)}, score_value, null))" for i, n in enumerate(names)}
+    found = frame_of(dj.U("session_id").aggr(scores, **wide)) if names else frame_of(scores.proj())
+    return found.rename(columns={f"score_{i}": n for i, n in enumerate(names)})[["session_id", *names]]
+
+
+def _literal(text: str) -> str:
+    return "'" + text.replace("\\", "\\\\").replace("'", "''") + "'"
+
+
+def frame_of(query: Any) -> Any:
+    """The rows of a query as a frame of pandas, keys as columns, of numbers, texts and dates only.
+
+    A third of the time of DataJoint's `to_pandas`, which looks at each value whether it has to be decoded.
+    """
+    import pandas as pd
+
+    return pd.DataFrame(list(query.cursor().fetchall()), columns=list(query.heading.names))
+
+
+def cycle_frame(restriction: Any = True, chain: Any = True) -> pd.DataFrame:
+    """One row per gait cycle that is used, with its index: of the current fits of the visits of `restriction`, as for
+    `visit_frame`. Times in s, lengths in m; `activity` and `pace` say what is done in its video ("unknown" where it is
+    not stated). Set-based: no file is read.
+    """
+    visits = session.Session.proj("subject", "session_label", "session_date") * lab.Subject.proj("population")
+    sets = (fit.FitSelection & {"fit_current": True}).proj() * fit.FitSet.proj("session_id")
+    sets = sets & (visits & restriction).proj() if restriction is not True else sets
+    return cycle_rows(sets, chain)
+
+
+def cycle_rows(sets: Any, chain: Any) -> Any:
+    """The frame of `cycle_frame` for sets of videos (with `session_id`). `pool`: the pace that pools the cycle."""
+    columns = ("cycle_side", "cycle_start", "cycle_foot_up", "cycle_end", "cycle_stride_length", "cycle_step_length")
+    cycles = (gait.GaitCycle.Cycle & {"cycle_used": True}).proj(*columns)
+    found = frame_of(cycles * gdi.GDI.Cycle.proj("cycle_gdi") * sets & chain)
+    done = video.conditions(fit.FitSet.Video & sets)
+    for name in ("activity", "pace"):
+        found[name] = found["video_id"].map({k: getattr(c, name) for k, c in done.items()})
+    found["pool"] = found["video_id"].map({k: c.pool for k, c in done.items()})
+    return found
 
 
 def cycle_curves(restriction: Any = True) -> pd.DataFrame:

@@ -36,3 +36,92 @@ def import_(sheets: tuple[Path, ...], dry_run: bool, distinct_codes: bool) -> No
     click.echo(f"{len(changed)} rows {word}, {same} unchanged, {wrong} refused")
     if wrong:
         raise click.exceptions.Exit(1)
+
+
+@click.command(
+    "slice",
+    epilog="\b\nExample: pbl study slice spine2026 --cohort dcm --role pre --role 6_weeks --event surgery\n"
+    "Example: pbl study slice spine2026",
+)
+@click.argument("name", required=False)
+@click.option("--cohort", metavar="NAME", help="Visits of the people of this cohort (else: of everybody).")
+@click.option("--role", "roles", multiple=True, help="Visits of this role; repeat for several (else: all).")
+@click.option("--event", default="", help="What the days of the visits count from, such as surgery.")
+@click.option("--note", default="", help="Shown on the report.")
+@click.option("--keypoints", "keypoint_method", help="Keypoint method, where the tables hold several.")
+@click.option("--fit", "fit_method", help="Fit method, where the tables hold several.")
+@click.option("--gait", "gait_method", help="Event method, where the tables hold several.")
+@click.option("--index", "gdi_method", help="Method of the index, where the tables hold several.")
+@click.option("--norm", help="Normative set, where the tables hold several.")
+def slice_(name: str | None, cohort: str | None, roles: tuple[str, ...], event: str, note: str, **methods: str) -> None:
+    """Freeze visits and methods under NAME; for a slice that is there, say what changed since. Without NAME: the list.
+
+    Methods are named by their key, such as blazepose-v2.
+    """
+    import schemas
+    from schemas import slices, study
+
+    schemas.activate()
+    if name is None:
+        for row in study.StudySlice().to_dicts(order_by="slice_created"):
+            cohort_name = row["cohort"] or "everybody"
+            click.echo(f"{row['study_slice']:<32} {row['slice_hash']}  {row['slice_n']} visits of {cohort_name}")
+        return
+    if study.StudySlice & {"study_slice": name} and not (cohort or roles or event or note):
+        changed = slices.changes(name)
+        for text in changed:
+            click.echo(text)
+        click.echo(f"{name}: {'not ' if changed else ''}as it was frozen")
+        if changed:
+            raise click.exceptions.Exit(1)
+        return
+    made = slices.freeze(name, cohort, roles, {k: v for k, v in methods.items() if v}, event, note)
+    click.echo(f"{made.name}: {made.n} visits, {made.n_included} count, hash {made.hash}")
+
+
+@click.command(epilog="Example: pbl study export --slice spine2026 --out spine2026 --key spine2026_key.csv")
+@click.option("--slice", "name", required=True, metavar="NAME", help="A slice (`pbl study slice`).")
+@click.option("--out", required=True, type=click.Path(path_type=Path), metavar="DIR", help="Folder to write.")
+@click.option(
+    "--key", type=click.Path(path_type=Path), metavar="FILE", help="Where to keep which code became which; apart."
+)
+@click.option("--keep-codes", is_flag=True, help="The codes of persons and visits as they are here.")
+@click.option("--no-curves", is_flag=True, help="Without the mean curves, whose files take the longest to read.")
+def export(name: str, out: Path, key: Path | None, keep_codes: bool, no_curves: bool) -> None:
+    """The rows and curves of a slice as a folder of CSV files with new codes for persons and visits (docs/study.md).
+
+    `pbl study report DIR` makes figures and tables of it, without a database.
+    """
+    import schemas
+    from pbl_pipeline.study import deidentified, write_study
+    from schemas import slices
+
+    schemas.activate(methods=False)
+    data = slices.study_data(name, curves=not no_curves)
+    for text in slices.changes(name):
+        click.echo(f"changed since it was frozen: {text}", err=True)
+    if not keep_codes:
+        data, codes = deidentified(data)
+        if key is not None:
+            _write_key(key, codes.to_csv(index=False))
+    paths = write_study(data, out)
+    click.echo(f"{data.n_subjects} persons, {data.n_visits} visits: {len(paths)} files in {out}")
+
+
+def _write_key(path: Path, text: str) -> None:
+    """The key to the codes, for its owner alone. Raises FILE_UNWRITABLE."""
+    import os
+
+    from pbl_pipeline.errors import PblError
+
+    try:
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as out:
+            out.write(text)
+    except OSError as error:
+        raise PblError(
+            "FILE_UNWRITABLE",
+            found=error.strerror or str(error),
+            expected="a file for the key to the codes",
+            next_step="pass another --key",
+            key=path,
+        ) from error

@@ -1,0 +1,435 @@
+"""Slices: the visits and methods that figures were made of, frozen, and their rows as the library's `StudyData`."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import check_label, is_plain
+
+from . import fit, gait, gdi, lab, session, study, video
+from ._datajoint import dj
+from .ingest import in_transaction
+from .rows import inside, utc_now
+from .stored_files import file_ref, stored_file
+from .views import cycle_rows, frame_of
+
+if TYPE_CHECKING:
+    from pbl_pipeline.study import StudyData
+
+#: One chain of methods, as StudySlice names it.
+CHAIN = ("tracking_method", "keypoint_method", "fit_method", "gait_method", "gdi_method", "norm")
+_SIDES = {"mean": "both", "left": "left", "right": "right"}
+_UNITS = {"steps_per_min": "steps/min", "m_per_s": "m/s", "percent": "%", "s": "s", "m": "m"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Slice:
+    """A frozen slice: name, hash, how many visits it has and how many of them count."""
+
+    name: str
+    hash: str
+    n: int
+    n_included: int
+
+
+def freeze(
+    name: str,
+    cohort: str | None = None,
+    roles: Sequence[str] = (),
+    methods: Mapping[str, str] | None = None,
+    event: str = "",
+    note: str = "",
+) -> Slice:
+    """Freeze the visits of a cohort (None: of everybody) with the measures that they have now.
+
+    Parameters
+    ----------
+    name
+        Of the slice; a name is never used for another one.
+    roles
+        Visits of these roles alone; empty: all.
+    methods
+        Key of StudySlice (`fit_method`, ...) -> method, where the tables hold several chains.
+    event
+        What the days of the visits count from, such as surgery.
+    note
+        Shown on the report.
+
+    Raises
+    ------
+    PblError
+        USAGE for a name that is taken, labels too long, several chains of methods; DB_NOT_FOUND for an unknown cohort,
+        no visits, no measures.
+    """
+    for what, text, longest, least in (("slice", name, 32, 1), ("event", event, 64, 0), ("note", note, 1000, 0)):
+        check_label(what, text, longest, least)
+    if study.StudySlice & {"study_slice": name}:
+        raise PblError(
+            "USAGE",
+            found=f"slice {name!r} is there already",
+            expected="a new name: a slice never changes",
+            next_step=f"name it {name}-2, or delete the old one from study.StudySlice",
+        )
+    if cohort is not None and not study.Cohort & {"cohort": cohort}:
+        raise _none(
+            f"no cohort {cohort!r}", "a row of study.Cohort", "`pbl study import` with the columns cohort, group"
+        )
+
+    def work() -> Slice:
+        visits = _candidates(cohort, roles)
+        chain = _chain(visits, methods or {})
+        rows = _decided(visits, chain, cohort)
+        about = {**chain, "study_slice": name, "slice_event": event, "slice_note": note, "cohort": cohort}
+        hashes = _hashes(_frames(rows, about))
+        digest = _digest(hashes.values())
+        study.StudySlice.insert1(
+            {
+                **about,
+                "slice_roles": list(roles),
+                "slice_n": len(rows),
+                "slice_hash": digest,
+                "slice_code_version": _version(),
+                "slice_created": utc_now(),
+            }
+        )
+        study.StudySliceVisit.insert(
+            {
+                "study_slice": name,
+                "session_id": r["session_id"],
+                "slice_included": r["included"],
+                "slice_reason": r["reason"],
+                "slice_fit_set": r["fit_set"],
+                "slice_visit_hash": hashes[r["subject"], r["visit"]],
+            }
+            for r in rows.to_dict("records")
+        )
+        return Slice(name, digest, len(rows), int(rows["included"].sum()))
+
+    return in_transaction(work)
+
+
+def study_data(name: str, curves: bool = True) -> StudyData:
+    """The rows of a slice as frames: its visits, whether they count, and its methods are the frozen ones, values those
+    that the tables hold now (`changes` says whether they are the same).
+
+    Set-based but for the curves, whose files are read one by one (`curves` False leaves them out).
+
+    Raises
+    ------
+    PblError
+        DB_NOT_FOUND for an unknown slice; STUDY_INVALID as `StudyData`.
+    """
+    from pbl_pipeline.study import StudyData, StudyDescription
+
+    about = _about(name)
+    rows = _frozen(about)
+    frames = _frames(rows, about)
+    if curves:
+        frames["curves"] = _curves(rows, about)
+    description = StudyDescription(
+        name=name,
+        hash=about["slice_hash"],
+        methods={k: about[k] for k in CHAIN},
+        code_version=about["slice_code_version"],
+        event=about["slice_event"],
+        note=about["slice_note"],
+    )
+    return StudyData(**frames, description=description)
+
+
+def changes(name: str) -> list[str]:
+    """What of a slice's rows is not as it was when it was frozen, in words; empty where the same frames come out.
+
+    Raises
+    ------
+    PblError
+        DB_NOT_FOUND for an unknown slice.
+    """
+    about = _about(name)
+    rows = _frozen(about)
+    out = [] if len(rows) == about["slice_n"] else [f"{about['slice_n'] - len(rows)} visits were deleted"]
+    hashes = _hashes(_frames(rows, about)) if len(rows) else {}
+    for r in rows.to_dict("records"):
+        if hashes[r["subject"], r["visit"]] != r["frozen_hash"]:
+            out.append(f"visit {r['visit']} of {r['subject']} has other rows")
+    return out
+
+
+# ------------------------------------------------------------------------------------------------------------ freezing
+def _candidates(cohort: str | None, roles: Sequence[str]) -> Any:
+    visits = study.Visit.proj("visit_role", "visit_days") * session.Session.proj(
+        "subject", "session_label", "session_date"
+    )
+    if cohort is not None:
+        visits = visits & (study.CohortMember & {"cohort": cohort}).proj()
+    if roles:
+        visits = visits & [{"visit_role": r} for r in roles]
+    found = frame_of(visits).sort_values(["subject", "session_date", "session_id"], ignore_index=True)
+    if not len(found):
+        raise _none("no visit", "visits of the cohort with these roles", "`pbl study import` visits")
+    return found
+
+
+def _chain(visits: Any, methods: Mapping[str, str]) -> dict[str, str]:
+    """The one chain of methods by which the visits are measured."""
+    if unknown := sorted(set(methods) - set(CHAIN)):
+        raise _usage(f"methods of {', '.join(unknown)}", f"of {', '.join(CHAIN)}")
+    found = [tuple(r[c] for c in CHAIN) for r in (dj.U(*CHAIN) & (_measured(visits) & dict(methods))).to_dicts()]
+    if not found:
+        raise _none("no measures of these visits", "visits with measures", "`pbl populate`, `pbl status`")
+    if len(found) > 1:
+        raise _usage(
+            f"measures of {len(found)} chains of methods: " + "; ".join(", ".join(c) for c in sorted(found)[:4]),
+            f"one: name the method of one or more of {', '.join(CHAIN)}",
+        )
+    return dict(zip(CHAIN, found[0], strict=True))
+
+
+def _measured(visits: Any) -> Any:
+    """SessionGdi of the current sets of the visits, with session and chain."""
+    sets = fit.FitSet.proj("session_id") * (fit.FitSelection & {"fit_current": True}).proj()
+    of_set = dj.U("fit_set", "tracking_method", "keypoint_method") & fit.FitSet.Video
+    columns = ("session_status", "session_reason", "session_gdi_reason")
+    return sets * of_set * gdi.SessionGdi.proj(*columns) & inside("session_id", map(int, visits["session_id"]))
+
+
+def _decided(visits: Any, chain: Mapping[str, str], cohort: str | None) -> Any:
+    """The visits with their set of videos, and whether each counts."""
+    members = (study.CohortMember & {"cohort": cohort}).to_dicts() if cohort is not None else []
+    left_out = {m["subject"]: m["member_reason"] for m in members if not m["member_included"]}
+    measured = {int(r["session_id"]): r for r in (_measured(visits) & dict(chain)).to_dicts()}
+    taken: set[tuple[str, str]] = set()
+    rows = []
+    for v in visits.to_dict("records"):
+        row, role = measured.get(int(v["session_id"])), (v["subject"], v["visit_role"])
+        if v["subject"] in left_out:
+            reason = left_out[v["subject"]] or "excluded from the cohort"
+        elif row is None:
+            reason = "no measures"
+        elif row["session_status"] != "PASS":
+            reason = row["session_reason"] or "no gait cycle"
+        elif role in taken:
+            reason = f"the person has an earlier visit of the role {v['visit_role']}"
+        else:
+            reason = ""
+            taken.add(role)
+        rows.append((row["fit_set"] if row else "", not reason, _line(reason)))
+    fit_set, included, reasons = zip(*rows, strict=True)
+    columns = {"session_label": "visit", "visit_role": "role", "visit_days": "days"}
+    return visits.rename(columns=columns).assign(fit_set=fit_set, included=included, reason=reasons)
+
+
+def _line(text: str) -> str:
+    text = " ".join(text.split())
+    return (text if is_plain(text) else ascii(text))[:200]
+
+
+# ------------------------------------------------------------------------------------------------------------- reading
+def _about(name: str) -> dict[str, Any]:
+    found = (study.StudySlice & {"study_slice": name}).to_dicts()
+    if not found:
+        known = ", ".join(sorted(study.StudySlice().to_arrays("study_slice"))) or "none yet"
+        raise _none(f"no slice {name!r}", f"a slice that was frozen ({known})", "`pbl study slice NAME` freezes one")
+    return found[0]
+
+
+def _frozen(about: Mapping[str, Any]) -> Any:
+    own = study.StudySliceVisit & {"study_slice": about["study_slice"]}
+    named = session.Session.proj("subject", visit="session_label")
+    rows = frame_of(own * named * study.Visit.proj(role="visit_role", days="visit_days"))
+    names = {"slice_included": "included", "slice_reason": "reason", "slice_fit_set": "fit_set"}
+    return rows.rename(columns={**names, "slice_visit_hash": "frozen_hash"})
+
+
+def _frames(rows: Any, about: Mapping[str, Any]) -> dict[str, Any]:
+    """visits, measures, scores, instruments and cycles of the visits `rows` by the chain of `about`."""
+
+    ids = inside("session_id", map(int, rows["session_id"]))
+    chain = {k: about[k] for k in CHAIN if k not in ("tracking_method", "keypoint_method")}
+    key = rows[["session_id", "subject", "visit"]]
+    sets = rows.loc[rows["fit_set"] != "", ["fit_set", "session_id", "subject", "visit"]]
+    of_sets = inside("fit_set", sets["fit_set"])
+
+    index = (gdi.SessionGdi & chain & of_sets).proj(
+        "session_gdi_left", "session_gdi_right", "session_gps", "session_gps_left", "session_gps_right",
+        gdi="session_gdi", gdi_sd="session_gdi_sd", n_cycles="session_gdi_n",
+    )  # fmt: skip
+    index = frame_of(index)
+    more = ("intervention", "intervention_date", "assistive_device", "orthosis", "visit_age")
+    people = session.Session.proj("subject", date="session_date") * lab.Subject.proj("population")
+    visit = frame_of(study.Visit.proj(*more) * people & ids).drop(columns="subject")
+    visits = rows[[*key, "role", "days", "included", "reason", "fit_set"]].merge(visit, on="session_id")
+    visits = visits.merge(index[["fit_set", "gdi", "gdi_sd", "n_cycles"]], how="left", on="fit_set")
+    visits["group"] = _groups(visits, about.get("cohort"))
+    visits = visits.sort_values(["subject", "date", "session_id"], ignore_index=True)
+    visits = visits.drop(columns=["session_id", "fit_set"]).rename(columns={"visit_age": "age"})
+
+    scores = frame_of(study.ClinicalScore & ids).merge(key, on="session_id")
+    instruments = frame_of(study.ClinicalInstrument & (study.ClinicalScore & ids).proj("instrument"))
+    named = instruments.rename(
+        columns={
+            "instrument_unit": "unit",
+            "instrument_low": "low",
+            "instrument_high": "high",
+            "minimal_change": "mic",
+            "instrument_classes": "classes",
+        }
+    )
+    sources = [
+        "; ".join(filter(None, (a, f"minimal important change: {b}" if b else "")))[:200]
+        for a, b in zip(instruments["instrument_source"], instruments["minimal_change_source"], strict=True)
+    ]
+    wanted = ["instrument", "unit", "low", "high", "higher_is_better", "ordinal", "mic", "classes"]
+    cycles = cycle_rows(fit.FitSelection.proj() * fit.FitSet.proj("session_id") & of_sets, chain)
+    return {
+        "visits": visits,
+        "measures": _measures(sets, index, chain, of_sets),
+        "scores": scores.rename(columns={"score_value": "value"})[["subject", "visit", "instrument", "value"]],
+        "instruments": named[wanted].assign(source=sources),
+        "cycles": _cycles(cycles, sets, about["gdi_method"]),
+    }
+
+
+def _groups(visits: Any, cohort: str | None) -> Any:
+    """Of each visit's person: the group in the cohort, else the population."""
+    members = (study.CohortMember & {"cohort": cohort} & "member_group != ''") if cohort is not None else None
+    groups = {} if members is None else {r["subject"]: r["member_group"] for r in members.to_dicts()}
+    return visits["subject"].map(groups).fillna(visits["population"])
+
+
+def _measures(sets: Any, index: Any, chain: Mapping[str, str], of_sets: Any) -> Any:
+    """Long: measures of both sides and of each, the index and the Gait Profile Score of a side."""
+    import pandas as pd
+
+    own = (gdi.SessionGdi.Measure & chain & of_sets).proj(
+        "session_measure_mean",
+        "session_measure_left",
+        "session_measure_right",
+        "session_measure_sd",
+        "session_measure_n",
+    )
+    rows = frame_of(own).rename(columns={"session_measure": "measure", "session_measure_n": "n_cycles"})
+    parts = []
+    for column, side in _SIDES.items():
+        part = rows.assign(side=side, value=rows[f"session_measure_{column}"].astype(float), sd=np.nan)
+        if side == "both":
+            part["sd"] = rows["session_measure_sd"].astype(float)
+        else:
+            part["n_cycles"] = np.nan
+        parts.append(part[["fit_set", "side", "measure", "value", "sd", "n_cycles"]])
+    for measure, column in (("gdi", "session_gdi"), ("gps_deg", "session_gps")):
+        for side in ("left", "right", *(("both",) if measure == "gps_deg" else ())):
+            name = column if side == "both" else f"{column}_{side}"
+            one = index.assign(side=side, measure=measure, value=index[name].astype(float), sd=np.nan)
+            parts.append(one[["fit_set", "side", "measure", "value", "sd", "n_cycles"]])
+    long = pd.concat(parts, ignore_index=True).dropna(subset=["value"])
+    long["unit"] = [unit_of(m) for m in long["measure"]]
+    return long.merge(sets, on="fit_set").drop(columns=["fit_set", "session_id"])
+
+
+def unit_of(measure: str) -> str:
+    """The unit that the name of a measure ends with; "" for one without."""
+    if measure == "gps_deg":
+        return "deg"
+    return next((unit for end, unit in _UNITS.items() if measure.endswith(f"_{end}")), "")
+
+
+def _cycles(cycles: Any, sets: Any, gdi_method: str) -> Any:
+    """Long: index, stride time and stride length of each cycle that the visit pools, numbered by visit and side."""
+    from pbl_pipeline.gait import ANY_PACE
+
+    pace = gdi.pace_of(gdi_method)
+    kept = cycles[(cycles["pool"] != "") if pace == ANY_PACE else (cycles["pool"] == pace)]
+    kept = kept.merge(sets, on=["fit_set", "session_id"]).sort_values(["subject", "visit", "video_id", "cycle_no"])
+    kept = kept.assign(
+        side=kept["cycle_side"],
+        cycle=kept.groupby(["subject", "visit", "cycle_side"]).cumcount() + 1,
+        gdi=kept["cycle_gdi"],
+        stride_time_s=kept["cycle_end"] - kept["cycle_start"],
+        stride_length_m=kept["cycle_stride_length"].astype(float),
+    )
+    names = ["gdi", "stride_time_s", "stride_length_m"]
+    keys = ["subject", "visit", "side", "cycle"]
+    long = kept[[*keys, *names]].melt(keys, names, "measure", "value")
+    return long.dropna(subset=["value"])
+
+
+def _curves(rows: Any, about: Mapping[str, Any]) -> Any:
+    """Mean curve of the used cycles that each visit pools, per side and angle, at 0, 1, ..., 100 %."""
+    import pandas as pd
+
+    from pbl_pipeline.study import CURVE_PERCENT, CURVE_POINTS
+
+    of = rows.loc[rows["fit_set"] != ""].set_index("fit_set")
+    of_sets = inside("fit_set", of.index)
+    chain = {k: about[k] for k in ("fit_method", "gait_method")}
+    done = video.conditions(fit.FitSet.Video & of_sets)
+    pace = gdi.pace_of(about["gdi_method"])
+    used: dict[tuple[str, int], dict[int, str]] = defaultdict(dict)
+    for r in (gait.GaitCycle.Cycle & chain & of_sets & {"cycle_used": True}).proj("cycle_side").to_dicts():
+        used[r["fit_set"], int(r["video_id"])][int(r["cycle_no"])] = r["cycle_side"]
+    found: dict[tuple[str, str, str], list[np.ndarray]] = defaultdict(list)
+    for r in (gait.GaitCycle & chain & of_sets).to_dicts(order_by="KEY"):
+        number = int(r["video_id"])
+        sides = used[r["fit_set"], number]
+        if not sides or not done[number].pooled(pace):
+            continue
+        with stored_file(gait.GaitCycle(), file_ref(r["curves"])) as path:
+            by_cycle = gait.load_curves(path)
+        for n, side in sides.items():
+            for angle, curve in by_cycle[n].deg.items():
+                found[r["fit_set"], side, angle].append(curve)
+    out, points = [], []
+    for (fit_set, side, angle), curves in found.items():
+        mean = np.mean(curves, axis=0, dtype=float)
+        points.append(np.interp(CURVE_PERCENT, np.linspace(0.0, 100.0, len(mean)), mean))
+        out.append((of.at[fit_set, "subject"], of.at[fit_set, "visit"], side, angle, "deg", len(curves)))
+    frame = pd.DataFrame(out, columns=["subject", "visit", "side", "variable", "unit", "n_cycles"])
+    return frame.join(pd.DataFrame(np.array(points).reshape(len(out), len(CURVE_POINTS)), columns=list(CURVE_POINTS)))
+
+
+# --------------------------------------------------------------------------------------------------------------- hashes
+def _hashes(frames: Mapping[str, Any]) -> dict[tuple[str, str], str]:
+    """(subject, visit) -> hash over all rows of the visit in these frames, in any order."""
+    lines: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for name in ("visits", "measures", "scores", "cycles"):
+        frame = frames[name]
+        columns = sorted(set(frame.columns) - {"subject", "visit"})
+        # One text for a number, whatever type its column has while other rows are there or not.
+        plain = frame[columns].apply(lambda c: c.map(_text)).to_numpy()
+        for key, row in zip(zip(frame["subject"], frame["visit"], strict=True), plain, strict=True):
+            lines[key].append("\t".join((name, *row)))
+    return {key: _digest(sorted(texts)) for key, texts in lines.items()}
+
+
+def _text(value: Any) -> str:
+    if value is None or value != value:  # NaN, NaT
+        return ""
+    if isinstance(value, (bool, np.bool_)):
+        return str(int(value))
+    return f"{float(value):.10g}" if isinstance(value, (int, float, np.number)) else str(value)
+
+
+def _digest(texts: Any) -> str:
+    return hashlib.sha256("\n".join(sorted(texts)).encode()).hexdigest()[:16]
+
+
+def _version() -> str:
+    from pbl_pipeline.code_version import code_version
+
+    return code_version()[:64]
+
+
+def _usage(found: str, expected: str) -> PblError:
+    return PblError("USAGE", found=found, expected=expected, next_step="see `pbl study slice --help`")
+
+
+def _none(found: str, expected: str, next_step: str) -> PblError:
+    return PblError("DB_NOT_FOUND", found=found, expected=expected, next_step=next_step)

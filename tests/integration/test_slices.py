@@ -1,0 +1,199 @@
+"""Slices: frozen visits as frames, whether they are the same again, and the frames of the views."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import schemas
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.study import read_study
+from schemas import fit, gait, gdi, session, slices, study, video, views
+from schemas.cli.study import export, slice_
+from schemas.conditions import set_condition
+from schemas.ingest import Visit, ingest
+from schemas.study_import import import_sheets
+from tests.rows import remove_all
+from workers.populate import populate
+
+from . import chain
+
+VISITS = """subject,visit,date,role,intervention_date,population,cohort,group,included,reason,mJOA,TUG
+P001,pre,2026-01-10,pre,2026-02-01,patient,dcm,surgery,yes,,11,14.5
+P001,after,2026-03-15,6_weeks,2026-02-01,,dcm,,,,13,
+P002,pre,2026-01-12,pre,2026-02-01,patient,dcm,surgery,yes,,12,
+C001,pre,2026-01-11,baseline,,healthy,dcm,,no,moved away,,
+C001,again,2026-01-20,baseline,,,dcm,,,,,
+"""
+
+
+@pytest.fixture(scope="module")
+def cohort(database: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Three visits through the whole chain, one of them with a fast trial too; one visit without a video; an excluded
+    person."""
+    schemas.activate()
+    folder = tmp_path_factory.mktemp("cohort")
+    with pytest.MonkeyPatch.context() as patch:
+        chain.install(patch)
+        for i, (subject, label, pace) in enumerate(
+            [("P001", "pre", None), ("P001", "pre", "fast"), ("P001", "after", None), ("C001", "pre", None)]
+        ):
+            path = chain.small_video(folder, f"walk{i}", n=340 + i)
+            ingest([path], Visit(subject, label, pace=pace))
+        populate()
+        sheet = folder / "visits.csv"
+        sheet.write_text(VISITS)
+        assert import_sheets([sheet]).done
+        slices.freeze("first", "dcm", event="surgery", note="Two clinics.")
+        yield folder
+    remove_all()
+
+
+def of(frame: Any, subject: str, visit: str) -> Any:
+    return frame[(frame["subject"] == subject) & (frame["visit"] == visit)]
+
+
+def test_a_slice_as_frames(cohort: Path):
+    found: Any = slices.study_data("first")
+    told = found.visits[["subject", "visit", "role", "days", "group", "included", "reason"]]
+    assert [tuple(None if v != v else v for v in r) for r in told.itertuples(index=False)] == [
+        ("C001", "pre", "baseline", None, "healthy", False, "moved away"),
+        ("C001", "again", "baseline", None, "healthy", False, "moved away"),
+        ("P001", "pre", "pre", -22, "surgery", True, ""),
+        ("P001", "after", "6_weeks", 42, "surgery", True, ""),
+        ("P002", "pre", "pre", -20, "surgery", False, "no measures"),
+    ]
+    # Index and measures are those of the row of the visit.
+    key = (session.Session & {"subject": "P001", "session_label": "pre"}).fetch1("KEY")
+    row = (gdi.SessionGdi & (fit.FitSet & key)).fetch1()
+    visit = of(found.visits, "P001", "pre").iloc[0]
+    assert (visit["gdi"], visit["n_cycles"]) == (row["session_gdi"], row["session_gdi_n"])
+    measures = of(found.measures, "P001", "pre").set_index(["measure", "side"])
+    assert measures.at[("cadence_steps_per_min", "both"), "value"] == row["session_cadence"]
+    assert measures.at[("cadence_steps_per_min", "both"), "unit"] == "steps/min"
+    assert measures.at[("gdi", "left"), "value"] == row["session_gdi_left"]
+    assert set(found.measures["unit"]) <= {"steps/min", "%", "s", "m", "m/s", "deg", ""}
+    # Cycles of the fast trial are in none of the frames.
+    slow = (video.Video & key & "video_name = 'walk0.mp4'").fetch1("KEY")
+    used = (gait.GaitCycle & slow).fetch1("n_cycles_used")
+    cycles = of(found.cycles, "P001", "pre")
+    index = cycles[cycles["measure"] == "gdi"]
+    assert len(index) == used == row["session_gdi_n"]
+    assert index["value"].mean() == pytest.approx(row["session_gdi"])
+    stride = cycles.loc[cycles["measure"] == "stride_time_s", "value"].mean()
+    assert stride == pytest.approx(measures.at[("stride_time_s", "both"), "value"])
+    curves = of(found.curves, "P001", "pre")
+    assert curves.groupby("variable")["n_cycles"].sum().eq(used).all()
+    expected = [c for c in gait.load_cycles((gait.GaitCycle & slow).fetch1("KEY")) if c.used and c.side == "left"]
+    mean = np.mean([c.curves["knee_flexion"] for c in expected], axis=0)
+    points = curves[(curves["variable"] == "knee_flexion") & (curves["side"] == "left")].iloc[0]
+    np.testing.assert_allclose(points[[f"p{i}" for i in range(0, 101, 2)]].astype(float), mean, rtol=1e-5)
+    # Scores and their instruments.
+    assert set(map(tuple, found.scores.to_numpy())) == {
+        ("P001", "pre", "mJOA", 11.0),
+        ("P001", "pre", "TUG", 14.5),
+        ("P001", "after", "mJOA", 13.0),
+        ("P002", "pre", "mJOA", 12.0),
+    }
+    mjoa = found.instruments.set_index("instrument").loc["mJOA"]
+    assert (mjoa["low"], mjoa["high"], mjoa["mic"], mjoa["higher_is_better"]) == (0, 18, 2, True)
+    assert "Tetreault" in mjoa["source"]
+    assert (found.description.name, found.description.event) == ("first", "surgery")
+    assert found.description.methods["fit_method"] == fit.SessionFit().to_dicts()[0]["fit_method"]
+
+
+def test_the_same_frames_again_until_a_row_changes(cohort: Path):
+    frozen = slices.freeze("second", "dcm", roles=("pre", "6_weeks"))
+    assert (frozen.n, frozen.n_included) == (3, 2)
+    assert frozen.hash == slices.freeze("third", "dcm", roles=("pre", "6_weeks")).hash
+    assert slices.changes("second") == slices.changes("first") == []
+    pre = (session.Session & {"subject": "P001", "session_label": "pre"}).fetch1("session_id")
+    score = {"session_id": pre, "instrument": "mJOA"}
+    study.ClinicalScore.update1({**score, "score_value": 10})
+    assert slices.changes("second") == ["visit pre of P001 has other rows"]
+    study.ClinicalScore.update1({**score, "score_value": 11})
+    assert slices.changes("second") == []
+    # A later video makes another set; the slice keeps its own.
+    (extra,) = ingest([chain.small_video(cohort, "later", n=350)], Visit("P001", "pre"))
+    populate()
+    assert slices.changes("second") == []
+    again: Any = slices.study_data("second", curves=False)
+    assert again.visits["n_cycles"].sum() > 0
+    # Another pace: the measures of both sets are computed anew, the new set's alone, since only that is current.
+    set_condition(extra.video_id or 0, pace="fast")
+    assert slices.changes("second") == []
+    populate()
+    study.Visit.update1({"session_id": pre, "visit_days": -30})
+    assert slices.changes("first") == ["visit pre of P001 has other rows"]
+    study.Visit.update1({"session_id": pre, "visit_days": -22})
+    after = session.Session & {"subject": "P001", "session_label": "after"}
+    number = after.fetch1("session_id")
+    (study.StudySliceVisit & {"study_slice": "third", "session_id": number}).delete(prompt=False)
+    assert slices.changes("third") == ["1 visits were deleted"]
+
+
+def test_what_cannot_be_frozen(cohort: Path):
+    for refused, code in (
+        (lambda: slices.freeze("first"), "USAGE"),
+        (lambda: slices.freeze("x", "no such cohort"), "DB_NOT_FOUND"),
+        (lambda: slices.freeze("x", roles=("5_years",)), "DB_NOT_FOUND"),
+        (lambda: slices.freeze("x", methods={"fit_method": "paper-2025-v1"}), "DB_NOT_FOUND"),
+        (lambda: slices.freeze("x", methods={"solver": "a"}), "USAGE"),
+        (lambda: slices.study_data("absent"), "DB_NOT_FOUND"),
+        (lambda: slices.changes("absent"), "DB_NOT_FOUND"),
+    ):
+        with pytest.raises(PblError) as error:
+            refused()
+        assert error.value.code == code
+    assert not study.StudySlice & {"study_slice": "x"}
+
+
+def test_the_views_of_a_study(cohort: Path):
+    visits: Any = views.visit_frame()
+    assert len(visits) == 5
+    one = visits[(visits["subject"] == "P001") & (visits["session_label"] == "pre")].iloc[0]
+    assert (one["mJOA"], one["TUG"], one["visit_role"], one["population"]) == (11, 14.5, "pre", "patient")
+    assert visits["mJOA"].notna().sum() == 3
+    assert visits["session_gdi"].notna().sum() == 3
+    assert views.visit_frame({"subject": "P002"})["mJOA"].tolist() == [12]
+    cycles: Any = views.cycle_frame({"subject": "P001", "session_label": "pre"})
+    assert {"fast", "unknown"} <= set(cycles["pace"])
+    assert set(cycles["activity"]) == {"walking"}
+    assert len(cycles) == sum(
+        (gait.GaitCycle & (fit.FitSelection & {"fit_current": True}).proj() & video_ids()).to_arrays("n_cycles_used")
+    )
+
+
+def video_ids() -> list[dict]:
+    own = session.Session & {"subject": "P001", "session_label": "pre"}
+    return list((video.Video & own.proj()).proj().to_dicts())
+
+
+def test_the_commands(cohort: Path, tmp_path: Path):
+    run = CliRunner()
+    made = run.invoke(slice_, ["from-shell", "--cohort", "dcm", "--role", "pre", "--role", "6_weeks"])
+    assert made.exit_code == 0, made.output
+    assert "3 visits, 2 count" in made.output
+    shown = run.invoke(slice_, ["from-shell"])
+    assert "as it was frozen" in shown.output
+    listed = run.invoke(slice_, [])
+    assert "from-shell" in listed.output
+    out = tmp_path / "study"
+    done = run.invoke(export, ["--slice", "from-shell", "--out", str(out), "--keep-codes"])
+    assert done.exit_code == 0, done.output
+    again: Any = read_study(out)
+    assert (again.n_visits, again.description.name) == (3, "from-shell")
+    assert set(again.visits["subject"]) == {"P001", "P002"}
+    coded = tmp_path / "coded"
+    assert (
+        run.invoke(export, ["--slice", "from-shell", "--out", str(coded), "--key", str(tmp_path / "key.csv")]).exit_code
+        == 0
+    )
+    text = "".join(p.read_text() for p in coded.glob("*.csv"))
+    assert "C001" not in text
+    assert (tmp_path / "key.csv").stat().st_mode & 0o077 == 0
