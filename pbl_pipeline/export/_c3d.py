@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,24 +36,50 @@ def write_c3d(trial: ExportTrial, path: Path, origin: Mapping[str, str], name: s
     PblError
         PACKAGE_MISSING without ezc3d; EXPORT_INPUT for a trial with more than 65,535 frames.
     """
-    ezc3d: Any = needed("ezc3d", "export", "writing C3D files")
+    ezc3d: Any = needed("ezc3d.ezc3d", "export", "writing C3D files")
     check_frames(trial)
     even = trial.even
-    file = ezc3d.c3d()
-    file["header"]["points"]["first_frame"] = even.first
-    _points(file, trial, even)
-    _poses(file, trial, even)
-    _sensors(file, trial, even)
+    file = _Parameters(ezc3d)
+    # In this order: once ezc3d knows the rate of the points it takes no further channel.
+    for marker in trial.fit.marker_names:
+        file.low.point(marker)
+    analogs = _sensors(file, trial, even)
+    points, residuals = _points(file, even)
+    poses = _poses(file, trial, even)
     _events(file, trial, name)
-    for key, value in (("COMPANY", "pbl-pipeline"), ("SOFTWARE", origin["software"])):
-        file.add_parameter("MANUFACTURER", key, [value])
-    file.add_parameter("SUBJECTS", "USED", [1 if name else 0])
+    file.add("MANUFACTURER", "COMPANY", ["pbl-pipeline"])
+    file.add("MANUFACTURER", "SOFTWARE", [origin["software"]])
+    file.add("SUBJECTS", "USED", [1 if name else 0])
     if name:
-        file.add_parameter("SUBJECTS", "NAMES", [name])
+        file.add("SUBJECTS", "NAMES", [name])
     for key, value in origin.items():
-        file.add_parameter("PBL", key.upper(), [value[:250]])
-    file.add_parameter("PBL", "TIMES", ["interpolated to an even rate" if even.resampled else "as filmed"])
-    file.write(str(path))
+        file.add("PBL", key.upper(), [value[:250]])
+    file.add("PBL", "TIMES", ["interpolated to an even rate" if even.resampled else "as filmed"])
+    file.low.header().firstFrame(even.first)
+    # ezc3d's own `write` wants the masks as bool and loses the memory of their conversion, 0.4 MB for 8 s of 33 points.
+    masks = np.zeros((7, *points.shape[1:]))
+    file.low.import_numpy_data(points, residuals, masks, analogs, poses)
+    file.low.write(str(path), ezc3d.WriteOptions())
+
+
+class _Parameters:
+    """A new file of ezc3d, its parameters set from plain values."""
+
+    def __init__(self, ezc3d: Any) -> None:
+        self.ezc3d, self.low = ezc3d, ezc3d.c3d()
+
+    def add(self, group: str, name: str, values: Sequence[str] | Sequence[int] | np.ndarray) -> None:
+        """Set texts, whole numbers, or an array of floats, whose first dimension runs fastest in the file."""
+        made = self.ezc3d.Parameter(name)
+        if isinstance(values, np.ndarray):
+            made.set(self.ezc3d.VecDouble(values.T.ravel().astype(float).tolist()), values.shape)
+        elif values and isinstance(values[0], str):
+            made.set(self.ezc3d.VecString(list(values)), [len(values)])
+        else:
+            made.set(self.ezc3d.VecInt([int(v) for v in values]), [len(values)])
+        if not self.low.parameters().isGroup(group):
+            self.low.parameters().group(self.ezc3d.Group(group))
+        self.low.parameter(group, made)
 
 
 def check_frames(trial: ExportTrial) -> None:
@@ -70,42 +96,36 @@ def check_frames(trial: ExportTrial) -> None:
         )
 
 
-def _points(file: Any, trial: ExportTrial, even: EvenTrial) -> None:
+def _points(file: _Parameters, even: EvenTrial) -> tuple[np.ndarray, np.ndarray]:
+    """(4, J, N) points in mm and (1, J, N) residuals."""
     xyz = 1e3 * even.markers_m.transpose(2, 1, 0)
-    file["data"]["points"] = np.concatenate([xyz, np.ones((1, *xyz.shape[1:]))])
-    missing = np.isnan(xyz[0])
-    residuals = np.where(missing, -1.0, 0.0)[None]
-    file["data"]["meta_points"] = {"residuals": residuals, "camera_masks": np.zeros((7, *missing.shape), bool)}
-    point = file["parameters"]["POINT"]
-    point["RATE"]["value"] = np.array([even.rate_hz])
-    point["UNITS"]["value"] = ["mm"]
-    # Those that exceed 255 go to LABELS2: a parameter's dimension has 8 bits.
-    point["LABELS"]["value"] = list(trial.fit.marker_names[:255])
-    point["DESCRIPTIONS"]["value"] = ["fitted marker"] * min(255, len(trial.fit.marker_names))
-    if len(trial.fit.marker_names) > 255:
-        file.add_parameter("POINT", "LABELS2", list(trial.fit.marker_names[255:]))
-    file.add_parameter("POINT", "X_SCREEN", ["+X"])
-    file.add_parameter("POINT", "Y_SCREEN", ["+Z"])
+    file.add("POINT", "RATE", np.array([even.rate_hz]))
+    file.add("POINT", "UNITS", ["mm"])
+    file.add("POINT", "X_SCREEN", ["+X"])
+    file.add("POINT", "Y_SCREEN", ["+Z"])
+    points = np.concatenate([xyz, np.ones((1, *xyz.shape[1:]))])
+    return points, np.where(np.isnan(xyz[:1]), -1.0, 0.0)
 
 
-def _poses(file: Any, trial: ExportTrial, even: EvenTrial) -> None:
-    """The bodies' frames (x forward, y up, z right) as 4x4 matrices, body to world, translation in mm."""
+def _poses(file: _Parameters, trial: ExportTrial, even: EvenTrial) -> np.ndarray:
+    """The bodies' frames (x forward, y up, z right) as (4, 4, B, N) matrices, body to world, translation in mm."""
     names = trial.poses.body.body_names
     pose = np.full((4, 4, len(names), len(even.rotation)), np.nan)
     pose[:3, :3] = even.rotation.transpose(2, 3, 1, 0)
     pose[:3, 3] = 1e3 * even.position_m.transpose(2, 1, 0)
     pose[3] = np.array([0.0, 0.0, 0.0, 1.0])[:, None, None]
     pose[:, :, np.isnan(pose[0, 0])] = np.nan
-    file.add_parameter("ROTATION", "LABELS", [f"{n}_4X4" for n in names])
-    file.add_parameter("ROTATION", "DESCRIPTIONS", ["body to laboratory; x forward, y up, z right"] * len(names))
-    file["data"]["rotations"] = pose
+    file.add("ROTATION", "LABELS", [f"{n}_4X4" for n in names])
+    file.add("ROTATION", "DESCRIPTIONS", ["body to laboratory; x forward, y up, z right"] * len(names))
+    file.add("ROTATION", "RATIO", [1])
+    return pose
 
 
-def _events(file: Any, trial: ExportTrial, name: str) -> None:
+def _events(file: _Parameters, trial: ExportTrial, name: str) -> None:
     found = () if trial.measured is None else trial.measured.events.events
     found = sorted(found, key=lambda e: e.time_s)
     if not found:
-        file.add_parameter("EVENT", "USED", [0])
+        file.add("EVENT", "USED", [0])
         return
     icons = [_EVENTS[e.event][1] for e in found]
     # Minutes and seconds, from frame 1.
@@ -120,17 +140,17 @@ def _events(file: Any, trial: ExportTrial, name: str) -> None:
         ("ICON_IDS", icons),
         ("GENERIC_FLAGS", [0] * len(found)),
     ):
-        file.add_parameter("EVENT", key, values)
-    file.add_parameter("EVENT_CONTEXT", "USED", [2])
-    file.add_parameter("EVENT_CONTEXT", "LABELS", ["Left", "Right"])
-    file.add_parameter("EVENT_CONTEXT", "ICON_IDS", [0, 0])
+        file.add("EVENT", key, values)
+    file.add("EVENT_CONTEXT", "USED", [2])
+    file.add("EVENT_CONTEXT", "LABELS", ["Left", "Right"])
+    file.add("EVENT_CONTEXT", "ICON_IDS", [0, 0])
 
 
-def _sensors(file: Any, trial: ExportTrial, even: EvenTrial) -> None:
+def _sensors(file: _Parameters, trial: ExportTrial, even: EvenTrial) -> np.ndarray:
     """The phone's sensors as analog channels, interpolated to a multiple of the frames' rate; NaN outside the log."""
     log = trial.log
     if log is None or not log.sensors:
-        return
+        return np.zeros((1, 0, 0))
     wanted = max(len(s.time_s) / max(float(np.ptp(s.time_s)), 1e-9) for s in log.sensors.values() if len(s.time_s) > 1)
     ratio = min(max(1, math.ceil(wanted / even.rate_hz - 0.05)), _MOST_PER_FRAME)
     at = (even.first + np.arange(len(even.markers_m) * ratio) / ratio) / even.rate_hz
@@ -141,13 +161,12 @@ def _sensors(file: Any, trial: ExportTrial, even: EvenTrial) -> None:
             labels.append(f"phone_{sensor}_{axis}")
             units.append(SENSORS[sensor][1] if sensor in SENSORS else "m/s^2")
             channels.append(_at(time, samples.xyz[:, k], at))
-    analog = file["parameters"]["ANALOG"]
-    analog["RATE"]["value"] = np.array([even.rate_hz * ratio])
-    analog["LABELS"]["value"], analog["UNITS"]["value"] = labels, units
-    analog["DESCRIPTIONS"]["value"] = ["axes of the phone (docs/phone_capture.md)"] * len(labels)
-    analog["SCALE"]["value"] = np.ones(len(labels))
-    analog["OFFSET"]["value"] = np.zeros(len(labels), int)
-    file["data"]["analogs"] = np.array(channels)[None]
+    for label in labels:
+        file.low.analog(label)
+    file.add("ANALOG", "RATE", np.array([even.rate_hz * ratio]))
+    file.add("ANALOG", "UNITS", units)
+    file.add("ANALOG", "SCALE", np.ones(len(labels)))
+    return np.array(channels)[None]
 
 
 def _at(time: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:

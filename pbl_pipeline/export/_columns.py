@@ -11,7 +11,7 @@ import numpy as np
 
 from pbl_pipeline.extras import needed
 
-from ._text import column
+from ._text import lines, number_cells, text_cells
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,9 +80,8 @@ def joined(parts: Sequence[Table]) -> Table:
 
 def write_csv(table: Table, path: Path) -> None:
     """UTF-8, comma, point; header of names; empty cells for what is missing; true and false in words."""
-    cells = [_cells(c) for c in table.columns]
-    lines = [",".join(_quoted(c.name) for c in table.columns), *map(",".join, zip(*cells, strict=True))]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+    head = ",".join(_quoted(c.name) for c in table.columns) + "\n"
+    path.write_bytes(head.encode() + (lines([_cells(c) for c in table.columns], ",") if len(table) else b""))
 
 
 def write_parquet(table: Table, path: Path, about: Mapping[str, str]) -> None:
@@ -133,13 +132,13 @@ def _stacked(pieces: Sequence[np.ndarray | Labels | None], lengths: Sequence[int
     return Labels(np.concatenate(codes), tuple(texts))
 
 
-def _cells(c: Column) -> list[str]:
-    if isinstance(c.values, Labels):
-        texts = [_quoted(t) for t in c.values.texts]
-        return [texts[i] for i in c.values.codes.tolist()]
+def _cells(c: Column) -> np.ndarray:
+    values = c.values
     if c.kind == "boolean":
-        return ["true" if v else "false" for v in c.values.tolist()]
-    return column(c.values, "%d" if c.kind == "integer" else "%.6f")
+        values = Labels(np.asarray(values, np.int32), ("false", "true"))
+    if isinstance(values, Labels):
+        return text_cells([_quoted(t).encode() for t in values.texts])[values.codes]
+    return number_cells(values, 0 if c.kind == "integer" else 6)
 
 
 def _quoted(text: str) -> str:

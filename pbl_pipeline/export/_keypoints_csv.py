@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import csv
+import io
 from pathlib import Path
 
 import numpy as np
 
 from pbl_pipeline.errors import PblError
 
-from ._text import rows
+from ._text import lines, number_cells
 from ._trial import ExportTrial
 
 
@@ -36,8 +37,6 @@ def write_keypoints_csv(trial: ExportTrial, path: Path) -> None:
         ["coords", *["x", "y", "likelihood"] * j],
     ]
     table = np.concatenate([points.xy_px, points.confidence[..., None]], axis=2).reshape(n, 3 * j)
-    table = np.column_stack([np.arange(n), table])
-    body = rows(table, ["%d", *["%.3f", "%.3f", "%.4f"] * j], ",", "")
-    with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file, lineterminator="\n").writerows(head)
-        file.write("\n".join(body) + "\n")
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(head)
+    path.write_bytes(text.getvalue().encode() + lines([number_cells(np.arange(n), 0), number_cells(table, 4)], ","))

@@ -10,7 +10,7 @@ import numpy as np
 from pbl_pipeline.body import PELVIS_TURNS, SLIDES, load_body
 
 from ._osim import pelvis_rest_m
-from ._text import rows
+from ._text import lines, number_cells
 from ._trial import ExportTrial
 
 
@@ -34,5 +34,4 @@ def write_mot(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: 
     head += [f"{name}={text}" for name, text in origin.items()]
     head += ["units: angles in degrees, pelvis_tx/ty/tz in metres; ground with y up", "endheader"]
     head.append("\t".join(["time", *names]))
-    body = rows(table, ["%.6f"] * table.shape[1], "\t", "nan")
-    path.write_text("\n".join([*head, *body]) + "\n", encoding="ascii")
+    path.write_bytes(("\n".join(head) + "\n").encode("ascii") + lines([number_cells(table, 6)], "\t"))

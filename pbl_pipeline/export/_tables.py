@@ -4,7 +4,7 @@ stand in a column `unit` beside the values."""
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -70,7 +70,8 @@ def session_tables(trials: Sequence[ExportTrial], metrics: GaitMetrics | None) -
     if measured:
         made.append(joined([_events(name, m) for name, m in measured]))
         cycles = [(name, c, _gdi_of(m.gdi, c)) for name, m in measured for c in m.cycles]
-        made += [_cycles_wide(cycles), _cycles_long(cycles), _curves_wide(cycles), _curves_long(cycles)]
+        pooled = {name for name, m in measured if m.pooled}
+        made += [_cycles_wide(cycles, pooled), _cycles_long(cycles), _curves_wide(cycles), _curves_long(cycles)]
         parts = [("trial", name, m.spatiotemporal, m.gdi) for name, m in measured]
         if metrics is not None:
             parts = [("session", "", metrics.spatiotemporal, metrics.gdi), *parts]
@@ -87,9 +88,9 @@ def unit_of(name: str) -> str:
 def _angles_wide(trial: ExportTrial) -> Table:
     frame = angles_table(trial.fit)
     columns = _time(trial)
-    for joint in frame.columns[1:]:
+    for joint, values in zip(frame.columns[1:], frame.to_numpy().T[1:] + 0.0, strict=True):
         unit, text = ("m" if joint in SLIDES else "deg"), JOINT_SIGNS.get(_sided(joint)[0], "")
-        columns.append(Column(f"{joint}_{unit}", frame[joint].to_numpy() + 0.0, unit, f"positive: {text}"))
+        columns.append(Column(f"{joint}_{unit}", values, unit, f"positive: {text}"))
     return Table("angles_wide", tuple(columns))
 
 
@@ -175,7 +176,8 @@ def _cycle_keys(cycles: Sequence[_Cycle], each: int = 1) -> list[Column]:
     ]
 
 
-def _cycles_wide(cycles: Sequence[_Cycle]) -> Table:
+def _cycles_wide(cycles: Sequence[_Cycle], pooled: Collection[str]) -> Table:
+    """`pooled`: names of the trials that the measures of the visit are made of."""
     values = [measures_of(c) for _, c, _ in cycles]
     columns = _cycle_keys(cycles)
     columns.append(Column("bout", _integers(c.bout for _, c, _ in cycles), "", "walking bout, from 0"))
@@ -188,6 +190,12 @@ def _cycles_wide(cycles: Sequence[_Cycle]) -> Table:
         columns.append(Column(name, column, unit_of(name), "of this cycle (docs/measures.md)"))
     columns += [
         Column("gdi", _floats(g for _, _, g in cycles), "", "Gait Deviation Index of the cycle"),
+        Column(
+            "pooled",
+            np.array([n in pooled for n, _, _ in cycles], bool),
+            "",
+            "whether the visit pools its trial (docs/measures.md)",
+        ),
         Column("far_leg", Labels.of([c.far_leg for _, c, _ in cycles]), "", "leg that the other hid from the camera"),
         Column("excluded", Labels.of([c.excluded for _, c, _ in cycles]), "", "why it is no part of the measures"),
     ]

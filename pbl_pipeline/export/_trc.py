@@ -8,23 +8,22 @@ import numpy as np
 
 from pbl_pipeline.body import Y_UP_TO_Z_UP
 
-from ._text import rows
+from ._text import lines, number_cells
 from ._trial import ExportTrial
 
 
 def write_trc(trial: ExportTrial, path: Path, title: str = "markers") -> None:
     """Write the fitted markers in mm, in OpenSim's ground: x as ours, y up, z = -y of our world.
 
-    Frames at the ends in which no marker is known are left out; inside, unknown markers are empty cells. `Time` holds
-    the video's own stamps, `DataRate` their mean rate.
+    Frames in which no marker is known are left out, because OpenSim's inverse kinematics stops at them; a single marker
+    that is not known is an empty cell. `Time` holds the video's own stamps, `DataRate` their median rate.
     """
     fit = trial.fit
-    seen = np.flatnonzero(np.isfinite(fit.markers_world_m).any(axis=(1, 2)))
-    part = slice(seen[0], seen[-1] + 1)
-    time = np.asarray(fit.time_s, float)[part]
-    xyz = 1e3 * np.asarray(fit.markers_world_m, float)[part] @ Y_UP_TO_Z_UP
+    seen = np.isfinite(fit.markers_world_m).any(axis=(1, 2))
+    time = np.asarray(fit.time_s, float)[seen]
+    xyz = 1e3 * np.asarray(fit.markers_world_m, float)[seen] @ Y_UP_TO_Z_UP
     n, j = xyz.shape[:2]
-    rate = f"{(n - 1) / (time[-1] - time[0]) if n > 1 else 0.0:.6g}"
+    rate = f"{1.0 / np.median(np.diff(time)) if n > 1 else 0.0:.6g}"
     numbers = range(1, j + 1)
     head = [
         f"PathFileType\t4\t(X/Y/Z)\t{title}.trc",
@@ -34,6 +33,12 @@ def write_trc(trial: ExportTrial, path: Path, title: str = "markers") -> None:
         "\t\t" + "\t".join(f"X{i}\tY{i}\tZ{i}" for i in numbers),
         "",
     ]
-    table = np.column_stack([np.arange(1, n + 1), time, xyz.reshape(n, -1)])
-    body = rows(table, ["%d", "%.6f", *["%.4f"] * (3 * j)], "\t", "")
-    path.write_text("\n".join([*head, *body]) + "\n", encoding="ascii")
+    # OpenSim loses an empty cell at the end of a line: a further tab keeps it.
+    kept = np.where(np.isnan(xyz[:, -1, 0]), ord("\t"), 0).astype(np.uint8)[:, None]
+    cells = number_cells(xyz.reshape(n, -1), 4)
+    blocks = [number_cells(np.arange(1, n + 1), 0), number_cells(time, 6), cells[:, :-1], _beside(cells[:, -1], kept)]
+    path.write_bytes(("\n".join(head) + "\n").encode("ascii") + lines(blocks, "\t"))
+
+
+def _beside(cell: np.ndarray, more: np.ndarray) -> np.ndarray:
+    return np.concatenate([cell, more], axis=1)

@@ -110,14 +110,19 @@ def test_the_trc_is_in_opensims_ground_and_in_millimetres(fit, tmp_path):
     assert all(len(line.split("\t")) == 2 + 3 * 33 for line in lines[6:])
 
 
-def test_a_gap_is_empty_cells_in_the_trc_and_left_out_of_the_mot(fit, tmp_path):
+def test_frames_without_a_pose_are_left_out_and_a_missing_marker_is_an_empty_cell(fit, tmp_path):
     qpos = fit.qpos.copy()
     qpos[50:53] = np.nan
     gap = with_markers(dataclasses.replace(fit, qpos=qpos))
-    folder = written(ExportTrial("walk", gap), tmp_path / "a", "trc", "mot")
-    rows = (folder / "walk.trc").read_text().splitlines()[6:]
-    assert rows[40].rstrip("\t").split("\t") == ["41", f"{50 / 30:.6f}"]
-    assert np.isnan(WorldMarkers.from_trc(folder / "walk.trc", gap.marker_set).xyz_world_m[40:43]).all()
+    gap.markers_world_m[60, [4, 32]] = np.nan
+    folder = written(ExportTrial("walk", gap), tmp_path / "a", "trc", "mot", body_points=False)
+    seen = WorldMarkers.from_trc(folder / "walk.trc", gap.marker_set)
+    kept = np.delete(np.arange(10, 175), np.arange(40, 43))
+    np.testing.assert_allclose(seen.time_s, fit.time_s[kept], atol=1e-6)
+    np.testing.assert_array_equal(np.isnan(seen.xyz_world_m), np.isnan(gap.markers_world_m[kept]))
+    line = (folder / "walk.trc").read_text().splitlines()[6 + 47]
+    assert line.startswith(f"48\t{60 / 30:.6f}\t")
+    assert line.endswith("\t\t\t\t")  # three cells, and one more tab: OpenSim loses an empty cell at the end
     angles = reference_of_mot(folder / "walk.mot")
     assert len(angles.time_s) == 162
     assert all(np.isfinite(v).all() for v in angles.angles_deg.values())
@@ -434,7 +439,9 @@ def test_opensim_agrees(markers, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # OpenSim writes a log where it starts
     opensim: Any = pytest.importorskip("opensim")
     opensim.Logger.setLevelString("error")
-    fit = marked_fit(markers, n_frames=100, seed=2)
+    fit = marked_fit(markers, n_frames=104, seed=2)
+    fit.qpos[50:54] = np.nan  # out of view for a moment
+    fit = with_markers(fit)
     folder = written(ExportTrial("walk", fit), tmp_path / "a", "osim", "mot", "trc")
     model = opensim.Model(str(folder / "walk.osim"))
     state = model.initSystem()
@@ -445,7 +452,9 @@ def test_opensim_agrees(markers, tmp_path, monkeypatch):
     assert len(names) == 40
     coordinates, places = model.getCoordinateSet(), model.getMarkerSet()
     worst = 0.0
-    for row, expected in zip(values, fit.markers_world_m, strict=True):
+    known = fit.markers_world_m[np.isfinite(fit.qpos[:, 0])]
+    assert len(known) == 100
+    for row, expected in zip(values, known, strict=True):
         for name, value in zip(names, row, strict=True):
             is_length = name in ("pelvis_tx", "pelvis_ty", "pelvis_tz")
             coordinates.get(name).setValue(state, float(value if is_length else np.radians(value)), False)
