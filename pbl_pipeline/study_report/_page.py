@@ -15,6 +15,7 @@ from pbl_pipeline.code_version import code_version
 from pbl_pipeline.files import check_out_folder
 from pbl_pipeline.stats import CurveTest, Estimate
 from pbl_pipeline.study import StudyData, content_hash
+from pbl_pipeline.svg_pdf import can_write_pdf, svg_to_pdf
 
 from ._figures import (
     AFTER,
@@ -39,9 +40,10 @@ PAGE = "report.html"
 def write_study_report(
     study: StudyData, folder: str | Path, change_from: str = "", change_to: str = "", change_group: str = ""
 ) -> list[Path]:
-    """Write `report.html`, `figures/*.svg`, and `tables/*.csv` and `*.tex`; returns the paths, the page first.
+    """Write `report.html`, `figures/*.svg` and `*.pdf`, `tables/*.csv` and `*.tex`; returns the paths, the page first.
 
-    The page asks for nothing from elsewhere. What the values do not support stands there as a code with its reason.
+    PDF where reportlab is installed (the extra `export`). The page asks for nothing from elsewhere. What the values do
+    not support stands there as a code with its reason.
     `change_from`, `change_to` (roles) and `change_group` go before those of the study's description.
 
     Raises
@@ -62,7 +64,10 @@ def write_study_report(
     paths[0].write_text(_render(head, tables, sections, results), encoding="utf-8")
     for figure in (f for figures in sections.values() for f in figures):
         paths.append(folder / "figures" / f"{figure.name}.svg")
-        paths[-1].write_text(_file_of(figure, footer), encoding="utf-8")
+        paths[-1].write_text(svg := _file_of(figure, footer), encoding="utf-8")
+        if can_write_pdf():
+            paths.append(paths[-1].with_suffix(".pdf"))
+            paths[-1].write_bytes(svg_to_pdf(svg))
     for name, frame in _frames(results).items():
         paths.append(folder / "tables" / f"{name}.csv")
         frame.to_csv(paths[-1], index=False, float_format="%.8g", lineterminator="\n")
@@ -106,7 +111,13 @@ def _render(
 ) -> str:
     text = resources.files("pbl_pipeline.study_report").joinpath("templates/report.html").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    return environment.from_string(text).render(head=head, tables=tables, sections=sections, plan=results.plan)
+    return environment.from_string(text).render(
+        head=head,
+        tables=tables,
+        sections=sections,
+        plan=results.plan,
+        formats="SVG and PDF" if can_write_pdf() else "SVG",
+    )
 
 
 def _frames(results: StudyResults) -> dict[str, pd.DataFrame]:
