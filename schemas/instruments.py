@@ -38,7 +38,7 @@ def _instrument(
 
 
 def _mjoa_part(key: str, name: str, high: float) -> dict[str, Any]:
-    return _instrument(f"mJOA_{key}", f"mJOA, {name}", "points", (0, high), _MJOA, better=True, ordinal=True)
+    return _instrument(f"mJOA-{key}", f"mJOA, {name}", "points", (0, high), _MJOA, better=True, ordinal=True)
 
 
 INSTRUMENTS = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -35,21 +36,36 @@ def check(folder: Path) -> None:
     click.echo(f"slice {data.description.name or '-'} {data.description.hash or '-'}, content {content_hash(data)}")
 
 
-@study.command(epilog="Example: pbl study report spine2026 --out spine2026_report")
-@click.argument("folder", type=click.Path(path_type=Path))
+@study.command(
+    epilog="\b\nExample: pbl study report spine2026 --out spine2026_report\n"
+    "Example: pbl study report --slice spine2026 --out spine2026_report"
+)
+@click.argument("folder", required=False, type=click.Path(path_type=Path))
+@click.option("--slice", "name", metavar="NAME", help="A slice of the tables (`pbl study slice`) in place of FOLDER.")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for report.html, figures, tables.")
 @click.option(
     "--from", "change_from", default="", metavar="ROLE", help="Change from this visit (default: the study's)."
 )
 @click.option("--to", "change_to", default="", metavar="ROLE", help="Last visit of the change.")
 @click.option("--group", default="", metavar="GROUP", help="The group whose change is judged.")
-def report(folder: Path, out: Path, change_from: str, change_to: str, group: str) -> None:
-    """One page of a study's FOLDER: who is in and out, repeatability, correlation with scores, change, curves.
+def report(folder: Path | None, name: str | None, out: Path, change_from: str, change_to: str, group: str) -> None:
+    """One page of a study's FOLDER or slice: who is in and out, repeatability, correlation with scores, change, curves.
 
     Figures are written as SVG, tables as CSV and LaTeX. What the values do not support is a code with its reason.
     """
     from pbl_pipeline.study import read_study
     from pbl_pipeline.study_report import write_study_report
 
-    paths = write_study_report(read_study(folder), out, change_from, change_to, group)
+    if (folder is None) == (name is None):
+        raise click.UsageError("the FOLDER of a study, or --slice NAME")
+    data = read_study(folder) if folder is not None else _of_slice(name or "")
+    paths = write_study_report(data, out, change_from, change_to, group)
     click.echo(f"written: {paths[0]}, {len(paths) - 1} figures and tables")
+
+
+def _of_slice(name: str) -> Any:
+    """The `StudyData` of a slice, from what the tables register as the entry point `slice` of `pbl.study_data`."""
+    found = [e for e in entry_points(group="pbl.study_data") if e.name == "slice"]
+    if not found:
+        raise click.UsageError("--slice needs the tables, which are not installed")
+    return found[0].load()(name)

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+
+if TYPE_CHECKING:
+    from pbl_pipeline.study import StudyData
 
 
 @click.command(
@@ -92,20 +96,27 @@ def export(name: str, out: Path, key: Path | None, keep_codes: bool, no_curves: 
 
     `pbl study report DIR` makes figures and tables of it, without a database.
     """
-    import schemas
     from pbl_pipeline.study import deidentified, write_study
-    from schemas import slices
 
-    schemas.activate(methods=False)
-    data = slices.study_data(name, curves=not no_curves)
-    for text in slices.changes(name):
-        click.echo(f"changed since it was frozen: {text}", err=True)
+    data = load_slice(name, curves=not no_curves)
     if not keep_codes:
         data, codes = deidentified(data)
         if key is not None:
             _write_key(key, codes.to_csv(index=False))
     paths = write_study(data, out)
     click.echo(f"{data.n_subjects} persons, {data.n_visits} visits: {len(paths)} files in {out}")
+
+
+def load_slice(name: str, curves: bool = True) -> StudyData:
+    """The `StudyData` of a slice; what changed since it was frozen is said on stderr. Raises as `slices.study_data`."""
+    import schemas
+    from schemas import slices
+
+    schemas.activate(methods=False)
+    data = slices.study_data(name, curves)
+    for text in slices.changes(name):
+        click.echo(f"changed since it was frozen: {text}", err=True)
+    return data
 
 
 def _write_key(path: Path, text: str) -> None:

@@ -18,6 +18,7 @@ from schemas.cli.study import export, slice_
 from schemas.conditions import set_condition
 from schemas.ingest import Visit, ingest
 from schemas.study_import import import_sheets
+from tests.command import pbl
 from tests.rows import remove_all
 from workers.populate import populate
 
@@ -189,6 +190,11 @@ def test_the_commands(cohort: Path, tmp_path: Path):
     again: Any = read_study(out)
     assert (again.n_visits, again.description.name) == (3, "from-shell")
     assert set(again.visits["subject"]) == {"P001", "P002"}
+    page = pbl("study", "report", "--slice", "from-shell", "--out", tmp_path / "report")
+    assert (page.code, page.err) == (0, "")
+    assert "from-shell" in (tmp_path / "report" / "report.html").read_text()
+    assert pbl("study", "report", "--out", tmp_path / "report").code == 2
+    assert pbl("study", "report", "--slice", "absent", "--out", tmp_path / "report").error_code == "DB_NOT_FOUND"
     coded = tmp_path / "coded"
     assert (
         run.invoke(export, ["--slice", "from-shell", "--out", str(coded), "--key", str(tmp_path / "key.csv")]).exit_code
