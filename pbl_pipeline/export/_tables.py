@@ -190,12 +190,7 @@ def _cycles_wide(cycles: Sequence[_Cycle], pooled: Collection[str]) -> Table:
         columns.append(Column(name, column, unit_of(name), "of this cycle (docs/measures.md)"))
     columns += [
         Column("gdi", _floats(g for _, _, g in cycles), "", "Gait Deviation Index of the cycle"),
-        Column(
-            "pooled",
-            np.array([n in pooled for n, _, _ in cycles], bool),
-            "",
-            "whether the visit pools its trial (docs/measures.md)",
-        ),
+        Column("pooled", np.array([n in pooled for n, _, _ in cycles], bool), "", "whether the visit pools its trial"),
         Column("far_leg", Labels.of([c.far_leg for _, c, _ in cycles]), "", "leg that the other hid from the camera"),
         Column("excluded", Labels.of([c.excluded for _, c, _ in cycles]), "", "why it is no part of the measures"),
     ]

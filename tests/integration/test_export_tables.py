@@ -30,8 +30,8 @@ def _fit_with_markers(trials, names, paramset=None, camera_motion="static") -> S
     """The stand-in's fit with the markers of its set."""
     made, points = chain.fit_session(trials, names, paramset, camera_motion), marker_set("blazepose_33")
     more = {"marker_set": points.name, "marker_names": points.names, "site_offset_m": np.zeros((33, 3))}
-    empty = {k: np.full((chain.N_FRAMES, 33), np.nan) for k in ("residual_2d_px", "residual_3d_m")}
-    fits = tuple(with_markers(dataclasses.replace(t, **more, **empty)) for t in made.trials)
+    seen = {k: np.full((chain.N_FRAMES, 33), v) for k, v in (("residual_2d_px", 4.0), ("residual_3d_m", 0.03))}
+    fits = tuple(with_markers(dataclasses.replace(t, **more, **seen)) for t in made.trials)
     return dataclasses.replace(made, trials=fits, site_offset_m=np.zeros((33, 3)))
 
 
@@ -60,6 +60,7 @@ def test_a_visit_of_the_tables(tables: None, tmp_path: Path, monkeypatch: pytest
     assert about["trial_1"]["fitted_with"].startswith("0.")
     stored = gait.GaitEvents.Event().to_dicts(order_by="video_id, event_no")
     events = pd.read_csv(tmp_path / "out" / "events.csv")
+    assert len(stored) > 10
     np.testing.assert_allclose(events["time_s"], [float(e["event_time"]) for e in stored], atol=1e-6)
     first, second = (ezc3d.c3d(str(tmp_path / "out" / t / f"{t}.c3d")) for t in about)
     assert second["parameters"]["ANALOG"]["USED"]["value"][0] == 0
