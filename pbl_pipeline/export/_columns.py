@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -81,7 +82,10 @@ def joined(parts: Sequence[Table]) -> Table:
 def write_csv(table: Table, path: Path) -> None:
     """UTF-8, comma, point; header of names; empty cells for what is missing; true and false in words."""
     head = ",".join(_quoted(c.name) for c in table.columns) + "\n"
-    path.write_bytes(head.encode() + (lines([_cells(c) for c in table.columns], ",") if len(table) else b""))
+    # Neighbouring columns of one kind are formatted together.
+    kinds = itertools.groupby(table.columns, lambda c: c.kind)
+    parts = [block for kind, columns in kinds for block in _cells(kind, list(columns))]
+    path.write_bytes(head.encode() + (lines(parts, ",") if len(table) else b""))
 
 
 def write_parquet(table: Table, path: Path, about: Mapping[str, str]) -> None:
@@ -132,13 +136,17 @@ def _stacked(pieces: Sequence[np.ndarray | Labels | None], lengths: Sequence[int
     return Labels(np.concatenate(codes), tuple(texts))
 
 
-def _cells(c: Column) -> np.ndarray:
-    values = c.values
-    if c.kind == "boolean":
-        values = Labels(np.asarray(values, np.int32), ("false", "true"))
-    if isinstance(values, Labels):
-        return text_cells([_quoted(t).encode() for t in values.texts])[values.codes]
-    return number_cells(values, 0 if c.kind == "integer" else 6)
+def _cells(kind: str, columns: Sequence[Column]) -> list[np.ndarray]:
+    """Blocks of cells of columns of one kind."""
+    if kind in ("number", "integer"):
+        return [number_cells(np.stack([np.asarray(c.values) for c in columns], axis=1), 6 if kind == "number" else 0)]
+    found = []
+    for column in columns:
+        values = column.values
+        if not isinstance(values, Labels):
+            values = Labels(values.astype(np.int32), ("false", "true"))
+        found.append(text_cells([_quoted(t).encode() for t in values.texts])[values.codes])
+    return found
 
 
 def _quoted(text: str) -> str:

@@ -3,7 +3,7 @@ stand in a column `unit` beside the values."""
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
@@ -79,6 +79,7 @@ def session_tables(trials: Sequence[ExportTrial], metrics: GaitMetrics | None) -
     return made
 
 
+@functools.cache
 def unit_of(name: str) -> str:
     """The unit that a measure's name ends with; empty where it has none, such as an index."""
     return next((unit for end, unit in (*_UNITS, ("_m", "m")) if name.endswith(end)), "")
@@ -252,8 +253,8 @@ def _values(part: _Part) -> Iterator[tuple[str, str, float, str]]:
         if measure is None:
             yield name, "mean", np.nan, spatiotemporal.reasons.get(name, "")
             continue
-        for statistic, value in dataclasses.asdict(measure).items():
-            if value is not None:
+        for statistic in _STATISTICS:
+            if (value := getattr(measure, statistic)) is not None:
                 yield name, statistic, float(value), ""
     for statistic in ("mean", "left", "right", "sd", "minimal_change", "n"):
         value = getattr(gdi, statistic)

@@ -18,7 +18,7 @@ def number_cells(values: np.ndarray, decimals: int, missing: bytes = b"") -> np.
     scaled = np.rint(np.where(known, values, 0.0) * 10.0**decimals)
     size = float(np.max(np.abs(scaled), initial=0.0))
     if size >= _EXACT:
-        texts = [f"{v:.{decimals}f}".encode() if np.isfinite(v) else missing for v in values.flat]
+        texts = [f"{v + 0.0:.{decimals}f}".encode() if np.isfinite(v) else missing for v in values.flat]
         return text_cells(texts).reshape(*values.shape, -1)
     left = np.abs(scaled).astype(np.int32 if size < 2**31 else np.int64)
     n_digits = max(len(str(int(size))), decimals + 1)

@@ -234,6 +234,8 @@ def _check_trial(trial: ExportTrial, formats: Sequence[str], body_points: bool) 
             f"a fit of this version's body, {body.name} version {body.version} ({body.sha256[:12]})",
             "fit again with this version, or export with the version that made the fit",
         )
+    if not np.isfinite(fit.time_s).all() or np.any(np.diff(fit.time_s) <= 0):
+        raise _input("time stamps that are missing or do not increase", "frames in order of time", "fit again")
     if not trial.known.any():
         raise _input("a fit without one pose", "a person in at least some frames", "look at the keypoints; fit again")
     if {"trc", "c3d"} & set(formats) and not np.isfinite(fit.markers_world_m).any():

@@ -20,6 +20,7 @@ import pbl_pipeline.body
 from pbl_pipeline.body import Y_UP_TO_Z_UP, load_body, load_marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import FORMATS, ExportOptions, ExportSession, ExportTrial, session_of_files, write_export
+from pbl_pipeline.export._text import lines, number_cells, text_cells
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import GaitMetrics, gait_metrics, trial_poses
 from pbl_pipeline.keypoints import Keypoints, WorldMarkers
@@ -139,6 +140,28 @@ def test_the_reader_of_references_finds_the_angles_and_the_pelvis_in_the_mot(out
         np.testing.assert_allclose(found.angles_deg[name], own, atol=1e-5)
     knee = -np.degrees(fit.qpos[10:175, fit.joint_names.index("knee_angle_l")])
     np.testing.assert_allclose(found.angles_deg["knee_flexion_l"], knee, atol=1e-5)
+
+
+# ------------------------------------------------------------------------------------------------------------- numbers
+@pytest.mark.parametrize("decimals", [0, 1, 4, 6])
+def test_numbers_are_written_as_python_writes_them(decimals):
+    rng = np.random.default_rng(decimals)
+    values = np.concatenate([rng.normal(0, 10.0**k, 200) for k in (-7, -3, 0, 3, 7)]).reshape(-1, 4)
+    own = lines([number_cells(values, decimals)], "\t").decode()
+    theirs = "".join("\t".join(f"{v:.{decimals}f}" for v in row) + "\n" for row in values.tolist())
+    pairs = list(zip(own.split(), theirs.split(), strict=True))
+    # Except for the sign of a zero, which we do not write.
+    assert [(a, b) for a, b in pairs if a != b and not (float(a) == float(b) == 0 and not a.startswith("-"))] == []
+
+
+def test_numbers_that_are_missing_or_large():
+    values = np.array([[np.nan, -0.0, 1e17], [5.0, np.inf, -1e18]])
+    assert lines([number_cells(values, 2, b"nan")], ",") == (
+        b"nan,0.00,100000000000000000.00\n5.00,nan,-1000000000000000000.00\n"
+    )
+    assert lines([number_cells(np.array([np.nan, -0.004]), 2), text_cells([b"a", b"longer"])], ",") == (
+        b",a\n0.00,longer\n"
+    )
 
 
 # ---------------------------------------------------------------------------------------------------------------- osim
@@ -530,6 +553,8 @@ def test_a_fit_without_a_pose_or_of_another_body_is_refused(fit, tmp_path):
     assert "without one pose" in refused("EXPORT_INPUT", ExportTrial("w", empty), tmp_path / "a", "mot")
     other = dataclasses.replace(fit, body_sha256="0" * 64)
     assert "000000000000" in refused("EXPORT_INPUT", ExportTrial("w", other), tmp_path / "a", "osim")
+    backwards = dataclasses.replace(fit, time_s=fit.time_s[::-1])
+    assert "time stamps" in refused("EXPORT_INPUT", ExportTrial("w", backwards), tmp_path / "a", "mot")
     blind = dataclasses.replace(fit, markers_world_m=np.full_like(fit.markers_world_m, np.nan))
     assert "without one marker" in refused("EXPORT_INPUT", ExportTrial("w", blind), tmp_path / "a", "trc")
 
