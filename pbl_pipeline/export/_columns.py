@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -95,18 +96,24 @@ def write_parquet(table: Table, path: Path, about: Mapping[str, str]) -> None:
     """
     pa: Any = needed("pyarrow", "export", "writing Parquet files")
     parquet: Any = needed("pyarrow.parquet", "export", "writing Parquet files")
-    arrays, fields = [], []
+    arrays = []
     for c in table.columns:
         if isinstance(c.values, Labels):
-            array = pa.DictionaryArray.from_arrays(pa.array(c.values.codes), pa.array(c.values.texts, pa.string()))
+            arrays.append(
+                pa.DictionaryArray.from_arrays(pa.array(c.values.codes), pa.array(c.values.texts, pa.string()))
+            )
         else:
-            array = pa.array(c.values, from_pandas=True)
-        arrays.append(array)
-        fields.append(pa.field(c.name, array.type, metadata={"unit": c.unit, "meaning": c.meaning}))
+            arrays.append(pa.array(c.values, from_pandas=True))
+    fields = [_field(pa, c.name, a.type, c.unit, c.meaning) for c, a in zip(table.columns, arrays, strict=True)]
     made = pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=dict(about)))
     parquet.write_table(
         made, path, compression="zstd", write_statistics=False
     )  # statistics double the size of few rows
+
+
+@functools.lru_cache(1000)
+def _field(pa: Any, name: str, kind: Any, unit: str, meaning: str) -> Any:
+    return pa.field(name, kind, metadata={"unit": unit, "meaning": meaning})
 
 
 def dictionary(tables: Sequence[Table]) -> Table:
