@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -60,7 +60,7 @@ def freeze(
     event
         What the days of the visits count from, such as surgery.
     note
-        Shown on the report.
+        Shown on the report, with how many people of the cohort have no visit, and why they were excluded.
 
     Raises
     ------
@@ -86,7 +86,8 @@ def freeze(
         visits = _candidates(cohort, roles)
         chain = _chain(visits, methods or {})
         rows = _decided(visits, chain, cohort)
-        about = {**chain, "study_slice": name, "slice_event": event, "slice_note": note, "cohort": cohort}
+        said = " ".join(filter(None, (note, _absent(visits, cohort))))[:1000]
+        about = {**chain, "study_slice": name, "slice_event": event, "slice_note": said, "cohort": cohort}
         hashes = _hashes(_frames(rows, about))
         digest = _digest(hashes.values())
         study.StudySlice.insert1(
@@ -224,6 +225,24 @@ def _decided(visits: Any, chain: Mapping[str, str], cohort: str | None) -> Any:
     fit_set, included, reasons = zip(*rows, strict=True)
     columns = {"session_label": "visit", "visit_role": "role", "visit_days": "days"}
     return visits.rename(columns=columns).assign(fit_set=fit_set, included=included, reason=reasons)
+
+
+def _absent(visits: Any, cohort: str | None) -> str:
+    """A sentence on the people of a cohort who have none of the visits; "" where there are none."""
+    members = (study.CohortMember & {"cohort": cohort}).to_dicts() if cohort is not None else []
+    there = set(visits["subject"])
+    absent = [m for m in members if m["subject"] not in there]
+    if not absent:
+        return ""
+    reasons = Counter(m["member_reason"] or "no reason stated" for m in absent if not m["member_included"])
+    why = ", ".join(f"{n} excluded: {reason}" for reason, n in sorted(reasons.items()))
+    return (
+        _line(
+            f"{len(absent)} of {len(members)} people of the cohort have none of these visits"
+            + (f" ({why})" if why else "")
+        )
+        + "."
+    )
 
 
 def _line(text: str) -> str:

@@ -267,7 +267,9 @@ class _Plan:
             for r in (study.ClinicalScore & ids.proj()).to_dicts()
         }
         members = (study.CohortMember & of_people).to_dicts()
-        self.stored_members = {(r["cohort"], r["subject"]): r for r in members}
+        self.stored_members = {
+            (r["cohort"], r["subject"]): {**r, "member_included": bool(r["member_included"])} for r in members
+        }
         self.cohorts = set(study.Cohort().to_arrays("cohort"))
 
     def _check_codes(self, distinct: bool) -> None:
@@ -582,9 +584,11 @@ def _new_condition(now: Any, stated: Mapping[str, Any]) -> list[str]:
 
 
 def _shown(value: Any) -> str:
-    if isinstance(value, bool) or value in (0, 1):
-        return str(value)
-    return "nothing" if value in (None, "") else f"{value:g}" if isinstance(value, float) else str(value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if value is None or value == "":
+        return "nothing"
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _same(first: Any, value: Any, what: str, whose: str) -> None:

@@ -30,6 +30,7 @@ P001,after,2026-03-15,6_weeks,2026-02-01,,dcm,,,,13,
 P002,pre,2026-01-12,pre,2026-02-01,patient,dcm,surgery,yes,,12,
 C001,pre,2026-01-11,baseline,,healthy,dcm,,no,moved away,,
 C001,again,2026-01-20,baseline,,,dcm,,,,,
+X001,,,,,patient,dcm,,no,declined,,
 """
 
 
@@ -105,6 +106,8 @@ def test_a_slice_as_frames(cohort: Path):
     assert (mjoa["low"], mjoa["high"], mjoa["mic"], mjoa["higher_is_better"]) == (0, 18, 2, True)
     assert "Tetreault" in mjoa["source"]
     assert (found.description.name, found.description.event) == ("first", "surgery")
+    absent = "1 of 4 people of the cohort have none of these visits (1 excluded: declined)."
+    assert found.description.note == f"Two clinics. {absent}"
     assert found.description.methods["fit_method"] == fit.SessionFit().to_dicts()[0]["fit_method"]
 
 

@@ -82,14 +82,18 @@ def test_a_study_from_two_sheets(empty: None, tmp_path: Path):
     again = run(*paths)
     assert not any(line.changes for line in again.lines)
     assert everything_but_refreshes() == rows
-    changed = run(sheet(tmp_path, VISITS.replace("cane", "walker").replace(",13\n", ",-\n")), paths[1])
+    text = VISITS.replace("cane", "walker").replace(",13\n", ",-\n").replace(",surgery,no,", ",surgery,yes,")
+    changed = run(sheet(tmp_path, text), paths[1])
     assert [line.changes for line in changed.lines if line.changes] == [
         ["assistive_device cane -> walker"],
         ["mJOA 13 -> nothing"],
+        ["included no -> yes"],
     ]
     assert len(study.ClinicalScore()) == 4
     # An empty cell leaves what is stored.
-    left = run(sheet(tmp_path, VISITS.replace("walker", "").replace("cane", "").replace(",13\n", ",\n")))
+    left = run(
+        sheet(tmp_path, VISITS.replace("cane", "").replace(",13\n", ",\n").replace(",surgery,no,", ",surgery,,"))
+    )
     assert not any(line.changes for line in left.lines)
     assert stored()["P001", "pre"]["assistive_device"] == "walker"
 
