@@ -1,12 +1,14 @@
 """The report of a study: statistics, figures, tables, one page (docs/study.md)."""
 
-from ._page import write_study_report
+from ._figures import Figure
+from ._page import study_figures, write_study_report
 from ._results import CurveResult, StudyResults, study_results
 from ._tables import PageTable, all_tables
 from ._values import Plan, mean_curves, pairs, plan, visit_table
 
 __all__ = [
     "CurveResult",
+    "Figure",
     "PageTable",
     "Plan",
     "StudyResults",
@@ -14,6 +16,7 @@ __all__ = [
     "mean_curves",
     "pairs",
     "plan",
+    "study_figures",
     "study_results",
     "visit_table",
     "write_study_report",

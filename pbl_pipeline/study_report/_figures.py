@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -48,6 +49,17 @@ class Figure:
     def svg(self, footer: Sequence[str] = ()) -> Markup:
         """The figure as SVG; with a footer, and then its legend, it is a file of its own."""
         return self.axes.svg(f"{self.title}. {self.note}", footer, self.colours if footer else None)
+
+    def _repr_svg_(self) -> str:
+        """In a notebook: with title, note and legend below."""
+        return self.standalone()
+
+    def standalone(self, footer: Sequence[str] = ()) -> str:
+        """As a file of its own, with its words and the lines of `footer` below."""
+        room = int(self.axes.size[0] / 4.4)
+        lines = [line for text in (self.title, self.note, *footer) for line in textwrap.wrap(text, room)]
+        start = '<svg xmlns="http://www.w3.org/2000/svg" style="font:11px sans-serif" '
+        return start + str(self.svg(lines)).removeprefix("<svg ") + "\n"
 
 
 def colours_of(groups: Sequence[str]) -> dict[str, str]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -64,7 +63,7 @@ def write_study_report(
     paths[0].write_text(_render(head, tables, sections, results), encoding="utf-8")
     for figure in (f for figures in sections.values() for f in figures):
         paths.append(folder / "figures" / f"{figure.name}.svg")
-        paths[-1].write_text(svg := _file_of(figure, footer), encoding="utf-8")
+        paths[-1].write_text(svg := figure.standalone(footer), encoding="utf-8")
         if can_write_pdf():
             paths.append(paths[-1].with_suffix(".pdf"))
             paths[-1].write_bytes(svg_to_pdf(svg))
@@ -75,15 +74,6 @@ def write_study_report(
         paths.append(folder / "tables" / f"{table.name}.tex")
         paths[-1].write_text(table.latex(". ".join(footer)), encoding="utf-8")
     return paths
-
-
-def _file_of(figure: Figure, footer: Sequence[str]) -> str:
-    """A figure as a file of its own, with its words and what it was made from below."""
-    words = [figure.title, figure.note, *footer]
-    room = int(figure.axes.size[0] / 4.4)
-    lines = [line for text in words for line in textwrap.wrap(text, room)]
-    start = '<svg xmlns="http://www.w3.org/2000/svg" style="font:11px sans-serif" '
-    return start + str(figure.svg(lines)).removeprefix("<svg ") + "\n"
 
 
 def _head(study: StudyData, results: StudyResults) -> dict[str, str]:
@@ -140,6 +130,11 @@ def _frames(results: StudyResults) -> dict[str, pd.DataFrame]:
         "groups": results.groups,
         "curve_tests": pd.concat(rows) if rows else pd.DataFrame(columns=curve_columns),
     }
+
+
+def study_figures(study: StudyData, results: StudyResults) -> dict[str, Figure]:
+    """All figures of a report, by name; a notebook shows one as it is."""
+    return {f.name: f for figures in _sections(study, results).values() for f in figures}
 
 
 def _sections(study: StudyData, results: StudyResults) -> dict[str, list[Figure]]:
