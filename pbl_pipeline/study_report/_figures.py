@@ -110,7 +110,7 @@ def scatter_axes(
 ) -> Axes:
     """A dot per person, y over x, by group; with the line of least squares over all where `line`."""
     x, y = (np.concatenate([p[i] for p in parts.values()]) for i in (0, 1))
-    x_ticks = nice_ticks(float(x.min()), float(x.max()))
+    x_ticks = _ticks(x)
     axes = _axes(_SIZE, (x_ticks[0], x_ticks[-1]), y, "", x_ticks)
     axes.text(((axes.left + axes.right) / 2, axes.size[1] - 8), names[0], "middle")
     axes.text((axes.left + 4, axes.top + 2), names[1])
@@ -193,11 +193,18 @@ def _axes(
     x_unit: str = "",
 ) -> Axes:
     known = values[np.isfinite(values)]
-    ticks = nice_ticks(float(known.min()), float(known.max()))
+    ticks = _ticks(known)
     axes = Axes(size, x_range, (ticks[0], ticks[-1]), margin=_MARGIN)
     axes.grid(x_ticks, ticks, x_unit, f"\N{NO-BREAK SPACE}{unit}" if unit and len(unit) < 4 else "")
     axes.line((axes.left, axes.bottom), (axes.right, axes.bottom), _LINE, 1)
     return axes
+
+
+def _ticks(values: np.ndarray) -> list[float]:
+    """Round numbers around values, also around one alone."""
+    low, high = float(values.min()), float(values.max())
+    room = 0.0 if high > low else max(0.1 * abs(high), 1e-3)
+    return nice_ticks(low - room, high + room)
 
 
 def _categories(axes: Axes, names: Sequence[str], below: Sequence[str] = ()) -> None:

@@ -83,14 +83,18 @@ def _head(study: StudyData, results: StudyResults) -> dict[str, str]:
         "name": given.name or "Study",
         "slice": f"{given.name or 'none'} {given.hash}".strip(),
         "content": content_hash(study),
-        "n": f"{counted['subject'].nunique()} persons, {len(counted)} visits",
-        "all": f"{study.n_subjects} persons, {study.n_visits} visits",
+        "n": _counts(counted["subject"].nunique(), len(counted)),
+        "all": _counts(study.n_subjects, study.n_visits),
         "methods": "; ".join(f"{stage} {method}" for stage, method in given.methods.items()) or "not stated",
         "made_by": given.code_version or "unknown code",
         "code": code_version(),
         "event": given.event,
         "note": given.note,
     }
+
+
+def _counts(persons: int, visits: int) -> str:
+    return f"{persons} person{'s' * (persons != 1)}, {visits} visit{'s' * (visits != 1)}"
 
 
 def _render(
