@@ -83,7 +83,7 @@ def _head(study: StudyData, results: StudyResults) -> dict[str, str]:
         "name": given.name or "Study",
         "slice": f"{given.name or 'none'} {given.hash}".strip(),
         "content": content_hash(study),
-        "n": _counts(counted["subject"].nunique(), len(counted)),
+        "n": _counts(len(set(counted["subject"])), len(counted)),
         "all": _counts(study.n_subjects, study.n_visits),
         "methods": "; ".join(f"{stage} {method}" for stage, method in given.methods.items()) or "not stated",
         "made_by": given.code_version or "unknown code",
