@@ -134,20 +134,13 @@ def _shape(model: mujoco.MjModel, geom: int, scale: float, turn: np.ndarray) -> 
 
 def _joint(body: Body, index: int, own_scale: np.ndarray) -> ET.Element:
     model, parent, child = body.mj_model, int(body.parent_index[index]), body.body_names[index]
-    joints = np.flatnonzero(body.joint_body == index)
-    hinges, slides = joints[body.is_hinge[joints]], joints[body.is_slide[joints]]
-    expressible = len(hinges) <= 3 and len(hinges) + len(slides) == len(joints) and not np.any(model.jnt_pos[joints])
-    if not expressible or (len(slides) and len(hinges) and slides.max() > hinges.min()):
-        raise ValueError(f"the joints of {child} are not those of one CustomJoint")
+    coordinates, transform = _movement(body, index)
     base, *side = child.rsplit("_", 1)
     element = ET.Element("CustomJoint", name="_".join([_JOINTS.get(base, f"{base}_joint"), *side]))
     offset = f"{body.body_names[parent] if parent >= 0 else 'ground'}_offset"
     _text(element, "socket_parent_frame", offset)
     _text(element, "socket_child_frame", f"/bodyset/{child}")
-    coordinates = ET.SubElement(element, "coordinates")
-    # OpenSim numbers the coordinates of a joint as its transform meets them: rotations first.
-    for joint in (*hinges, *sorted(slides, key=lambda j: body.joint_names[j])):
-        coordinates.append(_coordinate(body, int(joint)))
+    element.append(coordinates)
     frame = ET.SubElement(ET.SubElement(element, "frames"), "PhysicalOffsetFrame", name=offset)
     place, turn = np.zeros(3), np.zeros(3)
     if parent >= 0:  # where the root is at qpos 0 is part of its coordinates
@@ -156,13 +149,33 @@ def _joint(body: Body, index: int, own_scale: np.ndarray) -> ET.Element:
     _text(frame, "socket_parent", f"/bodyset/{body.body_names[parent]}" if parent >= 0 else "/ground")
     _text(frame, "translation", _vector(place))
     _text(frame, "orientation", _vector(turn))
-    transform = ET.SubElement(element, "SpatialTransform")
+    element.append(transform)
+    return element
+
+
+@functools.cache
+def _movement(body: Body, index: int) -> tuple[ET.Element, ET.Element]:
+    """Coordinates and transform of a body's joint: what no scale changes.
+
+    Raises `ValueError` for joints that no CustomJoint expresses.
+    """
+    model = body.mj_model
+    joints = np.flatnonzero(body.joint_body == index)
+    hinges, slides = joints[body.is_hinge[joints]], joints[body.is_slide[joints]]
+    expressible = len(hinges) <= 3 and len(hinges) + len(slides) == len(joints) and not np.any(model.jnt_pos[joints])
+    if not expressible or (len(slides) and len(hinges) and slides.max() > hinges.min()):
+        raise ValueError(f"the joints of {body.body_names[index]} are not those of one CustomJoint")
+    coordinates = ET.Element("coordinates")
+    # OpenSim numbers the coordinates of a joint as its transform meets them: rotations first.
+    for joint in (*hinges, *sorted(slides, key=lambda j: body.joint_names[j])):
+        coordinates.append(_coordinate(body, int(joint)))
+    transform = ET.Element("SpatialTransform")
     for k, (axis, joint) in enumerate(_rotations(model.jnt_axis[hinges], hinges), 1):
         _axis(transform, f"rotation{k}", axis, None if joint is None else body.joint_names[joint])
     moved = {int(np.argmax(model.jnt_axis[j])): body.joint_names[j] for j in slides}
     for k, axis in enumerate(np.eye(3)):
         _axis(transform, f"translation{k + 1}", axis, moved.get(k))
-    return element
+    return coordinates, transform
 
 
 def _rotations(axes: np.ndarray, hinges: np.ndarray) -> list[tuple[np.ndarray, int | None]]:
