@@ -6,7 +6,8 @@
 A mixture of two normal distributions over the joints of pelvis, lumbar spine and legs, the pelvis against the vertical
 (`fit.priors.posture`). The covariance of each is that within a recording (around the person's own mean, by expectation
 maximisation, because no laboratory measured all joints) plus that between people, which so few of them cannot tell and
-which is set by anatomy: a pelvis that is tilted stands under an upright trunk and over upright legs. Left and right are
+which is set by anatomy: a pelvis that is tilted stands under an upright trunk and over upright legs, and who walks with
+bent knees bends hips and ankles by half as much, on both sides. Left and right are
 alike: every recording counts once as it is and once mirrored. The spine of the LBMC recordings is another joint than
 the body's and counts as unknown. Persons whom `pbl validate gdi` holds out are left out.
 """
@@ -57,6 +58,8 @@ class Component(NamedTuple):
     hips: float
     lumbar: float
     factor: float
+    #: Between people: standard deviation (deg) of how bent both knees are, thighs and shanks leaning alike.
+    bent_sd_deg: float
 
 
 COMPONENTS = (
@@ -71,6 +74,7 @@ COMPONENTS = (
         hips=-1.0,
         lumbar=-0.7,
         factor=1.0,
+        bent_sd_deg=12.0,
     ),
     Component(
         weight=0.4,
@@ -83,6 +87,7 @@ COMPONENTS = (
         hips=-1.0,
         lumbar=-0.4,
         factor=1.5,
+        bent_sd_deg=0.0,
     ),
 )
 
@@ -144,8 +149,11 @@ def covariance_within(
 
 def covariance_between(c: Component) -> Float[np.ndarray, "J J"]:
     """Covariance (deg^2) of people's own means."""
-    way = of_joints([1, 0, c.lumbar, 0, 0, c.hips, *[0] * 5])
-    return np.diag((c.factor * of_joints(BETWEEN_DEG)) ** 2) + c.tilt_sd_deg**2 * np.outer(way, way)
+    ways = (
+        (c.tilt_sd_deg, of_joints([1, 0, c.lumbar, 0, 0, c.hips, *[0] * 5])),
+        (c.bent_sd_deg, of_joints([*[0] * 5, 0.5, 0, 0, -1, 0.5, 0])),
+    )
+    return np.diag((c.factor * of_joints(BETWEEN_DEG)) ** 2) + sum(sd**2 * np.outer(way, way) for sd, way in ways)
 
 
 def learn(motions: Collection[Motion]) -> dict:
@@ -171,7 +179,7 @@ def learn(motions: Collection[Motion]) -> dict:
 @click.command(help=__doc__)
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--everybody", is_flag=True, help="Also the persons who are held out.")
-@click.option("--out", type=click.Path(path_type=Path), default=DATA / "people.json", help="Default: the shipped file.")
+@click.option("--out", type=click.Path(path_type=Path), default=DATA / "people-2.json", help="Else the shipped.")
 def main(folder: Path, everybody: bool, out: Path) -> None:
     motions = [m for m in read_motions(folder) if everybody or not is_held_out(m.person)]
     prior = learn(motions)

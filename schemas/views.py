@@ -66,7 +66,7 @@ def visit_frame(restriction: Any = True, chain: Any = True) -> pd.DataFrame:
     restriction
         Of the visits: `study.Visit`, subject, session label and date, population.
     chain
-        Of the methods, such as `{"fit_method": "blazepose-v2"}`, where the tables hold several chains.
+        Of the methods, such as `{"fit_method": "blazepose-v3"}`, where the tables hold several chains.
     """
     visits = study.Visit * session.Session.proj("subject", "session_label", "session_date")
     visits = visits * lab.Subject.proj("population") & restriction

@@ -212,7 +212,7 @@ BLAZEPOSE = GaussNewtonParams(
         weight_offset_per_m2=40.0,
         weight_pose=0.07,
         pose_prior_deg=POSE_PRIOR_DEG,
-        pose_prior="people",
+        pose_prior="people-2",
         weight_scale=0.1,
     ),
 )

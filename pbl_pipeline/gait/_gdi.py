@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,6 +45,10 @@ class GdiParams:
     pace
         Measures and index of a session pool the trials that are walked at this pace: one of `PACES`, a word of one's
         own, or "any".
+    average
+        What is averaged over cycles: their indices ("cycles", the paper's way) or, of each side, their curves
+        ("curves"). What differs by chance from cycle to cycle adds to the distance of each cycle from the norm, and so
+        lowers a mean of indices, most of all near 100.
     """
 
     norm: str = DEFAULT_NORM
@@ -52,6 +57,7 @@ class GdiParams:
     min_explained: float = 0.5
     repeated: float = later(0.75)
     pace: str = later(SELF_SELECTED)
+    average: str = later("cycles")
 
 
 #: A 90 % interval of a normal error, in standard deviations.
@@ -60,9 +66,10 @@ Z90 = 1.6449
 GDI_MODEL, GILLETTE_MODEL = "pbl-2025-three-angles", "gillette-2008"
 #: Angles that an index is made of.
 MODEL_ANGLES: dict[str, tuple[str, ...]] = {GDI_MODEL: THREE_ANGLES, GILLETTE_MODEL: NINE_ANGLES}
-#: Version 1 of the index of three angles had the norm `gillette-166-three-angles`.
+#: Version 1 of the index of three angles had the norm `gillette-166-three-angles`; version 2 is the mean of the indices
+#: of the cycles, as the paper's.
 GDI_METHODS: Stage[GdiParams] = Stage("gdi", "family", GDI_MODEL)
-GDI_METHODS.register(GDI_MODEL, 2, GdiParams(), "pbl_pipeline.gait:score_gdi")
+GDI_METHODS.register(GDI_MODEL, 3, GdiParams(average="curves"), "pbl_pipeline.gait:score_gdi")
 GDI_METHODS.register(GILLETTE_MODEL, 1, GdiParams(norm="gillette-166-nine-angles"), "pbl_pipeline.gait:score_gdi")
 _NAMES = {GDI_MODEL: "GDI of three angles", GILLETTE_MODEL: "GDI (Schwartz & Rozumalski 2008)"}
 
@@ -82,9 +89,10 @@ class GdiCycle:
 
 @dataclasses.dataclass(frozen=True)
 class Gdi:
-    """The index of one trial or session: means over used cycles, None where too few (`reason`).
+    """The index of one trial or session, of its `n` used cycles; None where too few (`reason`).
 
-    `mean` is over all cycles of both sides, `n` of them. Status PASS or EMPTY. `profile` says which angle deviates by
+    `left`, `right` and `mean` are of the mean curves of each side and the mean of the two, or means over the cycles of
+    a side and over all (`GdiParams.average`). Status PASS or EMPTY. `profile` says which angle deviates by
     how much, None where there is no index. `sd` is the standard deviation of the error of `mean`, None where the
     angles' is not known; `minimal_change` what two visits filmed alike differ by, beyond chance in 9 of 10 cases.
     """
@@ -139,9 +147,10 @@ def score_gdi(
 ) -> Gdi:
     """Gait Deviation Index over the used cycles of one or several trials.
 
-    Each cycle's curves of the norm's angles make a vector; the Euclidean distance of its normative component scores to
-    the normative mean, logarithm, standardised by the normative cycles, GDI = 100 - 10 z (Schwartz & Rozumalski 2008,
-    Gait & Posture 28:351-357). 100 is normative, each 10 points one normative standard deviation.
+    The curves of the norm's angles, of a cycle or the mean of a side's, make a vector; the Euclidean distance of its
+    normative component scores to the normative mean, logarithm, standardised by the normative cycles, GDI = 100 - 10 z
+    (Schwartz & Rozumalski 2008, Gait & Posture 28:351-357). 100 is normative, each 10 points one normative standard
+    deviation.
 
     `gillette-2008` is the original: nine angles at 51 points, the 15 published features. `pbl-2025-three-angles` is the
     paper's: hip flexion, hip adduction and knee flexion at 0, 2, ..., 98 %, principal components. The two must not be
@@ -183,23 +192,24 @@ def score_gdi(
     usable = [c for c in cycles if c.used and all(v in c.curves for v in basis.variables)]
     vectors = [_vector(c, basis) for c in usable]
     scored = tuple(_score(c, v, basis) for c, v in zip(usable, vectors, strict=True))
-    by_side = {side: [c.gdi for c in scored if c.side == side] for side in (LEFT, RIGHT)}
-    left, right = (float(np.mean(by_side[s])) if by_side[s] else None for s in (LEFT, RIGHT))
-    n_left, n_right = len(by_side[LEFT]), len(by_side[RIGHT])
-    enough = min(n_left, n_right) >= params.min_cycles_per_side
+    n_left, n_right = (sum(c.side == side for c in usable) for side in (LEFT, RIGHT))
+    enough = bool(usable) and min(n_left, n_right) >= params.min_cycles_per_side
     reason = "" if enough else _too_few(cycles, n_left, n_right, params)
-    profile, sd, minimal_change = None, None, None
+    left, right, mean, profile, sd, minimal_change = None, None, None, None, None, None
     if enough:
-        sd, minimal_change = _errors(usable, vectors, [c.gdi for c in scored], basis, params)
+        parts = _parts(usable, vectors, basis, params)
+        left, right = (_weighted([p for p in parts if p.side == side]) for side in (LEFT, RIGHT))
+        mean = _weighted(parts)
+        sd, minimal_change = _errors(parts, params)
         scores = variable_scores(np.array(vectors), basis)
         sides = np.array([c.side for c in usable])
         profile = movement_profile({s: scores[sides == s] for s in (LEFT, RIGHT)}, basis)
     return Gdi(
         status=PASS if enough else EMPTY,
         reason=reason,
-        left=left if enough else None,
-        right=right if enough else None,
-        mean=float(np.mean([c.gdi for c in scored])) if enough else None,
+        left=left,
+        right=right,
+        mean=mean,
         n=len(scored),
         n_left=n_left,
         n_right=n_right,
@@ -218,30 +228,67 @@ def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 3)
 
 
-def _errors(
-    cycles: Sequence[GaitCycle],
-    vectors: Sequence[np.ndarray],
-    scores: Sequence[float],
-    norm: NormativeSet,
-    params: GdiParams,
-) -> tuple[float | None, float | None]:
-    """Standard deviation of the error of the mean index, and the change that two such visits exceed by chance in one of
-    ten cases.
+class _Part(NamedTuple):
+    """What an index is the weighted mean of: one cycle, or the mean curves of one side.
+
+    `change`: what one standard deviation of each angle's curve changes it by, None where that is not known; `chance`:
+    variance that cycles give it.
+    """
+
+    side: str
+    weight: float
+    gdi: float
+    change: np.ndarray | None
+    chance: float
+
+
+def _parts(
+    cycles: Sequence[GaitCycle], vectors: Sequence[np.ndarray], norm: NormativeSet, params: GdiParams
+) -> list[_Part]:
+    known = all(v in c.curves_sd for c in cycles for v in norm.variables)
+    x, sides = np.array(vectors), np.array([c.side for c in cycles])
+    spread = np.array([_at_percent(c.curves_sd, norm) for c in cycles]) if known else np.zeros_like(x)
+
+    def part(own: np.ndarray, weight: float) -> _Part:
+        middle = x[own].mean(axis=0)
+        inside = norm.components @ (middle - norm.mean_deg)
+        slope = -10.0 / norm.ln_sd * (inside @ norm.components) / max(float(inside @ inside), 1e-12)
+        change = (slope * spread[own].mean(axis=0)).reshape(len(norm.variables), -1).sum(axis=1) if known else None
+        return _Part(sides[own][0], weight, float(norm.index(middle)[0]), change, _of_mean((x[own] - middle) @ slope))
+
+    if params.average == "curves":
+        seen = [side for side in (LEFT, RIGHT) if side in sides]
+        return [part(sides == side, 1.0 / len(seen)) for side in seen]
+    one, n = np.arange(len(x)), len(x)
+    parts = [part(one == i, 1.0 / n) for i in one]
+    # Each of n shares of the variance of their mean.
+    chance = n * _of_mean(np.array([p.gdi for p in parts]))
+    return [p._replace(chance=chance) for p in parts]
+
+
+def _of_mean(values: np.ndarray) -> float:
+    """Variance of the mean of values."""
+    return float(np.var(values, ddof=min(1, len(values) - 1))) / len(values)
+
+
+def _weighted(parts: Sequence[_Part]) -> float | None:
+    return float(np.average([p.gdi for p in parts], weights=[p.weight for p in parts])) if parts else None
+
+
+def _errors(parts: Sequence[_Part], params: GdiParams) -> tuple[float | None, float | None]:
+    """Standard deviation of the error of the index, and the change that two such visits exceed by chance in one of ten
+    cases.
 
     To first order in the angles' errors. What a fit is unsure of (`curves_sd`: the detector's errors, the lean) is the
-    same in all cycles, and on both sides, of an angle; what differs from cycle to cycle is in the spread of `scores`.
+    same in all cycles, and on both sides, of an angle; what differs from cycle to cycle is in the cycles' spread.
     """
     from pbl_pipeline.stats import minimal_detectable_change  # loads pandas, which every command would wait for
 
-    if not all(v in c.curves_sd for c in cycles for v in norm.variables):
+    changes = [p.weight * p.change for p in parts if p.change is not None]
+    if len(changes) < len(parts):
         return None, None
-    change = np.zeros(len(norm.variables))
-    for cycle, vector in zip(cycles, vectors, strict=True):
-        inside = norm.components @ (vector - norm.mean_deg)
-        slope = -10.0 / norm.ln_sd * (inside @ norm.components) / max(float(inside @ inside), 1e-12)
-        each = slope * _at_percent(cycle.curves_sd, norm)
-        change += each.reshape(len(change), -1).sum(axis=1) / len(cycles)
-    fit, walk = float(change @ change), float(np.var(scores, ddof=min(1, len(scores) - 1))) / len(scores)
+    change = np.sum(changes, axis=0)
+    fit, walk = float(change @ change), sum(p.weight**2 * p.chance for p in parts)
     anew = float(np.sqrt((1.0 - params.repeated) * fit + walk))
     return float(np.sqrt(fit + walk)), minimal_detectable_change(anew, 0.9)
 

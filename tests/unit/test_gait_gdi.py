@@ -73,12 +73,30 @@ def test_against_plain_numpy(toy):
     expected = index_another_way(toy_vectors(), others)
     np.testing.assert_allclose(toy.index(others), expected, rtol=0, atol=1e-8)
     cycles = [cycle(v, ("left", "right")[i % 2], i) for i, v in enumerate(others)]
-    result = score_gdi(cycles, toy)
+    result = score_gdi(cycles, toy, GdiParams(average="cycles"))
     np.testing.assert_allclose([c.gdi for c in result.cycles], expected, atol=1e-8)
     assert result.left == pytest.approx(expected[::2].mean())
     assert result.right == pytest.approx(expected[1::2].mean())
     assert (result.mean, result.n, result.status) == (pytest.approx(expected.mean()), 20, "PASS")
     assert [c.z for c in result.cycles] == pytest.approx((100 - expected) / 10)
+    # The default: each side's mean curves, 14 cycles of the left and 6 of the right here, which count alike.
+    cycles = [cycle(v, ("left", "right")[i >= 14], i) for i, v in enumerate(others)]
+    sides = index_another_way(toy_vectors(), np.array([others[:14].mean(axis=0), others[14:].mean(axis=0)]))
+    result = score_gdi(cycles, toy)
+    np.testing.assert_allclose([c.gdi for c in result.cycles], expected, atol=1e-8)
+    assert (result.left, result.right, result.mean) == pytest.approx((*sides, sides.mean()))
+
+
+def test_chance_in_the_cycles_lowers_the_mean_of_their_indices(toy):
+    rng = np.random.default_rng(3)
+    person = toy.mean_deg + 60 * toy.components[0]
+    chance = 15 * rng.standard_normal((20, len(toy.components))) @ toy.components
+    chance = np.concatenate([chance, -chance])  # nothing is left of it in a mean
+    cycles = [cycle(person + e, ("left", "right")[i % 2], i) for i, e in enumerate(chance)]
+    true = float(toy.index(person)[0])
+    of_curves, of_cycles = (score_gdi(cycles, toy, GdiParams(average=a)).mean for a in ("curves", "cycles"))
+    assert of_curves == pytest.approx(true)
+    assert of_cycles < true - 3.0
 
 
 def test_the_normative_vectors_average_100_with_sd_10(toy):
@@ -124,19 +142,35 @@ def test_unused_cycles_do_not_count(toy):
     assert result.mean == pytest.approx(toy.index(good)[0])
 
 
-def test_the_index_is_as_unsure_as_its_angles_and_its_cycles(toy):
+@pytest.mark.parametrize("average", ["cycles", "curves"])
+def test_the_index_is_as_unsure_as_its_angles_and_its_cycles(toy, average):
     vectors = toy_vectors(6, seed=9) + 5.0
     sd = dict(zip(THREE_ANGLES, (3.0, 1.0, 2.0), strict=True))
     cycles = [
         cycle(v, ("left", "right")[i % 2], i, curves_sd={k: np.full(51, s) for k, s in sd.items()})
         for i, v in enumerate(vectors)
     ]
-    result = score_gdi(cycles, toy)
+    params = GdiParams(average=average)
+
+    def index(x):
+        return (
+            toy.index(x).mean()
+            if average == "cycles"
+            else toy.index(np.array([x[::2].mean(0), x[1::2].mean(0)])).mean()
+        )
+
+    result = score_gdi(cycles, toy, params)
+    assert result.mean == pytest.approx(index(vectors))
     # What all cycles have wrong alike, an angle at a time; and what differs from cycle to cycle.
     step = 1e-3
-    moved = [(toy.index(vectors + step * np.repeat(np.eye(3)[k], 50)).mean() - result.mean) / step for k in range(3)]
+    moved = [(index(vectors + step * np.repeat(np.eye(3)[k], 50)) - result.mean) / step for k in range(3)]
     fit = float(np.sum((np.array(moved) * list(sd.values())) ** 2))
     walk = np.var([c.gdi for c in result.cycles], ddof=1) / 6
+    if average == "curves":
+        # What a cycle changes the index by, to first order: the variance of the mean of three follows.
+        each = np.array([(index(vectors + (np.arange(6) == i)[:, None] * step * (v - vectors[i % 2 :: 2].mean(0)))
+                          - result.mean) / step for i, v in enumerate(vectors)])  # fmt: skip
+        walk = sum(np.sum(each[i::2] ** 2) * 3 / 2 for i in range(2))
     assert result.sd == pytest.approx(np.sqrt(fit + walk), rel=1e-3)
     assert result.mean is not None
     half = 1.645 * float(np.sqrt(fit + walk))
@@ -144,7 +178,7 @@ def test_the_index_is_as_unsure_as_its_angles_and_its_cycles(toy):
     assert result.minimal_change == pytest.approx(1.645 * np.sqrt(2 * (0.25 * fit + walk)), rel=1e-3)
     assert result.to_dict()["interval"] == pytest.approx(result.interval, abs=1e-3)
     # Where the fit does not know how sure it is, the index does not either.
-    unknown = score_gdi([dataclasses.replace(c, curves_sd={}) if c.number == 0 else c for c in cycles], toy)
+    unknown = score_gdi([dataclasses.replace(c, curves_sd={}) if c.number == 0 else c for c in cycles], toy, params)
     assert (unknown.mean, unknown.sd, unknown.interval, unknown.minimal_change) == (result.mean, None, None, None)
 
 

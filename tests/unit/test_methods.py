@@ -28,12 +28,12 @@ SHIPPED = {
     ("fit", "paper-2025", 1): "cb777aa5f08f1d04",
     ("fit", "paper-gauss-newton", 1): "9352bf72dc58b91e",
     ("fit", "gauss-newton", 1): "c5df362782a452e5",
-    ("fit", "blazepose", 2): "7dbedb7fd2e19331",
+    ("fit", "blazepose", 3): "87fc4233c1aba41a",
     ("fit", "markers", 1): "055842ad943fce0d",
     ("gait", "phase-transformer", 1): "9f9ad11a864dcb24",
     ("gait", "zeni-2008", 1): "b29b1d5b52f512f4",
     ("gait", "oconnor-2007", 2): "818ff933a9a6365a",
-    ("gdi", "pbl-2025-three-angles", 2): "381dc13a55e5c0c7",
+    ("gdi", "pbl-2025-three-angles", 3): "2bd10c60694c651c",
     ("gdi", "gillette-2008", 1): "a68829dd8731dde1",
 }
 EVERY = [m for name in methods.STAGES for m in of_stage(name).values()]
