@@ -94,9 +94,10 @@ def test_chance_in_the_cycles_lowers_the_mean_of_their_indices(toy):
     chance = np.concatenate([chance, -chance])  # nothing is left of it in a mean
     cycles = [cycle(person + e, ("left", "right")[i % 2], i) for i, e in enumerate(chance)]
     true = float(toy.index(person)[0])
-    of_curves, of_cycles = (score_gdi(cycles, toy, GdiParams(average=a)).mean for a in ("curves", "cycles"))
-    assert of_curves == pytest.approx(true)
-    assert of_cycles < true - 3.0
+    of_curves, of_cycles = (score_gdi(cycles, toy, GdiParams(average=a)) for a in ("curves", "cycles"))
+    assert of_curves.mean == pytest.approx(true)
+    assert of_cycles.mean == pytest.approx(np.mean([c.gdi for c in of_cycles.cycles]))
+    assert np.mean([c.gdi for c in of_curves.cycles]) < true - 3.0
 
 
 def test_the_normative_vectors_average_100_with_sd_10(toy):
