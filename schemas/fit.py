@@ -25,9 +25,11 @@ from .stored_files import file_ref, new_folder, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import fit as lib
-    from pbl_pipeline import keypoints as keypoints_lib
 
 schema = dj.Schema()
+
+#: What stands for the methods before the fit where markers of a laboratory are fitted.
+LABORATORY = "laboratory markers"
 
 
 @schema
@@ -60,6 +62,15 @@ class FitPlan(dj.Manual):
     # which keypoints of a session are fitted by which method
     -> session.Session
     -> keypoints.KeypointMethod
+    -> FitMethod
+    """
+
+
+@schema
+class MarkerPlan(dj.Manual):
+    definition = """
+    # which marker recordings are fitted by which method
+    -> video.MarkerRecording
     -> FitMethod
     """
 
@@ -107,20 +118,21 @@ class TrialInput(dj.Computed):
 @schema
 class FitSet(dj.Manual):
     definition = """
-    # videos of a session that are fitted together; another video or person makes another set
-    fit_set           : char(16)               # hash over session, videos, persons and keypoint method
+    # recordings of a session that are fitted together, videos or marker recordings; another or another person makes another set
+    fit_set           : char(16)               # hash over session, recordings, persons and keypoint method or marker set
     ---
     -> session.Session
-    fit_set_n         : int16                  # how many videos
+    fit_set_n         : int16                  # how many recordings
     fit_set_created   : datetime               # when planned, UTC
-    """
+    """  # noqa: E501
 
     class Video(dj.Part):
         definition = """
+        # keypoints of a video; a marker recording has none, and no method before the fit
         -> master
         -> video.Video
         ---
-        -> keypoints.Keypoints
+        -> [nullable] keypoints.Keypoints
         """
 
 
@@ -193,23 +205,33 @@ class SessionFit(dj.Computed):
         rows = (FitSet.Video * keypoints.Keypoints.proj("keypoints_file") * video.Video & key).to_dicts(
             order_by="video_id"
         )
-        if not rows:
+        recorded = FitSet.Video.proj() * video.MarkerRecording * video.Video & key
+        of_markers = [] if rows else recorded.to_dicts(order_by="video_id")
+        if not rows and not of_markers:
             raise InputChanged("no video of this set has keypoints any more")
-        names = trial_names([(r["video_id"], r["video_name"]) for r in rows])
+        both = rows or of_markers
+        names = trial_names([(r["video_id"], r["video_name"]) for r in both])
         trials = [
-            (r["video_id"], n, r["camera_motion"], file_ref(r["keypoints_file"]))
-            for r, n in zip(rows, names, strict=True)
+            (r["video_id"], n, r["camera_motion"], file_ref(r["keypoints_file" if rows else "markers_file"]))
+            for r, n in zip(both, names, strict=True)
         ]
-        return trials, method_row(FitMethod, key)
+        return trials, _marker_table(of_markers), method_row(FitMethod, key)
 
     @computes
     def make_compute(
-        self, key: dict, trials: Sequence[tuple], method: Mapping[str, Any]
+        self, key: dict, trials: Sequence[tuple], table: tuple | None, method: Mapping[str, Any]
     ) -> tuple[lib.SessionFit, list[int], str]:
         from pbl_pipeline.fit import fit_session
 
-        loaded, names, motions = self._loaded(trials)
-        result = fit_session(loaded, names, methods.stored(**method), camera_motion=motions)
+        session_input = self._loaded(trials, table)
+        own = {} if session_input.markers is None else {"markers": session_input.markers}
+        result = fit_session(
+            session_input.trials,
+            session_input.names,
+            methods.stored(**method),
+            camera_motion=session_input.camera_motion,
+            **own,
+        )
         return result, [t[0] for t in trials], method["sha"]
 
     def make_computes(
@@ -219,36 +241,42 @@ class SessionFit(dj.Computed):
 
         A worker with a GPU fits a batch so, and hands each result to the table's own make.
         """
-        from pbl_pipeline.fit import SessionInput, fit_sessions
+        from pbl_pipeline.fit import fit_sessions
 
         out: list[tuple[lib.SessionFit, list[int], str, Origin] | None] = [None] * len(keys)
-        for sha in dict.fromkeys(method["sha"] for _, method in fetched):
-            rows = [i for i, (_, method) in enumerate(fetched) if method["sha"] == sha]
+        for sha in dict.fromkeys(method["sha"] for *_, method in fetched):
+            rows = [i for i, (*_, method) in enumerate(fetched) if method["sha"] == sha]
             start = time.monotonic()
             sessions, places = [], []
             for i in rows:
                 try:
-                    sessions.append(SessionInput(*self._loaded(fetched[i][0])))
+                    sessions.append(self._loaded(*fetched[i][:2]))
                     places.append(i)
                 except PblError:
                     continue  # make_compute will say it
-            results = fit_sessions(sessions, methods.stored(**fetched[rows[0]][1]))
+            results = fit_sessions(sessions, methods.stored(**fetched[rows[0]][-1]))
             origin = Origin.now((time.monotonic() - start) / max(len(results), 1))
             for i, result in zip(places, results, strict=True):
                 if not isinstance(result, PblError):
                     out[i] = (result, [t[0] for t in fetched[i][0]], sha, origin)
         return out
 
-    def _loaded(self, trials: Sequence[tuple]) -> tuple[list[keypoints_lib.Keypoints], list[str], list[str]]:
-        """Keypoints, names and camera motions of the trials that `make_fetch` gave."""
-        from pbl_pipeline.keypoints import Keypoints
+    def _loaded(self, trials: Sequence[tuple], table: tuple | None) -> lib.SessionInput:
+        """Keypoints or markers, names and camera motions of the trials that `make_fetch` gave."""
+        from pbl_pipeline.body import load_marker_set
+        from pbl_pipeline.fit import SessionInput
+        from pbl_pipeline.keypoints import Keypoints, WorldMarkers
 
         _, names, motions, refs = (list(column) for column in zip(*trials, strict=True))
+        kind = WorldMarkers if video.NO_CAMERA in motions else Keypoints
+        own = None
         with ExitStack() as stack:
             paths = [stack.enter_context(stored_file(self, ref)) for ref in refs]
-            loaded = [Keypoints.load(path) for path in paths]
+            loaded = [kind.load(path) for path in paths]
+            if table is not None:
+                own = load_marker_set(stack.enter_context(stored_file(self, table[1])), name=table[0])
         # The library knows one moving camera; "one of several" on stands is a static one for it.
-        return loaded, names, ["handheld" if m == "handheld" else "static" for m in motions]
+        return SessionInput(loaded, names, ["handheld" if m == "handheld" else "static" for m in motions], own)
 
     def make_insert(self, key: dict, result: lib.SessionFit, ids: list[int], sha: str, origin: Origin) -> None:
         from pbl_pipeline.qc import worst
@@ -298,6 +326,13 @@ class SessionFit(dj.Computed):
                     }
                 )
         self.Check.insert({**key, **check_row("fit", check)} for check in result.qc)
+
+
+def _marker_table(rows: Sequence[Mapping[str, Any]]) -> tuple[str, dict] | None:
+    """Name and file of the marker set of marker recordings, where it is the laboratory's own: one for a session."""
+    if not rows or rows[0]["marker_table_file"] is None:
+        return None
+    return rows[0]["recording_marker_set"], file_ref(rows[0]["marker_table_file"])
 
 
 def fit_checks(key: Mapping[str, Any]) -> list[tuple]:

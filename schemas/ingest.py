@@ -109,15 +109,7 @@ def ingest(
         USAGE for a subject code that could be a name, a label too long, or one person's number for several videos;
         SOLVER_UNKNOWN, NORM_UNKNOWN for unknown methods. Errors of single files are in the result.
     """
-    check_subject(visit.subject, "pass such a code with --subject")
-    for what, text, longest in (
-        ("session", visit.session_label, 64),
-        ("project", visit.project or "", 32),
-        ("activity", visit.activity or "", 32),
-        ("pace", visit.pace or "", 32),
-        ("population", visit.population or "", 32),
-    ):
-        check_label(f"--{what}", text, longest)
+    check_visit(visit)
     if visit.person is not None and len(paths) > 1:
         raise PblError(
             "USAGE",
@@ -144,6 +136,19 @@ def ingest(
     return done
 
 
+def check_visit(visit: Visit) -> None:
+    """Raise `PblError` USAGE for a subject code that could be a name, or a label too long."""
+    check_subject(visit.subject, "pass such a code with --subject")
+    for what, text, longest in (
+        ("session", visit.session_label, 64),
+        ("project", visit.project or "", 32),
+        ("activity", visit.activity or "", 32),
+        ("pace", visit.pace or "", 32),
+        ("population", visit.population or "", 32),
+    ):
+        check_label(f"--{what}", text, longest)
+
+
 def resolve(named: Methods) -> dict[str, str]:
     """Keys of the method rows, defaults filled in. Raises SOLVER_UNKNOWN, NORM_UNKNOWN."""
 
@@ -156,9 +161,14 @@ def resolve(named: Methods) -> dict[str, str]:
         "subject_method": key(tracking.SubjectMethod, named.subject),
         "keypoint_method": points,
         "fit_method": resolve_method(fit.FitMethod, named.fit) if named.fit else default_fit(points),
-        "gait_method": key(gait.GaitEventMethod, named.gait),
+        "gait_method": gait_method(named.gait),
         **gdi.resolve(named.gdi, named.norm),
     }
+
+
+def gait_method(name: str | None) -> str:
+    """Key of the method of events of this name, None for the default. Raises SOLVER_UNKNOWN."""
+    return resolve_method(gait.GaitEventMethod, name or of_stage(gait.GaitEventMethod.stage).default)
 
 
 def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str], given: sensors.Sensors) -> Ingested:
@@ -172,22 +182,7 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
             next_step="check the path",
             key=path,
         )
-    if not is_plain(str(path)):
-        raise PblError(
-            "USAGE",
-            found="a path with line breaks, other control characters, or bytes that are no UTF-8",
-            expected="a path of ordinary characters",
-            next_step="rename the file or folder",
-            key=ascii(str(path)),
-        )
-    if len(str(path)) > 1000:
-        raise PblError(
-            "USAGE",
-            found=f"a path of {len(str(path))} characters",
-            expected="at most 1000",
-            next_step="move the file to a shorter path",
-            key=path,
-        )
+    check_path(path)
     size = path.stat().st_size
     if size == 0:
         raise PblError(
@@ -199,7 +194,7 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
         )
     sha256 = sha256_of(path)
     found = sensors.read(given)
-    known = _with_sha256(sha256)
+    known = with_sha256(sha256)
     if known:
         return _known(path, known, visit, chosen, more, found)
     camera = _camera(visit.camera_file, path) if visit.camera_file else None
@@ -216,7 +211,7 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
     notes: list[str] = []
 
     def insert() -> None:
-        row["session_id"] = _session(visit)
+        row["session_id"] = session_of(visit)
         row["camera_id"] = camera_id_of(camera) if camera else None
         row["video_id"] = next_id(video.Video, "video_id")
         video.Video.insert1(row)
@@ -225,9 +220,9 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
         notes[:] = sensors.register(row["video_id"], found)
 
     try:
-        in_transaction(insert, until=lambda: bool(_with_sha256(sha256)))
+        in_transaction(insert, until=lambda: bool(with_sha256(sha256)))
     except DuplicateError:
-        known = _with_sha256(sha256)
+        known = with_sha256(sha256)
         if not known:
             raise
         return _known(path, known, visit, chosen, more, found)
@@ -235,7 +230,28 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
     return Ingested(path, "registered", row["video_id"], said)
 
 
-def _with_sha256(sha256: str) -> dict[str, Any] | None:
+def check_path(path: Path) -> None:
+    """Raise `PblError` USAGE for a path that cannot be kept in a row."""
+    if not is_plain(str(path)):
+        raise PblError(
+            "USAGE",
+            found="a path with line breaks, other control characters, or bytes that are no UTF-8",
+            expected="a path of ordinary characters",
+            next_step="rename the file or folder",
+            key=ascii(str(path)),
+        )
+    if len(str(path)) > 1000:
+        raise PblError(
+            "USAGE",
+            found=f"a path of {len(str(path))} characters",
+            expected="at most 1000",
+            next_step="move the file to a shorter path",
+            key=path,
+        )
+
+
+def with_sha256(sha256: str) -> dict[str, Any] | None:
+    """The row of Video with these bytes, with subject and label of its session; None where there is none."""
     rows = (video.Video * session.Session.proj("subject", "session_label") & {"video_sha256": sha256}).to_dicts()
     return rows[0] if rows else None
 
@@ -272,6 +288,14 @@ def _known(
     """Update a registered video: its path if the old one is gone, and the camera, files and methods that were given."""
     check_owner(row, visit.subject, visit.session_label, path)
     number = int(row["video_id"])
+    if video.MarkerRecording & {"video_id": number}:
+        raise PblError(
+            "USAGE",
+            found=f"bytes that are registered as laboratory markers, video_id {number}",
+            expected="a video",
+            next_step="name the file with --markers",
+            key=path,
+        )
     status, notes = "known", [f"already video_id {number} of subject {row['subject']}, session {row['session_label']}"]
     if str(path) != row["video_path"] and not Path(row["video_path"]).is_file():
         video.Video.update1({"video_id": number, "video_path": str(path), "video_name": path.name[-255:]})
@@ -282,7 +306,7 @@ def _known(
     changes += _new_files(row, visit, found)
     changes += _new_methods(row, chosen, more)
     changes += in_transaction(lambda: set_condition(number, visit.activity, visit.pace))
-    changes += _new_population(row["subject"], visit.population)
+    changes += new_population(row["subject"], visit.population)
     if changes and status == "known":
         status = "updated"
     if visit.camera_motion not in (None, row["camera_motion"]):
@@ -334,7 +358,7 @@ def _new_files(row: dict[str, Any], visit: Visit, found: sensors.Read) -> list[s
     return done
 
 
-def _new_population(subject: str, population: str | None) -> list[str]:
+def new_population(subject: str, population: str | None) -> list[str]:
     """Put a subject into the population that was named; what was done, in words."""
     key = {"subject": subject}
     if not population or (lab.Subject & key).fetch1("population") == population:
@@ -346,15 +370,20 @@ def _new_population(subject: str, population: str | None) -> list[str]:
 
 def _new_methods(row: dict[str, Any], chosen: dict[str, str], more: set[str]) -> list[str]:
     """Add the selections and plans of the methods that were named; returns those that are new, in words."""
-    added = []
     with video.schema.connection.transaction:  # type: ignore[union-attr]
-        for table, rows in selections([int(row["video_id"])], [int(row["session_id"])], chosen, more):
-            for values in rows:
-                key = {k: v for k, v in values.items() if k in table.primary_key}
-                if not table & key:
-                    table.insert1(values)
-                    names = [str(v) for k, v in key.items() if k not in ("video_id", "session_id")]
-                    added.append(f"{table.__name__} {', '.join(names)} was added")
+        return insert_new(selections([int(row["video_id"])], [int(row["session_id"])], chosen, more))
+
+
+def insert_new(planned: Sequence[tuple[Any, list[dict[str, Any]]]]) -> list[str]:
+    """Insert the rows of selections and plans that are not there; returns those that are new, in words."""
+    added = []
+    for table, rows in planned:
+        for values in rows:
+            key = {k: v for k, v in values.items() if k in table.primary_key}
+            if not table & key:
+                table.insert1(values)
+                names = [str(v) for k, v in key.items() if k not in ("video_id", "session_id")]
+                added.append(f"{table.__name__} {', '.join(names)} was added")
     return added
 
 
@@ -407,14 +436,15 @@ def forget_errors(video_id: int, codes: Sequence[str] | None = None) -> None:
                 (jobs & {k: row[k] for k in jobs.primary_key}).delete_quick()
 
 
-def _session(visit: Visit) -> int:
+def session_of(visit: Visit) -> int:
+    """Number of the session of a visit; subject and session are inserted where they are new."""
     if visit.project:
         lab.Project.insert1({"project": visit.project}, skip_duplicates=True)
     subject = {"subject": visit.subject}
     if not lab.Subject & subject:
         more = {"project": visit.project, "population": "unknown", "subject_created": utc_now()}
         lab.Subject.insert1({**subject, **more})
-    _new_population(visit.subject, visit.population)
+    new_population(visit.subject, visit.population)
     label = {**subject, "session_label": visit.session_label}
     found = (session.Session & label).to_dicts()
     if found:

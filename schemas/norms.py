@@ -179,7 +179,7 @@ def _newest(name: str) -> dict[str, Any] | None:
 
 
 def _one_chain(keys: Sequence[dict[str, Any]]) -> None:
-    chains = sorted({tuple(k[c] for c in _CHAIN) for k in keys})
+    chains = sorted({tuple(k[c] or fit.LABORATORY for c in _CHAIN) for k in keys})
     if len(chains) > 1:
         raise _usage(
             f"cycles of {len(chains)} chains of methods: " + "; ".join(", ".join(c) for c in chains[:4]),

@@ -40,7 +40,8 @@ def plan_fits(selected: Sequence[Mapping[str, Any]], fit_method: str) -> None:
 
 
 def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]:
-    """Make a FitSet for every session whose trials are all decided and not yet in a current set.
+    """Make a FitSet for every session whose trials are all decided and not yet in a current set, and one for its
+    marker recordings (MarkerPlan): the two are never fitted together.
 
     A trial is decided when it can be fitted (TrialInput), failed, shows nobody, or waits for a person's choice. While
     another trial of the session is still being computed, nothing is planned: otherwise every single video of a visit
@@ -62,9 +63,11 @@ def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]
     fitted = (fit.FitSet.Video * current).proj("tracking_method", "keypoint_method")
     in_a_set = dj.U("video_id", "tracking_method", "keypoint_method", "fit_method") & fitted
     new = fit.TrialInput.proj() * (video.Video.proj("session_id") & chosen) - in_a_set
+    recorded = fit.MarkerPlan.proj() * (video.Video.proj("session_id") & chosen)
+    new_markers = recorded - (dj.U("video_id", "fit_method") & (fit.FitSet.Video * current))
     by_method = dj.U("session_id", "fit_method").aggr(current * fit.FitSet.proj("session_id"), n_current="count(*)")
     several = (by_method & "n_current > 1").proj()
-    to_plan = sorted({int(s) for found in (new, several) for s in found.to_arrays("session_id")})
+    to_plan = sorted({int(s) for found in (new, new_markers, several) for s in found.to_arrays("session_id")})
     # An error row before the fit decides that a trial does not take part. (Job tables are declared here, not below:
     # that would end the transaction.)
     failed = [jobs_of(table) for table in before(fit.SessionFit)]
@@ -72,7 +75,7 @@ def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]
     for session_id in to_plan:
         with _locked(session_id):
             _keep_one_current(session_id)
-            made += _plan_session(session_id, failed)
+            made += _plan_session(session_id, failed) + _plan_markers(session_id)
     return made
 
 
@@ -131,6 +134,22 @@ def _plan_session(session_id: int, failed: Sequence[Any]) -> list[dict[str, Any]
     return made
 
 
+def _plan_markers(session_id: int) -> list[dict[str, Any]]:
+    """Marker recordings make sets of their own, never with a video: one fit method's, all those of the session.
+
+    They were found fit to be used when they were registered, so none is waited for.
+    """
+    columns = ("recording_marker_set", "marker_table_sha256")
+    videos = video.Video.proj("session_id", "video_sha256") & {"session_id": session_id}
+    by_method: dict[str, list[dict]] = defaultdict(list)
+    for row in (fit.MarkerPlan.proj() * video.MarkerRecording.proj(*columns) * videos).to_dicts(order_by="video_id"):
+        by_method[row["fit_method"]].append({**row, "tracking_method": None, "keypoint_method": None})
+    made = []
+    for method, rows in by_method.items():
+        made += _make_set(dict(zip(GROUP, (session_id, None, None, method), strict=True)), rows)
+    return made
+
+
 def _make_set(group: Mapping[str, Any], rows: list[dict]) -> list[dict[str, Any]]:
     name = fit_set_hash(group, rows)
     selection = {"fit_set": name, "fit_method": group["fit_method"]}
@@ -159,10 +178,17 @@ def _older_sets(group: Mapping[str, Any], name: str) -> list[dict]:
 
 
 def fit_set_hash(group: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> str:
-    """16 hex digits over the session, the methods up to the keypoints, and each video's bytes and person."""
+    """16 hex digits over the session, the methods up to the keypoints, and each video's bytes and person (each marker
+    recording's bytes and marker set)."""
     lines = [str(group[k]) for k in GROUP[:3]]
-    lines += sorted(f"{row['video_sha256']} person {row['keypoints_person_id']}" for row in rows)
+    lines += sorted(f"{row['video_sha256']} {_measured(row)}" for row in rows)
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+
+
+def _measured(row: Mapping[str, Any]) -> str:
+    if "recording_marker_set" in row:
+        return f"markers {row['recording_marker_set']} {row['marker_table_sha256']}".rstrip()
+    return f"person {row['keypoints_person_id']}"
 
 
 def _decided(videos: Any, failed: Sequence[Any]) -> Any:

@@ -47,7 +47,8 @@ def write_session(restriction: Any, out: Path) -> list[Path]:
 def methods_of(key: Any) -> dict[str, str]:
     """Name and version of the method behind each stage, of a key of `SessionResults`; of those that it names."""
     member = (fit.FitSet.Video & {"fit_set": key["fit_set"]}).to_dicts(limit=1)[0]
-    found = {"Tracking": member["tracking_method"], "Keypoints": member["keypoint_method"], "Fit": key["fit_method"]}
+    before = {"Tracking": member["tracking_method"], "Keypoints": member["keypoint_method"]}
+    found = {stage: method or fit.LABORATORY for stage, method in before.items()} | {"Fit": key["fit_method"]}
     if "gdi_method" in key:
         found |= {"Gait events": key["gait_method"], "Index": f"{key['gdi_method']}, norm {key['norm']}"}
     return found

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class TrialResults:
-    """One video of a session. What a stage did not produce is None, with a sentence in `problem`."""
+    """One recording of a session. What a stage did not produce is None, with a sentence in `problem`."""
 
     video_id: int
     name: str
@@ -44,6 +44,7 @@ class TrialResults:
     events: lib.GaitEvents | None = None
     cycles: tuple[lib.GaitCycle, ...] = ()
     problem: str = ""
+    is_markers: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +78,19 @@ class SessionResults:
 
     @property
     def fitted(self) -> tuple[FittedTrial, ...]:
-        """The trials that have a fit, in the order of `fit.trials` and `metrics.trials`."""
+        """The trials that have a fit, in the order of `fit.trials` and `metrics.trials`.
+
+        Raises `PblError` USAGE where they are laboratory markers: what reads them wants the video, too.
+        """
+        if any(t.fit is not None and t.is_markers for t in self.trials):
+            raise PblError(
+                "USAGE",
+                found=f"laboratory markers of session {self.session_label!r}",
+                expected="the fit of a video",
+                next_step="name the method of the videos' fit; measures and curves of markers are in `schemas.views`, "
+                "and `pbl fit FILE`, `pbl gait` write theirs as files",
+                key=f"subject {self.subject}",
+            )
         return tuple(_fitted(t) for t in self.trials if t.fit is not None)
 
 
@@ -116,7 +129,15 @@ def load_session(restriction: Any) -> SessionResults:
     measured = (gdi.SessionGdi & key & restriction).keys() if key else []
     metrics_key = _single(measured, "gait_method", restriction) if measured else {}
     metrics = load_metrics(metrics_key) if metrics_key else None
-    rows = (video.Video & chain).to_dicts(order_by="video_id")
+    # Videos and markers are fitted apart: beside a fit of the one the others are not left out.
+    recorded = video.MarkerRecording.proj()
+    if not key:
+        of_kind = video.Video & chain
+    elif recorded & [{"video_id": v} for v in fit_by_video]:
+        of_kind = (video.Video & recorded) & chain
+    else:
+        of_kind = (video.Video - recorded) & chain
+    rows = of_kind.to_dicts(order_by="video_id")
     by_name = {t.name: t for t in metrics.trials} if metrics else {}
     trials = tuple(_trial(row, restriction, fit_by_video.get(int(row["video_id"])), by_name) for row in rows)
     return SessionResults(
@@ -401,7 +422,8 @@ def _trial(
 ) -> TrialResults:
     key = {"video_id": int(row["video_id"])}
     name = fitted.name if fitted is not None else Path(row["video_name"]).stem
-    out = TrialResults(key["video_id"], name, Path(row["video_path"]), fit=fitted)
+    markers = row["camera_motion"] == video.NO_CAMERA
+    out = TrialResults(key["video_id"], name, Path(row["video_path"]), fit=fitted, is_markers=markers)
     found: dict[str, Any] = {}
     if video.VideoInfo & key:
         found["info"] = load_info(key)

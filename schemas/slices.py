@@ -137,7 +137,7 @@ def study_data(name: str, curves: bool = True) -> StudyData:
     description = StudyDescription(
         name=name,
         hash=about["slice_hash"],
-        methods={k: about[k] for k in CHAIN},
+        methods={k: about[k] for k in CHAIN if about[k] is not None},
         code_version=about["slice_code_version"],
         event=about["slice_event"],
         note=about["slice_note"],
@@ -178,16 +178,17 @@ def _candidates(cohort: str | None, roles: Sequence[str]) -> Any:
     return found
 
 
-def _chain(visits: Any, methods: Mapping[str, str]) -> dict[str, str]:
-    """The one chain of methods by which the visits are measured."""
+def _chain(visits: Any, methods: Mapping[str, str]) -> dict[str, str | None]:
+    """The one chain of methods by which the visits are measured; None for tracking and keypoints of markers."""
     if unknown := sorted(set(methods) - set(CHAIN)):
         raise _usage(f"methods of {', '.join(unknown)}", f"of {', '.join(CHAIN)}")
     found = [tuple(r[c] for c in CHAIN) for r in (dj.U(*CHAIN) & (_measured(visits) & dict(methods))).to_dicts()]
     if not found:
         raise _none("no measures of these visits", "visits with measures", "`pbl populate`, `pbl status`")
     if len(found) > 1:
+        named = sorted(", ".join(method or fit.LABORATORY for method in chain) for chain in found)
         raise _usage(
-            f"measures of {len(found)} chains of methods: " + "; ".join(", ".join(c) for c in sorted(found)[:4]),
+            f"measures of {len(found)} chains of methods: " + "; ".join(named[:4]),
             f"one: name the method of one or more of {', '.join(CHAIN)}",
         )
     return dict(zip(CHAIN, found[0], strict=True))
@@ -201,7 +202,7 @@ def _measured(visits: Any) -> Any:
     return sets * of_set * gdi.SessionGdi.proj(*columns) & inside("session_id", map(int, visits["session_id"]))
 
 
-def _decided(visits: Any, chain: Mapping[str, str], cohort: str | None) -> Any:
+def _decided(visits: Any, chain: Mapping[str, str | None], cohort: str | None) -> Any:
     """The visits with their set of videos, and whether each counts."""
     members = (study.CohortMember & {"cohort": cohort}).to_dicts() if cohort is not None else []
     left_out = {m["subject"]: m["member_reason"] for m in members if not m["member_included"]}

@@ -180,8 +180,8 @@ class StudySlice(dj.Manual):
     study_slice          : varchar(32)         # short name
     ---
     -> [nullable] Cohort
-    -> tracking.TrackingMethod
-    -> keypoints.KeypointMethod
+    -> [nullable] tracking.TrackingMethod
+    -> [nullable] keypoints.KeypointMethod
     -> fit.FitMethod
     -> gait.GaitEventMethod
     -> gdi.GdiModel

@@ -22,12 +22,14 @@ if TYPE_CHECKING:
 schema = dj.Schema()
 
 CAMERA_MOTIONS = ("static", "handheld", "one of several")
+#: Of a recording without a camera: laboratory markers.
+NO_CAMERA = "none"
 
 
 @schema
 class Video(dj.Manual):
     definition = """
-    # a video file of one trial
+    # a video file of one trial, or a file of laboratory markers (MarkerRecording)
     video_id        : int32
     ---
     -> session.Session
@@ -37,7 +39,7 @@ class Video(dj.Manual):
     video_sha256    : char(64)                 # of its bytes: the same file is never registered twice
     video_size      : int64                    # (byte) length of the file
     activity        : varchar(32)              # what the subject does, such as walking
-    camera_motion   : enum('static', 'handheld', 'one of several')
+    camera_motion   : enum('static', 'handheld', 'one of several', 'none')  # none: laboratory markers
     video_created   : datetime                 # when registered, UTC
     unique index (video_sha256)
     """
@@ -51,6 +53,24 @@ class Pace(dj.Manual):
     ---
     pace            : varchar(32)              # self_selected, fast, slow, dual_task, or the study's own word
     """
+
+
+@schema
+class MarkerRecording(dj.Manual):
+    definition = """
+    # a recording that is no video but laboratory markers: it goes straight to the fit, with the others of its session
+    -> Video
+    ---
+    recording_marker_set     : varchar(64)     # where on the body the markers sit: a shipped set, or the stem of marker_table_file
+    marker_table_sha256=''   : varchar(64)     # of the bytes of marker_table_file, empty where the set ships
+    vertical_axis            : enum('y', 'z')  # of the file as it was given; z for .npz
+    recording_n_frames       : int32           # frames
+    recording_n_markers      : int16           # markers of the set that the file has
+    recording_duration       : float64         # (s) from the first to the last frame
+    recording_in_view_share  : float64         # (0..1) share of frames with enough markers to be fitted
+    markers_file             : <object@arrays> # npz: time_s (T) s, xyz_world_m (T,J,3) m, z up, confidence (T,J) 0..1; docs/files.md
+    marker_table_file=null   : <object@arrays> # CSV of a marker set of the laboratory's own; null where the set ships
+    """  # noqa: E501
 
 
 @schema
@@ -131,6 +151,11 @@ class VideoInfo(dj.Computed):
     frame_time           : <npy@arrays>       # (s) float64 (T): the container's own time stamps, first frame 0
     {origin_columns("video_info")}
     """
+
+    @property
+    def key_source(self) -> Any:
+        """Files with pictures."""
+        return Video.proj() - MarkerRecording.proj()
 
     def make_fetch(self, key: dict) -> tuple:
         return one(Video & key, "video_path", "video_sha256")

@@ -275,7 +275,7 @@ def _compared(restriction: Any = True) -> Iterator[tuple[dict[str, Any], TrialEr
             # A camera that is one of several is fitted alone here: it stands still.
             camera="handheld" if row["camera_motion"] == "handheld" else "static",
             trial=trial,
-            detector=row["keypoint_method"],
+            detector=row["keypoint_method"] or fit.LABORATORY,
             solver=row["fit_method"],
             **{k: row[k] for k in ("dataset", "subject", "population", "activity")},
         )

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 from . import computed_tables, fit, tracking, video
+from .chain import before
 from .coded_errors import error_code, error_found, error_next_step
 from .jobs import jobs_of
 from .status import EMPTY_COLUMNS
@@ -56,7 +57,9 @@ def why(video_id: int) -> Why:
     current = fit.FitSelection & {"fit_current": True}
     sets = [{"fit_set": k["fit_set"]} for k in (current & sets).to_dicts()] if sets else []
     steps: list[Step] = []
-    for table in computed_tables():
+    # Markers go straight to the fit: nothing is computed before it.
+    markers = row["camera_motion"] == video.NO_CAMERA
+    for table in [t for t in computed_tables() if not (markers and t in before(fit.SessionFit))]:
         about = {"video_id": video_id} if "video_id" in table.heading.primary_key else sets
         if "video_id" in table.heading.primary_key and "fit_set" in table.heading.primary_key:
             about = [{**s, "video_id": video_id} for s in sets]

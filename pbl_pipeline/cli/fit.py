@@ -90,33 +90,19 @@ def _load(path: Path, table: MarkerSet | None, up: str) -> Keypoints | WorldMark
     """One file as a trial; markers of a laboratory are put into the order of their marker set."""
     import dataclasses
 
-    from pbl_pipeline.body import marker_set
     from pbl_pipeline.files import fields_of
-    from pbl_pipeline.keypoints import Keypoints, WorldMarkers
+    from pbl_pipeline.fit import read_markers
+    from pbl_pipeline.keypoints import Keypoints
 
-    if path.suffix.lower() == ".trc":
-        if table is None:
-            raise PblError(
-                "USAGE",
-                found=f"{path.name} without --marker-set",
-                expected="the marker set that says where on the body each marker sits",
-                next_step="pass --marker-set with a name or a table (CSV: name, body, x, y, z); see docs/files.md",
-                key=str(path),
-            )
-        seen = WorldMarkers.from_trc(path, table.name, up)
-    elif "xyz_world_m" in fields_of(path):
-        seen = WorldMarkers.load(path)
-    else:
+    if path.suffix.lower() != ".trc" and "xyz_world_m" not in fields_of(path):
         keypoints = Keypoints.load(path)
         return keypoints if table is None else dataclasses.replace(keypoints, marker_set=table.name)
-    wanted = table or marker_set(seen.marker_set)
-    chosen = seen.select(wanted.names, wanted.name)
-    absent, unused = set(wanted.names) - set(seen.names), set(seen.names) - set(wanted.names)
-    click.echo(f"{path.name}: {len(wanted) - len(absent)} of {len(wanted)} markers of {wanted.name}")
-    for what, names in (("  not in the file", absent), ("  not in the marker set", unused)):
+    found = read_markers(path, table, up)
+    click.echo(f"{path.name}: {found.text()}")
+    for what, names in (("  not in the file", found.absent), ("  not in the marker set", found.unused)):
         if names:
-            click.echo(f"{what}: {', '.join(sorted(names))}")
-    return chosen
+            click.echo(f"{what}: {', '.join(names)}")
+    return found.trial
 
 
 def _views_of_one(

@@ -8,6 +8,7 @@ from ._fit_session import (
     fit_session,
     fit_sessions,
 )
+from ._marker_files import MarkerFile, read_markers
 from ._methods import METHODS
 from ._params import (
     CostParams,
@@ -27,6 +28,7 @@ __all__ = [
     "CostParams",
     "GaussNewtonParams",
     "ImplicitAdamParams",
+    "MarkerFile",
     "Params",
     "SessionFit",
     "SessionInput",
@@ -39,4 +41,5 @@ __all__ = [
     "fit_session",
     "fit_sessions",
     "paper_objective",
+    "read_markers",
 ]

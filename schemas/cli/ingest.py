@@ -1,4 +1,4 @@
-"""`pbl ingest`: register videos."""
+"""`pbl ingest`: register videos and laboratory markers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,18 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("videos", nargs=-1, required=True, type=click.Path(path_type=Path, readable=False))
+@click.argument("videos", nargs=-1, type=click.Path(path_type=Path, readable=False))
+@click.option(
+    "--markers",
+    type=click.Path(path_type=Path, readable=False),
+    multiple=True,
+    metavar="FILE",
+    help="Markers of a laboratory (.trc or .npz) in place of videos; repeat it for each recording.",
+)
+@click.option("--marker-set", metavar="SET", help="Of --markers: a name, or a table (CSV) of your own; for .trc files.")
+@click.option(
+    "--up", type=click.Choice(["y", "z"]), default="y", show_default=True, help="Vertical axis of .trc files."
+)
 @click.option("--subject", required=True, metavar="CODE", help="Pseudonymous code of the person, never a name.")
 @click.option(
     "--session",
@@ -59,6 +70,9 @@ if TYPE_CHECKING:
 @click.option("--norm", metavar="NAME", help="Normative set of the Gait Deviation Index (else: the index's own).")
 def ingest(
     videos: tuple[Path, ...],
+    markers: tuple[Path, ...],
+    marker_set: str | None,
+    up: str,
     subject: str,
     session_label: str,
     project: str | None,
@@ -77,26 +91,34 @@ def ingest(
     index: str | None,
     norm: str | None,
 ) -> None:
-    """Register videos of one visit; `pbl populate` then computes them. Nothing is decoded here.
+    """Register videos, or with --markers recordings of laboratory markers, of one visit; `pbl populate` then computes
+    them. No video is decoded here.
 
     A file whose bytes are registered already is not registered twice, but takes a new camera (what was computed with
     another is deleted and listed), a sensor log of the phone (the same), activity, pace and further methods. Logs,
-    depth videos and IMU files are copied. Exit code 1 when a file was refused; the others are registered all the same.
+    depth videos, IMU files and markers are copied. Videos and markers of a visit are fitted apart. Exit code 1 when a
+    file was refused; the others are registered all the same.
 
     \b
     Example: pbl ingest walk1.mp4 walk2.mp4 --subject P017 --session 2026-03-01
     Example: pbl ingest walk.mov --subject P018 --camera iphone.toml --person 2
     Example: pbl ingest walk.mov --subject P018 --attitude 2026-03-01_09-15-30.zip
+    Example: pbl ingest --markers walk1.trc --marker-set our_lab.csv --subject P017 --session 2026-03-01
     """
     import schemas
     from schemas.ingest import Methods, Visit
     from schemas.ingest import ingest as register
+    from schemas.marker_recordings import ingest_markers
 
+    _one_kind(videos, markers, marker_set, bool(attitude or depth or imu))
     files = _files(len(videos), attitude, depth, imu)
     schemas.activate()
     visit = Visit(subject, session_label, project, camera, camera_motion, activity, person, population, pace)
     methods = Methods(tracking=tracking_method, keypoint=keypoint_method, fit=fit_method, gdi=index, norm=norm)
-    results = register(videos, visit, methods, files)
+    if markers:
+        results = ingest_markers(markers, visit, marker_set, up, methods)
+    else:
+        results = register(videos, visit, methods, files)
     for result in results:
         if result.error is not None:
             click.echo(result.error.text(), err=True)
@@ -106,6 +128,18 @@ def ingest(
             click.echo(f"  to measure another person of it: pbl choose {result.video_id} {person}")
     if any(r.error for r in results):
         raise click.exceptions.Exit(1)
+
+
+def _one_kind(videos: tuple[Path, ...], markers: tuple[Path, ...], marker_set: str | None, with_files: bool) -> None:
+    """Raises `click.UsageError` unless there are videos, or markers without a phone's files."""
+    if not videos and not markers:
+        raise click.UsageError("Missing argument 'VIDEOS...' (or --markers FILE).")
+    if videos and markers:
+        raise click.UsageError("Videos and --markers in one call: register each in a call of its own.")
+    if markers and with_files:
+        raise click.UsageError("--attitude, --depth and --imu belong to videos, not to --markers.")
+    if marker_set is not None and not markers:
+        raise click.UsageError("--marker-set goes with --markers.")
 
 
 def _files(n: int, attitude: tuple[Path, ...], depth: tuple[Path, ...], imu: tuple[Path, ...]) -> list[Sensors]:
