@@ -7,15 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import pbl_pipeline.body
 import pbl_pipeline.fit
+from pbl_pipeline.body import marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import fit_session
 from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.synthetic import observe_markers, plain_walk
-from schemas import fit, gait, gdi, norms, video, views
+from schemas import fit, gait, gdi, norms, slices, video, views
+from schemas.forget import forget
+from schemas.ingest import Visit, ingest
+from schemas.marker_recordings import ingest_markers
 from schemas.results import load_session
+from schemas.study_import import import_sheets
 from schemas.why import why
 from tests.command import pbl
+from tests.inputs import ROWS, trc_text
 from tests.walking_fit import CYCLE_S
 from workers.populate import populate
 
@@ -56,7 +63,8 @@ def test_a_phone_and_a_laboratory_measure_the_same_walk(fitted: None, tmp_path: 
     assert video.VideoInfo().to_arrays("video_id").tolist() == [ids["static"]]
     # A set of its own, and an index of its own, whose only cycles are its own.
     found = {r["fit_method"]: r for r in views.session_summary().to_dict("records")}
-    assert set(found) == {"blazepose-v2", "markers-v1"} and len(gdi.SessionGdi()) == 2
+    assert set(found) == {"blazepose-v2", "markers-v1"}
+    assert len(gdi.SessionGdi()) == 2
     used = {int(r["video_id"]): int(r["n_cycles_used"]) for r in gait.GaitCycle().to_dicts()}
     assert found["blazepose-v2"]["session_cycles"] == used[ids["static"]] > 0
     assert found["markers-v1"]["session_cycles"] == used[ids["none"]] > 0
@@ -65,16 +73,109 @@ def test_a_phone_and_a_laboratory_measure_the_same_walk(fitted: None, tmp_path: 
     assert laboratory == pytest.approx(phone, abs=1.0)
     assert found["markers-v1"]["session_cadence"] == pytest.approx(120 / CYCLE_S, rel=0.01)
     row = (fit.SessionFit.Trial & {"video_id": ids["none"]}).fetch1()
-    assert row["trial_residual_3d"] < 0.5 and row["trial_residual_2d"] is None
+    assert row["trial_residual_3d"] < 0.5
+    assert row["trial_residual_2d"] is None
+    # As docs/study.md says it.
+    of_markers = fit.FitSet.Video & video.MarkerRecording.proj()
+    current = gdi.SessionGdi & (fit.FitSelection & {"fit_current": True})
+    assert (current & of_markers).to_arrays("session_gdi").tolist() == [laboratory]
+    assert (current - of_markers).to_arrays("session_gdi").tolist() == [phone]
     # What was computed is not planned again; the phone's report is of the phone, the markers have none.
     populate()
     assert len(fit.SessionFit()) == 2
     shown = load_session({"subject": "P001", "fit_method": "blazepose-v2"})
-    assert [t.name for t in shown.trials] == ["walk"] and len(shown.fitted) == 1
-    of_markers = load_session({"subject": "P001", "fit_method": "markers-v1"})
-    assert [t.name for t in of_markers.trials] == ["lab"]
+    assert [t.name for t in shown.trials] == ["walk"]
+    assert len(shown.fitted) == 1
+    of_lab = load_session({"subject": "P001", "fit_method": "markers-v1"})
+    assert [t.name for t in of_lab.trials] == ["lab"]
     with pytest.raises(PblError, match="USAGE"):
-        _ = of_markers.fitted
+        _ = of_lab.fitted
     assert why(ids["none"]).verdict == "everything is computed"
+    report = pbl("report", "--subject", "P001", "--fit-method", "markers-v1", "--out", tmp_path / "out")
+    assert report.error_code == "USAGE"
     with pytest.raises(PblError, match="laboratory markers"):
         norms.build_norm("both", populations=(), subjects=("P001",))
+    # A study is of the one chain or of the other.
+    sheet = tmp_path / "visits.csv"
+    sheet.write_text("subject,visit,date,role\nP001,2026-03-01,2026-03-01,baseline\n")
+    assert import_sheets([sheet]).done
+    with pytest.raises(PblError, match="laboratory markers"):
+        slices.freeze("both")
+    for name, method, index in (("phone", "blazepose-v2", phone), ("lab", "markers-v1", laboratory)):
+        assert slices.freeze(name, methods={"fit_method": method}).n_included == 1
+        data = slices.study_data(name)
+        assert data.visits["gdi"].tolist() == [index]
+        assert ("keypoint_method" in data.description.methods) == (name == "phone")
+        assert slices.changes(name) == []
+
+
+def test_recordings_of_a_table_of_ones_own(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    seen: list[tuple] = []
+
+    def fit_markers(trials, names, paramset=None, camera_motion="static", markers=None):
+        assert markers is not None
+        seen.append((names, {type(t) for t in trials}, markers.name, markers.names))
+        return chain.fit_session(trials, names, paramset)
+
+    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", fit_markers)
+    table = tmp_path / "our_lab.csv"
+    table.write_text(SHIPPED.read_text())
+    names = marker_set("mpi_inf_3dhp_17").names
+    first, second, third = (recording(tmp_path / f"w{i}.npz", 8 + i, "mpi_inf_3dhp_17") for i in range(3))
+    given = ("--subject", "P002", "--marker-set", table)
+    assert pbl("ingest", "--markers", first, "--markers", second, *given).code == 0
+    table.unlink()  # the store has its own
+    populate()
+    assert seen == [(["w0", "w1"], {WorldMarkers}, "our_lab", names)]
+    # The same bytes again: nothing new; another pace and index: added.
+    table.write_text(SHIPPED.read_text())
+    again = ingest_markers([first], Visit("P002"), str(table))[0]
+    assert (again.status, again.note.split("; ")[-1]) == ("known", "nothing was inserted")
+    (third_row,) = ingest_markers([third], Visit("P002"), str(table))
+    populate()
+    assert [len(s[0]) for s in seen] == [2, 3]
+    current = fit.FitSelection & {"fit_current": True}
+    assert len(fit.FitSet.Video & current) == 3
+    assert len(gdi.SessionGdi & current.proj()) == 1
+    (fast,) = ingest_markers([third], Visit("P002", pace="fast"), str(table))
+    assert (fast.status, fast.video_id) == ("updated", third_row.video_id)
+    assert "what pooled it was deleted" in fast.note
+    # Another set in the same session, and other uses of the same bytes, are refused.
+    with_other = ingest_markers([recording(tmp_path / "other.npz", 12)], Visit("P002"))[0]
+    assert with_other.error is not None
+    assert with_other.error.code == "USAGE"
+    codes = [
+        ingest_markers([first], Visit("P003"), str(table))[0].error,
+        ingest_markers([first], Visit("P002"))[0].error,
+        ingest([first], Visit("P002"))[0].error,
+    ]
+    assert [e.code if e else "" for e in codes] == ["VIDEO_DUPLICATE", "USAGE", "USAGE"]
+    assert len(video.Video()) == 3
+    forgotten = forget("P002")
+    assert forgotten.left == []
+    assert sum("/marker_recording/" in path for path in forgotten.files) == 6
+    assert len(video.MarkerRecording()) == 0
+
+
+def test_bad_files_are_refused(tables: None, tmp_path: Path):
+    def code(text: str | bytes | None, *more: str, name: str = "walk.trc") -> str:
+        path = tmp_path / name
+        path.unlink(missing_ok=True)
+        if text is not None:
+            path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return pbl("ingest", "--subject", "P001", "--markers", path, *more).error_code
+
+    shipped = ("--marker-set", "blazepose_33")
+    assert code(None, *shipped) == "FILE_MISSING"
+    assert code("", *shipped) == "FILE_FORMAT"
+    assert code("no header", *shipped) == "FILE_FORMAT"
+    assert code(trc_text(ROWS)) == "USAGE"  # nobody says where the markers sit
+    assert code(trc_text(ROWS), *shipped) == "MARKER_SET_UNKNOWN"  # none of its names
+    assert code(trc_text(ROWS, names="nose\t\t\tleft_hip\t\t"), *shipped) == "FIT_INPUT"  # two of 33, for 20 ms
+    assert code(b"PK", name="walk.npz") == "FILE_FORMAT"
+    assert code(trc_text(ROWS), "--marker-set", "no_such_set") == "MARKER_SET_UNKNOWN"
+    assert code(trc_text(ROWS), *shipped, "--camera-motion", "handheld") == "USAGE"
+    assert code(trc_text(ROWS), *shipped, "--keypoint-method", "blazepose-33") == "USAGE"
+    assert pbl("ingest", "--subject", "P001").code == 2
+    assert pbl("ingest", "--subject", "P001", tmp_path / "a.mp4", "--markers", tmp_path / "b.trc").code == 2
+    assert len(video.Video()) == 0
