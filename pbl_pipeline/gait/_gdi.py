@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Method, Stage
@@ -253,8 +254,9 @@ def _parts(
         middle = x[own].mean(axis=0)
         inside = norm.components @ (middle - norm.mean_deg)
         slope = -10.0 / norm.ln_sd * (inside @ norm.components) / max(float(inside @ inside), 1e-12)
-        change = (slope * spread[own].mean(axis=0)).reshape(len(norm.variables), -1).sum(axis=1) if known else None
-        return _Part(sides[own][0], weight, float(norm.index(middle)[0]), change, _of_mean((x[own] - middle) @ slope))
+        gdi = float(norm.index(middle)[0])
+        change = _changes(gdi, middle, slope, spread[own].mean(axis=0), norm) if known else None
+        return _Part(sides[own][0], weight, gdi, change, _of_mean((x[own] - middle) @ slope))
 
     if params.average == "curves":
         seen = [side for side in (LEFT, RIGHT) if side in sides]
@@ -264,6 +266,16 @@ def _parts(
     # Each of n shares of the variance of their mean.
     chance = n * _of_mean(np.array([p.gdi for p in parts]))
     return [p._replace(chance=chance) for p in parts]
+
+
+def _changes(
+    gdi: float, vector: np.ndarray, slope: np.ndarray, spread: np.ndarray, norm: NormativeSet
+) -> Float[np.ndarray, " V"]:
+    """What an error of one standard deviation of each angle's curve changes an index by: the root mean square of both
+    directions, because near the norm a derivative would go beyond all bounds; with the derivative's sign."""
+    each = np.repeat(np.eye(len(norm.variables)), len(norm.percent), axis=1) * spread
+    both = norm.index(np.concatenate([vector + each, vector - each])).reshape(2, -1) - gdi
+    return np.sqrt(np.mean(both**2, axis=0)) * np.where(each @ slope < 0, -1.0, 1.0)
 
 
 def _of_mean(values: np.ndarray) -> float:
@@ -279,7 +291,7 @@ def _errors(parts: Sequence[_Part], params: GdiParams) -> tuple[float | None, fl
     """Standard deviation of the error of the index, and the change that two such visits exceed by chance in one of ten
     cases.
 
-    To first order in the angles' errors. What a fit is unsure of (`curves_sd`: the detector's errors, the lean) is the
+    What a fit is unsure of (`curves_sd`: the detector's errors, the lean) is the
     same in all cycles, and on both sides, of an angle; what differs from cycle to cycle is in the cycles' spread.
     """
     from pbl_pipeline.stats import minimal_detectable_change  # loads pandas, which every command would wait for

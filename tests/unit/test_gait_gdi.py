@@ -145,8 +145,9 @@ def test_unused_cycles_do_not_count(toy):
 
 @pytest.mark.parametrize("average", ["cycles", "curves"])
 def test_the_index_is_as_unsure_as_its_angles_and_its_cycles(toy, average):
-    vectors = toy_vectors(6, seed=9) + 5.0
-    sd = dict(zip(THREE_ANGLES, (3.0, 1.0, 2.0), strict=True))
+    # Small errors, so that the index changes by as much in both directions.
+    vectors = toy_vectors(1, seed=9) + 5.0 + 0.01 * (toy_vectors(6, seed=8) - toy.mean_deg)
+    sd = dict(zip(THREE_ANGLES, (0.03, 0.01, 0.02), strict=True))
     cycles = [
         cycle(v, ("left", "right")[i % 2], i, curves_sd={k: np.full(51, s) for k, s in sd.items()})
         for i, v in enumerate(vectors)
@@ -181,6 +182,16 @@ def test_the_index_is_as_unsure_as_its_angles_and_its_cycles(toy, average):
     # Where the fit does not know how sure it is, the index does not either.
     unknown = score_gdi([dataclasses.replace(c, curves_sd={}) if c.number == 0 else c for c in cycles], toy, params)
     assert (unknown.mean, unknown.sd, unknown.interval, unknown.minimal_change) == (result.mean, None, None, None)
+
+
+def test_near_the_norm_an_error_has_two_directions(toy):
+    person = toy.mean_deg + 1e-6 * toy.components[0]
+    sd = {v: np.full(51, s) for v, s in zip(THREE_ANGLES, (3.0, 0.0, 0.0), strict=True)}
+    result = score_gdi([cycle(person, side, curves_sd=sd) for side in ("left", "right")], toy)
+    error = 3.0 * np.repeat([1.0, 0.0, 0.0], 50)
+    down = toy.index(np.array([person + error, person - error])) - toy.index(person)[0]
+    assert result.sd == pytest.approx(np.sqrt(np.mean(down**2)))
+    assert np.all(down < 0)
 
 
 @pytest.mark.parametrize("n_left", [0, 2])
