@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 _MJOA = "the scale: Benzel et al. 1991, J Spinal Disord 4:286-295"
-_PERERA = "substantial change in older adults: Perera et al. 2006, J Am Geriatr Soc 54:743-749"
+_PERERA = "Perera et al. 2006, J Am Geriatr Soc 54:743-749 (doi 10.1111/j.1532-5415.2006.00701.x)"
 _BOUNDS = "no scale: bounds that only mistakes exceed"
 
 
@@ -69,7 +69,7 @@ INSTRUMENTS = (
         better=True,
         ordinal=False,
         change=0.1,
-        change_source=_PERERA,
+        change_source=f"substantial change of gait speed in older adults (a small one is 0.05): {_PERERA}",
     ),
     _instrument(
         "BBS",
@@ -90,7 +90,7 @@ INSTRUMENTS = (
         better=True,
         ordinal=False,
         change=50,
-        change_source=_PERERA,
+        change_source=f"substantial change in older adults (a small one is 20): {_PERERA}",
     ),
     _instrument(
         "TUG",

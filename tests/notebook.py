@@ -1,6 +1,6 @@
-"""Notebooks without Jupyter: run the code cells of one, and store what they show.
+"""Notebooks without Jupyter: run the code cells of several, in order, and store what they show.
 
-python -m tests.notebook docs/notebooks/04_study.ipynb
+python -m tests.notebook docs/notebooks/*.ipynb
 """
 
 from __future__ import annotations
@@ -15,13 +15,15 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from tests.database import installation
 
-def run(path: Path) -> dict[str, Any]:
-    """The notebook with the outputs of its code cells, run in order in one namespace and in a folder of their own."""
+
+def run(path: Path, folder: Path) -> dict[str, Any]:
+    """The notebook with the outputs of its code cells, run in order in one namespace, in `folder`."""
     notebook = json.loads(path.read_text(encoding="utf-8"))
     names: dict[str, Any] = {"__name__": "__main__"}
     code = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
-    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+    with contextlib.chdir(folder):
         for number, cell in enumerate(code, 1):
             cell["execution_count"], cell["outputs"] = number, _outputs("".join(cell["source"]), names, number)
     return notebook
@@ -51,9 +53,11 @@ def _outputs(source: str, names: dict[str, Any], number: int) -> list[dict[str, 
 
 
 def main() -> None:
-    for name in sys.argv[1:]:
-        path = Path(name).resolve()
-        path.write_text(json.dumps(run(path), indent=1, ensure_ascii=False) + os.linesep, encoding="utf-8")
+    paths = [Path(name).resolve() for name in sys.argv[1:]]
+    with installation(), tempfile.TemporaryDirectory() as folder:
+        for path in paths:
+            done = run(path, Path(folder))
+            path.write_text(json.dumps(done, indent=1, ensure_ascii=False) + os.linesep, encoding="utf-8")
 
 
 if __name__ == "__main__":
