@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
+    from schemas.ingest import Ingested
     from schemas.sensors import Sensors
 
 
@@ -24,14 +25,17 @@ if TYPE_CHECKING:
 @click.option(
     "--up", type=click.Choice(["y", "z"]), default="y", show_default=True, help="Vertical axis of .trc files."
 )
-@click.option("--subject", required=True, metavar="CODE", help="Pseudonymous code of the person, never a name.")
+@click.option("--subject", metavar="CODE", help="Pseudonymous code of the person, never a name.")
 @click.option(
     "--session",
     "session_label",
-    default="unlabelled",
-    show_default=True,
     metavar="LABEL",
-    help="Visit: a date (YYYY-MM-DD) or your own label. Its videos are fitted together with one body.",
+    help="Visit: a date (YYYY-MM-DD) or your own label (else: unlabelled). Its videos are fitted with one body.",
+)
+@click.option(
+    "--name-pattern",
+    metavar="REGEX",
+    help="What the files' names, without suffix, say: named groups subject, session, pace, activity.",
 )
 @click.option("--project", metavar="NAME", help="Study or clinic, for a subject that is new.")
 @click.option("--camera", type=click.Path(path_type=Path), metavar="FILE", help="Calibration of the camera.")
@@ -73,8 +77,9 @@ def ingest(
     markers: tuple[Path, ...],
     marker_set: str | None,
     up: str,
-    subject: str,
-    session_label: str,
+    subject: str | None,
+    session_label: str | None,
+    name_pattern: str | None,
     project: str | None,
     camera: Path | None,
     camera_motion: str | None,
@@ -103,22 +108,39 @@ def ingest(
     Example: pbl ingest walk1.mp4 walk2.mp4 --subject P017 --session 2026-03-01
     Example: pbl ingest walk.mov --subject P018 --camera iphone.toml --person 2
     Example: pbl ingest walk.mov --subject P018 --attitude 2026-03-01_09-15-30.zip
+    Example: pbl ingest *.mp4 --session 2026-03-01 --name-pattern '(?P<subject>[^_]+)_(?P<pace>[^_]+)_.*'
     Example: pbl ingest --markers walk1.trc --marker-set our_lab.csv --subject P017 --session 2026-03-01
     """
     import schemas
     from schemas.ingest import Methods, Visit
     from schemas.ingest import ingest as register
     from schemas.marker_recordings import ingest_markers
+    from schemas.session import UNLABELLED
 
     _one_kind(videos, markers, marker_set, bool(attitude or depth or imu))
     files = _files(len(videos), attitude, depth, imu)
+    options = {"subject": subject, "session": session_label, "pace": pace, "activity": activity}
+    calls, results = _visits(videos or markers, name_pattern, {k: v for k, v in options.items() if v is not None})
+    if person is not None and len(videos) > 1 and len(calls) > 1:
+        raise click.UsageError("--person goes with one video: people are numbered anew in each.")
     schemas.activate()
-    visit = Visit(subject, session_label, project, camera, camera_motion, activity, person, population, pace)
     methods = Methods(tracking=tracking_method, keypoint=keypoint_method, fit=fit_method, gdi=index, norm=norm)
-    if markers:
-        results = ingest_markers(markers, visit, marker_set, up, methods)
-    else:
-        results = register(videos, visit, methods, files)
+    for said, numbers in calls:
+        visit = Visit(
+            subject=said["subject"],
+            session_label=said.get("session", UNLABELLED),
+            project=project,
+            camera_file=camera,
+            camera_motion=camera_motion,
+            activity=said.get("activity"),
+            person=person,
+            population=population,
+            pace=said.get("pace"),
+        )
+        if markers:
+            results += ingest_markers([markers[i] for i in numbers], visit, marker_set, up, methods)
+        else:
+            results += register([videos[i] for i in numbers], visit, methods, [files[i] for i in numbers])
     for result in results:
         if result.error is not None:
             click.echo(result.error.text(), err=True)
@@ -128,6 +150,35 @@ def ingest(
             click.echo(f"  to measure another person of it: pbl choose {result.video_id} {person}")
     if any(r.error for r in results):
         raise click.exceptions.Exit(1)
+
+
+def _visits(
+    paths: tuple[Path, ...], name_pattern: str | None, options: dict[str, str]
+) -> tuple[list[tuple[dict[str, str], list[int]]], list[Ingested]]:
+    """(what is stated, positions of the files it is stated of), and the files whose name does not fit the pattern.
+
+    Raises `PblError` USAGE for a pattern that is none; `click.UsageError` where it and an option state the same, or
+    nobody states the subject.
+    """
+    from pbl_pipeline.errors import PblError
+    from schemas.ingest import Ingested
+    from schemas.name_pattern import compiled, read_name, together
+
+    pattern = compiled(name_pattern) if name_pattern is not None else None
+    if pattern is not None and (twice := sorted(set(pattern.groupindex) & set(options))):
+        raise click.UsageError(f"--{twice[0]} and the name pattern state the same: leave one out.")
+    stated, positions, refused = [], [], []
+    for i, path in enumerate(paths):
+        try:
+            said = options | (read_name(pattern, path) if pattern is not None else {})
+        except PblError as error:
+            refused.append(Ingested(path, "refused", error=error))
+            continue
+        if "subject" not in said:
+            raise click.UsageError("Missing option '--subject' (or a group 'subject' in --name-pattern).")
+        stated.append(said)
+        positions.append(i)
+    return [(stated[g[0]], [positions[i] for i in g]) for g in together(stated)], refused
 
 
 def _one_kind(videos: tuple[Path, ...], markers: tuple[Path, ...], marker_set: str | None, with_files: bool) -> None:

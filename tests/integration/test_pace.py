@@ -10,7 +10,7 @@ import pytest
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GDI_METHODS
 from pbl_pipeline.paramset import Paramset
-from schemas import gait, gdi, norms, video, views
+from schemas import gait, gdi, norms, session, video, views
 from schemas.conditions import set_condition
 from schemas.ingest import Methods, Visit, ingest
 from schemas.method_rows import insert_methods
@@ -77,3 +77,53 @@ def test_a_change_that_pools_the_same_deletes_nothing(tables: None, tmp_path: Pa
         set_condition(number + 1, pace="fast")
     with pytest.raises(PblError, match="at the pace 'fast'"):
         norms.build_norm("fast-lab", populations=(), subjects=("P001",), pace="fast")
+
+
+PATTERN = r"(?P<subject>P\d+)_(?:(?P<pace>[a-z]+)_)?\d"
+
+
+def _files(folder: Path, *names: str) -> list[Path]:
+    """Files that ingest takes: it decodes nothing."""
+    for name in names:
+        (folder / name).write_text(name)
+    return [folder / name for name in names]
+
+
+def test_the_file_name_states_subject_and_pace(tables: None, tmp_path: Path):
+    files = _files(tmp_path, "P001_fast_1.mp4", "P002_slow_1.mp4", "P001_fast_2.mp4", "P001_3.mp4", "holiday.mp4")
+    done = pbl("ingest", *files, "--session", "2026-03-01", "--name-pattern", PATTERN)
+    assert (done.code, done.error_code) == (1, "USAGE")
+    assert "holiday" in done.err
+    rows = (video.Video * session.Session.proj("subject", "session_label")).to_dicts(order_by="video_name")
+    stated = {r["video_name"]: (r["subject"], r["session_label"]) for r in rows}
+    day = "2026-03-01"
+    assert stated == {f.name: (f.name[:4], day) for f in files[:4]}
+    paces = (video.Video.proj("video_name") * video.Pace).to_dicts()
+    expected = {"P001_fast_1.mp4": "fast", "P001_fast_2.mp4": "fast", "P002_slow_1.mp4": "slow"}
+    assert {r["video_name"]: r["pace"] for r in paces} == expected
+    assert len(session.Session()) == 2
+
+
+def test_session_and_activity_from_the_name(tables: None, tmp_path: Path):
+    (file,) = _files(tmp_path, "2026-03-01 tug.mp4")
+    assert pbl("ingest", file, "--subject", "P001", "--name-pattern", "(?P<session>.*) (?P<activity>.*)").code == 0
+    (row,) = (video.Video * session.Session.proj("session_label")).to_dicts()
+    assert (row["session_label"], row["activity"]) == ("2026-03-01", "tug")
+
+
+@pytest.mark.parametrize(
+    ("more", "code", "said"),
+    [
+        (["--name-pattern", "(?P<subject>.*"], 1, "missing )"),
+        (["--name-pattern", ".*"], 1, "without named groups"),
+        (["--name-pattern", "(?P<name>.*)"], 1, "with the groups name"),
+        (["--name-pattern", "(?P<subject>.*)", "--subject", "P001"], 2, "state the same"),
+        (["--name-pattern", "(?P<pace>.*)"], 2, "--subject"),
+        ([], 2, "--subject"),
+    ],
+)
+def test_a_pattern_that_cannot_be_read(tables: None, tmp_path: Path, more: list[str], code: int, said: str):
+    done = pbl("ingest", *_files(tmp_path, "P001.mp4"), *more)
+    assert done.code == code
+    assert said in done.err
+    assert not len(video.Video())
