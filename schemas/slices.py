@@ -319,9 +319,11 @@ def _frames(rows: Any, about: Mapping[str, Any]) -> dict[str, Any]:
 
 def _groups(visits: Any, cohort: str | None) -> Any:
     """Of each visit's person: the group in the cohort, else the population."""
-    members = (study.CohortMember & {"cohort": cohort} & "member_group != ''") if cohort is not None else None
-    groups = {} if members is None else {r["subject"]: r["member_group"] for r in members.to_dicts()}
-    return visits["subject"].map(groups).fillna(visits["population"])
+    if cohort is None:
+        return visits["population"]
+    members = study.CohortMember & {"cohort": cohort} & "member_group != ''"
+    groups = {r["subject"]: r["member_group"] for r in members.to_dicts()}
+    return visits["subject"].map(groups).astype(object).fillna(visits["population"])
 
 
 def _measures(sets: Any, index: Any, chain: Mapping[str, str], of_sets: Any) -> Any:

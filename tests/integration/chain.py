@@ -15,6 +15,7 @@ import pytest
 
 import pbl_pipeline.fit
 import pbl_pipeline.keypoints
+import pbl_pipeline.pipeline  # binds the real functions now, not the stand-ins at its first import later
 import pbl_pipeline.tracking
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
