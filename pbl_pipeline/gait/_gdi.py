@@ -167,7 +167,7 @@ def score_gdi(
     norm
         A set or its name; None for that of `params`.
     params
-        None for those of `model`.
+        None for those of `model`, and without one for those of the index that the norm's angles make.
     model, version
         A method of `GDI_METHODS`, or its name, which decides the angles, and its version (None: the newest). Without it
         the norm's angles decide; a norm of other angles than the two indices have gives an index of its own name.
@@ -179,10 +179,8 @@ def score_gdi(
         ANGLE_UNITS for curves that are not in degrees.
     """
     method = GDI_METHODS.find(model)
-    params = params or method.params
-    if norm is None:
-        norm = params.norm
-    basis = load_norm(norm) if isinstance(norm, str) else norm
+    basis = norm_of(norm, params or method.params)
+    params = params or params_of(basis, model)
     family = _model_of(basis, method.family.name if model else None)
     known = method if model else GDI_METHODS.get(family)
     model = method.name if model else family
@@ -223,6 +221,18 @@ def score_gdi(
         sd=sd,
         minimal_change=minimal_change,
     )
+
+
+def norm_of(norm: NormativeSet | str | None, params: GdiParams) -> NormativeSet:
+    """A set, by its name, or None for that of the parameters."""
+    wanted = params.norm if norm is None else norm
+    return load_norm(wanted) if isinstance(wanted, str) else wanted
+
+
+def params_of(norm: NormativeSet, model: Method[GdiParams] | str | None) -> GdiParams:
+    """Parameters of a model; without one, of the index that the norm's angles make, if one is named so."""
+    method = GDI_METHODS.find(model)
+    return method.params if model is not None else GDI_METHODS.get(_model_of(norm, None), method).params
 
 
 def _rounded(value: float | None) -> float | None:

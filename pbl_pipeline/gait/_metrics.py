@@ -15,12 +15,12 @@ from pbl_pipeline.qc import EMPTY, OUTCOMES, PASS, WARN, Check, in_session, wors
 
 from ._condition import Condition
 from ._cycles import GaitCycle, find_cycles
-from ._gdi import GDI_METHODS, GDI_MODEL, GILLETTE_MODEL, Gdi, GdiParams, score_gdi
+from ._gdi import GDI_METHODS, GDI_MODEL, GILLETTE_MODEL, Gdi, GdiParams, norm_of, params_of, score_gdi
 from ._laboratory import LabTrial
 from ._spatiotemporal import MEASURES, Spatiotemporal, far_leg_of, spatiotemporal
 from .events import METHODS, GaitEvents, detect_events
 from .motion import BodyPoses, feet_from_fit, trial_poses
-from .normative import NormativeSet, load_norm
+from .normative import NormativeSet
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit
@@ -31,7 +31,7 @@ class GaitParams:
     """Method of the events (a row of `events.METHODS`) and parameters of the index together."""
 
     events: Paramset = dataclasses.field(default_factory=lambda: METHODS.find().paramset)
-    gdi: GdiParams = dataclasses.field(default_factory=GdiParams)
+    gdi: GdiParams = dataclasses.field(default_factory=lambda: GDI_METHODS.find().params)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,9 +149,8 @@ def gait_metrics(
         raise PblError(
             "GAIT_INPUT", found="no trial", expected="at least one fitted trial", next_step="pass fit.npz files"
         )
-    params = params or GaitParams(gdi=GDI_METHODS.find(model).params)
-    wanted = params.gdi.norm if norm is None else norm
-    basis = load_norm(wanted) if isinstance(wanted, str) else wanted
+    basis = norm_of(norm, params.gdi if params else GDI_METHODS.find(model).params)
+    params = params or GaitParams(gdi=params_of(basis, model))
     index = {"norm": basis, "params": params.gdi, "model": model, "version": version}
     given = [Condition()] * len(trials) if conditions is None else conditions
     done = tuple(

@@ -86,7 +86,8 @@ def test_a_slice_as_frames(cohort: Path):
     cycles = of(found.cycles, "P001", "pre")
     index = cycles[cycles["measure"] == "gdi"]
     assert len(index) == used == row["session_gdi_n"]
-    assert index["value"].mean() == pytest.approx(row["session_gdi"])
+    # The index of the visit is of the mean curves; each cycle has its own.
+    assert index["value"].mean() == pytest.approx(row["session_gdi"], abs=1.0)
     stride = cycles.loc[cycles["measure"] == "stride_time_s", "value"].mean()
     assert stride == pytest.approx(measures.at[("stride_time_s", "both"), "value"])
     curves = of(found.curves, "P001", "pre")

@@ -103,7 +103,7 @@ def test_the_report_of_a_visit_names_the_recordings_it_lacks(monkeypatch: pytest
     )
     found = SessionResults(1, "P1", "visit", None, trials, fit=anything, metrics=anything)
     monkeypatch.setattr(schemas.report, "load_session", lambda _: found)
-    monkeypatch.setattr(schemas.report, "_methods", lambda _: {})
+    monkeypatch.setattr(schemas.report, "methods_of", lambda _: {})
     written = []
     monkeypatch.setattr(pipeline, "write_results", lambda out, session, **_: written.append(session) or [])
     schemas.report.write_session({}, tmp_path)
