@@ -1,6 +1,18 @@
-"""Names of gait measures and joint angles as people read them."""
+"""Names of gait measures and joint angles as people read them, and the units that names end with."""
 
 from __future__ import annotations
+
+import functools
+
+#: Ends of the names of measures and their units, longer ones before those that they end with.
+_UNITS = (
+    ("_steps_per_min", "steps/min"),
+    ("_m_per_s", "m/s"),
+    ("_percent", "%"),
+    ("_deg", "deg"),
+    ("_s", "s"),
+    ("_m", "m"),
+)
 
 #: Gait measures: key of metrics.json -> name, unit, decimals.
 MEASURES: dict[str, tuple[str, str, int]] = {
@@ -36,3 +48,9 @@ PELVIS_ANGLES: dict[str, tuple[str, str]] = {
 }
 #: So does the direction of the foot.
 FOOT_ANGLES: dict[str, tuple[str, str]] = {"foot_progression": ("Foot direction", "toes in +")}
+
+
+@functools.cache
+def unit_of(name: str) -> str:
+    """The unit that a measure's name ends with; empty where it has none, such as an index."""
+    return next((unit for end, unit in _UNITS if name.endswith(end)), "")

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pbl_pipeline.errors import PblError
-
 from . import fit, video
 from .report import methods_of
-from .results import FittedTrial, load_session
+from .results import FittedTrial, load_session, not_finished
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -29,14 +27,7 @@ def session_of_tables(restriction: Any, *, sensors: bool = True) -> ExportSessio
 
     found = load_session(restriction)
     if found.fit is None:
-        problems = "; ".join(f"{t.name}: {t.problem}" for t in found.trials if t.problem)
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=f"no finished fit of session {found.session_label!r}. {problems}".strip(),
-            expected="a session that was populated",
-            next_step="run `pbl populate`, then `pbl status`",
-            key=f"subject {found.subject}",
-        )
+        raise not_finished(found, "fit")
     methods = methods_of(found.key)
     version = (fit.SessionFit & found.key).fetch1("fit_code_version")
     measured = found.metrics.trials if found.metrics is not None else (None,) * len(found.fitted)

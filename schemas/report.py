@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pbl_pipeline.errors import PblError
-
 from . import fit
-from .results import load_session
+from .results import load_session, not_finished
 
 
 def write_session(restriction: Any, out: Path) -> list[Path]:
@@ -25,14 +23,7 @@ def write_session(restriction: Any, out: Path) -> list[Path]:
 
     found = load_session(restriction)
     if found.fit is None or found.metrics is None:
-        problems = "; ".join(f"{t.name}: {t.problem}" for t in found.trials if t.problem)
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=f"no finished fit and measures of session {found.session_label!r}. {problems}".strip(),
-            expected="a session that was populated",
-            next_step="run `pbl populate`, then `pbl status`",
-            key=f"subject {found.subject}",
-        )
+        raise not_finished(found, "fit and measures")
     trials = tuple(Trial(t.name, t.path, t.info, t.choice, t.keypoints) for t in found.fitted)
     return write_results(
         out,

@@ -152,6 +152,18 @@ def load_session(restriction: Any) -> SessionResults:
     )
 
 
+def not_finished(found: SessionResults, what: str) -> PblError:
+    """A `PblError` DB_NOT_FOUND for a session that lacks `what`, with what is wrong with its trials."""
+    problems = "; ".join(f"{t.name}: {t.problem}" for t in found.trials if t.problem)
+    return PblError(
+        "DB_NOT_FOUND",
+        found=f"no finished {what} of session {found.session_label!r}. {problems}".strip(),
+        expected="a session that was populated",
+        next_step="run `pbl populate`, then `pbl status`",
+        key=f"subject {found.subject}",
+    )
+
+
 def _single(rows: list[dict], attribute: str, restriction: Any) -> dict:
     if len(rows) > 1:
         raise PblError(

@@ -12,13 +12,14 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label, is_plain
+from pbl_pipeline.words import unit_of
 
 from . import fit, gait, gdi, lab, session, study, video
 from ._datajoint import dj
 from .ingest import in_transaction
 from .rows import inside, utc_now
 from .stored_files import file_ref, stored_file
-from .views import cycle_rows, frame_of
+from .views import cycle_rows, frame_of, newest_sets
 
 if TYPE_CHECKING:
     from pbl_pipeline.study import StudyData
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 #: One chain of methods, as StudySlice names it.
 CHAIN = ("tracking_method", "keypoint_method", "fit_method", "gait_method", "gdi_method", "norm")
 _SIDES = {"mean": "both", "left": "left", "right": "right"}
-_UNITS = {"steps_per_min": "steps/min", "m_per_s": "m/s", "percent": "%", "s": "s", "m": "m"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,7 +196,7 @@ def _chain(visits: Any, methods: Mapping[str, str]) -> dict[str, str | None]:
 
 def _measured(visits: Any) -> Any:
     """SessionGdi of the current sets of the visits, with session and chain."""
-    sets = fit.FitSet.proj("session_id") * (fit.FitSelection & {"fit_current": True}).proj()
+    sets = newest_sets()
     of_set = dj.U("fit_set", "tracking_method", "keypoint_method") & fit.FitSet.Video
     columns = ("session_status", "session_reason", "session_gdi_reason")
     return sets * of_set * gdi.SessionGdi.proj(*columns) & inside("session_id", map(int, visits["session_id"]))
@@ -356,13 +356,6 @@ def _measures(sets: Any, index: Any, chain: Mapping[str, str], of_sets: Any) -> 
     return long.merge(sets, on="fit_set").drop(columns=["fit_set", "session_id"])
 
 
-def unit_of(measure: str) -> str:
-    """The unit that the name of a measure ends with; "" for one without."""
-    if measure == "gps_deg":
-        return "deg"
-    return next((unit for end, unit in _UNITS.items() if measure.endswith(f"_{end}")), "")
-
-
 def _cycles(cycles: Any, sets: Any, gdi_method: str) -> Any:
     """Long: index, stride time and stride length of each cycle that the visit pools, numbered by visit and side."""
     from pbl_pipeline.gait import ANY_PACE
@@ -428,7 +421,7 @@ def _hashes(frames: Mapping[str, Any]) -> dict[tuple[str, str], str]:
         plain = frame[columns].apply(lambda c: c.map(_text)).to_numpy()
         for key, row in zip(zip(frame["subject"], frame["visit"], strict=True), plain, strict=True):
             lines[key].append("\t".join((name, *row)))
-    return {key: _digest(sorted(texts)) for key, texts in lines.items()}
+    return {key: _digest(texts) for key, texts in lines.items()}
 
 
 def _text(value: Any) -> str:

@@ -45,6 +45,16 @@ def current_sets() -> Any:
     )
 
 
+def newest_sets() -> Any:
+    """Keys of the sets that are the newest of their session, by method of the fit, with `session_id`."""
+    return fit.FitSet.proj("session_id") * (fit.FitSelection & {"fit_current": True}).proj()
+
+
+def _sessions() -> Any:
+    """Sessions with what restricts them: subject, label, date, population."""
+    return session.Session.proj("subject", "session_label", "session_date") * lab.Subject.proj("population")
+
+
 def session_summary(restriction: Any = True) -> pd.DataFrame:
     """One row per visit and chain of methods: cadence, stride time, index, worst quality check.
 
@@ -68,9 +78,8 @@ def visit_frame(restriction: Any = True, chain: Any = True) -> pd.DataFrame:
     chain
         Of the methods, such as `{"fit_method": "blazepose-v3"}`, where the tables hold several chains.
     """
-    visits = study.Visit * session.Session.proj("subject", "session_label", "session_date")
-    visits = visits * lab.Subject.proj("population") & restriction
-    sets = fit.FitSet.proj("session_id") * (fit.FitSelection & {"fit_current": True}).proj()
+    visits = study.Visit * _sessions() & restriction
+    sets = newest_sets()
     if restriction is not True:
         sets = sets & visits.proj()
     measures = sets * gdi.SessionGdi.proj(*_SESSION_COLUMNS, "session_gps", "session_gdi_reason") & chain
@@ -84,10 +93,9 @@ def score_frame(restriction: Any = True) -> pd.DataFrame:
 
     The rows are turned by the server. `restriction`: of sessions, subjects and visits.
     """
-    visits = session.Session.proj("subject", "session_label", "session_date") * lab.Subject.proj("population")
     scores = study.ClinicalScore()
     if restriction is not True:
-        scores = scores & (visits * study.Visit & restriction).proj()
+        scores = scores & (_sessions() * study.Visit & restriction).proj()
     names = sorted((dj.U("instrument") & scores).to_arrays("instrument"))
     # DataJoint's names have no capitals and begin with a letter: numbers there, the instruments' names here.
     wide = {f"score_{i}": f"max(if(instrument = {_literal(n)}, score_value, null))" for i, n in enumerate(names)}
@@ -114,9 +122,8 @@ def cycle_frame(restriction: Any = True, chain: Any = True) -> pd.DataFrame:
     `visit_frame`. Times in s, lengths in m; `activity` and `pace` say what is done in its video ("unknown" where it is
     not stated). Set-based: no file is read.
     """
-    visits = session.Session.proj("subject", "session_label", "session_date") * lab.Subject.proj("population")
-    sets = (fit.FitSelection & {"fit_current": True}).proj() * fit.FitSet.proj("session_id")
-    sets = sets & (visits & restriction).proj() if restriction is not True else sets
+    sets = newest_sets()
+    sets = sets & (_sessions() & restriction).proj() if restriction is not True else sets
     return cycle_rows(sets, chain)
 
 

@@ -3,7 +3,6 @@ stand in a column `unit` beside the values."""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from pbl_pipeline.body import SLIDES, angle_of
 from pbl_pipeline.gait import ANGLE_NAMES, MEASURES, GaitCycle, GaitMetrics, Gdi, Spatiotemporal, TrialMetrics
 from pbl_pipeline.gait import cycle_measures as measures_of
+from pbl_pipeline.words import unit_of
 
 from ._angles import angles_table
 from ._columns import Column, Labels, Table, joined
@@ -47,8 +47,6 @@ JOINT_SIGNS: dict[str, str] = {
     "wrist_dev": "ulnar deviation",
 }
 _SIDES = {"r": "right", "l": "left"}
-#: Ends of the names of measures and their units.
-_UNITS = (("_steps_per_min", "steps/min"), ("_m_per_s", "m/s"), ("_percent", "%"), ("_deg", "deg"), ("_s", "s"))
 _STATISTICS = {
     "mean": "mean over both sides",
     "left": "mean of the left side",
@@ -77,12 +75,6 @@ def session_tables(trials: Sequence[ExportTrial], metrics: GaitMetrics | None) -
             parts = [("session", "", metrics.spatiotemporal, metrics.gdi), *parts]
         made += [_measures_wide(parts), _measures_long(parts)]
     return made
-
-
-@functools.cache
-def unit_of(name: str) -> str:
-    """The unit that a measure's name ends with; empty where it has none, such as an index."""
-    return next((unit for end, unit in (*_UNITS, ("_m", "m")) if name.endswith(end)), "")
 
 
 # --------------------------------------------------------------------------------------------------------------- angles

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 
-from pbl_pipeline.body import MarkerSet
+from pbl_pipeline.body import MarkerSet, load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.methods import Method
@@ -131,6 +131,7 @@ def _batches(
 ) -> Iterator[list[_Packed]]:
     """Up to `batch` sessions of the same sizes and terms at a time; errors of the others go to `out`."""
     waiting: dict[tuple, list[_Packed]] = {}
+    load_body()  # before the threads, each of which would load a body of its own, and compile for it
 
     def pack(i: int) -> _Packed | PblError:
         begin, given = time.perf_counter(), sessions[i]

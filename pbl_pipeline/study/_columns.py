@@ -36,7 +36,7 @@ FRAMES: dict[str, tuple[Column, ...]] = {
         Column("group", "label", "", "group of the person, the same at all visits"),
         Column("included", "flag", "", "whether the visit counts"),
         Column("reason", "text", "", "why it does not count; empty where it does"),
-        Column("gdi", "number", "", "gait deviation index, mean over the cycles of both sides; 100 is the norm"),
+        Column("gdi", "number", "", "gait deviation index of both sides; 100 is the norm"),
         Column("gdi_sd", "number", "", "standard deviation of the error of gdi"),
         Column("n_cycles", "number", "", "gait cycles of both sides in gdi"),
     ),
