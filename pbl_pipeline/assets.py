@@ -346,7 +346,7 @@ def _one_at_a_time() -> Iterator[None]:
     except ImportError:
         yield
         return
-    with (folder() / ".lock").open("w") as file:
+    with (folder() / ".lock").open("w", encoding="utf-8") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         for left in folder().glob("fetch-*"):  # of a process that was killed: we alone fetch now
             shutil.rmtree(left) if left.is_dir() else left.unlink()

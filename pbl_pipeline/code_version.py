@@ -27,7 +27,7 @@ def code_version() -> str:
 
 def built_commit(file: Path) -> str:
     """The commit that a wheel was built from, "" where it does not say."""
-    return file.read_text().strip() if file.is_file() else ""
+    return file.read_text(encoding="utf-8").strip() if file.is_file() else ""
 
 
 def checked_out_commit(root: Path) -> str:

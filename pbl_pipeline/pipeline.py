@@ -233,7 +233,7 @@ def write_session_json(fit: SessionFit, path: Path) -> None:
         "qc": [c.to_dict() for c in fit.qc],
         "code_version": code_version(),
     }
-    path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _known(value: float) -> float | None:

@@ -78,7 +78,7 @@ def remove_copies(archive: Path, subject: str | None = None) -> None:
 def load_seen(archive: Path) -> dict[str, list[Any]]:
     """What `save_seen` wrote; empty where there is nothing to read."""
     try:
-        return dict(json.loads((archive / COPIES / _SEEN).read_text()))
+        return dict(json.loads((archive / COPIES / _SEEN).read_text(encoding="utf-8")))
     except (OSError, ValueError):
         return {}
 

@@ -140,7 +140,7 @@ def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
         BACKUP_INVALID naming what is missing or changed.
     """
     try:
-        manifest = json.loads((folder / "manifest.json").read_text())
+        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
         parts = manifest["sha256"]
         manifest.setdefault("n_recordings", 0)  # a backup of before they were saved
         if manifest["format"] != FORMAT:
@@ -267,7 +267,10 @@ def _save_tables(
 
 def _save_files(paths: list[str], folder: Path) -> int:
     store, lost, n_bytes = connection.store_backend(), [], 0
-    with (folder / "store.sha256").open("w") as listing, progress.bar("store", total=len(paths), unit="file") as update:
+    with (
+        (folder / "store.sha256").open("w", encoding="utf-8") as listing,
+        progress.bar("store", total=len(paths), unit="file") as update,
+    ):
         for path in paths:
             target = folder / "store" / safe_path(path)
             target.parent.mkdir(parents=True, exist_ok=True)

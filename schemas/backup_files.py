@@ -34,7 +34,7 @@ def safe_path(path: str) -> PurePosixPath:
 
 def listed(folder: Path, part: str) -> Iterable[tuple[str, str]]:
     """SHA-256 and path of the files of a part of a backup. Raises BACKUP_INVALID for a path that leaves it."""
-    for line in (folder / f"{part}.sha256").read_text().splitlines():
+    for line in (folder / f"{part}.sha256").read_text(encoding="utf-8").splitlines():
         sha, _, path = line.partition("  ")
         yield sha, str(safe_path(path))
 
@@ -78,7 +78,10 @@ def save_recordings(videos: Iterable[tuple[str, str]], folder: Path, previous: P
     done, before = Recordings(), set()
     if previous is not None and (previous / f"{RECORDINGS}.sha256").is_file():
         before = set(listed(previous, RECORDINGS))
-    with (folder / f"{RECORDINGS}.sha256").open("w") as listing, progress.bar(RECORDINGS, unit="file") as update:
+    with (
+        (folder / f"{RECORDINGS}.sha256").open("w", encoding="utf-8") as listing,
+        progress.bar(RECORDINGS, unit="file") as update,
+    ):
         for path, sha in videos:
             update(1)
             name = path.lstrip("/")

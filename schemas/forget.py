@@ -343,7 +343,7 @@ def _mentions(subject: str, videos: Sequence[dict[str, Any]]) -> list[str]:
 def read_manifest(subject: str) -> dict[str, Any]:
     """The list that an earlier run wrote; empty where there is none."""
     try:
-        return json.loads(manifest_path(subject).read_text())
+        return json.loads(manifest_path(subject).read_text(encoding="utf-8"))
     except FileNotFoundError:
         return {}
     except (OSError, ValueError) as error:

@@ -18,8 +18,9 @@ def write_json(path: Path, content: dict[str, Any], mode: int = 0o600) -> None:
     """
     aside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with os.fdopen(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "w") as out:
-            os.fchmod(out.fileno(), mode)
+        with os.fdopen(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "w", encoding="utf-8") as out:
+            if hasattr(os, "fchmod"):  # not on Windows before Python 3.13
+                os.fchmod(out.fileno(), mode)
             json.dump(content, out, indent=1)
             out.flush()
             os.fsync(out.fileno())

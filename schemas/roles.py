@@ -101,7 +101,7 @@ def password_file(folder: Path, account: Account) -> Path:
     path = folder / account.user
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as out:
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as out:
             out.write(secrets.token_hex(24))
     except FileExistsError:
         pass
@@ -119,7 +119,7 @@ def password_file(folder: Path, account: Account) -> Path:
 def read_password(path: Path) -> str:
     """The password in a file. Raises FILE_MISSING for none, or for one too short to be a secret."""
     try:
-        text = path.read_text().strip()
+        text = path.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError):
         text = ""
     if len(text) < 12:

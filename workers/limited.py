@@ -58,7 +58,7 @@ def _call(pipe: Connection, n_bytes: int, function: Callable[..., object], args:
         import resource
 
         # What the imports took does not count: with many cores numpy alone reserves a gigabyte for its threads.
-        pages = int(Path("/proc/self/statm").read_text().split()[5])
+        pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[5])
         most = pages * resource.getpagesize() + n_bytes
         resource.setrlimit(resource.RLIMIT_DATA, (most, most))
     except (ImportError, OSError, ValueError):  # another system than Linux, or a lower limit that may not be raised

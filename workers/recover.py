@@ -120,8 +120,8 @@ def _alive_here(pid: int, reserved: datetime.datetime | None, now: datetime.date
 def _age_of_process(pid: int) -> float | None:
     """Seconds since a process started; None where the system does not tell (no /proc)."""
     try:
-        ticks = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19])
-        uptime = float(Path("/proc/uptime").read_text().split()[0])
+        ticks = int(Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[19])
+        uptime = float(Path("/proc/uptime").read_text(encoding="utf-8").split()[0])
     except (OSError, ValueError, IndexError):
         return None
     return uptime - ticks / os.sysconf("SC_CLK_TCK")

@@ -111,6 +111,6 @@ def write(found: Summary, folder: Path) -> list[Path]:
     out = []
     for ending, text in (("txt", as_text(found)), ("html", as_html(found))):
         path = folder / f"summary-{found.until:%Y-%m-%d}.{ending}"
-        path.write_text(text)
+        path.write_text(text, encoding="utf-8")
         out.append(path)
     return out

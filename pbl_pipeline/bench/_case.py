@@ -38,7 +38,7 @@ def main() -> None:
         result = {"error": error.code, "error_text": error.text()}
     except Exception as error:  # noqa: BLE001 - the table shows what went wrong in a case and goes on
         result = {"error": type(error).__name__, "error_text": str(error)}
-    Path(spec["result"]).write_text(json.dumps(result | machine()))
+    Path(spec["result"]).write_text(json.dumps(result | machine()), encoding="utf-8")
 
 
 def measure(case: Case, folder: Path, stage: str, started: float) -> dict[str, Any]:

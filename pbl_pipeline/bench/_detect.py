@@ -59,7 +59,7 @@ def _measure(spec: dict, timeout_s: float) -> Row:
     result = Path(spec["result"])
     if not result.exists():
         return {"error": f"died, exit {done.returncode}", "error_text": done.stderr[-2000:]}
-    return json.loads(result.read_text())
+    return json.loads(result.read_text(encoding="utf-8"))
 
 
 def detect_text(row: Row) -> str:

@@ -31,7 +31,7 @@ def main() -> None:
         result = {"error": error.code, "error_text": error.text()}
     except Exception as error:  # noqa: BLE001 - the caller shows what went wrong
         result = {"error": type(error).__name__, "error_text": str(error)}
-    Path(spec["result"]).write_text(json.dumps(result | machine()))
+    Path(spec["result"]).write_text(json.dumps(result | machine()), encoding="utf-8")
 
 
 def measure(video: Path, person: int | None, repeat: int, keypoints: str | None) -> dict[str, Any]:
@@ -114,7 +114,7 @@ def growth(samples: np.ndarray) -> int | None:
 def resident_bytes() -> int | None:
     """Memory of this process now; None where the system does not say."""
     try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError):
         return None
 

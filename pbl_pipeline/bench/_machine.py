@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import sys
 from pathlib import Path
 from typing import Any
@@ -24,8 +23,10 @@ def peak_rss() -> int:
     """Peak memory (bytes) of this process so far."""
     # Linux counts ru_maxrss on from the process that forked; VmHWM belongs to this program alone.
     try:
-        status = Path("/proc/self/status").read_text()
+        status = Path("/proc/self/status").read_text(encoding="utf-8")
         return 1024 * int(next(x for x in status.splitlines() if x.startswith("VmHWM:")).split()[1])
     except (OSError, StopIteration):
+        import resource  # here: Windows has neither
+
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return peak if sys.platform == "darwin" else 1024 * peak

@@ -100,5 +100,5 @@ def _stage(case: Case, stage: str, folder: Path, cache: Path, root: Path, timeou
         return {"error": f"over {timeout_s:g} s"}
     if result.exists():
         # NaN is no JSON: what is not known is null in the file that people read.
-        return json.loads(result.read_text(), parse_constant=lambda _: None)
+        return json.loads(result.read_text(encoding="utf-8"), parse_constant=lambda _: None)
     return {"error": f"died, exit {done.returncode}", "error_text": done.stderr[-2000:]}

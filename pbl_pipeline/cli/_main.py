@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import sys
 import traceback
 from importlib.metadata import entry_points
@@ -48,6 +49,9 @@ def cli(quiet: bool, debug: bool) -> None:
 
 def main() -> None:
     """Entry point of the `pbl` script."""
+    for stream in (sys.stdout, sys.stderr):  # a name that the terminal's encoding lacks must not end the work
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         # Not standalone: click would turn Ctrl-C into "Aborted!" and code 1, as if there had been an error.
         sys.exit(cli.main(prog_name="pbl", standalone_mode=False) or 0)

@@ -107,7 +107,7 @@ def fit(
         rows.append(row)
         if json_path is not None:  # after each row: a run of hours may be interrupted
             content = {"benchmark": "fit", "version": __version__, "time_utc": begun, "rows": rows}
-            json_path.write_text(json.dumps(content, indent=1) + "\n")
+            json_path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     click.echo(b.text(rows))
 
 
@@ -151,7 +151,7 @@ def detect(
         rows.append(row)
         if json_path is not None:
             content = {"benchmark": "detect", "version": __version__, "time_utc": begun, "rows": rows}
-            json_path.write_text(json.dumps(content, indent=1) + "\n")
+            json_path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     click.echo("\n\n".join(b.detect_text(row) for row in rows))
     if any("error" in row for row in rows):
         raise SystemExit(1)

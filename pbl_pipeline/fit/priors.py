@@ -256,7 +256,7 @@ def learned_poses(name: str) -> dict[str, Any]:
             next_step="correct the paramset",
             key=name,
         )
-    return json.loads(path.read_text())
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
 def scale_precision(scale_names: Sequence[str], sd: float, sd_sides: float) -> Float[np.ndarray, "S S"]:

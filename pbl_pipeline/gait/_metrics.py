@@ -123,7 +123,7 @@ class GaitMetrics:
 
     def save(self, path: str | Path) -> None:
         """Write `metrics.json`. Missing values are null with a reason in `reasons`."""
-        Path(path).write_text(json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
+        Path(path).write_text(json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def gait_metrics(

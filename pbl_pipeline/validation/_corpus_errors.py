@@ -265,5 +265,5 @@ def write_corpus(
     errors.to_csv(paths[0], index=False, float_format="%.5g")
     # Through JSON's own numbers: NaN is null.
     rows = {k: json.loads(str(t.to_json(orient="records"))) for k, t in tables.items()}
-    paths[1].write_text(json.dumps({"about": about, "tables": rows}, indent=1) + "\n")
+    paths[1].write_text(json.dumps({"about": about, "tables": rows}, indent=1) + "\n", encoding="utf-8")
     return paths

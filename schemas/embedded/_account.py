@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pwd
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,6 +47,8 @@ def server_account(data: Path) -> Account:
     PblError
         DB_UNAVAILABLE when the caller is root and the system has no unprivileged account to drop to.
     """
+    import pwd  # here: Windows has none, and this module is imported there too
+
     if os.geteuid() != 0:
         return Account(_name_of(os.geteuid()), os.geteuid(), os.getegid())
     if data.exists() and data.stat().st_uid != 0:
@@ -95,6 +96,8 @@ def _can_enter(folder: Path, account: Account) -> bool:
 
 
 def _name_of(uid: int) -> str:
+    import pwd
+
     try:
         return pwd.getpwuid(uid).pw_name
     except KeyError:  # a container may run under a number that has no name

@@ -17,6 +17,7 @@ from ._apt import install, unpack
 PLACES = ("/usr/sbin", "/usr/local/sbin", "/usr/libexec", "/opt/homebrew/bin", "/usr/local/bin")
 
 Say = Callable[[str], None]
+_ABSENT = "there is no MariaDB server on this machine"
 
 
 def silent(_: str) -> None:
@@ -53,6 +54,24 @@ def find_server() -> Binaries | None:
     return _unpacked()
 
 
+def check_obtainable() -> None:
+    """Return where the server can be started or fetched; nothing is made or fetched.
+
+    Raises
+    ------
+    PblError
+        DB_UNAVAILABLE with the reason and the other ways to a database.
+    """
+    if not hasattr(os, "geteuid"):
+        raise _unavailable("the embedded database needs the accounts and file locks of Linux or macOS", install=False)
+    if find_server() is not None:
+        return
+    if shutil.which("apt-get") is None or shutil.which("dpkg") is None:
+        raise _unavailable(f"{_ABSENT}, and no apt to get it with")
+    if settings.offline():
+        raise _unavailable(f"{_ABSENT}, and PBL_OFFLINE forbids to fetch it")
+
+
 def get_server(say: Say = silent) -> Binaries:
     """The server of this machine, fetched with apt when it is absent.
 
@@ -69,11 +88,7 @@ def get_server(say: Say = silent) -> Binaries:
     found = find_server()
     if found:
         return found
-    reason = "there is no MariaDB server on this machine"
-    if shutil.which("apt-get") is None or shutil.which("dpkg") is None:
-        raise _unavailable(f"{reason}, and no apt to get it with")
-    if settings.offline():
-        raise _unavailable(f"{reason}, and PBL_OFFLINE forbids to fetch it")
+    check_obtainable()
     say("The tables need a database server and this machine has none: getting MariaDB (8 MB, no service is started).")
     failure = install(say)
     if failure is not None:
@@ -81,7 +96,7 @@ def get_server(say: Say = silent) -> Binaries:
         failure = unpack(_unpack_folder(), say)
     found = find_server()
     if found is None:
-        raise _unavailable(f"{reason}; getting it with apt failed: {failure or 'the package holds no mariadbd'}")
+        raise _unavailable(f"{_ABSENT}; getting it with apt failed: {failure or 'the package holds no mariadbd'}")
     return found
 
 
@@ -98,11 +113,16 @@ def _unpacked() -> Binaries | None:
     return Binaries(server, script, base, {"LD_LIBRARY_PATH": os.pathsep.join(libraries)} if libraries else {})
 
 
-def _unavailable(found: str) -> PblError:
+def _unavailable(found: str, install: bool = True) -> PblError:
+    own = (
+        "install MariaDB, which is then found and started here (Debian: apt-get install mariadb-server-core "
+        "mariadb-client-core; Fedora: dnf install mariadb-server; macOS: brew install mariadb); or "
+    )
     return PblError(
         "DB_UNAVAILABLE",
         found=found,
         expected="mariadbd on this machine, or apt with its archive in reach, or a server named in DJ_HOST",
-        next_step="install it (Debian: apt-get install mariadb-server-core mariadb-client-core), or run a server with "
-        "`docker compose up -d db` and set DJ_HOST, DJ_PORT, DJ_USER and DJ_PASS",
+        next_step=f"{own if install else ''}start a server with `docker compose up -d db`, or use one that your "
+        "institution runs (MySQL 8, MariaDB), and set DJ_HOST, DJ_PORT, DJ_USER and DJ_PASS. `pbl run` and "
+        "`pbl demo --no-database` need none",
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import secrets
@@ -121,6 +120,8 @@ class Folder:
         PblError
             DB_UNAVAILABLE when another command holds it for longer than `timeout_s`.
         """
+        import fcntl  # here: Windows has none, and this module is imported there too
+
         try:
             handle = os.open(self.lock_file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         except OSError as error:
@@ -154,7 +155,7 @@ class Folder:
             DB_NOT_RUNNING when the database was never set up; DB_REFUSED when the file may not be read.
         """
         try:
-            return Credentials(**json.loads(self.credentials_file.read_text()))
+            return Credentials(**json.loads(self.credentials_file.read_text(encoding="utf-8")))
         except FileNotFoundError as error:
             raise PblError(
                 "DB_NOT_RUNNING",
@@ -181,7 +182,7 @@ class Folder:
     def state(self) -> dict[str, Any]:
         """`port`, `pid`, `version` and the schema prefixes the application may use; empty before the first start."""
         try:
-            return json.loads(self.state_file.read_text())
+            return json.loads(self.state_file.read_text(encoding="utf-8"))
         except FileNotFoundError:
             return {}
 
@@ -194,7 +195,7 @@ class Folder:
     def log_tail(self, lines: int = 12) -> str:
         """The last lines the server wrote."""
         try:
-            return "\n".join(self.log.read_text(errors="replace").splitlines()[-lines:])
+            return "\n".join(self.log.read_text(errors="replace", encoding="utf-8").splitlines()[-lines:])
         except OSError as error:
             return f"(no log: {error})"
 

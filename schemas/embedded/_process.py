@@ -159,8 +159,8 @@ def alive(pid: int, folder: Folder) -> bool:
         return marker in listed.stdout
     proc = Path("/proc") / str(pid)
     try:
-        state = (proc / "stat").read_text().rpartition(")")[2].split()[0]
-        return state not in ("Z", "X") and marker in (proc / "cmdline").read_text().split("\0")
+        state = (proc / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
+        return state not in ("Z", "X") and marker in (proc / "cmdline").read_text(encoding="utf-8").split("\0")
     except (FileNotFoundError, ProcessLookupError):
         return False
 

@@ -12,7 +12,7 @@ import pymysql
 from pbl_pipeline.errors import PblError
 
 from ._account import server_account
-from ._binaries import Say, get_server, silent
+from ._binaries import Say, check_obtainable, get_server, silent
 from ._folder import Folder
 from ._port import HOST
 from ._process import admin, alive, launch, running_pid, terminate, wait_until_answers
@@ -65,6 +65,8 @@ def start(say: Say = silent, folder: Folder | None = None) -> Status:
         log lines).
     """
     folder = folder or Folder.default()
+    if running_pid(folder) is None:
+        check_obtainable()  # before a folder is made
     account = server_account(folder.data)
     folder.create(account)
     with folder.locked():

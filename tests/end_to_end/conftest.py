@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -10,6 +12,8 @@ from pbl_pipeline import assets, settings
 from pbl_pipeline.errors import PblError
 
 from . import clips
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="session")
@@ -36,4 +40,25 @@ def folder(demo_files: dict[str, Path], tmp_path_factory: pytest.TempPathFactory
     (folder / "copy of walking.mp4").write_bytes((folder / "walking.mp4").read_bytes())
     (folder / "notes.mp4").write_text("not a video")
     (folder / "nothing.mp4").touch()
+    return folder
+
+
+@pytest.fixture(scope="session")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel of this checkout."""
+    folder = tmp_path_factory.mktemp("wheel")
+    words = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder)]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    (made,) = folder.glob("*.whl")
+    return made
+
+
+@pytest.fixture(scope="session")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the wheel installed by pip, to be put before the dependencies of this environment."""
+    folder = tmp_path_factory.mktemp("installed")
+    words = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(folder)]
+    done = subprocess.run([*words, str(wheel)], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
     return folder

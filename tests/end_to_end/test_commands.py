@@ -1,4 +1,6 @@
-"""The commands on files, one after the other on a short clip, and their files against docs/files.md."""
+"""The commands on files, one after the other on a short clip, and their files against docs/files.md.
+
+In processes that find nothing of POSIX (tests/without_posix.py): what they write is what other systems would get."""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.body import load_body
-from tests.command import pbl
+from tests.without_posix import ENCODING, pbl
 
 pytestmark = pytest.mark.slow
 
@@ -179,15 +181,29 @@ def test_metrics_are_as_described(fitted, tmp_path):
     assert content["session"]["cadence_steps_per_min"]["mean"] == pytest.approx(98, rel=0.06)
 
 
-def test_run_does_the_same_in_one(fitted, folder, tmp_path):
-    out = tmp_path / "Ergebnis, früh"
-    done = pbl("run", folder / "walking.mp4", "--out", out, "--subject", "P017")
+def test_the_fit_is_exported(fitted, tmp_path):
+    out = tmp_path / "exports"
+    formats = ("trc", "mot", "osim", "csv")
+    done = pbl("export", fitted, *(word for name in formats for word in ("--to", name)), "--out", out)
+    assert done.code == 0, done.err
+    written = [Path(line) for line in done.out.splitlines()]
+    assert {f".{name}" for name in formats} <= {path.suffix for path in written}
+    assert all(path.is_relative_to(out) and path.stat().st_size for path in written)
+
+
+def test_run_of_the_installed_wheel_does_the_same_in_one(installed, fitted, folder, tmp_path):
+    out = tmp_path / "Měření, früh"  # a letter that the encoding of the output lacks
+    done = pbl("run", folder / "walking.mp4", "--out", out, "--subject", "P017", packages=installed)
     assert done.code == 0, done.err
     ends = ("keypoints.npz", "fit.npz", "angles.csv", "events.csv", "overlay.mp4")
     written = {"report.html", "metrics.json", "session.json", *(f"walking.{end}" for end in ends)}
     assert {p.name for p in out.iterdir()} == written
-    assert all(str(out / name) in done.out for name in written)
+    assert all(_shown(out / name) in done.out for name in written)
     assert "P017" in (out / "report.html").read_text()
     with np.load(fitted) as one, np.load(out / "walking.fit.npz") as other:
         assert str(one["params_hash"]) == str(other["params_hash"])
         np.testing.assert_allclose(one["qpos"], other["qpos"], atol=1e-4)
+
+
+def _shown(path: Path) -> str:
+    return str(path).encode(ENCODING, "backslashreplace").decode(ENCODING)

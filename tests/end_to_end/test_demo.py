@@ -26,6 +26,8 @@ from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait.events import load_events
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.video import probe
+from schemas.embedded import APP_USER, HOST, Folder
+from tests import without_posix
 from tests.database import new_home, remove_home
 
 pytestmark = pytest.mark.slow
@@ -189,4 +191,17 @@ def test_a_second_populate_does_nothing(home, out):
     # The recording has three tracks: she, he on the wall, he on the lawn.
     assert {t["table"]: t["done"] for t in state["tables"]}["SessionQc"] == 1
     assert (state["errors"], state["waiting"]) == ([], [])
+    assert pbl(home, "db", "stop").returncode == 0
+
+
+def test_reports_and_exports_come_from_a_named_server_without_posix(home, out, tmp_path):
+    assert pbl(home, "db", "start").returncode == 0
+    folder = Folder(home / "db")
+    server = {"DJ_HOST": f"{HOST}:{folder.state()['port']}", "DJ_USER": APP_USER, "PBL_HOME": str(home)}
+    server["DJ_PASS"] = folder.credentials().app_password
+    done = without_posix.pbl("export", "--subject", "DEMO", "--to", "trc", "--out", tmp_path / "x", **server)
+    assert done.code == 0, done.err
+    assert ".trc" in {path.suffix for path in map(Path, done.out.splitlines()) if path.stat().st_size}
+    done = without_posix.pbl("report", "--subject", "NOBODY", "--out", tmp_path / "r", **server)
+    assert done.error_code == "DB_NOT_FOUND", done.err
     assert pbl(home, "db", "stop").returncode == 0

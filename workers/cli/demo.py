@@ -16,12 +16,21 @@ SUBJECT, SESSION, PROJECT = "DEMO", "sports2d-demo", "demo"
 
 @click.command(epilog="Example: pbl demo --out pbl_demo")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("pbl_demo"), show_default=True)
-def demo(out: Path) -> None:
+@click.option("--no-database", is_flag=True, help="On files alone, as `pbl run` does; needs no database server.")
+@click.pass_context
+def demo(context: click.Context, out: Path, no_database: bool) -> None:
     """Set up what the default needs, put the demo recording through every table, show the rows and write the report.
 
     Safe to repeat: what is there already is not computed again. The database is stopped at the end if it was not
     running before.
     """
+    if no_database:
+        from pbl_pipeline import assets
+        from pbl_pipeline.cli.run import run
+
+        files = {name: assets.fetch(name) for name in assets.needed()}
+        context.invoke(run, videos=(files["demo_video"],), camera=files["demo_camera"], out=out, subject=SUBJECT)
+        return
     if os.environ.get("DJ_HOST"):
         raise PblError(
             "USAGE",

@@ -112,7 +112,7 @@ class GaitEvents:
 
     def save(self, path: str | Path) -> None:
         """Write `events.csv`: time_s, side, event, probability. Without walking only the header is written."""
-        with Path(path).open("w", newline="") as f:
+        with Path(path).open("w", encoding="utf-8", newline="") as f:
             rows = csv.writer(f, lineterminator="\n")
             rows.writerow(COLUMNS)
             for e in self.events:

@@ -95,7 +95,8 @@ class NormativeSet:
         """
         text = _to_json(self, digits)
         text["sha256"] = _checksum(text)
-        Path(path).write_text(json.dumps(text, indent=None, separators=(",", ":")).replace(',"', ',\n"') + "\n")
+        lines = json.dumps(text, indent=None, separators=(",", ":")).replace(',"', ',\n"') + "\n"
+        Path(path).write_text(lines, encoding="utf-8")
         return text["sha256"]
 
 
@@ -198,7 +199,7 @@ def load_norm(name: str = DEFAULT_NORM) -> NormativeSet:
     if name not in norm_names() if shipped else not Path(name).is_file():
         raise _unknown(name)
     try:
-        data = parse_json(_FOLDER.joinpath(name + ".json").read_text()) if shipped else read_json(name)
+        data = parse_json(_FOLDER.joinpath(name + ".json").read_text(encoding="utf-8")) if shipped else read_json(name)
         checksum = data.pop("sha256")
         if _checksum(data) != checksum:
             raise ValueError("the numbers are not those the checksum was made of")

@@ -94,7 +94,7 @@ def harmonic_sum(coefficients: np.ndarray, phase_rad: np.ndarray) -> np.ndarray:
 @functools.cache
 def gait_norm() -> GaitNorm:
     """The norm that ships with the package (`curves/schwartz_2008.json`, written by `build_schwartz.py`)."""
-    raw = json.loads(_FILE.read_text())
+    raw = json.loads(_FILE.read_text(encoding="utf-8"))
     return GaitNorm(
         groups=tuple(raw["groups"]),
         speed=np.array(raw["speed"]),
