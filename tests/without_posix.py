@@ -14,6 +14,7 @@ import os
 import subprocess
 import sys
 import types
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,7 +72,7 @@ def main() -> None:
     pbl_main()
 
 
-def pbl(*arguments: object, packages: Path = ROOT, **variables: str) -> Done:
+def pbl(*arguments: object, packages: Path = ROOT, variables: Mapping[str, str] | None = None) -> Done:
     """Run `pbl --quiet ARGUMENTS` in a process of its own without POSIX, with these environment variables, too.
 
     `packages` is the folder that the project's packages are imported from: this checkout, or an installed wheel.
@@ -79,7 +80,7 @@ def pbl(*arguments: object, packages: Path = ROOT, **variables: str) -> Done:
     from tests.command import Done
 
     words = [sys.executable, "-P", __file__, "--quiet", *map(str, arguments)]
-    env = {**os.environ, "PYTHONPATH": str(packages), **variables}
+    env = {**os.environ, "PYTHONPATH": str(packages), **(variables or {})}
     done = subprocess.run(words, capture_output=True, env=env, timeout=300, check=False)
     return Done(done.returncode, done.stdout.decode(ENCODING), done.stderr.decode(ENCODING))
 

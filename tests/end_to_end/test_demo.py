@@ -199,9 +199,9 @@ def test_reports_and_exports_come_from_a_named_server_without_posix(home, out, t
     folder = Folder(home / "db")
     server = {"DJ_HOST": f"{HOST}:{folder.state()['port']}", "DJ_USER": APP_USER, "PBL_HOME": str(home)}
     server["DJ_PASS"] = folder.credentials().app_password
-    done = without_posix.pbl("export", "--subject", "DEMO", "--to", "trc", "--out", tmp_path / "x", **server)
+    done = without_posix.pbl("export", "--subject", "DEMO", "--to", "trc", "--out", tmp_path / "x", variables=server)
     assert done.code == 0, done.err
     assert ".trc" in {path.suffix for path in map(Path, done.out.splitlines()) if path.stat().st_size}
-    done = without_posix.pbl("report", "--subject", "NOBODY", "--out", tmp_path / "r", **server)
+    done = without_posix.pbl("report", "--subject", "NOBODY", "--out", tmp_path / "r", variables=server)
     assert done.error_code == "DB_NOT_FOUND", done.err
     assert pbl(home, "db", "stop").returncode == 0

@@ -40,7 +40,7 @@ def test_every_command_is_found_without_posix():
 
 @pytest.mark.slow
 def test_the_database_says_at_once_that_it_is_not_for_this_system(tmp_path):
-    done = pbl("db", "start", PBL_HOME=str(tmp_path / "home"))
+    done = pbl("db", "start", variables={"PBL_HOME": str(tmp_path / "home")})
     assert (done.code, done.error_code) == (1, "DB_UNAVAILABLE")
     for way in ("docker compose", "DJ_HOST", "pbl run"):
         assert way in done.err
