@@ -44,7 +44,7 @@ from ._datajoint import IntegrityError as IntegrityError
 from ._datajoint import inserting as inserting
 from .embedded import APP_USER, HOST, Folder, not_running
 from .secret_files import secret
-from .store import store_spec
+from .store import further_stores, store_spec
 
 #: How long a server may take to answer before it counts as not running.
 CONNECT_TIMEOUT_S = 4.0
@@ -152,7 +152,7 @@ def configure(target: dict[str, Any] | None = None) -> None:
     dj.config["database.reconnect"] = True
     dj.config["loglevel"] = os.environ["DJ_LOG_LEVEL"]
     dj.config.stores.clear()
-    dj.config.stores.update({"default": STORE, STORE: store_spec()})
+    dj.config.stores.update({"default": STORE, **further_stores(STORE), STORE: store_spec()})
     dj.config.jobs.auto_refresh = True
     dj.config.jobs.keep_completed = False  # a result row says that a job is done; queues stay as small as their work
     dj.config.jobs.add_job_metadata = False  # origin columns say duration, time and version

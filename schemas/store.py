@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import json
 import os
 import secrets
 from pathlib import Path
@@ -87,6 +88,34 @@ def _bucket_spec() -> dict[str, Any]:
         )
     spec = {"protocol": "s3", "endpoint": endpoint, "bucket": bucket(), "location": LOCATION, "subfolding": [2, 2]}
     return {**spec, "secure": endpoint.startswith("https://"), **_login(key, password)}
+
+
+def further_stores(taken: str) -> dict[str, Any]:
+    """The stores that DJ_STORES describes (JSON, as DataJoint reads it), for tables of a lab's own.
+
+    Raises
+    ------
+    PblError
+        USAGE where it is no JSON object of stores, or describes the store `taken`, which other variables decide.
+    """
+    raw = os.environ.get("DJ_STORES")
+    if not raw:
+        return {}
+    try:
+        found = json.loads(raw)
+    except ValueError:
+        found = None
+    if not isinstance(found, dict) or taken in found:
+        # The value is not repeated: it may hold a key.
+        raise PblError(
+            "USAGE",
+            key="DJ_STORES",
+            found=f"it describes the store {taken!r}" if isinstance(found, dict) else "it is no JSON object",
+            expected='stores of your own, such as {"raw": {"protocol": "file", "location": "/data/raw"}}; '
+            f"PBL_STORE and PBL_S3_* describe {taken!r}",
+            next_step="correct the variable, or unset it",
+        )
+    return found
 
 
 def _login(key: str | None, password: str | None) -> dict[str, str]:

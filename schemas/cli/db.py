@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from ._db_backup import backup, restore
+from ._db_config import config
 from ._db_migrate import migrate
 from ._db_roles import roles
 
@@ -26,7 +27,7 @@ def db() -> None:
     """
 
 
-for command in (backup, restore, migrate, roles):
+for command in (backup, config, restore, migrate, roles):
     db.add_command(command)
 
 

@@ -1,0 +1,89 @@
+"""The configuration with which plain `import datajoint` reaches this database: what `pbl db config` writes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from pbl_pipeline.errors import PblError
+
+from . import connection
+from ._datajoint import dj
+from .folders import private_folder
+from .json_files import write_json
+
+#: Names that DataJoint looks for, in the working directory and above it.
+CONFIG, SECRETS = "datajoint.json", ".secrets"
+#: Attributes of a store that are secret.
+_SECRET = ("access_key", "secret_key", "account_key", "connection_string", "token", "password")
+
+
+def write_config(folder: Path, overwrite: bool = False) -> list[Path]:
+    """Write `datajoint.json` (server, stores, nothing secret) and `.secrets/` (login, keys of stores; mode 0600).
+
+    Python in that folder, or below it, then connects with plain `import datajoint` as this process does. `safemode`
+    stays on: DataJoint asks before it deletes or drops.
+
+    Parameters
+    ----------
+    folder
+        Made where it is missing.
+    overwrite
+        Replace the files of an earlier call; without it they are left.
+
+    Raises
+    ------
+    PblError
+        FILE_UNWRITABLE: it exists already, or cannot be written; what `connection.connect` raises.
+    """
+    connection.connect()
+    config, here = dj.config, folder / CONFIG
+    if not overwrite and (here.exists() or (folder / SECRETS).exists()):
+        raise _unwritable(here, "it is there already", "pass --overwrite to replace it and .secrets/, or another --out")
+    stores, secrets = _without_secrets(dict(config.stores))
+    secrets |= {"database.user": config["database.user"], "database.password": config["database.password"]}
+    database = {name: config[f"database.{name}"] for name in ("host", "port", "use_tls", "reconnect")}
+    content = {
+        **{f"database.{name}": value for name, value in database.items() if value is not None},
+        "safemode": True,
+        "stores": stores,
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        kept = private_folder(folder / SECRETS)
+        for name, value in {".gitignore": "*\n", **secrets}.items():
+            (kept / name).unlink(missing_ok=True)  # what else lies there stays
+            handle = os.open(kept / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with os.fdopen(handle, "w", encoding="utf-8") as file:
+                file.write(value)
+        write_json(here, content, 0o644)
+    except OSError as error:
+        raise _unwritable(folder, error.strerror or str(error), "pass another place with --out") from error
+    return [here, *(kept / name for name in secrets)]
+
+
+def is_mariadb() -> bool:
+    """Whether the server is one that plain DataJoint has not been repaired for (`schemas._datajoint`)."""
+    return "MariaDB" in str(connection.connect().query("SELECT VERSION()").fetchone()[0])
+
+
+def _without_secrets(stores: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+    """The stores without their secrets, and these by the name of the file that DataJoint reads them from."""
+    plain, secrets = {}, {}
+    for name, spec in stores.items():
+        if isinstance(spec, dict):
+            secrets |= {f"stores.{name}.{k}": str(v) for k, v in spec.items() if k in _SECRET}
+            spec = {k: v for k, v in spec.items() if k not in _SECRET}
+        plain[name] = spec
+    return plain, secrets
+
+
+def _unwritable(path: Path, found: str, next_step: str) -> PblError:
+    return PblError(
+        "FILE_UNWRITABLE",
+        key=path,
+        found=found,
+        expected=f"a folder for {CONFIG} and {SECRETS}/",
+        next_step=next_step,
+    )

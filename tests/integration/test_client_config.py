@@ -1,0 +1,114 @@
+"""`pbl db config`: DataJoint alone, in the folder of the files, reaches the same database and the same store."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import schemas
+from pbl_pipeline.errors import PblError
+from schemas import connection
+from schemas._datajoint import dj
+from schemas.store import further_stores
+from tests.command import pbl
+
+#: In a process that knows DataJoint and nothing of this project.
+PLAIN = """
+import sys
+import datajoint as dj
+own = dj.VirtualModule("own", "pbl_tried")
+print(own.Tried().fetch1("curve").load().tolist(), dj.config.safemode, dj.config.stores["far"]["secret_key"])
+assert not [n for n in sys.modules if n.split(".")[0] in ("schemas", "pbl_pipeline")]
+own.Tried().delete()
+"""
+
+
+@pytest.fixture
+def stores(monkeypatch: pytest.MonkeyPatch, database: Path, tmp_path: Path) -> None:
+    """Stores of the lab's own, one with a key."""
+    far = {"protocol": "s3", "endpoint": "s.example:9000", "bucket": "b", "location": "x", "access_key": "acc3ss"}
+    raw = {"protocol": "file", "location": str(tmp_path / "raw")}
+    monkeypatch.setenv("DJ_STORES", json.dumps({"default": "raw", "raw": raw, "far": {**far, "secret_key": "s3cret"}}))
+
+
+@pytest.fixture
+def tried(stores: None):
+    """A table of the lab's own with a row."""
+    schemas.activate()
+    schema = dj.Schema("pbl_tried", connection=connection.connect())
+
+    class Tried(dj.Manual):
+        definition = """
+        tried : int32
+        ---
+        curve : <npy@arrays>
+        """
+
+    table = schema(Tried)
+    table.insert1({"tried": 1, "curve": np.arange(3.0)})
+    yield table
+    schema.drop(prompt=False)
+    connection.configure()
+
+
+def test_plain_datajoint_connects_with_what_is_written(tried, tmp_path):
+    out = tmp_path / "notebooks"
+    done = pbl("db", "config", "--out", out)
+    assert done.code == 0, done.err
+    text = (out / "datajoint.json").read_text(encoding="utf-8")
+    assert json.loads(text)["safemode"] is True
+    secrets = {p.name: p.read_text(encoding="utf-8") for p in (out / ".secrets").iterdir()}
+    assert {"database.user", "database.password", "stores.far.secret_key", ".gitignore"} <= secrets.keys()
+    assert not [name for name, secret in secrets.items() if "password" in name or "key" in name if secret in text]
+    assert stat.S_IMODE((out / ".secrets").stat().st_mode) == 0o700
+    assert {stat.S_IMODE(p.stat().st_mode) for p in (out / ".secrets").iterdir()} == {0o600}
+    assert str(out / ".secrets" / "database.password") in done.out
+
+    below = out / "deeper"
+    below.mkdir()
+    env = {k: v for k, v in os.environ.items() if not k.startswith(("DJ_", "PBL_", "PYTHONPATH"))}
+    asked = subprocess.run(
+        [sys.executable, "-P", "-c", PLAIN],
+        cwd=below,
+        env=env,
+        capture_output=True,
+        text=True,
+        input="no\n",
+        check=False,
+    )
+    assert "[0.0, 1.0, 2.0] True s3cret" in asked.stdout, asked.stderr
+    assert "Commit deletes?" in asked.stdout  # safemode asks a person, who says no
+    assert len(tried()) == 1
+
+
+def test_files_that_are_there_are_left_unless_told(database, tmp_path):
+    (tmp_path / "datajoint.json").write_text("{}", encoding="utf-8")
+    done = pbl("db", "config", "--out", tmp_path)
+    assert (done.code, done.error_code) == (1, "FILE_UNWRITABLE")
+    assert (tmp_path / "datajoint.json").read_text(encoding="utf-8") == "{}"
+    assert pbl("db", "config", "--out", tmp_path, "--overwrite").code == 0
+    (tmp_path / ".secrets" / "another").write_text("kept", encoding="utf-8")
+    assert pbl("db", "config", "--out", tmp_path, "--overwrite").code == 0
+    assert (tmp_path / ".secrets" / "another").is_file()
+    assert json.loads((tmp_path / "datajoint.json").read_text(encoding="utf-8"))["database.port"]
+
+
+def test_a_labs_own_stores_stand_beside_ours(tried):
+    assert set(dj.config.stores) == {"default", "raw", "far", connection.STORE}
+    assert dj.config.stores["default"] == "raw"
+    assert dj.config.stores[connection.STORE]["protocol"] == "file"
+
+
+@pytest.mark.parametrize("value", ["[1]", "no json s3cret", '{"arrays": {"protocol": "file"}}'])
+def test_stores_that_cannot_be_are_refused_without_their_keys(monkeypatch, value):
+    monkeypatch.setenv("DJ_STORES", value)
+    with pytest.raises(PblError, match="USAGE") as caught:
+        further_stores(connection.STORE)
+    assert "s3cret" not in caught.value.text()
