@@ -92,6 +92,7 @@ _POSE2SIM = Wheel(
 )
 
 _BLAZEPOSE = ("Apache-2.0", "MediaPipe 0.10.21, Google LLC; Bazarevsky et al. 2020, arXiv:2006.10204")
+_BLAZEFACE = ("Apache-2.0", "MediaPipe 0.10.21, Google LLC; Bazarevsky et al. 2019, arXiv:1907.05047")
 _AUGMENTER = ("BSD-3-Clause", "Pose2Sim 0.10.49, David Pagnon; OpenCap 0.3, Falisse et al. 2025, IEEE TBME 72:2013")
 _DEMO = ("BSD-3-Clause", "Sports2D 0.8.34, David Pagnon; doi:10.21105/joss.06849")
 
@@ -126,6 +127,26 @@ ASSETS: dict[str, Asset] = {
             27_709_200,
             "Apache-2.0",
             "@mediapipe/pose 0.5.1675469404, Google LLC; Bazarevsky et al. 2020, arXiv:2006.10204",
+            optional=True,
+        ),
+        Asset(
+            "face_detector",
+            "faces near and far (BlazeFace, full range)",
+            _MEDIAPIPE,
+            "mediapipe/modules/face_detection/face_detection_full_range_sparse.tflite",
+            "2c3728e6da56f21e21a320433396fb06d40d9088f2247c05e5635a688d45dfe1",
+            676_746,
+            *_BLAZEFACE,
+            optional=True,
+        ),
+        Asset(
+            "face_detector_near",
+            "faces in a close view (BlazeFace, short range)",
+            _MEDIAPIPE,
+            "mediapipe/modules/face_detection/face_detection_short_range.tflite",
+            "bbff11cebd1eb27a1e004cae0b0e63ec8c551cbf34a4451148b4908b8db3eca8",
+            229_714,
+            *_BLAZEFACE,
             optional=True,
         ),
         Asset(

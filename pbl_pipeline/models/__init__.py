@@ -4,6 +4,7 @@ from ._device import DEVICES, asked_device, available_devices, providers_for
 from ._onnx import OnnxModel
 from ._registry import ModelStatus, add, find, is_registered, registered, remove, verify
 from ._spec import KINDS, ModelInput, ModelSpec, load_spec, mirror_pairs, model_invalid, parse_spec
+from ._ssd import SsdLayout, SsdModel, box_iou, suppress
 from ._tflite import LiteModel
 
 __all__ = [
@@ -14,9 +15,12 @@ __all__ = [
     "ModelSpec",
     "ModelStatus",
     "OnnxModel",
+    "SsdLayout",
+    "SsdModel",
     "add",
     "asked_device",
     "available_devices",
+    "box_iou",
     "find",
     "is_registered",
     "load_spec",
@@ -26,5 +30,6 @@ __all__ = [
     "providers_for",
     "registered",
     "remove",
+    "suppress",
     "verify",
 ]

@@ -2,7 +2,7 @@
 
 from ._appearance import appearance_of, appearance_similarity
 from ._associate import AssociationParams
-from ._blazepose import BlazePoseDetector, body_box, box_iou, circle_roi
+from ._blazepose import BlazePoseDetector, body_box, circle_roi
 from ._choose import choose_subject
 from ._detection_schedule import WatchParams
 from ._identity_swaps import UncrossParams
@@ -37,7 +37,6 @@ __all__ = [
     "appearance_of",
     "appearance_similarity",
     "body_box",
-    "box_iou",
     "carried_choice",
     "choose_subject",
     "circle_roi",

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ._blazepose import box_iou
+from pbl_pipeline.models import box_iou
+
 from ._types import Detection, PersonDetector
 
 #: A box that ends within this fraction of the window's width from its edge is taken as cut by it.

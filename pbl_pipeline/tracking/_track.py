@@ -12,6 +12,7 @@ import numpy as np
 from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Method
+from pbl_pipeline.models import box_iou
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.prefetch import prefetched
 from pbl_pipeline.video import VideoInfo, probe, read_frames
@@ -19,7 +20,7 @@ from pbl_pipeline.video import VideoInfo, probe, read_frames
 from ._appearance import appearance_of
 from ._associate import Associator, Trail, measure
 from ._backtrack import backtrack
-from ._blazepose import body_box, box_iou
+from ._blazepose import body_box
 from ._detection_schedule import Watch, window_around
 from ._identity_swaps import undo_swaps
 from ._methods import METHODS

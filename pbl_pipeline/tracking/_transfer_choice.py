@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 
 from pbl_pipeline.methods import Method
+from pbl_pipeline.models import box_iou
 from pbl_pipeline.paramset import Paramset
 
-from ._blazepose import box_iou
 from ._choose import choose_subject
 from ._subject import SubjectParams
 from ._types import PersonTrack, SubjectChoice, Tracking

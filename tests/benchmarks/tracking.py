@@ -28,6 +28,7 @@ from pbl_pipeline import assets
 from pbl_pipeline.bench._clip import demo_clip, repeated
 from pbl_pipeline.keypoints import BlazePoseLandmarks
 from pbl_pipeline.keypoints._crops import smooth_rois
+from pbl_pipeline.models import box_iou
 from pbl_pipeline.tracking import (
     BlazePoseDetector,
     Detection,
@@ -36,7 +37,6 @@ from pbl_pipeline.tracking import (
     TrackingParams,
     WatchParams,
     body_box,
-    box_iou,
     track_people,
 )
 from pbl_pipeline.tracking import _track as tracks

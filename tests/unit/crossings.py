@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pbl_pipeline.tracking import AssociationParams, Detection, JoinParams, UncrossParams, body_box, box_iou
+from pbl_pipeline.models import box_iou
+from pbl_pipeline.tracking import AssociationParams, Detection, JoinParams, UncrossParams, body_box
 from pbl_pipeline.tracking._associate import Associator, Trail
 from pbl_pipeline.tracking._identity_swaps import undo_swaps
 from pbl_pipeline.tracking._reidentify import join_trails

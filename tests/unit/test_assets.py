@@ -200,6 +200,7 @@ def test_pins_are_complete():
     assert set(assets.ASSETS) == {
         *default,
         *("blazepose_landmarks_heavy", "augmenter_network", "augmenter_mean", "augmenter_std"),
+        *("face_detector", "face_detector_near"),
     }
     files = [a.path.name for a in assets.ASSETS.values()]
     assert len(set(files)) == len(files)

@@ -17,10 +17,10 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import METHODS, BlazePoseLandmarks, KeypointParams
 from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES, _same_sides
 from pbl_pipeline.keypoints._flips import leg_points
-from pbl_pipeline.models import LiteModel
+from pbl_pipeline.models import LiteModel, suppress
 from pbl_pipeline.models._tflite_outputs import keep_outputs
 from pbl_pipeline.tracking import BlazePoseDetector
-from pbl_pipeline.tracking._blazepose import N_ANCHORS, anchor_centres, decode, suppress
+from pbl_pipeline.tracking._blazepose import LAYOUT
 from pbl_pipeline.tracking._tiles import detect_in, tiles
 from pbl_pipeline.video import Camera, read_frames
 
@@ -69,8 +69,8 @@ def landmarks(request: pytest.FixtureRequest) -> BlazePoseLandmarks:
 
 
 def test_anchors():
-    centres = anchor_centres()
-    assert centres.shape == (N_ANCHORS, 2)
+    centres = LAYOUT.anchor_centres
+    assert centres.shape == (2254, 2)
     np.testing.assert_allclose(centres[:3], [[0.5 / 28, 0.5 / 28], [0.5 / 28, 0.5 / 28], [1.5 / 28, 0.5 / 28]])
     first16 = 28 * 28 * 2
     np.testing.assert_allclose(centres[first16 + 2 * 14], [0.5 / 14, 1.5 / 14])
@@ -78,12 +78,12 @@ def test_anchors():
 
 
 def test_decode_one_box_by_hand():
-    raw_boxes = np.zeros((N_ANCHORS, 12), np.float32)
-    raw_scores = np.full(N_ANCHORS, -500, np.float32)
+    raw_boxes = np.zeros((2254, 12), np.float32)
+    raw_scores = np.full(2254, -500, np.float32)
     row = 28 * 28 * 2 + 14 * 14 * 2  # first anchor of stride 32: centre at 16 px
     raw_boxes[row] = [4, 8, 40, 20, 0, 0, 0, -50, 1, 2, 3, 4]
     raw_scores[row] = np.log(3)
-    values, scores = decode(raw_boxes, raw_scores, 0.5)
+    values, scores = LAYOUT.decode(raw_boxes, raw_scores, 0.5)
     np.testing.assert_allclose(scores, [0.75])
     np.testing.assert_allclose(values[0, :8] * 224, [0, 14, 40, 34, 16, 16, 16, -34], rtol=1e-6, atol=1e-9)
 

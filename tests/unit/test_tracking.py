@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.models import box_iou
 from pbl_pipeline.tracking import (
     METHODS,
     AssociationParams,
@@ -18,7 +19,6 @@ from pbl_pipeline.tracking import (
     Tracking,
     TrackingParams,
     body_box,
-    box_iou,
     choose_subject,
     circle_roi,
     contact_sheet,
