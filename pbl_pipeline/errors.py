@@ -24,6 +24,7 @@ CODES: dict[str, str] = {
     "TRACK_TOO_SHORT": "the person is in view for less than the shortest time that can be fitted",
     "SUBJECT_NEEDS_CHOICE": "several people, none clearly the subject: a person has to choose",
     "SUBJECT_UNKNOWN_PERSON": "the chosen person number is not among the tracks of the video",
+    "HEAD_NOT_FOUND": "no head was found in a video that was to be de-identified",
     "ASSET_MISSING": "a model or demo file is absent and could not be fetched",
     "ASSET_CHECKSUM": "a fetched file is not the pinned one (SHA-256 differs)",
     "MODEL_MISSING": "a keypoint model that was named is not registered here, or its files are not there",

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from fractions import Fraction
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
-from av.video.reformatter import ColorRange, Colorspace
 
 from pbl_pipeline import progress
 from pbl_pipeline.body import capsules, load_body
@@ -20,9 +17,8 @@ from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.render._draw import capsule_outline, draw_body, draw_keypoints
 from pbl_pipeline.render._project import scaled_camera, to_camera
 from pbl_pipeline.render._strip import Event, Strip
-from pbl_pipeline.video import read_frames
+from pbl_pipeline.video import read_frames, write_h264
 
-_TICKS_PER_S = 90_000  # time base of the output: every common frame rate is a whole number of ticks
 _BLOCK = 64  # frames whose capsules are computed and kept at a time
 
 
@@ -152,7 +148,7 @@ def render_overlay(
             yield frame.time_s, picture
 
     try:
-        _encode(part, pictures(), (width, height + strip_height), fit.time_s, crf)
+        write_h264(part, pictures(), (width, height + strip_height), fit.time_s, crf)
         if count != len(fit.time_s):
             raise _changed(video_path, f"{count} frames", f"{len(fit.time_s)} frames, as when it was fitted")
         part.replace(out_path)
@@ -223,39 +219,6 @@ def _known(fit: TrialFit) -> np.ndarray:
     """(T,) bool: frames whose pose and camera orientation are known."""
     state = np.concatenate([fit.qpos, fit.phone_quat_wxyz], axis=1)
     return np.asarray(np.isfinite(state).all(axis=1), bool)
-
-
-def _encode(
-    path: Path, pictures: Iterator[tuple[float, np.ndarray]], size: tuple[int, int], time_s: np.ndarray, crf: int
-) -> None:
-    """H.264 in MP4 with the given times. The index stands at the front, so that a browser starts at once."""
-    ticks = np.rint(np.asarray(time_s, float) * _TICKS_PER_S).astype(np.int64)
-    step = int(np.median(np.diff(ticks))) if len(ticks) > 1 else _TICKS_PER_S // 30
-    last = {int(a): int(b - a) for a, b in zip(ticks, np.append(ticks[1:], ticks[-1] + step), strict=True)}
-    with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as out:
-        # A key frame every two seconds or so: a viewer that drags the slider does not wait.
-        options = {"crf": str(crf), "preset": "veryfast", "g": str(max(1, 2 * _TICKS_PER_S // step))}
-        stream = out.add_stream("libx264", rate=Fraction(_TICKS_PER_S, step), options=options)
-        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
-        context = stream.codec_context
-        context.time_base = Fraction(1, _TICKS_PER_S)
-        # Untagged video is guessed to be BT.601 or BT.709 by its size; with the tag the colours are right everywhere.
-        context.colorspace = context.color_primaries = context.color_trc = 1
-        context.color_range = 1
-        for t, picture in pictures:
-            frame = av.VideoFrame.from_ndarray(picture, format="bgr24").reformat(
-                format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
-            )
-            frame.pts, frame.time_base = round(t * _TICKS_PER_S), Fraction(1, _TICKS_PER_S)
-            out.mux(_timed(stream.encode(frame), last))
-        out.mux(_timed(stream.encode(None), last))
-
-
-def _timed(packets: Sequence[av.Packet], duration: dict[int, int]) -> list[av.Packet]:
-    for packet in packets:
-        if packet.pts is not None:
-            packet.duration = duration.get(packet.pts, packet.duration or 0)
-    return list(packets)
 
 
 def _even_size(size: tuple[int, int], max_side_px: int) -> tuple[int, int]:

@@ -13,6 +13,7 @@ from ._reidentify import JoinParams
 from ._require import require_subject
 from ._sheet import contact_sheet, contact_sheet_jpeg, save_contact_sheet
 from ._subject import SubjectParams, time_in_view_s
+from ._tiles import tiles
 from ._track import track_people
 from ._transfer_choice import carried_choice, same_person
 from ._types import Detection, PersonDetector, PersonTrack, SubjectChoice, Tracking
@@ -46,6 +47,7 @@ __all__ = [
     "require_subject",
     "same_person",
     "save_contact_sheet",
+    "tiles",
     "time_in_view_s",
     "track_people",
 ]

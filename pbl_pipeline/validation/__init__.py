@@ -6,6 +6,15 @@ from ._corpus import Case, Walk, corpus, is_held_out, lasting, recorded_walks, s
 from ._corpus_errors import corpus_errors, corpus_tables, print_corpus, responsiveness, write_corpus
 from ._curves import CURVE_COLUMNS, cycle_curves, save_curves
 from ._frame import COLUMNS, TrialErrors, error_frame
+from ._head_coverage import (
+    BAR,
+    HeadCoverage,
+    LocatedClip,
+    LocatedHead,
+    frame_coverage,
+    head_coverage,
+    located_clips,
+)
 from ._joints import JOINTS_CLIP, JOINTS_OPENCAP, JOINTS_PAPER
 from ._motions import ACTIVITIES, Motion, read_index, read_motion, read_motions, stride_s
 from ._paper import paper_figures
@@ -36,6 +45,7 @@ from ._write import html, latex, print_tables, write_tables
 
 __all__ = [
     "ACTIVITIES",
+    "BAR",
     "BODY_ROTATIONS",
     "COLUMNS",
     "CONVENTIONS",
@@ -47,8 +57,11 @@ __all__ = [
     "RELIABILITY_COLUMNS",
     "Case",
     "Cell",
+    "HeadCoverage",
     "JointError",
     "KinematicErrors",
+    "LocatedClip",
+    "LocatedHead",
     "Motion",
     "PointErrors",
     "PointTruth",
@@ -70,10 +83,13 @@ __all__ = [
     "fit_angles",
     "fit_angles_sd",
     "fit_of_qpos",
+    "frame_coverage",
+    "head_coverage",
     "html",
     "is_held_out",
     "lasting",
     "latex",
+    "located_clips",
     "median_niqr",
     "niqr",
     "paper_figures",

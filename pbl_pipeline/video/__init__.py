@@ -19,10 +19,11 @@ from ._phone_lens import (
     turned_camera,
 )
 from ._phone_log import SENSORS, VIDEO_CLOCK, PhoneLog, Sensor, read_phone_log
-from ._probe import probe, read_first, sha256_of
+from ._probe import probe, read_first, read_metadata, sha256_of
 from ._read import read_frames
 from ._timing import check_timing
 from ._types import CAMERA_KINDS, Camera, FirstPicture, Frame, VideoInfo
+from ._write import write_h264
 
 __all__ = [
     "CAMERA_KINDS",
@@ -60,9 +61,11 @@ __all__ = [
     "probe",
     "read_first",
     "read_frames",
+    "read_metadata",
     "read_phone_log",
     "sha256_of",
     "turned_camera",
     "undistort_px",
     "viewing_ray",
+    "write_h264",
 ]

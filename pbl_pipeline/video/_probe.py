@@ -106,6 +106,20 @@ def read_first(path: str | Path) -> FirstPicture:
         return FirstPicture(str(path), width, height, turn.rotation_deg, **_phone(metadata))
 
 
+def read_metadata(path: str | Path) -> dict[str, str]:
+    """What a file says beside its pictures (place, phone, times, ...): names in lower case, and texts of one line.
+
+    Raises
+    ------
+    PblError
+        As `probe`.
+    """
+    path = check_file(path)
+    with Decoder(path) as decoder:
+        found = dict(decoder.stream.metadata) | dict(decoder.container.metadata) | read_tags(path).items
+    return {name.lower(): text.strip() for name, text in found.items() if is_plain(text.strip())}
+
+
 def _phone(metadata: Mapping[str, str]) -> dict[str, Any]:
     return {
         "make": _first(metadata, "com.apple.quicktime.make", "com.android.manufacturer", "make"),

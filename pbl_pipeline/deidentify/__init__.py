@@ -1,0 +1,40 @@
+"""Videos without faces: heads found, held over gaps and covered (docs/privacy.md)."""
+
+from ._deidentify import (
+    HOW,
+    KEEP,
+    SPREAD_S,
+    STATUSES,
+    Deidentified,
+    check_call,
+    covered_picture,
+    deidentify,
+    sidecar_of,
+)
+from ._faces import FaceDetector
+from ._find import find_heads
+from ._paint import cover, outline
+from ._params import HeadParams
+from ._types import REASONS, SOURCES, Head, Heads, ranges
+
+__all__ = [
+    "HOW",
+    "KEEP",
+    "REASONS",
+    "SOURCES",
+    "SPREAD_S",
+    "STATUSES",
+    "Deidentified",
+    "FaceDetector",
+    "Head",
+    "HeadParams",
+    "Heads",
+    "check_call",
+    "cover",
+    "covered_picture",
+    "deidentify",
+    "find_heads",
+    "outline",
+    "ranges",
+    "sidecar_of",
+]
