@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -60,7 +61,8 @@ class _Face:
 def _sightings(video_path: str | Path, info: VideoInfo, params: HeadParams) -> list[_Face]:
     """All faces in frames `face_interval_s` apart."""
     detector = FaceDetector(params.face_score)
-    windows = tiles(info.width_px, info.height_px, params.face_tile, params.face_overlap)
+    sizes = [tiles(info.width_px, info.height_px, f, params.face_overlap) for f in params.face_tiles]
+    turns = itertools.cycle(sizes)
     found, next_s = [], -np.inf
     slack = 0.5 * float(np.median(np.diff(info.time_s))) if info.n_frames > 1 else 0.0
     frames = prefetched(read_frames(video_path), _FRAMES_AHEAD)
@@ -68,7 +70,8 @@ def _sightings(video_path: str | Path, info: VideoInfo, params: HeadParams) -> l
         if frame.time_s + slack < next_s and frame.index != info.n_frames - 1:
             continue
         next_s = frame.time_s + params.face_interval_s
-        found += [_Face(frame.index, *face) for face in zip(*detector.detect(frame.image, windows), strict=True)]
+        faces = zip(*detector.detect(frame.image, next(turns)), strict=True)
+        found += [_Face(frame.index, box, float(score)) for box, score in faces]
     return found
 
 

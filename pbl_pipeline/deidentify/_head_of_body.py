@@ -32,10 +32,10 @@ def head_of_person(track: PersonTrack, keypoints: Keypoints, params: HeadParams)
     from_body = body_end(track.roi_px, params)
     circle, source = from_body.copy(), np.where(np.isfinite(from_body).all(axis=1), BODY, NONE).astype(np.uint8)
     seen = head_circle(keypoints, params)
-    known = np.isfinite(seen).all(axis=1)
+    known = np.asarray(np.isfinite(seen).all(axis=1), bool)
     circle[known], source[known] = seen[known], KEYPOINTS
     radius = track.roi_px[:, 2] / 2
-    apart = np.hypot(*(seen[:, :2] - from_body[:, :2]).T)
+    apart = np.linalg.norm(seen[:, :2] - from_body[:, :2], axis=1)
     wrong = known & (apart > params.agree * radius)  # NaN compares as False: without a body nothing disagrees
     jumped = known & (off_course(seen) > params.jump * seen[:, 2])
     source[wrong | jumped] = DISAGREE
@@ -61,11 +61,11 @@ def head_circle(keypoints: Keypoints, params: HeadParams) -> np.ndarray:
 
 def px_per_m(keypoints: Keypoints) -> np.ndarray:
     """(T,) pixels per metre at the person, from the spread of the points in the picture and in the camera's x and y."""
-    both = np.isfinite(keypoints.xy_px).all(-1) & np.isfinite(keypoints.xyz_cam_m).all(-1)
+    both = np.asarray(np.isfinite(keypoints.xy_px).all(-1) & np.isfinite(keypoints.xyz_cam_m).all(-1), bool)
     xy = np.where(both[..., None], keypoints.xy_px, np.nan).astype(float)
     across = np.where(both[..., None], keypoints.xyz_cam_m[..., :2], np.nan).astype(float)
     spread = [np.nansum((a - mean(a)[:, None]) ** 2, axis=(1, 2)) for a in (xy, across)]
-    enough = (both.sum(axis=1) >= 4) & (spread[1] > 0)
+    enough = (np.sum(both, axis=1) >= 4) & (spread[1] > 0)
     return np.sqrt(np.divide(spread[0], spread[1], out=np.full(len(xy), np.nan), where=enough))
 
 
@@ -86,7 +86,7 @@ def off_course(circle: np.ndarray) -> np.ndarray:
             moved[max(0, -step) : len(circle) - max(0, step)] = circle[max(0, step) : len(circle) + min(0, step), :2]
         shifted.append(moved)
     around = np.stack(shifted)
-    some = np.isfinite(around).any(axis=0).all(axis=1)
+    some = np.isfinite(around[..., 0]).any(axis=0)
     course = np.full((len(circle), 2), np.nan)
     if some.any():
         course[some] = np.nanmedian(around[:, some], axis=0)

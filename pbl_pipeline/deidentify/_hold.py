@@ -14,9 +14,13 @@ def held(head: Head, time_s: np.ndarray, size_px: tuple[int, int], params: HeadP
     """The head with its gaps filled; where its place is in doubt, also where the sure frames around say it is.
 
     Gaps up to `bridge_s` are interpolated. Beyond the ends, and at both sides of a longer gap, the circle stays: for
-    `hold_s`, or `leave_s` where it touches the edge of the picture, through which a head comes and goes. It grows
-    meanwhile.
+    `hold_s`, but no longer than the head was seen (a wrong sighting is short), or `leave_s` where it touches the edge
+    of the picture, through which a head comes and goes. It grows meanwhile.
     """
+    n_seen = int((head.source != NONE).sum())
+    seen_s = n_seen * float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    hold_s = params.leave_s if head.body_px is None else params.hold_s
+    params = dataclasses.replace(params, hold_s=min(hold_s, max(seen_s, params.leave_s)))
     sure = (head.source == KEYPOINTS) | (head.source == FACE)
     doubt = (head.source != NONE) & ~sure
     also = np.full_like(head.circle_px, np.nan)
@@ -55,7 +59,8 @@ def _fill(
             out[t] = _grown(between, min(since, until), params)
             continue
         near, for_s = (before, since) if since <= until else (after, until)
-        if near is not None and for_s <= (params.leave_s if _at_edge(circle[near], size_px) else params.hold_s):
+        longest = params.leave_s if near is not None and _at_edge(circle[near], size_px) else params.hold_s
+        if near is not None and for_s <= longest + 1e-9:
             out[t] = _grown(circle[near], for_s, params)
 
 

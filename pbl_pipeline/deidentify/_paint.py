@@ -55,7 +55,7 @@ def _blurred(part: np.ndarray, radius: float) -> np.ndarray:
     factor = max(1.0, radius / _RADIUS_PX)
     small = _smaller(part, factor)
     sd = BLUR_RADII * radius / factor
-    small = cv2.GaussianBlur(small, (0, 0), max(sd, 0.5), borderType=cv2.BORDER_REPLICATE)
+    small = cv2.GaussianBlur(small, (0, 0), max(sd, 0.5))
     return cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
 
 

@@ -22,10 +22,11 @@ class HeadParams:
     jump: so does one farther than this many head radii from where the frames around say.
     face_score, face_sure, face_gap_s: a face counts from this score, if its scores add up to `face_sure` with no longer
     gap between them (two sure sightings, three less sure ones).
-    face_interval_s, face_tile, face_overlap: searched so often, on tiles of this fraction of the shorter side.
+    face_interval_s, face_tiles, face_overlap: searched so often, on tiles of these fractions of the shorter side by
+    turns.
     face_radius: of the circle, in sides of the face's box.
     hold_s, leave_s, bridge_s: a head is held so long before it is first and after it is last found; the same where it
-    touches the edge of the picture; and over gaps up to this.
+    touches the edge of the picture, and a face without a body; and over gaps up to this.
     hold_growth: the circle grows meanwhile, by this many of its radii per second, to at most `hold_most` radii.
     """
 
@@ -44,11 +45,11 @@ class HeadParams:
     body_radius: float = 0.42
     agree: float = 0.3
     jump: float = 0.5
-    face_score: float = 0.65
-    face_sure: float = 1.5
+    face_score: float = 0.6
+    face_sure: float = 1.2
     face_gap_s: float = 0.5
     face_interval_s: float = 0.1
-    face_tile: float = 0.5
+    face_tiles: tuple[float, ...] = (0.5, 0.25)
     face_overlap: float = 0.3
     face_radius: float = 1.1
     hold_s: float = 2.0

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-#: How the circle of a head in a frame was obtained, by its number in `Head.source`. The first three are certain enough
-#: to need no look of a person.
+#: How the circle of a head in a frame was obtained, by its number in `Head.source`: keypoints and faces are certain
+#: enough to need no look of a person.
 SOURCES = ("none", "keypoints", "face", "disagree", "body", "held")
 NONE, KEYPOINTS, FACE, DISAGREE, BODY, HELD = range(len(SOURCES))
 #: Why a frame is not certain -> what a person is told.
@@ -18,7 +18,6 @@ REASONS: dict[str, str] = {
     "body": "the points of a head were not found; its place is that of the body's upper end",
     "disagree": "the points of a head do not lie where the body, or the frames around, say",
     "overlap": "one person is in front of another",
-    "face_alone": "a face without a body",
 }
 
 
@@ -78,9 +77,6 @@ class Heads:
             for number, name in ((DISAGREE, "disagree"), (BODY, "body"), (HELD, "held")):
                 for t in np.flatnonzero((head.source == number) & inside):
                     names[t].add(name)
-            if head.body_px is None:
-                for t in np.flatnonzero(head.source == FACE):
-                    names[t].add("face_alone")
         for t in np.flatnonzero(overlapping(self.heads)) if len(self.heads) > 1 else ():
             names[t].add("overlap")
         for t in np.flatnonzero(~seen):

@@ -28,9 +28,9 @@ def skeleton_lines(names: Sequence[str]) -> list[tuple[int, int, str]]:
 def draw_skeleton(image: np.ndarray, names: Sequence[str], xy_px: np.ndarray) -> None:
     """Draw the lines between known points (J, 2) in px into `image` (H, W, 3) uint8 BGR, in place; nothing of a
     face."""
-    known = np.isfinite(xy_px).all(axis=1)
+    known = np.asarray(np.isfinite(xy_px).all(axis=1), bool)
     width = max(2, round(max(image.shape[:2]) / 320))
     for a, b, side in skeleton_lines(names):
         if known[a] and known[b]:
-            ends = [(round(float(x)), round(float(y))) for x, y in (xy_px[a], xy_px[b])]
-            cv2.line(image, *ends, bgr(SIDE_COLOUR[side]), width, cv2.LINE_AA)
+            start, end = ((round(float(x)), round(float(y))) for x, y in (xy_px[a], xy_px[b]))
+            cv2.line(image, start, end, bgr(SIDE_COLOUR[side]), width, cv2.LINE_AA)

@@ -91,7 +91,7 @@ class HeadCoverage:
 
 def located_clips() -> tuple[LocatedClip, ...]:
     """The heads that this package locates (`data/heads.json`)."""
-    content = json.loads(files(__package__).joinpath("data/heads.json").read_text(encoding="utf-8"))
+    content = json.loads(files("pbl_pipeline.validation").joinpath("data/heads.json").read_text(encoding="utf-8"))
     return tuple(
         LocatedClip(c["name"], c["file"], c["tune"], tuple(_located(h) for h in c["heads"])) for c in content["clips"]
     )
