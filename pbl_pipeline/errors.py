@@ -41,6 +41,7 @@ CODES: dict[str, str] = {
     "CALIBRATION_POOR": "the views of the board do not determine the lens",
     "PHONE_LOG": "the orientation log of the phone is not usable",
     "FIT_INPUT": "the keypoints cannot be fitted: too few frames, time stamps out of order, nothing seen",
+    "VIEWS_DISAGREE": "the cameras of a trial do not see one person where the calibration says",
     "AUGMENTER_INPUT": "the points do not suffice to predict anatomical markers",
     "FIT_DIVERGED": "the optimisation ended in values that are not finite",
     "SOLVER_UNKNOWN": "no solver or paramset has that name",

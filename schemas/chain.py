@@ -35,7 +35,7 @@ def references(name: str, cls: Any) -> list[str]:
     out = []
     for line in cls.definition.splitlines():
         if match := _REFERENCE.match(line):
-            target = match[1]
+            target = match[1].removesuffix(".proj")  # renamed columns
             known = master if target == "master" else target
             out.append(known if known.split(".")[0] in STAGES else f"{stage}.{known}")
     return out

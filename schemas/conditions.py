@@ -11,7 +11,8 @@ from .rows import delete_below
 
 
 def set_condition(video_id: int, activity: str | None = None, pace: str | None = None) -> list[str]:
-    """State activity or pace of a registered video (None: as it is); returns what changed, in words.
+    """State activity or pace of a registered video (None: as it is), of one of several cameras for all of the trial's;
+    returns what changed, in words.
 
     Where a session's measures pool the video now and did not before, or the other way round, they are deleted, so that
     the next populate computes them anew. Call it inside a transaction.
@@ -21,6 +22,12 @@ def set_condition(video_id: int, activity: str | None = None, pace: str | None =
     PblError
         DB_NOT_FOUND for a number that no video has; USAGE for labels of more than 32 characters.
     """
+    trial = fit.trials_of([video_id]).get(video_id)
+    videos = [video_id] if trial is None else [int(v["video_id"]) for v in fit.views_of([trial])[trial]]
+    return list(dict.fromkeys(change for v in videos for change in _set_condition(v, activity, pace)))
+
+
+def _set_condition(video_id: int, activity: str | None, pace: str | None) -> list[str]:
     from pbl_pipeline.gait import Condition
 
     key = {"video_id": video_id}

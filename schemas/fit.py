@@ -30,6 +30,12 @@ schema = dj.Schema()
 
 #: What stands for the methods before the fit where markers of a laboratory are fitted.
 LABORATORY = "laboratory markers"
+#: What a set holds, and so what is never fitted, pooled or averaged with another: videos of one camera each, trials of
+#: several calibrated cameras, marker recordings.
+SINGLE, RIG, MARKERS = "single", "rig", "markers"
+KINDS = (SINGLE, RIG, MARKERS)
+#: Column definition of a kind.
+KIND_COLUMN = "fit_set_kind : enum('single', 'rig', 'markers')"
 
 
 @schema
@@ -59,7 +65,7 @@ class FitMethod(dj.Lookup):
 @schema
 class FitPlan(dj.Manual):
     definition = """
-    # which keypoints of a session are fitted by which method
+    # which keypoints of a session are fitted by which method: videos of one camera each, and trials of several cameras
     -> session.Session
     -> keypoints.KeypointMethod
     -> FitMethod
@@ -84,51 +90,84 @@ class TrialInput(dj.Computed):
     ---
     in_view_share   : float64                  # (0..1) share of frames with the whole person in view
     n_used          : int32                    # frames that the fit will use
+    ray_miss=null   : float64                  # (cm) by how much the rays of several cameras miss each other, of the worst; null for one camera
     {origin_columns("trial_input")}
-    """
+    """  # noqa: E501
+
+    class View(dj.Part):
+        definition = """
+        # keypoints of each camera, of a trial that several cameras film
+        -> master
+        -> keypoints.Keypoints.proj(view_video_id='video_id')
+        """
 
     @property
     def key_source(self) -> Any:
+        """Keypoints of one camera; of several cameras those of the video that has the trial's number, where all of its
+        views have keypoints."""
         planned = video.Video.proj("session_id") * FitPlan
-        return (keypoints.Keypoints.proj() * FitMethod.proj()) & planned
+        of_view = keypoints.Keypoints.proj(view_video_id="video_id")
+        trials = video.RigView.proj(view_video_id="video_id", video_id="rig_trial")
+        unseen = (trials * keypoints.Keypoints.proj()).proj() - of_view
+        others = (video.RigView & "video_id != rig_trial").proj()
+        return (((keypoints.Keypoints.proj() * FitMethod.proj()) & planned) - others) - unseen
+
+    @staticmethod
+    def with_trials(keys: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """These keys of Keypoints, and those of the trials of which the videos are views."""
+        trial_of = trials_of([int(k["video_id"]) for k in keys])
+        more = [{**k, "video_id": trial_of[v]} for k in keys if (v := int(k["video_id"])) in trial_of]
+        return [*map(dict, keys), *(k for k in more if k not in keys)]
 
     def make_fetch(self, key: dict) -> tuple:
-        ref = file_ref(one(keypoints.Keypoints & key, "keypoints_file"))
-        return (
-            ref,
-            one(video.Video & key, "video_name"),
-            method_row(FitMethod, key),
-        )
+        name, file = one(keypoints.Keypoints * video.Video & key, "video_name", "keypoints_file")
+        views = views_of([key["video_id"]])[key["video_id"]]
+        ids = [int(v["video_id"]) for v in views]
+        files = {key["video_id"]: file}
+        if ids:
+            of_views = keypoints.Keypoints & [{**key, "video_id": v} for v in ids]
+            files = {r["video_id"]: r["keypoints_file"] for r in of_views.to_dicts()}
+        if missing := [str(v) for v in ids if v not in files]:
+            raise InputChanged(f"no keypoints any more of video_id {', '.join(missing)}, a camera of this trial")
+        refs = [file_ref(files[v]) for v in ids or files]
+        return refs, _rig(views), ids, name, method_row(FitMethod, key)
 
     @computes
-    def make_compute(self, key: dict, ref: dict, name: str, method: Mapping[str, Any]) -> tuple[int, float, str]:
+    def make_compute(
+        self, key: dict, refs: Sequence[dict], rig: tuple | None, ids: list[int], name: str, method: Mapping[str, Any]
+    ) -> tuple[int, float, float | None, list[int], str]:
         from pbl_pipeline.fit import check_trial
-        from pbl_pipeline.keypoints import Keypoints
+        from pbl_pipeline.keypoints import MultiView, ray_miss_m
 
-        with stored_file(self, ref) as path:
-            found = Keypoints.load(path)
+        with ExitStack() as stack:
+            found = _load_trial(self, stack, refs, rig)
         used, share = check_trial(found, name, methods.stored(**method))
-        return int(np.sum(used)), float(share), method["sha"]
+        miss = number(100 * np.nanmax(ray_miss_m(found))) if isinstance(found, MultiView) else None
+        return int(np.sum(used)), float(share), miss, ids, method["sha"]
 
-    def make_insert(self, key: dict, n_used: int, share: float, sha: str, origin: Origin) -> None:
-        row = {"n_used": n_used, "in_view_share": share, **origin.row("trial_input", method_hash=sha)}
-        self.insert1({**key, **row})
+    def make_insert(
+        self, key: dict, n_used: int, share: float, miss: float | None, ids: list[int], sha: str, origin: Origin
+    ) -> None:
+        row = {"n_used": n_used, "in_view_share": share, "ray_miss": miss}
+        self.insert1({**key, **row, **origin.row("trial_input", method_hash=sha)})
+        self.View.insert({**key, "view_video_id": v} for v in ids)
 
 
 @schema
 class FitSet(dj.Manual):
-    definition = """
-    # recordings of a session that are fitted together, videos or marker recordings; another or another person makes another set
-    fit_set           : char(16)               # hash over session, recordings, persons and keypoint method or marker set
+    definition = f"""
+    # recordings of one kind of a session that are fitted together; another or another person makes another set
+    fit_set           : char(16)               # hash over session, recordings, persons, keypoint method or marker set, cameras of a rig
     ---
     -> session.Session
+    {KIND_COLUMN}  # videos of one camera each, trials of several calibrated cameras, or marker recordings
     fit_set_n         : int16                  # how many recordings
     fit_set_created   : datetime               # when planned, UTC
     """  # noqa: E501
 
     class Video(dj.Part):
         definition = """
-        # keypoints of a video; a marker recording has none, and no method before the fit
+        # keypoints of a video, of every camera of a rig; a marker recording has none, and no method before the fit
         -> master
         -> video.Video
         ---
@@ -171,7 +210,7 @@ class SessionFit(dj.Computed):
     class Trial(dj.Part):
         # trial_orientation is no enum: DataJoint 2.3.5 cannot read one back whose values hold a colon.
         definition = """
-        # the fitted movement of one video
+        # the fitted movement of one video, or of several cameras' trial, which has the number of one of them
         -> master
         -> FitSet.Video
         ---
@@ -202,19 +241,24 @@ class SessionFit(dj.Computed):
         return super().populate(*restrictions, **options)
 
     def make_fetch(self, key: dict) -> tuple:
-        rows = (FitSet.Video * keypoints.Keypoints.proj("keypoints_file") * video.Video & key).to_dicts(
-            order_by="video_id"
-        )
+        with_points = FitSet.proj("fit_set_kind") * FitSet.Video * keypoints.Keypoints.proj("keypoints_file")
+        rows = (with_points * video.Video & key).to_dicts(order_by="video_id")
         recorded = FitSet.Video.proj() * video.MarkerRecording * video.Video & key
         of_markers = [] if rows else recorded.to_dicts(order_by="video_id")
         if not rows and not of_markers:
             raise InputChanged("no video of this set has keypoints any more")
-        both = rows or of_markers
-        names = trial_names([(r["video_id"], r["video_name"]) for r in both])
-        trials = [
-            (r["video_id"], n, r["camera_motion"], file_ref(r["keypoints_file" if rows else "markers_file"]))
-            for r, n in zip(both, names, strict=True)
-        ]
+        of_rig = bool(rows) and rows[0]["fit_set_kind"] == RIG
+        views = views_of([int(r["video_id"]) for r in rows]) if of_rig else {}
+        files = {r["video_id"]: file_ref(r["keypoints_file" if rows else "markers_file"]) for r in rows or of_markers}
+        leads = [r for r in rows or of_markers if not of_rig or views[int(r["video_id"])]]
+        names = trial_names([(r["video_id"], r["video_name"]) for r in leads])
+        trials = []
+        for r, name in zip(leads, names, strict=True):
+            own = views.get(int(r["video_id"]), [])
+            if not all(v["video_id"] in files for v in own):
+                raise InputChanged("a camera of this set has no keypoints any more")
+            refs = [files[v["video_id"]] for v in own] or [files[r["video_id"]]]
+            trials.append((r["video_id"], name, r["camera_motion"], refs, _rig(own)))
         return trials, _marker_table(of_markers), method_row(FitMethod, key)
 
     @computes
@@ -262,17 +306,15 @@ class SessionFit(dj.Computed):
         return out
 
     def _loaded(self, trials: Sequence[tuple], table: tuple | None) -> lib.SessionInput:
-        """Keypoints or markers, names and camera motions of the trials that `make_fetch` gave."""
+        """Keypoints of one or several cameras or markers, names and camera motions of the trials of `make_fetch`."""
         from pbl_pipeline.body import load_marker_set
         from pbl_pipeline.fit import SessionInput
-        from pbl_pipeline.keypoints import Keypoints, WorldMarkers
 
-        _, names, motions, refs = (list(column) for column in zip(*trials, strict=True))
-        kind = WorldMarkers if video.NO_CAMERA in motions else Keypoints
+        _, names, motions, refs, rigs = (list(column) for column in zip(*trials, strict=True))
         own = None
         with ExitStack() as stack:
-            paths = [stack.enter_context(stored_file(self, ref)) for ref in refs]
-            loaded = [kind.load(path) for path in paths]
+            markers = video.NO_CAMERA in motions
+            loaded = [_load_trial(self, stack, r, rig, markers) for r, rig in zip(refs, rigs, strict=True)]
             if table is not None:
                 own = load_marker_set(stack.enter_context(stored_file(self, table[1])), name=table[0])
         # The library knows one moving camera; "one of several" on stands is a static one for it.
@@ -326,6 +368,42 @@ class SessionFit(dj.Computed):
                     }
                 )
         self.Check.insert({**key, **check_row("fit", check)} for check in result.qc)
+
+
+def views_of(trials: Sequence[int]) -> dict[int, list[dict[str, Any]]]:
+    """The views of trials that several cameras film, by the trial's number: rows of RigView and Rig, the video that has
+    the number first. Empty for other videos."""
+    found: dict[int, list[dict[str, Any]]] = {int(t): [] for t in trials}
+    rows = (video.RigView * video.Rig & [{"rig_trial": t} for t in found]).to_dicts(order_by="video_id")
+    for row in sorted(rows, key=lambda r: r["video_id"] != r["rig_trial"]):
+        found[int(row["rig_trial"])].append(row)
+    return found
+
+
+def trials_of(videos: Sequence[int]) -> dict[int, int]:
+    """Video -> trial of those videos that are one of several cameras."""
+    rows = (video.RigView & [{"video_id": v} for v in videos]).proj("rig_trial").to_dicts() if videos else []
+    return {int(r["video_id"]): int(r["rig_trial"]) for r in rows}
+
+
+def _rig(views: Sequence[Mapping[str, Any]]) -> tuple[dict, list[str]] | None:
+    """File of the calibration and the camera of each view; None for a video of one camera."""
+    return (file_ref(views[0]["rig_file"]), [v["rig_camera"] for v in views]) if views else None
+
+
+def _load_trial(
+    table: Any, stack: ExitStack, refs: Sequence[dict], rig: tuple | None, markers: bool = False
+) -> lib.Trial:
+    """A trial from its files: keypoints of one camera, or of several with their calibration, or markers."""
+    from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
+
+    paths = [stack.enter_context(stored_file(table, ref)) for ref in refs]
+    if markers:
+        return WorldMarkers.load(paths[0])
+    views = [Keypoints.load(path) for path in paths]
+    if rig is None:
+        return views[0]
+    return MultiView.from_calibration(views, stack.enter_context(stored_file(table, rig[0])), rig[1])
 
 
 def _marker_table(rows: Sequence[Mapping[str, Any]]) -> tuple[str, dict] | None:

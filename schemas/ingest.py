@@ -196,7 +196,7 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
     found = sensors.read(given)
     known = with_sha256(sha256)
     if known:
-        return _known(path, known, visit, chosen, more, found)
+        return update_known(path, known, visit, chosen, more, found)
     camera = _camera(visit.camera_file, path) if visit.camera_file else None
     row = {
         "video_path": str(path),
@@ -225,7 +225,7 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
         known = with_sha256(sha256)
         if not known:
             raise
-        return _known(path, known, visit, chosen, more, found)
+        return update_known(path, known, visit, chosen, more, found)
     said = "; ".join([f"subject {visit.subject}, session {visit.session_label}", *notes])
     return Ingested(path, "registered", row["video_id"], said)
 
@@ -282,7 +282,7 @@ def check_owner(row: dict[str, Any], subject: str, session_label: str, path: str
         )
 
 
-def _known(
+def update_known(
     path: Path, row: dict[str, Any], visit: Visit, chosen: dict[str, str], more: set[str], found: sensors.Read
 ) -> Ingested:
     """Update a registered video: its path if the old one is gone, and the camera, files and methods that were given."""
@@ -302,6 +302,14 @@ def _known(
         forget_errors(number, _FILE_ERRORS)
         status = "moved"
         notes.append(f"it was {row['video_path']}, which is gone")
+    if visit.camera_file is not None and fit.trials_of([number]):
+        raise PblError(
+            "USAGE",
+            found=f"--camera for one of several cameras, video_id {number}",
+            expected="the lens of its rig's calibration",
+            next_step="to use another calibration, delete the trial's rows of video.Video and register it with that",
+            key=path,
+        )
     changes = _new_camera(path, row, visit.camera_file) if visit.camera_file else []
     changes += _new_files(row, visit, found)
     changes += _new_methods(row, chosen, more)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 #: What a set is called: as the shipped ones, and short enough for its column.
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{1,39}")
 #: What makes one chain of methods: cycles of several chains are not one norm.
-_CHAIN = ("tracking_method", "keypoint_method", "fit_method", "gait_method")
+_CHAIN = ("fit_set_kind", "tracking_method", "keypoint_method", "fit_method", "gait_method")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,7 +152,7 @@ def _cycle_keys(people: Sequence[dict], restriction: Any, pace: str) -> list[dic
     """Keys of GaitCycle of the current fits of these people who walk at this pace, with subject and methods."""
     found = (
         (fit.FitSelection & {"fit_current": True}).proj()
-        * fit.FitSet.proj("session_id")
+        * fit.FitSet.proj("session_id", "fit_set_kind")
         * session.Session.proj("subject")
         * lab.Subject.proj("population")
         * fit.FitSet.Video.proj("tracking_method", "keypoint_method")

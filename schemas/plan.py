@@ -17,8 +17,8 @@ from .jobs import jobs_of
 from .method_rows import method_row, resolve_method
 from .rows import utc_now
 
-#: What one fit is for: a session, seen through one chain of methods.
-GROUP = ("session_id", "tracking_method", "keypoint_method", "fit_method")
+#: What one fit is for: recordings of one kind of a session, seen through one chain of methods.
+GROUP = ("session_id", "tracking_method", "keypoint_method", "fit_method", "fit_set_kind")
 
 
 def default_fit(keypoint_method: str) -> str:
@@ -40,8 +40,8 @@ def plan_fits(selected: Sequence[Mapping[str, Any]], fit_method: str) -> None:
 
 
 def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]:
-    """Make a FitSet for every session whose trials are all decided and not yet in a current set, and one for its
-    marker recordings (MarkerPlan): the two are never fitted together.
+    """Make a FitSet for every session whose trials are all decided and not yet in a current set, one for its trials of
+    several cameras, and one for its marker recordings (MarkerPlan): these are never fitted together.
 
     A trial is decided when it can be fitted (TrialInput), failed, shows nobody, or waits for a person's choice. While
     another trial of the session is still being computed, nothing is planned: otherwise every single video of a visit
@@ -65,7 +65,8 @@ def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]
     new = fit.TrialInput.proj() * (video.Video.proj("session_id") & chosen) - in_a_set
     recorded = fit.MarkerPlan.proj() * (video.Video.proj("session_id") & chosen)
     new_markers = recorded - (dj.U("video_id", "fit_method") & (fit.FitSet.Video * current))
-    by_method = dj.U("session_id", "fit_method").aggr(current * fit.FitSet.proj("session_id"), n_current="count(*)")
+    of_kind = current * fit.FitSet.proj("session_id", "fit_set_kind")
+    by_method = dj.U("session_id", "fit_method", "fit_set_kind").aggr(of_kind, n_current="count(*)")
     several = (by_method & "n_current > 1").proj()
     to_plan = sorted({int(s) for found in (new, new_markers, several) for s in found.to_arrays("session_id")})
     # An error row before the fit decides that a trial does not take part. (Job tables are declared here, not below:
@@ -98,7 +99,7 @@ def _locked(session_id: int) -> Iterator[None]:
 def _keep_one_current(session_id: int) -> None:
     """Of several current sets of one group the largest stays current, of equally large ones the newest."""
     member = fit.FitSet.Video.proj("tracking_method", "keypoint_method")
-    sets = fit.FitSet.proj("session_id", "fit_set_n", "fit_set_created") & {"session_id": session_id}
+    sets = fit.FitSet.proj("session_id", "fit_set_kind", "fit_set_n", "fit_set_created") & {"session_id": session_id}
     rows = ((fit.FitSelection & {"fit_current": True}) * sets).to_dicts(order_by="fit_set_n DESC, fit_set_created DESC")
     kept = set()
     for row in rows:
@@ -112,26 +113,51 @@ def _keep_one_current(session_id: int) -> None:
 def _plan_session(session_id: int, failed: Sequence[Any]) -> list[dict[str, Any]]:
     videos = video.Video & {"session_id": session_id}
     selected = (keypoints.KeypointSelection.proj() * videos.proj("session_id")) * fit.FitPlan.proj()
-    ready = (
-        fit.TrialInput.proj()
-        * videos.proj("session_id", "video_sha256")
-        * keypoints.Keypoints.proj("keypoints_person_id")
-    )
+    views = {int(r["video_id"]): r for r in (video.RigView * video.Rig.proj("rig_sha256") & videos.proj()).to_dicts()}
     ready_by_group: dict[tuple, list[dict]] = defaultdict(list)
-    for row in ready.to_dicts(order_by="video_id"):
-        ready_by_group[tuple(row[k] for k in GROUP)].append(row)
+    trials_by_group: dict[tuple, set[int]] = defaultdict(set)
+    for row in _members(videos, views):
+        ready_by_group[group := tuple(row[k] for k in GROUP)].append(row)
+        trials_by_group[group].add(_trial_of(row))
     decided = _decided(videos, failed)
-    waiting = set()
+    # Of several cameras one that gives no keypoints decides that the trial does not take part.
+    undecided: dict[tuple, dict[int, bool]] = defaultdict(dict)
     for row in selected.to_dicts():
-        group = tuple(row[k] for k in GROUP)
-        is_ready = any(r["video_id"] == row["video_id"] for r in ready_by_group.get(group, ()))
-        if not is_ready and not decided(row):
-            waiting.add(group)
+        row |= _of_view(row, views)
+        group, trial = tuple(row[k] for k in GROUP), _trial_of(row)
+        if trial not in trials_by_group[group]:
+            undecided[group][trial] = undecided[group].get(trial, True) and not decided(row)
+    waiting = {group for group, trials in undecided.items() if any(trials.values())}
     made = []
     for group, rows in ready_by_group.items():
         if group not in waiting:
             made += _make_set(dict(zip(GROUP, group, strict=True)), rows)
     return made
+
+
+def _members(videos: Any, views: Mapping[int, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The videos of a session's trials that can be fitted, of all cameras where there are several, with methods, bytes,
+    person and kind, and of one of several cameras (`views`) with its columns of RigView."""
+    about = videos.proj("session_id", "video_sha256") * keypoints.Keypoints.proj("keypoints_person_id")
+    rows = (fit.TrialInput.proj() * about).to_dicts(order_by="video_id")
+    rows = [row for row in rows if row["video_id"] not in views]
+    if views:
+        seen = fit.TrialInput.View.proj(trial="video_id", video_id="view_video_id")
+        rows += (seen * about).to_dicts(order_by="video_id")
+    sha256 = {row["video_id"]: row["video_sha256"] for row in rows}
+    rows = [{**row, **_of_view(row, views)} for row in rows]
+    return [{**row, "trial_sha256": sha256[_trial_of(row)]} for row in rows]
+
+
+def _of_view(row: Mapping[str, Any], views: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
+    """The kind of set that a video belongs to, and its columns of RigView and Rig."""
+    view = views.get(int(row["video_id"]))
+    return {"fit_set_kind": fit.RIG if view else fit.SINGLE, **(view or {})}
+
+
+def _trial_of(row: Mapping[str, Any]) -> int:
+    """The number of the trial that a video is of: its own unless it is one of several cameras."""
+    return int(row.get("rig_trial", row["video_id"]))
 
 
 def _plan_markers(session_id: int) -> list[dict[str, Any]]:
@@ -146,7 +172,7 @@ def _plan_markers(session_id: int) -> list[dict[str, Any]]:
         by_method[row["fit_method"]].append({**row, "tracking_method": None, "keypoint_method": None})
     made = []
     for method, rows in by_method.items():
-        made += _make_set(dict(zip(GROUP, (session_id, None, None, method), strict=True)), rows)
+        made += _make_set(dict(zip(GROUP, (session_id, None, None, method, fit.MARKERS), strict=True)), rows)
     return made
 
 
@@ -155,9 +181,9 @@ def _make_set(group: Mapping[str, Any], rows: list[dict]) -> list[dict[str, Any]
     selection = {"fit_set": name, "fit_method": group["fit_method"]}
     if fit.FitSelection & selection & {"fit_current": True}:
         return []
+    about = {k: group[k] for k in ("session_id", "fit_set_kind")}
     fit.FitSet.insert1(
-        {"fit_set": name, "session_id": group["session_id"], "fit_set_n": len(rows), "fit_set_created": utc_now()},
-        skip_duplicates=True,
+        {"fit_set": name, **about, "fit_set_n": len(rows), "fit_set_created": utc_now()}, skip_duplicates=True
     )
     member = ("video_id", "tracking_method", "keypoint_method")
     fit.FitSet.Video.insert(({"fit_set": name, **{k: row[k] for k in member}} for row in rows), skip_duplicates=True)
@@ -169,17 +195,18 @@ def _make_set(group: Mapping[str, Any], rows: list[dict]) -> list[dict[str, Any]
 
 
 def _older_sets(group: Mapping[str, Any], name: str) -> list[dict]:
-    """Current selections of the same session, methods and fit method, other than `name`."""
+    """Current selections of the same session, kind, methods and fit method, other than `name`."""
     same = {"tracking_method": group["tracking_method"], "keypoint_method": group["keypoint_method"]}
-    sets = (fit.FitSet & {"session_id": group["session_id"]}) & (fit.FitSet.Video & same).proj()
+    of_kind = {k: group[k] for k in ("session_id", "fit_set_kind")}
+    sets = (fit.FitSet & of_kind) & (fit.FitSet.Video & same).proj()
     current = fit.FitSelection & {"fit_method": group["fit_method"], "fit_current": True}
     keys = (current & sets.proj()).keys()
     return [k for k in keys if k["fit_set"] != name]
 
 
 def fit_set_hash(group: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> str:
-    """16 hex digits over the session, the methods up to the keypoints, and each video's bytes and person (each marker
-    recording's bytes and marker set)."""
+    """16 hex digits over the session, the methods up to the keypoints, and each video's bytes and person (of several
+    cameras also trial, camera and calibration; each marker recording's bytes and marker set)."""
     lines = [str(group[k]) for k in GROUP[:3]]
     lines += sorted(f"{row['video_sha256']} {_measured(row)}" for row in rows)
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
@@ -188,7 +215,10 @@ def fit_set_hash(group: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) ->
 def _measured(row: Mapping[str, Any]) -> str:
     if "recording_marker_set" in row:
         return f"markers {row['recording_marker_set']} {row['marker_table_sha256']}".rstrip()
-    return f"person {row['keypoints_person_id']}"
+    said = f"person {row['keypoints_person_id']}"
+    if "rig_camera" in row:
+        said += f" trial {row['trial_sha256']} camera {row['rig_camera']} of {row['rig_sha256']}"
+    return said
 
 
 def _decided(videos: Any, failed: Sequence[Any]) -> Any:

@@ -87,8 +87,8 @@ class SessionResults:
                 "USAGE",
                 found=f"laboratory markers of session {self.session_label!r}",
                 expected="the fit of a video",
-                next_step="name the method of the videos' fit; measures and curves of markers are in `schemas.views`, "
-                "and `pbl fit FILE`, `pbl gait` write theirs as files",
+                next_step="name the kind of the videos, single or rig; measures and curves of markers are in "
+                "`schemas.views`, and `pbl fit FILE`, `pbl gait` write theirs as files",
                 key=f"subject {self.subject}",
             )
         return tuple(_fitted(t) for t in self.trials if t.fit is not None)
@@ -101,7 +101,8 @@ def load_session(restriction: Any) -> SessionResults:
     ----------
     restriction
         What picks one session and, where several methods were used, one chain of methods: a dict such as
-        `{"subject": "P017", "session_label": "2026-03-01", "fit_method": "paper-2025-v1"}`.
+        `{"subject": "P017", "session_label": "2026-03-01", "fit_method": "paper-2025-v1"}`; `fit_set_kind` where it has
+        recordings of one camera, of several, or markers.
 
     Raises
     ------
@@ -119,7 +120,7 @@ def load_session(restriction: Any) -> SessionResults:
     visit = _single(found, "session_id", restriction)
     chain = {"session_id": int(visit["session_id"])}
     fits = (
-        fit.SessionFit * (fit.FitSelection & {"fit_current": True}) * fit.FitSet.proj("session_id")
+        fit.SessionFit * (fit.FitSelection & {"fit_current": True}) * fit.FitSet.proj("session_id", "fit_set_kind")
         & chain
         & restriction
     ).keys()
@@ -129,15 +130,14 @@ def load_session(restriction: Any) -> SessionResults:
     measured = (gdi.SessionGdi & key & restriction).keys() if key else []
     metrics_key = _single(measured, "gait_method", restriction) if measured else {}
     metrics = load_metrics(metrics_key) if metrics_key else None
-    # Videos and markers are fitted apart: beside a fit of the one the others are not left out.
-    recorded = video.MarkerRecording.proj()
-    if not key:
-        of_kind = video.Video & chain
-    elif recorded & [{"video_id": v} for v in fit_by_video]:
-        of_kind = (video.Video & recorded) & chain
-    else:
-        of_kind = (video.Video - recorded) & chain
-    rows = of_kind.to_dicts(order_by="video_id")
+    # Videos of one camera, of several, and markers are fitted apart: beside a fit of one kind the others are not left
+    # out.
+    rows = (video.Video & chain).to_dicts(order_by="video_id")
+    trial_of = fit.trials_of([int(r["video_id"]) for r in rows])
+    if key:
+        kind = (fit.FitSet & key).fetch1("fit_set_kind")
+        rows = [r for r in rows if _kind_of(r, trial_of) == kind]
+    rows = [r for r in rows if trial_of.get(int(r["video_id"]), int(r["video_id"])) == int(r["video_id"])]
     by_name = {t.name: t for t in metrics.trials} if metrics else {}
     trials = tuple(_trial(row, restriction, fit_by_video.get(int(row["video_id"])), by_name) for row in rows)
     return SessionResults(
@@ -150,6 +150,13 @@ def load_session(restriction: Any) -> SessionResults:
         metrics=metrics,
         key={**key, **metrics_key},
     )
+
+
+def _kind_of(row: Mapping[str, Any], trial_of: Mapping[int, int]) -> str:
+    """The kind of set that a recording (row of Video) belongs to."""
+    if row["camera_motion"] == video.NO_CAMERA:
+        return fit.MARKERS
+    return fit.RIG if int(row["video_id"]) in trial_of else fit.SINGLE
 
 
 def not_finished(found: SessionResults, what: str) -> PblError:

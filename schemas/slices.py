@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pbl_pipeline.study import StudyData
 
 #: One chain of methods, as StudySlice names it.
-CHAIN = ("tracking_method", "keypoint_method", "fit_method", "gait_method", "gdi_method", "norm")
+CHAIN = ("fit_set_kind", "tracking_method", "keypoint_method", "fit_method", "gait_method", "gdi_method", "norm")
 _SIDES = {"mean": "both", "left": "left", "right": "right"}
 
 
@@ -179,7 +179,8 @@ def _candidates(cohort: str | None, roles: Sequence[str]) -> Any:
 
 
 def _chain(visits: Any, methods: Mapping[str, str]) -> dict[str, str | None]:
-    """The one chain of methods by which the visits are measured; None for tracking and keypoints of markers."""
+    """The one kind of recordings and chain of methods by which the visits are measured; None for tracking and keypoints
+    of markers."""
     if unknown := sorted(set(methods) - set(CHAIN)):
         raise _usage(f"methods of {', '.join(unknown)}", f"of {', '.join(CHAIN)}")
     found = [tuple(r[c] for c in CHAIN) for r in (dj.U(*CHAIN) & (_measured(visits) & dict(methods))).to_dicts()]
@@ -272,7 +273,7 @@ def _frames(rows: Any, about: Mapping[str, Any]) -> dict[str, Any]:
     """visits, measures, scores, instruments and cycles of the visits `rows` by the chain of `about`."""
 
     ids = inside("session_id", map(int, rows["session_id"]))
-    chain = {k: about[k] for k in CHAIN if k not in ("tracking_method", "keypoint_method")}
+    chain = {k: about[k] for k in gdi.SessionGdi.primary_key if k in CHAIN}
     key = rows[["session_id", "subject", "visit"]]
     sets = rows.loc[rows["fit_set"] != "", ["fit_set", "session_id", "subject", "visit"]]
     of_sets = inside("fit_set", sets["fit_set"])

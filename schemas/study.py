@@ -175,10 +175,11 @@ class CohortMember(dj.Manual):
 
 @schema
 class StudySlice(dj.Manual):
-    definition = """
+    definition = f"""
     # frozen: the visits and methods that figures and tables were made of
     study_slice          : varchar(32)         # short name
     ---
+    {fit.KIND_COLUMN}  # recordings that count: videos of one camera each, trials of several, or markers
     -> [nullable] Cohort
     -> [nullable] tracking.TrackingMethod
     -> [nullable] keypoints.KeypointMethod

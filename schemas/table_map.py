@@ -84,7 +84,7 @@ def table_map() -> str:
             stage = name.split(".")[0]
             lines += ["", f"## {stage}", "", modules()[STAGES.index(stage)].__doc__ or ""]
         lines += ["", f"### {name} ({kind(cls)})", "", *([comment(cls), ""] if comment(cls) else [])]
-        refers = ", ".join(references(name, cls))
+        refers = ", ".join(_refers_to(name, cls))
         lines += ["| column | type | meaning |", "|---|---|---|"]
         if refers:
             lines.append(f"| *refers to* | | {refers} |")
@@ -96,6 +96,13 @@ def table_map() -> str:
         if origin:
             lines.append("| *origin* | | |")
     return "\n".join(lines) + "\n"
+
+
+def _refers_to(name: str, cls: Any) -> list[str]:
+    """`references`, with the column's name here where it is another: "video.Video as rig_trial"."""
+    lines = [line for line in cls.definition.splitlines() if line.strip().startswith("->")]
+    renamed = (re.search(r"\.proj\((\w+)=", line) for line in lines)
+    return [f"{t} as {new[1]}" if new else t for t, new in zip(references(name, cls), renamed, strict=True)]
 
 
 def _is_origin(column: str, cls: Any) -> bool:

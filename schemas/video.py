@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 schema = dj.Schema()
 
-CAMERA_MOTIONS = ("static", "handheld", "one of several")
+ONE_OF_SEVERAL = "one of several"
+CAMERA_MOTIONS = ("static", "handheld", ONE_OF_SEVERAL)
 #: Of a recording without a camera: laboratory markers.
 NO_CAMERA = "none"
 
@@ -71,6 +72,32 @@ class MarkerRecording(dj.Manual):
     markers_file             : <object@arrays> # npz: time_s (T) s, xyz_world_m (T,J,3) m, z up, confidence (T,J) 0..1; docs/files.md
     marker_table_file=null   : <object@arrays> # CSV of a marker set of the laboratory's own; null where the set ships
     """  # noqa: E501
+
+
+@schema
+class Rig(dj.Manual):
+    definition = """
+    # several calibrated cameras that stand still around one place
+    rig_id        : int32
+    ---
+    rig_sha256    : char(64)                   # of the bytes of rig_file: the same calibration has one number
+    rig_cameras   : json                       # names of its cameras, in the order of the file
+    rig_created   : datetime                   # when registered, UTC
+    rig_file      : <object@arrays>            # TOML of Pose2Sim: lens and pose of each camera; docs/files.md
+    unique index (rig_sha256)
+    """
+
+
+@schema
+class RigView(dj.Manual):
+    definition = """
+    # a camera of a trial that several film at once; rig_trial: video_id of the one whose number the trial has
+    -> Video
+    ---
+    -> Rig
+    -> Video.proj(rig_trial='video_id')
+    rig_camera    : varchar(64)                # the camera of the rig that filmed it
+    """
 
 
 @schema

@@ -36,18 +36,19 @@ _SESSION_COLUMNS = (
 
 
 def current_sets() -> Any:
-    """Sets of videos that are the newest of their session, with subject and session."""
+    """Sets of recordings that are the newest of their session and kind, with subject and session."""
     current = fit.FitSelection & {"fit_current": True}
     return (
         current
-        * fit.FitSet.proj("session_id", "fit_set_n")
+        * fit.FitSet.proj("session_id", "fit_set_kind", "fit_set_n")
         * session.Session.proj("subject", "session_label", "session_date")
     )
 
 
 def newest_sets() -> Any:
-    """Keys of the sets that are the newest of their session, by method of the fit, with `session_id`."""
-    return fit.FitSet.proj("session_id") * (fit.FitSelection & {"fit_current": True}).proj()
+    """Keys of the sets that are the newest of their session and kind, by method of the fit, with `session_id` and
+    `fit_set_kind`."""
+    return fit.FitSet.proj("session_id", "fit_set_kind") * (fit.FitSelection & {"fit_current": True}).proj()
 
 
 def _sessions() -> Any:
@@ -56,7 +57,8 @@ def _sessions() -> Any:
 
 
 def session_summary(restriction: Any = True) -> pd.DataFrame:
-    """One row per visit and chain of methods: cadence, stride time, index, worst quality check.
+    """One row per visit, kind of recordings (`fit_set_kind`: single, rig, markers) and chain of methods: cadence,
+    stride time, index, worst quality check.
 
     Columns carry the units of their tables (docs/tables.md): cadence steps/min, times s, stance and swing percent,
     residuals px and cm.
@@ -68,15 +70,17 @@ def session_summary(restriction: Any = True) -> pd.DataFrame:
 
 
 def visit_frame(restriction: Any = True, chain: Any = True) -> pd.DataFrame:
-    """One row per visit of a study and chain of methods, also visits that have no measures: what it is in the study,
-    measures and index of the current set of videos, and every clinical score as a column of its instrument's name.
+    """One row per visit of a study, kind of recordings and chain of methods, also visits that have no measures: what it
+    is in the study, measures and index of the current set, and every clinical score as a column of its instrument's
+    name.
 
     Parameters
     ----------
     restriction
         Of the visits: `study.Visit`, subject, session label and date, population.
     chain
-        Of the methods, such as `{"fit_method": "blazepose-v3"}`, where the tables hold several chains.
+        Of the methods and the kind, such as `{"fit_method": "blazepose-v3", "fit_set_kind": "single"}`, where the
+        tables hold several chains.
     """
     visits = study.Visit * _sessions() & restriction
     sets = newest_sets()
@@ -279,7 +283,7 @@ def _compared(restriction: Any = True) -> Iterator[tuple[dict[str, Any], TrialEr
         key = {k: row[k] for k in names}
         about = TrialErrors(
             errors=validation.errors_of_rows(row, joints.get(tuple(key.values()), [])),
-            # A camera that is one of several is fitted alone here: it stands still.
+            # One of several cameras stands still, fitted together with the others or alone.
             camera="handheld" if row["camera_motion"] == "handheld" else "static",
             trial=trial,
             detector=row["keypoint_method"] or fit.LABORATORY,

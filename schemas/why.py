@@ -17,13 +17,14 @@ DONE, EMPTY, PENDING, RUNNING, ERROR, NOT_YET = "done", "empty", "pending", "bei
 @dataclasses.dataclass(frozen=True)
 class Step:
     """One stage of one video. what: one of the words above. method: that names the row. note: origin, error or reason;
-    next_step: of an error."""
+    next_step: of an error. camera: the video it is about, where several cameras filmed the trial."""
 
     table: str
     what: str
     method: str = ""
     note: str = ""
     next_step: str = ""
+    camera: int | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,20 +54,28 @@ def why(video_id: int) -> Why:
     if not rows:
         raise unknown_video(video_id)
     row = rows[0]
-    sets = [{"fit_set": s} for s in (fit.FitSet.Video & {"video_id": video_id}).to_arrays("fit_set")]
+    # One of several cameras: from the fit on the trial counts, before it every camera.
+    trial = fit.trials_of([video_id]).get(video_id, video_id)
+    views = [int(v["video_id"]) for v in fit.views_of([trial])[trial]] or [video_id]
+    sets = [{"fit_set": s} for s in (fit.FitSet.Video & {"video_id": trial}).to_arrays("fit_set")]
     current = fit.FitSelection & {"fit_current": True}
     sets = [{"fit_set": k["fit_set"]} for k in (current & sets).to_dicts()] if sets else []
     steps: list[Step] = []
     # Markers go straight to the fit: nothing is computed before it.
     markers = row["camera_motion"] == video.NO_CAMERA
     for table in [t for t in computed_tables() if not (markers and t in before(fit.SessionFit))]:
-        about = {"video_id": video_id} if "video_id" in table.heading.primary_key else sets
-        if "video_id" in table.heading.primary_key and "fit_set" in table.heading.primary_key:
-            about = [{**s, "video_id": video_id} for s in sets]
-        if isinstance(about, list) and not about:
+        names = table.heading.primary_key
+        of_view = "video_id" in names and table in before(fit.TrialInput)
+        about = [{"video_id": v} for v in (views if of_view else [trial])] if "video_id" in names else sets
+        if "video_id" in names and "fit_set" in names:
+            about = [{**s, "video_id": trial} for s in sets]
+        if not about:
             steps.append(Step(table.__name__, NOT_YET))
             continue
-        steps += _steps(table, about) or [Step(table.__name__, NOT_YET)]
+        several = of_view and len(views) > 1
+        for one in [[a] for a in about] if several else [about]:
+            found = _steps(table, one) or [Step(table.__name__, NOT_YET)]
+            steps += [dataclasses.replace(s, camera=one[0]["video_id"] if several else None) for s in found]
     return Why(
         video_id, row["video_name"], row["video_path"], int(row["session_id"]), steps, _verdict(steps, bool(sets))
     )
@@ -108,18 +117,19 @@ def _method(row: dict[str, Any], table: Any) -> str:
 
 def _verdict(steps: list[Step], in_a_set: bool) -> str:
     for step in steps:
+        stage = step.table if step.camera is None else f"{step.table} of its camera, video_id {step.camera},"
         if step.what == ERROR:
-            return f"{step.table} failed ({step.note}); next: {step.next_step}, then pbl retry"
+            return f"{stage} failed ({step.note}); next: {step.next_step}, then pbl retry"
         if step.next_step:
-            return f"{step.table} {step.what}: {step.note}; next: {step.next_step}"
+            return f"{stage} {step.what}: {step.note}; next: {step.next_step}"
         if step.what == RUNNING:
-            return f"{step.table} is being computed {step.note}"
+            return f"{stage} is being computed {step.note}"
         if step.what == PENDING:
-            return f"{step.table} waits for a worker ({step.note}); next: pbl worker or pbl populate"
+            return f"{stage} waits for a worker ({step.note}); next: pbl worker or pbl populate"
         if step.what == EMPTY:
-            return f"{step.table} ran well and found nothing to go on with: {step.note}"
+            return f"{stage} ran well and found nothing to go on with: {step.note}"
         if step.what == NOT_YET and step.table != "KinematicError":
             if step.table == "SessionFit" and not in_a_set:
                 return "its session is fitted when all of its videos are decided; next: pbl populate plans it"
-            return f"{step.table} is not queued yet; next: pbl populate, or a worker looks at all tables every minute"
+            return f"{stage} is not queued yet; next: pbl populate, or a worker looks at all tables every minute"
     return "everything is computed"

@@ -51,7 +51,10 @@ def after(done: Sequence[Claim], failed: Sequence[Claim] = ()) -> Refreshed:
         of_table = [c for c in done if c.table is table]
         for follower in chain.followers(table):
             for priority in {c.priority for c in of_table}:
-                n = queue.fill(follower, [c.key for c in of_table if c.priority == priority], priority)
+                keys = [c.key for c in of_table if c.priority == priority]
+                if follower is fit.TrialInput:
+                    keys = fit.TrialInput.with_trials(keys)
+                n = queue.fill(follower, keys, priority)
                 out.add(Refreshed({follower.__name__: n}))
         if table in (tracking.SubjectChoice, fit.TrialInput):
             touched += [c.key for c in of_table]

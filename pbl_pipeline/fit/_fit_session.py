@@ -76,7 +76,7 @@ def fit_session(
     Raises
     ------
     PblError
-        FIT_INPUT, MARKER_SET_UNKNOWN, PHONE_LOG, SOLVER_UNKNOWN, FIT_DIVERGED.
+        FIT_INPUT, VIEWS_DISAGREE, MARKER_SET_UNKNOWN, PHONE_LOG, SOLVER_UNKNOWN, FIT_DIVERGED.
     """
     result = fit_sessions([SessionInput(trials, names, camera_motion, markers)], paramset)[0]
     if isinstance(result, PblError):
@@ -183,7 +183,7 @@ def check_trial(
 ) -> tuple[np.ndarray, float]:
     """Which frames (T,) bool of a trial the fit would use, and the share of frames with the whole person in view.
 
-    Raises `PblError` FIT_INPUT or MARKER_SET_UNKNOWN where the trial cannot be fitted.
+    Raises `PblError` FIT_INPUT, VIEWS_DISAGREE or MARKER_SET_UNKNOWN where the trial cannot be fitted.
     """
     return _check_trial(trial, name, METHODS.find(paramset).params.view, markers)
 

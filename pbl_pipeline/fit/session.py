@@ -16,6 +16,7 @@ from pbl_pipeline.keypoints import (
     WorldMarkers,
     blind_runs,
     bridge_gaps,
+    check_views_agree,
     longest_run_s,
     visibility,
 )
@@ -70,7 +71,7 @@ def make_session(
     ------
     PblError
         FIT_INPUT (no trial, too few frames in view, time stamps out of order, nothing seen, values not finite where
-        confidence is positive, trials of different kinds), MARKER_SET_UNKNOWN, PHONE_LOG.
+        confidence is positive, trials of different kinds), VIEWS_DISAGREE, MARKER_SET_UNKNOWN, PHONE_LOG.
     """
     if not trials or len(trials) != len(names):
         raise _input_error(f"{len(trials)} trials and {len(names)} names", "at least one trial and a name for each")
@@ -109,7 +110,7 @@ def check_trial(
 ) -> tuple[np.ndarray, float]:
     """Which frames (T,) bool of a trial a fit would use, and the share of frames with the whole person in view.
 
-    Raises `PblError` FIT_INPUT, MARKER_SET_UNKNOWN or PHONE_LOG where the trial cannot be fitted.
+    Raises `PblError` FIT_INPUT, VIEWS_DISAGREE, MARKER_SET_UNKNOWN or PHONE_LOG where the trial cannot be fitted.
     """
     (markers or marker_set(trial.marker_set)).check_names(trial.names)
     step = np.diff(trial.time_s)
@@ -127,6 +128,7 @@ def check_trial(
     elif isinstance(trial, MultiView):
         for k in trial.views:
             _check_points(name, k, need_3d=False)
+        check_views_agree(trial, name)
         confidence = np.max([k.confidence for k in trial.views], axis=0)
         seen = confidence > 0
         in_view = (np.mean(seen, axis=1) >= SEEN_SHARE) & (_mean_seen(confidence) >= view.min_confidence)

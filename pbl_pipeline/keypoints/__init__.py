@@ -22,7 +22,7 @@ from ._in_view import (
 )
 from ._marker_augmenter import AnatomicalMarkers, AugmenterParams, MarkerAugmenter
 from ._methods import METHODS
-from ._multi_view import SAME_TIME_S, MultiView, cameras_of_files
+from ._multi_view import SAME_TIME_S, MultiView, cameras_of_files, check_same_times
 from ._onnx_keypoints import ModelKeypointParams, ModelParams, OnnxKeypoints
 from ._params import KeypointParams
 from ._picture import Picture, PictureMeter
@@ -31,11 +31,13 @@ from ._quality import check_keypoints, side_changes
 from ._trc import read_trc
 from ._types import Keypoints
 from ._view import view_rotation
+from ._view_agreement import MOST_MISS_M, check_views_agree, ray_miss_m
 from ._world_markers import WorldMarkers
 
 __all__ = [
     "BOUND_TRUNK",
     "METHODS",
+    "MOST_MISS_M",
     "SAME_TIME_S",
     "SEEN_SHARE",
     "AnatomicalMarkers",
@@ -60,12 +62,15 @@ __all__ = [
     "bridge_gaps",
     "cameras_of_files",
     "check_keypoints",
+    "check_same_times",
+    "check_views_agree",
     "confidence_curve",
     "confidence_curves",
     "confidence_text",
     "detect_keypoints",
     "longest_run_s",
     "probability_within",
+    "ray_miss_m",
     "read_trc",
     "side_changes",
     "view_rotation",

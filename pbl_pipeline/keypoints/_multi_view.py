@@ -28,6 +28,8 @@ class MultiView:
         Keypoints of each camera: equal time stamps (within 1 ms), names and marker set. `xyz_cam_m` may be all NaN.
     poses
         Where each camera stands, in the same order; one world for all.
+    cameras
+        What each is called, for messages; empty where they have no names.
 
     Raises
     ------
@@ -38,6 +40,7 @@ class MultiView:
 
     views: tuple[Keypoints, ...]
     poses: tuple[CameraPose, ...]
+    cameras: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "views", tuple(self.views))
@@ -56,13 +59,7 @@ class MultiView:
             if (view.marker_set, view.names) != (first.marker_set, first.names):
                 found = f"{view.marker_set} with {len(view.names)} names in view {number}, other than in the first"
                 raise _view_error(found, f"{first.marker_set} and the same names in the same order")
-            if len(view.time_s) != len(first.time_s):
-                found = f"{len(view.time_s)} frames in view {number}, {len(first.time_s)} in the first"
-                raise _view_error(found, "the same frames in all")
-            apart = float(np.max(np.abs(np.asarray(view.time_s) - first.time_s), initial=0.0))
-            if not apart <= SAME_TIME_S:
-                found = f"time stamps of view {number} up to {1000 * apart:.3g} ms from the first's"
-                raise _view_error(found, f"at most {1000 * SAME_TIME_S:g} ms: cameras that were started together")
+        check_same_times([view.time_s for view in self.views])
 
     @property
     def time_s(self) -> np.ndarray:
@@ -100,7 +97,20 @@ class MultiView:
             raise _calibration_error(calibration, list(poses), [str(n) for n in unknown or names], len(views))
         lenses = [load_camera(calibration, v.image_size_px, n) for v, n in zip(views, names, strict=True)]
         seen = [dataclasses.replace(v, camera=lens) for v, lens in zip(views, lenses, strict=True)]
-        return cls(tuple(seen), tuple(poses[n] for n in names))
+        return cls(tuple(seen), tuple(poses[n] for n in names), tuple(names))
+
+
+def check_same_times(times_s: Sequence[np.ndarray], key: object = None) -> None:
+    """Raise `PblError` FIT_INPUT unless all cameras have as many time stamps (s), which agree within `SAME_TIME_S`."""
+    first = np.asarray(times_s[0])
+    for number, other in enumerate(times_s[1:], 2):
+        if len(other) != len(first):
+            found = f"{len(other)} frames in view {number}, {len(first)} in the first"
+            raise _view_error(found, "the same frames in all", key)
+        apart = float(np.max(np.abs(np.asarray(other) - first), initial=0.0))
+        if not apart <= SAME_TIME_S:
+            found = f"time stamps of view {number} up to {1000 * apart:.3g} ms from the first's"
+            raise _view_error(found, f"at most {1000 * SAME_TIME_S:g} ms: cameras that were started together", key)
 
 
 def cameras_of_files(stems: Sequence[str], calibration: str | Path) -> tuple[str, list[str]]:
@@ -130,12 +140,13 @@ def _plain(name: str) -> str:
     return re.sub(r"[_\-\s]", "", name).casefold()
 
 
-def _view_error(found: str, expected: str) -> PblError:
+def _view_error(found: str, expected: str, key: object = None) -> PblError:
     return PblError(
         "FIT_INPUT",
         found=found,
         expected=expected,
         next_step="synchronise and cut the recordings to the same frames, and detect each with the same method",
+        key=key,
     )
 
 

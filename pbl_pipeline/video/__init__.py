@@ -19,7 +19,7 @@ from ._phone_lens import (
     turned_camera,
 )
 from ._phone_log import SENSORS, VIDEO_CLOCK, PhoneLog, Sensor, read_phone_log
-from ._probe import probe, read_first, read_metadata, sha256_of
+from ._probe import packet_times, probe, read_first, read_metadata, sha256_of
 from ._read import read_frames
 from ._timing import check_timing
 from ._types import CAMERA_KINDS, Camera, FirstPicture, Frame, VideoInfo
@@ -57,6 +57,7 @@ __all__ = [
     "load_camera",
     "load_camera_poses",
     "load_lens_calibration",
+    "packet_times",
     "phone_lens",
     "probe",
     "read_first",

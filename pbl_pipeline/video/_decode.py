@@ -138,6 +138,11 @@ class Decoder:
                     yield pts, frame
         self._check()
 
+    def packet_stamps(self) -> list[int]:
+        """Stamps of the pictures in the order of the file, without decoding any; in place of iterating."""
+        stamps = [p.dts if p.pts is None else p.pts for p in self._packets() if p.size and not p.is_discard]
+        return [s for s in stamps if s is not None]
+
     def _packets(self) -> Iterator[av.Packet]:
         """Every packet of the video stream; those of the other streams only tell how long the file is."""
         packets = self.container.demux()

@@ -106,6 +106,21 @@ def read_first(path: str | Path) -> FirstPicture:
         return FirstPicture(str(path), width, height, turn.rotation_deg, **_phone(metadata))
 
 
+def packet_times(path: str | Path) -> np.ndarray:
+    """(n,) time stamps (s) of a video's pictures as its container states them, the first 0. Nothing is decoded: a file
+    with a damaged end or an edit list may decode to other frames (`probe`).
+
+    Raises
+    ------
+    PblError
+        VIDEO_MISSING, VIDEO_EMPTY, VIDEO_NOT_A_VIDEO, VIDEO_TRUNCATED, VIDEO_TOO_LARGE.
+    """
+    path = check_file(path)
+    with Decoder(path) as decoder:
+        stamps = decoder.packet_stamps()
+    return (np.sort(stamps) - min(stamps, default=0)) * float(decoder.time_base)
+
+
 def read_metadata(path: str | Path) -> dict[str, str]:
     """What a file says beside its pictures (place, phone, times, ...): names in lower case, and texts of one line.
 

@@ -9,6 +9,8 @@ import click
 
 from pbl_pipeline.errors import PblError
 
+from ._kind import kind_option
+
 if TYPE_CHECKING:
     from pbl_pipeline.export import ExportSession
 
@@ -31,6 +33,7 @@ Example: pbl export --subject P017 --session 2026-03-01 --to c3d --to parquet --
 @click.option("--subject", help="Code of the subject, in place of FILES: from the tables.")
 @click.option("--session", "label", help="Date or label of the visit; needed where the subject has several.")
 @click.option("--fit-method", help="Name of the fit method; needed where several were used.")
+@kind_option
 @click.option(
     "--attitude",
     type=click.Path(path_type=Path),
@@ -50,6 +53,7 @@ def export(
     subject: str | None,
     label: str | None,
     fit_method: str | None,
+    fit_set_kind: str | None,
     attitude: tuple[Path, ...],
     marker_set: Path | None,
     name: str,
@@ -67,8 +71,8 @@ def export(
 
     if not files and subject is None:
         raise _usage("neither FILES nor --subject", "one of them")
-    if files and (subject or label or fit_method):
-        raise _usage("FILES with --subject, --session or --fit-method", "FILES, or a visit of the tables")
+    if files and (subject or label or fit_method or fit_set_kind):
+        raise _usage("FILES with --subject, --session, --fit-method or --kind", "FILES, or a visit of the tables")
     if subject is not None and (attitude or marker_set):
         raise _usage("--attitude or --marker-set with --subject", "them with FILES: the tables have the log")
     options = ExportOptions(name, number_trials, not markers_only, allow_failed, overwrite)
@@ -76,7 +80,8 @@ def export(
     if files:
         session = _of_files(files, formats, attitude, marker_set)
     else:
-        session = _of_tables({"subject": subject, "session_label": label, "fit_method": fit_method}, formats)
+        wanted = {"subject": subject, "session_label": label, "fit_method": fit_method, "fit_set_kind": fit_set_kind}
+        session = _of_tables(wanted, formats)
     for path in write_export(session, formats, out, options):
         click.echo(path)
 

@@ -1,4 +1,4 @@
-"""`pbl ingest`: register videos and laboratory markers."""
+"""`pbl ingest`: register videos, trials of several cameras, and laboratory markers."""
 
 from __future__ import annotations
 
@@ -24,6 +24,12 @@ if TYPE_CHECKING:
 @click.option("--marker-set", metavar="SET", help="Of --markers: a name, or a table (CSV) of your own; for .trc files.")
 @click.option(
     "--up", type=click.Choice(["y", "z"]), default="y", show_default=True, help="Vertical axis of .trc files."
+)
+@click.option(
+    "--rig",
+    type=click.Path(path_type=Path, readable=False),
+    metavar="FILE",
+    help="Calibration (TOML) of several cameras: VIDEOS are one trial, a view each, named like them or in order.",
 )
 @click.option("--subject", metavar="CODE", help="Pseudonymous code of the person, never a name.")
 @click.option(
@@ -77,6 +83,7 @@ def ingest(
     markers: tuple[Path, ...],
     marker_set: str | None,
     up: str,
+    rig: Path | None,
     subject: str | None,
     session_label: str | None,
     name_pattern: str | None,
@@ -96,33 +103,38 @@ def ingest(
     index: str | None,
     norm: str | None,
 ) -> None:
-    """Register videos, or with --markers recordings of laboratory markers, of one visit; `pbl populate` then computes
-    them. No video is decoded here.
+    """Register videos, with --rig the views of one trial by several calibrated cameras, or with --markers recordings of
+    laboratory markers, of one visit; `pbl populate` then computes them. No video is decoded here.
 
     A file whose bytes are registered already is not registered twice, but takes a new camera (what was computed with
     another is deleted and listed), a sensor log of the phone (the same), activity, pace and further methods. Logs,
-    depth videos, IMU files and markers are copied. Videos and markers of a visit are fitted apart. Exit code 1 when a
-    file was refused; the others are registered all the same.
+    depth videos, IMU files, markers and calibrations of a rig are copied. Videos of one camera, trials of several and
+    markers of a visit are fitted apart. Exit code 1 when a file was refused; the others are registered all the same,
+    but a trial of several cameras whole or not at all.
 
     \b
     Example: pbl ingest walk1.mp4 walk2.mp4 --subject P017 --session 2026-03-01
     Example: pbl ingest walk.mov --subject P018 --camera iphone.toml --person 2
     Example: pbl ingest walk.mov --subject P018 --attitude 2026-03-01_09-15-30.zip
     Example: pbl ingest *.mp4 --session 2026-03-01 --name-pattern '(?P<subject>[^_]+)_(?P<pace>[^_]+)_.*'
+    Example: pbl ingest cam_01.mp4 cam_02.mp4 cam_03.mp4 --rig Calib.toml --subject P017 --session 2026-03-01
     Example: pbl ingest --markers walk1.trc --marker-set our_lab.csv --subject P017 --session 2026-03-01
     """
     import schemas
     from schemas.ingest import Methods, Visit
     from schemas.ingest import ingest as register
     from schemas.marker_recordings import ingest_markers
+    from schemas.rigs import ingest_rig
     from schemas.session import UNLABELLED
 
-    _one_kind(videos, markers, marker_set, bool(attitude or depth or imu))
+    _one_kind(videos, markers, marker_set, bool(attitude or depth or imu), rig is not None)
     files = _files(len(videos), attitude, depth, imu)
     options = {"subject": subject, "session": session_label, "pace": pace, "activity": activity}
     calls, results = _visits(videos or markers, name_pattern, {k: v for k, v in options.items() if v is not None})
     if person is not None and len(videos) > 1 and len(calls) > 1:
         raise click.UsageError("--person goes with one video: people are numbered anew in each.")
+    if rig is not None and (results or len(calls) > 1):
+        raise click.UsageError("--rig: all videos are of one trial, so their names must state the same.")
     schemas.activate()
     methods = Methods(tracking=tracking_method, keypoint=keypoint_method, fit=fit_method, gdi=index, norm=norm)
     for said, numbers in calls:
@@ -139,6 +151,8 @@ def ingest(
         )
         if markers:
             results += ingest_markers([markers[i] for i in numbers], visit, marker_set, up, methods)
+        elif rig is not None:
+            results += ingest_rig([videos[i] for i in numbers], rig, visit, methods)
         else:
             results += register([videos[i] for i in numbers], visit, methods, [files[i] for i in numbers])
     for result in results:
@@ -181,14 +195,20 @@ def _visits(
     return [(stated[g[0]], [positions[i] for i in g]) for g in together(stated)], refused
 
 
-def _one_kind(videos: tuple[Path, ...], markers: tuple[Path, ...], marker_set: str | None, with_files: bool) -> None:
-    """Raises `click.UsageError` unless there are videos, or markers without a phone's files."""
+def _one_kind(
+    videos: tuple[Path, ...], markers: tuple[Path, ...], marker_set: str | None, with_files: bool, rig: bool
+) -> None:
+    """Raises `click.UsageError` unless there are videos, or markers or views of a rig without a phone's files."""
     if not videos and not markers:
         raise click.UsageError("Missing argument 'VIDEOS...' (or --markers FILE).")
     if videos and markers:
         raise click.UsageError("Videos and --markers in one call: register each in a call of its own.")
-    if markers and with_files:
-        raise click.UsageError("--attitude, --depth and --imu belong to videos, not to --markers.")
+    if (markers or rig) and with_files:
+        raise click.UsageError(
+            "--attitude, --depth and --imu belong to videos of one camera, not to --markers or --rig."
+        )
+    if markers and rig:
+        raise click.UsageError("--rig goes with videos, not with --markers.")
     if marker_set is not None and not markers:
         raise click.UsageError("--marker-set goes with --markers.")
 

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from ._kind import kind_option
+
 
 @click.group(epilog="Example: pbl norm build our-lab --population healthy")
 def norm() -> None:
@@ -101,6 +103,7 @@ def show(name: str, out: Path | None) -> None:
 @click.option("--fit", "fit_method", help="Fit method, where the tables hold several.")
 @click.option("--gait", "gait_method", help="Event method, where the tables hold several.")
 @click.option("--keypoints", "keypoint_method", help="Keypoint method, where the tables hold several.")
+@kind_option
 @click.option("--nine-angles", is_flag=True, help="All nine angles, for gillette-2008.")
 @click.option("--variance", type=click.FloatRange(0.5, 0.999), default=0.95, show_default=True)
 @click.option("--pace", default="self_selected", show_default=True, help="Videos walked at this pace; any for all.")
@@ -113,6 +116,7 @@ def build(
     fit_method: str | None,
     gait_method: str | None,
     keypoint_method: str | None,
+    fit_set_kind: str | None,
     nine_angles: bool,
     variance: float,
     pace: str,
@@ -127,6 +131,7 @@ def build(
 
     schemas.activate()
     methods = {"fit_method": fit_method, "gait_method": gait_method, "keypoint_method": keypoint_method}
+    methods["fit_set_kind"] = fit_set_kind
     built = build_norm(
         name,
         populations or (() if subjects else ("healthy",)),

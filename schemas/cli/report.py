@@ -6,13 +6,16 @@ from pathlib import Path
 
 import click
 
+from ._kind import kind_option
+
 
 @click.command(epilog="Example: pbl report --subject P017 --session 2026-03-01 --out P017")
 @click.option("--subject", required=True, help="Code of the subject.")
 @click.option("--session", "label", help="Date or label of the visit; needed where the subject has several.")
 @click.option("--fit-method", help="Name of the fit method; needed where several were used.")
+@kind_option
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the files.")
-def report(subject: str, label: str | None, fit_method: str | None, out: Path) -> None:
+def report(subject: str, label: str | None, fit_method: str | None, fit_set_kind: str | None, out: Path) -> None:
     """Write report.html, overlay videos, angles and events of one visit from the tables."""
     import schemas
     from pbl_pipeline.files import check_out_folder
@@ -20,6 +23,6 @@ def report(subject: str, label: str | None, fit_method: str | None, out: Path) -
 
     check_out_folder(out)
     schemas.activate(methods=False)
-    wanted = {"subject": subject, "session_label": label, "fit_method": fit_method}
+    wanted = {"subject": subject, "session_label": label, "fit_method": fit_method, "fit_set_kind": fit_set_kind}
     for path in write_session({k: v for k, v in wanted.items() if v is not None}, out):
         click.echo(path)

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ._kind import kind_option
+
 if TYPE_CHECKING:
     from pbl_pipeline.study import StudyData
 
@@ -52,6 +54,7 @@ def import_(sheets: tuple[Path, ...], dry_run: bool, distinct_codes: bool) -> No
 @click.option("--role", "roles", multiple=True, help="Visits of this role; repeat for several (else: all).")
 @click.option("--event", default="", help="What the days of the visits count from, such as surgery.")
 @click.option("--note", default="", help="Shown on the report.")
+@kind_option
 @click.option("--keypoints", "keypoint_method", help="Keypoint method, where the tables hold several.")
 @click.option("--fit", "fit_method", help="Fit method, where the tables hold several.")
 @click.option("--gait", "gait_method", help="Event method, where the tables hold several.")

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+from typing import TYPE_CHECKING
 
 import click
+
+if TYPE_CHECKING:
+    from schemas.why import Step
 
 
 @click.command()
@@ -26,7 +30,12 @@ def why(video_id: int, as_json: bool) -> None:
         return
     click.echo(f"video {found.video_id}  {found.name}  session {found.session_id}\n{found.path}\n")
     for step in found.steps:
-        click.echo(f"{step.table:<16}{step.what:<20}{step.method:<34}{step.note}".rstrip())
+        click.echo(f"{step.table:<16}{step.what:<20}{_about(step):<34}{step.note}".rstrip())
         if step.next_step:
             click.echo(f"{'':<16}next: {step.next_step}")
     click.echo(f"\n{found.verdict}")
+
+
+def _about(step: Step) -> str:
+    """Method of a step, and the video where several cameras filmed the trial."""
+    return ", ".join(filter(None, (step.method, f"video_id {step.camera}" if step.camera is not None else "")))

@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers, cameras_of_files
+from pbl_pipeline.keypoints import (
+    MOST_MISS_M,
+    Keypoints,
+    MultiView,
+    WorldMarkers,
+    cameras_of_files,
+    check_views_agree,
+    ray_miss_m,
+)
 from pbl_pipeline.video import Camera, CameraPose, load_camera, load_camera_poses
 from tests.conftest import SHARED
 from tests.inputs import CALIBRATION, LENS, NAMES, POSE, ROWS, J, T, changed, keypoints, markers, trc_text
@@ -209,6 +217,45 @@ def test_views_that_do_not_belong_together(other, code):
     with pytest.raises(PblError) as error:
         MultiView((keypoints(), keypoints(**other)), (POSE, POSE))
     assert code_of(error) == code
+
+
+def looking(x: float, z: float, distance: float = 4.0) -> tuple[Keypoints, CameraPose]:
+    """A camera `distance` behind the origin that looks along world +y, and turned by 90 degrees for x: it sees all
+    points at (x, 0, z)."""
+    xy = np.broadcast_to(LENS.matrix[:2, 2] + LENS.matrix[0, 0] / distance * np.array([x, -z]), (T, J, 2))
+    return keypoints(xy_px=xy), CameraPose(LEVEL_Y, np.array([0.0, -distance, 0.0]))
+
+
+#: Columns: right is +x, down -z, forward +y of the world; and for a camera that looks along -x.
+LEVEL_Y = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+LEVEL_X = np.array([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]])
+
+
+def test_rays_that_meet_and_rays_that_miss():
+    """Two cameras at right angles: heights that differ by 2 d at the crossing miss by d each, and by c1, c2 as the
+    weights say."""
+    front, front_pose = looking(0.0, 0.0)
+    for up, miss in ((0.0, 0.0), (0.08, 0.04), (0.3, 0.15)):
+        side, _ = looking(0.0, up)
+        side_pose = CameraPose(LEVEL_X, np.array([4.0, 0.0, 0.0]))
+        trial = MultiView((front, side), (front_pose, side_pose), ("left", "right"))
+        # The side's ray climbs: its nearest point lies a little off the crossing, at cos of its slope.
+        slope = np.arctan2(up, 4.0)
+        np.testing.assert_allclose(ray_miss_m(trial), miss * np.cos(slope), atol=1e-6)
+        if miss <= MOST_MISS_M:
+            assert check_views_agree(trial, "walk") == pytest.approx(miss * np.cos(slope), abs=1e-6)
+            continue
+        with pytest.raises(PblError, match="VIEWS_DISAGREE") as error:
+            check_views_agree(trial, "walk")
+        assert "left 15 cm, right 15 cm" in error.value.found
+    doubted = MultiView((keypoints(xy_px=front.xy_px, confidence=np.full((T, J), 0.25)), side), (front_pose, side_pose))
+    np.testing.assert_allclose(ray_miss_m(doubted), 0.3 * np.cos(slope) * np.array([0.8, 0.2]), atol=1e-6)
+    # A place behind a camera is not what it sees; and where no point is seen twice nothing is compared.
+    away = MultiView((front, side), (front_pose, CameraPose(LEVEL_X, np.array([-4.0, 0.0, 0.0]))))
+    assert ray_miss_m(away)[1] > 3.0
+    blind = MultiView((front, keypoints(confidence=np.zeros((T, J)))), (front_pose, side_pose))
+    assert np.isnan(ray_miss_m(blind)).all()
+    assert np.isnan(check_views_agree(blind, "walk"))
 
 
 def test_too_few_views_or_poses():

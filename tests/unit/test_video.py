@@ -22,6 +22,7 @@ from pbl_pipeline.video import (
     _decode,
     guess_camera,
     load_camera,
+    packet_times,
     probe,
     read_first,
     read_frames,
@@ -84,6 +85,7 @@ def test_variable_frame_rate_stamps_are_the_containers(tmp_path, suffix, codec, 
     assert info.size_bytes == path.stat().st_size
     assert info.sha256 == sha256_of(path) == hashlib.sha256(path.read_bytes()).hexdigest()
     assert info.notes == ()
+    assert np.array_equal(packet_times(path), info.time_s)
     assert [grey(f) for f in read_frames(path)] == [i % 30 for i in range(40)]
 
 
@@ -222,6 +224,7 @@ def test_frames_that_an_edit_list_hides_do_not_count(with_edit_list):
     assert (info.n_frames, info.n_frames_announced) == (40, 60)
     assert info.notes == ("20 frames are hidden by the file's edit list and do not count",)
     np.testing.assert_allclose(info.time_s, constant_rate(40), atol=1e-4)
+    np.testing.assert_allclose(packet_times(path), info.time_s, atol=1e-9)
     assert [grey(f) for f in read_frames(path)] == [(20 + i) % 30 for i in range(40)]
 
 
