@@ -14,7 +14,7 @@ from typing import Any
 from ._activate import STAGES, modules
 from ._datajoint import dj
 
-_REFERENCE = re.compile(r"\s*->\s*(?:\[[^\]]*\]\s*)?([\w.]+)")
+_REFERENCE = re.compile(r"\s*->\s*(?:\[[^\]]*\]\s*)?([\w.]+?)(?:\.proj\((\w+)=.*)?\s*$")
 
 
 def tables() -> dict[str, Any]:
@@ -35,10 +35,15 @@ def references(name: str, cls: Any) -> list[str]:
     out = []
     for line in cls.definition.splitlines():
         if match := _REFERENCE.match(line):
-            target = match[1].removesuffix(".proj")  # renamed columns
+            target = match[1]
             known = master if target == "master" else target
             out.append(known if known.split(".")[0] in STAGES else f"{stage}.{known}")
     return out
+
+
+def renamed(cls: Any) -> list[str | None]:
+    """For each of `references` the name that its column has here, None where it keeps its own."""
+    return [match[2] for line in cls.definition.splitlines() if (match := _REFERENCE.match(line))]
 
 
 def computed_tables() -> list[Any]:

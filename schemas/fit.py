@@ -34,8 +34,8 @@ LABORATORY = "laboratory markers"
 #: several calibrated cameras, marker recordings.
 SINGLE, RIG, MARKERS = "single", "rig", "markers"
 KINDS = (SINGLE, RIG, MARKERS)
-#: Column definition of a kind.
-KIND_COLUMN = "fit_set_kind : enum('single', 'rig', 'markers')"
+#: Type of a column that holds a kind.
+KIND_TYPE = "enum('single', 'rig', 'markers')"
 
 
 @schema
@@ -160,7 +160,7 @@ class FitSet(dj.Manual):
     fit_set           : char(16)               # hash over session, recordings, persons, keypoint method or marker set, cameras of a rig
     ---
     -> session.Session
-    {KIND_COLUMN}  # videos of one camera each, trials of several calibrated cameras, or marker recordings
+    fit_set_kind      : {KIND_TYPE} # videos of one camera each, trials of several calibrated cameras, or marker recordings
     fit_set_n         : int16                  # how many recordings
     fit_set_created   : datetime               # when planned, UTC
     """  # noqa: E501

@@ -24,7 +24,7 @@ from .views import cycle_rows, frame_of, newest_sets
 if TYPE_CHECKING:
     from pbl_pipeline.study import StudyData
 
-#: One chain of methods, as StudySlice names it.
+#: One kind of recordings and chain of methods; the kind is `slice_kind` in StudySlice.
 CHAIN = ("fit_set_kind", "tracking_method", "keypoint_method", "fit_method", "gait_method", "gdi_method", "norm")
 _SIDES = {"mean": "both", "left": "left", "right": "right"}
 
@@ -92,7 +92,8 @@ def freeze(
         digest = _digest(hashes.values())
         study.StudySlice.insert1(
             {
-                **about,
+                **{k: v for k, v in about.items() if k != "fit_set_kind"},
+                "slice_kind": chain["fit_set_kind"],
                 "slice_roles": list(roles),
                 "slice_n": len(rows),
                 "slice_hash": digest,
@@ -258,7 +259,7 @@ def _about(name: str) -> dict[str, Any]:
     if not found:
         known = ", ".join(sorted(study.StudySlice().to_arrays("study_slice"))) or "none yet"
         raise _none(f"no slice {name!r}", f"a slice that was frozen ({known})", "`pbl study slice NAME` freezes one")
-    return found[0]
+    return {**found[0], "fit_set_kind": found[0]["slice_kind"]}
 
 
 def _frozen(about: Mapping[str, Any]) -> Any:

@@ -179,7 +179,7 @@ class StudySlice(dj.Manual):
     # frozen: the visits and methods that figures and tables were made of
     study_slice          : varchar(32)         # short name
     ---
-    {fit.KIND_COLUMN}  # recordings that count: videos of one camera each, trials of several, or markers
+    slice_kind           : {fit.KIND_TYPE} # fit_set_kind of the recordings that count
     -> [nullable] Cohort
     -> [nullable] tracking.TrackingMethod
     -> [nullable] keypoints.KeypointMethod

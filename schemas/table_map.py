@@ -8,7 +8,7 @@ from typing import Any
 
 from ._activate import STAGES, modules
 from ._datajoint import dj
-from .chain import references, tables
+from .chain import references, renamed, tables
 
 _ORIGIN = ("code_version", "method_hash", "model_sha256", "host", "seconds", "computed")
 _KINDS = {dj.Manual: "manual", dj.Lookup: "lookup", dj.Computed: "computed", dj.Part: "part"}
@@ -100,9 +100,7 @@ def table_map() -> str:
 
 def _refers_to(name: str, cls: Any) -> list[str]:
     """`references`, with the column's name here where it is another: "video.Video as rig_trial"."""
-    lines = [line for line in cls.definition.splitlines() if line.strip().startswith("->")]
-    renamed = (re.search(r"\.proj\((\w+)=", line) for line in lines)
-    return [f"{t} as {new[1]}" if new else t for t, new in zip(references(name, cls), renamed, strict=True)]
+    return [f"{t} as {new}" if new else t for t, new in zip(references(name, cls), renamed(cls), strict=True)]
 
 
 def _is_origin(column: str, cls: Any) -> bool:
