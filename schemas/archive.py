@@ -93,3 +93,9 @@ def save_seen(archive: Path, seen: dict[str, list[Any]]) -> None:
     """
     private_folder(archive)
     write_json(private_folder(archive / COPIES) / _SEEN, seen)
+
+
+def plain_name(text: str) -> str:
+    """A name for a file or folder of ours from one that came from outside: ASCII, no separator, no leading dot."""
+    kept = "".join(c if c.isascii() and (c.isalnum() or c in "-_. ") else "_" for c in text).lstrip(". ").rstrip()
+    return kept[-100:] or "_"

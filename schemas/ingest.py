@@ -277,7 +277,8 @@ def check_owner(row: dict[str, Any], subject: str, session_label: str, path: str
             "VIDEO_DUPLICATE",
             found=f"video_id {row['video_id']} of {owner}, has these bytes",
             expected=f"a recording of subject {subject} (session {session_label}) and of nobody else",
-            next_step=f"find out whose recording it is; if not {row['subject']}'s, delete that video before",
+            next_step=f"find out whose recording it is; if not {row['subject']}'s: "
+            f"pbl move {row['video_id']} --to {subject}/{session_label}",
             key=path,
         )
 

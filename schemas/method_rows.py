@@ -68,7 +68,7 @@ def resolve_method(table: Any, name: str) -> str:
         SOLVER_UNKNOWN; for a registered model MODEL_INVALID, MARKER_SET_UNKNOWN.
     """
     offered = methods.of_stage(table.stage).offered(name)
-    return stored_key(table, name) if offered is None else _key_of_offered(table, offered)
+    return stored_key(table, name) if offered is None else register(table, offered)[0]
 
 
 def stored_key(table: Any, name: str) -> str:
@@ -88,17 +88,21 @@ def stored_key(table: Any, name: str) -> str:
     )
 
 
-def _key_of_offered(table: Any, offered: methods.Method[Any]) -> str:
+def register(table: Any, offered: methods.Method[Any]) -> tuple[str, bool]:
+    """Key of the row with these parameters under this name, and whether it is new: then as the name's next version.
+
+    Raises what `insert_methods` raises.
+    """
     prefix, stage = _prefix(table), methods.of_stage(table.stage)
     rows = (table & {f"{prefix}_method_name": offered.name}).to_dicts(order_by=f"{prefix}_method_version")
     versions = [row[f"{prefix}_method_version"] for row in rows]
     for version in versions:
         known = stage.make(offered.name, version, offered.params)
         if table & {f"{prefix}_method_sha": known.hash}:
-            return known.key
+            return known.key, False
     new = stage.make(offered.name, max(versions, default=0) + 1, offered.params)
     insert_methods(table, [new])
-    return new.key
+    return new.key, True
 
 
 def method_row(table: Any, key: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 
 from . import fit, gait, gdi, lab, session, video
+from .method_names import with_keys
 from .rows import plain
 from .stored_files import new_folder
 
@@ -73,7 +74,7 @@ def build_norm(
     ------
     PblError
         USAGE (name, nobody asked for, several chains of methods), DB_NOT_FOUND (no cycles, unknown population or
-        subject), NORM_INVALID, ANGLE_UNITS.
+        subject), SOLVER_UNKNOWN (a method that there is not), NORM_INVALID, ANGLE_UNITS.
     """
     from pbl_pipeline import gait as lib
 
@@ -82,6 +83,8 @@ def build_norm(
     check_label("--source", source, 255)
     if not populations and not subjects:
         raise _usage("neither populations nor subjects", "whose cycles make the norm")
+    if isinstance(restriction, Mapping):
+        restriction = with_keys(restriction)
     _must_exist(lab.Population, "population", [*populations, *pooled_populations])
     _must_exist(lab.Subject, "subject", subjects)
     chosen = [{"population": p} for p in populations] + [{"subject": s} for s in subjects]

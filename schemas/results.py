@@ -17,6 +17,7 @@ from .chain import before
 from .checks import check_values
 from .coded_errors import error_code, error_found
 from .jobs import jobs_of
+from .method_names import with_keys
 from .rows import number
 from .stored_files import file_ref, stored_file
 
@@ -101,14 +102,17 @@ def load_session(restriction: Any) -> SessionResults:
     ----------
     restriction
         What picks one session and, where several methods were used, one chain of methods: a dict such as
-        `{"subject": "P017", "session_label": "2026-03-01", "fit_method": "paper-2025-v1"}`; `fit_set_kind` where it has
+        `{"subject": "P017", "session_label": "2026-03-01", "fit_method": "paper-2025"}`; `fit_set_kind` where it has
         recordings of one camera, of several, or markers.
 
     Raises
     ------
     PblError
-        DB_NOT_FOUND when no session matches, USAGE when several sessions or chains match.
+        DB_NOT_FOUND when no session matches, USAGE when several sessions or chains match, SOLVER_UNKNOWN and
+        NORM_UNKNOWN for methods that there are not.
     """
+    if isinstance(restriction, Mapping):
+        restriction = with_keys(restriction)
     found = (session.Session & restriction).to_dicts()
     if not found:
         raise PblError(

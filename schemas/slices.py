@@ -17,6 +17,7 @@ from pbl_pipeline.words import unit_of
 from . import fit, gait, gdi, lab, session, study, video
 from ._datajoint import dj
 from .ingest import in_transaction
+from .method_names import with_keys
 from .rows import inside, utc_now
 from .stored_files import file_ref, stored_file
 from .views import cycle_rows, frame_of, newest_sets
@@ -84,7 +85,7 @@ def freeze(
 
     def work() -> Slice:
         visits = _candidates(cohort, roles)
-        chain = _chain(visits, methods or {})
+        chain = _chain(visits, with_keys(methods or {}))
         rows = _decided(visits, chain, cohort)
         said = " ".join(filter(None, (note, _absent(visits, cohort))))[:1000]
         about = {**chain, "study_slice": name, "slice_event": event, "slice_note": said, "cohort": cohort}

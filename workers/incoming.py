@@ -26,7 +26,17 @@ import pymysql
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import read_phone_log, sha256_of
 from schemas import video, worker
-from schemas.archive import COPIES, LOCK, REFUSED, archive_dir, folder_of, load_seen, remove_copies, save_seen
+from schemas.archive import (
+    COPIES,
+    LOCK,
+    REFUSED,
+    archive_dir,
+    folder_of,
+    load_seen,
+    plain_name,
+    remove_copies,
+    save_seen,
+)
 from schemas.codes import check_subject
 from schemas.connection import dj
 from schemas.folders import private_folder, remove_empty, sync_folders
@@ -56,15 +66,15 @@ class Taken:
     """What one run did, by the uploads' names.
 
     registered, known: taken; the latter are registered already, with what `ingest` notes of them. refused: moved aside,
-    with the reason. left: whole, but not taken this time, with the reason. ignored: no SUBJECT/SESSION/FILE of a video,
-    or a log without its video. uploading: how many are not whole yet. later: how many the time did not suffice for.
+    with the reason. left: whole, but not taken this time, with the reason. ignored: what is no recording in its place,
+    and why. uploading: how many are not whole yet. later: how many the time did not suffice for.
     """
 
     registered: list[str] = dataclasses.field(default_factory=list)
     known: dict[str, str] = dataclasses.field(default_factory=dict)
     refused: dict[str, PblError] = dataclasses.field(default_factory=dict)
     left: dict[str, PblError] = dataclasses.field(default_factory=dict)
-    ignored: list[str] = dataclasses.field(default_factory=list)
+    ignored: dict[str, str] = dataclasses.field(default_factory=dict)
     uploading: int = 0
     later: int = 0
 
@@ -121,8 +131,8 @@ def _listed(drop: Folder | Bucket, archive: Path, settled_s: float, out: Taken) 
     logs: dict[PurePosixPath, list[Upload]] = {}
     for upload in drop.uploads():
         name = upload.name
-        if not upload.file or not _has_place(name):
-            out.ignored.append(str(name))
+        if why := _misplaced(upload):
+            out.ignored[str(name)] = why
             continue
         state, before = [upload.size, upload.stamp], seen.get(str(name), [])
         # A clock that was set back does not make anything wait.
@@ -143,17 +153,23 @@ def _listed(drop: Folder | Bucket, archive: Path, settled_s: float, out: Taken) 
         if recording.name in settled and all(log.name in settled for log in own):  # else its log is still on its way
             whole.append((recording, own[:1]))
     alone = set(logs).difference(r.name.with_suffix("") for r in recordings)
-    out.ignored += [str(log.name) for stem in alone for log in logs[stem] if log.name in settled]
-    out.ignored.sort()
+    for log in (log.name for stem in alone for log in logs[stem] if log.name in settled):
+        out.ignored[str(log)] = "a log without a video of its name"
     return whole
 
 
-def _has_place(name: PurePosixPath) -> bool:
-    return (
-        len(name.parts) == 3
-        and not any(part.startswith((".", "_")) for part in name.parts)
-        and name.suffix.lower() in (*VIDEO_ENDINGS, *LOG_ENDINGS)
-    )
+def _misplaced(upload: Upload) -> str:
+    """Why something in the drop folder is no recording in its place; "" where it is one, or a log."""
+    name = upload.name
+    if any(part.startswith((".", "_")) for part in name.parts):
+        return "a name that begins with . or _, as what is still being written has"
+    if not upload.file:
+        return "no file: a folder where a file is expected, one that may not be read, or a name that leads elsewhere"
+    if len(name.parts) != 3:
+        return f"{len(name.parts) - 1} folders deep, where SUBJECT/SESSION/FILE is expected"
+    if name.suffix.lower() not in (*VIDEO_ENDINGS, *LOG_ENDINGS):
+        return f"another ending than {', '.join((*VIDEO_ENDINGS, *LOG_ENDINGS))}"
+    return ""
 
 
 # -------------------------------------------------------------------------------------------------------------- taking
@@ -297,12 +313,6 @@ def _set_aside(
         else:
             drop.move(upload, to)
     sync_folders(folder, archive)
-
-
-def plain_name(text: str) -> str:
-    """A name for a file or folder of ours from one that came from outside: ASCII, no separator, no leading dot."""
-    kept = "".join(c if c.isascii() and (c.isalnum() or c in "-_. ") else "_" for c in text).lstrip(". ").rstrip()
-    return kept[-100:] or "_"
 
 
 def _unwritable(archive: Path, error: OSError) -> PblError:

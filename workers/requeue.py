@@ -13,6 +13,7 @@ from schemas.connection import dj
 from schemas.ingest import Methods
 from schemas.ingest import resolve as resolve_ingest
 from schemas.jobs import jobs_of
+from schemas.method_names import keys_named
 from schemas.method_rows import resolve_method
 from schemas.plan import default_fit, plan_fits
 from schemas.rows import delete_below
@@ -133,7 +134,7 @@ def plan_again(
     prefix = next(n.removesuffix("_computed") for n in one.heading.names if n.endswith("_computed"))
     if method is not None:
         columns = [n for n in one.heading.names if n.endswith("_method")]
-        rows = rows & [{c: method} for c in columns]
+        rows = rows & [{c: key} for c, key in _named(columns, method)]
     if since is not None:
         rows = rows & f"{prefix}_computed >= '{since:%Y-%m-%d %H:%M:%S}'"
     if before is not None:
@@ -144,6 +145,19 @@ def plan_again(
         counts = dj.Diagram.cascade(one & keys, part_integrity="cascade").counts()
         below = {n: c for n, c in counts.items() if c}
     return Reprocess(one.__name__, [], keys, below)
+
+
+def _named(columns: Sequence[str], name: str) -> list[tuple[str, str]]:
+    """(column, key) of every method, and version of it, that has this key or short name. Raises SOLVER_UNKNOWN."""
+    out, problem = [], None
+    for column in columns:
+        try:
+            out += [(column, key) for key in keys_named(column, name)]
+        except PblError as error:
+            problem = error
+    if not out and problem is not None:
+        raise problem
+    return out
 
 
 def carry_out(plan: Reprocess) -> Iterator[int]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -103,15 +101,16 @@ def fit_paramset(solver: str | None, params: str | None, default: str | None = N
     Raises `PblError` SOLVER_UNKNOWN (also where the method is of another solver than `--solver`), FILE_FORMAT.
     """
     from pbl_pipeline.fit import METHODS
-    from pbl_pipeline.paramset import Paramset
+    from pbl_pipeline.method_file import changed
 
     if solver is not None and solver not in METHODS.families:
         raise _unknown(f"solver {solver!r}", METHODS.families)
     base = _default_of(solver, default)
     if params is None:
         return METHODS[base]
-    if params in METHODS:
-        return _of_solver(METHODS[params], solver)
+    for method in METHODS.values():
+        if params in (method.name, method.key):
+            return _of_solver(method, solver)
     path = Path(params)
     if not path.is_file():
         raise _unknown(f"paramset {params!r}, and no such file", METHODS)
@@ -125,8 +124,7 @@ def fit_paramset(solver: str | None, params: str | None, default: str | None = N
         before = _of_solver(METHODS[base], solver)
         if changes.get("solver", before.family.name) != before.family.name:
             raise ValueError(f"solver {changes['solver']!r}, but {base} is of {before.family.name}: name another base")
-        merged = Paramset("fit", path.stem, 1, _merge(dataclasses.asdict(before.params), changes))
-        return METHODS.make(path.stem, 1, merged.to(before.family.params))
+        return changed(before, path.stem, changes)
     except (OSError, ValueError, TypeError, KeyError, OverflowError) as error:
         raise PblError(
             "FILE_FORMAT",
@@ -154,21 +152,6 @@ def _of_solver(method: Method[Params], solver: str | None) -> Method[Params]:
             next_step="leave out --solver, or name a paramset of that solver",
         )
     return method
-
-
-def _merge(base: dict, changes: dict) -> dict:
-    """`changes` laid over `base`, group by group."""
-    for name, value in changes.items():
-        _check_number(name, value)
-    groups = {k: v for k, v in changes.items() if isinstance(v, dict) and isinstance(base.get(k), dict)}
-    return {**base, **changes, **{k: _merge(base[k], v) for k, v in groups.items()}}
-
-
-def _check_number(name: str, value: object) -> None:
-    """Numbers of the fit are finite and not negative, counts at least 1. Whether a number is wanted, its class says."""
-    least = 1 if name in ("steps", "samples_per_trial", "max_iterations") else 0
-    if isinstance(value, (int, float)) and not least <= value < math.inf:
-        raise ValueError(f"{name} = {value}; expected a finite number, {least} or more")
 
 
 def _unknown(found: str, known: Iterable[str]) -> PblError:

@@ -36,7 +36,9 @@ def test_whole_files_are_taken_checked_and_registered(drop: Path, tmp_path: Path
     (drop / "P001/2026-11-20/.walk2.mp4.part").write_bytes(b"hidden: still being uploaded")
     taken = twice(drop, archive)
     assert taken.registered == ["P001/2026-11-20/walk.mp4", "P002/2026-11-20/walk.MOV"]
-    assert taken.ignored == ["P001/2026-11-20/.walk2.mp4.part", "notes.txt"]
+    assert sorted(taken.ignored) == ["P001/2026-11-20/.walk2.mp4.part", "notes.txt"]
+    assert "begins with ." in taken.ignored["P001/2026-11-20/.walk2.mp4.part"]
+    assert "0 folders deep" in taken.ignored["notes.txt"]
     assert not taken.refused
     rows = (video.Video * session.Session).to_dicts(order_by="subject")
     assert [(r["subject"], r["session_label"]) for r in rows] == [("P001", "2026-11-20"), ("P002", "2026-11-20")]
@@ -205,8 +207,8 @@ def test_names_from_outside_do_not_leave_the_archive(drop: Path, tmp_path: Path)
     "name", ["P001/../x.mp4", "../1/x.mp4", "P001/1/.x.mp4", "P001/_1/x.mp4", "x.mp4", "P001/1/2/x.mp4", "P001/1/x.exe"]
 )
 def test_places_that_an_object_store_can_hold_but_the_layout_does_not(name: str):
-    assert incoming._has_place(PurePosixPath("P001/1/x.mp4"))
-    assert not incoming._has_place(PurePosixPath(name))
+    assert not incoming._misplaced(uploads.Upload(PurePosixPath("P001/1/x.mp4")))
+    assert incoming._misplaced(uploads.Upload(PurePosixPath(name)))
 
 
 def test_the_command_says_what_it_needs(tables: None, monkeypatch):

@@ -130,7 +130,7 @@ def test_what_cannot_be_built(walkers: Path):
         ({"name": "x1", "populations": ()}, "USAGE"),
         ({"name": "x1", "populations": ("martians",)}, "DB_NOT_FOUND"),
         ({"name": "x1", "subjects": ("C99",)}, "DB_NOT_FOUND"),
-        ({"name": "x1", "restriction": {"fit_method": "none-v1"}}, "DB_NOT_FOUND"),
+        ({"name": "x1", "restriction": {"fit_method": "none-v1"}}, "SOLVER_UNKNOWN"),
         ({"name": "x1", "populations": (), "subjects": ("C01",)}, "NORM_INVALID"),
     )
     for arguments, code in refused:

@@ -53,8 +53,10 @@ def import_(settled_s: float) -> None:
     )
     for name, note in sorted(taken.known.items()):
         click.echo(harmless(f"known: {name}: {note}", lines=False))
-    for name in taken.ignored[:_MOST_IGNORED]:
-        click.echo(harmless(f"ignored, no SUBJECT/SESSION/FILE of a video or its log: {name}", lines=False))
+    for name, why in sorted(taken.ignored.items())[:_MOST_IGNORED]:
+        click.echo(harmless(f"ignored, {why}: {name}", lines=False))
+    if len(taken.ignored) > _MOST_IGNORED:
+        click.echo(f"ignored: {len(taken.ignored) - _MOST_IGNORED} more")
     for what in ("refused", "left"):
         for _, error in sorted(getattr(taken, what).items()):
             click.echo(f"{what}: {error.text()}", err=True)

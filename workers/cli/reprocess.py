@@ -19,18 +19,18 @@ from pbl_pipeline.errors import PblError
     "--since", metavar="TIME", help="Only results computed (with --new-method: videos registered) since, UTC."
 )
 @click.option("--before", metavar="TIME", help="Only results computed before this time, UTC.")
-@click.option("--go", is_flag=True, help="Do it. Without this, only say what would be done.")
+@click.option("--yes", is_flag=True, help="Do it. Without this, only say what would be done.")
 def reprocess(
-    table: str, new_method: str | None, method: str | None, since: str | None, before: str | None, go: bool
+    table: str, new_method: str | None, method: str | None, since: str | None, before: str | None, yes: bool
 ) -> None:
-    """Compute results again, with lower priority than new videos. Prints what it would do; --go does it.
+    """Compute results again, with lower priority than new videos. Prints what it would do; --yes does it.
 
     With --new-method the old rows stay and the new method's are added beside them. Without, the chosen rows and all
     that was computed from them are deleted, in small steps, and queued again.
 
     \b
     Example: pbl reprocess --table SessionFit --new-method gauss-newton
-    Example: pbl reprocess --table Keypoints --before 2026-06-01 --go
+    Example: pbl reprocess --table Keypoints --before 2026-06-01 --yes
     """
     import schemas
     from pbl_pipeline import progress
@@ -54,8 +54,8 @@ def reprocess(
     n = len(plan.add) + len(plan.outdated)
     if not n:
         return
-    if not go:
-        click.echo("nothing was changed; add --go to do it")
+    if not yes:
+        click.echo("nothing was changed; add --yes to do it")
         return
     with progress.bar("reprocess", total=n, unit="row") as update:
         done = 0

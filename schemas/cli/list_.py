@@ -1,0 +1,95 @@
+"""`pbl list`: what is registered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@click.group("list", epilog="Example: pbl list videos --subject P017")
+def list_() -> None:
+    """What is registered: people, visits, videos, methods.
+
+    Example: pbl list visits --population patient --csv > visits.csv
+    """
+
+
+_FORMAT = (
+    click.option("--json", "as_json", is_flag=True, help="Print a JSON list of rows instead of a table."),
+    click.option("--csv", "as_csv", is_flag=True, help="Print CSV instead of a table."),
+)
+_PEOPLE = (
+    click.option("--subject", metavar="CODE", help="Of this person."),
+    click.option("--population", metavar="NAME", help="Of people of this group."),
+    click.option("--project", metavar="NAME", help="Of people of this study or clinic."),
+)
+_VISITS = (*_PEOPLE, click.option("--session", "session_label", metavar="LABEL", help="Of visits of this label."))
+
+
+def _options(*given: Callable) -> Callable:
+    def decorate(command: Callable) -> Callable:
+        for option in reversed((*given, *_FORMAT)):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+@list_.command(epilog="Example: pbl list subjects --population healthy")
+@_options(*_PEOPLE)
+def subjects(as_json: bool, as_csv: bool, **restriction: str | None) -> None:
+    """The people, with how many visits and videos each has."""
+    _print("subjects", restriction, as_json, as_csv)
+
+
+@list_.command(epilog="Example: pbl list visits --subject P017")
+@_options(*_VISITS)
+def visits(as_json: bool, as_csv: bool, **restriction: str | None) -> None:
+    """The visits, with how many videos and results each has."""
+    _print("visits", restriction, as_json, as_csv)
+
+
+@list_.command(epilog="Example: pbl list videos --subject P017 --session 2026-03-01 --json")
+@_options(*_VISITS, click.option("--activity", help="Of this activity, such as walking."))
+def videos(as_json: bool, as_csv: bool, **restriction: str | None) -> None:
+    """The videos, with their numbers: what `pbl why`, `pbl choose` and `pbl move` ask for."""
+    _print("videos", restriction, as_json, as_csv)
+
+
+@list_.command(epilog="Example: pbl list methods --stage fit")
+@_options(click.option("--stage", metavar="NAME", help="Of this stage, such as keypoint, fit or gait."))
+def methods(as_json: bool, as_csv: bool, stage: str | None) -> None:
+    """The methods by stage. Where a method is asked for, its key or its name is taken; a name is its newest version."""
+    from schemas import activate, listing
+
+    activate()
+    _show(listing.method_rows(stage), as_json, as_csv)
+
+
+def _print(what: str, restriction: dict[str, str | None], as_json: bool, as_csv: bool) -> None:
+    from schemas import activate, listing
+
+    activate(methods=False)
+    _show(getattr(listing, what)({k: v for k, v in restriction.items() if v is not None}), as_json, as_csv)
+
+
+def _show(rows: pd.DataFrame, as_json: bool, as_csv: bool) -> None:
+    if as_json and as_csv:
+        raise click.UsageError("--json and --csv: choose one.")
+    if as_json:
+        click.echo(rows.to_json(orient="records", date_format="iso", indent=1))
+    elif as_csv:
+        click.echo(rows.to_csv(index=False, lineterminator="\n"), nl=False)
+    elif rows.empty:
+        click.echo("none")
+    else:
+        click.echo(rows.astype(object).where(rows.notna(), "").map(_cell).to_string(index=False))
+
+
+def _cell(value: Any) -> str:
+    return f"{value:%Y-%m-%d %H:%M}" if hasattr(value, "hour") else str(value)

@@ -1,0 +1,90 @@
+"""What is registered: people, visits, videos and methods as frames, a row for each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from pbl_pipeline import methods
+from pbl_pipeline.errors import PblError
+
+from . import fit, gdi, keypoints, lab, session, video
+from ._datajoint import dj
+from ._methods import METHOD_TABLES
+from .views import frame_of, newest_sets
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def subjects(restriction: Any = True) -> pd.DataFrame:
+    """One row per person: population, project, how many visits and videos, first and last day (null: no date)."""
+    rows = frame_of(lab.Subject.proj("population", "project") & restriction)
+    visits = session.Session.proj("subject", "session_date")
+    counts = dj.U("subject").aggr(visits, visits="count(*)", first="min(session_date)", last="max(session_date)")
+    recorded = dj.U("subject").aggr(video.Video.proj("session_id") * visits, videos="count(*)")
+    return _counted(rows, "subject", counts, recorded)
+
+
+def visits(restriction: Any = True) -> pd.DataFrame:
+    """One row per visit: its label and day, how many videos (and marker recordings), and how many results (an index by
+    one chain of methods) of its newest set."""
+    rows = frame_of(_visits() & restriction).sort_values(["subject", "session_label"], ignore_index=True)
+    recorded = dj.U("session_id").aggr(video.Video.proj("session_id"), videos="count(*)")
+    results = dj.U("session_id").aggr(gdi.SessionGdi.proj() * newest_sets(), results="count(*)")
+    return _counted(rows, "session_id", recorded, results)
+
+
+def videos(restriction: Any = True) -> pd.DataFrame:
+    """One row per video: whose, what is done at which pace, how many methods made keypoints and fits of it."""
+    columns = ("session_id", "video_name", "activity", "camera_motion", "video_created")
+    query = video.Video.proj(*columns) * _visits() & restriction
+    rows = frame_of(query).sort_values("video_id", ignore_index=True)
+    found = video.conditions(query.proj())
+    rows["pace"] = rows["video_id"].map({number: about.pace for number, about in found.items()})
+    points = dj.U("video_id").aggr(keypoints.Keypoints.proj(), keypoints="count(*)")
+    fits = dj.U("video_id").aggr(fit.SessionFit.Trial.proj() * newest_sets(), fits="count(*)")
+    rows = _counted(rows, "video_id", points, fits)
+    first = ["video_id", "subject", "session_label", "video_name", "activity", "pace"]
+    return rows[[*first, *(c for c in rows.columns if c not in first)]]
+
+
+def method_rows(stage: str | None = None) -> pd.DataFrame:
+    """One row per method: the stage, its key and short name (which means the newest version), and whether it is the
+    stage's default.
+
+    Raises `PblError` SOLVER_UNKNOWN for a stage that there is not.
+    """
+    import pandas as pd
+
+    tables = {table.stage: table for table in METHOD_TABLES}
+    if stage is not None and stage not in tables:
+        raise PblError(
+            "SOLVER_UNKNOWN",
+            found=f"stage {stage!r}",
+            expected=f"one of {', '.join(tables)}",
+            next_step="choose one of these",
+        )
+    out: list[Mapping[str, Any]] = []
+    for name in tables if stage is None else [stage]:
+        prefix, known = tables[name].primary_key[0], methods.of_stage(name)
+        default = known[known.default].key
+        columns = (f"{prefix}_name", f"{prefix}_version")
+        for row in tables[name].proj(*columns).to_dicts(order_by=columns):
+            about = {"stage": name, "method": row[prefix], "name": row[columns[0]], "version": row[columns[1]]}
+            out.append({**about, "default": "yes" if row[prefix] == default else ""})
+    return pd.DataFrame(out, columns=["stage", "method", "name", "version", "default"])
+
+
+def _visits() -> Any:
+    people = lab.Subject.proj("population", "project")
+    return session.Session.proj("subject", "session_label", "session_date") * people
+
+
+def _counted(rows: Any, key: str, *counts: Any) -> Any:
+    """Rows with the columns of queries that count by `key`; 0 where a query has no row."""
+    for query in counts:
+        rows = rows.merge(frame_of(query), how="left", on=key)
+        for name in set(query.heading.names) - {key, "first", "last"}:
+            rows[name] = rows[name].fillna(0).astype(int)
+    return rows

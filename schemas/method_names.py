@@ -1,0 +1,57 @@
+"""Which method a name means: keys (`blazepose-v3`) and short names (`blazepose`) of what the tables hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pbl_pipeline.errors import PblError
+
+from . import fit, gait, gdi, keypoints, tracking
+from .method_rows import stored_key
+
+#: Column of a method -> table of the methods, table of the results.
+_RESULTS = {
+    "tracking_method": (tracking.TrackingMethod, tracking.Tracking),
+    "keypoint_method": (keypoints.KeypointMethod, keypoints.Keypoints),
+    "fit_method": (fit.FitMethod, fit.SessionFit),
+    "gait_method": (gait.GaitEventMethod, gait.GaitEvents),
+    "gdi_method": (gdi.GdiModel, gdi.GDI),
+    "norm": (gdi.NormativeSet, gdi.GDI),
+}
+
+
+def with_keys(restriction: Mapping[str, Any]) -> dict[str, Any]:
+    """A restriction of results whose methods (and normative set) may be named short: `blazepose` becomes the key of its
+    newest version that has results, else of the newest.
+
+    Raises
+    ------
+    PblError
+        SOLVER_UNKNOWN, NORM_UNKNOWN.
+    """
+    out = dict(restriction)
+    for column in out.keys() & _RESULTS.keys():
+        if isinstance(out[column], str):
+            keys = keys_named(column, out[column])
+            results = _RESULTS[column][1]
+            out[column] = next((key for key in keys if results & {column: key}), keys[0])
+    return out
+
+
+def keys_named(column: str, name: str) -> list[str]:
+    """Keys of the methods (column `fit_method`, ...) or normative sets (`norm`) that a key or a short name means, the
+    newest version first. Raises `PblError` SOLVER_UNKNOWN, NORM_UNKNOWN."""
+    table = _RESULTS[column][0]
+    rows = table.proj(f"{column}_name", f"{column}_version").to_dicts(order_by=f"{column}_version DESC")
+    found = [row[column] for row in rows if name in (row[column], row[f"{column}_name"])]
+    if found:
+        return found
+    if column != "norm":
+        stored_key(table, name)  # says which there are
+    raise PblError(
+        "NORM_UNKNOWN",
+        found=f"normative set {name!r}",
+        expected=f"one of {', '.join(sorted({row['norm_name'] for row in rows}))}",
+        next_step="choose one of the names above (`pbl norm list`)",
+    )

@@ -1,0 +1,175 @@
+"""`pbl list`, `pbl move` and `pbl method add`, and short names of methods, on a chain of stand-ins."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import METHODS
+from schemas import fit, gait, gdi, keypoints, lab, session, video
+from schemas.ingest import Methods, Visit, ingest
+from schemas.method_names import keys_named, with_keys
+from schemas.move import carry_out, plan_move
+from tests.command import pbl
+from tests.rows import everything, register
+from workers import incoming
+from workers.populate import populate
+
+from . import chain
+
+
+def visits_of_fits() -> dict[str, int]:
+    """Visit -> number of videos in its current fit."""
+    current = fit.SessionFit * (fit.FitSelection & {"fit_current": True}) * fit.FitSet.proj("session_id", "fit_set_n")
+    rows = (current * session.Session.proj("subject", "session_label")).to_dicts()
+    assert len({(r["subject"], r["session_label"]) for r in rows}) == len(rows)
+    return {f"{r['subject']}/{r['session_label']}": int(r["fit_set_n"]) for r in rows}
+
+
+@pytest.fixture
+def walks(tables: None, tmp_path: Path) -> dict[str, int]:
+    """Two videos of one visit of P001 and one of P002, through the chain."""
+    paths = [chain.small_video(tmp_path, name, n=240 + i) for i, name in enumerate(("one", "two", "three"))]
+    one, two = register(*paths[:2], session_label="2026-03-01", project="spine", population="patient")
+    (three,) = register(paths[2], subject="P002", session_label="2026-03-02", population="healthy")
+    populate()
+    return {"one": one, "two": two, "three": three}
+
+
+def test_lists_then_moves(walks):
+    """One chain for both: the lists look at it before anything is moved."""
+    lists_have_a_row_for_each_with_counts_and_filters(walks)
+    a_moved_video_takes_its_keypoints_and_leaves_the_fit(walks)
+    a_visit_that_is_new_is_made_with_the_plans_of_the_old(walks)
+
+
+def lists_have_a_row_for_each_with_counts_and_filters(walks):
+    people = pd.read_csv(io.StringIO(pbl("list", "subjects", "--csv").out))
+    assert people[["subject", "population", "visits", "videos"]].to_numpy().tolist() == [
+        ["P001", "patient", 1, 2],
+        ["P002", "healthy", 1, 1],
+    ]
+    assert list(people["first"]) == ["2026-03-01", "2026-03-02"]
+    visits = json.loads(pbl("list", "visits", "--json", "--population", "healthy").out)
+    assert [(v["subject"], v["videos"], v["results"]) for v in visits] == [("P002", 1, 1)]
+    videos = json.loads(pbl("list", "videos", "--json", "--session", "2026-03-01").out)
+    assert [(v["video_id"], v["pace"], v["keypoints"], v["fits"]) for v in videos] == [
+        (walks["one"], "unknown", 1, 1),
+        (walks["two"], "unknown", 1, 1),
+    ]
+    assert pbl("list", "videos", "--subject", "P003").out == "none\n"
+    assert json.loads(pbl("list", "videos", "--subject", "P003", "--json").out) == []
+    table = pbl("list", "visits").out.splitlines()
+    assert len(table) == 3
+    assert "2026-03-01" in table[1]
+    assert pbl("list", "visits", "--json", "--csv").code == 2
+    methods = json.loads(pbl("list", "methods", "--stage", "fit", "--json").out)
+    assert {m["name"] for m in methods if m["default"]} == {METHODS.default}
+    assert {m["method"] for m in methods} >= {m.key for m in METHODS.values()}
+    assert pbl("list", "methods", "--stage", "feet").error_code == "SOLVER_UNKNOWN"
+
+
+def a_moved_video_takes_its_keypoints_and_leaves_the_fit(walks):
+    assert visits_of_fits() == {"P001/2026-03-01": 2, "P002/2026-03-02": 1}
+    made = keypoints.Keypoints().to_arrays("keypoints_computed", order_by="KEY").tolist()
+    before = everything()
+    shown = pbl("move", walks["two"], "--to", "P002/2026-03-02")
+    assert shown.code == 0, shown.err
+    assert "from P001/2026-03-01 to P002/2026-03-02" in shown.out
+    assert "1 rows of" in shown.out
+    assert "--yes" in shown.out
+    assert everything() == before
+    done = pbl("move", walks["two"], "--to", "P002/2026-03-02", "--yes")
+    assert done.code == 0, done.err
+    assert visits_of_fits() == {"P002/2026-03-02": 1}  # nothing is left of the set it was in
+    populate()
+    assert visits_of_fits() == {"P001/2026-03-01": 1, "P002/2026-03-02": 2}
+    assert keypoints.Keypoints().to_arrays("keypoints_computed", order_by="KEY").tolist() == made
+
+
+def a_visit_that_is_new_is_made_with_the_plans_of_the_old(walks):
+    done = pbl("move", walks["one"], "--to", "P003/first", "--yes")
+    assert "a new person" in done.out
+    assert "P001/2026-03-01 keeps no video" in done.out
+    populate()
+    assert visits_of_fits() == {"P002/2026-03-02": 2, "P003/first": 1}
+    assert len(session.Session & {"subject": "P001"}) == 1
+    old, new = ((session.Session & {"subject": s}).fetch1("session_id") for s in ("P001", "P003"))
+    for table in (fit.FitPlan, gait.GaitPlan, gdi.GdiPlan):
+        plans = [[{**r, "session_id": 0} for r in (table & {"session_id": n}).to_dicts()] for n in (old, new)]
+        assert plans[0] == plans[1] != []
+
+
+@pytest.mark.parametrize(
+    ("target", "code"),
+    [("P001/2026-03-01", "USAGE"), ("Anna Meier/1", "USAGE"), ("P001/" + "x" * 65, "USAGE")],
+)
+def test_what_cannot_be_moved_is_refused_and_changes_nothing(tables, tmp_path, target, code):
+    (number,) = register(chain.small_video(tmp_path, "walk"), session_label="2026-03-01")
+    before = everything()
+    assert pbl("move", number, "--to", target, "--yes").error_code == code
+    assert pbl("move", 999, "--to", "P002/1", "--yes").error_code == "DB_NOT_FOUND"
+    assert pbl("move", number, "--to", "P002").code == 2
+    assert everything() == before
+
+
+def test_a_recording_of_the_archive_goes_to_the_folder_of_its_new_person(drop, tmp_path, monkeypatch):
+    archive = tmp_path / "archive"
+    monkeypatch.setenv("PBL_ARCHIVE", str(archive))
+    path = drop / "P001" / "1" / "walk.mp4"
+    path.parent.mkdir(parents=True)
+    content = chain.small_video(tmp_path, "walk").read_bytes()
+    path.write_bytes(content)
+    for _ in range(2):
+        incoming.take_over(str(drop), archive, settled_s=0)
+    number, old = video.Video.fetch1("video_id", "video_path")
+    assert Path(old).is_relative_to(archive / "P001")
+    plan = plan_move(int(number), "P002", "2")
+    monkeypatch.setattr("schemas.move.session_of", lambda visit: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        carry_out(plan)
+    assert (video.Video.fetch1("video_path"), len(list(archive.rglob("*.mp4")))) == (old, 1)
+    monkeypatch.undo()
+    monkeypatch.setenv("PBL_ARCHIVE", str(archive))
+    carry_out(plan)
+    (now,) = archive.rglob("*.mp4")
+    assert now.is_relative_to(archive / "P002" / "2")
+    assert video.Video.fetch1("video_path") == str(now)
+    assert now.read_bytes() == content
+    assert not (archive / "P001").exists()
+    assert {r["subject"] for r in lab.Subject().to_dicts()} == {"P001", "P002"}
+
+
+def test_a_method_from_a_file_is_registered_once_and_used_by_its_name(tables, tmp_path):
+    path = chain.small_video(tmp_path, "walk")
+    register(path, subject="P002", session_label="2026-03-02")
+    file = tmp_path / "slow.json"
+    file.write_text(json.dumps({"base": METHODS.default, "max_iterations": 7}), encoding="utf-8")
+    try:
+        assert "slow-v1: registered as a fit method" in pbl("method", "add", file).out
+        assert "slow-v1: known already" in pbl("method", "add", file).out
+        file.write_text(json.dumps({"base": METHODS.default, "max_iterations": 8}), encoding="utf-8")
+        assert "slow-v2: registered" in pbl("method", "add", file).out
+        assert keys_named("fit_method", "slow") == ["slow-v2", "slow-v1"]
+        (result,) = ingest([path], Visit("P002", "2026-03-02"), Methods(fit="slow-v1"))
+        assert result.status == "updated"
+        populate()
+        assert {r["fit_method"] for r in fit.SessionFit().to_dicts()} > {"slow-v1"}
+        # Short: the newest version that has results, which is not the newest one.
+        assert with_keys({"fit_method": "slow", "subject": "P002"}) == {"fit_method": "slow-v1", "subject": "P002"}
+        out = tmp_path / "x"
+        done = pbl("export", "--subject", "P002", "--fit-method", "slow", "--to", "csv", "--out", out)
+        assert done.code == 0, done.err
+        plan = pbl("reprocess", "--table", "SessionFit", "--method", "slow").out
+        assert "1 rows of SessionFit would be deleted" in plan
+        assert "--yes" in plan
+        assert pbl("reprocess", "--table", "SessionFit", "--method", "slower").error_code == "SOLVER_UNKNOWN"
+        with pytest.raises(PblError, match="NORM_UNKNOWN"):
+            with_keys({"norm": "nobody"})
+    finally:
+        (fit.FitMethod & {"fit_method_name": "slow"}).delete(prompt=False)
