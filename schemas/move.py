@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import glob
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from .choose import unknown_video
 from .codes import check_subject
 from .folders import private_folder, remove_empty, sync_folders
 from .ingest import Visit, forget_errors, in_transaction, session_of
+from .rigs import check_same_number
 from .rows import delete_below
 
 #: Plans of a visit that follow a video into its new one.
@@ -28,13 +29,13 @@ _PLANS = (fit.FitPlan, gait.GaitPlan, gdi.GdiPlan)
 
 @dataclasses.dataclass(frozen=True)
 class Move:
-    """What moving a video would change. `before` and `after` are (subject, session label); new_subject, new_session:
-    it would make them; sets: keys of the fits' sets of the old visit that hold the video, which are deleted with all
-    that was computed from them (`deleted`: table -> rows); left: videos that the old visit keeps."""
+    """What moving a video would change. `files`: number -> path of the videos that move: it, or all of its trial where
+    several cameras filmed it. `before` and `after` are (subject, session label); new_subject, new_session: those are to
+    be made; sets: keys of the fits' sets of the old visit that hold one of them, which are deleted with all that was
+    computed from them (`deleted`: table -> rows); left: videos that the old visit keeps."""
 
     video_id: int
-    name: str
-    path: Path
+    files: Mapping[int, Path]
     before: tuple[str, str]
     after: tuple[str, str]
     new_subject: bool
@@ -66,20 +67,25 @@ def plan_move(video_id: int, subject: str, session_label: str) -> Move:
             expected="another visit",
             next_step="nothing is to be done",
         )
-    sets = (fit.FitSet & (fit.FitSet.Video & {"video_id": video_id})).keys()
+    trial = fit.trials_of([video_id]).get(video_id)
+    numbers = [video_id] if trial is None else [int(v["video_id"]) for v in fit.views_of([trial])[trial]]
+    of_these = [{"video_id": v} for v in numbers]
+    sets = (fit.FitSet & (fit.FitSet.Video & of_these)).keys()
     counts = dj.Diagram.cascade(fit.FitSet & list(sets), part_integrity="cascade").counts() if sets else {}
     there = {"subject": subject, "session_label": session_label}
+    if trial is not None:
+        for found in (session.Session & there).to_dicts():
+            check_same_number(int(found["session_id"]), len(numbers), Path(row["video_path"]))
     return Move(
         video_id,
-        row["video_name"],
-        Path(row["video_path"]),
+        {int(v["video_id"]): Path(v["video_path"]) for v in (video.Video & of_these).to_dicts(order_by="video_id")},
         (row["subject"], row["session_label"]),
         (subject, session_label),
         not lab.Subject & {"subject": subject},
         not session.Session & there,
         tuple(sets),
         {name: n for name, n in counts.items() if n},
-        len(video.Video & {"session_id": row["session_id"]}) - 1,
+        len(video.Video & {"session_id": row["session_id"]}) - len(numbers),
     )
 
 
@@ -96,15 +102,16 @@ def carry_out(plan: Move) -> None:
         What `plan_move` raises, where rows changed since; FILE_UNWRITABLE: the recording in the archive cannot be
         moved, or another process is changing the archive. Nothing is changed then.
     """
-    number = {"video_id": plan.video_id}
+    of_these = [{"video_id": v} for v in plan.files]
 
-    def work(path: Path) -> None:
+    def work(paths: Mapping[int, Path]) -> None:
         again = plan_move(plan.video_id, *plan.after)
-        old = int((video.Video & number).fetch1("session_id"))
+        old = int((video.Video & {"video_id": plan.video_id}).fetch1("session_id"))
         delete_below(fit.FitSet, again.sets)
         new = session_of(Visit(*plan.after))
-        video.Video.update1({**number, "session_id": new, "video_path": str(path)})
-        points = keypoints.KeypointSelection & number
+        for number, path in paths.items():
+            video.Video.update1({"video_id": number, "session_id": new, "video_path": str(path)})
+        points = keypoints.KeypointSelection & of_these
         for table in _PLANS:
             rows = (table & {"session_id": old}).to_dicts()
             if "keypoint_method" in table.primary_key:
@@ -112,38 +119,42 @@ def carry_out(plan: Move) -> None:
                 rows = [row for row in rows if row["keypoint_method"] in here]
             table.insert(({**row, "session_id": new} for row in rows), skip_duplicates=True)
 
-    with _moved_file(plan) as path:
-        in_transaction(lambda: work(path))
-    forget_errors(plan.video_id)
+    with _moved_files(plan) as paths:
+        in_transaction(lambda: work(paths))
+    for number in plan.files:
+        forget_errors(number)
 
 
 @contextlib.contextmanager
-def _moved_file(plan: Move) -> Iterator[Path]:
-    """Path of the recording in its new visit. One in the archive gets a name there and loses the old one at the end."""
+def _moved_files(plan: Move) -> Iterator[Mapping[int, Path]]:
+    """Paths of the recordings in their visit. One in the archive gets a name there and loses its old one at the end."""
     archive = archive_dir()
-    if not plan.path.is_relative_to(archive) or not plan.path.is_file():
-        yield plan.path
+    kept = [path for path in plan.files.values() if path.is_relative_to(archive) and path.is_file()]
+    if not kept:
+        yield plan.files
         return
     with worker.alone(LOCK, video.Video.connection) as obtained:
         if not obtained:
-            raise _kept(plan.path, "uploads are being taken over now", "repeat this in a minute")
+            raise _kept(kept[0], "uploads are being taken over now", "repeat this in a minute")
         names: dict[Path, Path] = {}
         try:
             folder = private_folder(folder_of(archive, "", plan.after[0]) / plain_name(plan.after[1]))
-            for old in plan.path.parent.glob(f"{glob.escape(plan.path.stem)}.*"):  # its log, too
-                names[old] = folder / old.name
-                os.link(old, names[old])
+            for path in kept:
+                for old in path.parent.glob(f"{glob.escape(path.stem)}.*"):  # its log, too
+                    names[old] = folder / old.name
+                    os.link(old, names[old])
             sync_folders(folder, archive)
         except OSError as error:
             _unlink(names.values())
-            raise _kept(plan.path, error.strerror or str(error), "see that the archive can be written") from error
+            raise _kept(kept[0], error.strerror or str(error), "see that the archive can be written") from error
         try:
-            yield names[plan.path]
+            yield {number: names.get(path, path) for number, path in plan.files.items()}
         except BaseException:
             _unlink(names.values())
             raise
         _unlink(names)
-        remove_empty(plan.path.parent, 2)
+        for folder in {path.parent for path in kept}:
+            remove_empty(folder, 2)
 
 
 def _unlink(paths: Any) -> None:

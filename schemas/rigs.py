@@ -112,7 +112,7 @@ def _ingest(
 
     def insert() -> None:
         session_id = ingest.session_of(visit)
-        _check_same_number(session_id, len(files), files[0])
+        check_same_number(session_id, len(files), files[0])
         rig_id = _rig_id(calibration, about)
         first = ingest.next_id(video.Video, "video_id", len(files))
         numbers[:] = range(first, first + len(files))
@@ -173,7 +173,7 @@ def _rig_id(calibration: Path, about: dict[str, Any]) -> int:
     return number
 
 
-def _check_same_number(session_id: int, n: int, path: Path) -> None:
+def check_same_number(session_id: int, n: int, path: Path) -> None:
     """Raise `PblError` USAGE where the session has trials of another number of cameras: they are fitted together."""
     views = video.RigView * video.Video.proj("session_id") & {"session_id": session_id}
     for row in dj.U("rig_trial").aggr(views, n_views="count(*)").to_dicts(limit=1):

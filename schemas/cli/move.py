@@ -12,8 +12,9 @@ import click
 def move(video_id: int, target: str, yes: bool) -> None:
     """Put video VIDEO_ID, registered for the wrong person or visit, where it belongs.
 
-    Its keypoints stay. Fits that hold it are deleted with all that was computed from them; `pbl populate` fits what is
-    left of the old visit, and the new one. A person or visit that is new is made.
+    Where several cameras filmed the trial, all of its videos go. Keypoints stay. Fits that hold them are deleted with
+    all that was computed from them; `pbl populate` fits what is left of the old visit, and the new one. A person or
+    visit that is new is made.
 
     \b
     Example: pbl move 17 --to P018/2026-03-01
@@ -28,7 +29,9 @@ def move(video_id: int, target: str, yes: bool) -> None:
     schemas.activate(methods=False)
     plan = plan_move(video_id, subject, label)
     new = " (a new person)" if plan.new_subject else " (a new visit)" if plan.new_session else ""
-    click.echo(f"video_id {video_id}, {plan.name}: from {'/'.join(plan.before)} to {target}{new}")
+    click.echo(f"video_id {video_id}: from {'/'.join(plan.before)} to {target}{new}")
+    for number, path in plan.files.items():
+        click.echo(f"  video_id {number}, {path.name}")
     for table, n in plan.deleted.items():
         click.echo(f"  {'deleted' if yes else 'would be deleted'}: {n} rows of {table}")
     if not plan.left:

@@ -15,12 +15,13 @@ from schemas import fit, gait, gdi, keypoints, lab, session, video
 from schemas.ingest import Methods, Visit, ingest
 from schemas.method_names import keys_named, with_keys
 from schemas.move import carry_out, plan_move
+from schemas.rigs import ingest_rig
 from tests.command import pbl
 from tests.rows import everything, register
 from workers import incoming
 from workers.populate import populate
 
-from . import chain
+from . import chain, test_rigs
 
 
 def visits_of_fits() -> dict[str, int]:
@@ -116,6 +117,18 @@ def test_what_cannot_be_moved_is_refused_and_changes_nothing(tables, tmp_path, t
     assert pbl("move", 999, "--to", "P002/1", "--yes").error_code == "DB_NOT_FOUND"
     assert pbl("move", number, "--to", "P002").code == 2
     assert everything() == before
+
+
+def test_all_cameras_of_a_trial_move_together(tables, tmp_path):
+    toml = test_rigs.calibration(tmp_path / "rig.toml")
+    done = ingest_rig(test_rigs.rig_videos(tmp_path / "three"), toml, Visit("P001", "2026-03-01"))
+    numbers = {int(r.video_id or 0) for r in done}
+    pair = test_rigs.calibration(tmp_path / "pair.toml", test_rigs.CAMERAS[:2])
+    ingest_rig(test_rigs.rig_videos(tmp_path / "two", "b_", 250, test_rigs.CAMERAS[:2]), pair, Visit("P003", "1"))
+    assert pbl("move", max(numbers), "--to", "P003/1", "--yes").error_code == "USAGE"  # two cameras there
+    assert pbl("move", max(numbers), "--to", "P002/1", "--yes").code == 0
+    moved = video.Video * session.Session.proj("subject") & {"subject": "P002"}
+    assert {int(v) for v in moved.to_arrays("video_id")} == numbers
 
 
 def test_a_recording_of_the_archive_goes_to_the_folder_of_its_new_person(drop, tmp_path, monkeypatch):
