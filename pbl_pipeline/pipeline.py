@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pbl_pipeline import __version__
 from pbl_pipeline.body import SCALE_NAMES
 from pbl_pipeline.code_version import code_version
+from pbl_pipeline.deidentify import to_show
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import write_angles_csv
 from pbl_pipeline.fit import METHODS as FIT_METHODS
@@ -34,13 +36,15 @@ TRIAL_FILES = ("overlay.mp4", "angles.csv", "events.csv", "fit.npz", "keypoints.
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
-    """One recording up to its keypoints."""
+    """One recording up to its keypoints. `shown`: the recording whose pictures overlay and report show, where that is
+    another one (a de-identified copy); None: what `deidentify.to_show` says."""
 
     name: str
     path: Path
     video: VideoInfo
     choice: SubjectChoice
     keypoints: Keypoints
+    shown: Path | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,15 +174,33 @@ def write_results(
     """Write everything a person or program reads of a session into `out` and return the paths, the report first.
 
     `<name>.keypoints.npz`, `.fit.npz`, `.angles.csv`, `.events.csv` and `.overlay.mp4` per trial; `session.json`,
-    `metrics.json` and `report.html` (docs/files.md).
+    `metrics.json` and `report.html` (docs/files.md). Where PBL_DEIDENTIFY says so, overlays and pictures show the
+    recordings with hidden heads.
+
+    Raises the `PblError`s of `render_overlay` and `deidentify.to_show`.
     """
     out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        trials = tuple(
+            dataclasses.replace(t, shown=t.shown or to_show(t.path, Path(folder), t.video)) for t in session.trials
+        )
+        return _write_results(out, dataclasses.replace(session, trials=trials), title, subject_code, date, origin)
+
+
+def _write_results(
+    out: Path,
+    session: Session,
+    title: str,
+    subject_code: str,
+    date: str,
+    origin: Mapping[str, Mapping[str, str]] | None,
+) -> list[Path]:
     paths, reports = [out / "report.html"], []
     for trial, fit, measured in zip(session.trials, session.fit.trials, session.metrics.trials, strict=True):
         files = {end: out / f"{trial.name}.{end}" for end in TRIAL_FILES}
         events = measured.events.events if measured.events else ()
         render_overlay(
-            trial.path,
+            trial.shown or trial.path,
             fit,
             files["overlay.mp4"],
             keypoints=trial.keypoints,
@@ -268,5 +290,5 @@ def _named(checks: Sequence[Check], trial: str, n_trials: int) -> list[Check]:
 def _pictures(trial: Trial, fit: TrialFit) -> tuple[Picture, ...]:
     """Frames for the report, cut to the person."""
     index = report_indices(fit)
-    images = overlay_frames(trial.path, fit, index, crop_to_body=True, max_side_px=760)
+    images = overlay_frames(trial.shown or trial.path, fit, index, crop_to_body=True, max_side_px=760)
     return tuple(Picture(i, float(fit.time_s[i]), image) for i, image in zip(index, images, strict=True))

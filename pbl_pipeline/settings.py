@@ -7,6 +7,11 @@ from pathlib import Path
 
 import platformdirs
 
+from pbl_pipeline.errors import PblError
+
+#: How the heads in a recording may be hidden (`pbl_pipeline.deidentify`).
+DEIDENTIFY = ("blur", "pixelate", "skeleton")
+
 #: Every environment variable the project reads, with its meaning (README lists them; a test compares).
 VARIABLES: dict[str, str] = {
     "PBL_CACHE": "folder for fetched models, demo files and compiled programs (default: the user's cache folder)",
@@ -19,6 +24,8 @@ VARIABLES: dict[str, str] = {
     "PBL_INCOMING": "folder or s3://BUCKET/PREFIX into which phones upload, for pbl cron import",
     "PBL_ARCHIVE": "folder in which uploaded recordings are kept (default: recordings/ in PBL_HOME)",
     "PBL_BACKUP": "folder of the regular backups (database, store, recordings), for pbl cron backup",
+    "PBL_DEIDENTIFY": "blur, pixelate or skeleton: overlays and reports show recordings with hidden heads, and workers "
+    "compute these (default: off)",
     "PBL_S3_ENDPOINT": "address of an object store (S3, MinIO) that holds arrays instead of a folder",
     "PBL_S3_BUCKET": "its bucket (default: pbl)",
     "PBL_S3_KEY": "its access key; or PBL_S3_KEY_FILE, a file with it",
@@ -52,6 +59,22 @@ def store_dir() -> Path:
 def models_dir() -> Path:
     """Folder of the registered keypoint models (not created here). Not the cache: a lab's own model is nowhere else."""
     return Path(os.environ.get("PBL_MODELS") or home_dir() / "models").absolute()
+
+
+def deidentify_how() -> str:
+    """How recordings are shown in overlays and reports: "blur", "pixelate", "skeleton", or "" for as they are.
+
+    Raises `PblError` USAGE for another word: who misspells it must not see faces.
+    """
+    how = os.environ.get("PBL_DEIDENTIFY", "").strip().lower()
+    if how not in ("", *DEIDENTIFY):
+        raise PblError(
+            "USAGE",
+            found=f"PBL_DEIDENTIFY={how!r}",
+            expected=f"one of {', '.join(DEIDENTIFY)}, or nothing",
+            next_step="correct the environment variable",
+        )
+    return how
 
 
 def offline() -> bool:

@@ -17,6 +17,7 @@ STAGES = (
     "gdi",
     "qc",
     "validation",
+    "privacy",
     "study",
     "worker",
 )

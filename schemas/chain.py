@@ -51,6 +51,15 @@ def computed_tables() -> list[Any]:
     return [cls for cls in tables().values() if issubclass(cls, dj.Computed)]
 
 
+#: Computed tables that have rows only where somebody asked for it: a reference was registered, a setting wants copies.
+ON_REQUEST = ("KinematicError", "Deidentified")
+
+
+def is_wanted(table: Any) -> bool:
+    """Whether the settings ask for this table (its `wanted`, where it has one); no question to the database."""
+    return getattr(table, "wanted", lambda: True)()
+
+
 @functools.cache
 def before(table: Any) -> tuple[Any, ...]:
     """The computed tables before this one."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
-from . import fit
+from . import fit, privacy
 from .results import load_session, not_finished
 
 
@@ -16,7 +17,8 @@ def write_session(restriction: Any, out: Path) -> list[Path]:
     ------
     PblError
         DB_NOT_FOUND when the session is unknown or not fitted yet, USAGE when several match, VIDEO_MISSING when a
-        recording is no longer where it was.
+        recording is no longer where it was. Where PBL_DEIDENTIFY is set: DB_NOT_FOUND without a de-identified copy,
+        HEAD_NOT_FOUND where nothing was covered in it.
     """
     # The library's drawing half is heavy; commands that only look at rows do not pay for it.
     from pbl_pipeline.pipeline import Session, Trial, write_results
@@ -24,15 +26,20 @@ def write_session(restriction: Any, out: Path) -> list[Path]:
     found = load_session(restriction)
     if found.fit is None or found.metrics is None:
         raise not_finished(found, "fit and measures")
-    trials = tuple(Trial(t.name, t.path, t.info, t.choice, t.keypoints) for t in found.fitted)
-    return write_results(
-        out,
-        Session(trials, found.fit, found.metrics, left_out={t.name: t.problem for t in found.trials if t.fit is None}),
-        title="Gait report",
-        subject_code=found.subject,
-        date=str(found.session_date or found.session_label),
-        origin={"Methods": methods_of(found.key)},
-    )
+    with contextlib.ExitStack() as open_files:
+        trials = tuple(
+            Trial(t.name, t.path, t.info, t.choice, t.keypoints, open_files.enter_context(privacy.shown(t.video_id)))
+            for t in found.fitted
+        )
+        left_out = {t.name: t.problem for t in found.trials if t.fit is None}
+        return write_results(
+            out,
+            Session(trials, found.fit, found.metrics, left_out=left_out),
+            title="Gait report",
+            subject_code=found.subject,
+            date=str(found.session_date or found.session_label),
+            origin={"Methods": methods_of(found.key)},
+        )
 
 
 def methods_of(key: Any) -> dict[str, str]:

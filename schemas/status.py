@@ -25,6 +25,7 @@ EMPTY_COLUMNS: dict[str, tuple[str, tuple[str, ...], str | None]] = {
     "Spatiotemporal": ("measures_status", ("EMPTY",), "measures_reason"),
     "GDI": ("gdi_status", ("EMPTY",), None),
     "SessionGdi": ("session_status", ("EMPTY",), None),
+    "Deidentified": ("deidentified_status", ("NO_HEAD",), "deidentified_reason"),
 }
 
 

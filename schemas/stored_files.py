@@ -32,6 +32,11 @@ def new_folder() -> Iterator[Path]:
         yield Path(folder)
 
 
+def lasting_folder() -> tempfile.TemporaryDirectory:
+    """Such a folder for a file that is computed now and stored later: gone when nobody holds the object any more."""
+    return tempfile.TemporaryDirectory(prefix=f"{_PREFIX}{os.getpid()}-{_OWN}-")
+
+
 def remove_left_folders() -> list[Path]:
     """Remove such folders of processes that were killed; returns those that this account may not remove."""
     left = []

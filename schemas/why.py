@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 from . import computed_tables, fit, tracking, video
-from .chain import before
+from .chain import ON_REQUEST, before
 from .coded_errors import error_code, error_found, error_next_step
 from .jobs import jobs_of
 from .status import EMPTY_COLUMNS
@@ -128,7 +128,7 @@ def _verdict(steps: list[Step], in_a_set: bool) -> str:
             return f"{stage} waits for a worker ({step.note}); next: pbl worker or pbl populate"
         if step.what == EMPTY:
             return f"{stage} ran well and found nothing to go on with: {step.note}"
-        if step.what == NOT_YET and step.table != "KinematicError":
+        if step.what == NOT_YET and step.table not in ON_REQUEST:
             if step.table == "SessionFit" and not in_a_set:
                 return "its session is fitted when all of its videos are decided; next: pbl populate plans it"
             return f"{stage} is not queued yet; next: pbl populate, or a worker looks at all tables every minute"

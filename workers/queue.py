@@ -21,6 +21,7 @@ from typing import Any
 import pymysql
 
 from pbl_pipeline.errors import PblError
+from schemas import chain
 from schemas.connection import dj
 from schemas.jobs import COUNTS, jobs_of, keys_of
 
@@ -77,7 +78,7 @@ def fill(
     `keys`: only what belongs to these (keys of a table above); `where`: only what a condition on the key holds for.
     DataJoint's own refresh inserts row by row.
     """
-    if keys is not None and not keys:
+    if (keys is not None and not keys) or not chain.is_wanted(table):
         return 0
     jobs, quote = jobs_of(table), table.connection.adapter.quote_identifier
     source = keys_of(table)

@@ -50,6 +50,7 @@ STAGES: dict[str, Stage] = {
     "SessionGdi": Stage(LIGHT, 600.0, 16),
     "SessionQc": Stage(LIGHT, 300.0, 16),
     "KinematicError": Stage(LIGHT, 300.0, 16),
+    "Deidentified": Stage(DETECTOR, 4 * 3600.0, 1),
 }
 
 

@@ -42,8 +42,7 @@ def deidentify(video: Path, out: Path | None, how: str, keep: tuple[str, ...], o
     done = run(video, out, how, keep=keep, overwrite=overwrite)
     click.echo(f"{done.status}: {done.reason}")
     for first, last in done.uncertain[:_MOST_RUNS]:
-        why = {r for of_frame in done.reasons[first : last + 1] for r in of_frame}
-        click.echo(f"  frames {first} to {last}: {'; '.join(text for r, text in REASONS.items() if r in why)}")
+        click.echo(f"  frames {first} to {last}: {'; '.join(REASONS[r] for r in done.why(first, last))}")
     if len(done.uncertain) > _MOST_RUNS:
         click.echo(f"  and {len(done.uncertain) - _MOST_RUNS} more ranges")
     click.echo(f"{done.path}\n{done.sidecar}")

@@ -9,7 +9,9 @@ from ._deidentify import (
     check_call,
     covered_picture,
     deidentify,
+    nothing_covered,
     sidecar_of,
+    to_show,
 )
 from ._faces import FaceDetector
 from ._find import find_heads
@@ -34,7 +36,9 @@ __all__ = [
     "covered_picture",
     "deidentify",
     "find_heads",
+    "nothing_covered",
     "outline",
     "ranges",
     "sidecar_of",
+    "to_show",
 ]

@@ -6,6 +6,7 @@ import collections
 import dataclasses
 import json
 import os
+import secrets
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_out_file
 from pbl_pipeline.render import draw_skeleton
+from pbl_pipeline.settings import DEIDENTIFY, deidentify_how
 from pbl_pipeline.video import VideoInfo, probe, read_frames, read_metadata, sha256_of, write_h264
 
 from ._find import find_heads
@@ -24,7 +26,7 @@ from ._paint import cover
 from ._params import HeadParams
 from ._types import REASONS, Heads, ranges
 
-HOW = ("blur", "pixelate", "skeleton")
+HOW = DEIDENTIFY
 #: What may be kept of the file's metadata, and how the names of its tags begin.
 KEEP: Mapping[str, tuple[str, ...]] = {
     "place": ("location", "com.apple.quicktime.location"),
@@ -64,6 +66,11 @@ class Deidentified:
     def uncertain(self) -> list[tuple[int, int]]:
         """First and last frame of each run of frames that are not certain."""
         return ranges([bool(r) for r in self.reasons])
+
+    def why(self, first: int, last: int) -> tuple[str, ...]:
+        """The reasons of a run of frames, in the order of `REASONS`."""
+        found = {r for of_frame in self.reasons[first : last + 1] for r in of_frame}
+        return tuple(r for r in REASONS if r in found)
 
     @property
     def n_uncertain(self) -> int:
@@ -157,6 +164,32 @@ def deidentify(
     return done
 
 
+def to_show(video: str | Path, folder: Path, info: VideoInfo | None = None) -> Path:
+    """The recording itself, or where PBL_DEIDENTIFY asks for it a de-identified copy that is written into `folder`.
+
+    Raises the `PblError`s of `deidentify`, and HEAD_NOT_FOUND: what is shown must not be a picture of which nothing
+    was covered.
+    """
+    how = deidentify_how()
+    if not how:
+        return Path(video)
+    done = deidentify(video, folder / f"{secrets.token_hex(8)}.mp4", how, info=info)
+    if done.status == "NO_HEAD" and how != "skeleton":
+        raise nothing_covered(video)
+    return done.path
+
+
+def nothing_covered(about: object) -> PblError:
+    """HEAD_NOT_FOUND about a recording whose pictures are to be shown without heads."""
+    return PblError(
+        "HEAD_NOT_FOUND",
+        found="no head, so nothing of the recording is covered, and PBL_DEIDENTIFY forbids to show it",
+        expected="a person whose head is in the picture",
+        next_step="look at the recording; PBL_DEIDENTIFY=skeleton shows no picture at all",
+        key=str(about),
+    )
+
+
 def covered_picture(image: np.ndarray, heads: Heads, index: int, how: str) -> np.ndarray:
     """Frame `index` as the de-identified video shows it, from `image` (H, W, 3) uint8 BGR, which stays."""
     if how == "skeleton":
@@ -228,7 +261,7 @@ def _content(
                 "last": last,
                 "first_s": round(float(info.time_s[first]), 4),
                 "last_s": round(float(info.time_s[last]), 4),
-                "why": [r for r in REASONS if any(r in done.reasons[t] for t in range(first, last + 1))],
+                "why": list(done.why(first, last)),
             }
             for first, last in done.uncertain
         ],

@@ -43,7 +43,8 @@ def find_heads(video_path: str | Path, params: HeadParams | None = None, info: V
         people.append(head_of_person(person, found, params))
     sightings = _sightings(video_path, info, params)
     people = [_confirmed(head, sightings) for head in people]
-    alone = [t for t in _trails(sightings, info.time_s, params) if not _explained(t, people)]
+    trails = [t for t in _trails(sightings, info.time_s, params) if not _explained(t, people)]
+    alone = [t for t in trails if not _on_body(t, people) or sum(face.score for face in t) >= params.face_on_body]
     heads = [*people, *(_of_face(t, info.time_s, params) for t in alone)]
     size = (info.width_px, info.height_px)
     return Heads(info.time_s, size, tuple(held(h, info.time_s, size, params) for h in heads))
@@ -100,6 +101,18 @@ def _trails(faces: Sequence[_Face], time_s: np.ndarray, params: HeadParams) -> l
 def _explained(trail: Sequence[_Face], heads: Sequence[Head]) -> bool:
     """Whether every sighting lies in the circle of a known head."""
     return all(any(_inside(face, head) for head in heads) for face in trail)
+
+
+def _on_body(trail: Sequence[_Face], heads: Sequence[Head]) -> bool:
+    """Whether most sightings lie within the box of a person whose head is surely elsewhere."""
+    n = sum(any(_within_box(face, head) for head in heads) for face in trail)
+    return n > len(trail) / 2
+
+
+def _within_box(face: _Face, head: Head) -> bool:
+    x, y = (face.box_px[:2] + face.box_px[2:]) / 2
+    x0, y0, x1, y1 = head.box_px[face.index]
+    return bool(head.source[face.index] == KEYPOINTS and x0 < x < x1 and y0 < y < y1)
 
 
 def _inside(face: _Face, head: Head) -> bool:

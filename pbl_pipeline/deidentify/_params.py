@@ -22,6 +22,8 @@ class HeadParams:
     jump: so does one farther than this many head radii from where the frames around say.
     face_score, face_sure, face_gap_s: a face counts from this score, if its scores add up to `face_sure` with no longer
     gap between them (two sure sightings, three less sure ones).
+    face_on_body: what the scores must add up to where the face lies on the body of somebody whose head is known: knees
+    and folds of cloth are taken for faces, and a blurred knee is not measured.
     face_interval_s, face_tiles, face_overlap: searched so often, on tiles of these fractions of the shorter side by
     turns.
     face_radius: of the circle, in sides of the face's box.
@@ -47,6 +49,7 @@ class HeadParams:
     jump: float = 0.5
     face_score: float = 0.6
     face_sure: float = 1.2
+    face_on_body: float = 5.0
     face_gap_s: float = 0.5
     face_interval_s: float = 0.1
     face_tiles: tuple[float, ...] = (0.5, 0.25)

@@ -19,6 +19,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import load_npz
 from pbl_pipeline.video import read_phone_log
 from schemas import fit, video
+from schemas.chain import ON_REQUEST
 from schemas.coded_errors import error_next_step
 from schemas.ingest import Visit, ingest
 from schemas.references import add_reference
@@ -84,7 +85,7 @@ def test_names_go_through_tables_and_report_as_text(tables: None, tmp_path: Path
         assert "\x1b" not in said
         assert error_next_step(said) == "rename the file or folder"
         assert len(said.splitlines()) == 5
-    run = populate([t.__name__ for t in schemas.computed_tables() if t.__name__ != "KinematicError"])
+    run = populate([t.__name__ for t in schemas.computed_tables() if t.__name__ not in ON_REQUEST])
     assert not {t.table: t.errors for t in run.tables if t.errors}
     assert len(fit.SessionFit.Trial()) == len(paths)
     status = pbl("status")

@@ -79,6 +79,7 @@ def test_a_bad_file_leaves_one_error_row_while_the_others_finish(tables: None, t
         "SessionGdi": 1,
         "SessionQc": 1,
         "KinematicError": 0,
+        "Deidentified": 0,
     }
     assert fit.SessionFit.fetch1("fit_iterations", "fit_converged") == (7, True)
     assert set(fit.SessionFit.Trial.to_arrays("trial_orientation")) == {"assumed: level"}

@@ -24,6 +24,7 @@ import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS
 from schemas import connection, embedded, fit, gait, gdi, lab, qc, tracking, video, worker
+from schemas.chain import ON_REQUEST
 from schemas.cli.why import why as why_command
 from schemas.status import live_workers, pipeline_status, queue_counts
 from schemas.why import why
@@ -66,7 +67,7 @@ def test_what_follows_a_job_is_queued_at_once_and_nothing_is_forgotten(tables: N
     monkeypatch.setattr("workers.loop.REFRESH_EVERY_S", 1e9)  # one look at all tables, at the beginning
     done = work()
     expected = {t.__name__: 3 for t in schemas.computed_tables()}
-    expected |= {"SessionFit": 2, "SessionGdi": 2, "SessionQc": 2, "KinematicError": 0}
+    expected |= {"SessionFit": 2, "SessionGdi": 2, "SessionQc": 2, **dict.fromkeys(ON_REQUEST, 0)}
     assert counts() == expected
     assert (done.done, done.failed) == (sum(expected.values()), 0)
     assert jobs_left() == {}

@@ -20,6 +20,7 @@ NEEDS = {
     "SessionGdi": ["SessionFit"],
     "SessionQc": ["GaitEvents", "SessionGdi"],
     "KinematicError": ["SessionFit"],
+    "Deidentified": ["VideoInfo"],
 }
 
 

@@ -92,6 +92,33 @@ def test_a_persons_number_belongs_to_one_video(tmp_path: Path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["", "blur"])
+def test_overlay_and_pictures_are_of_the_copy_where_the_setting_says_so(
+    fitted: list[list[str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, how: str
+):
+    """The stand-in copy is another video; both the overlay and the report's pictures are made from it."""
+    import pbl_pipeline.deidentify._deidentify as lib
+
+    def copied(video, out, way, info=None):
+        assert (video, way) == (recording, "blur")
+        out.write_bytes(recording.read_bytes())
+        return lib.Deidentified(out, out, way, 1, "CERTAIN", "", ())
+
+    used = []
+    monkeypatch.setenv("PBL_DEIDENTIFY", how)
+    monkeypatch.setattr(lib, "deidentify", copied)
+    monkeypatch.setattr(pipeline, "render_overlay", lambda path, *_, **__: used.append(path))
+    monkeypatch.setattr(pipeline, "overlay_frames", lambda path, *_, **__: used.append(path) or [])
+    monkeypatch.setattr(pipeline, "report_indices", lambda _: [])
+    monkeypatch.setattr(pipeline, "write_report", lambda *_: None)
+    recording = chain.small_video(tmp_path, "walk")
+    pipeline.write_results(tmp_path / "out", pipeline.run_session([recording], tmp_path / "out"))
+    assert len(used) == 2
+    assert all((path == recording) is (not how) for path in used)
+    assert not [p for p in used if p != recording and p.exists()]
+
+
 def test_the_report_of_a_visit_names_the_recordings_it_lacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     import schemas.report
     from schemas.results import SessionResults, TrialResults

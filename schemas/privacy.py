@@ -1,0 +1,139 @@
+"""Copies of the recordings in which nobody can be recognised."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pbl_pipeline import settings
+from pbl_pipeline.errors import PblError
+
+from . import video
+from ._datajoint import dj
+from .origin import Origin, computes, origin_columns
+from .rows import one
+from .stored_files import file_ref, lasting_folder, stored_file
+
+if TYPE_CHECKING:
+    from pbl_pipeline import deidentify as lib
+
+schema = dj.Schema()
+
+
+@schema
+class Deidentified(dj.Computed):
+    definition = f"""
+    # a video with hidden heads, where PBL_DEIDENTIFY asks for it; overlays and reports show its pictures
+    -> video.VideoInfo
+    ---
+    deidentified_how         : enum('blur', 'pixelate', 'skeleton')  # how heads are hidden; skeleton: keypoints on black
+    deidentified_status      : enum('CERTAIN', 'REVIEW', 'NO_HEAD')  # REVIEW: some frames are to be looked at; NO_HEAD: nothing was covered
+    deidentified_reason      : varchar(255)     # the status in words
+    deidentified_heads       : int32            # heads that were found, false ones included
+    deidentified_uncertain   : int32            # frames that are not certain
+    deidentified_ranges      : json             # runs of these: first and last frame (from 0), and why
+    deidentified_sha256      : char(64)         # of the bytes of the copy
+    deidentified_file        : <object@arrays>  # mp4 without sound and metadata, frame by frame as the recording; docs/privacy.md
+    {origin_columns("deidentified")}
+    """  # noqa: E501
+
+    @staticmethod
+    def wanted() -> bool:
+        """Whether the setting asks for copies."""
+        return bool(settings.deidentify_how())
+
+    @property
+    def key_source(self) -> Any:
+        """Every recording with pictures where the setting asks for copies, else none."""
+        return video.VideoInfo.proj() & self.wanted()
+
+    def make_fetch(self, key: dict) -> tuple:
+        probed = one(video.Video * video.VideoInfo & key)
+        return probed, file_ref(probed.pop("frame_time"))
+
+    @computes
+    def make_compute(
+        self, key: dict, probed: Mapping[str, Any], times: dict
+    ) -> tuple[lib.Deidentified, tempfile.TemporaryDirectory, str]:
+        from pbl_pipeline.deidentify import deidentify
+        from pbl_pipeline.video import sha256_of
+
+        how = settings.deidentify_how()
+        if not how:
+            raise PblError(
+                "USAGE",
+                found="PBL_DEIDENTIFY is not set on this machine",
+                expected="blur, pixelate or skeleton",
+                next_step="set it as on the machine that queued the job, then `pbl retry`",
+            )
+        path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
+        with stored_file(self, times) as stored:
+            info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
+        folder = lasting_folder()
+        done = deidentify(path, Path(folder.name) / "deidentified.mp4", how, info=info)
+        return done, folder, sha256_of(done.path)
+
+    def make_insert(
+        self,
+        key: dict,
+        done: lib.Deidentified,
+        folder: tempfile.TemporaryDirectory,
+        sha256: str,
+        origin: Origin,
+    ) -> None:
+        # The folder goes with the object: an insert that meets a deadlock is tried again.
+        assert Path(folder.name).is_dir()
+        self.insert1(
+            {
+                **key,
+                "deidentified_how": done.how,
+                "deidentified_status": done.status,
+                "deidentified_reason": done.reason[:255],
+                "deidentified_heads": done.n_heads,
+                "deidentified_uncertain": done.n_uncertain,
+                "deidentified_ranges": [
+                    {"first": first, "last": last, "why": list(done.why(first, last))} for first, last in done.uncertain
+                ],
+                "deidentified_sha256": sha256,
+                "deidentified_file": done.path,
+                **origin.row("deidentified"),
+            }
+        )
+
+
+@contextlib.contextmanager
+def shown(video_id: int) -> Iterator[Path | None]:
+    """The recording whose pictures overlays and reports show: the de-identified copy where PBL_DEIDENTIFY asks for it,
+    None where it does not.
+
+    Raises
+    ------
+    PblError
+        DB_NOT_FOUND: there is no copy of that kind yet. HEAD_NOT_FOUND: nothing was covered in it.
+    """
+    from pbl_pipeline.deidentify import nothing_covered
+
+    how = settings.deidentify_how()
+    if not how:
+        yield None
+        return
+    key = {"video_id": video_id}
+    rows = (Deidentified & key).to_dicts()
+    if not rows or rows[0]["deidentified_how"] != how:
+        again = "`pbl reprocess --table Deidentified --go`, then `pbl populate`" if rows else "`pbl populate`"
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"a copy by {rows[0]['deidentified_how']}" if rows else "no de-identified copy of the video",
+            expected=f"one by {how}, which PBL_DEIDENTIFY asks for",
+            next_step=f"compute it: {again}",
+            key=f"video_id={video_id}",
+        )
+    if rows[0]["deidentified_status"] == "NO_HEAD" and how != "skeleton":
+        raise nothing_covered(f"video_id={video_id}")
+    with stored_file(Deidentified(), file_ref(rows[0]["deidentified_file"])) as path:
+        yield path
