@@ -126,7 +126,7 @@ def shown(video_id: int) -> Iterator[Path | None]:
     key = {"video_id": video_id}
     rows = (Deidentified & key).to_dicts()
     if not rows or rows[0]["deidentified_how"] != how:
-        again = "`pbl reprocess --table Deidentified --go`, then `pbl populate`" if rows else "`pbl populate`"
+        again = "`pbl reprocess --table Deidentified --yes`, then `pbl populate`" if rows else "`pbl populate`"
         raise PblError(
             "DB_NOT_FOUND",
             found=f"a copy by {rows[0]['deidentified_how']}" if rows else "no de-identified copy of the video",
