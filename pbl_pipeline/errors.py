@@ -54,7 +54,7 @@ CODES: dict[str, str] = {
     "PACKAGE_MISSING": "a package that this step needs is not installed",
     "STATS_INPUT": "the values do not support the statistic: too few, missing, without variation, or of another shape",
     "STUDY_INVALID": "the parts of a study contradict each other, or one lacks what it must have",
-    "SHEET_FORMAT": "a sheet of a study has columns or cells that cannot be read",
+    "SHEET_FORMAT": "a sheet has columns or cells that cannot be read",
     "SHEET_CONFLICT": "rows of a sheet contradict each other, or what is registered",
     "SCORE_RANGE": "a clinical score has a value that its instrument cannot have",
     "DB_NOT_RUNNING": "the database does not answer",

@@ -29,3 +29,8 @@ def day_of(label: str) -> datetime.date | None:
         return datetime.date.fromisoformat(label)
     except ValueError:
         return None
+
+
+def folded(code: str) -> str:
+    """A code without case, hyphens and leading zeros: two that are equal so are likely one person."""
+    return re.sub(r"0*(\d+)", r"\1", re.sub(r"[-_.]", "", code.lower()))

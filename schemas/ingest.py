@@ -171,7 +171,26 @@ def gait_method(name: str | None) -> str:
     return resolve_method(gait.GaitEventMethod, name or of_stage(gait.GaitEventMethod.stage).default)
 
 
-def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str], given: sensors.Sensors) -> Ingested:
+@dataclasses.dataclass(frozen=True)
+class Prepared:
+    """A video and what comes with it, read and found good; nothing of it is in the tables yet. camera: a row."""
+
+    path: Path
+    visit: Visit
+    sha256: str
+    size: int
+    found: sensors.Read
+    camera: dict[str, Any] | None
+
+
+def prepare(path: Path, visit: Visit, given: sensors.Sensors) -> Prepared:
+    """Read a video's bytes and its sensor files; no picture is decoded.
+
+    Raises
+    ------
+    PblError
+        VIDEO_MISSING, VIDEO_EMPTY, USAGE (a path that no row can keep), FILE_MISSING, PHONE_LOG.
+    """
     from pbl_pipeline.video import sha256_of
 
     if not os.path.isfile(path):  # not Path.is_file: that raises where a folder on the way may not be entered
@@ -192,42 +211,53 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
             next_step="copy it from the phone again",
             key=path,
         )
-    sha256 = sha256_of(path)
     found = sensors.read(given)
-    known = with_sha256(sha256)
+    return Prepared(path, visit, sha256_of(path), size, found, None)
+
+
+def with_camera(one: Prepared) -> Prepared:
+    """With the calibration of the visit as a row, for the size of the video's first picture. Raises CAMERA_INVALID."""
+    file = one.visit.camera_file
+    return dataclasses.replace(one, camera=_camera(file, one.path)) if file else one
+
+
+def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str], given: sensors.Sensors) -> Ingested:
+    one = prepare(path, visit, given)
+    known = with_sha256(one.sha256)
     if known:
-        return update_known(path, known, visit, chosen, more, found)
-    camera = _camera(visit.camera_file, path) if visit.camera_file else None
-    row = {
-        "video_path": str(path),
-        "video_name": path.name[-255:],
-        "video_sha256": sha256,
-        "video_size": size,
-        "activity": visit.activity or "walking",
-        "camera_motion": visit.camera_motion or ("handheld" if given.has_log else "static"),
-        "video_created": utc_now(),
-    }
-
-    notes: list[str] = []
-
-    def insert() -> None:
-        row["session_id"] = session_of(visit)
-        row["camera_id"] = camera_id_of(camera) if camera else None
-        row["video_id"] = next_id(video.Video, "video_id")
-        video.Video.insert1(row)
-        set_condition(row["video_id"], pace=visit.pace)
-        _select(row["video_id"], row["session_id"], visit.person, chosen)
-        notes[:] = sensors.register(row["video_id"], found)
-
+        return update_known(path, known, visit, chosen, more, one.found)
+    one = with_camera(one)
     try:
-        in_transaction(insert, until=lambda: bool(with_sha256(sha256)))
+        return in_transaction(lambda: insert(one, chosen), until=lambda: bool(with_sha256(one.sha256)))
     except DuplicateError:
-        known = with_sha256(sha256)
+        known = with_sha256(one.sha256)
         if not known:
             raise
-        return update_known(path, known, visit, chosen, more, found)
+        return update_known(path, known, visit, chosen, more, one.found)
+
+
+def insert(one: Prepared, chosen: dict[str, str]) -> Ingested:
+    """Register a video that is new. Call it in a transaction."""
+    visit = one.visit
+    session_id, number = session_of(visit), next_id(video.Video, "video_id")
+    row = {
+        "video_id": number,
+        "session_id": session_id,
+        "camera_id": camera_id_of(one.camera) if one.camera else None,
+        "video_path": str(one.path),
+        "video_name": one.path.name[-255:],
+        "video_sha256": one.sha256,
+        "video_size": one.size,
+        "activity": visit.activity or "walking",
+        "camera_motion": visit.camera_motion or ("handheld" if one.found.given.has_log else "static"),
+        "video_created": utc_now(),
+    }
+    video.Video.insert1(row)
+    set_condition(number, pace=visit.pace)
+    _select(number, session_id, visit.person, chosen)
+    notes = sensors.register(number, one.found)
     said = "; ".join([f"subject {visit.subject}, session {visit.session_label}", *notes])
-    return Ingested(path, "registered", row["video_id"], said)
+    return Ingested(one.path, "registered", number, said)
 
 
 def check_path(path: Path) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import datetime
 import io
+import re
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -64,6 +66,27 @@ def read_sheets(path: Path) -> list[Sheet]:
 def refused(where: str, found: str, expected: str, next_step: str) -> PblError:
     """A `PblError` SHEET_FORMAT about a sheet or row."""
     return PblError("SHEET_FORMAT", found=found, expected=expected, next_step=next_step, key=where)
+
+
+def needed(row: Row, column: str) -> str:
+    """The cell of a row in a column. Raises `PblError` SHEET_FORMAT where it is empty."""
+    if column not in row.cells:
+        raise refused(row.where, f"no {column}", f"a value in the column {column}", "write it, or remove the row")
+    return row.cells[column]
+
+
+def date_of(row: Row, column: str) -> datetime.date:
+    """The day in a cell. Raises `PblError` SHEET_FORMAT for what is not written YYYY-MM-DD."""
+    text = row.cells[column]
+    if re.fullmatch(r"\d{4}-\d\d-\d\d", text):
+        with contextlib.suppress(ValueError):
+            return datetime.date.fromisoformat(text)
+    raise refused(
+        row.where,
+        f"{column} {text!r}",
+        "a day as YYYY-MM-DD, such as 2026-03-09, or a date cell of a workbook",
+        "write it so: 03/09 is another day in other countries",
+    )
 
 
 def _csv(path: Path) -> list[list[str]]:

@@ -16,11 +16,11 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 
 from . import lab, session, study, video
-from .codes import check_subject, day_of
+from .codes import check_subject, day_of, folded
 from .conditions import set_condition
 from .ingest import in_transaction, next_id
 from .rows import inside, utc_now
-from .sheets import Row, Sheet, read_sheets, refused
+from .sheets import Row, Sheet, date_of, needed, read_sheets, refused
 
 #: Column of a sheet -> column of `study.Visit`.
 VISIT_COLUMNS = {
@@ -156,7 +156,7 @@ class _Plan:
                 read(Row(row.where, cells))
 
     def _person(self, row: Row) -> str:
-        code = _needed(row, "subject")
+        code = needed(row, "subject")
         check_subject(code, "write the code of the person")
         stated = self.people.setdefault(code, _Stated(row, {}))
         if population := row.cells.get("population"):
@@ -165,12 +165,12 @@ class _Plan:
         return code
 
     def _session(self, row: Row, code: str) -> tuple[str, str]:
-        label = _needed(row, "visit")
+        label = needed(row, "visit")
         check_label("visit", label, 64, 1)
         stated = self.sessions.setdefault((code, label), _Stated(row, {}))
         day = day_of(label)
         if "date" in row.cells:
-            date = _date(row, "date")
+            date = date_of(row, "date")
             _same(day or date, date, "date of the visit", f"{code}, {label}")
             _same(stated.values.setdefault("session_date", date), date, "date of the visit", f"{code}, {label}")
         return code, label
@@ -206,11 +206,13 @@ class _Plan:
                 raise _conflict(f"{len(mine)} records of {code}", "one record for a person", "correct code or record")
         if "birth_date" in row.cells:
             text = row.cells["birth_date"]
-            day = datetime.date(int(text), 7, 1) if re.fullmatch(r"(18|19|20)\d\d", text) else _date(row, "birth_date")
+            day = (
+                datetime.date(int(text), 7, 1) if re.fullmatch(r"(18|19|20)\d\d", text) else date_of(row, "birth_date")
+            )
             _same(self.births.setdefault(code, (text, day))[0], text, "birth date", code)
 
     def _member(self, row: Row, code: str) -> None:
-        cohort = _needed(row, "cohort")
+        cohort = needed(row, "cohort")
         check_label("cohort", cohort, 32, 1)
         stated = self.members.setdefault((cohort, code), _Stated(row, {}))
         for column, name in MEMBER_COLUMNS.items():
@@ -225,7 +227,7 @@ class _Plan:
 
     def _long_score(self, row: Row) -> None:
         key = self._session(row, self._person(row))
-        self._score(row, key, _needed(row, "instrument"), _needed(row, "value"))
+        self._score(row, key, needed(row, "instrument"), needed(row, "value"))
 
     def _score(self, row: Row, key: tuple[str, str], name: str, text: str) -> None:
         if name not in self.instruments:
@@ -277,9 +279,9 @@ class _Plan:
             return
         alike: dict[str, set[str]] = defaultdict(set)
         for code in {*self.known, *self.people}:
-            alike[_folded(code)].add(code)
+            alike[folded(code)].add(code)
         for code, stated in self.people.items():
-            others = sorted(alike[_folded(code)] - {code})
+            others = sorted(alike[folded(code)] - {code})
             if others and (code not in self.known or any(o not in self.known for o in others)):
                 with self._row(stated.row):
                     raise _conflict(
@@ -490,30 +492,6 @@ def _default(column: str) -> Any:
     return None if column in ("visit_days", "visit_age", "intervention_date") else ""
 
 
-def _folded(code: str) -> str:
-    """A code without case, hyphens and leading zeros."""
-    return re.sub(r"0*(\d+)", r"\1", re.sub(r"[-_.]", "", code.lower()))
-
-
-def _needed(row: Row, column: str) -> str:
-    if column not in row.cells:
-        raise refused(row.where, f"no {column}", f"a value in the column {column}", "write it, or remove the row")
-    return row.cells[column]
-
-
-def _date(row: Row, column: str) -> datetime.date:
-    text = row.cells[column]
-    if re.fullmatch(r"\d{4}-\d\d-\d\d", text):
-        with contextlib.suppress(ValueError):
-            return datetime.date.fromisoformat(text)
-    raise refused(
-        row.where,
-        f"{column} {text!r}",
-        "a day as YYYY-MM-DD, such as 2026-03-09, or a date cell of a workbook",
-        "write it so: 03/09 is another day in other countries",
-    )
-
-
 def _number(row: Row, column: str, text: str) -> float:
     with contextlib.suppress(ValueError):
         if math.isfinite(value := float(text)) and "_" not in text:
@@ -542,7 +520,7 @@ def _visit_value(row: Row, column: str) -> Any:
     if text == CLEAR:
         return CLEAR
     if column == "intervention_date":
-        return _date(row, column)
+        return date_of(row, column)
     if column in ("days", "age"):
         number = _number(row, column, text)
         if (column == "age" and not 0 <= number <= 130) or (
@@ -556,7 +534,7 @@ def _visit_value(row: Row, column: str) -> Any:
 
 
 def _video(row: Row) -> int:
-    name = _needed(row, "video")
+    name = needed(row, "video")
     where = {k: v for k, v in (("subject", row.cells.get("subject")), ("session_label", row.cells.get("visit"))) if v}
     of = {"video_id": int(name)} if re.fullmatch(r"\d{1,9}", name) else {"video_name": name}
     named = video.Video.proj("video_name") & (video.Video & (session.Session & where).proj()).proj() & of

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from schemas.ingest import Ingested
+    from schemas.ingest import Ingested, Methods
     from schemas.sensors import Sensors
 
 
@@ -31,6 +31,13 @@ if TYPE_CHECKING:
     metavar="FILE",
     help="Calibration (TOML) of several cameras: VIDEOS are one trial, a view each, named like them or in order.",
 )
+@click.option(
+    "--sheet",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="In place of VIDEOS: a sheet (.csv, .xlsx) with a row for each, of any people and visits (docs/files.md).",
+)
+@click.option("--dry-run", is_flag=True, help="With --sheet: read all, change nothing, say what would happen.")
 @click.option("--subject", metavar="CODE", help="Pseudonymous code of the person, never a name.")
 @click.option(
     "--session",
@@ -84,6 +91,8 @@ def ingest(
     marker_set: str | None,
     up: str,
     rig: Path | None,
+    sheet: Path | None,
+    dry_run: bool,
     subject: str | None,
     session_label: str | None,
     name_pattern: str | None,
@@ -118,6 +127,7 @@ def ingest(
     Example: pbl ingest walk.mov --subject P018 --attitude 2026-03-01_09-15-30.zip
     Example: pbl ingest *.mp4 --session 2026-03-01 --name-pattern '(?P<subject>[^_]+)_(?P<pace>[^_]+)_.*'
     Example: pbl ingest cam_01.mp4 cam_02.mp4 cam_03.mp4 --rig Calib.toml --subject P017 --session 2026-03-01
+    Example: pbl ingest --sheet visits.csv --dry-run
     Example: pbl ingest --markers walk1.trc --marker-set our_lab.csv --subject P017 --session 2026-03-01
     """
     import schemas
@@ -127,6 +137,16 @@ def ingest(
     from schemas.rigs import ingest_rig
     from schemas.session import UNLABELLED
 
+    methods = Methods(tracking=tracking_method, keypoint=keypoint_method, fit=fit_method, gdi=index, norm=norm)
+    if sheet is not None:
+        of_rows = (videos, markers, marker_set, rig, subject, session_label, name_pattern, project, camera)
+        of_rows += (camera_motion, attitude, depth, imu, activity, pace, population, person)
+        if any(of_rows):
+            raise click.UsageError("--sheet: its columns state files, people and visits; only methods are options.")
+        _sheet(sheet, methods, dry_run)
+        return
+    if dry_run:
+        raise click.UsageError("--dry-run goes with --sheet.")
     _one_kind(videos, markers, marker_set, bool(attitude or depth or imu), rig is not None)
     files = _files(len(videos), attitude, depth, imu)
     options = {"subject": subject, "session": session_label, "pace": pace, "activity": activity}
@@ -136,7 +156,6 @@ def ingest(
     if rig is not None and (results or len(calls) > 1):
         raise click.UsageError("--rig: all videos are of one trial, so their names must state the same.")
     schemas.activate()
-    methods = Methods(tracking=tracking_method, keypoint=keypoint_method, fit=fit_method, gdi=index, norm=norm)
     for said, numbers in calls:
         visit = Visit(
             subject=said["subject"],
@@ -163,6 +182,26 @@ def ingest(
         if result.status in ("known", "moved", "updated") and person is not None:
             click.echo(f"  to measure another person of it: pbl choose {result.video_id} {person}")
     if any(r.error for r in results):
+        raise click.exceptions.Exit(1)
+
+
+def _sheet(sheet: Path, methods: Methods, dry_run: bool) -> None:
+    import schemas
+    from schemas.ingest_sheet import ingest_sheet
+
+    schemas.activate()
+    found = ingest_sheet(sheet, methods, dry_run)
+    for line in found.lines:
+        for error in line.errors:
+            click.echo(error.text(), err=True)
+        if line.note and not line.errors:
+            number = "" if line.video_id is None else f"video_id {line.video_id}: "
+            click.echo(f"{line.where}: {line.file}: {number}{line.note}")
+    wrong = sum(bool(line.errors) for line in found.lines)
+    known = sum(line.note.startswith("registered already") for line in found.lines if not line.errors)
+    word = "registered" if found.done else "would be registered" if dry_run and not wrong else "not registered"
+    click.echo(f"{len(found.lines) - wrong - known} videos {word}, {known} known, {wrong} rows refused")
+    if wrong:
         raise click.exceptions.Exit(1)
 
 

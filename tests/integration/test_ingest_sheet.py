@@ -1,0 +1,161 @@
+"""`pbl ingest --sheet`: every row or none, and what is refused."""
+
+from __future__ import annotations
+
+import datetime
+from pathlib import Path
+
+import pytest
+
+from schemas import lab, session, video
+from schemas.ingest_sheet import ingest_sheet
+from tests.command import pbl
+from tests.rows import everything
+
+from . import chain
+
+HEADER = "file,subject,visit,date,pace,activity,camera,camera_motion,population,project"
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with three videos and a calibration."""
+    folder = tmp_path_factory.mktemp("recordings")
+    for i, name in enumerate(("one", "two", "three")):
+        chain.small_video(folder, name, n=30 + i)
+    (folder / "copy.mp4").write_bytes((folder / "one.mp4").read_bytes())
+    (folder / "empty.mp4").touch()
+    text = (
+        "[phone]\nsize = [128, 72]\nmatrix = [[100.0, 0, 64], [0, 100.0, 36], [0, 0, 1]]\ndistortions = [0, 0, 0, 0]\n"
+    )
+    (folder / "phone.toml").write_text(text, encoding="utf-8")
+    return folder
+
+
+def sheet(folder: Path, *rows: str, header: str = HEADER, name: str = "visits.csv") -> Path:
+    path = folder / name
+    path.write_text("\n".join((header, *rows)) + "\n", encoding="utf-8")
+    return path
+
+
+GOOD = (
+    "one.mp4,P001,2026-03-01,,fast,,phone.toml,handheld,patient,spine",
+    "two.mp4,P001,2026-03-01,,,tug,,,,",
+    "three.mp4,P002,first,2026-03-02,,,,,,",
+)
+
+
+def test_a_sheet_registers_people_visits_pace_and_cameras_once(tables, recordings):
+    path = sheet(recordings, *GOOD)
+    before = everything()
+    tried = pbl("ingest", "--sheet", path, "--dry-run")
+    assert tried.code == 0, tried.err
+    assert "visits.csv, row 2: one.mp4: new: P001/2026-03-01" in tried.out
+    assert "3 videos would be registered, 0 known, 0 rows refused" in tried.out
+    assert everything() == before
+    done = pbl("ingest", "--sheet", path)
+    assert done.code == 0, done.err
+    assert "3 videos registered" in done.out
+    rows = (video.Video * session.Session.proj("subject", "session_label", "session_date")).to_dicts(
+        order_by="video_id"
+    )
+    assert [(r["subject"], r["session_label"], r["session_date"]) for r in rows] == [
+        ("P001", "2026-03-01", datetime.date(2026, 3, 1)),
+        ("P001", "2026-03-01", datetime.date(2026, 3, 1)),
+        ("P002", "first", datetime.date(2026, 3, 2)),
+    ]
+    assert [(r["activity"], r["camera_motion"]) for r in rows] == [
+        ("walking", "handheld"),
+        ("tug", "static"),
+        ("walking", "static"),
+    ]
+    assert video.conditions({"video_id": rows[0]["video_id"]})[rows[0]["video_id"]].pace == "fast"
+    focal = (lab.CameraCalibration & {"camera_id": rows[0]["camera_id"]}).fetch1("camera_fx")
+    assert focal == pytest.approx(100.0)
+    person = (lab.Subject & {"subject": "P001"}).fetch1()
+    assert (person["population"], person["project"]) == ("patient", "spine")
+    before = everything()
+    again = pbl("ingest", "--sheet", path)
+    assert "0 videos registered, 3 known, 0 rows refused" in again.out
+    assert everything() == before
+
+
+@pytest.mark.parametrize(
+    ("row", "code", "words"),
+    [
+        ("nobody.mp4,P003,1,,,,,,,", "VIDEO_MISSING", "nobody.mp4"),
+        ("empty.mp4,P003,1,,,,,,,", "VIDEO_EMPTY", "empty.mp4"),
+        ("copy.mp4,P003,1,,,,,,,", "SHEET_CONFLICT", "row 2"),
+        ("three.mp4,Anna Meier,1,,,,,,,", "USAGE", "pseudonymous"),
+        ("three.mp4,p-1,1,,,,,,,", "SHEET_CONFLICT", "P001"),
+        (",P003,1,,,,,,,", "SHEET_FORMAT", "no file"),
+        ("three.mp4,P003,,,,,,,,", "SHEET_FORMAT", "no visit"),
+        ("three.mp4,P003,1,03/02/2026,,,,,,", "SHEET_FORMAT", "YYYY-MM-DD"),
+        ("three.mp4,P001,2026-03-01,2026-03-09,,,,,,", "SHEET_CONFLICT", "2026-03-09"),
+        ("three.mp4,P002,first,2026-03-09,,,,,,", "SHEET_CONFLICT", "two visits need two labels"),
+        ("three.mp4,P001,2026-03-01,,,,,,healthy,", "SHEET_CONFLICT", "patient"),
+        ("three.mp4,P003,1,,,,,flying,,", "SHEET_FORMAT", "static"),
+        ("three.mp4,P003,1,,,,no.toml,,,", "CAMERA_INVALID", "no.toml"),
+    ],
+)
+def test_one_bad_row_and_nothing_is_registered(tables, recordings, row, code, words):
+    second = "two.mp4,P002,first,2026-03-02,,,,,,"
+    path = sheet(recordings, GOOD[0], second, row, name="bad.csv")
+    before = everything()
+    for more in ((), ("--dry-run",)):
+        done = pbl("ingest", "--sheet", path, *more)
+        assert (done.code, done.error_code) == (1, code), done.err
+        assert "bad.csv, row 4" in done.err
+        assert words in done.err
+        assert "not registered" in done.out
+    assert everything() == before
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("file,subject,visit,mJOA", "unknown column 'mJOA'"),
+        ("file,subject", "file, subject, visit"),
+        ("File,file,subject,visit", "columns"),
+    ],
+)
+def test_other_columns_are_refused_whole(tables, recordings, header, words):
+    before = everything()
+    done = pbl("ingest", "--sheet", sheet(recordings, "one.mp4,P001", header=header, name="columns.csv"))
+    assert done.error_code == "SHEET_FORMAT"
+    assert words in done.err
+    assert pbl("ingest", "--sheet", sheet(recordings, header=HEADER, name="none.csv")).error_code == "SHEET_FORMAT"
+    assert pbl("ingest", "--sheet", recordings / "absent.csv").error_code == "FILE_MISSING"
+    assert everything() == before
+
+
+def test_a_database_that_fails_in_the_middle_leaves_nothing(tables, recordings, monkeypatch):
+    import schemas.ingest_sheet as module
+
+    real, calls = module.insert, []
+
+    def fails(one, chosen):
+        calls.append(one)
+        if len(calls) == 3:
+            raise OSError("the connection is gone")
+        return real(one, chosen)
+
+    monkeypatch.setattr(module, "insert", fails)
+    with pytest.raises(OSError, match="gone"):
+        ingest_sheet(sheet(recordings, *GOOD))
+    assert (len(video.Video()), len(session.Session()), len(lab.Subject())) == (0, 0, 0)
+
+
+def test_what_a_row_states_is_no_option(tables, recordings):
+    path = sheet(recordings, *GOOD)
+    for words in (("--subject", "P001"), ("--pace", "fast"), (recordings / "one.mp4",)):
+        assert pbl("ingest", "--sheet", path, *words).code == 2
+    assert pbl("ingest", recordings / "one.mp4", "--subject", "P001", "--dry-run").code == 2
+
+
+def test_a_recording_of_another_visit_or_person_is_named_with_the_way_out(tables, recordings):
+    assert pbl("ingest", recordings / "one.mp4", "--subject", "P001", "--session", "1").code == 0
+    for row, code in (("one.mp4,P001,2", "SHEET_CONFLICT"), ("one.mp4,P009,1", "VIDEO_DUPLICATE")):
+        done = pbl("ingest", "--sheet", sheet(recordings, row, header="file,subject,visit", name="other.csv"))
+        assert done.error_code == code, done.err
+        assert "pbl move" in done.err
