@@ -14,9 +14,9 @@ from pbl_pipeline.files import fields_of
 from pbl_pipeline.names import check_label
 from pbl_pipeline.paramset import canonical_json
 
-from . import validation, video
+from . import fit, validation, video
 from .rows import utc_now
-from .stored_files import new_folder
+from .stored_files import file_ref, new_folder, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import validation as lib
@@ -179,6 +179,57 @@ def add_reference(
     if older:
         note += f"; the older reference {', '.join(r['reference'] for r in older)} is no longer current"
     return Added(video_id, key["reference"], "replaced" if older else "registered", note)
+
+
+def add_trial(
+    about: int | str | Path,
+    trial: int,
+    dataset: str | None = None,
+    origin: str | None = None,
+    shift_s: float = 0.0,
+    fit_method: str | None = None,
+) -> Added:
+    """`add_reference` with the current fit of another recording as it is in the tables: what several cameras or a
+    laboratory's markers say of the movement that a video shows. The reference stays as it is when that fit is redone.
+
+    Parameters
+    ----------
+    trial
+        Number of the trial of several cameras, or of the marker recording.
+    fit_method
+        Key of the fit's method, where the trial was fitted by several.
+
+    Raises
+    ------
+    PblError
+        DB_NOT_FOUND where it has no current fit; USAGE where it is a video of one camera, or has several fits; what
+        `add_reference` raises.
+    """
+    trial = fit.trials_of([trial]).get(trial, trial)
+    current = (fit.FitSelection & {"fit_current": True}).proj() * fit.FitSet.proj("fit_set_kind")
+    named = {"fit_method": fit_method} if fit_method is not None else True
+    rows = (fit.SessionFit.Trial * current & {"video_id": trial} & named).to_dicts()
+    if not rows:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no current fit of video_id {trial}",
+            expected="a trial of several cameras, or a marker recording, that is fitted",
+            next_step=f"`pbl populate`; `pbl why {trial}` says where it stands",
+            key=f"video_id={trial}",
+        )
+    if len(rows) > 1 or rows[0]["fit_set_kind"] == fit.SINGLE:
+        kinds = ", ".join(f"{r['fit_set_kind']} by {r['fit_method']}" for r in rows)
+        raise PblError(
+            "USAGE",
+            found=f"video_id {trial}: {kinds}",
+            expected="one fit, of several cameras or of markers",
+            next_step="name the method of the fit, or a trial whose fit can be a reference",
+            key=f"video_id={trial}",
+        )
+    (row,) = rows
+    said = origin or f"fit of video_id {trial}, set {row['fit_set']}, {row['fit_method']}"
+    with stored_file(fit.SessionFit(), file_ref(row["trial_file"])) as path:
+        return add_reference(about, path, dataset, origin=said, shift_s=shift_s)
 
 
 def _insert(row: dict[str, Any], truth: lib.Reference, path: Path, sha256: str, origin: str | None) -> None:

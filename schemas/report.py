@@ -6,7 +6,7 @@ import contextlib
 from pathlib import Path
 from typing import Any
 
-from . import fit, privacy
+from . import fit, privacy, video
 from .results import load_session, not_finished
 
 
@@ -43,10 +43,15 @@ def write_session(restriction: Any, out: Path) -> list[Path]:
 
 
 def methods_of(key: Any) -> dict[str, str]:
-    """Name and version of the method behind each stage, of a key of `SessionResults`; of those that it names."""
-    member = (fit.FitSet.Video & {"fit_set": key["fit_set"]}).to_dicts(limit=1)[0]
+    """Name and version of the method behind each stage, of a key of `SessionResults`; of those that it names. Of
+    several cameras also their names."""
+    members = fit.FitSet.Video & {"fit_set": key["fit_set"]}
+    member = members.to_dicts(limit=1)[0]
+    cameras = sorted(set((video.RigView & members.proj()).to_arrays("rig_camera")))
     before = {"Tracking": member["tracking_method"], "Keypoints": member["keypoint_method"]}
     found = {stage: method or fit.LABORATORY for stage, method in before.items()} | {"Fit": key["fit_method"]}
+    if cameras:
+        found = {"Cameras": ", ".join(cameras), **found}
     if "gdi_method" in key:
         found |= {"Gait events": key["gait_method"], "Index": f"{key['gdi_method']}, norm {key['norm']}"}
     return found

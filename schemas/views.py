@@ -66,7 +66,8 @@ def session_summary(restriction: Any = True) -> pd.DataFrame:
     fits = fit.SessionFit.proj("fit_residual_2d", "fit_residual_3d", "fit_outcome")
     measures = gdi.SessionGdi.proj(*_SESSION_COLUMNS)
     quality = qc.SessionQc.proj("qc_outcome", "qc_worst")
-    return (current_sets() * fits * measures * quality & restriction).to_pandas(order_by="session_id").reset_index()
+    rows = frame_of(current_sets() * fits * measures * quality & restriction)
+    return rows.sort_values("session_id", kind="stable", ignore_index=True)
 
 
 def visit_frame(restriction: Any = True, chain: Any = True) -> pd.DataFrame:

@@ -151,30 +151,55 @@ def _show(frame: pd.DataFrame, where: Sequence[str], out: Path | None, in_databa
 @click.argument("video")
 @click.option(
     "--reference",
-    required=True,
     type=click.Path(path_type=Path, readable=False),
     metavar="FILE",
     help="Reference movement: .npz, fit.npz, truth.npz, .json.gz or .mot.",
 )
+@click.option(
+    "--of-trial",
+    type=int,
+    metavar="VIDEO_ID",
+    help="In place of a file: the current fit of a trial of several cameras, or of a marker recording, in the tables.",
+)
+@click.option("--fit-method", metavar="KEY", help="With --of-trial, where that was fitted by several methods.")
 @click.option("--dataset", metavar="NAME", help="Collection of recordings to report it with (else: unnamed).")
 @click.option("--source", metavar="TEXT", help="Instrument, such as 'optical markers' (default: what the file states).")
 @click.option("--origin", metavar="TEXT", help="Where the file comes from (else: its path).")
 @_SHIFT
 def add(
-    video: str, reference: Path, dataset: str | None, source: str | None, origin: str | None, shift_s: float
+    video: str,
+    reference: Path | None,
+    of_trial: int | None,
+    fit_method: str | None,
+    dataset: str | None,
+    source: str | None,
+    origin: str | None,
+    shift_s: float,
 ) -> None:
     """Register the reference movement of VIDEO (number, path or file name of a registered video).
 
     `pbl populate` then computes the errors of its fits. The same file is registered once; another file of the same
     source takes its place. Population, activity and camera are those of the video (`pbl ingest`).
 
+    \b
     Example: pbl validate add 3 --reference walk1_mocap.mot --dataset OURLAB
+    Example: pbl validate add 3 --of-trial 4 --dataset OURLAB
     """
     import schemas
-    from schemas.references import add_reference
+    from schemas.references import add_reference, add_trial
 
+    if (reference is None) == (of_trial is None):
+        raise click.UsageError("Name one reference: --reference FILE or --of-trial VIDEO_ID.")
+    if of_trial is None and fit_method is not None:
+        raise click.UsageError("--fit-method goes with --of-trial.")
+    if of_trial is not None and source is not None:
+        raise click.UsageError("--source goes with --reference: the tables know what a trial was recorded with.")
     schemas.activate()
-    done = add_reference(video, reference, dataset, source, origin, shift_s)
+    if reference is not None:
+        done = add_reference(video, reference, dataset, source, origin, shift_s)
+    else:
+        assert of_trial is not None
+        done = add_trial(video, of_trial, dataset, origin, shift_s, fit_method)
     click.echo(f"video_id {done.video_id}: reference {done.reference} {done.status} ({done.note})")
     if done.status in ("registered", "replaced"):
         click.echo("next: pbl populate")

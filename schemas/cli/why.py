@@ -30,7 +30,7 @@ def why(video_id: int, as_json: bool) -> None:
         return
     click.echo(f"video {found.video_id}  {found.name}  session {found.session_id}\n{found.path}\n")
     for step in found.steps:
-        click.echo(f"{step.table:<16}{step.what:<20}{_about(step):<34}{step.note}".rstrip())
+        click.echo(f"{step.table:<16}{step.what:<20}{_about(step):<33} {step.note}".rstrip())
         if step.next_step:
             click.echo(f"{'':<16}next: {step.next_step}")
     click.echo(f"\n{found.verdict}")

@@ -16,12 +16,13 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import fit_session
 from pbl_pipeline.keypoints import Keypoints, MultiView
 from pbl_pipeline.synthetic import NO_NOISE, observe_views, plain_walk
-from schemas import fit, gait, gdi, jobs, norms, slices, video, views
+from schemas import fit, gait, gdi, jobs, norms, slices, validation, video, views
 from schemas.choose import choose_person
 from schemas.coded_errors import error_code
 from schemas.forget import forget
 from schemas.ingest import Visit, ingest
 from schemas.plan import fit_set_hash
+from schemas.report import methods_of
 from schemas.results import load_session
 from schemas.rigs import ingest_rig
 from schemas.study_import import import_sheets
@@ -34,6 +35,7 @@ from workers.populate import populate
 from . import chain
 
 CAMERAS = ("cam_01", "cam_02", "cam_03")
+REFUSED = PblError("FIT_INPUT", found="x", expected="y", next_step="z")
 
 
 def rig_views(n_frames: int, backwards: bool = False) -> MultiView:
@@ -136,6 +138,8 @@ def test_a_phone_and_three_cameras_measure_the_same_walk(rig: pytest.MonkeyPatch
     for joint in ("knee_angle_r", "hip_flexion_l"):
         column = truth.joint_names.index(joint)
         assert np.degrees(np.nanmedian(np.abs(seen.qpos - truth.qpos)[:, column])) < 2.0, joint
+    assert methods_of(by_kind["rig"].key)["Cameras"] == "cam_01, cam_02, cam_03"
+    assert "Cameras" not in methods_of(by_kind["single"].key)
     assert [[t.name for t in s.trials] for s in by_kind.values()] == [["walk"], ["cam_01"]]
     with pytest.raises(PblError, match="USAGE"):
         load_session({"subject": "P001"})
@@ -159,6 +163,19 @@ def test_a_phone_and_three_cameras_measure_the_same_walk(rig: pytest.MonkeyPatch
         assert data.visits["gdi"].tolist() == [found[kind]["session_gdi"]]
         assert data.description.methods["fit_set_kind"] == kind
         assert slices.changes(name) == []
+    # The cameras' angles as the reference of the phone's, from the tables.
+    added = pbl("validate", "add", 1, "--of-trial", 3, "--dataset", "OURS")  # any camera of the trial
+    assert added.code == 0, added
+    assert "source several cameras" in added.out
+    populate()
+    (error,) = validation.KinematicError().to_dicts()
+    joints = {r["error_joint"]: r["joint_median_abs"] for r in validation.KinematicError.Joint().to_dicts()}
+    assert abs(error["error_lag"]) < 0.02
+    assert joints["knee_flexion_r"] < 2.0
+    assert views.validation_frame()["dataset"].unique().tolist() == ["OURS"]
+    for wrong, code in ((("--of-trial", 1), "USAGE"), (("--of-trial", 99), "DB_NOT_FOUND")):
+        assert pbl("validate", "add", 1, *wrong).error_code == code
+    assert pbl("validate", "add", 1).code == 2
     # As docs/study.md says it.
     wide = views.session_summary().pivot_table("session_gdi", ["subject", "session_label"], "fit_set_kind")
     assert wide["rig"].tolist() == [found["rig"]["session_gdi"]]
@@ -183,6 +200,12 @@ def test_people_of_the_cameras(rig: pytest.MonkeyPatch, tmp_path: Path):
     (first,) = fit.FitSet().to_dicts()
     assert (first["fit_set_kind"], first["fit_set_n"]) == ("rig", 3)
     assert fit.SessionFit.Trial().to_arrays("video_id").tolist() == [1]
+    # A worker with a GPU hands a batch over.
+    batch: list = []
+    rig.setattr(pbl_pipeline.fit, "fit_sessions", lambda given, paramset: batch.extend(given) or [REFUSED])
+    (key,) = fit.FitSelection().keys()
+    assert fit.SessionFit().make_computes([key], [fit.SessionFit().make_fetch(key)]) == [None]
+    assert [t.cameras for t in batch[0].trials] == [CAMERAS]
     for number in (4, 6):
         assert why(number).verdict.startswith("SubjectChoice of its camera, video_id 5, ran well and found nothing")
     # Another person in one camera: what was computed of the trial goes, and the check says it.
