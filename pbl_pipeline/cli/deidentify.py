@@ -24,13 +24,14 @@ _MOST_RUNS = 10
     "--keep",
     type=click.Choice(["place", "device", "time"]),
     multiple=True,
-    help="What to keep of the metadata; repeatable. The intrinsics of the camera are found by the device.",
+    help="What to keep of the metadata; repeatable.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace files of these names.")
 def deidentify(video: Path, out: Path | None, how: str, keep: tuple[str, ...], overwrite: bool) -> None:
     """Write a copy of VIDEO in which the heads of all people are hidden, without sound and metadata.
 
-    Frames and time stamps are those of VIDEO. Beside the copy a .deidentified.json lists the frames that are not
+    Frames and time stamps are those of VIDEO, so that what is computed from VIDEO belongs to both; measure VIDEO, not the
+    copy, in which detectors miss the faces. Beside the copy a .deidentified.json lists the frames that are not
     certain: look at these before the copy leaves the house. docs/privacy.md says how often a head is covered.
     """
     from pbl_pipeline.deidentify import REASONS, check_call
