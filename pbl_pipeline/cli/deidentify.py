@@ -30,8 +30,8 @@ _MOST_RUNS = 10
 def deidentify(video: Path, out: Path | None, how: str, keep: tuple[str, ...], overwrite: bool) -> None:
     """Write a copy of VIDEO in which the heads of all people are hidden, without sound and metadata.
 
-    Frames and time stamps are those of VIDEO, so that what is computed from VIDEO belongs to both; measure VIDEO, not the
-    copy, in which detectors miss the faces. Beside the copy a .deidentified.json lists the frames that are not
+    Frames and time stamps are those of VIDEO, so that what is computed from VIDEO belongs to both; measure VIDEO, not
+    the copy, in which detectors miss the faces. Beside the copy a .deidentified.json lists the frames that are not
     certain: look at these before the copy leaves the house. docs/privacy.md says how often a head is covered.
     """
     from pbl_pipeline.deidentify import REASONS, check_call
@@ -50,7 +50,8 @@ def deidentify(video: Path, out: Path | None, how: str, keep: tuple[str, ...], o
     if done.status == "NO_HEAD":
         raise PblError(
             "HEAD_NOT_FOUND",
-            found=f"no head in {len(done.reasons)} frames; {done.path.name} was written, and nothing in it is covered",
+            found=f"no head in {len(done.reasons)} frames; {done.path.name} was written, and "
+            + ("nothing is drawn in it" if how == "skeleton" else "nothing in it is covered"),
             expected="a person whose head is in the picture",
             next_step="look at the whole video before it leaves the house; --how skeleton shows no picture at all",
             key=str(video),
