@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from pbl_pipeline import methods
+from pbl_pipeline.errors import PblError
 
 from . import fit, keypoints, session, tracking, video
 from ._datajoint import dj
@@ -30,6 +31,23 @@ def default_fit(keypoint_method: str) -> str:
 
     row = method_row(keypoints.KeypointMethod, {"keypoint_method": keypoint_method})
     return resolve_method(fit.FitMethod, fit_default(methods.stored(**row)))
+
+
+def unsuited(fit_method: str, keypoint_method: str | None) -> str:
+    """What is to be said where a fit method (key) was made for other points than those of a keypoint method (key; None:
+    markers of a laboratory), "" where it was not, and where the keypoint method's model is not on this machine."""
+    from pbl_pipeline.fit import unsuited as compare
+
+    name = method_row(fit.FitMethod, {"fit_method": fit_method})["name"]
+    if keypoint_method is None:
+        return compare(name, None)
+    row = method_row(keypoints.KeypointMethod, {"keypoint_method": keypoint_method})
+    try:
+        return compare(name, methods.stored(**row).params.points())
+    except PblError as error:
+        if error.code not in ("MODEL_MISSING", "MODEL_INVALID"):
+            raise
+        return ""
 
 
 def plan_fits(selected: Sequence[Mapping[str, Any]], fit_method: str) -> None:

@@ -15,7 +15,7 @@ from schemas.ingest import resolve as resolve_ingest
 from schemas.jobs import jobs_of
 from schemas.method_names import keys_named
 from schemas.method_rows import resolve_method
-from schemas.plan import default_fit, plan_fits
+from schemas.plan import default_fit, plan_fits, unsuited
 from schemas.rows import delete_below
 
 from . import queue
@@ -208,6 +208,8 @@ def summary(plan: Reprocess) -> Sequence[str]:
     out = []
     if plan.add:
         out.append(f"{len(plan.add)} selections would be added for {plan.table}; nothing is deleted")
+        pairs = {(row["fit_method"], row["keypoint_method"]) for row in plan.add if "fit_method" in row}
+        out += [f"warning: {said}" for pair in sorted(pairs) if (said := unsuited(*pair))]
     if plan.outdated:
         out.append(f"{len(plan.outdated)} rows of {plan.table} would be deleted and computed again")
         out += [f"  with it: {n} rows of {name}" for name, n in plan.below.items()]

@@ -1,5 +1,5 @@
 """The `pbl` command. Each command is a module found through the entry-point group `pbl.commands`."""
 
-from ._main import main
+from ._main import TASKS, main
 
-__all__ = ["main"]
+__all__ = ["TASKS", "main"]

@@ -35,7 +35,35 @@ class Commands(click.Group):
         return None
 
 
-@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
+#: What people want to do, and the commands for it, in the order of doing it.
+TASKS = {
+    "From files to files": ("run", "detect", "fit", "events", "gait", "study", "deidentify"),
+    "Begin with the tables": ("demo", "db", "ingest", "list", "populate", "status", "report", "export"),
+    "Correct and decide": ("why", "choose", "move", "retry", "reprocess", "forget"),
+    "Cameras, models, methods, norms": ("calibrate", "camera", "models", "method", "norm"),
+    "Run it for many": ("worker", "cron", "doctor"),
+    "Check and measure": ("validate", "bench", "synth"),
+}
+
+
+class ByTask(Commands):
+    """Commands whose help lists them by task."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        names = self.list_commands(ctx)
+        listed = {name for task in TASKS.values() for name in task}
+        more = {"Further commands": tuple(name for name in names if name not in listed)}
+        width = max(map(len, names), default=0)
+        for task, wanted in (TASKS | more).items():
+            found = [(n, self.get_command(ctx, n)) for n in wanted if n in names]
+            limit = formatter.width - 6 - width
+            rows = [(n.ljust(width), command.get_short_help_str(limit)) for n, command in found if command is not None]
+            if rows:
+                with formatter.section(task):
+                    formatter.write_dl(rows)
+
+
+@click.group(cls=ByTask, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="pbl")
 @click.option("--quiet", is_flag=True, help="No progress bars.")
 @click.option("--debug", is_flag=True, help="Print the traceback of an error, too.")

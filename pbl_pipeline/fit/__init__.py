@@ -1,6 +1,6 @@
 """The session fit: keypoints of 1..N trials to joint angles, one body for all."""
 
-from ._default import default_for_points, default_method
+from ._default import default_for_points, default_method, unsuited
 from ._fit_session import (
     LEVEL_CAMERA_QUAT_WXYZ,
     SessionInput,
@@ -42,4 +42,5 @@ __all__ = [
     "fit_sessions",
     "paper_objective",
     "read_markers",
+    "unsuited",
 ]

@@ -1,4 +1,4 @@
-"""The method that a fit takes where nobody names one: it follows from what was seen."""
+"""The method that suits what was seen: taken where nobody names one, and compared with one that is named."""
 
 from __future__ import annotations
 
@@ -27,3 +27,24 @@ def default_for_points(marker_set: str, root_relative: bool) -> str:
     """Name of the method for keypoints of that marker set: `gauss-newton`, which was tuned for MeTRAbs' 87 points with
     3D in the camera's frame, for these; the project's default, with BlazePose's priors, for all else."""
     return "gauss-newton" if (marker_set, root_relative) == ("bml_movi_87", False) else METHODS.default
+
+
+def unsuited(method: str, points: tuple[str, bool] | None) -> str:
+    """What is to be said of a method (its name) that was made for other points than these, "" where it was not.
+
+    `points`: marker set and whether 3D is relative to the root, as of a keypoint method; None for markers of a
+    laboratory. The methods of the paper were made for no points in particular, and neither were those of one's own.
+    """
+    suits = "markers" if points is None else default_for_points(*points)
+    if method == suits or method not in _MADE_FOR:
+        return ""
+    seen = "markers of a laboratory" if points is None else f"points of {points[0]}"
+    return f"{method} was made for {_MADE_FOR[method]}, and is asked for {seen}: {suits} suits these"
+
+
+#: Method -> the points that its priors and weights were made with.
+_MADE_FOR = {
+    "blazepose": "BlazePose's points",
+    "gauss-newton": "MeTRAbs' 87 points with 3D",
+    "markers": "markers of a laboratory",
+}

@@ -10,6 +10,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 
+from ._notices import without_notice
 from ._tflite_outputs import keep_outputs
 
 #: Two threads are the sweet spot of these small models; more only waits. Not a method parameter.
@@ -48,8 +49,9 @@ class LiteModel:
 
         if outputs is not None:
             content = keep_outputs(content, outputs)
-        self._interpreter = Interpreter(model_content=content, num_threads=num_threads)
-        self._interpreter.allocate_tensors()
+        with without_notice(b"XNNPACK delegate"):
+            self._interpreter = Interpreter(model_content=content, num_threads=num_threads)
+            self._interpreter.allocate_tensors()
         self._input = self._interpreter.get_input_details()[0]["index"]
         self._outputs = self._interpreter.get_output_details()
 

@@ -156,6 +156,8 @@ def ingest(
     if rig is not None and (results or len(calls) > 1):
         raise click.UsageError("--rig: all videos are of one trial, so their names must state the same.")
     schemas.activate()
+    if fit_method is not None:
+        _warn(methods, bool(markers))
     for said, numbers in calls:
         visit = Visit(
             subject=said["subject"],
@@ -185,11 +187,23 @@ def ingest(
         raise click.exceptions.Exit(1)
 
 
+def _warn(methods: Methods, markers: bool) -> None:
+    """Say on the terminal where the fit method was made for other points."""
+    from schemas.ingest import resolve
+    from schemas.plan import unsuited
+
+    chosen = resolve(methods)
+    if said := unsuited(chosen["fit_method"], None if markers else chosen["keypoint_method"]):
+        click.echo(f"warning: {said}", err=True)
+
+
 def _sheet(sheet: Path, methods: Methods, dry_run: bool) -> None:
     import schemas
     from schemas.ingest_sheet import ingest_sheet
 
     schemas.activate()
+    if methods.fit is not None:
+        _warn(methods, markers=False)
     found = ingest_sheet(sheet, methods, dry_run)
     for line in found.lines:
         for error in line.errors:

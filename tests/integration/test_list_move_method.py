@@ -119,6 +119,17 @@ def test_what_cannot_be_moved_is_refused_and_changes_nothing(tables, tmp_path, t
     assert everything() == before
 
 
+def test_a_fit_method_for_other_points_is_warned_of(tables, tmp_path):
+    path = chain.small_video(tmp_path, "walk")
+    done = pbl("ingest", path, "--subject", "P001", "--fit-method", "gauss-newton")
+    assert done.code == 0
+    assert "warning: gauss-newton was made for MeTRAbs' 87 points with 3D, and is asked for points of blaze" in done.err
+    assert "warning" not in pbl("ingest", path, "--subject", "P001", "--fit-method", METHODS.default).err
+    plan = pbl("reprocess", "--table", "SessionFit", "--new-method", "markers")
+    assert "warning: markers was made for markers of a laboratory" in plan.out
+    assert "warning" not in pbl("reprocess", "--table", "SessionFit", "--new-method", "paper-2025").out
+
+
 def test_all_cameras_of_a_trial_move_together(tables, tmp_path):
     toml = test_rigs.calibration(tmp_path / "rig.toml")
     done = ingest_rig(test_rigs.rig_videos(tmp_path / "three"), toml, Visit("P001", "2026-03-01"))

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import click
 
+from pbl_pipeline.cli import TASKS
 from pbl_pipeline.errors import CODES
 from pbl_pipeline.settings import VARIABLES
+from tests.command import pbl
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -42,3 +44,12 @@ def test_every_command_has_help_with_an_example():
     for entry in commands:
         command = entry.load()
         assert "Example:" in command.get_help(click.Context(command)), entry.name
+
+
+def test_the_help_lists_every_command_under_one_task():
+    listed = [name for names in TASKS.values() for name in names]
+    assert sorted(listed) == sorted(entry.name for entry in entry_points(group="pbl.commands"))
+    shown = pbl("--help").out
+    assert "Further commands" not in shown
+    assert all(f"\n{task}:\n" in shown for task in TASKS)
+    assert all(shown.count(f"\n  {name} ") == 1 for name in listed)

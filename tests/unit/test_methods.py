@@ -12,6 +12,7 @@ import pytest
 
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import unsuited
 from pbl_pipeline.gait import GaitParams
 from pbl_pipeline.keypoints import ModelKeypointParams, ModelParams
 from pbl_pipeline.methods import Stage, of_stage, stored
@@ -203,3 +204,26 @@ def test_asking_for_no_method_loads_no_detector_and_no_jax():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("method", "points", "suits"),
+    [
+        ("gauss-newton", ("blazepose_33", False), "blazepose"),
+        ("blazepose", ("bml_movi_87", False), "gauss-newton"),
+        ("blazepose", None, "markers"),
+        ("markers", ("blazepose_33", False), "blazepose"),
+        ("blazepose", ("blazepose_33", False), None),
+        ("gauss-newton", ("bml_movi_87", False), None),
+        ("markers", None, None),
+        ("paper-2025", ("blazepose_33", False), None),
+        ("one-of-my-own", ("blazepose_33", False), None),
+    ],
+)
+def test_a_fit_method_made_for_other_points_is_named_with_the_one_that_suits(method, points, suits):
+    said = unsuited(method, points)
+    if suits is None:
+        assert said == ""
+    else:
+        assert said.startswith(f"{method} was made for")
+        assert f": {suits} suits" in said

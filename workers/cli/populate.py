@@ -47,8 +47,10 @@ def summary(run: Run) -> list[str]:
         lines.append(f"deleted because another person was chosen: {rows}")
     if run.planned:
         lines.append(f"{run.planned} sets of videos planned for a fit")
-    lines.append(f"{'table':<16}{'done':>7}{'empty':>7}{'waiting':>9}{'errors':>8}")
-    for t in run.tables:
+    busy = [t for t in run.tables if t.done or t.empty or t.waiting or t.errors]
+    if busy:
+        lines.append(f"{'table':<16}{'done':>7}{'empty':>7}{'waiting':>9}{'errors':>8}")
+    for t in busy:
         codes = ", ".join(f"{n} {code}" for code, n in sorted(t.errors.items()))
         n_errors = sum(t.errors.values())
         lines.append(f"{t.table:<16}{t.done:>7}{t.empty:>7}{t.waiting:>9}{n_errors:>8}  {codes}".rstrip())
