@@ -157,7 +157,6 @@ ASSETS: dict[str, Asset] = {
             "8dbd686784f6c6e3b42fdfe968a8808a789bdcaff284e3dd9e8c321bbca4e52c",
             2_080_428,
             *_AUGMENTER,
-            optional=True,
             file="marker_augmenter.onnx",
         ),
         Asset(
@@ -168,7 +167,6 @@ ASSETS: dict[str, Asset] = {
             "e8783601a37f827c728bb1f2bbb143d66f59c92a3268306697cfc2932e99888f",
             504,
             *_AUGMENTER,
-            optional=True,
             file="marker_augmenter_mean.npy",
         ),
         Asset(
@@ -179,7 +177,6 @@ ASSETS: dict[str, Asset] = {
             "e7bcbe84f460666696fb500663a281c418ed20205aab9d8e1b18fd8568c77436",
             504,
             *_AUGMENTER,
-            optional=True,
             file="marker_augmenter_std.npy",
         ),
         Asset(

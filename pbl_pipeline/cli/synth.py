@@ -50,7 +50,7 @@ class _Speed(click.ParamType):
 @click.option("--fps", type=float, default=30.0, show_default=True)
 @click.option("--speed", type=_Speed(), help="m/s, or very_slow, slow, free, fast, very_fast (default: the person's).")
 @click.option("--ground", type=click.Choice(["overground", "treadmill"]), default="overground", show_default=True)
-@click.option("--noise", type=click.Choice(["benchmark", "none"]), default="benchmark", show_default=True)
+@click.option("--noise", type=click.Choice(["benchmark", "memory", "none"]), default="benchmark", show_default=True)
 def synth(
     out: Path,
     name: str | None,

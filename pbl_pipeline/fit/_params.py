@@ -179,6 +179,10 @@ class GaussNewtonParams:
     weight_detector: float = later(0.0)
     lean_sd_deg: float = later(5.0)
     depth_sd_m: float = later(0.08)
+    #: Of the pelvis' tilt and list, where a person sits or squats, as the marker augmenter has them from a first
+    #: solution (`augmented_pelvis.py`): half squares in standard deviations. 0: the augmenter is not asked.
+    weight_pelvis: float = later(0.0)
+    pelvis_sd_deg: float = later(6.0)
     sd_factor: tuple[tuple[str, float], ...] = SD_FACTOR
     #: Least standard deviation in deg (slides: cm), added in squares: what a detector gets wrong in the same way in
     #: many frames, which no number of frames mends.
@@ -204,6 +208,7 @@ BLAZEPOSE = GaussNewtonParams(
     weight_floor=0.03,
     weight_slide=0.03,
     weight_detector=0.1,
+    weight_pelvis=0.07,
     sd_factor=(),
     sd_floor=SD_FLOOR_BLAZEPOSE,
     cost=CostParams(

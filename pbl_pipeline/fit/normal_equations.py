@@ -320,7 +320,11 @@ def _add_joints(sum_: _Blocks, p: Problem, w: Weights, state: State) -> tuple[_B
     curvature = jnp.einsum("fc,cqr->fqr", own, jnp.einsum("cpq,cpr->cqr", w.whitener, w.whitener))
     if w.pelvis.shape[0]:
         # Only the pelvis' own three joints are seen through its tilt and list.
-        by_pelvis = linearised(inclination, state.qpos[:, w.pelvis])[1]
+        inclined, by_pelvis = linearised(inclination, state.qpos[:, w.pelvis])
+        # Among a posture's values these two are the pelvis' own.
+        each = w.weight_pelvis * p.weight * p.c_pelvis / w.pelvis_sd**2
+        towards = towards.at[:, w.pelvis[:2]].add(each[:, None] * (inclined - p.pelvis))
+        curvature = curvature.at[:, w.pelvis[:2], w.pelvis[:2]].add(each[:, None])
         through = lambda a: _through(a, by_pelvis, w.pelvis)  # noqa: E731
         towards = through(towards[:, None])[:, 0]
         curvature = jnp.swapaxes(through(jnp.swapaxes(through(curvature), 1, 2)), 1, 2)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, ArrayLike, Float
 
-from .priors import Weights, bent, beyond_limit_deg, pose_cost, pose_z, posture
+from .priors import Weights, bent, beyond_limit_deg, inclination, pose_cost, pose_z, posture
 from .problem import Problem
 
 #: Depth below which a point is treated as if it were this far away: keeps projections and gradients finite.
@@ -274,6 +274,13 @@ def _lslide(at: At) -> Array:
     return at.mean(Lslide(at.soles, later(at.soles), p.rate, slide_contact(p), w.huber_slide_cm))
 
 
+def Lpelvis(qpos: Float[Array, "F Q"], p: Problem, w: Weights) -> Float[Array, " F"]:
+    """Half squares of the pelvis' tilt and list less the augmenter's, in standard deviations."""
+    if not w.pelvis.shape[0]:
+        return jnp.zeros_like(p.c_pelvis)
+    return 0.5 * p.c_pelvis * square((inclination(qpos[:, w.pelvis]) - p.pelvis) / w.pelvis_sd)
+
+
 def slide_contact(p: Problem) -> Float[Array, "F P"]:
     """How surely a point of the soles stands in a frame and the next one of its trial."""
     return p.contact * later(p.contact) * ((p.rate > 0) * later(p.weight))[:, None]
@@ -315,6 +322,7 @@ TERMS: dict[str, tuple[Callable[[Weights], ArrayLike], Callable[[At], Array]]] =
     ),
     "Lfloor": (lambda w: w.weight_floor, _lfloor),
     "Lslide": (lambda w: w.weight_slide, _lslide),
+    "Lpelvis": (lambda w: w.weight_pelvis, lambda at: at.mean(Lpelvis(at.state.qpos, at.problem, at.weights))),
     "detector prior": (
         lambda w: w.weight_detector,
         lambda at: detector_prior(at.problem, at.weights, at.state.lean, at.state.depth_m),

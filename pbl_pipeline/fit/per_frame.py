@@ -22,6 +22,7 @@ from pbl_pipeline.jax_setup import compile_seconds
 from ._params import GaussNewtonParams
 from ._phone_error import phone_variance
 from ._threads import one_blas_thread
+from .augmented_pelvis import with_augmented_pelvis
 from .initial_pose import placed_poses
 from .normal_equations import Linearised, linearise, moved
 from .objective import State
@@ -61,7 +62,8 @@ def solve_per_frame(sessions: Sequence[Session], params: GaussNewtonParams, star
 
     The result does not depend on which sessions are fitted together. A session whose result is suspicious is solved
     again from a start that faces the other way, and the better one of the two is kept. Where the paramset has feet on
-    the floor, a first solution tells when each foot stands, and a second one uses it.
+    the floor or a pelvis as the marker augmenter has it, a first solution tells when each foot stands and what the
+    augmenter sees, and a second one uses it.
 
     Raises
     ------
@@ -69,8 +71,8 @@ def solve_per_frame(sessions: Sequence[Session], params: GaussNewtonParams, star
         FIT_INPUT: the paramset has a prior of no joint.
     """
     begin, compiled = time.perf_counter(), compile_seconds()
-    on_floor = params.weight_floor > 0 or params.weight_slide > 0
-    solve = functools.partial(_solve, params=params, last=not on_floor)
+    twice = params.weight_floor > 0 or params.weight_slide > 0 or params.weight_pelvis > 0
+    solve = functools.partial(_solve, params=params, last=not twice)
     starts = [_with_detector(s, params) for s in starts]
     found = solve(sessions, [s.problem for s in sessions], starts)
     again = [i for i, f in enumerate(found) if suspicious(sessions[i], f.end.state.qpos)]
@@ -80,8 +82,12 @@ def solve_per_frame(sessions: Sequence[Session], params: GaussNewtonParams, star
         for i, other in zip(again, turned, strict=True):
             found[i] = min(found[i], other, key=lambda f: float(f.end.cost))
     traces = [f.trace for f in found]
-    if on_floor:
+    if twice:
         problems, starts = zip(*map(_on_floor, sessions, found), strict=True)
+        if params.weight_pelvis > 0:
+            scales = scale_multipliers(jnp.asarray(np.stack([f.end.state.s for f in found])))
+            each = zip(sessions, problems, [f.end.state.qpos for f in found], np.asarray(scales), strict=True)
+            problems = [with_augmented_pelvis(*e) for e in each]
         found = _solve(sessions, problems, starts, params, last=True)
         # The cost of the second one has a term more.
         traces = [np.concatenate([t, f.trace + np.array([len(t), 0.0])]) for t, f in zip(traces, found, strict=True)]

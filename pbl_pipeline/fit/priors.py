@@ -60,6 +60,8 @@ class Weights:
     whitener: Float[Array, "C Q Q"]
     pose_log_weight: Float[Array, " C"]
     pelvis: Int[Array, " P"]
+    weight_pelvis: Float[Array, ""]
+    pelvis_sd: Float[Array, ""]
     weight_detector: Float[Array, ""]
     lean_sd: Float[Array, ""]
     depth_sd_m: Float[Array, ""]
@@ -95,6 +97,8 @@ class Weights:
             "neutral": neutral,
             "whitener": whitener,
             "pose_log_weight": pose_log_weight,
+            "weight_pelvis": own.weight_pelvis if own else 0.0,
+            "pelvis_sd": np.deg2rad(own.pelvis_sd_deg) if own else 1.0,
             "weight_detector": own.weight_detector if own else 0.0,
             "lean_sd": np.deg2rad(own.lean_sd_deg) if own else 1.0,
             "depth_sd_m": own.depth_sd_m if own else 1.0,
@@ -106,7 +110,8 @@ class Weights:
             "floor_precision": np.array([1e-6, slope, slope]),
         }
         values |= {f.name: getattr(c, f.name) for f in dataclasses.fields(CostParams) if f.name in _FIELDS}
-        names = [n for n in PELVIS_TURNS if n in body.joint_names] if c.pose_prior else []
+        inclined = c.pose_prior or (own and own.weight_pelvis)
+        names = [n for n in PELVIS_TURNS if n in body.joint_names] if inclined else []
         pelvis = jnp.asarray([body.joint_names.index(n) for n in names], jnp.int32)
         return cls(pelvis=pelvis, **{k: jnp.asarray(v, jnp.float32) for k, v in values.items()})
 

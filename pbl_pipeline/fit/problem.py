@@ -58,7 +58,8 @@ class Problem:
     seen, where values are finite and do not count. `xy_px` are pixels of an ideal pinhole camera (undistorted). `bend`
     holds the weights of the frames before, at and after a frame in the second difference there (per 1/30 s squared), 0
     where it is not formed; `rate` is 1/30 s over the time to the next frame of the trial, 0 where there is none.
-    `contact`: how surely each of the soles' points stands (0 to 1), 0 until a first solution tells. `sample_*`: the
+    `contact`: how surely each of the soles' points stands (0 to 1), 0 until a first solution tells; `pelvis`: its tilt
+    and list (rad) as the marker augmenter has them, and `c_pelvis`, 1 where it has. `sample_*`: the
     phone's orientation R_nc as quaternions at a fixed interval, from `sample_start_s` on; there where `has_phone` is 1.
     M is 0 where no camera of the session turns.
     """
@@ -80,6 +81,8 @@ class Problem:
     bend: Float[Array, "F 3"]
     rate: Float[Array, " F"]
     contact: Float[Array, "F P"]
+    pelvis: Float[Array, "F 2"]
+    c_pelvis: Float[Array, " F"]
     has_phone: Float[Array, " N"]
     sample_quat_wxyz: Float[Array, "N M 4"]
     sample_start_s: Float[Array, " N"]
@@ -231,6 +234,8 @@ def pack(trials: Sequence[TrialArrays], body: Body, markers: MarkerSet) -> Probl
         "bend": np.pad(bend, [(0, frames), (0, 0)]),
         "rate": np.pad(np.concatenate([step_rates(t.time_s) for t in trials]), (0, frames)),
         "contact": np.zeros((total + frames, sum(name in body.body_names for name, _ in SOLES))),
+        "pelvis": np.zeros((total + frames, 2)),
+        "c_pelvis": np.zeros(total + frames),
         "has_phone": np.pad([float(t.phone_time_s is not None) for t in trials], (0, n - len(trials))),
         "sample_quat_wxyz": quats,
         "sample_start_s": starts,

@@ -27,13 +27,13 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import body_poses, load_body, marker_positions, marker_set
 from pbl_pipeline.fit import METHODS, TrialFit, fit_session
+from pbl_pipeline.fit.augmented_pelvis import pelvis_of
 from pbl_pipeline.keypoints import AugmenterParams, MarkerAugmenter
 from pbl_pipeline.validation import read_motions
 from tests.benchmarks import marker_ik
 from tests.benchmarks.real_clips import CLIPS, fitted_angles, recorded_angles, score
 from tests.conftest import SHARED
 
-SPINES = ("r_ASIS", "l_ASIS", "r_PSIS", "l_PSIS")
 BODY, SITES, SEEN = load_body(), marker_set("opencap_35"), marker_set("halpe_26")
 PELVIS = BODY.body_names.index("pelvis")
 #: Markers that a laboratory has under OpenCap's names, by our names.
@@ -46,17 +46,6 @@ def points(qpos: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """(T, 15, 3) what the augmenter wants, on the body."""
     x = np.asarray(marker_positions(BODY, SEEN, qpos, scale, np.zeros((len(SEEN), 3))))
     return x[:, [SEEN.names.index(n) for n in MarkerAugmenter.points]]
-
-
-def pelvis_of(markers: np.ndarray) -> np.ndarray:
-    """(T, 3, 3) pelvis from markers (T, 35, 3): least squares onto the iliac spines."""
-    rows = [SITES.names.index(n) for n in SPINES]
-    site = SITES.position_m[rows] - SITES.position_m[rows].mean(axis=0)
-    seen = markers[:, rows] - markers[:, rows].mean(axis=1, keepdims=True)
-    known = np.asarray(np.isfinite(seen).all(axis=(1, 2)))
-    out = np.full((len(markers), 3, 3), np.nan)
-    out[known] = [Rotation.align_vectors(s, site)[0].as_matrix() for s in seen[known]]
-    return out
 
 
 def tilt_deg(pelvis: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
     python -m tests.benchmarks.synthetic_accuracy
     python -m tests.benchmarks.synthetic_accuracy --params blazepose --marker-set blazepose_33 --seeds 2
+    python -m tests.benchmarks.synthetic_accuracy --noise memory         # pixels that err with a memory
 
 Healthy and impaired walks and other tasks, with the noise of the fitting benchmark, by a phone in the hand (with its
 log) and by one that stands level. Each line: the median over the recordings of the median absolute error over the
@@ -37,12 +38,12 @@ WALKS = tuple(k for k, (task, *_) in KINDS.items() if task == "walk")
 BAR_DEG, BAR_CM = 1.5, 5.0
 
 
-def recording(kind: str, camera: str, seed: int, marker_set: str) -> tuple[SessionInput, Truth]:
+def recording(kind: str, camera: str, seed: int, marker_set: str, noise: str) -> tuple[SessionInput, Truth]:
     """One recording and its truth."""
     task, impairments, views = KINDS[kind]
     view = views[seed % len(views)]
     ground = "treadmill" if view == "sagittal" else "overground"  # nobody walks out of a phone's upright picture
-    spec = SynthSpec(task, seed, impairments, view, camera, marker_set, ground=ground)
+    spec = SynthSpec(task, seed, impairments, view, camera, marker_set, ground=ground, noise=noise)
     made = synthesise(spec)
     return SessionInput([made.keypoints], [spec.name], "static" if camera == "static" else "handheld"), made.truth
 
@@ -69,14 +70,15 @@ def line(errors: Sequence[KinematicErrors]) -> tuple[float, float, float, float]
 @click.option("--seeds", default=6, show_default=True, help="Recordings of each kind and camera.")
 @click.option("--params", default="gauss-newton", show_default=True, type=click.Choice(sorted(METHODS)))
 @click.option("--marker-set", default="bml_movi_87", show_default=True)
-def main(seeds: int, params: str, marker_set: str) -> None:
+@click.option("--noise", default="benchmark", show_default=True, type=click.Choice(["benchmark", "memory"]))
+def main(seeds: int, params: str, marker_set: str, noise: str) -> None:
     """Print the errors of each kind; exit code 1 where a bar is missed."""
-    click.echo(f"{params}, {marker_set}, {seeds} recordings a line")
+    click.echo(f"{params}, {marker_set}, noise {noise}, {seeds} recordings a line")
     click.echo(f"{'':26}{'paper joints':>13}{'main joints':>13}{'pelvis cm':>11}{'in 90 %':>9}")
     found: dict[tuple[str, str], list[KinematicErrors]] = {}
     for camera in ("handheld", "static"):
         for kind in KINDS:
-            made = [recording(kind, camera, seed, marker_set) for seed in range(seeds)]
+            made = [recording(kind, camera, seed, marker_set, noise) for seed in range(seeds)]
             fits = fit_sessions([given for given, _ in made], METHODS[params])
             errors = []
             for (given, truth), fit in zip(made, fits, strict=True):

@@ -195,7 +195,8 @@ def test_leftovers_of_a_killed_process_are_removed(index):
 
 def test_pins_are_complete():
     """The real list: every hash is a hash, every file name is one of its own, every asset says its licence."""
-    default = ["blazepose_detector", "blazepose_landmarks", "demo_video", "demo_camera"]
+    augmenter = ["augmenter_network", "augmenter_mean", "augmenter_std"]
+    default = ["blazepose_detector", "blazepose_landmarks", *augmenter, "demo_video", "demo_camera"]
     assert assets.needed() == default
     assert set(assets.ASSETS) == {
         *default,

@@ -259,6 +259,10 @@ def small_session(kind: str) -> Session:
         else:
             trials.append(observe(qpos, TIME_S, marker_set=few, seed=seed, camera_motion=motion).keypoints)
     session = make_session(trials, ["a", "b"], PARAMS.view, [motion] * 2, few)
+    if "pelvis" in kind:
+        p, rng = session.problem, np.random.default_rng(6)
+        tilt, known = jnp.asarray(rng.normal(0, 0.3, p.pelvis.shape)), jnp.asarray(rng.integers(0, 2, len(p.c_pelvis)))
+        session = dataclasses.replace(session, problem=dataclasses.replace(p, pelvis=tilt, c_pelvis=known))
     if "floor" in kind:
         p = session.problem
         seen = jnp.asarray(np.random.default_rng(5).random(p.contact.shape) * p.weight[:, None])
@@ -297,10 +301,11 @@ def cost(session: Session, w: Weights, state: State) -> jax.Array:
     return total(At(p, w, state, markers, soles, phone))
 
 
-@pytest.mark.parametrize("kind", ["moving", "views", "world", "floor", "moving floor", "moving detector"])
+@pytest.mark.parametrize("kind", ["moving", "views", "world", "floor", "moving floor", "moving detector", "pelvis"])
 def test_normal_equations_hold_the_gradient_of_the_cost(kind):
     session, detector = small_session(kind), "detector" in kind
-    p, w, state = session.problem, Weights.of(session.body, PARAMS), away(session, detector=detector)
+    params = dataclasses.replace(PARAMS, weight_pelvis=0.5) if "pelvis" in kind else PARAMS
+    p, w, state = session.problem, Weights.of(session.body, params), away(session, detector=detector)
     assert p.moving == ("moving" in kind)
     n = float(jnp.sum(p.weight))
     assert 30 < n < len(p.weight)  # and padding

@@ -1,0 +1,89 @@
+"""How the pelvis of a person who sits down or squats is tipped, as the marker augmenter has it.
+
+Two hip points do not tell. The 15 points that the network sees are those of the body of a first solution, whose legs
+and trunk were seen; of its 35 markers the four iliac spines place the pelvis. It is not asked about people who walk:
+how far each of them tips the pelvis it does not know (slope 0.30 over eight persons), how the pelvis turns in a squat
+it does (`tests/benchmarks/marker_augmenter.py`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+from jaxtyping import Float
+
+from pbl_pipeline.body import Body, marker_positions, marker_set
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.keypoints import MarkerAugmenter
+
+from .problem import Problem
+from .session import Session
+
+#: Markers of `opencap_35` on the pelvis.
+SPINES = ("r_ASIS", "l_ASIS", "r_PSIS", "l_PSIS")
+#: Both knees bent by so much (rad) at once, in more than this share of the frames: no walk, nor one in a crouch.
+FOLDED_RAD, FOLDED_SHARE = np.deg2rad(60.0), 0.05
+
+
+def with_augmented_pelvis(
+    session: Session, p: Problem, qpos: Float[np.ndarray, "F Q"], scale: Float[np.ndarray, " S"]
+) -> Problem:
+    """The problem with the pelvis' tilt and list of the augmenter, from the joint values (padded) and scale of a first
+    solution. A trial in which nobody sits or squats has none, nor has one that the network cannot be asked about (too
+    short, a person of a size that it does not know); it is fitted without.
+
+    Raises those of `assets.fetch` where the network cannot be had.
+    """
+    asked = [i for i, a in enumerate(session.arrays) if folds(session.body, qpos[session.frames(i)][a.used])]
+    if not asked:
+        return p
+    points, augmenter = marker_set("halpe_26"), _augmenter()
+    x = np.asarray(marker_positions(session.body, points, qpos, scale, np.zeros((len(points), 3))), float)
+    x = x[:, [points.names.index(n) for n in augmenter.points]]
+    pelvis, known = np.zeros(p.pelvis.shape, np.float32), np.zeros(p.c_pelvis.shape, np.float32)
+    for i in asked:
+        arrays, at = session.arrays[i], session.frames(i)
+        seen = np.where(arrays.used[:, None, None], x[at], np.nan)
+        try:
+            spines = augmenter(arrays.time_s, seen).xyz_world_m
+        except PblError as e:
+            if e.code != "AUGMENTER_INPUT":
+                raise
+            continue
+        found = inclination_of(pelvis_of(spines))
+        known[at] = np.isfinite(found).all(axis=1)
+        pelvis[at] = np.nan_to_num(found)
+    return dataclasses.replace(p, pelvis=pelvis, c_pelvis=known)  # type: ignore[arg-type]
+
+
+def folds(body: Body, qpos: Float[np.ndarray, "T Q"]) -> bool:
+    """Whether a person sits or squats for a part of the time."""
+    knees = -qpos[:, [body.joint_names.index(n) for n in ("knee_angle_r", "knee_angle_l")]].max(axis=1)
+    return bool(np.mean(knees > FOLDED_RAD) > FOLDED_SHARE)
+
+
+def pelvis_of(markers: Float[np.ndarray, "T 35 3"]) -> Float[np.ndarray, "T 3 3"]:
+    """Orientation of the pelvis (columns: its axes forward, up, right; in the world) with which the iliac spines
+    lie best, in least squares, on those of `opencap_35` (Kabsch 1976, Acta Cryst A32:922); NaN where unknown."""
+    table = marker_set("opencap_35")
+    rows = [table.names.index(n) for n in SPINES]
+    site = table.position_m[rows] - table.position_m[rows].mean(axis=0)
+    seen = markers[:, rows] - markers[:, rows].mean(axis=1, keepdims=True)
+    known = np.asarray(np.isfinite(seen).all(axis=(1, 2)))
+    out = np.full((len(markers), 3, 3), np.nan)
+    left, _, right = np.linalg.svd(np.einsum("tni,nj->tij", seen[known], site))
+    left[..., -1] *= np.sign(np.linalg.det(left @ right))[:, None]
+    out[known] = left @ right
+    return out
+
+
+def inclination_of(pelvis: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, "T 2"]:
+    """Tilt (backwards positive) and list (rad) of a pelvis against the vertical, as `priors.inclination`."""
+    return np.arcsin(0.999 * np.stack([pelvis[:, 2, 0], -pelvis[:, 2, 2]], axis=-1))
+
+
+@functools.cache
+def _augmenter() -> MarkerAugmenter:
+    return MarkerAugmenter()
