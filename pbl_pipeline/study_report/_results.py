@@ -15,6 +15,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.stats import (
     CurveTest,
     Estimate,
+    adjust,
     compare_groups,
     correlation,
     curve_test,
@@ -259,8 +260,8 @@ def validity(study: StudyData, to_compare: Plan, table: pd.DataFrame) -> pd.Data
                         **why,
                     }
                 )
-    columns = ["name", "score", "persons", "kind", "value", "low", "high", "p", "n", "code", "message"]
-    return pd.DataFrame(rows, columns=columns)
+    columns = ["name", "score", "persons", "kind", "value", "low", "high", "p", "p_holm", "n", "code", "message"]
+    return _corrected(pd.DataFrame(rows, columns=columns), "persons")
 
 
 def change(to_compare: Plan, table: pd.DataFrame, resamples: int = 10_000) -> pd.DataFrame:
@@ -289,8 +290,8 @@ def change(to_compare: Plan, table: pd.DataFrame, resamples: int = 10_000) -> pd
                 **why,
             }
         )
-    columns = ["name", "n", "statistic", "value", "low", "high", "p", "code", "message"]
-    return pd.DataFrame(rows, columns=columns)
+    columns = ["name", "n", "statistic", "value", "low", "high", "p", "p_holm", "code", "message"]
+    return _corrected(pd.DataFrame(rows, columns=columns), "statistic")
 
 
 def group_differences(study: StudyData, to_compare: Plan, table: pd.DataFrame) -> pd.DataFrame:
@@ -339,6 +340,7 @@ def group_differences(study: StudyData, to_compare: Plan, table: pd.DataFrame) -
         "test",
         "statistic",
         "p",
+        "p_holm",
         "g",
         "g_low",
         "g_high",
@@ -347,7 +349,15 @@ def group_differences(study: StudyData, to_compare: Plan, table: pd.DataFrame) -
         "code",
         "message",
     ]
-    return pd.DataFrame(rows, columns=columns)
+    return _corrected(pd.DataFrame(rows, columns=columns), "by")
+
+
+def _corrected(tests: pd.DataFrame, family: str) -> pd.DataFrame:
+    """With `p_holm`: p corrected (Holm) for the tests that have the same value in the column `family`."""
+    known: Any = tests[tests["p"].notna()]
+    for _, of_family in known.groupby(family):
+        tests.loc[of_family.index, "p_holm"] = adjust(of_family["p"])
+    return tests
 
 
 def score_classes(study: StudyData, to_compare: Plan, table: Any) -> dict[str, Any]:

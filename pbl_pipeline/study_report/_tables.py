@@ -18,7 +18,9 @@ from ._values import INDEX, score_column
 
 GAIT, SCORES = "Gait measures", "Clinical scores"
 _MINUS = "\N{MINUS SIGN}"
-_STARS = "* p < 0.05, not corrected for the number of tests."
+_STARS = "* p < 0.05, not corrected for the number of tests"
+#: Of a table that shows it.
+_HOLM = "p, Holm: corrected for those"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,7 +217,7 @@ def table2(results: StudyResults) -> PageTable:
         "ICC of cycles (Shrout & Fleiss 2,1 and 2,k), one visit per person, with 95 % interval. r: Spearman for "
         f"ordinal scores, else Pearson, all persons with both values at the visit {plan.change_from}. Effect size: "
         f"Wilcoxon's with bootstrap interval, {plan.change_group}, {plan.change_from} to {plan.change_to or 'none'}. "
-        f"{_STARS}"
+        f"{_STARS}."
     )
     return PageTable("table2", "Reliability, validity and responsiveness", note, body, marks.messages())
 
@@ -235,15 +237,17 @@ def srm_table(study: StudyData, results: StudyResults) -> PageTable:
                     "": "" if i else kind,
                     "Measure": title_of(study, name),
                     "SRM": estimate(srm, marks, star=True),
+                    "p, Holm": p_text(srm["p_holm"]),
                     "Mean change": estimate(mean, marks, digits),
                     "Persons": str(srm["n"]),
                 }
             )
     note = (
         f"Standardised response mean (mean change / its standard deviation) with the jackknife's 95 % interval; "
-        f"{plan.change_group}, {plan.change_from} to {plan.change_to or 'none'}, persons with both visits. * p < 0.05."
+        f"{plan.change_group}, {plan.change_from} to {plan.change_to or 'none'}, persons with both visits. {_STARS}; "
+        f"{_HOLM} of this table."
     )
-    body = pd.DataFrame(rows, columns=["", "Measure", "SRM", "Mean change", "Persons"])
+    body = pd.DataFrame(rows, columns=["", "Measure", "SRM", "p, Holm", "Mean change", "Persons"])
     return PageTable("srm", "Standardised response mean", note, body, marks.messages())
 
 
@@ -318,11 +322,12 @@ def validity(results: StudyResults) -> PageTable:
                 "Kind": r["kind"].capitalize(),
                 "r": estimate(r, marks, star=True),
                 "p": p_text(r["p"]),
+                "p, Holm": p_text(r["p_holm"]),
                 "n": str(r["n"]),
             }
         )
-    columns = ["Measure", "Score", "Persons", "Kind", "r", "p", "n"]
-    note = f"At the visit {results.plan.change_from}, with 95 % interval. {_STARS}"
+    columns = ["Measure", "Score", "Persons", "Kind", "r", "p", "p, Holm", "n"]
+    note = f"At the visit {results.plan.change_from}, with 95 % interval. {_STARS}; {_HOLM} of the same persons."
     return PageTable(
         "validity", "Correlation with clinical scores", note, pd.DataFrame(rows, columns=columns), marks.messages()
     )
@@ -349,13 +354,14 @@ def groups(results: StudyResults) -> PageTable:
                 "Test": r["test"],
                 "Hedges' g (a - b)": estimate(size, marks, star=True),
                 "p": p_text(r["p"]),
+                "p, Holm": p_text(r["p_holm"]),
                 "n": f"{r['n_a']}, {r['n_b']}",
             }
         )
-    columns = ["Measure", "By", "A", "B", "Test", "Hedges' g (a - b)", "p", "n"]
+    columns = ["Measure", "By", "A", "B", "Test", "Hedges' g (a - b)", "p", "p, Holm", "n"]
     note = (
         f"At the visit {results.plan.change_from}. Student's t where Shapiro-Wilk rejects neither group, else "
-        f"Mann-Whitney U. {_STARS}"
+        f"Mann-Whitney U. {_STARS}; {_HOLM} with the same By."
     )
     return PageTable(
         "groups", "Differences between groups", note, pd.DataFrame(rows, columns=columns), marks.messages()

@@ -96,6 +96,18 @@ def test_correlation_is_spearman_for_ordinal_scores_only(study, results):
     assert row(results.validity, name="gdi", score="10MWT", persons=made.PATIENTS)["n"] == len(first)
 
 
+def test_p_is_corrected_within_its_family(results):
+    srm = results.change[results.change["statistic"] == "srm"].set_index("name")
+    smallest = srm["p"].idxmin()
+    assert srm.loc[smallest, "p_holm"] == pytest.approx(min(1.0, srm.loc[smallest, "p"] * len(srm)))
+    assert (srm["p_holm"] >= srm["p"]).all()
+    mean = results.change["statistic"] == "mean"
+    assert results.change.loc[mean, "p_holm"].isna().all()
+    for by, family in results.groups.groupby("by"):
+        known = family[family["p"].notna()]
+        assert known["p_holm"].min() == pytest.approx(min(1.0, known["p"].min() * len(known))), by
+
+
 def test_repeatability_is_of_one_visit_per_person_and_of_visits_by_group(study, results):
     controls = [by_hand(study, role, made.CONTROLS) for role in made.ROLES]
     persons = sorted(set().union(*controls))
