@@ -39,8 +39,8 @@ class Deidentified(dj.Computed):
     deidentified_ranges      : json             # runs of these: first and last frame (from 0), and why
     deidentified_sha256      : char(64)         # of the bytes of the copy
     deidentified_file        : <object@arrays>  # mp4 without sound and metadata, frame by frame as the recording; docs/privacy.md
-    index (deidentified_status)
     {origin_columns("deidentified")}
+    index (deidentified_status)
     """  # noqa: E501
 
     @staticmethod

@@ -185,6 +185,8 @@ class Folder:
             return json.loads(self.state_file.read_text(encoding="utf-8"))
         except FileNotFoundError:
             return {}
+        except NotADirectoryError as error:
+            raise folder_error(self.path, error) from error
 
     def write_state(self, **changes: Any) -> dict[str, Any]:
         """Change some entries of the state, keeping the others."""
