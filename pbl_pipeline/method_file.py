@@ -42,7 +42,7 @@ def read_method(path: Path) -> Method[Any]:
             raise KeyError(f"stage {stage!r}; known: {', '.join(STAGES)}")
         methods = of_stage(stage)
         base = about.get("base", methods.default)
-        before = {**methods, **{m.key: m for m in methods.values()}}.get(base)
+        before = methods.registered(base)
         if before is None:
             raise KeyError(f"base {base!r}; known: {', '.join(methods)}")
         if not _NAME.fullmatch(name) or name in methods:

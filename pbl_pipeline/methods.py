@@ -240,9 +240,12 @@ class Stage(Mapping[str, Method[P]]):
         """Every method that can be named on this machine."""
         return [*self, *(self._provider.names() if self._provider else ())]
 
+    def registered(self, name: str) -> Method[P] | None:
+        """The registered method of that name or key; None where there is none."""
+        return ({m.key: m for m in self.values()} | self._methods).get(name)
+
     def _named(self, name: str) -> Method[P]:
-        found = {m.key: m for m in self.values()} | self._methods
-        method = found[name] if name in found else self.offered(name)
+        method = self.registered(name) or self.offered(name)
         if method is None:
             more = ", or add a model with `pbl models add`" if self._provider else ""
             raise self._unknown(

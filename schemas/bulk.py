@@ -7,12 +7,11 @@ import datetime
 import functools
 from collections.abc import Iterable, Iterator
 from itertools import islice
-from pathlib import PurePath
 from typing import Any
 
 from . import lab, session, video
 from .codes import check_subject, day_of
-from .ingest import METHOD_FIELDS, Methods, check_owner, in_transaction, next_id, resolve, selections
+from .ingest import METHOD_FIELDS, Methods, check_owner, in_transaction, next_id, resolve, selections, video_row
 from .rows import utc_now
 
 #: Rows in one transaction.
@@ -86,18 +85,9 @@ def _insert(chunk: list[Recording], chosen: dict[str, str]) -> int:
     sessions = _sessions({(r.subject, r.session_label) for r in new.values()}, now)
     first = next_id(video.Video, "video_id", len(new))
     rows: list[dict[str, Any]] = [
-        {
-            "video_id": first + i,
-            "session_id": sessions[r.subject, r.session_label],
-            "camera_id": None,
-            "video_path": r.path,
-            "video_name": PurePath(r.path).name[-255:],
-            "video_sha256": r.sha256,
-            "video_size": r.size,
-            "activity": r.activity,
-            "camera_motion": r.camera_motion,
-            "video_created": now,
-        }
+        video_row(
+            first + i, sessions[r.subject, r.session_label], r.path, r.sha256, r.size, r.activity, r.camera_motion
+        )
         for i, r in enumerate(new.values())
     ]
     video.Video.insert(rows)

@@ -22,8 +22,7 @@ def set_condition(video_id: int, activity: str | None = None, pace: str | None =
     PblError
         DB_NOT_FOUND for a number that no video has; USAGE for labels of more than 32 characters.
     """
-    trial = fit.trials_of([video_id]).get(video_id)
-    videos = [video_id] if trial is None else [int(v["video_id"]) for v in fit.views_of([trial])[trial]]
+    videos = fit.videos_of(fit.trial_of(video_id))
     return list(dict.fromkeys(change for v in videos for change in _set_condition(v, activity, pace)))
 
 

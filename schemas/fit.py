@@ -386,6 +386,16 @@ def trials_of(videos: Sequence[int]) -> dict[int, int]:
     return {int(r["video_id"]): int(r["rig_trial"]) for r in rows}
 
 
+def trial_of(video_id: int) -> int:
+    """The number of the trial that a video is of: its own unless it is one of several cameras."""
+    return trials_of([video_id]).get(video_id, video_id)
+
+
+def videos_of(trial: int) -> list[int]:
+    """The videos of a trial, the one with its number first: all of its cameras, or itself."""
+    return [int(v["video_id"]) for v in views_of([trial])[trial]] or [trial]
+
+
 def _rig(views: Sequence[Mapping[str, Any]]) -> tuple[dict, list[str]] | None:
     """File of the calibration and the camera of each view; None for a video of one camera."""
     return (file_ref(views[0]["rig_file"]), [v["rig_camera"] for v in views]) if views else None

@@ -7,7 +7,7 @@ import hashlib
 import math
 import os
 from collections.abc import Callable, Collection, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from pbl_pipeline.errors import PblError
@@ -236,22 +236,38 @@ def _ingest_one(path: Path, visit: Visit, chosen: dict[str, str], more: set[str]
         return update_known(path, known, visit, chosen, more, one.found)
 
 
+def video_row(
+    number: int,
+    session_id: int,
+    path: str | PurePath,
+    sha256: str,
+    size: int,
+    activity: str | None,
+    camera_motion: str,
+    camera_id: int | None = None,
+) -> dict[str, Any]:
+    """A new row of Video; without an activity it is walking."""
+    return {
+        "video_id": number,
+        "session_id": session_id,
+        "camera_id": camera_id,
+        "video_path": str(path),
+        "video_name": PurePath(path).name[-255:],
+        "video_sha256": sha256,
+        "video_size": size,
+        "activity": activity or "walking",
+        "camera_motion": camera_motion,
+        "video_created": utc_now(),
+    }
+
+
 def insert(one: Prepared, chosen: dict[str, str]) -> Ingested:
     """Register a video that is new. Call it in a transaction."""
     visit = one.visit
     session_id, number = session_of(visit), next_id(video.Video, "video_id")
-    row = {
-        "video_id": number,
-        "session_id": session_id,
-        "camera_id": camera_id_of(one.camera) if one.camera else None,
-        "video_path": str(one.path),
-        "video_name": one.path.name[-255:],
-        "video_sha256": one.sha256,
-        "video_size": one.size,
-        "activity": visit.activity or "walking",
-        "camera_motion": visit.camera_motion or ("handheld" if one.found.given.has_log else "static"),
-        "video_created": utc_now(),
-    }
+    motion = visit.camera_motion or ("handheld" if one.found.given.has_log else "static")
+    camera_id = camera_id_of(one.camera) if one.camera else None
+    row = video_row(number, session_id, one.path, one.sha256, one.size, visit.activity, motion, camera_id)
     video.Video.insert1(row)
     set_condition(number, pace=visit.pace)
     _select(number, session_id, visit.person, chosen)

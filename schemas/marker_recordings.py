@@ -17,7 +17,6 @@ from ._datajoint import DuplicateError
 from .conditions import set_condition
 from .ingest import Ingested, Methods, Visit
 from .method_rows import method_row, resolve_method
-from .rows import utc_now
 from .stored_files import new_folder
 
 if TYPE_CHECKING:
@@ -126,27 +125,20 @@ def _ingest_one(
         "recording_duration": float(time[-1] - time[0]),
         "recording_in_view_share": share,
     }
-    row = {
-        "video_path": str(path),
-        "video_name": path.name[-255:],
-        "video_sha256": sha256,
-        "video_size": path.stat().st_size,
-        "activity": visit.activity or "walking",
-        "camera_motion": video.NO_CAMERA,
-        "video_created": utc_now(),
-    }
+    size = path.stat().st_size
 
-    def insert() -> None:
-        row["session_id"] = ingest.session_of(visit)
-        _check_same_set(row["session_id"], about, path)
-        row["video_id"] = ingest.next_id(video.Video, "video_id")
-        video.Video.insert1(row)
-        set_condition(row["video_id"], pace=visit.pace)
-        _keep(int(row["video_id"]), recording, found, table_file)
-        _plan(int(row["video_id"]), int(row["session_id"]), chosen, set(chosen))
+    def insert() -> int:
+        session_id = ingest.session_of(visit)
+        _check_same_set(session_id, about, path)
+        number = ingest.next_id(video.Video, "video_id")
+        video.Video.insert1(ingest.video_row(number, session_id, path, sha256, size, visit.activity, video.NO_CAMERA))
+        set_condition(number, pace=visit.pace)
+        _keep(number, recording, found, table_file)
+        _plan(number, session_id, chosen, set(chosen))
+        return number
 
     try:
-        ingest.in_transaction(insert, until=lambda: bool(ingest.with_sha256(sha256)))
+        number = ingest.in_transaction(insert, until=lambda: bool(ingest.with_sha256(sha256)))
     except DuplicateError:
         if not (known := ingest.with_sha256(sha256)):
             raise
@@ -154,7 +146,7 @@ def _ingest_one(
     said = f"subject {visit.subject}, session {visit.session_label}; {found.text()}"
     if found.unused:
         said += f"; not in the marker set: {', '.join(found.unused)}"
-    return Ingested(path, "registered", row["video_id"], said)
+    return Ingested(path, "registered", number, said)
 
 
 def _check_same_set(session_id: int, about: Mapping[str, Any], path: Path) -> None:

@@ -67,13 +67,12 @@ def plan_move(video_id: int, subject: str, session_label: str) -> Move:
             expected="another visit",
             next_step="nothing is to be done",
         )
-    trial = fit.trials_of([video_id]).get(video_id)
-    numbers = [video_id] if trial is None else [int(v["video_id"]) for v in fit.views_of([trial])[trial]]
+    numbers = fit.videos_of(fit.trial_of(video_id))
     of_these = [{"video_id": v} for v in numbers]
     sets = (fit.FitSet & (fit.FitSet.Video & of_these)).keys()
     counts = dj.Diagram.cascade(fit.FitSet & list(sets), part_integrity="cascade").counts() if sets else {}
     there = {"subject": subject, "session_label": session_label}
-    if trial is not None:
+    if fit.trials_of([video_id]):
         for found in (session.Session & there).to_dicts():
             check_same_number(int(found["session_id"]), len(numbers), Path(row["video_path"]))
     return Move(

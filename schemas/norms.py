@@ -14,6 +14,7 @@ from . import fit, gait, gdi, lab, session, video
 from .method_names import with_keys
 from .rows import plain
 from .stored_files import new_folder
+from .views import newest_sets
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib
@@ -154,8 +155,7 @@ def load_norm(norm: str) -> lib.NormativeSet:
 def _cycle_keys(people: Sequence[dict], restriction: Any, pace: str) -> list[dict[str, Any]]:
     """Keys of GaitCycle of the current fits of these people who walk at this pace, with subject and methods."""
     found = (
-        (fit.FitSelection & {"fit_current": True}).proj()
-        * fit.FitSet.proj("session_id", "fit_set_kind")
+        newest_sets()
         * session.Session.proj("subject")
         * lab.Subject.proj("population")
         * fit.FitSet.Video.proj("tracking_method", "keypoint_method")

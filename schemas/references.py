@@ -205,7 +205,7 @@ def add_trial(
         DB_NOT_FOUND where it has no current fit; USAGE where it is a video of one camera, or has several fits; what
         `add_reference` raises.
     """
-    trial = fit.trials_of([trial]).get(trial, trial)
+    trial = fit.trial_of(trial)
     current = (fit.FitSelection & {"fit_current": True}).proj() * fit.FitSet.proj("fit_set_kind")
     named = {"fit_method": fit_method} if fit_method is not None else True
     rows = (fit.SessionFit.Trial * current & {"video_id": trial} & named).to_dicts()

@@ -117,19 +117,10 @@ def _ingest(
         first = ingest.next_id(video.Video, "video_id", len(files))
         numbers[:] = range(first, first + len(files))
         for number, path, sha, lens in zip(numbers, files, sha256, lenses, strict=True):
-            row = {
-                "video_id": number,
-                "session_id": session_id,
-                "camera_id": ingest.camera_id_of(lens),
-                "video_path": str(path),
-                "video_name": path.name[-255:],
-                "video_sha256": sha,
-                "video_size": path.stat().st_size,
-                "activity": visit.activity or "walking",
-                "camera_motion": _MOTION,
-                "video_created": utc_now(),
-            }
-            video.Video.insert1(row)
+            size, camera_id = path.stat().st_size, ingest.camera_id_of(lens)
+            video.Video.insert1(
+                ingest.video_row(number, session_id, path, sha, size, visit.activity, _MOTION, camera_id)
+            )
         video.RigView.insert(
             {"video_id": number, "rig_id": rig_id, "rig_trial": first, "rig_camera": camera}
             for number, camera in zip(numbers, seen_by, strict=True)

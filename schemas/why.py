@@ -55,8 +55,8 @@ def why(video_id: int) -> Why:
         raise unknown_video(video_id)
     row = rows[0]
     # One of several cameras: from the fit on the trial counts, before it every camera.
-    trial = fit.trials_of([video_id]).get(video_id, video_id)
-    views = [int(v["video_id"]) for v in fit.views_of([trial])[trial]] or [video_id]
+    trial = fit.trial_of(video_id)
+    views = fit.videos_of(trial)
     sets = [{"fit_set": s} for s in (fit.FitSet.Video & {"video_id": trial}).to_arrays("fit_set")]
     current = fit.FitSelection & {"fit_current": True}
     sets = [{"fit_set": k["fit_set"]} for k in (current & sets).to_dicts()] if sets else []

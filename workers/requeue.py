@@ -49,7 +49,7 @@ def _of_video(table: Any, video_id: int) -> list[dict[str, Any]]:
     """Keys of the error rows of a table that belong to a video or its trial, or to the set it is fitted in."""
     names = jobs_of(table).primary_key
     if "video_id" in names:
-        trial = fit.trials_of([video_id]).get(video_id, video_id)
+        trial = fit.trial_of(video_id)
         return (jobs_of(table).errors & [{"video_id": v} for v in {video_id, trial}]).keys()
     sets = [{"fit_set": s} for s in (fit.FitSet.Video & {"video_id": video_id}).to_arrays("fit_set")]
     return (jobs_of(table).errors & sets).keys() if sets else []

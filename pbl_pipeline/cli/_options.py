@@ -108,9 +108,8 @@ def fit_paramset(solver: str | None, params: str | None, default: str | None = N
     base = _default_of(solver, default)
     if params is None:
         return METHODS[base]
-    for method in METHODS.values():
-        if params in (method.name, method.key):
-            return _of_solver(method, solver)
+    if (method := METHODS.registered(params)) is not None:
+        return _of_solver(method, solver)
     path = Path(params)
     if not path.is_file():
         raise _unknown(f"paramset {params!r}, and no such file", METHODS)

@@ -58,8 +58,8 @@ class Problem:
     seen, where values are finite and do not count. `xy_px` are pixels of an ideal pinhole camera (undistorted). `bend`
     holds the weights of the frames before, at and after a frame in the second difference there (per 1/30 s squared), 0
     where it is not formed; `rate` is 1/30 s over the time to the next frame of the trial, 0 where there is none.
-    `contact`: how surely each of the soles' points stands (0 to 1), 0 until a first solution tells; `pelvis`: its tilt
-    and list (rad) as the marker augmenter has them, and `c_pelvis`, 1 where it has. `sample_*`: the
+    `contact`: how surely each of the soles' points stands (0 to 1), 0 until a first solution tells; `pelvis`: tilt
+    and list of the pelvis (rad) as the marker augmenter has them, and `c_pelvis`, 1 where it has. `sample_*`: the
     phone's orientation R_nc as quaternions at a fixed interval, from `sample_start_s` on; there where `has_phone` is 1.
     M is 0 where no camera of the session turns.
     """

@@ -14,7 +14,7 @@ import numpy as np
 from pbl_pipeline import progress
 from pbl_pipeline.names import is_plain
 
-from ._container_tags import read_tags
+from ._container_tags import Tags, read_tags
 from ._decode import Decoder, check_file
 from ._orientation import Orientation, orientation_of
 from ._timing import speed_notes
@@ -62,7 +62,7 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
         time_s = ticks * tick_s
         interval_s, varies = _rate(time_s, tick_s, float(stream.average_rate) if stream.average_rate else None)
         tags = read_tags(path)
-        metadata = dict(stream.metadata) | dict(container.metadata) | tags.items
+        metadata = _metadata(decoder, tags)
         capture_fps = _number(metadata, "com.android.capture.fps", "com.apple.quicktime.capture.fps")
         notes = decoder.notes + _picture_notes(turn, stream.sample_aspect_ratio)
         notes += speed_notes(1.0 / interval_s, capture_fps, tags.speeds)
@@ -101,7 +101,7 @@ def read_first(path: str | Path) -> FirstPicture:
     with Decoder(path) as decoder:
         _, frame = next(iter(decoder))  # without a picture it raises
         turn = orientation_of(frame)
-        metadata = dict(decoder.stream.metadata) | dict(decoder.container.metadata) | read_tags(path).items
+        metadata = _metadata(decoder, read_tags(path))
         width, height = turn.size(frame.width, frame.height)
         return FirstPicture(str(path), width, height, turn.rotation_deg, **_phone(metadata))
 
@@ -131,8 +131,13 @@ def read_metadata(path: str | Path) -> dict[str, str]:
     """
     path = check_file(path)
     with Decoder(path) as decoder:
-        found = dict(decoder.stream.metadata) | dict(decoder.container.metadata) | read_tags(path).items
+        found = _metadata(decoder, read_tags(path))
     return {name.lower(): text.strip() for name, text in found.items() if is_plain(text.strip())}
+
+
+def _metadata(decoder: Decoder, tags: Tags) -> dict[str, str]:
+    """Of the stream, the container and its atoms by name; the later ones win."""
+    return dict(decoder.stream.metadata) | dict(decoder.container.metadata) | tags.items
 
 
 def _phone(metadata: Mapping[str, str]) -> dict[str, Any]:

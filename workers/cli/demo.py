@@ -25,10 +25,9 @@ def demo(context: click.Context, out: Path, no_database: bool) -> None:
     running before.
     """
     if no_database:
-        from pbl_pipeline import assets
         from pbl_pipeline.cli.run import run
 
-        files = {name: assets.fetch(name) for name in assets.needed()}
+        files = _fetched()
         context.invoke(run, videos=(files["demo_video"],), camera=files["demo_camera"], out=out, subject=SUBJECT)
         return
     if os.environ.get("DJ_HOST"):
@@ -52,9 +51,15 @@ def demo(context: click.Context, out: Path, no_database: bool) -> None:
     click.echo(f"done in {time.monotonic() - begin:.0f} s")
 
 
+def _fetched() -> dict[str, Path]:
+    """The models of the default methods and the demo recording."""
+    from pbl_pipeline import assets
+
+    return {name: assets.fetch(name) for name in assets.needed()}
+
+
 def _run(out: Path) -> None:
     import schemas
-    from pbl_pipeline import assets
     from schemas import connection, embedded, views
     from schemas.ingest import Visit, ingest
     from schemas.report import write_session
@@ -66,7 +71,7 @@ def _run(out: Path) -> None:
     connection.connect()
     schemas.activate()
     _step(2, "models and the demo recording")
-    files = {name: assets.fetch(name) for name in assets.needed()}
+    files = _fetched()
     for name, path in files.items():
         click.echo(f"{name}: {path}")
     _step(3, "ingest")
