@@ -15,7 +15,7 @@ from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
 
-from . import keypoints, session, video  # noqa: F401  a definition refers to session
+from . import keypoints, session, video
 from ._datajoint import dj
 from .checks import check_columns, check_row, check_values
 from .method_rows import method_columns, method_row
@@ -192,6 +192,7 @@ class SessionFit(dj.Computed):
     # one body fitted to all trials of a set
     -> FitSelection
     ---
+    -> session.Session
     -> BodyModel
     solver               : varchar(32)
     fit_loss             : float64             # (-) total loss at the end
@@ -336,6 +337,7 @@ class SessionFit(dj.Computed):
             self.insert1(
                 {
                     **key,
+                    "session_id": session_of_set(key),
                     "body_model": one(BodyModel & {"body_sha256": body_sha}, "body_model"),
                     "solver": result.solver,
                     "fit_loss": float(result.trials[0].loss),
@@ -368,6 +370,23 @@ class SessionFit(dj.Computed):
                     }
                 )
         self.Check.insert({**key, **check_row("fit", check)} for check in result.qc)
+
+
+def session_of_set(key: Mapping[str, Any]) -> int:
+    """The session of a set, by a key that holds `fit_set`.
+
+    It stands in every computed table below a set, so that its natural join with `session.Session` is its own visit and
+    not every pair. A set never changes its session. The session's row is locked as the insert of a row that refers to
+    it does: here before other rows, so that who plans the session (which locks it, then its sets) waits and never meets
+    a deadlock.
+    """
+    number = int(one(FitSet & {"fit_set": key["fit_set"]}, "session_id"))
+    sessions = session.Session
+    sessions.connection.query(
+        f"SELECT session_id FROM {sessions.full_table_name} WHERE session_id = %s LOCK IN SHARE MODE",  # noqa: S608
+        args=(number,),
+    )
+    return number
 
 
 def views_of(trials: Sequence[int]) -> dict[int, list[dict[str, Any]]]:

@@ -67,6 +67,7 @@ class GaitEvents(dj.Computed):
     -> fit.SessionFit.Trial
     -> GaitEventMethod
     ---
+    -> session.Session
     events_status     : enum('PASS', 'EMPTY')
     events_reason     : varchar(1000)          # why EMPTY
     events_detector   : varchar(64)            # name of the method in the library
@@ -119,6 +120,7 @@ class GaitEvents(dj.Computed):
         self.insert1(
             {
                 **key,
+                "session_id": fit.session_of_set(key),
                 "events_status": found.status,
                 "events_reason": found.reason[:1000],
                 "events_detector": found.method,
@@ -151,6 +153,7 @@ class GaitCycle(dj.Computed):
     # strides of a trial, foot down to the next foot down of the same side
     -> GaitEvents
     ---
+    -> session.Session
     n_cycles        : int16                    # all complete cycles
     n_cycles_used   : int16                    # without first and last steps, odd lengths and odd curves
     curves          : <object@arrays>          # npz: cycle_no (N), names (A), percent (P) of the cycle, curve and curve_sd (N,A,P) deg
@@ -209,6 +212,7 @@ class GaitCycle(dj.Computed):
             self.insert1(
                 {
                     **key,
+                    "session_id": fit.session_of_set(key),
                     "n_cycles": len(cycles),
                     "n_cycles_used": sum(c.used for c in cycles),
                     "curves": folder / "curves.npz",
@@ -251,6 +255,7 @@ class Spatiotemporal(dj.Computed):
     # measures of a trial over its used cycles; null where one cannot be trusted (Measure says why)
     -> GaitCycle
     ---
+    -> session.Session
     measures_status          : enum('PASS', 'EMPTY')
     measures_reason          : varchar(1000)   # why EMPTY
     n_steps_used             : int16
@@ -289,6 +294,7 @@ class Spatiotemporal(dj.Computed):
         self.insert1(
             {
                 **key,
+                "session_id": fit.session_of_set(key),
                 "measures_status": result.status,
                 "measures_reason": result.reason[:1000],
                 "n_steps_used": result.n_steps_used,

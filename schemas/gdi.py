@@ -84,6 +84,7 @@ class GDI(dj.Computed):
     -> GdiModel
     -> NormativeSet
     ---
+    -> session.Session
     gdi_status      : enum('PASS', 'EMPTY')
     gdi_reason      : varchar(1000)            # why EMPTY
     gdi=null        : float64                  # (-) mean over all used cycles
@@ -151,6 +152,7 @@ class GDI(dj.Computed):
         self.insert1(
             {
                 **key,
+                "session_id": fit.session_of_set(key),
                 "gdi_status": result.status,
                 "gdi_reason": result.reason[:1000],
                 "gdi": number(result.mean),
@@ -180,6 +182,7 @@ class SessionGdi(dj.Computed):
     -> GdiModel
     -> NormativeSet
     ---
+    -> session.Session
     session_status              : enum('PASS', 'EMPTY')
     session_reason              : varchar(2000)  # why EMPTY
     session_gdi_reason          : varchar(1000)  # why there is no index
@@ -271,6 +274,7 @@ class SessionGdi(dj.Computed):
         self.insert1(
             {
                 **key,
+                "session_id": fit.session_of_set(key),
                 "session_status": result.status,
                 "session_reason": result.reason[:2000],
                 "session_gdi_reason": index.reason[:1000],

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from . import fit, gait, gdi, keypoints
+from . import fit, gait, gdi, keypoints, session  # noqa: F401  a definition refers to session
 from ._datajoint import dj
 from .checks import check_values
 from .origin import Origin, computes, origin_columns
@@ -31,6 +31,7 @@ class SessionQc(dj.Computed):
     # worst outcome of all checks of a visit; a recording without gait beside others with gait counts as WARN
     -> gdi.SessionGdi
     ---
+    -> session.Session
     qc_outcome : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')
     qc_n       : int16                         # how many checks
     qc_worst   : varchar(1000)                 # names of the checks with that outcome, empty for PASS
@@ -84,6 +85,7 @@ class SessionQc(dj.Computed):
         self.insert1(
             {
                 **key,
+                "session_id": fit.session_of_set(key),
                 "qc_outcome": outcome,
                 "qc_n": len(rows),
                 "qc_worst": ", ".join(dict.fromkeys(named))[:1000],

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from . import fit, video  # noqa: F401  a definition refers to video
+from . import fit, session, video  # noqa: F401  definitions refer to session and video
 from ._datajoint import dj
 from .origin import Origin, computes, origin_columns
 from .rows import number, one
@@ -48,6 +48,7 @@ class KinematicError(dj.Computed):
     -> fit.SessionFit.Trial
     -> ReferenceKinematics
     ---
+    -> session.Session
     error_lag             : float64            # (s) found by comparison; positive: the video is later than the reference
     error_max_lag         : float64            # (s) how far it was searched to both sides
     error_n               : int32              # frames compared
@@ -101,6 +102,7 @@ class KinematicError(dj.Computed):
         self.insert1(
             {
                 **key,
+                "session_id": fit.session_of_set(key),
                 "error_lag": errors.lag_s,
                 "error_max_lag": errors.max_lag_s,
                 "error_n": errors.n,

@@ -1,4 +1,4 @@
-"""Numbered migrations: what brings the tables of an older release to this one. There are none before the first release.
+"""Numbered migrations: what brings the tables of an older release to this one.
 
 A migration is a module here whose name begins with its number, `0001_what_it_does.py`, with a docstring and
 

@@ -1,6 +1,6 @@
 """Databases of older releases become those of this one, with every row they had.
 
-There is no release yet, and so no migration: the tests write their own into a folder that the runner reads as well.
+Beside the package's own migrations the tests write some into a folder that the runner reads as well.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection, embedded, jobs, lab, migrations, video, views
+from schemas import connection, embedded, gait, gdi, jobs, lab, migrations, session, video, views
 from schemas.chain import ON_REQUEST
 from schemas.ingest import Visit, ingest
 from tests.command import pbl
@@ -92,7 +92,7 @@ def _make_older(add: Callable[[str, str], None]) -> None:
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute("ALTER TABLE pbl_video.video DROP COLUMN video_size")
         cursor.execute("DROP DATABASE pbl_validation")
-    add("0001_sizes", SIZES)
+    add("0002_sizes", SIZES)
 
 
 @pytest.fixture
@@ -157,10 +157,10 @@ def test_an_older_database_keeps_its_rows_and_works(
     kept = [t for t in before if t != with_size and not t.split(".")[1].startswith("~")]
     assert "pbl_fit.__session_fit__trial" in kept
     assert {t: after[t] for t in kept} == {t: before[t] for t in kept}
-    assert [(a.number, a.name) for a in migrations.applied()] == [(1, "sizes")]
+    assert [a.name for a in migrations.applied()] == ["session_of_results", "sizes"]
     # Again there is nothing to do.
     assert migrations.migrate().steps == []
-    assert len(migrations.applied()) == 1
+    assert len(migrations.applied()) == 2
     # A new visit goes through the whole chain beside it.
     assert views.session_summary()["subject"].tolist() == ["P001"]
     ingest([chain.small_video(tmp_path, "new")], Visit(subject="P002"))
@@ -168,6 +168,45 @@ def test_an_older_database_keeps_its_rows_and_works(
     assert not {t.table: t.errors for t in run.tables if t.errors}
     assert set(views.session_summary()["subject"]) == {"P001", "P002"}
     assert set(video.Video.to_arrays("video_size")) > {7}
+
+
+#: The tables of results as they were before migration 0001.
+WITHOUT_SESSION = [
+    *(f"pbl_{t}" for t in ("fit.__session_fit", "gait.__gait_events", "gait.__gait_cycle", "gait.__spatiotemporal")),
+    *(f"pbl_{t}" for t in ("gdi.__g_d_i", "gdi.__session_gdi", "qc.__session_qc", "validation.__kinematic_error")),
+]
+
+
+def test_results_from_before_they_had_their_session_get_it(
+    empty: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    chain.install(monkeypatch)
+    schemas.activate()
+    for visit in ("2026-03-01", "2026-06-01"):
+        register(chain.small_video(tmp_path, f"walk{visit}"), session_label=visit)
+    assert not {t.table: t.errors for t in populate(_chain()).tables if t.errors}
+    new = everything()
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        for table in WITHOUT_SESSION:
+            cursor.execute(
+                "SELECT constraint_name FROM information_schema.key_column_usage WHERE CONCAT(table_schema, '.', "
+                "table_name) = %s AND column_name = 'session_id' AND referenced_table_name IS NOT NULL",
+                (table,),
+            )
+            ((key,),) = cursor.fetchall()
+            cursor.execute(f"ALTER TABLE {table} DROP FOREIGN KEY `{key}`, DROP COLUMN session_id")
+            schema, name = table.split(".")
+            cursor.execute(f"DELETE FROM {schema}.`~lineage` WHERE table_name = %s", (name,))
+    empty()
+    dry = migrations.migrate(dry_run=True)
+    assert ([len(statements) for _, statements in dry.steps], dry.open) == ([4 * len(WITHOUT_SESSION)], [])
+    migrations.migrate()
+    after = everything()
+    changed = {t for t in new if after[t] != new[t] and not t.split(".")[1].startswith("~")}
+    assert changed == set()
+    assert len(gdi.SessionGdi * session.Session) == len(session.Session()) == 2
+    assert len(gait.Spatiotemporal * session.Session * video.Video) == 2
+    assert migrations.migrate().steps == []
 
 
 def test_what_no_migration_removes_is_named(empty: Callable[[], None]):
@@ -207,7 +246,7 @@ def _named() -> list[str]:
 
 
 def test_a_migration_that_was_broken_off_goes_on(older: None):
-    statements = dict(migrations.migrate(dry_run=True).steps)["0001 sizes"]
+    statements = dict(migrations.migrate(dry_run=True).steps)["0002 sizes"]
     assert len(statements) == 3
 
     class Killed(BaseException):
@@ -219,27 +258,27 @@ def test_a_migration_that_was_broken_off_goes_on(older: None):
 
     with pytest.raises(Killed):
         migrations.migrate(say=say)
-    assert migrations.applied() == []
+    assert [a.number for a in migrations.applied()] == [1]
     done: list[str] = []
     migrations.migrate(say=lambda line: done.append(line.strip()))
     assert done == statements[1:]  # the column is there already
-    assert [a.number for a in migrations.applied()] == [1]
+    assert [a.number for a in migrations.applied()] == [1, 2]
     assert video.Video.fetch1("video_size") == 7
 
 
 def test_a_statement_that_the_server_refuses_is_named_and_not_recorded(older: None, add: Callable[[str, str], None]):
-    add("0002_wrong", 'def statements(conn):\n    return ["ALTER TABLE pbl_video.nothing DROP COLUMN x"]\n')
-    with pytest.raises(PblError, match="0002 wrong") as error:
+    add("0003_wrong", 'def statements(conn):\n    return ["ALTER TABLE pbl_video.nothing DROP COLUMN x"]\n')
+    with pytest.raises(PblError, match="0003 wrong") as error:
         migrations.migrate()
     assert error.value.code == "DB_REFUSED"
-    assert [a.number for a in migrations.applied()] == [1]
+    assert [a.number for a in migrations.applied()] == [1, 2]
 
 
 def test_migrations_without_a_gap(add: Callable[[str, str], None]):
     nothing = "def statements(conn):\n    return []\n"
-    add("0001_first", nothing)
-    add("0003_third", nothing)
-    with pytest.raises(ValueError, match=r"\[1, 3\]"):
+    add("0002_second", nothing)
+    add("0004_fourth", nothing)
+    with pytest.raises(ValueError, match=r"\[1, 2, 4\]"):
         migrations.available()
 
 
@@ -266,14 +305,14 @@ def test_one_process_migrates_at_a_time(database: Path):
 def test_an_empty_server_gets_the_tables_as_they_are_defined(
     empty: Callable[[], None], add: Callable[[str, str], None]
 ):
-    add("0001_sizes", SIZES)
+    add("0002_sizes", SIZES)
     planned = migrations.migrate(dry_run=True)
     assert "pbl_lab: the schema is created" in planned.created
     assert planned.open == []
     assert everything() == {}
     outcome = migrations.migrate()
     assert "`pbl_lab`.`subject`: the table is created" in outcome.created
-    assert [a.number for a in migrations.applied()] == [1]  # with nothing to do
+    assert [a.number for a in migrations.applied()] == [1, 2]  # with nothing to do
     assert len(lab.Subject()) == len(video.Video()) == 0
     assert migrations.migrate() == migrations.Outcome([], [], [])
 

@@ -1,0 +1,83 @@
+"""Natural joins with the visit, as an analyst writes them: a row for each that there is, never every pair."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import schemas
+from schemas import fit, gdi, lab, session, video
+from schemas._datajoint import dj
+from schemas.chain import ON_REQUEST
+from tests.rows import register, remove_all
+from workers.populate import populate
+
+from . import chain
+
+VISITS, VIDEOS = 4, 8
+
+
+@pytest.fixture(scope="module")
+def visits(declared: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Two people with two visits each of two videos each, computed."""
+    folder: Path = tmp_path_factory.mktemp("videos")
+    with pytest.MonkeyPatch.context() as patch:
+        chain.install(patch)
+        for person in ("P001", "P002"):
+            for label in ("2026-03-01", "2026-06-01"):
+                paths = [chain.small_video(folder, f"{person}-{label}-{i}") for i in range(2)]
+                register(*paths, subject=person, session_label=label)
+        populate()
+    yield
+    remove_all()
+
+
+def _computed() -> list[Any]:
+    return [t for t in schemas.computed_tables() if t.__name__ not in ON_REQUEST]
+
+
+def _of_fit() -> list[Any]:
+    """The computed tables below a set: each row is of one visit."""
+    return [t for t in _computed() if "fit_set" in t.heading.primary_key]
+
+
+def test_what_is_computed_from_a_fit_is_joined_with_its_own_visit(visits: None):
+    assert len(_of_fit()) == 7
+    for table in _of_fit():
+        n = VIDEOS if "video_id" in table.heading.primary_key else VISITS
+        assert len(table()) == n
+        for joined in (
+            table * session.Session,
+            session.Session * table,
+            table * session.Session * lab.Subject,
+            table * fit.FitSet * session.Session,
+        ):
+            assert len(joined) == n, table.__name__
+        rows = (table * session.Session * lab.Subject).to_dicts()
+        truth = (fit.FitSet.proj("session_id") * session.Session).to_dicts()
+        subject = {r["fit_set"]: (r["session_id"], r["subject"]) for r in truth}
+        assert all((r["session_id"], r["subject"]) == subject[r["fit_set"]] for r in rows)
+    kinematic = next(t for t in schemas.computed_tables() if t.__name__ == "KinematicError")
+    assert "session_id" in kinematic.heading.secondary_attributes
+
+
+def test_with_the_videos_there_is_a_row_for_each_video(visits: None):
+    for table in _computed():
+        # One row per visit: with each video of the visit. One per video or trial: with its own.
+        for joined in (table * video.Video, table * video.Video * session.Session * lab.Subject):
+            assert len(joined) == VIDEOS, table.__name__
+
+
+def test_results_of_several_tables_and_a_restriction_to_visits(visits: None):
+    results = [t.proj(*t.heading.secondary_attributes) for t in _of_fit() if "video_id" not in t.heading.primary_key]
+    joined = results[0]
+    for other in results[1:]:
+        joined = joined * other
+    assert len(joined * session.Session) == VISITS
+    one = session.Session & {"subject": "P001", "session_label": "2026-06-01"}
+    assert len(gdi.SessionGdi & one) == 1
+    by_person = dj.U("subject").aggr(gdi.SessionGdi * session.Session, n="count(*)").to_dicts()
+    assert by_person == [{"subject": "P001", "n": 2}, {"subject": "P002", "n": 2}]
