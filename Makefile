@@ -10,13 +10,16 @@ OUT    ?= pbl_demo
 JOBS   ?= 2# test processes, a file of tests at a time
 PYTEST := $(BIN)/pytest --numprocesses $(JOBS) --dist loadfile
 
-.PHONY: demo test test-fast lint format lock clean help
+.PHONY: demo docs test test-fast lint format lock clean help
 
 help:           ## what can be made
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
 demo: $(READY)  ## put the demo recording through every table and show the result
 	$(BIN)/pbl demo --out $(OUT)
+
+docs: $(READY)  ## the site of the documentation: build/docs/site/index.html
+	$(BIN)/python -m docs_site
 
 test: $(READY)  ## the tests
 	$(PYTEST)
@@ -58,4 +61,4 @@ $(READY): pyproject.toml requirements.lock
 	@touch $(READY)
 
 clean:          ## remove the virtual environment and the demo's output; the database and the cache stay
-	rm -rf $(VENV) $(OUT) .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(OUT) build .pytest_cache .ruff_cache

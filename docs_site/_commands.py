@@ -1,0 +1,46 @@
+"""A page for each task of `pbl --help`, with the help of each of its commands and of theirs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import click
+
+from pbl_pipeline.cli import TASKS
+from pbl_pipeline.cli._main import cli
+
+FOLDER = "reference/commands"
+
+
+def tree() -> Iterator[tuple[str, click.Context]]:
+    """Full name (`pbl db init`) and context of every command, parents before children."""
+
+    def below(command: click.Command, name: str, parent: click.Context | None) -> Iterator[tuple[str, click.Context]]:
+        own = name.rsplit(" ", 1)[-1]
+        ctx = click.Context(command, info_name=own, parent=parent, terminal_width=100, max_content_width=100)
+        yield name, ctx
+        if isinstance(command, click.Group):
+            for sub in command.list_commands(ctx):
+                child = command.get_command(ctx, sub)
+                assert child is not None, sub
+                yield from below(child, f"{name} {sub}", ctx)
+
+    yield from below(cli, "pbl", None)
+
+
+def pages() -> dict[str, str]:
+    """Path in the site -> Markdown."""
+    helps = {name: f"```text\n{ctx.get_help()}\n```" for name, ctx in tree()}
+    found = {f"{FOLDER}/index.md": f"# Commands\n\n{helps['pbl']}\n"}
+    for task, names in TASKS.items():
+        parts = [f"# {task}\n"]
+        for name in names:
+            below = [full for full in helps if full == f"pbl {name}" or full.startswith(f"pbl {name} ")]
+            parts += [f"{'#' * full.count(' ')}# {full}\n\n{helps[full]}\n" for full in below]
+        found[f"{FOLDER}/{slug(task)}.md"] = "\n".join(parts)
+    return found
+
+
+def slug(task: str) -> str:
+    return re.sub(r"\W+", "-", task.lower()).strip("-")
