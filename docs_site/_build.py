@@ -1,7 +1,7 @@
 """From the repository to the folder that zensical builds, and the build.
 
-Pages are staged because they lie in several places: docs/, the READMEs of the rooms, notebooks, commands and docstrings.
-A link to a page is rewritten to where that page is staged; a link to any other file of the repository becomes its path as text.
+Pages come from several places: docs/, the READMEs of the rooms, notebooks, commands and docstrings. A link to a page is
+rewritten to where that page is staged; a link to any other file of the repository becomes its path as text.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from . import _api, _commands, _notebook
+from . import _notebook, api, commands
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Where `make docs` builds, ignored by git.
@@ -27,11 +27,17 @@ _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
 _MERMAID = re.compile(r"^```mermaid\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
+class BuildError(RuntimeError):
+    """The site could not be built; the text is what zensical printed."""
+
+
 def pages() -> dict[str, str]:
     """Path in the repository -> path in the site, of every page that is written by hand."""
     found = {"README.md": "readme.md", "CHANGELOG.md": "changelog.md"}
     found |= {f"docs/{p.name}": p.name for p in sorted((ROOT / "docs").glob("*.md"))}
-    found |= {f"docs/notebooks/{p.name}": f"notebooks/{p.stem}.md" for p in sorted((ROOT / "docs/notebooks").glob("*.ipynb"))}
+    found |= {
+        f"docs/notebooks/{p.name}": f"notebooks/{p.stem}.md" for p in sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
+    }
     for room in ("pbl_pipeline", "pbl_pipeline/fit", "schemas", "workers", "research", "tests", "docs_site"):
         found[f"{room}/README.md"] = f"rooms/{posixpath.basename(room)}.md"
     return found
@@ -41,7 +47,7 @@ def stage(folder: Path) -> Path:
     """Write `folder`/zensical.toml and all pages below `folder`/src, and return the latter."""
     src, where = folder / "src", pages()
     shutil.rmtree(src, ignore_errors=True)
-    texts = _commands.pages() | _api.pages(ROOT)
+    texts = commands.pages() | api.pages(ROOT)
     for path, target in where.items():
         file = ROOT / path
         text = _notebook.markdown(file) if file.suffix == ".ipynb" else file.read_text(encoding="utf-8")
@@ -62,15 +68,17 @@ def build(folder: Path) -> Path:
 
     Raises
     ------
-    subprocess.CalledProcessError
-        zensical failed, or warned: a link or an anchor leads nowhere, a page is in no menu.
+    BuildError
+        zensical failed, or warned, as of a link that leads nowhere; with what it printed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     stage(folder)
     shutil.rmtree(folder / "site", ignore_errors=True)
     command = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]
     env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    subprocess.run(command, cwd=folder, env=env, check=True)
+    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, encoding="utf-8")
+    if done.returncode:
+        raise BuildError(re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + done.stderr))
     return folder / "site"
 
 
@@ -101,8 +109,13 @@ def _graph(match: re.Match[str]) -> str:
         nodes = [re.match(r"\s*(\w+)(?:\[/?\"(.*?)\"/?\])?", part) for part in re.split(r"-->|-\.->", line)]
         found = [node for node in nodes if node is not None]
         for node in found:
-            names[node[1]] = node[2] if node[2] and "_" not in node[1] else names.get(node[1], node[1].replace("_", ".", 1))
+            names[node[1]] = (
+                node[2] if node[2] and "_" not in node[1] else names.get(node[1], node[1].replace("_", ".", 1))
+            )
         for a, b in itertools.pairwise(found):
             edges.setdefault(a[1], set()).add(b[1])
     rows = "".join(f"| {names[a]} | {', '.join(sorted(names[b] for b in to))} |\n" for a, to in edges.items())
-    return f"| table | tables that refer to it |\n|---|---|\n{rows}"
+    summary = "The diagram as a list: which table is referred to by which"
+    return (
+        f"<details markdown><summary>{summary}</summary>\n\n| table | referred to by |\n|---|---|\n{rows}\n</details>"
+    )

@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+import ast
+import json
 import re
+import tomllib
+from collections.abc import Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 import click
+import pytest
+from markdown.extensions.toc import slugify
 
+import docs_site
+from docs_site import _notebook, api
 from pbl_pipeline.cli import TASKS
 from pbl_pipeline.errors import CODES
+from pbl_pipeline.report._words import VERDICT_WORDS
 from pbl_pipeline.settings import VARIABLES
+from schemas import STAGES
+from tests import pages
 from tests.command import pbl
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = pages.ROOT
+#: Modules of tables: docs/tables.md has what is in them.
+TABLES = {f"schemas.{stage}" for stage in STAGES}
 
 
 def test_errors_page_lists_exactly_the_codes():
@@ -29,13 +43,64 @@ def test_readme_names_every_variable_and_command():
     assert not missing
 
 
-def test_readme_has_no_placeholder_and_no_dead_link():
+def test_readme_has_no_placeholder_and_no_target_that_is_not_there():
     text = (ROOT / "README.md").read_text()
     assert not re.findall(r"@[A-Z]+@", text)
-    links = [x for x in re.findall(r"\]\(([^)#]+)", text) if "://" not in x]
-    assert [x for x in links if not (ROOT / x).exists()] == []
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     assert [t for t in re.findall(r"`make ([a-z-]+)`", text) if t not in targets] == []
+
+
+@pytest.mark.parametrize("page", docs_site.pages())
+def test_no_link_of_a_page_is_dead(page: str):
+    """As a viewer of the repository follows it; the site's own links are checked in test_docs_site.py."""
+    text = _notebook.markdown(ROOT / page) if page.endswith(".ipynb") else pages.text(page)
+    for target in re.findall(r"\]\(([^()\s]+)\)", re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)):
+        path, _, anchor = target.partition("#")
+        if "://" in target:
+            continue
+        file = (ROOT / page).parent / path if path else ROOT / page
+        assert file.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", file.read_text(), re.MULTILINE)
+            assert anchor in [slugify(re.sub(r"[`*]", "", h), "-") for h in headings], target
+
+
+def test_the_page_of_reports_names_every_verdict():
+    listed = re.findall(r"^\| ([A-Z][^|]*?) \|", pages.text("docs/report.md"), re.MULTILINE)
+    assert sorted(listed) == sorted(VERDICT_WORDS.values())
+
+
+def test_every_page_is_in_the_menu_once(tmp_path: Path):
+    src = docs_site.stage(tmp_path)
+    menu = list(_menu(tomllib.loads((tmp_path / "zensical.toml").read_text())["project"]["nav"]))
+    assert sorted(menu) == sorted(p.relative_to(src).as_posix() for p in src.rglob("*.md"))
+
+
+def _menu(entries: Any) -> Iterator[str]:
+    if isinstance(entries, str):
+        yield entries
+    else:
+        for entry in entries.values() if isinstance(entries, dict) else entries:
+            yield from _menu(entry)
+
+
+def test_what_the_examples_import_is_public_and_in_the_reference():
+    public = api.public(ROOT)
+    code = [
+        (b.page, b.code) for b in pages.python_blocks() if b.page != "docs/extending.md"
+    ]  # that one is inside the library
+    for notebook in sorted(ROOT.glob("docs/notebooks/*.ipynb")):
+        cells = json.loads(notebook.read_text())["cells"]
+        code += [(notebook.name, "".join(c["source"])) for c in cells if c["cell_type"] == "code"]
+    found = []
+    for page, text in code:
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.ImportFrom) and str(node.module).partition(".")[0] in ("pbl_pipeline", "schemas"):
+                for alias in node.names:
+                    module = f"{node.module}.{alias.name}"
+                    if module not in TABLES | public.keys() and alias.name not in public.get(str(node.module), ()):
+                        found.append((page, module))
+    assert found == []
 
 
 def test_every_command_has_help_with_an_example():

@@ -1,0 +1,78 @@
+"""A page for each package of the library and for the modules that the docs tell an analyst or contributor to import."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+FOLDER = "reference/api"
+#: Modules that the pages and notebooks of docs/ import from, and which of their names are for that; none: all without
+#: an underscore. The packages of the library need not be listed.
+MODULES: dict[str, tuple[str, ...]] = {
+    "pbl_pipeline.assets": (),
+    "pbl_pipeline.charts": (),
+    "pbl_pipeline.errors": (),
+    "pbl_pipeline.method_file": (),
+    "pbl_pipeline.methods": (),
+    "pbl_pipeline.paramset": (),
+    "pbl_pipeline.pipeline": (),
+    "schemas": (),
+    "schemas.bulk": (),
+    "schemas.connection": ("connect", "schema_name"),
+    "schemas.ingest": ("Ingested", "Methods", "Visit", "ingest"),
+    "schemas.method_rows": ("insert_methods", "method_columns"),
+    "schemas.origin": (),
+    "schemas.results": (),
+    "schemas.rows": ("InputChanged", "one"),
+    "schemas.status": ("pipeline_status",),
+    "schemas.views": (),
+}
+
+
+def public(root: Path) -> dict[str, list[str]]:
+    """Package or module -> its public names: `__all__`, or what it defines without an underscore."""
+    found: dict[str, list[str]] = {}
+    for file in sorted((root / "pbl_pipeline").rglob("__init__.py")):
+        name = ".".join(file.parent.relative_to(root).parts)
+        names = _all(file)
+        if names and name != "pbl_pipeline.cli":  # the commands have pages of their own
+            found[name] = names
+    for name, names in MODULES.items():
+        path = root.joinpath(*name.split("."))
+        file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+        found[name] = list(names) or _all(file) or _defined(file)
+    return dict(sorted(found.items()))
+
+
+def pages(root: Path) -> dict[str, str]:
+    """Path in the site -> Markdown with the directives of mkdocstrings."""
+    modules = public(root)
+    listed = "\n".join(f"- [`{name}`]({name}.md): {len(names)} names" for name, names in modules.items())
+    start = "The public names of the library's packages and of the modules that these pages import from."
+    found = {f"{FOLDER}/index.md": f"# API\n\n{start}\n\n{listed}\n"}
+    for name, names in modules.items():
+        below = {n: m for m in modules if m.startswith(f"{name}.") for n in modules[m] if n in names}
+        # A function with the name of its module: asked for the name, mkdocstrings would show the module.
+        hidden = [n for n in names if root.joinpath(*name.split("."), f"{n}.py").is_file()]
+        parts = [f"# {name}"]
+        if below:
+            parts.append(f"Also here: {', '.join(f'[`{n}`]({m}.md#{m}.{n})' for n, m in below.items())}.")
+        members = "".join(f"\n        - {n}" for n in names if n not in below and n not in hidden)
+        parts.append(f"::: {name}\n    options:\n      members:{members}")
+        options = "options:\n      show_root_heading: true\n      show_root_toc_entry: true"
+        parts += [f"::: {name}.{n}.{n}\n    {options}" for n in hidden]
+        found[f"{FOLDER}/{name}.md"] = "\n\n".join(parts) + "\n"
+    return found
+
+
+def _all(file: Path) -> list[str]:
+    for node in ast.parse(file.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Assign) and any(isinstance(t, ast.Name) and t.id == "__all__" for t in node.targets):
+            return list(ast.literal_eval(node.value))
+    return []
+
+
+def _defined(file: Path) -> list[str]:
+    kinds = (ast.FunctionDef, ast.ClassDef)
+    body = ast.parse(file.read_text(encoding="utf-8")).body
+    return [node.name for node in body if isinstance(node, kinds) and not node.name.startswith("_")]
