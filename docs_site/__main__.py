@@ -5,6 +5,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from . import BUILT, build
+from . import BUILT, BuildError, build
 
-print(build(Path(sys.argv[1]) if len(sys.argv) > 1 else BUILT) / "index.html")  # noqa: T201
+try:
+    print(build(Path(sys.argv[1]) if len(sys.argv) > 1 else BUILT) / "index.html")  # noqa: T201
+except BuildError as error:
+    sys.exit(str(error))

@@ -191,21 +191,26 @@ def _videos(key: Mapping[str, Any]) -> list[int]:
 
 
 def load_keypoints(key: Any) -> Keypoints:
-    """The library's `Keypoints` of one row."""
+    """The library's `Keypoints` of one row, named by its key or by a query that holds it alone."""
     from pbl_pipeline.keypoints import Keypoints
 
-    ref = file_ref((keypoints.Keypoints & key).fetch1("keypoints_file"))
+    ref = file_ref((keypoints.Keypoints & _keys(key)).fetch1("keypoints_file"))
     with stored_file(keypoints.Keypoints(), ref) as path:
         return Keypoints.load(path)
 
 
 def load_trial_fit(key: Any) -> TrialFit:
-    """The library's `TrialFit` of one row of SessionFit.Trial."""
+    """The library's `TrialFit` of one row of SessionFit.Trial, named by its key or by a query that holds it alone."""
     from pbl_pipeline.fit import TrialFit
 
-    ref = file_ref((fit.SessionFit.Trial & key).fetch1("trial_file"))
+    ref = file_ref((fit.SessionFit.Trial & _keys(key)).fetch1("trial_file"))
     with stored_file(fit.SessionFit(), ref) as path:
         return TrialFit.load(path)
+
+
+def _keys(key: Any) -> Any:
+    """A query without its other columns, by which DataJoint joins no table; any other restriction as it is."""
+    return key.proj() if hasattr(key, "proj") else key
 
 
 def load_session_fit(key: Any) -> SessionFit:

@@ -21,7 +21,7 @@ from pbl_pipeline.cli import TASKS
 from pbl_pipeline.errors import CODES
 from pbl_pipeline.report._words import VERDICT_WORDS
 from pbl_pipeline.settings import VARIABLES
-from schemas import STAGES
+from schemas import STAGES, computed_tables
 from tests import pages
 from tests.command import pbl
 
@@ -70,6 +70,17 @@ def test_the_page_of_reports_names_every_verdict():
     assert sorted(listed) == sorted(VERDICT_WORDS.values())
 
 
+def test_the_chain_of_the_contributors_page_is_the_tables_and_their_functions():
+    rows = re.findall(r"^\| `([\w.]+)` \|[^|]*\|([^|]*)\|", pages.text("docs/house.md"), re.MULTILINE)
+    computed = [f"{table.__module__.removeprefix('schemas.')}.{table.__name__}" for table in computed_tables()]
+    beside = {"validation.KinematicError", "privacy.Deidentified"}  # on request
+    assert [name for name, _ in rows if name != "fit.FitSet"] == [name for name in computed if name not in beside]
+    public = api.public(ROOT)
+    for name, calls in rows:
+        for package, function in re.findall(r"`(\w+)\.(\w+)`", calls):
+            assert function in public[f"pbl_pipeline.{package}"], name
+
+
 def test_every_page_is_in_the_menu_once(tmp_path: Path):
     src = docs_site.stage(tmp_path)
     menu = list(_menu(tomllib.loads((tmp_path / "zensical.toml").read_text())["project"]["nav"]))
@@ -82,6 +93,17 @@ def _menu(entries: Any) -> Iterator[str]:
     else:
         for entry in entries.values() if isinstance(entries, dict) else entries:
             yield from _menu(entry)
+
+
+@pytest.mark.parametrize("page", pages.pages())
+def test_json_can_be_read_and_modules_that_are_run_exist(page: str):
+    for block in pages.blocks(page):
+        if block.language == "json":
+            json.loads(block.code)
+    for module in re.findall(r"python -m ([a-z_]+(?:\.[a-z_]+)*)(?![.\w])", pages.text(page)):
+        if (ROOT / module.split(".")[0]).is_dir():
+            path = ROOT.joinpath(*module.split("."))
+            assert path.with_suffix(".py").is_file() or (path / "__main__.py").is_file(), module
 
 
 def test_what_the_examples_import_is_public_and_in_the_reference():
