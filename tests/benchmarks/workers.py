@@ -108,14 +108,14 @@ def scale(videos: int) -> None:
         register_many(recordings(0, EACH))
         work(1)  # the session whose rows are copied
         register_many(recordings(EACH, small - EACH))
-        _copy_results(0, small // EACH)
+        copy_results(0, small // EACH)
         few = _cost_per_job(small, sessions=40)
         begin = small + 40 * EACH
         t = time.monotonic()
         registered = register_many(recordings(begin, videos - begin)).new
         seconds = time.monotonic() - t
         say(f"{videos:,} videos registered", seconds * videos / max(registered, 1), "s", "bar 300")
-        _copy_results(begin // EACH, videos // EACH)
+        copy_results(begin // EACH, videos // EACH)
         t = time.monotonic()
         state = pipeline_status()
         say("what pbl status asks the database", time.monotonic() - t, "s")
@@ -162,7 +162,7 @@ def _computed(table: Any) -> tuple[int, float]:
     return int(n), float(total or 0.0)
 
 
-def _copy_results(first_session: int, last_session: int) -> None:
+def copy_results(first_session: int, last_session: int) -> None:
     """Give sessions the rows of session 1, in the tables that the queue reads, without the parts it does not read."""
     from schemas import fit, gait, gdi, keypoints, qc, tracking, video
 
@@ -306,7 +306,7 @@ def method(sessions: int, worked: int) -> None:
         register_many(recordings(0, EACH))
         work(1)  # the session whose rows are copied
         register_many(recordings(EACH, (sessions - 1) * EACH))
-        _copy_results(0, sessions)
+        copy_results(0, sessions)
         refresh.refresh(True)
         tables = computed_tables()
         assert not any(_pending(tables).values()), "the copied sessions are not complete"
