@@ -1,8 +1,9 @@
-"""Names of gait measures and joint angles as people read them, and the units that names end with."""
+"""Names of gait measures, joint angles and checks as people read them, the units that names end with, and numbers."""
 
 from __future__ import annotations
 
 import functools
+import math
 
 #: Ends of the names of measures and their units, longer ones before those that they end with.
 _UNITS = (
@@ -54,3 +55,36 @@ FOOT_ANGLES: dict[str, tuple[str, str]] = {"foot_progression": ("Foot direction"
 def unit_of(name: str) -> str:
     """The unit that a measure's name ends with; empty where it has none, such as an index."""
     return next((unit for end, unit in _UNITS if name.endswith(end)), "")
+
+
+#: Ends of the names of checks and what stands in brackets for them, and words that are not spelled as they stand there.
+_CHECK_UNITS = {"cm": "cm", "px": "px", "s": "s", "deg": "\N{DEGREE SIGN}", "percent": "%", "m": "m"}
+_SPELLED = {"2d": "2D", "3d": "3D", "gdi": "GDI"}
+
+
+def check_words(name: str) -> str:
+    """ "residual_3d_cm" -> "Residual 3D (cm)"."""
+    words = name.split("_")
+    unit = _CHECK_UNITS.get(words[-1]) if len(words) > 1 else None
+    words = [_SPELLED.get(w, w) for w in (words[:-1] if unit else words)]
+    text = " ".join(words) + (f" ({unit})" if unit else "")
+    return text[:1].upper() + text[1:]
+
+
+def number(value: float | None, decimals: int) -> str:
+    """The value with so many decimals and a real minus sign; an en dash where it is unknown."""
+    if value is None or not math.isfinite(value):
+        return "\N{EN DASH}"
+    text = f"{value:.{decimals}f}"
+    return (text.lstrip("-") if float(text) == 0 else text).replace("-", "\N{MINUS SIGN}")
+
+
+def significant(value: float | None, digits: int = 3) -> str:
+    """The value with so many significant digits, never in powers of ten; empty where there is none."""
+    if value is None or not math.isfinite(value):
+        return ""
+    if value == 0:
+        return "0"
+    decimals = min(6, max(0, digits - 1 - math.floor(math.log10(abs(value)))))
+    text = f"{value:.{decimals}f}"
+    return (text.rstrip("0").rstrip(".") if "." in text else text).replace("-", "\N{MINUS SIGN}")

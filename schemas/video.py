@@ -288,6 +288,28 @@ def camera_of(row: Mapping[str, Any]) -> dict[str, Any] | None:
     return {**found, "turn_deg": int(row["rotation"]) - int(of_device[0]["stored_rotation"])}
 
 
+def present_file(video_id: int) -> Path:
+    """The file of a video, if it is there; whether its bytes are still those that were registered is not looked at.
+
+    Raises
+    ------
+    PblError
+        DB_NOT_FOUND, VIDEO_MISSING.
+    """
+    paths = (Video & {"video_id": video_id}).to_arrays("video_path")
+    if not len(paths):
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no video_id {video_id}",
+            expected="a registered video",
+            next_step="`pbl list videos` prints the numbers",
+        )
+    path = Path(str(paths[0]))
+    if not path.is_file():
+        raise _missing(path, {"video_id": video_id})
+    return path
+
+
 def registered_file(path: str, sha256: str, key: dict) -> Path:
     """The video file, after checking that it is still the one that was registered.
 
@@ -299,14 +321,7 @@ def registered_file(path: str, sha256: str, key: dict) -> Path:
     from pbl_pipeline.video import sha256_of
 
     if not Path(path).is_file():
-        raise PblError(
-            "VIDEO_MISSING",
-            found=f"no file at {path}",
-            expected="the file that was registered",
-            next_step="bring the file or its disk back, then `pbl populate --retry-errors`; "
-            "if it lies elsewhere now, `pbl ingest` the new path and the row takes it over",
-            key=f"video_id={key['video_id']}",
-        )
+        raise _missing(path, key)
     found = sha256_of(path)
     if found != sha256:
         raise PblError(
@@ -318,3 +333,14 @@ def registered_file(path: str, sha256: str, key: dict) -> Path:
             key=f"video_id={key['video_id']}",
         )
     return Path(path)
+
+
+def _missing(path: str | Path, key: Mapping[str, Any]) -> PblError:
+    return PblError(
+        "VIDEO_MISSING",
+        found=f"no file at {path}",
+        expected="the file that was registered",
+        next_step="bring the file or its disk back, then `pbl populate --retry-errors`; "
+        "if it lies elsewhere now, `pbl ingest` the new path and the row takes it over",
+        key=f"video_id={key['video_id']}",
+    )

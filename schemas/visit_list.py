@@ -4,6 +4,9 @@ Plain SQL with arguments: what a person types is never part of a statement, and 
 for the numbers and a few for the rows that are shown (`python -m tests.benchmarks.visit_list`).
 """
 
+# Names of tables are DataJoint's own, quoted, and every value is an argument.
+# ruff: noqa: S608
+
 from __future__ import annotations
 
 import dataclasses
@@ -11,7 +14,7 @@ import datetime
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from . import computed_tables, fit, gdi, lab, qc, session, study, tracking, video
+from . import computed_tables, fit, gdi, qc, session, study, tracking, video
 from .catalog import quote
 from .coded_errors import error_code
 from .rows import number
@@ -113,32 +116,31 @@ def visit_page(wanted: Filter, after: tuple[str, int] | None = None, size: int =
     size
         Visits of a page.
     """
-    where, args = _where(wanted)
-    total = None if after is not None else _count(where, args)
+    joins, where, args = _asked(wanted)
     if after is not None:
-        # As two ranges: the day of a visit may be unknown, which compares with nothing.
+        # The day of a visit may be unknown, which compares with nothing.
         where.append("(COALESCE(s.session_date, %s), s.session_id) < (%s, %s)")
         args += [_NO_DAY, after[0], int(after[1])]
+    # Where nothing is joined, to count apart is quicker than to keep all rows for it.
+    counted = ", COUNT(*) OVER ()" if joins and after is None else ""
     rows = _ask(
-        f"SELECT s.session_id, s.subject, s.session_label, s.session_date, COALESCE(v.visit_role, '')"
-        f" FROM {_name(session.Session)} s LEFT JOIN {_name(study.Visit)} v USING (session_id)"
-        f"{_all(where)} ORDER BY s.session_date DESC, s.session_id DESC LIMIT %s",
+        f"SELECT {_VISIT}{counted} FROM {_visits()} {' '.join(joins)}{_all(where)}"
+        " ORDER BY s.session_date DESC, s.session_id DESC LIMIT %s",
         [*args, size + 1],
     )
     shown = rows[:size]
-    visits = _visit_rows(shown)
     last = shown[-1] if len(rows) > size else None
-    return Page(visits, None if last is None else (str(last[3] or _NO_DAY), int(last[0])), total)
+    total = None
+    if after is None:
+        of_all = f"SELECT COUNT(*) FROM {_visits(wanted.role != '')}{_all(where)}"
+        total = (int(rows[0][5]) if rows else 0) if joins else int(_ask(of_all, args)[0][0])
+    return Page(_visit_rows(shown), None if last is None else (str(last[3] or _NO_DAY), int(last[0])), total)
 
 
 def visits_of(subject: str) -> tuple[VisitRow, ...]:
     """All visits of a person, newest first."""
-    rows = _ask(
-        f"SELECT s.session_id, s.subject, s.session_label, s.session_date, COALESCE(v.visit_role, '')"
-        f" FROM {_name(session.Session)} s LEFT JOIN {_name(study.Visit)} v USING (session_id)"
-        " WHERE s.subject = %s ORDER BY s.session_date DESC, s.session_id DESC",
-        [subject],
-    )
+    newest_first = "ORDER BY s.session_date DESC, s.session_id DESC"
+    rows = _ask(f"SELECT {_VISIT} FROM {_visits()} WHERE s.subject = %s {newest_first}", [subject])
     return _visit_rows(rows)
 
 
@@ -180,13 +182,27 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
 
 
 # --------------------------------------------------------------------------------------------------------- the filter
-def _where(wanted: Filter) -> tuple[list[str], list[Any]]:
+def _asked(wanted: Filter) -> tuple[list[str], list[str], list[Any]]:
+    """Joins, conditions and their arguments, in this order.
+
+    What is a set of visits is joined as a table of its own: as a condition the server would look it up for each visit.
+    """
+    joins: list[str] = []
     where: list[str] = []
-    args: list[Any] = []
+    of_joins: list[Any] = []
+    of_where: list[Any] = []
+
+    def only(name: str, visits: str, *values: Any) -> None:
+        joins.append(f"JOIN ({visits}) {name} ON {name}.session_id = s.session_id")
+        of_joins.extend(values)
 
     def add(condition: str, *values: Any) -> None:
         where.append(condition)
-        args.extend(values)
+        of_where.extend(values)
+
+    def outside(visits: set[int]) -> None:
+        if visits:
+            add(f"s.session_id NOT IN ({_places(list(visits))})", *visits)
 
     if wanted.search:
         like = "%" + wanted.search.replace("\\", "\\\\").replace("%", "\\%").replace("_", "\\_") + "%"
@@ -202,70 +218,68 @@ def _where(wanted: Filter) -> tuple[list[str], list[Any]]:
     if wanted.last_day:
         add("s.session_date <= %s", wanted.last_day)
     if wanted.quality:
-        add(f"s.session_id IN (SELECT f.session_id FROM {_judged()} WHERE q.qc_outcome = %s)", wanted.quality)
-    if wanted.state:
-        _add_state(wanted.state, add)
-    return where, args
-
-
-def _add_state(state: str, add: Any) -> None:
-    waits = f"s.session_id IN ({_waiting()})"
-    failed = _failed()
-    fails = f"s.session_id IN ({failed})" if failed else "FALSE"
-    done = f"s.session_id IN (SELECT f.session_id FROM {_judged()})"
-    if state == "waiting":
-        add(waits)
-    elif state == "failed":
-        add(fails)
-    elif state == "computed":
-        add(f"{done} AND NOT ({waits} OR {fails})")
-    else:  # pending
-        add(f"NOT ({done} OR {waits} OR {fails})")
+        only("j", f"{_judged()} WHERE q.qc_outcome = %s", wanted.quality)
+    if wanted.state in ("computed", "pending"):
+        # Asked for first: as a part of the question the server would answer them for each visit.
+        apart = {int(i) for question in (_waiting(), _failed()) for (i,) in _ask(question, [])}
+        unfinished = {int(i) for (i,) in _ask(_unfinished(), [])}
+        with_set = f"EXISTS (SELECT 1 FROM {_name(fit.FitSet)} p WHERE p.session_id = s.session_id)"
+        if wanted.state == "computed":
+            add(with_set)
+            outside(apart | unfinished)
+        else:
+            listed = f" OR s.session_id IN ({_places(list(unfinished))})" if unfinished else ""
+            add(f"(NOT {with_set}{listed})", *unfinished)
+            outside(apart)
+    elif wanted.state:
+        only("x", _waiting() if wanted.state == "waiting" else _failed())
+    return joins, where, [*of_joins, *of_where]
 
 
 def _judged() -> str:
-    """Current sets whose checks are computed."""
+    """Visits with a current set whose checks are computed."""
     return (
-        f"{_name(qc.SessionQc)} q JOIN {_name(fit.FitSelection)} c"
+        f"SELECT DISTINCT f.session_id FROM {_name(qc.SessionQc)} q STRAIGHT_JOIN {_name(fit.FitSelection)} c"
         " ON c.fit_set = q.fit_set AND c.fit_method = q.fit_method AND c.fit_current = 1"
-        f" JOIN {_name(fit.FitSet)} f ON f.fit_set = c.fit_set"
+        f" STRAIGHT_JOIN {_name(fit.FitSet)} f ON f.fit_set = c.fit_set"
+    )
+
+
+def _unfinished() -> str:
+    """Visits with a current set whose checks are not computed yet."""
+    return (
+        f"SELECT DISTINCT f.session_id FROM {_name(fit.FitSelection)} c LEFT JOIN {_name(qc.SessionQc)} q"
+        " ON q.fit_set = c.fit_set AND q.fit_method = c.fit_method"
+        f" JOIN {_name(fit.FitSet)} f ON f.fit_set = c.fit_set WHERE q.fit_set IS NULL AND c.fit_current = 1"
     )
 
 
 def _waiting() -> str:
     """Visits with a video that waits for a person's choice."""
-    return (
-        f"SELECT w.session_id FROM {_name(tracking.SubjectChoice)} t JOIN {_name(video.Video)} w USING (video_id)"
-        " WHERE t.choice_status = 'NEEDS_CHOICE'"
-    )
+    videos, chosen = _name(video.Video), _name(tracking.SubjectChoice)
+    waiting = f"{chosen} t JOIN {videos} o USING (video_id) WHERE t.choice_status = 'NEEDS_CHOICE'"
+    return f"SELECT DISTINCT o.session_id FROM {waiting}"
 
 
-def _failed(columns: str = "session_id") -> str:
-    """Visits with an error row in any queue. Empty where no queue was ever used."""
+def _failed(column: str = "") -> str:
+    """Visits with an error row in any queue; with that column of it, a row for each."""
     parts = []
     there = _queues()
     for table in computed_tables():
         if queue_name(table) not in there:
             continue
         jobs, names = quote(*queue_name(table)), table.heading.primary_key
-        error = ", e.error_message" if columns != "session_id" else ""
-        if "fit_set" in names:
-            of = f"{_name(fit.FitSet)} o USING (fit_set)"
-        else:
-            of = f"{_name(video.Video)} o USING (video_id)"
-        parts.append(f"SELECT o.session_id{error} FROM {jobs} e JOIN {of} WHERE e.status = 'error'")
-    return " UNION ALL ".join(parts)
+        of, key = (fit.FitSet, "fit_set") if "fit_set" in names else (video.Video, "video_id")
+        failed = f"{jobs} e JOIN {_name(of)} o USING ({key}) WHERE e.status = 'error'"
+        parts.append(f"SELECT o.session_id{f', e.{column}' if column else ''} FROM {failed}")
+    if not parts:
+        return f"SELECT session_id{f', NULL AS {column}' if column else ''} FROM {_name(session.Session)} WHERE FALSE"
+    return f" {'UNION ALL' if column else 'UNION'} ".join(parts)
 
 
 def _queues() -> set[tuple[str, str]]:
     rows = _ask("SELECT table_schema, table_name FROM information_schema.tables WHERE table_name LIKE '~~%%'", [])
     return {(str(schema), str(name)) for schema, name in rows}
-
-
-def _count(where: Sequence[str], args: Sequence[Any]) -> int:
-    of_role = any("v.visit_role" in w for w in where)
-    visit = f" JOIN {_name(study.Visit)} v USING (session_id)" if of_role else ""
-    return int(_ask(f"SELECT COUNT(*) FROM {_name(session.Session)} s{visit}{_all(where)}", list(args))[0][0])
 
 
 # ----------------------------------------------------------------------------------------------------- rows of a page
@@ -284,18 +298,19 @@ def _visit_rows(rows: Sequence[Sequence[Any]]) -> tuple[VisitRow, ...]:
         if day is not None:
             of_person.setdefault(str(subject), []).append((day, int(session_id)))
     listed = _places(ids)
-    videos = dict(_ask(f"SELECT session_id, COUNT(*) FROM {_name(video.Video)} WHERE session_id IN ({listed})"
-                       " GROUP BY session_id", ids))  # fmt: skip
-    waiting = {int(s) for (s,) in _ask(f"{_waiting()} AND w.session_id IN ({listed})", ids)}
-    failed: dict[int, str] = {}
-    if errors := _failed("with the error"):
-        of_page = f"SELECT session_id, error_message FROM ({errors}) x WHERE session_id IN ({listed})"
-        failed = {int(s): error_code(message) for s, message in _ask(of_page, ids)}
+    counted = (
+        f"SELECT session_id, COUNT(*) FROM {_name(video.Video)} WHERE session_id IN ({listed}) GROUP BY session_id"
+    )
+    videos = dict(_ask(counted, ids))
+    waiting = {int(s) for (s,) in _ask(f"{_waiting()} AND o.session_id IN ({listed})", ids)}
+    open_sets = {int(s) for (s,) in _ask(f"{_unfinished()} AND f.session_id IN ({listed})", ids)}
+    errors = f"SELECT session_id, error_message FROM ({_failed('error_message')}) x WHERE session_id IN ({listed})"
+    failed = {int(s): error_code(message) for s, message in _ask(errors, ids)}
     out = []
-    for session_id, subject, label, day, role in rows:
+    for session_id, subject, label, day, role, *_ in rows:
         i = int(session_id)
         found = results[i]
-        computed = any(r.outcome for r in found)
+        computed = bool(found) and i not in open_sets
         state = "failed" if i in failed else "waiting" if i in waiting else "computed" if computed else "pending"
         first = found[0] if found else None
         out.append(
@@ -337,6 +352,15 @@ def _trend(
 
 
 # --------------------------------------------------------------------------------------------------------------- SQL
+#: Columns of a visit (s) and what it is in a study (v).
+_VISIT = "s.session_id, s.subject, s.session_label, s.session_date, COALESCE(v.visit_role, '')"
+
+
+def _visits(with_role: bool = True) -> str:
+    role = f" LEFT JOIN {_name(study.Visit)} v ON v.session_id = s.session_id" if with_role else ""
+    return f"{_name(session.Session)} s{role}"
+
+
 def _ask(sql: str, args: Sequence[Any]) -> list[tuple[Any, ...]]:
     return list(session.Session.connection.query(sql, args=tuple(args)).fetchall())
 

@@ -6,10 +6,13 @@ from pbl_pipeline.render._project import NEAR_M, rotation_matrix, scaled_camera,
 from pbl_pipeline.render._skeleton import draw_skeleton, skeleton_lines
 from pbl_pipeline.render._strip import stance_spans
 from pbl_pipeline.render._style import SIDE_COLOUR, side_of
+from pbl_pipeline.render._track import BodyTrack, body_track
 
 __all__ = [
     "NEAR_M",
     "SIDE_COLOUR",
+    "BodyTrack",
+    "body_track",
     "capsule_outline",
     "draw_body",
     "draw_keypoints",

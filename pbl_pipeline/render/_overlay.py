@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from pbl_pipeline import progress
-from pbl_pipeline.body import capsules, load_body
+from pbl_pipeline.body import Body, capsules, load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.keypoints import Keypoints
@@ -35,14 +35,7 @@ class _Painter:
                 key=fit.name,
             )
         body = load_body()
-        if fit.body_sha256 != body.sha256:
-            raise PblError(
-                "FILE_FORMAT",
-                found=f"a fit made with the body model {fit.body_sha256[:12]}",
-                expected=f"the installed body model {body.sha256[:12]} ({body.name} {body.version})",
-                next_step="fit the trial again with this version, or install the version that made the fit",
-                key=fit.name,
-            )
+        check_body(fit, body)
         self.fit, self._keypoints = fit, keypoints
         self._known = _known(fit)
         self._body, self._block, self._capsules = body, -1, None
@@ -84,6 +77,18 @@ class _Painter:
         if self._keypoints is not None and index < len(self._keypoints.time_s):
             xy = (np.asarray(self._keypoints.xy_px[index], float) + 0.5) * [fx, fy] - 0.5
             draw_keypoints(image, xy, self._keypoints.confidence[index])
+
+
+def check_body(fit: TrialFit, body: Body) -> None:
+    """Raise `PblError` FILE_FORMAT for a fit that was made with another body model than this one."""
+    if fit.body_sha256 != body.sha256:
+        raise PblError(
+            "FILE_FORMAT",
+            found=f"a fit made with the body model {fit.body_sha256[:12]}",
+            expected=f"the installed body model {body.sha256[:12]} ({body.name} {body.version})",
+            next_step="fit the trial again with this version, or install the version that made the fit",
+            key=fit.name,
+        )
 
 
 def render_overlay(

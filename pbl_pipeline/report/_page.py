@@ -30,13 +30,11 @@ from pbl_pipeline.report._words import (
     OUTCOME_WORDS,
     VERDICT_WORDS,
     check_name,
-    number,
     plural,
     sentence,
-    significant,
     size,
 )
-from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES
+from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, number, significant
 
 _CONVERGED = {True: "converged", False: "not converged", None: "convergence not recorded"}
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, PASS, WARN, Check
+from pbl_pipeline.words import check_words
 
 #: The measures of the tiles, before the GDI.
 HEADLINES = ("cadence_steps_per_min", "stride_time_s", "stance_percent", "double_support_percent")
@@ -23,36 +22,11 @@ VERDICT_WORDS = {
     NEEDS_CHOICE: "A person has to be chosen",
     FAIL: "Not to be used",
 }
-_UNITS = {"cm": "cm", "px": "px", "s": "s", "deg": "°", "percent": "%", "m": "m"}
-_SPELLED = {"2d": "2D", "3d": "3D", "gdi": "GDI"}
-
-
-def number(value: float | None, decimals: int) -> str:
-    """The value with so many decimals and a real minus sign; an en dash where it is unknown."""
-    if value is None or not math.isfinite(value):
-        return "\N{EN DASH}"
-    text = f"{value:.{decimals}f}"
-    return (text.lstrip("-") if float(text) == 0 else text).replace("-", "\N{MINUS SIGN}")
-
-
-def significant(value: float | None, digits: int = 3) -> str:
-    """The value with so many significant digits, never in powers of ten; empty where there is none."""
-    if value is None or not math.isfinite(value):
-        return ""
-    if value == 0:
-        return "0"
-    decimals = min(6, max(0, digits - 1 - math.floor(math.log10(abs(value)))))
-    text = f"{value:.{decimals}f}"
-    return (text.rstrip("0").rstrip(".") if "." in text else text).replace("-", "\N{MINUS SIGN}")
 
 
 def check_name(check: Check) -> str:
     """ "residual_3d_cm" -> "Residual 3D (cm)"."""
-    words = check.check.split("_")
-    unit = _UNITS.get(words[-1]) if len(words) > 1 else None
-    words = [_SPELLED.get(w, w) for w in (words[:-1] if unit else words)]
-    text = " ".join(words) + (f" ({unit})" if unit else "")
-    return text[:1].upper() + text[1:]
+    return check_words(check.check)
 
 
 def sentence(text: str) -> str:

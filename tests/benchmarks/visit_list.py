@@ -61,7 +61,11 @@ def filters() -> dict[str, Any]:
 
     day = datetime.date
     found = {"everything": Filter(), "a person's code": Filter(search="s000123"), "a label": Filter(search="2024-0")}
-    found |= {"nothing found": Filter(search="nobody"), "a cohort": Filter(cohort="spine"), "a role": Filter(role="pre")}
+    found |= {
+        "nothing found": Filter(search="nobody"),
+        "a cohort": Filter(cohort="spine"),
+        "a role": Filter(role="pre"),
+    }
     found |= {f"quality {o}": Filter(quality=o) for o in OUTCOMES}
     found |= {f"state {s}": Filter(state=s) for s in STATES}
     found["a month"] = Filter(first_day=day(2024, 3, 1), last_day=day(2024, 3, 31))

@@ -17,9 +17,10 @@ from pbl_pipeline.fit import SessionFit, TrialFit
 from pbl_pipeline.gait import GaitMetrics, gait_metrics, load_norm
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, PASS, WARN, Check
 from pbl_pipeline.report import Picture, SessionReport, TrialReport, write_report
-from pbl_pipeline.report._words import check_name, number, plural, sentence, significant, size
+from pbl_pipeline.report._words import check_name, plural, sentence, size
 from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.video import VideoInfo
+from pbl_pipeline.words import number, significant
 from tests.walking_fit import walking_fit
 
 N, FPS = 200, 30.0

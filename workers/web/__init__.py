@@ -1,0 +1,6 @@
+"""The review page (`pbl web`): find a visit, look at its recordings, decide, in a browser. docs/web.md describes it."""
+
+from .app import Options, create_app
+from .serve import serve
+
+__all__ = ["Options", "create_app", "serve"]

@@ -1,0 +1,240 @@
+"""Who may open a page: one-time links, sessions, the token of each form, and the headers of every answer.
+
+A request passes `Gate` before any page sees it. What a page does later can rely on `request.state.session`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import hmac
+import secrets
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+from urllib.parse import parse_qsl, urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import Request
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+COOKIE = "pbl_session"
+#: Hours after which a session ends, whatever was done in it.
+HOURS = 12.0
+#: What a role may do: a reader looks, a reviewer also decides, an operator also runs jobs again.
+RIGHTS: dict[str, frozenset[str]] = {
+    "reader": frozenset({"look"}),
+    "reviewer": frozenset({"look", "decide"}),
+    "operator": frozenset({"look", "decide", "operate"}),
+}
+#: Longest body of a form (byte), and seconds in which it has to be here.
+BODY_BYTES, BODY_S = 65_536, 10.0
+#: Searches that a session remembers.
+_SEARCHES = 200
+
+#: Everything comes from this server and nothing is written into a page: no script and no style of a text that a
+#: recording or a label brings along can run.
+CONTENT_POLICY = "; ".join(
+    (
+        "default-src 'none'",
+        "script-src 'self'",
+        "style-src 'self'",
+        "img-src 'self' data:",
+        "media-src 'self'",
+        "connect-src 'self'",
+        "form-action 'self'",
+        "base-uri 'none'",
+        "frame-ancestors 'none'",
+    )
+)
+#: Of a report, which is one file with its own style and no script.
+REPORT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
+HEADERS = {
+    "content-security-policy": CONTENT_POLICY,
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "same-origin",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "permissions-policy": "camera=(), microphone=(), geolocation=()",
+    "cache-control": "no-store",
+}
+
+
+@dataclasses.dataclass
+class Session:
+    """A person in front of a browser. token: what each of her forms has to bring back; name: what her decisions carry;
+    searches: what she searched for, so that a person's code never stands in an address."""
+
+    name: str
+    role: str
+    ends: float
+    token: str = dataclasses.field(default_factory=lambda: secrets.token_urlsafe(24))
+    searches: list[str] = dataclasses.field(default_factory=list)
+
+    def may(self, right: str) -> bool:
+        """Whether her role has a right of `RIGHTS`."""
+        return right in RIGHTS.get(self.role, frozenset())
+
+    def search_number(self, text: str) -> int:
+        """The number of a text that was searched for, from 1; 0 for none."""
+        if not text:
+            return 0
+        if text not in self.searches:
+            del self.searches[: max(0, len(self.searches) + 1 - _SEARCHES)]
+            self.searches.append(text)
+        return self.searches.index(text) + 1
+
+    def search_text(self, number: int) -> str:
+        """The text of a number, empty where there is none."""
+        return self.searches[number - 1] if 0 < number <= len(self.searches) else ""
+
+
+class Sessions:
+    """Sessions and one-time links, in memory: a server that ends forgets them all.
+
+    Only hashes are kept, so that a copy of the memory's contents opens nothing.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic, hours: float = HOURS) -> None:
+        self._clock, self._hours = clock, hours
+        self._sessions: dict[str, Session] = {}
+        self._links: dict[str, tuple[str, str]] = {}
+
+    def new_link(self, name: str, role: str) -> str:
+        """The key of a link that opens one session, once."""
+        key = secrets.token_urlsafe(32)
+        self._links[_hashed(key)] = (name, role)
+        return key
+
+    def enter(self, key: str) -> str | None:
+        """A new session's cookie for the key of a link, which is used up; None for a key that opens nothing."""
+        found = self._links.pop(_hashed(key), None)
+        if found is None:
+            return None
+        now = self._clock()
+        self._sessions = {k: s for k, s in self._sessions.items() if s.ends > now}
+        cookie = secrets.token_urlsafe(32)
+        self._sessions[_hashed(cookie)] = Session(*found, ends=now + 3600 * self._hours)
+        return cookie
+
+    def find(self, cookie: str) -> Session | None:
+        """The session of a cookie, None where it ended or never was."""
+        session = self._sessions.get(_hashed(cookie))
+        return session if session is not None and session.ends > self._clock() else None
+
+    def leave(self, cookie: str) -> None:
+        """End a session."""
+        self._sessions.pop(_hashed(cookie), None)
+
+
+def _hashed(secret: str) -> str:
+    return hashlib.sha256(secret.encode(errors="replace")).hexdigest()
+
+
+class Gate:
+    """Lets a request through to the pages when it has a session, and sets the headers of every answer.
+
+    refuse
+        Makes the answer for a request that may not pass, from its reason: "host", "session", "token".
+    open_paths
+        Beginnings of paths that need no session: the way in, and the files of the page itself, which say nothing.
+    """
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        sessions: Sessions,
+        hosts: frozenset[str],
+        refuse: Callable[[Request, str], Any],
+        open_paths: tuple[str, ...],
+    ) -> None:
+        self._app, self._sessions, self._hosts, self._refuse, self._open = app, sessions, hosts, refuse, open_paths
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            if scope["type"] == "lifespan":
+                await self._app(scope, receive, send)
+            return
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        request = Request(scope, receive)
+        reason = self._reason(request)
+        if reason:
+            await self._refuse(request, reason)(scope, receive, with_headers)
+        else:
+            await self._app(scope, receive, with_headers)
+
+    def _reason(self, request: Request) -> str:
+        headers = request.headers
+        # Another name that leads to 127.0.0.1 (DNS rebinding) would make a page of its own one of this server.
+        if len(headers.getlist("host")) != 1 or host_of(headers["host"]) not in self._hosts:
+            return "host"
+        session = self._sessions.find(request.cookies.get(COOKIE, ""))
+        request.state.session = session
+        if request.method not in ("GET", "HEAD") and not _from_here(headers):
+            return "token"
+        if session is None and not request.url.path.startswith(self._open):
+            return "session"
+        return ""
+
+
+def host_of(header: str) -> str:
+    """Name or address in a Host header, without the port; empty for what is none."""
+    try:
+        return (urlsplit(f"//{header}").hostname or "").rstrip(".")
+    except ValueError:
+        return ""
+
+
+def _from_here(headers: Headers) -> bool:
+    """Whether what changes something was sent from a page of this server, as far as the browser says."""
+    origin = headers.get("origin")
+    if origin is not None and urlsplit(origin).netloc != headers.get("host"):
+        return False
+    return headers.get("sec-fetch-site", "same-origin") in ("same-origin", "none")
+
+
+class Refused(Exception):
+    """A form that may not be accepted: "token", "right", "size" or "form"."""
+
+
+async def form_of(request: Request, right: str) -> Mapping[str, str]:
+    """The fields of a form whose sender has a right and whose token is that of her session.
+
+    Raises
+    ------
+    Refused
+        Another token or none, no such right, a body that is too long, too slow or no form.
+    """
+    import asyncio
+
+    session: Session = request.state.session
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/x-www-form-urlencoded":
+        raise Refused("form")
+    body = bytearray()
+    try:
+        async with asyncio.timeout(BODY_S):
+            async for piece in request.stream():
+                body += piece
+                if len(body) > BODY_BYTES:
+                    raise Refused("size")
+    except TimeoutError:
+        raise Refused("size") from None
+    try:
+        pairs = parse_qsl(body.decode(), keep_blank_values=True, max_num_fields=100)
+    except ValueError:
+        raise Refused("form") from None
+    fields = dict(pairs)
+    sent = fields.pop("token", "") or request.headers.get("x-token", "")
+    if session is None or not hmac.compare_digest(sent.encode(), session.token.encode()):
+        raise Refused("token")
+    if not session.may(right):
+        raise Refused("right")
+    return fields

@@ -1,0 +1,132 @@
+"""The application: which address is answered by which page, and what is said where something does not work."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+from collections.abc import AsyncIterator, Callable
+from importlib import resources
+from pathlib import Path
+
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.middleware.gzip import GZipMiddleware
+from starlette.requests import Request
+from starlette.responses import RedirectResponse, Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from pbl_pipeline.errors import PblError
+
+from . import access, find, look
+from .pages import Pages
+from .tables import Tables
+from .videos import Videos
+
+log = logging.getLogger(__name__)
+
+#: Status of an answer by the code of its error; 409 for the others: what the tables hold does not allow it now.
+STATUS = {"DB_NOT_FOUND": 404, "VIDEO_MISSING": 404, "USAGE": 400, "DB_NOT_RUNNING": 503, "DB_REFUSED": 503}
+#: Longest address (characters).
+_ADDRESS = 2000
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """How the page is served. hosts: names in a Host header that are answered; name and role: of who opens a link;
+    on_entry: called when a link was used, with the key of the next one."""
+
+    hosts: frozenset[str] = frozenset({"127.0.0.1", "localhost", "::1"})
+    name: str = ""
+    role: str = "reviewer"
+    on_entry: Callable[[str], None] | None = None
+
+
+def create_app(options: Options, sessions: access.Sessions | None = None) -> Starlette:
+    """The page as an ASGI application. `sessions`: those of a test; `app.state.sessions` makes the first link."""
+    sessions = sessions or access.Sessions()
+    pages, tables, videos = Pages(), Tables(), Videos()
+    files = Path(str(resources.files(__package__)))
+
+    @contextlib.asynccontextmanager
+    async def life(app: Starlette) -> AsyncIterator[None]:
+        yield
+        videos.close()
+        tables.close()
+
+    async def enter(request: Request) -> Response:
+        cookie = sessions.enter(request.query_params.get("key", ""))
+        if cookie is None:
+            return pages.refused(request, "session")
+        to = request.query_params.get("to", "")
+        response = RedirectResponse(to if to.startswith("/visits/") and to[8:].isdecimal() else "/visits", 303)
+        response.set_cookie(
+            access.COOKIE, cookie, max_age=int(3600 * access.HOURS), path="/", httponly=True, samesite="strict"
+        )
+        if options.on_entry is not None:
+            options.on_entry(sessions.new_link(options.name, options.role))
+        return response
+
+    async def leave(request: Request) -> Response:
+        await access.form_of(request, "look")
+        sessions.leave(request.cookies.get(access.COOKIE, ""))
+        response = RedirectResponse("/visits", 303)
+        response.delete_cookie(access.COOKIE, path="/", httponly=True, samesite="strict")
+        return response
+
+    async def home(request: Request) -> Response:
+        return RedirectResponse("/visits", 303)
+
+    async def language(request: Request) -> Response:
+        fields = await access.form_of(request, "look")
+        response = RedirectResponse(look.own_address(fields.get("back", "")), 303)
+        response.set_cookie("pbl_language", fields.get("language", "")[:2], path="/", httponly=True, samesite="strict")
+        return response
+
+    async def refused(request: Request, error: Exception) -> Response:
+        return pages.refused(request, str(error))
+
+    async def coded(request: Request, error: Exception) -> Response:
+        assert isinstance(error, PblError)
+        return pages.error(request, error, STATUS.get(error.code, 409))
+
+    async def missing(request: Request, error: Exception) -> Response:
+        assert isinstance(error, HTTPException)
+        return pages.missing(request, error.status_code, error.headers)
+
+    async def unforeseen(request: Request, error: Exception) -> Response:
+        return pages.unforeseen(request)
+
+    app = Starlette(
+        routes=[
+            Route("/", home),
+            Route("/enter", enter),
+            Route("/leave", leave, methods=["POST"]),
+            Route("/language", language, methods=["POST"]),
+            *find.routes(pages, tables),
+            *look.routes(pages, tables, videos),
+            Mount("/static", StaticFiles(directory=files / "static")),
+            Mount("/vendor", StaticFiles(directory=files / "vendor")),
+        ],
+        exception_handlers={
+            access.Refused: refused,
+            PblError: coded,
+            HTTPException: missing,
+            Exception: unforeseen,
+        },
+        middleware=[
+            Middleware(
+                access.Gate,
+                sessions=sessions,
+                hosts=options.hosts,
+                refuse=pages.refused,
+                open_paths=("/enter", "/static/", "/vendor/"),
+            ),
+            Middleware(GZipMiddleware, minimum_size=1000),
+        ],
+        lifespan=life,
+    )
+    app.state.sessions = sessions
+    return app

@@ -1,0 +1,76 @@
+"""Templates to answers."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from importlib import resources
+from typing import Any
+
+import jinja2
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, Response
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.words import MEASURES, check_words, number, significant
+
+from . import texts
+from .access import HEADERS, HOURS, Session
+
+#: Status of the answer to a request that may not pass, by its reason.
+_REFUSED = {"session": 401, "host": 400, "token": 403, "right": 403, "size": 413, "form": 415}
+
+
+class Pages:
+    """Renders the templates of this folder: escaped, in the reader's language, a name that is missing is an error."""
+
+    def __init__(self) -> None:
+        self._environment = jinja2.Environment(
+            loader=jinja2.FileSystemLoader(str(resources.files(__package__) / "templates")),
+            autoescape=True,
+            undefined=jinja2.StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        self._environment.globals.update(
+            number=number, significant=significant, check_words=check_words, measure_words=MEASURES
+        )
+
+    def show(
+        self,
+        request: Request,
+        template: str,
+        status: int = 200,
+        headers: Mapping[str, str] | None = None,
+        **values: Any,
+    ) -> Response:
+        """A page. `values`: what its template names."""
+        language = texts.language_of(request.cookies.get("pbl_language"), request.headers.get("accept-language", ""))
+        session: Session | None = getattr(request.state, "session", None)
+        page = self._environment.get_template(template).render(
+            t=functools.partial(texts.text, language),
+            language=language,
+            other_language=next(name for name in texts.LANGUAGES if name != language),
+            session=session,
+            path=request.url.path,
+            **values,
+        )
+        return HTMLResponse(page, status, dict(headers or {}))
+
+    def refused(self, request: Request, reason: str) -> Response:
+        """The answer to a request that may not pass."""
+        name = "enter.title" if reason == "session" else f"enter.{reason}_title"
+        text = "enter.text" if reason == "session" else f"enter.{reason}"
+        return self.show(request, "refused.html", _REFUSED[reason], title=name, text=text, hours=f"{HOURS:g}")
+
+    def error(self, request: Request, error: PblError, status: int) -> Response:
+        """The answer that a coded error makes: what is known and what to do."""
+        return self.show(request, "error.html", status, error=error)
+
+    def missing(self, request: Request, status: int, headers: Mapping[str, str] | None) -> Response:
+        """The answer for an address that there is not."""
+        return self.show(request, "missing.html", status, headers)
+
+    def unforeseen(self, request: Request) -> Response:
+        """The answer where the program itself failed; the traceback is in the terminal."""
+        return self.show(request, "unforeseen.html", 500, HEADERS)

@@ -1,0 +1,60 @@
+"""The page's way to the tables: one thread, because DataJoint's connection serves one thread only."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+import pymysql
+
+from pbl_pipeline.errors import PblError
+
+T = TypeVar("T")
+
+
+class Tables:
+    """Asks questions of the tables one after the other, away from the loop that answers browsers."""
+
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="tables")
+        self._declared = False
+
+    async def ask(self, question: Callable[..., T], *args: Any) -> T:
+        """The answer of a function that reads or writes tables.
+
+        Raises
+        ------
+        PblError
+            What the function raises; DB_NOT_RUNNING, DB_REFUSED where the database is away.
+        """
+        return await asyncio.get_running_loop().run_in_executor(self._thread, self._answer, question, args)
+
+    def _answer(self, question: Callable[..., T], args: tuple[Any, ...]) -> T:
+        import schemas
+        from schemas import connection
+
+        if not self._declared:
+            schemas.activate(methods=False)
+            self._declared = True
+        else:
+            connection.connect()  # a server that was started again is found again
+        try:
+            return question(*args)
+        except (pymysql.err.OperationalError, connection.LostConnectionError) as error:
+            raise gone(error) from error
+
+    def close(self) -> None:
+        """Wait for the question that is being asked, take no more."""
+        self._thread.shutdown(cancel_futures=True)
+
+
+def gone(error: Exception) -> PblError:
+    """DB_NOT_RUNNING for a connection that was lost while a question was asked."""
+    return PblError(
+        "DB_NOT_RUNNING",
+        found=f"the database went away while it was asked ({error.args[-1] if error.args else type(error).__name__})",
+        expected="an answer",
+        next_step="load the page again; if that fails: `pbl db status`, `pbl db start`",
+    )
