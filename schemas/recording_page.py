@@ -65,7 +65,7 @@ def recording_about(video_id: int) -> RecordingPage:
     row = rows[0]
     columns = ("codec", "width", "height", "duration", "n_frames")
     probed = (video.VideoInfo & {"video_id": video_id}).proj(*columns).to_dicts()
-    info = probed[0] if probed else dict.fromkeys(columns)
+    info: dict[str, Any] = probed[0] if probed else dict.fromkeys(columns)
     lead = fit.trial_of(video_id)
     key = trial_key(video_id)
     has_pictures = row["camera_motion"] != video.NO_CAMERA

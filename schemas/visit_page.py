@@ -74,7 +74,7 @@ def visit_about(session_id: int, shown: int = 0) -> VisitPage:
         )
     of_person = visits_of(str(subjects[0]))
     results = tuple(results_of([session_id])[session_id])
-    if results and not 0 <= shown < len(results):
+    if not 0 <= shown < max(1, len(results)):
         raise PblError(
             "DB_NOT_FOUND",
             found=f"no result {shown} of session_id {session_id}",

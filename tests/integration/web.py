@@ -14,7 +14,7 @@ BASE = "http://127.0.0.1:8484"
 def client(role: str = "reviewer", name: str = "R. Viewer", signed_in: bool = True) -> TestClient:
     """A browser of this machine; errors of the program are answers, as they are for a browser."""
     app = create_app(Options(name=name, role=role))
-    browser = TestClient(app, base_url=BASE, raise_server_exceptions=True, headers={"accept-language": "en"})
+    browser = TestClient(app, base_url=BASE, raise_server_exceptions=False, headers={"accept-language": "en"})
     if signed_in:
         found = browser.get("/enter", params={"key": app.state.sessions.new_link(name, role)}, follow_redirects=False)
         assert found.status_code == 303, found.text

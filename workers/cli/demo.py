@@ -88,11 +88,14 @@ def _run(out: Path) -> None:
     _step(5, "result")
     here = {"subject": SUBJECT, "session_label": SESSION}
     paths = write_session(here, out)
-    click.echo(rows_text(views.session_summary(here), views.trial_summary(here)))
+    summary_rows = views.session_summary(here)
+    click.echo(rows_text(summary_rows, views.trial_summary(here)))
     click.echo()
     for path in paths:
         click.echo(path)
+    visit = int(summary_rows["session_id"].iloc[0])
     click.echo("look further: `pbl db start`, `pbl status`, and docs/tables.md for the tables")
+    click.echo(f"open this visit in a browser: pbl web --visit {visit}")
 
 
 def _step(number: int, title: str) -> None:

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import logging
 from collections.abc import AsyncIterator, Callable
-from importlib import resources
 from pathlib import Path
 
 from starlette.applications import Starlette
@@ -48,7 +47,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
     """The page as an ASGI application. `sessions`: those of a test; `app.state.sessions` makes the first link."""
     sessions = sessions or access.Sessions()
     pages, tables, videos = Pages(), Tables(), Videos()
-    files = Path(str(resources.files(__package__)))
+    files = Path(__file__).parent
 
     @contextlib.asynccontextmanager
     async def life(app: Starlette) -> AsyncIterator[None]:

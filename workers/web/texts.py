@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import tomllib
-from importlib import resources
+from pathlib import Path
 from typing import Any
 
 #: The first is taken where a browser asks for none of them.
@@ -14,7 +14,7 @@ LANGUAGES = ("en", "de")
 @functools.cache
 def catalogue() -> dict[str, dict[str, str]]:
     """Every text by "group.name": language to text."""
-    groups = tomllib.loads((resources.files(__package__) / "texts.toml").read_text("utf-8"))
+    groups = tomllib.loads((Path(__file__).parent / "texts.toml").read_text("utf-8"))
     return {f"{group}.{name}": text for group, names in groups.items() for name, text in names.items()}
 
 

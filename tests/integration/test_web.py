@@ -1,0 +1,318 @@
+"""The review page over tables: finding visits, and what must not work."""
+
+from __future__ import annotations
+
+import html
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pbl_pipeline.errors import PblError
+from schemas import gdi, lab, qc, session, study, visit_list
+from schemas.rows import utc_now
+from schemas.visit_list import Filter, visit_page
+from tests.integration import web
+from tests.integration.chain import small_video
+from tests.rows import register
+from workers.populate import populate
+from workers.web import Options, create_app
+from workers.web.access import HOURS, Sessions
+
+
+@pytest.fixture
+def four_visits(tables: None) -> None:
+    """P001 with three visits and P002 with one, no videos: numbers 1 to 4."""
+    people = ({"subject": s, "population": "patient", "subject_created": utc_now()} for s in ("P001", "P002"))
+    lab.Subject.insert(people)
+    days = {1: ("P001", "2026-01-10"), 2: ("P001", "2026-04-10"), 3: ("P001", None), 4: ("P002", "2026-02-01")}
+    session.Session.insert(
+        {"session_id": i, "subject": s, "session_label": d or "later", "session_date": d, "session_created": utc_now()}
+        for i, (s, d) in days.items()
+    )
+    study.Visit.insert({"session_id": i, "visit_role": r} for i, r in ((1, "pre"), (2, "3_months"), (4, "pre")))
+    study.Cohort.insert1({"cohort": "spine"})
+    members = (("P001", True), ("P002", False))
+    study.CohortMember.insert({"cohort": "spine", "subject": s, "member_included": i} for s, i in members)
+
+
+def numbers(wanted: Filter, **more: Any) -> list[int]:
+    return [v.session_id for v in visit_page(wanted, **more).visits]
+
+
+def test_filters_of_the_list_and_their_order(four_visits: None):
+    import datetime
+
+    assert numbers(Filter()) == [2, 4, 1, 3]  # the newest day first, no day last
+    assert numbers(Filter(search="p001")) == [2, 1, 3]
+    assert numbers(Filter(search="LATE")) == [3]
+    assert numbers(Filter(search="%")) == numbers(Filter(search="_")) == numbers(Filter(search="\\")) == []
+    assert numbers(Filter(search="' OR 1=1 -- ")) == []
+    assert numbers(Filter(cohort="spine")) == [2, 1, 3]  # who was left out of a cohort is not in it
+    assert numbers(Filter(role="pre")) == [4, 1]
+    assert numbers(Filter(first_day=datetime.date(2026, 2, 1))) == [2, 4]
+    assert numbers(Filter(last_day=datetime.date(2026, 2, 1), cohort="spine")) == [1]
+    assert numbers(Filter(state="pending")) == [2, 4, 1, 3]
+    assert [numbers(Filter(state=s)) for s in ("computed", "waiting", "failed")] == [[], [], []]
+    assert visit_list.choices() == {"cohort": ["spine"], "role": ["pre", "3_months"]}
+
+
+def test_pages_of_the_list_hold_every_visit_once(four_visits: None):
+    first = visit_page(Filter(), size=1)
+    assert first.total == 4
+    found, page = [first.visits[0].session_id], first
+    while page.after is not None:
+        page = visit_page(Filter(), page.after, size=1)
+        found.append(page.visits[0].session_id)
+        assert page.total is None
+    assert found == [2, 4, 1, 3]
+
+
+def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Path):
+    for day in ("2026-01-10", "2026-04-10"):
+        register(small_video(tmp_path, f"walk {day}"), session_label=day)
+    waits = register(small_video(tmp_path, "two", people="two alike"), subject="P002", session_label="2026-02-01")[0]
+    broken = tmp_path / "gone.mp4"
+    broken.write_bytes(small_video(tmp_path, "gone").read_bytes() + b"x")
+    gone = register(broken, subject="P003", session_label="2026-02-02")[0]
+    broken.unlink()
+    populate()
+    for number, index in ((1, 80.0), (2, 90.0)):
+        key = (gdi.SessionGdi & visit_list_key(number)).keys()[0]
+        gdi.SessionGdi.update1({**key, "session_gdi": index, "session_gdi_sd": 3, "session_gdi_minimal_change": 7})
+    rows = {v.subject + str(v.day): v for v in visit_page(Filter()).visits}
+    later, before = rows["P0012026-04-10"], rows["P0012026-01-10"]
+    assert later.trend is not None
+    assert (later.trend.session_id, later.trend.change, later.trend.sure) == (before.session_id, 10.0, True)
+    assert before.trend is None
+    assert (later.state, later.videos, later.more) == ("computed", 1, 0)
+    assert later.result is not None
+    assert later.result.outcome == (qc.SessionQc & visit_list_key(2)).fetch1("qc_outcome")
+    assert "residual_3d_cm" in later.result.worst
+    assert [rows[k].state for k in ("P0022026-02-01", "P0032026-02-02")] == ["waiting", "failed"]
+    assert rows["P0032026-02-02"].problem == "VIDEO_MISSING"
+    by_state = {s: numbers(Filter(state=s)) for s in visit_list.STATES}
+    assert {s: len(n) for s, n in by_state.items()} == {"computed": 2, "pending": 0, "waiting": 1, "failed": 1}
+    assert sorted(numbers(Filter(quality=later.result.outcome))) == [1, 2]
+    page = web.client().get("/visits").text
+    assert "+10.0 since 2026-01-10: more than chance" in page
+    assert "Residual 3D (cm)" in page
+    assert "VIDEO_MISSING" in page
+    visit = web.client().get(f"/visits/{later.session_id}").text
+    assert "Cadence" in visit
+    assert "look at the overlay" in visit  # the advice of the check
+    stopped = web.client().get(f"/visits/{rows['P0032026-02-02'].session_id}").text
+    assert "VIDEO_MISSING" in html.unescape(stopped)
+    assert waits != gone
+
+
+def visit_list_key(number: int) -> dict[str, str]:
+    from schemas import fit
+
+    return {"fit_set": (fit.FitSet & {"session_id": number}).fetch1("fit_set")}
+
+
+# ---------------------------------------------------------------------------------------------------------- the way in
+def test_a_link_opens_one_browser_once():
+    app = create_app(Options())
+    key = app.state.sessions.new_link("A", "reader")
+    browser, other = (web.TestClient(app, base_url=web.BASE) for _ in range(2))
+    answer = browser.get("/enter", params={"key": key, "to": "/visits/12"}, follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"]) == (303, "/visits/12")
+    cookie = answer.headers["set-cookie"].lower()
+    assert all(part in cookie for part in ("httponly", "samesite=strict", "path=/", "max-age=43200"))
+    assert other.get("/enter", params={"key": key}, follow_redirects=False).status_code == 401
+    assert other.get("/visits").status_code == 401
+    for to in ("//evil.example", "https://evil.example", "/visits/1/../../x", "/visits/1\r\nx: y", "/recordings"):
+        key = app.state.sessions.new_link("A", "reader")
+        answer = other.get("/enter", params={"key": key, "to": to}, follow_redirects=False)
+        assert answer.headers["location"] == "/visits"
+
+
+def test_a_session_ends_and_is_never_taken_from_the_browser():
+    now = [0.0]
+    sessions = Sessions(clock=lambda: now[0])
+    app = create_app(Options(), sessions)
+    cookie = sessions.enter(sessions.new_link("A", "reader"))
+    assert cookie is not None
+    assert sessions.find(cookie) is not None
+    now[0] = 3600 * HOURS + 1
+    assert sessions.find(cookie) is None
+    # Fixation: a cookie that was put into a browser before is not the one that it gets.
+    browser = web.TestClient(app, base_url=web.BASE, cookies={"pbl_session": "planted"})
+    browser.get("/enter", params={"key": sessions.new_link("A", "reader")}, follow_redirects=False)
+    assert sessions.find("planted") is None
+    assert web.TestClient(app, base_url=web.BASE, cookies={"pbl_session": "planted"}).get("/visits").status_code == 401
+
+
+def test_leaving_ends_the_session():
+    browser = web.client()
+    assert browser.get("/nothing").status_code == 404
+    token = re.search(r'name="token" value="([^"]+)"', browser.get("/nothing").text)
+    assert token
+    kept = browser.cookies["pbl_session"]
+    browser.post("/leave", data={"token": token[1]}, follow_redirects=False)
+    browser.cookies.set("pbl_session", kept)
+    assert browser.get("/nothing").status_code == 401
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("127.0.0.1:8484", 404),
+        ("localhost", 404),
+        ("[::1]:8484", 404),
+        ("evil.example", 400),
+        ("127.0.0.1.evil.example:8484", 400),
+        ("127.0.0.1@evil.example", 400),
+        ("", 400),
+        ("[::1", 400),
+    ],
+)
+def test_only_the_names_of_this_machine_are_answered(host: str, status: int):
+    """Otherwise a page elsewhere could have its own name lead here (DNS rebinding)."""
+    assert web.client().get("/nothing", headers={"host": host}).status_code == status
+
+
+@pytest.mark.parametrize(
+    ("fields", "headers", "status"),
+    [
+        ({"search": "x"}, {}, 403),
+        ({"token": "guessed"}, {}, 403),
+        ({"token": "its own"}, {"origin": "https://evil.example"}, 403),
+        ({"token": "its own"}, {"origin": "null"}, 403),
+        ({"token": "its own"}, {"sec-fetch-site": "cross-site"}, 403),
+        ({"token": "its own"}, {"content-type": "text/plain"}, 415),
+        ({"token": "its own", "search": "x" * 70_000}, {}, 413),
+        ({"token": "its own"}, {"origin": web.BASE}, 303),
+    ],
+)
+def test_a_form_of_another_page_changes_nothing(tables: None, fields: dict, headers: dict, status: int):
+    browser = web.client()
+    if fields.get("token") == "its own":
+        fields = {**fields, "token": web.token(browser)}
+    assert browser.post("/visits", data=fields, headers=headers, follow_redirects=False).status_code == status
+
+
+def test_what_was_searched_for_is_no_part_of_an_address(four_visits: None):
+    browser = web.client()
+    answer = web.post(browser, "/visits", search="P001", role="pre")
+    assert answer.headers["location"] == "/visits?q=1&role=pre"
+    page = browser.get("/visits?q=1&role=pre").text
+    assert "/visits/1" in page
+    assert "/visits/4" not in page
+    assert 'value="P001"' in page
+    assert "This filter does not exist" in web.client().get("/visits?q=1").text  # another session's number
+
+
+def test_every_answer_carries_the_headers(four_visits: None):
+    browser = web.client()
+    signed_out = web.client(signed_in=False)
+    for answer in (browser.get("/visits"), browser.get("/nothing"), signed_out.get("/visits"),
+                   browser.get("/static/page.css"), browser.get("/visits", headers={"host": "evil"})):  # fmt: skip
+        policy = answer.headers["content-security-policy"]
+        assert "unsafe" not in policy
+        assert policy.startswith("default-src 'none'")
+        assert (answer.headers["x-content-type-options"], answer.headers["cache-control"]) == ("nosniff", "no-store")
+
+
+def test_no_page_has_a_script_or_style_of_its_own(four_visits: None):
+    """Else the policy would have to allow them, and with them those of a label."""
+    browser = web.client()
+    for path in ("/visits", "/visits/1", "/nothing", "/visits/99"):
+        page = browser.get(path).text
+        assert not re.search(r"<style|\sstyle=|\son[a-z]+=|javascript:|<script(?![^>]*\ssrc=)", page)
+
+
+def test_labels_and_names_are_text(tables: None):
+    evil = '"><script>alert(1)</script>'
+    lab.Subject.insert1({"subject": evil[:32], "population": "patient", "subject_created": utc_now()})
+    row = {"session_id": 1, "subject": evil[:32], "session_label": evil, "session_created": utc_now()}
+    session.Session.insert1(row)
+    study.Cohort.insert1({"cohort": evil[:32]})
+    study.Visit.insert1({"session_id": 1, "visit_role": evil[:32]})
+    browser = web.client(name=evil)
+    for path in ("/visits", "/visits/1", f"/visits?cohort={evil}&role={evil}&quality={evil}"):
+        page = browser.get(path)
+        assert page.status_code == 200
+        assert "<script>" not in page.text
+        assert "&lt;script&gt;" in page.text
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/static/../app.py",
+        "/static/%2e%2e/app.py",
+        "/static/..%2fapp.py",
+        "/static/%2e%2e%2f%2e%2e%2f%2e%2e%2fetc/passwd",
+        "/vendor//etc/passwd",
+        "/static/",
+        "/static/%00",
+        "/visits/../enter",
+        "/visits/-1",
+        "/visits/1e3",
+        "/visits/%31%27",
+        "/visits/99999999999999999999999",
+        "/visits/1?result=9",
+        "/visits/1?result=-1",
+    ],
+)
+def test_addresses_that_lead_nowhere(four_visits: None, path: str):
+    answer = web.client().get(path)
+    assert answer.status_code in (401, 404), answer.text
+    assert "root:" not in answer.text
+
+
+@pytest.mark.parametrize(
+    "query",
+    ["after=2026-01-01~99999999999", "after=x", "after=2026-99-99~1", "first_day=yesterday", "quality=GOOD", "q=0",
+     "q=999999999999", "cohort=none", "role=%00", "state='--", "after=0000-00-00~1"],
+)  # fmt: skip
+def test_filters_that_do_not_exist_are_left_out(four_visits: None, query: str):
+    answer = web.client().get(f"/visits?{query}")
+    assert answer.status_code == 200
+    assert ("/visits/1" in answer.text) != query.startswith(("cohort", "role"))
+
+
+def test_the_database_away_is_a_page_that_says_what_to_do(four_visits: None, monkeypatch: pytest.MonkeyPatch):
+    from schemas import embedded
+
+    browser = web.client()
+    assert browser.get("/visits").status_code == 200
+    embedded.stop()
+    try:
+        away = browser.get("/visits")
+        assert away.status_code == 503
+        assert "DB_NOT_RUNNING" in away.text
+        assert "pbl db start" in away.text
+    finally:
+        embedded.start()
+    assert "/visits/1" in browser.get("/visits").text  # the same page finds the server again
+
+
+def test_an_error_nobody_foresaw_says_nothing_of_the_program(four_visits: None, monkeypatch: pytest.MonkeyPatch):
+    def fail(*_: object) -> None:
+        raise RuntimeError("secret path /home/x")
+
+    monkeypatch.setattr(visit_list, "choices", fail)
+    answer = web.client().get("/visits")
+    assert answer.status_code == 500
+    assert "secret" not in answer.text
+    assert "unsafe" not in answer.headers["content-security-policy"]
+
+
+def test_german_by_the_browser_and_by_choice(four_visits: None):
+    browser = web.client()
+    assert "Besuche" in browser.get("/visits", headers={"accept-language": "fr, de-CH;q=0.8, en;q=0.1"}).text
+    web.post(browser, "/language", language="de", back="/visits/1")
+    assert "Alle Besuche dieser Person" in browser.get("/visits/1").text
+    assert web.post(browser, "/language", language="de", back="//evil").headers["location"] == "/visits"
+
+
+def test_a_page_for_other_machines_is_refused():
+    from workers.web import serve
+
+    with pytest.raises(PblError, match="no accounts yet"):
+        serve("0.0.0.0", 0, "A", "reader")

@@ -1,0 +1,40 @@
+"""The review page's own files: texts in both languages, scripts of others as published."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import string
+from pathlib import Path
+
+from workers.web import texts
+
+WEB = Path(texts.__file__).parent
+_PAGES = [*WEB.glob("templates/*.html"), *WEB.glob("*.py")]
+
+
+def test_every_text_is_in_both_languages_with_the_same_places():
+    for name, by_language in texts.catalogue().items():
+        assert set(by_language) == set(texts.LANGUAGES), name
+        places = {frozenset(p for _, p, _, _ in string.Formatter().parse(t) if p) for t in by_language.values()}
+        assert len(places) == 1, name
+
+
+def test_every_text_that_a_page_names_is_in_the_catalogue():
+    named = {n for f in _PAGES for n in re.findall(r"""\bt\("([a-z_]+\.[A-Za-z_]+)"[,)]""", f.read_text())}
+    assert len(named) > 40
+    assert named <= set(texts.catalogue())
+
+
+def test_scripts_of_others_are_as_published():
+    rows = re.findall(r"^\| `([^`]+)` \|.*\| ([0-9a-f]{64}) \|$", (WEB / "vendor/README.md").read_text(), re.MULTILINE)
+    found = {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in WEB.glob("vendor/*.min.*")}
+    assert dict(rows) == found
+    assert len(list(WEB.glob("vendor/*.LICENSE"))) == 2
+
+
+def test_the_browsers_language():
+    assert texts.language_of(None, "de-AT,de;q=0.9,en;q=0.5") == "de"
+    assert texts.language_of(None, "fr;q=0.9, en;q=0.5, de;q=0.1") == "en"
+    assert texts.language_of("de", "en") == "de"
+    assert texts.language_of("xx", ";;;q=x,,") == "en"
