@@ -39,7 +39,7 @@ class Commands(click.Group):
 TASKS = {
     "From files to files": ("run", "detect", "fit", "events", "gait", "study", "deidentify"),
     "Begin with the tables": ("demo", "db", "ingest", "list", "populate", "status", "report", "export"),
-    "Look, correct and decide": ("web", "why", "choose", "move", "retry", "reprocess", "forget"),
+    "Correct and decide": ("web", "why", "choose", "move", "retry", "reprocess", "forget"),
     "Cameras, models, methods, norms": ("calibrate", "camera", "models", "method", "norm"),
     "Run it for many": ("worker", "cron", "doctor"),
     "Check and measure": ("validate", "bench", "synth"),

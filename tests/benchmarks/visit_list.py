@@ -1,4 +1,4 @@
-"""What the list of visits of `pbl web` costs: figures of docs/web.md.
+"""What the list of visits of `pbl web` costs: for docs/web.md.
 
     python -m tests.benchmarks.visit_list                 # 50,000 visits of 10,000 people, in a database of its own
 
