@@ -18,7 +18,7 @@ def tree() -> Iterator[tuple[str, click.Context]]:
 
     def below(command: click.Command, name: str, parent: click.Context | None) -> Iterator[tuple[str, click.Context]]:
         own = name.rsplit(" ", 1)[-1]
-        ctx = click.Context(command, info_name=own, parent=parent, terminal_width=100, max_content_width=100)
+        ctx = click.Context(command, info_name=own, parent=parent, terminal_width=88, max_content_width=88)
         yield name, ctx
         if isinstance(command, click.Group):
             for sub in command.list_commands(ctx):
@@ -32,14 +32,16 @@ def tree() -> Iterator[tuple[str, click.Context]]:
 def pages() -> dict[str, str]:
     """Path in the site -> Markdown."""
     helps = {name: f"```text\n{ctx.get_help()}\n```" for name, ctx in tree()}
-    found = {f"{FOLDER}/index.md": f"# Commands\n\n{helps['pbl']}\n"}
+    start = ["# Commands", helps["pbl"]]
+    found = {}
     for task, names in TASKS.items():
+        start.append(f"**{task}**: " + ", ".join(f"[`pbl {n}`]({slug(task)}.md#pbl-{n})" for n in names))
         parts = [f"# {task}\n"]
         for name in names:
             below = [full for full in helps if full == f"pbl {name}" or full.startswith(f"pbl {name} ")]
             parts += [f"{'#' * full.count(' ')}# {full}\n\n{helps[full]}\n" for full in below]
         found[f"{FOLDER}/{slug(task)}.md"] = "\n".join(parts)
-    return found
+    return found | {f"{FOLDER}/index.md": "\n\n".join(start) + "\n"}
 
 
 def slug(task: str) -> str:
