@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from unicodedata import category
 
@@ -34,11 +35,12 @@ def check_label(what: str, text: str, longest: int, least: int = 0) -> None:
 
 def distinct(stems: Sequence[str], numbers: Sequence[int]) -> list[str]:
     """A name for each stem: the stem itself, with its number where stems repeat or a name is taken already."""
-    taken = {s for s in stems if stems.count(s) == 1}
+    count = Counter(stems)
+    taken = {s for s in stems if count[s] == 1}
     names = []
     for stem, number in zip(stems, numbers, strict=True):
         name = stem
-        if stems.count(stem) > 1:
+        if count[stem] > 1:
             name = f"{stem}-{number}"
             while name in taken:
                 name += f"-{number}"

@@ -15,7 +15,7 @@ from ._datajoint import dj
 from .checks import check_columns, check_row
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
-from .rows import number, one
+from .rows import Rows, number, one, row_of, stored_rows
 from .stored_files import file_ref, new_folder, stored_file
 
 if TYPE_CHECKING:
@@ -408,12 +408,11 @@ def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Curves | None = Non
     )
 
 
-def load_cycles(key: Mapping[str, Any], trial: str = "") -> list[lib.GaitCycle]:
+def load_cycles(key: Mapping[str, Any], trial: str = "", rows: Rows = stored_rows) -> list[lib.GaitCycle]:
     """The library's cycles of one row of GaitCycle, with their curves."""
-    with stored_file(GaitCycle(), file_ref((GaitCycle & key).fetch1("curves"))) as path:
+    with stored_file(GaitCycle(), file_ref(row_of(GaitCycle, key, rows)["curves"])) as path:
         curves = load_curves(path)
-    rows = (GaitCycle.Cycle & key).to_dicts(order_by="cycle_no")
-    return [cycle_of_row(r, trial, curves.get(int(r["cycle_no"]))) for r in rows]
+    return [cycle_of_row(r, trial, curves.get(int(r["cycle_no"]))) for r in rows(GaitCycle.Cycle, key)]
 
 
 def save_curves(cycles: Sequence[lib.GaitCycle], path: Path) -> None:

@@ -14,7 +14,7 @@ from ._datajoint import dj
 from .checks import check_columns, check_row
 from .method_rows import method_columns, method_row, resolve_method
 from .origin import Origin, computes, origin_columns
-from .rows import number, one, utc_now
+from .rows import Rows, number, one, row_of, stored_rows, utc_now
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -335,11 +335,11 @@ def profile_of_rows(
     return MovementProfile(sides["left"], sides["right"], *gps)
 
 
-def pace_of(gdi_method: str) -> str:
+def pace_of(gdi_method: str, rows: Rows = stored_rows) -> str:
     """The pace that an index pools, by the key of its method."""
     from pbl_pipeline.gait import SELF_SELECTED
 
-    return one(GdiModel & {"gdi_method": gdi_method}, "gdi_params").get("pace", SELF_SELECTED)
+    return row_of(GdiModel, {"gdi_method": gdi_method}, rows)["gdi_params"].get("pace", SELF_SELECTED)
 
 
 def norm_row(norm: lib.NormativeSet) -> dict[str, Any]:

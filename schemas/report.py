@@ -8,6 +8,7 @@ from typing import Any
 
 from . import fit, privacy, video
 from .results import load_session, not_finished
+from .rows import Rows, stored_rows
 
 
 def write_session(restriction: Any, out: Path) -> list[Path]:
@@ -42,12 +43,12 @@ def write_session(restriction: Any, out: Path) -> list[Path]:
         )
 
 
-def methods_of(key: Any) -> dict[str, str]:
+def methods_of(key: Any, rows: Rows = stored_rows) -> dict[str, str]:
     """Name and version of the method behind each stage, of a key of `SessionResults`; of those that it names. Of
     several cameras also their names."""
-    members = fit.FitSet.Video & {"fit_set": key["fit_set"]}
-    member = members.to_dicts(limit=1)[0]
-    cameras = sorted(set((video.RigView & members.proj()).to_arrays("rig_camera")))
+    members = rows(fit.FitSet.Video, {"fit_set": key["fit_set"]})
+    member = members[0]
+    cameras = sorted({r["rig_camera"] for m in members for r in rows(video.RigView, {"video_id": m["video_id"]})})
     before = {"Tracking": member["tracking_method"], "Keypoints": member["keypoint_method"]}
     found = {stage: method or fit.LABORATORY for stage, method in before.items()} | {"Fit": key["fit_method"]}
     if cameras:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ from .checks import check_values
 from .coded_errors import error_code, error_found
 from .jobs import jobs_of
 from .method_names import with_keys
-from .rows import number
+from .rows import Rows, number, row_of, stored_rows
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -84,15 +84,43 @@ class SessionResults:
         Raises `PblError` USAGE where they are laboratory markers: what reads them wants the video, too.
         """
         if any(t.fit is not None and t.is_markers for t in self.trials):
-            raise PblError(
-                "USAGE",
-                found=f"laboratory markers of session {self.session_label!r}",
-                expected="the fit of a video",
-                next_step="name the kind of the videos, single or rig; measures and curves of markers are in "
-                "`schemas.views`, and `pbl fit FILE`, `pbl gait` write theirs as files",
-                key=f"subject {self.subject}",
-            )
+            raise of_markers(self.subject, self.session_label)
         return tuple(_fitted(t) for t in self.trials if t.fit is not None)
+
+
+def of_markers(subject: str, session_label: str) -> PblError:
+    """A `PblError` USAGE: the fit of a session is one of laboratory markers, where a video's is wanted."""
+    return PblError(
+        "USAGE",
+        found=f"laboratory markers of session {session_label!r}",
+        expected="the fit of a video",
+        next_step="name the kind of the videos, single or rig; measures and curves of markers are in "
+        "`schemas.views`, and `pbl fit FILE`, `pbl gait` write theirs as files",
+        key=f"subject {subject}",
+    )
+
+
+def find_session(restriction: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    """One session (row of Session) and the key of its current fit and of its measures, as far as there are any.
+
+    restriction and errors are those of `load_session`.
+    """
+    if isinstance(restriction, Mapping):
+        restriction = with_keys(restriction)
+    found = (session.Session & restriction).to_dicts()
+    if not found:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no session for {restriction}",
+            expected="a registered session",
+            next_step="`pbl ingest` prints subject and session of each video",
+        )
+    visit = _single(found, "session_id", restriction)
+    current = fit.SessionFit * (fit.FitSelection & {"fit_current": True}) * fit.FitSet.proj("fit_set_kind")
+    fits = (current & {"session_id": visit["session_id"]} & restriction).keys()
+    key = dict(_single(fits, "fit_set", restriction)) if fits else {}
+    measured = (gdi.SessionGdi & key & restriction).keys() if key else []
+    return visit, {**key, **(_single(measured, "gait_method", restriction) if measured else {})}
 
 
 def load_session(restriction: Any) -> SessionResults:
@@ -113,27 +141,11 @@ def load_session(restriction: Any) -> SessionResults:
     """
     if isinstance(restriction, Mapping):
         restriction = with_keys(restriction)
-    found = (session.Session & restriction).to_dicts()
-    if not found:
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=f"no session for {restriction}",
-            expected="a registered session",
-            next_step="`pbl ingest` prints subject and session of each video",
-        )
-    visit = _single(found, "session_id", restriction)
+    visit, key = find_session(restriction)
     chain = {"session_id": int(visit["session_id"])}
-    fits = (
-        fit.SessionFit * (fit.FitSelection & {"fit_current": True}) * fit.FitSet.proj("session_id", "fit_set_kind")
-        & chain
-        & restriction
-    ).keys()
-    key = dict(_single(fits, "fit_set", restriction)) if fits else {}
     session_fit = load_session_fit(key) if key else None
-    fit_by_video = dict(zip(_videos(key), session_fit.trials, strict=True)) if session_fit else {}
-    measured = (gdi.SessionGdi & key & restriction).keys() if key else []
-    metrics_key = _single(measured, "gait_method", restriction) if measured else {}
-    metrics = load_metrics(metrics_key) if metrics_key else None
+    fit_by_video = dict(zip(videos_of(key), session_fit.trials, strict=True)) if session_fit else {}
+    metrics = load_metrics(key) if "norm" in key else None
     # Videos of one camera, of several, and markers are fitted apart: beside a fit of one kind the others are not left
     # out.
     rows = (video.Video & chain).to_dicts(order_by="video_id")
@@ -152,7 +164,7 @@ def load_session(restriction: Any) -> SessionResults:
         trials=trials,
         fit=session_fit,
         metrics=metrics,
-        key={**key, **metrics_key},
+        key=key,
     )
 
 
@@ -186,24 +198,30 @@ def _single(rows: list[dict], attribute: str, restriction: Any) -> dict:
     return rows[0]
 
 
-def _videos(key: Mapping[str, Any]) -> list[int]:
-    return [int(v) for v in (fit.SessionFit.Trial & key).to_arrays("video_id", order_by="video_id")]
+def videos_of(key: Mapping[str, Any], rows: Rows = stored_rows) -> list[int]:
+    """Numbers of the trials of a fit, in the order of its `trials`."""
+    return [int(r["video_id"]) for r in rows(fit.SessionFit.Trial, _of(fit.SessionFit, key))]
 
 
-def load_keypoints(key: Any) -> Keypoints:
+def _of(table: Any, key: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a key belongs to a table."""
+    return {name: key[name] for name in table.primary_key if name in key}
+
+
+def load_keypoints(key: Any, rows: Rows = stored_rows) -> Keypoints:
     """The library's `Keypoints` of one row, named by its key or by a query that holds it alone."""
     from pbl_pipeline.keypoints import Keypoints
 
-    ref = file_ref((keypoints.Keypoints & _keys(key)).fetch1("keypoints_file"))
+    ref = file_ref(row_of(keypoints.Keypoints, _keys(key), rows)["keypoints_file"])
     with stored_file(keypoints.Keypoints(), ref) as path:
         return Keypoints.load(path)
 
 
-def load_trial_fit(key: Any) -> TrialFit:
+def load_trial_fit(key: Any, rows: Rows = stored_rows) -> TrialFit:
     """The library's `TrialFit` of one row of SessionFit.Trial, named by its key or by a query that holds it alone."""
     from pbl_pipeline.fit import TrialFit
 
-    ref = file_ref((fit.SessionFit.Trial & _keys(key)).fetch1("trial_file"))
+    ref = file_ref(row_of(fit.SessionFit.Trial, _keys(key), rows)["trial_file"])
     with stored_file(fit.SessionFit(), ref) as path:
         return TrialFit.load(path)
 
@@ -217,10 +235,10 @@ def load_session_fit(key: Any) -> SessionFit:
     """The library's `SessionFit` of one row, its trials in the order of their video numbers."""
     from pbl_pipeline.fit import SessionFit
 
-    row = (fit.SessionFit & key).fetch1()
+    row = row_of(fit.SessionFit, key)
     with stored_file(fit.SessionFit(), file_ref(row["session_file"])) as path, np.load(path, allow_pickle=False) as f:
         arrays = {k: f[k] for k in f.files}
-    trials = tuple(load_trial_fit({**key, "video_id": v}) for v in _videos(key))
+    trials = tuple(load_trial_fit({**key, "video_id": v}) for v in videos_of(key))
     return SessionFit(
         trials=trials,
         scale=arrays["scale"],
@@ -234,8 +252,13 @@ def load_session_fit(key: Any) -> SessionFit:
         seconds=float(row["fit_seconds"]),
         compile_seconds=float(row["compile_seconds"]),
         device=row["compute_device"],
-        qc=tuple(_checks(fit.SessionFit.Check & key, "fit")),
+        qc=tuple(load_fit_checks(key)),
     )
+
+
+def load_fit_checks(key: Any, rows: Rows = stored_rows) -> list[Check]:
+    """The library's `Check`s of one row of SessionFit."""
+    return _checks(rows(fit.SessionFit.Check, key), "fit")
 
 
 def load_info(key: Any) -> VideoInfo:
@@ -269,12 +292,12 @@ def load_choice(key: Any) -> tracking_lib.SubjectChoice:
     )
 
 
-def load_events(key: Any) -> lib.GaitEvents:
+def load_events(key: Any, rows: Rows = stored_rows) -> lib.GaitEvents:
     """The library's `GaitEvents` of one row."""
     from pbl_pipeline.gait import GaitEvents
 
-    row = (gait.GaitEvents & key).fetch1()
-    events = (gait.GaitEvents.Event & key).to_dicts(order_by="event_no")
+    row = row_of(gait.GaitEvents, key, rows)
+    events = rows(gait.GaitEvents.Event, key)
     return GaitEvents(
         status=row["events_status"],
         events=tuple(gait.event_of_row(e) for e in events),
@@ -285,35 +308,38 @@ def load_events(key: Any) -> lib.GaitEvents:
         walking_s=tuple((float(a), float(b)) for a, b in row["walking_bouts"]),
         n_candidates=int(row["n_candidates"]),
         n_order_breaks=int(row["n_order_breaks"]),
-        qc=tuple(_checks(gait.GaitEvents.Check & key, "events")),
+        qc=tuple(_checks(rows(gait.GaitEvents.Check, key), "events")),
     )
 
 
-def load_cycles(key: Any, trial: str) -> tuple[lib.GaitCycle, ...]:
+def load_cycles(key: Any, trial: str, rows: Rows = stored_rows) -> tuple[lib.GaitCycle, ...]:
     """The library's `GaitCycle`s of one row, with their curves."""
-    return tuple(gait.load_cycles(key, trial))
+    return tuple(gait.load_cycles(key, trial, rows))
 
 
-def _checks(rows: Any, prefix: str) -> list[Check]:
+def _checks(rows: Sequence[Mapping[str, Any]], prefix: str) -> list[Check]:
     from pbl_pipeline.qc import Check
 
-    return [Check(*check_values(prefix, row)) for row in rows.to_dicts(order_by="KEY")]
+    return [Check(*check_values(prefix, row)) for row in rows]
 
 
-def load_metrics(key: Any) -> lib.GaitMetrics:
+def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
     """The library's `GaitMetrics` of one row of SessionGdi, from the rows of its trials and its own: nothing is
     computed anew but the checks of a trial's cycles."""
     from pbl_pipeline import gait as lib
 
-    row = (gdi.SessionGdi & key).fetch1()
-    row_key = {k: row[k] for k in gdi.SessionGdi.primary_key}
-    done, pace = video.conditions(fit.SessionFit.Trial & row_key), gdi.pace_of(row_key["gdi_method"])
+    row = row_of(gdi.SessionGdi, key, rows)
+    row_key = _of(gdi.SessionGdi, row)
+    pace = gdi.pace_of(row_key["gdi_method"], rows)
     trials = tuple(
-        dataclasses.replace(_trial_metrics({**row_key, "video_id": v}), pooled=done[v].pooled(pace))
-        for v in _videos(row_key)
+        dataclasses.replace(
+            _trial_metrics({**row_key, "video_id": v}, rows), pooled=video.condition(v, rows).pooled(pace)
+        )
+        for v in videos_of(row_key, rows)
     )
     pooled = [t for t in trials if t.pooled]
-    norm_name, model = _names(row_key)
+    norm_name, model = _names(row_key, rows)
+    checks = _checks(rows(gdi.SessionGdi.Check, row_key), "gdi")
     index = lib.Gdi(
         status="PASS" if row["session_gdi"] is not None else "EMPTY",
         reason=row["session_gdi_reason"],
@@ -329,11 +355,11 @@ def load_metrics(key: Any) -> lib.GaitMetrics:
         model=model,
         params_hash=row["session_gdi_method_hash"],
         cycles=tuple(c for t in pooled for c in t.gdi.cycles),
-        qc=tuple(c for c in _checks(gdi.SessionGdi.Check & row_key, "gdi") if c.check in _INDEX_CHECKS),
-        profile=gdi.profile_of_rows((gdi.SessionGdi.Profile & row_key).to_dicts(), row, "session"),
+        qc=tuple(c for c in checks if c.check in _INDEX_CHECKS),
+        profile=gdi.profile_of_rows(rows(gdi.SessionGdi.Profile, row_key), row, "session"),
     )
     measures = _spatiotemporal(
-        (gdi.SessionGdi.Measure & row_key).to_dicts(),
+        rows(gdi.SessionGdi.Measure, row_key),
         "session_measure",
         status=row["session_status"],
         reason=row["session_reason"],
@@ -347,7 +373,7 @@ def load_metrics(key: Any) -> lib.GaitMetrics:
         reason=row["session_reason"],
         spatiotemporal=measures,
         gdi=index,
-        qc=tuple(_checks(gdi.SessionGdi.Check & row_key, "gdi")),
+        qc=tuple(checks),
         params_hash=row["session_params_hash"],
     )
 
@@ -356,23 +382,24 @@ def load_metrics(key: Any) -> lib.GaitMetrics:
 _INDEX_CHECKS = ("gdi_cycles", "gdi_explained", "norm_convention")
 
 
-def _trial_metrics(key: Mapping[str, Any]) -> lib.TrialMetrics:
+def _trial_metrics(key: Mapping[str, Any], rows: Rows) -> lib.TrialMetrics:
     from pbl_pipeline import gait as lib
 
-    name = (fit.SessionFit.Trial & key).fetch1("trial_name")
-    counts = (gait.GaitCycle & key).fetch1("n_cycles", "n_cycles_used")
-    row = (gait.Spatiotemporal & key).fetch1()
-    events = load_events(key)
+    name = row_of(fit.SessionFit.Trial, _of(fit.SessionFit.Trial, key), rows)["trial_name"]
+    of_trial = _of(gait.GaitEvents, key)
+    counts = row_of(gait.GaitCycle, of_trial, rows)
+    row = row_of(gait.Spatiotemporal, of_trial, rows)
+    events = load_events(of_trial, rows)
     measures = _spatiotemporal(
-        (gait.Spatiotemporal.Measure & key).to_dicts(),
+        rows(gait.Spatiotemporal.Measure, of_trial),
         "measure",
         status=row["measures_status"],
         reason=row["measures_reason"],
-        n_cycles_found=int(counts[0]),
-        n_cycles_used=int(counts[1]),
+        n_cycles_found=int(counts["n_cycles"]),
+        n_cycles_used=int(counts["n_cycles_used"]),
         n_steps_used=int(row["n_steps_used"]),
     )
-    index, cycles = load_gdi(key, name), load_cycles(key, name)
+    index, cycles = load_gdi(key, name, rows), load_cycles(of_trial, name, rows)
     reason = events.reason or measures.reason
     return lib.TrialMetrics(
         name=name,
@@ -386,23 +413,23 @@ def _trial_metrics(key: Mapping[str, Any]) -> lib.TrialMetrics:
     )
 
 
-def load_gdi(key: Any, trial: str) -> lib.Gdi:
+def load_gdi(key: Any, trial: str, rows: Rows = stored_rows) -> lib.Gdi:
     """The library's `Gdi` of one row of GDI."""
     from pbl_pipeline import gait as lib
 
-    row = (gdi.GDI & key).fetch1()
-    norm_name, model = _names(row)
-    rows = (gdi.GDI.Cycle * gait.GaitCycle.Cycle.proj("cycle_side") & key).to_dicts(order_by="cycle_no")
+    row = row_of(gdi.GDI, key, rows)
+    norm_name, model = _names(row, rows)
+    sides = {int(r["cycle_no"]): r["cycle_side"] for r in rows(gait.GaitCycle.Cycle, _of(gait.GaitCycle, row))}
     cycles = tuple(
         lib.GdiCycle(
             trial=trial,
             number=int(r["cycle_no"]),
-            side=r["cycle_side"],
+            side=sides[int(r["cycle_no"])],
             gdi=float(r["cycle_gdi"]),
             z=float(r["cycle_z"]),
             explained=float(r["cycle_explained"]),
         )
-        for r in rows
+        for r in rows(gdi.GDI.Cycle, key)
     )
     return lib.Gdi(
         status=row["gdi_status"],
@@ -419,14 +446,14 @@ def load_gdi(key: Any, trial: str) -> lib.Gdi:
         model=model,
         params_hash=row["gdi_method_hash"],
         cycles=cycles,
-        qc=tuple(_checks(gdi.GDI.Check & key, "index")),
-        profile=gdi.profile_of_rows((gdi.GDI.Profile & key).to_dicts(), row, "gdi"),
+        qc=tuple(_checks(rows(gdi.GDI.Check, key), "index")),
+        profile=gdi.profile_of_rows(rows(gdi.GDI.Profile, key), row, "gdi"),
     )
 
 
-def _names(key: Mapping[str, Any]) -> tuple[str, str]:
-    norm = (gdi.NormativeSet & {"norm": key["norm"]}).fetch1("norm_name")
-    return norm, (gdi.GdiModel & {"gdi_method": key["gdi_method"]}).fetch1("gdi_method_name")
+def _names(key: Mapping[str, Any], rows: Rows) -> tuple[str, str]:
+    norm = row_of(gdi.NormativeSet, {"norm": key["norm"]}, rows)["norm_name"]
+    return norm, row_of(gdi.GdiModel, {"gdi_method": key["gdi_method"]}, rows)["gdi_method_name"]
 
 
 def _spatiotemporal(rows: list[dict], prefix: str, **fields: Any) -> lib.Spatiotemporal:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,10 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 
 from ._datajoint import dj
+
+#: What returns the rows of a table that agree with a key, in the order of the table's own key: `stored_rows` asks the
+#: database each time, `ReadAhead` for many keys at once.
+Rows = Callable[[Any, Mapping[str, Any]], list[dict[str, Any]]]
 
 
 class InputChanged(PblError):
@@ -40,6 +44,70 @@ def one(query: Any, *columns: str) -> Any:
         if len(query):
             raise
         raise InputChanged(f"no row of {query.from_clause()} for this key") from None
+
+
+def stored_rows(table: Any, key: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The rows of a table that agree with a key, in the order of the table's own key."""
+    columns = table.heading.attributes.values()
+    if any(c.codec or c.json or c.uuid for c in columns):
+        return (table & key).to_dicts(order_by="KEY")
+    # Numbers, texts and dates: a third of the time of DataJoint's own, which looks at each value for what to decode.
+    return list((table & key & dj.Top(None, "KEY")).cursor(as_dict=True))
+
+
+def row_of(table: Any, key: Any, rows: Rows = stored_rows) -> dict[str, Any]:
+    """The one row of a table that agrees with a key, or with a query where `stored_rows` reads it.
+
+    Raises
+    ------
+    PblError
+        DB_NOT_FOUND for none, USAGE for several.
+    """
+    found = rows(table, key)
+    if len(found) == 1:
+        return found[0]
+    raise PblError(
+        "USAGE" if found else "DB_NOT_FOUND",
+        key=f"{table.__name__} {dict(key) if isinstance(key, Mapping) else 'of the query'}",
+        found=f"{len(found)} rows",
+        expected="one row",
+        next_step="name more columns of the table's key" if found else "`pbl status` shows what is computed",
+    )
+
+
+class ReadAhead:
+    """Rows of several results of sets, with one question to the database for each table.
+
+    keys: rows with `fit_set` and, where they are known, the methods; videos: numbers of all videos of these sets. Holds
+    the rows of every table that was asked for: for some dozen visits at a time.
+    """
+
+    def __init__(self, keys: Sequence[Mapping[str, Any]], videos: Iterable[int]) -> None:
+        first = keys[0] if keys else {}
+        self._common = {k: v for k, v in first.items() if all(key.get(k) == v for key in keys)}
+        self._values = {"fit_set": {str(key["fit_set"]) for key in keys}, "video_id": {int(v) for v in videos}}
+        self._tables: dict[tuple, dict[Any, list[dict[str, Any]]]] = {}
+        self._names: dict[Any, frozenset[str]] = {}
+
+    def __call__(self, table: Any, key: Mapping[str, Any]) -> list[dict[str, Any]]:
+        if table not in self._names:
+            self._names[table] = frozenset(table.heading.names)
+        names = self._names[table]
+        column = next((c for c in self._values if c in names), None)
+        if column is None:  # no result: a method or a norm, the same for many
+            return self._grouped((table, *key.items()), lambda: stored_rows(table, key), None)[None]
+        common = {k: v for k, v in self._common.items() if k in names and k not in self._values}
+        of_all = inside(column, self._values[column])
+        read = self._grouped((table,), lambda: stored_rows(table & of_all, common), column)
+        return [r for r in read.get(key[column], ()) if all(r[k] == v for k, v in key.items() if k in r)]
+
+    def _grouped(self, name: tuple, read: Callable[[], list[dict[str, Any]]], column: str | None) -> dict[Any, list]:
+        if name not in self._tables:
+            groups: dict[Any, list] = {} if column else {None: []}
+            for row in read():
+                groups.setdefault(column and row[column], []).append(row)
+            self._tables[name] = groups
+        return self._tables[name]
 
 
 def utc_now() -> datetime.datetime:

@@ -147,6 +147,17 @@ def study_data(name: str, curves: bool = True) -> StudyData:
     return StudyData(**frames, description=description)
 
 
+def chain_of(name: str) -> tuple[dict[str, str], list[str]]:
+    """Kind and methods of a slice's results, from the fit on, and the sets of the visits that count.
+
+    Raises `PblError` DB_NOT_FOUND for an unknown slice.
+    """
+    about = _about(name)
+    own = study.StudySliceVisit & {"study_slice": name, "slice_included": True} & "slice_fit_set != ''"
+    later = ("fit_set_kind", "fit_method", "gait_method", "gdi_method", "norm")
+    return {k: about[k] for k in later}, sorted(map(str, own.to_arrays("slice_fit_set")))
+
+
 def changes(name: str) -> list[str]:
     """What of a slice's rows is not as it was when it was frozen, in words; empty where the same frames come out.
 

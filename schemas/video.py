@@ -13,7 +13,7 @@ from pbl_pipeline.errors import PblError
 from . import lab, session  # noqa: F401  the definitions refer to them
 from ._datajoint import dj
 from .origin import Origin, computes, origin_columns
-from .rows import number, one
+from .rows import Rows, number, one, row_of, stored_rows
 
 if TYPE_CHECKING:
     from pbl_pipeline import video as lib
@@ -265,6 +265,15 @@ def conditions(videos: Any) -> dict[int, Condition]:
     paces = {int(r["video_id"]): r["pace"] for r in (Pace & found.proj()).to_dicts()}
     rows = found.to_dicts(order_by="video_id")
     return {(v := int(r["video_id"])): Condition(r["activity"], paces.get(v, "")) for r in rows}
+
+
+def condition(video_id: int, rows: Rows = stored_rows) -> Condition:
+    """The library's `Condition` of one video."""
+    from pbl_pipeline.gait import Condition
+
+    key = {"video_id": video_id}
+    paces = [r["pace"] for r in rows(Pace, key)]
+    return Condition(row_of(Video, key, rows)["activity"], paces[0] if paces else "")
 
 
 def camera_of(row: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -106,9 +106,10 @@ def write_parquet(table: Table, path: Path, about: Mapping[str, str]) -> None:
             arrays.append(pa.array(c.values, from_pandas=True))
     fields = [_field(pa, c.name, a.type, c.unit, c.meaning) for c, a in zip(table.columns, arrays, strict=True)]
     made = pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=dict(about)))
-    parquet.write_table(
-        made, path, compression="zstd", write_statistics=False
-    )  # statistics double the size of few rows
+    # Statistics double the size of few rows. A dictionary of numbers that hardly repeat costs a tenth of the size and a
+    # fifth of the time.
+    labels = [c.name for c in table.columns if isinstance(c.values, Labels)]
+    parquet.write_table(made, path, compression="zstd", write_statistics=False, use_dictionary=labels)
 
 
 @functools.lru_cache(1000)

@@ -12,11 +12,12 @@ from pbl_pipeline.errors import PblError
 from ._kind import kind_option
 
 if TYPE_CHECKING:
-    from pbl_pipeline.export import ExportSession
+    from pbl_pipeline.export import ExportOptions, ExportSession
 
 _EPILOG = """\b
 Example: pbl export walk1.fit.npz walk2.fit.npz --to osim --to trc --to mot --out for_opensim
-Example: pbl export --subject P017 --session 2026-03-01 --to c3d --to parquet --out P017"""
+Example: pbl export --subject P017 --session 2026-03-01 --to c3d --to parquet --out P017
+Example: pbl export --slice paper --to parquet --out paper_visits"""
 
 
 @click.command(epilog=_EPILOG)
@@ -32,6 +33,8 @@ Example: pbl export --subject P017 --session 2026-03-01 --to c3d --to parquet --
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder; one below it for each trial.")
 @click.option("--subject", help="Code of the subject, in place of FILES: from the tables.")
 @click.option("--session", "label", help="Date or label of the visit; needed where the subject has several.")
+@click.option("--all", "every", is_flag=True, help="All fitted visits of the tables, or all of --subject.")
+@click.option("--slice", "slice_name", help="The visits that count in this slice (`pbl study slice`).")
 @click.option("--fit-method", help="Name of the fit method; needed where several were used.")
 @kind_option
 @click.option(
@@ -52,6 +55,8 @@ def export(
     out: Path,
     subject: str | None,
     label: str | None,
+    every: bool,
+    slice_name: str | None,
     fit_method: str | None,
     fit_set_kind: str | None,
     attitude: tuple[Path, ...],
@@ -62,21 +67,37 @@ def export(
     allow_failed: bool,
     overwrite: bool,
 ) -> None:
-    """Write the trials of one visit for OpenSim, Visual3D, Mokka, R, pandas or movement.
+    """Write the trials of one visit, or of many, for OpenSim, Visual3D, Mokka, R, pandas or movement.
 
     FILES are fits (fit.npz) of `pbl fit` or `pbl run`, with their keypoints.npz and session.json beside them. Axes,
-    units and signs of each format: docs/export.md. c3d and parquet need the extra `export`.
+    units and signs of each format: docs/export.md. c3d and parquet need the extra `export`. With --all and --slice each
+    visit has a folder OUT/SUBJECT/SESSION; one that cannot be exported is named, the others are written, and the exit
+    status is 1.
     """
     from pbl_pipeline.export import ExportOptions, check_export, write_export
 
-    if not files and subject is None:
-        raise _usage("neither FILES nor --subject", "one of them")
-    if files and (subject or label or fit_method or fit_set_kind):
-        raise _usage("FILES with --subject, --session, --fit-method or --kind", "FILES, or a visit of the tables")
-    if subject is not None and (attitude or marker_set):
-        raise _usage("--attitude or --marker-set with --subject", "them with FILES: the tables have the log")
+    many = every or slice_name is not None
+    if not files and subject is None and not many:
+        raise _usage("neither FILES nor --subject, --all or --slice", "one of them")
+    if files and (subject or label or fit_method or fit_set_kind or many):
+        raise _usage("FILES with an option that picks visits of the tables", "FILES, or visits of the tables")
+    if slice_name is not None and (every or subject or label or fit_method or fit_set_kind):
+        raise _usage("--slice with --all, --subject, --session, --fit-method or --kind", "--slice alone: it names them")
+    if every and label:
+        raise _usage("--all with --session", "one of them")
+    if not files and (attitude or marker_set):
+        raise _usage("--attitude or --marker-set without FILES", "them with FILES: the tables have the log")
     options = ExportOptions(name, number_trials, not markers_only, allow_failed, overwrite)
     check_export(formats, out, options)
+    if many:
+        _write_many(
+            {"subject": subject, "fit_method": fit_method, "fit_set_kind": fit_set_kind},
+            slice_name,
+            formats,
+            out,
+            options,
+        )
+        return
     if files:
         session = _of_files(files, formats, attitude, marker_set)
     else:
@@ -105,7 +126,45 @@ def _of_tables(restriction: dict[str, str | None], formats: tuple[str, ...]) -> 
     from schemas.export import session_of_tables
 
     schemas.activate(methods=False)
-    return session_of_tables({k: v for k, v in restriction.items() if v is not None}, sensors="c3d" in formats)
+    return session_of_tables({k: v for k, v in restriction.items() if v is not None}, **_wanted(formats))
+
+
+def _wanted(formats: tuple[str, ...]) -> dict[str, bool]:
+    """What of a visit these formats hold."""
+    from pbl_pipeline.export import GAIT_FORMATS
+
+    return {"sensors": "c3d" in formats, "gait": bool(GAIT_FORMATS & set(formats))}
+
+
+def _write_many(
+    restriction: dict[str, str | None],
+    slice_name: str | None,
+    formats: tuple[str, ...],
+    out: Path,
+    options: ExportOptions,
+) -> None:
+    """Each visit into its folder; those that cannot be exported are named at the end of their line."""
+    import schemas
+    from pbl_pipeline import progress
+    from pbl_pipeline.export import write_export
+    from schemas.export import sessions_of_tables, visits_of_tables
+
+    schemas.activate(methods=False)
+    visits = visits_of_tables({k: v for k, v in restriction.items() if v is not None}, slice_name)
+    refused = 0
+    with progress.bar("export", len(visits), "visit") as update:
+        for visit, session in sessions_of_tables(visits, **_wanted(formats)):
+            try:
+                if isinstance(session, PblError):
+                    raise session
+                write_export(session, formats, out / visit["folder"], options)
+            except PblError as error:
+                refused += 1
+                click.echo(f"{visit['folder']}: {error.code}: {error.found}. Next: {error.next_step}", err=True)
+            update()
+    click.echo(f"{len(visits) - refused} of {len(visits)} visits in {out}")
+    if refused:
+        raise click.exceptions.Exit(1)
 
 
 def _usage(found: str, expected: str) -> PblError:

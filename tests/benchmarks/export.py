@@ -45,7 +45,7 @@ def _run(path: Path, known: ExportSession, formats: list[str], visits: int, meas
     cpu = before = 0.0
     for i in range(visits + 10):
         if i == 10:  # what is loaded and compiled once is
-            seconds, cpu, before = [], time.process_time(), _resident_mib()
+            seconds, cpu, before = [], time.process_time(), resident_mib()
         start = time.perf_counter()
         session = session_of_files([path]) if measure else _as_stored(path, known)
         write_export(session, formats, out)
@@ -53,7 +53,7 @@ def _run(path: Path, known: ExportSession, formats: list[str], visits: int, meas
         shutil.rmtree(out)
     cpu = 1e3 * (time.process_time() - cpu) / visits
     name = " ".join(formats)
-    click.echo(f"{name:<44}{visits:>7}{1 / np.mean(seconds):>10.1f}{cpu:>9.1f}{before:>12.0f}{_resident_mib():>8.0f}")
+    click.echo(f"{name:<44}{visits:>7}{1 / np.mean(seconds):>10.1f}{cpu:>9.1f}{before:>12.0f}{resident_mib():>8.0f}")
 
 
 def _as_stored(path: Path, known: ExportSession) -> ExportSession:
@@ -86,7 +86,7 @@ def _visit(folder: Path) -> Path:
     return folder / "walk.fit.npz"
 
 
-def _resident_mib() -> float:
+def resident_mib() -> float:
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize() / 2**20
 

@@ -15,18 +15,19 @@ import pbl_pipeline.gait
 from pbl_pipeline.body import marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit
-from schemas import gait, gdi
+from schemas import export, fit, gait, gdi, session
 from schemas.export import session_of_tables
-from schemas.ingest import Visit, ingest
+from schemas.ingest import Methods, Visit, ingest
 from schemas.sensors import Sensors
 from tests.command import pbl
 from tests.exported import with_markers
+from tests.rows import register
 from workers.populate import populate
 
 from . import chain
 
 
-def _fit_with_markers(trials, names, paramset=None, camera_motion="static") -> SessionFit:
+def fit_with_markers(trials, names, paramset=None, camera_motion="static") -> SessionFit:
     """The stand-in's fit with the markers of its set."""
     made, points = chain.fit_session(trials, names, paramset, camera_motion), marker_set("blazepose_33")
     more = {"marker_set": points.name, "marker_names": points.names, "site_offset_m": np.zeros((33, 3))}
@@ -37,7 +38,7 @@ def _fit_with_markers(trials, names, paramset=None, camera_motion="static") -> S
 
 def test_a_visit_of_the_tables(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     ezc3d = pytest.importorskip("ezc3d")
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", _fit_with_markers)
+    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", fit_with_markers)
     time = np.arange(-0.5, 9.0, 0.02)
     log = {"time_s": time, "qw": 0.5, "qx": -0.5, "qy": 0.5, "qz": -0.5, "ax": 0.0, "ay": 9.81, "az": time}
     pd.DataFrame(log).to_csv(tmp_path / "log.csv", index=False)
@@ -70,3 +71,74 @@ def test_a_visit_of_the_tables(tables: None, tmp_path: Path, monkeypatch: pytest
     np.testing.assert_allclose(z, at, atol=1e-4)
     assert [p for p in (tmp_path / "out").rglob("*") if p.is_file() and b"Doe" in p.read_bytes()] == []
     assert pbl("export", "--subject", "P999", "--to", "mot", "--out", tmp_path / "b").error_code == "DB_NOT_FOUND"
+
+
+def _files(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_many_visits_are_each_as_alone(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", fit_with_markers)
+    visits = [("P001", "2026-03-01"), ("P001", "nach OP é"), ("P002", "2026-03-01"), ("P003", "2026-03-01")]
+    for i, (subject, label) in enumerate(visits):
+        register(chain.small_video(tmp_path, f"walk{i}"), subject=subject, session_label=label)
+    register(chain.small_video(tmp_path, "nobody", people="nobody"), subject="P004", session_label="1")
+    populate()
+    monkeypatch.setattr(export, "_TOGETHER", 3)
+    wanted = ("--to", "trc", "--to", "csv")
+    done = pbl("export", "--all", *wanted, "--out", tmp_path / "all")
+    assert done.code == 0, done.err
+    assert done.out == f"4 of 4 visits in {tmp_path / 'all'}\n"
+    assert {p.parent.relative_to(tmp_path / "all").as_posix() for p in (tmp_path / "all").rglob("export.json")} == {
+        "P001/2026-03-01",
+        "P001/nach OP _",
+        "P002/2026-03-01",
+        "P003/2026-03-01",
+    }
+    alone = pbl("export", "--subject", "P001", "--session", "nach OP é", *wanted, "--out", tmp_path / "alone")
+    assert alone.code == 0, alone.err
+    assert _files(tmp_path / "alone") == _files(tmp_path / "all" / "P001" / "nach OP _")
+    # One that cannot be exported does not hold up the others, and the exit status says that there was one.
+    failed = fit.SessionFit & (session.Session & {"subject": "P001", "session_label": "2026-03-01"})
+    check = {"fit_check": "residual_2d_px", "fit_check_outcome": "FAIL", "fit_check_advice": "look at the overlay"}
+    fit.SessionFit.Check.insert1({**failed.keys()[0], **check})
+    done = pbl("export", "--all", "--subject", "P001", *wanted, "--out", tmp_path / "one")
+    assert done.code == 1
+    assert done.out.startswith("1 of 2 visits")
+    assert done.err.startswith("P001/2026-03-01: EXPORT_INPUT: a fit that failed its check residual_2d_px")
+    assert len(list((tmp_path / "one").rglob("export.json"))) == 1
+
+
+def test_many_visits_take_as_many_questions_as_one(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for i in range(3):
+        register(chain.small_video(tmp_path, f"walk{i}"), subject=f"P00{i}")
+    populate()
+    asked: list[str] = []
+    query = fit.schema.connection.query
+
+    def counted(text: str, *args, **options):
+        asked.append(text)
+        return query(text, *args, **options)
+
+    visits = export.visits_of_tables({})
+    monkeypatch.setattr(fit.schema.connection, "query", counted)
+    assert len([s for _, s in export.sessions_of_tables(visits) if not isinstance(s, PblError)]) == 3
+    three, asked[:] = len(asked), []
+    list(export.sessions_of_tables(visits[:1]))
+    assert three == len(asked) > 10
+
+
+def test_visits_that_are_not_there_or_are_ambiguous(tables: None, tmp_path: Path):
+    out = ("--to", "mot", "--out", tmp_path / "out")
+    assert pbl("export", "--all", *out).error_code == "DB_NOT_FOUND"
+    assert pbl("export", "--slice", "paper", *out).error_code == "DB_NOT_FOUND"
+    assert pbl("export", "--all", "--session", "1", *out).error_code == "USAGE"
+    assert pbl("export", "--slice", "paper", "--subject", "P001", *out).error_code == "USAGE"
+    path = chain.small_video(tmp_path, "walk")
+    for method in ("blazepose", "gauss-newton"):
+        ingest([path], Visit("P001"), methods=Methods(fit=method))
+    populate()
+    ambiguous = pbl("export", "--all", *out)
+    assert ambiguous.error_code == "USAGE"
+    assert "fit_method blazepose-v" in ambiguous.err
+    assert pbl("export", "--all", "--fit-method", "gauss-newton", *out).code == 0

@@ -207,3 +207,13 @@ def test_the_commands(cohort: Path, tmp_path: Path):
     text = "".join(p.read_text() for p in coded.glob("*.csv"))
     assert "C001" not in text
     assert (tmp_path / "key.csv").stat().st_mode & 0o077 == 0
+
+
+def test_the_visits_of_a_slice_are_exported(cohort: Path, tmp_path: Path):
+    done = pbl("export", "--slice", "first", "--to", "mot", "--out", tmp_path / "out")
+    assert done.code == 0, done.err
+    made = {p.parent.relative_to(tmp_path / "out").as_posix() for p in (tmp_path / "out").rglob("export.json")}
+    data = slices.study_data("first", curves=False).visits
+    rows = data.to_dict("records")
+    assert made == {f"{v['subject']}/{v['visit']}" for v in rows if v["included"]}
+    assert 0 < len(made) < len(data)
