@@ -19,6 +19,11 @@ def enable(on: bool = True) -> None:
     _enabled = on
 
 
+def enabled() -> bool:
+    """Whether somebody looks at bars."""
+    return _enabled
+
+
 def track(items: Iterable[T], label: str, total: int | None = None, unit: str = "frame") -> Iterator[T]:
     """Iterate over `items`, drawing a bar on stderr when enabled. `total` may be unknown."""
     return iter(tqdm(items, desc=label, total=total, unit=unit, disable=not _enabled, **_style()))

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.ndimage import gaussian_filter1d
 
+from pbl_pipeline import progress
 from pbl_pipeline.body import Body, scale_multipliers
 from pbl_pipeline.jax_setup import compile_seconds
 
@@ -30,7 +31,7 @@ from .priors import Weights, pixels_alone
 from .problem import Problem, power_of_2
 from .session import Session
 from .solution import Outcome, Solution, outcome
-from .solvers.gauss_newton import Limits, Progress, minimise
+from .solvers.gauss_newton import Limits, Progress, before_first, minimise
 from .solvers.linear import marginal_variance
 
 #: A point that stands is slower than this fraction of its own fastest, or than this (m/s); speeds are means over some
@@ -129,9 +130,14 @@ def _with_detector(start: State, params: GaussNewtonParams) -> State:
     return dataclasses.replace(start, lean=seen[0], depth_m=seen[1])
 
 
-def fit_problem(body: Body, p: Problem, w: Weights, start: State, limits: Limits) -> Progress:
-    """Minimise the total of `objective.py` over per-frame poses."""
-    return minimise(lambda state: linearise(body, p, w, state), moved, start, p.weight, limits)
+def begin_of(body: Body, p: Problem, w: Weights, start: State) -> Progress:
+    """What `fit_problem` begins with."""
+    return before_first(lambda state: linearise(body, p, w, state), start)
+
+
+def fit_problem(body: Body, p: Problem, w: Weights, begin: Progress, limits: Limits) -> Progress:
+    """Minimise the total of `objective.py` over per-frame poses, from `begin_of` or where it ended before."""
+    return minimise(lambda state: linearise(body, p, w, state), moved, begin, p.weight, limits)
 
 
 def finish(p: Problem, latest: Linearised, R_nc: Array) -> tuple[Float[Array, "F U"], Outcome]:
@@ -147,14 +153,35 @@ def finish(p: Problem, latest: Linearised, R_nc: Array) -> tuple[Float[Array, "F
     return variance * latest.dispersion, outcome(p, latest.x, R_nc)
 
 
+_begin_one = jax.jit(begin_of, static_argnames="body")
 _one = jax.jit(fit_problem, static_argnames="body")
 _finish_one = jax.jit(finish)
 _finish_many = jax.jit(jax.vmap(finish))
 
 
 @functools.partial(jax.jit, static_argnames="body")
-def _many(body: Body, p: Problem, w: Weights, start: State, limits: Limits) -> Progress:
-    return jax.vmap(functools.partial(fit_problem, body), in_axes=(0, None, 0, None))(p, w, start, limits)
+def _begin_many(body: Body, p: Problem, w: Weights, start: State) -> Progress:
+    return jax.vmap(functools.partial(begin_of, body), in_axes=(0, None, 0))(p, w, start)
+
+
+# What the iteration begins with makes room for what it ends with: a batch on a GPU lies there once.
+@functools.partial(jax.jit, static_argnames="body", donate_argnames="begin")
+def _many(body: Body, p: Problem, w: Weights, begin: Progress, limits: Limits) -> Progress:
+    return jax.vmap(functools.partial(fit_problem, body), in_axes=(0, None, 0, None))(p, w, begin, limits)
+
+
+def _step_by_step(body: Body, p: Problem, w: Weights, begin: Progress, limits: Limits) -> Progress:
+    """`_one` with a bar that moves with each iteration; all at once where nobody looks at it."""
+    if not progress.enabled():
+        return _one(body, p, w, begin, limits)
+    most, at = int(limits.iterations), begin
+    with progress.bar("fit", unit="iteration") as update:
+        for n in range(most + 1):  # the first one evaluates the start
+            at = _one(body, p, w, at, dataclasses.replace(limits, iterations=jnp.asarray(n, jnp.int32)))
+            update(min(n, 1), f"of at most {most}, cost {float(at.cost):.4g}")
+            if bool(at.converged):
+                break
+    return at
 
 
 def _solve(
@@ -174,7 +201,8 @@ def _solve(
     # Stacked on the host, so that each array goes to the device once.
     p, start = jax.device_put(given[0] if alone else jax.tree.map(lambda *a: np.stack(a), *given))
     with one_blas_thread():
-        end = (_one if alone else _many)(body, p, w, start, limits)
+        begin = (_begin_one if alone else _begin_many)(body, p, w, start)
+        end = (_step_by_step if alone else _many)(body, p, w, begin, limits)
         rest = (_finish_one if alone else _finish_many)(p, end.latest, end.state.R_nc) if last else ()
         found = jax.device_get((dataclasses.replace(end, latest=None, candidate=None), end.latest.x, *rest))
     each = [found] if alone else [jax.tree.map(lambda a, i=i: a[i], found) for i in range(len(sessions))]

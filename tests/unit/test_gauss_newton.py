@@ -43,7 +43,7 @@ from pbl_pipeline.fit.objective import (
     square,
     total,
 )
-from pbl_pipeline.fit.per_frame import finish, fit_problem, limits_of, standing, start_of
+from pbl_pipeline.fit.per_frame import begin_of, finish, fit_problem, limits_of, standing, start_of
 from pbl_pipeline.fit.priors import Weights, bent, beyond_limit_deg
 from pbl_pipeline.fit.problem import SAMPLE_S, TrialArrays, bend_weights, pack, point_table
 from pbl_pipeline.fit.session import Session, make_session
@@ -546,8 +546,18 @@ def test_a_body_of_three_joints_goes_through_the_same_code(tmp_path):
         clock_s=jnp.zeros(1),
         floor=jnp.zeros((1, 3)),
     )
-    end = fit_problem(body, p, Weights.of(body, params), start, limits_of(params))
+    w, limits = Weights.of(body, params), limits_of(params)
+    solve = jax.jit(fit_problem, static_argnames="body")
+    begin = begin_of(body, p, w, start)
+    end = solve(body, p, w, begin, limits)
     assert bool(end.converged)
+    # One iteration a call, as where a bar is drawn, takes the same steps.
+    at = begin
+    for n in range(int(end.iteration) + 1):
+        assert not bool(at.converged)
+        at = solve(body, p, w, at, dataclasses.replace(limits, iterations=jnp.asarray(n, jnp.int32)))
+    assert bool(at.converged)
+    jax.tree.map(np.testing.assert_array_equal, at, end)
     np.testing.assert_allclose(end.state.qpos[:40], truth, atol=5e-3)
     np.testing.assert_allclose(scale_multipliers(end.state.s), scale, atol=5e-3)
     variance, seen = finish(p, end.latest, end.state.R_nc)

@@ -71,14 +71,32 @@ class Progress:
     trace: Array
 
 
+def before_first(evaluate: Callable[[S], Quadratic], start: S) -> Progress:
+    """What `minimise` begins with: nothing is evaluated yet."""
+    shapes = jax.eval_shape(evaluate, start)
+    return Progress(
+        state=start,
+        cost=jnp.asarray(jnp.inf, jnp.float32),
+        latest=jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes),
+        candidate=start,
+        step=jnp.asarray(jnp.inf, jnp.float32),
+        damping=jnp.asarray(DAMPING_START, jnp.float32),
+        iteration=jnp.asarray(-1, jnp.int32),
+        idle=jnp.asarray(0, jnp.int32),
+        converged=jnp.asarray(False),
+        trace=jnp.full(MOST_ITERATIONS, jnp.nan, jnp.float32),
+    )
+
+
 def minimise(
     evaluate: Callable[[S], Quadratic],
     move: Callable[[S, Array, Array], S],
-    start: S,
+    begin: Progress,
     counts: Float[Array, " F"],
     limits: Limits,
 ) -> Progress:
-    """Minimise a cost from `start`.
+    """Minimise a cost, from `before_first` or from where a call with fewer iterations ended: both ways take the
+    same steps.
 
     `evaluate`: cost and its quadratic model at a state; `move`: the state after a step (F, Q) of the frames' unknowns
     and (K,) of the shared ones; `counts`: 0 for frames whose step says nothing of convergence.
@@ -113,21 +131,8 @@ def minimise(
             trace=p.trace.at[jnp.where(first, MOST_ITERATIONS, p.iteration)].set(cost, mode="drop"),
         )
 
-    shapes = jax.eval_shape(evaluate, start)
-    before = Progress(
-        state=start,
-        cost=jnp.asarray(jnp.inf),
-        latest=jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes),
-        candidate=start,
-        step=jnp.asarray(jnp.inf),
-        damping=jnp.asarray(DAMPING_START),
-        iteration=jnp.asarray(-1),
-        idle=jnp.asarray(0),
-        converged=jnp.asarray(False),
-        trace=jnp.full(MOST_ITERATIONS, jnp.nan),
-    )
     most = jnp.minimum(limits.iterations, MOST_ITERATIONS)
-    return jax.lax.while_loop(lambda p: ~p.converged & (p.iteration < most), step, before)
+    return jax.lax.while_loop(lambda p: ~p.converged & (p.iteration < most), step, begin)
 
 
 def _damped(system: BorderedBandedSystem, damping: Array) -> BorderedBandedSystem:
