@@ -27,6 +27,7 @@ from pymysql.converters import escape_string
 from pbl_pipeline.errors import PblError
 
 from . import connection, embedded
+from ._activate import STAGES
 from .catalog import pattern
 
 #: Role -> rights in the schemas of the prefix.
@@ -39,18 +40,33 @@ ROLES: dict[str, tuple[str, ...]] = {
 #: Role -> end of the default account's name, after the prefix. The embedded server has a `pbl_admin` of its own.
 _ENDINGS = {"admin": "owner", "worker": "worker", "analyst": "analyst"}
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
+#: Names of schemas of a lab's own, after the prefix.
+_SCHEMA = re.compile(r"[a-z][a-z0-9_]{0,39}")
 _HOST = re.compile(r"[A-Za-z0-9%_.:/-]{1,255}")
 
 
 @dataclasses.dataclass(frozen=True)
 class Account:
-    """An account of a role. `host` is where it may come from, as MySQL has it: `%` is anywhere."""
+    """An account of a role. `host` is where it may come from, as MySQL has it: `%` is anywhere. schemas: names after
+    the prefix of schemas of its own, in which it may do everything; `mylab` stands for `mylab_...` too."""
 
     role: str
     user: str
     host: str
+    schemas: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        for name in self.schemas:
+            if not _SCHEMA.fullmatch(name) or name.split("_")[0] in STAGES:
+                raise PblError(
+                    "USAGE",
+                    key=name,
+                    found="a schema of the package"
+                    if name.split("_")[0] in STAGES
+                    else "a name that no schema can have",
+                    expected="at most 40 small letters, digits and '_', a letter first, no name of the package",
+                    next_step=f"choose another name; it becomes {connection.prefix()}_NAME on the server",
+                )
         if self.role not in ROLES or not _NAME.fullmatch(self.user) or not _HOST.fullmatch(self.host):
             raise PblError(
                 "USAGE",
@@ -82,12 +98,22 @@ def default_account(role: str, host: str) -> Account:
 def statements(account: Account, password: str, require_tls: bool = False) -> list[str]:
     """What makes the account exist with this password and exactly the rights of its role. Safe to repeat."""
     literal = f"'{escape_string(password)}'"
+    own = [p for name in account.schemas for p in (_own(name), _own(name) + r"\_%")]
+    # A foreign key to a table of ours takes a right of its own on MySQL.
+    more = [f"GRANT REFERENCES ON `{pattern()}%`.* TO {account.name}"] if own else []
     return [
         f"CREATE USER IF NOT EXISTS {account.name} IDENTIFIED BY {literal}",
         f"ALTER USER {account.name} IDENTIFIED BY {literal} REQUIRE {'SSL' if require_tls else 'NONE'}",
         f"REVOKE ALL PRIVILEGES, GRANT OPTION FROM {account.name}",
         f"GRANT {', '.join(ROLES[account.role])} ON `{pattern()}%`.* TO {account.name}",
+        *more,
+        *(f"GRANT ALL PRIVILEGES ON `{p}`.* TO {account.name}" for p in own),
     ]
+
+
+def _own(name: str) -> str:
+    """The name of a schema of a lab's own for GRANT."""
+    return pattern() + name.replace("_", r"\_")
 
 
 def password_file(folder: Path, account: Account) -> Path:

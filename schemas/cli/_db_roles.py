@@ -18,6 +18,13 @@ from pbl_pipeline.errors import PblError
     help="Only this role; may be given several times (default: all three).",
 )
 @click.option("--user", help="Name of the account, with one --role (default: pbl_worker, pbl_analyst, pbl_owner).")
+@click.option(
+    "--schema",
+    "own",
+    multiple=True,
+    metavar="NAME",
+    help="With --user: a schema of its own (on the server pbl_NAME) for tables below ours; once for each.",
+)
 @click.option("--from", "host", metavar="HOST", help="Where it may come from; % is anywhere (default: this machine).")
 @click.option(
     "--secrets",
@@ -34,6 +41,7 @@ from pbl_pipeline.errors import PblError
 def roles(
     names: tuple[str, ...],
     user: str | None,
+    own: tuple[str, ...],
     host: str | None,
     folder: Path,
     require_tls: bool,
@@ -49,6 +57,7 @@ def roles(
     Example: pbl db roles
     Example: DJ_HOST=db DJ_USER=root DJ_PASS_FILE=secrets/mysql_root pbl db roles --from %
     Example: pbl db roles --role analyst --user maria --from %
+    Example: pbl db roles --role analyst --user maria --from % --schema mylab
     """
     from schemas import connection
     from schemas import roles as lib
@@ -60,9 +69,13 @@ def roles(
             expected="one --role",
             next_step="name the role of that account",
         )
+    if own and not user:
+        raise PblError(
+            "USAGE", found="--schema without --user", expected="the account that may use it", next_step="name it"
+        )
     where = host or ("localhost" if connection.external() else "127.0.0.1")
     chosen = names or tuple(lib.ROLES)
-    accounts = [lib.Account(r, user, where) if user else lib.default_account(r, where) for r in chosen]
+    accounts = [lib.Account(r, user, where, own) if user else lib.default_account(r, where) for r in chosen]
     if remove:
         lib.drop(accounts[0])
         click.echo(f"{accounts[0].user} from {where} is removed; its password file, if any, stays")
@@ -76,4 +89,5 @@ def roles(
     lib.apply([(a, lib.read_password(f)) for a, f in zip(accounts, files, strict=True)], require_tls)
     for account, file in zip(accounts, files, strict=True):
         rights = ", ".join(lib.ROLES[account.role]).lower()
-        click.echo(f"{account.role:<8} {account.user} from {where}: {rights} on {connection.prefix()}_*; {file}")
+        also = "".join(f", all on {connection.prefix()}_{name}" for name in account.schemas)
+        click.echo(f"{account.role:<8} {account.user} from {where}: {rights} on {connection.prefix()}_*{also}; {file}")

@@ -13,7 +13,8 @@ import yaml
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection, embedded, lab, roles, views, worker
+from schemas import connection, embedded, gdi, lab, roles, session, views, worker
+from schemas._datajoint import dj
 from schemas._declare import declare_all
 from schemas.chain import ON_REQUEST
 from schemas.ingest import Visit, ingest
@@ -45,7 +46,7 @@ def login(secrets: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Login]:
     with monkeypatch.context() as patch:
 
         def become(role: str) -> None:
-            user = roles.default_account(role, "127.0.0.1").user
+            user = roles.default_account(role, "127.0.0.1").user if role in roles.ROLES else role
             for name, value in (("HOST", "127.0.0.1"), ("PORT", port), ("USER", user), ("PASS_FILE", secrets / user)):
                 patch.setenv(f"DJ_{name}", str(value))
             connection.connect()
@@ -149,6 +150,71 @@ def test_it_can_be_repeated_and_takes_excess_rights_back(secrets: Path, login: L
     assert denied.error_code == "DB_REFUSED"
     assert "DJ_USER=root" in denied.err
     assert not any(password in denied.out + denied.err for password in before.values())
+
+
+def test_an_analyst_has_tables_of_a_labs_own_below_ours(
+    login: Login, secrets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    chain.install(monkeypatch)
+    own = ("db", "roles", "--role", "analyst", "--user", "maria", "--schema", "mylab", "--secrets", secrets)
+    done = pbl(*own)
+    assert done.code == 0, done.err
+    assert "maria from 127.0.0.1: select, show view on pbl_*, all on pbl_mylab" in done.out
+    login("worker")
+    schemas.activate()
+    for subject in ("P001", "P002"):
+        ingest([chain.small_video(tmp_path, subject)], Visit(subject, "2026-03-01"))
+    populate()
+
+    login("maria")
+    schemas.activate(methods=False)
+    schema = dj.Schema(connection.schema_name("mylab"), context={"gdi": gdi})
+
+    @schema
+    class CycleSpread(dj.Computed):
+        definition = """
+        # spread of the index over the cycles of a visit
+        -> gdi.SessionGdi
+        ---
+        spread_range=null : float64    # (-) highest minus lowest
+        """
+
+        def make(self, key):
+            index = (gdi.GDI.Cycle & key).to_arrays("cycle_gdi")
+            self.insert1({**key, "spread_range": float(index.max() - index.min())})
+
+    CycleSpread.populate(reserve_jobs=True)
+    assert len(CycleSpread * gdi.SessionGdi * session.Session * lab.Subject) == 2
+    assert not refused("CREATE DATABASE pbl_mylab_more")
+    assert not refused("DROP DATABASE pbl_mylab_more")
+    assert refused("CREATE DATABASE pbl_theirs")
+    assert refused("CREATE DATABASE mylab")
+    assert refused("CREATE TABLE pbl_lab.more (i INT)")
+    assert refused("DELETE FROM pbl_gdi.__session_gdi")
+
+    def spreads() -> int:
+        with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+            cursor.execute("SELECT COUNT(*) FROM pbl_mylab.__cycle_spread")
+            return int(cursor.fetchall()[0][0])
+
+    # Who computes a result anew, and who forgets a person, takes the rows below with it.
+    login("worker")
+    assert ingest([tmp_path / "P001.mp4"], Visit("P001", "2026-03-01", pace="fast"))[0].status != "failed"
+    assert spreads() == 1
+    login("admin")
+    forgotten = pbl("forget", "P002", "--yes")
+    assert forgotten.code == 0, forgotten.err
+    assert spreads() == 0
+    with closing(roles._server_admin()) as server, server.cursor() as cursor:
+        cursor.execute("DROP USER 'maria'@'127.0.0.1'")
+        cursor.execute("DROP DATABASE pbl_mylab")
+
+
+@pytest.mark.parametrize("name", ["gdi", "lab_more", "My", "a-b", "1a", "x" * 41])
+def test_schemas_that_an_analyst_cannot_have(name: str):
+    with pytest.raises(PblError) as error:
+        roles.Account("analyst", "maria", "%", (name,))
+    assert error.value.code == "USAGE"
 
 
 def test_another_account_of_a_role_and_its_end(secrets: Path):
