@@ -205,9 +205,13 @@ def test_an_analyst_has_tables_of_a_labs_own_below_ours(
     forgotten = pbl("forget", "P002", "--yes")
     assert forgotten.code == 0, forgotten.err
     assert spreads() == 0
-    with closing(roles._server_admin()) as server, server.cursor() as cursor:
-        cursor.execute("DROP USER 'maria'@'127.0.0.1'")
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute("DROP DATABASE pbl_mylab")
+    with monkeypatch.context() as as_before:
+        as_before.delenv("DJ_HOST")
+        as_before.delenv("DJ_USER")
+        as_before.delenv("DJ_PASS_FILE")
+        roles.drop(roles.Account("analyst", "maria", "127.0.0.1"))
 
 
 @pytest.mark.parametrize("name", ["gdi", "lab_more", "My", "a-b", "1a", "x" * 41])
