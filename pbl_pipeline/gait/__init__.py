@@ -4,7 +4,7 @@ Each step is a function of its own with a frozen result: `feet_from_fit` or `fee
 `find_cycles`, `spatiotemporal`, `score_gdi`; `gait_metrics` runs them for a session.
 """
 
-from ._angles import ANGLE_NAMES, LEG_ANGLES, AngleSeries, angle_series, leg_angles, pelvis_angles
+from ._angles import ANGLE_NAMES, LEG_ANGLES, AngleSeries, angle_series, leg_angles, leg_angles_sd, pelvis_angles
 from ._bands import NormalBands, leg_length_m, normal_bands
 from ._camera_side import camera_side, mostly
 from ._condition import ACTIVITIES, ANY_PACE, PACES, SELF_SELECTED, UNKNOWN, Condition
@@ -126,6 +126,7 @@ __all__ = [
     "gdi_vector",
     "interval_90",
     "leg_angles",
+    "leg_angles_sd",
     "leg_length_m",
     "load_events",
     "load_norm",

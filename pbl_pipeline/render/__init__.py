@@ -6,7 +6,7 @@ from pbl_pipeline.render._project import NEAR_M, rotation_matrix, scaled_camera,
 from pbl_pipeline.render._skeleton import draw_skeleton, skeleton_lines
 from pbl_pipeline.render._strip import stance_spans
 from pbl_pipeline.render._style import SIDE_COLOUR, side_of
-from pbl_pipeline.render._track import BodyTrack, body_track
+from pbl_pipeline.render._track import BodyTrack, body_track, uncertain_sides
 
 __all__ = [
     "NEAR_M",
@@ -27,4 +27,5 @@ __all__ = [
     "stance_spans",
     "to_camera",
     "to_pixels",
+    "uncertain_sides",
 ]

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 
 import numpy as np
 
 from pbl_pipeline.body import capsules, load_body
 from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.render._overlay import check_body
 from pbl_pipeline.render._project import to_camera, to_pixels
 from pbl_pipeline.render._style import side_of
+
+#: Confidence of a side's leg below which it is drawn as uncertain: as `draw_keypoints` draws points hollow.
+SEEN_CONFIDENCE = 0.5
+_LEG = ("hip", "knee", "ankle", "heel", "foot_index")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,3 +60,23 @@ def body_track(fit: TrialFit) -> BodyTrack:
     names = shapes.body_names
     discs = np.concatenate([centre, radius[..., None]], axis=-1)
     return BodyTrack(names, tuple(side_of(n) for n in names), discs, seen[..., 2].mean(axis=2))
+
+
+def uncertain_sides(
+    time_s: np.ndarray, far_legs: Iterable[tuple[str, float, float]], keypoints: Keypoints | None
+) -> dict[str, np.ndarray]:
+    """Side -> (T,) bool: frames in which its leg is less certain than it looks.
+
+    It is behind the other leg (`far_legs`: side, start and end in s, of the cycles: `GaitCycle.far_leg`), or the mean
+    confidence of its points is below `SEEN_CONFIDENCE`; marker sets without points of such names tell nothing.
+    """
+    time = np.asarray(time_s, float)
+    out = {side: np.zeros(len(time), bool) for side in ("left", "right")}
+    for side, start, end in far_legs:
+        out[side] |= (time >= start) & (time <= end)
+    if keypoints is not None and len(keypoints.time_s) == len(time):
+        for side, mask in out.items():
+            points = [i for i, name in enumerate(keypoints.names) if name in [f"{side}_{p}" for p in _LEG]]
+            if points:
+                mask |= keypoints.confidence[:, points].mean(axis=1) < SEEN_CONFIDENCE
+    return out

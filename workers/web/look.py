@@ -2,20 +2,70 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 
+from starlette.requests import Request
+from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
+from pbl_pipeline.errors import PblError
+from schemas import recording_page
+
+from .find import number_of
+from .movement import movement_json, outlines
 from .pages import Pages
 from .tables import Tables
 from .videos import Videos
 
 _OWN = re.compile(r"/(visits|recordings)(/\d{1,10})?")
+#: How browsers call a file by its ending; others are offered as MP4, and a browser that cannot play one says so.
+_KINDS = {".webm": "video/webm", ".mkv": "video/x-matroska", ".mov": "video/mp4", ".mp4": "video/mp4"}
 
 
 def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
     """The addresses of this part."""
-    return []
+
+    async def recording(request: Request) -> Response:
+        about = await tables.ask(recording_page.recording_about, number_of(request))
+        problem: PblError | None = None
+        if about.has_pictures:
+            try:
+                await tables.ask(videos.path, about.video_id)
+            except PblError as error:
+                problem = error
+        return pages.show(request, "recording.html", about=about, no_video=problem)
+
+    async def video(request: Request) -> Response:
+        path = await tables.ask(videos.path, number_of(request))
+        return FileResponse(path, media_type=_KINDS.get(path.suffix.lower(), "video/mp4"))
+
+    async def fitted(request: Request) -> recording_page.RecordingFit:
+        about = await tables.ask(recording_page.recording_about, number_of(request))
+        if about.key is None:
+            raise PblError(
+                "DB_NOT_FOUND",
+                found=f"no fit of video_id {about.video_id}: {about.problem}",
+                expected="a recording to which a body is fitted",
+                next_step="`pbl populate`; `pbl why` says what stops it",
+            )
+        return await tables.ask(recording_page.recording_fit, about.key)
+
+    async def movement(request: Request) -> Response:
+        found = await fitted(request)
+        return Response(await asyncio.to_thread(movement_json, found), media_type="application/json")
+
+    async def body(request: Request) -> Response:
+        found = await fitted(request)
+        sides, numbers = await asyncio.to_thread(outlines, found)
+        return Response(numbers, media_type="application/octet-stream", headers={"x-sides": sides})
+
+    return [
+        Route("/recordings/{number:int}", recording),
+        Route("/recordings/{number:int}/video", video),
+        Route("/recordings/{number:int}/movement", movement),
+        Route("/recordings/{number:int}/body", body),
+    ]
 
 
 def own_address(text: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import socket
+import threading
 from collections.abc import Iterator
 
 import click
@@ -73,6 +74,7 @@ def serve(host: str, port: int, name: str, role: str, visit: int | None = None) 
         h11_max_incomplete_event_size=16_384,
     )
     logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
+    threading.Thread(target=_warm, daemon=True).start()
     with database(), contextlib.closing(listening), contextlib.suppress(KeyboardInterrupt):
         uvicorn.Server(config).run(sockets=[listening])
 
@@ -90,6 +92,11 @@ def database() -> Iterator[None]:
     finally:
         if started:
             embedded.stop(say=click.echo)
+
+
+def _warm() -> None:
+    """Load what draws a body (JAX, MuJoCo: seconds) before the first recording is opened."""
+    from pbl_pipeline import gait, render  # noqa: F401
 
 
 def _listen(host: str, port: int) -> socket.socket:

@@ -1,0 +1,168 @@
+"""A recording in the review page: its video by ranges, the body and the curves as numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pbl_pipeline.render import body_track
+from schemas import fit, recording_page, video
+from tests.integration import web
+from tests.integration.chain import N_FRAMES, small_video
+from tests.rows import register
+from workers.populate import populate
+from workers.web.movement import DEPTH_STEPS, PIXEL_STEPS, UNKNOWN
+
+
+@pytest.fixture(scope="module")
+def looked_at(database: Path, tmp_path_factory: pytest.TempPathFactory):
+    """Videos 1 (fitted) and 2 (nobody in it), and the file of 1."""
+    import schemas
+    from tests.integration import chain
+    from tests.rows import remove_all
+
+    with pytest.MonkeyPatch.context() as patch:
+        schemas.activate()
+        chain.install(patch)
+        folder = tmp_path_factory.mktemp("look")
+        path = small_video(folder, "walk")
+        ids = register(path, session_label="2026-01-10")
+        ids += register(small_video(folder, "none", people="nobody"), session_label="2026-02-10")
+        populate()
+        yield path, *ids
+        remove_all()
+
+
+def test_a_page_of_a_recording(looked_at):
+    _, walk, nobody = looked_at
+    browser = web.client()
+    page = browser.get(f"/recordings/{walk}").text
+    assert f'src="/recordings/{walk}/video"' in page
+    assert "initial contact" in page
+    assert f"{N_FRAMES} frames" in page
+    empty = browser.get(f"/recordings/{nobody}").text
+    assert "No body is fitted" in empty
+    assert "nobody" in empty
+    assert browser.get(f"/recordings/{nobody}/movement").status_code == 404
+    for forged in (0, 999, 2**31, 10**30):
+        for what in ("", "/video", "/movement", "/body"):
+            assert browser.get(f"/recordings/{forged}{what}").status_code == 404
+
+
+def test_the_body_that_is_sent_is_the_one_that_the_overlay_draws(looked_at):
+    _, walk, _ = looked_at
+    answer = web.client().get(f"/recordings/{walk}/body")
+    key = recording_page.trial_key(walk)
+    assert key is not None
+    track = body_track(recording_page.recording_fit(key).fit)
+    sides = answer.headers["x-sides"]
+    assert [s[0] for s in track.sides] == list(sides)
+    numbers = np.frombuffer(answer.content, "<i2").reshape(N_FRAMES, len(sides), 7)
+    frames = np.cumsum(numbers.astype(np.int64), axis=0).astype(np.int16)  # as the page's script counts
+    known = frames[..., 0] != UNKNOWN
+    assert known.any()
+    found = frames[known][:, :6].reshape(-1, 2, 3) / PIXEL_STEPS
+    np.testing.assert_allclose(found, track.discs_px[known], atol=0.5 / PIXEL_STEPS + 1e-9)
+    np.testing.assert_allclose(frames[known][:, 6] / DEPTH_STEPS, track.depth_m[known], atol=0.5 / DEPTH_STEPS + 1e-9)
+
+
+def test_curves_events_and_what_is_uncertain(looked_at):
+    from pbl_pipeline.gait import leg_angles
+
+    _, walk, _ = looked_at
+    found = web.client().get(f"/recordings/{walk}/movement").json()
+    key = recording_page.trial_key(walk)
+    assert key is not None
+    about = recording_page.recording_fit(key)
+    assert len(found["time"]) == N_FRAMES
+    knee = next(c for c in found["curves"] if c["name"] == "Knee flexion")
+    np.testing.assert_allclose(knee["left"]["value"], leg_angles(about.fit)["left"]["knee_flexion"], atol=0.006)
+    assert len(found["events"]) == len(about.events) > 4
+    far = {c.far_leg for c in about.cycles}
+    for side in ("left", "right"):
+        spans = found["uncertain"][side]
+        if side in far:
+            assert any(a <= c.start_s <= b for c in about.cycles if c.far_leg == side for a, b in spans)
+
+
+@pytest.mark.parametrize(
+    ("asked", "status"),
+    [
+        ("bytes=0-99", 206),
+        ("bytes=-50", 206),
+        ("bytes=100-", 206),
+        ("bytes=0-0,-1", 206),
+        ("bytes=99999999999-", 416),
+        ("bytes=50-10", 400),
+        ("bytes=x-y", 400),
+        ("lines=0-1", 400),
+        ("bytes=" + ",".join(["0-"] * 5000), 200),
+        ("bytes=" + ",".join(["0-"] * 90), 206),
+    ],
+)
+def test_ranges_of_a_video(looked_at, asked: str, status: int):
+    path, walk, _ = looked_at
+    whole = path.read_bytes()
+    answer = web.client().get(f"/recordings/{walk}/video", headers={"range": asked})
+    assert answer.status_code == status
+    assert len(answer.content) <= len(whole)  # many ranges over each other are not sent many times
+    expected = {"bytes=0-99": whole[:100], "bytes=-50": whole[-50:], "bytes=100-": whole[100:]}
+    if asked in expected:
+        assert answer.content == expected[asked]
+    assert answer.headers["content-security-policy"]
+
+
+def test_a_video_needs_a_session(looked_at):
+    _, walk, _ = looked_at
+    for what in ("", "/video", "/movement", "/body"):
+        assert web.client(signed_in=False).get(f"/recordings/{walk}{what}").status_code == 401
+
+
+def test_a_video_that_is_gone_leaves_the_rest(looked_at):
+    path, walk, _ = looked_at
+    away = path.rename(path.with_suffix(".away"))
+    try:
+        browser = web.client()
+        page = browser.get(f"/recordings/{walk}")
+        assert page.status_code == 200
+        assert "VIDEO_MISSING" in page.text
+        assert "<video" not in page.text
+        assert browser.get(f"/recordings/{walk}/video").status_code == 404
+        assert browser.get(f"/recordings/{walk}/movement").status_code == 200
+    finally:
+        away.rename(path)
+
+
+def test_where_heads_are_to_be_hidden_the_original_is_never_sent(looked_at, monkeypatch: pytest.MonkeyPatch):
+    _, walk, _ = looked_at
+    monkeypatch.setenv("PBL_DEIDENTIFY", "blur")
+    browser = web.client()
+    assert browser.get(f"/recordings/{walk}/video").status_code == 404
+    page = browser.get(f"/recordings/{walk}").text
+    assert "no de-identified copy" in page
+    assert "<video" not in page
+
+
+def test_a_fit_of_another_body_says_so(looked_at, monkeypatch: pytest.MonkeyPatch):
+    import dataclasses
+
+    _, walk, _ = looked_at
+    load = recording_page.load_trial_fit
+    monkeypatch.setattr(recording_page, "load_trial_fit", lambda k: dataclasses.replace(load(k), body_sha256="0" * 64))
+    answer = web.client().get(f"/recordings/{walk}/body")
+    assert answer.status_code == 409
+    assert "install the version that made the fit" in answer.text
+
+
+def test_a_lost_file_of_the_fit_says_so(looked_at, monkeypatch: pytest.MonkeyPatch):
+    from schemas import results
+
+    _, walk, _ = looked_at
+    assert fit.SessionFit.Trial & {"video_id": walk}
+    assert video.Video & {"video_id": walk}
+    monkeypatch.setattr(results, "file_ref", lambda value: {"path": "gone.npz", "store": "arrays", "size": 1})
+    answer = web.client().get(f"/recordings/{walk}/movement")
+    assert answer.status_code == 409
+    assert "restore the object store" in answer.text

@@ -1,0 +1,266 @@
+// The player of a recording: the fitted body over the video, curves and events on one time line.
+// What is drawn follows the frame that the browser says it shows (requestVideoFrameCallback), never a clock beside it.
+
+/**
+ * @typedef {{time: number[], size: [number, number], events: [number, string, string, number][],
+ *   curves: ({name: string} & Record<"left"|"right", {value: (number|null)[], half: (number|null)[]}>)[],
+ *   stance: Record<string, [number, number][]>, uncertain: Record<string, [number, number][]>,
+ *   steps: {pixel: number, depth: number, unknown: number}}} Movement
+ * @typedef {{sides: string, numbers: Int16Array, count: number}} Body
+ */
+
+/** The frame that is shown at a time: the last that began by then. @param {number[]} times @param {number} at */
+export function frameAt(times, at) {
+  let low = 0, high = times.length - 1;
+  while (low < high) {
+    const middle = (low + high + 1) >> 1;
+    if (times[middle] <= at + 1e-4) low = middle; else high = middle - 1;
+  }
+  return low;
+}
+
+/** Frames from what changed since the one before. @param {ArrayBuffer} buffer @param {string} sides @returns {Body} */
+export function bodyOf(buffer, sides) {
+  const numbers = new Int16Array(buffer), each = sides.length * 7;
+  for (let i = each; i < numbers.length; i++) numbers[i] += numbers[i - each];
+  return { sides, numbers, count: sides.length };
+}
+
+/** Outline of a capsule: the hull of two discs. @param {CanvasRenderingContext2D} c */
+export function capsule(c, x0, y0, r0, x1, y1, r1) {
+  const dx = x1 - x0, dy = y1 - y0, d = Math.hypot(dx, dy);
+  c.beginPath();
+  if (d <= Math.abs(r0 - r1)) {
+    r0 > r1 ? c.arc(x0, y0, r0, 0, 2 * Math.PI) : c.arc(x1, y1, r1, 0, 2 * Math.PI);
+  } else {
+    const along = Math.atan2(dy, dx), open = Math.acos((r0 - r1) / d);
+    c.arc(x0, y0, r0, along + open, along - open + 2 * Math.PI);
+    c.arc(x1, y1, r1, along - open, along + open);
+  }
+  c.closePath();
+}
+
+const within = (spans, at) => spans.some(([from, to]) => from <= at && at <= to);
+const $ = (/** @type {string} */ id) => /** @type {any} */ (document.getElementById(id));
+const colour = (/** @type {string} */ name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+
+/** Draw a frame of the body. @param {HTMLCanvasElement} canvas @param {Movement} m @param {Body} body @param {number} frame */
+export function drawBody(canvas, m, body, frame) {
+  const c = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
+  const f = canvas.width / m.size[0], { pixel, unknown } = m.steps;
+  c.clearRect(0, 0, canvas.width, canvas.height);
+  const first = frame * body.count * 7, at = m.time[frame];
+  const shown = [];
+  for (let g = 0; g < body.count; g++) if (body.numbers[first + 7 * g] !== unknown) shown.push(g);
+  shown.sort((a, b) => body.numbers[first + 7 * b + 6] - body.numbers[first + 7 * a + 6]);  // far ones first
+  const names = { l: "left", r: "right", m: "" };
+  const fills = { l: "#d55e00", r: "#0072b2", m: "#8a8f98" };
+  c.lineWidth = Math.max(1, canvas.width / 640);
+  for (const g of shown) {
+    const n = body.numbers.subarray(first + 7 * g, first + 7 * g + 6), side = body.sides[g];
+    const unsure = names[side] !== "" && within(m.uncertain[names[side]], at);
+    // Pixel centres are whole numbers.
+    const v = [0, 1, 2, 3, 4, 5].map((i) => (n[i] / pixel + (i % 3 < 2 ? 0.5 : 0)) * f);
+    capsule(c, v[0], v[1], v[2], v[3], v[4], v[5]);
+    c.fillStyle = fills[side];
+    c.strokeStyle = unsure ? fills[side] : "rgba(0,0,0,.55)";
+    c.setLineDash(unsure ? [5 * c.lineWidth, 4 * c.lineWidth] : []);
+    c.globalAlpha = unsure ? 0.12 : 0.5;
+    c.fill();
+    c.globalAlpha = unsure ? 0.9 : 0.35;
+    c.stroke();
+  }
+  c.globalAlpha = 1;
+  c.setLineDash([]);
+}
+
+/** Moves a picture of what is at a time; a video where there is one, else a clock. */
+class Clock {
+  /** @param {HTMLVideoElement|null} video @param {number[]} times @param {(frame: number) => void} show */
+  constructor(video, times, show) {
+    this.video = video; this.times = times; this.show = show; this.frame = 0; this.rate = 1; this.playing = false;
+    this.changed = () => {};
+    if (video) this.#follow(video);
+  }
+
+  #follow(/** @type {HTMLVideoElement} */ video) {
+    video.controls = false;
+    const shown = (_now, /** @type {{mediaTime: number}} */ about) => {
+      if (this.video !== video) return;
+      this.#at(frameAt(this.times, about.mediaTime + 0.25 * this.#step()));
+      video.requestVideoFrameCallback(shown);
+    };
+    video.requestVideoFrameCallback(shown);
+    for (const name of ["play", "pause", "ended"]) video.addEventListener(name, () => { this.playing = !video.paused; this.changed(); });
+  }
+
+  #step() { return this.times.length > 1 ? (this.times[this.times.length - 1] - this.times[0]) / (this.times.length - 1) : 0.04; }
+
+  #at(/** @type {number} */ frame) { this.frame = frame; this.show(frame); }
+
+  /** Without a video from now on. */
+  alone() { this.video = null; this.#at(this.frame); }
+
+  /** Show a frame. @param {number} frame */
+  go(frame) {
+    frame = Math.min(Math.max(frame, 0), this.times.length - 1);
+    if (!this.video) { this.#at(frame); return; }
+    const end = frame + 1 < this.times.length ? this.times[frame + 1] : this.times[frame] + this.#step();
+    this.frame = frame;  // a second step does not wait for the first to be shown
+    this.video.currentTime = (this.times[frame] + end) / 2;
+  }
+
+  speed(/** @type {number} */ rate) { this.rate = rate; if (this.video) this.video.playbackRate = rate; }
+
+  toggle() {
+    if (this.video) { this.video.paused ? this.video.play() : this.video.pause(); return; }
+    this.playing = !this.playing;
+    this.changed();
+    if (!this.playing) return;
+    if (this.frame === this.times.length - 1) this.frame = 0;
+    let last = performance.now(), at = this.times[this.frame];
+    const tick = (/** @type {number} */ now) => {
+      if (!this.playing) return;
+      at += this.rate * (now - last) / 1000; last = now;
+      this.#at(frameAt(this.times, at));
+      if (this.frame === this.times.length - 1) { this.playing = false; this.changed(); } else requestAnimationFrame(tick);
+    };
+    requestAnimationFrame(tick);
+  }
+}
+
+/** Charts of the joint angles; the returned function moves their cursors. @param {Movement} m @param {(at: number) => void} seek */
+function charts(m, seek) {
+  const into = $("curves"), made = [];
+  const build = () => {
+    into.replaceChildren();
+    made.length = 0;
+    for (const curve of m.curves) {
+      const figure = document.createElement("figure"), title = document.createElement("figcaption");
+      title.textContent = into.dataset.angle.replace("{name}", curve.name);
+      figure.append(title);
+      into.append(figure);
+      const data = [m.time], series = [{}], bands = [];
+      for (const side of ["left", "right"]) {
+        if (!curve[side]) continue;
+        const unsure = m.time.map((t) => within(m.uncertain[side], t)), { value, half } = curve[side], ink = colour(side);
+        const edge = (sign) => value.map((v, i) => (v === null || half[i] === null ? null : v + sign * half[i]));
+        bands.push({ series: [series.length, series.length + 1], fill: ink + "30" });
+        for (const sign of [1, -1]) { series.push({ stroke: "transparent", width: 0, points: { show: false } }); data.push(edge(sign)); }
+        series.push({ stroke: ink, width: 2, points: { show: false } });
+        data.push(value.map((v, i) => (unsure[i] ? null : v)));
+        series.push({ stroke: ink, width: 1.5, dash: [5, 3], points: { show: false } });
+        data.push(value.map((v, i) => (unsure[i] || unsure[i - 1] || unsure[i + 1] ? v : null)));
+      }
+      const axis = { stroke: colour("soft"), grid: { stroke: colour("line"), width: 1 }, ticks: { stroke: colour("line") } };
+      const chart = new uPlot({
+        width: Math.max(200, into.clientWidth), height: 130, legend: { show: false }, series, bands,
+        scales: { x: { time: false } }, cursor: { drag: { x: false, y: false }, points: { show: false } },
+        axes: [{ ...axis, size: 26 }, { ...axis, size: 38 }],
+      }, data, figure);
+      chart.root.setAttribute("role", "img");
+      chart.root.setAttribute("aria-label", into.dataset.chart.replace("{name}", curve.name));
+      const line = document.createElement("div");
+      line.className = "now-line";
+      chart.over.append(line);
+      chart.over.addEventListener("click", (e) => seek(chart.posToVal(e.offsetX, "x")));
+      made.push({ chart, line });
+    }
+  };
+  build();
+  let at = 0;
+  const move = (/** @type {number} */ time) => {
+    at = time;
+    for (const { chart, line } of made) line.style.transform = `translateX(${chart.valToPos(time, "x")}px)`;
+  };
+  let width = into.clientWidth;
+  new ResizeObserver(() => {
+    if (into.clientWidth === width) return;
+    width = into.clientWidth;
+    for (const { chart } of made) chart.setSize({ width: Math.max(200, width), height: 130 });
+    move(at);
+  }).observe(into);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { build(); move(at); });
+  return move;
+}
+
+/** Foot contacts over the recording. @param {HTMLCanvasElement} canvas @param {Movement} m */
+function drawStrip(canvas, m) {
+  const box = canvas.getBoundingClientRect(), dense = devicePixelRatio || 1;
+  canvas.width = box.width * dense; canvas.height = box.height * dense;
+  const c = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
+  const end = m.time[m.time.length - 1] || 1, x = (t) => (t / end) * canvas.width, row = canvas.height / 2;
+  ["left", "right"].forEach((side, i) => {
+    c.fillStyle = colour(side);
+    c.globalAlpha = 0.45;
+    for (const [from, to] of m.stance[side]) c.fillRect(x(from), i * row + row * 0.2, x(to) - x(from), row * 0.6);
+    c.globalAlpha = 1;
+    for (const [t, s, kind] of m.events) if (s === side) c.fillRect(x(t) - dense, i * row + (kind === "foot_down" ? 0 : row * 0.5), 2 * dense, row * 0.5);
+  });
+}
+
+async function start() {
+  const look = /** @type {HTMLElement} */ (document.querySelector(".look[data-fitted]"));
+  const number = look.dataset.recording;
+  const stage = /** @type {HTMLElement} */ (look.querySelector(".stage"));
+  const video = look.querySelector("video"), canvas = /** @type {HTMLCanvasElement} */ (look.querySelector("canvas.body"));
+  const [movement, outlines] = await Promise.all(["movement", "body"].map((what) => fetch(`/recordings/${number}/${what}`)));
+  if (!movement.ok || !outlines.ok) { document.open(); document.write(await (movement.ok ? outlines : movement).text()); document.close(); return; }
+  /** @type {Movement} */ const m = await movement.json();
+  const body = bodyOf(await outlines.arrayBuffer(), outlines.headers.get("x-sides") ?? "");
+  const [width, height] = m.size;
+  canvas.width = Math.min(width, 1280); canvas.height = Math.round(canvas.width * height / width);
+  stage.style.aspectRatio = `${width} / ${height}`;
+  stage.style.width = `min(100%, calc(70vh * ${width / height}))`;
+  const controls = /** @type {HTMLElement} */ (look.querySelector(".controls"));
+  controls.hidden = false;
+  const position = $("position"), now = $("now"), play = $("play");
+  position.max = m.time.length - 1;
+  const seek = (/** @type {number} */ at) => clock.go(frameAt(m.time, at));
+  const cursor = charts(m, seek);
+  const show = (/** @type {number} */ frame) => {
+    if ($("show-body").checked) drawBody(canvas, m, body, frame);
+    else canvas.getContext("2d")?.clearRect(0, 0, canvas.width, canvas.height);
+    canvas.dataset.frame = String(frame);
+    position.value = frame;
+    now.textContent = `${m.time[frame].toFixed(2)} s, ${now.dataset.text.replace("{n}", frame + 1).replace("{total}", m.time.length)}`;
+    cursor(m.time[frame]);
+  };
+  const clock = new Clock(video, m.time, show);
+  clock.changed = () => { play.textContent = clock.playing ? play.dataset.pause : play.dataset.play; };
+  const refused = () => { $("not-played").hidden = false; video?.remove(); clock.alone(); };
+  if (video) { video.addEventListener("error", refused); if (video.error) refused(); }
+  show(0);
+  drawStrip($("strip"), m);
+  new ResizeObserver(() => drawStrip($("strip"), m)).observe($("strip"));
+  const event = (/** @type {number} */ way) => {
+    const at = m.time[clock.frame], times = m.events.map((e) => e[0]);
+    const next = way > 0 ? times.find((t) => frameAt(m.time, t) > clock.frame) : times.findLast((t) => frameAt(m.time, t) < clock.frame);
+    if (next !== undefined) seek(next);
+    return at;
+  };
+  const speeds = $("speed");
+  const faster = (/** @type {number} */ by) => { speeds.selectedIndex = Math.min(Math.max(speeds.selectedIndex + by, 0), speeds.length - 1); clock.speed(+speeds.value); };
+  const keys = { " ": () => clock.toggle(), ",": () => clock.go(clock.frame - 1), ".": () => clock.go(clock.frame + 1), j: () => event(-1), l: () => event(1),
+    "-": () => faster(-1), "+": () => faster(1) };
+  document.addEventListener("keydown", (e) => {
+    const typing = /** @type {HTMLElement} */ (e.target).closest("input:not([type=range]):not([type=checkbox]), textarea, select, button, a, summary");
+    const act = keys[/** @type {keyof typeof keys} */ (e.key.toLowerCase())];
+    if (!act || e.ctrlKey || e.altKey || e.metaKey || (typing && (e.key === " " || typing.matches("input, textarea, select")))) return;
+    e.preventDefault();
+    act();
+  });
+  play.addEventListener("click", () => clock.toggle());
+  stage.addEventListener("click", () => clock.toggle());
+  $("back").addEventListener("click", () => clock.go(clock.frame - 1));
+  $("forward").addEventListener("click", () => clock.go(clock.frame + 1));
+  $("event-back").addEventListener("click", () => event(-1));
+  $("event-forward").addEventListener("click", () => event(1));
+  speeds.addEventListener("change", () => clock.speed(+speeds.value));
+  position.addEventListener("input", () => clock.go(+position.value));
+  $("show-body").addEventListener("change", () => show(clock.frame));
+  for (const button of document.querySelectorAll("button[data-time]")) button.addEventListener("click", () => seek(+(/** @type {HTMLElement} */ (button).dataset.time ?? 0)));
+  look.dataset.ready = "";
+}
+
+if (typeof document !== "undefined" && document.querySelector(".look[data-fitted]")) start();
