@@ -115,12 +115,14 @@ def find_session(restriction: Any) -> tuple[dict[str, Any], dict[str, Any]]:
             expected="a registered session",
             next_step="`pbl ingest` prints subject and session of each video",
         )
-    visit = _single(found, "session_id", restriction)
+    visit = _single(found, "visits", ("subject", "session_label"))
     current = fit.SessionFit * (fit.FitSelection & {"fit_current": True}) * fit.FitSet.proj("fit_set_kind")
-    fits = (current & {"session_id": visit["session_id"]} & restriction).keys()
-    key = dict(_single(fits, "fit_set", restriction)) if fits else {}
+    fits = (current & {"session_id": visit["session_id"]} & restriction).proj("fit_set_kind").to_dicts()
+    key = (
+        _of(fit.SessionFit, _single(fits, "fits", ("fit_set_kind", *fit.SessionFit.primary_key[::-1]))) if fits else {}
+    )
     measured = (gdi.SessionGdi & key & restriction).keys() if key else []
-    return visit, {**key, **(_single(measured, "gait_method", restriction) if measured else {})}
+    return visit, {**key, **(_single(measured, "results", gdi.SessionGdi.primary_key) if measured else {})}
 
 
 def load_session(restriction: Any) -> SessionResults:
@@ -187,15 +189,29 @@ def not_finished(found: SessionResults, what: str) -> PblError:
     )
 
 
-def _single(rows: list[dict], attribute: str, restriction: Any) -> dict:
-    if len(rows) > 1:
-        raise PblError(
-            "USAGE",
-            found=f"{len(rows)} rows for {restriction}: " + "; ".join(str(r) for r in rows[:4]),
-            expected="one session and one chain of methods",
-            next_step=f"add {attribute} or the name of a method to the restriction",
-        )
-    return rows[0]
+#: Column -> the option of `pbl report` and `pbl export` that names it.
+_OPTIONS = {
+    "subject": "--subject",
+    "session_label": "--session",
+    "fit_set_kind": "--kind",
+    "fit_method": "--fit-method",
+}
+
+
+def _single(rows: list[dict], what: str, columns: Sequence[str]) -> dict:
+    """The one row; `columns`: what can tell several apart, by which the error names them."""
+    if len(rows) == 1:
+        return rows[0]
+    values = {c: sorted({str(row[c]) for row in rows}) for c in columns}
+    differ = [c for c in columns if len(values[c]) > 1]
+    first = differ[0]
+    ways = [f"`{_OPTIONS[first]} {v}`" for v in values[first][:4]] if first in _OPTIONS else []
+    raise PblError(
+        "USAGE",
+        found=f"{len(rows)} {what} match: " + "; ".join(f"{c} {', '.join(values[c][:8])}" for c in differ),
+        expected="one",
+        next_step=" or ".join(["add " + ways[0], *ways[1:]]) if ways else f"name one {first} in the restriction",
+    )
 
 
 def videos_of(key: Mapping[str, Any], rows: Rows = stored_rows) -> list[int]:
@@ -484,13 +500,13 @@ def _trial(
         found["info"] = load_info(key)
     chain = tracking.Tracking & key & restriction
     if chain:
-        track_key = _single(chain.keys(), "tracking_method", restriction)
+        track_key = _single(chain.keys(), "trackings", chain.primary_key)
         found["tracking"] = load_tracking(track_key)
         if tracking.SubjectChoice & track_key:
             found["choice"] = load_choice(track_key)
     points = (keypoints.Keypoints & key & restriction).keys()
     if points:
-        found["keypoints"] = load_keypoints(_single(points, "keypoint_method", restriction))
+        found["keypoints"] = load_keypoints(_single(points, "keypoints", keypoints.Keypoints.primary_key))
     if fitted is not None and name in metrics:
         found["events"], found["cycles"] = metrics[name].events, metrics[name].cycles
     return dataclasses.replace(out, **found, problem=_problem(key, found.get("choice"), fitted))

@@ -98,6 +98,10 @@ def test_many_visits_are_each_as_alone(tables: None, tmp_path: Path, monkeypatch
     alone = pbl("export", "--subject", "P001", "--session", "nach OP é", *wanted, "--out", tmp_path / "alone")
     assert alone.code == 0, alone.err
     assert _files(tmp_path / "alone") == _files(tmp_path / "all" / "P001" / "nach OP _")
+    several = pbl("export", "--subject", "P001", *wanted, "--out", tmp_path / "several")
+    assert several.error_code == "USAGE"
+    assert "2 visits match: session_label 2026-03-01, nach OP é" in several.err
+    assert "add `--session 2026-03-01` or `--session nach OP é`" in several.err
     # One that cannot be exported does not hold up the others, and the exit status says that there was one.
     failed = fit.SessionFit & (session.Session & {"subject": "P001", "session_label": "2026-03-01"})
     check = {"fit_check": "residual_2d_px", "fit_check_outcome": "FAIL", "fit_check_advice": "look at the overlay"}
@@ -141,4 +145,8 @@ def test_visits_that_are_not_there_or_are_ambiguous(tables: None, tmp_path: Path
     ambiguous = pbl("export", "--all", *out)
     assert ambiguous.error_code == "USAGE"
     assert "fit_method blazepose-v" in ambiguous.err
+    ambiguous = pbl("export", "--subject", "P001", *out)
+    assert ambiguous.error_code == "USAGE"
+    assert "2 fits match: fit_method blazepose-v" in ambiguous.err
+    assert "or `--fit-method gauss-newton-v" in ambiguous.err
     assert pbl("export", "--all", "--fit-method", "gauss-newton", *out).code == 0
