@@ -67,6 +67,7 @@ CODES: dict[str, str] = {
     "BACKUP_INVALID": "a backup is incomplete or was changed",
     "TIME_LIMIT": "a job took longer than a worker gives it and was ended",
     "WORKER_CRASH": "a job took its worker's process down more than once",
+    "DECIDED_MEANWHILE": "somebody else decided, or it was computed anew, since the page was loaded",
     "WEB_PORT": "the review page cannot listen on that port",
     "USAGE": "the command was called in a way that cannot work",
     "INTERNAL": "an unforeseen error: please report it with the whole text",

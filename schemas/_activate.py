@@ -19,6 +19,7 @@ STAGES = (
     "validation",
     "privacy",
     "study",
+    "review",
     "worker",
 )
 

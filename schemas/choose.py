@@ -137,17 +137,27 @@ def choose_person(video_id: int, person: int, tracking_method: str | None = None
         DB_NOT_FOUND for a video that is not registered, SUBJECT_UNKNOWN_PERSON, SOLVER_UNKNOWN; USAGE where several
         methods track the video and none is named, or another one.
     """
-    key = _key(video_id, tracking_method)
-    selections = (tracking.TrackingSelection & key).keys()
-    if len(selections) != 1:
-        raise _which_tracking(video_id, tracking_method)
+    selection = selection_of(video_id, tracking_method)
     failed = jobs_of(tracking.SubjectChoice)  # declares the job table, which would end a transaction
     connection = tracking.schema.connection
     assert connection is not None
     with connection.transaction:
-        tracking.set_override(selections[0], person)
-        (failed.errors & selections[0]).delete_quick()
-        return tracking.drop_outdated_choices(key)
+        return choice_applied(selection, person, failed)
+
+
+def selection_of(video_id: int, tracking_method: str | None = None) -> dict[str, Any]:
+    """Key of the one TrackingSelection that is meant. Raises `PblError` as `choose_person` does."""
+    selections = (tracking.TrackingSelection & _key(video_id, tracking_method)).keys()
+    if len(selections) != 1:
+        raise _which_tracking(video_id, tracking_method)
+    return dict(selections[0])
+
+
+def choice_applied(selection: dict[str, Any], person: int, failed: Any) -> dict[str, int]:
+    """What `choose_person` does inside its transaction; `failed`: the job table of SubjectChoice."""
+    tracking.set_override(selection, person)
+    (failed.errors & selection).delete_quick()
+    return tracking.drop_outdated_choices(selection)
 
 
 def _which_tracking(video_id: int, tracking_method: str | None) -> PblError:

@@ -30,8 +30,9 @@ class RecordingRow:
 
 @dataclasses.dataclass(frozen=True)
 class VisitCheck:
-    """A check of a visit; video_id: of the recording that it is about, None for the visit."""
+    """A check of a visit; number: its `qc_no`; video_id: of the recording that it is about, None for the visit."""
 
+    number: int
     check: Check
     video_id: int | None
 
@@ -48,7 +49,7 @@ class MeasureRow:
 @dataclasses.dataclass(frozen=True)
 class VisitPage:
     """A visit. results: by every chain of methods, `shown` the number of the one whose measures and checks stand here
-    (None: there is none)."""
+    (None: there is none); key: that of its row of SessionGdi; computed: when its checks were."""
 
     visit: VisitRow
     of_person: tuple[VisitRow, ...]
@@ -57,6 +58,8 @@ class VisitPage:
     shown: int | None
     measures: tuple[MeasureRow, ...]
     checks: tuple[VisitCheck, ...]
+    key: dict[str, Any]
+    computed: str
 
 
 def visit_about(session_id: int, shown: int = 0) -> VisitPage:
@@ -90,6 +93,8 @@ def visit_about(session_id: int, shown: int = 0) -> VisitPage:
         shown=shown if results else None,
         measures=_measures(key) if key else (),
         checks=checks_of(key) if key else (),
+        key=key,
+        computed="".join(str(t) for t in (qc.SessionQc & key).to_arrays("qc_computed")) if key else "",
     )
 
 
@@ -111,7 +116,7 @@ def checks_of(key: dict[str, Any]) -> tuple[VisitCheck, ...]:
     for row in rows:
         values = [row[c] for c in qc.COLUMNS]
         video_id = row["qc_video_id"]
-        out.append(VisitCheck(Check(*values), None if video_id is None else int(video_id)))
+        out.append(VisitCheck(int(row["qc_no"]), Check(*values), None if video_id is None else int(video_id)))
     return tuple(out)
 
 

@@ -19,7 +19,7 @@ from starlette.staticfiles import StaticFiles
 
 from pbl_pipeline.errors import PblError
 
-from . import access, find, look
+from . import access, decide, find, look
 from .pages import Pages
 from .tables import Tables
 from .videos import Videos
@@ -106,6 +106,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
             Route("/language", language, methods=["POST"]),
             *find.routes(pages, tables),
             *look.routes(pages, tables, videos),
+            *decide.routes(pages, tables),
             Mount("/static", StaticFiles(directory=files / "static")),
             Mount("/vendor", StaticFiles(directory=files / "vendor")),
         ],

@@ -12,7 +12,7 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 
-from schemas import visit_list
+from schemas import decide, visit_list
 
 from .access import Session, form_of
 from .pages import Pages
@@ -60,7 +60,9 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
         shown = request.query_params.get("result", "0")
         number = int(shown) if shown.isdecimal() and len(shown) < 4 else LARGEST
         about = await tables.ask(visit_about, number_of(request), number)
-        return pages.show(request, "visit.html", about=about, interval=interval)
+        decided = await tables.ask(decide.decisions, about.visit.session_id)
+        accepted = await tables.ask(decide.accepted, about.key) if about.key else {}
+        return pages.show(request, "visit.html", about=about, decisions=decided, accepted=accepted, interval=interval)
 
     return [
         Route("/visits", visits, methods=["GET", "POST"]),

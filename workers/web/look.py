@@ -10,7 +10,7 @@ from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
 from pbl_pipeline.errors import PblError
-from schemas import recording_page
+from schemas import choose, decide, recording_page
 
 from .find import number_of
 from .movement import movement_json, outlines
@@ -34,7 +34,8 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
                 await tables.ask(videos.path, about.video_id)
             except PblError as error:
                 problem = error
-        return pages.show(request, "recording.html", about=about, no_video=problem)
+        people, seen = await tables.ask(_people, about) if about.has_pictures else ([], [])
+        return pages.show(request, "recording.html", about=about, no_video=problem, people=people, seen=seen)
 
     async def video(request: Request) -> Response:
         path = await tables.ask(videos.path, number_of(request))
@@ -66,6 +67,17 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
         Route("/recordings/{number:int}/movement", movement),
         Route("/recordings/{number:int}/body", body),
     ]
+
+
+def _people(about: recording_page.RecordingPage) -> tuple[list[choose.Candidates], list[str]]:
+    """Who can be chosen, by tracking method, and the state in which that is shown. Empty before people are searched."""
+    try:
+        found = choose.candidates(about.video_id)
+    except PblError as error:
+        if error.code != "DB_NOT_FOUND":
+            raise
+        return [], []
+    return found, [decide.person_state(about.video_id, c.key["tracking_method"]) for c in found]
 
 
 def own_address(text: str) -> str:

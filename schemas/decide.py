@@ -1,0 +1,182 @@
+"""Decisions of people who look at results, each with a row that says who decided, when, and what was before."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from collections.abc import Mapping
+from typing import Any
+
+from pbl_pipeline.errors import PblError
+
+from . import fit, qc, session, tracking, video
+from .choose import choice_applied, selection_of
+from .ingest import next_id
+from .jobs import jobs_of
+from .review import Decision
+from .rows import utc_now
+
+
+@dataclasses.dataclass(frozen=True)
+class Decided:
+    """A row of Decision."""
+
+    number: int
+    what: str
+    by: str
+    at: datetime.datetime
+    about: Mapping[str, Any]
+    before: Mapping[str, Any]
+    after: Mapping[str, Any]
+    reason: str
+    video_id: int | None
+
+
+def decisions(session_id: int) -> tuple[Decided, ...]:
+    """What was decided about a visit and its videos, the last first."""
+    videos = [{"video_id": int(v)} for v in (video.Video & {"session_id": session_id}).to_arrays("video_id")]
+    rows = (Decision & [{"session_id": session_id}, *videos]).to_dicts(order_by="decision_id DESC")
+    return tuple(_decided(row) for row in rows)
+
+
+def person_state(video_id: int, tracking_method: str) -> str:
+    """What is shown of the choice in a video: another text after each decision, also one by `pbl choose`."""
+    key = {"video_id": video_id, "tracking_method": tracking_method}
+    last = max((int(n) for n in (Decision & {"video_id": video_id}).to_arrays("decision_id")), default=0)
+    by_hand = (tracking.SubjectOverride & key).to_arrays("override_person_id")
+    chosen = (tracking.SubjectChoice & key).to_arrays("chosen_person_id")
+    return f"{last}-{by_hand[0] if len(by_hand) else ''}-{chosen[0] if len(chosen) else ''}"
+
+
+def decide_person(video_id: int, tracking_method: str, person: int, by: str, seen: str) -> dict[str, int]:
+    """Measure `person` of a video: as `schemas.choose.choose_person`, with a row of Decision in the same transaction.
+
+    Parameters
+    ----------
+    seen
+        `person_state` of the page on which it was decided.
+
+    Returns
+    -------
+    dict
+        Table name to number of deleted rows, which the next populate computes anew.
+
+    Raises
+    ------
+    PblError
+        DECIDED_MEANWHILE where the state is another one by now; what `choose_person` raises.
+    """
+    selection = selection_of(video_id, tracking_method)
+    failed = jobs_of(tracking.SubjectChoice)  # declares the job table, which would end a transaction
+    connection = tracking.schema.connection
+    assert connection is not None
+    with connection.transaction:
+        table = video.Video.full_table_name  # who decides at the same moment waits here
+        connection.query(f"SELECT video_id FROM {table} WHERE video_id = %s FOR UPDATE", args=(video_id,))  # noqa: S608
+        if person_state(video_id, tracking_method) != seen:
+            raise _meanwhile(video_id)
+        rows = (tracking.SubjectChoice & selection).to_dicts()
+        before = {"status": rows[0]["choice_status"], "person": rows[0]["chosen_person_id"]} if rows else {}
+        deleted = choice_applied(selection, person, failed)
+        _insert("person", by, {"tracking_method": tracking_method}, before, {"person": person}, video_id=video_id)
+    return deleted
+
+
+def accept_check(key: Mapping[str, Any], number: int, by: str, reason: str = "") -> None:
+    """Accept a check of a visit that asks for attention, with one's name; nothing is computed anew.
+
+    It holds for this result: when the checks are computed again, they ask again. Accepted already: nothing happens.
+
+    Parameters
+    ----------
+    key, number
+        Key of SessionQc and `qc_no` of the check.
+
+    Raises
+    ------
+    PblError
+        DB_NOT_FOUND where there is no such check (any more), USAGE for one that is not WARN.
+    """
+    connection = qc.schema.connection
+    assert connection is not None
+    key = {k: key[k] for k in qc.SessionQc.primary_key}
+    with connection.transaction:
+        session_id = int((fit.FitSet & key).fetch1("session_id"))
+        table = session.Session.full_table_name
+        connection.query(f"SELECT session_id FROM {table} WHERE session_id = %s FOR UPDATE", args=(session_id,))  # noqa: S608
+        rows = (qc.SessionQc.proj("qc_computed") * qc.SessionQc.Check & key & {"qc_no": number}).to_dicts()
+        if not rows:
+            raise PblError(
+                "DB_NOT_FOUND",
+                found=f"no check {number} of this result",
+                expected="a check that the page shows",
+                next_step="load the page again: it may have been computed anew",
+                key=f"session_id={session_id}",
+            )
+        if rows[0]["qc_check_outcome"] != "WARN":
+            raise PblError(
+                "USAGE",
+                found=f"{rows[0]['qc_check']} is {rows[0]['qc_check_outcome']}",
+                expected="a check that asks for attention (WARN)",
+                next_step="what failed is not accepted: it is recorded or computed again",
+                key=f"session_id={session_id}",
+            )
+        if number in accepted(key):
+            return
+        about = {**key, "computed": str(rows[0]["qc_computed"]), "qc_no": number, "check": rows[0]["qc_check"]}
+        after = {"outcome": "accepted"}
+        _insert("check", by, about, {"outcome": "WARN"}, after, reason, session_id=session_id)
+
+
+def accepted(key: Mapping[str, Any]) -> dict[int, Decided]:
+    """Checks of a result (key of SessionQc) that were accepted since it was computed, by `qc_no`."""
+    key = {k: key[k] for k in qc.SessionQc.primary_key}
+    rows = (qc.SessionQc.proj("qc_computed") * fit.FitSet.proj("session_id") & key).to_dicts()
+    if not rows:
+        return {}
+    of_result = {**key, "computed": str(rows[0]["qc_computed"])}
+    found = (Decision & {"session_id": rows[0]["session_id"], "decision_what": "check"}).to_dicts()
+    return {
+        int(row["decision_about"]["qc_no"]): _decided(row)
+        for row in found
+        if all(row["decision_about"].get(k) == v for k, v in of_result.items())
+    }
+
+
+def _insert(what: str, by: str, about: dict, before: dict, after: dict, reason: str = "", **of: int) -> None:
+    Decision.insert1(
+        {
+            "decision_id": next_id(Decision, "decision_id"),
+            **of,
+            "decision_what": what,
+            "decision_by": by[:64],
+            "decision_at": utc_now(),
+            "decision_about": about,
+            "decision_before": before,
+            "decision_after": after,
+            "decision_reason": reason[:500],
+        }
+    )
+
+
+def _decided(row: Mapping[str, Any]) -> Decided:
+    parts = {k: row[f"decision_{k}"] for k in ("what", "by", "at", "about", "before", "after", "reason")}
+    number = row["video_id"]
+    return Decided(int(row["decision_id"]), **parts, video_id=None if number is None else int(number))
+
+
+def _meanwhile(video_id: int) -> PblError:
+    rows = (Decision & {"video_id": video_id}).to_dicts(order_by="decision_id DESC", limit=1)
+    last = rows[0] if rows else None
+    who = (
+        f"{last['decision_by']} decided for person {last['decision_after'].get('person')} at {last['decision_at']} UTC"
+        if last
+        else "the choice was made or computed anew"
+    )
+    return PblError(
+        "DECIDED_MEANWHILE",
+        found=f"since this page was loaded {who}",
+        expected="the state that the page showed; nothing of yours was written",
+        next_step="load the page again, look at what was decided, and decide then",
+        key=f"video_id={video_id}",
+    )

@@ -1,0 +1,158 @@
+"""Deciding in the review page: who is measured, a warning accepted; rows, conflicts and rights."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pbl_pipeline.errors import PblError
+from schemas import choose, decide, fit, forget, qc, tracking
+from schemas.review import Decision
+from tests.integration import web
+from tests.integration.chain import small_video
+from tests.rows import everything, register
+from workers.populate import populate
+
+
+@pytest.fixture
+def two_alike(tables: None, tmp_path: Path) -> int:
+    """A video in which somebody has to be chosen."""
+    number = register(small_video(tmp_path, "walk", people="two alike"), session_label="2026-01-10")[0]
+    populate()
+    assert tracking.SubjectChoice.fetch1("choice_status") == "NEEDS_CHOICE"
+    return number
+
+
+def form_of(browser: Any, number: int) -> dict[str, str]:
+    """The hidden fields of the form in which a person is chosen."""
+    page = browser.get(f"/recordings/{number}").text
+    form = page[page.index(f'action="/recordings/{number}/person"') :]
+    return dict(re.findall(r'type="hidden" name="([a-z]+)" value="([^"]*)"', form))
+
+
+def send(browser: Any, number: int, fields: dict[str, str], person: int):
+    return browser.post(f"/recordings/{number}/person", data={**fields, "person": person}, follow_redirects=False)
+
+
+def test_two_people_decide_at_once_and_the_second_sees_it(two_alike: int):
+    first, second = web.client(name="A. First"), web.client(name="B. Second")
+    forms = [form_of(b, two_alike) for b in (first, second)]
+    assert send(first, two_alike, forms[0], 2).status_code == 303
+    late = send(second, two_alike, forms[1], 1)
+    assert late.status_code == 409
+    assert "DECIDED_MEANWHILE" in late.text
+    assert "A. First decided for person 2" in late.text
+    assert tracking.SubjectOverride.fetch1("override_person_id") == 2
+    (row,) = Decision().to_dicts()
+    assert (row["video_id"], row["session_id"], row["decision_by"]) == (two_alike, None, "A. First")
+    assert row["decision_before"] == {"status": "NEEDS_CHOICE", "person": None}
+    assert row["decision_after"] == {"person": 2}
+    populate()  # what depends on it is computed
+    assert tracking.SubjectChoice.fetch1("choice_status", "chosen_person_id") == ("MANUAL", 2)
+    assert len(fit.SessionFit()) == 1
+    # Having seen it, the second decides otherwise: exactly what was computed for the other person goes.
+    assert send(second, two_alike, form_of(second, two_alike), 1).status_code == 303
+    assert len(tracking.Tracking()) == 1
+    assert len(tracking.SubjectChoice()) == 0
+    history = second.get("/visits/1").text
+    assert history.index("B. Second") < history.index("A. First")
+
+
+def test_a_choice_on_the_command_line_is_seen_too(two_alike: int):
+    browser = web.client()
+    form = form_of(browser, two_alike)
+    choose.choose_person(two_alike, 1)
+    assert send(browser, two_alike, form, 2).status_code == 409
+    assert tracking.SubjectOverride.fetch1("override_person_id") == 1
+
+
+@pytest.mark.parametrize("person", ["99", "0", "-1", "1.5", "1 or 1=1", "99999999999", ""])
+def test_a_forged_person_changes_nothing(two_alike: int, person: str):
+    browser, before = web.client(), everything()
+    form = form_of(browser, two_alike)
+    answer = browser.post(f"/recordings/{two_alike}/person", data={**form, "person": person}, follow_redirects=False)
+    assert answer.status_code in (409, 415), answer.text
+    assert everything() == before
+
+
+@pytest.mark.parametrize("change", [{"method": "none"}, {"seen": ""}, {"seen": "'--"}, {"token": ""}])
+def test_a_forged_form_changes_nothing(two_alike: int, change: dict[str, str]):
+    browser, before = web.client(), everything()
+    answer = send(browser, two_alike, {**form_of(browser, two_alike), **change}, 1)
+    assert answer.status_code in (400, 403, 409)
+    assert send(browser, 999, form_of(browser, two_alike), 1).status_code in (400, 404)
+    assert everything() == before
+
+
+def test_a_reader_looks_and_does_not_decide(two_alike: int):
+    reader, before = web.client(role="reader"), everything()
+    assert "Your role looks" in reader.get(f"/recordings/{two_alike}").text
+    assert send(reader, two_alike, form_of(reader, two_alike), 1).status_code == 403
+    assert everything() == before
+
+
+def test_the_picture_of_the_people(two_alike: int, monkeypatch: pytest.MonkeyPatch):
+    browser = web.client()
+    picture = browser.get(f"/recordings/{two_alike}/people?method=0")
+    assert (picture.status_code, picture.content[:3]) == (200, b"\xff\xd8\xff")
+    assert browser.get(f"/recordings/{two_alike}/people?method=7").status_code == 404
+    monkeypatch.setenv("PBL_DEIDENTIFY", "blur")  # it shows faces
+    assert browser.get(f"/recordings/{two_alike}/people?method=0").status_code == 404
+    assert "/people" not in browser.get(f"/recordings/{two_alike}").text
+
+
+@pytest.fixture
+def warned(tables: None, tmp_path: Path) -> dict[str, Any]:
+    """A computed visit, number 1; the row of its check `residual_3d_cm`, which is WARN."""
+    register(small_video(tmp_path, "walk"), session_label="2026-01-10")
+    populate()
+    return (qc.SessionQc.proj("qc_computed") * qc.SessionQc.Check & {"qc_check": "residual_3d_cm"}).fetch1()
+
+
+def accept(browser: Any, row: dict[str, Any], **change: object):
+    fields = {"result": 0, "check": row["qc_no"], "computed": str(row["qc_computed"]), **change}
+    return web.post(browser, "/visits/1/accept", **fields)
+
+
+def test_a_warning_is_accepted_with_a_name_until_it_is_computed_anew(warned: dict[str, Any]):
+    browser = web.client(name="A. First")
+    assert "accepted by" not in browser.get("/visits/1").text
+    assert accept(browser, warned, reason="<b>looked at the overlay").status_code == 303
+    assert accept(web.client(name="B. Second"), warned).status_code == 303  # accepted already
+    page = browser.get("/visits/1").text
+    assert "accepted by A. First" in page
+    assert "&lt;b&gt;looked at the overlay" in page
+    (row,) = Decision().to_dicts()
+    assert (row["session_id"], row["video_id"], row["decision_before"]) == (1, None, {"outcome": "WARN"})
+    key = {k: warned[k] for k in qc.SessionQc.primary_key}
+    qc.SessionQc.update1({**key, "qc_computed": "2030-01-01 00:00:00"})  # as if computed again
+    assert "accepted by" not in browser.get("/visits/1").text
+    assert accept(browser, warned).status_code == 409
+    assert len(decide.decisions(1)) == 1  # what was decided stays in the history
+
+
+def test_only_warnings_can_be_accepted(warned: dict[str, Any]):
+    key = {k: warned[k] for k in (*qc.SessionQc.primary_key, "qc_no")}
+    assert accept(web.client(), warned, check=999).status_code == 404
+    assert accept(web.client(), warned, check="x").status_code == 415
+    assert accept(web.client(), warned, result=5).status_code == 404
+    qc.SessionQc.Check.update1({**key, "qc_check_outcome": "FAIL"})
+    with pytest.raises(PblError, match="asks for attention"):
+        decide.accept_check(key, warned["qc_no"], "A")
+    assert len(Decision()) == 0
+
+
+def test_a_forgotten_person_takes_the_decisions_along(warned: dict[str, Any]):
+    accept(web.client(), warned)
+    decide.decide_person(1, *_chosen(), "A", decide.person_state(1, _chosen()[0]))
+    assert len(Decision()) == 2
+    assert not forget.forget("P001").left
+    assert len(Decision()) == 0
+    forget.manifest_path("P001").unlink()
+
+
+def _chosen() -> tuple[str, int]:
+    return tracking.SubjectChoice.fetch1("tracking_method", "chosen_person_id")

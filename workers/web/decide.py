@@ -1,0 +1,82 @@
+"""Decide: who is measured, and which warnings are accepted. Each decision is a row (`schemas.decide`)."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from starlette.requests import Request
+from starlette.responses import RedirectResponse, Response
+from starlette.routing import Route
+
+from pbl_pipeline import settings
+from pbl_pipeline.errors import PblError
+from schemas import choose, decide
+
+from .access import Refused, Session, form_of
+from .find import LARGEST, number_of
+from .pages import Pages
+from .tables import Tables
+
+
+def routes(pages: Pages, tables: Tables) -> list[Route]:
+    """The addresses of this part."""
+
+    async def person(request: Request) -> Response:
+        fields = await form_of(request, "decide")
+        session: Session = request.state.session
+        number = number_of(request)
+        chosen = _number(fields.get("person", ""))
+        method, seen = fields.get("method", ""), fields.get("seen", "")
+        await tables.ask(decide.decide_person, number, method, chosen, session.name, seen)
+        return RedirectResponse(f"/recordings/{number}", 303)
+
+    async def accept(request: Request) -> Response:
+        from schemas.visit_page import visit_about
+
+        fields = await form_of(request, "decide")
+        session: Session = request.state.session
+        number, shown = number_of(request), _number(fields.get("result", ""))
+
+        def write() -> None:
+            about = visit_about(number, shown)
+            if not about.key or about.computed != fields.get("computed"):
+                raise PblError(
+                    "DECIDED_MEANWHILE",
+                    found="the checks were computed anew since this page was loaded",
+                    expected="the checks that the page showed; nothing of yours was written",
+                    next_step="load the page again and look at them",
+                    key=f"session_id={number}",
+                )
+            reason = fields.get("reason", "").strip()
+            decide.accept_check(about.key, _number(fields.get("check", "")), session.name, reason)
+
+        await tables.ask(write)
+        return RedirectResponse(f"/visits/{number}?result={shown}", 303)
+
+    async def people(request: Request) -> Response:
+        """The picture of the numbered people. It is of the original: none where heads are to be hidden."""
+        number, which = number_of(request), _number(request.query_params.get("method", "0"))
+
+        def picture() -> bytes:
+            if settings.deidentify_how():
+                raise choose.unknown_video(number)
+            found = choose.candidates(number)
+            if which >= len(found):
+                raise choose.unknown_video(number)
+            with tempfile.TemporaryDirectory() as folder:
+                return choose.write_sheet(found[which], Path(folder) / "people.jpg").read_bytes()
+
+        return Response(await tables.ask(picture), media_type="image/jpeg")
+
+    return [
+        Route("/recordings/{number:int}/person", person, methods=["POST"]),
+        Route("/recordings/{number:int}/people", people),
+        Route("/visits/{number:int}/accept", accept, methods=["POST"]),
+    ]
+
+
+def _number(text: str) -> int:
+    if not text.isdecimal() or len(text) > 9 or int(text) > LARGEST:
+        raise Refused("form")
+    return int(text)
