@@ -175,7 +175,7 @@ def _step_by_step(body: Body, p: Problem, w: Weights, begin: Progress, limits: L
     if not progress.enabled():
         return _one(body, p, w, begin, limits)
     most, at = int(limits.iterations), begin
-    with progress.bar("fit", unit="iteration") as update:
+    with progress.bar("fit", unit=" iterations") as update:
         for n in range(most + 1):  # the first one evaluates the start
             at = _one(body, p, w, at, dataclasses.replace(limits, iterations=jnp.asarray(n, jnp.int32)))
             update(min(n, 1), f"of at most {most}, cost {float(at.cost):.4g}")
