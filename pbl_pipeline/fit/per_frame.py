@@ -164,8 +164,7 @@ def _begin_many(body: Body, p: Problem, w: Weights, start: State) -> Progress:
     return jax.vmap(functools.partial(begin_of, body), in_axes=(0, None, 0))(p, w, start)
 
 
-# What the iteration begins with makes room for what it ends with: a batch on a GPU lies there once.
-@functools.partial(jax.jit, static_argnames="body", donate_argnames="begin")
+@functools.partial(jax.jit, static_argnames="body")
 def _many(body: Body, p: Problem, w: Weights, begin: Progress, limits: Limits) -> Progress:
     return jax.vmap(functools.partial(fit_problem, body), in_axes=(0, None, 0, None))(p, w, begin, limits)
 

@@ -71,7 +71,10 @@ def roles(
         )
     if own and not user:
         raise PblError(
-            "USAGE", found="--schema without --user", expected="the account that may use it", next_step="name it"
+            "USAGE",
+            found="--schema without --user",
+            expected="the account that may use it",
+            next_step="add --role analyst --user NAME",
         )
     where = host or ("localhost" if connection.external() else "127.0.0.1")
     chosen = names or tuple(lib.ROLES)
