@@ -22,8 +22,8 @@ from .status import queue_name
 
 #: Visits of a page.
 PAGE = 50
-#: What is asked of the state of a visit.
-STATES = ("computed", "pending", "waiting", "failed")
+#: What is asked of the state of a visit; empty: nobody is in any of its videos.
+STATES = ("computed", "pending", "waiting", "failed", "empty")
 #: Outcomes of the checks that can be asked for.
 OUTCOMES = ("PASS", "WARN", "EMPTY", "NEEDS_CHOICE", "FAIL")
 #: Checks (q) of measures (g).
@@ -221,7 +221,7 @@ def _asked(wanted: Filter) -> tuple[list[str], list[str], list[Any]]:
         only("j", f"{_judged()} WHERE q.qc_outcome = %s", wanted.quality)
     if wanted.state in ("computed", "pending"):
         # Asked for first: as a part of the question the server would answer them for each visit.
-        apart = {int(i) for question in (_waiting(), _failed()) for (i,) in _ask(question, [])}
+        apart = {int(i) for question in (_waiting(), _failed(), _empty()) for (i,) in _ask(question, [])}
         unfinished = {int(i) for (i,) in _ask(_unfinished(), [])}
         with_set = f"EXISTS (SELECT 1 FROM {_name(fit.FitSet)} p WHERE p.session_id = s.session_id)"
         if wanted.state == "computed":
@@ -232,7 +232,7 @@ def _asked(wanted: Filter) -> tuple[list[str], list[str], list[Any]]:
             add(f"(NOT {with_set}{listed})", *unfinished)
             outside(apart)
     elif wanted.state:
-        only("x", _waiting() if wanted.state == "waiting" else _failed())
+        only("x", {"waiting": _waiting, "failed": _failed, "empty": _empty}[wanted.state]())
     return joins, where, [*of_joins, *of_where]
 
 
@@ -259,6 +259,17 @@ def _waiting() -> str:
     videos, chosen = _name(video.Video), _name(tracking.SubjectChoice)
     waiting = f"{chosen} t JOIN {videos} o USING (video_id) WHERE t.choice_status = 'NEEDS_CHOICE'"
     return f"SELECT DISTINCT o.session_id FROM {waiting}"
+
+
+def _empty() -> str:
+    """Visits in whose videos nobody is."""
+    videos, chosen = _name(video.Video), _name(tracking.SubjectChoice)
+    nobody = f"SELECT t.video_id FROM {chosen} t WHERE t.choice_status = 'NO_PERSON'"
+    some = f"SELECT b.session_id FROM {videos} b JOIN ({nobody}) c ON c.video_id = b.video_id"
+    return (
+        f"SELECT o.session_id FROM {videos} o LEFT JOIN ({nobody}) n ON n.video_id = o.video_id"
+        f" WHERE o.session_id IN ({some}) GROUP BY o.session_id HAVING SUM(n.video_id IS NULL) = 0"
+    )
 
 
 def _failed(column: str = "") -> str:
@@ -303,6 +314,7 @@ def _visit_rows(rows: Sequence[Sequence[Any]]) -> tuple[VisitRow, ...]:
     )
     videos = dict(_ask(counted, ids))
     waiting = {int(s) for (s,) in _ask(f"{_waiting()} AND o.session_id IN ({listed})", ids)}
+    empty = {int(s) for (s,) in _ask(f"SELECT session_id FROM ({_empty()}) x WHERE session_id IN ({listed})", ids)}
     open_sets = {int(s) for (s,) in _ask(f"{_unfinished()} AND f.session_id IN ({listed})", ids)}
     errors = f"SELECT session_id, error_message FROM ({_failed('error_message')}) x WHERE session_id IN ({listed})"
     failed = {int(s): error_code(message) for s, message in _ask(errors, ids)}
@@ -311,7 +323,8 @@ def _visit_rows(rows: Sequence[Sequence[Any]]) -> tuple[VisitRow, ...]:
         i = int(session_id)
         found = results[i]
         computed = bool(found) and i not in open_sets
-        state = "failed" if i in failed else "waiting" if i in waiting else "computed" if computed else "pending"
+        states = (("failed", i in failed), ("waiting", i in waiting), ("empty", i in empty), ("computed", computed))
+        state = next((name for name, holds in states if holds), "pending")
         first = found[0] if found else None
         out.append(
             VisitRow(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import html
+import io
 import re
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
 from workers.populate import populate
-from workers.web import Options, create_app
+from workers.web import Options, create_app, take
 from workers.web.access import HOURS, Sessions
 
 
@@ -54,7 +56,7 @@ def test_filters_of_the_list_and_their_order(four_visits: None):
     assert numbers(Filter(first_day=datetime.date(2026, 2, 1))) == [2, 4]
     assert numbers(Filter(last_day=datetime.date(2026, 2, 1), cohort="spine")) == [1]
     assert numbers(Filter(state="pending")) == [2, 4, 1, 3]
-    assert [numbers(Filter(state=s)) for s in ("computed", "waiting", "failed")] == [[], [], []]
+    assert [numbers(Filter(state=s)) for s in ("computed", "waiting", "failed", "empty")] == [[], [], [], []]
     assert visit_list.choices() == {"cohort": ["spine"], "role": ["pre", "3_months"]}
 
 
@@ -69,9 +71,10 @@ def test_pages_of_the_list_hold_every_visit_once(four_visits: None):
     assert found == [2, 4, 1, 3]
 
 
-def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Path):
+def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for day in ("2026-01-10", "2026-04-10"):
         register(small_video(tmp_path, f"walk {day}"), session_label=day)
+    nobody = register(small_video(tmp_path, "none", people="nobody"), subject="P004", session_label="2026-02-03")[0]
     waits = register(small_video(tmp_path, "two", people="two alike"), subject="P002", session_label="2026-02-01")[0]
     broken = tmp_path / "gone.mp4"
     broken.write_bytes(small_video(tmp_path, "gone").read_bytes() + b"x")
@@ -93,7 +96,14 @@ def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Pa
     assert [rows[k].state for k in ("P0022026-02-01", "P0032026-02-02")] == ["waiting", "failed"]
     assert rows["P0032026-02-02"].problem == "VIDEO_MISSING"
     by_state = {s: numbers(Filter(state=s)) for s in visit_list.STATES}
-    assert {s: len(n) for s, n in by_state.items()} == {"computed": 2, "pending": 0, "waiting": 1, "failed": 1}
+    counts = {s: len(n) for s, n in by_state.items()}
+    assert counts == {
+        "computed": 2,
+        "pending": 0,
+        "waiting": 1,
+        "failed": 1,
+        "empty": 1,
+    }
     assert sorted(numbers(Filter(quality=later.result.outcome))) == [1, 2]
     page = web.client().get("/visits").text
     assert "+10.0 since 2026-01-10: more than chance" in page
@@ -104,7 +114,17 @@ def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Pa
     assert "look at the overlay" in visit  # the advice of the check
     stopped = web.client().get(f"/visits/{rows['P0032026-02-02'].session_id}").text
     assert "VIDEO_MISSING" in html.unescape(stopped)
-    assert waits != gone
+    assert "a fit without one marker" in web.client().get(f"/visits/{later.session_id}/export").text
+    monkeypatch.setattr(take, "FORMATS", ("csv", "mot"))  # the stand-in of the fit has no markers for a .trc
+    taken = web.client().get(f"/visits/{later.session_id}/export")
+    assert taken.status_code == 200, taken.text
+    assert taken.headers["content-disposition"] == f'attachment; filename="visit_{later.session_id}.zip"'
+    names = zipfile.ZipFile(io.BytesIO(taken.content)).namelist()
+    assert {Path(n).suffix for n in names} >= {".csv", ".mot"}
+    assert not any("walk" in n or "P001" in n for n in names)
+    assert web.client().get(f"/visits/{rows['P0032026-02-02'].session_id}/export").status_code == 404
+    assert rows["P0042026-02-03"].state == "empty"
+    assert len({waits, gone, nobody}) == 3
 
 
 def visit_list_key(number: int) -> dict[str, str]:

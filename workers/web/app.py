@@ -19,7 +19,7 @@ from starlette.staticfiles import StaticFiles
 
 from pbl_pipeline.errors import PblError
 
-from . import access, decide, find, look
+from . import access, decide, find, look, take
 from .pages import Pages
 from .tables import Tables
 from .videos import Videos
@@ -107,6 +107,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
             *find.routes(pages, tables),
             *look.routes(pages, tables, videos),
             *decide.routes(pages, tables),
+            *take.routes(pages, tables),
             Mount("/static", StaticFiles(directory=files / "static")),
             Mount("/vendor", StaticFiles(directory=files / "vendor")),
         ],

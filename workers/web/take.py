@@ -1,0 +1,71 @@
+"""Take along: a visit's movement as files of other programs."""
+
+from __future__ import annotations
+
+import asyncio
+import tempfile
+import zipfile
+from pathlib import Path
+
+from starlette.background import BackgroundTask
+from starlette.requests import Request
+from starlette.responses import FileResponse, Response
+from starlette.routing import Route
+
+from pbl_pipeline.errors import PblError
+
+from .find import LARGEST, number_of
+from .pages import Pages
+from .tables import Tables
+
+#: Formats of the archive: those that need no further package.
+FORMATS = ("csv", "trc", "mot")
+
+
+def routes(pages: Pages, tables: Tables) -> list[Route]:
+    """The addresses of this part."""
+
+    async def export(request: Request) -> Response:
+        from schemas.export import session_of_tables
+        from schemas.visit_page import visit_about
+
+        number, asked = number_of(request), request.query_params.get("result", "0")
+        shown = int(asked) if asked.isdecimal() and len(asked) < 4 else LARGEST
+
+        def load():
+            about = visit_about(number, shown)
+            if about.shown is None:
+                raise PblError(
+                    "DB_NOT_FOUND",
+                    found=f"no result of session_id {number}",
+                    expected="a visit that was computed",
+                    next_step="`pbl populate`; `pbl status` says what stops it",
+                )
+            kind, fit_method = about.results[shown].kind, about.results[shown].methods[0]
+            wanted = {"session_id": number, "fit_set_kind": kind, "fit_method": fit_method}
+            return session_of_tables(wanted, sensors=False)
+
+        session = await tables.ask(load)
+        folder = tempfile.TemporaryDirectory()
+
+        def write() -> Path:
+            from pbl_pipeline.export import ExportOptions, write_export
+
+            # As a reviewer sees it: what failed a check says so in its files.
+            options = ExportOptions(number_trials=True, allow_failed=True)
+            out, archive = Path(folder.name) / "files", Path(folder.name) / "visit.zip"
+            paths = write_export(session, FORMATS, out, options)
+            with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
+                for path in paths:
+                    file.write(path, path.relative_to(out))
+            return archive
+
+        try:
+            archive = await asyncio.to_thread(write)
+        except BaseException:
+            folder.cleanup()
+            raise
+        remove = BackgroundTask(folder.cleanup)
+        return FileResponse(archive, media_type="application/zip", filename=f"visit_{number}.zip", background=remove)
+
+    return [Route("/visits/{number:int}/export", export)]
