@@ -13,8 +13,8 @@ import click
 @click.option("--visit", type=click.IntRange(min=1), metavar="NUMBER", help="Open this visit (`pbl list visits`).")
 @click.option("--name", metavar="WHO", help="Whose name decisions carry (default: your account's).")
 @click.option(
-    "--role", type=click.Choice(["reader", "reviewer", "operator"]), default="reviewer", show_default=True,
-    help="What may be done: look; also decide; also run jobs again.",
+    "--role", type=click.Choice(["reader", "reviewer"]), default="reviewer", show_default=True,
+    help="What may be done: look; also decide.",
 )  # fmt: skip
 def web(port: int, host: str, visit: int | None, name: str | None, role: str) -> None:
     """Find visits, look at recordings with the fitted body, and decide, in a browser on this machine.

@@ -21,11 +21,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 COOKIE = "pbl_session"
 #: Hours after which a session ends, whatever was done in it.
 HOURS = 12.0
-#: What a role may do: a reader looks, a reviewer also decides, an operator also runs jobs again.
+#: What a role may do: a reader looks, a reviewer also decides.
 RIGHTS: dict[str, frozenset[str]] = {
     "reader": frozenset({"look"}),
     "reviewer": frozenset({"look", "decide"}),
-    "operator": frozenset({"look", "decide", "operate"}),
 }
 #: Longest body of a form (byte), and seconds in which it has to be here.
 BODY_BYTES, BODY_S = 65_536, 10.0
