@@ -117,6 +117,7 @@ ASSETS: dict[str, Asset] = {
             "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f",
             6_440_512,
             *_BLAZEPOSE,
+            optional=True,
         ),
         Asset(
             "blazepose_landmarks_heavy",
@@ -127,7 +128,6 @@ ASSETS: dict[str, Asset] = {
             27_709_200,
             "Apache-2.0",
             "@mediapipe/pose 0.5.1675469404, Google LLC; Bazarevsky et al. 2020, arXiv:2006.10204",
-            optional=True,
         ),
         Asset(
             "face_detector",
@@ -345,7 +345,7 @@ def _unwritable(error: OSError) -> PblError:
     return PblError(
         "ASSET_MISSING",
         found=f"the cache folder cannot be written ({error})",
-        expected="a folder for model and demo files with 200 MB free",
+        expected="a folder for model and demo files with 400 MB free",
         next_step="set PBL_CACHE to a folder of your own with free space",
     )
 

@@ -18,6 +18,8 @@ import zipfile
 from pathlib import Path
 from typing import ClassVar
 
+from . import npm_by_pip
+
 
 @dataclasses.dataclass(frozen=True)
 class Package(abc.ABC):
@@ -90,28 +92,37 @@ class Wheel(Package):
 
 @dataclasses.dataclass(frozen=True)
 class NpmPackage(Package):
-    """Of an npm registry; `npm pack` downloads the tarball as it was published."""
+    """Of an npm registry; `npm pack` downloads the tarball as it was published. Where npm is absent, pip brings it."""
 
     kind: ClassVar[str] = "npm package"
 
     def command(self, into: str | Path) -> list[str]:
-        program = shutil.which("npm") or "npm"
+        npm = shutil.which("npm")
+        return [*([npm] if npm else [sys.executable, "-m", npm_by_pip.__name__]), *self._pack(into)]
+
+    def _pack(self, into: str | Path) -> list[str]:
         quiet = ("--ignore-scripts", "--loglevel=error")
-        return [program, "pack", *quiet, "--pack-destination", str(into), self.requirement]
+        return ["pack", *quiet, "--pack-destination", str(into), self.requirement]
 
     def absent(self) -> str:
+        if shutil.which("npm") or importlib.util.find_spec("pip"):
+            return ""
         remedy = "the system's package manager has it (Debian: `apt-get install npm`)"
-        return "" if shutil.which("npm") else f"this machine has no npm, which fetches it; {remedy}"
+        return f"this machine has neither npm, which fetches it, nor pip, which brings npm; {remedy}"
+
+    def remedy(self) -> str:
+        return shlex.join(["npm", *self._pack(".")])
 
     def environment(self, scratch: Path) -> dict[str, str]:
         return {"npm_config_cache": str(scratch)}
 
     def reason(self, done: subprocess.CompletedProcess[str]) -> str:
         """Npm's first sentence, after its codes; where it cannot connect, that is said first."""
-        lines = _lines(done.stderr, "npm ERR!", "npm error")
+        lines = _lines(done.stderr, "npm ERR!", "npm error", "ERROR")
         errors = [line for line in lines if line and not line.startswith(("code ", "syscall ", "errno "))]
         reason = errors[0] if errors else f"npm ended with code {done.returncode} and brought another file"
-        unreachable = any(code in done.stderr for code in ("ENOTFOUND", "ECONNREFUSED", "EAI_AGAIN", "ETIMEDOUT"))
+        codes = ("ENOTFOUND", "ECONNREFUSED", "EAI_AGAIN", "ETIMEDOUT", "connection broken", "ConnectionError")
+        unreachable = any(code in done.stderr for code in codes)
         return f"no connection to the package registry ({reason})" if unreachable else reason
 
     def read(self, path: Path, member: str) -> bytes:

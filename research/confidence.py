@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import click
@@ -62,24 +62,31 @@ def truth_of(name: str, keypoints: Keypoints, data: Path) -> tuple[PointTruth, s
     return truth_of_trc(keypoints, folder / _TRC, lens), "Pose2Sim balancing trial"
 
 
+def detected(data: Path, folder: Path, method: Method[KeypointParams]) -> Iterator[tuple[str, Keypoints]]:
+    """Name and keypoints by the method of each of the recordings; what is not yet in `folder` is kept there."""
+    for name, video in recordings(data).items():
+        kept = folder / f"{name}.keypoints.npz"
+        if not kept.exists():
+            folder.mkdir(parents=True, exist_ok=True)
+            detect_trial(video, kept.with_suffix(".png"), keypoints=method).keypoints.save(kept)
+        yield name, Keypoints.load(kept)
+
+
 def measured(data: Path, keypoints_folder: Path, method: Method[KeypointParams]) -> list[PointErrors]:
     """The method's errors on all recordings; its keypoints are kept in `keypoints_folder`."""
     errors = []
-    for name, video in recordings(data).items():
-        kept = keypoints_folder / f"{name}.keypoints.npz"
-        if not kept.exists():
-            keypoints_folder.mkdir(parents=True, exist_ok=True)
-            detect_trial(video, kept.with_suffix(".png"), keypoints=method).keypoints.save(kept)
-        keypoints = Keypoints.load(kept)
+    for name, keypoints in detected(data, keypoints_folder, method):
         truth, dataset = truth_of(name, keypoints, data)
         click.echo(f"{name}: {truth.note}")
         errors.append(point_errors(keypoints, truth, method.params.detector, dataset, name))
     return errors
 
 
-def curve_params(params: KeypointParams) -> dict:
+def curve_params(method: Method[KeypointParams]) -> dict:
     """What the confidence depends on: the parameters less the curve's own name."""
-    return {k: v for k, v in dataclasses.asdict(params).items() if k != "confidence_curve"}
+    params = json.loads(method.paramset.canonical_json)
+    del params["confidence_curve"]
+    return params
 
 
 def fit_curve(
@@ -204,8 +211,8 @@ def main(data: Path, version: int, method: str, keypoints: Path, out: Path, plot
     for e in errors:
         median, most = 100 * np.percentile(e.error_trunk, [50, 90])
         click.echo(f"  {e.title:44} error in the picture: median {median:.1f} %, 90 % within {most:.1f} % of the trunk")
-    name = of.params.detector if of.name == METHODS.default else of.name
-    curve = fit_curve(errors, f"{name}-v{version}", curve_params(of.params))
+    name = of.params.confidence_curve.rsplit("-v", 1)[0] or of.name
+    curve = fit_curve(errors, f"{name}-v{version}", curve_params(of))
     click.echo("\nof a recording, by a curve fitted to the other datasets (stated confidence taken as it is | curve)")
     for s in leave_one_out(errors):
         click.echo(

@@ -12,7 +12,7 @@ import numpy as np
 
 from pbl_pipeline.video import Camera, Frame
 
-from ._protocol import PersonKeypoints
+from ._protocol import Look, PersonKeypoints
 
 _Item = tuple[Frame, np.ndarray, bool, "Future[PersonKeypoints]"]
 
@@ -48,10 +48,10 @@ class BatchedInference:
         self._waiting.put(None)
         self._thread.join()
 
-    def submit(self, frame: Frame, roi_px: np.ndarray, *, quick: bool) -> Future[PersonKeypoints]:
+    def submit(self, frame: Frame, roi_px: np.ndarray, look: Look) -> Future[PersonKeypoints]:
         """Detect in the region `roi_px` (4,) of a frame, in the order of the calls."""
         future: Future[PersonKeypoints] = Future()
-        self._waiting.put((frame, np.array(roi_px, np.float64), quick, future))
+        self._waiting.put((frame, np.array(roi_px, np.float64), look is Look.QUICK, future))
         return future
 
     def _work(self) -> None:

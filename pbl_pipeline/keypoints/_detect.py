@@ -28,7 +28,7 @@ from ._methods import METHODS
 from ._params import KeypointParams
 from ._passes import ParallelInference, n_workers, two_passes
 from ._picture import Picture, PictureMeter
-from ._protocol import KeypointDetector, PersonKeypoints
+from ._protocol import KeypointDetector, Look, MirrorDetector, PersonKeypoints
 from ._types import Keypoints
 
 
@@ -106,8 +106,14 @@ def _detect_all(
     frames = meter.watch(_in_view(video_path, regions.rows), roi)
     one = detectors[0]
     batched = isinstance(one, BatchDetector)
+    sharing = one if isinstance(one, MirrorDetector) and _close(time_s[regions.rows], params.share_looks_s) else None
+    mirrored = np.arange(len(roi)) % 2 == 1
+
+    def look(row: int) -> Look:
+        return Look.FULL if sharing is None else Look.MIRRORED if mirrored[row] else Look.QUICK
+
     with BatchedInference(one, camera) if batched else ParallelInference(detectors, camera) as inference:
-        seen = two_passes(frames, inference, time_s, regions)
+        seen = two_passes(frames, inference, time_s, regions, look)
         for row, person in progress.track(seen, "keypoints", total=len(regions.rows)):
             found[row] = person
     n_seen = sum(person is not None for person in found)
@@ -119,7 +125,12 @@ def _detect_all(
             next_step="track the people again in this file",
             key=str(video_path),
         )
-    return found
+    return sharing.mirror_looks.shared(found, mirrored, time_s, params.min_presence) if sharing else found
+
+
+def _close(time_s: np.ndarray, most_s: float) -> bool:
+    """Whether these frames follow each other within that time, most of them."""
+    return len(time_s) > 1 and float(np.median(np.diff(time_s))) <= most_s
 
 
 def _in_view(video_path: str | Path, rows: np.ndarray) -> Iterator[Frame]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
+from pbl_pipeline.paramset import later
+
 from ._blazepose import MODEL_SHA256, BlazePoseLandmarks
 from ._flips import FlipParams
 
@@ -20,6 +22,8 @@ class KeypointParams:
     track's, and differs from it in size by at most this factor.
     agree_mm, agree_width_mm: how far the answers for the picture and its mirror image may lie apart, see
     `BlazePoseLandmarks`.
+    share_looks_s: frames no further apart than this share the looks at picture and mirror image, every second frame
+    mirrored (`MirrorLooks.shared`); 0: each frame has both.
     sides: where left and right are exchanged back, see `exchange_sides`; None: nowhere.
     min_time_s: a person in view for less cannot be measured.
     box_margin: added to the keypoints' box on each side, as a fraction of its size.
@@ -41,6 +45,7 @@ class KeypointParams:
     min_time_s: float = 1.0
     box_margin: float = 0.1
     confidence_curve: str = "blazepose-v1"
+    share_looks_s: float = later(0.0)
 
     def points(self) -> tuple[str, bool]:
         """Marker set of the keypoints, and whether their 3D is relative to the root of the body."""

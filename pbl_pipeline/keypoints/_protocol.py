@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol, runtime_checkable
+import enum
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
 from pbl_pipeline.video import Camera
+
+if TYPE_CHECKING:
+    from ._mirror_looks import MirrorLooks
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +29,14 @@ class PersonKeypoints:
     confidence: np.ndarray
     presence: float
     roi_px: np.ndarray
+
+
+class Look(enum.Enum):
+    """How a detector looks at a frame: as well as it can; quickly; at the mirror image alone."""
+
+    FULL = "full"
+    QUICK = "quick"
+    MIRRORED = "mirrored"
 
 
 class KeypointDetector(Protocol):
@@ -59,4 +71,15 @@ class CropDetector(Protocol):
         self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, quick: bool = False
     ) -> PersonKeypoints:
         """As `KeypointDetector.detect`, from the region (height, width, 3) uint8 BGR."""
+        ...
+
+
+@runtime_checkable
+class MirrorDetector(CropDetector, Protocol):
+    """A `CropDetector` that looks at a region and at its mirror image; `quick` is the first look alone."""
+
+    mirror_looks: MirrorLooks
+
+    def detect_mirrored(self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera) -> PersonKeypoints:
+        """The second look alone, in terms of the picture."""
         ...

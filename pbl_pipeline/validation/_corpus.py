@@ -129,7 +129,11 @@ def is_held_out(person: str) -> bool:
 
 
 def corpus(
-    detector: str = "blazepose", motions: str | Path | None = None, *, quick: bool = False, seconds: float = SECONDS
+    detector: str = "blazepose-heavy",
+    motions: str | Path | None = None,
+    *,
+    quick: bool = False,
+    seconds: float = SECONDS,
 ) -> list[Case]:
     """The cases: synthetic people, and the recorded walks of the folder `motions` (`read_motions`) where one is given.
 

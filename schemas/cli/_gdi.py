@@ -17,7 +17,11 @@ import click
 )
 @click.option("--method", metavar="FIT", help="Method of the fit (default: the one for the detector's points).")
 @click.option(
-    "--detector", default="blazepose", show_default=True, metavar="NAME", help="Error model: blazepose or metrabs-87."
+    "--detector",
+    default="blazepose-heavy",
+    show_default=True,
+    metavar="NAME",
+    help="Error model: blazepose-heavy, blazepose-33 or metrabs-87.",
 )
 @click.option("--quick", is_flag=True, help="Two synthetic people and one view per impairment: about 60 cases.")
 @click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Write CSV and JSON there.")

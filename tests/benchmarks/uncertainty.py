@@ -8,7 +8,7 @@ what makes a 90 % interval, 1.645 standard deviations to either side, hold the t
 recordings; then it counts what the intervals hold on others, of other people.
 
 `gauss-newton`: walks of 6 s with the benchmark's noise, half of them by a static phone and half by one in the hand,
-both with the phone's log. The residuals tell these errors, so a factor is found (`SD_FACTOR`).
+both with the phone's log. The residuals tell these errors, so a factor is found (`SD_FACTOR_METRABS`).
 `blazepose`: 5 s of walking, standing up or squats at 30 and 60 Hz with BlazePose's own errors (`BLAZEPOSE_NOISE`,
 points 25 mm from the marker set's places), half by a phone that stands tilted by some degrees without a log. Most of
 these errors are the same in many frames and in no residual, so a least standard deviation is found
@@ -33,7 +33,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, GaussNewtonParams, SessionInput, fit_sessions
 from pbl_pipeline.fit.per_frame import by_joint, floors_of
 from pbl_pipeline.methods import Method
-from pbl_pipeline.synthetic import BLAZEPOSE_NOISE, SynthSpec, observe, person, synthesise, walk_qpos
+from pbl_pipeline.synthetic import BLAZEPOSE_NOISE, METRABS_MEMORY, SynthSpec, observe, person, synthesise, walk_qpos
 
 #: Prefixes of joint names, one factor each; of two that fit, the later one counts.
 GROUPS = (
@@ -92,6 +92,7 @@ def walk(seed: int) -> tuple[SessionInput, np.ndarray]:
         camera_motion=motion,
         tilt_deg=tilt,
         with_phone=True,
+        noise=METRABS_MEMORY,
     )
     return SessionInput([seen.keypoints], [f"walk {seed}"], motion), qpos
 
@@ -196,11 +197,11 @@ def main(seeds: int, params: str) -> None:
         what, found = "SD_FLOOR_BLAZEPOSE", floors_for(known, known_sd, names)
         calibrated = dataclasses.replace(now, sd_factor=(), sd_floor=found)
     else:
-        what, found = "SD_FACTOR", factors_of(known, known_sd, names)
+        what, found = "SD_FACTOR_METRABS", factors_of(known, known_sd, names)
         calibrated = dataclasses.replace(now, sd_factor=found)
     new, old = coverage(other, other_sd, names, calibrated), coverage(other, other_sd, names, now)
     click.echo(f"{params}: {seeds} recordings to calibrate on ({len(known)} frames), {seeds} others ({len(other)})")
-    column = what.removesuffix("_BLAZEPOSE").lower()
+    column = what.rsplit("_", 1)[0].lower()
     click.echo(f"  {'group':16}{column:>10}{'held out':>10}{'now':>8}   median |error| held out")
     bad = []
     for group, value in found:

@@ -33,7 +33,7 @@ SIZE = (1768, 994)
 
 @pytest.fixture(scope="module")
 def demo() -> Path:
-    for name in ("blazepose_detector", "blazepose_landmarks", "demo_camera"):
+    for name in ("blazepose_detector", "blazepose_landmarks_heavy", "demo_camera"):
         asset(name)
     return asset("demo_video")
 

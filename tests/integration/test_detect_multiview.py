@@ -7,24 +7,25 @@ from __future__ import annotations
 
 import pytest
 
+from pbl_pipeline.keypoints import METHODS
 from tests.benchmarks.detection import MOST_FRAMES, MOST_PX, REFERENCE, compare, detected, read_trc, runs
 from tests.unit.test_blazepose import asset
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize("camera", ["cam02", "cam04"])
-def test_points_lie_where_four_cameras_see_them_and_sides_stay(shared_data, camera):
-    for name in ("blazepose_detector", "blazepose_landmarks"):
+@pytest.mark.parametrize(
+    ("camera", "method", "exchanged"),
+    # In cam02 his face is made unrecognisable; for half a second the lighter network takes him for somebody seen from
+    # behind.
+    [("cam02", "blazepose-33", (20, 45)), ("cam02", "blazepose-heavy", (0, 0)), ("cam04", "blazepose-heavy", (0, 0))],
+)
+def test_points_lie_where_four_cameras_see_them_and_sides_stay(shared_data, camera, method, exchanged):
+    for name in ("blazepose_detector", "blazepose_landmarks", "blazepose_landmarks_heavy"):
         asset(name)
-    result = compare(detected(camera), camera, read_trc(REFERENCE))
+    result = compare(detected(camera, METHODS[method].params), camera, read_trc(REFERENCE))
     assert result.median_px <= MOST_PX
     assert max((n for _, n in runs(result.exchanged)), default=0) <= MOST_FRAMES
     changed = result.keypoints.sides_changed
     assert changed is not None
-    if (
-        camera == "cam02"
-    ):  # his face is made unrecognisable; for half a second he is taken for somebody seen from behind
-        assert 20 <= changed[:, :2].any(axis=1).sum() <= 45
-    else:
-        assert not changed[:, :2].any()
+    assert exchanged[0] <= changed[:, :2].any(axis=1).sum() <= exchanged[1]

@@ -129,8 +129,8 @@ SEEN_BY = {
     "few-17": ("crop3d", "mpi_inf_3dhp_17"),
 }
 DEFAULT_FITS = {
-    ("blazepose-33-v2", "blazepose-v4"),
-    ("metrabs-87-v1", "gauss-newton-v1"),
+    ("blazepose-heavy-v2", "blazepose-v4"),
+    ("metrabs-87-v1", "gauss-newton-v2"),
     ("flat-87-v1", "blazepose-v4"),
     ("few-17-v1", "blazepose-v4"),
 }
@@ -165,7 +165,7 @@ def test_a_new_keypoint_method_for_all_comes_with_its_fit(
         ingest([chain.small_video(tmp_path, subject)], Visit(subject))
     for _ in requeue.carry_out(requeue.plan_new_method("Keypoints", "metrabs-87")):
         pass
-    assert plans() == {("blazepose-33-v2", "blazepose-v4"), ("metrabs-87-v1", "gauss-newton-v1")}
+    assert plans() == {("blazepose-heavy-v2", "blazepose-v4"), ("metrabs-87-v1", "gauss-newton-v2")}
     assert len(fit.FitPlan()) == 4
     populate()
     assert fitted() == plans()

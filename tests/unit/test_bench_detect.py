@@ -39,7 +39,7 @@ def test_growth_of_memory():
 
 @pytest.mark.slow
 def test_the_command_on_a_short_video(tmp_path):
-    for name in ("blazepose_detector", "blazepose_landmarks"):
+    for name in ("blazepose_detector", "blazepose_landmarks_heavy"):
         asset(name)
     images = [f.image[400:, 1000:1768] for f in read_frames(assets.fetch("demo_video"), start=60, stop=100)]
     video = write_video(tmp_path / "v.mp4", images, constant_rate(40))

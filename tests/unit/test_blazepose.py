@@ -15,8 +15,7 @@ import pytest
 from pbl_pipeline import assets
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import METHODS, BlazePoseLandmarks, KeypointParams
-from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES, _same_sides
-from pbl_pipeline.keypoints._flips import leg_points
+from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES
 from pbl_pipeline.models import LiteModel, suppress
 from pbl_pipeline.models._tflite_outputs import keep_outputs
 from pbl_pipeline.tracking import BlazePoseDetector
@@ -199,21 +198,6 @@ def test_an_output_that_the_network_lacks():
     path = asset("blazepose_landmarks")
     with pytest.raises(ValueError, match="no output of \\[7\\] elements"):
         keep_outputs(path.read_bytes(), (195, 7))
-
-
-def test_answers_of_exchanged_sides_are_not_averaged():
-    rng = np.random.default_rng(0)
-    points = rng.uniform(50, 200, (33, 2))
-    own, legs = np.arange(33), leg_points(NAMES)
-    np.testing.assert_array_equal(_same_sides(points, points + rng.normal(0, 3, points.shape)), own)
-    for group in (legs, ~legs, np.ones(33, bool)):
-        other = points.copy()
-        other[group] = points[MIRROR][group]
-        found = _same_sides(points, other + rng.normal(0, 3, points.shape))
-        np.testing.assert_array_equal(found, np.where(group, MIRROR, own))
-    # Legs one before the other, seen from the side: nothing to tell, nothing is renamed.
-    points[legs] = points[MIRROR][legs] + 2
-    np.testing.assert_array_equal(_same_sides(points, points + rng.normal(0, 3, points.shape)), own)
 
 
 def test_quick_gives_nearly_the_same_circle(landmarks, frames):

