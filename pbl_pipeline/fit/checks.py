@@ -12,6 +12,7 @@ from pbl_pipeline.body import SLIDES
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.qc import FAIL, PASS, WARN, Check
 
+from .augmented_pelvis import folds
 from .initial_pose import pelvis_path
 from .results import TrialFit
 from .session import GAIT, LEVEL, Session, has_3d
@@ -49,6 +50,8 @@ def check_fit(session: Session, trials: Sequence[TrialFit], solution: Solution) 
         checks += [*_depth(session, trials), *_assumed(session)]
     if solution.qpos_sd is not None:
         checks += [_observed(trials)]
+    if solution.pelvis_told is not None:
+        checks += _pelvis_told(session, trials, solution.pelvis_told)
     if np.any(np.isfinite([t.phone_clock_offset_s for t in trials])):
         checks += [_clock(trials)]
     # Advice is for whom a check asks to act.
@@ -140,6 +143,21 @@ def _scale(scale: np.ndarray) -> Check:
         SCALE_HIGH if worst > 1 else SCALE_LOW,
         "a body segment is scaled beyond what adults show: a child, or the camera's focal length is wrong",
     )
+
+
+def _pelvis_told(session: Session, trials: Sequence[TrialFit], told: np.ndarray) -> list[Check]:
+    """Of the trials in which somebody sits or squats; none where nobody does."""
+    folded = [i for i, t in enumerate(trials) if folds(session.body, t.qpos[np.isfinite(t.qpos[:, 0])])]
+    silent = sum(not np.any(told[session.frames(i)]) for i in folded)
+    check = Check(
+        "sitting_trials_without_augmented_pelvis",
+        WARN if silent else PASS,
+        float(silent),
+        0.0,
+        "the marker augmenter could not be asked (too short a trial, feet never in view, or a person of a size that it "
+        "does not know): how far the pelvis is tipped in sitting is most people's, not this person's",
+    )
+    return [check] if folded else []
 
 
 def _limits(session: Session, trials: Sequence[TrialFit]) -> Check:

@@ -82,21 +82,22 @@ def solve_per_frame(sessions: Sequence[Session], params: GaussNewtonParams, star
         turned = solve(part, [s.problem for s in part], [_with_detector(start_of(s, flip=True), params) for s in part])
         for i, other in zip(again, turned, strict=True):
             found[i] = min(found[i], other, key=lambda f: float(f.end.cost))
-    traces = [f.trace for f in found]
+    traces, told = [f.trace for f in found], [None] * len(found)
     if twice:
         problems, starts = zip(*map(_on_floor, sessions, found), strict=True)
         if params.weight_pelvis > 0:
             scales = scale_multipliers(jnp.asarray(np.stack([f.end.state.s for f in found])))
             each = zip(sessions, problems, [f.end.state.qpos for f in found], np.asarray(scales), strict=True)
             problems = [with_augmented_pelvis(*e) for e in each]
+            told = [np.asarray(p.c_pelvis) for p in problems]
         found = _solve(sessions, problems, starts, params, last=True)
         # The cost of the second one has a term more.
         traces = [np.concatenate([t, f.trace + np.array([len(t), 0.0])]) for t, f in zip(traces, found, strict=True)]
     n = len(sessions)
     scales = np.asarray(scale_multipliers(jnp.asarray(np.stack([f.end.state.s for f in found]))), np.float64)
     spent = (time.perf_counter() - begin) / n, (compile_seconds() - compiled) / n
-    each = zip(sessions, found, scales, traces, strict=True)
-    return [_solution(session, params, f, scale, trace, *spent) for session, f, scale, trace in each]
+    each = zip(sessions, found, scales, traces, told, strict=True)
+    return [_solution(session, params, f, scale, trace, asked, *spent) for session, f, scale, trace, asked in each]
 
 
 def start_of(session: Session, flip: bool = False) -> State:
@@ -236,6 +237,7 @@ def _solution(
     found: _Found,
     scale: np.ndarray,
     trace: np.ndarray,
+    pelvis_told: np.ndarray | None,
     seconds: float,
     compiled: float,
 ) -> Solution:
@@ -259,6 +261,7 @@ def _solution(
         outcome=found.outcome,
         # The phone's part was in the recordings on which the factors were found, so they are of both.
         qpos_sd=np.sqrt((variance + phone_variance(session, state.qpos)) * factor**2 + floor**2),
+        pelvis_told=pelvis_told,
     )
 
 

@@ -34,7 +34,8 @@ class Solution:
 
     qpos in m and rad; R_nc: camera to world; s: the paper's scale parameters; scale: their multipliers; clock_s: sensor
     time minus video time of each trial, 0 where not estimated; loss_trace: (step, loss) of K steps; qpos_sd: standard
-    deviations, None where the solver computes none.
+    deviations, None where the solver computes none; pelvis_told: 1 where the marker augmenter told how the pelvis is
+    tipped, None where the method does not ask it.
     """
 
     qpos: Float[np.ndarray, "F Q"]
@@ -50,6 +51,7 @@ class Solution:
     converged: bool
     outcome: Outcome
     qpos_sd: Float[np.ndarray, "F Q"] | None = None
+    pelvis_told: Float[np.ndarray, " F"] | None = None
 
 
 def outcome(p: Problem, x: Float[Array, "F P 3"], R_nc: Float[Array, "F V 3 3"]) -> Outcome:

@@ -3,7 +3,7 @@
     python -m tests.benchmarks.real_clips                                  # the default paramset
     python -m tests.benchmarks.real_clips --params blazepose --params paper-2025 --clip walk
     python -m tests.benchmarks.real_clips --plots clips                    # angles over time, one page per clip
-    python -m tests.benchmarks.real_clips --keypoints blazepose-heavy
+    python -m tests.benchmarks.real_clips --keypoints blazepose-33
     python -m tests.benchmarks.real_clips --set steps=12000 --set cost.weight_3d=0.1
 
 Reads `../shared/data/real/video_mocap/{walk,STS}`; see the README there for its source, licence and conventions. Key
@@ -148,8 +148,7 @@ def table(rows: dict[str, Score]) -> str:
 def keypoints_of(clip: str, fresh: bool = False, method: str | None = None) -> Keypoints:
     """Key points of a clip by a keypoint method, from the temporary folder where they were detected before."""
     detector = KEYPOINT_METHODS.find(method)
-    name = clip if detector == KEYPOINT_METHODS.find() else f"{clip}.{detector.name}"
-    cached = Path(tempfile.gettempdir()) / "pbl_real_clips" / f"{name}.keypoints.npz"
+    cached = Path(tempfile.gettempdir()) / "pbl_real_clips" / f"{clip}.{detector.key}.keypoints.npz"
     if fresh or not cached.exists():
         cached.parent.mkdir(exist_ok=True)
         video, people = SHARED / "real" / "video_mocap" / clip / "video.mp4", cached.with_suffix(".png")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from pbl_pipeline.body import PELVIS_TURNS, body_poses, load_body, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, augmented_pelvis
 from pbl_pipeline.fit.augmented_pelvis import folds, inclination_of, pelvis_of, with_augmented_pelvis
+from pbl_pipeline.fit.checks import _pelvis_told
 from pbl_pipeline.fit.priors import inclination
 from pbl_pipeline.fit.session import make_session
 from pbl_pipeline.keypoints import AnatomicalMarkers, MarkerAugmenter
@@ -93,3 +96,15 @@ def test_a_person_that_the_network_does_not_know_is_fitted_without(monkeypatch):
     monkeypatch.setattr(augmented_pelvis, "_augmenter", lambda: Tipped(gone))
     with pytest.raises(PblError, match="ASSET_MISSING"):
         with_augmented_pelvis(session, session.problem, qpos, np.ones(8))
+
+
+def test_who_sits_and_could_not_be_asked_about_is_told():
+    session, qpos = session_of("squat")
+    trial, frames = SimpleNamespace(qpos=qpos[session.frames(0)]), len(qpos)
+    (silent,) = _pelvis_told(session, [trial], np.zeros(frames))  # type: ignore[list-item]
+    assert (silent.outcome, silent.value) == ("WARN", 1.0)
+    (told,) = _pelvis_told(session, [trial], np.ones(frames))  # type: ignore[list-item]
+    assert told.outcome == "PASS"
+    walk, qpos = session_of("walk")
+    trial = SimpleNamespace(qpos=qpos[walk.frames(0)])
+    assert _pelvis_told(walk, [trial], np.zeros(len(qpos))) == []  # type: ignore[list-item]
