@@ -120,7 +120,7 @@ def test_the_fitted_body_lies_on_her(out):
     fit = TrialFit.load(out / "demo.fit.npz")
     # She is about 450 px tall: 6 px are about 2 cm on her.
     assert np.nanmedian(fit.residual_2d_px) < 6
-    assert np.nanmedian(fit.residual_3d_m) < 0.06
+    assert np.nanmedian(fit.residual_3d_m) < 0.1
     inside = np.isfinite(fit.qpos[:, 0])
     assert inside.sum() > 120
     knees = np.degrees(fit.qpos[inside][:, [fit.joint_names.index(f"knee_angle_{s}") for s in "rl"]])
