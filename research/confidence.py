@@ -191,17 +191,20 @@ def save_curve(curve: ConfidenceCurve, path: str | Path) -> None:
     path.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
 
 
-@click.command()
-@click.argument("data", type=click.Path(path_type=Path, exists=True, file_okay=False))
-@click.option("--version", type=click.IntRange(1), required=True, help="Of the curve; one that is there never changes.")
-@click.option("--method", default=METHODS.default, show_default=True, help="Keypoint method whose confidence it is.")
-@click.option(
+keypoints_option = click.option(
     "--keypoints",
     type=click.Path(path_type=Path, file_okay=False),
     default=Path("confidence_keypoints"),
     show_default=True,
     help="Folder of keypoints: taken from there, or detected and kept there.",
 )
+
+
+@click.command()
+@click.argument("data", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--version", type=click.IntRange(1), required=True, help="Of the curve; one that is there never changes.")
+@click.option("--method", default=METHODS.default, show_default=True, help="Keypoint method whose confidence it is.")
+@keypoints_option
 @click.option("--out", type=click.Path(path_type=Path), default=CURVES, show_default=True, help="File of curves.")
 @click.option("--plots", type=click.Path(path_type=Path, file_okay=False), help="Folder for table and page.")
 def main(data: Path, version: int, method: str, keypoints: Path, out: Path, plots: Path | None) -> None:

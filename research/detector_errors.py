@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.keypoints import METHODS, Keypoints
 from pbl_pipeline.validation import PointTruth
-from research.confidence import detected, truth_of
+from research.confidence import detected, keypoints_option, truth_of
 
 _GROSS_M = 0.2
 _AXES = ("right", "down", "ahead")
@@ -99,13 +99,7 @@ def _similarity(found: np.ndarray, true: np.ndarray, known: np.ndarray) -> tuple
 @click.command()
 @click.argument("data", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option("--method", default=METHODS.default, show_default=True, help="Keypoint method.")
-@click.option(
-    "--keypoints",
-    type=click.Path(path_type=Path, file_okay=False),
-    default=Path("confidence_keypoints"),
-    show_default=True,
-    help="Folder of keypoints: taken from there, or detected and kept there.",
-)
+@keypoints_option
 def main(data: Path, method: str, keypoints: Path) -> None:
     """Print the errors of the method on each recording, and of all of them together."""
     of = METHODS.find(method)
