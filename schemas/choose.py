@@ -114,7 +114,7 @@ def write_sheet(about: Candidates, out_path: Path) -> Path:
 def _key(video_id: int, tracking_method: str | None) -> dict[str, Any]:
     """Restriction to a registered video and, where named, one tracking method."""
     if not video.Video & {"video_id": video_id}:
-        raise unknown_video(video_id)
+        raise video.unknown_video(video_id)
     key: dict[str, Any] = {"video_id": video_id}
     if tracking_method is not None:
         key["tracking_method"] = stored_key(tracking.TrackingMethod, tracking_method)
@@ -170,14 +170,4 @@ def _which_tracking(video_id: int, tracking_method: str | None) -> PblError:
         expected=f"one of {', '.join(there)}" if there else "a video that is to be tracked",
         next_step=f"`pbl choose {video_id}` shows the numbers; pass --tracking-method with one of these",
         key=f"video_id={video_id}",
-    )
-
-
-def unknown_video(video_id: int) -> PblError:
-    """DB_NOT_FOUND for a number that no video has."""
-    return PblError(
-        "DB_NOT_FOUND",
-        found=f"no video_id {video_id}",
-        expected="a registered video",
-        next_step="`pbl ingest` prints the numbers of videos, and `pbl status` those that wait for a choice",
     )

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from pbl_pipeline.errors import PblError
-
 from . import fit, gdi, video
 from .rows import delete_below
 
@@ -32,12 +30,7 @@ def _set_condition(video_id: int, activity: str | None, pace: str | None) -> lis
     key = {"video_id": video_id}
     before = video.conditions(key).get(video_id)
     if before is None:
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=f"no video_id {video_id}",
-            expected="a registered video",
-            next_step="`pbl ingest` prints the numbers of videos",
-        )
+        raise video.unknown_video(video_id)
     changes = []
     after = Condition(before.activity if activity is None else activity, before.pace if pace is None else pace)
     if activity is not None and after.activity != before.activity:

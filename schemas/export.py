@@ -69,7 +69,7 @@ def visits_of_tables(restriction: Mapping[str, Any], slice_name: str | None = No
         DB_NOT_FOUND for an unknown slice or where no visit is left, USAGE where a visit has several kinds of recordings
         or chains of methods, SOLVER_UNKNOWN and NORM_UNKNOWN.
     """
-    sets: Any = fit.FitSelection & {"fit_current": True}
+    sets: Any = fit.current()
     restriction = with_keys(restriction)
     if slice_name is not None:
         chain, counted = chain_of(slice_name)

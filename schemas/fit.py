@@ -186,6 +186,11 @@ class FitSelection(dj.Manual):
     """
 
 
+def current() -> Any:
+    """Rows of `FitSelection` that count: the newest set of each session, kind and method of the fit."""
+    return FitSelection & {"fit_current": True}
+
+
 @schema
 class SessionFit(dj.Computed):
     definition = f"""
@@ -232,7 +237,7 @@ class SessionFit(dj.Computed):
 
     @property
     def key_source(self) -> Any:
-        return FitSelection & {"fit_current": True}
+        return current()
 
     def populate(self, *restrictions: Any, **options: Any) -> dict[str, Any]:
         """DataJoint's own, after the fits of all sessions whose trials are decided have been planned."""

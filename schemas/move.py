@@ -16,12 +16,12 @@ from pbl_pipeline.names import check_label
 from . import fit, gait, gdi, keypoints, lab, session, video, worker
 from ._datajoint import dj
 from .archive import LOCK, archive_dir, folder_of, plain_name
-from .choose import unknown_video
 from .codes import check_subject
 from .folders import private_folder, remove_empty, sync_folders
 from .ingest import Visit, forget_errors, in_transaction, session_of
 from .rigs import check_same_number
 from .rows import delete_below
+from .video import unknown_video
 
 #: Plans of a visit that follow a video into its new one.
 _PLANS = (fit.FitPlan, gait.GaitPlan, gdi.GdiPlan)

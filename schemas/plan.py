@@ -77,7 +77,7 @@ def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]
         fit_set and fit_method of the sets that became current now.
     """
     chosen = True if sessions is None else [{"session_id": int(s)} for s in sessions]
-    current = (fit.FitSelection & {"fit_current": True}) & (fit.FitSet & chosen)
+    current = fit.current() & (fit.FitSet & chosen)
     fitted = (fit.FitSet.Video * current).proj("tracking_method", "keypoint_method")
     in_a_set = dj.U("video_id", "tracking_method", "keypoint_method", "fit_method") & fitted
     new = fit.TrialInput.proj() * (video.Video.proj("session_id") & chosen) - in_a_set
@@ -118,7 +118,7 @@ def _keep_one_current(session_id: int) -> None:
     """Of several current sets of one group the largest stays current, of equally large ones the newest."""
     member = fit.FitSet.Video.proj("tracking_method", "keypoint_method")
     sets = fit.FitSet.proj("session_id", "fit_set_kind", "fit_set_n", "fit_set_created") & {"session_id": session_id}
-    rows = ((fit.FitSelection & {"fit_current": True}) * sets).to_dicts(order_by="fit_set_n DESC, fit_set_created DESC")
+    rows = (fit.current() * sets).to_dicts(order_by="fit_set_n DESC, fit_set_created DESC")
     kept = set()
     for row in rows:
         methods = (member & {"fit_set": row["fit_set"]}).to_dicts(limit=1)[0]

@@ -6,8 +6,8 @@ import dataclasses
 from typing import TYPE_CHECKING, Any
 
 from . import fit, gait, keypoints, session, video
-from .choose import unknown_video
 from .results import load_keypoints, load_trial_fit
+from .video import unknown_video
 from .why import why
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def recording_about(video_id: int) -> RecordingPage:
 
 def trial_key(video_id: int) -> dict[str, Any] | None:
     """Key of the fit of a recording: of its current sets the one that was computed last; None where there is none."""
-    current = (fit.FitSelection & {"fit_current": True}).proj()
+    current = fit.current().proj()
     trials = fit.SessionFit.Trial.proj() * fit.SessionFit.proj("fit_computed") * current & {"video_id": video_id}
     rows = trials.to_dicts(order_by="fit_computed DESC", limit=1)
     return {k: rows[0][k] for k in fit.SessionFit.Trial.primary_key} if rows else None

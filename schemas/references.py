@@ -206,7 +206,7 @@ def add_trial(
         `add_reference` raises.
     """
     trial = fit.trial_of(trial)
-    current = (fit.FitSelection & {"fit_current": True}).proj() * fit.FitSet.proj("fit_set_kind")
+    current = fit.current().proj() * fit.FitSet.proj("fit_set_kind")
     named = {"fit_method": fit_method} if fit_method is not None else True
     rows = (fit.SessionFit.Trial * current & {"video_id": trial} & named).to_dicts()
     if not rows:

@@ -116,7 +116,7 @@ def find_session(restriction: Any) -> tuple[dict[str, Any], dict[str, Any]]:
             next_step="`pbl ingest` prints subject and session of each video",
         )
     visit = _single(found, "visits", ("subject", "session_label"))
-    current = fit.SessionFit * (fit.FitSelection & {"fit_current": True}) * fit.FitSet.proj("fit_set_kind")
+    current = fit.SessionFit * fit.current() * fit.FitSet.proj("fit_set_kind")
     fits = (current & {"session_id": visit["session_id"]} & restriction).proj("fit_set_kind").to_dicts()
     key = (
         _of(fit.SessionFit, _single(fits, "fits", ("fit_set_kind", *fit.SessionFit.primary_key[::-1]))) if fits else {}

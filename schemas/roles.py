@@ -57,13 +57,12 @@ class Account:
 
     def __post_init__(self) -> None:
         for name in self.schemas:
-            if not _SCHEMA.fullmatch(name) or name.split("_")[0] in STAGES:
+            ours = name.split("_")[0] in STAGES
+            if ours or not _SCHEMA.fullmatch(name):
                 raise PblError(
                     "USAGE",
                     key=name,
-                    found="a schema of the package"
-                    if name.split("_")[0] in STAGES
-                    else "a name that no schema can have",
+                    found="a schema of the package" if ours else "a name that no schema can have",
                     expected="at most 40 small letters, digits and '_', a letter first, no name of the package",
                     next_step=f"choose another name; it becomes {connection.prefix()}_NAME on the server",
                 )

@@ -76,7 +76,7 @@ class KinematicError(dj.Computed):
 
     @property
     def key_source(self) -> Any:
-        trials = fit.SessionFit.Trial.proj() & (fit.FitSelection & {"fit_current": True})
+        trials = fit.SessionFit.Trial.proj() & fit.current()
         return trials * (ReferenceKinematics & {"reference_current": True}).proj()
 
     def make_fetch(self, key: dict) -> tuple:

@@ -307,16 +307,21 @@ def present_file(video_id: int) -> Path:
     """
     paths = (Video & {"video_id": video_id}).to_arrays("video_path")
     if not len(paths):
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=f"no video_id {video_id}",
-            expected="a registered video",
-            next_step="`pbl list videos` prints the numbers",
-        )
+        raise unknown_video(video_id)
     path = Path(str(paths[0]))
     if not path.is_file():
         raise _missing(path, {"video_id": video_id})
     return path
+
+
+def unknown_video(video_id: int) -> PblError:
+    """DB_NOT_FOUND for a number that no video has."""
+    return PblError(
+        "DB_NOT_FOUND",
+        found=f"no video_id {video_id}",
+        expected="a registered video",
+        next_step="`pbl list videos` prints the numbers, and `pbl status` those that wait for a choice",
+    )
 
 
 def registered_file(path: str, sha256: str, key: dict) -> Path:

@@ -37,7 +37,7 @@ _SESSION_COLUMNS = (
 
 def current_sets() -> Any:
     """Sets of recordings that are the newest of their session and kind, with subject and session."""
-    current = fit.FitSelection & {"fit_current": True}
+    current = fit.current()
     return (
         current
         * fit.FitSet.proj("session_id", "fit_set_kind", "fit_set_n")
@@ -48,7 +48,7 @@ def current_sets() -> Any:
 def newest_sets() -> Any:
     """Keys of the sets that are the newest of their session and kind, by method of the fit, with `session_id` and
     `fit_set_kind`."""
-    return fit.FitSet.proj("session_id", "fit_set_kind") * (fit.FitSelection & {"fit_current": True}).proj()
+    return fit.FitSet.proj("session_id", "fit_set_kind") * fit.current().proj()
 
 
 def _sessions() -> Any:
@@ -263,7 +263,7 @@ def _compared(restriction: Any = True) -> Iterator[tuple[dict[str, Any], TrialEr
     compared = (
         validation.KinematicError
         * references.proj("dataset", "reference_name", "reference_source", "reference_convention")
-        * (fit.FitSelection & {"fit_current": True}).proj()
+        * fit.current().proj()
         * fit.SessionFit.Trial.proj("trial_name", "trial_residual_2d", "trial_residual_3d")
         * fit.FitSet.Video.proj("keypoint_method")
         * video.Video.proj("session_id", "activity", "camera_motion")

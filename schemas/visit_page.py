@@ -103,7 +103,7 @@ def key_of(session_id: int, result: Result) -> dict[str, Any]:
     names = ("fit_method", "gait_method", "gdi_method", "norm")
     chain = dict(zip(names, result.methods, strict=True))
     sets = fit.FitSet.proj("fit_set_kind") & {"session_id": session_id, "fit_set_kind": result.kind}
-    current = (fit.FitSelection & {"fit_current": True}).proj() * sets
+    current = fit.current().proj() * sets
     return dict((gdi.SessionGdi.proj() & current.proj() & chain).keys()[0])
 
 

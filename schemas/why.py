@@ -48,7 +48,7 @@ def why(video_id: int) -> Why:
 
     Raises `PblError` DB_NOT_FOUND for an unknown video.
     """
-    from .choose import unknown_video
+    from .video import unknown_video
 
     rows = (video.Video & {"video_id": video_id}).to_dicts()
     if not rows:
@@ -58,7 +58,7 @@ def why(video_id: int) -> Why:
     trial = fit.trial_of(video_id)
     views = fit.videos_of(trial)
     sets = [{"fit_set": s} for s in (fit.FitSet.Video & {"video_id": trial}).to_arrays("fit_set")]
-    current = fit.FitSelection & {"fit_current": True}
+    current = fit.current()
     sets = [{"fit_set": k["fit_set"]} for k in (current & sets).to_dicts()] if sets else []
     steps: list[Step] = []
     # Markers go straight to the fit: nothing is computed before it.

@@ -11,7 +11,7 @@ from starlette.routing import Route
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
-from schemas import choose, decide
+from schemas import choose, decide, video
 
 from .access import Refused, Session, form_of
 from .find import LARGEST, number_of
@@ -60,10 +60,10 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
 
         def picture() -> bytes:
             if settings.deidentify_how():
-                raise choose.unknown_video(number)
+                raise video.unknown_video(number)
             found = choose.candidates(number)
             if which >= len(found):
-                raise choose.unknown_video(number)
+                raise video.unknown_video(number)
             with tempfile.TemporaryDirectory() as folder:
                 return choose.write_sheet(found[which], Path(folder) / "people.jpg").read_bytes()
 
