@@ -16,11 +16,11 @@ class Decision(dj.Manual):
     ---
     -> [nullable] session.Session
     -> [nullable] video.Video
-    decision_what       : enum('person', 'check')  # who is measured in a video; a check of a visit that is accepted
+    decision_what       : varchar(16)          # its kind, such as person, check, role, score (schemas.decide)
     decision_by         : varchar(64)          # name of who decided, as the page knows it
     decision_at         : datetime             # when, UTC
-    decision_about      : json                 # tracking_method; key of SessionQc, its time, the check and its video
-    decision_before     : json                 # person, null for none, and status of the choice; outcome of the check
-    decision_after      : json                 # likewise
+    decision_about      : json                 # what it is about: names to values, by its kind
+    decision_before     : json                 # what was before, likewise
+    decision_after      : json                 # what was decided, likewise
     decision_reason=''  : varchar(500)         # why, in the person's words; no names
     """

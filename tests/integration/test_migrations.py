@@ -92,7 +92,9 @@ def _make_older(add: Callable[[str, str], None]) -> None:
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute("ALTER TABLE pbl_video.video DROP COLUMN video_size")
         cursor.execute("DROP DATABASE pbl_validation")
-    add("0002_sizes", SIZES)
+        kinds = "ENUM('person','check') NOT NULL COMMENT ':enum(''person'',''check''):who is measured'"
+        cursor.execute(f"ALTER TABLE pbl_review.decision MODIFY COLUMN decision_what {kinds}")
+    add("0003_sizes", SIZES)
 
 
 @pytest.fixture
@@ -153,14 +155,15 @@ def test_an_older_database_keeps_its_rows_and_works(
     with_size = "pbl_video.video"
     assert len(after[with_size]) == len(before[with_size]) == 1
     assert "7" in after[with_size][0]
+    assert migrations.migrate(dry_run=True).open == []
     # The schemas' own bookkeeping (~lineage, ~log) may grow.
     kept = [t for t in before if t != with_size and not t.split(".")[1].startswith("~")]
     assert "pbl_fit.__session_fit__trial" in kept
     assert {t: after[t] for t in kept} == {t: before[t] for t in kept}
-    assert [a.name for a in migrations.applied()] == ["session_of_results", "sizes"]
+    assert [a.name for a in migrations.applied()] == ["session_of_results", "kinds_of_decisions", "sizes"]
     # Again there is nothing to do.
     assert migrations.migrate().steps == []
-    assert len(migrations.applied()) == 2
+    assert len(migrations.applied()) == 3
     # A new visit goes through the whole chain beside it.
     assert views.session_summary()["subject"].tolist() == ["P001"]
     ingest([chain.small_video(tmp_path, "new")], Visit(subject="P002"))
@@ -199,7 +202,7 @@ def test_results_from_before_they_had_their_session_get_it(
             cursor.execute(f"DELETE FROM {schema}.`~lineage` WHERE table_name = %s", (name,))
     empty()
     dry = migrations.migrate(dry_run=True)
-    assert ([len(statements) for _, statements in dry.steps], dry.open) == ([4 * len(WITHOUT_SESSION)], [])
+    assert (len(dict(dry.steps)["0001 session_of_results"]), dry.open) == (4 * len(WITHOUT_SESSION), [])
     migrations.migrate()
     after = everything()
     changed = {t for t in new if after[t] != new[t] and not t.split(".")[1].startswith("~")}
@@ -246,7 +249,7 @@ def _named() -> list[str]:
 
 
 def test_a_migration_that_was_broken_off_goes_on(older: None):
-    statements = dict(migrations.migrate(dry_run=True).steps)["0002 sizes"]
+    statements = dict(migrations.migrate(dry_run=True).steps)["0003 sizes"]
     assert len(statements) == 3
 
     class Killed(BaseException):
@@ -258,27 +261,27 @@ def test_a_migration_that_was_broken_off_goes_on(older: None):
 
     with pytest.raises(Killed):
         migrations.migrate(say=say)
-    assert [a.number for a in migrations.applied()] == [1]
+    assert [a.number for a in migrations.applied()] == [1, 2]
     done: list[str] = []
     migrations.migrate(say=lambda line: done.append(line.strip()))
     assert done == statements[1:]  # the column is there already
-    assert [a.number for a in migrations.applied()] == [1, 2]
+    assert [a.number for a in migrations.applied()] == [1, 2, 3]
     assert video.Video.fetch1("video_size") == 7
 
 
 def test_a_statement_that_the_server_refuses_is_named_and_not_recorded(older: None, add: Callable[[str, str], None]):
-    add("0003_wrong", 'def statements(conn):\n    return ["ALTER TABLE pbl_video.nothing DROP COLUMN x"]\n')
-    with pytest.raises(PblError, match="0003 wrong") as error:
+    add("0004_wrong", 'def statements(conn):\n    return ["ALTER TABLE pbl_video.nothing DROP COLUMN x"]\n')
+    with pytest.raises(PblError, match="0004 wrong") as error:
         migrations.migrate()
     assert error.value.code == "DB_REFUSED"
-    assert [a.number for a in migrations.applied()] == [1, 2]
+    assert [a.number for a in migrations.applied()] == [1, 2, 3]
 
 
 def test_migrations_without_a_gap(add: Callable[[str, str], None]):
     nothing = "def statements(conn):\n    return []\n"
-    add("0002_second", nothing)
-    add("0004_fourth", nothing)
-    with pytest.raises(ValueError, match=r"\[1, 2, 4\]"):
+    add("0003_second", nothing)
+    add("0005_fifth", nothing)
+    with pytest.raises(ValueError, match=r"\[1, 2, 3, 5\]"):
         migrations.available()
 
 
@@ -305,14 +308,14 @@ def test_one_process_migrates_at_a_time(database: Path):
 def test_an_empty_server_gets_the_tables_as_they_are_defined(
     empty: Callable[[], None], add: Callable[[str, str], None]
 ):
-    add("0002_sizes", SIZES)
+    add("0003_sizes", SIZES)
     planned = migrations.migrate(dry_run=True)
     assert "pbl_lab: the schema is created" in planned.created
     assert planned.open == []
     assert everything() == {}
     outcome = migrations.migrate()
     assert "`pbl_lab`.`subject`: the table is created" in outcome.created
-    assert [a.number for a in migrations.applied()] == [1, 2]  # with nothing to do
+    assert [a.number for a in migrations.applied()] == [1, 2, 3]  # with nothing to do
     assert len(lab.Subject()) == len(video.Video()) == 0
     assert migrations.migrate() == migrations.Outcome([], [], [])
 

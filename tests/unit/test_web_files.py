@@ -27,7 +27,9 @@ def test_every_text_that_a_page_names_is_in_the_catalogue():
 
 
 #: Groups and texts that are named by a value: a state, an outcome, a reason, a filter, an event.
-_BY_VALUE = re.compile(r"(role|state|quality|trend|enter)\.|visits\.(cohort|role|quality|state)|recording\.foot_")
+_BY_VALUE = re.compile(
+    r"(role|state|quality|trend|enter|decided)\.|visits\.(cohort|role|quality|state)|recording\.foot_"
+)
 
 
 def test_every_text_of_the_catalogue_is_on_a_page():
