@@ -1,4 +1,5 @@
-"""Names and labels: without control characters, and those of the recordings of a session all different."""
+"""What people state: names and labels, without control characters and those of the recordings of a session all
+different; a body height."""
 
 from __future__ import annotations
 
@@ -47,3 +48,18 @@ def distinct(stems: Sequence[str], numbers: Sequence[int]) -> list[str]:
             taken.add(name)
         names.append(name)
     return names
+
+
+#: Heights (m) of people, the smallest walking child and the tallest adult with room to spare.
+HEIGHT_M = (0.5, 2.6)
+
+
+def check_height(height_m: float | None) -> None:
+    """Raises `PblError` FIT_INPUT for what is no height of a person in metres."""
+    if height_m is not None and not HEIGHT_M[0] <= height_m <= HEIGHT_M[1]:
+        raise PblError(
+            "FIT_INPUT",
+            found=f"a body height of {height_m:g} m",
+            expected=f"metres, {HEIGHT_M[0]} to {HEIGHT_M[1]}",
+            next_step="state the height in metres, such as 1.72, or leave it out",
+        )

@@ -22,7 +22,7 @@ from pbl_pipeline.gait import DEFAULT_NORM, GaitMetrics, gait_metrics, load_norm
 from pbl_pipeline.keypoints import METHODS as KEYPOINT_METHODS
 from pbl_pipeline.keypoints import KeypointParams, Keypoints, check_keypoints, detect_keypoints
 from pbl_pipeline.methods import Method
-from pbl_pipeline.names import check_label, distinct
+from pbl_pipeline.names import check_height, check_label, distinct
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import WARN, Check
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
@@ -120,6 +120,7 @@ def run_session(
     attitude_files: Sequence[Path] = (),
     keypoints: Method[KeypointParams] | None = None,
     people: Method[TrackingParams] | None = None,
+    height_m: float | None = None,
 ) -> Session:
     """Videos of one session to gait measures. A video that fails is left out with its problem, and so is one whose
     bytes were named before, because its steps would count twice; the others go on. Into `out` goes only a picture of
@@ -127,7 +128,7 @@ def run_session(
 
     `paramset` is the method of the fit; None: the one that suits the keypoints (`fit_default`). `attitude_files` holds
     a sensor log of the phone for each path, or nothing; one that does not belong to its video leaves that out.
-    `camera_motion` None stands for "handheld" where there are logs, else "static".
+    `camera_motion` None stands for "handheld" where there are logs, else "static". `height_m`: as in `fit_session`.
 
     Raises
     ------
@@ -138,6 +139,7 @@ def run_session(
     # A wrong name or log must not cost a fit.
     method = FIT_METHODS.find(paramset or fit_default(KEYPOINT_METHODS.find(keypoints)))
     basis = load_norm(norm or DEFAULT_NORM)
+    check_height(height_m)
     logs = [(file, read_phone_log(file)) for file in attitude_files] or [None] * len(paths)
     camera_motion = camera_motion or ("handheld" if attitude_files else "static")
     trials, problems, seen = [], {}, {}
@@ -159,7 +161,7 @@ def run_session(
             trials.append(trial)
     if not trials:
         raise next(iter(problems.values()))
-    fit = fit_session([t.keypoints for t in trials], [t.name for t in trials], method, camera_motion)
+    fit = fit_session([t.keypoints for t in trials], [t.name for t in trials], method, camera_motion, height_m=height_m)
     return Session(tuple(trials), fit, gait_metrics(fit.trials, norm=basis, fit_checks=fit.qc), problems)
 
 
@@ -247,6 +249,7 @@ def write_session_json(fit: SessionFit, path: Path) -> None:
         "params_hash": fit.params_hash,
         "iterations": int(fit.iterations),
         "converged": bool(fit.converged),
+        "height_m": fit.height_m,
         "scale": dict(zip(SCALE_NAMES, (round(float(s), 5) for s in fit.scale), strict=True)),
         "loss_trace": [[int(step), round(float(loss), 5)] for step, loss in fit.loss_trace],
         "seconds": round(fit.seconds, 3),

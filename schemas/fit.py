@@ -15,7 +15,7 @@ from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
 
-from . import keypoints, session, video
+from . import keypoints, lab, session, video
 from ._datajoint import dj
 from .checks import check_columns, check_row, check_values
 from .method_rows import method_columns, method_row
@@ -207,6 +207,7 @@ class SessionFit(dj.Computed):
     fit_iterations=null  : int32               # steps of the solver, null for fits of before it was recorded
     fit_converged=null   : bool                # ended at a minimum, not at its bound on iterations or steps; null too
     fit_scale            : json                # multiplier (-) of each scale group, 1 = the unscaled body
+    fit_height=null      : float64             # (m) body height of the person that the fit was told, null: not known
     compile_seconds      : float64             # (s) of the duration, spent compiling
     compute_device       : varchar(64)         # what JAX computed on
     session_file         : <object@arrays>     # npz: scale (8), site_offset_m (J,3) m, loss_trace (K,2)
@@ -265,22 +266,22 @@ class SessionFit(dj.Computed):
                 raise InputChanged("a camera of this set has no keypoints any more")
             refs = [files[v["video_id"]] for v in own] or [files[r["video_id"]]]
             trials.append((r["video_id"], name, r["camera_motion"], refs, _rig(own)))
-        return trials, _marker_table(of_markers), method_row(FitMethod, key)
+        return trials, _marker_table(of_markers), _height_of(key), method_row(FitMethod, key)
 
     @computes
     def make_compute(
-        self, key: dict, trials: Sequence[tuple], table: tuple | None, method: Mapping[str, Any]
+        self, key: dict, trials: Sequence[tuple], table: tuple | None, height_m: float | None, method: Mapping[str, Any]
     ) -> tuple[lib.SessionFit, list[int], str]:
         from pbl_pipeline.fit import fit_session
 
-        session_input = self._loaded(trials, table)
-        own = {} if session_input.markers is None else {"markers": session_input.markers}
+        session_input = self._loaded(trials, table, height_m)
+        stated = {"markers": session_input.markers, "height_m": height_m}
         result = fit_session(
             session_input.trials,
             session_input.names,
             methods.stored(**method),
             camera_motion=session_input.camera_motion,
-            **own,
+            **{k: v for k, v in stated.items() if v is not None},
         )
         return result, [t[0] for t in trials], method["sha"]
 
@@ -300,7 +301,7 @@ class SessionFit(dj.Computed):
             sessions, places = [], []
             for i in rows:
                 try:
-                    sessions.append(self._loaded(*fetched[i][:2]))
+                    sessions.append(self._loaded(*fetched[i][:3]))
                     places.append(i)
                 except PblError:
                     continue  # make_compute will say it
@@ -311,7 +312,7 @@ class SessionFit(dj.Computed):
                     out[i] = (result, [t[0] for t in fetched[i][0]], sha, origin)
         return out
 
-    def _loaded(self, trials: Sequence[tuple], table: tuple | None) -> lib.SessionInput:
+    def _loaded(self, trials: Sequence[tuple], table: tuple | None, height_m: float | None) -> lib.SessionInput:
         """Keypoints of one or several cameras or markers, names and camera motions of the trials of `make_fetch`."""
         from pbl_pipeline.body import load_marker_set
         from pbl_pipeline.fit import SessionInput
@@ -324,7 +325,8 @@ class SessionFit(dj.Computed):
             if table is not None:
                 own = load_marker_set(stack.enter_context(stored_file(self, table[1])), name=table[0])
         # The library knows one moving camera; "one of several" on stands is a static one for it.
-        return SessionInput(loaded, names, ["handheld" if m == "handheld" else "static" for m in motions], own)
+        motions = ["handheld" if m == "handheld" else "static" for m in motions]
+        return SessionInput(loaded, names, motions, own, height_m)
 
     def make_insert(self, key: dict, result: lib.SessionFit, ids: list[int], sha: str, origin: Origin) -> None:
         from pbl_pipeline.qc import worst
@@ -352,6 +354,7 @@ class SessionFit(dj.Computed):
                     "fit_iterations": int(result.iterations),
                     "fit_converged": bool(result.converged),
                     "fit_scale": [round(float(s), 5) for s in result.scale],
+                    "fit_height": result.height_m,
                     "compile_seconds": result.compile_seconds,
                     "compute_device": result.device[:64],
                     "session_file": folder / "session.npz",
@@ -375,6 +378,12 @@ class SessionFit(dj.Computed):
                     }
                 )
         self.Check.insert({**key, **check_row("fit", check)} for check in result.qc)
+
+
+def _height_of(key: Mapping[str, Any]) -> float | None:
+    """The stated body height (m) of the person of a set."""
+    people = session.Session.proj("subject") * lab.Subject.proj("subject_height") & (FitSet & key).proj("session_id")
+    return number(one(people, "subject_height"))
 
 
 def session_of_set(key: Mapping[str, Any]) -> int:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import of_stage
-from pbl_pipeline.names import check_label, is_plain
+from pbl_pipeline.names import check_height, check_label, is_plain
 from pbl_pipeline.paramset import canonical_json
 
 from . import fit, gait, gdi, keypoints, lab, sensors, session, tracking, video
@@ -20,7 +20,7 @@ from ._datajoint import DuplicateError, dj
 from .chain import computed_tables
 from .coded_errors import error_code
 from .codes import check_subject, day_of
-from .conditions import set_condition
+from .conditions import set_condition, set_height
 from .jobs import jobs_of
 from .method_rows import resolve_method
 from .plan import default_fit
@@ -62,7 +62,7 @@ class Ingested:
 @dataclasses.dataclass(frozen=True)
 class Visit:
     """What all files of one call share. None: camera motion handheld where the phone's log is known, else static;
-    activity walking; pace unknown; population unchanged."""
+    activity walking; pace unknown; population and height (m) unchanged."""
 
     subject: str
     session_label: str = session.UNLABELLED
@@ -73,6 +73,7 @@ class Visit:
     person: int | None = None
     population: str | None = None
     pace: str | None = None
+    height_m: float | None = None
 
 
 #: Key of a selection or plan -> field of `Methods` that names it.
@@ -147,6 +148,7 @@ def check_visit(visit: Visit) -> None:
         ("population", visit.population or "", 32),
     ):
         check_label(f"--{what}", text, longest)
+    check_height(visit.height_m)
 
 
 def resolve(named: Methods) -> dict[str, str]:
@@ -362,6 +364,7 @@ def update_known(
     changes += _new_methods(row, chosen, more)
     changes += in_transaction(lambda: set_condition(number, visit.activity, visit.pace))
     changes += new_population(row["subject"], visit.population)
+    changes += in_transaction(lambda: set_height(row["subject"], visit.height_m))
     if changes and status == "known":
         status = "updated"
     if visit.camera_motion not in (None, row["camera_motion"]):
@@ -500,6 +503,7 @@ def session_of(visit: Visit) -> int:
         more = {"project": visit.project, "population": "unknown", "subject_created": utc_now()}
         lab.Subject.insert1({**subject, **more})
     new_population(visit.subject, visit.population)
+    set_height(visit.subject, visit.height_m)
     label = {**subject, "session_label": visit.session_label}
     found = (session.Session & label).to_dicts()
     if found:

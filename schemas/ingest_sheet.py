@@ -30,14 +30,14 @@ from .ingest import (
 )
 from .rows import inside
 from .sensors import Sensors
-from .sheets import Row, date_of, needed, read_sheets, refused
+from .sheets import Row, date_of, needed, number_of, read_sheets, refused
 from .video import CAMERA_MOTIONS
 
 #: Columns that must have a value, and those that may.
 NEEDED = ("file", "subject", "visit")
 COLUMNS = (
     *NEEDED,
-    *("date", "pace", "activity", "camera", "camera_motion", "attitude", "person", "population", "project"),
+    *("date", "pace", "activity", "camera", "camera_motion", "attitude", "person", "population", "height_m", "project"),
 )
 
 
@@ -179,6 +179,7 @@ def _read(row: Row, line: Line, folder: Path) -> tuple[Visit, datetime.date | No
             person=None if person is None else int(person),
             population=cells.get("population"),
             pace=cells.get("pace"),
+            height_m=number_of(row, "height_m", cells["height_m"]) if "height_m" in cells else None,
         )
         check_visit(visit)
         date = date_of(row, "date") if "date" in cells else None
@@ -223,6 +224,7 @@ def _check_people(visits: list[Any], lines: list[Line]) -> None:
                 ("date", date, (*key, "date")),
                 ("population", visit.population, (visit.subject, "population")),
                 ("project", visit.project, (visit.subject, "project")),
+                ("height_m", visit.height_m, (visit.subject, "height_m")),
             ):
                 if value is None:
                     continue

@@ -14,7 +14,7 @@ from pbl_pipeline.names import check_label
 
 from . import fit, gdi, ingest, video
 from ._datajoint import DuplicateError
-from .conditions import set_condition
+from .conditions import set_condition, set_height
 from .ingest import Ingested, Methods, Visit
 from .method_rows import method_row, resolve_method
 from .stored_files import new_folder
@@ -211,6 +211,7 @@ def _known(
         lambda: _plan(number, int(row["session_id"]), chosen, given) + set_condition(number, visit.activity, visit.pace)
     )
     changes += ingest.new_population(row["subject"], visit.population)
+    changes += ingest.in_transaction(lambda: set_height(row["subject"], visit.height_m))
     if changes and status == "known":
         status = "updated"
     return Ingested(path, status, number, "; ".join(notes + (changes or ["nothing was inserted"])))

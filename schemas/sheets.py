@@ -7,6 +7,7 @@ import csv
 import dataclasses
 import datetime
 import io
+import math
 import re
 import zipfile
 from collections.abc import Iterator
@@ -87,6 +88,14 @@ def date_of(row: Row, column: str) -> datetime.date:
         "a day as YYYY-MM-DD, such as 2026-03-09, or a date cell of a workbook",
         "write it so: 03/09 is another day in other countries",
     )
+
+
+def number_of(row: Row, column: str, text: str) -> float:
+    """The number that `text`, the cell of a row in a column, is. Raises `PblError` SHEET_FORMAT for what is none."""
+    with contextlib.suppress(ValueError):
+        if math.isfinite(value := float(text)) and "_" not in text:
+            return value
+    raise refused(row.where, f"{column} {text!r}", "a number with a decimal point", "correct it, or leave it empty")
 
 
 def _csv(path: Path) -> list[list[str]]:

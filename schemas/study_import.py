@@ -20,7 +20,7 @@ from .codes import check_subject, day_of, folded
 from .conditions import set_condition
 from .ingest import in_transaction, next_id
 from .rows import inside, utc_now
-from .sheets import Row, Sheet, date_of, needed, read_sheets, refused
+from .sheets import Row, Sheet, date_of, needed, number_of, read_sheets, refused
 
 #: Column of a sheet -> column of `study.Visit`.
 VISIT_COLUMNS = {
@@ -237,7 +237,7 @@ class _Plan:
                 f"one of {', '.join(self.instruments)}",
                 "correct the name, or insert your own into ClinicalInstrument first",
             )
-        value = None if text == CLEAR else _number(row, name, text)
+        value = None if text == CLEAR else number_of(row, name, text)
         if value is not None:
             study.check_score(value, self.instruments[name], row.where)
         if (other := self.scores.get((*key, name))) is not None:
@@ -492,13 +492,6 @@ def _default(column: str) -> Any:
     return None if column in ("visit_days", "visit_age", "intervention_date") else ""
 
 
-def _number(row: Row, column: str, text: str) -> float:
-    with contextlib.suppress(ValueError):
-        if math.isfinite(value := float(text)) and "_" not in text:
-            return value
-    raise refused(row.where, f"{column} {text!r}", "a number with a decimal point", "correct it, or leave it empty")
-
-
 def _flag(row: Row, column: str) -> bool:
     text = row.cells[column].lower()
     if text not in (*_YES, *_NO):
@@ -522,7 +515,7 @@ def _visit_value(row: Row, column: str) -> Any:
     if column == "intervention_date":
         return date_of(row, column)
     if column in ("days", "age"):
-        number = _number(row, column, text)
+        number = number_of(row, column, text)
         if (column == "age" and not 0 <= number <= 130) or (
             column == "days" and not (number.is_integer() and abs(number) < 1e5)
         ):

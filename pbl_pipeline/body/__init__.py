@@ -10,7 +10,7 @@ from pbl_pipeline import jax_setup
 jax_setup.configure()
 
 from pbl_pipeline.body._angles import angle_of, joint_angles, joint_angles_sd, joint_of  # noqa: E402
-from pbl_pipeline.body._capsules import Capsules, capsules  # noqa: E402
+from pbl_pipeline.body._capsules import Capsules, capsules, stature_m  # noqa: E402
 from pbl_pipeline.body._chain import chain_frames  # noqa: E402
 from pbl_pipeline.body._frames import Frames, mjx_frames  # noqa: E402
 from pbl_pipeline.body._kinematics import (  # noqa: E402
@@ -57,4 +57,5 @@ __all__ = [
     "marker_set",
     "mjx_frames",
     "scale_multipliers",
+    "stature_m",
 ]

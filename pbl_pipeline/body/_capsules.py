@@ -1,4 +1,4 @@
-"""The body as capsules in the world: all that a drawing needs, without JAX."""
+"""The body as capsules in the world: all that a drawing needs, without JAX; and how tall it is."""
 
 # MuJoCo is a compiled module without type stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -70,6 +70,14 @@ def capsules(body: Body, qpos: np.ndarray, scale: np.ndarray) -> Capsules:
         end=world(np.stack([c.end for c in local])),
         radius_m=own[index] * np.array([c.radius for c in local]),
     )
+
+
+def stature_m(body: Body, scale: np.ndarray) -> float:
+    """Height (m) of the body with scale multipliers (8,), standing at `qpos = 0`: from its soles to the top of its
+    head, as its shapes have them (1.80 m unscaled)."""
+    shapes = capsules(body, np.zeros((1, len(body.joint_names))), scale)
+    z, r = np.concatenate([shapes.start, shapes.end])[..., 2], shapes.radius_m
+    return float((z + r).max() - (z - r).min())
 
 
 def _poses(body: Body, qpos: np.ndarray, own_scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -24,6 +24,10 @@ CAMERA_MOTIONS = ("static", "handheld")
 CAMERA_MOTION_HELP = "Default: handheld where the phone's orientation is known, else static."
 
 
+HEIGHT = click.option(
+    "--height-m", type=float, help="Measured body height, such as 1.72: lengths and speeds become those of it."
+)
+
 KEYPOINTS = click.option(
     "--keypoints",
     "keypoints",

@@ -10,7 +10,7 @@ import click
 
 from pbl_pipeline.errors import PblError
 
-from ._options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, fit_paramset
+from ._options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, HEIGHT, fit_paramset
 
 if TYPE_CHECKING:
     from pbl_pipeline.body import MarkerSet
@@ -27,6 +27,7 @@ _ENDS = (".npz", ".keypoints", ".markers")
 @click.option("--camera-motion", type=click.Choice(CAMERA_MOTIONS), help=CAMERA_MOTION_HELP)
 @click.option("--cameras", type=click.Path(path_type=Path), help="Calibration (TOML): FILES are views of one trial.")
 @click.option("--marker-set", help="Name of a marker set, or a table (CSV) of your own; needed for .trc files.")
+@HEIGHT
 @click.option(
     "--up", type=click.Choice(["y", "z"]), default="y", show_default=True, help="Vertical axis of .trc files."
 )
@@ -38,6 +39,7 @@ def fit(
     camera_motion: str | None,
     cameras: Path | None,
     marker_set: str | None,
+    height_m: float | None,
     up: str,
 ) -> None:
     """Fit one body to FILES, the trials of one session.
@@ -64,7 +66,8 @@ def fit(
         names = distinct_names([Path(stem + ".npz") for stem in stems])
     motions = [camera_motion or _motion(trial) for trial in trials]
     markers = {} if table is None else {"markers": table}
-    session = fit_session(trials, names, paramset, motions[0] if len(set(motions)) == 1 else motions, **markers)
+    motion = motions[0] if len(set(motions)) == 1 else motions
+    session = fit_session(trials, names, paramset, motion, height_m=height_m, **markers)
     out.mkdir(parents=True, exist_ok=True)
     for trial in session.trials:
         trial.save(out / f"{trial.name}.fit.npz")

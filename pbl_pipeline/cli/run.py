@@ -11,6 +11,7 @@ from ._options import (
     CAMERA_MOTION_HELP,
     CAMERA_MOTIONS,
     DEVICE,
+    HEIGHT,
     KEYPOINTS,
     PEOPLE,
     Person,
@@ -44,6 +45,7 @@ from ._options import (
 @click.option("--solver", help="Such as gauss-newton or implicit-adam; without it the solver of the paramset.")
 @click.option("--params", help="Name of a paramset, or a JSON file with changes to one (docs/files.md).")
 @click.option("--norm", help="Normative set of the GDI.")
+@HEIGHT
 @click.option("--subject", default="-", help="Code of the subject on the report; never a name.")
 def run(
     videos: tuple[Path, ...],
@@ -58,6 +60,7 @@ def run(
     solver: str | None,
     params: str | None,
     norm: str | None,
+    height_m: float | None,
     subject: str,
 ) -> None:
     """Put VIDEOS, the trials of one session, through the whole chain.
@@ -89,7 +92,9 @@ def run(
     check_out_folder(out)
     method, finder = keypoint_method(keypoints, device), tracking_method(people)
     paramset = fit_paramset(solver, params, default=fit_default(method))
-    session = run_session(videos, out, camera, person, paramset, camera_motion, norm, attitude, method, finder)
+    session = run_session(
+        videos, out, camera, person, paramset, camera_motion, norm, attitude, method, finder, height_m
+    )
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
     paths = write_results(out, session, subject_code=subject, date=f"computed {today}")
     click.echo(session.judged.table())

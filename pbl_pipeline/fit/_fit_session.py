@@ -14,6 +14,7 @@ from pbl_pipeline.body import MarkerSet, load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.methods import Method
+from pbl_pipeline.names import check_height
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.video import Camera
 
@@ -21,6 +22,7 @@ from ._methods import METHODS
 from ._params import Params
 from ._rotation import quat_wxyz
 from .checks import check_fit
+from .known_height import as_tall
 from .objective import State
 from .per_frame import start_of
 from .priors import pixels_alone
@@ -47,6 +49,7 @@ class SessionInput:
     names: Sequence[str]
     camera_motion: str | Sequence[str] = "static"
     markers: MarkerSet | None = None
+    height_m: float | None = None
 
 
 def fit_session(
@@ -55,6 +58,7 @@ def fit_session(
     paramset: Method[Params] | Paramset | Params | str | None = None,
     camera_motion: str | Sequence[str] = "static",
     markers: MarkerSet | None = None,
+    height_m: float | None = None,
 ) -> SessionFit:
     """Fit the body to all trials of one session; scale and marker offsets are shared.
 
@@ -72,13 +76,16 @@ def fit_session(
         unless the walk tells its tilt; a check says which.
     markers
         Where the markers sit on the body, for a set of the laboratory's own (`body.load_marker_set`).
+    height_m
+        The person's measured body height (m): lengths of a fit to one camera then are those of a person so tall, where
+        they otherwise are the detector's guess (`known_height`). Angles do not depend on it.
 
     Raises
     ------
     PblError
         FIT_INPUT, VIEWS_DISAGREE, MARKER_SET_UNKNOWN, PHONE_LOG, SOLVER_UNKNOWN, FIT_DIVERGED.
     """
-    result = fit_sessions([SessionInput(trials, names, camera_motion, markers)], paramset)[0]
+    result = fit_sessions([SessionInput(trials, names, camera_motion, markers, height_m)], paramset)[0]
     if isinstance(result, PblError):
         raise result
     return result
@@ -106,11 +113,11 @@ def fit_sessions(
     out: list[SessionFit | PblError | None] = [None] * len(sessions)
     for part in _made_ahead(_batches(sessions, method.params, batch, out)):
         for packed, solution in zip(part, _solve(part, method), strict=True):
-            motions = _motions(sessions[packed.index])
+            given = sessions[packed.index]
             try:
                 if isinstance(solution, PblError):
                     raise solution
-                out[packed.index] = _session_fit(packed.session, solution, paramset, motions, packed.seconds)
+                out[packed.index] = _session_fit(packed, solution, paramset, given)
             except PblError as error:
                 out[packed.index] = error
     return [r for r in out if r is not None]
@@ -136,6 +143,7 @@ def _batches(
     def pack(i: int) -> _Packed | PblError:
         begin, given = time.perf_counter(), sessions[i]
         try:
+            check_height(given.height_m)
             session = make_session(given.trials, given.names, params.view, _motions(given), given.markers)
         except PblError as error:
             return error
@@ -188,10 +196,8 @@ def check_trial(
     return _check_trial(trial, name, METHODS.find(paramset).params.view, markers)
 
 
-def _session_fit(
-    session: Session, solution: Solution, paramset: Paramset, motions: Sequence[str], packing: float
-) -> SessionFit:
-    begin = time.perf_counter()
+def _session_fit(packed: _Packed, solution: Solution, paramset: Paramset, given: SessionInput) -> SessionFit:
+    begin, session, motions = time.perf_counter(), packed.session, _motions(given)
     used = np.asarray(session.problem.weight) > 0
     finite = np.all(np.isfinite(solution.qpos[used])) and np.all(np.isfinite(solution.scale))
     if not finite or not np.isfinite(solution.loss_trace[-1, 1]):
@@ -203,7 +209,8 @@ def _session_fit(
             key=", ".join(session.names),
         )
     solution, sources = upright(session, solution)
-    seconds = packing + solution.seconds + time.perf_counter() - begin
+    solution, taller = as_tall(session, solution, given.height_m)
+    seconds = packed.seconds + solution.seconds + time.perf_counter() - begin
     fits = tuple(
         _trial_fit(session, i, solution, sources[i], paramset, motions[i], seconds) for i in range(len(session.trials))
     )
@@ -219,7 +226,8 @@ def _session_fit(
         seconds=seconds,
         compile_seconds=solution.compile_seconds,
         device=str(jax.devices()[0].device_kind),
-        qc=check_fit(session, fits, solution),
+        qc=check_fit(session, fits, solution, taller),
+        height_m=given.height_m,
     )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import SLIDES
+from pbl_pipeline.body import SLIDES, stature_m
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.qc import FAIL, PASS, WARN, Check
 
@@ -41,10 +41,13 @@ FOCAL_SD_WARN = 0.02
 FACING_FAIL_DEG = 30.0
 
 
-def check_fit(session: Session, trials: Sequence[TrialFit], solution: Solution) -> tuple[Check, ...]:
-    """All checks of one session fit, worst trial per check."""
-    checks = [_residual_3d(session, trials), _in_view(session), _scale(solution.scale), _limits(session, trials)]
-    checks += [_converged(solution)]
+def check_fit(
+    session: Session, trials: Sequence[TrialFit], solution: Solution, taller: float | None = None
+) -> tuple[Check, ...]:
+    """All checks of one session fit, worst trial per check. `taller`: the person's height over the fitted one's
+    (`known_height.as_tall`)."""
+    checks = [_residual_3d(session, trials), _in_view(session), _limits(session, trials), _converged(solution)]
+    checks += [_scale(solution.scale)] if taller is None else _height(session, solution.scale, taller)
     if not isinstance(session.trials[0], WorldMarkers):
         checks = [_residual_2d(session, trials), *checks, _intrinsics(trials), _orientation(trials)]
         checks += [*_depth(session, trials), *_assumed(session)]
@@ -143,6 +146,22 @@ def _scale(scale: np.ndarray) -> Check:
         SCALE_HIGH if worst > 1 else SCALE_LOW,
         "a body segment is scaled beyond what adults show: a child, or the camera's focal length is wrong",
     )
+
+
+def _height(session: Session, scale: np.ndarray, taller: float) -> list[Check]:
+    """Where the person's height is known: the proportions, and the height against what was seen."""
+    tall = stature_m(session.body, scale) / stature_m(session.body, np.ones_like(scale))
+    return [
+        _scale(scale / tall),
+        Check(
+            "stated_over_seen_height",
+            PASS if SCALE_LOW <= taller <= SCALE_HIGH else WARN,
+            taller,
+            SCALE_HIGH if taller > 1 else SCALE_LOW,
+            "the stated height is far from what is seen: a mistyped height, another person, or a child, whose size a "
+            "detector does not know",
+        ),
+    ]
 
 
 def _pelvis_told(session: Session, trials: Sequence[TrialFit], told: np.ndarray) -> list[Check]:

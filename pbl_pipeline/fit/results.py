@@ -88,7 +88,8 @@ class TrialFit:
 
 @dataclasses.dataclass(frozen=True)
 class SessionFit:
-    """All trials of a session with one body. loss_trace (K, 2): step, total loss. converged None: not recorded."""
+    """All trials of a session with one body. loss_trace (K, 2): step, total loss. converged None: not recorded.
+    height_m: the person's stated body height (`known_height`), None where it was not stated."""
 
     trials: tuple[TrialFit, ...]
     scale: np.ndarray
@@ -102,6 +103,7 @@ class SessionFit:
     compile_seconds: float
     device: str
     qc: tuple[Check, ...]
+    height_m: float | None = None
 
 
 def _shapes(n: int, q: int, j: int) -> dict[str, tuple[int | None, ...]]:

@@ -79,6 +79,7 @@ if TYPE_CHECKING:
     "--pace", help="How fast: self_selected, fast, slow, dual_task, ... (else: unknown, which counts as self_selected)."
 )
 @click.option("--population", metavar="NAME", help="Group of the subject, such as healthy (else: as it was).")
+@click.option("--height-m", type=float, help="Measured body height of the subject, such as 1.72 (else: as it was).")
 @click.option("--person", type=click.IntRange(min=1), help="Measure this person of the tracking (else: automatic).")
 @click.option("--tracking-method", metavar="NAME", help="Method of person tracking (else: the default).")
 @click.option("--keypoint-method", metavar="NAME", help="Keypoint method or model (else: default).")
@@ -105,6 +106,7 @@ def ingest(
     activity: str | None,
     pace: str | None,
     population: str | None,
+    height_m: float | None,
     person: int | None,
     tracking_method: str | None,
     keypoint_method: str | None,
@@ -140,7 +142,7 @@ def ingest(
     methods = Methods(tracking=tracking_method, keypoint=keypoint_method, fit=fit_method, gdi=index, norm=norm)
     if sheet is not None:
         of_rows = (videos, markers, marker_set, rig, subject, session_label, name_pattern, project, camera)
-        of_rows += (camera_motion, attitude, depth, imu, activity, pace, population, person)
+        of_rows += (camera_motion, attitude, depth, imu, activity, pace, population, height_m, person)
         if any(of_rows):
             raise click.UsageError("--sheet: its columns state files, people and visits; only methods are options.")
         _sheet(sheet, methods, dry_run)
@@ -169,6 +171,7 @@ def ingest(
             person=person,
             population=population,
             pace=said.get("pace"),
+            height_m=height_m,
         )
         if markers:
             results += ingest_markers([markers[i] for i in numbers], visit, marker_set, up, methods)

@@ -69,7 +69,7 @@ def detect_keypoints(video_path, tracking, person_id, camera, params=None) -> Ke
     return dataclasses.replace(found, camera=camera)
 
 
-def fit_session(trials, names, paramset=None, camera_motion="static") -> SessionFit:
+def fit_session(trials, names, paramset=None, camera_motion="static", height_m=None) -> SessionFit:
     """The movement that was put in; as many time stamps as the keypoints have."""
     body = load_body()
     fits = tuple(
@@ -88,6 +88,7 @@ def fit_session(trials, names, paramset=None, camera_motion="static") -> Session
         seconds=0.1,
         compile_seconds=0.0,
         device="cpu",
+        height_m=height_m,
         qc=(Check("residual_3d_cm", "WARN", 7.0, 6.0, "look at the overlay"), Check("scale", "PASS", None, None)),
     )
 

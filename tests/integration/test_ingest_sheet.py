@@ -14,7 +14,7 @@ from tests.rows import everything
 
 from . import chain
 
-HEADER = "file,subject,visit,date,pace,activity,camera,camera_motion,population,project"
+HEADER = "file,subject,visit,date,pace,activity,camera,camera_motion,population,project,height_m"
 
 
 @pytest.fixture(scope="module")
@@ -39,9 +39,9 @@ def sheet(folder: Path, *rows: str, header: str = HEADER, name: str = "visits.cs
 
 
 GOOD = (
-    "one.mp4,P001,2026-03-01,,fast,,phone.toml,handheld,patient,spine",
-    "two.mp4,P001,2026-03-01,,,tug,,,,",
-    "three.mp4,P002,first,2026-03-02,,,,,,",
+    "one.mp4,P001,2026-03-01,,fast,,phone.toml,handheld,patient,spine,1.72",
+    "two.mp4,P001,2026-03-01,,,tug,,,,,",
+    "three.mp4,P002,first,2026-03-02,,,,,,,",
 )
 
 
@@ -73,7 +73,7 @@ def test_a_sheet_registers_people_visits_pace_and_cameras_once(tables, recording
     focal = (lab.CameraCalibration & {"camera_id": rows[0]["camera_id"]}).fetch1("camera_fx")
     assert focal == pytest.approx(100.0)
     person = (lab.Subject & {"subject": "P001"}).fetch1()
-    assert (person["population"], person["project"]) == ("patient", "spine")
+    assert (person["population"], person["project"], person["subject_height"]) == ("patient", "spine", 1.72)
     before = everything()
     again = pbl("ingest", "--sheet", path)
     assert "0 videos registered, 3 known, 0 rows refused" in again.out
@@ -83,23 +83,26 @@ def test_a_sheet_registers_people_visits_pace_and_cameras_once(tables, recording
 @pytest.mark.parametrize(
     ("row", "code", "words"),
     [
-        ("nobody.mp4,P003,1,,,,,,,", "VIDEO_MISSING", "nobody.mp4"),
-        ("empty.mp4,P003,1,,,,,,,", "VIDEO_EMPTY", "empty.mp4"),
-        ("copy.mp4,P003,1,,,,,,,", "SHEET_CONFLICT", "row 2"),
-        ("three.mp4,Anna Meier,1,,,,,,,", "USAGE", "pseudonymous"),
-        ("three.mp4,p-1,1,,,,,,,", "SHEET_CONFLICT", "P001"),
-        (",P003,1,,,,,,,", "SHEET_FORMAT", "no file"),
-        ("three.mp4,P003,,,,,,,,", "SHEET_FORMAT", "no visit"),
-        ("three.mp4,P003,1,03/02/2026,,,,,,", "SHEET_FORMAT", "YYYY-MM-DD"),
-        ("three.mp4,P001,2026-03-01,2026-03-09,,,,,,", "SHEET_CONFLICT", "2026-03-09"),
-        ("three.mp4,P002,first,2026-03-09,,,,,,", "SHEET_CONFLICT", "two visits need two labels"),
-        ("three.mp4,P001,2026-03-01,,,,,,healthy,", "SHEET_CONFLICT", "patient"),
-        ("three.mp4,P003,1,,,,,flying,,", "SHEET_FORMAT", "static"),
-        ("three.mp4,P003,1,,,,no.toml,,,", "CAMERA_INVALID", "no.toml"),
+        ("nobody.mp4,P003,1,,,,,,,,", "VIDEO_MISSING", "nobody.mp4"),
+        ("empty.mp4,P003,1,,,,,,,,", "VIDEO_EMPTY", "empty.mp4"),
+        ("copy.mp4,P003,1,,,,,,,,", "SHEET_CONFLICT", "row 2"),
+        ("three.mp4,Anna Meier,1,,,,,,,,", "USAGE", "pseudonymous"),
+        ("three.mp4,p-1,1,,,,,,,,", "SHEET_CONFLICT", "P001"),
+        (",P003,1,,,,,,,,", "SHEET_FORMAT", "no file"),
+        ("three.mp4,P003,,,,,,,,,", "SHEET_FORMAT", "no visit"),
+        ("three.mp4,P003,1,03/02/2026,,,,,,,", "SHEET_FORMAT", "YYYY-MM-DD"),
+        ("three.mp4,P001,2026-03-01,2026-03-09,,,,,,,", "SHEET_CONFLICT", "2026-03-09"),
+        ("three.mp4,P002,first,2026-03-09,,,,,,,", "SHEET_CONFLICT", "two visits need two labels"),
+        ("three.mp4,P001,2026-03-01,,,,,,healthy,,", "SHEET_CONFLICT", "patient"),
+        ("three.mp4,P001,2026-03-01,,,,,,,,1.80", "SHEET_CONFLICT", "1.72"),
+        ("three.mp4,P003,1,,,,,,,,1.7 m", "SHEET_FORMAT", "height_m"),
+        ("three.mp4,P003,1,,,,,,,,172", "FIT_INPUT", "172"),
+        ("three.mp4,P003,1,,,,,flying,,,", "SHEET_FORMAT", "static"),
+        ("three.mp4,P003,1,,,,no.toml,,,,", "CAMERA_INVALID", "no.toml"),
     ],
 )
 def test_one_bad_row_and_nothing_is_registered(tables, recordings, row, code, words):
-    second = "two.mp4,P002,first,2026-03-02,,,,,,"
+    second = "two.mp4,P002,first,2026-03-02,,,,,,,"
     path = sheet(recordings, GOOD[0], second, row, name="bad.csv")
     before = everything()
     for more in ((), ("--dry-run",)):
@@ -155,7 +158,7 @@ def test_what_a_row_states_is_no_option(tables, recordings):
 
 def test_a_recording_of_another_visit_or_person_is_named_with_the_way_out(tables, recordings):
     assert pbl("ingest", recordings / "one.mp4", "--subject", "P001", "--session", "1").code == 0
-    for row, code in (("one.mp4,P001,2", "SHEET_CONFLICT"), ("one.mp4,P009,1", "VIDEO_DUPLICATE")):
+    for row, code in (("one.mp4,P001,2,", "SHEET_CONFLICT"), ("one.mp4,P009,1,", "VIDEO_DUPLICATE")):
         done = pbl("ingest", "--sheet", sheet(recordings, row, header="file,subject,visit", name="other.csv"))
         assert done.error_code == code, done.err
         assert "pbl move" in done.err

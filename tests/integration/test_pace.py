@@ -1,4 +1,5 @@
-"""Activity and pace of a video decide which measures it is pooled in, and a change computes those anew."""
+"""Activity and pace of a video decide which measures it is pooled in, and a person's height how long strides are; a
+change computes anew what depends on it."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ import pytest
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GDI_METHODS
 from pbl_pipeline.paramset import Paramset
-from schemas import gait, gdi, norms, session, video, views
+from schemas import fit, gait, gdi, norms, session, video, views
 from schemas.conditions import set_condition
 from schemas.ingest import Methods, Visit, ingest
 from schemas.method_rows import insert_methods
@@ -77,6 +78,26 @@ def test_a_change_that_pools_the_same_deletes_nothing(tables: None, tmp_path: Pa
         set_condition(number + 1, pace="fast")
     with pytest.raises(PblError, match="at the pace 'fast'"):
         norms.build_norm("fast-lab", populations=(), subjects=("P001",), pace="fast")
+
+
+def test_a_stated_height_reaches_the_fit_and_a_corrected_one_fits_anew(tables: None, tmp_path: Path):
+    walk, other = (chain.small_video(tmp_path, n, n=300 + i) for i, n in enumerate(("walk", "other")))
+    assert pbl("ingest", walk, "--subject", "P001").code == 0
+    assert pbl("ingest", other, "--subject", "P002", "--height-m", "1.8").code == 0
+    populate()
+    told = {r["subject"]: r["fit_height"] for r in (fit.SessionFit * session.Session).to_dicts()}
+    assert told == {"P001": None, "P002": 1.8}
+    assert load_session({"subject": "P002"}).fit.height_m == 1.8
+    refused = pbl("ingest", walk, "--subject", "P001", "--height-m", "172")
+    assert (refused.code, "body height of 172 m" in refused.err) == (1, True)
+    done = pbl("ingest", walk, "--subject", "P001", "--height-m", "1.72")
+    assert "height of P001 is 1.72 m now; what was fitted without it was deleted: " in done.out
+    assert [r["subject"] for r in (fit.SessionFit * session.Session).to_dicts()] == ["P002"]
+    populate()
+    assert (fit.SessionFit * session.Session & {"subject": "P001"}).fetch1("fit_height") == 1.72
+    again = pbl("ingest", walk, "--subject", "P001", "--height-m", "1.72")
+    assert "nothing was inserted" in again.out
+    assert len(fit.SessionFit()) == 2
 
 
 PATTERN = r"(?P<subject>P\d+)_(?:(?P<pace>[a-z]+)_)?\d"

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import load_body
+from pbl_pipeline.body import load_body, marker_positions, marker_set, stature_m
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import (
     METHODS,
@@ -150,6 +150,34 @@ def test_two_trials_share_one_body():
     for trial, truth in zip(fit.trials, truths, strict=True):
         assert_near(trial, truth, deg=2.8, m=0.06)
         assert trial.scale is fit.scale or np.array_equal(trial.scale, fit.scale)
+
+
+def test_a_known_height_sets_every_length_and_moves_no_pixel():
+    """Points that are 10 % too small, as a detector that takes people for smaller would give them."""
+    scale = person(5)[0]
+    tall = stature_m(load_body(), scale)
+    given = look(5).keypoints
+    small = dataclasses.replace(given, xyz_cam_m=0.9 * given.xyz_cam_m)
+    free, known = (fit_session([small], ["a"], PARAMSET, height_m=h) for h in (None, tall))
+    a, b = free.trials[0], known.trials[0]
+    assert stature_m(load_body(), known.scale) == pytest.approx(tall, rel=1e-6)
+    assert stature_m(load_body(), free.scale) < 0.93 * tall
+    factor = known.scale[0] / free.scale[0]
+    np.testing.assert_allclose(b.qpos[:, 3:], a.qpos[:, 3:], atol=1e-9)
+    np.testing.assert_allclose(b.markers_world_m, factor * a.markers_world_m, rtol=1e-6)  # the phone is the origin
+    # The model says the same as the markers: what it puts at the pose lies there.
+    body, markers = load_body(), marker_set(b.marker_set)
+    seen = np.flatnonzero(np.isfinite(b.qpos[:, 0]))[:3]
+    x = marker_positions(body, markers, b.qpos[seen], b.scale, b.site_offset_m)
+    np.testing.assert_allclose(np.asarray(x), b.markers_world_m[seen], atol=2e-4)
+    assert_near(b, walk(5), deg=2.8, m=0.06)
+    assert check(known, "stated_over_seen_height") == "PASS"
+    assert "stated_over_seen_height" not in {c.check for c in free.qc}
+    mistyped = fit_session([small], ["a"], PARAMSET, height_m=1.4 * tall)
+    assert check(mistyped, "stated_over_seen_height") == "WARN"
+    assert check(mistyped, "scale_furthest_from_1") == "PASS"  # proportions, not the size
+    with pytest.raises(PblError, match="FIT_INPUT"):
+        fit_session([small], ["a"], PARAMSET, height_m=172.0)
 
 
 def test_a_tilted_camera_is_set_upright_by_the_walk():

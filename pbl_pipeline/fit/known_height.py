@@ -1,0 +1,57 @@
+"""The person's measured height as the size of the fitted body.
+
+One camera sees no lengths: a person half as large at half the distance gives the same pixels, and how large the
+detector's 3D points are is the detector's guess (those of `blazepose-heavy` were 6 % too small on six recordings,
+`research.detector_errors`). A height that was measured says it. The whole scene is enlarged about the camera, so that
+pixels and joint angles stay what they are, and every length (strides, speed, the distance from the camera) follows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.body import SLIDES, stature_m
+from pbl_pipeline.keypoints import Keypoints
+
+from .initial_pose import pelvis_path, pelvis_values
+from .session import Session
+from .solution import Solution
+
+
+def as_tall(session: Session, solution: Solution, height_m: float | None) -> tuple[Solution, float | None]:
+    """The solution with a body of the person's height, and that height over the one of the solution (None: unknown).
+
+    What several cameras or laboratory markers measured stays as it is.
+    """
+    if height_m is None:
+        return solution, None
+    factor = height_m / stature_m(session.body, solution.scale)
+    if not all(isinstance(t, Keypoints) for t in session.trials):
+        return solution, factor
+    qpos, points = solution.qpos.copy(), np.array(solution.outcome.x_world_m)
+    sd = None if solution.qpos_sd is None else solution.qpos_sd.copy()
+    slides = [session.body.joint_names.index(name) for name in SLIDES]
+    for i, arrays in enumerate(session.arrays):
+        frames, camera = session.frames(i), arrays.p_nc[:, 0]
+        x, R = pelvis_path(session.body, qpos[frames])
+        for name, value in pelvis_values(session.body, R, camera + factor * (x - camera)).items():
+            if name in SLIDES:
+                qpos[frames, session.body.joint_names.index(name)] = value
+        points[frames] = camera[:, None] + factor * (points[frames] - camera[:, None])
+    if sd is not None:
+        sd[:, slides] *= factor
+    s = factor * solution.s
+    s[0] += factor - 1.0  # a multiplier is 1 plus these
+    shown: Any = points
+    enlarged = dataclasses.replace(
+        solution,
+        qpos=qpos,
+        qpos_sd=sd,
+        s=s,
+        scale=factor * solution.scale,
+        outcome=dataclasses.replace(solution.outcome, x_world_m=shown),
+    )
+    return enlarged, factor
