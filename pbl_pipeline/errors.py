@@ -68,6 +68,7 @@ CODES: dict[str, str] = {
     "TIME_LIMIT": "a job took longer than a worker gives it and was ended",
     "WORKER_CRASH": "a job took its worker's process down more than once",
     "DECIDED_MEANWHILE": "somebody else decided, or it was computed anew, since the page was loaded",
+    "WEB_NOT_MADE": "a file that the review page was making was not finished",
     "WEB_PORT": "the review page cannot listen on that port",
     "USAGE": "the command was called in a way that cannot work",
     "INTERNAL": "an unforeseen error: please report it with the whole text",

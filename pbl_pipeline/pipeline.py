@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pbl_pipeline import __version__
@@ -182,11 +183,34 @@ def write_results(
     Raises the `PblError`s of `render_overlay` and `deidentify.to_show`.
     """
     out.mkdir(parents=True, exist_ok=True)
+    with _as_shown(session) as shown:
+        return _write_results(out, shown, title, subject_code, date, origin)
+
+
+def write_session_report(
+    path: Path,
+    session: Session,
+    title: str = "Gait report",
+    subject_code: str = "-",
+    date: str = "",
+    origin: Mapping[str, Mapping[str, str]] | None = None,
+) -> Path:
+    """Write `report.html` of a session alone, as `write_results` does, and return its path.
+
+    Raises the `PblError`s of `overlay_frames` and `deidentify.to_show`.
+    """
+    with _as_shown(session) as shown:
+        return _write_report(path, shown, title, subject_code, date, origin)
+
+
+@contextlib.contextmanager
+def _as_shown(session: Session) -> Iterator[Session]:
+    """The session with the recordings whose pictures may be shown."""
     with tempfile.TemporaryDirectory() as folder:
         trials = tuple(
             dataclasses.replace(t, shown=t.shown or to_show(t.path, Path(folder), t.video)) for t in session.trials
         )
-        return _write_results(out, dataclasses.replace(session, trials=trials), title, subject_code, date, origin)
+        yield dataclasses.replace(session, trials=trials)
 
 
 def _write_results(
@@ -197,7 +221,7 @@ def _write_results(
     date: str,
     origin: Mapping[str, Mapping[str, str]] | None,
 ) -> list[Path]:
-    paths, reports = [out / "report.html"], []
+    paths = [out / "report.html"]
     for trial, fit, measured in zip(session.trials, session.fit.trials, session.metrics.trials, strict=True):
         files = {end: out / f"{trial.name}.{end}" for end in TRIAL_FILES}
         events = measured.events.events if measured.events else ()
@@ -214,23 +238,36 @@ def _write_results(
         fit.save(files["fit.npz"])
         trial.keypoints.save(files["keypoints.npz"])
         paths += [p for p in files.values() if p.exists()]
-        pictures = _pictures(trial, fit)
-        reports.append(TrialReport(trial.name, trial.video, trial.choice, fit, trial.keypoints, pictures))
     write_session_json(session.fit, out / "session.json")
-    metrics = session.judged
-    metrics.save(out / "metrics.json")
+    session.judged.save(out / "metrics.json")
+    _write_report(out / "report.html", session, title, subject_code, date, origin)
+    return [*paths, out / "session.json", out / "metrics.json"]
+
+
+def _write_report(
+    path: Path,
+    session: Session,
+    title: str,
+    subject_code: str,
+    date: str,
+    origin: Mapping[str, Mapping[str, str]] | None,
+) -> Path:
+    reports = tuple(
+        TrialReport(t.name, t.video, t.choice, fit, t.keypoints, _pictures(t, fit))
+        for t, fit in zip(session.trials, session.fit.trials, strict=True)
+    )
     report = SessionReport(
         title=title,
         subject_code=subject_code,
         date=date,
-        trials=tuple(reports),
-        metrics=metrics,
+        trials=reports,
+        metrics=session.judged,
         session=session.fit,
         checks=session.checks,
         origin=dict(origin or {}) | {"Software": {"pbl-pipeline": __version__} | _models(session)},
     )
-    write_report(out / "report.html", report)
-    return [*paths, out / "session.json", out / "metrics.json"]
+    write_report(path, report)
+    return path
 
 
 def _models(session: Session) -> dict[str, str]:

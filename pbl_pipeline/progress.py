@@ -11,6 +11,13 @@ from tqdm import tqdm
 
 T = TypeVar("T")
 _enabled = False
+_told: Callable[[int, int | None], None] | None = None
+
+
+def tell(function: Callable[[int, int | None], None] | None) -> None:
+    """Have a function called with what `track` has done and the total, about after each item; None: no longer."""
+    global _told
+    _told = function
 
 
 def enable(on: bool = True) -> None:
@@ -26,7 +33,14 @@ def enabled() -> bool:
 
 def track(items: Iterable[T], label: str, total: int | None = None, unit: str = "frame") -> Iterator[T]:
     """Iterate over `items`, drawing a bar on stderr when enabled. `total` may be unknown."""
-    return iter(tqdm(items, desc=label, total=total, unit=unit, disable=not _enabled, **_style()))
+    bar = tqdm(items, desc=label, total=total, unit=unit, disable=not _enabled, **_style())
+    return iter(bar) if _told is None else _telling(bar, total, _told)
+
+
+def _telling(items: Iterable[T], total: int | None, told: Callable[[int, int | None], None]) -> Iterator[T]:
+    for done, item in enumerate(items):
+        told(done, total)
+        yield item
 
 
 @contextmanager

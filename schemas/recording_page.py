@@ -97,6 +97,14 @@ def trial_key(video_id: int) -> dict[str, Any] | None:
     return {k: rows[0][k] for k in fit.SessionFit.Trial.primary_key} if rows else None
 
 
+def computed(key: dict[str, Any]) -> tuple[Any, ...]:
+    """What tells the computations apart that a recording's fit of `trial_key` and its newest events come from."""
+    fitted = (fit.SessionFit & key).to_arrays("fit_computed")
+    found = _newest_events(key)
+    events = () if found is None else (gait.GaitEvents & found).to_arrays("events_computed")
+    return (*key.values(), *map(str, fitted), *(found or {}).values(), *map(str, events))
+
+
 def recording_fit(key: dict[str, Any]) -> RecordingFit:
     """The files of the fit of `trial_key`. Raises `PblError` FILE_FORMAT where one is lost or damaged."""
     trial = load_trial_fit(key)

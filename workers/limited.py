@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import multiprocessing
+import threading
+import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -13,7 +15,13 @@ class LimitExceeded(Exception):
     """The function took more time or memory than it was given, or its process died."""
 
 
-def limited(function: Callable[..., object], *args: Any, seconds: float, n_bytes: int) -> None:
+def limited(
+    function: Callable[..., object],
+    *args: Any,
+    seconds: float,
+    n_bytes: int,
+    stop: threading.Event | None = None,
+) -> None:
     """Call a function for what it raises; its result is dropped.
 
     Parameters
@@ -24,11 +32,13 @@ def limited(function: Callable[..., object], *args: Any, seconds: float, n_bytes
         Time it may take, the start of the process (about a second) included.
     n_bytes
         Memory the process may allocate beside what its imports take.
+    stop
+        Ends the process when it is set.
 
     Raises
     ------
     LimitExceeded
-        In words what it took too much of. Whatever `function` raises is raised here.
+        In words what it took too much of, or that it was stopped. Whatever `function` raises is raised here.
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
@@ -36,8 +46,12 @@ def limited(function: Callable[..., object], *args: Any, seconds: float, n_bytes
     process.start()
     theirs.close()
     try:
-        if not ours.poll(seconds):
-            raise LimitExceeded(f"more than {seconds:g} s")
+        end = time.monotonic() + seconds
+        while not ours.poll(min(0.2, max(0.0, end - time.monotonic())) if stop else seconds):
+            if stop and stop.is_set():
+                raise LimitExceeded("it was stopped")
+            if time.monotonic() >= end:
+                raise LimitExceeded(f"more than {seconds:g} s")
         try:
             error = ours.recv()
         except EOFError:

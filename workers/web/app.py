@@ -19,7 +19,8 @@ from starlette.staticfiles import StaticFiles
 
 from pbl_pipeline.errors import PblError
 
-from . import access, decide, find, look, take
+from . import access, decide, drawn, find, look, take
+from .making import Making
 from .pages import Pages
 from .tables import Tables
 from .videos import Videos
@@ -46,12 +47,13 @@ class Options:
 def create_app(options: Options, sessions: access.Sessions | None = None) -> Starlette:
     """The page as an ASGI application. `sessions`: those of a test; `app.state.sessions` makes the first link."""
     sessions = sessions or access.Sessions()
-    pages, tables, videos = Pages(), Tables(), Videos()
+    pages, tables, videos, making = Pages(), Tables(), Videos(), Making()
     files = Path(__file__).parent
 
     @contextlib.asynccontextmanager
     async def life(app: Starlette) -> AsyncIterator[None]:
         yield
+        making.close()
         videos.close()
         tables.close()
 
@@ -108,6 +110,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
             *look.routes(pages, tables, videos),
             *decide.routes(pages, tables),
             *take.routes(pages, tables),
+            *drawn.routes(pages, tables, making),
             Mount("/static", StaticFiles(directory=files / "static")),
             Mount("/vendor", StaticFiles(directory=files / "vendor")),
         ],

@@ -57,9 +57,7 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
     async def visit(request: Request) -> Response:
         from schemas.visit_page import visit_about
 
-        shown = request.query_params.get("result", "0")
-        number = int(shown) if shown.isdecimal() and len(shown) < 4 else LARGEST
-        about = await tables.ask(visit_about, number_of(request), number)
+        about = await tables.ask(visit_about, number_of(request), shown_of(request))
         decided = await tables.ask(decide.decisions, about.visit.session_id)
         accepted = await tables.ask(decide.accepted, about.key) if about.key else {}
         return pages.show(request, "visit.html", about=about, decisions=decided, accepted=accepted, interval=interval)
@@ -74,6 +72,12 @@ def number_of(request: Request) -> int:
     """The number in the address; one that no row can have becomes 0, which none has."""
     number = int(request.path_params["number"])
     return number if number <= LARGEST else 0
+
+
+def shown_of(request: Request) -> int:
+    """Which result of a visit is asked for; one that none can be becomes `LARGEST`, which none has."""
+    asked = request.query_params.get("result", "0")
+    return int(asked) if asked.isdecimal() and len(asked) < 4 else LARGEST
 
 
 def interval(result: visit_list.Result) -> str:

@@ -6,6 +6,7 @@ import asyncio
 import tempfile
 import zipfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from starlette.background import BackgroundTask
 from starlette.requests import Request
@@ -14,12 +15,30 @@ from starlette.routing import Route
 
 from pbl_pipeline.errors import PblError
 
-from .find import LARGEST, number_of
+from .find import number_of, shown_of
 from .pages import Pages
 from .tables import Tables
 
+if TYPE_CHECKING:
+    from schemas.visit_page import VisitPage
+
 #: Formats of the archive: those that need no further package.
 FORMATS = ("csv", "trc", "mot")
+
+
+def result_of(session_id: int, shown: int) -> VisitPage:
+    """A visit that has a result. Raises `PblError` DB_NOT_FOUND for an unknown one and for one that has none."""
+    from schemas.visit_page import visit_about
+
+    about = visit_about(session_id, shown)
+    if about.shown is None:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no result of session_id {session_id}",
+            expected="a visit that was computed",
+            next_step="`pbl populate`; `pbl status` says what stops it",
+        )
+    return about
 
 
 def routes(pages: Pages, tables: Tables) -> list[Route]:
@@ -27,20 +46,11 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
 
     async def export(request: Request) -> Response:
         from schemas.export import session_of_tables
-        from schemas.visit_page import visit_about
 
-        number, asked = number_of(request), request.query_params.get("result", "0")
-        shown = int(asked) if asked.isdecimal() and len(asked) < 4 else LARGEST
+        number, shown = number_of(request), shown_of(request)
 
         def load():
-            about = visit_about(number, shown)
-            if about.shown is None:
-                raise PblError(
-                    "DB_NOT_FOUND",
-                    found=f"no result of session_id {number}",
-                    expected="a visit that was computed",
-                    next_step="`pbl populate`; `pbl status` says what stops it",
-                )
+            about = result_of(number, shown)
             kind, fit_method = about.results[shown].kind, about.results[shown].methods[0]
             wanted = {"session_id": number, "fit_set_kind": kind, "fit_method": fit_method}
             return session_of_tables(wanted, sensors=False)

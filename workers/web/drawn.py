@@ -1,0 +1,142 @@
+"""Take along: the overlay video of a recording and the report of a visit, made when somebody asks for them."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response
+from starlette.routing import Route
+
+from pbl_pipeline import settings
+from pbl_pipeline.errors import PblError
+from schemas import privacy, recording_page, video
+
+from .access import REPORT_POLICY
+from .find import number_of, shown_of
+from .making import Making, Task, Work
+from .pages import Pages
+from .tables import Tables
+from .take import result_of
+
+
+def routes(pages: Pages, tables: Tables, making: Making) -> list[Route]:
+    """The addresses of this part."""
+
+    async def work_of(request: Request, key: Callable[..., Any], load: Callable[..., Task], *args: int) -> Work:
+        """The work that a request is about, begun where it was not. Raises what stopped it, once."""
+        wanted = await tables.ask(key, *args)
+        work = making.find(wanted)
+        if work is None:
+            work = making.begin(wanted, await tables.ask(load, *args))
+        if work.error is not None:
+            making.drop(wanted)
+            raise work.error
+        return work
+
+    async def overlay(request: Request) -> Response:
+        number = number_of(request)
+        about = await tables.ask(recording_page.recording_about, number)
+        work = await work_of(request, overlay_key, load_overlay, number)
+        return pages.show(request, "overlay.html", about=about, work=work)
+
+    async def overlay_file(request: Request) -> Response:
+        number = number_of(request)
+        work = making.find(await tables.ask(overlay_key, number))
+        if work is None or work.path is None:
+            return RedirectResponse(f"/recordings/{number}/overlay", 303)
+        return FileResponse(work.path, media_type="video/mp4", filename=f"recording_{number}_overlay.mp4",
+                            content_disposition_type="inline")  # fmt: skip
+
+    async def report(request: Request) -> Response:
+        number, shown = number_of(request), shown_of(request)
+        work = await work_of(request, report_key, load_report, number, shown)
+        if work.path is None:
+            return pages.show(request, "report_made.html", number=number, shown=shown, work=work)
+        headers = {"content-security-policy": REPORT_POLICY}
+        return FileResponse(work.path, media_type="text/html; charset=utf-8", headers=headers)
+
+    async def overlay_state(request: Request) -> Response:
+        return state(making.find(await tables.ask(overlay_key, number_of(request))))
+
+    async def report_state(request: Request) -> Response:
+        return state(making.find(await tables.ask(report_key, number_of(request), shown_of(request))))
+
+    return [
+        Route("/recordings/{number:int}/overlay", overlay),
+        Route("/recordings/{number:int}/overlay/file", overlay_file),
+        Route("/recordings/{number:int}/overlay/state", overlay_state),
+        Route("/visits/{number:int}/report", report),
+        Route("/visits/{number:int}/report/state", report_state),
+    ]
+
+
+def state(work: Work | None) -> Response:
+    """How far a work is: what the script of a page that waits for it asks."""
+    return JSONResponse({"ended": work is None or work.ended, "share": 0.0 if work is None else round(work.share, 3)})
+
+
+# ------------------------------------------------------------------------------------ asked in the thread of the tables
+def overlay_key(video_id: int) -> tuple[Any, ...]:
+    """What the overlay of a recording depends on: another one where something was computed anew or heads are hidden.
+
+    Raises `PblError` DB_NOT_FOUND for a recording without pictures or a fit.
+    """
+    about = recording_page.recording_about(video_id)
+    if about.key is None or not about.has_pictures:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no pictures with a fit of video_id {video_id}. {about.problem}".strip(),
+            expected="a recording to which a body is fitted",
+            next_step="`pbl populate`; `pbl why` says what stops it",
+        )
+    return ("overlay", video_id, *recording_page.computed(about.key), about.hidden_heads, _copy_of(video_id))
+
+
+def load_overlay(video_id: int) -> Task:
+    """How the overlay of a recording is drawn."""
+    key = recording_page.trial_key(video_id)
+    assert key is not None, "overlay_key raises"
+    found = recording_page.recording_fit(key)
+    with contextlib.ExitStack() as stack:
+        path = stack.enter_context(privacy.shown(video_id)) or video.present_file(video_id)
+        return Task("overlay.mp4", _draw, (path, found.fit, found.keypoints, found.events), stack.pop_all())
+
+
+def report_key(session_id: int, shown: int) -> tuple[Any, ...]:
+    """What the report of a result of a visit depends on."""
+    about = result_of(session_id, shown)
+    copies = [_copy_of(r.video_id) for r in about.recordings]
+    return ("report", session_id, *about.key.values(), about.computed, settings.deidentify_how(), *copies)
+
+
+def load_report(session_id: int, shown: int) -> Task:
+    """How the report of a result of a visit is written."""
+    from schemas.report import load_session_files
+
+    about = result_of(session_id, shown)
+    wanted = {"session_id": session_id, **about.key, "fit_set_kind": about.results[shown].kind}
+    with contextlib.ExitStack() as stack:
+        loaded = load_session_files(wanted, stack)
+        return Task("report.html", _write, (loaded.session, loaded.words), stack.pop_all())
+
+
+def _copy_of(video_id: int) -> str:
+    """Hash of the de-identified copy of a recording, empty where there is none."""
+    return "".join(str(h) for h in (privacy.Deidentified & {"video_id": video_id}).to_arrays("deidentified_sha256"))
+
+
+# -------------------------------------------------------------------------------------------- in processes of their own
+def _draw(out: Path, path: Path, fit: Any, keypoints: Any, events: Any) -> None:
+    from pbl_pipeline.render import render_overlay
+
+    render_overlay(path, fit, out, keypoints, events=events)
+
+
+def _write(out: Path, session: Any, words: dict[str, Any]) -> None:
+    from pbl_pipeline.pipeline import write_session_report
+
+    write_session_report(out, session, **words)
