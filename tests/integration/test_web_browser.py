@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import shutil
-import socket
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-import uvicorn
 
+from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
 from workers.populate import populate
-from workers.web import Options, create_app
 
 pytestmark = [pytest.mark.needs_extra, pytest.mark.slow]
 
@@ -37,40 +33,13 @@ WATCH = """
 """
 
 
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
-    sync_api = pytest.importorskip("playwright.sync_api", reason="pip install -e .[browser]")
-    program = shutil.which("chromium") or shutil.which("google-chrome")
-    if program is None:
-        pytest.skip("no Chromium on this machine: apt-get install chromium")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        yield browser
-        browser.close()
-
-
 @pytest.fixture
 def page(chromium: Any, tables: None, tmp_path: Path) -> Iterator[Any]:
-    """A signed-in page over one fitted recording, video 1 of visit 1; an error of a script fails the test."""
+    """A signed-in page of a phone's width over one fitted recording, video 1 of visit 1."""
     register(small_video(tmp_path, "walk"), session_label="2026-01-10")
     populate()
-    app = create_app(Options(name="R. Viewer"))
-    listening = socket.create_server(("127.0.0.1", 0))
-    server = uvicorn.Server(uvicorn.Config(app, log_level="error"))
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
-    thread.start()
-    context = chromium.new_context(
-        base_url=f"http://127.0.0.1:{listening.getsockname()[1]}", viewport={"width": 390, "height": 800}
-    )
-    opened, errors = context.new_page(), []
-    opened.on("pageerror", lambda error: errors.append(str(error)))
-    opened.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
-    opened.goto(f"/enter?key={app.state.sessions.new_link('R. Viewer', 'reviewer')}")
-    yield opened
-    context.close()
-    server.should_exit = True
-    thread.join(10)
-    assert not errors
+    with web.shown(chromium) as opened:
+        yield opened
 
 
 def test_from_the_link_to_a_frame_of_the_body(page: Any):

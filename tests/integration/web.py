@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+import socket
+import threading
+from collections.abc import Iterator
+from typing import Any
 
+import uvicorn
 from starlette.testclient import TestClient
 
 from workers.web import Options, create_app
@@ -31,3 +37,29 @@ def token(browser: TestClient) -> str:
 def post(browser: TestClient, path: str, **fields: object):
     """Send a form of the page; the answer as it is, without going where it leads."""
     return browser.post(path, data={"token": token(browser), **fields}, follow_redirects=False)
+
+
+@contextlib.contextmanager
+def shown(
+    chromium: Any, role: str = "reviewer", size: tuple[int, int] = (390, 800), name: str = "R. Viewer", **context: Any
+) -> Iterator[Any]:
+    """A page of the browser `chromium`, signed in; an error of a script or an answer that failed fails the test."""
+    app = create_app(Options(name=name, role=role))
+    listening = socket.create_server(("127.0.0.1", 0))
+    server = uvicorn.Server(uvicorn.Config(app, log_level="error"))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
+    thread.start()
+    base = f"http://127.0.0.1:{listening.getsockname()[1]}"
+    viewport = {"width": size[0], "height": size[1]}
+    made = chromium.new_context(base_url=base, viewport=viewport, **context)
+    try:
+        opened, errors = made.new_page(), []
+        opened.on("pageerror", lambda error: errors.append(str(error)))
+        opened.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
+        opened.goto(f"/enter?key={app.state.sessions.new_link(name, role)}")
+        yield opened
+        assert not errors
+    finally:
+        made.close()
+        server.should_exit = True
+        thread.join(10)

@@ -19,7 +19,7 @@ from starlette.staticfiles import StaticFiles
 
 from pbl_pipeline.errors import PblError
 
-from . import access, decide, drawn, find, look, take
+from . import access, decide, drawn, find, look, people, take
 from .making import Making
 from .pages import Pages
 from .tables import Tables
@@ -109,6 +109,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
             *find.routes(pages, tables),
             *look.routes(pages, tables, videos),
             *decide.routes(pages, tables),
+            *people.routes(pages, tables),
             *take.routes(pages, tables),
             *drawn.routes(pages, tables, making),
             Mount("/static", StaticFiles(directory=files / "static")),
