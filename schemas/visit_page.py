@@ -102,7 +102,8 @@ def key_of(session_id: int, result: Result) -> dict[str, Any]:
     """The key of SessionGdi of a result of a visit."""
     names = ("fit_method", "gait_method", "gdi_method", "norm")
     chain = dict(zip(names, result.methods, strict=True))
-    sets = fit.FitSet.proj("fit_set_kind") & {"session_id": session_id, "fit_set_kind": result.kind}
+    # Restricted before it is projected: DataJoint leaves out what names a column that is not there.
+    sets = (fit.FitSet & {"session_id": session_id, "fit_set_kind": result.kind}).proj()
     current = fit.current().proj() * sets
     return dict((gdi.SessionGdi.proj() & current.proj() & chain).keys()[0])
 

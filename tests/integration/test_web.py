@@ -13,6 +13,7 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from schemas import gdi, lab, qc, session, study, visit_list
+from schemas import visit_page as visit_page_module
 from schemas.rows import utc_now
 from schemas.visit_list import Filter, visit_page
 from tests.integration import web
@@ -109,6 +110,8 @@ def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Pa
     assert "+10.0 since 2026-01-10: more than chance" in page
     assert "Residual 3D (cm)" in page
     assert "VIDEO_MISSING" in page
+    for number in (1, 2):  # each page shows the result of its own visit
+        assert visit_page_module.visit_about(number).key["fit_set"] == visit_list_key(number)["fit_set"]
     visit = web.client().get(f"/visits/{later.session_id}").text
     assert "Cadence" in visit
     assert "look at the overlay" in visit  # the advice of the check
