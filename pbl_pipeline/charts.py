@@ -16,6 +16,18 @@ from pbl_pipeline.runs import runs
 
 _INK, _FAINT, _GRID, _BAND = "#2a2e33", "#687078", "#e3e6e9", "#dfe3e8"
 _DASH = {"right": "none", "left": "7 3"}  # sides differ in print without colour too
+_CYCLE_SIZE, _CYCLE_MARGIN = (280, 200), (36, 8, 8, 22)
+#: The plot of `compare_chart` in its view box: left, top, right and bottom; from left to right it is 0 to 100 %.
+CYCLE_PLOT = (_CYCLE_MARGIN[0], _CYCLE_MARGIN[1], _CYCLE_SIZE[0] - _CYCLE_MARGIN[2], _CYCLE_SIZE[1] - _CYCLE_MARGIN[3])
+#: Colour and dash of lines that are compared (Okabe and Ito): they differ for every colour vision and in grey.
+SERIES = (
+    ("#22262b", "none"),
+    ("#d55e00", "7 3"),
+    ("#0072b2", "2 2.5"),
+    ("#009e73", "9 3 2 3"),
+    ("#b4588f", "5 2"),
+    ("#b07800", "12 4"),
+)
 
 
 class Axes:
@@ -80,11 +92,13 @@ class Axes:
             )
         )
 
-    def band(self, x: np.ndarray, low: np.ndarray, high: np.ndarray, colour: str = _BAND) -> None:
+    def band(self, x: np.ndarray, low: np.ndarray, high: np.ndarray, colour: str = _BAND, opacity: float = 1.0) -> None:
         """A filled area between two curves."""
         there = np.stack([self.x(x), self.y(high)], axis=-1)
         back = np.stack([self.x(x), self.y(low)], axis=-1)[::-1]
-        self.add(Markup('<polygon points="{}" fill="{}"/>').format(_points(np.concatenate([there, back])), colour))
+        seen = Markup("") if opacity == 1.0 else Markup(' fill-opacity="{}"').format(opacity)
+        points = _points(np.concatenate([there, back]))
+        self.add(Markup('<polygon points="{}" fill="{}"{}/>').format(points, colour, seen))
 
     def curve(
         self,
@@ -168,7 +182,7 @@ def cycle_chart(
     if norm is not None:
         values += [norm[1] - norm[2], norm[1] + norm[2]]
     ticks = nice_ticks(*_extent(values, least=20.0))
-    axes = Axes((280, 200), (0, 100), (ticks[0], ticks[-1]), margin=(36, 8, 8, 22))
+    axes = Axes(_CYCLE_SIZE, (0, 100), (ticks[0], ticks[-1]), margin=_CYCLE_MARGIN)
     if norm is not None:
         axes.band(norm[0], norm[1] - norm[2], norm[1] + norm[2])
         axes.curve(norm[0], norm[1], "#9aa3ad", 1.2)
@@ -188,6 +202,53 @@ def cycle_chart(
     return axes.svg(label)
 
 
+def compare_chart(
+    label: str,
+    percent: np.ndarray,
+    curves: Sequence[tuple[np.ndarray, np.ndarray] | None],
+    norm: tuple[np.ndarray, np.ndarray, np.ndarray] | None,
+    reference: int = 0,
+) -> Markup:
+    """One joint angle of one side over the gait cycle, of several visits: mean curves with bands of one sd.
+
+    Parameters
+    ----------
+    percent : (P,)
+        Percent of the cycle of the curves' points.
+    curves
+        Mean (P,) and sd (P,) in degrees, drawn as `SERIES` has it at the same place; NaN where the sd is not known,
+        None for a visit without this curve. At most `len(SERIES)`.
+    norm
+        percent (Q,), mean (Q,), sd (Q,) in degrees; None where there is none.
+    reference
+        Place of the curve that is drawn thicker.
+    """
+    drawn = [(*SERIES[i], i, *c) for i, c in enumerate(curves) if c is not None]
+    values = [edge for *_, mean, sd in drawn for edge in (mean, mean - sd, mean + sd)]
+    if norm is not None:
+        values += [norm[1] - norm[2], norm[1] + norm[2]]
+    ticks = nice_ticks(*_extent(values, least=20.0))
+    axes = Axes(_CYCLE_SIZE, (0, 100), (ticks[0], ticks[-1]), margin=_CYCLE_MARGIN)
+    if norm is not None:
+        axes.band(norm[0], norm[1] - norm[2], norm[1] + norm[2])
+    axes.grid([0, 25, 50, 75, 100], ticks, "\N{NO-BREAK SPACE}%", "\N{DEGREE SIGN}")
+    for colour, _, _, mean, sd in drawn:
+        if np.isfinite(sd).all():
+            axes.band(percent, mean - sd, mean + sd, colour, 0.14)
+    for colour, dash, i, mean, _ in drawn:
+        axes.curve(percent, mean, colour, 2.6 if i == reference else 1.8, 1.0, dash)
+    return axes.svg(label)
+
+
+def series_key(place: int) -> Markup:
+    """A sample of a line of `compare_chart`."""
+    colour, dash = SERIES[place]
+    return Markup(
+        '<svg viewBox="0 0 30 12" class="key" aria-hidden="true"><line x1="0" y1="6" x2="30" y2="6" stroke="{}"'
+        ' stroke-width="3" stroke-dasharray="{}"/></svg>'
+    ).format(colour, dash)
+
+
 def time_chart(
     label: str,
     time_s: np.ndarray,
@@ -200,7 +261,7 @@ def time_chart(
     """
     ticks = nice_ticks(*_extent(list(curves.values()), least=20.0))
     stop = float(time_s[-1]) if len(time_s) else 1.0
-    axes = Axes((280, 150), (0, max(stop, 1e-3)), (ticks[0], ticks[-1]), margin=(36, 8, 8, 22))
+    axes = Axes((280, 150), (0, max(stop, 1e-3)), (ticks[0], ticks[-1]), margin=_CYCLE_MARGIN)
     axes.grid(_inside(nice_ticks(0, stop), stop), ticks, "\N{NO-BREAK SPACE}s", "\N{DEGREE SIGN}")
     for row, (side, bars) in enumerate(spans.items()):
         y = axes.bottom - 3 - 5 * row

@@ -77,6 +77,15 @@ class Trend:
 
 
 @dataclasses.dataclass(frozen=True)
+class Change:
+    """Of an index against another one. sure: it is at least the larger of the two minimal changes; None where these are
+    not known, or another chain of methods made the other one."""
+
+    by: float
+    sure: bool | None
+
+
+@dataclasses.dataclass(frozen=True)
 class VisitRow:
     """A visit of the list. state: one of `STATES`; problem: code of the error where it failed. more: further results of
     other chains of methods or kinds of recordings."""
@@ -135,6 +144,16 @@ def visit_page(wanted: Filter, after: tuple[str, int] | None = None, size: int =
         of_all = f"SELECT COUNT(*) FROM {_visits(wanted.role != '')}{_all(where)}"
         total = (int(rows[0][5]) if rows else 0) if joins else int(_ask(of_all, args)[0][0])
     return Page(_visit_rows(shown), None if last is None else (str(last[3] or _NO_DAY), int(last[0])), total)
+
+
+def change_since(result: Result, before: Result) -> Change | None:
+    """The change of the index from one result to another; None where one of them has no index."""
+    if result.index is None or before.index is None:
+        return None
+    change = result.index - before.index
+    least = [m for m in (result.minimal_change, before.minimal_change) if m is not None]
+    comparable = len(least) == 2 and (result.kind, result.methods) == (before.kind, before.methods)
+    return Change(change, abs(change) >= max(least) if comparable else None)
 
 
 def visits_of(subject: str) -> tuple[VisitRow, ...]:
@@ -356,11 +375,10 @@ def _trend(
         if before >= day:
             continue
         for other in results[session_id]:
-            if (other.kind, other.methods) == (result.kind, result.methods) and other.index is not None:
-                change = result.index - other.index
-                least = [m for m in (result.minimal_change, other.minimal_change) if m is not None]
-                sure = abs(change) >= max(least) if len(least) == 2 else None
-                return Trend(session_id, before, change, sure)
+            if (other.kind, other.methods) == (result.kind, result.methods):
+                change = change_since(result, other)
+                if change is not None:
+                    return Trend(session_id, before, change.by, change.sure)
     return None
 
 

@@ -65,6 +65,21 @@ class Measure:
     def to_dict(self) -> dict:
         return {k: round(v, 4) if isinstance(v, float) else v for k, v in dataclasses.asdict(self).items()}
 
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """90 % interval of the mean over repetitions, mean +- t sd / sqrt(n) by Student's t, as far as the values vary
+        from cycle to cycle: what camera, detector and fit do to all of them alike is not in it.
+
+        The sd is `variability` where it is known (n - 2 degrees of freedom), else `sd` (n - 1); None without either.
+        """
+        from scipy.stats import t  # takes longer to import than most commands run
+
+        sd, freedom = (self.variability, self.n - 2) if self.variability is not None else (self.sd, self.n - 1)
+        if sd is None or freedom < 1:
+            return None
+        half = float(t.isf(0.05, freedom)) * sd / float(np.sqrt(self.n))
+        return self.mean - half, self.mean + half
+
 
 @dataclasses.dataclass(frozen=True)
 class Spatiotemporal:

@@ -1,0 +1,184 @@
+"""Two to six results side by side: of visits of a person, of people, or of one visit by several chains of methods."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from pbl_pipeline.errors import PblError
+
+from . import fit, gait, study, video, views
+from .visit_list import Change, Result, change_since, results_of
+from .visit_page import MeasureRow, VisitPage, visit_about
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+#: Fewest and most results that are compared.
+FEWEST, MOST = 2, 6
+
+
+@dataclasses.dataclass(frozen=True)
+class Cycle:
+    """A gait cycle of a recording that counts: from an initial contact of a side to its next (s)."""
+
+    video_id: int
+    video_name: str
+    side: str
+    start_s: float
+    end_s: float
+
+
+@dataclasses.dataclass(frozen=True)
+class MeasureChange:
+    """What a measure differs by from that of the reference. sure: whether that is more than chance, None where the
+    smallest change that is no chance is not known, as it is for all measures but the index."""
+
+    by: float
+    sure: bool | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Score:
+    """A clinical score. change: against the reference; important: whether that is at least the minimal important change
+    of the instrument, None where none is taken over."""
+
+    value: float
+    change: float | None
+    important: bool | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Compared:
+    """One of the results. number: of the result among those of its visit, None where there is none yet; curves: the
+    frame of `views.cycle_curves`; change: of the index against the reference, None for the reference itself."""
+
+    about: VisitPage
+    number: int | None
+    curves: pd.DataFrame
+    cycles: tuple[Cycle, ...]
+    measures: dict[str, MeasureRow]
+    scores: dict[str, Score]
+    change: Change | None
+    changes: dict[str, MeasureChange]
+
+    @property
+    def result(self) -> Result | None:
+        """The result, None where there is none yet."""
+        return None if self.number is None else self.about.results[self.number]
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """The results in the order of their days; `reference`: the place of the one that the others are compared with.
+    instruments: rows of ClinicalInstrument of which any visit has a score, by name."""
+
+    compared: tuple[Compared, ...]
+    reference: int
+    instruments: dict[str, dict[str, Any]]
+
+    @property
+    def same_methods(self) -> bool:
+        """Whether one chain of methods made all results that there are."""
+        return len({(r.kind, r.methods) for c in self.compared if (r := c.result) is not None}) <= 1
+
+
+def compare(chosen: Sequence[tuple[int, int | None]], reference: tuple[int, int | None] | None = None) -> Comparison:
+    """Compare results.
+
+    Parameters
+    ----------
+    chosen
+        `session_id` of each, and which of its results (the order of `visit_list.results_of`); None: by the chain of
+        methods that most of the visits have.
+    reference
+        One of `chosen`; None: the earliest.
+
+    Raises
+    ------
+    PblError
+        USAGE for fewer than two or more than six, DB_NOT_FOUND for a visit or result that there is not.
+    """
+    chosen = list(dict.fromkeys(chosen))
+    if not FEWEST <= len(chosen) <= MOST:
+        raise PblError(
+            "USAGE",
+            found=f"{len(chosen)} chosen" if len(chosen) != 1 else "one chosen",
+            expected=f"{FEWEST} to {MOST} visits, or results of one visit by several methods",
+            next_step="tick them in the list of a person's visits, on the page of any of them",
+        )
+    results = results_of({i for i, _ in chosen})
+    counts = Counter((r.kind, r.methods) for found in results.values() for r in found)
+    usual = max(counts, key=lambda chain: counts[chain], default=None)
+    pages: list[tuple[tuple[int, int | None], VisitPage]] = []
+    for one in chosen:
+        session_id, number = one
+        chains = [(r.kind, r.methods) for r in results[session_id]]
+        if number is None:
+            number = chains.index(usual) if usual in chains else 0
+        page = visit_about(session_id, number)
+        if all((p.visit.session_id, p.shown) != (session_id, page.shown) for _, p in pages):
+            pages.append((one, page))
+    pages.sort(key=lambda p: (p[1].visit.day is None, p[1].visit.day, p[1].visit.session_id))
+    at = next((i for i, (one, _) in enumerate(pages) if one == reference), 0)
+    first = pages[at][1]
+    ids = {p.visit.session_id for _, p in pages}
+    scores = _scores(ids)
+    names = {n for of_visit in scores.values() for n in of_visit}
+    known = (study.ClinicalInstrument & [{"instrument": n} for n in names]).to_dicts() if names else []
+    instruments = {r["instrument"]: r for r in sorted(known, key=lambda r: r["instrument"])}
+    out = tuple(_compared(page, first, scores, instruments) for _, page in pages)
+    return Comparison(out, at, instruments)
+
+
+def _compared(
+    about: VisitPage, first: VisitPage, scores: dict[int, dict[str, float]], instruments: dict[str, dict[str, Any]]
+) -> Compared:
+    measures = {m.name: m for m in about.measures}
+    change, changes = None, {}
+    if about is not first:
+        if about.shown is not None and first.shown is not None:
+            change = change_since(about.results[about.shown], first.results[first.shown])
+        for other in first.measures:
+            mine = measures.get(other.name)
+            if mine is not None and mine.value is not None and other.value is not None:
+                changes[other.name] = MeasureChange(mine.value.mean - other.value.mean)
+    before = scores[first.visit.session_id] if about is not first else {}
+    return Compared(
+        about=about,
+        number=about.shown,
+        curves=views.cycle_curves(about.key or False),
+        cycles=_cycles(about.key) if about.key else (),
+        measures=measures,
+        scores={n: _score(v, before.get(n), instruments[n]) for n, v in scores[about.visit.session_id].items()},
+        change=change,
+        changes=changes,
+    )
+
+
+def _scores(ids: set[int]) -> dict[int, dict[str, float]]:
+    out: dict[int, dict[str, float]] = {i: {} for i in ids}
+    for row in (study.ClinicalScore & [{"session_id": i} for i in ids]).to_dicts():
+        out[int(row["session_id"])][row["instrument"]] = float(row["score_value"])
+    return out
+
+
+def _score(value: float, before: float | None, instrument: dict[str, Any]) -> Score:
+    if before is None:
+        return Score(value, None, None)
+    least = instrument["minimal_change"]
+    return Score(value, value - before, None if least is None else abs(value - before) >= least)
+
+
+def _cycles(key: dict[str, Any]) -> tuple[Cycle, ...]:
+    """The cycles of a result that count, in the order of recordings and time; those without pictures left out."""
+    cycles = gait.GaitCycle.Cycle * fit.FitSet.proj() * video.Video.proj("video_name", "camera_motion")
+    of_result = {k: key[k] for k in ("fit_set", "fit_method", "gait_method")}
+    rows = (cycles & of_result & {"cycle_used": True} & f"camera_motion != '{video.NO_CAMERA}'").to_dicts()
+    found = [
+        Cycle(int(r["video_id"]), r["video_name"], r["cycle_side"], float(r["cycle_start"]), float(r["cycle_end"]))
+        for r in rows
+    ]
+    return tuple(sorted(found, key=lambda c: (c.video_id, c.start_s)))

@@ -1,0 +1,229 @@
+"""Comparing in the review page: curves, measures, changes; what is no comparison; videos in step in a browser."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import pbl_pipeline.fit
+import schemas
+from pbl_pipeline.errors import PblError
+from schemas import compare, gdi, study, views
+from tests.integration import chain, web
+from tests.integration.chain import small_video
+from tests.rows import register, remove_all
+from workers.populate import populate
+from workers.web.compare import charts_of
+
+#: What the legs' angles of the second visit are of those of the first.
+LESS = 0.8
+
+
+@pytest.fixture(scope="module")
+def visits(database: Path, tmp_path_factory: pytest.TempPathFactory):
+    """Visits 1 and 2 of P001, the second with smaller angles, 3 of P002, and 4 of P001 without a result."""
+    with pytest.MonkeyPatch.context() as patch:
+        schemas.activate()
+        chain.install(patch)
+
+        def smaller(trials: Any, names: Any, *args: Any, **more: Any):
+            found = chain.fit_session(trials, names, *args, **more)
+            by = LESS if "2026-04-10" in names[0] else 1.0
+            fits = (dataclasses.replace(t, qpos=np.hstack([t.qpos[:, :6], by * t.qpos[:, 6:]])) for t in found.trials)
+            return dataclasses.replace(found, trials=tuple(fits))
+
+        patch.setattr(pbl_pipeline.fit, "fit_session", smaller)
+        folder = tmp_path_factory.mktemp("compare")
+        for subject, day in (("P001", "2026-01-10"), ("P001", "2026-04-10"), ("P002", "2026-02-01")):
+            register(small_video(folder, f"walk {day}"), subject=subject, session_label=day)
+        populate()
+        register(small_video(folder, "later"), session_label="2026-09-10")
+        for number, index in ((1, 80.0), (2, 86.0), (3, 95.0)):
+            key = compare.visit_about(number).key
+            row = {k: key[k] for k in gdi.SessionGdi.primary_key}
+            values = {"session_gdi": index, "session_gdi_sd": 3.0, "session_gdi_minimal_change": 5.0 + number}
+            gdi.SessionGdi.update1({**row, **values})
+        study.ClinicalScore.insert(
+            {"session_id": i, "instrument": n, "score_value": v}
+            for i, n, v in ((1, "mJOA", 12), (2, "mJOA", 15), (1, "BBS", 44), (2, "mJOA-LE", 4))
+        )
+        yield
+        remove_all()
+
+
+def test_changes_against_the_reference(visits: None):
+    found = compare.compare([(2, None), (1, None), (4, None)])
+    assert [c.about.visit.session_id for c in found.compared] == [1, 2, 4]  # by day
+    first, second, without = found.compared
+    assert (first.change, first.changes) == (None, {})
+    assert second.change is not None
+    assert (second.change.by, second.change.sure) == (6.0, False)  # the larger of 6 and 7 is not reached
+    knee = lambda c: c.curves[(c.curves["angle"] == "knee_flexion") & (c.curves["side"] == "left")]["mean_deg"]  # noqa: E731
+    np.testing.assert_allclose(knee(second), LESS * knee(first), atol=0.7)
+    name = "stride_time_s"
+    values = [c.measures[name].value for c in (first, second)]
+    assert values[0] is not None
+    assert values[1] is not None
+    assert second.changes[name].by == values[1].mean - values[0].mean
+    assert second.changes[name].sure is None  # no figure says what is more than chance
+    assert (second.scores["mJOA"].change, second.scores["mJOA"].important) == (3.0, True)  # its minimal change is 2
+    assert second.scores["mJOA-LE"].change is None  # the reference has none
+    assert (without.result, without.cycles, without.change) == (None, (), None)
+    assert len(without.curves) == 0
+    turned = compare.compare([(1, None), (2, None)], (2, None))
+    assert turned.reference == 1
+    assert turned.compared[0].change is not None
+    assert turned.compared[0].change.by == -6.0
+    gdi.SessionGdi.update1({k: first.about.key[k] for k in gdi.SessionGdi.primary_key} | {"session_gdi": 79.0})
+    again = compare.compare([(1, None), (2, None)]).compared[1].change
+    assert again is not None
+    assert (again.by, again.sure) == (7.0, True)
+    gdi.SessionGdi.update1({k: first.about.key[k] for k in gdi.SessionGdi.primary_key} | {"session_gdi": 80.0})
+
+
+def test_results_by_other_methods_are_not_judged(visits: None, monkeypatch: pytest.MonkeyPatch):
+    one, other = compare.visit_about(1).results[0], compare.visit_about(2).results[0]
+    assert compare.change_since(other, one) == compare.Change(6.0, False)
+    strange = dataclasses.replace(other, methods=("another", *other.methods[1:]))
+    assert compare.change_since(strange, one) == compare.Change(6.0, None)
+    assert compare.change_since(dataclasses.replace(other, minimal_change=None), one) == compare.Change(6.0, None)
+    assert compare.change_since(dataclasses.replace(other, index=None), one) is None
+
+
+def test_the_interval_of_a_measure_is_students():
+    from scipy import stats
+
+    from pbl_pipeline.gait import Measure
+
+    values = np.array([1.0, 1.1, 1.3, 0.9])
+    plain = Measure(None, None, float(values.mean()), float(values.std(ddof=1)), 4)
+    expected = stats.t.interval(0.9, 3, loc=values.mean(), scale=stats.sem(values))
+    assert plain.interval == pytest.approx(expected)
+    sided = dataclasses.replace(plain, variability=0.05)
+    assert sided.interval == pytest.approx(stats.t.interval(0.9, 2, loc=values.mean(), scale=0.05 / 2))
+    assert dataclasses.replace(plain, sd=None).interval is None
+    assert dataclasses.replace(plain, n=1).interval is None
+
+
+def test_the_page_has_curves_measures_and_videos_without_scripts(visits: None):
+    browser = web.client()
+    page = browser.get("/compare?v=1&v=2").text
+    assert "Changes are against 2026-01-10" in page
+    assert "+6.0: may be chance" in page
+    assert "+3: at least the minimal important change" in page
+    assert page.count('role="img"') == 18  # nine angles of two legs
+    videos = re.findall(r'<video src="(/recordings/\d+/video)#t=([\d.]+),([\d.]+)"', page)
+    assert len(videos) == 2
+    assert all(float(a) < float(b) for _, a, b in videos)
+    assert not re.search(r"<style|\sstyle=|<script(?![^>]*\ssrc=)", page)
+    turned = browser.get("/compare?v=1&v=2&ref=2.0").text
+    assert "Changes are against 2026-01-10" in turned  # "2.0" was not asked for
+    assert "Changes are against 2026-04-10" in browser.get("/compare?v=1.0&v=2.0&ref=2.0").text
+    assert "different people" in browser.get("/compare?v=1&v=3").text
+    assert "no measures of this visit yet" in browser.get("/compare?v=1&v=4").text
+    assert 'name="v" value="2" form="compare"' in browser.get("/visits/1").text
+    assert "P001" not in "".join(re.findall(r'(?:href|src|action)="([^"]*)"', page))
+
+
+def test_a_video_that_is_gone_leaves_the_rest(visits: None, monkeypatch: pytest.MonkeyPatch):
+    from workers.web.videos import Videos
+
+    def gone(self: Videos, number: int) -> Path:
+        raise PblError("VIDEO_MISSING", found="no file", expected="a video", next_step="bring it back")
+
+    monkeypatch.setattr(Videos, "path", gone)
+    page = web.client().get("/compare?v=1&v=2").text
+    assert "VIDEO_MISSING" in page
+    assert "<video" not in page
+    assert 'role="img"' in page
+
+
+@pytest.mark.parametrize(
+    ("asked", "status"),
+    [
+        ("", 400),
+        ("v=1", 400),
+        ("v=1&v=1", 400),
+        ("&".join(f"v={i}" for i in range(1, 8)), 400),
+        ("v=1&v=999", 404),
+        ("v=1&v=2.7", 404),
+        ("v=1&v=99999999999", 404),
+        ("v=1&v=-2", 404),
+        ("v=1&v=2'--", 404),
+        ("v=1&v=%3Cscript%3E", 404),
+        ("v=1&v=2&ref=%3Cscript%3E", 200),
+    ],
+)
+def test_what_cannot_be_compared(visits: None, asked: str, status: int):
+    answer = web.client().get(f"/compare?{asked}")
+    assert answer.status_code == status, answer.text
+    assert "<script>" not in answer.text
+
+
+def test_curves_that_are_drawn_are_those_of_the_tables(visits: None):
+    found = compare.compare([(1, None), (2, None)])
+    frame = views.cycle_curves({"session_id": 1})
+    drawn = charts_of(found, ["a", "b"])
+    knee = next(c for c in drawn if c.title == "Knee flexion")
+    own = frame[(frame["angle"] == "knee_flexion") & (frame["side"] == "left")]["mean_deg"]
+    assert f"a {own.min():.0f} to {own.max():.0f}\N{DEGREE SIGN}" in knee.sides["left"].replace("\N{MINUS SIGN}", "-")
+    assert knee.sides["left"].count("<polyline") == 2
+    assert knee.sides["left"].count("fill-opacity") == 2  # a band each
+
+
+@pytest.mark.needs_extra
+@pytest.mark.slow
+def test_videos_in_step_in_a_browser(visits: None, chromium: Any):
+    with web.shown(chromium) as page:
+        page.get_by_role("link", name="2026-01-10").first.click()
+        page.get_by_label("Compare this visit: 2026-04-10").check()
+        page.get_by_role("button", name="Compare the ticked visits").click()
+        page.wait_for_selector(".together[data-ready]")
+        assert page.url.endswith("/compare?v=2&v=1")
+        # Two cycles of other lengths.
+        page.locator("select.cycle").nth(1).select_option(index=0)
+        lengths = page.evaluate("[...document.querySelectorAll('video')].map((v) => +v.dataset.end - +v.dataset.start)")
+        assert min(lengths) > 0.5
+        page.locator("#phase").fill("37")
+        off = """() => [...document.querySelectorAll(".videos figure")].map((f) => {
+          const v = f.querySelector("video"), c = f.querySelector("select").selectedOptions[0].dataset;
+          const phase = +document.querySelector(".together").dataset.phase;
+          return v.seeking ? 9 : (v.currentTime - +c.start) / (+c.end - +c.start) - phase; })"""
+        _until(page, f"({off})().every((d) => Math.abs(d) < 0.002)")
+        assert page.locator("#phase-now").inner_text() == "37 %"
+        line = page.locator(".phase-line").first
+        assert float(line.get_attribute("x1")) == pytest.approx(36 + 0.37 * 236)
+        page.locator("#phase-speed").select_option("0.5")
+        page.get_by_role("button", name="Play").click()
+        worst = page.evaluate(f"""() => new Promise((done) => {{
+          const from = performance.now(), found = [];
+          const look = () => {{
+            if (performance.now() - from > 400) found.push(...({off})().filter((d) => d !== 9));
+            if (performance.now() - from < 900) requestAnimationFrame(look); else done(found);
+          }};
+          look();
+        }})""")
+        assert len(worst) > 10
+        assert float(np.median(np.abs(worst))) < 0.06
+        page.get_by_role("button", name="Pause").click()
+        _until(page, "[...document.querySelectorAll('video')].every((v) => v.paused)")
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        # For the record: what is printed has curves and no buttons or videos.
+        page.emulate_media(media="print")
+        assert page.locator(".charts svg").first.is_visible()
+        assert not page.locator(".together").is_visible()
+        assert not page.locator(".top").is_visible()
+
+
+def _until(page: Any, holds: str) -> None:
+    """Wait until an expression holds. Playwright's own wait evaluates texts in the page, which its policy forbids."""
+    for _ in range(100):
+        if page.evaluate(holds):
+            return
+        page.wait_for_timeout(50)
+    raise AssertionError(holds)

@@ -1,0 +1,142 @@
+"""Compare: results side by side, curves over each other, videos in step by gait phase."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import re
+from collections.abc import Sequence
+from typing import Any
+from urllib.parse import urlencode
+
+import numpy as np
+from markupsafe import Markup
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+
+from pbl_pipeline import charts
+from pbl_pipeline.code_version import code_version
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, number
+from schemas import compare
+
+from .find import LARGEST, interval
+from .pages import Pages
+from .tables import Tables
+from .videos import Videos
+
+_ONE = re.compile(r"(\d{1,10})(?:\.(\d{1,3}))?")
+
+
+@dataclasses.dataclass(frozen=True)
+class Chart:
+    """Curves of one angle. sides: "left" and "right" with their pictures."""
+
+    title: str
+    positive: str
+    sides: dict[str, Markup]
+
+
+def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
+    """The addresses of this part."""
+
+    async def show(request: Request) -> Response:
+        chosen = [_read(text) for text in request.query_params.getlist("v")[:100]]
+        wanted = request.query_params.get("ref", "")
+        found = await tables.ask(compare.compare, chosen, _read(wanted) if wanted else None)
+        names = [_name(c) for c in found.compared]
+        cycles = [c.cycles for c in found.compared]
+        shown: dict[int, PblError | None] = {}
+        for video_id in {c.video_id for of_result in cycles for c in of_result}:
+            try:
+                await tables.ask(videos.path, video_id)
+                shown[video_id] = None
+            except PblError as error:
+                shown[video_id] = error
+        return pages.show(
+            request,
+            "compare.html",
+            found=found,
+            names=names,
+            keys=[charts.series_key(i) for i in range(len(names))],
+            measures=[n for n in MEASURES if any(n in c.measures for c in found.compared)],
+            charts=charts_of(found, names),
+            plot=charts.CYCLE_PLOT,
+            first_cycle=[_first_cycle(c, cycles) for c in cycles],
+            videos=shown,
+            as_reference=[_address(found, i) for i in range(len(names))],
+            interval=interval,
+            bounds=_bounds,
+            now=f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M} UTC",
+            version=code_version(),
+        )
+
+    return [Route("/compare", show)]
+
+
+def charts_of(found: compare.Comparison, names: Sequence[str]) -> list[Chart]:
+    """Every angle of which any result has curves, in the order of the report."""
+    out = []
+    for angle, (title, positive) in (ANGLES | FOOT_ANGLES | PELVIS_ANGLES).items():
+        sides = {}
+        for side in ("left", "right"):
+            frames: list[Any] = [
+                c.curves[(c.curves["angle"] == angle) & (c.curves["side"] == side)] for c in found.compared
+            ]
+            first = next((f for f in frames if len(f)), None)
+            if first is None:
+                continue
+            of_reference = frames[found.reference] if len(frames[found.reference]) else first
+            curves = [(f["mean_deg"].to_numpy(float), f["sd_deg"].to_numpy(float)) if len(f) else None for f in frames]
+            means = [
+                f"{name} {number(float(c[0].min()), 0)} to {number(float(c[0].max()), 0)}\N{DEGREE SIGN}"
+                for name, c in zip(names, curves, strict=True)
+                if c is not None
+            ]
+            label = f"{title}, {side} leg, in degrees over the gait cycle in percent. Mean curves: {'; '.join(means)}."
+            sides[side] = charts.compare_chart(
+                label, first["percent"].to_numpy(float), curves, _norm(of_reference), found.reference
+            )
+        if sides:
+            out.append(Chart(title, positive, sides))
+    return out
+
+
+def _norm(frame: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    columns = tuple(frame[c].to_numpy(float) for c in ("percent", "normal_mean_deg", "normal_sd_deg"))
+    return (columns[0], columns[1], columns[2]) if np.isfinite(columns[1]).all() else None
+
+
+def _name(one: compare.Compared) -> str:
+    """What tells a result from the others, without the person's code."""
+    label = one.about.visit.label
+    if len(one.about.results) < 2 or one.result is None:
+        return label
+    return f"{label}, {one.result.kind}, {one.result.methods[0]}"
+
+
+def _first_cycle(own: Sequence[compare.Cycle], of_all: Sequence[Sequence[compare.Cycle]]) -> int | None:
+    """The place of the cycle that is shown at first: in the middle of those of one side, the same side for all."""
+    side = max(("right", "left"), key=lambda s: sum(any(c.side == s for c in cycles) for cycles in of_all))
+    mine = [i for i, c in enumerate(own) if c.side == side] or list(range(len(own)))
+    return mine[len(mine) // 2] if mine else None
+
+
+def _bounds(limits: tuple[float, float] | None, decimals: int) -> str:
+    """Limits of an interval as numbers; empty where there are none."""
+    return "" if limits is None else f"{number(limits[0], decimals)}\N{EN DASH}{number(limits[1], decimals)}"
+
+
+def _read(text: str) -> tuple[int, int | None]:
+    """A visit, and which of its results, as an address names it; 0, which no visit has, for anything else."""
+    found = _ONE.fullmatch(text)
+    if found is None or int(found[1]) > LARGEST:
+        return 0, None
+    return int(found[1]), None if found[2] is None else int(found[2])
+
+
+def _address(found: compare.Comparison, reference: int) -> str:
+    """The same comparison with another reference."""
+    named = [f"{c.about.visit.session_id}" + ("" if c.number is None else f".{c.number}") for c in found.compared]
+    return "/compare?" + urlencode([*(("v", n) for n in named), ("ref", named[reference])])
