@@ -78,7 +78,7 @@ def decide_person(video_id: int, tracking_method: str, person: int, by: str, see
         rows = (tracking.SubjectChoice & selection).to_dicts()
         before = {"status": rows[0]["choice_status"], "person": rows[0]["chosen_person_id"]} if rows else {}
         deleted = choice_applied(selection, person, failed)
-        _insert("person", by, {"tracking_method": tracking_method}, before, {"person": person}, video_id=video_id)
+        record("person", by, {"tracking_method": tracking_method}, before, {"person": person}, video_id=video_id)
     return deleted
 
 
@@ -125,7 +125,7 @@ def accept_check(key: Mapping[str, Any], number: int, by: str, reason: str = "")
             return
         about = {**key, "computed": str(rows[0]["qc_computed"]), "qc_no": number, "check": rows[0]["qc_check"]}
         after = {"outcome": "accepted"}
-        _insert("check", by, about, {"outcome": "WARN"}, after, reason, session_id=session_id)
+        record("check", by, about, {"outcome": "WARN"}, after, reason, session_id=session_id)
 
 
 def accepted(key: Mapping[str, Any]) -> dict[int, Decided]:
@@ -143,7 +143,8 @@ def accepted(key: Mapping[str, Any]) -> dict[int, Decided]:
     }
 
 
-def _insert(what: str, by: str, about: dict, before: dict, after: dict, reason: str = "", **of: int) -> None:
+def record(what: str, by: str, about: dict, before: dict, after: dict, reason: str = "", **of: int) -> None:
+    """Insert a row of Decision; `of`: session_id or video_id. Inside the transaction of what was decided."""
     Decision.insert1(
         {
             "decision_id": next_id(Decision, "decision_id"),

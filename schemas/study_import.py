@@ -84,16 +84,17 @@ def import_sheets(paths: Sequence[Path], dry_run: bool = False, distinct_codes: 
         FILE_MISSING, SHEET_FORMAT for a sheet that cannot be read. What is wrong with a row is in the result.
     """
     sheets = [sheet for path in paths for sheet in read_sheets(path)]
+    return in_transaction(lambda: import_rows(sheets, dry_run, distinct_codes))
 
-    def work() -> Imported:
-        plan = _Plan(sheets, distinct_codes)
-        lines = list(plan.lines.values())
-        done = not dry_run and not any(line.errors for line in lines)
-        if done:
-            plan.apply()
-        return Imported(lines, done)
 
-    return in_transaction(work)
+def import_rows(sheets: Sequence[Sheet], dry_run: bool = False, distinct_codes: bool = False) -> Imported:
+    """As `import_sheets`, of sheets that were read, inside a transaction of the caller."""
+    plan = _Plan(sheets, distinct_codes)
+    lines = list(plan.lines.values())
+    done = not dry_run and not any(line.errors for line in lines)
+    if done:
+        plan.apply()
+    return Imported(lines, done)
 
 
 @dataclasses.dataclass

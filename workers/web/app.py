@@ -19,7 +19,7 @@ from starlette.staticfiles import StaticFiles
 
 from pbl_pipeline.errors import PblError
 
-from . import access, compare, decide, drawn, find, look, people, take
+from . import access, compare, decide, drawn, entry, find, look, people, take
 from .making import Making
 from .pages import Pages
 from .tables import Tables
@@ -113,6 +113,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
             *take.routes(pages, tables),
             *drawn.routes(pages, tables, making),
             *compare.routes(pages, tables, videos),
+            *entry.routes(pages, tables),
             Mount("/static", StaticFiles(directory=files / "static")),
             Mount("/vendor", StaticFiles(directory=files / "vendor")),
         ],

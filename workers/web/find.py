@@ -13,6 +13,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 
 from schemas import decide, visit_list
+from schemas.enter import entry
 
 from .access import Session, form_of
 from .pages import Pages
@@ -60,7 +61,10 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
         about = await tables.ask(visit_about, number_of(request), shown_of(request))
         decided = await tables.ask(decide.decisions, about.visit.session_id)
         accepted = await tables.ask(decide.accepted, about.key) if about.key else {}
-        return pages.show(request, "visit.html", about=about, decisions=decided, accepted=accepted, interval=interval)
+        entered = await tables.ask(entry, about.visit.session_id)
+        return pages.show(
+            request, "visit.html", about=about, decisions=decided, accepted=accepted, entry=entered, interval=interval
+        )
 
     return [
         Route("/visits", visits, methods=["GET", "POST"]),

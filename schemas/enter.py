@@ -1,0 +1,167 @@
+"""What a person enters about a visit: its role in a study and clinical scores, each change a row of Decision.
+
+The rows are checked and written as those of a sheet of `pbl study import` are.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from pbl_pipeline.errors import PblError
+
+from . import session, study
+from .decide import decisions, record
+from .ingest import in_transaction
+from .sheets import Row, Sheet, refused
+from .study_import import CLEAR, SCORE_COLUMNS, Line, import_rows
+
+#: Name of the field of the role; the others are named by their instruments.
+ROLE = "role"
+#: Roles that are offered; any word of small letters, digits and underscores can be one.
+USUAL_ROLES = (*study.FIRST_ROLES, "6_weeks", "3_months", "6_months", "12_months", "24_months")
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """What is stored of a visit, as a form shows it. values: by field, empty where there is none; instruments: rows of
+    ClinicalInstrument by name; seen: another text after each change."""
+
+    session_id: int
+    subject: str
+    label: str
+    values: dict[str, str]
+    instruments: dict[str, dict[str, Any]]
+    seen: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Entered:
+    """The outcome. changed: the fields that were; errors: by field; with any of them nothing was written."""
+
+    changed: tuple[str, ...]
+    errors: dict[str, PblError]
+
+
+def entry(session_id: int) -> Entry:
+    """What can be entered about a visit. Raises `PblError` DB_NOT_FOUND for a number that no visit has."""
+    rows = (session.Session & {"session_id": session_id}).to_dicts()
+    if not rows:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no session_id {session_id}",
+            expected="a registered visit",
+            next_step="`pbl list visits` prints the numbers",
+        )
+    roles = (study.Visit & {"session_id": session_id}).to_arrays("visit_role")
+    scores = (study.ClinicalScore & {"session_id": session_id}).to_dicts()
+    stored = {r["instrument"]: f"{r['score_value']:.12g}" for r in scores}
+    instruments = {r["instrument"]: r for r in study.ClinicalInstrument().to_dicts(order_by="instrument")}
+    values = {ROLE: str(roles[0]) if len(roles) else "", **{n: stored.get(n, "") for n in instruments}}
+    text = json.dumps([session_id, values], sort_keys=True)
+    seen = hashlib.sha256(text.encode()).hexdigest()[:16]
+    return Entry(session_id, rows[0]["subject"], rows[0]["session_label"], values, instruments, seen)
+
+
+def enter(session_id: int, values: Mapping[str, str], by: str, seen: str, reason: str = "") -> Entered:
+    """Bring what is stored of a visit to what was entered, all of it or nothing.
+
+    Parameters
+    ----------
+    values
+        Text by field of `Entry.values`; an empty one removes a score. Fields that are not named stay.
+    by, reason
+        Who entered it, and why (no names).
+    seen
+        `Entry.seen` of the form that was filled in.
+
+    Raises
+    ------
+    PblError
+        DB_NOT_FOUND; USAGE for a field that there is not; DECIDED_MEANWHILE where something else is stored by now.
+        What is wrong with a value is in the result.
+    """
+    return in_transaction(lambda: _enter(session_id, values, by, seen, reason))
+
+
+def _enter(session_id: int, values: Mapping[str, str], by: str, seen: str, reason: str) -> Entered:
+    table = session.Session.full_table_name  # who enters at the same moment waits here
+    locked = f"SELECT session_id FROM {table} WHERE session_id = %s FOR UPDATE"  # noqa: S608
+    session.Session.connection.query(locked, args=(session_id,))
+    now = entry(session_id)
+    if unknown := sorted(set(values) - set(now.values)):
+        raise PblError(
+            "USAGE",
+            found=f"a field {unknown[0][:64]!r}",
+            expected="the role or an instrument of ClinicalInstrument",
+            next_step="load the form again",
+            key=f"session_id={session_id}",
+        )
+    if now.seen != seen:
+        raise _meanwhile(session_id)
+    given = {name: text.strip()[:200] for name, text in values.items()}
+    changed = {name: text for name, text in given.items() if not _same(text, now.values[name])}
+    errors: dict[str, PblError] = {}
+    if changed.get(ROLE) == "":
+        errors[ROLE] = refused(ROLE, "no role", f"a role, such as {', '.join(USUAL_ROLES[:3])}", "write it")
+    of_visit = {"subject": now.subject, "visit": now.label}
+    rows = {
+        name: Row(name, {**of_visit, **({"role": text} if name == ROLE else _score(name, text))})
+        for name, text in changed.items()
+        if name not in errors
+    }
+    roles = Sheet("role", ("subject", "visit", "role"), tuple(r for n, r in rows.items() if n == ROLE))
+    scores = Sheet("scores", SCORE_COLUMNS, tuple(r for n, r in rows.items() if n != ROLE))
+    # Codes that are alike are a question to who registers people, not to who enters a score.
+    found = import_rows([s for s in (roles, scores) if s.rows], dry_run=bool(errors), distinct_codes=True)
+    errors |= {line.where: error for line in found.lines if (error := _first(line)) is not None}
+    if errors:
+        return Entered((), errors)
+    for name, text in changed.items():
+        is_role = name == ROLE
+        about = {} if is_role else {"instrument": name}
+        before, after = ({"value": _stored(v, is_role)} for v in (now.values[name], text))
+        record("role" if is_role else "score", by, about, before, after, reason, session_id=session_id)
+    return Entered(tuple(changed), {})
+
+
+def _score(name: str, text: str) -> dict[str, str]:
+    return {"instrument": name, "value": text or CLEAR}
+
+
+def _same(text: str, stored: str) -> bool:
+    """Whether a text is what is stored, also written otherwise: 12.0 for 12."""
+    if text == stored:
+        return True
+    try:
+        return "_" not in text and float(text) == float(stored)
+    except ValueError:
+        return False
+
+
+def _stored(text: str, is_role: bool) -> Any:
+    """What is stored of a field: a number of a score, None where there is nothing."""
+    if not text:
+        return None
+    return text if is_role else float(text)
+
+
+def _first(line: Line) -> PblError | None:
+    return line.errors[0] if line.errors else None
+
+
+def _meanwhile(session_id: int) -> PblError:
+    last = next((d for d in decisions(session_id) if d.what in ("role", "score")), None)
+    who = (
+        f"{last.by} entered {last.about.get('instrument', 'the role')} at {last.at} UTC" if last else "it was imported"
+    )
+    return PblError(
+        "DECIDED_MEANWHILE",
+        found=f"since this form was loaded something else is stored: {who}",
+        expected="what the form showed; nothing of yours was written",
+        next_step="load the form again, look at what is stored, and enter then",
+        key=f"session_id={session_id}",
+    )

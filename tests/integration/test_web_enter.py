@@ -1,0 +1,146 @@
+"""Entering in the review page: the role of a visit and clinical scores, from the click to the row."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+
+from schemas import lab, session, study
+from schemas.enter import enter, entry
+from schemas.review import Decision
+from schemas.rows import utc_now
+from tests.integration import web
+from tests.rows import everything
+
+
+@pytest.fixture
+def two_visits(tables: None) -> None:
+    """P001 with visits 1 (pre, mJOA 12) and 2 of 2026, without videos."""
+    lab.Subject.insert1({"subject": "P001", "population": "patient", "subject_created": utc_now()})
+    session.Session.insert(
+        {"session_id": i, "subject": "P001", "session_label": d, "session_date": d, "session_created": utc_now()}
+        for i, d in ((1, "2026-01-10"), (2, "2026-04-10"))
+    )
+    study.Visit.insert1({"session_id": 1, "visit_role": "pre", "visit_note": "uses a cane"})
+    study.ClinicalScore.insert1({"session_id": 1, "instrument": "mJOA", "score_value": 12})
+
+
+def send(browser: Any, number: int, seen: str = "", reason: str = "", **values: object):
+    seen = seen or str(re.findall(r'name="seen" value="([^"]*)"', browser.get(f"/visits/{number}/enter").text)[0])
+    fields = {f"value:{name}": str(value) for name, value in values.items()}
+    return web.post(browser, f"/visits/{number}/enter", seen=seen, reason=reason, **fields)
+
+
+def score(number: int, name: str) -> float | None:
+    found = (study.ClinicalScore & {"session_id": number, "instrument": name}).to_arrays("score_value")
+    return float(found[0]) if len(found) else None
+
+
+def test_each_change_is_a_row_with_what_was_before(two_visits: None):
+    browser = web.client(name="A. First")
+    answer = send(browser, 1, mJOA="13.5", BBS="44", role="baseline", reason="read from the <i>chart")
+    assert (answer.status_code, answer.headers["location"]) == (303, "/visits/1#entered")
+    assert (score(1, "mJOA"), score(1, "BBS")) == (13.5, 44)
+    assert (study.Visit & {"session_id": 1}).fetch1("visit_role", "visit_note") == ("baseline", "uses a cane")
+    rows = {(r["decision_what"], r["decision_about"].get("instrument")): r for r in Decision().to_dicts()}
+    told = {k: (r["decision_before"]["value"], r["decision_after"]["value"]) for k, r in rows.items()}
+    expected = {("score", "mJOA"): (12.0, 13.5), ("score", "BBS"): (None, 44.0), ("role", None): ("pre", "baseline")}
+    assert told == expected
+    assert {(r["decision_by"], r["session_id"]) for r in rows.values()} == {("A. First", 1)}
+    page = browser.get("/visits/1").text
+    assert "clinical score mJOA: read from the &lt;i&gt;chart" in page
+    assert re.search(r"mJOA 13\.5 <span[^>]*>points", page)
+    # What is as it was changes nothing; an empty field removes.
+    assert send(browser, 1, mJOA="13.50", BBS="", role="baseline").status_code == 303
+    assert (score(1, "BBS"), len(Decision())) == (None, 4)
+
+
+@pytest.mark.parametrize(
+    ("values", "code", "said"),
+    [
+        ({"mJOA": "19"}, "SCORE_RANGE", "at least 0 and at most 18"),
+        ({"mJOA": "-1"}, "SCORE_RANGE", "at least 0"),
+        ({"mJOA": "nan"}, "SHEET_FORMAT", "a number with a decimal point"),
+        ({"mJOA": "12,5"}, "SHEET_FORMAT", "a number with a decimal point"),
+        ({"mJOA": "1_2"}, "SHEET_FORMAT", "a number"),
+        ({"mJOA": "<script>"}, "SHEET_FORMAT", "&lt;script&gt;"),
+        ({"role": "6 Weeks"}, "SHEET_FORMAT", "small letters"),
+        ({"role": ""}, "SHEET_FORMAT", "no role"),
+        ({"role": "x" * 33}, "SHEET_FORMAT", "small letters"),
+    ],
+)
+def test_a_wrong_value_is_said_beside_its_field(two_visits: None, values: dict[str, str], code: str, said: str):
+    browser, before = web.client(), everything()
+    answer = send(browser, 1, **{"BBS": "40", **values})
+    assert answer.status_code == 200
+    page = answer.text
+    at = page.index('aria-invalid="true"')
+    beside = page[at : page.index("</div>", at)]
+    assert code in beside
+    assert said in beside
+    assert page.count("aria-invalid") == 1
+    assert 'value="40"' in page  # what was right is not typed again
+    assert everything() == before  # all or nothing
+
+
+def test_a_role_that_does_not_fit_the_days_is_refused(two_visits: None):
+    answer = send(web.client(), 2, role="baseline")
+    assert answer.status_code == 303  # two visits may be before
+    answer = send(web.client(), 1, role="6_weeks")
+    assert answer.status_code == 200
+    assert "roles in the order of their dates" in answer.text
+
+
+def test_the_second_of_two_sees_what_the_first_entered(two_visits: None):
+    first, second = web.client(name="A. First"), web.client(name="B. Second")
+    seen = entry(1).seen
+    assert send(first, 1, seen, mJOA="14").status_code == 303
+    late = send(second, 1, seen, mJOA="15")
+    assert late.status_code == 409
+    assert "DECIDED_MEANWHILE" in late.text
+    assert "A. First entered mJOA" in late.text
+    assert (score(1, "mJOA"), len(Decision())) == (14, 1)
+    study.ClinicalScore.update1({"session_id": 1, "instrument": "mJOA", "score_value": 16})  # as an import does
+    assert send(second, 1, seen, BBS="3").status_code == 409
+    assert send(second, 1, mJOA="15").status_code == 303
+    assert score(1, "mJOA") == 15
+
+
+def test_forged_forms_change_nothing(two_visits: None):
+    reviewer, reader, before = web.client(), web.client(role="reader"), everything()
+    assert send(reader, 1, mJOA="14").status_code == 403
+    assert "Your role looks" in reader.get("/visits/1/enter").text
+    assert send(reviewer, 1, seen="forged", mJOA="14").status_code == 409
+    assert send(reviewer, 1, **{"none'--": "3"}).status_code == 400
+    assert send(reviewer, 999, seen=entry(1).seen, mJOA="3").status_code == 404
+    token = {"value:mJOA": "3", "seen": entry(1).seen}
+    assert reviewer.post("/visits/1/enter", data=token, follow_redirects=False).status_code == 403
+    assert reviewer.get("/visits/999/enter").status_code == 404
+    assert everything() == before
+
+
+def test_a_value_that_an_import_wrote_out_of_range_does_not_block_the_others(two_visits: None):
+    table = study.ClinicalScore.full_table_name
+    study.ClinicalScore.connection.query(f"UPDATE {table} SET score_value = 99")
+    assert enter(1, {"mJOA": "99", "BBS": "12"}, "A", entry(1).seen).changed == ("BBS",)
+
+
+@pytest.mark.needs_extra
+@pytest.mark.slow
+def test_from_the_click_to_the_row_in_a_browser(two_visits: None, chromium: Any):
+    with web.shown(chromium) as page:
+        page.goto("/visits/1")
+        page.get_by_role("link", name="Enter role and clinical scores").click()
+        page.get_by_label("Role of the visit").fill("baseline")
+        page.get_by_label("BBS", exact=False).first.fill("57")
+        page.get_by_role("button", name="Save").click()
+        page.get_by_role("alert").wait_for()
+        assert "at most 56" in page.locator(".problem").inner_text()
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        page.get_by_label("BBS", exact=False).first.fill("50")
+        page.get_by_role("button", name="Save").click()
+        page.wait_for_url("**/visits/1#entered")
+    assert score(1, "BBS") == 50
+    assert {r["decision_what"] for r in Decision().to_dicts()} == {"role", "score"}
