@@ -10,7 +10,15 @@ from pbl_pipeline import jax_setup
 jax_setup.configure()
 
 from pbl_pipeline.body._angles import angle_of, joint_angles, joint_angles_sd, joint_of  # noqa: E402
-from pbl_pipeline.body._capsules import Capsules, capsules, stature_m  # noqa: E402
+from pbl_pipeline.body._capsules import (  # noqa: E402
+    CapsuleFrames,
+    Capsules,
+    CapsuleShapes,
+    capsule_frames,
+    capsule_shapes,
+    capsules,
+    stature_m,
+)
 from pbl_pipeline.body._chain import chain_frames  # noqa: E402
 from pbl_pipeline.body._frames import Frames, mjx_frames  # noqa: E402
 from pbl_pipeline.body._kinematics import (  # noqa: E402
@@ -38,6 +46,8 @@ __all__ = [
     "SLIDES",
     "Y_UP_TO_Z_UP",
     "Body",
+    "CapsuleFrames",
+    "CapsuleShapes",
     "Capsules",
     "Frames",
     "MarkerJacobian",
@@ -45,6 +55,8 @@ __all__ = [
     "Points",
     "angle_of",
     "body_poses",
+    "capsule_frames",
+    "capsule_shapes",
     "capsules",
     "chain_frames",
     "joint_angles",

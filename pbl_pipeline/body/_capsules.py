@@ -38,6 +38,35 @@ class Capsules:
 
 
 @dataclasses.dataclass(frozen=True)
+class CapsuleShapes:
+    """G capsules in the frames of their bodies.
+
+    Attributes
+    ----------
+    names : G names
+    body : (G,)
+        Index of the body that a capsule moves with, in `Body.body_names`.
+    start, end : (G, 3)
+        In that body's frame, metres.
+    radius_m : (G,)
+    """
+
+    names: tuple[str, ...]
+    body: np.ndarray
+    start: np.ndarray
+    end: np.ndarray
+    radius_m: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class CapsuleFrames:
+    """`position_m` (T, B, 3) and `rotation` (T, B, 3, 3), body to world (z up); NaN where qpos is NaN."""
+
+    position_m: np.ndarray
+    rotation: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
 class _Local:
     """One capsule in its body's frame."""
 
@@ -53,22 +82,17 @@ def capsules(body: Body, qpos: np.ndarray, scale: np.ndarray) -> Capsules:
 
     Ellipsoids are drawn as capsules side by side (see `_strands`). Kinematics by C MuJoCo, in double precision.
     """
-    qpos, scale = np.asarray(qpos, np.float64), np.asarray(scale, np.float64)
-    local = _local(body)
-    own = scale[body.scale_index]
-    xpos, xmat = _poses(body, qpos, own)
-    index = np.array([c.body for c in local])
-    factor = own[index, None]
+    shapes, at = capsule_shapes(body, scale), capsule_frames(body, qpos, scale)
 
     def world(points: np.ndarray) -> np.ndarray:
-        return xpos[:, index] + np.einsum("tgij,gj->tgi", xmat[:, index], factor * points)
+        return at.position_m[:, shapes.body] + np.einsum("tgij,gj->tgi", at.rotation[:, shapes.body], points)
 
     return Capsules(
-        names=tuple(c.name for c in local),
-        body_names=tuple(body.body_names[c.body] for c in local),
-        start=world(np.stack([c.start for c in local])),
-        end=world(np.stack([c.end for c in local])),
-        radius_m=own[index] * np.array([c.radius for c in local]),
+        names=shapes.names,
+        body_names=tuple(body.body_names[i] for i in shapes.body),
+        start=world(shapes.start),
+        end=world(shapes.end),
+        radius_m=shapes.radius_m,
     )
 
 
@@ -80,10 +104,26 @@ def stature_m(body: Body, scale: np.ndarray) -> float:
     return float((z + r).max() - (z - r).min())
 
 
-def _poses(body: Body, qpos: np.ndarray, own_scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def capsule_shapes(body: Body, scale: np.ndarray) -> CapsuleShapes:
+    """The body's shapes with scale multipliers (8,), which move with their bodies."""
+    local, own = _local(body), np.asarray(scale, np.float64)[body.scale_index]
+    index = np.array([c.body for c in local])
+    return CapsuleShapes(
+        names=tuple(c.name for c in local),
+        body=index,
+        start=own[index, None] * np.stack([c.start for c in local]),
+        end=own[index, None] * np.stack([c.end for c in local]),
+        radius_m=own[index] * np.array([c.radius for c in local]),
+    )
+
+
+def capsule_frames(body: Body, qpos: np.ndarray, scale: np.ndarray) -> CapsuleFrames:
+    """Where the bodies are at the poses `qpos` (T, 40) with scale multipliers (8,), by C MuJoCo in double precision."""
+    own_scale = np.asarray(scale, np.float64)[body.scale_index]
     model = copy.copy(body.mj_model)
     model.body_pos[2:] *= own_scale[body.parent_index[1:], None]
     data = mujoco.MjData(model)
+    qpos = np.asarray(qpos, np.float64)
     xpos = np.full((len(qpos), len(body.body_names), 3), np.nan)
     xmat = np.full((len(qpos), len(body.body_names), 3, 3), np.nan)
     for t, pose in enumerate(qpos):
@@ -91,7 +131,7 @@ def _poses(body: Body, qpos: np.ndarray, own_scale: np.ndarray) -> tuple[np.ndar
             data.qpos[:] = pose
             mujoco.mj_kinematics(model, data)
             xpos[t], xmat[t] = data.xpos[1:], data.xmat[1:].reshape(-1, 3, 3)
-    return xpos, xmat
+    return CapsuleFrames(xpos, xmat)
 
 
 @functools.cache

@@ -38,7 +38,7 @@ def to_pixels(points_cam_m: np.ndarray, camera: Camera) -> np.ndarray:
     x, y = p[..., 0] / depth, p[..., 1] / depth
     k1, k2, p1, p2, k3 = np.asarray(camera.distortion, float)
     r2 = x * x + y * y
-    r2 = np.where(r2 < _turning_radius2(k1, k2, k3), r2, np.nan)
+    r2 = np.where(r2 < turning_radius2(camera), r2, np.nan)
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
@@ -56,8 +56,9 @@ def scaled_camera(camera: Camera, factor_x: float, factor_y: float) -> Camera:
     return Camera(m, camera.distortion, camera.source)
 
 
-def _turning_radius2(k1: float, k2: float, k3: float) -> float:
+def turning_radius2(camera: Camera) -> float:
     """Squared normalised radius where r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing; inf where it never does."""
+    k1, k2, _, _, k3 = np.asarray(camera.distortion, float)
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     real = roots[np.abs(roots.imag) < 1e-12].real
     return float(min(real[real > 0], default=np.inf))

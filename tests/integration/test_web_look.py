@@ -13,7 +13,7 @@ from tests.integration import web
 from tests.integration.chain import N_FRAMES, small_video
 from tests.rows import register
 from workers.populate import populate
-from workers.web.movement import DEPTH_STEPS, PIXEL_STEPS, UNKNOWN
+from workers.web.movement import METRE_STEPS, TURN_STEPS
 
 
 @pytest.fixture(scope="module")
@@ -51,21 +51,22 @@ def test_a_page_of_a_recording(looked_at):
             assert browser.get(f"/recordings/{forged}{what}").status_code == 404
 
 
-def test_the_body_that_is_sent_is_the_one_that_the_overlay_draws(looked_at):
+def test_the_body_that_is_sent_is_that_of_the_fit(looked_at):
+    """What the page's script makes of it is compared with the overlay in tests/unit/test_web_scripts.py."""
     _, walk, _ = looked_at
-    answer = web.client().get(f"/recordings/{walk}/body")
+    browser = web.client()
+    body = browser.get(f"/recordings/{walk}/movement").json()["body"]
     key = recording_page.trial_key(walk)
     assert key is not None
     track = body_track(recording_page.recording_fit(key).fit)
-    sides = answer.headers["x-sides"]
-    assert [s[0] for s in track.sides] == list(sides)
-    numbers = np.frombuffer(answer.content, "<i2").reshape(N_FRAMES, len(sides), 7)
-    frames = np.cumsum(numbers.astype(np.int64), axis=0).astype(np.int16)  # as the page's script counts
-    known = frames[..., 0] != UNKNOWN
-    assert known.any()
-    found = frames[known][:, :6].reshape(-1, 2, 3) / PIXEL_STEPS
-    np.testing.assert_allclose(found, track.discs_px[known], atol=0.5 / PIXEL_STEPS + 1e-9)
-    np.testing.assert_allclose(frames[known][:, 6] / DEPTH_STEPS, track.depth_m[known], atol=0.5 / DEPTH_STEPS + 1e-9)
+    low, high = np.frombuffer(browser.get(f"/recordings/{walk}/body").content, np.uint8).reshape(2, -1, N_FRAMES)
+    again = (low.astype(np.uint16) | high.astype(np.uint16) << 8).astype(np.int16).astype(np.int64)
+    changes = np.concatenate([again[:, :1], np.cumsum(again[:, 1:], axis=1)], axis=1)
+    found = np.cumsum(changes, axis=1).T
+    assert body["known"] == [[0, N_FRAMES - 1]]
+    np.testing.assert_allclose(found[:, :3] / METRE_STEPS + body["start"], track.root_m, atol=0.5 / METRE_STEPS + 1e-6)
+    turns = found[:, 3:-4].reshape(N_FRAMES, -1, 4) / TURN_STEPS
+    np.testing.assert_allclose(turns, track.quat_wxyz, atol=0.5 / TURN_STEPS + 1e-9)
 
 
 def test_curves_events_and_what_is_uncertain(looked_at):

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pbl_pipeline.body import load_body
+from pbl_pipeline.body import capsules, load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import fit_session
 from pbl_pipeline.gait import GaitEvent, angle_series
@@ -18,6 +18,7 @@ from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.render import (
     NEAR_M,
     SIDE_COLOUR,
+    body_track,
     capsule_outline,
     draw_body,
     draw_keypoints,
@@ -30,6 +31,7 @@ from pbl_pipeline.render import (
     stance_spans,
     to_camera,
     to_pixels,
+    uncertain_sides,
 )
 from pbl_pipeline.synthetic import NO_NOISE, observe, plain_walk
 from pbl_pipeline.video import Camera, probe, read_frames
@@ -396,3 +398,34 @@ def test_sides_differ_for_every_colour_vision() -> None:
     """Blue and vermilion: the blue channel alone tells them apart, which no common colour blindness loses."""
     right, left = SIDE_COLOUR["right"], SIDE_COLOUR["left"]
     assert abs(int(right[5:], 16) - int(left[5:], 16)) > 120
+
+
+def test_a_side_is_uncertain_behind_the_other_when_badly_seen_or_of_a_wide_interval() -> None:
+    time = np.arange(6.0)
+    sd = np.array([5.0, 5, 20, 25, np.nan, 5])
+    flat = np.full(6, 3.0)
+    found = uncertain_sides(
+        time, [("left", 0.5, 1.5)], None, {"left": {"knee": flat}, "right": {"hip": flat, "knee": sd}}
+    )
+    assert found["left"].tolist() == [False, True, False, False, False, False]
+    assert found["right"].tolist() == [False, False, True, True, False, False]
+
+
+def test_the_track_of_the_body_puts_its_capsules_where_they_are_drawn() -> None:
+    body = load_body()
+    fit = walking_fit(body.joint_names, body.sha256, n_frames=30, seen=(3, 28))
+    fit = dataclasses.replace(fit, scale=np.linspace(0.9, 1.1, 8))
+    track, drawn = body_track(fit), capsules(body, fit.qpos, fit.scale)
+    assert np.isnan(track.root_m[[0, 2, 28]]).all()
+    turned = rotation_matrix(track.quat_wxyz[3:28])
+    at = np.zeros((25, len(track.names), 3))
+    for b, parent in enumerate(track.parent):
+        carried = np.einsum("tij,j->ti", turned[:, parent], track.offset_m[b])
+        at[:, b] = track.root_m[3:28] if parent < 0 else at[:, parent] + carried
+    own = track.shapes.body
+    start = at[:, own] + np.einsum("tgij,gj->tgi", turned[:, own], track.shapes.start)
+    np.testing.assert_allclose(start, drawn.start[3:28], atol=1e-9)
+    assert {n for n, leg in zip(track.names, track.leg, strict=True) if leg} == {
+        f"{part}_{side}" for part in ("femur", "tibia", "talus", "calcn", "toes") for side in "lr"
+    }
+    assert (np.sum(track.quat_wxyz[4:28] * track.quat_wxyz[3:27], axis=2) > 0).all()

@@ -37,11 +37,17 @@ def test_every_text_of_the_catalogue_is_on_a_page():
     assert not [n for n in texts.catalogue() if not _BY_VALUE.match(n) and not re.search(f"[\"']{n}[\"']", pages)]
 
 
-def test_scripts_of_others_are_as_published():
+def test_scripts_of_others_are_those_that_the_readme_names():
     rows = re.findall(r"^\| `([^`]+)` \|.*\| ([0-9a-f]{64}) \|$", (WEB / "vendor/README.md").read_text(), re.MULTILINE)
     found = {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in WEB.glob("vendor/*.min.*")}
     assert dict(rows) == found
-    assert len(list(WEB.glob("vendor/*.LICENSE"))) == 1
+    assert len(list(WEB.glob("vendor/*.LICENSE"))) == 2
+
+
+def test_scripts_of_others_are_named_with_their_versions():
+    """A page, or a script of ours, that names a vendored file names one that is there."""
+    named = {n for f in [*_PAGES, *WEB.glob("static/*.js")] for n in re.findall(r"/vendor/([\w.-]+)", f.read_text())}
+    assert {p.name for p in WEB.glob("vendor/*.min.*")} == named
 
 
 def test_the_browsers_language():

@@ -13,7 +13,7 @@ from pbl_pipeline.errors import PblError
 from schemas import choose, decide, recording_page
 
 from .find import number_of
-from .movement import movement_json, outlines
+from .movement import body_json, movement_json
 from .pages import Pages
 from .tables import Tables
 from .videos import Videos
@@ -58,8 +58,8 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
 
     async def body(request: Request) -> Response:
         found = await fitted(request)
-        sides, numbers = await asyncio.to_thread(outlines, found)
-        return Response(numbers, media_type="application/octet-stream", headers={"x-sides": sides})
+        _, numbers = await asyncio.to_thread(body_json, found)
+        return Response(numbers, media_type="application/octet-stream")
 
     return [
         Route("/recordings/{number:int}", recording),

@@ -7,31 +7,31 @@ from typing import Any
 
 import numpy as np
 
+from pbl_pipeline.errors import PblError
 from schemas.recording_page import RecordingFit
 
-#: Steps of a pixel and of a metre's hundredth in which outlines are sent.
-PIXEL_STEPS, DEPTH_STEPS = 4, 100
-#: What stands for an unknown value among them.
-UNKNOWN = -32768
+#: Steps of a metre, of a body's quaternion and of the camera's in which poses are sent: a millimetre; a half step of a
+#: quaternion is 0.01 deg, of the camera's 0.2 px at a focal length of 1,500 px.
+METRE_STEPS, TURN_STEPS, CAMERA_STEPS = 1000, 4096, 8192
 
 
 def movement_json(found: RecordingFit) -> bytes:
     """Times, joint angles with their 90 % half widths (deg), events, stance, and where a side is uncertain, as JSON.
 
     `time` (T) s; `curves`: name, by side `value` and `half` (T) deg, null where unknown; `events`: time, side, kind,
-    probability; `stance` and `uncertain`: by side, spans (from, to) in s.
+    probability; `stance` and `uncertain`: by side, spans (from, to) in s; `body`: of `body_json`.
     """
     from pbl_pipeline.gait import interval_90, leg_angles, leg_angles_sd
     from pbl_pipeline.render import stance_spans, uncertain_sides
     from pbl_pipeline.runs import runs
     from pbl_pipeline.words import ANGLES
 
-    fit = found.fit
+    fit, (body, _) = found.fit, body_json(found)
     one = interval_90(0.0, 1.0)
     assert one is not None
     angles, sd = leg_angles(fit), leg_angles_sd(fit)
     far = [(c.far_leg, c.start_s, c.end_s) for c in found.cycles if c.far_leg]
-    unsure = uncertain_sides(fit.time_s, far, found.keypoints)
+    unsure = uncertain_sides(fit.time_s, far, found.keypoints, sd)
     curves = [
         {
             "name": title,
@@ -53,35 +53,119 @@ def movement_json(found: RecordingFit) -> bytes:
             side: [(float(fit.time_s[r][0]), float(fit.time_s[r][-1])) for r in runs(mask)]
             for side, mask in unsure.items()
         },
-        "steps": {"pixel": PIXEL_STEPS, "depth": DEPTH_STEPS, "unknown": UNKNOWN},
+        "body": body,
     }
     return json.dumps(out, allow_nan=False, separators=(",", ":")).encode()
 
 
-def outlines(found: RecordingFit) -> tuple[str, bytes]:
-    """The body's capsules: the side of each as a letter (l, r, m), and little-endian int16 (T, G, 7): x, y, radius of
-    the two discs in `PIXEL_STEPS` of a pixel, depth in `DEPTH_STEPS` of a metre.
+def body_json(found: RecordingFit) -> tuple[dict[str, Any], bytes]:
+    """The fitted body and the camera as the page's script draws them (`static/body.js`).
 
-    Each frame but the first is what changed since the one before, counted round 2^16: that packs to a third.
+    Returns
+    -------
+    dict
+        `sides` of the B bodies as letters (l, r, m), `legs`: indices of those of a leg, `parent`, `offset` (m, in the
+        parent's frame), `capsules` (body, start x y z, end x y z, radius; m, in the body's frame), `floor` and `start`
+        (m: height of the floor, where the root is in the first known frame), `known`: runs of frames (first, last) with
+        a pose, and `steps`. `camera`: `lens` (fx, fy, cx, cy px), `distortion` (k1, k2, p1, p2, k3), `turning` (squared
+        radius up to which that is a lens), `near` and `position` (m), `known`; null where there is no camera.
+    bytes
+        Channels (C, T): root x, y, z relative to `start`, four of each body's quaternion (w, x, y, z), four of the
+        camera's, in steps. Of each channel second differences, first the low bytes of all, then the high bytes: that
+        packs to a third. Frames without a pose repeat the one before.
 
     Raises
     ------
     PblError
-        FILE_FORMAT for a fit of another body model than the installed one.
+        FILE_FORMAT for a fit of another body model than the installed one, and for movement that cannot be sent.
     """
-    from pbl_pipeline.render import body_track
+    from pbl_pipeline.render import NEAR_M, body_track, turning_radius2
 
-    track = body_track(found.fit)
-    t, g = track.depth_m.shape
-    values = np.concatenate(
-        [PIXEL_STEPS * track.discs_px.reshape(t, g, 6), DEPTH_STEPS * track.depth_m[..., None]], axis=2
+    fit, track = found.fit, body_track(found.fit)
+    t = len(track.root_m)
+    known = _finite(track.quat_wxyz) & _finite(track.root_m)
+    quat, position = np.asarray(fit.phone_quat_wxyz, float), np.asarray(fit.camera_position_m, float)
+    aimed = _finite(quat) & bool(np.isfinite(position).all() and np.isfinite(fit.camera.matrix).all())
+    start = track.root_m[np.argmax(known)] if known.any() else np.zeros(3)
+    channels = np.concatenate(
+        [
+            METRE_STEPS * _held(track.root_m - start, known),
+            TURN_STEPS * _held(track.quat_wxyz.reshape(t, -1), known),
+            CAMERA_STEPS * _held(_continuous(quat), aimed),
+        ],
+        axis=1,
     )
-    known = np.isfinite(values).all(axis=2) & (np.abs(values) < -UNKNOWN - 1).all(axis=2)
-    whole = np.full(values.shape, UNKNOWN, np.int16)
-    whole[known] = np.rint(values[known]).astype(np.int16)
-    changes = whole.copy()
-    changes[1:] -= whole[:-1]  # int16 counts round
-    return "".join(side[0] for side in track.sides), changes.astype("<i2").tobytes()
+    shapes, m = track.shapes, np.asarray(fit.camera.matrix, float)
+    capsules = np.concatenate([shapes.start, shapes.end, shapes.radius_m[:, None]], axis=1)
+    body: dict[str, Any] = {
+        "sides": "".join(side[0] for side in track.sides),
+        "legs": np.flatnonzero(track.leg).tolist(),
+        "parent": [int(p) for p in track.parent],
+        "offset": np.round(track.offset_m, 6).tolist(),
+        "capsules": [[int(b), *np.round(c, 6).tolist()] for b, c in zip(shapes.body, capsules, strict=True)],
+        "floor": round(track.floor_m, 4) if np.isfinite(track.floor_m) else None,
+        "start": np.round(start, 6).tolist(),
+        "known": _spans(known),
+        "steps": {"metre": METRE_STEPS, "turn": TURN_STEPS, "camera": CAMERA_STEPS},
+        "camera": {
+            "lens": [float(v) for v in (m[0, 0], m[1, 1], m[0, 2], m[1, 2])],
+            "distortion": [float(v) for v in fit.camera.distortion],
+            "turning": _number(turning_radius2(fit.camera)),
+            "near": NEAR_M,
+            "position": position.tolist(),
+            "known": _spans(aimed),
+        }
+        if aimed.any()
+        else None,
+    }
+    return body, _packed(np.rint(channels).astype(np.int64).T, fit.name)
+
+
+def _packed(channels: np.ndarray, name: str) -> bytes:
+    """Second differences of (C, T) whole numbers as bytes: low ones, then high ones."""
+    changes = channels.copy()
+    changes[:, 1:] -= channels[:, :-1]
+    again = changes.copy()
+    again[:, 2:] -= changes[:, 1:-1]
+    if np.abs(again).max(initial=0) > 32767:
+        raise PblError(
+            "FILE_FORMAT",
+            found="a body that is metres away from one frame to the next",
+            expected="the movement of a person",
+            next_step="look at the checks of the fit; fit the recording again",
+            key=name,
+        )
+    return again.astype("<i2").view(np.uint8).reshape(-1, 2).T.tobytes()
+
+
+def _held(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Rows (T, N), those that are not known as the known one before, the first ones as the first known; else 0."""
+    if not known.any():
+        return np.zeros(values.shape)
+    last = np.maximum.accumulate(np.where(known, np.arange(len(known)), np.argmax(known)))
+    return values[last]
+
+
+def _continuous(quat_wxyz: np.ndarray) -> np.ndarray:
+    """Unit quaternions (T, 4) without changes of sign."""
+    unit = quat_wxyz / np.linalg.norm(quat_wxyz, axis=1, keepdims=True)
+    turned = np.nan_to_num(np.sign(np.sum(unit[1:] * unit[:-1], axis=1, keepdims=True)), nan=1.0)
+    unit[1:] *= np.cumprod(np.where(turned == 0, 1.0, turned), axis=0)
+    return unit
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    return np.asarray(np.isfinite(values).all(axis=tuple(range(1, values.ndim))), bool)
+
+
+def _spans(mask: np.ndarray) -> list[list[int]]:
+    from pbl_pipeline.runs import runs
+
+    return [[int(r.start), int(r.stop) - 1] for r in runs(mask)]
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 def _listed(values: np.ndarray) -> list[float | None]:

@@ -1,12 +1,15 @@
 // The player of a recording: the fitted body over the video, curves and events on one time line.
 // What is drawn follows the frame that the browser says it shows (requestVideoFrameCallback), never a clock beside it.
 
+import { Poses, drawBody } from "./body.js";
+
 /**
  * @typedef {{time: number[], size: [number, number], events: [number, string, string, number][],
  *   curves: ({name: string} & Record<"left"|"right", {value: (number|null)[], half: (number|null)[]}>)[],
  *   stance: Record<string, [number, number][]>, uncertain: Record<string, [number, number][]>,
- *   steps: {pixel: number, depth: number, unknown: number}}} Movement
- * @typedef {{sides: string, numbers: Int16Array, count: number}} Body
+ *   body: import("./body.js").Body}} Movement
+ * @typedef {{movement: Movement, poses: Poses, look: HTMLElement, canvas: HTMLCanvasElement, frame: number,
+ *   watch: (seen: (frame: number) => void) => void, redraw: () => void}} Player
  */
 
 /** The frame that is shown at a time: the last that began by then. @param {number[]} times @param {number} at */
@@ -19,60 +22,9 @@ export function frameAt(times, at) {
   return low;
 }
 
-/** Frames from what changed since the one before. @param {ArrayBuffer} buffer @param {string} sides @returns {Body} */
-export function bodyOf(buffer, sides) {
-  const numbers = new Int16Array(buffer), each = sides.length * 7;
-  for (let i = each; i < numbers.length; i++) numbers[i] += numbers[i - each];
-  return { sides, numbers, count: sides.length };
-}
-
-/** Outline of a capsule: the hull of two discs. @param {CanvasRenderingContext2D} c */
-export function capsule(c, x0, y0, r0, x1, y1, r1) {
-  const dx = x1 - x0, dy = y1 - y0, d = Math.hypot(dx, dy);
-  c.beginPath();
-  if (d <= Math.abs(r0 - r1)) {
-    r0 > r1 ? c.arc(x0, y0, r0, 0, 2 * Math.PI) : c.arc(x1, y1, r1, 0, 2 * Math.PI);
-  } else {
-    const along = Math.atan2(dy, dx), open = Math.acos((r0 - r1) / d);
-    c.arc(x0, y0, r0, along + open, along - open + 2 * Math.PI);
-    c.arc(x1, y1, r1, along - open, along + open);
-  }
-  c.closePath();
-}
-
 const within = (spans, at) => spans.some(([from, to]) => from <= at && at <= to);
 const $ = (/** @type {string} */ id) => /** @type {any} */ (document.getElementById(id));
 const colour = (/** @type {string} */ name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
-
-/** Draw a frame of the body. @param {HTMLCanvasElement} canvas @param {Movement} m @param {Body} body @param {number} frame */
-export function drawBody(canvas, m, body, frame) {
-  const c = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
-  const f = canvas.width / m.size[0], { pixel, unknown } = m.steps;
-  c.clearRect(0, 0, canvas.width, canvas.height);
-  const first = frame * body.count * 7, at = m.time[frame];
-  const shown = [];
-  for (let g = 0; g < body.count; g++) if (body.numbers[first + 7 * g] !== unknown) shown.push(g);
-  shown.sort((a, b) => body.numbers[first + 7 * b + 6] - body.numbers[first + 7 * a + 6]);  // far ones first
-  const names = { l: "left", r: "right", m: "" };
-  const fills = { l: "#d55e00", r: "#0072b2", m: "#8a8f98" };
-  c.lineWidth = Math.max(1, canvas.width / 640);
-  for (const g of shown) {
-    const n = body.numbers.subarray(first + 7 * g, first + 7 * g + 6), side = body.sides[g];
-    const unsure = names[side] !== "" && within(m.uncertain[names[side]], at);
-    // Pixel centres are whole numbers.
-    const v = [0, 1, 2, 3, 4, 5].map((i) => (n[i] / pixel + (i % 3 < 2 ? 0.5 : 0)) * f);
-    capsule(c, v[0], v[1], v[2], v[3], v[4], v[5]);
-    c.fillStyle = fills[side];
-    c.strokeStyle = unsure ? fills[side] : "rgba(0,0,0,.55)";
-    c.setLineDash(unsure ? [5 * c.lineWidth, 4 * c.lineWidth] : []);
-    c.globalAlpha = unsure ? 0.12 : 0.5;
-    c.fill();
-    c.globalAlpha = unsure ? 0.9 : 0.35;
-    c.stroke();
-  }
-  c.globalAlpha = 1;
-  c.setLineDash([]);
-}
 
 /** Moves a picture of what is at a time; a video where there is one, else a clock. */
 class Clock {
@@ -199,19 +151,22 @@ function drawStrip(canvas, m) {
   });
 }
 
+/** @returns {Promise<Player|null>} */
 async function start() {
   const look = /** @type {HTMLElement} */ (document.querySelector(".look[data-fitted]"));
   const number = look.dataset.recording;
   const stage = /** @type {HTMLElement} */ (look.querySelector(".stage"));
   const video = look.querySelector("video"), canvas = /** @type {HTMLCanvasElement} */ (look.querySelector("canvas.body"));
   const [movement, outlines] = await Promise.all(["movement", "body"].map((what) => fetch(`/recordings/${number}/${what}`)));
-  if (!movement.ok || !outlines.ok) { document.open(); document.write(await (movement.ok ? outlines : movement).text()); document.close(); return; }
+  if (!movement.ok || !outlines.ok) { document.open(); document.write(await (movement.ok ? outlines : movement).text()); document.close(); return null; }
   /** @type {Movement} */ const m = await movement.json();
-  const body = bodyOf(await outlines.arrayBuffer(), outlines.headers.get("x-sides") ?? "");
+  const poses = new Poses(m.body, await outlines.arrayBuffer(), m.time.length);
   const [width, height] = m.size;
-  canvas.width = Math.min(width, 1280); canvas.height = Math.round(canvas.width * height / width);
-  stage.style.aspectRatio = `${width} / ${height}`;
-  stage.style.width = `min(100%, calc(70vh * ${width / height}))`;
+  if (m.body.camera) {
+    canvas.width = Math.min(width, 1280); canvas.height = Math.round(canvas.width * height / width);
+    stage.style.aspectRatio = `${width} / ${height}`;
+    stage.style.width = `min(100%, calc(70vh * ${width / height}))`;
+  } else stage.hidden = true;  // markers of a laboratory: there is no picture
   const controls = /** @type {HTMLElement} */ (look.querySelector(".controls"));
   controls.hidden = false;
   const position = $("position"), now = $("now"), play = $("play");
@@ -219,13 +174,15 @@ async function start() {
   const seek = (/** @type {number} */ at) => clock.go(frameAt(m.time, at));
   const cursor = charts(m, seek);
   const show = (/** @type {number} */ frame) => {
-    if ($("show-body").checked) drawBody(canvas, m, body, frame);
+    if ($("show-body").checked) drawBody(canvas, m, poses, frame);
     else canvas.getContext("2d")?.clearRect(0, 0, canvas.width, canvas.height);
     canvas.dataset.frame = String(frame);
     position.value = frame;
     now.textContent = `${m.time[frame].toFixed(2)} s, ${now.dataset.text.replace("{n}", frame + 1).replace("{total}", m.time.length)}`;
     cursor(m.time[frame]);
+    for (const seen of watching) seen(frame);
   };
+  /** @type {((frame: number) => void)[]} */ const watching = [];
   const clock = new Clock(video, m.time, show);
   clock.changed = () => { play.textContent = clock.playing ? play.dataset.pause : play.dataset.play; };
   const refused = () => { $("not-played").hidden = false; video?.remove(); clock.alone(); };
@@ -261,6 +218,9 @@ async function start() {
   $("show-body").addEventListener("change", () => show(clock.frame));
   for (const button of document.querySelectorAll("button[data-time]")) button.addEventListener("click", () => seek(+(/** @type {HTMLElement} */ (button).dataset.time ?? 0)));
   look.dataset.ready = "";
+  return { movement: m, poses, look, canvas, get frame() { return clock.frame; }, watch: (seen) => { watching.push(seen); seen(clock.frame); },
+    redraw: () => show(clock.frame) };
 }
 
-if (typeof document !== "undefined" && document.querySelector(".look[data-fitted]")) start();
+/** What other scripts of the page follow; null where nothing is fitted or shown. @type {Promise<Player|null>} */
+export const player = typeof document !== "undefined" && document.querySelector(".look[data-fitted]") ? start() : Promise.resolve(null);

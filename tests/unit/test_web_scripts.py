@@ -1,0 +1,98 @@
+"""The logic of the review page's scripts, by `node --test`. Skips where there is no node."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pbl_pipeline.body import capsules, load_body
+from pbl_pipeline.render import body_track, to_camera, to_pixels
+from pbl_pipeline.video import Camera
+from schemas.recording_page import RecordingFit
+from tests.walking_fit import LEVEL_CAMERA_QUAT_WXYZ, walking_fit
+from workers.web import texts
+from workers.web.movement import body_json, movement_json
+
+STATIC = Path(texts.__file__).parent / "static"
+TESTS = Path(__file__).parent / "web_scripts"
+
+needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="no node on this machine: apt-get install nodejs")
+
+
+def handheld_walk(n_frames: int = 90):
+    """A walk before a lens with distortion, in a hand that turns; the person is in view from frame 5 to 79."""
+    body = load_body()
+    fit = walking_fit(body.joint_names, body.sha256, n_frames=n_frames, seen=(5, 80), image_size_px=(1280, 720))
+    lens = np.array([[1100.0, 0, 655], [0, 1090, 350], [0, 0, 1]])
+    sway = Rotation.from_rotvec(0.05 * np.sin(np.arange(n_frames)[:, None] / [9.0, 14.0, 6.0]))
+    quat = (sway * Rotation.from_quat(LEVEL_CAMERA_QUAT_WXYZ, scalar_first=True)).as_quat(scalar_first=True)
+    camera = Camera(lens, np.array([-0.11, 0.05, 0.002, -0.001, 0.004]), "test")
+    scale = np.linspace(0.9, 1.1, 8)
+    return dataclasses.replace(
+        fit, camera=camera, phone_quat_wxyz=quat, scale=scale, camera_position_m=np.array([0.2, -0.1, 0.05])
+    )
+
+
+def discs_of(fit) -> list[list[list[float | None]] | None]:
+    """What `render_overlay` draws, frame by frame: x, y, radius of the discs of both ends (px), depth (m)."""
+    drawn = capsules(load_body(), fit.qpos, fit.scale)
+    focal = 0.5 * (fit.camera.matrix[0, 0] + fit.camera.matrix[1, 1])
+    out: list[list[list[float | None]] | None] = []
+    for t in range(len(fit.time_s)):
+        if not np.isfinite(fit.qpos[t]).all():
+            out.append(None)
+            continue
+        ends = [to_camera(p[t], fit.phone_quat_wxyz[t], fit.camera_position_m) for p in (drawn.start, drawn.end)]
+        parts = [np.c_[to_pixels(e, fit.camera), focal * drawn.radius_m / e[:, 2]] for e in ends]
+        rows = np.c_[parts[0], parts[1], (ends[0][:, 2] + ends[1][:, 2]) / 2]
+        out.append([[float(v) if np.isfinite(v) else None for v in row] for row in rows])
+    return out
+
+
+@needs_node
+def test_scripts_of_the_page(tmp_path: Path):
+    found = RecordingFit(handheld_walk(), (), (), None)
+    shutil.copytree(STATIC, tmp_path / "static")
+    for file in TESTS.glob("*.mjs"):
+        shutil.copy(file, tmp_path)
+    (tmp_path / "package.json").write_text('{"type": "module"}')
+    (tmp_path / "movement.json").write_bytes(movement_json(found))
+    (tmp_path / "body.bin").write_bytes(body_json(found)[1])
+    (tmp_path / "expected.json").write_text(json.dumps(discs_of(found.fit)))
+    (tmp_path / "root.json").write_text(json.dumps(np.nan_to_num(body_track(found.fit).root_m).tolist()))
+    files = sorted(p.name for p in tmp_path.glob("*.test.mjs"))
+    done = subprocess.run(["node", "--test", *files], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
+    assert "# pass 0" not in done.stdout
+
+
+def test_a_recording_without_a_camera_or_a_pose_is_sent_too():
+    fit = handheld_walk()
+    markers = dataclasses.replace(
+        fit,
+        camera=Camera(np.full((3, 3), np.nan), np.zeros(5), "none"),
+        phone_quat_wxyz=np.full_like(fit.phone_quat_wxyz, np.nan),
+        camera_position_m=np.full(3, np.nan),
+        image_size_px=(0, 0),
+    )
+    body, numbers = body_json(RecordingFit(markers, (), (), None))
+    assert body["camera"] is None
+    assert body["known"] == [[5, 79]]
+    assert len(numbers) == 2 * 90 * (3 + 4 * len(body["sides"]) + 4)
+    nobody = dataclasses.replace(fit, qpos=np.full_like(fit.qpos, np.nan))
+    body, _ = body_json(RecordingFit(nobody, (), (), None))
+    assert (body["known"], body["floor"]) == ([], None)
+    json.loads(movement_json(RecordingFit(nobody, (), (), None)))
+
+
+def test_the_floor_is_under_the_feet():
+    """The walker's pelvis is 0.95 m above the floor, which lies 1.15 m under the camera (`walking_fit`)."""
+    body, _ = body_json(RecordingFit(walking_fit(load_body().joint_names, load_body().sha256), (), (), None))
+    assert body["floor"] == pytest.approx(-1.15, abs=0.06)
