@@ -286,7 +286,7 @@ def write_session_json(fit: SessionFit, path: Path) -> None:
         "params_hash": fit.params_hash,
         "iterations": int(fit.iterations),
         "converged": bool(fit.converged),
-        "height_m": fit.height_m,
+        "height_m": _known(fit.trials[0].height_m),
         "scale": dict(zip(SCALE_NAMES, (round(float(s), 5) for s in fit.scale), strict=True)),
         "loss_trace": [[int(step), round(float(loss), 5)] for step, loss in fit.loss_trace],
         "seconds": round(fit.seconds, 3),

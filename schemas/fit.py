@@ -354,7 +354,7 @@ class SessionFit(dj.Computed):
                     "fit_iterations": int(result.iterations),
                     "fit_converged": bool(result.converged),
                     "fit_scale": [round(float(s), 5) for s in result.scale],
-                    "fit_height": result.height_m,
+                    "fit_height": number(result.trials[0].height_m),
                     "compile_seconds": result.compile_seconds,
                     "compute_device": result.device[:64],
                     "session_file": folder / "session.npz",

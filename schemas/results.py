@@ -269,7 +269,6 @@ def load_session_fit(key: Any) -> SessionFit:
         compile_seconds=float(row["compile_seconds"]),
         device=row["compute_device"],
         qc=tuple(load_fit_checks(key)),
-        height_m=number(row["fit_height"]),
     )
 
 

@@ -212,7 +212,8 @@ def _session_fit(packed: _Packed, solution: Solution, paramset: Paramset, given:
     solution, taller = as_tall(session, solution, given.height_m)
     seconds = packed.seconds + solution.seconds + time.perf_counter() - begin
     fits = tuple(
-        _trial_fit(session, i, solution, sources[i], paramset, motions[i], seconds) for i in range(len(session.trials))
+        _trial_fit(session, i, solution, sources[i], paramset, motions[i], seconds, given.height_m)
+        for i in range(len(session.trials))
     )
     return SessionFit(
         trials=fits,
@@ -227,7 +228,6 @@ def _session_fit(packed: _Packed, solution: Solution, paramset: Paramset, given:
         compile_seconds=solution.compile_seconds,
         device=str(jax.devices()[0].device_kind),
         qc=check_fit(session, fits, solution, taller),
-        height_m=given.height_m,
     )
 
 
@@ -239,6 +239,7 @@ def _trial_fit(
     paramset: Paramset,
     camera_motion: str,
     seconds: float,
+    height_m: float | None,
 ) -> TrialFit:
     trial, arrays, at = session.trials[i], session.arrays[i], session.frames(i)
     hide, seen = ~arrays.used[:, None], solution.outcome
@@ -274,6 +275,7 @@ def _trial_fit(
         body_sha256=session.body.sha256,
         loss=float(solution.loss_trace[-1, 1]),
         seconds=seconds,
+        height_m=float("nan") if height_m is None else height_m,
     )
 
 

@@ -47,7 +47,7 @@ def check_fit(
     """All checks of one session fit, worst trial per check. `taller`: the person's height over the fitted one's
     (`known_height.as_tall`)."""
     checks = [_residual_3d(session, trials), _in_view(session), _limits(session, trials), _converged(solution)]
-    checks += [_scale(solution.scale)] if taller is None else _height(session, solution.scale, taller)
+    checks += _height(session, solution.scale, taller)
     if not isinstance(session.trials[0], WorldMarkers):
         checks = [_residual_2d(session, trials), *checks, _intrinsics(trials), _orientation(trials)]
         checks += [*_depth(session, trials), *_assumed(session)]
@@ -148,18 +148,19 @@ def _scale(scale: np.ndarray) -> Check:
     )
 
 
-def _height(session: Session, scale: np.ndarray, taller: float) -> list[Check]:
-    """Where the person's height is known: the proportions, and the height against what was seen."""
-    tall = stature_m(session.body, scale) / stature_m(session.body, np.ones_like(scale))
+def _height(session: Session, scale: np.ndarray, taller: float | None) -> list[Check]:
+    """The proportions, and a stated height against what was seen."""
+    if taller is None:
+        return [_scale(scale)]
     return [
-        _scale(scale / tall),
+        _scale(scale * stature_m(session.body, np.ones_like(scale)) / stature_m(session.body, scale)),
         Check(
-            "stated_over_seen_height",
+            "body_height_stated",
             PASS if SCALE_LOW <= taller <= SCALE_HIGH else WARN,
             taller,
             SCALE_HIGH if taller > 1 else SCALE_LOW,
-            "the stated height is far from what is seen: a mistyped height, another person, or a child, whose size a "
-            "detector does not know",
+            "the stated height is far from what is seen (value: their ratio): a mistyped height, another person, or a "
+            "child, whose size a detector does not know",
         ),
     ]
 

@@ -25,7 +25,8 @@ class TrialFit:
     marker's body frame; residual_2d_px (T, J) and residual_3d_m (T, J), NaN where nothing was seen. Of several cameras
     residual_2d_px is the mean over them, and camera, phone_quat_wxyz and camera_position_m (3,) are the first one's;
     laboratory markers have none (NaN). phone_clock_offset_s: the sensor's clock minus the video's, NaN where not
-    estimated. orientation_source: where the world's vertical comes from.
+    estimated. orientation_source: where the world's vertical comes from. height_m: the person's stated body height,
+    which sets the size of what one camera sees (`known_height.py`), NaN where it was not stated.
     """
 
     name: str
@@ -52,6 +53,7 @@ class TrialFit:
     body_sha256: str
     loss: float
     seconds: float
+    height_m: float = float("nan")
 
     def save(self, path: str | Path) -> None:
         """Write `<name>.fit.npz`."""
@@ -64,9 +66,9 @@ class TrialFit:
     @classmethod
     def load(cls, path: str | Path) -> TrialFit:
         """Read `<name>.fit.npz`. Raises `PblError` FILE_MISSING, FILE_FORMAT, CAMERA_INVALID. Never unpickles."""
-        wanted = [f.name for f in dataclasses.fields(cls) if f.name != "camera"]
+        wanted = [f.name for f in dataclasses.fields(cls) if f.name not in ("camera", "height_m")]
         fields = [*wanted, "camera_matrix", "distortion", "camera_source"]
-        data = load_npz(path, fields)
+        data = load_npz(path, [*fields, "height_m"])
         missing = [k for k in fields if k not in data]
         if missing:
             raise _format_error(f"{path} lacks {', '.join(missing)}", "a file that `pbl fit` wrote")
@@ -83,13 +85,13 @@ class TrialFit:
         if not np.isnan(camera.matrix).all():  # as of markers of a laboratory
             values["image_size_px"] = picture_size(path, data["image_size_px"])
             check_lens(camera.matrix, camera.distortion, values["image_size_px"], str(path))
-        return cls(**values, camera=camera)
+        # Files of before heights could be stated lack it.
+        return cls(**values, camera=camera, height_m=float(data.get("height_m", np.nan)))
 
 
 @dataclasses.dataclass(frozen=True)
 class SessionFit:
-    """All trials of a session with one body. loss_trace (K, 2): step, total loss. converged None: not recorded.
-    height_m: the person's stated body height (`known_height`), None where it was not stated."""
+    """All trials of a session with one body. loss_trace (K, 2): step, total loss. converged None: not recorded."""
 
     trials: tuple[TrialFit, ...]
     scale: np.ndarray
@@ -103,7 +105,6 @@ class SessionFit:
     compile_seconds: float
     device: str
     qc: tuple[Check, ...]
-    height_m: float | None = None
 
 
 def _shapes(n: int, q: int, j: int) -> dict[str, tuple[int | None, ...]]:
@@ -112,7 +113,7 @@ def _shapes(n: int, q: int, j: int) -> dict[str, tuple[int | None, ...]]:
     shapes |= dict.fromkeys(("residual_2d_px", "residual_3d_m"), (n, j))
     shapes |= {"time_s": (n,), "markers_world_m": (n, j, 3), "phone_quat_wxyz": (n, 4), "site_offset_m": (j, 3)}
     shapes |= {"scale": (len(SCALE_NAMES),), "image_size_px": (2,), "camera_matrix": (3, 3), "distortion": (5,)}
-    return shapes | {"loss": (), "seconds": (), "camera_position_m": (3,), "phone_clock_offset_s": ()}
+    return shapes | {"loss": (), "seconds": (), "height_m": (), "camera_position_m": (3,), "phone_clock_offset_s": ()}
 
 
 def _format_error(found: str, expected: str) -> PblError:

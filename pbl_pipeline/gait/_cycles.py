@@ -129,11 +129,12 @@ def find_cycles(
     """
     found = events.events if isinstance(events, GaitEvents) else tuple(events)
     name = trial or (fit.name if fit is not None else "")
-    no_lengths, metric, far = "" if feet is not None else NO_POSITIONS, True, None
+    no_lengths, metric, stated, far = "" if feet is not None else NO_POSITIONS, True, False, None
     if fit is not None:
         poses = poses or trial_poses(fit)
         series, feet = angle_series(fit, poses), feet_from_fit(fit, poses)
         no_lengths, metric, far = why_no_lengths(fit), is_metric(fit), far_leg(fit, poses)
+        stated = bool(np.isfinite(fit.height_m))
     cycles = []
     for bout in sorted({e.bout for e in found}):
         inside = sorted((e for e in found if e.bout == bout), key=lambda e: e.time_s)
@@ -154,7 +155,7 @@ def find_cycles(
             lengths = Lengths(missing=no_lengths)
             if feet is not None and not no_lengths:
                 times = (start.time_s, inner[1].time_s, end.time_s)
-                lengths = cycle_lengths(feet, start.side, *times, metric=metric)
+                lengths = cycle_lengths(feet, start.side, *times, metric=metric or stated, width=metric)
             cycle = GaitCycle(
                 trial=name,
                 number=0,

@@ -32,7 +32,8 @@ class Lengths:
 
     `stride_length_m` between two places of the own foot; `step_length_m` of the step that ends the cycle, from the
     other foot to the own one along the stride; `step_width_m` between that other foot and the line of the stride.
-    `metric` is False where the metres are those of a detector that guesses how tall a person is.
+    `metric` is False where the metres are those of a detector that guesses how tall a person is; where her height was
+    stated they are hers, but the step width stays unknown.
     """
 
     stride_length_m: float | None = None
@@ -53,15 +54,15 @@ def why_no_lengths(fit: TrialFit) -> str:
 
 
 def cycle_lengths(
-    feet: FootTrajectories, side: str, start_s: float, other_down_s: float, end_s: float, *, metric: bool
+    feet: FootTrajectories, side: str, start_s: float, other_down_s: float, end_s: float, *, metric: bool, width: bool
 ) -> Lengths:
     """Lengths of the cycle of `side` from `start_s` to `end_s`, whose other foot comes down at `other_down_s`.
 
     The place of a foot is the median of its heel over the frames in which it lies flat. With A and C the own foot's
     places at the start and the end and B the other's in between, all on the floor: stride length |C - A|, step length
     the part of C - B along A to C, step width the distance of B from that line (Huxham et al. 2006, Gait & Posture
-    23:159-163), which holds on a curved path, too. Positions must be in a world that stands still. Without `metric` the
-    step width is left out: its error is too large a part of it.
+    23:159-163), which holds on a curved path, too. Positions must be in a world that stands still. `metric`: of the
+    result; without `width` the step width is left out: of one camera its error is too large a part of it.
     """
     stride_s = end_s - start_s
     own, other = (0, 1) if side == LEFT else (1, 0)
@@ -79,8 +80,8 @@ def cycle_lengths(
         return Lengths(missing=SLIDES)
     along = (c - a) / stride
     step = float((c - b) @ along)
-    width = float(np.linalg.norm((b - a) - ((b - a) @ along) * along))
-    return Lengths(stride, step, width if metric else None, metric=metric)
+    across = float(np.linalg.norm((b - a) - ((b - a) @ along) * along))
+    return Lengths(stride, step, across if width else None, metric=metric)
 
 
 def _place(feet: FootTrajectories, foot: int, down_s: float, stride_s: float) -> tuple[np.ndarray | None, float]:

@@ -285,8 +285,8 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
                 WARN if guessed else PASS,
                 None,
                 None,
-                "lengths and speed are scaled by an assumed body size (one camera sees no scale): compare visits of "
-                "one person, not people"
+                "lengths and speed are scaled by an assumed body size (one camera sees no scale): state the measured "
+                "body height (--height-m), or compare visits of one person, not people"
                 if guessed
                 else "",
             )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pbl_pipeline.body import joint_angles, joint_angles_sd
+from pbl_pipeline.body import joint_angles, joint_angles_sd, load_body, stature_m
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit, SessionInput, TrialFit, fit_sessions
 from pbl_pipeline.gait import Z90, GaitCycle, find_cycles, gait_metrics, score_gdi, spatiotemporal
@@ -37,8 +37,10 @@ def corpus_errors(
     cases: Sequence[Case],
     method: Paramset | str | None = None,
     fit: Callable[..., Sequence[SessionFit | PblError]] = fit_sessions,
+    heights: bool = False,
 ) -> pd.DataFrame:
-    """Fit every case as a session of one trial, all at once, and compare with its truth: one row per case.
+    """Fit every case as a session of one trial, all at once, and compare with its truth: one row per case. `heights`:
+    the fit is told how tall each person is.
 
     Columns: what the case is; `error`, a code where the fit failed; index and measures of the truth (`gdi_true`,
     `cadence_true` ...), of the fit with the true events (`gdi`, with its `gdi_sd` and `gdi_minimal_change`) and with
@@ -48,7 +50,11 @@ def corpus_errors(
 
     Raises `PblError` SOLVER_UNKNOWN.
     """
-    sessions = [SessionInput([c.keypoints()], [f"case{i}"], c.camera) for i, c in enumerate(cases)]
+    body = load_body()
+    tall = {c.walk: stature_m(body, c.walk.scale) if heights else None for c in cases}
+    sessions = [
+        SessionInput([c.keypoints()], [f"case{i}"], c.camera, height_m=tall[c.walk]) for i, c in enumerate(cases)
+    ]
     fits = fit(sessions, method)
     # Several cases are of one walk.
     truths = {walk: walk.fit() for walk in dict.fromkeys(c.walk for c in cases)}

@@ -24,8 +24,9 @@ import click
     help="Error model: blazepose-heavy, blazepose-33 or metrabs-87.",
 )
 @click.option("--quick", is_flag=True, help="Two synthetic people and one view per impairment: about 60 cases.")
+@click.option("--heights", is_flag=True, help="Tell the fit how tall each person is.")
 @click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Write CSV and JSON there.")
-def gdi(motions: Path | None, method: str | None, detector: str, quick: bool, out: Path) -> None:
+def gdi(motions: Path | None, method: str | None, detector: str, quick: bool, heights: bool, out: Path) -> None:
     """Fit walks whose truth is known, and print how far index, measures and angles are off (docs/validation.md).
 
     Synthetic people, healthy and with each impairment, and recorded walks on the body, seen by the detector's error
@@ -45,7 +46,7 @@ def gdi(motions: Path | None, method: str | None, detector: str, quick: bool, ou
     people = len({c.walk.person for c in cases})
     click.echo(f"{len(cases)} cases of {people} people, fit {chosen.name}, version {chosen.version}")
     made = time.perf_counter()
-    errors = corpus_errors(cases, chosen.paramset)
+    errors = corpus_errors(cases, chosen.paramset, heights=heights)
     tables = corpus_tables(errors)
     click.echo(print_corpus(tables))
     about = {
@@ -54,6 +55,7 @@ def gdi(motions: Path | None, method: str | None, detector: str, quick: bool, ou
         "version": chosen.version,
         "params_hash": chosen.hash,
         "quick": quick,
+        "heights": heights,
         "motions": motions is not None,
         "seconds": round(time.perf_counter() - start, 1),
     }

@@ -73,7 +73,9 @@ def fit_session(trials, names, paramset=None, camera_motion="static", height_m=N
     """The movement that was put in; as many time stamps as the keypoints have."""
     body = load_body()
     fits = tuple(
-        walking_fit(body.joint_names, body.sha256, name=name, n_frames=len(k.time_s))
+        dataclasses.replace(
+            walking_fit(body.joint_names, body.sha256, name=name, n_frames=len(k.time_s)), height_m=height_m or np.nan
+        )
         for name, k in zip(names, trials, strict=True)
     )
     return SessionFit(
@@ -88,7 +90,6 @@ def fit_session(trials, names, paramset=None, camera_motion="static", height_m=N
         seconds=0.1,
         compile_seconds=0.0,
         device="cpu",
-        height_m=height_m,
         qc=(Check("residual_3d_cm", "WARN", 7.0, 6.0, "look at the overlay"), Check("scale", "PASS", None, None)),
     )
 

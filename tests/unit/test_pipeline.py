@@ -33,9 +33,9 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         points = dataclasses.replace(points, image_size_px=(1920, 1080))
         return pipeline.Trial(path.stem, path, info, pipeline.choose_subject(chain.track_people(path)), points)
 
-    def fit(trials, names, paramset=None, camera_motion="static"):
+    def fit(trials, names, paramset=None, camera_motion="static", height_m=None):
         calls.append(list(names))
-        return chain.fit_session(trials, names, paramset, camera_motion)
+        return chain.fit_session(trials, names, paramset, camera_motion, height_m)
 
     monkeypatch.setattr(pipeline, "detect_trial", detect)
     monkeypatch.setattr(pipeline, "check_trial", lambda *_: None)
