@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import datetime
 import functools
 import queue
 from collections.abc import Callable, Collection, Sequence
@@ -61,6 +62,18 @@ class ErrorRow:
     found: str
     next_step: str
     stack: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Running:
+    """A job in a worker's hands. since: by the server's clock."""
+
+    table: str
+    key: dict[str, Any]
+    about: str
+    host: str
+    pid: int
+    since: datetime.datetime | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,6 +229,30 @@ def live_workers(seen_within_s: float = 60.0) -> list[dict[str, Any]]:
     alive = alive & f"worker_seen > CURRENT_TIMESTAMP(3) - INTERVAL {float(seen_within_s)} SECOND"
     names = ("worker_host", "worker_pid", "worker_resource", "worker_doing")
     return [{n: r[n] for n in names} for r in alive.to_dicts(order_by="worker_host, worker_pid")]
+
+
+def running(most: int = 200) -> list[Running]:
+    """Jobs in workers' hands, the oldest first; of each table as many as are asked for."""
+    out = []
+    for table, counts in zip(computed_tables(), queue_counts(video.Video.connection).values(), strict=True):
+        if counts["reserved"]:
+            jobs = jobs_of(table)
+            for row in jobs.reserved.to_dicts(order_by="reserved_time", limit=most):
+                key = {k: row[k] for k in jobs.primary_key}
+                since = row["reserved_time"]
+                out.append(Running(table.__name__, key, _file_of(key), str(row["host"]), int(row["pid"]), since))
+    return sorted(out, key=lambda r: (r.since is None, r.since))
+
+
+def span(seconds: float | None) -> str:
+    """A duration in the largest unit of which it has at least 1: 45 s, 12 min, 3.5 h, 2.1 d."""
+    if seconds is None:
+        return "-"
+    for unit, length in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= length:
+            value = seconds / length
+            return f"{value:.1f} {unit}" if value < 10 and unit != "min" else f"{value:.0f} {unit}"
+    return f"{seconds:.0f} s"
 
 
 def _oldest(table: Any, server: Any) -> tuple[float | None, str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from pbl_pipeline.errors import PblError
@@ -27,8 +27,14 @@ OUTSIDE = ("ASSET_MISSING", "MODEL_MISSING", "VIDEO_MISSING", "WORKER_CRASH", "D
 CHUNK = 200
 
 
-def retry(code: str | None = None, table: str | None = None, video_id: int | None = None) -> dict[str, int]:
-    """Make error rows pending again, of one code, one table, one video if asked; table -> how many.
+def retry(
+    code: str | None = None,
+    table: str | None = None,
+    video_id: int | None = None,
+    key: Mapping[str, Any] | None = None,
+) -> dict[str, int]:
+    """Make error rows pending again, of one code, one table, one video, one key of that table if asked; table -> how
+    many.
 
     Raises
     ------
@@ -39,6 +45,8 @@ def retry(code: str | None = None, table: str | None = None, video_id: int | Non
     out = {}
     for one in tables:
         keys = None if video_id is None else _of_video(one, video_id)
+        if key is not None:  # compared here: the server takes "1 x" for 1
+            keys = [k for k in queue.errors_of(one, code).keys() if k == key]  # noqa: SIM118  a query
         n = queue.reset_to_new(queue.errors_of(one, code, keys)) if keys is None or keys else 0
         if n:
             out[one.__name__] = n

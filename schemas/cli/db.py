@@ -64,16 +64,14 @@ def status(as_json: bool) -> None:
 
     Example: pbl db status --json
     """
-    if os.environ.get("DJ_HOST"):
-        from schemas import connection
+    from schemas import embedded
+    from schemas.server_status import database_status
 
-        version = connection.connect().query("SELECT VERSION()").fetchone()[0]
-        _print({"kind": "external", "running": True, "address": connection.external(), "version": version}, as_json)
+    known = database_status()
+    _print(known, as_json)
+    if known["kind"] == "external":
         return
-    from schemas import embedded, store
-
     now = embedded.status()
-    _print({"kind": "embedded", **now.to_dict(), "store": store.describe()}, as_json)
     if not now.running:
         found = "there is no database yet" if not now.initialised else "it is not running"
         if now.pid is not None:

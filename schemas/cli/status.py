@@ -35,6 +35,8 @@ def status(exact: bool, as_json: bool) -> None:
 
 def lines(state: Status) -> list[str]:
     """The printed form."""
+    from schemas.status import span
+
     out = [f"{state.videos} videos", ""]
     out.append(
         f"{'table':<16}{'done':>8}{'empty':>7}{'pending':>9}{'reserved':>10}{'error':>7}{'waiting':>9}"
@@ -74,14 +76,3 @@ def lines(state: Status) -> list[str]:
         out += [f"  video_id={w.video_id}  {w.about}", f"    {w.reason}"]
         out += [f"    look:  {w.look}", f"    next:  {w.next_step}"]
     return out
-
-
-def span(seconds: float | None) -> str:
-    """A duration in the largest unit of which it has at least 1: 45 s, 12 min, 3.5 h, 2.1 d."""
-    if seconds is None:
-        return "-"
-    for unit, length in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
-        if seconds >= length:
-            value = seconds / length
-            return f"{value:.1f} {unit}" if value < 10 and unit != "min" else f"{value:.0f} {unit}"
-    return f"{seconds:.0f} s"

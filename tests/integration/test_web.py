@@ -338,4 +338,4 @@ def test_a_page_for_other_machines_is_refused():
     from workers.web import serve
 
     with pytest.raises(PblError, match="no accounts yet"):
-        serve("0.0.0.0", 0, "A", "reader")
+        serve("0.0.0.0", 0, "A", ["reader"])

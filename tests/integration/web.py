@@ -19,7 +19,7 @@ BASE = "http://127.0.0.1:8484"
 
 def client(role: str = "reviewer", name: str = "R. Viewer", signed_in: bool = True) -> TestClient:
     """A browser of this machine; errors of the program are answers, as they are for a browser."""
-    app = create_app(Options(name=name, role=role))
+    app = create_app(Options(name=name, roles=(role,)))
     browser = TestClient(app, base_url=BASE, raise_server_exceptions=False, headers={"accept-language": "en"})
     if signed_in:
         found = browser.get("/enter", params={"key": app.state.sessions.new_link(name, role)}, follow_redirects=False)
@@ -44,7 +44,7 @@ def shown(
     chromium: Any, role: str = "reviewer", size: tuple[int, int] = (390, 800), name: str = "R. Viewer", **context: Any
 ) -> Iterator[Any]:
     """A page of the browser `chromium`, signed in; an error of a script or an answer that failed fails the test."""
-    app = create_app(Options(name=name, role=role))
+    app = create_app(Options(name=name, roles=(role,)))
     listening = socket.create_server(("127.0.0.1", 0))
     server = uvicorn.Server(uvicorn.Config(app, log_level="error"))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})

@@ -13,10 +13,11 @@ import click
 @click.option("--visit", type=click.IntRange(min=1), metavar="NUMBER", help="Open this visit (`pbl list visits`).")
 @click.option("--name", metavar="WHO", help="Whose name decisions carry (default: your account's).")
 @click.option(
-    "--role", type=click.Choice(["reader", "reviewer"]), default="reviewer", show_default=True,
-    help="What may be done: look; also decide.",
+    "--role", "roles", type=click.Choice(["reader", "reviewer", "operator"]), multiple=True,
+    default=("reviewer", "operator"), show_default=True,
+    help="What may be done: look; also decide and enter; see queues and try errors again. Can be repeated.",
 )  # fmt: skip
-def web(port: int, host: str, visit: int | None, name: str | None, role: str) -> None:
+def web(port: int, host: str, visit: int | None, name: str | None, roles: tuple[str, ...]) -> None:
     """Find visits, look at recordings with the fitted body, and decide, in a browser on this machine.
 
     Prints a link that opens one browser, once; docs/web.md describes the page and how it is protected. An embedded
@@ -24,4 +25,4 @@ def web(port: int, host: str, visit: int | None, name: str | None, role: str) ->
     """
     from workers.web import serve
 
-    serve(host, port, (name or getpass.getuser())[:64], role, visit)
+    serve(host, port, (name or getpass.getuser())[:64], roles, visit)

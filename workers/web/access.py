@@ -21,11 +21,15 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 COOKIE = "pbl_session"
 #: Hours after which a session ends, whatever was done in it.
 HOURS = 12.0
-#: What a role may do: a reader looks, a reviewer also decides.
+#: What a role may do: a reader looks at visits and recordings, a reviewer also decides and enters; an operator sees
+#: queues, errors and disks and tries again, for which nobody has to be looked at. Several roles: what each of them may.
 RIGHTS: dict[str, frozenset[str]] = {
     "reader": frozenset({"look"}),
     "reviewer": frozenset({"look", "decide"}),
+    "operator": frozenset({"operate"}),
 }
+#: The right that an address needs by how it begins; "": any session has it. Every other needs "look".
+_NEEDS = (("/operate", "operate"), ("/leave", ""), ("/language", ""))
 #: Longest body of a form (byte), and seconds in which it has to be here.
 BODY_BYTES, BODY_S = 65_536, 10.0
 #: Searches that a session remembers.
@@ -66,14 +70,19 @@ class Session:
     searches: what she searched for, so that a person's code never stands in an address."""
 
     name: str
-    role: str
+    roles: tuple[str, ...]
     ends: float
     token: str = dataclasses.field(default_factory=lambda: secrets.token_urlsafe(24))
     searches: list[str] = dataclasses.field(default_factory=list)
 
     def may(self, right: str) -> bool:
-        """Whether her role has a right of `RIGHTS`."""
-        return right in RIGHTS.get(self.role, frozenset())
+        """Whether one of her roles has a right of `RIGHTS`; any session has ""."""
+        return not right or any(right in RIGHTS.get(role, frozenset()) for role in self.roles)
+
+    @property
+    def home(self) -> str:
+        """The address of the first page that she may see."""
+        return "/visits" if self.may("look") else "/operate"
 
     def search_number(self, text: str) -> int:
         """The number of a text that was searched for, from 1; 0 for none."""
@@ -98,12 +107,12 @@ class Sessions:
     def __init__(self, clock: Callable[[], float] = time.monotonic, hours: float = HOURS) -> None:
         self._clock, self._hours = clock, hours
         self._sessions: dict[str, Session] = {}
-        self._links: dict[str, tuple[str, str]] = {}
+        self._links: dict[str, tuple[str, tuple[str, ...]]] = {}
 
-    def new_link(self, name: str, role: str) -> str:
+    def new_link(self, name: str, *roles: str) -> str:
         """The key of a link that opens one session, once."""
         key = secrets.token_urlsafe(32)
-        self._links[_hashed(key)] = (name, role)
+        self._links[_hashed(key)] = (name, roles)
         return key
 
     def enter(self, key: str) -> str | None:
@@ -179,9 +188,17 @@ class Gate:
         request.state.session = session
         if request.method not in ("GET", "HEAD") and not _from_here(headers):
             return "token"
-        if session is None and not request.url.path.startswith(self._open):
+        path = request.url.path
+        if path == "/" or path.startswith(self._open):
+            return ""
+        if session is None:
             return "session"
-        return ""
+        return "" if session.may(right_for(path)) else "right"
+
+
+def right_for(path: str) -> str:
+    """The right of `RIGHTS` that an address needs, "" for one that every session may open."""
+    return next((right for begin, right in _NEEDS if path == begin or path.startswith(f"{begin}/")), "look")
 
 
 def host_of(header: str) -> str:

@@ -19,7 +19,7 @@ from starlette.staticfiles import StaticFiles
 
 from pbl_pipeline.errors import PblError
 
-from . import access, compare, decide, drawn, entry, find, look, people, take
+from . import access, compare, decide, drawn, entry, find, look, operate, people, take
 from .making import Making
 from .pages import Pages
 from .tables import Tables
@@ -35,12 +35,12 @@ _ADDRESS = 2000
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """How the page is served. hosts: names in a Host header that are answered; name and role: of who opens a link;
+    """How the page is served. hosts: names in a Host header that are answered; name and roles: of who opens a link;
     on_entry: called when a link was used, with the key of the next one."""
 
     hosts: frozenset[str] = frozenset({"127.0.0.1", "localhost", "::1"})
     name: str = ""
-    role: str = "reviewer"
+    roles: tuple[str, ...] = ("reviewer", "operator")
     on_entry: Callable[[str], None] | None = None
 
 
@@ -62,26 +62,27 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
         if cookie is None:
             return pages.refused(request, "session")
         to = request.query_params.get("to", "")
-        response = RedirectResponse(to if to.startswith("/visits/") and to[8:].isdecimal() else "/visits", 303)
+        response = RedirectResponse(to if to.startswith("/visits/") and to[8:].isdecimal() else "/", 303)
         response.set_cookie(
             access.COOKIE, cookie, max_age=int(3600 * access.HOURS), path="/", httponly=True, samesite="strict"
         )
         if options.on_entry is not None:
-            options.on_entry(sessions.new_link(options.name, options.role))
+            options.on_entry(sessions.new_link(options.name, *options.roles))
         return response
 
     async def leave(request: Request) -> Response:
-        await access.form_of(request, "look")
+        await access.form_of(request, "")
         sessions.leave(request.cookies.get(access.COOKIE, ""))
-        response = RedirectResponse("/visits", 303)
+        response = RedirectResponse("/", 303)
         response.delete_cookie(access.COOKIE, path="/", httponly=True, samesite="strict")
         return response
 
     async def home(request: Request) -> Response:
-        return RedirectResponse("/visits", 303)
+        session: access.Session | None = request.state.session
+        return pages.refused(request, "session") if session is None else RedirectResponse(session.home, 303)
 
     async def language(request: Request) -> Response:
-        fields = await access.form_of(request, "look")
+        fields = await access.form_of(request, "")
         response = RedirectResponse(look.own_address(fields.get("back", "")), 303)
         response.set_cookie("pbl_language", fields.get("language", "")[:2], path="/", httponly=True, samesite="strict")
         return response
@@ -114,6 +115,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
             *drawn.routes(pages, tables, making),
             *compare.routes(pages, tables, videos),
             *entry.routes(pages, tables),
+            *operate.routes(pages, tables),
             Mount("/static", StaticFiles(directory=files / "static")),
             Mount("/vendor", StaticFiles(directory=files / "vendor")),
         ],

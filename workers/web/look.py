@@ -18,7 +18,7 @@ from .pages import Pages
 from .tables import Tables
 from .videos import Videos
 
-_OWN = re.compile(r"/(visits|recordings)(/\d{1,10})?")
+_OWN = re.compile(r"/(visits|recordings)(/\d{1,10}(/enter)?)?|/operate")
 #: How browsers call a file by its ending; others are offered as MP4, and a browser that cannot play one says so.
 _KINDS = {".webm": "video/webm", ".mkv": "video/x-matroska", ".mov": "video/mp4", ".mp4": "video/mp4"}
 
@@ -81,5 +81,5 @@ def _people(about: recording_page.RecordingPage) -> tuple[list[choose.Candidates
 
 
 def own_address(text: str) -> str:
-    """An address of this page that a form names, else the list's."""
-    return text if _OWN.fullmatch(text) else "/visits"
+    """An address of this page that a form names, else the first page."""
+    return text if _OWN.fullmatch(text) else "/"

@@ -6,7 +6,7 @@ import contextlib
 import logging
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import click
 import uvicorn
@@ -22,14 +22,14 @@ LOOPBACK = ("127.0.0.1", "::1", "localhost")
 _CONNECTIONS, _IDLE_S = 200, 10
 
 
-def serve(host: str, port: int, name: str, role: str, visit: int | None = None) -> None:
+def serve(host: str, port: int, name: str, roles: Sequence[str], visit: int | None = None) -> None:
     """Serve the page at an address of this machine and print a one-time link; after its use, the next one.
 
     Parameters
     ----------
     host, port
         Where. Port 0: a free one.
-    name, role
+    name, roles
         What decisions carry, and what may be done (`access.RIGHTS`).
     visit
         session_id of the visit that the link opens; None: the list.
@@ -59,8 +59,8 @@ def serve(host: str, port: int, name: str, role: str, visit: int | None = None) 
         say(key)
 
     sessions = Sessions()
-    app = create_app(Options(name=name, role=role, on_entry=used), sessions)
-    say(sessions.new_link(name, role))
+    app = create_app(Options(name=name, roles=tuple(roles), on_entry=used), sessions)
+    say(sessions.new_link(name, *roles))
     click.echo("The page ends with Ctrl-C.")
     # Addresses are not logged: the link's key would be among them.
     config = uvicorn.Config(

@@ -1,0 +1,16 @@
+"""What is known of the database server, for `pbl db status` and the review page."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from . import connection, embedded, store
+
+
+def database_status() -> dict[str, Any]:
+    """What `pbl db status` says of a server that answers: its kind (external or embedded), version, and what is known
+    of it."""
+    if (address := connection.external()) is not None:
+        version = connection.connect().query("SELECT VERSION()").fetchone()[0]
+        return {"kind": "external", "running": True, "address": address, "version": version}
+    return {"kind": "embedded", **embedded.status().to_dict(), "store": store.describe()}

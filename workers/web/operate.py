@@ -1,0 +1,121 @@
+"""Operate: queues, what is being computed, errors with their next step and another try, database and disks."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import RedirectResponse, Response
+from starlette.routing import Route
+
+from schemas import decide, fit
+from schemas.ingest import in_transaction
+from schemas.server_status import database_status
+from schemas.status import ErrorRow, Running, Status, pipeline_status, running, span
+
+from ..requeue import retry
+from ..summary import disks
+from .access import Refused, Session, form_of
+from .pages import Pages
+from .tables import Tables
+
+#: Errors, jobs and waiting recordings that are listed, of each table.
+MOST = 100
+
+
+@dataclasses.dataclass(frozen=True)
+class Group:
+    """Errors of one table and code."""
+
+    table: str
+    code: str
+    errors: tuple[ErrorRow, ...]
+
+
+def routes(pages: Pages, tables: Tables) -> list[Route]:
+    """The addresses of this part."""
+
+    async def show(request: Request) -> Response:
+        state, jobs, server, free = await tables.ask(_state)
+        retried = request.query_params.get("retried", "")
+        return pages.show(
+            request,
+            "operate.html",
+            state=state,
+            jobs=jobs,
+            server=server,
+            disks=free,
+            groups=groups_of(state.errors),
+            n_errors=sum(t.error for t in state.tables),
+            retried=int(retried) if retried.isdecimal() and len(retried) < 9 else None,
+            now=f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M:%S}",
+            span=span,
+            key_text=lambda key: json.dumps(key, default=str),
+        )
+
+    async def again(request: Request) -> Response:
+        fields = await form_of(request, "operate")
+        session: Session = request.state.session
+        table, code, key = fields.get("table", ""), fields.get("code", ""), _key(fields.get("key", ""))
+        if not table or not code:
+            raise Refused("form")
+        n = await tables.ask(_retry, table, code, key, session.name)
+        return RedirectResponse(f"/operate?retried={n}", 303)
+
+    return [
+        Route("/operate", show),
+        Route("/operate/retry", again, methods=["POST"]),
+    ]
+
+
+def groups_of(errors: Sequence[ErrorRow]) -> list[Group]:
+    """Errors by table and code, the most first."""
+    found: dict[tuple[str, str], list[ErrorRow]] = {}
+    for error in errors:
+        found.setdefault((error.table, error.code), []).append(error)
+    made = [Group(table, code, tuple(rows)) for (table, code), rows in found.items()]
+    return sorted(made, key=lambda g: -len(g.errors))
+
+
+def _state() -> tuple[Status, list[Running], dict[str, Any], list[tuple[str, float, float]]]:
+    return pipeline_status(most=MOST), running(MOST), database_status(), disks()
+
+
+def _retry(table: str, code: str, key: dict[str, Any] | None, by: str) -> int:
+    """Put errors of a table and code back, all or that of one key, with a row of Decision; how many."""
+
+    def work() -> int:
+        n = sum(retry(code, table, key=key).values())
+        if n:
+            about = {"table": table, "code": code, **({"key": key} if key else {})}
+            decide.record("retry", by, about, {"errors": n}, {"errors": 0}, "", **_whose(key or {}))
+        return n
+
+    return in_transaction(work)
+
+
+def _whose(key: dict[str, Any]) -> dict[str, int]:
+    """The recording or visit that a job is of, so that the row goes with its person."""
+    if "video_id" in key:
+        return {"video_id": int(key["video_id"])}
+    return {"session_id": fit.session_of_set({"fit_set": key["fit_set"]})} if "fit_set" in key else {}
+
+
+def _key(text: str) -> dict[str, Any] | None:
+    """The key of a job as a form names it; None for none. Raises `Refused` for what is no key."""
+    if not text:
+        return None
+    try:
+        found = json.loads(text)
+    except ValueError:
+        raise Refused("form") from None
+    named = isinstance(found, dict) and all(
+        isinstance(v, str | int) and not isinstance(v, bool) and len(str(v)) <= 64 for v in found.values()
+    )
+    if not named:
+        raise Refused("form")
+    return found
