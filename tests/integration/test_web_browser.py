@@ -33,6 +33,17 @@ WATCH = """
 """
 
 
+#: In the page: the number in the picture that is shown now, and the frame of the body, of the 3D view and of the strip.
+SHOWN = """
+() => {
+  const video = document.querySelector("video"), c = new OffscreenCanvas(1, 1).getContext("2d");
+  c.drawImage(video, video.videoWidth / 2, video.videoHeight / 2, 1, 1, 0, 0, 1, 1);
+  return { picture: Math.round(c.getImageData(0, 0, 1, 1).data[0] / 8), body: +document.querySelector("canvas.body").dataset.frame,
+    space: +document.querySelector(".space canvas").dataset.frame, strip: +document.querySelector("#position").value };
+}
+"""  # noqa: E501
+
+
 @pytest.fixture
 def page(chromium: Any, tables: None, tmp_path: Path) -> Iterator[Any]:
     """A signed-in page of a phone's width over one fitted recording, video 1 of visit 1."""
@@ -71,3 +82,43 @@ def test_from_the_link_to_a_frame_of_the_body(page: Any):
         " return b.getContext('2d').getImageData(0, 0, b.width, b.height).data.some((v) => v > 0); }"
     )
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+def settled(page: Any) -> int:
+    """The frame that picture, body and 3D view show once nothing moves any more; they are the same one."""
+    last: dict[str, int] = {}
+    for _ in range(60):
+        found = page.evaluate(SHOWN)
+        if found == last and found["picture"] == found["body"] % 30:
+            assert found["body"] == found["space"] == found["strip"], found
+            return found["body"]
+        last = found
+        page.wait_for_timeout(60)
+    raise AssertionError(f"picture and body do not show one frame: {last}")
+
+
+def test_picture_body_and_3d_view_show_one_frame_at_pause_step_and_seek(page: Any):
+    page.set_viewport_size({"width": 1200, "height": 1500})  # all in view: what is not is not drawn
+    page.goto("/recordings/1")
+    page.wait_for_selector(".look[data-ready]")
+    page.locator(".space").scroll_into_view_if_needed()
+    page.wait_for_selector(".space[data-ready]")
+    for frame in (0, 7, 59, 60, 201, 239, 33):  # on both sides of whole seconds and key frames, forwards and back
+        page.locator("#position").fill(str(frame))
+        page.wait_for_selector(f"canvas.body[data-frame='{frame}']")
+        assert settled(page) == frame
+    for key, way in ((".", 1), (".", 1), (",", -1), (".", 1)):
+        before = settled(page)
+        page.locator("#position").press(key)
+        page.wait_for_selector(f"canvas.body[data-frame='{before + way}']")
+        assert settled(page) == before + way
+    for speed in ("1", "0.5"):
+        page.locator("#speed").select_option(speed)
+        before = settled(page)
+        page.get_by_role("button", name="Play").click()
+        page.wait_for_timeout(700)
+        page.get_by_role("button", name="Pause").click()
+        assert settled(page) > before + 3
+    page.get_by_label("Points").check()
+    page.wait_for_selector("canvas.body[data-points]")
+    settled(page)

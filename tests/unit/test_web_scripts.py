@@ -13,12 +13,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import capsules, load_body
+from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.render import body_track, to_camera, to_pixels
+from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.video import Camera
 from schemas.recording_page import RecordingFit
+from tests.walker import observe
 from tests.walking_fit import LEVEL_CAMERA_QUAT_WXYZ, walking_fit
 from workers.web import texts
-from workers.web.movement import body_json, movement_json
+from workers.web.movement import body_json, movement_json, points_bytes
 
 STATIC = Path(texts.__file__).parent / "static"
 TESTS = Path(__file__).parent / "web_scripts"
@@ -56,9 +59,25 @@ def discs_of(fit) -> list[list[list[float | None]] | None]:
     return out
 
 
+def detected(fit) -> Keypoints:
+    """Points around the picture of a fit, some of them not known for a while."""
+    rng = np.random.default_rng(5)
+    found = observe(plain_walk(fit.time_s), fit.time_s)
+    xy = np.array([640.0, 360.0]) + np.cumsum(rng.normal(0, 9, found.xy_px.shape), axis=0)
+    confidence = rng.uniform(0.01, 1, found.confidence.shape)
+    xy[20:30, 3], confidence[20:30, 3] = np.nan, 0
+    confidence[:, 7] = 0
+    return dataclasses.replace(found, xy_px=xy.astype(found.xy_px.dtype), confidence=confidence)
+
+
+def spelled(points: Keypoints) -> tuple[list, list]:
+    return np.nan_to_num(points.xy_px).astype(float).tolist(), points.confidence.astype(float).tolist()
+
+
 @needs_node
 def test_scripts_of_the_page(tmp_path: Path):
-    found = RecordingFit(handheld_walk(), (), (), None)
+    points = detected(handheld_walk())
+    found = RecordingFit(handheld_walk(), (), (), points)
     shutil.copytree(STATIC, tmp_path / "static")
     for file in TESTS.glob("*.mjs"):
         shutil.copy(file, tmp_path)
@@ -66,6 +85,9 @@ def test_scripts_of_the_page(tmp_path: Path):
     (tmp_path / "movement.json").write_bytes(movement_json(found))
     (tmp_path / "body.bin").write_bytes(body_json(found)[1])
     (tmp_path / "expected.json").write_text(json.dumps(discs_of(found.fit)))
+    (tmp_path / "points.bin").write_bytes(points_bytes(found))
+    seen = [[[*xy, c] for xy, c in zip(p, q, strict=True) if c > 0] for p, q in zip(*spelled(points), strict=True)]
+    (tmp_path / "points.json").write_text(json.dumps(seen))
     (tmp_path / "root.json").write_text(json.dumps(np.nan_to_num(body_track(found.fit).root_m).tolist()))
     files = sorted(p.name for p in tmp_path.glob("*.test.mjs"))
     done = subprocess.run(["node", "--test", *files], cwd=tmp_path, capture_output=True, text=True, timeout=120)

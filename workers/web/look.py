@@ -13,7 +13,7 @@ from pbl_pipeline.errors import PblError
 from schemas import choose, decide, recording_page
 
 from .find import number_of
-from .movement import body_json, movement_json
+from .movement import body_json, movement_json, points_bytes
 from .pages import Pages
 from .tables import Tables
 from .videos import Videos
@@ -61,11 +61,16 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
         _, numbers = await asyncio.to_thread(body_json, found)
         return Response(numbers, media_type="application/octet-stream")
 
+    async def points(request: Request) -> Response:
+        found = await fitted(request)
+        return Response(await asyncio.to_thread(points_bytes, found), media_type="application/octet-stream")
+
     return [
         Route("/recordings/{number:int}", recording),
         Route("/recordings/{number:int}/video", video),
         Route("/recordings/{number:int}/movement", movement),
         Route("/recordings/{number:int}/body", body),
+        Route("/recordings/{number:int}/points", points),
     ]
 
 

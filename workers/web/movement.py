@@ -13,13 +13,16 @@ from schemas.recording_page import RecordingFit
 #: Steps of a metre, of a body's quaternion and of the camera's in which poses are sent: a millimetre; a half step of a
 #: quaternion is 0.01 deg, of the camera's 0.2 px at a focal length of 1,500 px.
 METRE_STEPS, TURN_STEPS, CAMERA_STEPS = 1000, 4096, 8192
+#: Steps of a pixel in which detected points are sent, and how far from the picture one may be.
+POINT_STEPS, _FAR_PX = 2, 4000.0
 
 
 def movement_json(found: RecordingFit) -> bytes:
     """Times, joint angles with their 90 % half widths (deg), events, stance, and where a side is uncertain, as JSON.
 
     `time` (T) s; `curves`: name, by side `value` and `half` (T) deg, null where unknown; `events`: time, side, kind,
-    probability; `stance` and `uncertain`: by side, spans (from, to) in s; `body`: of `body_json`.
+    probability; `stance` and `uncertain`: by side, spans (from, to) in s; `body`: of `body_json`; `points`: how many
+    detected ones there are.
     """
     from pbl_pipeline.gait import interval_90, leg_angles, leg_angles_sd
     from pbl_pipeline.render import stance_spans, uncertain_sides
@@ -54,6 +57,7 @@ def movement_json(found: RecordingFit) -> bytes:
             for side, mask in unsure.items()
         },
         "body": body,
+        "points": 0 if found.keypoints is None else len(found.keypoints.names),
     }
     return json.dumps(out, allow_nan=False, separators=(",", ":")).encode()
 
@@ -119,6 +123,22 @@ def body_json(found: RecordingFit) -> tuple[dict[str, Any], bytes]:
         else None,
     }
     return body, _packed(np.rint(channels).astype(np.int64).T, fit.name)
+
+
+def points_bytes(found: RecordingFit) -> bytes:
+    """The detected points: channels (2 J, T) x, y in half pixels, packed as those of `body_json`, then their confidence
+    (J, T) in 255ths as bytes, 0 where a point is not known. Empty where the fit is of markers."""
+    points = found.keypoints
+    if points is None or len(points.time_s) != len(found.fit.time_s):
+        return b""
+    xy, confidence = np.asarray(points.xy_px, float), np.asarray(points.confidence, float)
+    known = np.isfinite(xy).all(axis=2) & (np.abs(xy) < _FAR_PX).all(axis=2) & (confidence > 0)
+    held = np.stack([_held(xy[:, j], known[:, j]) for j in range(xy.shape[1])], axis=1)
+    channels = np.rint(POINT_STEPS * held).astype(np.int64).reshape(len(xy), -1).T
+    shares = np.rint(255 * np.where(known, np.clip(confidence, 0, 1), 0)).astype(np.uint8)
+    # A point that is known does not become unknown by rounding.
+    shares[known & (shares == 0)] = 1
+    return _packed(channels, found.fit.name) + shares.T.tobytes()
 
 
 def _packed(channels: np.ndarray, name: str) -> bytes:

@@ -7,7 +7,7 @@ import { Poses, drawBody } from "./body.js";
  * @typedef {{time: number[], size: [number, number], events: [number, string, string, number][],
  *   curves: ({name: string} & Record<"left"|"right", {value: (number|null)[], half: (number|null)[]}>)[],
  *   stance: Record<string, [number, number][]>, uncertain: Record<string, [number, number][]>,
- *   body: import("./body.js").Body}} Movement
+ *   body: import("./body.js").Body, points: number}} Movement
  * @typedef {{movement: Movement, poses: Poses, look: HTMLElement, canvas: HTMLCanvasElement, frame: number,
  *   watch: (seen: (frame: number) => void) => void, redraw: () => void}} Player
  */

@@ -93,8 +93,9 @@ export class Space {
     this.height = body.floor ?? 0;
     this.eye = roots.length ? roots.map((r) => r[2]).sort((a, b) => a - b)[roots.length >> 1] - 0.08 : 0;
     if (body.floor === null || !roots.length) return;
-    const lines = [];  // around the body, wherever it walks
-    for (let i = -REACH_M; i <= REACH_M; i++) lines.push(i, -REACH_M, 0, i, REACH_M, 0, -REACH_M, i, 0, REACH_M, i, 0);
+    // Around the body, wherever it walks; metre by metre, because drawing in software drops a line that ends behind the viewer.
+    const lines = [];
+    for (let i = -REACH_M; i <= REACH_M; i++) for (let j = -REACH_M; j < REACH_M; j++) lines.push(i, j, 0, i, j + 1, 0, j, i, 0, j + 1, i, 0);
     this.grid = new three.LineSegments(points(three, lines), new three.LineBasicMaterial());
     this.path = new three.Line(points(three, roots.flatMap((r) => [r[0], r[1], 0.002])), new three.LineBasicMaterial());
     const arrow = [[0.45, 0.035], [0.75, 0.035], [0.75, 0.12], [1.05, 0], [0.75, -0.12], [0.75, -0.035], [0.45, -0.035]];
