@@ -66,9 +66,10 @@ class TrialFit:
     @classmethod
     def load(cls, path: str | Path) -> TrialFit:
         """Read `<name>.fit.npz`. Raises `PblError` FILE_MISSING, FILE_FORMAT, CAMERA_INVALID. Never unpickles."""
-        wanted = [f.name for f in dataclasses.fields(cls) if f.name not in ("camera", "height_m")]
+        wanted = [f.name for f in dataclasses.fields(cls) if f.name != "camera"]
         fields = [*wanted, "camera_matrix", "distortion", "camera_source"]
-        data = load_npz(path, [*fields, "height_m"])
+        # Files of before heights could be stated lack it.
+        data = {"height_m": np.asarray(np.nan), **load_npz(path, fields)}
         missing = [k for k in fields if k not in data]
         if missing:
             raise _format_error(f"{path} lacks {', '.join(missing)}", "a file that `pbl fit` wrote")
@@ -78,15 +79,14 @@ class TrialFit:
             values[k] = texts_of(path, data, k)
         for k in ("name", "marker_set", "camera_motion", "orientation_source", "solver", "params_hash", "body_sha256"):
             values[k] = text_of(path, data, k)
-        for k in ("loss", "seconds", "phone_clock_offset_s"):
+        for k in ("loss", "seconds", "phone_clock_offset_s", "height_m"):
             values[k] = float(values[k])
         camera = Camera(data["camera_matrix"], data["distortion"], text_of(path, data, "camera_source"))
         values["image_size_px"] = (0, 0)
         if not np.isnan(camera.matrix).all():  # as of markers of a laboratory
             values["image_size_px"] = picture_size(path, data["image_size_px"])
             check_lens(camera.matrix, camera.distortion, values["image_size_px"], str(path))
-        # Files of before heights could be stated lack it.
-        return cls(**values, camera=camera, height_m=float(data.get("height_m", np.nan)))
+        return cls(**values, camera=camera)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,7 +14,7 @@ from pbl_pipeline.qc import Check, failed
 from ._angles import AngleSeries, angle_series
 from ._camera_side import far_leg, mostly
 from ._exclusion import Exclusion
-from ._ground import Lengths, cycle_lengths, is_metric, why_no_lengths
+from ._ground import Lengths, cycle_lengths, is_metric, where_feet_stand, why_no_lengths
 from ._outliers import without_odd_curves, without_odd_lengths
 from .events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents
 from .motion import BodyPoses, FootTrajectories, feet_from_fit, trial_poses
@@ -177,7 +177,7 @@ def find_cycles(
                 far_leg="" if fit is None or far is None else mostly(_during(far, fit.time_s, start, end)),
             )
             cycles.append(cycle)
-    cycles = without_odd_curves(without_odd_lengths(cycles))
+    cycles = without_odd_curves(without_odd_lengths(where_feet_stand(cycles)))
     if checks := failed(fit_checks):
         cycles = [dataclasses.replace(c, exclusion=Exclusion(failed_checks=checks)) for c in cycles]
     cycles.sort(key=lambda c: c.start_s)

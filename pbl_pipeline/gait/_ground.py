@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,11 +14,14 @@ from .motion import FootTrajectories
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit
 
+    from ._cycles import GaitCycle
+
 #: The part of a stride after its foot down in which the foot lies flat (fraction of the stride).
-FLAT_FROM, FLAT_TO = 0.12, 0.27
-#: A standing foot that moves over the floor at more than this fraction of its speed against the pelvis does not stand:
-#: a treadmill's belt carries it, or the camera moves (1 and more for both; 0.2 at most in fits of synthetic walkers,
-#: 0.1 to 0.6 in the demo recording, whose feet are seen less well).
+FLAT_FROM, FLAT_TO = 0.08, 0.32
+#: Where the standing feet of a trial move over the floor at more than this fraction of their speed against the pelvis
+#: (median), they do not stand: a treadmill's belt carries them, or the camera moves (1 and more for both; 0.2 at most
+#: in fits of synthetic walkers). One foot alone may seem to: while the other leg passes, a detector can take it for
+#: that one for a tenth of a second, which a median place does not mind.
 MAX_SLIDE = 0.6
 #: Fewest frames of a standing foot.
 _MIN_FRAMES = 3
@@ -32,6 +36,7 @@ class Lengths:
 
     `stride_length_m` between two places of the own foot; `step_length_m` of the step that ends the cycle, from the
     other foot to the own one along the stride; `step_width_m` between that other foot and the line of the stride.
+    `slide`: speed of the standing feet over the floor against that relative to the pelvis (median of the three).
     `metric` is False where the metres are those of a detector that guesses how tall a person is; where her height was
     stated they are hers, but the step width stays unknown.
     """
@@ -41,6 +46,7 @@ class Lengths:
     step_width_m: float | None = None
     missing: str = ""
     metric: bool = False
+    slide: float | None = None
 
 
 def is_metric(fit: TrialFit) -> bool:
@@ -66,14 +72,13 @@ def cycle_lengths(
     """
     stride_s = end_s - start_s
     own, other = (0, 1) if side == LEFT else (1, 0)
-    places = []
+    places, slides = [], []
     for foot, down in ((own, start_s), (other, other_down_s), (own, end_s)):
         place, slide = _place(feet, foot, down, stride_s)
         if place is None:
             return Lengths(missing=UNSEEN)
-        if slide > MAX_SLIDE:
-            return Lengths(missing=SLIDES)
         places.append(place)
+        slides.append(slide)
     a, b, c = places
     stride = float(np.linalg.norm(c - a))
     if not stride > 1e-6:
@@ -81,7 +86,15 @@ def cycle_lengths(
     along = (c - a) / stride
     step = float((c - b) @ along)
     across = float(np.linalg.norm((b - a) - ((b - a) @ along) * along))
-    return Lengths(stride, step, across if width else None, metric=metric)
+    return Lengths(stride, step, across if width else None, metric=metric, slide=float(np.median(slides)))
+
+
+def where_feet_stand(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
+    """The cycles of a trial, without lengths where its standing feet slide (`MAX_SLIDE`)."""
+    slides = [c.lengths.slide for c in cycles if c.lengths.slide is not None]
+    if not slides or np.median(slides) <= MAX_SLIDE:
+        return list(cycles)
+    return [dataclasses.replace(c, lengths=Lengths(missing=SLIDES)) if c.lengths.slide else c for c in cycles]
 
 
 def _place(feet: FootTrajectories, foot: int, down_s: float, stride_s: float) -> tuple[np.ndarray | None, float]:

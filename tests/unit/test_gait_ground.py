@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.gait import FootTrajectories, cycle_lengths, find_cycles, spatiotemporal
-from pbl_pipeline.gait._ground import FOLLOWS, SLIDES, UNSEEN, why_no_lengths
+from pbl_pipeline.gait._ground import FLAT_FROM, FLAT_TO, FOLLOWS, SLIDES, UNSEEN, why_no_lengths
 from pbl_pipeline.gait._spatiotemporal import NO_WIDTH
 from pbl_pipeline.gait.events import GaitEvent
 from pbl_pipeline.synthetic import SynthSpec, synthesise
@@ -80,6 +80,18 @@ def test_a_treadmill_and_a_phone_that_follows_have_no_lengths(belt_m_per_s):
     result = spatiotemporal(cycles[:4])
     assert result["speed_m_per_s"] is None
     assert "treadmill" in result.reasons["speed_m_per_s"]
+
+
+def test_a_foot_that_is_taken_for_the_passing_one_keeps_its_place():
+    """A standing heel that a detector drags along for a tenth of a second, once."""
+    feet, events = walk(footprints())
+    heel = feet.heel_m.copy()
+    down = [e.time_s for e in events if (e.side, e.event) == ("left", "foot_down")][1]
+    dragged = (feet.time_s > down + 0.2 * STRIDE_S) & (feet.time_s < down + 0.2 * STRIDE_S + 0.1)
+    heel[dragged, 0, 0] += np.linspace(0.1, 0.4, dragged.sum())
+    assert 2 <= dragged.sum() < 0.5 * (FLAT_TO - FLAT_FROM) * STRIDE_S / np.diff(feet.time_s)[0]
+    cycles = find_cycles(events, feet=dataclasses.replace(feet, heel_m=heel), keep_ends=True)
+    assert [c.lengths.stride_length_m for c in cycles[:4]] == pytest.approx([1.2] * 4, abs=1e-9)
 
 
 def test_too_few_frames_are_no_place():
