@@ -70,6 +70,8 @@ CODES: dict[str, str] = {
     "DECIDED_MEANWHILE": "somebody else decided, or it was computed anew, since the page was loaded",
     "WEB_NOT_MADE": "a file that the review page was making was not finished",
     "WEB_PORT": "the review page cannot listen on that port",
+    "WEB_TLS": "the review page would be reached without encryption, or its certificate cannot be used",
+    "WEB_ACCOUNT": "an account of the review page is not there, or cannot be as it was asked for",
     "USAGE": "the command was called in a way that cannot work",
     "INTERNAL": "an unforeseen error: please report it with the whole text",
 }

@@ -334,8 +334,8 @@ def test_german_by_the_browser_and_by_choice(four_visits: None):
     assert web.post(browser, "/language", language="de", back="//evil").headers["location"] == "/"
 
 
-def test_a_page_for_other_machines_is_refused():
-    from workers.web import serve
+def test_a_page_for_other_machines_without_tls_is_refused():
+    from workers.web import Where, serve
 
-    with pytest.raises(PblError, match="no accounts yet"):
-        serve("0.0.0.0", 0, "A", ["reader"])
+    with pytest.raises(PblError, match="without TLS"):
+        serve(Where("0.0.0.0", 0))

@@ -16,11 +16,11 @@ from urllib.parse import parse_qsl, urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import Request
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-COOKIE = "pbl_session"
-#: Hours after which a session ends, whatever was done in it.
-HOURS = 12.0
+#: Hours after which a session ends, whatever was done in it; and where people sign in, hours without a request.
+HOURS, IDLE_HOURS = 12.0, 1.0
 #: What a role may do: a reader looks at visits and recordings, a reviewer also decides and enters; an operator sees
 #: queues, errors and disks and tries again, for which nobody has to be looked at. Several roles: what each of them may.
 RIGHTS: dict[str, frozenset[str]] = {
@@ -62,16 +62,22 @@ HEADERS = {
     "permissions-policy": "camera=(), microphone=(), geolocation=()",
     "cache-control": "no-store",
 }
+#: Beside them where the browser reaches the page by TLS: it never tries without.
+_BY_TLS = {"strict-transport-security": "max-age=31536000"}
 
 
 @dataclasses.dataclass
 class Session:
     """A person in front of a browser. token: what each of her forms has to bring back; name: what her decisions carry;
-    searches: what she searched for, so that a person's code never stands in an address."""
+    searches: what she searched for, so that a person's code never stands in an address. seen: when the last request
+    was; changed: when her account was, empty without one; looked: when her looks at recordings were last written."""
 
     name: str
     roles: tuple[str, ...]
     ends: float
+    seen: float = 0.0
+    changed: str = ""
+    looked: dict[tuple[str, ...], float] = dataclasses.field(default_factory=dict)
     token: str = dataclasses.field(default_factory=lambda: secrets.token_urlsafe(24))
     searches: list[str] = dataclasses.field(default_factory=list)
 
@@ -102,10 +108,21 @@ class Sessions:
     """Sessions and one-time links, in memory: a server that ends forgets them all.
 
     Only hashes are kept, so that a copy of the memory's contents opens nothing.
+
+    idle_hours
+        Hours without a request after which a session ends; None: it does not.
+    still
+        Whether the account of a session, by its name and when it was changed, is still as it was. Others end.
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic, hours: float = HOURS) -> None:
-        self._clock, self._hours = clock, hours
+    def __init__(
+        self,
+        clock: Callable[[], float] = time.monotonic,
+        hours: float = HOURS,
+        idle_hours: float | None = None,
+        still: Callable[[str, str], bool] | None = None,
+    ) -> None:
+        self._clock, self._hours, self._idle, self._still = clock, hours, idle_hours, still
         self._sessions: dict[str, Session] = {}
         self._links: dict[str, tuple[str, tuple[str, ...]]] = {}
 
@@ -118,22 +135,58 @@ class Sessions:
     def enter(self, key: str) -> str | None:
         """A new session's cookie for the key of a link, which is used up; None for a key that opens nothing."""
         found = self._links.pop(_hashed(key), None)
-        if found is None:
-            return None
+        return None if found is None else self.open(*found)
+
+    def open(self, name: str, roles: tuple[str, ...], changed: str = "") -> str:
+        """A new session's cookie. `changed`: of the account."""
         now = self._clock()
-        self._sessions = {k: s for k, s in self._sessions.items() if s.ends > now}
+        self._sessions = {k: s for k, s in self._sessions.items() if self._lasts(s, now)}
         cookie = secrets.token_urlsafe(32)
-        self._sessions[_hashed(cookie)] = Session(*found, ends=now + 3600 * self._hours)
+        self._sessions[_hashed(cookie)] = Session(name, roles, now + 3600 * self._hours, now, changed)
         return cookie
 
     def find(self, cookie: str) -> Session | None:
         """The session of a cookie, None where it ended or never was."""
-        session = self._sessions.get(_hashed(cookie))
-        return session if session is not None and session.ends > self._clock() else None
+        session, now = self._sessions.get(_hashed(cookie)), self._clock()
+        if session is None or not self._lasts(session, now):
+            return None
+        if self._still is not None and not self._still(session.name, session.changed):
+            return None
+        session.seen = now
+        return session
+
+    def _lasts(self, session: Session, now: float) -> bool:
+        return session.ends > now and (self._idle is None or now - session.seen < 3600 * self._idle)
 
     def leave(self, cookie: str) -> None:
         """End a session."""
         self._sessions.pop(_hashed(cookie), None)
+
+
+@dataclasses.dataclass(frozen=True)
+class Cookie:
+    """The session's cookie. secure: sent by TLS alone, and by its name (`__Host-`) bound to this very host."""
+
+    secure: bool = False
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return "__Host-pbl_session" if self.secure else "pbl_session"
+
+    def of(self, request: Request) -> str:
+        """Its value in a request, empty for none."""
+        return request.cookies.get(self.name, "")
+
+    def set(self, response: Response, value: str, seconds: int) -> None:
+        """Give it to a browser: no script reads it, and no other page makes a browser send it."""
+        response.set_cookie(
+            self.name, value, max_age=seconds, path="/", httponly=True, samesite="strict", secure=self.secure
+        )
+
+    def delete(self, response: Response) -> None:
+        """Have a browser forget it."""
+        response.delete_cookie(self.name, path="/", httponly=True, samesite="strict", secure=self.secure)
 
 
 def _hashed(secret: str) -> str:
@@ -156,8 +209,11 @@ class Gate:
         hosts: frozenset[str],
         refuse: Callable[[Request, str], Any],
         open_paths: tuple[str, ...],
+        cookie: Cookie,
     ) -> None:
         self._app, self._sessions, self._hosts, self._refuse, self._open = app, sessions, hosts, refuse, open_paths
+        self._cookie = cookie
+        self._headers = {**HEADERS, **(_BY_TLS if cookie.secure else {})}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -168,7 +224,7 @@ class Gate:
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
-                for name, value in HEADERS.items():
+                for name, value in self._headers.items():
                     headers.setdefault(name, value)
             await send(message)
 
@@ -184,7 +240,7 @@ class Gate:
         # Another name that leads to 127.0.0.1 (DNS rebinding) would make a page of its own one of this server.
         if len(headers.getlist("host")) != 1 or host_of(headers["host"]) not in self._hosts:
             return "host"
-        session = self._sessions.find(request.cookies.get(COOKIE, ""))
+        session = self._sessions.find(self._cookie.of(request))
         request.state.session = session
         if request.method not in ("GET", "HEAD") and not _from_here(headers):
             return "token"
@@ -229,9 +285,20 @@ async def form_of(request: Request, right: str) -> Mapping[str, str]:
     Refused
         Another token or none, no such right, a body that is too long, too slow or no form.
     """
+    session: Session | None = request.state.session
+    fields = await read_form(request)
+    sent = fields.pop("token", "") or request.headers.get("x-token", "")
+    if session is None or not hmac.compare_digest(sent.encode(), session.token.encode()):
+        raise Refused("token")
+    if not session.may(right):
+        raise Refused("right")
+    return fields
+
+
+async def read_form(request: Request) -> dict[str, str]:
+    """The fields of a form, whoever sent it. Raises `Refused` for a body that is too long, too slow or no form."""
     import asyncio
 
-    session: Session = request.state.session
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/x-www-form-urlencoded":
         raise Refused("form")
     body = bytearray()
@@ -244,13 +311,6 @@ async def form_of(request: Request, right: str) -> Mapping[str, str]:
     except TimeoutError:
         raise Refused("size") from None
     try:
-        pairs = parse_qsl(body.decode(), keep_blank_values=True, max_num_fields=100)
+        return dict(parse_qsl(body.decode(), keep_blank_values=True, max_num_fields=100))
     except ValueError:
         raise Refused("form") from None
-    fields = dict(pairs)
-    sent = fields.pop("token", "") or request.headers.get("x-token", "")
-    if session is None or not hmac.compare_digest(sent.encode(), session.token.encode()):
-        raise Refused("token")
-    if not session.may(right):
-        raise Refused("right")
-    return fields

@@ -19,7 +19,8 @@ from starlette.staticfiles import StaticFiles
 
 from pbl_pipeline.errors import PblError
 
-from . import access, compare, decide, drawn, entry, find, look, operate, people, take
+from . import access, compare, decide, drawn, entry, find, look, operate, people, take, way_in
+from .accounts import Accounts, Attempts
 from .making import Making
 from .pages import Pages
 from .tables import Tables
@@ -36,18 +37,25 @@ _ADDRESS = 2000
 @dataclasses.dataclass(frozen=True)
 class Options:
     """How the page is served. hosts: names in a Host header that are answered; name and roles: of who opens a link;
-    on_entry: called when a link was used, with the key of the next one."""
+    on_entry: called when a link was used, with the key of the next one. accounts: of those who sign in, None where
+    links open the page; secure: browsers reach it by TLS."""
 
     hosts: frozenset[str] = frozenset({"127.0.0.1", "localhost", "::1"})
     name: str = ""
     roles: tuple[str, ...] = ("reviewer", "operator")
     on_entry: Callable[[str], None] | None = None
+    accounts: Accounts | None = None
+    secure: bool = False
 
 
 def create_app(options: Options, sessions: access.Sessions | None = None) -> Starlette:
     """The page as an ASGI application. `sessions`: those of a test; `app.state.sessions` makes the first link."""
+    accounts = options.accounts
+    if sessions is None and accounts is not None:
+        sessions = access.Sessions(idle_hours=access.IDLE_HOURS, still=accounts.current)
     sessions = sessions or access.Sessions()
-    pages, tables, videos, making = Pages(), Tables(), Videos(), Making()
+    way = way_in.WayIn(sessions, access.Cookie(options.secure), accounts, Attempts())
+    pages, tables, videos, making = Pages(accounts is not None), Tables(), Videos(), Making()
     files = Path(__file__).parent
 
     @contextlib.asynccontextmanager
@@ -57,25 +65,9 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
         videos.close()
         tables.close()
 
-    async def enter(request: Request) -> Response:
-        cookie = sessions.enter(request.query_params.get("key", ""))
-        if cookie is None:
-            return pages.refused(request, "session")
-        to = request.query_params.get("to", "")
-        response = RedirectResponse(to if to.startswith("/visits/") and to[8:].isdecimal() else "/", 303)
-        response.set_cookie(
-            access.COOKIE, cookie, max_age=int(3600 * access.HOURS), path="/", httponly=True, samesite="strict"
-        )
+    def link_used() -> None:
         if options.on_entry is not None:
             options.on_entry(sessions.new_link(options.name, *options.roles))
-        return response
-
-    async def leave(request: Request) -> Response:
-        await access.form_of(request, "")
-        sessions.leave(request.cookies.get(access.COOKIE, ""))
-        response = RedirectResponse("/", 303)
-        response.delete_cookie(access.COOKIE, path="/", httponly=True, samesite="strict")
-        return response
 
     async def home(request: Request) -> Response:
         session: access.Session | None = request.state.session
@@ -104,8 +96,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
     app = Starlette(
         routes=[
             Route("/", home),
-            Route("/enter", enter),
-            Route("/leave", leave, methods=["POST"]),
+            *way_in.routes(pages, way, link_used),
             Route("/language", language, methods=["POST"]),
             *find.routes(pages, tables),
             *look.routes(pages, tables, videos),
@@ -132,10 +123,11 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
                 hosts=options.hosts,
                 refuse=pages.refused,
                 open_paths=("/enter", "/static/", "/vendor/"),
+                cookie=way.cookie,
             ),
             Middleware(GZipMiddleware, minimum_size=1000),
         ],
         lifespan=life,
     )
-    app.state.sessions = sessions
+    app.state.sessions, app.state.way_in = sessions, way
     return app

@@ -24,7 +24,9 @@ _REFUSED = {"session": 401, "host": 400, "token": 403, "right": 403, "size": 413
 class Pages:
     """Renders the templates of this folder: escaped, in the reader's language, a name that is missing is an error."""
 
-    def __init__(self) -> None:
+    def __init__(self, sign_in: bool = False) -> None:
+        """sign_in: whether people sign in with a password; else a link opens the page."""
+        self._sign_in = sign_in
         self._environment = jinja2.Environment(
             loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
             autoescape=True,
@@ -59,6 +61,8 @@ class Pages:
 
     def refused(self, request: Request, reason: str) -> Response:
         """The answer to a request that may not pass."""
+        if reason == "session" and self._sign_in:
+            return self.show(request, "sign_in.html", _REFUSED[reason], problem="", wait=0)
         name = "enter.title" if reason == "session" else f"enter.{reason}_title"
         text = "enter.text" if reason == "session" else f"enter.{reason}"
         return self.show(request, "refused.html", _REFUSED[reason], title=name, text=text, hours=f"{HOURS:g}")

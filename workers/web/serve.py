@@ -1,12 +1,16 @@
-"""Runs the page until Ctrl-C, and prints the links that open it."""
+"""Runs the page until Ctrl-C: on this machine, opened by links that it prints; elsewhere, by accounts and TLS."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import ipaddress
 import logging
 import socket
+import ssl
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from pathlib import Path
 
 import click
 import uvicorn
@@ -14,41 +18,167 @@ import uvicorn
 from pbl_pipeline.errors import PblError
 
 from .access import Sessions
+from .accounts import Accounts
 from .app import Options, create_app
+from .connections import Connection
 
-#: Addresses of this machine alone.
-LOOPBACK = ("127.0.0.1", "::1", "localhost")
-#: Connections at a time, and seconds that an idle one is kept.
-_CONNECTIONS, _IDLE_S = 200, 10
+#: Addresses of this machine alone, and those that mean all of its addresses.
+LOOPBACK, EVERYWHERE = ("127.0.0.1", "::1", "localhost"), ("0.0.0.0", "::", "")  # noqa: S104
+#: Connections at a time, those of one address, and seconds that an idle one is kept.
+_CONNECTIONS, _OF_ONE, _IDLE_S = 200, 100, 10
 
 
-def serve(host: str, port: int, name: str, roles: Sequence[str], visit: int | None = None) -> None:
-    """Serve the page at an address of this machine and print a one-time link; after its use, the next one.
+@dataclasses.dataclass(frozen=True)
+class Where:
+    """Where the page is served.
+
+    tls_cert, tls_key: files (PEM) of the server's certificate and key. behind_proxy: address, or network, of a proxy of
+    one's own that ends TLS before the page; what it says of who asks is believed, and nobody else is answered.
+    hostnames: the names under which browsers reach the page. Port 0: a free one.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 8484
+    tls_cert: Path | None = None
+    tls_key: Path | None = None
+    behind_proxy: str = ""
+    hostnames: tuple[str, ...] = ()
+
+    @property
+    def by_accounts(self) -> bool:
+        """Whether people sign in: wherever more than this machine may come."""
+        return self.host not in LOOPBACK or bool(self.behind_proxy) or self.tls_cert is not None
+
+    @property
+    def names(self) -> frozenset[str]:
+        """The names in a Host header that are answered."""
+        own = {*LOOPBACK} if self.host in LOOPBACK and not self.by_accounts else {self.host} - {*EVERYWHERE}
+        return frozenset({*self.hostnames, *own})
+
+    def check(self) -> None:
+        """Raise `PblError` where this cannot be served safely: WEB_TLS; USAGE for what does not belong together."""
+        if (self.tls_cert is None) != (self.tls_key is None) or (self.tls_cert is not None and self.behind_proxy):
+            raise PblError(
+                "USAGE",
+                found="--tls-cert without --tls-key, or the other way round, or beside --behind-proxy",
+                expected="both files where the page itself speaks TLS, or --behind-proxy where a proxy does",
+                next_step="name both or neither",
+            )
+        if self.host not in LOOPBACK and self.tls_cert is None and not self.behind_proxy:
+            raise PblError(
+                "WEB_TLS",
+                found=f"--host {self.host} without TLS",
+                expected="an encrypted way from the browser: passwords and videos of people go along it",
+                next_step="add --tls-cert FILE --tls-key FILE; or --behind-proxy ADDRESS where a proxy of your own "
+                "ends TLS; or leave --host out and open the page through a tunnel: "
+                "ssh -L 8484:127.0.0.1:8484 THIS_MACHINE",
+            )
+        try:
+            _ = ipaddress.ip_network(self.behind_proxy or "127.0.0.1", strict=False)
+        except ValueError as error:
+            raise PblError(
+                "USAGE",
+                found=f"--behind-proxy {self.behind_proxy}",
+                expected="an address such as 127.0.0.1, or a network such as 172.18.0.0/16",
+                next_step="write the address from which the proxy connects",
+            ) from error
+        if self.by_accounts and not self.names - {*LOOPBACK}:
+            raise PblError(
+                "USAGE",
+                found="no name under which browsers reach the page",
+                expected="--hostname NAME, as often as there are names; requests under another name are refused",
+                next_step="add --hostname, such as --hostname gait.example.org",
+            )
+        if self.tls_cert is not None:
+            try:
+                ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(self.tls_cert, self.tls_key)
+            except (OSError, ssl.SSLError) as error:
+                raise PblError(
+                    "WEB_TLS",
+                    found=f"{self.tls_cert}, {self.tls_key}: {error.strerror or type(error).__name__}",
+                    expected="a certificate and its key as PEM, readable by this account, the key without a password",
+                    next_step="check both files: openssl x509 -in CERT -noout -dates",
+                ) from error
+
+
+def serve(
+    where: Where,
+    name: str = "",
+    roles: tuple[str, ...] = ("reviewer", "operator"),
+    visit: int | None = None,
+    accounts: Accounts | None = None,
+) -> None:
+    """Serve the page. On this machine alone a one-time link is printed, after its use the next one; elsewhere people
+    sign in with accounts (`pbl web account`).
 
     Parameters
     ----------
-    host, port
-        Where. Port 0: a free one.
+    where
+        Address, TLS, names.
     name, roles
-        What decisions carry, and what may be done (`access.RIGHTS`).
+        Of who opens a link: what decisions carry, and what may be done (`access.RIGHTS`).
     visit
-        session_id of the visit that the link opens; None: the list.
+        session_id of the visit that the link opens; None: the first page.
+    accounts
+        None: those of this machine.
 
     Raises
     ------
     PblError
-        USAGE for an address that other machines reach; WEB_PORT where the port is taken.
+        What `Where.check` raises; WEB_ACCOUNT where people sign in and there are no accounts; WEB_PORT where the
+        port is taken.
     """
-    if host not in LOOPBACK:
-        raise PblError(
-            "USAGE",
-            found=f"--host {host}",
-            expected=f"an address of this machine alone ({', '.join(LOOPBACK)}): there are no accounts yet",
-            next_step="leave --host out and open the page through a tunnel: ssh -L 8484:127.0.0.1:8484 THIS_MACHINE",
-        )
-    listening = _listen(host, port)
+    where.check()
+    if where.by_accounts:
+        accounts = accounts or Accounts()
+        if not accounts.all():
+            raise PblError(
+                "WEB_ACCOUNT",
+                found="no accounts",
+                expected="at least one, with which somebody can sign in",
+                next_step="pbl web account add NAME --role reviewer",
+            )
+    listening = _listen(where.host, where.port)
     port = listening.getsockname()[1]
-    shown = f"[{host}]" if ":" in host else host
+    if where.by_accounts:
+        app = create_app(Options(hosts=where.names, accounts=accounts, secure=True))
+        shown = ", ".join(sorted(where.names))
+        click.echo(f"Serving on {where.host}:{port} for {shown}, to those who have an account (pbl web account list).")
+    else:
+        app = _opened_by_links(where, port, name, roles, visit)
+    click.echo("The page ends with Ctrl-C.")
+    logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
+    threading.Thread(target=_warm, daemon=True).start()
+    with database(), contextlib.closing(listening), contextlib.suppress(KeyboardInterrupt):
+        uvicorn.Server(config(app, where)).run(sockets=[listening])
+
+
+def config(app: object, where: Where) -> uvicorn.Config:
+    """How uvicorn serves the page."""
+    proxy = ipaddress.ip_network(where.behind_proxy, strict=False) if where.behind_proxy else None
+    limits = {"per_address": None if proxy else _OF_ONE, "only_from": proxy}
+    return uvicorn.Config(
+        app,  # type: ignore[arg-type]
+        http=type("Connection", (Connection,), limits),
+        ws="none",
+        # Addresses are not logged: the link's key would be among them.
+        access_log=False,
+        log_level="warning",
+        server_header=False,
+        limit_concurrency=_CONNECTIONS,
+        timeout_keep_alive=_IDLE_S,
+        timeout_graceful_shutdown=5,
+        h11_max_incomplete_event_size=16_384,
+        ssl_certfile=where.tls_cert,
+        ssl_keyfile=where.tls_key,
+        # Who asks, as the proxy has it; what anybody else writes into those headers is left out.
+        proxy_headers=bool(where.behind_proxy),
+        forwarded_allow_ips=where.behind_proxy or None,
+    )
+
+
+def _opened_by_links(where: Where, port: int, name: str, roles: tuple[str, ...], visit: int | None) -> object:
+    shown = f"[{where.host}]" if ":" in where.host else where.host
     to = f"&to=/visits/{visit}" if visit is not None else ""
 
     def say(key: str) -> None:
@@ -59,24 +189,9 @@ def serve(host: str, port: int, name: str, roles: Sequence[str], visit: int | No
         say(key)
 
     sessions = Sessions()
-    app = create_app(Options(name=name, roles=tuple(roles), on_entry=used), sessions)
+    app = create_app(Options(hosts=where.names, name=name, roles=roles, on_entry=used), sessions)
     say(sessions.new_link(name, *roles))
-    click.echo("The page ends with Ctrl-C.")
-    # Addresses are not logged: the link's key would be among them.
-    config = uvicorn.Config(
-        app,
-        access_log=False,
-        log_level="warning",
-        server_header=False,
-        limit_concurrency=_CONNECTIONS,
-        timeout_keep_alive=_IDLE_S,
-        timeout_graceful_shutdown=5,
-        h11_max_incomplete_event_size=16_384,
-    )
-    logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
-    threading.Thread(target=_warm, daemon=True).start()
-    with database(), contextlib.closing(listening), contextlib.suppress(KeyboardInterrupt):
-        uvicorn.Server(config).run(sockets=[listening])
+    return app
 
 
 @contextlib.contextmanager

@@ -1,0 +1,482 @@
+"""Accounts of the review page: passwords, sessions, who guesses, addresses that other machines reach, slow clients."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import socket
+import ssl
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+from click.testing import CliRunner
+from starlette.testclient import TestClient
+
+from pbl_pipeline.errors import PblError
+from schemas import lab, session
+from schemas.rows import utc_now
+from workers.cli.web import web
+from workers.web import Options, Where, accounts, connections, create_app, serve
+from workers.web.access import IDLE_HOURS, Sessions
+from workers.web.accounts import Accounts, Attempts
+from workers.web.serve import config
+
+BASE = "https://gait.example"
+WORDS = "correct horse battery staple"
+
+
+@pytest.fixture
+def cheap(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hashes that cost little; the tests that need it measure the real cost."""
+    monkeypatch.setattr(accounts, "LOG_N", 4)
+
+
+@pytest.fixture
+def known(cheap: None, tmp_path: Path) -> Accounts:
+    """Accounts A (reader) and O (operator)."""
+    made = Accounts(tmp_path / "web" / "accounts.json")
+    made.add("A", ["reader"], WORDS)
+    made.add("O", ["operator"], WORDS + " 2")
+    return made
+
+
+def browser(known: Accounts, sessions: Sessions | None = None) -> TestClient:
+    app = create_app(Options(hosts=frozenset({"gait.example"}), accounts=known, secure=True), sessions)
+    return TestClient(app, base_url=BASE, raise_server_exceptions=False, headers={"accept-language": "en"})
+
+
+def sign_in(client: TestClient, name: str = "A", password: str = WORDS, **headers: str):
+    return client.post("/enter", data={"name": name, "password": password}, headers=headers, follow_redirects=False)
+
+
+# ------------------------------------------------------------------------------------------------------------ passwords
+def test_a_hash_is_salted_memory_hard_and_of_its_password_alone(tmp_path: Path):
+    start = time.perf_counter()
+    stored = accounts.hashed(WORDS)
+    seconds = time.perf_counter() - start
+    kind, log_n, r, p, *_ = stored.split("$")
+    assert (kind, 128 * 2 ** int(log_n) * int(r), p) == ("scrypt", 128 * 2**20, "1")  # 128 MiB a guess
+    assert seconds > 0.05
+    assert accounts.matches(WORDS, stored)
+    assert not accounts.matches(WORDS + " ", stored)
+    assert stored != accounts.hashed(WORDS)
+    umlaut = accounts.hashed("Stra\u00dfenk\u00fcnstler im Regen", 4)
+    assert accounts.matches("Stra\u00dfenku\u0308nstler im Regen", umlaut)  # composed of two signs
+
+
+def test_the_file_is_for_its_account_alone_and_has_no_password(known: Accounts):
+    text = known.path.read_text()
+    assert WORDS not in text
+    assert known.path.stat().st_mode & 0o777 == 0o600
+    assert known.path.parent.stat().st_mode & 0o777 == 0o700
+    known.path.chmod(0o644)
+    with pytest.raises(PblError, match="chmod 600"):
+        Accounts(known.path).all()
+    known.path.chmod(0o600)
+    known.path.write_text("{")
+    with pytest.raises(PblError, match="restore the file") as error:
+        Accounts(known.path).all()
+    assert error.value.code == "WEB_ACCOUNT"
+
+
+@pytest.mark.parametrize(
+    ("name", "roles", "password", "said"),
+    [
+        ("A", ["reader"], WORDS, "an account 'A'"),
+        ("", ["reader"], WORDS, "the name"),
+        ("a\nb", ["reader"], WORDS, "the name"),
+        ("../x", ["reader"], WORDS, "the name"),
+        ("<b>", ["reader"], WORDS, "the name"),
+        ("B", ["admin"], WORDS, "roles admin"),
+        ("B", [], WORDS, "roles none"),
+        ("B", ["reader"], "short", "a password of 5 characters"),
+    ],
+)
+def test_accounts_that_cannot_be(known: Accounts, name: str, roles: list[str], password: str, said: str):
+    before = known.path.read_bytes()
+    with pytest.raises(PblError, match=re.escape(said)) as error:
+        known.add(name, roles, password)
+    assert error.value.code == "WEB_ACCOUNT"
+    assert password not in str(error.value) or password == WORDS
+    assert known.path.read_bytes() == before
+
+
+def test_the_commands(cheap: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("PBL_HOME", str(tmp_path))
+    run = lambda *args, **more: CliRunner().invoke(web, ["account", *args], **more)  # noqa: E731
+    typed = f"{WORDS}\n{WORDS}\n"
+    done = run("add", "R.Viewer", "--role", "reviewer", "--role", "operator", input=typed)
+    assert done.exit_code == 0, done.output
+    assert WORDS not in done.output
+    assert Accounts().all()["R.Viewer"].roles == ("reviewer", "operator")
+    assert run("add", "B", input=typed).exit_code == 2  # a role has to be said
+    assert "R.Viewer" in run("list").output
+    assert run("password", "R.Viewer", input="another pass phrase\nanother pass phrase\n").exit_code == 0
+    assert Accounts().check("R.Viewer", WORDS) is None
+    assert isinstance(run("remove", "nobody").exception, PblError)
+    assert run("remove", "R.Viewer").exit_code == 0
+    assert Accounts().all() == {}
+
+
+def test_a_backup_has_no_accounts(tables: None, tmp_path: Path, cheap: None):
+    from schemas.backup import backup
+
+    Accounts().add("A", ["reader"], WORDS)
+    try:
+        kept = Accounts().all()["A"].password
+        backup(tmp_path / "saved")
+        for path in (tmp_path / "saved").rglob("*"):
+            assert "account" not in path.name
+            assert not path.is_file() or kept.encode() not in path.read_bytes()
+    finally:
+        Accounts().remove("A")
+
+
+# ------------------------------------------------------------------------------------------------------------- sessions
+def test_the_way_in_and_out(known: Accounts, tables: None):
+    client = browser(known)
+    assert client.get("/visits").status_code == 401
+    assert "<form" in client.get("/visits").text
+    assert "pbl web prints" not in client.get("/visits").text  # links are no way in here
+    key = client.app.state.sessions.new_link("X", "reviewer")  # type: ignore[attr-defined]
+    assert client.get(f"/enter?key={key}", follow_redirects=False).status_code == 200
+    assert client.get("/visits").status_code == 401
+    for name, password in (("A", "wrong password words"), ("nobody", WORDS), ("", ""), ("A", "x" * 300)):
+        answer = sign_in(client, name, password)
+        assert answer.status_code == 401
+        assert "do not belong together" in answer.text
+        client.app.state.way_in.attempts._failures.clear()  # type: ignore[attr-defined]
+    answer = sign_in(client)
+    assert (answer.status_code, answer.headers["location"]) == (303, "/")
+    cookie = answer.headers["set-cookie"].lower()
+    assert cookie.startswith("__host-pbl_session=")
+    assert all(part in cookie for part in ("secure", "httponly", "samesite=strict", "path=/"))
+    assert "domain" not in cookie
+    page = client.get("/visits")
+    assert page.status_code == 200
+    assert page.headers["strict-transport-security"]
+    assert client.get("/operate").status_code == 403  # A is a reader
+    token = re.findall(r'name="token" value="([^"]+)"', page.text)[0]
+    kept = client.cookies["__Host-pbl_session"]
+    client.post("/leave", data={"token": token}, follow_redirects=False)
+    client.cookies.set("__Host-pbl_session", kept)
+    assert client.get("/visits").status_code == 401
+
+
+def test_a_session_is_never_the_browsers_choice_and_the_old_one_ends(known: Accounts, tables: None):
+    client = browser(known)
+    client.cookies.set("__Host-pbl_session", "planted")
+    answer = sign_in(client)
+    assert answer.status_code == 303
+    first = answer.headers["set-cookie"].partition("=")[2].partition(";")[0]
+    assert "planted" not in first
+    sessions = client.app.state.sessions  # type: ignore[attr-defined]
+    assert sessions.find("planted") is None
+    client.cookies.clear()
+    client.cookies.set("__Host-pbl_session", first)
+    assert sign_in(client, "O", WORDS + " 2").status_code == 303
+    assert sessions.find(first) is None  # another person at the same browser is not in the session of the one before
+
+
+def test_a_session_ends_by_itself_and_with_its_account(known: Accounts, tables: None):
+    now = [0.0]
+    sessions = Sessions(clock=lambda: now[0], idle_hours=IDLE_HOURS, still=known.current)
+    client = browser(known, sessions)
+    sign_in(client)
+    for _ in range(3):  # each request keeps it
+        now[0] += 3600 * IDLE_HOURS - 1
+        assert client.get("/visits").status_code == 200
+    now[0] += 3600 * IDLE_HOURS + 1
+    assert client.get("/visits").status_code == 401
+    sign_in(client)
+    known.set_password("A", "another pass phrase")
+    assert client.get("/visits").status_code == 401
+    sign_in(client, "A", "another pass phrase")
+    assert client.get("/visits").status_code == 200
+    Accounts(known.path).remove("A")  # by another process
+    assert client.get("/visits").status_code == 401
+
+
+def test_a_form_elsewhere_signs_nobody_in(known: Accounts):
+    client = browser(known)
+    for headers in ({"origin": "https://evil.example"}, {"origin": "null"}, {"sec-fetch-site": "cross-site"}):
+        assert sign_in(client, **headers).status_code == 403
+    assert sign_in(client, origin=BASE).status_code == 303
+    assert client.get("/visits", headers={"host": "127.0.0.1"}).status_code == 400
+    assert client.get("/visits", headers={"host": "gait.example.evil"}).status_code == 400
+
+
+def test_a_file_that_is_damaged_meanwhile_lets_nobody_in(known: Accounts, tables: None):
+    client = browser(known)
+    sign_in(client)
+    known.path.write_text("{}")
+    assert client.get("/visits").status_code in (401, 500)
+    assert sign_in(browser(known)).status_code == 409
+
+
+# ------------------------------------------------------------------------------------------------------------ guessing
+def test_who_guesses_waits_twice_as_long_each_time():
+    now = [0.0]
+    attempts = Attempts(clock=lambda: now[0])
+    waits = []
+    for _ in range(12):
+        now[0] += attempts.wait_s("A", "192.0.2.1")
+        attempts.failed("A", "192.0.2.1")
+        waits.append(attempts.wait_s("A", "192.0.2.1"))
+    assert waits == [0, 0, 1, 2, 4, 8, 16, 32, 60, 60, 60, 60]
+    assert attempts.wait_s("A", "198.51.100.1") == 60  # the account, from wherever
+    assert attempts.wait_s("B", "198.51.100.1") == 0
+    for i in range(30):  # many accounts from one address
+        attempts.failed(f"person{i}", "192.0.2.1")
+    assert attempts.wait_s("B", "192.0.2.1") == 900
+    attempts.succeeded("A", "192.0.2.1")
+    assert attempts.wait_s("A", "198.51.100.1") == 0
+    assert attempts.wait_s("B", "192.0.2.1") == 900  # an account of one's own does not clear the address
+    now[0] += Attempts.FORGOTTEN_S + 901
+    attempts.failed("B", "192.0.2.1")
+    assert attempts.wait_s("B", "192.0.2.1") == 0
+
+
+def test_an_ipv6_network_counts_as_one_address_and_memory_is_bounded():
+    attempts = Attempts(clock=lambda: 0.0)
+    for i in range(20):
+        attempts.failed(f"n{i}", f"2001:db8:0:1::{i:x}")
+    assert attempts.wait_s("B", "2001:db8:0:1:ffff::1") > 0
+    assert attempts.wait_s("B", "2001:db8:0:2::1") == 0
+    for i in range(Attempts.MOST):
+        attempts.failed(f"x{i}", f"10.0.{i // 256}.{i % 256}")
+    assert len(attempts._failures) <= Attempts.MOST
+
+
+def test_the_page_refuses_before_it_compares(known: Accounts, monkeypatch: pytest.MonkeyPatch):
+    client = browser(known)
+    for _ in range(3):
+        assert sign_in(client, "A", "wrong password words").status_code == 401
+    monkeypatch.setattr(Accounts, "check", lambda *_: pytest.fail("it was compared"))
+    late = sign_in(client)
+    assert late.status_code == 429
+    assert int(late.headers["retry-after"]) >= 1
+    assert "Try again in" in late.text
+
+
+def test_an_unknown_name_takes_as_long_as_a_known_one(known: Accounts, monkeypatch: pytest.MonkeyPatch):
+    asked = []
+    key = accounts._key
+    monkeypatch.setattr(accounts, "_key", lambda *a: asked.append(a[2:]) or key(*a))
+    known.check("A", "wrong password words")
+    known.check("nobody", "wrong password words")
+    assert asked[0] == asked[1]
+
+
+# --------------------------------------------------------------------------------------------- where other machines are
+@pytest.mark.parametrize(
+    ("where", "code", "said"),
+    [
+        (Where("0.0.0.0"), "WEB_TLS", "without TLS"),
+        (Where("192.0.2.1", hostnames=("gait.example",)), "WEB_TLS", "without TLS"),
+        (Where("0.0.0.0", tls_cert=Path("c")), "USAGE", "--tls-key"),
+        (Where("0.0.0.0", tls_cert=Path("c"), tls_key=Path("k"), behind_proxy="127.0.0.1"), "USAGE", "--tls-key"),
+        (Where("0.0.0.0", behind_proxy="127.0.0.1"), "USAGE", "--hostname"),
+        (Where("127.0.0.1", behind_proxy="127.0.0.1"), "USAGE", "--hostname"),
+        (Where("0.0.0.0", behind_proxy="proxy", hostnames=("gait.example",)), "USAGE", "--behind-proxy proxy"),
+        (Where("192.0.2.1", tls_cert=Path("none"), tls_key=Path("none")), "WEB_TLS", "as PEM"),
+    ],
+)
+def test_what_is_not_safe_is_not_served(where: Where, code: str, said: str):
+    with pytest.raises(PblError, match=re.escape(said)) as error:
+        serve(where)
+    assert error.value.code == code
+
+
+def test_without_accounts_nobody_could_sign_in(tmp_path: Path):
+    where = Where("127.0.0.1", 0, behind_proxy="127.0.0.1", hostnames=("gait.example",))
+    with pytest.raises(PblError, match="pbl web account add") as error:
+        serve(where, accounts=Accounts(tmp_path / "accounts.json"))
+    assert error.value.code == "WEB_ACCOUNT"
+
+
+def test_this_machine_alone_needs_neither():
+    Where().check()
+    assert Where().names == {"127.0.0.1", "localhost", "::1"}
+    assert not Where().by_accounts
+
+
+@contextlib.contextmanager
+def running(app: Any, where: Where) -> Iterator[int]:
+    """The page by a server of its own; its port."""
+    listening = socket.create_server((where.host, 0))
+    server = uvicorn.Server(config(app, where))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+    thread.start()
+    try:
+        yield listening.getsockname()[1]
+    finally:
+        server.should_exit = True
+        thread.join(10)
+
+
+def asked(connection: socket.socket, host: str = "gait.example", more: str = "") -> bytes:
+    connection.settimeout(10)
+    connection.sendall(f"GET /visits HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n{more}\r\n".encode())
+    parts = []
+    while part := connection.recv(65536):
+        parts.append(part)
+    return b"".join(parts)
+
+
+def test_tls_is_spoken_and_nothing_else(known: Accounts, tmp_path: Path):
+    cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+    made = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", key, "-out", cert, "-days", "2",
+            "-subj", "/CN=gait.example", "-addext", "subjectAltName=DNS:gait.example"]  # fmt: skip
+    try:
+        subprocess.run(made, check=True, capture_output=True)
+    except FileNotFoundError:
+        pytest.skip("no openssl on this machine")
+    where = Where("127.0.0.1", 0, cert, key, hostnames=("gait.example",))
+    where.check()
+    app = create_app(Options(hosts=where.names, accounts=known, secure=True))
+    with running(app, where) as port:
+        context = ssl.create_default_context(cafile=str(cert))
+        plain = socket.create_connection(("127.0.0.1", port))
+        with context.wrap_socket(plain, server_hostname="gait.example") as secure:
+            assert secure.version() in ("TLSv1.2", "TLSv1.3")
+            assert b"401" in asked(secure).split(b"\r\n", 1)[0]
+        with socket.create_connection(("127.0.0.1", port)) as plain, contextlib.suppress(ConnectionError):
+            assert b"HTTP/1.1" not in asked(plain)
+
+
+def test_only_the_proxy_is_answered_and_believed(known: Accounts):
+    app = create_app(Options(hosts=frozenset({"gait.example"}), accounts=known, secure=True))
+    elsewhere = Where("127.0.0.1", behind_proxy="192.0.2.0/24", hostnames=("gait.example",))
+    with running(app, elsewhere) as port, socket.create_connection(("127.0.0.1", port)) as other:
+        answer = b""
+        with contextlib.suppress(ConnectionError):
+            answer = asked(other)
+        assert answer == b""
+    seen = []
+
+    async def tell(scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] == "http":
+            seen.append(scope["client"][0])
+        await app(scope, receive, send)
+
+    forged = "X-Forwarded-For: 198.51.100.7\r\n"
+    for where, expected in (
+        (Where("127.0.0.1", behind_proxy="127.0.0.1", hostnames=("gait.example",)), "198.51.100.7"),
+        (Where("127.0.0.1", hostnames=("gait.example",)), "127.0.0.1"),
+    ):
+        with running(tell, where) as port, socket.create_connection(("127.0.0.1", port)) as client:
+            asked(client, more=forged)
+        assert seen[-1] == expected
+
+
+# -------------------------------------------------------------------------------------------------------- slow clients
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """A page that waits for half a second."""
+    monkeypatch.setattr(connections, "HEAD_S", 0.5)
+    monkeypatch.setattr(connections, "TAKE_S", 0.5)
+
+    async def large(scope: Any, receive: Any, send: Any) -> None:
+        assert scope["type"] != "websocket"
+        if scope["type"] != "http":
+            return
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        for _ in range(400 if scope["path"] == "/large" else 1):
+            await send({"type": "http.response.body", "body": b"x" * 65536, "more_body": True})
+        await send({"type": "http.response.body", "body": b"", "more_body": False})
+
+    with running(large, Where()) as port:
+        yield port
+
+
+def _closed_after(connection: socket.socket, drip: bytes) -> float:
+    """Seconds until the other side closes, while it is sent a byte now and then."""
+    start = time.monotonic()
+    connection.settimeout(0.05)
+    while time.monotonic() - start < 5:
+        try:
+            if drip:
+                connection.sendall(drip)
+            if connection.recv(1) == b"":
+                break
+        except TimeoutError:
+            continue
+        except ConnectionError:
+            break
+    return time.monotonic() - start
+
+
+@pytest.mark.parametrize("drip", [b"", b"x"])
+def test_a_request_that_never_ends_keeps_no_connection(impatient: int, drip: bytes):
+    with socket.create_connection(("127.0.0.1", impatient)) as slow:
+        if drip:
+            slow.sendall(b"GET / HTTP/1.1\r\nX: ")
+        with socket.create_connection(("127.0.0.1", impatient)) as quick:  # others are served meanwhile
+            assert b"200" in asked(quick)[:20]
+        assert _closed_after(slow, drip) < 2
+    with socket.create_connection(("127.0.0.1", impatient)) as again:  # nor does a second one on the same connection
+        again.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n")
+        time.sleep(0.2)
+        assert again.recv(1 << 20)
+        again.sendall(b"GET / HTTP/1.1\r\nX: ")
+        assert _closed_after(again, b"") < 2
+
+
+def test_an_answer_that_nobody_takes_is_given_up(impatient: int):
+    with socket.socket() as slow:
+        slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        slow.connect(("127.0.0.1", impatient))
+        slow.sendall(b"GET /large HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
+        time.sleep(1.5)
+        taken = 0
+        slow.settimeout(5)
+        with contextlib.suppress(ConnectionError):
+            while part := slow.recv(1 << 20):
+                taken += len(part)
+        assert taken < 400 * 65536
+    with socket.create_connection(("127.0.0.1", impatient)) as patient:
+        patient.settimeout(5)
+        patient.sendall(b"GET /large HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
+        taken = 0
+        while part := patient.recv(1 << 16):
+            taken += len(part)
+        assert taken > 400 * 65536  # who takes it gets all
+
+
+def test_one_address_does_not_take_all_connections(impatient: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys.modules[config.__module__], "_OF_ONE", 3)
+
+    async def nothing(scope: Any, receive: Any, send: Any) -> None:
+        return
+
+    with running(nothing, Where()) as port, contextlib.ExitStack() as stack:
+        held = [stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(4)]
+        time.sleep(0.2)
+        held[3].settimeout(0.2)
+        with contextlib.suppress(ConnectionError):
+            assert held[3].recv(1) == b""
+        held[0].settimeout(0.05)
+        with pytest.raises(TimeoutError):
+            held[0].recv(1)
+
+
+def test_no_name_of_a_person_gets_into_a_path_or_a_log(known: Accounts, tables: None, caplog: pytest.LogCaptureFixture):
+    lab.Subject.insert1({"subject": "P-SECRET", "population": "patient", "subject_created": utc_now()})
+    row = {"session_id": 1, "subject": "P-SECRET", "session_label": "x", "session_created": utc_now()}
+    session.Session.insert1(row)
+    client = browser(known)
+    sign_in(client, "my password by mistake", "A")
+    sign_in(client)
+    assert "P-SECRET" in client.get("/visits/1").text
+    assert "a failed sign-in from" in caplog.text
+    assert "mistake" not in caplog.text
+    assert WORDS not in caplog.text
+    assert "P-SECRET" not in caplog.text
