@@ -4,13 +4,15 @@
 
 Needs `pip install -e .[browser]` and a Chromium of the machine. Without a graphics processor the browser draws in
 software; the renderer is printed. Bar: 50 frames a second. "drawn" waits after each frame until it is finished;
-"shown" draws a frame each time the browser asks for one, which it does at most 60 times a second.
+"shown" draws a frame each time the browser asks for one, which it does at most 60 times a second; "processor_ms" is what a frame takes of all of the browser's
+processes together (mean of both), which says what idle processors would do where others compute, too.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
 import socket
 import threading
@@ -29,7 +31,7 @@ from pbl_pipeline.body import load_body
 from schemas.recording_page import RecordingFit
 from tests.walking_fit import walking_fit
 from workers.web import texts
-from workers.web.movement import body_json, movement_json
+from workers.web.movement import Movement
 
 PAGE = '<!doctype html><link rel="stylesheet" href="/static/page.css"><canvas></canvas>'
 DRAW = """
@@ -65,16 +67,16 @@ async ([width, height]) => {
 def app_of(n_frames: int) -> Starlette:
     """The page's scripts over a walk of so many frames."""
     body, files = load_body(), Path(texts.__file__).parent
-    found = RecordingFit(walking_fit(body.joint_names, body.sha256, n_frames=n_frames), (), (), None)
+    found = Movement.of(RecordingFit(walking_fit(body.joint_names, body.sha256, n_frames=n_frames), (), (), None))
 
     async def page(request: Request) -> Response:
         return HTMLResponse(PAGE)
 
     async def movement(request: Request) -> Response:
-        return Response(movement_json(found), media_type="application/json")
+        return Response(found.movement, media_type="application/json")
 
     async def numbers(request: Request) -> Response:
-        return Response(body_json(found)[1], media_type="application/octet-stream")
+        return Response(found.body, media_type="application/octet-stream")
 
     static = [Mount(f"/{name}", StaticFiles(directory=files / name)) for name in ("static", "vendor")]
     return Starlette(routes=[Route("/", page), Route("/movement", movement), Route("/body", numbers), *static])
@@ -94,6 +96,25 @@ def served(app: Starlette) -> Iterator[str]:
         thread.join()
 
 
+def processor_s() -> float:
+    """Seconds that all processes below this one, the browser's among them, have computed."""
+    parent, used = {}, {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            fields = stat.read_text().rpartition(")")[2].split()
+            pid = int(stat.parent.name)
+            parent[pid], used[pid] = int(fields[1]), (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def below(pid: int) -> bool:
+        while pid in parent:
+            pid = parent[pid]
+            if pid == os.getpid():
+                return True
+        return False
+
+    return sum(s for pid, s in used.items() if below(pid))
+
+
 @click.command()
 @click.option("--frames", default=2000, show_default=True)
 @click.option("--size", default=(1280, 720), show_default=True, type=(int, int))
@@ -105,7 +126,9 @@ def main(frames: int, size: tuple[int, int]) -> None:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": size[0], "height": size[1]})
         page.goto(address)
+        before = processor_s()
         found = page.evaluate(DRAW, list(size))
+        found["processor_ms"] = 1000 * (processor_s() - before) / (2 * frames)
         browser.close()
     click.echo(json.dumps({k: round(v, 1) if isinstance(v, float) else v for k, v in found.items()}))
 

@@ -21,7 +21,7 @@ from schemas.recording_page import RecordingFit
 from tests.walker import observe
 from tests.walking_fit import LEVEL_CAMERA_QUAT_WXYZ, walking_fit
 from workers.web import texts
-from workers.web.movement import body_json, movement_json, points_bytes
+from workers.web.movement import Movement, body_json
 
 STATIC = Path(texts.__file__).parent / "static"
 TESTS = Path(__file__).parent / "web_scripts"
@@ -82,10 +82,11 @@ def test_scripts_of_the_page(tmp_path: Path):
     for file in TESTS.glob("*.mjs"):
         shutil.copy(file, tmp_path)
     (tmp_path / "package.json").write_text('{"type": "module"}')
-    (tmp_path / "movement.json").write_bytes(movement_json(found))
-    (tmp_path / "body.bin").write_bytes(body_json(found)[1])
+    sent = Movement.of(found)
+    (tmp_path / "movement.json").write_bytes(sent.movement)
+    (tmp_path / "body.bin").write_bytes(sent.body)
     (tmp_path / "expected.json").write_text(json.dumps(discs_of(found.fit)))
-    (tmp_path / "points.bin").write_bytes(points_bytes(found))
+    (tmp_path / "points.bin").write_bytes(sent.points)
     seen = [[[*xy, c] for xy, c in zip(p, q, strict=True) if c > 0] for p, q in zip(*spelled(points), strict=True)]
     (tmp_path / "points.json").write_text(json.dumps(seen))
     (tmp_path / "root.json").write_text(json.dumps(np.nan_to_num(body_track(found.fit).root_m).tolist()))
@@ -109,9 +110,8 @@ def test_a_recording_without_a_camera_or_a_pose_is_sent_too():
     assert body["known"] == [[5, 79]]
     assert len(numbers) == 2 * 90 * (3 + 4 * len(body["sides"]) + 4)
     nobody = dataclasses.replace(fit, qpos=np.full_like(fit.qpos, np.nan))
-    body, _ = body_json(RecordingFit(nobody, (), (), None))
-    assert (body["known"], body["floor"]) == ([], None)
-    json.loads(movement_json(RecordingFit(nobody, (), (), None)))
+    sent = json.loads(Movement.of(RecordingFit(nobody, (), (), None)).movement)
+    assert (sent["body"]["known"], sent["body"]["floor"]) == ([], None)
 
 
 def test_the_floor_is_under_the_feet():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import collections
 import re
+from collections.abc import Hashable
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response
@@ -13,11 +15,13 @@ from pbl_pipeline.errors import PblError
 from schemas import choose, decide, recording_page
 
 from .find import number_of
-from .movement import body_json, movement_json, points_bytes
+from .movement import Movement
 from .pages import Pages
 from .tables import Tables
 from .videos import Videos
 
+#: Recordings whose movement is kept in memory at a time: some hundred kB each.
+_KEPT = 8
 _OWN = re.compile(r"/(visits|recordings)(/\d{1,10}(/enter)?)?|/operate")
 #: How browsers call a file by its ending; others are offered as MP4, and a browser that cannot play one says so.
 _KINDS = {".webm": "video/webm", ".mkv": "video/x-matroska", ".mov": "video/mp4", ".mp4": "video/mp4"}
@@ -41,29 +45,35 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
         path = await tables.ask(videos.path, number_of(request))
         return FileResponse(path, media_type=_KINDS.get(path.suffix.lower(), "video/mp4"))
 
-    async def fitted(request: Request) -> recording_page.RecordingFit:
-        about = await tables.ask(recording_page.recording_about, number_of(request))
-        if about.key is None:
-            raise PblError(
-                "DB_NOT_FOUND",
-                found=f"no fit of video_id {about.video_id}: {about.problem}",
-                expected="a recording to which a body is fitted",
-                next_step="`pbl populate`; `pbl why` says what stops it",
-            )
-        return await tables.ask(recording_page.recording_fit, about.key)
+    kept: collections.OrderedDict[Hashable, asyncio.Future[Movement]] = collections.OrderedDict()
+
+    async def prepared(request: Request) -> Movement:
+        """What a recording's page asks for, made once for the requests of several."""
+        number = number_of(request)
+        key = await tables.ask(_fitted, number)
+        if key not in kept:
+            kept[key] = asyncio.ensure_future(prepare(number))
+            while len(kept) > _KEPT:
+                kept.popitem(last=False)
+        kept.move_to_end(key)
+        try:
+            return await asyncio.shield(kept[key])
+        except Exception:
+            kept.pop(key, None)  # what was wrong may be put right
+            raise
+
+    async def prepare(number: int) -> Movement:
+        found = await tables.ask(_load, number)
+        return await asyncio.to_thread(Movement.of, found)
 
     async def movement(request: Request) -> Response:
-        found = await fitted(request)
-        return Response(await asyncio.to_thread(movement_json, found), media_type="application/json")
+        return Response((await prepared(request)).movement, media_type="application/json")
 
     async def body(request: Request) -> Response:
-        found = await fitted(request)
-        _, numbers = await asyncio.to_thread(body_json, found)
-        return Response(numbers, media_type="application/octet-stream")
+        return Response((await prepared(request)).body, media_type="application/octet-stream")
 
     async def points(request: Request) -> Response:
-        found = await fitted(request)
-        return Response(await asyncio.to_thread(points_bytes, found), media_type="application/octet-stream")
+        return Response((await prepared(request)).points, media_type="application/octet-stream")
 
     return [
         Route("/recordings/{number:int}", recording),
@@ -72,6 +82,25 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
         Route("/recordings/{number:int}/body", body),
         Route("/recordings/{number:int}/points", points),
     ]
+
+
+def _fitted(video_id: int) -> Hashable:
+    """What tells apart what was fitted to a recording. Raises `PblError` DB_NOT_FOUND where nothing was."""
+    about = recording_page.recording_about(video_id)
+    if about.key is None:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no fit of video_id {about.video_id}: {about.problem}",
+            expected="a recording to which a body is fitted",
+            next_step="`pbl populate`; `pbl why` says what stops it",
+        )
+    return recording_page.computed(about.key)
+
+
+def _load(video_id: int) -> recording_page.RecordingFit:
+    key = recording_page.trial_key(video_id)
+    assert key is not None, "_fitted raises"
+    return recording_page.recording_fit(key)
 
 
 def _people(about: recording_page.RecordingPage) -> tuple[list[choose.Candidates], list[str]]:

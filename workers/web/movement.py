@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from typing import Any
 
@@ -17,19 +18,34 @@ METRE_STEPS, TURN_STEPS, CAMERA_STEPS = 1000, 4096, 8192
 POINT_STEPS, _FAR_PX = 2, 4000.0
 
 
-def movement_json(found: RecordingFit) -> bytes:
+@dataclasses.dataclass(frozen=True)
+class Movement:
+    """What a recording's page asks for: `movement_json`, the numbers of `body_json`, `points_bytes`."""
+
+    movement: bytes
+    body: bytes
+    points: bytes
+
+    @classmethod
+    def of(cls, found: RecordingFit) -> Movement:
+        """All three. Raises as they do."""
+        body, numbers = body_json(found)
+        return cls(movement_json(found, body), numbers, points_bytes(found))
+
+
+def movement_json(found: RecordingFit, body: dict[str, Any]) -> bytes:
     """Times, joint angles with their 90 % half widths (deg), events, stance, and where a side is uncertain, as JSON.
 
     `time` (T) s; `curves`: name, by side `value` and `half` (T) deg, null where unknown; `events`: time, side, kind,
-    probability; `stance` and `uncertain`: by side, spans (from, to) in s; `body`: of `body_json`; `points`: how many
-    detected ones there are.
+    probability; `stance` and `uncertain`: by side, spans (from, to) in s; `body`: that of `body_json`; `points`: how many
+    there are.
     """
     from pbl_pipeline.gait import interval_90, leg_angles, leg_angles_sd
     from pbl_pipeline.render import stance_spans, uncertain_sides
     from pbl_pipeline.runs import runs
     from pbl_pipeline.words import ANGLES
 
-    fit, (body, _) = found.fit, body_json(found)
+    fit = found.fit
     one = interval_90(0.0, 1.0)
     assert one is not None
     angles, sd = leg_angles(fit), leg_angles_sd(fit)

@@ -97,7 +97,9 @@ export class Space {
     const lines = [];
     for (let i = -REACH_M; i <= REACH_M; i++) for (let j = -REACH_M; j < REACH_M; j++) lines.push(i, j, 0, i, j + 1, 0, j, i, 0, j + 1, i, 0);
     this.grid = new three.LineSegments(points(three, lines), new three.LineBasicMaterial());
-    this.path = new three.Line(points(three, roots.flatMap((r) => [r[0], r[1], 0.002])), new three.LineBasicMaterial());
+    const corners = [roots[0]];  // a point a hand's breadth after the other is enough
+    for (const r of roots) { const last = corners[corners.length - 1]; if (Math.hypot(r[0] - last[0], r[1] - last[1]) > 0.2) corners.push(r); }
+    this.path = new three.Line(points(three, corners.flatMap((r) => [r[0], r[1], 0.002])), new three.LineBasicMaterial());
     const arrow = [[0.45, 0.035], [0.75, 0.035], [0.75, 0.12], [1.05, 0], [0.75, -0.12], [0.75, -0.035], [0.45, -0.035]];
     const flat = [[0, 1, 5], [0, 5, 6], [2, 3, 4]].flat().flatMap((i) => [...arrow[i], 0.004]);
     this.arrow = new three.Mesh(points(three, flat), new three.MeshBasicMaterial({ side: 2 }));
