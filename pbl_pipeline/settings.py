@@ -26,6 +26,8 @@ VARIABLES: dict[str, str] = {
     "PBL_BACKUP": "folder of the regular backups (database, store, recordings), for pbl cron backup",
     "PBL_DEIDENTIFY": "blur, pixelate or skeleton: overlays and reports show recordings with hidden heads, and workers "
     "compute these (default: off)",
+    "PBL_AUDIT_LOOKS": "1: each look at a recording in pbl web is a row of review.Viewing, and without it nothing is "
+    "shown",
     "PBL_S3_ENDPOINT": "address of an object store (S3, MinIO) that holds arrays instead of a folder",
     "PBL_S3_BUCKET": "its bucket (default: pbl)",
     "PBL_S3_KEY": "its access key; or PBL_S3_KEY_FILE, a file with it",
@@ -75,6 +77,11 @@ def deidentify_how() -> str:
             next_step="correct the environment variable",
         )
     return how
+
+
+def audit_looks() -> bool:
+    """True where each look at a recording in the review page has to leave a row."""
+    return os.environ.get("PBL_AUDIT_LOOKS", "") not in ("", "0")
 
 
 def offline() -> bool:

@@ -1,4 +1,5 @@
-"""What people decided on the review page. Rows are added, never changed; `schemas.decide` writes them."""
+"""What people decided and looked at on the review page. Rows are added, never changed; `schemas.decide` and
+`schemas.viewings` write them."""
 
 from __future__ import annotations
 
@@ -23,4 +24,18 @@ class Decision(dj.Manual):
     decision_before     : json                 # what was before, likewise
     decision_after      : json                 # what was decided, likewise
     decision_reason=''  : varchar(500)         # why, in the person's words; no names
+    """
+
+
+@schema
+class Viewing(dj.Manual):
+    definition = """
+    # a look at a recording, or at files of a visit, on the review page, where PBL_AUDIT_LOOKS asks for these rows
+    viewing_id   : int32
+    ---
+    -> [nullable] session.Session
+    -> [nullable] video.Video
+    viewing_what : varchar(16)                 # page, video, body, overlay, report, export, ...
+    viewing_by   : varchar(64)                 # name of who looked, as the page knows it
+    viewing_at   : datetime                    # when, UTC; of what is asked for again and again, once in ten minutes
     """

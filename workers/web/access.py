@@ -199,7 +199,8 @@ class Gate:
     refuse
         Makes the answer for a request that may not pass, from its reason: "host", "session", "token".
     open_paths
-        Beginnings of paths that need no session: the way in, and the files of the page itself, which say nothing.
+        Paths that need no session, or their beginnings where they end with "/": the way in, and the files of the page
+        itself, which say nothing.
     """
 
     def __init__(
@@ -244,8 +245,8 @@ class Gate:
         request.state.session = session
         if request.method not in ("GET", "HEAD") and not _from_here(headers):
             return "token"
-        path = request.url.path
-        if path == "/" or path.startswith(self._open):
+        path = request.scope["path"]  # as the routes see it
+        if path == "/" or any(path.startswith(p) if p.endswith("/") else path == p for p in self._open):
             return ""
         if session is None:
             return "session"

@@ -17,10 +17,12 @@ from starlette.responses import RedirectResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
+from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
 from . import access, compare, decide, drawn, entry, find, look, operate, people, take, way_in
 from .accounts import Accounts, Attempts
+from .looks import Looks
 from .making import Making
 from .pages import Pages
 from .tables import Tables
@@ -84,7 +86,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
 
     async def coded(request: Request, error: Exception) -> Response:
         assert isinstance(error, PblError)
-        return pages.error(request, error, STATUS.get(error.code, 409))
+        return failed(request, error)
 
     async def missing(request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)
@@ -93,6 +95,10 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
     async def unforeseen(request: Request, error: Exception) -> Response:
         return pages.unforeseen(request)
 
+    def failed(request: Request, error: PblError) -> Response:
+        return pages.error(request, error, STATUS.get(error.code, 409))
+
+    audit = [Middleware(Looks, tables=tables, failed=failed)] if settings.audit_looks() else []
     app = Starlette(
         routes=[
             Route("/", home),
@@ -125,6 +131,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
                 open_paths=("/enter", "/static/", "/vendor/"),
                 cookie=way.cookie,
             ),
+            *audit,
             Middleware(GZipMiddleware, minimum_size=1000),
         ],
         lifespan=life,

@@ -1,0 +1,27 @@
+"""Who looked at which recording: rows that the review page writes where PBL_AUDIT_LOOKS asks for them."""
+
+from __future__ import annotations
+
+from . import session, video
+from .ingest import in_transaction, next_id
+from .review import Viewing
+from .rows import utc_now
+
+
+def record_viewing(of: str, number: int, what: str, by: str) -> None:
+    """Insert a row of Viewing. Nothing happens for a number that there is not.
+
+    Parameters
+    ----------
+    of, number
+        "video_id" or "session_id", and which.
+    what
+        What of it is looked at, such as "video" or "report".
+    by
+        Name of who looks.
+    """
+    table = {"video_id": video.Video, "session_id": session.Session}[of]
+    if not table & {of: number}:
+        return
+    row = {of: number, "viewing_what": what[:16], "viewing_by": by[:64], "viewing_at": utc_now()}
+    in_transaction(lambda: Viewing.insert1({"viewing_id": next_id(Viewing, "viewing_id"), **row}))

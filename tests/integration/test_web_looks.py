@@ -1,0 +1,78 @@
+"""A row for each look at a recording, where that is asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from schemas import embedded, forget, session, video
+from schemas.review import Viewing
+from tests.integration import web
+from tests.integration.chain import small_video
+from tests.rows import register
+from workers.web import looks
+
+
+@pytest.fixture
+def audited(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
+    """A video, and a page that has to write looks down."""
+    monkeypatch.setenv("PBL_AUDIT_LOOKS", "1")
+    return register(small_video(tmp_path, "walk"), session_label="2026-01-10")[0]
+
+
+def rows() -> list[tuple[Any, ...]]:
+    found = Viewing().to_dicts(order_by="viewing_id")
+    return [(r["viewing_by"], r["viewing_what"], r["video_id"], r["session_id"]) for r in found]
+
+
+def test_each_look_is_a_row_before_anything_is_shown(audited: int, monkeypatch: pytest.MonkeyPatch):
+    browser = web.client(name="A. First")
+    assert browser.get("/visits").status_code == browser.get("/visits/1").status_code == 200
+    assert rows() == []  # measures are no look at a recording
+    for _ in range(2):
+        assert browser.get(f"/recordings/{audited}").status_code == 200
+    assert rows() == [("A. First", "page", audited, None)] * 2
+    for part in ("bytes=0-9", "bytes=10-19"):
+        assert browser.get(f"/recordings/{audited}/video", headers={"range": part}).status_code == 206
+    assert rows()[2:] == [("A. First", "video", audited, None)]
+    web.client(name="B. Second").head(f"/recordings/{audited}/video")
+    assert rows()[3:] == [("B. Second", "video", audited, None)]
+    browser.get("/visits/1/export")
+    browser.get("/visits/1/enter")
+    assert rows()[4:] == [("A. First", "export", None, 1)]
+    monkeypatch.setattr(looks, "AGAIN_S", 0.0)  # later it is another look
+    browser.get(f"/recordings/{audited}/video")
+    assert len(rows()) == 6
+    of_person = session.Session & {"subject": "P001"}  # as docs/web.md has it
+    assert len(Viewing & [(video.Video & of_person.proj()).proj(), of_person.proj()]) == 6
+    assert not forget.forget("P001").left
+    assert rows() == []
+    forget.manifest_path("P001").unlink()
+
+
+def test_no_row_for_what_there_is_not_or_nobody_saw(audited: int, monkeypatch: pytest.MonkeyPatch):
+    assert web.client(signed_in=False).get(f"/recordings/{audited}/video").status_code == 401
+    assert web.client("operator").get(f"/recordings/{audited}/video").status_code == 403
+    assert web.client().get("/recordings/999/video").status_code == 404
+    assert web.client().get(f"/recordings/{10**30}/video").status_code == 404
+    assert rows() == []
+    monkeypatch.setenv("PBL_AUDIT_LOOKS", "0")
+    assert web.client().get(f"/recordings/{audited}/video").status_code == 200
+    assert rows() == []
+
+
+def test_what_cannot_be_written_down_is_not_shown(audited: int, monkeypatch: pytest.MonkeyPatch):
+    browser = web.client()
+    browser.get(f"/recordings/{audited}/video")
+    embedded.stop()
+    try:
+        answer = browser.get(f"/recordings/{audited}")
+        assert answer.status_code == 503
+        assert "DB_NOT_RUNNING" in answer.text
+        assert answer.headers["content-security-policy"]
+    finally:
+        embedded.start()
+    assert browser.get(f"/recordings/{audited}").status_code == 200
+    assert [r[1] for r in rows()] == ["video", "page"]
