@@ -46,6 +46,7 @@ CODES: dict[str, str] = {
     "FIT_DIVERGED": "the optimisation ended in values that are not finite",
     "SOLVER_UNKNOWN": "no solver or paramset has that name",
     "GAIT_INPUT": "the trajectories cannot be searched for gait events",
+    "EVENTS_IMPLAUSIBLE": "gait events that were set by hand cannot be those of walking",
     "REFERENCE_INPUT": "fit and reference cannot be compared: no common time, joint or frames",
     "ANGLE_UNITS": "joint angles are not in degrees",
     "NORM_UNKNOWN": "no normative set has that name",

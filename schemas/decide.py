@@ -9,12 +9,14 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 
-from . import fit, qc, session, tracking, video
+from . import fit, qc, session, tracking, usable, video
 from .choose import choice_applied, selection_of
 from .ingest import next_id
 from .jobs import jobs_of
+from .plan import locked, plan_anew, queues_before_fit
 from .review import Decision
 from .rows import utc_now
+from .usable import Unusable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +44,8 @@ def decisions(session_id: int) -> tuple[Decided, ...]:
 def person_state(video_id: int, tracking_method: str) -> str:
     """What is shown of the choice in a video: another text after each decision, also one by `pbl choose`."""
     key = {"video_id": video_id, "tracking_method": tracking_method}
-    last = max((int(n) for n in (Decision & {"video_id": video_id}).to_arrays("decision_id")), default=0)
+    of_person = Decision & {"video_id": video_id, "decision_what": "person"}
+    last = max((int(n) for n in of_person.to_arrays("decision_id")), default=0)
     by_hand = (tracking.SubjectOverride & key).to_arrays("override_person_id")
     chosen = (tracking.SubjectChoice & key).to_arrays("chosen_person_id")
     return f"{last}-{by_hand[0] if len(by_hand) else ''}-{chosen[0] if len(chosen) else ''}"
@@ -74,12 +77,89 @@ def decide_person(video_id: int, tracking_method: str, person: int, by: str, see
         table = video.Video.full_table_name  # who decides at the same moment waits here
         connection.query(f"SELECT video_id FROM {table} WHERE video_id = %s FOR UPDATE", args=(video_id,))  # noqa: S608
         if person_state(video_id, tracking_method) != seen:
-            raise _meanwhile(video_id)
+            raise meanwhile(video_id, "person")
         rows = (tracking.SubjectChoice & selection).to_dicts()
         before = {"status": rows[0]["choice_status"], "person": rows[0]["chosen_person_id"]} if rows else {}
         deleted = choice_applied(selection, person, failed)
         record("person", by, {"tracking_method": tracking_method}, before, {"person": person}, video_id=video_id)
     return deleted
+
+
+def usable_state(video_id: int) -> str:
+    """What is shown of the mark of a recording: another text after each decision."""
+    last = (Decision & {"video_id": video_id, "decision_what": "usable"}).to_arrays("decision_id")
+    marked = (video.NotUsable & {"video_id": video_id}).to_dicts()
+    return f"{max(map(int, last), default=0)}-{marked[0]['unusable_reason'] if marked else ''}"
+
+
+def mark_not_usable(video_id: int, reason: str, note: str = "", by: str = "", seen: str | None = None) -> None:
+    """Leave a recording out, with a row of Decision: one transaction.
+
+    Where several cameras filmed the trial, all of its videos are marked. Sets of fits that hold it cease to be current,
+    and the session is planned without it: exactly what depends on it is pending. Nothing is deleted, so taking it back
+    brings back what was computed; frozen slices stay as they are.
+
+    Parameters
+    ----------
+    reason, note
+        One of `video.UNUSABLE_REASONS`, and more in free words (no names), which "other" asks for.
+    by
+        Name of who decides.
+    seen
+        `usable_state` of the page on which it was decided; None: whatever it is.
+
+    Raises
+    ------
+    PblError
+        USAGE for a reason that there is not, or "other" without words; DB_NOT_FOUND for an unknown recording;
+        DECIDED_MEANWHILE where `seen` is another state than the tables'.
+    """
+    note = " ".join(note.split())[:500]
+    if reason not in video.UNUSABLE_REASONS or (reason == "other" and not note):
+        raise PblError(
+            "USAGE",
+            found="the reason 'other' without words" if reason == "other" else f"the reason {reason!r}",
+            expected="one of " + ", ".join(video.UNUSABLE_REASONS) + "; with 'other' also words of your own",
+            next_step="choose a reason, and say more in the note; nothing was changed",
+            key=f"video_id={video_id}",
+        )
+    _decide_usable(video_id, {"unusable_reason": reason, "unusable_note": note, "unusable_by": by[:64]}, by, seen)
+
+
+def take_back(video_id: int, by: str = "", seen: str | None = None) -> None:
+    """Use a recording again that was marked as not usable, with a row of Decision: one transaction.
+
+    The session is planned with it again; what was computed with it before is there at once. Not marked: nothing
+    happens. Raises `PblError` as `mark_not_usable`.
+    """
+    _decide_usable(video_id, None, by, seen)
+
+
+def _decide_usable(video_id: int, mark: dict[str, str] | None, by: str, seen: str | None) -> None:
+    rows = (video.Video & {"video_id": video_id}).to_dicts()
+    if not rows:
+        raise video.unknown_video(video_id)
+    session_id = int(rows[0]["session_id"])
+    failed = queues_before_fit()
+    with locked(session_id):
+        if seen is not None and usable_state(video_id) != seen:
+            raise meanwhile(video_id, "usable")
+        before = usable.unusable([video_id]).get(video_id)
+        if mark is None and before is None:
+            return
+        # Of several cameras all: their trial is fitted with every view or not at all.
+        views = [{"video_id": v} for v in fit.videos_of(fit.trial_of(video_id))]
+        (video.NotUsable & views).delete_quick()
+        if mark is not None:
+            video.NotUsable.insert({**view, **mark, "unusable_created": utc_now()} for view in views)
+        after = usable.unusable([video_id]).get(video_id)
+        reason = after.note if after else ""
+        record("usable", by, {}, _said(before), _said(after), reason, video_id=video_id)
+        plan_anew(session_id, failed)
+
+
+def _said(mark: Unusable | None) -> dict[str, str]:
+    return {"usable": "yes"} if mark is None else {"usable": "no", "why": mark.reason}
 
 
 def accept_check(key: Mapping[str, Any], number: int, by: str, reason: str = "") -> None:
@@ -166,13 +246,18 @@ def _decided(row: Mapping[str, Any]) -> Decided:
     return Decided(int(row["decision_id"]), **parts, video_id=None if number is None else int(number))
 
 
-def _meanwhile(video_id: int) -> PblError:
-    rows = (Decision & {"video_id": video_id}).to_dicts(order_by="decision_id DESC", limit=1)
+def meanwhile(video_id: int, what: str) -> PblError:
+    """DECIDED_MEANWHILE: the kind of decision about a recording was made, or what is decided about computed, since the
+    page was loaded."""
+    about = {"video_id": video_id, "decision_what": what}
+    rows = (Decision & about).to_dicts(order_by="decision_id DESC", limit=1)
     last = rows[0] if rows else None
+    after = {} if last is None else last["decision_after"]
+    said = ", ".join(f"{k} {v}" for k, v in after.items() if not isinstance(v, list))
     who = (
-        f"{last['decision_by']} decided for person {last['decision_after'].get('person')} at {last['decision_at']} UTC"
+        f"{last['decision_by']} decided for {said} at {last['decision_at']} UTC"
         if last
-        else "the choice was made or computed anew"
+        else "what is decided about was made or computed anew"
     )
     return PblError(
         "DECIDED_MEANWHILE",

@@ -10,6 +10,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
 
 from . import fit, gdi, keypoints, session, video
+from . import gait as gait_tables
 from .archive import plain_name
 from .method_names import with_keys
 from .report import methods_of
@@ -80,7 +81,8 @@ def visits_of_tables(restriction: Mapping[str, Any], slice_name: str | None = No
         (r["fit_set"], r["fit_method"]): r for r in fits.to_dicts(order_by="subject, session_id, fit_set, fit_method")
     }
     measured: dict[tuple, list[dict[str, Any]]] = {}
-    for row in (gdi.SessionGdi.proj() & sets.proj() & restriction).to_dicts(order_by="KEY"):
+    of_sets = (gdi.SessionGdi.proj() & sets.proj() & restriction).to_dicts(order_by="KEY")
+    for row in gait_tables.without_uncorrected(of_sets):
         measured.setdefault((row["fit_set"], row["fit_method"]), []).append(row)
     visits = [{**row, **more} for key, row in found.items() for more in measured.get(key, [{}])]
     if not visits:

@@ -110,7 +110,7 @@ class TrialInput(dj.Computed):
         trials = video.RigView.proj(view_video_id="video_id", video_id="rig_trial")
         unseen = (trials * keypoints.Keypoints.proj()).proj() - of_view
         others = (video.RigView & "video_id != rig_trial").proj()
-        return (((keypoints.Keypoints.proj() * FitMethod.proj()) & planned) - others) - unseen
+        return (((keypoints.Keypoints.proj() * FitMethod.proj()) & planned) - others) - unseen - video.NotUsable
 
     @staticmethod
     def with_trials(keys: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

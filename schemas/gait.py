@@ -10,7 +10,7 @@ import numpy as np
 
 from pbl_pipeline import methods
 
-from . import fit, session  # noqa: F401  a definition refers to session
+from . import fit, keypoints, session, video  # noqa: F401  a definition refers to video
 from ._datajoint import dj
 from .checks import check_columns, check_row
 from .method_rows import method_columns, method_row
@@ -20,6 +20,7 @@ from .stored_files import file_ref, new_folder, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib
+    from pbl_pipeline.fit import TrialFit
 
 schema = dj.Schema()
 
@@ -58,6 +59,109 @@ class GaitPlan(dj.Manual):
     -> session.Session
     -> GaitEventMethod
     """
+
+
+@schema
+class HandEvents(dj.Manual):
+    definition = """
+    # events of a trial as a person corrected them; the methods by-hand take them where the same person is measured
+    -> video.Video
+    ---
+    -> GaitEventMethod.proj(hand_from='gait_method')  # the automatic method that it began from
+    hand_changed       : int16                 # events that were moved, added or taken away
+    hand_tracking=null : varchar(48)           # tracking_method in which the measured person has its number, null for markers
+    hand_person=null   : int16                 # number of the measured person, null for markers
+    hand_by            : varchar(64)           # name of who corrected
+    hand_at            : datetime              # when, UTC
+    """  # noqa: E501
+
+    class Event(dj.Part):
+        definition = """
+        -> master
+        hand_no            : int16             # in order of time, from 1
+        ---
+        hand_time          : float64           # (s) time of the trial
+        hand_side          : enum('left', 'right')
+        hand_kind          : enum('foot_down', 'foot_up')
+        hand_probability=null : float64        # (0..1) of the automatic method that found it there; null: set by hand
+        """
+
+
+def is_by_hand(gait_method: str) -> bool:
+    """Whether a key of GaitEventMethod is of corrected events."""
+    return gait_method.rpartition("-v")[0] == "by-hand"
+
+
+def corrected(key: Mapping[str, Any], videos: Sequence[int]) -> dict[int, dict[str, Any]]:
+    """Corrected events of trials of a set (key with `fit_set`): `n_changed` and `events` (time, side, kind,
+    probability) by the trial's number; without those in which another person was measured than in the set.
+
+    It waits for a decision that is being written, and inside a transaction keeps others waiting until its end, so that
+    what is computed of these rows and what is decided about them never cross.
+    """
+    server, session_of_set = session.Session.connection, fit.FitSet.full_table_name
+    # Names are DataJoint's own; a locking read sees what was committed, whenever this transaction began.
+    server.query(
+        f"SELECT s.session_id FROM {session.Session.full_table_name} s JOIN {session_of_set} f USING (session_id)"  # noqa: S608
+        " WHERE f.fit_set = %s LOCK IN SHARE MODE",
+        args=(key["fit_set"],),
+    )
+    of_set = (fit.FitSet.Video & {"fit_set": key["fit_set"]}) * keypoints.Keypoints.proj("keypoints_person_id")
+    measured = {int(r["video_id"]): (r["tracking_method"], int(r["keypoints_person_id"])) for r in of_set.to_dicts()}
+    columns, parts = "hand_tracking, hand_person, hand_changed", "hand_time, hand_side, hand_kind, hand_probability"
+    out = {}
+    for video_id in videos:
+        row, events = (
+            server.query(
+                f"SELECT {names} FROM {table} WHERE video_id = %s {order} LOCK IN SHARE MODE",  # noqa: S608
+                args=(video_id,),
+            ).fetchall()
+            for names, table, order in (
+                (columns, HandEvents.full_table_name, ""),
+                (parts, HandEvents.Event.full_table_name, "ORDER BY hand_no"),
+            )
+        )
+        if row and (row[0][0], row[0][1]) == measured.get(video_id, (None, None)):
+            found = [(float(t), str(side), str(kind), number(p)) for t, side, kind, p in events]
+            out[video_id] = {"n_changed": int(row[0][2]), "events": found}
+    return out
+
+
+def automatic_of() -> dict[str, str]:
+    """The automatic method that each method by hand began from, by their keys."""
+    rows = (GaitEventMethod & {"gait_method_name": "by-hand"}).to_dicts()
+    return {r["gait_method"]: str(r["gait_params"]["automatic"]) for r in rows}
+
+
+def without_uncorrected(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Results (rows with `gait_method`) without those for which there is one of corrected events beside: what is meant
+    where nobody names a method of the events."""
+    automatic = automatic_of() if any(is_by_hand(r["gait_method"]) for r in rows) else {}
+
+    def rest(row: Mapping[str, Any]) -> tuple:
+        return tuple((k, v) for k, v in row.items() if k != "gait_method")
+
+    replaced = [(rest(r), automatic[r["gait_method"]]) for r in rows if r["gait_method"] in automatic]
+    return [dict(r) for r in rows if (rest(r), r["gait_method"]) not in replaced]
+
+
+def events_of(
+    trial: TrialFit, method: methods.Method[Any], automatic: methods.Method[Any], by_hand: Mapping[str, Any] | None
+) -> lib.GaitEvents:
+    """The events of a trial: corrected ones (of `corrected`) by `method`, else those of the automatic method."""
+    from pbl_pipeline.gait import GaitEvent, detect_events, events_by_hand, feet_from_fit
+
+    if by_hand is None:
+        return detect_events(feet_from_fit(trial), automatic)
+    found = [GaitEvent(t, side, kind, 1.0 if p is None else p) for t, side, kind, p in by_hand["events"]]
+    return events_by_hand(found, method, "fit", by_hand["n_changed"])
+
+
+def automatic_row(row: Mapping[str, Any]) -> dict[str, Any]:
+    """The row (`method_row`) of the automatic method that a method by hand began from; of others itself."""
+    if row["name"] != "by-hand":
+        return dict(row)
+    return method_row(GaitEventMethod, {"gait_method": row["params"]["automatic"]})
 
 
 @schema
@@ -104,17 +208,25 @@ class GaitEvents(dj.Computed):
         return (fit.SessionFit.Trial.proj() * GaitEventMethod.proj()) & planned
 
     def make_fetch(self, key: dict) -> tuple:
+        by_hand = corrected(key, [key["video_id"]]) if is_by_hand(key["gait_method"]) else {}
         ref = file_ref(one(fit.SessionFit.Trial & key, "trial_file"))
-        return ref, method_row(GaitEventMethod, key)
+        method = method_row(GaitEventMethod, key)
+        return ref, method, automatic_row(method), by_hand.get(key["video_id"])
 
     @computes
-    def make_compute(self, key: dict, ref: dict, method: Mapping[str, Any]) -> tuple[lib.GaitEvents, str]:
+    def make_compute(
+        self,
+        key: dict,
+        ref: dict,
+        method: Mapping[str, Any],
+        automatic: Mapping[str, Any],
+        by_hand: Mapping[str, Any] | None,
+    ) -> tuple[lib.GaitEvents, str]:
         from pbl_pipeline.fit import TrialFit
-        from pbl_pipeline.gait import detect_events, feet_from_fit
 
         with stored_file(self, ref) as path:
             trial = TrialFit.load(path)
-        return detect_events(feet_from_fit(trial), methods.stored(**method)), method["sha"]
+        return events_of(trial, methods.stored(**method), methods.stored(**automatic), by_hand), method["sha"]
 
     def make_insert(self, key: dict, found: lib.GaitEvents, sha: str, origin: Origin) -> None:
         self.insert1(

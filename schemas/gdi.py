@@ -233,10 +233,15 @@ class SessionGdi(dj.Computed):
 
     def make_fetch(self, key: dict) -> tuple:
         rows = (fit.SessionFit.Trial & key).to_dicts(order_by="video_id")
+        videos, by_hand = [int(r["video_id"]) for r in rows], None
+        if gait.is_by_hand(key["gait_method"]):
+            found = gait.corrected(key, videos)
+            by_hand = [found.get(v) for v in videos]
+        events = method_row(gait.GaitEventMethod, key)
         return (
             [file_ref(r["trial_file"]) for r in rows],
             norm_ref(key),
-            method_row(gait.GaitEventMethod, key),
+            (events, gait.automatic_row(events), by_hand),
             method_row(GdiModel, key),
             fit.fit_checks(key),
             [(c.activity, c.pace) for c in video.conditions([{"video_id": r["video_id"]} for r in rows]).values()],
@@ -248,7 +253,7 @@ class SessionGdi(dj.Computed):
         key: dict,
         refs: Sequence[dict],
         norm: tuple,
-        events: Mapping[str, Any],
+        events: tuple[Mapping[str, Any], Mapping[str, Any], Sequence[Mapping[str, Any] | None] | None],
         index: Mapping[str, Any],
         checks: Sequence[tuple],
         conditions: Sequence[tuple[str, str]],
@@ -258,13 +263,17 @@ class SessionGdi(dj.Computed):
         from pbl_pipeline.qc import Check
 
         model = methods.stored(**index)
-        params = lib.GaitParams(methods.stored(**events).paramset, model.params)
+        method, automatic = (methods.stored(**row) for row in events[:2])
+        params = lib.GaitParams(method.paramset, model.params)
         with ExitStack() as stack:
             paths = [stack.enter_context(stored_file(self, ref)) for ref in refs]
             trials = [TrialFit.load(path) for path in paths]
         about_fit = [Check(*check) for check in checks]
         done = [lib.Condition(*c) for c in conditions]
-        result = lib.gait_metrics(trials, norm_of_row(*norm), params, about_fit, model, conditions=done)
+        found = None
+        if events[2] is not None:
+            found = [gait.events_of(t, method, automatic, h) for t, h in zip(trials, events[2], strict=True)]
+        result = lib.gait_metrics(trials, norm_of_row(*norm), params, about_fit, model, conditions=done, events=found)
         return result, model.hash, norm[1]
 
     def make_insert(self, key: dict, result: lib.GaitMetrics, sha: str, norm_sha: str, origin: Origin) -> None:

@@ -11,6 +11,7 @@ from pbl_pipeline.errors import PblError
 from . import fit, gdi, keypoints, lab, session, video
 from ._datajoint import dj
 from ._methods import METHOD_TABLES
+from .usable import unusable
 from .views import frame_of, newest_sets
 
 if TYPE_CHECKING:
@@ -36,7 +37,8 @@ def visits(restriction: Any = True) -> pd.DataFrame:
 
 
 def videos(restriction: Any = True) -> pd.DataFrame:
-    """One row per video: whose, what is done at which pace, how many methods made keypoints and fits of it."""
+    """One row per video: whose, what is done at which pace, how many methods made keypoints and fits of it, and why it
+    is not usable ("" where nobody said so)."""
     columns = ("session_id", "video_name", "activity", "camera_motion", "video_created")
     query = video.Video.proj(*columns) * _visits() & restriction
     rows = frame_of(query).sort_values("video_id", ignore_index=True)
@@ -45,6 +47,8 @@ def videos(restriction: Any = True) -> pd.DataFrame:
     points = dj.U("video_id").aggr(keypoints.Keypoints.proj(), keypoints="count(*)")
     fits = dj.U("video_id").aggr(fit.SessionFit.Trial.proj() * newest_sets(), fits="count(*)")
     rows = _counted(rows, "video_id", points, fits)
+    marked = {number: mark.text for number, mark in unusable(rows["video_id"]).items()}
+    rows["not_usable"] = [marked.get(int(number), "") for number in rows["video_id"]]
     first = ["video_id", "subject", "session_label", "video_name", "activity", "pace"]
     return rows[[*first, *(c for c in rows.columns if c not in first)]]
 

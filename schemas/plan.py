@@ -64,6 +64,7 @@ def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]
     A trial is decided when it can be fitted (TrialInput), failed, shows nobody, or waits for a person's choice. While
     another trial of the session is still being computed, nothing is planned: otherwise every single video of a visit
     would trigger a fit of its own. A later video (or choice) makes a new set; the old set and its fit stay, no longer
+    current. A recording that is marked as not usable (`video.NotUsable`) takes no part, and sets with it cease to be
     current. Workers take turns at a session, and where several sets of it are current all but one cease to be.
 
     Parameters
@@ -80,26 +81,45 @@ def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]
     current = fit.current() & (fit.FitSet & chosen)
     fitted = (fit.FitSet.Video * current).proj("tracking_method", "keypoint_method")
     in_a_set = dj.U("video_id", "tracking_method", "keypoint_method", "fit_method") & fitted
-    new = fit.TrialInput.proj() * (video.Video.proj("session_id") & chosen) - in_a_set
-    recorded = fit.MarkerPlan.proj() * (video.Video.proj("session_id") & chosen)
+    usable = (video.Video.proj("session_id") & chosen) - video.NotUsable
+    new = fit.TrialInput.proj() * usable - in_a_set
+    recorded = fit.MarkerPlan.proj() * usable
     new_markers = recorded - (dj.U("video_id", "fit_method") & (fit.FitSet.Video * current))
     of_kind = current * fit.FitSet.proj("session_id", "fit_set_kind")
     by_method = dj.U("session_id", "fit_method", "fit_set_kind").aggr(of_kind, n_current="count(*)")
     several = (by_method & "n_current > 1").proj()
-    to_plan = sorted({int(s) for found in (new, new_markers, several) for s in found.to_arrays("session_id")})
-    # An error row before the fit decides that a trial does not take part. (Job tables are declared here, not below:
-    # that would end the transaction.)
-    failed = [jobs_of(table) for table in before(fit.SessionFit)]
+    marked = fit.FitSet.proj("session_id") & (_with_unusable() & current)
+    to_plan = sorted({int(s) for found in (new, new_markers, several, marked) for s in found.to_arrays("session_id")})
+    failed = queues_before_fit()
     made = []
     for session_id in to_plan:
-        with _locked(session_id):
-            _keep_one_current(session_id)
-            made += _plan_session(session_id, failed) + _plan_markers(session_id)
+        with locked(session_id):
+            made += plan_anew(session_id, failed)
     return made
 
 
+def queues_before_fit() -> list[Any]:
+    """Queues whose error rows decide that a trial does not take part in a fit. Declares them, which ends a transaction
+    that is open: ask before `locked`."""
+    return [jobs_of(table) for table in before(fit.SessionFit)]
+
+
+def plan_anew(session_id: int, failed: Sequence[Any]) -> list[dict[str, Any]]:
+    """What `plan_fit_sets` does for one session, inside `locked`; `failed`: `queues_before_fit`."""
+    outdated = fit.current() & (_with_unusable() & {"session_id": session_id})
+    for key in outdated.proj().to_dicts():
+        fit.FitSelection.update1({**key, "fit_current": False})
+    _keep_one_current(session_id)
+    return _plan_session(session_id, failed) + _plan_markers(session_id)
+
+
+def _with_unusable() -> Any:
+    """Sets (with `session_id`) that hold a recording which is marked as not usable."""
+    return fit.FitSet.proj("session_id") & (fit.FitSet.Video & video.NotUsable).proj()
+
+
 @contextmanager
-def _locked(session_id: int) -> Iterator[None]:
+def locked(session_id: int) -> Iterator[None]:
     """A transaction in which nobody else plans this session and every query sees what others have committed.
 
     Two workers that see different trials ready would otherwise both make their set the current one.
@@ -129,7 +149,7 @@ def _keep_one_current(session_id: int) -> None:
 
 
 def _plan_session(session_id: int, failed: Sequence[Any]) -> list[dict[str, Any]]:
-    videos = video.Video & {"session_id": session_id}
+    videos = (video.Video & {"session_id": session_id}) - video.NotUsable
     selected = (keypoints.KeypointSelection.proj() * videos.proj("session_id")) * fit.FitPlan.proj()
     views = {int(r["video_id"]): r for r in (video.RigView * video.Rig.proj("rig_sha256") & videos.proj()).to_dicts()}
     ready_by_group: dict[tuple, list[dict]] = defaultdict(list)
@@ -184,7 +204,7 @@ def _plan_markers(session_id: int) -> list[dict[str, Any]]:
     They were found fit to be used when they were registered, so none is waited for.
     """
     columns = ("recording_marker_set", "marker_table_sha256")
-    videos = video.Video.proj("session_id", "video_sha256") & {"session_id": session_id}
+    videos = (video.Video.proj("session_id", "video_sha256") & {"session_id": session_id}) - video.NotUsable
     by_method: dict[str, list[dict]] = defaultdict(list)
     for row in (fit.MarkerPlan.proj() * video.MarkerRecording.proj(*columns) * videos).to_dicts(order_by="video_id"):
         by_method[row["fit_method"]].append({**row, "tracking_method": None, "keypoint_method": None})

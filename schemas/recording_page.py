@@ -102,7 +102,8 @@ def computed(key: dict[str, Any]) -> tuple[Any, ...]:
     fitted = (fit.SessionFit & key).to_arrays("fit_computed")
     found = _newest_events(key)
     events = () if found is None else (gait.GaitEvents & found).to_arrays("events_computed")
-    return (*key.values(), *map(str, fitted), *(found or {}).values(), *map(str, events))
+    by_hand = (gait.HandEvents & key).to_arrays("hand_at")
+    return (*key.values(), *map(str, fitted), *(found or {}).values(), *map(str, (*events, *by_hand)))
 
 
 def recording_fit(key: dict[str, Any]) -> RecordingFit:
@@ -120,11 +121,20 @@ def recording_fit(key: dict[str, Any]) -> RecordingFit:
 
 
 def _events(key: dict[str, Any]) -> tuple[lib.GaitEvent, ...]:
+    from pbl_pipeline.gait import GaitEvent
+
+    by_hand = gait.corrected(key, [key["video_id"]])
+    if by_hand:  # at once, before anything is computed of them
+        rows = by_hand[key["video_id"]]["events"]
+        return tuple(GaitEvent(t, side, kind, 1.0 if p is None else p) for t, side, kind, p in rows)
     found = _newest_events(key)
     rows = [] if found is None else (gait.GaitEvents.Event & found).to_dicts(order_by="event_no")
     return tuple(gait.event_of_row(row) for row in rows)
 
 
 def _newest_events(key: dict[str, Any]) -> dict[str, Any] | None:
-    rows = (gait.GaitEvents.proj("events_computed") & key).to_dicts(order_by="events_computed DESC", limit=1)
+    """Key of the events of a fit: of the corrected ones where there are any, None where they are not computed yet."""
+    rows = (gait.GaitEvents.proj("events_computed") & key).to_dicts(order_by="events_computed DESC")
+    if gait.corrected(key, [key["video_id"]]):
+        rows = [row for row in rows if gait.is_by_hand(row["gait_method"])]
     return {k: rows[0][k] for k in gait.GaitEvents.primary_key} if rows else None

@@ -20,6 +20,7 @@ from .jobs import jobs_of
 from .method_names import with_keys
 from .rows import Rows, number, row_of, stored_rows
 from .stored_files import file_ref, stored_file
+from .usable import unusable
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib
@@ -103,7 +104,8 @@ def of_markers(subject: str, session_label: str) -> PblError:
 def find_session(restriction: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     """One session (row of Session) and the key of its current fit and of its measures, as far as there are any.
 
-    restriction and errors are those of `load_session`.
+    restriction and errors are those of `load_session`. Of corrected and automatic events the corrected ones are meant,
+    unless the restriction names a `gait_method`.
     """
     if isinstance(restriction, Mapping):
         restriction = with_keys(restriction)
@@ -121,7 +123,7 @@ def find_session(restriction: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     key = (
         _of(fit.SessionFit, _single(fits, "fits", ("fit_set_kind", *fit.SessionFit.primary_key[::-1]))) if fits else {}
     )
-    measured = (gdi.SessionGdi & key & restriction).keys() if key else []
+    measured = gait.without_uncorrected((gdi.SessionGdi & key & restriction).keys()) if key else []
     return visit, {**key, **(_single(measured, "results", gdi.SessionGdi.primary_key) if measured else {})}
 
 
@@ -524,6 +526,8 @@ def _problem(key: Mapping[str, Any], choice: tracking_lib.SubjectChoice | None, 
     """Why a video has no fit, in a sentence."""
     if fitted is not None:
         return ""
+    if mark := unusable([key["video_id"]]):
+        return f"not usable: {mark[key['video_id']].text}"
     for table in before(fit.SessionFit):
         for row in (jobs_of(table).errors & key).to_dicts():
             message = row["error_message"]

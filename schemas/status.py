@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from . import computed_tables, connection, keypoints, tracking, video, worker
+from . import computed_tables, connection, keypoints, tracking, usable, video, worker
 from .catalog import quote
 from .coded_errors import error_code, error_found, error_next_step
 from .jobs import jobs_of
@@ -100,6 +100,16 @@ class Waiting:
 
 
 @dataclasses.dataclass(frozen=True)
+class LeftOut:
+    """A video that somebody marked as not usable."""
+
+    video_id: int
+    about: str
+    reason: str
+    by: str
+
+
+@dataclasses.dataclass(frozen=True)
 class Status:
     """The whole state."""
 
@@ -112,6 +122,7 @@ class Status:
     exact: bool = True
     #: Source of the focal length (file, measured, metadata, preset, guess) -> number of keypoints with it.
     cameras: dict[str, int] = dataclasses.field(default_factory=dict)
+    not_usable: list[LeftOut] = dataclasses.field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -127,7 +138,7 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
         Also count keys that no worker has queued yet; that compares whole tables (seconds each with 300,000 videos).
         None: where there are fewer than `SMALL` videos.
     most
-        Errors, empty and waiting rows that are listed, each; the counts are of all.
+        Errors, empty, waiting and not usable rows that are listed, each; the counts are of all.
     """
     n_videos = int(video.Video.connection.query(f"SELECT COUNT(*) FROM {video.Video.full_table_name}").fetchone()[0])  # noqa: S608
     exact = n_videos < SMALL if exact is None else exact
@@ -142,7 +153,8 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
     errors = [e for t, s in zip(chain, tables, strict=True) if s.error for e in _errors(t, most)]
     empty = {t.table for t in tables if t.empty}
     waiting = _waiting(most) if any(t.waiting for t in tables) else []
-    return Status(n_videos, tables, errors, _empty(empty, most), waiting, live_workers(), exact, cameras)
+    marked = [LeftOut(m.video_id, _file_of({"video_id": m.video_id}), m.text, m.by) for m in usable.all_unusable(most)]
+    return Status(n_videos, tables, errors, _empty(empty, most), waiting, live_workers(), exact, cameras, marked)
 
 
 def _table_status(
@@ -329,7 +341,7 @@ def _file_of(key: dict[str, Any]) -> str:
 def _waiting(most: int) -> list[Waiting]:
     out = []
     rows = (tracking.SubjectChoice & {"choice_status": "NEEDS_CHOICE"}) * video.Video.proj("video_name")
-    for row in rows.to_dicts(order_by="video_id", limit=most):
+    for row in (rows - video.NotUsable).to_dicts(order_by="video_id", limit=most):
         key = {k: row[k] for k in ("video_id", "tracking_method")}
         persons = sorted(int(p) for p in (tracking.Tracking.Person & key).to_arrays("person_id"))
         out.append(

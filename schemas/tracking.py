@@ -99,7 +99,7 @@ class Tracking(dj.Computed):
     @property
     def key_source(self) -> Any:
         """Only what a probe could read: a file that is no video has one error row, in VideoInfo."""
-        return TrackingSelection & video.VideoInfo
+        return (TrackingSelection & video.VideoInfo) - video.NotUsable
 
     def make_fetch(self, key: dict) -> tuple:
         method = method_row(TrackingMethod, key)
@@ -163,7 +163,7 @@ class SubjectChoice(dj.Computed):
 
     @property
     def key_source(self) -> Any:
-        return Tracking & video.VideoInfo
+        return (Tracking & video.VideoInfo) - video.NotUsable
 
     @computes
     def make_compute(

@@ -100,6 +100,33 @@ class RigView(dj.Manual):
     """
 
 
+#: Why a recording is not usable, as people say it with one word; "other" asks for words of their own.
+UNUSABLE_REASONS = (
+    "not_in_view",
+    "too_dark",
+    "camera_moved",
+    "other_person",
+    "other_task",
+    "helped",
+    "interrupted",
+    "duplicate",
+    "other",
+)
+
+
+@schema
+class NotUsable(dj.Manual):
+    definition = f"""
+    # recordings that a person marked as not usable: nothing further is computed of them, and no set of a fit takes them
+    -> Video
+    ---
+    unusable_reason  : enum({", ".join(f"'{r}'" for r in UNUSABLE_REASONS)})
+    unusable_note='' : varchar(500)            # more of why, in the person's words; no names
+    unusable_by      : varchar(64)             # name of who decided
+    unusable_created : datetime                # when, UTC
+    """
+
+
 @schema
 class PhoneAttitude(dj.Manual):
     definition = """
@@ -181,8 +208,8 @@ class VideoInfo(dj.Computed):
 
     @property
     def key_source(self) -> Any:
-        """Files with pictures."""
-        return Video.proj() - MarkerRecording.proj()
+        """Files with pictures, but those that a person marked as not usable before they were read."""
+        return Video.proj() - MarkerRecording.proj() - NotUsable.proj()
 
     def make_fetch(self, key: dict) -> tuple:
         return one(Video & key, "video_path", "video_sha256")

@@ -14,7 +14,7 @@ import datetime
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from . import computed_tables, fit, gdi, qc, session, study, tracking, video
+from . import computed_tables, fit, gait, gdi, qc, session, study, tracking, video
 from .catalog import quote
 from .coded_errors import error_code
 from .rows import number
@@ -22,8 +22,8 @@ from .status import queue_name
 
 #: Visits of a page.
 PAGE = 50
-#: What is asked of the state of a visit; empty: nobody is in any of its videos.
-STATES = ("computed", "pending", "waiting", "failed", "empty")
+#: What is asked of the state of a visit; empty: nobody is in any of its usable videos; unusable: it has none.
+STATES = ("computed", "pending", "waiting", "failed", "empty", "unusable")
 #: Outcomes of the checks that can be asked for.
 OUTCOMES = ("PASS", "WARN", "EMPTY", "NEEDS_CHOICE", "FAIL")
 #: Checks (q) of measures (g).
@@ -51,7 +51,8 @@ class Result:
     """Index and checks of the current set of a visit by one chain of methods.
 
     sd: of the error of the index; minimal_change: smallest change between two such visits that is no chance (90 %).
-    outcome: worst check, empty before the checks are computed; worst: its names.
+    outcome: worst check, empty before the checks are computed; worst: its names. automatic: the method of the events
+    that the corrections began from, empty where nobody corrected them.
     """
 
     kind: str
@@ -63,6 +64,12 @@ class Result:
     minimal_change: float | None
     outcome: str
     worst: tuple[str, ...]
+    automatic: str = ""
+
+    @property
+    def uncorrected(self) -> tuple[str, ...]:
+        """The methods, of corrected events the automatic one that they began from."""
+        return (self.methods[0], self.automatic or self.methods[1], *self.methods[2:])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,7 +179,8 @@ def choices() -> dict[str, list[str]]:
 
 
 def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
-    """Results of the current sets of visits, by session: videos of one camera first, then the newest methods."""
+    """Results of the current sets of visits, by session: videos of one camera first, then those of corrected events,
+    then the newest methods."""
     ids = [int(s) for s in sessions]
     found: dict[int, list[Result]] = {i: [] for i in ids}
     if not ids:
@@ -189,15 +197,30 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
         f" WHERE f.session_id IN ({_places(ids)}) ORDER BY g.session_gdi_computed DESC",
         ids,
     )
+    automatic = gait.automatic_of() if any(gait.is_by_hand(str(row[3])) for row in rows) else {}
     for session_id, kind, fit_method, gait_method, model, norm, status, why, no_index, *values, outcome, worst in rows:
         index, sd, change = (number(v) for v in values)
         methods = (str(fit_method), str(gait_method), str(model), str(norm))
         names = tuple(n for n in str(worst).split(", ") if n)
         reason = str(why or no_index or "")
         found[int(session_id)].append(
-            Result(str(kind), methods, str(status), reason, index, sd, change, str(outcome), names)
+            Result(
+                str(kind),
+                methods,
+                str(status),
+                reason,
+                index,
+                sd,
+                change,
+                str(outcome),
+                names,
+                automatic.get(methods[1], ""),
+            )
         )
-    return {i: sorted(r, key=lambda one: order.get(one.kind, 9)) for i, r in found.items()}
+    return {
+        i: sorted(r, key=lambda one: (order.get(one.kind, 9), not gait.is_by_hand(one.methods[1])))
+        for i, r in found.items()
+    }
 
 
 # --------------------------------------------------------------------------------------------------------- the filter
@@ -240,8 +263,9 @@ def _asked(wanted: Filter) -> tuple[list[str], list[str], list[Any]]:
         only("j", f"{_judged()} WHERE q.qc_outcome = %s", wanted.quality)
     if wanted.state in ("computed", "pending"):
         # Asked for first: as a part of the question the server would answer them for each visit.
-        apart = {int(i) for question in (_waiting(), _failed(), _empty()) for (i,) in _ask(question, [])}
-        unfinished = {int(i) for (i,) in _ask(_unfinished(), [])}
+        questions = (_waiting(), _failed(), _empty(), _unusable())
+        apart = {int(i) for question in questions for (i,) in _ask(question, [])}
+        unfinished = {int(i) for question in (_unfinished(), _none_current()) for (i,) in _ask(question, [])}
         with_set = f"EXISTS (SELECT 1 FROM {_name(fit.FitSet)} p WHERE p.session_id = s.session_id)"
         if wanted.state == "computed":
             add(with_set)
@@ -251,7 +275,7 @@ def _asked(wanted: Filter) -> tuple[list[str], list[str], list[Any]]:
             add(f"(NOT {with_set}{listed})", *unfinished)
             outside(apart)
     elif wanted.state:
-        only("x", {"waiting": _waiting, "failed": _failed, "empty": _empty}[wanted.state]())
+        only("x", _STATES[wanted.state]())
     return joins, where, [*of_joins, *of_where]
 
 
@@ -273,38 +297,73 @@ def _unfinished() -> str:
     )
 
 
+def _none_current() -> str:
+    """Visits with sets of which none is current: one that was marked as not usable held up the others."""
+    chosen, sets = _name(fit.FitSelection), _name(fit.FitSet)
+    other = f"{sets} g JOIN {chosen} d ON d.fit_set = g.fit_set WHERE g.session_id = f.session_id AND d.fit_current = 1"
+    return (
+        f"SELECT DISTINCT f.session_id FROM {chosen} c STRAIGHT_JOIN {sets} f ON f.fit_set = c.fit_set"
+        f" WHERE c.fit_current = 0 AND NOT EXISTS (SELECT 1 FROM {other})"
+    )
+
+
 def _waiting() -> str:
     """Visits with a video that waits for a person's choice."""
     videos, chosen = _name(video.Video), _name(tracking.SubjectChoice)
     waiting = f"{chosen} t JOIN {videos} o USING (video_id) WHERE t.choice_status = 'NEEDS_CHOICE'"
-    return f"SELECT DISTINCT o.session_id FROM {waiting}"
+    return f"SELECT DISTINCT o.session_id FROM {waiting} AND {_is_usable('t')}"
 
 
 def _empty() -> str:
-    """Visits in whose videos nobody is."""
+    """Visits in whose usable videos nobody is."""
     videos, chosen = _name(video.Video), _name(tracking.SubjectChoice)
-    nobody = f"SELECT t.video_id FROM {chosen} t WHERE t.choice_status = 'NO_PERSON'"
+    nobody = f"SELECT t.video_id FROM {chosen} t WHERE t.choice_status = 'NO_PERSON' AND {_is_usable('t')}"
     some = f"SELECT b.session_id FROM {videos} b JOIN ({nobody}) c ON c.video_id = b.video_id"
     return (
         f"SELECT o.session_id FROM {videos} o LEFT JOIN ({nobody}) n ON n.video_id = o.video_id"
+        f" WHERE o.session_id IN ({some}) AND {_is_usable('o')}"
+        " GROUP BY o.session_id HAVING SUM(n.video_id IS NULL) = 0"
+    )
+
+
+def _unusable() -> str:
+    """Visits whose videos are all marked as not usable."""
+    videos, marked = _name(video.Video), _name(video.NotUsable)
+    some = f"SELECT b.session_id FROM {marked} m JOIN {videos} b ON b.video_id = m.video_id"
+    return (
+        f"SELECT o.session_id FROM {videos} o LEFT JOIN {marked} n ON n.video_id = o.video_id"
         f" WHERE o.session_id IN ({some}) GROUP BY o.session_id HAVING SUM(n.video_id IS NULL) = 0"
     )
 
 
+def _is_usable(alias: str) -> str:
+    """Condition on a table with `video_id`."""
+    return f"NOT EXISTS (SELECT 1 FROM {_name(video.NotUsable)} u WHERE u.video_id = {alias}.video_id)"
+
+
 def _failed(column: str = "") -> str:
-    """Visits with an error row in any queue; with that column of it, a row for each."""
+    """Visits with an error row in any queue, of a usable video or a current set; with that column of it, a row for
+    each."""
     parts = []
     there = _queues()
     for table in computed_tables():
         if queue_name(table) not in there:
             continue
         jobs, names = quote(*queue_name(table)), table.heading.primary_key
-        of, key = (fit.FitSet, "fit_set") if "fit_set" in names else (video.Video, "video_id")
-        failed = f"{jobs} e JOIN {_name(of)} o USING ({key}) WHERE e.status = 'error'"
+        if "fit_set" in names:  # of an older set nobody waits for
+            same = "c.fit_set = e.fit_set AND c.fit_method = e.fit_method AND c.fit_current = 1"
+            of = f"{_name(fit.FitSet)} o USING (fit_set) JOIN {_name(fit.FitSelection)} c ON {same}"
+            failed = f"{jobs} e JOIN {of} WHERE e.status = 'error'"
+        else:
+            of = f"{_name(video.Video)} o USING (video_id)"
+            failed = f"{jobs} e JOIN {of} WHERE e.status = 'error' AND {_is_usable('e')}"
         parts.append(f"SELECT o.session_id{f', e.{column}' if column else ''} FROM {failed}")
     if not parts:
         return f"SELECT session_id{f', NULL AS {column}' if column else ''} FROM {_name(session.Session)} WHERE FALSE"
     return f" {'UNION ALL' if column else 'UNION'} ".join(parts)
+
+
+_STATES = {"waiting": _waiting, "failed": _failed, "empty": _empty, "unusable": _unusable}
 
 
 def _queues() -> set[tuple[str, str]]:
@@ -333,7 +392,10 @@ def _visit_rows(rows: Sequence[Sequence[Any]]) -> tuple[VisitRow, ...]:
     )
     videos = dict(_ask(counted, ids))
     waiting = {int(s) for (s,) in _ask(f"{_waiting()} AND o.session_id IN ({listed})", ids)}
-    empty = {int(s) for (s,) in _ask(f"SELECT session_id FROM ({_empty()}) x WHERE session_id IN ({listed})", ids)}
+    empty, unusable = (
+        {int(s) for (s,) in _ask(f"SELECT session_id FROM ({question}) x WHERE session_id IN ({listed})", ids)}
+        for question in (_empty(), _unusable())
+    )
     open_sets = {int(s) for (s,) in _ask(f"{_unfinished()} AND f.session_id IN ({listed})", ids)}
     errors = f"SELECT session_id, error_message FROM ({_failed('error_message')}) x WHERE session_id IN ({listed})"
     failed = {int(s): error_code(message) for s, message in _ask(errors, ids)}
@@ -342,8 +404,9 @@ def _visit_rows(rows: Sequence[Sequence[Any]]) -> tuple[VisitRow, ...]:
         i = int(session_id)
         found = results[i]
         computed = bool(found) and i not in open_sets
-        states = (("failed", i in failed), ("waiting", i in waiting), ("empty", i in empty), ("computed", computed))
-        state = next((name for name, holds in states if holds), "pending")
+        sets = {"failed": failed, "waiting": waiting, "empty": empty, "unusable": unusable}
+        states = [(name, i in found_in) for name, found_in in sets.items()]
+        state = next((name for name, holds in [*states, ("computed", computed)] if holds), "pending")
         first = found[0] if found else None
         out.append(
             VisitRow(
@@ -374,8 +437,10 @@ def _trend(
     for before, session_id in sorted(of_person, reverse=True):
         if before >= day:
             continue
-        for other in results[session_id]:
-            if (other.kind, other.methods) == (result.kind, result.methods):
+        # Corrected events against automatic ones where nobody corrected that visit: no error of the change is known.
+        alike = [o for o in results[session_id] if o.kind == result.kind and o.uncorrected == result.uncorrected]
+        for other in sorted(alike, key=lambda o: o.methods != result.methods):
+            if other.index is not None:
                 change = change_since(result, other)
                 if change is not None:
                     return Trend(session_id, before, change.by, change.sure)

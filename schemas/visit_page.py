@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline.errors import PblError
 
 from . import fit, gait, gdi, listing, qc, session
+from .usable import Unusable, unusable
 from .visit_list import Result, VisitRow, results_of, visits_of
 from .why import why
 
@@ -18,7 +19,8 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class RecordingRow:
-    """A recording of a visit. problem: where its computation stands, empty where it has a fit."""
+    """A recording of a visit. problem: where its computation stands, empty where it has a fit; mark: why it is not
+    usable, None where nobody said so."""
 
     video_id: int
     name: str
@@ -26,6 +28,7 @@ class RecordingRow:
     pace: str
     fitted: bool
     problem: str
+    mark: Unusable | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,12 +126,13 @@ def checks_of(key: dict[str, Any]) -> tuple[VisitCheck, ...]:
 
 def _recordings(session_id: int) -> tuple[RecordingRow, ...]:
     out = []
-    for row in listing.videos({"session_id": session_id}).to_dict("records"):
-        fitted = bool(row["fits"])
-        said = "" if fitted else why(int(row["video_id"])).verdict
-        out.append(
-            RecordingRow(int(row["video_id"]), row["video_name"], row["activity"], row["pace"] or "", fitted, said)
-        )
+    rows = listing.videos({"session_id": session_id}).to_dict("records")
+    marked = unusable(int(row["video_id"]) for row in rows)
+    for row in rows:
+        number, fitted = int(row["video_id"]), bool(row["fits"])
+        mark = marked.get(number)
+        said = "" if fitted or mark else why(number).verdict
+        out.append(RecordingRow(number, row["video_name"], row["activity"], row["pace"] or "", fitted, said, mark))
     return tuple(out)
 
 

@@ -10,7 +10,9 @@ from .chain import ON_REQUEST, before
 from .coded_errors import error_code, error_found, error_next_step
 from .jobs import jobs_of
 from .status import EMPTY_COLUMNS
+from .usable import unusable
 
+_TAKE_BACK = "no fit uses it; `pbl choose {} --usable` takes that back"
 DONE, EMPTY, PENDING, RUNNING, ERROR, NOT_YET = "done", "empty", "pending", "being computed", "error", "not yet"
 
 
@@ -76,9 +78,9 @@ def why(video_id: int) -> Why:
         for one in [[a] for a in about] if several else [about]:
             found = _steps(table, one) or [Step(table.__name__, NOT_YET)]
             steps += [dataclasses.replace(s, camera=one[0]["video_id"] if several else None) for s in found]
-    return Why(
-        video_id, row["video_name"], row["video_path"], int(row["session_id"]), steps, _verdict(steps, bool(sets))
-    )
+    mark = unusable([video_id]).get(video_id)
+    verdict = _verdict(steps, bool(sets)) if mark is None else f"not usable: {mark.text}; {_TAKE_BACK.format(video_id)}"
+    return Why(video_id, row["video_name"], row["video_path"], int(row["session_id"]), steps, verdict)
 
 
 def _steps(table: Any, about: Any) -> list[Step]:

@@ -30,14 +30,18 @@ from ._metrics import GaitMetrics, GaitParams, TrialMetrics, cycle_checks, gait_
 from ._own_norm import norm_from_cycles
 from ._profile import MovementProfile, movement_profile, variable_scores
 from ._spatiotemporal import MEASURES, Measure, Spatiotemporal, cycle_measures, far_leg_of, spatiotemporal
-from .events import METHODS as EVENT_METHODS
 from .events import (
+    BY_HAND,
+    ByHandParams,
     EventParams,
     GaitEvent,
     GaitEvents,
+    check_by_hand,
     detect_events,
+    events_by_hand,
     load_events,
 )
+from .events import METHODS as EVENT_METHODS
 from .motion import (
     FOOT_MARKER_SETS,
     BodyPoses,
@@ -67,6 +71,7 @@ __all__ = [
     "ANGLE_NAMES",
     "ANY_PACE",
     "BODY_ANGLES",
+    "BY_HAND",
     "CURVE_FRAME_COLUMNS",
     "DEFAULT_NORM",
     "EVENT_METHODS",
@@ -88,6 +93,7 @@ __all__ = [
     "Z90",
     "AngleSeries",
     "BodyPoses",
+    "ByHandParams",
     "Condition",
     "EventParams",
     "Exclusion",
@@ -110,12 +116,14 @@ __all__ = [
     "TrialMetrics",
     "angle_series",
     "camera_side",
+    "check_by_hand",
     "curve_frame",
     "cycle_checks",
     "cycle_curves",
     "cycle_lengths",
     "cycle_measures",
     "detect_events",
+    "events_by_hand",
     "far_leg_of",
     "feet_from_fit",
     "feet_from_keypoints",

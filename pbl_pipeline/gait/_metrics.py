@@ -134,12 +134,14 @@ def gait_metrics(
     model: Method[GdiParams] | str | None = None,
     version: int | None = None,
     conditions: Sequence[Condition] | None = None,
+    events: Sequence[GaitEvents | None] | None = None,
 ) -> GaitMetrics:
     """Measures of the trials of one session and of the session (all used cycles of its pooled trials).
 
     Trials are fits, or recordings of a laboratory, whose first and last steps in view count. `model` and `version` are
     those of `score_gdi`. `conditions` says what is done in each trial (None: unknown): the session pools walking at the
-    pace of `params.gdi`, the other trials have measures of their own alone.
+    pace of `params.gdi`, the other trials have measures of their own alone. `events`: those of each fit where they are
+    known already, such as by hand; None: they are searched by the method of `params`.
 
     A trial without walking has status EMPTY and takes no part in the session; the session is EMPTY where no trial
     has a used cycle. Where one of `fit_checks`, the checks of the session fit, FAILs, there is none: measures and index
@@ -153,9 +155,10 @@ def gait_metrics(
     params = params or GaitParams(gdi=params_of(basis, model))
     index = {"norm": basis, "params": params.gdi, "model": model, "version": version}
     given = [Condition()] * len(trials) if conditions is None else conditions
+    found = [None] * len(trials) if events is None else events
     done = tuple(
-        dataclasses.replace(_trial(t, params.events, index, fit_checks), pooled=c.pooled(params.gdi.pace))
-        for t, c in zip(trials, given, strict=True)
+        dataclasses.replace(_trial(t, e, params.events, index, fit_checks), pooled=c.pooled(params.gdi.pace))
+        for t, e, c in zip(trials, found, given, strict=True)
     )
     pooled = [t for t in done if t.pooled]
     cycles = [c for t in pooled for c in t.cycles]
@@ -180,13 +183,17 @@ def gait_metrics(
 
 
 def _trial(
-    trial: TrialFit | LabTrial, event_method: Paramset, index: dict[str, Any], fit_checks: Sequence[Check]
+    trial: TrialFit | LabTrial,
+    known: GaitEvents | None,
+    event_method: Paramset,
+    index: dict[str, Any],
+    fit_checks: Sequence[Check],
 ) -> TrialMetrics:
     if isinstance(trial, LabTrial):
         events = trial.events
         cycles = find_cycles(events, trial=trial.name, series=trial.series, feet=trial.feet, keep_ends=True)
     else:
-        poses, events = _events(trial, event_method)
+        poses, events = (trial_poses(trial), known) if known is not None else _events(trial, event_method)
         cycles = find_cycles(events, trial, poses=poses, fit_checks=fit_checks)
     measures, gdi = spatiotemporal(cycles), score_gdi(cycles, **index)
     reason = events.reason or measures.reason

@@ -10,27 +10,60 @@ import click
 if TYPE_CHECKING:
     from schemas.choose import Candidates
 
+#: Those of `schemas.video`, which is loaded only where the command runs (a test compares them).
+UNUSABLE = (
+    "not_in_view",
+    "too_dark",
+    "camera_moved",
+    "other_person",
+    "other_task",
+    "helped",
+    "interrupted",
+    "duplicate",
+    "other",
+)
+
 
 @click.command()
 @click.argument("video_id", type=int)
 @click.argument("person", type=click.IntRange(min=1), required=False)
 @click.option("--sheet", type=click.Path(path_type=Path), help="Write a picture of the numbered people (.jpg, .png).")
 @click.option("--tracking-method", metavar="NAME", help="Which tracking is meant, where a video has several.")
-def choose(video_id: int, person: int | None, sheet: Path | None, tracking_method: str | None) -> None:
-    """Measure PERSON of video VIDEO_ID. The choice wins over the automatic one.
+@click.option("--not-usable", "reason", type=click.Choice(UNUSABLE), help="Leave the video out, for this reason.")
+@click.option("--note", default="", metavar="TEXT", help="With --not-usable: more of why, without names.")
+@click.option("--usable", is_flag=True, help="Take --not-usable back.")
+def choose(
+    video_id: int,
+    person: int | None,
+    sheet: Path | None,
+    tracking_method: str | None,
+    reason: str | None,
+    note: str,
+    usable: bool,
+) -> None:
+    """Measure PERSON of video VIDEO_ID, or nobody. The choice wins over the automatic one.
 
     What was computed for another person is deleted and listed; `pbl populate` computes it anew. Without PERSON nothing
     changes: the persons, their scores and the reason of the automatic choice are printed, and with --sheet a picture of
-    them is written.
+    them is written. A video that is --not-usable takes part in no fit; its visit is computed without it, and what was
+    computed with it comes back with --usable.
 
     \b
     Example: pbl choose 3 --sheet persons.jpg
     Example: pbl choose 3 2
+    Example: pbl choose 3 --not-usable interrupted --note "stumbled at the turn"
     """
+    if (person is not None) + (reason is not None) + usable > 1:
+        raise click.UsageError("PERSON, --not-usable and --usable: choose one.")
+    if note and reason is None:
+        raise click.UsageError("--note goes with --not-usable.")
     import schemas
     from schemas.choose import candidates, choose_person, write_sheet
 
     schemas.activate(methods=False)
+    if reason is not None or usable:
+        _decide_usable(video_id, reason, note)
+        return
     if person is None or sheet is not None:
         found = candidates(video_id, tracking_method)
         for line in lines(found):
@@ -45,6 +78,21 @@ def choose(video_id: int, person: int | None, sheet: Path | None, tracking_metho
     click.echo(f"video_id {video_id}: person {person} will be measured")
     for name, n in result.items():
         click.echo(f"  deleted {n} rows of {name}")
+    click.echo("next: pbl populate")
+
+
+def _decide_usable(video_id: int, reason: str | None, note: str) -> None:
+    import getpass
+
+    from schemas.decide import mark_not_usable, take_back
+
+    who = getpass.getuser()
+    if reason is None:
+        take_back(video_id, who)
+        click.echo(f"video_id {video_id} is used")
+    else:
+        mark_not_usable(video_id, reason, note, who)
+        click.echo(f"video_id {video_id} is left out: {reason}")
     click.echo("next: pbl populate")
 
 

@@ -75,4 +75,7 @@ def lines(state: Status) -> list[str]:
     for w in state.waiting:
         out += [f"  video_id={w.video_id}  {w.about}", f"    {w.reason}"]
         out += [f"    look:  {w.look}", f"    next:  {w.next_step}"]
+    if state.not_usable:
+        out += ["", "not usable (taken back with: pbl choose VIDEO_ID --usable)"]
+    out += [f"  video_id={m.video_id}  {m.about}: {m.reason} ({m.by})" for m in state.not_usable]
     return out

@@ -104,6 +104,7 @@ def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Pa
         "waiting": 1,
         "failed": 1,
         "empty": 1,
+        "unusable": 0,
     }
     assert sorted(numbers(Filter(quality=later.result.outcome))) == [1, 2]
     page = web.client().get("/visits").text

@@ -20,7 +20,7 @@ from starlette.staticfiles import StaticFiles
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
-from . import access, compare, decide, drawn, entry, find, look, operate, people, take, way_in
+from . import access, compare, decide, drawn, entry, find, judge, look, operate, people, take, way_in
 from .accounts import Accounts, Attempts
 from .looks import Looks
 from .making import Making
@@ -108,6 +108,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
             *look.routes(pages, tables, videos),
             *decide.routes(pages, tables),
             *people.routes(pages, tables),
+            *judge.routes(tables),
             *take.routes(pages, tables),
             *drawn.routes(pages, tables, making),
             *compare.routes(pages, tables, videos),

@@ -14,6 +14,7 @@ from starlette.routing import Route
 from pbl_pipeline.errors import PblError
 from schemas import choose, decide, recording_page
 
+from . import judge
 from .find import number_of
 from .movement import Movement
 from .pages import Pages
@@ -39,7 +40,10 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
             except PblError as error:
                 problem = error
         people, seen = await tables.ask(_people, about) if about.has_pictures else ([], [])
-        return pages.show(request, "recording.html", about=about, no_video=problem, people=people, seen=seen)
+        judged = await tables.ask(judge.judged, about.video_id)
+        return pages.show(
+            request, "recording.html", about=about, no_video=problem, people=people, seen=seen, judged=judged
+        )
 
     async def video(request: Request) -> Response:
         path = await tables.ask(videos.path, number_of(request))

@@ -51,8 +51,7 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
 
         def load():
             about = result_of(number, shown)
-            kind, fit_method = about.results[shown].kind, about.results[shown].methods[0]
-            wanted = {"session_id": number, "fit_set_kind": kind, "fit_method": fit_method}
+            wanted = {"session_id": number, **about.key, "fit_set_kind": about.results[shown].kind}
             return session_of_tables(wanted, sensors=False)
 
         session = await tables.ask(load)

@@ -1,5 +1,6 @@
 """Initial contact and toe-off (`foot_down`, `foot_up`) of both sides."""
 
+from ._by_hand import BY_HAND, ByHandParams, check_by_hand, events_by_hand
 from ._detect import detect_events
 from ._foot_velocity import FootVelocityParams
 from ._methods import METHODS
@@ -22,6 +23,7 @@ from ._types import (
 from ._walking import WalkingParams
 
 __all__ = [
+    "BY_HAND",
     "EVENTS",
     "FOOT_DOWN",
     "FOOT_UP",
@@ -30,6 +32,7 @@ __all__ = [
     "PHASE_ORDER",
     "RIGHT",
     "SIDES",
+    "ByHandParams",
     "EventParams",
     "FilterParams",
     "FootVelocityParams",
@@ -38,8 +41,10 @@ __all__ = [
     "PhaseParams",
     "WalkingParams",
     "candidates",
+    "check_by_hand",
     "check_preconditions",
     "detect_events",
+    "events_by_hand",
     "load_events",
     "no_events",
 ]

@@ -19,12 +19,12 @@ class Candidate:
 
 
 #: Place of each event in the cycle; the next event has the next place.
-_PLACE = {(LEFT, "foot_down"): 0, (RIGHT, "foot_up"): 1, (RIGHT, "foot_down"): 2, (LEFT, "foot_up"): 3}
+PLACE = {(LEFT, "foot_down"): 0, (RIGHT, "foot_up"): 1, (RIGHT, "foot_down"): 2, (LEFT, "foot_up"): 3}
 
 
 def follows(a: Candidate, b: Candidate, params: EventParams) -> bool:
     """True where `b` can be the very next event after `a`: next place, phase neither too short nor too long."""
-    if (_PLACE[a.side, a.event] + 1) % 4 != _PLACE[b.side, b.event]:
+    if (PLACE[a.side, a.event] + 1) % 4 != PLACE[b.side, b.event]:
         return False
     shortest = params.min_swing_s if b.event == FOOT_DOWN else 0.0
     return shortest < b.time_s - a.time_s <= params.max_phase_s

@@ -181,6 +181,7 @@ async function start() {
     now.textContent = `${m.time[frame].toFixed(2)} s, ${now.dataset.text.replace("{n}", frame + 1).replace("{total}", m.time.length)}`;
     cursor(m.time[frame]);
     for (const seen of watching) seen(frame);
+    look.dispatchEvent(new CustomEvent("frame", { detail: frame }));
   };
   /** @type {((frame: number) => void)[]} */ const watching = [];
   const clock = new Clock(video, m.time, show);
@@ -217,6 +218,8 @@ async function start() {
   position.addEventListener("input", () => clock.go(+position.value));
   $("show-body").addEventListener("change", () => show(clock.frame));
   for (const button of document.querySelectorAll("button[data-time]")) button.addEventListener("click", () => seek(+(/** @type {HTMLElement} */ (button).dataset.time ?? 0)));
+  look.addEventListener("seek", (e) => seek(/** @type {CustomEvent<number>} */ (e).detail));
+  look.dispatchEvent(new CustomEvent("movement", { detail: m }));
   look.dataset.ready = "";
   return { movement: m, poses, look, canvas, get frame() { return clock.frame; }, watch: (seen) => { watching.push(seen); seen(clock.frame); },
     redraw: () => show(clock.frame) };

@@ -1,0 +1,40 @@
+"""A decision in a process of its own, begun at the same moment as another one."""
+
+from __future__ import annotations
+
+from multiprocessing.synchronize import Barrier
+from typing import Any
+
+import schemas
+from pbl_pipeline.errors import PblError
+
+
+def decide(function: str, arguments: tuple[Any, ...], together: Barrier, answers: Any) -> None:
+    """Call a function of `schemas.decide` when all have come so far; its error's code, or "done", into `answers`."""
+    import importlib
+
+    schemas.activate(methods=False)
+    module, _, name = function.rpartition(".")
+    together.wait(60)
+    try:
+        getattr(importlib.import_module(module), name)(*arguments)
+    except PblError as error:
+        answers.put((error.code, error.found))
+    else:
+        answers.put(("done", ""))
+
+
+def at_once(function: str, *calls: tuple[Any, ...]) -> list[tuple[str, str]]:
+    """The answers of the same function called by as many processes at one moment, sorted."""
+    import multiprocessing
+
+    context = multiprocessing.get_context("spawn")
+    together, answers = context.Barrier(len(calls)), context.Queue()
+    processes = [context.Process(target=decide, args=(function, c, together, answers)) for c in calls]
+    for process in processes:
+        process.start()
+    found = sorted(answers.get(timeout=90) for _ in processes)
+    for process in processes:
+        process.join(30)
+        assert process.exitcode == 0
+    return found

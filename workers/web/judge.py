@@ -1,0 +1,82 @@
+"""Judge a recording: whether it is usable, and its events by hand. Each decision is a row (`schemas.decide`)."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+from starlette.requests import Request
+from starlette.responses import RedirectResponse, Response
+from starlette.routing import Route
+
+from schemas import decide, fit, hand_events, usable, video
+
+from .access import Refused, Session, form_of
+from .find import number_of
+from .tables import Tables
+
+_EVENT = re.compile(r"(\d{1,5}(?:\.\d{1,6})?)([lr])([du])", re.ASCII)
+_EVENTS = {"d": "foot_down", "u": "foot_up"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Judged:
+    """What was decided of a recording, and the state in which the page shows it. views: videos of its trial, which are
+    marked together; events: those that count, None where none were searched."""
+
+    mark: usable.Unusable | None
+    usable_state: str
+    views: int
+    events: hand_events.Shown | None
+    reasons: tuple[str, ...] = video.UNUSABLE_REASONS
+
+
+def judged(video_id: int) -> Judged:
+    """Of a registered recording. Reads tables."""
+    views = fit.videos_of(fit.trial_of(video_id))
+    mark = usable.unusable([video_id]).get(video_id)
+    return Judged(mark, decide.usable_state(video_id), len(views), hand_events.shown(video_id))
+
+
+def routes(tables: Tables) -> list[Route]:
+    """The addresses of this part."""
+
+    async def usable_or_not(request: Request) -> Response:
+        fields = await form_of(request, "decide")
+        session: Session = request.state.session
+        number, seen = number_of(request), fields.get("seen", "")
+        if fields.get("usable") == "yes":
+            await tables.ask(decide.take_back, number, session.name, seen)
+        elif fields.get("usable") == "no":
+            reason, note = fields.get("reason", ""), fields.get("note", "")
+            await tables.ask(decide.mark_not_usable, number, reason, note, session.name, seen)
+        else:
+            raise Refused("form")
+        return RedirectResponse(f"/recordings/{number}", 303)
+
+    async def events(request: Request) -> Response:
+        fields = await form_of(request, "decide")
+        session: Session = request.state.session
+        number, seen = number_of(request), fields.get("seen", "")
+        if fields.get("back") == "automatic":
+            await tables.ask(hand_events.take_back, number, session.name, seen)
+        else:
+            found = _events(fields.get("events", ""))
+            await tables.ask(hand_events.save, number, found, session.name, seen)
+        return RedirectResponse(f"/recordings/{number}", 303)
+
+    return [
+        Route("/recordings/{number:int}/usable", usable_or_not, methods=["POST"]),
+        Route("/recordings/{number:int}/events", events, methods=["POST"]),
+    ]
+
+
+def _events(text: str) -> list[tuple[float, str, str]]:
+    """Events as the page sends them: `1.2345ld` is the left foot down at 1.2345 s."""
+    out = []
+    for word in text.split():
+        found = _EVENT.fullmatch(word)
+        if not found:
+            raise Refused("form")
+        out.append((float(found[1]), {"l": "left", "r": "right"}[found[2]], _EVENTS[found[3]]))
+    return out
