@@ -15,6 +15,14 @@ _ROLE = click.Choice(["reader", "reviewer", "operator"])
 @click.option("--port", type=click.IntRange(0, 65535), default=8484, show_default=True, help="0: a free one.")
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option("--visit", type=click.IntRange(min=1), metavar="NUMBER", help="Open this visit (`pbl list visits`).")
+@click.option(
+    "--folder", type=click.Path(path_type=Path, file_okay=False), metavar="DIR",
+    help="Show what `pbl run` wrote into this folder, or into folders in it, without a database.",
+)  # fmt: skip
+@click.option(
+    "--videos", type=click.Path(path_type=Path, file_okay=False), metavar="DIR",
+    help="With --folder: where the recordings are (default: beside their results).",
+)  # fmt: skip
 @click.option("--name", metavar="WHO", help="Whose name decisions carry (default: your account's).")
 @click.option(
     "--role", "roles", type=_ROLE, multiple=True, default=("reviewer", "operator"), show_default=True,
@@ -35,6 +43,8 @@ def web(
     port: int,
     host: str,
     visit: int | None,
+    folder: Path | None,
+    videos: Path | None,
     name: str | None,
     roles: tuple[str, ...],
     tls_cert: Path | None,
@@ -50,10 +60,14 @@ def web(
     """
     if context.invoked_subcommand is not None:
         return
-    from workers.web import Where, serve
+    from workers.web import ResultsFolder, Where, serve
+
+    if videos is not None and folder is None:
+        raise click.UsageError("--videos goes with --folder.")
+    shown = None if folder is None else ResultsFolder(folder, videos)
 
     where = Where(host, port, tls_cert, tls_key, behind_proxy, hostnames)
-    serve(where, (name or getpass.getuser())[:64], roles, visit)
+    serve(where, (name or getpass.getuser())[:64], roles, visit, folder=shown)
 
 
 @web.group(epilog="Example: pbl web account add R.Viewer --role reviewer")

@@ -20,12 +20,26 @@ from starlette.staticfiles import StaticFiles
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
-from . import access, compare, decide, drawn, entry, find, judge, look, operate, people, take, way_in
+from . import (
+    access,
+    compare,
+    decide,
+    drawn,
+    entry,
+    find,
+    judge,
+    look,
+    operate,
+    people,
+    results_folder,
+    take,
+    way_in,
+)
 from .accounts import Accounts, Attempts
 from .looks import Looks
 from .making import Making
 from .pages import Pages
-from .tables import Tables
+from .tables import Files, Tables
 from .videos import Videos
 
 log = logging.getLogger(__name__)
@@ -40,7 +54,7 @@ _ADDRESS = 2000
 class Options:
     """How the page is served. hosts: names in a Host header that are answered; name and roles: of who opens a link;
     on_entry: called when a link was used, with the key of the next one. accounts: of those who sign in, None where
-    links open the page; secure: browsers reach it by TLS."""
+    links open the page; secure: browsers reach it by TLS; folder: results that are shown in place of the tables."""
 
     hosts: frozenset[str] = frozenset({"127.0.0.1", "localhost", "::1"})
     name: str = ""
@@ -48,6 +62,7 @@ class Options:
     on_entry: Callable[[str], None] | None = None
     accounts: Accounts | None = None
     secure: bool = False
+    folder: results_folder.ResultsFolder | None = None
 
 
 def create_app(options: Options, sessions: access.Sessions | None = None) -> Starlette:
@@ -98,14 +113,17 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
     def failed(request: Request, error: PblError) -> Response:
         return pages.error(request, error, STATUS.get(error.code, 409))
 
-    audit = [Middleware(Looks, tables=tables, failed=failed)] if settings.audit_looks() else []
-    app = Starlette(
-        routes=[
-            Route("/", home),
-            *way_in.routes(pages, way, link_used),
-            Route("/language", language, methods=["POST"]),
+    audit = []
+    if options.folder is not None:
+        parts = [
+            *results_folder.routes(pages, Files(), options.folder),
+            *look.routes(pages, Files(), options.folder),
+        ]
+    else:
+        audit = [Middleware(Looks, tables=tables, failed=failed)] if settings.audit_looks() else []
+        parts = [
             *find.routes(pages, tables),
-            *look.routes(pages, tables, videos),
+            *look.routes(pages, tables, look.OfTables(videos)),
             *decide.routes(pages, tables),
             *people.routes(pages, tables),
             *judge.routes(tables),
@@ -114,6 +132,13 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
             *compare.routes(pages, tables, videos),
             *entry.routes(pages, tables),
             *operate.routes(pages, tables),
+        ]
+    app = Starlette(
+        routes=[
+            Route("/", home),
+            *way_in.routes(pages, way, link_used),
+            Route("/language", language, methods=["POST"]),
+            *parts,
             Mount("/static", StaticFiles(directory=files / "static")),
             Mount("/vendor", StaticFiles(directory=files / "vendor")),
         ],

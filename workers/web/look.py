@@ -6,6 +6,8 @@ import asyncio
 import collections
 import re
 from collections.abc import Hashable
+from pathlib import Path
+from typing import Protocol
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response
@@ -18,7 +20,7 @@ from . import judge
 from .find import number_of
 from .movement import Movement
 from .pages import Pages
-from .tables import Tables
+from .tables import Asks
 from .videos import Videos
 
 #: Recordings whose movement is kept in memory at a time: some hundred kB each.
@@ -28,25 +30,78 @@ _OWN = re.compile(r"/(visits|recordings)(/\d{1,10}(/enter)?)?|/operate")
 _KINDS = {".webm": "video/webm", ".mkv": "video/x-matroska", ".mov": "video/mp4", ".mp4": "video/mp4"}
 
 
-def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
+class Recordings(Protocol):
+    """Where recordings come from: the tables, or a folder of results (`results_folder.ResultsFolder`)."""
+
+    def about(self, number: int) -> recording_page.RecordingPage:
+        """A recording by its number. Raises `PblError` DB_NOT_FOUND."""
+        ...
+
+    def path(self, number: int) -> Path:
+        """The video that is shown of it. Raises `PblError` DB_NOT_FOUND, VIDEO_MISSING."""
+        ...
+
+    def state(self, number: int) -> Hashable:
+        """What tells apart what was fitted to it. Raises `PblError` DB_NOT_FOUND where nothing was."""
+        ...
+
+    def load(self, number: int) -> recording_page.RecordingFit:
+        """The fitted movement of it, where there is one. Raises `PblError` for files that cannot be read."""
+        ...
+
+    def people(self, about: recording_page.RecordingPage) -> tuple[list[choose.Candidates], list[str]]:
+        """Who can be chosen, by tracking method, and the state in which that is shown."""
+        ...
+
+    def judged(self, number: int) -> judge.Judged:
+        """What people decided about it."""
+        ...
+
+
+class OfTables:
+    """The recordings of the tables."""
+
+    def __init__(self, videos: Videos) -> None:
+        self._videos = videos
+
+    def about(self, number: int) -> recording_page.RecordingPage:
+        return recording_page.recording_about(number)
+
+    def path(self, number: int) -> Path:
+        return self._videos.path(number)
+
+    def state(self, number: int) -> Hashable:
+        return _fitted(number)
+
+    def load(self, number: int) -> recording_page.RecordingFit:
+        return _load(number)
+
+    def people(self, about: recording_page.RecordingPage) -> tuple[list[choose.Candidates], list[str]]:
+        return _people(about)
+
+    def judged(self, number: int) -> judge.Judged:
+        return judge.judged(number)
+
+
+def routes(pages: Pages, asks: Asks, recordings: Recordings) -> list[Route]:
     """The addresses of this part."""
 
     async def recording(request: Request) -> Response:
-        about = await tables.ask(recording_page.recording_about, number_of(request))
+        about = await asks.ask(recordings.about, number_of(request))
         problem: PblError | None = None
         if about.has_pictures:
             try:
-                await tables.ask(videos.path, about.video_id)
+                await asks.ask(recordings.path, about.video_id)
             except PblError as error:
                 problem = error
-        people, seen = await tables.ask(_people, about) if about.has_pictures else ([], [])
-        judged = await tables.ask(judge.judged, about.video_id)
+        people, seen = await asks.ask(recordings.people, about) if about.has_pictures else ([], [])
+        judged = await asks.ask(recordings.judged, about.video_id)
         return pages.show(
             request, "recording.html", about=about, no_video=problem, people=people, seen=seen, judged=judged
         )
 
     async def video(request: Request) -> Response:
-        path = await tables.ask(videos.path, number_of(request))
+        path = await asks.ask(recordings.path, number_of(request))
         return FileResponse(path, media_type=_KINDS.get(path.suffix.lower(), "video/mp4"))
 
     kept: collections.OrderedDict[Hashable, asyncio.Future[Movement]] = collections.OrderedDict()
@@ -54,7 +109,7 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
     async def prepared(request: Request) -> Movement:
         """What a recording's page asks for, made once for the requests of several."""
         number = number_of(request)
-        key = await tables.ask(_fitted, number)
+        key = await asks.ask(recordings.state, number)
         if key not in kept:
             kept[key] = asyncio.ensure_future(prepare(number))
             while len(kept) > _KEPT:
@@ -67,7 +122,7 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
             raise
 
     async def prepare(number: int) -> Movement:
-        found = await tables.ask(_load, number)
+        found = await asks.ask(recordings.load, number)
         return await asyncio.to_thread(Movement.of, found)
 
     async def movement(request: Request) -> Response:

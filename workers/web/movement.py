@@ -37,8 +37,8 @@ def movement_json(found: RecordingFit, body: dict[str, Any]) -> bytes:
     """Times, joint angles with their 90 % half widths (deg), events, stance, and where a side is uncertain, as JSON.
 
     `time` (T) s; `curves`: name, by side `value` and `half` (T) deg, null where unknown; `events`: time, side, kind,
-    probability; `stance` and `uncertain`: by side, spans (from, to) in s; `body`: that of `body_json`; `points`: how many
-    there are.
+    probability; `stance` and `uncertain`: by side, spans (from, to) in s; `body`: that of `body_json`; `points`: how
+    many there are.
     """
     from pbl_pipeline.gait import interval_90, leg_angles, leg_angles_sd
     from pbl_pipeline.render import stance_spans, uncertain_sides

@@ -21,6 +21,7 @@ from .access import Sessions
 from .accounts import Accounts
 from .app import Options, create_app
 from .connections import Connection
+from .results_folder import ResultsFolder
 
 #: Addresses of this machine alone, and those that mean all of its addresses.
 LOOPBACK, EVERYWHERE = ("127.0.0.1", "::1", "localhost"), ("0.0.0.0", "::", "")  # noqa: S104
@@ -107,6 +108,7 @@ def serve(
     roles: tuple[str, ...] = ("reviewer", "operator"),
     visit: int | None = None,
     accounts: Accounts | None = None,
+    folder: ResultsFolder | None = None,
 ) -> None:
     """Serve the page. On this machine alone a one-time link is printed, after its use the next one; elsewhere people
     sign in with accounts (`pbl web account`).
@@ -121,6 +123,8 @@ def serve(
         session_id of the visit that the link opens; None: the first page.
     accounts
         None: those of this machine.
+    folder
+        Results of `pbl run` that are shown in place of the tables, on this machine alone.
 
     Raises
     ------
@@ -129,6 +133,13 @@ def serve(
         port is taken.
     """
     where.check()
+    if folder is not None and where.by_accounts:
+        raise PblError(
+            "USAGE",
+            found="--folder for more than this machine",
+            expected="a folder of results on this machine alone: nothing says there who may see whom",
+            next_step="leave out --host, --tls-cert and --behind-proxy, or bring the recordings into tables",
+        )
     if where.by_accounts:
         accounts = accounts or Accounts()
         if not accounts.all():
@@ -145,11 +156,14 @@ def serve(
         shown = ", ".join(sorted(where.names))
         click.echo(f"Serving on {where.host}:{port} for {shown}, to those who have an account (pbl web account list).")
     else:
-        app = _opened_by_links(where, port, name, roles, visit)
+        roles = roles if folder is None else ("reader",)
+        options = Options(hosts=where.names, name=name, roles=roles, folder=folder)
+        app = _opened_by_links(where, port, options, visit)
     click.echo("The page ends with Ctrl-C.")
     logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
     threading.Thread(target=_warm, daemon=True).start()
-    with database(), contextlib.closing(listening), contextlib.suppress(KeyboardInterrupt):
+    needed = database() if folder is None else contextlib.nullcontext()
+    with needed, contextlib.closing(listening), contextlib.suppress(KeyboardInterrupt):
         uvicorn.Server(config(app, where)).run(sockets=[listening])
 
 
@@ -177,7 +191,7 @@ def config(app: object, where: Where) -> uvicorn.Config:
     )
 
 
-def _opened_by_links(where: Where, port: int, name: str, roles: tuple[str, ...], visit: int | None) -> object:
+def _opened_by_links(where: Where, port: int, options: Options, visit: int | None) -> object:
     shown = f"[{where.host}]" if ":" in where.host else where.host
     to = f"&to=/visits/{visit}" if visit is not None else ""
 
@@ -189,8 +203,8 @@ def _opened_by_links(where: Where, port: int, name: str, roles: tuple[str, ...],
         say(key)
 
     sessions = Sessions()
-    app = create_app(Options(hosts=where.names, name=name, roles=roles, on_entry=used), sessions)
-    say(sessions.new_link(name, *roles))
+    app = create_app(dataclasses.replace(options, on_entry=used), sessions)
+    say(sessions.new_link(options.name, *options.roles))
     return app
 
 

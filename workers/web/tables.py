@@ -1,17 +1,33 @@
-"""The page's way to the tables: one thread, because DataJoint's connection serves one thread only."""
+"""The page's way to the tables, by one thread because DataJoint's connection serves one thread only; and to files."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import pymysql
 
 from pbl_pipeline.errors import PblError
 
 T = TypeVar("T")
+
+
+class Asks(Protocol):
+    """A way to what is asked, away from the loop that answers browsers."""
+
+    async def ask(self, question: Callable[..., T], *args: Any) -> T:
+        """The answer of a function that reads or writes."""
+        ...
+
+
+class Files:
+    """Asks questions of files, several at a time."""
+
+    async def ask(self, question: Callable[..., T], *args: Any) -> T:
+        """The answer of a function that reads files."""
+        return await asyncio.to_thread(question, *args)
 
 
 class Tables:

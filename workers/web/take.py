@@ -20,6 +20,7 @@ from .pages import Pages
 from .tables import Tables
 
 if TYPE_CHECKING:
+    from pbl_pipeline.export import ExportSession
     from schemas.visit_page import VisitPage
 
 #: Formats of the archive: those that need no further package.
@@ -55,26 +56,30 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
             return session_of_tables(wanted, sensors=False)
 
         session = await tables.ask(load)
-        folder = tempfile.TemporaryDirectory()
-
-        def write() -> Path:
-            from pbl_pipeline.export import ExportOptions, write_export
-
-            # As a reviewer sees it: what failed a check says so in its files.
-            options = ExportOptions(number_trials=True, allow_failed=True)
-            out, archive = Path(folder.name) / "files", Path(folder.name) / "visit.zip"
-            paths = write_export(session, FORMATS, out, options)
-            with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
-                for path in paths:
-                    file.write(path, path.relative_to(out))
-            return archive
-
-        try:
-            archive = await asyncio.to_thread(write)
-        except BaseException:
-            folder.cleanup()
-            raise
-        remove = BackgroundTask(folder.cleanup)
-        return FileResponse(archive, media_type="application/zip", filename=f"visit_{number}.zip", background=remove)
+        return await archive_of(session, f"visit_{number}.zip")
 
     return [Route("/visits/{number:int}/export", export)]
+
+
+async def archive_of(session: ExportSession, name: str) -> Response:
+    """A visit's movement as an archive of that name, in the formats of `FORMATS`."""
+    folder = tempfile.TemporaryDirectory()
+
+    def write() -> Path:
+        from pbl_pipeline.export import ExportOptions, write_export
+
+        # As a reviewer sees it: what failed a check says so in its files.
+        options = ExportOptions(number_trials=True, allow_failed=True)
+        out, archive = Path(folder.name) / "files", Path(folder.name) / "visit.zip"
+        paths = write_export(session, FORMATS, out, options)
+        with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
+            for path in paths:
+                file.write(path, path.relative_to(out))
+        return archive
+
+    try:
+        archive = await asyncio.to_thread(write)
+    except BaseException:
+        folder.cleanup()
+        raise
+    return FileResponse(archive, media_type="application/zip", filename=name, background=BackgroundTask(folder.cleanup))
