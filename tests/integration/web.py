@@ -18,11 +18,13 @@ BASE = "http://127.0.0.1:8484"
 
 
 def client(role: str = "reviewer", name: str = "R. Viewer", signed_in: bool = True) -> TestClient:
-    """A browser of this machine; errors of the program are answers, as they are for a browser."""
-    app = create_app(Options(name=name, roles=(role,)))
+    """A browser of this machine, of a role or several ("reader,operator"); errors of the program are answers, as they
+    are for a browser."""
+    app = create_app(Options(name=name, roles=tuple(role.split(","))))
     browser = TestClient(app, base_url=BASE, raise_server_exceptions=False, headers={"accept-language": "en"})
     if signed_in:
-        found = browser.get("/enter", params={"key": app.state.sessions.new_link(name, role)}, follow_redirects=False)
+        key = app.state.sessions.new_link(name, *role.split(","))
+        found = browser.get("/enter", params={"key": key}, follow_redirects=False)
         assert found.status_code == 303, found.text
     return browser
 
@@ -46,7 +48,7 @@ def shown(
 ) -> Iterator[Any]:  # fmt: skip
     """A page of the browser `chromium`, signed in; an error of a script or an answer that failed fails the test, but
     with `refused` an answer that says why a decision is not accepted (409)."""
-    app = create_app(Options(name=name, roles=(role,)))
+    app = create_app(Options(name=name, roles=tuple(role.split(","))))
     listening = socket.create_server(("127.0.0.1", 0))
     server = uvicorn.Server(uvicorn.Config(app, log_level="error"))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
@@ -58,7 +60,7 @@ def shown(
         opened, errors = made.new_page(), []
         opened.on("pageerror", lambda error: errors.append(str(error)))
         opened.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
-        opened.goto(f"/enter?key={app.state.sessions.new_link(name, role)}")
+        opened.goto(f"/enter?key={app.state.sessions.new_link(name, *role.split(','))}")
         yield opened
         assert not [e for e in errors if not (refused and "409" in e)]
     finally:

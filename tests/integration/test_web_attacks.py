@@ -1,0 +1,221 @@
+"""Attacks on every address of the review page, by its own list of routes: what is added later is attacked as well."""
+
+from __future__ import annotations
+
+import re
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.routing import Route
+
+from schemas import lab, session, study, video
+from schemas.jobs import jobs_of
+from tests.integration import web
+from tests.integration.chain import small_video
+from tests.integration.test_web_accounts import running
+from tests.rows import everything, register
+from workers.populate import populate
+from workers.web import Options, Where, access, create_app
+
+#: What a page must never run, whatever it stands in.
+EVIL = '"><img src=x onerror=alert(1)><script>document.title="pwned"</script>'
+#: Addresses that anybody may open, and that any session may.
+OPEN, ANY_ROLE = {"/", "/enter"}, {"/leave", "/language"}
+#: Forms that change nothing but what the sender sees.
+HARMLESS = {"/leave", "/language", "/visits"}
+
+
+def routes() -> list[tuple[str, str]]:
+    """Method and path of every address, with 1 for its number."""
+    found = [r for r in create_app(Options()).routes if isinstance(r, Route)]
+    assert len(found) > 20
+    methods = [(m, re.sub(r"\{[^}]*\}", "1", r.path)) for r in found for m in r.methods or () if m != "HEAD"]
+    return sorted(set(methods))
+
+
+GETS = [path for method, path in routes() if method == "GET" and path not in OPEN]
+POSTS = [path for method, path in routes() if method == "POST"]
+
+
+def rows() -> dict[str, list[tuple]]:
+    """Every row but DataJoint's own notes, which grow when a queue is looked at for the first time."""
+    return {name: found for name, found in everything().items() if not name.split(".")[1].startswith("~")}
+
+
+@pytest.fixture
+def one_visit(tables: None, tmp_path: Path) -> None:
+    """Visit 1 with video 1, nothing computed."""
+    register(small_video(tmp_path, "walk", n=30), session_label="2026-01-10")
+
+
+def test_no_address_is_open_without_a_session(one_visit: None):
+    stranger = web.client(signed_in=False)
+    before = rows()
+    for path in GETS:
+        answer = stranger.get(path, follow_redirects=False)
+        assert answer.status_code == 401, path
+        assert "P001" not in answer.text
+    for path in POSTS:
+        answer = stranger.post(path, data={"token": "x"}, follow_redirects=False)
+        assert answer.status_code in (401, 403, 405), path
+    assert rows() == before
+
+
+def test_no_form_is_taken_without_its_token_or_from_elsewhere(one_visit: None):
+    browser = web.client("reviewer,operator")
+    token, before = web.token(browser), rows()
+    elsewhere = ({"origin": "https://evil.example"}, {"sec-fetch-site": "cross-site"}, {"origin": "null"})
+    for path in POSTS:
+        for fields, headers in [({}, {}), ({"token": "x"}, {}), *(({"token": token}, h) for h in elsewhere)]:
+            answer = browser.post(path, data=fields, headers=headers, follow_redirects=False)
+            assert answer.status_code == (403 if fields or headers else 415), (path, fields, headers)
+        plain = browser.post(path, content=f'{{"token": "{token}"}}', headers={"content-type": "application/json"})
+        assert plain.status_code in (403, 415), path
+    assert rows() == before
+
+
+def test_a_reader_changes_nothing_anywhere(one_visit: None):
+    reader = web.client("reader")
+    token, before = web.token(reader), rows()
+    for path in POSTS:
+        if path not in HARMLESS:
+            assert reader.post(path, data={"token": token}, follow_redirects=False).status_code == 403, path
+    assert rows() == before
+
+
+def test_an_operator_sees_nothing_of_a_person(one_visit: None):
+    operator = web.client("operator")
+    for path in GETS:
+        answer = operator.get(path, follow_redirects=False)
+        if not path.startswith("/operate"):
+            assert answer.status_code == 403, path
+            assert "P001" not in answer.text
+    for path in POSTS:
+        if path not in ANY_ROLE and not path.startswith("/operate"):
+            assert operator.post(path, data={"token": "x"}, follow_redirects=False).status_code == 403, path
+
+
+@pytest.mark.parametrize("number", ["0", "999", str(2**31), str(10**30), "01"])
+def test_forged_numbers_are_a_page_that_says_so(one_visit: None, number: str):
+    browser = web.client("reviewer,operator")
+    token, before = web.token(browser), rows()
+    for path in [p for p in GETS if "/1" in p]:
+        answer = browser.get(path.replace("/1", f"/{number}"), follow_redirects=False)
+        assert answer.status_code < 500, path
+        assert number == "01" or answer.status_code in (400, 404, 409), (path, answer.status_code)
+    for path in [p for p in POSTS if "/1" in p]:
+        answer = browser.post(path.replace("/1", f"/{number}"), data={"token": token}, follow_redirects=False)
+        assert 400 <= answer.status_code < 500, path
+    assert rows() == before
+
+
+@pytest.mark.parametrize("text", ["", "x" * 2000, "\x00", "'; DROP TABLE x; --", "\N{DISGUISED FACE}", "-1", "1e9"])
+def test_forms_full_of_nonsense_are_refused(one_visit: None, text: str):
+    browser = web.client("reviewer,operator")
+    token, before = web.token(browser), rows()
+    names = ("person", "method", "seen", "result", "check", "computed", "reason", "value:mJOA", "value:role", "table",
+             "code", "key", "event", "time", "note", "x", "y", "video", "all")  # fmt: skip
+    for path in POSTS:
+        if path not in HARMLESS:
+            answer = browser.post(path, data={"token": token, **dict.fromkeys(names, text)}, follow_redirects=False)
+            assert answer.status_code < 500, (path, answer.text)
+    assert rows() == before
+
+
+@pytest.fixture
+def hostile(tables: None, tmp_path: Path) -> Iterator[None]:
+    """Names, labels, roles, notes, instruments and errors that are written to run: visits 1 and 2 with videos."""
+    paths = [small_video(tmp_path, f"<img src=x onerror=alert({i})>", n=240) for i in range(2)]
+    for i, path in enumerate(paths):
+        register(path, session_label=f"2026-0{i + 1}-10")
+    populate()
+    gone = small_video(tmp_path, "<script>alert(3)<'\">", n=30)
+    register(gone, session_label="2026-05-10")
+    gone.unlink()
+    populate()
+    assert len(jobs_of(video.VideoInfo).errors) == 1
+    evil = EVIL[:64]
+    session.Session.update1({"session_id": 1, "session_label": evil})
+    study.Visit.insert1({"session_id": 1, "visit_role": EVIL[:32], "visit_note": EVIL})
+    row = {"instrument_unit": EVIL[:16], "instrument_name": EVIL, "higher_is_better": True, "ordinal": True}
+    study.ClinicalInstrument.insert1({"instrument": EVIL[:32], **row}, skip_duplicates=True)
+    study.ClinicalScore.insert1({"session_id": 1, "instrument": EVIL[:32], "score_value": 3})
+    lab.Population.insert1({"population": EVIL[:32], "population_description": ""}, skip_duplicates=True)
+    lab.Subject.update1({"subject": "P001", "population": EVIL[:32]})
+    yield
+    (study.ClinicalScore & {"instrument": EVIL[:32]}).delete_quick()
+    (study.ClinicalInstrument & {"instrument": EVIL[:32]}).delete_quick()
+
+
+PAGES = ("/visits", "/visits/1", "/visits/2", "/visits/3", "/visits/1/enter", "/recordings/1", "/recordings/3",
+         "/compare?v=1&v=2", "/operate", f"/visits?role={EVIL}&cohort={EVIL}", f"/compare?v={EVIL}")  # fmt: skip
+
+
+def test_names_are_text_on_every_page(hostile: None):
+    browser = web.client(name=EVIL[:60])
+    operator = web.client("operator", name=EVIL[:60])
+    for path in PAGES:
+        page = (operator if path == "/operate" else browser).get(path)
+        assert page.status_code in (200, 400, 404), path
+        assert "onerror=alert" not in re.sub(r"&lt;img src=x onerror=alert|&lt;img src=x onerror", "", page.text), path
+        assert not re.search(r"<img src=x|<script>", page.text), path
+        assert not re.search(r"<style|\sstyle=|<script(?![^>]*\ssrc=\"/)", page.text), path
+
+
+@pytest.mark.needs_extra
+@pytest.mark.slow
+def test_no_name_runs_in_a_browser(hostile: None, chromium: Any):
+    with web.shown(chromium, name=EVIL[:60]) as page:
+        asked: list[str] = []
+        page.on("dialog", lambda d: (asked.append(d.message), d.dismiss()))
+        page.on("request", lambda r: asked.append(r.url) if r.url.endswith("/x") else None)
+        for path in [p for p in PAGES if "?v=" not in p or "v=1" in p]:
+            if path != "/operate":
+                page.goto(path)
+                page.wait_for_timeout(100)
+                assert page.title() != "pwned"
+                assert page.locator("main").is_visible()
+        assert asked == []
+
+
+def test_a_form_that_never_ends_is_given_up(one_visit: None, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(access, "BODY_S", 0.5)
+    app = create_app(Options())
+    link = app.state.sessions.new_link("A", "reviewer")
+    cookie = app.state.sessions.enter(link)
+    with running(app, Where()) as port, socket.create_connection(("127.0.0.1", port)) as slow:
+        head = ["POST /visits HTTP/1.1", f"Host: 127.0.0.1:{port}", f"Cookie: pbl_session={cookie}",
+                "Content-Type: application/x-www-form-urlencoded", "Content-Length: 5000", "", ""]  # fmt: skip
+        slow.sendall("\r\n".join(head).encode())
+        start, answer = time.monotonic(), b""
+        slow.settimeout(0.05)
+        while time.monotonic() - start < 5 and not answer:
+            try:
+                slow.sendall(b"a")
+                answer = slow.recv(65536)
+            except TimeoutError:
+                continue
+        assert answer.startswith(b"HTTP/1.1 413")
+        assert time.monotonic() - start < 3
+
+
+@pytest.mark.parametrize("host", ["two", "none", "port only", "absolute"])
+def test_requests_that_name_another_host_in_other_ways(one_visit: None, host: str):
+    app = create_app(Options())
+    cookie = app.state.sessions.enter(app.state.sessions.new_link("A", "reviewer"))
+    lines = {
+        "two": ["GET /visits HTTP/1.1", "Host: 127.0.0.1", "Host: evil.example"],
+        "none": ["GET /visits HTTP/1.0"],
+        "port only": ["GET /visits HTTP/1.1", "Host: :80"],
+        "absolute": ["GET http://evil.example/visits HTTP/1.1", "Host: evil.example"],
+    }[host]
+    with running(app, Where()) as port, socket.create_connection(("127.0.0.1", port)) as sent:
+        sent.settimeout(5)
+        sent.sendall("\r\n".join([*lines, f"Cookie: pbl_session={cookie}", "Connection: close", "", ""]).encode())
+        answer = sent.recv(65536)
+    assert answer.startswith(b"HTTP/1.1 400")
+    assert b"P001" not in answer
