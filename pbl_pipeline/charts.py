@@ -244,7 +244,7 @@ def series_key(place: int) -> Markup:
     """A sample of a line of `compare_chart`."""
     colour, dash = SERIES[place]
     return Markup(
-        '<svg viewBox="0 0 30 12" class="key" aria-hidden="true"><line x1="0" y1="6" x2="30" y2="6" stroke="{}"'
+        '<svg viewBox="0 0 30 12" class="series" aria-hidden="true"><line x1="0" y1="6" x2="30" y2="6" stroke="{}"'
         ' stroke-width="3" stroke-dasharray="{}"/></svg>'
     ).format(colour, dash)
 

@@ -68,25 +68,33 @@ export class Together {
     }
   }
 
-  /** Let the videos run to the end of the cycle; one that falls behind or runs ahead is brought back. */
+  /** Let the videos run to the end of the cycle. They lead: the phase is the median of theirs, and one that is behind or
+   * ahead of it plays faster or slower. A clock beside them would hurry those that have only begun to play. */
   #follow(/** @type {number} */ turn) {
     return new Promise((done) => {
-      let last = performance.now();
+      const begun = performance.now(), longest = (3000 * this.common) / this.speed + 2000;
       const tick = (/** @type {number} */ now) => {
         if (turn !== this.turn) { done(undefined); return; }
-        this.phase += (this.speed * (now - last)) / 1000 / this.common;
-        last = now;
-        for (const one of this.all) {
-          const off = phaseAt(one, one.video.currentTime) - this.phase, { video } = one;
-          if (Math.abs(off) > 0.06 && !video.seeking) video.currentTime = timeAt(one, Math.min(this.phase, 1));
+        const at = this.all.map((one) => (one.video.ended ? 1 : phaseAt(one, one.video.currentTime)));
+        this.phase = Math.min(Math.max(median(at), 0), 1);
+        this.all.forEach((one, i) => {
+          const off = at[i] - this.phase, { video } = one;
+          if (video.seeking || video.ended) return;
+          if (Math.abs(off) > 0.15) video.currentTime = timeAt(one, this.phase);
           else video.playbackRate = rateOf((one.end - one.start) * Math.min(Math.max(1 - 4 * off, 0.5), 1.5), this.common, this.speed);
-        }
-        this.changed(Math.min(this.phase, 1), true);
-        if (this.phase >= 1) done(undefined); else requestAnimationFrame(tick);
+        });
+        this.changed(this.phase, true);
+        if (this.phase >= 1 || now - begun > longest) done(undefined); else requestAnimationFrame(tick);
       };
       requestAnimationFrame(tick);
     });
   }
+}
+
+/** @param {number[]} values */
+function median(values) {
+  const sorted = [...values].sort((a, b) => a - b), middle = sorted.length >> 1;
+  return sorted.length % 2 ? sorted[middle] : (sorted[middle - 1] + sorted[middle]) / 2;
 }
 
 /** Lines in the charts that stand at the phase. @returns {(phase: number) => void} */
