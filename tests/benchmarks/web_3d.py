@@ -4,8 +4,9 @@
 
 Needs `pip install -e .[browser]` and a Chromium of the machine. Without a graphics processor the browser draws in
 software; the renderer is printed. Bar: 50 frames a second. "drawn" waits after each frame until it is finished;
-"shown" draws a frame each time the browser asks for one, which it does at most 60 times a second; "processor_ms" is what a frame takes of all of the browser's
-processes together (mean of both), which says what idle processors would do where others compute, too.
+"shown" draws a frame each time the browser asks for one, which it does at most 60 times a second. "processor_ms" is
+what a frame takes of all of the browser's processes together (mean of both), which says what idle processors would do
+where others compute, too.
 """
 
 from __future__ import annotations
