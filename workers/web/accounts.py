@@ -113,8 +113,11 @@ class Accounts:
         return account if right else None
 
     def current(self, name: str, changed: str) -> bool:
-        """Whether an account is still as it was when a session was opened."""
-        account = self.all().get(name)
+        """Whether an account is still as it was when a session was opened; not where the file cannot be read."""
+        try:
+            account = self.all().get(name)
+        except PblError:  # who signs in then is told
+            return False
         return account is not None and account.changed == changed
 
     @contextlib.contextmanager
