@@ -7,12 +7,13 @@ from typing import Any
 
 import pytest
 
+from pbl_pipeline.errors import PblError
 from schemas import embedded, forget, session, video
 from schemas.review import Viewing
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
-from workers.web import looks
+from workers.web import Where, looks, serve
 
 
 @pytest.fixture
@@ -76,3 +77,10 @@ def test_what_cannot_be_written_down_is_not_shown(audited: int, monkeypatch: pyt
         embedded.start()
     assert browser.get(f"/recordings/{audited}").status_code == 200
     assert [r[1] for r in rows()] == ["video", "page"]
+
+
+def test_a_folder_is_not_shown_where_rows_are_asked_for(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("PBL_AUDIT_LOOKS", "1")
+    folder: Any = object()  # refused before it is looked into
+    with pytest.raises(PblError, match="--folder with PBL_AUDIT_LOOKS"):
+        serve(Where(port=0), folder=folder)

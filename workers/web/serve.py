@@ -15,6 +15,7 @@ from pathlib import Path
 import click
 import uvicorn
 
+from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
 from .access import Sessions
@@ -133,6 +134,13 @@ def serve(
         port is taken.
     """
     where.check()
+    if folder is not None and settings.audit_looks():
+        raise PblError(
+            "USAGE",
+            found="--folder with PBL_AUDIT_LOOKS",
+            expected="tables, in which each look at a recording leaves a row",
+            next_step="`pbl ingest` the recordings; or unset PBL_AUDIT_LOOKS where nobody asks for it",
+        )
     if folder is not None and where.by_accounts:
         raise PblError(
             "USAGE",
