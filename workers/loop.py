@@ -11,6 +11,9 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from schemas.jobs import jobs_of
+from schemas.scope import Scope
+
 from . import queue, refresh, registry, run_job
 from .batches import run_fits
 from .heartbeat import Listener
@@ -32,7 +35,8 @@ class Worker:
 
     tables: the computed tables it serves. stop: set when it is to end after the running job. report: called with each
     job before it and while it waits for the database (without an outcome), and after it. batch: fits per batch.
-    limit: most jobs of each table. found: what its looks at the tables, and its jobs, made computable.
+    limit: most jobs of each table. found: what its looks at the tables, and its jobs, made computable. only: takes no
+    job but of these recordings; called before each look, as sets come and go.
     """
 
     tables: Sequence[Any]
@@ -41,6 +45,7 @@ class Worker:
     report: Callable[[Claim, Outcome | None], None] = lambda *_: None
     batch: int = 1
     limit: int | None = None
+    only: Callable[[], Scope] | None = None
     done: int = 0
     failed: int = 0
     found: refresh.Refreshed = dataclasses.field(default_factory=refresh.Refreshed)
@@ -81,9 +86,11 @@ class Worker:
 
     def step(self) -> int:
         """Take jobs of the table that is most urgent, and do them; returns how many."""
-        ranked = []
+        ranked, conditions = [], self._conditions()
         for position, table in enumerate(self.tables):
-            urgent = queue.most_urgent(table)
+            if table not in conditions:
+                continue
+            urgent = queue.most_urgent(table, conditions[table])
             if urgent is not None:
                 ranked.append((urgent, -position, table))
         # What is near its end first: a session that is nearly done should not wait for all others to begin.
@@ -92,12 +99,19 @@ class Worker:
             n = self.batch if stage.resource == registry.FIT else stage.batch
             if self.limit is not None:
                 n = min(n, self.limit - self._taken[table.__name__])
-            jobs = queue.claim(table, n) if n > 0 else []
+            jobs = queue.claim(table, n, conditions[table]) if n > 0 else []
             if jobs:
                 self._taken[table.__name__] += len(jobs)
                 self._do(jobs)
                 return len(jobs)
         return 0
+
+    def _conditions(self) -> dict[Any, str | None]:
+        """The tables of which jobs may be taken, and the condition on their keys."""
+        if self.only is None:
+            return dict.fromkeys(self.tables)
+        scope = self.only()
+        return {table: where for table in self.tables if (where := scope.where(table)) is not None}
 
     def _do(self, jobs: list[Claim]) -> None:
         if registry.stage_of(jobs[0].table).resource == registry.FIT and self.batch > 1:
@@ -140,7 +154,16 @@ class Worker:
         self.found.add(refresh.after(good, [o.job for o in outcomes if o.what == run_job.FAILED]))
 
     def _refresh(self) -> bool | None:
-        """Look at all tables if it is time. Whether something was found; None where another worker is at it."""
+        """Look at all tables if it is time. Whether something was found; None where another worker is at it, or at a
+        job of the recordings that are ours alone."""
+        if self.only is not None:
+            scope = self.only()
+            found = refresh.refresh_scope(scope)
+            self.found.add(found)
+            if found.queued or found.freed or found.planned:
+                return True
+            held = [(jobs_of(t).reserved & where) for t in self.tables if (where := scope.where(t)) is not None]
+            return None if any(len(jobs) for jobs in held) else False
         if time.monotonic() - self._refreshed < REFRESH_EVERY_S and self._refreshed > 0:
             return False
         self.heartbeat.doing("looks at all tables")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from pbl_pipeline import progress
-from schemas import computed_tables, tracking
+from schemas import computed_tables, scope, tracking
 from schemas.jobs import jobs_of
 from schemas.status import empty_rows
 
@@ -52,7 +53,12 @@ class Run:
         return bool(self.dropped or self.planned or any(t.done or t.errors for t in self.tables))
 
 
-def populate(tables: Sequence[str] | None = None, limit: int | None = None, retry_errors: bool = False) -> Run:
+def populate(
+    tables: Sequence[str] | None = None,
+    limit: int | None = None,
+    retry_errors: bool = False,
+    visit: int | None = None,
+) -> Run:
     """Compute what is missing. One call is one worker; several may run at once. `schemas.activate()` comes before.
 
     Parameters
@@ -63,6 +69,9 @@ def populate(tables: Sequence[str] | None = None, limit: int | None = None, retr
         Most computations per table.
     retry_errors
         Clear error rows first, so that their keys are tried again.
+    visit
+        session_id of the visit of which alone is computed, its usable recordings and current sets; jobs of it that
+        other workers hold are waited for. None: everything.
 
     Raises
     ------
@@ -75,12 +84,14 @@ def populate(tables: Sequence[str] | None = None, limit: int | None = None, retr
     chosen = [t for t in computed_tables() if not tables or t in wanted]
     parts = {t.__name__: TableRun(t.__name__) for t in chosen}
     run = Run(list(parts.values()))
+    only = None if visit is None else functools.partial(scope.of_visit, visit)
     if retry_errors:
-        run.retried = sum(queue.reset_to_new(jobs_of(t).errors) for t in chosen)
+        of_visit = {t: True if only is None else only().where(t) for t in chosen}
+        run.retried = sum(queue.reset_to_new(jobs_of(t).errors & w) for t, w in of_visit.items() if w is not None)
     empty_before = {t: len(empty_rows(t)) for t in chosen}
-    found = refresh.refresh(everything=True) or refresh.Refreshed()
+    found = (refresh.refresh(everything=True) if only is None else refresh.refresh_scope(only())) or refresh.Refreshed()
     with progress.bar("populate", total=_ready(chosen, limit), unit="row") as update:
-        worker = Worker(chosen, Silent(), report=_counting(parts, chosen, limit, update), limit=limit)
+        worker = Worker(chosen, Silent(), report=_counting(parts, chosen, limit, update), limit=limit, only=only)
         try:
             worker.run(once=True)
         except (KeyboardInterrupt, SystemExit):

@@ -121,20 +121,22 @@ def sweep(table: Any, which: str = "status != 'reserved'") -> int:
 
 
 # --------------------------------------------------------------------------------------------------- reserving, ending
-def most_urgent(table: Any) -> int | None:
-    """Priority of the first job that can be taken now; None where there is none."""
+def most_urgent(table: Any, where: str | None = None) -> int | None:
+    """Priority of the first job that can be taken now; None where there is none. `where`: of those for whose key a
+    condition holds."""
     jobs = jobs_of(table)
     row = jobs.connection.query(
-        f"SELECT priority FROM {jobs.full_table_name} WHERE status='pending'"  # noqa: S608
+        f"SELECT priority FROM {jobs.full_table_name} WHERE status='pending'{f' AND {where}' if where else ''}"  # noqa: S608
         " AND scheduled_time <= CURRENT_TIMESTAMP(3) ORDER BY priority, scheduled_time LIMIT 1"
     ).fetchone()
     return None if row is None else int(row[0])
 
 
-def claim(table: Any, n: int = 1) -> list[Claim]:
-    """Reserve up to n jobs, the most urgent and oldest first; where many workers draw, nearly so."""
+def claim(table: Any, n: int = 1, where: str | None = None) -> list[Claim]:
+    """Reserve up to n jobs, the most urgent and oldest first; where many workers draw, nearly so. `where`: as for
+    `most_urgent`."""
     jobs = jobs_of(table)
-    ready = jobs.pending & "scheduled_time <= CURRENT_TIMESTAMP(3)"
+    ready = jobs.pending & "scheduled_time <= CURRENT_TIMESTAMP(3)" & (where or True)
     rows = ready.proj("priority", "attempts").to_dicts(order_by="priority, scheduled_time", limit=_SPREAD * n)
     claims: list[Claim] = []
     # Everybody sees the same candidates: a random order within a priority makes two hands on one job rare.

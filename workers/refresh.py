@@ -6,7 +6,8 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from schemas import chain, fit, tracking, video, worker
+from schemas import chain, fit, review, tracking, video, worker
+from schemas.scope import Scope
 from schemas.worker import alone
 
 from . import queue, recover
@@ -105,40 +106,43 @@ def refresh(everything: bool | None = None) -> Refreshed | None:
             return None
         if everything is None:
             everything = _few(server) or _age_of_full_look() > ALL_EVERY_S
-        recent = None if everything else Recent.find()
-        if recent is not None and len(recent.videos) > FEW:  # an archive that was just registered
-            recent = None
-        out = _refresh(chain.computed_tables(), recent)
-        if recent is None:
+        lately = None if everything else recent()
+        if lately is not None and len(lately.videos) > FEW:  # an archive that was just registered
+            lately = None
+        out = _refresh(chain.computed_tables(), lately)
+        if lately is None:
             _note_full_look()
         return out
 
 
-@dataclasses.dataclass(frozen=True)
-class Recent:
-    """Recordings that something from outside may have happened to lately, and their sessions."""
-
-    videos: list[int]
-    sessions: list[int]
-
-    @classmethod
-    def find(cls) -> Recent:
-        """Registered, or decided about by a person, in the last `RECENT_DAYS`."""
-        since = f">= CURRENT_TIMESTAMP - INTERVAL {RECENT_DAYS} DAY"
-        ids = {int(v) for v in (video.Video & f"video_created {since}").to_arrays("video_id")}
-        ids |= {int(v) for v in (tracking.SubjectOverride & f"override_created {since}").to_arrays("video_id")}
-        return cls(sorted(ids), sessions_of([{"video_id": v} for v in ids]))
-
-    def where(self, table: Any) -> str | None:
-        """Condition on the first column of a table's key; None where nothing of it can be recent."""
-        if "fit_set" not in table.heading.primary_key:
-            return f"video_id in ({','.join(map(str, self.videos))})" if self.videos else None
-        rows = fit.FitSet & f"session_id in ({','.join(map(str, self.sessions))})" if self.sessions else None
-        sets = [] if rows is None else [str(s) for s in rows.to_arrays("fit_set")]
-        return "fit_set in (" + ",".join(f"'{s}'" for s in sets) + ")" if sets else None
+def recent() -> Scope:
+    """Recordings that something from outside may have happened to lately, and their sessions: registered, or decided
+    about by a person, in the last `RECENT_DAYS`."""
+    since = f">= CURRENT_TIMESTAMP - INTERVAL {RECENT_DAYS} DAY"
+    ids = {int(v) for v in (video.Video & f"video_created {since}").to_arrays("video_id")}
+    ids |= {int(v) for v in (tracking.SubjectOverride & f"override_created {since}").to_arrays("video_id")}
+    decided = review.Decision & f"decision_at {since}" & "video_id is not null"
+    ids |= {int(v) for v in decided.to_arrays("video_id")}
+    return Scope(sorted(ids), sessions_of([{"video_id": v} for v in ids]))
 
 
-def _refresh(tables: Sequence[Any], recent: Recent | None) -> Refreshed:
+def refresh_scope(scope: Scope) -> Refreshed:
+    """`refresh` for some recordings alone, beside whoever looks at all: what of them can be computed is queued, what
+    nobody asks for any more is taken out of the queues."""
+    out = Refreshed()
+    for table in chain.computed_tables():
+        out.freed += recover.free_dead(table)
+        if table is fit.SessionFit:
+            out.planned = plan(scope.sessions)
+        where = scope.where(table)
+        if where is not None:
+            out.swept += queue.sweep(table, f"status != 'reserved' AND {where}")
+            if n := queue.fill(table, where=where):
+                out.queued[table.__name__] = n
+    return out
+
+
+def _refresh(tables: Sequence[Any], lately: Scope | None) -> Refreshed:
     from schemas.tracking import drop_outdated_choices
 
     out = Refreshed()
@@ -147,9 +151,9 @@ def _refresh(tables: Sequence[Any], recent: Recent | None) -> Refreshed:
     out.dropped = drop_outdated_choices()
     for table in tables:
         if table is fit.SessionFit:
-            out.planned = plan(None if recent is None else recent.sessions)
-        where = None if recent is None else recent.where(table)
-        if recent is not None and where is None:
+            out.planned = plan(None if lately is None else lately.sessions)
+        where = None if lately is None else lately.where(table)
+        if lately is not None and where is None:
             out.swept += queue.sweep(table, "status = 'error'")  # few: those of a deleted row go at once
             continue
         out.swept += queue.sweep(table)

@@ -13,14 +13,17 @@ import uvicorn
 from starlette.testclient import TestClient
 
 from workers.web import Options, create_app
+from workers.web.computing import Target, compute_visit
 
 BASE = "http://127.0.0.1:8484"
 
 
-def client(role: str = "reviewer", name: str = "R. Viewer", signed_in: bool = True) -> TestClient:
+def client(
+    role: str = "reviewer", name: str = "R. Viewer", signed_in: bool = True, target: Target = compute_visit
+) -> TestClient:
     """A browser of this machine, of a role or several ("reader,operator"); errors of the program are answers, as they
-    are for a browser."""
-    app = create_app(Options(name=name, roles=tuple(role.split(","))))
+    are for a browser. target: what computes a visit."""
+    app = create_app(Options(name=name, roles=tuple(role.split(",")), target=target))
     browser = TestClient(app, base_url=BASE, raise_server_exceptions=False, headers={"accept-language": "en"})
     if signed_in:
         key = app.state.sessions.new_link(name, *role.split(","))
@@ -44,11 +47,11 @@ def post(browser: TestClient, path: str, **fields: object):
 @contextlib.contextmanager
 def shown(
     chromium: Any, role: str = "reviewer", size: tuple[int, int] = (390, 800), name: str = "R. Viewer",
-    refused: bool = False, **context: Any
+    refused: bool = False, target: Target = compute_visit, **context: Any
 ) -> Iterator[Any]:  # fmt: skip
     """A page of the browser `chromium`, signed in; an error of a script or an answer that failed fails the test, but
     with `refused` an answer that says why something is not done or not there (4xx)."""
-    app = create_app(Options(name=name, roles=tuple(role.split(","))))
+    app = create_app(Options(name=name, roles=tuple(role.split(",")), target=target))
     listening = socket.create_server(("127.0.0.1", 0))
     server = uvicorn.Server(uvicorn.Config(app, log_level="error"))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})

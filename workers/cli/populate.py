@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 @click.option("--table", "tables", multiple=True, metavar="NAME", help="Only this table; may be given several times.")
 @click.option("--limit", type=click.IntRange(min=1), help="At most this many computations per table.")
 @click.option("--retry-errors", is_flag=True, help="Clear error rows first and try their videos again.")
-def populate(tables: tuple[str, ...], limit: int | None, retry_errors: bool) -> None:
+@click.option("--visit", type=click.IntRange(min=1), metavar="NUMBER", help="Only this visit (`pbl list visits`).")
+def populate(tables: tuple[str, ...], limit: int | None, retry_errors: bool, visit: int | None) -> None:
     """Compute what is missing, table after table. Safe to repeat and to run in several processes at once.
 
     A video that fails leaves an error row with a code and a next step (`pbl status` shows it) while all others finish;
@@ -28,7 +29,7 @@ def populate(tables: tuple[str, ...], limit: int | None, retry_errors: bool) -> 
     from workers.populate import populate as run_once
 
     schemas.activate()
-    run = run_once(tables, limit, retry_errors)
+    run = run_once(tables, limit, retry_errors, visit)
     for line in summary(run):
         click.echo(line)
     if run.interrupted:

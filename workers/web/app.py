@@ -23,6 +23,7 @@ from pbl_pipeline.errors import PblError
 from . import (
     access,
     compare,
+    compute,
     decide,
     drawn,
     entry,
@@ -36,6 +37,7 @@ from . import (
     way_in,
 )
 from .accounts import Accounts, Attempts
+from .computing import Computing, Target, compute_visit
 from .looks import Looks
 from .making import Making
 from .pages import Pages
@@ -54,7 +56,8 @@ _ADDRESS = 2000
 class Options:
     """How the page is served. hosts: names in a Host header that are answered; name and roles: of who opens a link;
     on_entry: called when a link was used, with the key of the next one. accounts: of those who sign in, None where
-    links open the page; secure: browsers reach it by TLS; folder: results that are shown in place of the tables."""
+    links open the page; secure: browsers reach it by TLS; folder: results that are shown in place of the tables;
+    target: what the process runs that computes a visit."""
 
     hosts: frozenset[str] = frozenset({"127.0.0.1", "localhost", "::1"})
     name: str = ""
@@ -63,6 +66,7 @@ class Options:
     accounts: Accounts | None = None
     secure: bool = False
     folder: results_folder.ResultsFolder | None = None
+    target: Target = compute_visit
 
 
 def create_app(options: Options, sessions: access.Sessions | None = None) -> Starlette:
@@ -73,12 +77,14 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
     sessions = sessions or access.Sessions()
     way = way_in.WayIn(sessions, access.Cookie(options.secure), accounts, Attempts())
     pages, tables, videos, making = Pages(accounts is not None), Tables(), Videos(), Making()
+    computing = Computing(options.target)
     files = Path(__file__).parent
 
     @contextlib.asynccontextmanager
     async def life(app: Starlette) -> AsyncIterator[None]:
         yield
         making.close()
+        computing.close()
         videos.close()
         tables.close()
 
@@ -129,6 +135,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
             *judge.routes(tables),
             *take.routes(pages, tables),
             *drawn.routes(pages, tables, making),
+            *compute.routes(pages, tables, computing),
             *compare.routes(pages, tables, videos),
             *entry.routes(pages, tables),
             *operate.routes(pages, tables),
@@ -163,4 +170,5 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
         lifespan=life,
     )
     app.state.sessions, app.state.way_in = sessions, way
+    app.state.computing = computing
     return app

@@ -14,6 +14,7 @@ from pbl_pipeline.errors import PblError
 from schemas import choose, decide, video
 
 from .access import Refused, Session, form_of
+from .computing import queue_visit_of
 from .find import LARGEST, number_of
 from .pages import Pages
 from .tables import Tables
@@ -29,6 +30,7 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
         chosen = _number(fields.get("person", ""))
         method, seen = fields.get("method", ""), fields.get("seen", "")
         await tables.ask(decide.decide_person, number, method, chosen, session.name, seen)
+        await tables.ask(queue_visit_of, number)
         return RedirectResponse(f"/recordings/{number}", 303)
 
     async def accept(request: Request) -> Response:

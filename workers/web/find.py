@@ -14,8 +14,10 @@ from starlette.routing import Route
 
 from schemas import decide, visit_list
 from schemas.enter import entry
+from schemas.visit_progress import visit_progress
 
 from .access import Session, form_of
+from .computing import told as told_of
 from .pages import Pages
 from .tables import Tables
 
@@ -62,8 +64,16 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
         decided = await tables.ask(decide.decisions, about.visit.session_id)
         accepted = await tables.ask(decide.accepted, about.key) if about.key else {}
         entered = await tables.ask(entry, about.visit.session_id)
+        told = told_of(request, await tables.ask(visit_progress, about.visit.session_id))
         return pages.show(
-            request, "visit.html", about=about, decisions=decided, accepted=accepted, entry=entered, interval=interval
+            request,
+            "visit.html",
+            about=about,
+            decisions=decided,
+            accepted=accepted,
+            entry=entered,
+            interval=interval,
+            told=told,
         )
 
     return [

@@ -12,6 +12,7 @@ from starlette.routing import Route
 from schemas import decide, fit, hand_events, usable, video
 
 from .access import Refused, Session, form_of
+from .computing import queue_visit_of
 from .find import number_of
 from .tables import Tables
 
@@ -52,6 +53,7 @@ def routes(tables: Tables) -> list[Route]:
             await tables.ask(decide.mark_not_usable, number, reason, note, session.name, seen)
         else:
             raise Refused("form")
+        await tables.ask(queue_visit_of, number)
         return RedirectResponse(f"/recordings/{number}", 303)
 
     async def events(request: Request) -> Response:
@@ -63,6 +65,7 @@ def routes(tables: Tables) -> list[Route]:
         else:
             found = _events(fields.get("events", ""))
             await tables.ask(hand_events.save, number, found, session.name, seen)
+        await tables.ask(queue_visit_of, number)
         return RedirectResponse(f"/recordings/{number}", 303)
 
     return [

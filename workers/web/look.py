@@ -15,8 +15,10 @@ from starlette.routing import Route
 
 from pbl_pipeline.errors import PblError
 from schemas import choose, decide, recording_page
+from schemas.visit_progress import Progress, visit_progress
 
 from . import judge
+from .computing import told as told_of
 from .find import number_of
 from .movement import Movement
 from .pages import Pages
@@ -57,6 +59,10 @@ class Recordings(Protocol):
         """What people decided about it."""
         ...
 
+    def progress(self, session_id: int) -> Progress:
+        """What is still to be computed of its visit."""
+        ...
+
 
 class OfTables:
     """The recordings of the tables."""
@@ -82,6 +88,9 @@ class OfTables:
     def judged(self, number: int) -> judge.Judged:
         return judge.judged(number)
 
+    def progress(self, session_id: int) -> Progress:
+        return visit_progress(session_id)
+
 
 def routes(pages: Pages, asks: Asks, recordings: Recordings) -> list[Route]:
     """The addresses of this part."""
@@ -96,8 +105,9 @@ def routes(pages: Pages, asks: Asks, recordings: Recordings) -> list[Route]:
                 problem = error
         people, seen = await asks.ask(recordings.people, about) if about.has_pictures else ([], [])
         judged = await asks.ask(recordings.judged, about.video_id)
+        told = told_of(request, await asks.ask(recordings.progress, about.session_id))
         return pages.show(
-            request, "recording.html", about=about, no_video=problem, people=people, seen=seen, judged=judged
+            request, "recording.html", about=about, no_video=problem, people=people, seen=seen, judged=judged, told=told
         )
 
     async def video(request: Request) -> Response:

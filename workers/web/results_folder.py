@@ -18,6 +18,7 @@ from pbl_pipeline.errors import PblError
 from schemas.recording_page import RecordingFit, RecordingPage
 from schemas.visit_list import Result
 from schemas.visit_page import MeasureRow
+from schemas.visit_progress import Progress
 
 from .access import REPORT_POLICY
 from .find import interval, number_of
@@ -202,6 +203,9 @@ class ResultsFolder:
     def judged(self, number: int) -> Judged:
         """Nothing is decided about results in a folder."""
         return Judged(None, "", 0, None)
+
+    def progress(self, session_id: int) -> Progress:
+        return Progress(session_id, 0, (), ())
 
 
 def routes(pages: Pages, files: Asks, folder: ResultsFolder) -> list[Route]:

@@ -1,0 +1,26 @@
+"""What the process that computes a visit for the page runs in tests: the real one, behind stand-ins."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import pytest
+
+from workers.web.computing import compute_visit
+
+from . import chain
+
+
+def compute(session_id: int, again: bool, pipe: Connection) -> None:
+    """`compute_visit` with stand-ins. A file in the folder PBL_TEST_HOLD holds it up (`hold`) or kills it (`kill`)."""
+    folder = Path(os.environ["PBL_TEST_HOLD"])
+    if (folder / "kill").exists():
+        os.kill(os.getpid(), signal.SIGKILL)
+    while (folder / "hold").exists():
+        time.sleep(0.05)
+    chain.install(pytest.MonkeyPatch())
+    compute_visit(session_id, again, pipe)

@@ -1,0 +1,52 @@
+"""Compute a visit on request, and how far it is."""
+
+from __future__ import annotations
+
+from starlette.requests import Request
+from starlette.responses import RedirectResponse, Response
+from starlette.routing import Route
+
+from pbl_pipeline.errors import PblError
+from schemas.visit_progress import visit_progress
+
+from .access import Refused, form_of
+from .computing import Computing, told
+from .find import number_of
+from .look import own_address
+from .pages import Pages
+from .tables import Tables
+
+
+def routes(pages: Pages, tables: Tables, computing: Computing) -> list[Route]:
+    """The addresses of this part."""
+
+    async def compute(request: Request) -> Response:
+        fields = await form_of(request, "decide")
+        number = number_of(request)
+        if fields.get("again") not in ("yes", "no"):
+            raise Refused("form")
+        await tables.ask(_must_be_there, number)
+        computing.begin(number, fields["again"] == "yes")
+        return RedirectResponse(own_address(fields.get("back", f"/visits/{number}")), 303)
+
+    async def progress(request: Request) -> Response:
+        number = number_of(request)
+        await tables.ask(_must_be_there, number)
+        return pages.show(request, "progress.html", told=told(request, await tables.ask(visit_progress, number)))
+
+    return [
+        Route("/visits/{number:int}/compute", compute, methods=["POST"]),
+        Route("/visits/{number:int}/progress", progress),
+    ]
+
+
+def _must_be_there(session_id: int) -> None:
+    from schemas import session
+
+    if not session.Session & {"session_id": session_id}:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no session_id {session_id}",
+            expected="a registered visit",
+            next_step="`pbl list visits` prints the numbers",
+        )
