@@ -182,6 +182,7 @@ def test_from_the_button_to_the_result(visits: None, chromium: Any, hold: Path):
         page.goto("/visits/1")
         page.get_by_role("button", name="Compute now").click()
         page.get_by_text("This visit is being computed").wait_for()
+        page.wait_for_load_state("load")
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         page.evaluate("window.loaded = 'once'")
         page.wait_for_timeout(2000)
