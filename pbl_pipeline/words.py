@@ -50,6 +50,19 @@ PELVIS_ANGLES: dict[str, tuple[str, str]] = {
 #: So does the direction of the foot.
 FOOT_ANGLES: dict[str, tuple[str, str]] = {"foot_progression": ("Foot direction", "toes in +")}
 
+#: Why a recording is not usable, by one word; "other" asks for words of one's own.
+UNUSABLE: dict[str, str] = {
+    "not_in_view": "the person is not in view, or only in part",
+    "too_dark": "too dark or blurred",
+    "camera_moved": "the camera was moved, or stood badly",
+    "other_person": "somebody else is filmed",
+    "other_task": "another task than the registered one",
+    "helped": "the person was held or led",
+    "interrupted": "the walk was interrupted",
+    "duplicate": "the same walk as in another recording",
+    "other": "another reason",
+}
+
 
 @functools.cache
 def unit_of(name: str) -> str:

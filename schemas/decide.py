@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.words import UNUSABLE
 
 from . import fit, qc, session, tracking, usable, video
 from .choose import choice_applied, selection_of
@@ -102,7 +103,7 @@ def mark_not_usable(video_id: int, reason: str, note: str = "", by: str = "", se
     Parameters
     ----------
     reason, note
-        One of `video.UNUSABLE_REASONS`, and more in free words (no names), which "other" asks for.
+        One of `words.UNUSABLE`, and more in free words (no names), which "other" asks for.
     by
         Name of who decides.
     seen
@@ -115,11 +116,11 @@ def mark_not_usable(video_id: int, reason: str, note: str = "", by: str = "", se
         DECIDED_MEANWHILE where `seen` is another state than the tables'.
     """
     note = " ".join(note.split())[:500]
-    if reason not in video.UNUSABLE_REASONS or (reason == "other" and not note):
+    if reason not in UNUSABLE or (reason == "other" and not note):
         raise PblError(
             "USAGE",
             found="the reason 'other' without words" if reason == "other" else f"the reason {reason!r}",
-            expected="one of " + ", ".join(video.UNUSABLE_REASONS) + "; with 'other' also words of your own",
+            expected="one of " + ", ".join(UNUSABLE) + "; with 'other' also words of your own",
             next_step="choose a reason, and say more in the note; nothing was changed",
             key=f"video_id={video_id}",
         )

@@ -7,25 +7,14 @@ import datetime
 from collections.abc import Iterable
 from typing import Any
 
-from . import video
+from pbl_pipeline.words import UNUSABLE
 
-#: The reasons in words, for texts in English.
-REASONS = {
-    "not_in_view": "the person is not in view, or only in part",
-    "too_dark": "too dark or blurred",
-    "camera_moved": "the camera was moved, or stood badly",
-    "other_person": "somebody else is filmed",
-    "other_task": "another task than the registered one",
-    "helped": "the person was held or led",
-    "interrupted": "the walk was interrupted",
-    "duplicate": "the same walk as in another recording",
-    "other": "another reason",
-}
+from . import video
 
 
 @dataclasses.dataclass(frozen=True)
 class Unusable:
-    """A recording that is marked as not usable. reason: one of `video.UNUSABLE_REASONS`; note: more of it."""
+    """A recording that is marked as not usable. reason: one of `words.UNUSABLE`; note: more of it."""
 
     video_id: int
     reason: str
@@ -36,7 +25,7 @@ class Unusable:
     @property
     def text(self) -> str:
         """Why, in words."""
-        said = REASONS[self.reason]
+        said = UNUSABLE[self.reason]
         return self.note if self.reason == "other" and self.note else f"{said} ({self.note})" if self.note else said
 
 

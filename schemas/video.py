@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.words import UNUSABLE
 
 from . import lab, session  # noqa: F401  the definitions refer to them
 from ._datajoint import dj
@@ -100,27 +101,13 @@ class RigView(dj.Manual):
     """
 
 
-#: Why a recording is not usable, as people say it with one word; "other" asks for words of their own.
-UNUSABLE_REASONS = (
-    "not_in_view",
-    "too_dark",
-    "camera_moved",
-    "other_person",
-    "other_task",
-    "helped",
-    "interrupted",
-    "duplicate",
-    "other",
-)
-
-
 @schema
 class NotUsable(dj.Manual):
     definition = f"""
     # recordings that a person marked as not usable: nothing further is computed of them, and no set of a fit takes them
     -> Video
     ---
-    unusable_reason  : enum({", ".join(f"'{r}'" for r in UNUSABLE_REASONS)})
+    unusable_reason  : enum({", ".join(f"'{r}'" for r in UNUSABLE)})
     unusable_note='' : varchar(500)            # more of why, in the person's words; no names
     unusable_by      : varchar(64)             # name of who decided
     unusable_created : datetime                # when, UTC

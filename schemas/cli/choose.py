@@ -7,21 +7,10 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pbl_pipeline.words import UNUSABLE
+
 if TYPE_CHECKING:
     from schemas.choose import Candidates
-
-#: Those of `schemas.video`, which is loaded only where the command runs (a test compares them).
-UNUSABLE = (
-    "not_in_view",
-    "too_dark",
-    "camera_moved",
-    "other_person",
-    "other_task",
-    "helped",
-    "interrupted",
-    "duplicate",
-    "other",
-)
 
 
 @click.command()
@@ -29,7 +18,9 @@ UNUSABLE = (
 @click.argument("person", type=click.IntRange(min=1), required=False)
 @click.option("--sheet", type=click.Path(path_type=Path), help="Write a picture of the numbered people (.jpg, .png).")
 @click.option("--tracking-method", metavar="NAME", help="Which tracking is meant, where a video has several.")
-@click.option("--not-usable", "reason", type=click.Choice(UNUSABLE), help="Leave the video out, for this reason.")
+@click.option(
+    "--not-usable", "reason", type=click.Choice(tuple(UNUSABLE)), help="Leave the video out, for this reason."
+)
 @click.option("--note", default="", metavar="TEXT", help="With --not-usable: more of why, without names.")
 @click.option("--usable", is_flag=True, help="Take --not-usable back.")
 def choose(

@@ -239,6 +239,9 @@ def test_every_answer_carries_the_headers(four_visits: None):
         assert "unsafe" not in policy
         assert policy.startswith("default-src 'none'")
         assert (answer.headers["x-content-type-options"], answer.headers["cache-control"]) == ("nosniff", "no-store")
+    # The name of such a file carries its version.
+    assert "immutable" in browser.get("/vendor/uplot-1.6.32.min.js").headers["cache-control"]
+    assert browser.get("/vendor/none.js").headers["cache-control"] == "no-store"
 
 
 def test_no_page_has_a_script_or_style_of_its_own(four_visits: None):

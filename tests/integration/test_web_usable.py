@@ -12,7 +12,6 @@ import pbl_pipeline.fit
 import pbl_pipeline.keypoints
 from pbl_pipeline.errors import PblError
 from schemas import decide, fit, gdi, listing, qc, slices, study, tracking, usable, video, visit_list
-from schemas.cli.choose import UNUSABLE
 from schemas.ingest import Visit
 from schemas.marker_recordings import ingest_markers
 from schemas.plan import plan_fit_sets
@@ -202,7 +201,6 @@ def test_a_forged_form_changes_nothing(visit: tuple[int, int]):
 
 
 def test_the_command(visit: tuple[int, int]):
-    assert UNUSABLE == video.UNUSABLE_REASONS == tuple(usable.REASONS)
     said = pbl("choose", 1, "--not-usable", "camera_moved", "--note", "fell over")
     assert (said.code, "left out" in said.out) == (0, True)
     assert usable.unusable([1, 2])[1].text == "the camera was moved, or stood badly (fell over)"

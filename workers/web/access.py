@@ -52,6 +52,8 @@ CONTENT_POLICY = "; ".join(
 )
 #: Of a report, which is one file with its own style and no script.
 REPORT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
+#: What a browser keeps: files whose names carry their versions.
+KEPT = "/vendor/"
 HEADERS = {
     "content-security-policy": CONTENT_POLICY,
     "x-content-type-options": "nosniff",
@@ -222,9 +224,13 @@ class Gate:
                 await self._app(scope, receive, send)
             return
 
+        kept = scope["path"].startswith(KEPT)
+
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
+                if kept and message["status"] == 200:
+                    headers["cache-control"] = "public, max-age=31536000, immutable"
                 for name, value in self._headers.items():
                     headers.setdefault(name, value)
             await send(message)

@@ -9,7 +9,8 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 
-from schemas import decide, fit, hand_events, usable, video
+from pbl_pipeline.words import UNUSABLE
+from schemas import decide, fit, hand_events, usable
 
 from .access import Refused, Session, form_of
 from .computing import queue_visit_of
@@ -29,7 +30,7 @@ class Judged:
     usable_state: str
     views: int
     events: hand_events.Shown | None
-    reasons: tuple[str, ...] = video.UNUSABLE_REASONS
+    reasons: tuple[str, ...] = tuple(UNUSABLE)
 
 
 def judged(video_id: int) -> Judged:
