@@ -50,12 +50,7 @@ def entry(session_id: int) -> Entry:
     """What can be entered about a visit. Raises `PblError` DB_NOT_FOUND for a number that no visit has."""
     rows = (session.Session & {"session_id": session_id}).to_dicts()
     if not rows:
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=f"no session_id {session_id}",
-            expected="a registered visit",
-            next_step="`pbl list visits` prints the numbers",
-        )
+        raise session.unknown_visit(session_id)
     roles = (study.Visit & {"session_id": session_id}).to_arrays("visit_role")
     scores = (study.ClinicalScore & {"session_id": session_id}).to_dicts()
     stored = {r["instrument"]: f"{r['score_value']:.12g}" for r in scores}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pbl_pipeline.errors import PblError
+
 from . import lab  # noqa: F401  the definition refers to it
 from ._datajoint import dj
 
@@ -23,3 +25,13 @@ class Session(dj.Manual):
     session_created     : datetime             # when registered, UTC
     unique index (subject, session_label)
     """
+
+
+def unknown_visit(session_id: int) -> PblError:
+    """DB_NOT_FOUND for a number that no visit has."""
+    return PblError(
+        "DB_NOT_FOUND",
+        found=f"no session_id {session_id}",
+        expected="a registered visit",
+        next_step="`pbl list visits` prints the numbers",
+    )

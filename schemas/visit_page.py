@@ -72,12 +72,7 @@ def visit_about(session_id: int, shown: int = 0) -> VisitPage:
     """
     subjects = (session.Session & {"session_id": session_id}).to_arrays("subject")
     if not len(subjects):
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=f"no session_id {session_id}",
-            expected="a registered visit",
-            next_step="`pbl list visits` prints the numbers",
-        )
+        raise session.unknown_visit(session_id)
     of_person = visits_of(str(subjects[0]))
     results = tuple(results_of([session_id])[session_id])
     if not 0 <= shown < max(1, len(results)):

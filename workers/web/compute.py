@@ -6,7 +6,6 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 
-from pbl_pipeline.errors import PblError
 from schemas.visit_progress import visit_progress
 
 from .access import Refused, form_of
@@ -44,9 +43,4 @@ def _must_be_there(session_id: int) -> None:
     from schemas import session
 
     if not session.Session & {"session_id": session_id}:
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=f"no session_id {session_id}",
-            expected="a registered visit",
-            next_step="`pbl list visits` prints the numbers",
-        )
+        raise session.unknown_visit(session_id)
