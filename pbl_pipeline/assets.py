@@ -19,6 +19,7 @@ from pathlib import Path
 
 from . import progress, settings
 from .errors import PblError
+from .files import one_process
 from .packages import NpmPackage, Package, Wheel
 
 #: Longest that a download may take (s); the largest package has 51 MB.
@@ -359,13 +360,7 @@ def _checksum(what: str, found: str, expected: str, next_step: str) -> PblError:
 @contextlib.contextmanager
 def _one_at_a_time() -> Iterator[None]:
     """Let one process fetch while others wait for it. Without file locks both fetch, which is slower but as safe."""
-    try:
-        import fcntl
-    except ImportError:
-        yield
-        return
-    with (folder() / ".lock").open("w", encoding="utf-8") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    with one_process(folder() / ".lock"):
         for left in folder().glob("fetch-*"):  # of a process that was killed: we alone fetch now
             shutil.rmtree(left) if left.is_dir() else left.unlink()
         yield

@@ -42,6 +42,19 @@ def fields_of(path: str | Path) -> frozenset[str]:
 
 
 @contextmanager
+def one_process(path: Path) -> Iterator[None]:
+    """Let one process in at a time, by a lock of the file `path`; where the system has none, all."""
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    with path.open("a", encoding="utf-8") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+@contextmanager
 def _coded(path: str | Path) -> Iterator[None]:
     try:
         yield

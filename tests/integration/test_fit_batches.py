@@ -96,11 +96,11 @@ def test_told_to_end_at_once_it_puts_all_back(sessions):
 def test_a_database_that_is_away_between_two_batches_leaves_no_job_behind(sessions, monkeypatch):
     worker, claim, asked = sessions(lambda n: None), queue.claim, []
 
-    def away_once(table, n=1):
+    def away_once(table, n=1, only=None):
         asked.append(n)
         if len(asked) == 3:
             raise pymysql.err.OperationalError(2006, "Server has gone away")
-        return claim(table, n)
+        return claim(table, n, only)
 
     monkeypatch.setattr(queue, "claim", away_once)
     worker.run(once=True)

@@ -186,7 +186,7 @@ class Cookie:
             self.name, value, max_age=seconds, path="/", httponly=True, samesite="strict", secure=self.secure
         )
 
-    def delete(self, response: Response) -> None:
+    def forget(self, response: Response) -> None:
         """Have a browser forget it."""
         response.delete_cookie(self.name, path="/", httponly=True, samesite="strict", secure=self.secure)
 

@@ -25,6 +25,7 @@ from typing import Any, ClassVar
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import one_process
 from schemas.folders import private_folder
 from schemas.json_files import write_json
 
@@ -123,7 +124,7 @@ class Accounts:
     @contextlib.contextmanager
     def _changing(self) -> Iterator[dict[str, Account]]:
         private_folder(self.path.parent)
-        with _alone(self.path.with_suffix(".lock")):
+        with one_process(self.path.with_suffix(".lock")):
             known = dict(self.all())
             yield known
             rows = {a.name: {"roles": a.roles, "password": a.password, "changed": a.changed} for a in known.values()}
@@ -172,17 +173,6 @@ def _nobody() -> str:
     """A hash that no password has, which costs what others cost."""
     nothing = base64.b64encode(b"0" * 16).decode()
     return f"scrypt${LOG_N}${R}${P}${nothing}${nothing}"
-
-
-@contextlib.contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    """One process at a time, where the system has locks of files."""
-    with path.open("a") as lock:
-        if os.name == "posix":
-            import fcntl
-
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
 
 
 def _now() -> str:

@@ -85,7 +85,7 @@ def routes(pages: Pages, way: WayIn, used: object = None) -> list[Route]:
         await form_of(request, "")
         way.sessions.leave(way.cookie.of(request))
         response = RedirectResponse("/", 303)
-        way.cookie.delete(response)
+        way.cookie.forget(response)
         return response
 
     if way.accounts is None:
