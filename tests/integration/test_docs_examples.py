@@ -143,7 +143,7 @@ def test_who_looked_at_a_person(visit: dict[str, Any]):
     lab.Subject.insert1({**lab.Subject.fetch1(), "subject": "P017"})
     session.Session.update1({"session_id": visit["session_id"], "subject": "P017"})
     record_viewing("video_id", visit["video_id"], "page", "R. Viewer")
-    _, (looks,) = run("docs/web.md", 0)
+    _, (_, looks) = run("docs/web.md", 0)
     assert looks["viewing_by"].tolist() == ["R. Viewer"]
 
 
