@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
+from pbl_pipeline.errors import PblError
+
 from . import fit, gait, keypoints, session, video
 from .results import load_keypoints, load_trial_fit
 from .video import unknown_video
@@ -95,6 +97,19 @@ def trial_key(video_id: int) -> dict[str, Any] | None:
     trials = fit.SessionFit.Trial.proj() * fit.SessionFit.proj("fit_computed") * current & {"video_id": video_id}
     rows = trials.to_dicts(order_by="fit_computed DESC", limit=1)
     return {k: rows[0][k] for k in fit.SessionFit.Trial.primary_key} if rows else None
+
+
+def fitted_key(video_id: int) -> dict[str, Any]:
+    """`trial_key` of a recording that has a fit. Raises `PblError` DB_NOT_FOUND for one that has none, or none now."""
+    about = recording_about(video_id)
+    if about.key is None:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no fit of video_id {video_id}: {about.problem}",
+            expected="a recording to which a body is fitted",
+            next_step="`pbl populate`; `pbl why` says what stops it",
+        )
+    return about.key
 
 
 def computed(key: dict[str, Any]) -> tuple[Any, ...]:

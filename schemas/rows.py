@@ -142,6 +142,10 @@ def inside(column: str, values: Iterable[str | int]) -> Any:
     return f"{column} IN ({listed})" if listed else False
 
 
+#: Times that a cascade is begun anew where somebody inserts below it meanwhile.
+_DELETES = 5
+
+
 def delete_below(table: Any, keys: Sequence[Mapping[str, Any]]) -> dict[str, int]:
     """Delete the rows with these keys and all that was computed from them, in one transaction.
 
@@ -152,5 +156,12 @@ def delete_below(table: Any, keys: Sequence[Mapping[str, Any]]) -> dict[str, int
     # As plain keys: a cascade from a restriction by subqueries fails in DataJoint 2.3.5 ("attribute not found").
     target = table & list(keys)
     counts = {name: n for name, n in dj.Diagram.cascade(target, part_integrity="cascade").counts().items() if n}
-    target.delete(prompt=False, part_integrity="cascade")
+    for attempt in range(_DELETES):
+        try:
+            target.delete(prompt=False, part_integrity="cascade")
+            break
+        except dj.DataJointError as error:
+            # A worker inserted a row below one that is deleted, after its table's turn; the row above is locked now.
+            if attempt == _DELETES - 1 or not str(error).startswith("Delete blocked"):
+                raise
     return counts

@@ -116,7 +116,9 @@ class Person(threading.Thread):
     def _movement(self, number: int) -> None:
         answer = self._ask("movement", f"/recordings/{number}/movement")
         # 404: what it was computed for is pending.
-        if answer is not None and not (answer.status_code == 404 or "curves" in answer.json()):
+        if answer is None or (answer.status_code == 404 and "DB_NOT_FOUND" in answer.text):
+            return
+        if answer.status_code != 200 or "curves" not in answer.json():
             self._wrong(f"movement of {number}: {answer.status_code}")
 
     def _video(self, number: int) -> None:

@@ -9,8 +9,10 @@ from typing import Any
 import pytest
 
 from pbl_pipeline.errors import PblError
-from schemas import choose, decide, fit, forget, qc, tracking
+from schemas import choose, decide, fit, forget, qc, recording_page, tracking
+from schemas._datajoint import dj
 from schemas.review import Decision
+from schemas.rows import delete_below
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import everything, register
@@ -103,6 +105,34 @@ def test_the_picture_of_the_people(two_alike: int, monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("PBL_DEIDENTIFY", "blur")  # it shows faces
     assert browser.get(f"/recordings/{two_alike}/people?method=0").status_code == 404
     assert "/people?" not in browser.get(f"/recordings/{two_alike}").text
+
+
+def test_a_worker_that_inserts_below_what_is_deleted_stops_no_decision(two_alike: int, monkeypatch: pytest.MonkeyPatch):
+    """DataJoint then says that its cascade was blocked; the second time the row is among those that go."""
+    browser = web.client()
+    assert send(browser, two_alike, form_of(browser, two_alike), 2).status_code == 303
+    populate()
+    real, times = dj.Table.delete, []
+
+    def blocked(self: Any, **how: Any) -> int:
+        times.append(self.table_name)
+        if len(times) == 1:
+            raise dj.DataJointError("Delete blocked by table `pbl_gait`.`__spatiotemporal` in an unloaded schema.")
+        return real(self, **how)
+
+    monkeypatch.setattr(dj.Table, "delete", blocked)
+    assert send(browser, two_alike, form_of(browser, two_alike), 1).status_code == 303
+    assert (len(times), len(fit.SessionFit()), len(tracking.SubjectChoice())) == (2, 0, 0)
+
+
+def test_a_fit_that_is_deleted_while_its_page_loads_is_pending(two_alike: int, monkeypatch: pytest.MonkeyPatch):
+    browser = web.client()
+    assert send(browser, two_alike, form_of(browser, two_alike), 2).status_code == 303
+    populate()
+    gone = lambda key: tuple(delete_below(fit.SessionFit, fit.SessionFit().keys()))  # noqa: E731
+    monkeypatch.setattr(recording_page, "computed", gone)
+    answer = browser.get(f"/recordings/{two_alike}/movement")
+    assert (answer.status_code, "DB_NOT_FOUND" in answer.text) == (404, True)
 
 
 @pytest.fixture

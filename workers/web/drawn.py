@@ -98,9 +98,7 @@ def overlay_key(video_id: int) -> tuple[Any, ...]:
 
 def load_overlay(video_id: int) -> Task:
     """How the overlay of a recording is drawn."""
-    key = recording_page.trial_key(video_id)
-    assert key is not None, "overlay_key raises"
-    found = recording_page.recording_fit(key)
+    found = recording_page.recording_fit(recording_page.fitted_key(video_id))
     with contextlib.ExitStack() as stack:
         path = stack.enter_context(privacy.shown(video_id)) or video.present_file(video_id)
         return Task("overlay.mp4", _draw, (path, found.fit, found.keypoints, found.events), stack.pop_all())

@@ -77,10 +77,10 @@ class OfTables:
         return self._videos.path(number)
 
     def state(self, number: int) -> Hashable:
-        return _fitted(number)
+        return recording_page.computed(recording_page.fitted_key(number))
 
     def load(self, number: int) -> recording_page.RecordingFit:
-        return _load(number)
+        return recording_page.recording_fit(recording_page.fitted_key(number))
 
     def people(self, about: recording_page.RecordingPage) -> tuple[list[choose.Candidates], list[str]]:
         return _people(about)
@@ -151,25 +151,6 @@ def routes(pages: Pages, asks: Asks, recordings: Recordings) -> list[Route]:
         Route("/recordings/{number:int}/body", body),
         Route("/recordings/{number:int}/points", points),
     ]
-
-
-def _fitted(video_id: int) -> Hashable:
-    """What tells apart what was fitted to a recording. Raises `PblError` DB_NOT_FOUND where nothing was."""
-    about = recording_page.recording_about(video_id)
-    if about.key is None:
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=f"no fit of video_id {about.video_id}: {about.problem}",
-            expected="a recording to which a body is fitted",
-            next_step="`pbl populate`; `pbl why` says what stops it",
-        )
-    return recording_page.computed(about.key)
-
-
-def _load(video_id: int) -> recording_page.RecordingFit:
-    key = recording_page.trial_key(video_id)
-    assert key is not None, "_fitted raises"
-    return recording_page.recording_fit(key)
 
 
 def _people(about: recording_page.RecordingPage) -> tuple[list[choose.Candidates], list[str]]:
