@@ -12,6 +12,7 @@ from pbl_pipeline.errors import PblError
 from . import tracking, video
 from .jobs import jobs_of
 from .method_rows import stored_key
+from .plan import locked
 from .results import load_tracking
 from .stored_files import file_ref, stored_file
 
@@ -139,9 +140,7 @@ def choose_person(video_id: int, person: int, tracking_method: str | None = None
     """
     selection = selection_of(video_id, tracking_method)
     failed = jobs_of(tracking.SubjectChoice)  # declares the job table, which would end a transaction
-    connection = tracking.schema.connection
-    assert connection is not None
-    with connection.transaction:
+    with locked(int((video.Video & {"video_id": video_id}).fetch1("session_id"))):
         return choice_applied(selection, person, failed)
 
 

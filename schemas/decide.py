@@ -72,11 +72,7 @@ def decide_person(video_id: int, tracking_method: str, person: int, by: str, see
     """
     selection = selection_of(video_id, tracking_method)
     failed = jobs_of(tracking.SubjectChoice)  # declares the job table, which would end a transaction
-    connection = tracking.schema.connection
-    assert connection is not None
-    with connection.transaction:
-        table = video.Video.full_table_name  # who decides at the same moment waits here
-        connection.query(f"SELECT video_id FROM {table} WHERE video_id = %s FOR UPDATE", args=(video_id,))  # noqa: S608
+    with locked(int((video.Video & {"video_id": video_id}).fetch1("session_id"))):  # who decides meanwhile waits here
         if person_state(video_id, tracking_method) != seen:
             raise meanwhile(video_id, "person")
         rows = (tracking.SubjectChoice & selection).to_dicts()
