@@ -101,15 +101,15 @@ def trial_key(video_id: int) -> dict[str, Any] | None:
 
 def fitted_key(video_id: int) -> dict[str, Any]:
     """`trial_key` of a recording that has a fit. Raises `PblError` DB_NOT_FOUND for one that has none, or none now."""
-    about = recording_about(video_id)
-    if about.key is None:
+    key = trial_key(video_id)
+    if key is None:
         raise PblError(
             "DB_NOT_FOUND",
-            found=f"no fit of video_id {video_id}: {about.problem}",
+            found=f"no fit of video_id {video_id}: {recording_about(video_id).problem}",
             expected="a recording to which a body is fitted",
             next_step="`pbl populate`; `pbl why` says what stops it",
         )
-    return about.key
+    return key
 
 
 def computed(key: dict[str, Any]) -> tuple[Any, ...]:

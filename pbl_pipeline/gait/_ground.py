@@ -94,7 +94,9 @@ def where_feet_stand(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
     slides = [c.lengths.slide for c in cycles if c.lengths.slide is not None]
     if not slides or np.median(slides) <= MAX_SLIDE:
         return list(cycles)
-    return [dataclasses.replace(c, lengths=Lengths(missing=SLIDES)) if c.lengths.slide else c for c in cycles]
+    return [
+        dataclasses.replace(c, lengths=Lengths(missing=SLIDES)) if c.lengths.slide is not None else c for c in cycles
+    ]
 
 
 def _place(feet: FootTrajectories, foot: int, down_s: float, stride_s: float) -> tuple[np.ndarray | None, float]:
