@@ -10,7 +10,7 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.words import UNUSABLE
 
-from . import fit, qc, session, tracking, usable, video
+from . import fit, qc, tracking, usable, video
 from .choose import choice_applied, selection_of
 from .ingest import next_id
 from .jobs import jobs_of
@@ -174,13 +174,9 @@ def accept_check(key: Mapping[str, Any], number: int, by: str, reason: str = "")
     PblError
         DB_NOT_FOUND where there is no such check (any more), USAGE for one that is not WARN.
     """
-    connection = qc.schema.connection
-    assert connection is not None
     key = {k: key[k] for k in qc.SessionQc.primary_key}
-    with connection.transaction:
-        session_id = int((fit.FitSet & key).fetch1("session_id"))
-        table = session.Session.full_table_name
-        connection.query(f"SELECT session_id FROM {table} WHERE session_id = %s FOR UPDATE", args=(session_id,))  # noqa: S608
+    session_id = int((fit.FitSet & key).fetch1("session_id"))
+    with locked(session_id):
         rows = (qc.SessionQc.proj("qc_computed") * qc.SessionQc.Check & key & {"qc_no": number}).to_dicts()
         if not rows:
             raise PblError(
