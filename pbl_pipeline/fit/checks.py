@@ -156,11 +156,11 @@ def _height(session: Session, scale: np.ndarray, taller: float | None) -> list[C
         _scale(scale * stature_m(session.body, np.ones_like(scale)) / stature_m(session.body, scale)),
         Check(
             "body_height_stated",
-            PASS if SCALE_LOW <= taller <= SCALE_HIGH else WARN,
+            PASS if SCALE_LOW <= taller <= SCALE_HIGH else FAIL,
             taller,
             SCALE_HIGH if taller > 1 else SCALE_LOW,
             "the stated height is far from what is seen (value: their ratio): a mistyped height, another person, or a "
-            "child, whose size a detector does not know",
+            "child, whom a phone's detector takes for an adult and on whom nobody has measured its index",
         ),
     ]
 

@@ -10,15 +10,23 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from pbl_pipeline.body import marker_set
+from pbl_pipeline.body import load_body, marker_set
 from pbl_pipeline.cli.events import events as events_command
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.gait import FootTrajectories, GaitEvents, detect_events, feet_from_markers, find_cycles
+from pbl_pipeline.gait import (
+    FootTrajectories,
+    GaitEvents,
+    detect_events,
+    feet_from_fit,
+    feet_from_markers,
+    find_cycles,
+)
 from pbl_pipeline.gait.events import METHODS
 from pbl_pipeline.gait.events._phase import double_support_s
 from pbl_pipeline.gait.events.network.predict import load, model_path
 from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.synthetic import Impairment, SynthSpec, Truth, synthesise
+from pbl_pipeline.validation import fit_of_qpos
 from research.events._gaits import curve_foot_off, gait_angles
 from research.events._leg import leg_points
 from research.events._rhythm import Rhythm, draw_run, leg_phase, schedule
@@ -252,6 +260,44 @@ def test_standing_on_the_spot_and_a_kick_are_no_walk():
         angles, heading = not_walking(rng, time)
         found = detect_events(feet_of_legs(0.9 * leg_points(angles, heading, np.ones((2, 8)))))
         assert found.status == "EMPTY", seed
+
+
+def rolling(seconds: float, fps: float) -> tuple[Truth, np.ndarray]:
+    """Somebody on wheels whose feet push along: 0.7 m/s, the knees by 25 deg either way; the person, and qpos."""
+    truth = truth_of(seed=1, task="sit_to_stand")
+    names, time = load_body().joint_names, np.arange(round(seconds * fps)) / fps
+    qpos = np.tile(truth.qpos[0], (len(time), 1))
+    forward = np.cos(qpos[:, names.index("pelvis_rotation")])
+    qpos[:, names.index("pelvis_tx")] += np.sign(forward) * 0.7 * time
+    for side, sign in (("r", 1.0), ("l", -1.0)):
+        push = sign * np.deg2rad(25) * np.sin(2 * np.pi * 0.9 * time)
+        for joint, share in (("knee_angle", 1.0), ("ankle_angle", 0.5), ("hip_flexion", 0.15)):
+            qpos[:, names.index(f"{joint}_{side}")] += share * push
+    return truth, qpos
+
+
+@pytest.mark.parametrize("method", [*METHODS])
+def test_feet_that_push_a_wheelchair_along_are_no_gait(method):
+    truth, qpos = rolling(8.0, 30.0)
+    fit = fit_of_qpos("wheelchair", np.arange(len(qpos)) / 30.0, qpos, truth.scale)
+    empty(detect_events(feet_from_fit(fit), method), "sits")
+
+
+def test_who_gets_up_from_the_wheelchair_has_events_only_after_it():
+    truth, seated = rolling(8.0, 30.0)
+    walk = truth_of(seed=1)
+    qpos = np.concatenate([seated, walk.qpos])
+    fit = fit_of_qpos("transfer", np.arange(len(qpos)) / 30.0, qpos, truth.scale)
+    found = detect_events(feet_from_fit(fit))
+    assert found.status == "PASS"
+    assert min(e.time_s for e in found.events) > 7.5
+    assert len(found.events) > 0.8 * len(walk.events)
+
+
+def test_the_deepest_crouch_still_stands():
+    for seed in range(4):
+        truth = truth_of(seed=seed, impairments=(Impairment("crouch", 1.0),))
+        assert detect_events(feet_of(truth)).status == "PASS", seed
 
 
 @pytest.mark.parametrize("method", [*METHODS])

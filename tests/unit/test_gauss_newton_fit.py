@@ -174,7 +174,7 @@ def test_a_known_height_sets_every_length_and_moves_no_pixel():
     assert check(known, "body_height_stated") == "PASS"
     assert (b.height_m, a.height_m) == (tall, pytest.approx(np.nan, nan_ok=True))
     mistyped = fit_session([small], ["a"], PARAMSET, height_m=1.4 * tall)
-    assert check(mistyped, "body_height_stated") == "WARN"
+    assert check(mistyped, "body_height_stated") == "FAIL"
     assert check(mistyped, "scale_furthest_from_1") == "PASS"  # proportions, not the size
     with pytest.raises(PblError, match="FIT_INPUT"):
         fit_session([small], ["a"], PARAMSET, height_m=172.0)

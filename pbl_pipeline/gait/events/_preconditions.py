@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from jaxtyping import Bool
 
 from pbl_pipeline.bounded import MAX_SECONDS, span_s
 from pbl_pipeline.errors import PblError
@@ -15,6 +16,11 @@ from .network.predict import GRID_HZ, MAX_GAP_S, Grid, on_grid
 
 #: Somebody who sits has the hips at half of this length above the feet and more; below it the legs lie.
 MIN_HIP_HEIGHT = 0.3
+#: Hips above the lower foot, as a share of thigh and shank together, below which somebody sits. Walking, crouched to 60
+#: deg at the knee too, 0.92 and more; on a chair 0.67 to 0.72 (5th percentiles of recorded and synthetic motions).
+SEATED_HEIGHT = 0.8
+#: Who sits in more of the frames than this is not searched.
+SEATED_SHARE = 0.95
 #: Cosine between where the pelvis faces and where it goes, below which the person walks backwards.
 BACKWARDS = -0.5
 
@@ -59,7 +65,21 @@ def _grid(feet: FootTrajectories, least_s: float) -> tuple[Grid | None, str, str
     if height < MIN_HIP_HEIGHT:
         said = f"the hips are {height:.2f} leg lengths above the feet: nobody stands"
         return grid, said, "nothing to do where the person lies or sits; else the vertical axis (z up) is another one"
+    if np.mean(seated(grid)[hips]) > SEATED_SHARE:
+        said = "the person sits: the hips are never above the lower foot by what a standing person's are"
+        return grid, said, "feet that push a wheelchair or a stool along have no gait events"
     return grid, "", ""
+
+
+def seated(grid: Grid) -> Bool[np.ndarray, " N"]:
+    """Frames in which somebody sits, by `SEATED_HEIGHT`; none where hips, knees and ankles are never seen together."""
+    x = np.where(grid.known[..., None], grid.joints_m, np.nan)
+    leg = np.linalg.norm(np.diff(x[:, :3], axis=1), axis=-1).sum(axis=1)
+    if not np.isfinite(leg).any():
+        return np.zeros(len(x), bool)
+    below = ((x[:, 0].mean(axis=1)[:, None, None] - x[:, 2:]) @ grid.up).reshape(len(x), -1)
+    height = np.where(np.isfinite(below), below, -np.inf).max(axis=1)
+    return np.isfinite(height) & (height < SEATED_HEIGHT * np.nanmedian(leg))
 
 
 def check_upright(grid: Grid) -> float:

@@ -10,6 +10,7 @@ from scipy.ndimage import uniform_filter1d
 
 from pbl_pipeline.runs import runs
 
+from ._preconditions import seated
 from .network.features import GRID_HZ
 from .network.predict import Grid, Phases
 
@@ -40,7 +41,7 @@ class WalkingParams:
 
 
 def walking_stretches(grid: Grid, phases: Phases, params: WalkingParams) -> list[tuple[int, int]]:
-    """First and last frame of the grid of each stretch of walking."""
+    """First and last frame of the grid of each stretch of walking: none while somebody sits."""
     frames = max(1, round(params.average_s * GRID_HZ))
     count = uniform_filter1d(phases.seen.astype(float), frames, mode="constant")
     mean = uniform_filter1d(phases.walking * phases.seen, frames, mode="constant") / np.maximum(count, 1e-9)
@@ -49,6 +50,7 @@ def walking_stretches(grid: Grid, phases: Phases, params: WalkingParams) -> list
     unseen = _without_short(~phases.seen, True, round(params.max_gap_s * GRID_HZ))
     walks = (walks | ~phases.seen) & ~unseen
     walks &= ~(np.abs(turning_deg_per_s(grid)) > params.max_turn_deg_per_s)
+    walks &= ~_without_short(seated(grid), True, round(params.pause_s * GRID_HZ))
     walks = _without_short(walks, True, round(params.shortest_s * GRID_HZ))
     swing = swing_leg(grid)
     return [(run.start, run.stop - 1) for run in runs(walks) if reach_leg(swing[run]) >= params.min_swing_leg]
