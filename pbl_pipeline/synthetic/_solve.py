@@ -231,6 +231,8 @@ class _Soles:
                 size.append(float(scale[body.scale_index[index]]))
                 local.append(size[-1] * np.array(place) * [1, 1, sign])
         self._ids, self._local = np.array(ids), np.array(local)
+        joints = self._model.jnt_bodyid
+        self._carried_by = np.array([[self._hangs_on(body, other) for other in joints] for body in ids])
         # The foot flat at the origin, pointing along x: forward, left, height above the floor.
         self._flat = np.empty((len(ids), 3))
         for i, (name, place) in enumerate(zip(self.names, self._local, strict=True)):
@@ -239,38 +241,30 @@ class _Soles:
             at = toes + place
             self._flat[i] = [at[0], -at[2], at[1] + SOLE_M * size[i]]
 
+    def _hangs_on(self, body: int, other: int) -> bool:
+        while body > other:  # parents have smaller numbers
+            body = self._model.body_parentid[body]
+        return body == other
+
     def points(self, q: np.ndarray) -> np.ndarray:
         """Points (N, P, 3)."""
-        x = np.empty((len(q), len(self._ids), 3))
-        for t, values in enumerate(q):
-            self._place(values)
-            turn = self._data.xmat[self._ids].reshape(-1, 3, 3)
-            x[t] = self._data.xpos[self._ids] + np.einsum("pij,pj->pi", turn, self._local)
-        return x
+        return self._points(*self._placed(q, "xpos", "xmat"))
 
     def with_jacobian(self, q: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points (N, P, 3) and their derivatives (N, P, 3, n) by the free joints."""
-        n_p = len(self._ids)
-        x, jac = np.empty((len(q), n_p, 3)), np.empty((len(q), n_p, 3, len(free)))
-        full = np.empty((3, self._model.nv))
-        for t, values in enumerate(q):
-            self._place(values)
-            mujoco.mj_comPos(self._model, self._data)
-            for p in range(n_p):
-                x[t, p] = self._at(p)
-                mujoco.mj_jac(self._model, self._data, full, None, x[t, p], self._ids[p])
-                jac[t, p] = full[:, free]
-        return x, jac
+        """Points (N, P, 3) and their derivatives (N, P, 3, n) by the free joints: a hinge moves what it carries by
+        axis x arm, a slide along its axis."""
+        xpos, xmat, axis, anchor = self._placed(q, "xpos", "xmat", "xaxis", "xanchor")
+        x, axis = self._points(xpos, xmat), axis[:, None, free]
+        turned = np.cross(axis, x[:, :, None] - anchor[:, None, free])
+        by_joint = np.where(self._model.jnt_type[free, None] == mujoco.mjtJoint.mjJNT_SLIDE, axis, turned)
+        return x, np.moveaxis(by_joint * self._carried_by[:, free, None], -1, -2)
 
     def carried(self, q: np.ndarray, contacts: Contacts) -> np.ndarray:
         """Where the pelvis (N, 3) is when the held points are where they belong in the mean, smoothly."""
-        pelvis = np.empty((len(q), 3))
-        for t, values in enumerate(q):
-            self._place(values)
-            x = np.array([self._at(p) for p in range(len(self._ids))])
-            weight = contacts.weight[t, :, 2] + 1e-9
-            pelvis[t] = self._data.xpos[1] + np.average(contacts.target_m[t] - x, axis=0, weights=weight)
-        return gaussian_filter1d(pelvis, 0.1 / GRID_STEP_S, axis=0, mode="nearest")
+        xpos, xmat = self._placed(q, "xpos", "xmat")
+        weight = contacts.weight[:, :, 2, None] + 1e-9
+        off = np.sum(weight * (contacts.target_m - self._points(xpos, xmat)), axis=1) / np.sum(weight, axis=1)
+        return gaussian_filter1d(xpos[:, 1] + off, 0.1 / GRID_STEP_S, axis=0, mode="nearest")
 
     def contacts(self, plan: Plan) -> Contacts:
         t, n_p = plan.grid_s, len(self.names)
@@ -295,13 +289,19 @@ class _Soles:
         x, y, z = self._flat[i]
         return np.array([step.xy_m[0] + c * x - s * y, step.xy_m[1] + s * x + c * y, z])
 
-    def _place(self, values: np.ndarray) -> None:
-        self._data.qpos[:] = values
-        mujoco.mj_kinematics(self._model, self._data)
+    def _placed(self, q: np.ndarray, *names: str) -> list[np.ndarray]:
+        """What MuJoCo's kinematics say of each pose, by name: (N, ...)."""
+        out = [np.empty((len(q), *getattr(self._data, name).shape)) for name in names]
+        for t, values in enumerate(q):
+            self._data.qpos[:] = values
+            mujoco.mj_kinematics(self._model, self._data)
+            for array, name in zip(out, names, strict=True):
+                array[t] = getattr(self._data, name)
+        return out
 
-    def _at(self, p: int) -> np.ndarray:
-        body = self._ids[p]
-        return self._data.xpos[body] + self._data.xmat[body].reshape(3, 3) @ self._local[p]
+    def _points(self, xpos: np.ndarray, xmat: np.ndarray) -> np.ndarray:
+        turn = xmat[:, self._ids].reshape(len(xmat), len(self._ids), 3, 3)
+        return xpos[:, self._ids] + np.einsum("npij,pj->npi", turn, self._local)
 
 
 def _holds(point: str, step: Step) -> list[tuple[tuple[float, float, float], tuple[float, float]]]:

@@ -301,7 +301,7 @@ def cost(session: Session, w: Weights, state: State) -> jax.Array:
     return total(At(p, w, state, markers, soles, phone))
 
 
-@pytest.mark.parametrize("kind", ["moving", "views", "world", "floor", "moving floor", "moving detector", "pelvis"])
+@pytest.mark.parametrize("kind", ["views", "world", "floor", "moving floor", "moving detector", "pelvis"])
 def test_normal_equations_hold_the_gradient_of_the_cost(kind):
     session, detector = small_session(kind), "detector" in kind
     params = dataclasses.replace(PARAMS, weight_pelvis=0.5) if "pelvis" in kind else PARAMS
@@ -314,8 +314,8 @@ def test_normal_equations_hold_the_gradient_of_the_cost(kind):
         return n * cost(session, w, moved(state, dx, dy))
 
     at = jax.jit(lambda s: linearise(session.body, p, w, s))(state)
-    want_g, want_h = jax.jit(jax.grad(changed, (0, 1)))(jnp.zeros_like(at.g), jnp.zeros_like(at.h))
-    assert float(at.cost) == pytest.approx(float(cost(session, w, state)), rel=1e-5)
+    value, (want_g, want_h) = jax.jit(jax.value_and_grad(changed, (0, 1)))(jnp.zeros_like(at.g), jnp.zeros_like(at.h))
+    assert float(at.cost) == pytest.approx(float(value) / n, rel=1e-5)
     k = 8 + state.site_offset_m.size
     pairs = {
         "qpos": (at.g[:, :40], want_g[:, :40]),
