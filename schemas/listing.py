@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 
-from . import fit, gdi, keypoints, lab, session, video
+from . import fit, gdi, keypoints, lab, review, session, video
 from ._datajoint import dj
 from ._methods import METHOD_TABLES
 from .usable import unusable
@@ -53,6 +53,17 @@ def videos(restriction: Any = True) -> pd.DataFrame:
     return rows[[*first, *(c for c in rows.columns if c not in first)]]
 
 
+def decisions(restriction: Any = True) -> pd.DataFrame:
+    """One row per decision of a person about a visit or a video, the newest first; what it is about, was before and is
+    now as JSON."""
+    return _of_visits(review.Decision, "decision", restriction)
+
+
+def looks(restriction: Any = True) -> pd.DataFrame:
+    """One row per look at a recording on the review page (written with PBL_AUDIT_LOOKS alone), the newest first."""
+    return _of_visits(review.Viewing, "viewing", restriction)
+
+
 def method_rows(stage: str | None = None) -> pd.DataFrame:
     """One row per method: the stage, its key and short name (which means the newest version), and whether it is the
     stage's default.
@@ -78,6 +89,19 @@ def method_rows(stage: str | None = None) -> pd.DataFrame:
             about = {"stage": name, "method": row[prefix], "name": row[columns[0]], "version": row[columns[1]]}
             out.append({**about, "default": "yes" if row[prefix] == default else ""})
     return pd.DataFrame(out, columns=["stage", "method", "name", "version", "default"])
+
+
+def _of_visits(table: Any, prefix: str, restriction: Any) -> pd.DataFrame:
+    """Rows about a visit or one of its videos, with whose visit it is; the columns without their prefix."""
+    rows = frame_of(table.proj(..., of="session_id"))
+    own = frame_of(video.Video.proj("session_id")).set_index("video_id")["session_id"]
+    rows["session_id"] = rows.pop("of").fillna(rows["video_id"].map(own)).astype("Int64")
+    rows["video_id"] = rows["video_id"].astype("Int64")
+    rows = rows.merge(frame_of(_visits() & restriction)[["session_id", "subject", "session_label"]], on="session_id")
+    rows = rows.sort_values(f"{prefix}_id", ascending=False, ignore_index=True)
+    rows.columns = [name.removeprefix(f"{prefix}_") for name in rows.columns]
+    first = ["id", "at", "by", "what", "subject", "session_label", "session_id", "video_id"]
+    return rows[[*first, *(c for c in rows.columns if c not in first)]]
 
 
 def _visits() -> Any:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @click.group("list", epilog="Example: pbl list videos --subject P017")
 def list_() -> None:
-    """What is registered: people, visits, videos, methods.
+    """What is registered: people, visits, videos, methods, decisions and looks.
 
     Example: pbl list visits --population patient --csv > visits.csv
     """
@@ -59,6 +59,20 @@ def visits(as_json: bool, as_csv: bool, **restriction: str | None) -> None:
 def videos(as_json: bool, as_csv: bool, **restriction: str | None) -> None:
     """The videos, with their numbers: what `pbl why`, `pbl choose` and `pbl move` ask for."""
     _print("videos", restriction, as_json, as_csv)
+
+
+@list_.command(epilog="Example: pbl list decisions --subject P017 --json")
+@_options(*_VISITS)
+def decisions(as_json: bool, as_csv: bool, **restriction: str | None) -> None:
+    """What people decided on the review page or with `pbl choose`, the newest first: who, when, what was before."""
+    _print("decisions", restriction, as_json, as_csv)
+
+
+@list_.command(epilog="Example: pbl list looks --subject P017 --csv > looks.csv")
+@_options(*_VISITS)
+def looks(as_json: bool, as_csv: bool, **restriction: str | None) -> None:
+    """Who looked at which recording on the review page, the newest first. Written where PBL_AUDIT_LOOKS=1 is set."""
+    _print("looks", restriction, as_json, as_csv)
 
 
 @list_.command(epilog="Example: pbl list methods --stage fit")

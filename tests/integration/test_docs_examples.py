@@ -19,8 +19,7 @@ from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.study import write_study
 from research.cohort import cohort
-from schemas import gdi, lab, session, study, views
-from schemas.viewings import record_viewing
+from schemas import gdi, study, views
 from tests import pages
 from tests.command import pbl
 from tests.exported import marked_fit
@@ -136,15 +135,6 @@ def test_the_phone_against_cameras(visit: dict[str, Any], monkeypatch: pytest.Mo
 def test_an_index_for_a_pace(without_its_method: None):
     run("docs/study.md", 4)
     assert (gdi.GdiModel & {"gdi_method": "fast-walk-v1"}).fetch1()["gdi_params"]["pace"] == "fast"
-
-
-@example("docs/web.md", 0)
-def test_who_looked_at_a_person(visit: dict[str, Any]):
-    lab.Subject.insert1({**lab.Subject.fetch1(), "subject": "P017"})
-    session.Session.update1({"session_id": visit["session_id"], "subject": "P017"})
-    record_viewing("video_id", visit["video_id"], "page", "R. Viewer")
-    _, (_, looks) = run("docs/web.md", 0)
-    assert looks["viewing_by"].tolist() == ["R. Viewer"]
 
 
 @example("docs/statistics.md", 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from schemas import choose, decide, fit, forget, qc, recording_page, tracking
 from schemas._datajoint import dj
 from schemas.review import Decision
 from schemas.rows import delete_below
+from tests.command import pbl
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import everything, register
@@ -62,6 +64,11 @@ def test_two_people_decide_at_once_and_the_second_sees_it(two_alike: int):
     assert len(tracking.SubjectChoice()) == 0
     history = second.get("/visits/1").text
     assert history.index("B. Second") < history.index("A. First")
+    listed = json.loads(pbl("list", "decisions", "--session", "2026-01-10", "--json").out)
+    assert [(row["by"], row["what"], row["session_id"], json.loads(row["after"])) for row in listed] == [
+        ("B. Second", "person", 1, {"person": 1}),
+        ("A. First", "person", 1, {"person": 2}),
+    ]
 
 
 def test_a_choice_on_the_command_line_is_seen_too(two_alike: int):

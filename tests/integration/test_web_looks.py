@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from pbl_pipeline.errors import PblError
-from schemas import embedded, forget, session, video
+from schemas import embedded, forget
 from schemas.review import Viewing
+from tests.command import pbl
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
@@ -46,8 +48,14 @@ def test_each_look_is_a_row_before_anything_is_shown(audited: int, monkeypatch: 
     monkeypatch.setattr(looks, "AGAIN_S", 0.0)  # later it is another look
     browser.get(f"/recordings/{audited}/video")
     assert len(rows()) == 6
-    of_person = session.Session & {"subject": "P001"}  # as docs/web.md has it
-    assert len(Viewing & [(video.Video & of_person.proj()).proj(), of_person.proj()]) == 6
+    listed = json.loads(pbl("list", "looks", "--subject", "P001", "--json").out)
+    whose = ("by", "what", "subject", "session_label", "session_id", "video_id")
+    assert [tuple(row[k] for k in whose) for row in listed[:2]] == [
+        ("A. First", "video", "P001", "2026-01-10", 1, audited),
+        ("A. First", "export", "P001", "2026-01-10", 1, None),
+    ]
+    assert len(listed) == 6
+    assert pbl("list", "looks", "--subject", "P002").out == "none\n"
     assert not forget.forget("P001").left
     assert rows() == []
     forget.manifest_path("P001").unlink()
