@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 from contextlib import closing
 from pathlib import Path
 
+from pbl_pipeline import settings
 from schemas import _dump, catalog, connection
 from schemas.ingest import Visit, ingest
 
@@ -32,7 +34,8 @@ def everything_but_refreshes() -> dict[str, list[tuple]]:
 
 
 def remove_all() -> None:
-    """Leave the tables as `schemas.activate` makes them: every row and every job goes but the methods (`#`).
+    """Leave the tables as `schemas.activate` makes them: every row and every job goes but the methods (`#`), and so do
+    the lists of what was removed of whom (`schemas.forget.manifest_path`), by which a person is forgotten again.
 
     In one transaction of plain statements: what depends on what was deleted is not looked up, which takes DataJoint
     seconds. That results go with their person is a test of its own (test_validation.py).
@@ -44,3 +47,4 @@ def remove_all() -> None:
             if not table.startswith("#") and (not table.startswith("~") or table.startswith("~~")):
                 cursor.execute(f"DELETE FROM {catalog.quote(schema, table)}")
         server.commit()
+    shutil.rmtree(settings.home_dir() / "forgotten", ignore_errors=True)

@@ -189,7 +189,6 @@ def test_a_forgotten_person_takes_the_decisions_along(warned: dict[str, Any]):
     assert len(Decision()) == 2
     assert not forget.forget("P001").left
     assert len(Decision()) == 0
-    forget.manifest_path("P001").unlink()
 
 
 def _chosen() -> tuple[str, int]:

@@ -14,7 +14,7 @@ import pbl_pipeline.gait
 from pbl_pipeline.errors import PblError
 from schemas import choose, decide, fit, gait, gdi, hand_events, move, qc, slices, study
 from schemas.export import visits_of_tables
-from schemas.forget import forget, manifest_path
+from schemas.forget import forget
 from schemas.recording_page import recording_about, recording_fit, trial_key
 from schemas.results import load_session
 from schemas.review import Decision
@@ -289,7 +289,6 @@ def test_trend_slices_move_and_forget(visit: str, tmp_path: Path):
     ) == "by-hand"
     assert not forget("P001").left
     assert len(gait.HandEvents()) == len(gait.HandEvents.Event()) == 0
-    manifest_path("P001").unlink()
 
 
 @pytest.mark.needs_extra

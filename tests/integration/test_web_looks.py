@@ -58,7 +58,6 @@ def test_each_look_is_a_row_before_anything_is_shown(audited: int, monkeypatch: 
     assert pbl("list", "looks", "--subject", "P002").out == "none\n"
     assert not forget.forget("P001").left
     assert rows() == []
-    forget.manifest_path("P001").unlink()
 
 
 def test_no_row_for_what_there_is_not_or_nobody_saw(audited: int, monkeypatch: pytest.MonkeyPatch):

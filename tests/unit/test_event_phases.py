@@ -176,6 +176,7 @@ def a_grid(n: int, swing: np.ndarray, heading_rad: np.ndarray | None = None) -> 
     joints, known = np.zeros((n, 5, 2, 3)), np.ones((n, 5, 2), bool)
     turn = np.zeros(n) if heading_rad is None else heading_rad
     ahead = np.stack([np.cos(turn), np.sin(turn), np.zeros(n)], axis=1)
+    joints[:, :2] += [[UP], [0.5 * UP]]  # hips and knees above the feet
     joints[:, 2:, 0] += 0.5 * swing[:, None, None] * ahead[:, None]
     joints[:, 2:, 1] -= 0.5 * swing[:, None, None] * ahead[:, None]
     return Grid(np.arange(n) / GRID_HZ, joints, known, UP, ahead, 1.0)
