@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tests.integration import web
-from tests.integration.chain import small_video
+from tests.integration.chain import N_FRAMES, small_video
 from tests.rows import register
 from workers.populate import populate
 
@@ -51,6 +51,17 @@ def page(chromium: Any, tables: None, tmp_path: Path) -> Iterator[Any]:
     populate()
     with web.shown(chromium) as opened:
         yield opened
+
+
+def test_a_recording_begins_where_the_body_does(page: Any):
+    def late(route: Any) -> None:
+        movement = route.fetch().json()
+        movement["body"]["known"] = [[40, N_FRAMES - 1]]
+        route.fulfill(json=movement)
+
+    page.route("**/recordings/1/movement", late)
+    page.goto("/recordings/1")
+    page.wait_for_selector("canvas.body[data-frame='40']")
 
 
 def test_from_the_link_to_a_frame_of_the_body(page: Any):

@@ -219,6 +219,9 @@ async function start() {
   $("show-body").addEventListener("change", () => show(clock.frame));
   for (const button of document.querySelectorAll("button[data-time]")) button.addEventListener("click", () => seek(+(/** @type {HTMLElement} */ (button).dataset.time ?? 0)));
   look.addEventListener("seek", (e) => seek(/** @type {CustomEvent<number>} */ (e).detail));
+  // Where the body is fitted later only, the page begins there: before, nobody may be in view.
+  const begin = m.body.known[0]?.[0] ?? 0;
+  if (begin > 0 && (!video || (video.paused && video.currentTime === 0))) clock.go(begin);
   look.dispatchEvent(new CustomEvent("movement", { detail: m }));
   look.dataset.ready = "";
   return { movement: m, poses, look, canvas, get frame() { return clock.frame; }, watch: (seen) => { watching.push(seen); seen(clock.frame); },
