@@ -131,8 +131,12 @@ def test_what_is_being_computed_by_whom_since_when(three_gone: list[int]):
 def test_from_the_click_to_the_queue_in_a_browser(three_gone: list[int], chromium: Any):
     with web.shown(chromium, role="operator") as page:
         page.wait_for_url("**/operate")
+        # The name of a folder may be long.
+        page.evaluate("for (const e of document.querySelectorAll('dt, dd')) e.textContent += '/wide'.repeat(30)")
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         page.get_by_role("button", name="Try all of this kind again (3)").click()
         page.get_by_role("status").wait_for()
         assert "3 jobs were put back" in page.get_by_role("status").inner_text()
+        page.wait_for_load_state()  # the style may come after the text
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert _errors() == set()

@@ -12,7 +12,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.words import MEASURES, check_words, number, significant
+from pbl_pipeline.words import ANGLES, MEASURES, check_words, number, significant
 
 from . import texts
 from .access import HEADERS, HOURS, Session
@@ -35,7 +35,11 @@ class Pages:
             lstrip_blocks=True,
         )
         self._environment.globals.update(
-            number=number, significant=significant, check_words=check_words, measure_words=MEASURES
+            number=number,
+            significant=significant,
+            check_words=check_words,
+            measure_words=MEASURES,
+            angle_words=[title for title, _ in ANGLES.values()],
         )
 
     def show(
@@ -51,6 +55,7 @@ class Pages:
         session: Session | None = getattr(request.state, "session", None)
         page = self._environment.get_template(template).render(
             t=functools.partial(texts.text, language),
+            said=functools.partial(texts.library, language),
             language=language,
             other_language=next(name for name in texts.LANGUAGES if name != language),
             session=session,

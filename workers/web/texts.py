@@ -7,6 +7,8 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup, escape
+
 #: The first is taken where a browser asks for none of them.
 LANGUAGES = ("en", "de")
 
@@ -21,6 +23,14 @@ def catalogue() -> dict[str, dict[str, str]]:
 def text(language: str, name: str, /, **values: Any) -> str:
     """A text in a language, its {places} filled in. A name that the catalogue lacks is a KeyError."""
     return catalogue()[name][language].format(**values)
+
+
+def library(language: str, english: str) -> str:
+    """What the library says in English, in the language of a page: HTML, marked as English where it stays so."""
+    own = catalogue().get(f"library.{english}", {}).get(language)
+    if own is not None or language == "en":
+        return escape(own or english)
+    return Markup('<span lang="en">{}</span>').format(english)
 
 
 def language_of(cookie: str | None, accepted: str) -> str:

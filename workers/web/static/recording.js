@@ -83,13 +83,14 @@ class Clock {
 
 /** Charts of the joint angles; the returned function moves their cursors. @param {Movement} m @param {(at: number) => void} seek */
 function charts(m, seek) {
-  const into = $("curves"), made = [];
+  const into = $("curves"), names = JSON.parse(into.dataset.names), made = [];
+  const named = (/** @type {string} */ text, /** @type {string} */ name) => text.replace("{name}", names[name] ?? name);
   const build = () => {
     into.replaceChildren();
     made.length = 0;
     for (const curve of m.curves) {
       const figure = document.createElement("figure"), title = document.createElement("figcaption");
-      title.textContent = into.dataset.angle.replace("{name}", curve.name);
+      title.textContent = named(into.dataset.angle, curve.name);
       figure.append(title);
       into.append(figure);
       const data = [m.time], series = [{}], bands = [];
@@ -111,7 +112,7 @@ function charts(m, seek) {
         axes: [{ ...axis, size: 26 }, { ...axis, size: 38 }],
       }, data, figure);
       chart.root.setAttribute("role", "img");
-      chart.root.setAttribute("aria-label", into.dataset.chart.replace("{name}", curve.name));
+      chart.root.setAttribute("aria-label", named(into.dataset.chart, curve.name));
       const line = document.createElement("div");
       line.className = "now-line";
       chart.over.append(line);
