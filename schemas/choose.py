@@ -1,4 +1,4 @@
-"""A person's choice who is measured: what there is to choose from, the choice, and its consequences."""
+"""A person's choice who is measured: what there is to choose from. `schemas.decide.decide_person` decides."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 
 from . import tracking, video
-from .jobs import jobs_of
 from .method_rows import stored_key
-from .plan import locked
 from .results import load_tracking
 from .stored_files import file_ref, stored_file
 
@@ -122,41 +120,19 @@ def _key(video_id: int, tracking_method: str | None) -> dict[str, Any]:
     return key
 
 
-def choose_person(video_id: int, person: int, tracking_method: str | None = None) -> dict[str, int]:
-    """Measure `person` of a video: write the override and delete what was computed for somebody else.
-
-    Both happen in one transaction. An error row of the choice (a number that did not exist) becomes pending again.
-
-    Returns
-    -------
-    dict
-        Table name to number of deleted rows.
+def selection_of(video_id: int, tracking_method: str | None = None) -> dict[str, Any]:
+    """Key of the one TrackingSelection that is meant.
 
     Raises
     ------
     PblError
-        DB_NOT_FOUND for a video that is not registered, SUBJECT_UNKNOWN_PERSON, SOLVER_UNKNOWN; USAGE where several
-        methods track the video and none is named, or another one.
+        DB_NOT_FOUND for a video that is not registered, SOLVER_UNKNOWN; USAGE where several methods track the video and
+        none is named, or another one.
     """
-    selection = selection_of(video_id, tracking_method)
-    failed = jobs_of(tracking.SubjectChoice)  # declares the job table, which would end a transaction
-    with locked(int((video.Video & {"video_id": video_id}).fetch1("session_id"))):
-        return choice_applied(selection, person, failed)
-
-
-def selection_of(video_id: int, tracking_method: str | None = None) -> dict[str, Any]:
-    """Key of the one TrackingSelection that is meant. Raises `PblError` as `choose_person` does."""
     selections = (tracking.TrackingSelection & _key(video_id, tracking_method)).keys()
     if len(selections) != 1:
         raise _which_tracking(video_id, tracking_method)
     return dict(selections[0])
-
-
-def choice_applied(selection: dict[str, Any], person: int, failed: Any) -> dict[str, int]:
-    """What `choose_person` does inside its transaction; `failed`: the job table of SubjectChoice."""
-    tracking.set_override(selection, person)
-    (failed.errors & selection).delete_quick()
-    return tracking.drop_outdated_choices(selection)
 
 
 def _which_tracking(video_id: int, tracking_method: str | None) -> PblError:

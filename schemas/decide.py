@@ -11,7 +11,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.words import UNUSABLE
 
 from . import fit, qc, tracking, usable, video
-from .choose import choice_applied, selection_of
+from .choose import selection_of
 from .ingest import next_id
 from .jobs import jobs_of
 from .plan import locked, plan_anew, queues_before_fit
@@ -52,13 +52,21 @@ def person_state(video_id: int, tracking_method: str) -> str:
     return f"{last}-{by_hand[0] if len(by_hand) else ''}-{chosen[0] if len(chosen) else ''}"
 
 
-def decide_person(video_id: int, tracking_method: str, person: int, by: str, seen: str) -> dict[str, int]:
-    """Measure `person` of a video: as `schemas.choose.choose_person`, with a row of Decision in the same transaction.
+def decide_person(
+    video_id: int, person: int, tracking_method: str | None = None, by: str = "", seen: str | None = None
+) -> dict[str, int]:
+    """Measure `person` of a video: write the override, delete what was computed for somebody else, add a Decision.
+
+    All in one transaction. An error row of the choice (a number that did not exist) becomes pending again.
 
     Parameters
     ----------
+    tracking_method
+        Whose number it is; needed where several methods track the video.
+    by
+        Name of who decides.
     seen
-        `person_state` of the page on which it was decided.
+        `person_state` of the page on which it was decided; None where nothing was shown.
 
     Returns
     -------
@@ -68,17 +76,20 @@ def decide_person(video_id: int, tracking_method: str, person: int, by: str, see
     Raises
     ------
     PblError
-        DECIDED_MEANWHILE where the state is another one by now; what `choose_person` raises.
+        DECIDED_MEANWHILE where the state is another one by now; SUBJECT_UNKNOWN_PERSON; what `selection_of` raises.
     """
     selection = selection_of(video_id, tracking_method)
     failed = jobs_of(tracking.SubjectChoice)  # declares the job table, which would end a transaction
     with locked(int((video.Video & {"video_id": video_id}).fetch1("session_id"))):  # who decides meanwhile waits here
-        if person_state(video_id, tracking_method) != seen:
+        if seen is not None and person_state(video_id, selection["tracking_method"]) != seen:
             raise meanwhile(video_id, "person")
         rows = (tracking.SubjectChoice & selection).to_dicts()
         before = {"status": rows[0]["choice_status"], "person": rows[0]["chosen_person_id"]} if rows else {}
-        deleted = choice_applied(selection, person, failed)
-        record("person", by, {"tracking_method": tracking_method}, before, {"person": person}, video_id=video_id)
+        tracking.set_override(selection, person)
+        (failed.errors & selection).delete_quick()
+        deleted = tracking.drop_outdated_choices(selection)
+        about = {"tracking_method": selection["tracking_method"]}
+        record("person", by, about, before, {"person": person}, video_id=video_id)
     return deleted
 
 

@@ -48,8 +48,11 @@ def choose(
         raise click.UsageError("PERSON, --not-usable and --usable: choose one.")
     if note and reason is None:
         raise click.UsageError("--note goes with --not-usable.")
+    import getpass
+
     import schemas
-    from schemas.choose import candidates, choose_person, write_sheet
+    from schemas.choose import candidates, write_sheet
+    from schemas.decide import decide_person
 
     schemas.activate(methods=False)
     if reason is not None or usable:
@@ -65,7 +68,7 @@ def choose(
                 click.echo(f"people: {write_sheet(about, name)}")
     if person is None:
         return
-    result = choose_person(video_id, person, tracking_method)
+    result = decide_person(video_id, person, tracking_method, getpass.getuser())
     click.echo(f"video_id {video_id}: person {person} will be measured")
     for name, n in result.items():
         click.echo(f"  deleted {n} rows of {name}")

@@ -17,8 +17,8 @@ from pbl_pipeline.fit import fit_session
 from pbl_pipeline.keypoints import Keypoints, MultiView
 from pbl_pipeline.synthetic import NO_NOISE, observe_views, plain_walk
 from schemas import fit, gait, gdi, jobs, norms, slices, validation, video, views
-from schemas.choose import choose_person
 from schemas.coded_errors import error_code
+from schemas.decide import decide_person
 from schemas.forget import forget
 from schemas.ingest import Visit, ingest
 from schemas.plan import fit_set_hash
@@ -209,7 +209,7 @@ def test_people_of_the_cameras(rig: pytest.MonkeyPatch, tmp_path: Path):
     for number in (4, 6):
         assert why(number).verdict.startswith("SubjectChoice of its camera, video_id 5, ran well and found nothing")
     # Another person in one camera: what was computed of the trial goes, and the check says it.
-    choose_person(3, 2)
+    decide_person(3, 2)
     assert len(fit.SessionFit()) == len(fit.FitSet()) == len(fit.TrialInput()) == 0
     populate()
     assert len(fit.FitSet()) == 0
@@ -217,7 +217,7 @@ def test_people_of_the_cameras(rig: pytest.MonkeyPatch, tmp_path: Path):
     verdict = why(2).verdict
     assert "VIEWS_DISAGREE" in verdict
     assert "cam_03" in verdict
-    choose_person(3, 1)
+    decide_person(3, 1)
     populate()
     assert errors_of(fit.TrialInput) == []
     assert fit.FitSet().to_arrays("fit_set").tolist() == [first["fit_set"]]

@@ -28,7 +28,8 @@ from pbl_pipeline.pipeline import Session, Trial
 from pbl_pipeline.qc import Check
 from pbl_pipeline.video import Camera
 from schemas import fit, gait, gdi, keypoints, lab, qc, session, table_map, tracking, video, views
-from schemas.choose import candidates, choose_person, write_sheet
+from schemas.choose import candidates, write_sheet
+from schemas.decide import decide_person
 from schemas.ingest import Methods, Visit, ingest
 from schemas.method_rows import resolve_method
 from schemas.plan import plan_fit_sets
@@ -401,9 +402,9 @@ def test_two_alike_wait_for_a_choice_and_the_rest_goes_on(tables: None, tmp_path
     assert (waiting.video_id, waiting.persons) == (alike, [1, 2])
     assert not populate().did_something
     with pytest.raises(PblError, match="SUBJECT_UNKNOWN_PERSON"):
-        choose_person(alike, 7)
+        decide_person(alike, 7)
     first_fit = fit.SessionFit.keys()
-    choose_person(alike, 2)
+    decide_person(alike, 2)
     run = populate()
     assert not errors(run)
     assert keypoints.Keypoints.to_arrays("keypoints_person_id", order_by="video_id").tolist() == [2, 1]
@@ -461,7 +462,7 @@ def test_a_decision_triggers_exactly_the_rows_that_depend_on_it(tables: None, tm
         }
 
     before = computed()
-    choose_person(first, 2)
+    decide_person(first, 2)
     left = computed()
     # Nothing of the other subject, nothing above the choice, nothing of the session's other video up to its input.
     for name in ("VideoInfo", "Tracking"):
@@ -490,7 +491,7 @@ def test_a_decision_wins_and_recomputes_what_was_another_persons(tables: None, t
     populate()
     old = keypoints.Keypoints.fetch1("focal_length", "keypoints_computed", "keypoints_person_id")
     assert old[2] == 1
-    deleted = choose_person(number, 2)
+    deleted = decide_person(number, 2)
     assert sum(deleted.values()) >= 10
     assert len(keypoints.Keypoints()) == len(fit.SessionFit()) == len(fit.FitSet()) == len(qc.SessionQc()) == 0
     assert len(tracking.Tracking()) == 1
@@ -500,7 +501,7 @@ def test_a_decision_wins_and_recomputes_what_was_another_persons(tables: None, t
     assert tracking.SubjectChoice.fetch1("choice_status", "chosen_person_id") == ("MANUAL", 2)
     assert keypoints.Keypoints.fetch1("keypoints_person_id") == 2
     # The same decision again changes nothing; a withdrawn one, by any route, is noticed by populate.
-    assert choose_person(number, 2) == {}
+    assert decide_person(number, 2) == {}
     tracking.SubjectOverride.delete(prompt=False)
     run = populate()
     assert run.dropped
@@ -519,7 +520,7 @@ def test_of_two_trackings_the_one_that_is_meant_is_named(tables: None, tmp_path:
     tracking.TrackingSelection.insert1({**selection, "tracking_method": "other-v1"})
     populate(["VideoInfo", "Tracking", "SubjectChoice"])
     with pytest.raises(PblError, match="USAGE") as caught:
-        choose_person(number, 2)
+        decide_person(number, 2)
     assert "other-v1" in caught.value.expected
     assert not tracking.SubjectOverride()
     asked = {w.next_step for w in pipeline_status().waiting}
@@ -535,7 +536,7 @@ def test_of_two_trackings_the_one_that_is_meant_is_named(tables: None, tmp_path:
     (tracking.TrackingSelection & {"tracking_method": "other-v1"}).delete(prompt=False, part_integrity="cascade")
     (tracking.TrackingMethod & {"tracking_method": "other-v1"}).delete(prompt=False)
     with pytest.raises(PblError, match="SOLVER_UNKNOWN"):
-        choose_person(number, 2, "other-v1")
+        decide_person(number, 2, "other-v1")
 
 
 def test_a_decision_is_carried_to_a_tracking_that_comes_later(
@@ -545,7 +546,7 @@ def test_a_decision_is_carried_to_a_tracking_that_comes_later(
     (number,) = register(chain.small_video(tmp_path, "walk"))
     populate(["VideoInfo", "Tracking", "SubjectChoice"])
     assert tracking.SubjectChoice.fetch1("chosen_person_id") == 1
-    choose_person(number, 2)
+    decide_person(number, 2)
     populate(["SubjectChoice"])
     found = chain.track_people(tmp_path / "walk.mp4")
     walks, stands = found.persons
@@ -580,7 +581,7 @@ def test_confirming_the_automatic_choice_deletes_nothing(tables: None, tmp_path:
     populate()
     assert tracking.SubjectChoice.fetch1("choice_status", "chosen_person_id") == ("CHOSEN", 1)
     computed = qc.SessionQc.fetch1("qc_computed")
-    assert choose_person(number, 1) == {}
+    assert decide_person(number, 1) == {}
     assert tracking.SubjectChoice.fetch1("choice_status", "chosen_person_id") == ("MANUAL", 1)
     assert "by hand" in tracking.SubjectChoice.fetch1("choice_reason")
     assert qc.SessionQc.fetch1("qc_computed") == computed
@@ -596,11 +597,11 @@ def test_confirming_the_automatic_choice_deletes_nothing(tables: None, tmp_path:
 def test_a_decision_given_with_the_video_is_checked_when_the_people_are_known(tables: None, tmp_path: Path):
     (number,) = register(chain.small_video(tmp_path, "walk"), person=9)
     assert errors(populate()) == {"SubjectChoice": {"SUBJECT_UNKNOWN_PERSON": 1}}
-    choose_person(number, 2)
+    decide_person(number, 2)
     assert not errors(populate())
     assert tracking.SubjectChoice.fetch1("choice_status") == "MANUAL"
     with pytest.raises(PblError, match="DB_NOT_FOUND"):
-        choose_person(12345, 1)
+        decide_person(12345, 1)
 
 
 def test_a_trial_that_cannot_be_fitted_does_not_hold_up_its_session(

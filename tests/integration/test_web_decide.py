@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import getpass
 import json
 import re
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import pytest
 
 from pbl_pipeline.errors import PblError
-from schemas import choose, decide, fit, forget, qc, recording_page, tracking
+from schemas import decide, fit, forget, qc, recording_page, tracking
 from schemas._datajoint import dj
 from schemas.review import Decision
 from schemas.rows import delete_below
@@ -74,8 +75,10 @@ def test_two_people_decide_at_once_and_the_second_sees_it(two_alike: int):
 def test_a_choice_on_the_command_line_is_seen_too(two_alike: int):
     browser = web.client()
     form = form_of(browser, two_alike)
-    choose.choose_person(two_alike, 1)
+    assert pbl("choose", two_alike, 1).code == 0
     assert send(browser, two_alike, form, 2).status_code == 409
+    (row,) = Decision().to_dicts()
+    assert (row["decision_by"], row["decision_after"]) == (getpass.getuser(), {"person": 1})
     assert tracking.SubjectOverride.fetch1("override_person_id") == 1
 
 
@@ -185,11 +188,7 @@ def test_only_warnings_can_be_accepted(warned: dict[str, Any]):
 
 def test_a_forgotten_person_takes_the_decisions_along(warned: dict[str, Any]):
     accept(web.client(), warned)
-    decide.decide_person(1, *_chosen(), "A", decide.person_state(1, _chosen()[0]))
+    decide.decide_person(1, int(tracking.SubjectChoice.fetch1("chosen_person_id")), by="A")
     assert len(Decision()) == 2
     assert not forget.forget("P001").left
     assert len(Decision()) == 0
-
-
-def _chosen() -> tuple[str, int]:
-    return tracking.SubjectChoice.fetch1("tracking_method", "chosen_person_id")

@@ -12,7 +12,7 @@ import pytest
 
 import pbl_pipeline.gait
 from pbl_pipeline.errors import PblError
-from schemas import choose, decide, fit, gait, gdi, hand_events, move, qc, slices, study
+from schemas import decide, fit, gait, gdi, hand_events, move, qc, slices, study
 from schemas.export import visits_of_tables
 from schemas.forget import forget
 from schemas.recording_page import recording_about, recording_fit, trial_key
@@ -247,7 +247,7 @@ def test_a_decision_waits_for_the_insert_that_reads_what_it_changes(visit: str):
 def test_corrections_are_of_the_person_that_was_measured(visit: str):
     save(1, moved())
     populate()
-    choose.choose_person(1, 2)
+    decide.decide_person(1, 2)
     populate()
     found = hand_events.shown(1)
     assert found is not None
@@ -256,7 +256,7 @@ def test_corrections_are_of_the_person_that_was_measured(visit: str):
     assert [r["events_detector"] for r in rows] == [visit.rpartition("-v")[0]]
     page = web.client().get("/recordings/1").text
     assert "corrected for another person" in page
-    choose.choose_person(1, 1)
+    decide.decide_person(1, 1)
     populate()
     assert (gait.GaitEvents & {"video_id": 1, "gait_method": "by-hand-v1"} & fit.current()).fetch1(
         "events_detector"

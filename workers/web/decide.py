@@ -29,7 +29,7 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
         number = number_of(request)
         chosen = _number(fields.get("person", ""))
         method, seen = fields.get("method", ""), fields.get("seen", "")
-        await tables.ask(decide.decide_person, number, method, chosen, session.name, seen)
+        await tables.ask(decide.decide_person, number, chosen, method, session.name, seen)
         await tables.ask(queue_visit_of, number)
         return RedirectResponse(f"/recordings/{number}", 303)
 
