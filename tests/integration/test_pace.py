@@ -87,7 +87,9 @@ def test_a_stated_height_reaches_the_fit_and_a_corrected_one_fits_anew(tables: N
     populate()
     told = {r["subject"]: r["fit_height"] for r in (fit.SessionFit * session.Session).to_dicts()}
     assert told == {"P001": None, "P002": 1.8}
-    assert load_session({"subject": "P002"}).fit.trials[0].height_m == 1.8
+    fitted = load_session({"subject": "P002"}).fit
+    assert fitted is not None
+    assert fitted.trials[0].height_m == 1.8
     refused = pbl("ingest", walk, "--subject", "P001", "--height-m", "172")
     assert (refused.code, "body height of 172 m" in refused.err) == (1, True)
     done = pbl("ingest", walk, "--subject", "P001", "--height-m", "1.72")
