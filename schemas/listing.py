@@ -11,6 +11,7 @@ from pbl_pipeline.errors import PblError
 from . import fit, gdi, keypoints, lab, review, session, video
 from ._datajoint import dj
 from ._methods import METHOD_TABLES
+from .rows import inside
 from .usable import unusable
 from .views import frame_of, newest_sets
 
@@ -94,10 +95,12 @@ def method_rows(stage: str | None = None) -> pd.DataFrame:
 def _of_visits(table: Any, prefix: str, restriction: Any) -> pd.DataFrame:
     """Rows about a visit or one of its videos, with whose visit it is; the columns without their prefix."""
     rows = frame_of(table.proj(..., of="session_id"))
-    own = frame_of(video.Video.proj("session_id")).set_index("video_id")["session_id"]
+    videos = video.Video.proj("session_id") & inside("video_id", rows["video_id"].dropna().astype(int).unique())
+    own = frame_of(videos).set_index("video_id")["session_id"]
     rows["session_id"] = rows.pop("of").fillna(rows["video_id"].map(own)).astype("Int64")
     rows["video_id"] = rows["video_id"].astype("Int64")
-    rows = rows.merge(frame_of(_visits() & restriction)[["session_id", "subject", "session_label"]], on="session_id")
+    found = frame_of(_visits() & inside("session_id", rows["session_id"].unique()) & restriction)
+    rows = rows.merge(found[["session_id", "subject", "session_label"]], on="session_id")
     rows = rows.sort_values(f"{prefix}_id", ascending=False, ignore_index=True)
     rows.columns = [name.removeprefix(f"{prefix}_") for name in rows.columns]
     first = ["id", "at", "by", "what", "subject", "session_label", "session_id", "video_id"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import getpass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,8 +49,6 @@ def choose(
         raise click.UsageError("PERSON, --not-usable and --usable: choose one.")
     if note and reason is None:
         raise click.UsageError("--note goes with --not-usable.")
-    import getpass
-
     import schemas
     from schemas.choose import candidates, write_sheet
     from schemas.decide import decide_person
@@ -76,8 +75,6 @@ def choose(
 
 
 def _decide_usable(video_id: int, reason: str | None, note: str) -> None:
-    import getpass
-
     from schemas.decide import mark_not_usable, take_back
 
     who = getpass.getuser()

@@ -301,7 +301,7 @@ def cost(session: Session, w: Weights, state: State) -> jax.Array:
     return total(At(p, w, state, markers, soles, phone))
 
 
-@pytest.mark.parametrize("kind", ["views", "world", "floor", "moving floor", "moving detector", "pelvis"])
+@pytest.mark.parametrize("kind", ["moving", "views", "world", "floor", "moving floor", "moving detector", "pelvis"])
 def test_normal_equations_hold_the_gradient_of_the_cost(kind):
     session, detector = small_session(kind), "detector" in kind
     params = dataclasses.replace(PARAMS, weight_pelvis=0.5) if "pelvis" in kind else PARAMS

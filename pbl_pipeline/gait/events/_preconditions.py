@@ -66,7 +66,7 @@ def _grid(feet: FootTrajectories, least_s: float) -> tuple[Grid | None, str, str
         said = f"the hips are {height:.2f} leg lengths above the feet: nobody stands"
         return grid, said, "nothing to do where the person lies or sits; else the vertical axis (z up) is another one"
     if np.mean(seated(grid)[hips]) > SEATED_SHARE:
-        said = "the person sits: the hips are never above the lower foot by what a standing person's are"
+        said = "the person sits: the hips are hardly ever as high above the lower foot as a standing person's"
         return grid, said, "feet that push a wheelchair or a stool along have no gait events"
     return grid, "", ""
 
