@@ -12,7 +12,7 @@ from .per_frame import solve_per_frame
 #: starts to a `Solution` of each, or the `PblError` of one that cannot be solved.
 METHODS: Stage[Params] = Stage("fit", "solver", "blazepose")
 METHODS.register("paper-2025", 1, PAPER_2025, solve_sessions)
-METHODS.register("gauss-newton", 2, GAUSS_NEWTON, solve_per_frame)
+METHODS.register("gauss-newton", 3, GAUSS_NEWTON, solve_per_frame)
 METHODS.register("paper-gauss-newton", 1, PAPER_GAUSS_NEWTON)
 METHODS.register("blazepose", 4, BLAZEPOSE)
 METHODS.register("markers", 1, MARKERS)

@@ -28,7 +28,7 @@ SHIPPED = {
     ("keypoints", "blazepose-heavy", 2): "e54e2b925d2257ff",
     ("fit", "paper-2025", 1): "cb777aa5f08f1d04",
     ("fit", "paper-gauss-newton", 1): "9352bf72dc58b91e",
-    ("fit", "gauss-newton", 2): "da906bc5db2da0a2",
+    ("fit", "gauss-newton", 3): "cde876ad058e7138",
     ("fit", "blazepose", 4): "e2ef096063debb39",
     ("fit", "markers", 1): "055842ad943fce0d",
     ("gait", "phase-transformer", 1): "9f9ad11a864dcb24",
