@@ -217,10 +217,10 @@ class GaussNewtonParams:
 PAPER_2025 = ImplicitAdamParams()
 #: The paper's costs as they are, for comparison: what `gauss-newton` finds where `paper-2025` looks.
 PAPER_GAUSS_NEWTON = GaussNewtonParams(smooth_per_rad2=30.0, smooth_per_m2=3_000.0)
-#: For 87 points of MeTRAbs. Pixels count 7 times more against 3D than in the paper, and depth less than what lies across
-#: the line of sight, because it errs more and together: the paper's own minimum is 0.8 deg worse on the synthetic walker
-#: (docs/benchmarks.md). Tuned there, on pixels that err with a memory and on such that do not. With a gain of 1e-5 as
-#: the end, wrists were 0.1 deg short of where one step more, or other padding, had them.
+#: For 87 points of MeTRAbs. Pixels count 7 times more against 3D than in the paper, and depth less than what lies
+#: across the line of sight, because it errs more and together: the paper's own minimum is 0.8 deg worse on the
+#: synthetic walker (docs/benchmarks.md). Tuned there, on pixels that err with a memory and on such that do not. With a
+#: gain of 1e-5 as the end, wrists were 0.1 deg short of where one step more, or other padding, had them.
 GAUSS_NEWTON = GaussNewtonParams(
     tolerance_cost=1e-6,
     smooth_per_rad2=100.0,

@@ -1,11 +1,15 @@
-"""Where a fit starts: the standing body, placed and turned in each frame by the points of the trunk."""
+"""Where a fit starts: the standing body, placed and turned in each frame by the points of the trunk, its arms in the
+nearest of some postures.
+"""
 
 # MuJoCo is a compiled module without type stubs.
 # pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import itertools
 
 import mujoco
 import numpy as np
@@ -21,6 +25,20 @@ from .session import Session
 TRUNK = ("pelvis", "torso", "head", "humerus_r", "humerus_l")
 #: Joint angles (deg) of the start beside the standing pose: bent a little, away from limits and from straight limbs.
 BENT_DEG = {"knee_angle": -10.0, "elbow_flex": 20.0, "pro_sup": 45.0, "hip_flexion": 5.0}
+#: An arm that does not hang starts in the nearest of these postures (deg, all combinations). From arms that hang the
+#: solver took bent ones for bent backwards, and frames found out one after the other, a step each.
+ARM_BODIES = ("humerus", "ulna", "radius", "hand")
+ARM_DEG = {
+    "arm_flex": (-30.0, 0.0, 40.0, 90.0, 140.0),
+    "arm_add": (-80.0, -40.0, 0.0),
+    "arm_rot": (-40.0, 0.0, 40.0),
+    "elbow_flex": (20.0, 60.0, 110.0),
+}
+#: Of an arm's points, mean distance (m): a posture must be nearer than hanging by the one, and no further than the
+#: other, which that of a body that faces the wrong way is.
+NEARER_M, NEAR_M = 0.10, 0.15
+#: Arms are looked at every so many frames, and interpolated.
+ARMS_EVERY = 15
 
 
 def placed_poses(session: Session, trial: int, flip: bool = False) -> np.ndarray:
@@ -44,7 +62,53 @@ def placed_poses(session: Session, trial: int, flip: bool = False) -> np.ndarray
         about = R @ middle + x
         R = R @ np.diag([-1.0, -1.0, 1.0])  # half a turn about the standing body's vertical
         x = about - R @ middle
-    return _poses(body, R, x, known)
+    qpos = _poses(body, R, x, known)
+    seen = np.flatnonzero(known)[::ARMS_EVERY]
+    on_body = np.einsum("tji,tmj->tmi", R[seen], points[seen] - x[seen, None])
+    for arm in _arms(body):
+        at = np.flatnonzero([b in arm.bodies for b in markers.body_names])
+        enough = np.count_nonzero(c[seen][:, at] > 0, axis=1) >= 2
+        if enough.any():
+            angles = arm.nearest(markers, at, on_body[enough][:, at], c[seen[enough]][:, at])
+            for column, values in zip(arm.columns, angles.T, strict=True):
+                qpos[:, column] = np.interp(np.arange(len(qpos)), seen[enough], values)
+    return qpos
+
+
+@dataclasses.dataclass(frozen=True)
+class _Arm:
+    """Postures (K, n) in rad of the joints in `columns`, the first of them hanging, and where all bodies are in these,
+    from the pelvis (K, B, 3), and how they are turned (K, B, 3, 3)."""
+
+    bodies: set[str]
+    columns: list[int]
+    postures: np.ndarray
+    x: np.ndarray
+    R: np.ndarray
+
+    def nearest(self, markers: MarkerSet, at: np.ndarray, points: np.ndarray, c: np.ndarray) -> np.ndarray:
+        """Angles (T, n) in rad for points (T, m, 3) of the markers `at`, from the pelvis of the standing body."""
+        on = markers.body_index[at]
+        places = self.x[:, on] + np.einsum("kmij,mj->kmi", self.R[:, on], markers.position_m[at])
+        away = np.where(c[:, None] > 0, np.linalg.norm(points[:, None] - places, axis=-1), 0.0)
+        mean = np.einsum("tkm,tm->tk", away, c) / c.sum(axis=1)[:, None]
+        best = np.argmin(mean, axis=1)
+        least = np.min(mean, axis=1)
+        taken = (least < NEAR_M) & (least < mean[:, 0] - NEARER_M)
+        return self.postures[np.where(taken, best, 0)]
+
+
+@functools.cache
+def _arms(body: Body) -> list[_Arm]:
+    found, standing = [], _bent(body)
+    for side in "rl":
+        columns = [body.joint_names.index(f"{joint}_{side}") for joint in ARM_DEG]
+        postures = np.vstack([standing[columns], np.deg2rad(list(itertools.product(*ARM_DEG.values())))])
+        qpos = np.tile(standing, (len(postures), 1))
+        qpos[:, columns] = postures
+        x, R = map(np.array, zip(*(_bodies(body, q) for q in qpos), strict=True))
+        found.append(_Arm({f"{name}_{side}" for name in ARM_BODIES}, columns, postures, x, R))
+    return found
 
 
 def world_points(arrays: TrialArrays) -> tuple[np.ndarray, np.ndarray]:
@@ -103,15 +167,17 @@ def triangulate(arrays: TrialArrays) -> tuple[np.ndarray, np.ndarray]:
 
 def standing_markers(body: Body, markers: MarkerSet) -> np.ndarray:
     """(J, 3) of the unscaled standing body with its pelvis at the origin and unturned, by C MuJoCo."""
-    x, R = _standing(body)
-    return x[markers.body_index] + np.einsum("mij,mj->mi", R[markers.body_index], markers.position_m) - x[0]
+    x, R = _bodies(body, np.zeros(len(body.joint_names)))
+    return x[markers.body_index] + np.einsum("mij,mj->mi", R[markers.body_index], markers.position_m)
 
 
-@functools.cache
-def _standing(body: Body) -> tuple[np.ndarray, np.ndarray]:
+def _bodies(body: Body, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (B, 3) from the pelvis and rotations (B, 3, 3) of the unscaled body, by C MuJoCo."""
     data = mujoco.MjData(body.mj_model)
+    data.qpos[:] = qpos
     mujoco.mj_kinematics(body.mj_model, data)
-    return data.xpos[1:].copy(), data.xmat[1:].reshape(-1, 3, 3).copy()
+    x = data.xpos[1:] - data.xpos[1]
+    return x, data.xmat[1:].reshape(-1, 3, 3).copy()
 
 
 def align(template: np.ndarray, points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -131,16 +197,20 @@ def align(template: np.ndarray, points: np.ndarray, weight: np.ndarray) -> tuple
 def _poses(body: Body, R: np.ndarray, x: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Poses with the pelvis of the standing template turned by R and moved to x; frames not known in between."""
     column = {n: k for k, n in enumerate(body.joint_names)}
-    qpos = np.zeros((len(x), len(body.joint_names)))
-    for joint, degrees in BENT_DEG.items():
-        for name in (joint, f"{joint}_r", f"{joint}_l"):
-            if name in column:
-                qpos[:, column[name]] = np.deg2rad(degrees)
+    qpos = np.tile(_bent(body), (len(x), 1))
     stands = pelvis_rest(body)[0]
     values = pelvis_values(body, R[known] @ stands, x[known])
     index, at = np.flatnonzero(known), np.arange(len(x))
     for name, value in values.items():
         qpos[:, column[name]] = np.interp(at, index, value)
+    return qpos
+
+
+def _bent(body: Body) -> np.ndarray:
+    """The standing posture of the start, (Q,)."""
+    qpos = np.zeros(len(body.joint_names))
+    for k, name in enumerate(body.joint_names):
+        qpos[k] = np.deg2rad(BENT_DEG.get(name.removesuffix("_r").removesuffix("_l"), 0.0))
     return qpos
 
 

@@ -28,8 +28,10 @@ from pbl_pipeline.fit import (
     per_frame,
     problem,
 )
+from pbl_pipeline.fit._params import BLAZEPOSE
 from pbl_pipeline.fit.initial_pose import placed_poses
 from pbl_pipeline.fit.per_frame import by_joint, floors_of
+from pbl_pipeline.fit.session import make_session
 from pbl_pipeline.fit.solution import Solution
 from pbl_pipeline.fit.vertical import on_their_feet, vertical
 from pbl_pipeline.keypoints import Keypoints
@@ -362,6 +364,22 @@ def test_a_start_that_faces_the_other_way_ends_the_right_way(one_by_one, monkeyp
     assert_near(fit.trials[0], walk(5), deg=2.8, m=0.025)
     e = fit.trials[0].qpos - one_by_one[0].trials[0].qpos
     assert np.nanmedian(np.abs(np.angle(np.exp(1j * e[:, 3:])))) < np.deg2rad(0.3)
+
+
+def test_arms_that_do_not_hang_start_in_the_posture_nearest_to_their_points():
+    """Sitting with bent arms."""
+    posture = {"hip_flexion": 80, "knee_angle": -90, "arm_flex": 45, "arm_rot": 15, "elbow_flex": 95, "pro_sup": 95}
+    truth, names = walk(5), load_body().joint_names
+    for j, degrees in posture.items():
+        for side in "rl":
+            truth[:, names.index(f"{j}_{side}")] = np.deg2rad(degrees)
+    seen = observe(truth, TIME_S, marker_set="blazepose_33", seed=5)
+    session = make_session([seen.keypoints], ["a"], BLAZEPOSE.view)
+    start = placed_poses(session, 0)[session.arrays[0].used]
+    for j in ("arm_flex", "elbow_flex"):
+        for side in "rl":
+            found = np.median(start[:, names.index(f"{j}_{side}")])
+            assert np.rad2deg(found) == pytest.approx(posture[j], abs=35), (j, side)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -29,7 +29,7 @@ SHIPPED = {
     ("fit", "paper-2025", 1): "cb777aa5f08f1d04",
     ("fit", "paper-gauss-newton", 1): "9352bf72dc58b91e",
     ("fit", "gauss-newton", 3): "cde876ad058e7138",
-    ("fit", "blazepose", 4): "e2ef096063debb39",
+    ("fit", "blazepose", 5): "7b6c4521ace26c96",
     ("fit", "markers", 1): "055842ad943fce0d",
     ("gait", "phase-transformer", 1): "9f9ad11a864dcb24",
     ("gait", "zeni-2008", 1): "b29b1d5b52f512f4",
