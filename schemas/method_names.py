@@ -1,4 +1,4 @@
-"""Which method a name means: keys (`blazepose-v4`) and short names (`blazepose`) of what the tables hold."""
+"""Which method a name means: keys (`blazepose-v5`) and short names (`blazepose`) of what the tables hold."""
 
 from __future__ import annotations
 

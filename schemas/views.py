@@ -80,7 +80,7 @@ def visit_frame(restriction: Any = True, chain: Any = True) -> pd.DataFrame:
     restriction
         Of the visits: `study.Visit`, subject, session label and date, population.
     chain
-        Of the methods and the kind, such as `{"fit_method": "blazepose-v4", "fit_set_kind": "single"}`, where the
+        Of the methods and the kind, such as `{"fit_method": "blazepose-v5", "fit_set_kind": "single"}`, where the
         tables hold several chains.
     """
     visits = study.Visit * _sessions() & restriction

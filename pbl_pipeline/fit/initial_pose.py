@@ -36,7 +36,7 @@ ARM_DEG = {
 }
 #: Of an arm's points, mean distance (m): a posture must be nearer than hanging by the one, and no further than the
 #: other, which that of a body that faces the wrong way is.
-NEARER_M, NEAR_M = 0.10, 0.15
+NEARER_M, FURTHEST_M = 0.10, 0.15
 #: Arms are looked at every so many frames, and interpolated.
 ARMS_EVERY = 15
 
@@ -94,7 +94,7 @@ class _Arm:
         mean = np.einsum("tkm,tm->tk", away, c) / c.sum(axis=1)[:, None]
         best = np.argmin(mean, axis=1)
         least = np.min(mean, axis=1)
-        taken = (least < NEAR_M) & (least < mean[:, 0] - NEARER_M)
+        taken = (least < FURTHEST_M) & (least < mean[:, 0] - NEARER_M)
         return self.postures[np.where(taken, best, 0)]
 
 

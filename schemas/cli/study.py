@@ -63,7 +63,7 @@ def import_(sheets: tuple[Path, ...], dry_run: bool, distinct_codes: bool) -> No
 def slice_(name: str | None, cohort: str | None, roles: tuple[str, ...], event: str, note: str, **methods: str) -> None:
     """Freeze visits and methods under NAME; for a slice that is there, say what changed since. Without NAME: the list.
 
-    Methods are named by their key, such as blazepose-v4, or short, such as blazepose: the newest version with results.
+    Methods are named by their key, such as blazepose-v5, or short, such as blazepose: the newest version with results.
     """
     import schemas
     from schemas import slices, study

@@ -128,11 +128,12 @@ SEEN_BY = {
     "flat-87": ("simcc", "bml_movi_87"),
     "few-17": ("crop3d", "mpi_inf_3dhp_17"),
 }
+BLAZEPOSE, GAUSS_NEWTON = (methods.of_stage("fit")[name].key for name in ("blazepose", "gauss-newton"))
 DEFAULT_FITS = {
-    ("blazepose-heavy-v2", "blazepose-v4"),
-    ("metrabs-87-v1", "gauss-newton-v2"),
-    ("flat-87-v1", "blazepose-v4"),
-    ("few-17-v1", "blazepose-v4"),
+    ("blazepose-heavy-v2", BLAZEPOSE),
+    ("metrabs-87-v1", GAUSS_NEWTON),
+    ("flat-87-v1", BLAZEPOSE),
+    ("few-17-v1", BLAZEPOSE),
 }
 
 
@@ -165,7 +166,7 @@ def test_a_new_keypoint_method_for_all_comes_with_its_fit(
         ingest([chain.small_video(tmp_path, subject)], Visit(subject))
     for _ in requeue.carry_out(requeue.plan_new_method("Keypoints", "metrabs-87")):
         pass
-    assert plans() == {("blazepose-heavy-v2", "blazepose-v4"), ("metrabs-87-v1", "gauss-newton-v2")}
+    assert plans() == {("blazepose-heavy-v2", BLAZEPOSE), ("metrabs-87-v1", GAUSS_NEWTON)}
     assert len(fit.FitPlan()) == 4
     populate()
     assert fitted() == plans()
