@@ -25,17 +25,18 @@ from .session import Session
 TRUNK = ("pelvis", "torso", "head", "humerus_r", "humerus_l")
 #: Joint angles (deg) of the start beside the standing pose: bent a little, away from limits and from straight limbs.
 BENT_DEG = {"knee_angle": -10.0, "elbow_flex": 20.0, "pro_sup": 45.0, "hip_flexion": 5.0}
+#: Bodies whose markers tell how an arm is held.
+ARM_BODIES = ("humerus", "ulna", "radius", "hand")
 #: An arm that does not hang starts in the nearest of these postures (deg, all combinations). From arms that hang the
 #: solver took bent ones for bent backwards, and frames found out one after the other, a step each.
-ARM_BODIES = ("humerus", "ulna", "radius", "hand")
 ARM_DEG = {
     "arm_flex": (-30.0, 0.0, 40.0, 90.0, 140.0),
     "arm_add": (-80.0, -40.0, 0.0),
     "arm_rot": (-40.0, 0.0, 40.0),
     "elbow_flex": (20.0, 60.0, 110.0),
 }
-#: Of an arm's points, mean distance (m): a posture must be nearer than hanging by the one, and no further than the
-#: other, which that of a body that faces the wrong way is.
+#: Mean distance (m) of an arm's points from a posture that is taken: less than from hanging by the first at least, and
+#: below the second, which no posture reaches on a body that faces the wrong way.
 NEARER_M, FURTHEST_M = 0.10, 0.15
 #: Arms are looked at every so many frames, and interpolated.
 ARMS_EVERY = 15
@@ -65,14 +66,22 @@ def placed_poses(session: Session, trial: int, flip: bool = False) -> np.ndarray
     qpos = _poses(body, R, x, known)
     seen = np.flatnonzero(known)[::ARMS_EVERY]
     on_body = np.einsum("tji,tmj->tmi", R[seen], points[seen] - x[seen, None])
+    _place_arms(qpos, body, markers, seen, on_body, c[seen])
+    return qpos
+
+
+def _place_arms(
+    qpos: np.ndarray, body: Body, markers: MarkerSet, seen: np.ndarray, points: np.ndarray, c: np.ndarray
+) -> None:
+    """Set the arms' columns of qpos (T, Q) by points (S, J, 3) and confidences (S, J) of the frames `seen`, in the axes
+    of the standing body, from its pelvis."""
     for arm in _arms(body):
         at = np.flatnonzero([b in arm.bodies for b in markers.body_names])
-        enough = np.count_nonzero(c[seen][:, at] > 0, axis=1) >= 2
+        enough = np.count_nonzero(c[:, at] > 0, axis=1) >= 2
         if enough.any():
-            angles = arm.nearest(markers, at, on_body[enough][:, at], c[seen[enough]][:, at])
+            angles = arm.nearest(markers, at, points[enough][:, at], c[enough][:, at])
             for column, values in zip(arm.columns, angles.T, strict=True):
                 qpos[:, column] = np.interp(np.arange(len(qpos)), seen[enough], values)
-    return qpos
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,14 +97,12 @@ class _Arm:
 
     def nearest(self, markers: MarkerSet, at: np.ndarray, points: np.ndarray, c: np.ndarray) -> np.ndarray:
         """Angles (T, n) in rad for points (T, m, 3) of the markers `at`, from the pelvis of the standing body."""
-        on = markers.body_index[at]
-        places = self.x[:, on] + np.einsum("kmij,mj->kmi", self.R[:, on], markers.position_m[at])
+        places = _marker_places(self.x, self.R, markers, at)
         away = np.where(c[:, None] > 0, np.linalg.norm(points[:, None] - places, axis=-1), 0.0)
         mean = np.einsum("tkm,tm->tk", away, c) / c.sum(axis=1)[:, None]
-        best = np.argmin(mean, axis=1)
         least = np.min(mean, axis=1)
         taken = (least < FURTHEST_M) & (least < mean[:, 0] - NEARER_M)
-        return self.postures[np.where(taken, best, 0)]
+        return self.postures[np.where(taken, np.argmin(mean, axis=1), 0)]
 
 
 @functools.cache
@@ -106,7 +113,7 @@ def _arms(body: Body) -> list[_Arm]:
         postures = np.vstack([standing[columns], np.deg2rad(list(itertools.product(*ARM_DEG.values())))])
         qpos = np.tile(standing, (len(postures), 1))
         qpos[:, columns] = postures
-        x, R = map(np.array, zip(*(_bodies(body, q) for q in qpos), strict=True))
+        x, R = _bodies(body, qpos)
         found.append(_Arm({f"{name}_{side}" for name in ARM_BODIES}, columns, postures, x, R))
     return found
 
@@ -166,18 +173,32 @@ def triangulate(arrays: TrialArrays) -> tuple[np.ndarray, np.ndarray]:
 
 
 def standing_markers(body: Body, markers: MarkerSet) -> np.ndarray:
-    """(J, 3) of the unscaled standing body with its pelvis at the origin and unturned, by C MuJoCo."""
-    x, R = _bodies(body, np.zeros(len(body.joint_names)))
-    return x[markers.body_index] + np.einsum("mij,mj->mi", R[markers.body_index], markers.position_m)
+    """(J, 3) of the unscaled standing body with its pelvis at the origin and unturned."""
+    return _marker_places(*_standing(body), markers)[0]
+
+
+@functools.cache
+def _standing(body: Body) -> tuple[np.ndarray, np.ndarray]:
+    return _bodies(body, np.zeros((1, len(body.joint_names))))
 
 
 def _bodies(body: Body, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (B, 3) from the pelvis and rotations (B, 3, 3) of the unscaled body, by C MuJoCo."""
-    data = mujoco.MjData(body.mj_model)
-    data.qpos[:] = qpos
-    mujoco.mj_kinematics(body.mj_model, data)
-    x = data.xpos[1:] - data.xpos[1]
-    return x, data.xmat[1:].reshape(-1, 3, 3).copy()
+    """Positions (K, B, 3) from the pelvis and rotations (K, B, 3, 3) of the unscaled body in K poses, by C MuJoCo."""
+    data, x, R = mujoco.MjData(body.mj_model), [], []
+    for pose in qpos:
+        data.qpos[:] = pose
+        mujoco.mj_kinematics(body.mj_model, data)
+        x.append(data.xpos[1:] - data.xpos[1])
+        R.append(data.xmat[1:].reshape(-1, 3, 3).copy())
+    return np.array(x), np.array(R)
+
+
+def _marker_places(
+    x: np.ndarray, R: np.ndarray, markers: MarkerSet, at: np.ndarray | slice = slice(None)
+) -> np.ndarray:
+    """(K, m, 3) of the markers `at` on bodies that lie at x and are turned by R."""
+    on = markers.body_index[at]
+    return x[:, on] + np.einsum("kmij,mj->kmi", R[:, on], markers.position_m[at])
 
 
 def align(template: np.ndarray, points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

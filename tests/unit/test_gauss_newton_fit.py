@@ -22,13 +22,13 @@ from pbl_pipeline.fit import (
     SessionFit,
     SessionInput,
     TrialFit,
+    ViewParams,
     _fit_session,
     fit_session,
     fit_sessions,
     per_frame,
     problem,
 )
-from pbl_pipeline.fit._params import BLAZEPOSE
 from pbl_pipeline.fit.initial_pose import placed_poses
 from pbl_pipeline.fit.per_frame import by_joint, floors_of
 from pbl_pipeline.fit.session import make_session
@@ -374,7 +374,7 @@ def test_arms_that_do_not_hang_start_in_the_posture_nearest_to_their_points():
         for side in "rl":
             truth[:, names.index(f"{j}_{side}")] = np.deg2rad(degrees)
     seen = observe(truth, TIME_S, marker_set="blazepose_33", seed=5)
-    session = make_session([seen.keypoints], ["a"], BLAZEPOSE.view)
+    session = make_session([seen.keypoints], ["a"], ViewParams())
     start = placed_poses(session, 0)[session.arrays[0].used]
     for j in ("arm_flex", "elbow_flex"):
         for side in "rl":
