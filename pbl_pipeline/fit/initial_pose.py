@@ -36,7 +36,7 @@ ARM_DEG = {
     "elbow_flex": (20.0, 60.0, 110.0),
 }
 #: Mean distance (m) of an arm's points from a posture that is taken: less than from hanging by the first at least, and
-#: below the second, which no posture reaches on a body that faces the wrong way.
+#: below the second, which the walks of the tests do not reach on a body that faces the wrong way.
 NEARER_M, FURTHEST_M = 0.10, 0.15
 #: Arms are looked at every so many frames, and interpolated.
 ARMS_EVERY = 15
