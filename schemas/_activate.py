@@ -45,11 +45,12 @@ def activate(start: bool = False, methods: bool = True) -> None:
     Raises
     ------
     PblError
-        What `schemas.connection.connect` raises.
+        What `schemas.connection.connect` raises; DB_MIGRATION for tables of an older version.
     """
-    from . import connection
+    from . import connection, migrations
 
     connection.connect(start=start)
+    migrations.refuse_older()
     for stage, module in zip(STAGES, modules(), strict=True):
         connection.bind(stage, module.schema)
     if methods and connection.prefix() not in _methods_done:

@@ -1,13 +1,17 @@
-"""Which tables on the server differ from their definitions, by DataJoint's own comparison. Nothing is changed."""
+"""Which tables on the server differ from their definitions. Nothing is changed."""
 
 from __future__ import annotations
 
 import dataclasses
+import re
 from typing import Any
 
-from schemas import connection
+from schemas import catalog, connection
 from schemas._datajoint import dj
 from schemas.chain import tables
+
+#: A line of a definition that makes a column of the table's own: its name.
+_OWN = re.compile(r"^\s*([a-z]\w*)\s*[:=]", re.MULTILINE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,8 +28,21 @@ class Difference:
         return f"{self.table}: {self.what}"
 
 
+def missing_columns() -> list[str]:
+    """Columns that tables on the server lack, as `table.column`; tables that are missing do not count.
+
+    One query, for every start: columns that a foreign key brings are left to `differences`.
+    """
+    there = {names: {c.name for c in columns} for names, columns in catalog.tables().items()}
+    out = []
+    for path, cls in tables().items():
+        names = connection.schema_name(path.split(".")[0]), cls.table_name
+        out += [f"{names[1]}.{c}" for c in _OWN.findall(cls.definition) if c not in there.get(names, {c})]
+    return out
+
+
 def differences() -> list[Difference]:
-    """Differences of all tables that exist; the schemas must be bound."""
+    """Differences of all tables that exist, by DataJoint's own comparison; the schemas must be bound."""
     conn = connection.connect()
     conn.dependencies.load()
     return [d for cls in tables().values() if cls.database and cls().is_declared for d in _compare(conn, cls)]

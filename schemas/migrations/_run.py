@@ -21,7 +21,7 @@ from schemas._declare import declare_all
 from schemas.chain import tables
 from schemas.rows import utc_now
 
-from ._differences import differences
+from ._differences import differences, missing_columns
 
 _NAME = re.compile(r"(\d{4})_(\w+)")
 Say = Callable[[str], None]
@@ -117,7 +117,6 @@ def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
         steps = _apply(cursor, say)
     if any(statements for _, statements in steps):
         _reread()
-    declare_all()
     left = [d.text() for d in differences()]
     if left:
         raise _error(
@@ -125,7 +124,26 @@ def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
             "tables as this version defines them",
             "they need a migration: see docs/deployment.md, section Upgrade",
         )
+    declare_all()
     return Outcome(steps, created, [])
+
+
+def refuse_older() -> None:
+    """Refuse a database of an older version: one of its tables lacks columns of this version's definition.
+
+    Raises
+    ------
+    PblError
+        DB_MIGRATION.
+    """
+    if missing := missing_columns():
+        more = f" and {len(missing) - 4} more" if len(missing) > 4 else ""
+        raise _error(
+            f"tables of an older version, without {', '.join(missing[:4])}{more}",
+            f"tables as pbl-pipeline {__version__} defines them",
+            "`pbl db migrate --dry-run` says what will be done, `pbl db migrate` does it; a database of which it says "
+            "that no migration does (of a development version): set PBL_HOME to a new folder, ingest the videos again",
+        )
 
 
 def _refuse_newer() -> None:

@@ -217,6 +217,18 @@ def test_results_from_before_they_had_their_session_get_it(
     assert migrations.migrate().steps == []
 
 
+@pytest.mark.parametrize("command", [("populate",), ("list", "videos"), ("worker", "--once"), ("db", "init")])
+def test_commands_over_tables_of_an_older_version_name_the_migration(older: None, command: tuple[str, ...]):
+    before = everything()
+    refused = pbl(*command)
+    assert (refused.code, refused.err.split(":")[0]) == (1, "DB_MIGRATION")
+    for part in ("without video.video_size, __session_fit.fit_height", "pbl db migrate --dry-run"):
+        assert part in refused.err, refused.err
+    assert everything() == before
+    migrations.migrate()
+    assert pbl("list", "videos").code == 0
+
+
 def test_what_no_migration_removes_is_named(empty: Callable[[], None]):
     schemas.activate()
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
