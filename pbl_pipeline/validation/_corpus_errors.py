@@ -44,9 +44,9 @@ def corpus_errors(
 
     Columns: what the case is; `error`, a code where the fit failed; index and measures of the truth (`gdi_true`,
     `cadence_true` ...), of the fit with the true events (`gdi`, with its `gdi_sd` and `gdi_minimal_change`) and with
-    detected ones (`gdi_detected`, `cadence` ...); of each of `ANGLES`, mean over the sides: `_offset` (deg), `_sd`
-    without it, `_ratio` of the ranges and `_in90`, the fraction of the samples that lie in their 90 % intervals. NaN
-    where there is none.
+    detected ones (`gdi_detected` and `gdi_detected_sd`, `cadence` ...); of each of `ANGLES`, mean over the sides:
+    `_offset` (deg), `_sd` without it, `_ratio` of the ranges and `_in90`, the fraction of the samples that lie in their
+    90 % intervals. NaN where there is none.
 
     Raises `PblError` SOLVER_UNKNOWN.
     """
@@ -88,7 +88,7 @@ def _row(case: Case, truth: TrialFit, measured: dict[str, float], result: Sessio
         "gdi_minimal_change": _number(index.minimal_change),
     }
     metrics = gait_metrics(result.trials, fit_checks=result.qc)
-    row["gdi_detected"] = _number(metrics.gdi.mean)
+    row |= {"gdi_detected": _number(metrics.gdi.mean), "gdi_detected_sd": _number(metrics.gdi.sd)}
     row |= {k: _value(metrics.spatiotemporal.measures.get(n)) for k, n in MEASURES.items()}
     return row | _angle_errors(fit, truth)
 
@@ -207,13 +207,15 @@ def angle_table(errors: pd.DataFrame) -> pd.DataFrame:
 
 
 def coverage_table(errors: pd.DataFrame) -> pd.DataFrame:
-    """Fraction of the samples of each angle, and of the cases' indices, inside of their 90 % intervals."""
+    """Fraction of the samples of each angle, and of the cases' indices (with true and with detected events), inside of
+    their 90 % intervals."""
     rows = []
     for name, group in _groups(errors).items():
-        known: Any = group[["gdi", "gdi_true", "gdi_sd"]].dropna()
-        inside = (known["gdi"] - known["gdi_true"]).abs() <= Z90 * known["gdi_sd"]
-        angles = {angle: group[f"{angle}_in90"].mean() for angle in ANGLES}
-        rows.append({"cases": name, **angles, "index": inside.mean(), "index sd": known["gdi_sd"].mean()})
+        row = {"cases": name, **{angle: group[f"{angle}_in90"].mean() for angle in ANGLES}}
+        for title, found in (("index", "gdi"), ("detected events", "gdi_detected")):
+            known: Any = group[[found, "gdi_true", f"{found}_sd"]].dropna()
+            row[title] = ((known[found] - known["gdi_true"]).abs() <= Z90 * known[f"{found}_sd"]).mean()
+        rows.append({**row, "index sd": group["gdi_sd"].mean()})
     return pd.DataFrame(rows)
 
 

@@ -184,10 +184,30 @@ def test_the_index_is_as_unsure_as_its_angles_and_its_cycles(toy, average):
     assert (unknown.mean, unknown.sd, unknown.interval, unknown.minimal_change) == (result.mean, None, None, None)
 
 
+def test_errors_that_pass_or_differ_between_the_sides_make_the_mean_surer(toy):
+    person = toy.mean_deg + 5.0
+    sd = {v: np.full(51, 0.01) for v in THREE_ANGLES}
+    both = [cycle(person, side, curves_sd=sd) for side in ("left", "right")]
+
+    def variance(cycles, **params):
+        before = GdiParams(average="curves", min_cycles_per_side=0)
+        after, all_of_it = (score_gdi(cycles, toy, p).sd for p in (dataclasses.replace(before, **params), before))
+        assert after is not None
+        assert all_of_it is not None
+        return (after / all_of_it) ** 2
+
+    assert variance(both, lasting=0.75) == pytest.approx(0.75)
+    assert variance(both, both_sides=0.0) == pytest.approx(0.5)
+    assert variance(both, both_sides=0.25) == pytest.approx(0.625)
+    # One side alone has nobody to differ from.
+    one = [cycle(person, "left", curves_sd=sd)]
+    assert variance(one, both_sides=0.0) == pytest.approx(1.0)
+
+
 def test_near_the_norm_an_error_has_two_directions(toy):
     person = toy.mean_deg + 1e-6 * toy.components[0]
     sd = {v: np.full(51, s) for v, s in zip(THREE_ANGLES, (3.0, 0.0, 0.0), strict=True)}
-    result = score_gdi([cycle(person, side, curves_sd=sd) for side in ("left", "right")], toy)
+    result = score_gdi([cycle(person, side, curves_sd=sd) for side in ("left", "right")], toy, GdiParams())
     error = 3.0 * np.repeat([1.0, 0.0, 0.0], 50)
     down = toy.index(np.array([person + error, person - error])) - toy.index(person)[0]
     assert result.sd == pytest.approx(np.sqrt(np.mean(down**2)))
