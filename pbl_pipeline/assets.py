@@ -118,7 +118,6 @@ ASSETS: dict[str, Asset] = {
             "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f",
             6_440_512,
             *_BLAZEPOSE,
-            optional=True,
         ),
         Asset(
             "blazepose_landmarks_heavy",

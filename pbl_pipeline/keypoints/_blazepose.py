@@ -71,6 +71,8 @@ NAMES: tuple[str, ...] = (
 N_POINTS = len(NAMES)
 #: The network adds six points; the first two are the middle of the hips and a point of the region of interest.
 N_ALL = 39
+#: Sizes of the networks' outputs: points of the picture, of the world, and whether there is a person.
+_OUTPUTS = (N_ALL * 5, N_ALL * 3, 1)
 #: For each point of the mirrored picture, whose it is: left and right change places.
 MIRROR = np.array(mirror_of(NAMES))
 
@@ -78,7 +80,8 @@ MIRROR = np.array(mirror_of(NAMES))
 class BlazePoseLandmarks:
     """`KeypointDetector` with BlazePose's 33 points, root-relative (origin between the hips).
 
-    The crop is shown twice, the second time mirrored, and `MirrorLooks` puts the answers together. The confidence that
+    The crop is shown twice, the second time mirrored, and `MirrorLooks` puts the answers together; a quick look is one
+    of `quick_path`'s network, where one is given, at the crop as it is. The confidence that
     the network states is sigmoid(visibility logit) * sigmoid(presence logit): the point is not hidden; it lies in the
     picture. presence = the network's own pose flag.
     """
@@ -98,8 +101,10 @@ class BlazePoseLandmarks:
         agree_width_mm: float = 20.0,
         num_threads: int = 1,
         sha256: str = MODEL_SHA256,
+        quick_path: str | Path | None = None,
     ) -> None:
-        self._model = LiteModel(model_path, sha256, (N_ALL * 5, N_ALL * 3, 1), num_threads)
+        self._model = LiteModel(model_path, sha256, _OUTPUTS, num_threads)
+        self._quick = LiteModel(quick_path, MODEL_SHA256, _OUTPUTS, num_threads) if quick_path else self._model
         self.model_sha256 = self._model.sha256
         self.mirror_looks = MirrorLooks(NAMES, agree_mm, agree_width_mm)
 
@@ -118,17 +123,23 @@ class BlazePoseLandmarks:
         self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, quick: bool = False
     ) -> PersonKeypoints:
         """See `CropDetector`."""
-        own = self._look(crop, roi_px, camera)
-        return own if quick else self.mirror_looks.averaged(own, self.detect_mirrored(crop, roi_px, camera))
+        if quick:
+            return self._look(self._quick, crop, roi_px, camera, mirrored=False)
+        own, other = (self.detect_once(crop, roi_px, camera, mirrored=m) for m in (False, True))
+        return self.mirror_looks.averaged(own, other)
 
-    def detect_mirrored(self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera) -> PersonKeypoints:
+    def detect_once(
+        self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, mirrored: bool = False
+    ) -> PersonKeypoints:
         """See `MirrorDetector`."""
-        return self._look(crop, roi_px, camera, mirrored=True)
+        return self._look(self._model, crop, roi_px, camera, mirrored=mirrored)
 
-    def _look(self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, mirrored: bool = False) -> PersonKeypoints:
-        """What the network says of the crop, or of its mirror image, in terms of the picture."""
+    def _look(
+        self, network: LiteModel, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, mirrored: bool
+    ) -> PersonKeypoints:
+        """What a network says of the crop, or of its mirror image, in terms of the picture."""
         crop = np.multiply(cv2.cvtColor(crop, cv2.COLOR_BGR2RGB), np.float32(1 / 255), dtype=np.float32)
-        output = self._model(np.ascontiguousarray(crop[:, ::-1] if mirrored else crop))
+        output = network(np.ascontiguousarray(crop[:, ::-1] if mirrored else crop))
         found = output[N_ALL * 5].reshape(N_ALL, 5).astype(np.float64)
         points, circle, logits = found[:N_POINTS, :2], found[N_POINTS : N_POINTS + 2, :2], found[:N_POINTS, 3:]
         world = output[N_ALL * 3].reshape(N_ALL, 3)[:N_POINTS].astype(np.float64)
@@ -168,4 +179,5 @@ def blazepose(params: KeypointParams) -> BlazePoseLandmarks:
             next_step="use the version of pbl-pipeline that the method was made with, or select another method",
         )
     path = assets.fetch(_NETWORKS[sha256])
-    return BlazePoseLandmarks(path, params.agree_mm, params.agree_width_mm, sha256=sha256)
+    quick = assets.fetch(_NETWORKS[MODEL_SHA256]) if params.lighter_first else None
+    return BlazePoseLandmarks(path, params.agree_mm, params.agree_width_mm, sha256=sha256, quick_path=quick)

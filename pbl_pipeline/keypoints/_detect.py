@@ -110,7 +110,7 @@ def _detect_all(
     mirrored = np.arange(len(roi)) % 2 == 1
 
     def look(row: int) -> Look:
-        return Look.FULL if sharing is None else Look.MIRRORED if mirrored[row] else Look.QUICK
+        return Look.FULL if sharing is None else Look.MIRRORED if mirrored[row] else Look.PLAIN
 
     with BatchedInference(one, camera) if batched else ParallelInference(detectors, camera) as inference:
         seen = two_passes(frames, inference, time_s, regions, look)

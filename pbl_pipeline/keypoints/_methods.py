@@ -26,7 +26,9 @@ METHODS.register("blazepose-33", 2, KeypointParams(), blazepose)
 #: It shares looks, at 24 frames/s and more: each is dear, and its answers of two frames lie close together.
 METHODS.register(
     "blazepose-heavy",
-    2,
-    KeypointParams(model_sha256=HEAVY_SHA256, share_looks_s=0.042, confidence_curve="blazepose-heavy-v2"),
+    3,
+    KeypointParams(
+        model_sha256=HEAVY_SHA256, share_looks_s=0.042, confidence_curve="blazepose-heavy-v3", lighter_first=True
+    ),
 )
 METHODS.register_family("onnx", ModelKeypointParams, onnx)

@@ -24,6 +24,7 @@ class KeypointParams:
     `BlazePoseLandmarks`.
     share_looks_s: frames no further apart than this share the looks at picture and mirror image, every second frame
     mirrored (`MirrorLooks.shared`); 0: each frame has both.
+    lighter_first: the first pass, which only places the crop, takes BlazePose's lighter network.
     sides: where left and right are exchanged back, see `exchange_sides`; None: nowhere.
     min_time_s: a person in view for less cannot be measured.
     box_margin: added to the keypoints' box on each side, as a fraction of its size.
@@ -46,6 +47,7 @@ class KeypointParams:
     box_margin: float = 0.1
     confidence_curve: str = "blazepose-v1"
     share_looks_s: float = later(0.0)
+    lighter_first: bool = later(False)
 
     def points(self) -> tuple[str, bool]:
         """Marker set of the keypoints, and whether their 3D is relative to the root of the body."""

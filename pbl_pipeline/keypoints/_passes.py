@@ -66,8 +66,8 @@ class ParallelInference:
         try:
             if isinstance(detector, CropDetector):
                 crop = frame.cut(*detector.crop_of(roi_px))
-                if look is Look.MIRRORED and isinstance(detector, MirrorDetector):
-                    return detector.detect_mirrored(crop, roi_px, self._camera)
+                if look in (Look.PLAIN, Look.MIRRORED) and isinstance(detector, MirrorDetector):
+                    return detector.detect_once(crop, roi_px, self._camera, mirrored=look is Look.MIRRORED)
                 return detector.detect_crop(crop, roi_px, self._camera, quick=quick)
             return detector.detect(frame.image, roi_px, self._camera, quick=quick)
         finally:

@@ -32,10 +32,11 @@ class PersonKeypoints:
 
 
 class Look(enum.Enum):
-    """How a detector looks at a frame: as well as it can; quickly; at the mirror image alone."""
+    """How a detector looks at a frame: as well as it can; quickly; at the picture alone; at its mirror image alone."""
 
     FULL = "full"
     QUICK = "quick"
+    PLAIN = "plain"
     MIRRORED = "mirrored"
 
 
@@ -76,10 +77,12 @@ class CropDetector(Protocol):
 
 @runtime_checkable
 class MirrorDetector(CropDetector, Protocol):
-    """A `CropDetector` that looks at a region and at its mirror image; `quick` is the first look alone."""
+    """A `CropDetector` that looks at a region and at its mirror image."""
 
     mirror_looks: MirrorLooks
 
-    def detect_mirrored(self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera) -> PersonKeypoints:
-        """The second look alone, in terms of the picture."""
+    def detect_once(
+        self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, mirrored: bool = False
+    ) -> PersonKeypoints:
+        """One of the two looks alone, in terms of the picture."""
         ...

@@ -129,8 +129,9 @@ SEEN_BY = {
     "few-17": ("crop3d", "mpi_inf_3dhp_17"),
 }
 BLAZEPOSE, GAUSS_NEWTON = (methods.of_stage("fit")[name].key for name in ("blazepose", "gauss-newton"))
+HEAVY = methods.of_stage("keypoints")["blazepose-heavy"].key
 DEFAULT_FITS = {
-    ("blazepose-heavy-v2", BLAZEPOSE),
+    (HEAVY, BLAZEPOSE),
     ("metrabs-87-v1", GAUSS_NEWTON),
     ("flat-87-v1", BLAZEPOSE),
     ("few-17-v1", BLAZEPOSE),
@@ -166,7 +167,7 @@ def test_a_new_keypoint_method_for_all_comes_with_its_fit(
         ingest([chain.small_video(tmp_path, subject)], Visit(subject))
     for _ in requeue.carry_out(requeue.plan_new_method("Keypoints", "metrabs-87")):
         pass
-    assert plans() == {("blazepose-heavy-v2", BLAZEPOSE), ("metrabs-87-v1", GAUSS_NEWTON)}
+    assert plans() == {(HEAVY, BLAZEPOSE), ("metrabs-87-v1", GAUSS_NEWTON)}
     assert len(fit.FitPlan()) == 4
     populate()
     assert fitted() == plans()

@@ -196,11 +196,12 @@ def test_leftovers_of_a_killed_process_are_removed(index):
 def test_pins_are_complete():
     """The real list: every hash is a hash, every file name is one of its own, every asset says its licence."""
     augmenter = ["augmenter_network", "augmenter_mean", "augmenter_std"]
-    default = ["blazepose_detector", "blazepose_landmarks_heavy", *augmenter, "demo_video", "demo_camera"]
+    networks = ["blazepose_detector", "blazepose_landmarks", "blazepose_landmarks_heavy"]
+    default = [*networks, *augmenter, "demo_video", "demo_camera"]
     assert assets.needed() == default
     assert set(assets.ASSETS) == {
         *default,
-        *("blazepose_landmarks", "face_detector", "face_detector_near"),
+        *("face_detector", "face_detector_near"),
     }
     files = [a.path.name for a in assets.ASSETS.values()]
     assert len(set(files)) == len(files)

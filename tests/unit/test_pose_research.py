@@ -16,7 +16,7 @@ MOTIONS = SHARED / "real" / "motions"
 @pytest.mark.skipif(not MOTIONS.is_dir(), reason="the recordings of other laboratories are not here")
 def test_the_shipped_prior_made_again():
     made = learn([m for m in read_motions(MOTIONS) if not is_held_out(m.person)])
-    shipped = learned_poses("people-2")
+    shipped = learned_poses("people-3")
     assert made["persons"] == shipped["persons"]
     assert not any(map(is_held_out, shipped["persons"]))
     assert tuple(shipped["joints"]) == JOINTS
@@ -26,7 +26,7 @@ def test_the_shipped_prior_made_again():
 
 
 def test_left_and_right_are_alike_in_the_shipped_prior():
-    for component in learned_poses("people-2")["components"]:
+    for component in learned_poses("people-3")["components"]:
         mean, S = np.array(component["mean_deg"]), np.array(component["covariance_deg2"])
         np.testing.assert_allclose(mirrored(mean[None])[0], mean, atol=1e-3)
         turn = mirrored(np.eye(len(JOINTS)))
