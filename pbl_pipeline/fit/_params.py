@@ -231,8 +231,8 @@ GAUSS_NEWTON = GaussNewtonParams(
 #: held by postures of people. Its depth is much less certain than its pixels, so it counts half. Its points were marked
 #: by eye in pictures and not felt on bone, so they may lie further from the marker set's places than a laboratory's.
 #: Weights were chosen on the two phone clips with marker mocap and on recorded walks with the detector's errors,
-#: persons held out of the prior (`pbl validate gdi`, tests/benchmarks/real_clips.py); the augmenter's pelvis on recorded
-#: squats with the same errors, too. Its 33 points weigh less than MeTRAbs's 87, and so does what smooths them.
+#: persons held out of the prior (`pbl validate gdi`, tests/benchmarks/real_clips.py); that of the augmenter's pelvis on
+#: recorded squats with the same errors, too. Its 33 points weigh less than MeTRAbs's 87, and so does what smooths them.
 BLAZEPOSE = GaussNewtonParams(
     smooth_per_rad2=20.0,
     weight_floor=0.03,
