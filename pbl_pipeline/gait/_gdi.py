@@ -48,6 +48,8 @@ class GdiParams:
         all cycles of a side; the rest differs from sample to sample, and means of curves lose it.
     both_sides
         Correlation of that lasting error between the two sides.
+    lengthening
+        Fraction of the variance of a sample's error that counts as lengthening the distance from the norm (`_shorter`).
     pace
         Measures and index of a session pool the trials that are walked at this pace: one of `PACES`, a word of one's
         own, or "any".
@@ -66,10 +68,14 @@ class GdiParams:
     average: str = later("cycles")
     lasting: float = later(1.0)
     both_sides: float = later(1.0)
+    lengthening: float = later(0.0)
 
 
 #: A 90 % interval of a normal error, in standard deviations.
 Z90 = 1.6449
+#: Errors count as at most so many times the squared distance that was found, which makes an index 15 points higher: of
+#: a fit that is less sure than that, more would be a guess.
+MOST_LONGER = 2.0
 #: The paper's index, and the original one (Schwartz & Rozumalski 2008).
 GDI_MODEL, GILLETTE_MODEL = "pbl-2025-three-angles", "gillette-2008"
 #: Angles that an index is made of.
@@ -77,10 +83,14 @@ MODEL_ANGLES: dict[str, tuple[str, ...]] = {GDI_MODEL: THREE_ANGLES, GILLETTE_MO
 #: Version 1 of the index of three angles had the norm `gillette-166-three-angles`; version 2 is the mean of the indices
 #: of the cycles, as the paper's; version 3 took all of the angles' error as lasting and the same on both sides. The
 #: correlation of the sides' lasting errors on the tuning persons of `pbl validate gdi`: hip flexion 0.5 to 0.8, knee 0
-#: to 0.4, adduction -0.9 to 0.2.
+#: to 0.4, adduction -0.9 to 0.2. `lengthening` is the least of 0, 0.05, 0.1 ... with which 0.75 of the change of each
+#: impairment survives with 33 points on these persons.
 GDI_METHODS: Stage[GdiParams] = Stage("gdi", "family", GDI_MODEL)
 GDI_METHODS.register(
-    GDI_MODEL, 4, GdiParams(average="curves", lasting=0.75, both_sides=0.25), "pbl_pipeline.gait:score_gdi"
+    GDI_MODEL,
+    4,
+    GdiParams(average="curves", lasting=0.5, both_sides=0.25, lengthening=0.2),
+    "pbl_pipeline.gait:score_gdi",
 )
 GDI_METHODS.register(GILLETTE_MODEL, 1, GdiParams(norm="gillette-166-nine-angles"), "pbl_pipeline.gait:score_gdi")
 _NAMES = {GDI_MODEL: "GDI of three angles", GILLETTE_MODEL: "GDI (Schwartz & Rozumalski 2008)"}
@@ -267,16 +277,23 @@ class _Part(NamedTuple):
 def _parts(
     cycles: Sequence[GaitCycle], vectors: Sequence[np.ndarray], norm: NormativeSet, params: GdiParams
 ) -> list[_Part]:
-    known = all(v in c.curves_sd for c in cycles for v in norm.variables)
     x, sides = np.array(vectors), np.array([c.side for c in cycles])
-    spread = np.array([_at_percent(c.curves_sd, norm) for c in cycles]) if known else np.zeros_like(x)
+    stated = all(v in c.curves_sd for c in cycles for v in norm.variables)
+    spread = np.array([_at_percent(c.curves_sd, norm) for c in cycles]) if stated else np.zeros_like(x)
+    known = stated and bool(np.isfinite(spread).all())
+    spread = spread if known else np.zeros_like(x)
 
     def part(own: np.ndarray, weight: float) -> _Part:
+        # An angle at a time, 0 in the others.
+        each = np.repeat(np.eye(len(norm.variables)), len(norm.percent), axis=1) * spread[own].mean(axis=0)
         middle = x[own].mean(axis=0)
         inside = norm.components @ (middle - norm.mean_deg)
-        slope = -10.0 / norm.ln_sd * (inside @ norm.components) / max(float(inside @ inside), 1e-12)
-        gdi = float(norm.index(middle)[0])
-        change = _changes(gdi, middle, slope, spread[own].mean(axis=0), norm) if known else None
+        square = max(float(inside @ inside), 1e-12)
+        longer = params.lengthening * float(np.sum((each @ norm.components.T) ** 2))
+        longer = min(longer, MOST_LONGER * square)
+        slope = -10.0 / norm.ln_sd * (inside @ norm.components) / square * (1.0 + longer / (square + longer))
+        gdi = float(_shorter(middle, longer, norm)[0])
+        change = _changes(gdi, middle, slope, each, longer, norm) if known else None
         return _Part(sides[own][0], weight, gdi, change, _of_mean((x[own] - middle) @ slope))
 
     if params.average == "curves":
@@ -289,13 +306,20 @@ def _parts(
     return [p._replace(chance=chance) for p in parts]
 
 
+def _shorter(vectors: Float[np.ndarray, "*n D"], longer: float, norm: NormativeSet) -> Float[np.ndarray, " n"]:
+    """The index of vectors whose squared distance d^2 from the norm is d^4 / (d^2 + longer): errors lengthen a distance
+    in the mean, a short one by most. That is d^2 - `longer` for long distances, and always positive (as a Wiener
+    filter's)."""
+    inside = (np.atleast_2d(vectors) - norm.mean_deg) @ norm.components.T
+    return norm.index(vectors) + 5.0 / norm.ln_sd * np.log1p(longer / np.maximum(np.sum(inside**2, axis=-1), 1e-12))
+
+
 def _changes(
-    gdi: float, vector: np.ndarray, slope: np.ndarray, spread: np.ndarray, norm: NormativeSet
+    gdi: float, vector: np.ndarray, slope: np.ndarray, each: np.ndarray, longer: float, norm: NormativeSet
 ) -> Float[np.ndarray, " V"]:
-    """What an error of one standard deviation of each angle's curve changes an index by: the root mean square of both
-    directions, because near the norm a derivative would go beyond all bounds; with the derivative's sign."""
-    each = np.repeat(np.eye(len(norm.variables)), len(norm.percent), axis=1) * spread
-    both = norm.index(np.concatenate([vector + each, vector - each])).reshape(2, -1) - gdi
+    """What an error of one standard deviation of each angle's curve (`each`) changes an index by: the root mean square
+    of both directions, because near the norm a derivative would go beyond all bounds; with the derivative's sign."""
+    both = _shorter(np.concatenate([vector + each, vector - each]), longer, norm).reshape(2, -1) - gdi
     return np.sqrt(np.mean(both**2, axis=0)) * np.where(each @ slope < 0, -1.0, 1.0)
 
 

@@ -204,6 +204,34 @@ def test_errors_that_pass_or_differ_between_the_sides_make_the_mean_surer(toy):
     assert variance(one, both_sides=0.0) == pytest.approx(1.0)
 
 
+def test_what_errors_lengthen_is_taken_back_from_the_distance(toy):
+    person = toy.mean_deg + 5.0
+    sd = dict(zip(THREE_ANGLES, (3.0, 1.0, 2.0), strict=True))
+    squares = np.sum((toy.components @ (person - toy.mean_deg)) ** 2)
+    variance = sum(np.sum((toy.components @ np.repeat(np.eye(3)[k] * s, 50)) ** 2) for k, s in enumerate(sd.values()))
+
+    def index(lengthening, times=1.0, known=True):
+        curves_sd = {v: np.full(51, s * times) for v, s in sd.items()} if known else {}
+        both = [cycle(person, side, curves_sd=curves_sd) for side in ("left", "right")]
+        return score_gdi(both, toy, GdiParams(average="curves", lengthening=lengthening))
+
+    plain, ten = index(0.0), 10.0 / toy.ln_sd
+    assert plain.mean == pytest.approx(toy.index(person)[0])
+    shorter = squares**2 / (squares + 0.2 * variance)
+    assert index(0.2).mean == pytest.approx(plain.mean + 0.5 * ten * np.log(squares / shorter))
+    # Small errors leave it, large ones change it by no more than a third of the squared distance that was found.
+    assert index(0.2, times=1e-3).mean == pytest.approx(plain.mean, abs=1e-4)
+    assert index(0.2, times=1e3).mean == pytest.approx(plain.mean + 0.5 * ten * np.log(3.0))
+    # A shorter distance is changed by more by the same error.
+    more, before = index(0.2).sd, plain.sd
+    assert more is not None
+    assert before is not None
+    assert more > before
+    # A fit that does not know how sure it is has the index as it is; so has one that is infinitely unsure.
+    for unknown in (index(0.2, known=False), index(0.2, times=np.inf)):
+        assert (unknown.mean, unknown.sd) == (pytest.approx(plain.mean), None)
+
+
 def test_near_the_norm_an_error_has_two_directions(toy):
     person = toy.mean_deg + 1e-6 * toy.components[0]
     sd = {v: np.full(51, s) for v, s in zip(THREE_ANGLES, (3.0, 0.0, 0.0), strict=True)}
