@@ -10,9 +10,9 @@ which is set by anatomy: a pelvis that is tilted stands under an upright trunk a
 bent knees bends hips and ankles by half as much, on both sides. Means are round figures near those of recorded walks;
 they and how differently bent people walk were chosen on the persons of `pbl validate gdi` who are not held out. Left
 and right are alike: every recording counts once as it is and once mirrored, and who squats or sits bends both hips and
-knees together (the squats of two persons: 0.4 and 1.4 deg apart in the mean), also in the postures of independent
-joints that stand beside the recorded ones. The spine of the LBMC recordings is another
-joint than the body's and counts as unknown. Persons whom `pbl validate gdi` holds out are left out.
+knees together (hips of two persons who squat: 0.4 and 1.4 deg apart in the mean), also in the postures that stand
+beside the recorded ones. The spine of the LBMC recordings is another joint than the body's and counts as unknown.
+Persons whom `pbl validate gdi` holds out are left out.
 """
 
 from __future__ import annotations

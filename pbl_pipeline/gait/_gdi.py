@@ -179,7 +179,8 @@ def score_gdi(
     compared with each other.
 
     The components come from the norm, so deviations in directions in which its people do not vary are not counted;
-    `GdiCycle.explained` says how much was.
+    `GdiCycle.explained` says how much was. Where the fit knows how sure its angles are, what their errors lengthen is
+    taken back from the distance (`GdiParams.lengthening`; docs/measures.md).
 
     Parameters
     ----------
@@ -278,10 +279,9 @@ def _parts(
     cycles: Sequence[GaitCycle], vectors: Sequence[np.ndarray], norm: NormativeSet, params: GdiParams
 ) -> list[_Part]:
     x, sides = np.array(vectors), np.array([c.side for c in cycles])
-    stated = all(v in c.curves_sd for c in cycles for v in norm.variables)
-    spread = np.array([_at_percent(c.curves_sd, norm) for c in cycles]) if stated else np.zeros_like(x)
-    known = stated and bool(np.isfinite(spread).all())
-    spread = spread if known else np.zeros_like(x)
+    stated = [_at_percent(c.curves_sd, norm) for c in cycles if all(v in c.curves_sd for v in norm.variables)]
+    known = len(stated) == len(cycles) and bool(np.isfinite(stated).all())
+    spread = np.array(stated) if known else np.zeros_like(x)
 
     def part(own: np.ndarray, weight: float) -> _Part:
         # An angle at a time, 0 in the others.

@@ -5,6 +5,7 @@ The tests with models need the assets and skip where those are absent and cannot
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from pathlib import Path
 
@@ -15,13 +16,15 @@ import pytest
 from pbl_pipeline import assets
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import METHODS, BlazePoseLandmarks, KeypointParams
-from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES
+from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES, blazepose
+from pbl_pipeline.keypoints._passes import ParallelInference
+from pbl_pipeline.keypoints._protocol import Look
 from pbl_pipeline.models import LiteModel, suppress
 from pbl_pipeline.models._tflite_outputs import keep_outputs
 from pbl_pipeline.tracking import BlazePoseDetector
 from pbl_pipeline.tracking._blazepose import LAYOUT
 from pbl_pipeline.tracking._tiles import detect_in, tiles
-from pbl_pipeline.video import Camera, read_frames
+from pbl_pipeline.video import Camera, Frame, cut_image, read_frames
 
 CAMERA = Camera(np.array([[2520.0, 0, 884], [0, 2520.0, 497], [0, 0, 1]]), np.zeros(5), "Calib_demo.toml of Sports2D")
 
@@ -204,3 +207,25 @@ def test_quick_gives_nearly_the_same_circle(landmarks, frames):
     full = landmarks.detect(frames[100], region(100), CAMERA)
     quick = landmarks.detect(frames[100], region(100), CAMERA, quick=True)
     np.testing.assert_allclose(quick.roi_px[:2], full.roi_px[:2], atol=20)
+
+
+def test_which_network_looks(frames):
+    """Of `blazepose-heavy`, the first look at a frame is the lighter network's; each look that counts is its own."""
+    for name in ("blazepose_landmarks", "blazepose_landmarks_heavy"):
+        asset(name)
+    heavy = METHODS["blazepose-heavy"].params
+    light, both = blazepose(KeypointParams()), blazepose(heavy)
+    alone = blazepose(dataclasses.replace(heavy, lighter_first=False))
+    roi = region(100)
+    crop = cut_image(frames[100], *both.crop_of(roi))
+
+    def points(detector: BlazePoseLandmarks, look: Look) -> np.ndarray:
+        with ParallelInference([detector], CAMERA) as inference:
+            return inference.submit(Frame(0, 0.0, lambda: frames[100]), roi, look).result().xy_px
+
+    np.testing.assert_array_equal(points(both, Look.QUICK), points(light, Look.QUICK))
+    assert np.abs(points(alone, Look.QUICK) - points(light, Look.QUICK)).max() > 1
+    for look in (Look.PLAIN, Look.MIRRORED, Look.FULL):
+        np.testing.assert_array_equal(points(both, look), points(alone, look))
+    np.testing.assert_array_equal(points(both, Look.PLAIN), points(alone, Look.QUICK))
+    np.testing.assert_array_equal(points(both, Look.MIRRORED), both.detect_once(crop, roi, CAMERA, mirrored=True).xy_px)
