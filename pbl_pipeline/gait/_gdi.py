@@ -310,8 +310,7 @@ def _shorter(vectors: Float[np.ndarray, "*n D"], longer: float, norm: NormativeS
     """The index of vectors whose squared distance d^2 from the norm is d^4 / (d^2 + longer): errors lengthen a distance
     in the mean, a short one by most. That is d^2 - `longer` for long distances, and always positive (as a Wiener
     filter's)."""
-    inside = (np.atleast_2d(vectors) - norm.mean_deg) @ norm.components.T
-    return norm.index(vectors) + 5.0 / norm.ln_sd * np.log1p(longer / np.maximum(np.sum(inside**2, axis=-1), 1e-12))
+    return norm.index(vectors) + 5.0 / norm.ln_sd * np.log1p(longer * np.exp(-2.0 * norm.log_distance(vectors)))
 
 
 def _changes(
@@ -342,10 +341,11 @@ def _errors(parts: Sequence[_Part], params: GdiParams) -> tuple[float | None, fl
     """
     from pbl_pipeline.stats import minimal_detectable_change  # loads pandas, which every command would wait for
 
-    changes = [(p.side, p.weight * p.change) for p in parts if p.change is not None]
+    changes = np.array([p.weight * p.change for p in parts if p.change is not None])
     if len(changes) < len(parts):
         return None, None
-    sides = np.array([np.sum([c for own, c in changes if own == side], axis=0) for side in dict(changes)])
+    own = np.array([p.side for p in parts])
+    sides = np.array([changes[own == side].sum(axis=0) for side in (LEFT, RIGHT)])
     alike, apart = np.sum(sides.sum(axis=0) ** 2), np.sum(sides**2)
     fit = params.lasting * (params.both_sides * alike + (1.0 - params.both_sides) * apart)
     walk = sum(p.weight**2 * p.chance for p in parts)

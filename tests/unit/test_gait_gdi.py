@@ -219,7 +219,7 @@ def test_what_errors_lengthen_is_taken_back_from_the_distance(toy):
     assert plain.mean == pytest.approx(toy.index(person)[0])
     shorter = squares**2 / (squares + 0.2 * variance)
     assert index(0.2).mean == pytest.approx(plain.mean + 0.5 * ten * np.log(squares / shorter))
-    # Small errors leave it, large ones change it by no more than a third of the squared distance that was found.
+    # Small errors leave it as it is; large ones leave a third of the squared distance that was found.
     assert index(0.2, times=1e-3).mean == pytest.approx(plain.mean, abs=1e-4)
     assert index(0.2, times=1e3).mean == pytest.approx(plain.mean + 0.5 * ten * np.log(3.0))
     # A shorter distance is changed by more by the same error.
