@@ -11,7 +11,7 @@ from typing import Any
 
 from pbl_pipeline.bounded import read_json
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.methods import STAGES, Method, of_stage
+from pbl_pipeline.methods import STAGES, Method, Stage, of_stage
 from pbl_pipeline.paramset import Paramset
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{1,31}")
@@ -61,6 +61,25 @@ def read_method(path: Path) -> Method[Any]:
             next_step="correct the file; docs/files.md describes it",
             key=path,
         ) from error
+
+
+def named_or_file(stage: Stage[Any], given: str | None) -> Method[Any]:
+    """The method of a stage that a text means: a name, or the path of a JSON file; None for the default.
+
+    Raises `PblError` SOLVER_UNKNOWN; what `read_method` raises; FILE_FORMAT for a method of another stage.
+    """
+    if given is None or not given.endswith(".json"):
+        return stage.find(given)
+    method = read_method(Path(given))
+    if method.stage != stage.name:
+        raise PblError(
+            "FILE_FORMAT",
+            found=f"a method of stage {method.stage!r}",
+            expected=f'"stage": "{stage.name}"',
+            next_step="name it in the file, or give the file to the other option",
+            key=given,
+        )
+    return method
 
 
 def changed(before: Method[Any], name: str, changes: Mapping[str, Any]) -> Method[Any]:

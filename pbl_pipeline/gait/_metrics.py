@@ -267,7 +267,7 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
                 None,
                 None,
                 f"the {far} leg was behind the {near} one: its curves and measures are less certain, and the sides are "
-                "not to be compared. Film from the front or the back, or a pass in each direction"
+                "not to be compared. Film a pass in each direction"
                 if far
                 else "",
             )

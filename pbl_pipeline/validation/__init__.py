@@ -2,7 +2,7 @@
 
 from ._align import align_path, best_lag
 from ._compare import JointError, KinematicErrors, compare, compare_angles, compare_references
-from ._corpus import Case, Walk, corpus, is_held_out, lasting, recorded_walks, synthetic_walk
+from ._corpus import Case, Walk, corpus, detector_model, is_held_out, lasting, recorded_walks, synthetic_walk
 from ._corpus_errors import corpus_errors, corpus_tables, print_corpus, responsiveness, write_corpus
 from ._curves import CURVE_COLUMNS, cycle_curves, save_curves
 from ._frame import COLUMNS, TrialErrors, error_frame
@@ -79,6 +79,7 @@ __all__ = [
     "corpus_errors",
     "corpus_tables",
     "cycle_curves",
+    "detector_model",
     "error_frame",
     "fit_angles",
     "fit_angles_sd",

@@ -27,6 +27,7 @@ from pbl_pipeline.progress import track
 from pbl_pipeline.synthetic import (
     DETECTORS,
     IMPAIRMENTS,
+    DetectorModel,
     Impairment,
     Noise,
     SynthSpec,
@@ -100,7 +101,7 @@ class Case:
 
         The random errors belong to person, view, camera and detector: two visits of a person differ by the walk alone.
         """
-        model = DETECTORS[self.detector]
+        model = detector_model(self.detector)
         seed = _number(f"{self.walk.person}|{self.view}|{self.camera}|{self.detector}")
         camera, size = lens(self.view, self.camera)
         reach = np.ptp(self.walk.qpos[:, _columns("pelvis_tx", "pelvis_tz")], axis=0)
@@ -128,6 +129,15 @@ def is_held_out(person: str) -> bool:
     return int(hashlib.sha256(person.encode()).hexdigest()[-1], 16) % 2 == 1
 
 
+def detector_model(name: str) -> DetectorModel:
+    """The error model of a detector. Raises `PblError` USAGE for an unknown name."""
+    if name not in DETECTORS:
+        raise PblError(
+            "USAGE", found=f"detector {name!r}", expected=f"one of {', '.join(DETECTORS)}", next_step="name one"
+        )
+    return DETECTORS[name]
+
+
 def corpus(
     detector: str = "blazepose-heavy",
     motions: str | Path | None = None,
@@ -146,10 +156,7 @@ def corpus(
     PblError
         USAGE for an unknown detector; what `read_motions` raises.
     """
-    if detector not in DETECTORS:
-        raise PblError(
-            "USAGE", found=f"detector {detector!r}", expected=f"one of {', '.join(DETECTORS)}", next_step="name one"
-        )
+    detector_model(detector)
     cases: list[Case] = []
     seeds = synthetic_seeds(1 if quick else 4)
     for p, seed in enumerate(track(seeds, "walkers", unit="person")):

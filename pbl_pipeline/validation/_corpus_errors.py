@@ -13,10 +13,11 @@ import pandas as pd
 from pbl_pipeline.body import joint_angles, joint_angles_sd, load_body, stature_m
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit, SessionInput, TrialFit, fit_sessions
-from pbl_pipeline.gait import Z90, GaitCycle, find_cycles, gait_metrics, score_gdi, spatiotemporal
+from pbl_pipeline.gait import Z90, GaitCycle, GdiParams, find_cycles, gait_metrics, score_gdi, spatiotemporal
+from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 
-from ._corpus import HEALTHY, Case
+from ._corpus import HEALTHY, VIEWS, Case
 
 #: Column -> measure of `gait.MEASURES`.
 MEASURES = {
@@ -27,6 +28,15 @@ MEASURES = {
 }
 #: Angles whose errors are reported, per side.
 ANGLES = ("hip_flexion", "hip_adduction", "hip_rotation", "knee_flexion", "ankle_angle")
+#: Views of one session whose indices are averaged. From which side is chance: "one side" is either.
+SESSIONS: dict[str, list[tuple[str, ...]]] = {
+    "front": [("frontal",)],
+    "back": [("rear",)],
+    "front and back": [("frontal", "rear")],
+    "one side": [("sagittal",), ("sagittal_right",)],
+    "both sides": [("sagittal", "sagittal_right")],
+    "all five": [VIEWS],
+}
 #: A mean true change of the index below this is too small for a fraction of it.
 LEAST_CHANGE = 3.0
 #: What two visits of one person have in common.
@@ -38,9 +48,11 @@ def corpus_errors(
     method: Paramset | str | None = None,
     fit: Callable[..., Sequence[SessionFit | PblError]] = fit_sessions,
     heights: bool = False,
+    index: Method[GdiParams] | str | None = None,
 ) -> pd.DataFrame:
     """Fit every case as a session of one trial, all at once, and compare with its truth: one row per case. `heights`:
-    the fit is told how tall each person is.
+    the fit is told how tall each person is. `index`: a method of `GDI_METHODS`, None for the default, of the
+    truth and of the fit.
 
     Columns: what the case is; `error`, a code where the fit failed; index and measures of the truth (`gdi_true`,
     `cadence_true` ...), of the fit with the true events (`gdi`, with its `gdi_sd` and `gdi_minimal_change`) and with
@@ -58,13 +70,19 @@ def corpus_errors(
     fits = fit(sessions, method)
     # Several cases are of one walk.
     truths = {walk: walk.fit() for walk in dict.fromkeys(c.walk for c in cases)}
-    measured = {walk: _measured(find_cycles(walk.events, truth)) for walk, truth in truths.items()}
+    measured = {walk: _measured(find_cycles(walk.events, truth), index) for walk, truth in truths.items()}
     return pd.DataFrame(
-        [_row(c, truths[c.walk], measured[c.walk], result) for c, result in zip(cases, fits, strict=True)]
+        [_row(c, truths[c.walk], measured[c.walk], result, index) for c, result in zip(cases, fits, strict=True)]
     )
 
 
-def _row(case: Case, truth: TrialFit, measured: dict[str, float], result: SessionFit | PblError) -> dict[str, Any]:
+def _row(
+    case: Case,
+    truth: TrialFit,
+    measured: dict[str, float],
+    result: SessionFit | PblError,
+    index: Method[GdiParams] | str | None,
+) -> dict[str, Any]:
     walk = case.walk
     row: dict[str, Any] = {
         "person": walk.person,
@@ -81,21 +99,23 @@ def _row(case: Case, truth: TrialFit, measured: dict[str, float], result: Sessio
     if isinstance(result, PblError):
         return row
     fit = result.trials[0]
-    index = score_gdi(find_cycles(walk.events, fit))
+    gdi = score_gdi(find_cycles(walk.events, fit), model=index)
     row |= {
-        "gdi": _number(index.mean),
-        "gdi_sd": _number(index.sd),
-        "gdi_minimal_change": _number(index.minimal_change),
+        "gdi": _number(gdi.mean),
+        "gdi_sd": _number(gdi.sd),
+        "gdi_minimal_change": _number(gdi.minimal_change),
     }
-    metrics = gait_metrics(result.trials, fit_checks=result.qc)
+    metrics = gait_metrics(result.trials, fit_checks=result.qc, model=index)
     row |= {"gdi_detected": _number(metrics.gdi.mean), "gdi_detected_sd": _number(metrics.gdi.sd)}
     row |= {k: _value(metrics.spatiotemporal.measures.get(n)) for k, n in MEASURES.items()}
     return row | _angle_errors(fit, truth)
 
 
-def _measured(cycles: Sequence[GaitCycle]) -> dict[str, float]:
+def _measured(cycles: Sequence[GaitCycle], index: Method[GdiParams] | str | None) -> dict[str, float]:
     measures = spatiotemporal(cycles).measures
-    return {"gdi": _number(score_gdi(cycles).mean)} | {k: _value(measures.get(n)) for k, n in MEASURES.items()}
+    return {"gdi": _number(score_gdi(cycles, model=index).mean)} | {
+        k: _value(measures.get(n)) for k, n in MEASURES.items()
+    }
 
 
 def _value(measure: Any) -> float:
@@ -136,6 +156,7 @@ def corpus_tables(errors: pd.DataFrame) -> dict[str, pd.DataFrame]:
     return {
         "index: error by view (true events)": _by_group(errors, "gdi", "gdi_true"),
         "index: error by view (detected events)": _by_group(errors, "gdi_detected", "gdi_true"),
+        "index: mean of a walk's views": view_table(errors),
         "gait measures: error": measure_table(errors),
         "joint angles: error by view (deg)": angle_table(errors),
         "samples in their 90 % intervals": coverage_table(errors),
@@ -167,6 +188,34 @@ def _by_group(errors: pd.DataFrame, found: str, true: str) -> pd.DataFrame:
                 "sd": off.std(),
                 "rms": float(np.sqrt((off**2).mean())),
                 "correlation": known.corr().iloc[0, 1] if len(known) > 2 else np.nan,
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def view_table(errors: pd.DataFrame) -> pd.DataFrame:
+    """Error of the mean of the indices of one walk from several views (`SESSIONS`), each by the first camera that saw
+    it: over the walks that were seen so, and over those of the persons held out. A trial of its own is made of each
+    view: the walk is the same, the detector errs anew."""
+    walk = ["held_out", "person", "condition", "severity"]
+    off: Any = errors.assign(off=errors["gdi"] - errors["gdi_true"]).pivot_table(
+        index=walk, columns="view", values="off", aggfunc="first"
+    )
+    rows = []
+    for name, sets in SESSIONS.items():
+        if not {v for views in sets for v in views} <= set(off.columns):
+            continue
+        means = pd.concat([off[list(views)].mean(axis=1, skipna=False) for views in sets]).dropna()
+        held = means[means.index.get_level_values("held_out")]
+        rows.append(
+            {
+                "views": name,
+                "n": len(means),
+                "bias": means.mean(),
+                "sd": means.std(),
+                "held out: n": len(held),
+                "held out: bias": held.mean(),
+                "held out: sd": held.std(),
             }
         )
     return pd.DataFrame(rows)

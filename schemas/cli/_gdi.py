@@ -15,7 +15,7 @@ import click
     metavar="DIR",
     help="Recorded motions with their index.csv: their straight walks take part.",
 )
-@click.option("--method", metavar="FIT", help="Method of the fit (default: the one for the detector's points).")
+@click.option("--method", metavar="FIT", help="Method of the fit, or a JSON file of one (default: that of the points).")
 @click.option(
     "--detector",
     default="blazepose-heavy",
@@ -23,10 +23,19 @@ import click
     metavar="NAME",
     help="Error model: blazepose-heavy, blazepose-33 or metrabs-87.",
 )
+@click.option("--index", metavar="NAME", help="Method of the index, or a JSON file of one (default: three angles).")
 @click.option("--quick", is_flag=True, help="Two synthetic people and one view per impairment: about 60 cases.")
 @click.option("--heights", is_flag=True, help="Tell the fit how tall each person is.")
 @click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Write CSV and JSON there.")
-def gdi(motions: Path | None, method: str | None, detector: str, quick: bool, heights: bool, out: Path) -> None:
+def gdi(
+    motions: Path | None,
+    method: str | None,
+    detector: str,
+    index: str | None,
+    quick: bool,
+    heights: bool,
+    out: Path,
+) -> None:
     """Fit walks whose truth is known, and print how far index, measures and angles are off (docs/validation.md).
 
     Synthetic people, healthy and with each impairment, and recorded walks on the body, seen by the detector's error
@@ -35,18 +44,20 @@ def gdi(motions: Path | None, method: str | None, detector: str, quick: bool, he
     """
     from pbl_pipeline.files import check_out_folder
     from pbl_pipeline.fit import METHODS, default_for_points
-    from pbl_pipeline.synthetic import DETECTORS
-    from pbl_pipeline.validation import corpus, corpus_errors, corpus_tables, print_corpus, write_corpus
+    from pbl_pipeline.gait import GDI_METHODS
+    from pbl_pipeline.method_file import named_or_file
+    from pbl_pipeline.validation import corpus, corpus_errors, corpus_tables, detector_model, print_corpus, write_corpus
 
     check_out_folder(out)
     start = time.perf_counter()
+    model = detector_model(detector)
+    chosen = named_or_file(METHODS, method or default_for_points(model.marker_set, model.root_relative))
+    scored = named_or_file(GDI_METHODS, index)
     cases = corpus(detector, motions, quick=quick)
-    model = DETECTORS[detector]
-    chosen = METHODS.find(method or default_for_points(model.marker_set, model.root_relative))
     people = len({c.walk.person for c in cases})
-    click.echo(f"{len(cases)} cases of {people} people, fit {chosen.name}, version {chosen.version}")
+    click.echo(f"{len(cases)} cases of {people} people, fit {chosen.key}, index {scored.key}")
     made = time.perf_counter()
-    errors = corpus_errors(cases, chosen.paramset, heights=heights)
+    errors = corpus_errors(cases, chosen.paramset, heights=heights, index=scored)
     tables = corpus_tables(errors)
     click.echo(print_corpus(tables))
     about = {
@@ -54,6 +65,9 @@ def gdi(motions: Path | None, method: str | None, detector: str, quick: bool, he
         "method": chosen.name,
         "version": chosen.version,
         "params_hash": chosen.hash,
+        "index": scored.name,
+        "index_version": scored.version,
+        "index_params_hash": scored.hash,
         "quick": quick,
         "heights": heights,
         "motions": motions is not None,

@@ -228,7 +228,7 @@ def test_pooled_components_come_from_patients_too():
 
 
 def test_paramsets():
-    assert {name: p.version for name, p in GDI_METHODS.items()} == {"pbl-2025-three-angles": 4, GILLETTE_MODEL: 1}
+    assert {name: p.version for name, p in GDI_METHODS.items()} == {"pbl-2025-three-angles": 5, GILLETTE_MODEL: 1}
     # A row of version 1 is understood as it was.
     old = score_gdi([], "gillette-166-three-angles", GdiParams(), "pbl-2025-three-angles", 1)
     assert (
