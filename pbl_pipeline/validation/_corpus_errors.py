@@ -273,7 +273,7 @@ def responsiveness(errors: pd.DataFrame, found: str = "gdi", true: str = "gdi_tr
 
     Two visits: healthy and impaired, or two severities, seen from the same view. The fraction is the sum of the changes
     found over the sum of the true ones, so that small changes do not dominate; NaN where the true mean change is below
-    `LEAST_CHANGE`. `sd` is that of the error of a change, `se` the standard error of the fraction, `within` the
+    `LEAST_CHANGE`. `rms` is that of the error of a change, `se` the standard error of the fraction, `within` the
     fraction of the errors that are below the minimal change of the first visit's index.
     """
     synthetic: Any = errors[errors["source"] == "synthetic"]
@@ -299,7 +299,7 @@ def responsiveness(errors: pd.DataFrame, found: str = "gdi", true: str = "gdi_tr
                 f"{label}: true": real[known].mean(),
                 f"{label}: survives": change[known].sum() / total if enough else np.nan,
                 f"{label}: se": off.std() * np.sqrt(n) / abs(total) if enough else np.nan,
-                f"{label}: sd": off.std(),
+                f"{label}: rms": float(np.sqrt((off**2).mean())),
                 f"{label}: within": (off.abs() <= both["gdi_minimal_change_before"][known]).mean(),
             }
         rows.append(row)

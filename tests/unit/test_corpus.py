@@ -6,11 +6,12 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.gait import detect_events, feet_from_fit
+from pbl_pipeline.gait import GDI_METHODS, detect_events, feet_from_fit
 from pbl_pipeline.synthetic import DETECTORS, NO_NOISE, VIEWS_DEG, Noise, observe, plain_walk
 from pbl_pipeline.validation import (
     Case,
@@ -25,6 +26,7 @@ from pbl_pipeline.validation import (
     responsiveness,
     write_corpus,
 )
+from pbl_pipeline.validation._corpus_errors import view_table
 
 COLUMN = {n: i for i, n in enumerate(load_body().joint_names)}
 TIME_S = np.arange(180) / 30
@@ -57,9 +59,9 @@ class _Fit:
     qc: tuple = ()
 
 
-def _errors(cases, fit) -> Any:
+def _errors(cases, fit, **kwargs) -> Any:
     """(pandas' own types say less of a column than these tests need.)"""
-    return corpus_errors(cases, fit=fit)
+    return corpus_errors(cases, fit=fit, **kwargs)
 
 
 def _session(fit) -> _Fit:
@@ -157,6 +159,32 @@ def test_known_errors_are_found():
     assert errors["knee_flexion_in90"].to_numpy() == pytest.approx(1.0)
     assert (errors["gdi"] < errors["gdi_true"]).all()
     assert errors["cadence"].to_numpy() == pytest.approx(errors["cadence_true"].to_numpy(), rel=0.01)
+
+
+def test_the_index_is_that_of_the_method_asked_for():
+    cases = [Case(_walk(), "frontal", "static", "blazepose-heavy")]
+    fit = _fake_fit(lambda fit: _off(fit, "hip_flexion", 10.0))(cases)
+    shipped = GDI_METHODS[GDI_METHODS.default]
+    more = GDI_METHODS.make("more", 1, dataclasses.replace(shipped.params, lengthening=0.5))
+    default, asked = _errors(cases, fit), _errors(cases, fit, index=more)
+    for found, true in (("gdi", "gdi_true"), ("gdi_detected", "gdi_true")):
+        assert asked[found][0] > default[found][0] + 1  # more is taken back from what errors lengthen
+        assert asked[true][0] == default[true][0]  # of which the truth has none
+
+
+def test_the_mean_of_a_walks_views():
+    """Two views whose errors are opposite have a mean without an error; a walk that lacks a view does not count."""
+    seen = [(p, v) for p in ("a", "b") for v in ("sagittal", "sagittal_right", "frontal")][:-1]
+    errors = pd.DataFrame(seen, columns=["person", "view"]).assign(
+        held_out=lambda d: d["person"] == "b", condition="healthy", severity=0.0, gdi_true=100.0
+    )
+    errors["gdi"] = errors["gdi_true"] + errors["view"].map({"sagittal": 6.0, "sagittal_right": -6.0, "frontal": 3.0})
+    again = errors[errors["view"] == "sagittal"].assign(gdi=0.0)  # another camera, which does not count
+    table: Any = view_table(pd.concat([errors, again])).set_index("views")
+    assert table["n"].to_dict() == {"front": 1, "one side": 4, "both sides": 2}
+    assert table.loc["both sides", ["bias", "sd", "held out: bias"]].tolist() == pytest.approx([0.0, 0.0, 0.0])
+    assert table["bias"]["front"] == pytest.approx(3.0)
+    assert table["sd"]["one side"] == pytest.approx(np.std([6, -6, 6, -6], ddof=1))
 
 
 def test_a_case_that_cannot_be_fitted_keeps_its_code(tmp_path):

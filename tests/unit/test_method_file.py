@@ -9,8 +9,9 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, ImplicitAdamParams
+from pbl_pipeline.gait import GDI_METHODS, GILLETTE_MODEL
 from pbl_pipeline.gait.events import METHODS as EVENTS
-from pbl_pipeline.method_file import read_method
+from pbl_pipeline.method_file import named_or_file, read_method
 from pbl_pipeline.methods import stored
 
 
@@ -33,6 +34,17 @@ def test_only_what_the_file_states_is_changed(tmp_path):
     row = found.paramset
     again = stored(stage="fit", name="slow", version=1, params=json.loads(row.canonical_json), sha=found.hash)
     assert again.params == found.params
+
+
+def test_a_name_or_a_file_says_which_method(tmp_path):
+    plain = write(tmp_path / "plain.json", {"stage": "gdi", "lengthening": 0})
+    assert named_or_file(GDI_METHODS, str(plain)).params.lengthening == 0
+    assert named_or_file(GDI_METHODS, GILLETTE_MODEL) is GDI_METHODS[GILLETTE_MODEL]
+    assert named_or_file(GDI_METHODS, None) is GDI_METHODS[GDI_METHODS.default]
+    for given, code in ((str(plain), "FILE_FORMAT"), (f"{tmp_path}/no.json", "FILE_MISSING"), ("no", "SOLVER_UNKNOWN")):
+        with pytest.raises(PblError) as error:
+            named_or_file(METHODS, given)
+        assert error.value.code == code
 
 
 def test_another_stage_a_name_and_a_base_by_its_key(tmp_path):
