@@ -89,7 +89,7 @@ def changed(before: Method[Any], name: str, changes: Mapping[str, Any]) -> Metho
     """
     params = _merge(dataclasses.asdict(before.params), changes, before.stage)
     merged = Paramset(before.stage, name, 1, params)
-    return of_stage(before.stage).make(name, 1, merged.to(before.family.params))
+    return of_stage(before.stage).make(name, 1, merged.to(before.family.params), before.family)
 
 
 def _merge(base: Mapping[str, Any], changes: Mapping[str, Any], stage: str) -> dict[str, Any]:

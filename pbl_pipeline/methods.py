@@ -204,12 +204,13 @@ class Stage(Mapping[str, Method[P]]):
         family = self._family_of(given)
         return self._method(f"{family.name}-custom", 1, given, family)
 
-    def make(self, name: str, version: int, params: P) -> Method[P]:
-        """A method of one's own: parameters of a family under a name.
+    def make(self, name: str, version: int, params: P, family: Family | None = None) -> Method[P]:
+        """A method of one's own: parameters of a family under a name. `family` decides where the parameters name none,
+        and several have parameters of their class.
 
         Raises `PblError` SOLVER_UNKNOWN, and `ValueError` for a value that is not of its field's type.
         """
-        return self._method(name, version, params, self._family_of(params))
+        return self._method(name, version, params, self._family_of(params, family))
 
     def of(self, paramset: Paramset) -> Method[P]:
         """The method of a paramset. Raises `PblError` SOLVER_UNKNOWN."""
@@ -261,9 +262,11 @@ class Stage(Mapping[str, Method[P]]):
             paramset = dataclasses.replace(paramset, params={self.kind: family.name, **paramset.params})
         return Method(paramset, params, family)
 
-    def _family_of(self, params: Any) -> Family:
-        """The family of a parameter object: the one that it names, else the one whose class it is."""
+    def _family_of(self, params: Any, family: Family | None = None) -> Family:
+        """The family of a parameter object: the one that it names, else `family`, else the one whose class it is."""
         name = getattr(params, self.kind, None)
+        if name is None and family is not None:
+            return family
         if name is None:
             name = next((f.name for f in self.families.values() if f.params is type(params)), type(params).__name__)
         family = self._family(name, "parameters")

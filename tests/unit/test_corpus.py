@@ -178,7 +178,8 @@ def test_the_mean_of_a_walks_views():
     errors = pd.DataFrame(seen, columns=["person", "view"]).assign(
         held_out=lambda d: d["person"] == "b", condition="healthy", severity=0.0, gdi_true=100.0
     )
-    errors["gdi"] = errors["gdi_true"] + errors["view"].map({"sagittal": 6.0, "sagittal_right": -6.0, "frontal": 3.0})
+    off = {"sagittal": 6.0, "sagittal_right": -6.0, "frontal": 3.0}
+    errors["gdi"] = errors["gdi_true"] + [off[view] for view in errors["view"]]
     again = errors[errors["view"] == "sagittal"].assign(gdi=0.0)  # another camera, which does not count
     table: Any = view_table(pd.concat([errors, again])).set_index("views")
     assert table["n"].to_dict() == {"front": 1, "one side": 4, "both sides": 2}

@@ -9,7 +9,7 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, ImplicitAdamParams
-from pbl_pipeline.gait import GDI_METHODS, GILLETTE_MODEL
+from pbl_pipeline.gait import GDI_METHODS, GILLETTE_MODEL, score_gdi
 from pbl_pipeline.gait.events import METHODS as EVENTS
 from pbl_pipeline.method_file import named_or_file, read_method
 from pbl_pipeline.methods import stored
@@ -45,6 +45,17 @@ def test_a_name_or_a_file_says_which_method(tmp_path):
         with pytest.raises(PblError) as error:
             named_or_file(METHODS, given)
         assert error.value.code == code
+
+
+def test_a_change_of_the_original_index_is_of_nine_angles(tmp_path):
+    """Both indices have parameters of one class: the base decides."""
+    content = {"stage": "gdi", "base": GILLETTE_MODEL, "min_cycles_per_side": 2}
+    found = read_method(write(tmp_path / "strict.json", content))
+    assert found.family is GDI_METHODS[GILLETTE_MODEL].family
+    row = found.paramset
+    again = stored(stage="gdi", name="strict", version=1, params=json.loads(row.canonical_json), sha=found.hash)
+    assert again.family is found.family
+    assert score_gdi([], model=again).model == "strict"
 
 
 def test_another_stage_a_name_and_a_base_by_its_key(tmp_path):
