@@ -83,7 +83,8 @@ class Walk:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Case:
-    """A walk as one phone with one detector sees it."""
+    """A walk as one phone with one detector sees it: from one view, or, with "+" between them (`joined`), from several,
+    each a trial of one session."""
 
     walk: Walk
     view: str
@@ -96,10 +97,15 @@ class Case:
         w = self.walk
         return f"{w.person}|{w.condition}|{w.severity:g}|{self.view}|{self.camera}|{self.detector}"
 
-    def keypoints(self, noise: Noise | None = None) -> Keypoints:
-        """What the detector gives, by its error model of `DETECTORS` or another noise; the same at each call.
+    def trials(self) -> dict[str, Keypoints]:
+        """What the detector gives in each view."""
+        return {v: dataclasses.replace(self, view=v).keypoints() for v in self.view.split("+")}
 
-        The random errors belong to person, view, camera and detector: two visits of a person differ by the walk alone.
+    def keypoints(self, noise: Noise | None = None) -> Keypoints:
+        """What the detector gives in the one view of a case, by its error model of `DETECTORS` or another noise.
+
+        The same at each call: the random errors belong to person, view, camera and detector, so that two visits of a
+        person differ by the walk alone.
         """
         model = detector_model(self.detector)
         seed = _number(f"{self.walk.person}|{self.view}|{self.camera}|{self.detector}")
@@ -129,6 +135,14 @@ def is_held_out(person: str) -> bool:
     return int(hashlib.sha256(person.encode()).hexdigest()[-1], 16) % 2 == 1
 
 
+def joined(views: Iterable[str]) -> str:
+    """The views of one session as a case names them. Raises `PblError` USAGE for an unknown one."""
+    names = list(dict.fromkeys(views))
+    if unknown := [v for v in names if v not in VIEWS]:
+        raise PblError("USAGE", found=f"view {unknown[0]!r}", expected=f"of {', '.join(VIEWS)}", next_step="name these")
+    return "+".join(names)
+
+
 def detector_model(name: str) -> DetectorModel:
     """The error model of a detector. Raises `PblError` USAGE for an unknown name."""
     if name not in DETECTORS:
@@ -144,34 +158,37 @@ def corpus(
     *,
     quick: bool = False,
     seconds: float = SECONDS,
+    together: Sequence[str] = (),
 ) -> list[Case]:
     """The cases: synthetic people, and the recorded walks of the folder `motions` (`read_motions`) where one is given.
 
     Each synthetic person is seen healthy in every view, and with each impairment at two severities: in every view, or
     `quick`, in one view that changes with the impairment. Eight people, four of them held out, or `quick` two,
-    one held out. Recorded walks are seen in every view by both cameras, or `quick` in two views.
+    one held out. Recorded walks are seen in every view by both cameras, or `quick` in two views. `together`: views that
+    make one session, in place of a session for each view.
 
     Raises
     ------
     PblError
-        USAGE for an unknown detector; what `read_motions` raises.
+        USAGE for an unknown detector or view; what `read_motions` raises.
     """
     detector_model(detector)
+    seen = [joined(together)] if together else VIEWS
     cases: list[Case] = []
     seeds = synthetic_seeds(1 if quick else 4)
     for p, seed in enumerate(track(seeds, "walkers", unit="person")):
         healthy = synthetic_walk(seed, seconds=seconds)
-        for v, view in enumerate(VIEWS):
+        for v, view in enumerate(seen):
             cameras = [CAMERAS[(p + v) % 2]] if quick else CAMERAS
             cases += [Case(healthy, view, camera, detector) for camera in cameras]
         for i, name in enumerate(IMPAIRMENTS):
-            views = [(p + i) % len(VIEWS)] if quick else range(len(VIEWS))
+            views = [(p + i) % len(seen)] if quick else range(len(seen))
             for severity in SEVERITIES:
                 walk = synthetic_walk(seed, name, severity, seconds)
-                cases += [Case(walk, VIEWS[v], CAMERAS[(p + v) % 2], detector) for v in views]
+                cases += [Case(walk, seen[v], CAMERAS[(p + v) % 2], detector) for v in views]
     for p, walk in enumerate(recorded_walks(motions, seconds) if motions is not None else ()):
-        for v, view in enumerate(VIEWS):
-            if quick and v not in (p % len(VIEWS), (p + 2) % len(VIEWS)):
+        for v, view in enumerate(seen):
+            if quick and v not in (p % len(seen), (p + 2) % len(seen)):
                 continue
             cameras = [CAMERAS[(p + v) % 2]] if quick else CAMERAS
             cases += [Case(walk, view, camera, detector) for camera in cameras]

@@ -50,13 +50,13 @@ def corpus_errors(
     heights: bool = False,
     index: Method[GdiParams] | str | None = None,
 ) -> pd.DataFrame:
-    """Fit every case as a session of one trial, all at once, and compare with its truth: one row per case. `heights`:
+    """Fit every case as a session, all at once, and compare with its truth: one row per case. `heights`:
     the fit is told how tall each person is. `index`: a method of `GDI_METHODS`, None for the default, of the
     truth and of the fit.
 
     Columns: what the case is; `error`, a code where the fit failed; index and measures of the truth (`gdi_true`,
     `cadence_true` ...), of the fit with the true events (`gdi`, with its `gdi_sd` and `gdi_minimal_change`) and with
-    detected ones (`gdi_detected` and `gdi_detected_sd`, `cadence` ...); of each of `ANGLES`, mean over the sides:
+    detected ones (`gdi_detected` and `gdi_detected_sd`, `cadence` ...); of each of `ANGLES`, over sides and trials:
     `_offset` (deg), `_sd` without it, `_ratio` of the ranges and `_in90`, the fraction of the samples that lie in their
     90 % intervals. NaN where there is none.
 
@@ -65,7 +65,8 @@ def corpus_errors(
     body = load_body()
     tall = {c.walk: stature_m(body, c.walk.scale) if heights else None for c in cases}
     sessions = [
-        SessionInput([c.keypoints()], [f"case{i}"], c.camera, height_m=tall[c.walk]) for i, c in enumerate(cases)
+        SessionInput([*found.values()], [f"case{i} {view}" for view in found], c.camera, height_m=tall[c.walk])
+        for i, (c, found) in enumerate((c, c.trials()) for c in cases)
     ]
     fits = fit(sessions, method)
     # Several cases are of one walk.
@@ -98,8 +99,7 @@ def _row(
     row |= {f"{k}_true": v for k, v in measured.items()}
     if isinstance(result, PblError):
         return row
-    fit = result.trials[0]
-    gdi = score_gdi(find_cycles(walk.events, fit), model=index)
+    gdi = score_gdi([c for trial in result.trials for c in find_cycles(walk.events, trial)], model=index)
     row |= {
         "gdi": _number(gdi.mean),
         "gdi_sd": _number(gdi.sd),
@@ -108,7 +108,7 @@ def _row(
     metrics = gait_metrics(result.trials, fit_checks=result.qc, model=index)
     row |= {"gdi_detected": _number(metrics.gdi.mean), "gdi_detected_sd": _number(metrics.gdi.sd)}
     row |= {k: _value(metrics.spatiotemporal.measures.get(n)) for k, n in MEASURES.items()}
-    return row | _angle_errors(fit, truth)
+    return row | pd.DataFrame([_angle_errors(trial, truth) for trial in result.trials]).mean().to_dict()
 
 
 def _measured(cycles: Sequence[GaitCycle], index: Method[GdiParams] | str | None) -> dict[str, float]:
@@ -156,7 +156,7 @@ def corpus_tables(errors: pd.DataFrame) -> dict[str, pd.DataFrame]:
     return {
         "index: error by view (true events)": _by_group(errors, "gdi", "gdi_true"),
         "index: error by view (detected events)": _by_group(errors, "gdi_detected", "gdi_true"),
-        "index: mean of a walk's views": view_table(errors),
+        **({} if (views := view_table(errors)).empty else {"index: mean of a walk's views": views}),
         "gait measures: error": measure_table(errors),
         "joint angles: error by view (deg)": angle_table(errors),
         "samples in their 90 % intervals": coverage_table(errors),

@@ -24,6 +24,7 @@ import click
     help="Error model: blazepose-heavy, blazepose-33 or metrabs-87.",
 )
 @click.option("--index", metavar="NAME", help="Method of the index, or a JSON file of one (default: three angles).")
+@click.option("--together", metavar="VIEW,...", help="Views that make one session, such as sagittal,sagittal_right.")
 @click.option("--quick", is_flag=True, help="Two synthetic people and one view per impairment: about 60 cases.")
 @click.option("--heights", is_flag=True, help="Tell the fit how tall each person is.")
 @click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Write CSV and JSON there.")
@@ -32,6 +33,7 @@ def gdi(
     method: str | None,
     detector: str,
     index: str | None,
+    together: str | None,
     quick: bool,
     heights: bool,
     out: Path,
@@ -53,7 +55,7 @@ def gdi(
     model = detector_model(detector)
     chosen = named_or_file(METHODS, method or default_for_points(model.marker_set, model.root_relative))
     scored = named_or_file(GDI_METHODS, index)
-    cases = corpus(detector, motions, quick=quick)
+    cases = corpus(detector, motions, quick=quick, together=together.split(",") if together else ())
     people = len({c.walk.person for c in cases})
     click.echo(f"{len(cases)} cases of {people} people, fit {chosen.key}, index {scored.key}")
     made = time.perf_counter()
@@ -68,6 +70,7 @@ def gdi(
         "index": scored.name,
         "index_version": scored.version,
         "index_params_hash": scored.hash,
+        "together": together,
         "quick": quick,
         "heights": heights,
         "motions": motions is not None,

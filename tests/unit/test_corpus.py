@@ -11,7 +11,7 @@ import pytest
 
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.gait import GDI_METHODS, detect_events, feet_from_fit
+from pbl_pipeline.gait import GDI_METHODS, GdiParams, detect_events, feet_from_fit
 from pbl_pipeline.synthetic import DETECTORS, NO_NOISE, VIEWS_DEG, Noise, observe, plain_walk
 from pbl_pipeline.validation import (
     Case,
@@ -26,6 +26,7 @@ from pbl_pipeline.validation import (
     responsiveness,
     write_corpus,
 )
+from pbl_pipeline.validation._corpus import joined
 from pbl_pipeline.validation._corpus_errors import view_table
 
 COLUMN = {n: i for i, n in enumerate(load_body().joint_names)}
@@ -170,6 +171,28 @@ def test_the_index_is_that_of_the_method_asked_for():
     for found, true in (("gdi", "gdi_true"), ("gdi_detected", "gdi_true")):
         assert asked[found][0] > default[found][0] + 1  # more is taken back from what errors lengthen
         assert asked[true][0] == default[true][0]  # of which the truth has none
+
+
+def test_several_views_make_one_session():
+    """A fit whose error in one view is the opposite of that in the other has none in the session's mean curves."""
+    both = joined(["sagittal", "sagittal_right"])
+    case = Case(_walk(), both, "static", "blazepose-heavy")
+    assert list(case.trials()) == ["sagittal", "sagittal_right"]
+    alone = Case(_walk(), "sagittal_right", "static", "blazepose-heavy").keypoints()
+    assert np.array_equal(case.trials()["sagittal_right"].xy_px, alone.xy_px)
+
+    def fit(sessions, method):
+        assert [len(s.trials) for s in sessions] == [2]
+        assert len(set(sessions[0].names)) == 2
+        truth = case.walk.fit()
+        return [_Fit((_off(truth, "hip_flexion", 6.0), _off(truth, "hip_flexion", -6.0)))]
+
+    errors = _errors([case], fit)
+    assert errors["hip_flexion_offset"][0] == pytest.approx(0.0, abs=1e-9)
+    plain = _errors([case], fit, index=GDI_METHODS.make("plain", 1, GdiParams(average="curves")))
+    assert plain["gdi"][0] == pytest.approx(plain["gdi_true"][0], abs=1e-6)
+    with pytest.raises(PblError, match="above"):
+        joined(["sagittal", "above"])
 
 
 def test_the_mean_of_a_walks_views():
