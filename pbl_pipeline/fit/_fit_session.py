@@ -22,7 +22,7 @@ from ._methods import METHODS
 from ._params import Params
 from ._rotation import quat_wxyz
 from .checks import check_fit
-from .known_height import as_tall
+from .known_height import in_metres
 from .objective import State
 from .per_frame import start_of
 from .priors import pixels_alone
@@ -144,7 +144,7 @@ def _batches(
         begin, given = time.perf_counter(), sessions[i]
         try:
             check_height(given.height_m)
-            session = make_session(given.trials, given.names, params.view, _motions(given), given.markers)
+            session = make_session(given.trials, given.names, params, _motions(given), given.markers)
         except PblError as error:
             return error
         return _Packed(i, session, start_of(session), time.perf_counter() - begin)
@@ -209,7 +209,7 @@ def _session_fit(packed: _Packed, solution: Solution, paramset: Paramset, given:
             key=", ".join(session.names),
         )
     solution, sources = upright(session, solution)
-    solution, taller = as_tall(session, solution, given.height_m)
+    solution, taller = in_metres(session, solution, given.height_m)
     seconds = packed.seconds + solution.seconds + time.perf_counter() - begin
     fits = tuple(
         _trial_fit(session, i, solution, sources[i], paramset, motions[i], seconds, given.height_m)

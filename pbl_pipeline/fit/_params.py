@@ -14,7 +14,13 @@ class CostParams:
     `weight_3d` and `weight_2d` count costs that are means over markers, in cm^2 and px^2; the priors are half sums of
     squares in standard deviations. The 2D cost of 33 independent markers with 5 px noise is about 10 times less than
     its negative log-likelihood, so a prior of weight 0.1 counts as its standard deviations say.
+
+    `pixel`: what a px is, "file", "1080x1920" or "crop"; `metre`: whose the metres and cm of a single camera's points
+    are, "detector" or "body" (`units.py`).
     """
+
+    pixel: str = later("file")
+    metre: str = later("detector")
 
     weight_3d: float = 1.0
     weight_2d: float = 0.1

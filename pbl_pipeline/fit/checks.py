@@ -45,8 +45,8 @@ def check_fit(
     session: Session, trials: Sequence[TrialFit], solution: Solution, taller: float | None = None
 ) -> tuple[Check, ...]:
     """All checks of one session fit, worst trial per check. `taller`: the person's height over the fitted one's
-    (`known_height.as_tall`)."""
-    checks = [_residual_3d(session, trials), _in_view(session), _limits(session, trials), _converged(solution)]
+    (`known_height.in_metres`)."""
+    checks = [_residual_3d(session, trials, solution.metre), _in_view(session), _limits(session, trials), _converged(solution)]
     checks += _height(session, solution.scale, taller)
     if not isinstance(session.trials[0], WorldMarkers):
         checks = [_residual_2d(session, trials), *checks, _intrinsics(trials), _orientation(trials)]
@@ -84,9 +84,13 @@ def _residual_2d(session: Session, trials: Sequence[TrialFit]) -> Check:
     )
 
 
-def _residual_3d(session: Session, trials: Sequence[TrialFit]) -> Check:
+def _residual_3d(session: Session, trials: Sequence[TrialFit], metre: float) -> Check:
+    """In centimetres of the fit, which are the same for small and tall people."""
     counts = np.asarray(session.markers.weight_3d) > 0
-    medians = [100 * np.median(r[np.isfinite(r)]) for t in trials if np.isfinite(r := t.residual_3d_m[:, counts]).any()]
+    medians = [
+        100 * np.median(r[np.isfinite(r)]) / metre
+        for t in trials if np.isfinite(r := t.residual_3d_m[:, counts]).any()
+    ]
     if not medians:
         # Pixels alone: nothing to compare with.
         return Check("residual_3d_cm", PASS, None, RESIDUAL_3D_WARN_CM, "")

@@ -2,16 +2,12 @@
 nearest of some postures.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import dataclasses
 import functools
 import itertools
 
-import mujoco
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
@@ -20,9 +16,8 @@ from pbl_pipeline.body import PELVIS_TURNS, SLIDES, Body, MarkerSet
 
 from .problem import TrialArrays
 from .session import Session
+from .standing import bodies_at, marker_places, standing_markers, trunk_of
 
-#: Bodies whose markers turn with the trunk; limbs would pull the heading towards where they swing.
-TRUNK = ("pelvis", "torso", "head", "humerus_r", "humerus_l")
 #: Joint angles (deg) of the start beside the standing pose: bent a little, away from limits and from straight limbs.
 BENT_DEG = {"knee_angle": -10.0, "elbow_flex": 20.0, "pro_sup": 45.0, "hip_flexion": 5.0}
 #: Bodies whose markers tell how an arm is held.
@@ -48,9 +43,7 @@ def placed_poses(session: Session, trial: int, flip: bool = False) -> np.ndarray
     points, c = world_points(arrays)
     body, markers = session.body, session.markers
     template = standing_markers(body, markers)
-    trunk = np.array([b in TRUNK for b in markers.body_names])
-    if trunk.sum() < 3:
-        trunk[:] = True
+    trunk = trunk_of(markers)
     weight = np.where(trunk, c, 0.0)
     R, x = align(template, points, weight)
     known = (np.count_nonzero(weight, axis=1) >= 3) & np.isfinite(x).all(axis=1) & arrays.used
@@ -97,7 +90,7 @@ class _Arm:
 
     def nearest(self, markers: MarkerSet, at: np.ndarray, points: np.ndarray, c: np.ndarray) -> np.ndarray:
         """Angles (T, n) in rad for points (T, m, 3) of the markers `at`, from the pelvis of the standing body."""
-        places = _marker_places(self.x, self.R, markers, at)
+        places = marker_places(self.x, self.R, markers, at)
         away = np.where(c[:, None] > 0, np.linalg.norm(points[:, None] - places, axis=-1), 0.0)
         mean = np.einsum("tkm,tm->tk", away, c) / c.sum(axis=1)[:, None]
         least = np.min(mean, axis=1)
@@ -113,7 +106,7 @@ def _arms(body: Body) -> list[_Arm]:
         postures = np.vstack([standing[columns], np.deg2rad(list(itertools.product(*ARM_DEG.values())))])
         qpos = np.tile(standing, (len(postures), 1))
         qpos[:, columns] = postures
-        x, R = _bodies(body, qpos)
+        x, R = bodies_at(body, qpos)
         found.append(_Arm({f"{name}_{side}" for name in ARM_BODIES}, columns, postures, x, R))
     return found
 
@@ -170,35 +163,6 @@ def triangulate(arrays: TrialArrays) -> tuple[np.ndarray, np.ndarray]:
     out = np.zeros(right.shape)
     out[seen] = np.linalg.solve(normal[seen] + 1e-9 * np.eye(3), right[seen][..., None])[..., 0]
     return out, np.where(seen, np.max(arrays.c_2d, axis=1), 0.0)
-
-
-def standing_markers(body: Body, markers: MarkerSet) -> np.ndarray:
-    """(J, 3) of the unscaled standing body with its pelvis at the origin and unturned."""
-    return _marker_places(*_standing(body), markers)[0]
-
-
-@functools.cache
-def _standing(body: Body) -> tuple[np.ndarray, np.ndarray]:
-    return _bodies(body, np.zeros((1, len(body.joint_names))))
-
-
-def _bodies(body: Body, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (K, B, 3) from the pelvis and rotations (K, B, 3, 3) of the unscaled body in K poses, by C MuJoCo."""
-    data, x, R = mujoco.MjData(body.mj_model), [], []
-    for pose in qpos:
-        data.qpos[:] = pose
-        mujoco.mj_kinematics(body.mj_model, data)
-        x.append(data.xpos[1:] - data.xpos[1])
-        R.append(data.xmat[1:].reshape(-1, 3, 3).copy())
-    return np.array(x), np.array(R)
-
-
-def _marker_places(
-    x: np.ndarray, R: np.ndarray, markers: MarkerSet, at: np.ndarray | slice = slice(None)
-) -> np.ndarray:
-    """(K, m, 3) of the markers `at` on bodies that lie at x and are turned by R."""
-    on = markers.body_index[at]
-    return x[:, on] + np.einsum("kmij,mj->kmi", R[:, on], markers.position_m[at])
 
 
 def align(template: np.ndarray, points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

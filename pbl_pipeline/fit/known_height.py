@@ -1,4 +1,4 @@
-"""The person's measured height as the size of the fitted body.
+"""From the metres of the fit to the person's: the detector's guess of her size, or her measured height.
 
 One camera sees no lengths: a person half as large at half the distance gives the same pixels, and how large the
 detector's 3D points are is the detector's guess (those of `blazepose-heavy` were 6 % too small on six recordings,
@@ -21,16 +21,22 @@ from .session import Session
 from .solution import Solution
 
 
-def as_tall(session: Session, solution: Solution, height_m: float | None) -> tuple[Solution, float | None]:
-    """The solution with a body of the person's height, and that height over the one of the solution (None: unknown).
+def in_metres(session: Session, solution: Solution, height_m: float | None) -> tuple[Solution, float | None]:
+    """The solution in metres of a body of the person's height, or of the detector's where it is not known; and that
+    height over what the detector takes it for (None: unknown).
 
     What several cameras or laboratory markers measured stays as it is.
     """
-    if height_m is None:
-        return solution, None
-    factor = height_m / stature_m(session.body, solution.scale)
-    if not all(isinstance(t, Keypoints) for t in session.trials):
-        return solution, factor
+    detectors = 1.0 / session.metre
+    taller = None if height_m is None else height_m / (detectors * stature_m(session.body, solution.scale))
+    factor = detectors
+    if taller is not None and all(isinstance(t, Keypoints) for t in session.trials):
+        factor *= taller
+    return solution if factor == 1.0 else _enlarged(session, solution, factor), taller
+
+
+def _enlarged(session: Session, solution: Solution, factor: float) -> Solution:
+    """The whole scene larger by a factor, about the camera."""
     qpos, points = solution.qpos.copy(), np.array(solution.outcome.x_world_m)
     sd = None if solution.qpos_sd is None else solution.qpos_sd.copy()
     slides = [session.body.joint_names.index(name) for name in SLIDES]
@@ -45,13 +51,13 @@ def as_tall(session: Session, solution: Solution, height_m: float | None) -> tup
         sd[:, slides] *= factor
     s = factor * solution.s
     s[0] += factor - 1.0  # a multiplier is 1 plus these
-    shown: Any = points
-    enlarged = dataclasses.replace(
+    shown: Any = points, factor * np.asarray(solution.outcome.residual_3d_m)
+    return dataclasses.replace(
         solution,
         qpos=qpos,
         qpos_sd=sd,
         s=s,
         scale=factor * solution.scale,
-        outcome=dataclasses.replace(solution.outcome, x_world_m=shown),
+        outcome=dataclasses.replace(solution.outcome, x_world_m=shown[0], residual_3d_m=shown[1]),
+        metre=factor,
     )
-    return enlarged, factor

@@ -33,7 +33,7 @@ PAPER_COST = CostParams(
 def paper_objective(fit: SessionFit, trials: Sequence[Trial], markers: MarkerSet | None = None) -> float:
     """The paper's own total (section Model Fitting) of a session fit, whatever the fit itself minimised."""
     motions = [t.camera_motion for t in fit.trials]
-    session = make_session(trials, [t.name for t in fit.trials], PAPER_2025.view, motions, markers)
+    session = make_session(trials, [t.name for t in fit.trials], PAPER_2025, motions, markers)
     qpos = np.zeros((session.problem.weight.shape[0], len(session.body.joint_names)))
     R_nc = np.array(session.problem.R_nc, np.float64)
     for i, trial in enumerate(fit.trials):

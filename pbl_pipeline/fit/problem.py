@@ -55,7 +55,8 @@ class Problem:
     `points`: what is fitted; `weight_3d`: of each marker, as in `MarkerSet`. time_s counts from each trial's first
     frame; `trial` is the number of a frame's trial; `weight` is 1 for a frame that counts and 0 for others. `c_*` are
     confidences over the numbers of markers and views, so that a sum over both is the paper's mean; 0 where nothing was
-    seen, where values are finite and do not count. `xy_px` are pixels of an ideal pinhole camera (undistorted). `bend`
+    seen, where values are finite and do not count. `xy_px` and `camera_matrix` are of an ideal pinhole camera
+    (undistorted), in the pixels of the cost, which are `pixel_px` pixels of the file (`units.py`). `bend`
     holds the weights of the frames before, at and after a frame in the second difference there (per 1/30 s squared), 0
     where it is not formed; `rate` is 1/30 s over the time to the next frame of the trial, 0 where there is none.
     `contact`: how surely each of the soles' points stands (0 to 1), 0 until a first solution tells; `pelvis`: tilt
@@ -78,6 +79,7 @@ class Problem:
     R_nc: Float[Array, "F V 3 3"]
     p_nc: Float[Array, "F V 3"]
     camera_matrix: Float[Array, "F V 3 3"]
+    pixel_px: Float[Array, "F V"]
     bend: Float[Array, "F 3"]
     rate: Float[Array, " F"]
     contact: Float[Array, "F P"]
@@ -106,7 +108,7 @@ class Problem:
 @dataclasses.dataclass(frozen=True)
 class TrialArrays:
     """One trial before padding (NumPy, float64): T frames, V views, J markers. Fields as in `Problem`, but `c_*` are
-    plain confidences.
+    plain confidences, `xy_px` and `camera_matrix` in pixels of the file.
 
     `used` (T,) bool: frames that count. phone_time_s (P,) on the video's clock, phone_quat_wxyz (P, 4): orientation of
     the one camera where it moves, else None.
@@ -123,6 +125,7 @@ class TrialArrays:
     R_nc: np.ndarray
     p_nc: np.ndarray
     camera_matrix: np.ndarray
+    pixel_px: np.ndarray
     phone_time_s: np.ndarray | None = None
     phone_quat_wxyz: np.ndarray | None = None
 
@@ -217,6 +220,9 @@ def pack(trials: Sequence[TrialArrays], body: Body, markers: MarkerSet) -> Probl
         return a * np.pad(used, (0, frames)).reshape(-1, *[1] * (a.ndim - 1))
 
     quats, starts = _phone_samples(trials, n, coarse)
+    pixel_px = joined("pixel_px")
+    to_pixels = np.ones((*pixel_px.shape, 3, 1))
+    to_pixels[..., :2, 0] /= pixel_px[..., None]
     bend = np.concatenate([bend_weights(t.time_s, t.used) for t in trials])
     arrays = {
         "weight_3d": np.pad(markers.weight_3d, (0, size - n_markers)),
@@ -224,13 +230,14 @@ def pack(trials: Sequence[TrialArrays], body: Body, markers: MarkerSet) -> Probl
         "weight": np.pad(used.astype(float), (0, frames)),
         "x_cam": joined("x_cam", 2),
         "c_3d": confidence("c_3d"),
-        "xy_px": joined("xy_px", 2),
+        "xy_px": joined("xy_px", 2) / pixel_px[..., None, None],
         "c_2d": confidence("c_2d"),
         "x_world": joined("x_world", 1),
         "c_world": confidence("c_world"),
         "R_nc": joined("R_nc"),
         "p_nc": joined("p_nc"),
-        "camera_matrix": joined("camera_matrix"),
+        "camera_matrix": joined("camera_matrix") * to_pixels,
+        "pixel_px": pixel_px,
         "bend": np.pad(bend, [(0, frames), (0, 0)]),
         "rate": np.pad(np.concatenate([step_rates(t.time_s) for t in trials]), (0, frames)),
         "contact": np.zeros((total + frames, sum(name in body.body_names for name, _ in SOLES))),
@@ -268,7 +275,10 @@ def _phone_samples(trials: Sequence[TrialArrays], n: int, coarse: bool) -> tuple
 
 
 #: Fields of `Problem` with one row per frame that a keypoint's cost depends on.
-PER_FRAME = ("weight", "trial", "x_cam", "c_3d", "xy_px", "c_2d", "x_world", "c_world", "R_nc", "p_nc", "camera_matrix")
+PER_FRAME = (
+    *("weight", "trial", "x_cam", "c_3d", "xy_px", "c_2d", "x_world", "c_world", "R_nc", "p_nc"),
+    *("camera_matrix", "pixel_px"),
+)
 
 
 def frames_at(p: Problem, index: Int[Array, " K"]) -> Problem:

@@ -22,9 +22,10 @@ from pbl_pipeline.keypoints import (
 )
 from pbl_pipeline.video import undistort_px
 
-from ._params import ViewParams
+from ._params import Params, ViewParams
 from ._rotation import mean_rotation, rotation_matrices
 from .problem import CLOCK_RANGE_S, Problem, TrialArrays, pack
+from .units import BODY, FILE, body_metres, check_units, pixel_px
 
 #: R_nc of a level camera that looks along world +x: columns are the camera's x (right), y (down), z (forward).
 LEVEL_CAMERA_R_NC = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -41,7 +42,8 @@ PHONE_COVERAGE = 0.9
 
 @dataclasses.dataclass(frozen=True)
 class Session:
-    """One session. `used` (T_i,) bool: frames that count, unpadded; `orientation`: source of each camera's."""
+    """One session. `used` (T_i,) bool: frames that count, unpadded; `orientation`: source of each camera's; `metre`:
+    metres of the fit in one of the detector's (`units.body_metres`)."""
 
     body: Body
     markers: MarkerSet
@@ -51,6 +53,7 @@ class Session:
     in_view_share: tuple[float, ...]
     orientation: tuple[str, ...]
     problem: Problem
+    metre: float = 1.0
 
     def frames(self, i: int) -> slice:
         """Where trial `i` lies in the packed frames."""
@@ -61,18 +64,19 @@ class Session:
 def make_session(
     trials: Sequence[Trial],
     names: Sequence[str],
-    view: ViewParams,
+    params: Params,
     camera_motion: Sequence[str] = (),
     markers: MarkerSet | None = None,
 ) -> Session:
-    """Validate the trials of one session and pack them.
+    """Validate the trials of one session and pack them, in the units of the paramset.
 
     Raises
     ------
     PblError
         FIT_INPUT (no trial, too few frames in view, time stamps out of order, nothing seen, values not finite where
-        confidence is positive, trials of different kinds), VIEWS_DISAGREE, MARKER_SET_UNKNOWN, PHONE_LOG.
+        confidence is positive, trials of different kinds, a paramset in unknown units), VIEWS_DISAGREE, MARKER_SET_UNKNOWN, PHONE_LOG.
     """
+    check_units(params.cost)
     if not trials or len(trials) != len(names):
         raise _input_error(f"{len(trials)} trials and {len(names)} names", "at least one trial and a name for each")
     kinds = {type(t) for t in trials}
@@ -86,13 +90,16 @@ def make_session(
     motions = list(camera_motion) or ["static"] * len(trials)
     if len(motions) != len(trials) or not set(motions) <= {"static", "handheld"}:
         raise _input_error(f"camera motions {', '.join(motions)}", "'static' or 'handheld' for each trial")
-    checked = [check_trial(t, n, view, table) for t, n in zip(trials, names, strict=True)]
+    checked = [check_trial(t, n, params.view, table) for t, n in zip(trials, names, strict=True)]
     arrays, orientation = [], []
     for trial, name, motion, (used, _) in zip(trials, names, motions, checked, strict=True):
-        packed, source = _arrays(trial, name, motion, used)
+        packed, source = _arrays(trial, name, motion, used, params.cost.pixel)
         arrays.append(packed)
         orientation.append(source)
-    body = load_body()
+    body, metre = load_body(), 1.0
+    if params.cost.metre == BODY and isinstance(trials[0], Keypoints):
+        metre = body_metres(body, table, [a.x_cam for a in arrays], [a.c_3d * a.used[:, None, None] for a in arrays])
+        arrays = [dataclasses.replace(a, x_cam=metre * a.x_cam) for a in arrays]
     return Session(
         body=body,
         markers=table,
@@ -102,6 +109,7 @@ def make_session(
         in_view_share=tuple(share for _, share in checked),
         orientation=tuple(orientation),
         problem=pack(arrays, body, table),
+        metre=metre,
     )
 
 
@@ -184,7 +192,7 @@ def _finite(points: np.ndarray) -> np.ndarray:
     return np.isfinite(points @ np.ones(points.shape[-1]))
 
 
-def _arrays(trial: Trial, name: str, motion: str, used: np.ndarray) -> tuple[TrialArrays, str]:
+def _arrays(trial: Trial, name: str, motion: str, used: np.ndarray, pixel: str = FILE) -> tuple[TrialArrays, str]:
     """The arrays of a trial and where its camera's orientation comes from."""
     t, j = len(trial.time_s), len(trial.names)
     if isinstance(trial, WorldMarkers):
@@ -202,6 +210,7 @@ def _arrays(trial: Trial, name: str, motion: str, used: np.ndarray) -> tuple[Tri
             R_nc=np.zeros((t, 0, 3, 3)),
             p_nc=np.zeros((t, 0, 3)),
             camera_matrix=np.zeros((t, 0, 3, 3)),
+            pixel_px=np.zeros((t, 0)),
         ), CALIBRATED
     phone = None
     if isinstance(trial, MultiView):
@@ -228,6 +237,7 @@ def _arrays(trial: Trial, name: str, motion: str, used: np.ndarray) -> tuple[Tri
         R_nc=R,
         p_nc=p,
         camera_matrix=np.tile(np.stack([k.camera.matrix for k in views]), (t, 1, 1, 1)),
+        pixel_px=np.stack([pixel_px(k, pixel) for k in views], axis=1),
         phone_time_s=None if phone is None else phone[0],
         phone_quat_wxyz=None if phone is None else phone[1],
     ), source

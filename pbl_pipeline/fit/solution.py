@@ -19,7 +19,7 @@ class Outcome:
     """On the F frames of a problem and its J markers; residuals are NaN where nothing was seen.
 
     x_world_m; residual_2d_px and residual_3d_m: means over the views that saw the marker (3D of a camera: with the mean
-    over the markers removed; in the world: as it is); body_axis_m: from between the heels to the head.
+    over the markers removed; in the world: as it is), in pixels of the file; body_axis_m: from between the heels to the head.
     """
 
     x_world_m: Float[Array, "F J 3"]
@@ -35,7 +35,7 @@ class Solution:
     qpos in m and rad; R_nc: camera to world; s: the paper's scale parameters; scale: their multipliers; clock_s: sensor
     time minus video time of each trial, 0 where not estimated; loss_trace: (step, loss) of K steps; qpos_sd: standard
     deviations, None where the solver computes none; pelvis_told: 1 where the marker augmenter told how the pelvis is
-    tipped, None where the method does not ask it.
+    tipped, None where the method does not ask it; metre: metres of the solution in one of the fit.
     """
 
     qpos: Float[np.ndarray, "F Q"]
@@ -52,6 +52,7 @@ class Solution:
     outcome: Outcome
     qpos_sd: Float[np.ndarray, "F Q"] | None = None
     pelvis_told: Float[np.ndarray, " F"] | None = None
+    metre: float = 1.0
 
 
 def outcome(p: Problem, x: Float[Array, "F P 3"], R_nc: Float[Array, "F V 3 3"]) -> Outcome:
@@ -60,7 +61,8 @@ def outcome(p: Problem, x: Float[Array, "F P 3"], R_nc: Float[Array, "F V 3 3"])
     px = m = jnp.full(markers.shape[:2], jnp.nan)
     if p.c_2d.shape[1] > 0:
         x_cam = in_camera(markers, R_nc, p.p_nc)
-        px = _mean_seen(square(residual_2d_px(x_cam, p.xy_px, p.camera_matrix)), p.c_2d)
+        r = residual_2d_px(x_cam, p.xy_px, p.camera_matrix) * p.pixel_px[..., None, None]
+        px = _mean_seen(square(r), p.c_2d)
         centred = mean_weights(p.c_3d, p.weight_3d)
         r = residual_3d_cm(x_cam - offset_m(x_cam, p.x_cam, centred), p.x_cam)
         m = 0.01 * _mean_seen(square(r), p.c_3d)

@@ -157,6 +157,7 @@ class BlazePoseLandmarks:
             confidence=confidence,
             presence=float(output[1].item()),
             roi_px=circle_roi(*circle_px),
+            crop_px=float(roi[2]),
         )
 
 

@@ -151,7 +151,7 @@ def _assemble(
 ) -> Keypoints:
     n, j = len(found), len(detector.names)
     xy, xyz = np.full((n, j, 2), np.nan), np.full((n, j, 3), np.nan)
-    confidence, box = np.zeros((n, j)), np.full((n, 4), np.nan)
+    confidence, box, crop = np.zeros((n, j)), np.full((n, 4), np.nan), np.full(n, np.nan)
     width, height = tracking.image_size_px
     for row, person in enumerate(found):
         if person is None or person.presence < params.min_presence:
@@ -160,6 +160,7 @@ def _assemble(
         inside = np.all((person.xy_px >= -0.5) & (person.xy_px <= np.array([width, height]) - 0.5), axis=1)
         xy[row, inside], xyz[row, inside] = person.xy_px[inside], person.xyz_cam_m[inside]
         confidence[row, inside] = np.clip(person.confidence[inside], 0.0, 1.0)
+        crop[row] = person.crop_px
         low, high = person.xy_px.min(axis=0), person.xy_px.max(axis=0)
         margin = params.box_margin * (high - low)
         box[row] = np.clip(np.concatenate([low - margin, high + margin]), 0.0, [width, height, width, height])
@@ -184,6 +185,7 @@ def _assemble(
         picture=picture,
         confidence_curve=_curve_of(detector, params),
         sides_changed=changed,
+        crop_px=crop.astype(np.float32) if np.isfinite(crop).any() else None,
     )
 
 

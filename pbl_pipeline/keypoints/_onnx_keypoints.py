@@ -155,7 +155,7 @@ class OnnxKeypoints:
             order = [self._mirror if a.mirrored else np.arange(shape[2]) for a in looks]
             scores = np.stack([score.reshape(shape)[:, a, o] for a, o in enumerate(order)], axis=1).mean(axis=1)
             return [
-                _person(x, np.full((shape[2], 3), np.nan), c, r)
+                _person(x, np.full((shape[2], 3), np.nan), c, r, self._crop_px(r))
                 for x, c, r in zip(mean_xy, scores, rois_px, strict=True)
             ]
         together = aligned(xyz)
@@ -167,7 +167,10 @@ class OnnxKeypoints:
         confidence = np.where(placed[:, None], confidence, 0.0)
         mean_xyz = mean_xyz + root[:, None]
         people = zip(mean_xy, mean_xyz, confidence, rois_px, strict=True)
-        return [_person(x, p, c, r, known=not quick) for x, p, c, r in people]
+        return [_person(x, p, c, r, self._crop_px(r), known=not quick) for x, p, c, r in people]
+
+    def _crop_px(self, roi_px: np.ndarray) -> float:
+        return float(self._spec.box_margin * roi_px[2])
 
     def _decode(self, output: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Points (N, J, 2) in the crop from the centre of its first pixel, scores (N, J), 3D (N, J, 3) in m or None."""
@@ -203,11 +206,11 @@ def onnx(params: ModelKeypointParams) -> OnnxKeypoints:
 
 
 def _person(
-    xy: np.ndarray, xyz: np.ndarray, confidence: np.ndarray, roi_px: np.ndarray, *, known: bool = True
+    xy: np.ndarray, xyz: np.ndarray, confidence: np.ndarray, roi_px: np.ndarray, crop_px: float, *, known: bool = True
 ) -> PersonKeypoints:
     """`known`: whether the confidence says anything; a single look of a model with 3D has none."""
     presence = float(confidence.mean()) if known else float("nan")
-    return PersonKeypoints(xy, xyz, confidence, presence, _region(xy, roi_px))
+    return PersonKeypoints(xy, xyz, confidence, presence, _region(xy, roi_px), crop_px)
 
 
 def _region(xy: np.ndarray, roi_px: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ _NEEDED = (
 _ASSUMED = ("distortion", "camera_source", "box_px")
 _OPTIONAL = (
     *("focal_rel_sd", "sides_changed", "phone_time_s", "phone_quat_wxyz", "confidence_curve", "origin"),
-    *("picture_time_s", "picture_luma", "picture_detail"),
+    *("picture_time_s", "picture_luma", "picture_detail", "crop_px"),
 )
 _NO_SOURCE = "not stated in the keypoints file"
 
@@ -50,6 +50,9 @@ class Keypoints:
     image_size_px : (width, height)
     box_px : (T, 4)
         x0, y0, x1, y1 of the person.
+    crop_px : (T,) or None
+        Longer side of the crop that the detector saw, in pixels of the picture. NaN where nothing was seen; None where
+        it was not stated.
     phone_time_s, phone_quat_wxyz : (P,), (P, 4) or None
         Phone orientation, camera to world, at its own stamps: both or neither. Brought to unit length, without jumps
         of sign, when made (`check_attitude`); how much of the recording it covers is for the fit to judge.
@@ -85,6 +88,7 @@ class Keypoints:
     picture: Picture | None = None
     origin: str = ""
     sides_changed: np.ndarray | None = None
+    crop_px: np.ndarray | None = None
     assumed: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -100,6 +104,8 @@ class Keypoints:
         }
         if self.sides_changed is not None:
             shapes["sides_changed"] = (self.sides_changed, (n, 3))
+        if self.crop_px is not None:
+            shapes["crop_px"] = (self.crop_px, (n,))
         for name, (array, shape) in shapes.items():
             if np.shape(array) != shape:
                 raise _format_error(f"{name} has shape {np.shape(array)}", f"shape {shape} for {n} frames, {j} names")
@@ -141,6 +147,8 @@ class Keypoints:
             optional["origin"] = np.asarray(self.origin)
         if self.sides_changed is not None:
             optional["sides_changed"] = np.asarray(self.sides_changed, bool)
+        if self.crop_px is not None:
+            optional["crop_px"] = np.asarray(self.crop_px, np.float32)
         if self.picture is not None:
             optional |= self.picture.arrays()
         np.savez(  # not packed, see `TrialFit.save`
@@ -182,6 +190,8 @@ class Keypoints:
             arrays["focal_rel_sd"] = ()
         if "sides_changed" in data:
             arrays["sides_changed"] = (n, 3)
+        if "crop_px" in data:
+            arrays["crop_px"] = (n,)
         check_numbers(path, data, arrays)
         rel_sd = float(data.get("focal_rel_sd", np.nan))
         distortion, source = data.get("distortion", np.zeros(5)), _NO_SOURCE
@@ -206,6 +216,7 @@ class Keypoints:
             picture=Picture.from_arrays(path, data),
             origin=text_of(path, data, "origin") if "origin" in data else "",
             sides_changed=data["sides_changed"].astype(bool) if "sides_changed" in data else None,
+            crop_px=data.get("crop_px"),
         )
 
 
