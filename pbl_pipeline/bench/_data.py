@@ -31,9 +31,10 @@ class Truth:
 
 def write(folder: Path, data: Data) -> None:
     """Write all sessions. The number of a session is the person's seed; its trial k walks with seed 1000 k + number."""
-    from pbl_pipeline.synthetic import Noise, observe, person, walk_qpos
+    from pbl_pipeline.synthetic import PHONE_CAMERA, PHONE_SIZE_PX, Noise, observe, person, resized, walk_qpos
 
     time_s = np.arange(data.n_frames) / FPS
+    camera, size = resized(PHONE_CAMERA, PHONE_SIZE_PX, data.short_side_px)
     noise = Noise(outlier_share=OUTLIER_SHARE) if data.trouble in ("outliers", "all") else Noise()
     never_seen = (NEVER_SEEN,) if data.trouble in ("marker", "all") else ()
     unseen_s = (UNSEEN_S,) if data.trouble in ("span", "all") else ()
@@ -51,6 +52,8 @@ def write(folder: Path, data: Data) -> None:
                 noise=noise,
                 seed=seed,
                 camera_motion=data.motion,
+                camera=camera,
+                image_size_px=size,
                 never_seen=never_seen,
                 unseen_s=unseen_s,
             )

@@ -23,13 +23,15 @@ AFFECTED_JOINT = "mtp_angle_l"
 
 @dataclasses.dataclass(frozen=True)
 class Data:
-    """What is observed: `n_sessions` people, each with `n_trials` walks of `n_frames` frames at 30 Hz."""
+    """What is observed: `n_sessions` people, each with `n_trials` walks of `n_frames` frames at 30 Hz, in an upright
+    picture with a shorter side of `short_side_px`."""
 
     n_trials: int = 1
     motion: str = "static"
     n_frames: int = 300
     trouble: str = "none"
     n_sessions: int = 3
+    short_side_px: int = 1080
 
     @property
     def key(self) -> str:

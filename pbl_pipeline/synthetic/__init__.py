@@ -10,7 +10,7 @@ speed, feet that stand still, impairments, other tasks; `pbl synth`).
 
 from pbl_pipeline.gait.normative import GaitNorm, gait_norm
 
-from ._camera import LEVEL_R_NC, PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor, picture_px
+from ._camera import LEVEL_R_NC, PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor, picture_px, resized, zoomed
 from ._impair import IMPAIRMENTS, Impairment
 from ._noise import BLAZEPOSE_MEASURED, BLAZEPOSE_NOISE, DETECTORS, METRABS_MEMORY, NO_NOISE, DetectorModel, Noise
 from ._observe import Seen, observe, pelvis_positions
@@ -59,10 +59,12 @@ __all__ = [
     "physique",
     "picture_px",
     "plain_walk",
+    "resized",
     "sole_points",
     "speed_of_group",
     "synthesise",
     "true_markers",
     "turned",
     "walk_qpos",
+    "zoomed",
 ]

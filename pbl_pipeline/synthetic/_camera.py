@@ -30,6 +30,23 @@ TREMOR_HZ = (0.3, 3.0)
 FOLLOW_DELAY_S, FOLLOW_SMOOTH_S = 0.2, 0.25
 
 
+def resized(camera: Camera, size_px: tuple[int, int], short_side_px: int) -> tuple[Camera, tuple[int, int]]:
+    """The same camera with a picture of another size: its shorter side has so many pixels."""
+    factor = short_side_px / min(size_px)
+    matrix = camera.matrix.copy()
+    matrix[:2] *= factor
+    matrix[:2, 2] += (factor - 1) / 2  # coordinates count from the first pixel's centre, sizes from its edge
+    width, height = (round(factor * side) for side in size_px)
+    return dataclasses.replace(camera, matrix=matrix), (width, height)
+
+
+def zoomed(camera: Camera, factor: float) -> Camera:
+    """The camera with a lens so many times as long."""
+    matrix = camera.matrix.copy()
+    matrix[[0, 1], [0, 1]] *= factor
+    return dataclasses.replace(camera, matrix=matrix)
+
+
 @dataclasses.dataclass(frozen=True)
 class PhoneSensor:
     """The phone's orientation log.

@@ -13,6 +13,9 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+#: Longer side (px) of the picture whose pixels `Noise.xy_px` and `Noise.outlier_px` count.
+PICTURE_PX = 1920
+
 
 @dataclasses.dataclass(frozen=True)
 class Noise:
@@ -33,12 +36,15 @@ class Noise:
     size_mean, size_sd
         Factor of the 3D points' distances from their middle, one for each trial.
     xy_px
-        Of the pixels, independent from frame to frame.
+        Of the pixels of a picture whose longer side has `PICTURE_PX` pixels, independent from frame to frame; in a
+        larger picture as much larger, as is `outlier_px`: a detector errs by a fraction of what it looks at.
     xy_m, xy_correlation
         Of the pixels, as a length at the person's distance (a detector's pixels err with the size of the person), and
         the correlation of that over 1/30 s.
     xy_constant_m
         One such error per marker and trial that does not change.
+    xy_file_px
+        Of the pixels of the file, whatever its size, with the same correlation: a small person is seen in few pixels.
     far_more, far_still
         Of the leg that is away from the camera, in a view from the side: its errors of `across_m`, `along_m` and `xy_m`
         are larger by the fraction `far_more`, and its points lose the fraction `far_still` of their movement against
@@ -69,6 +75,7 @@ class Noise:
     xy_m: float = 0.0
     xy_correlation: float = 0.9
     xy_constant_m: float = 0.0
+    xy_file_px: float = 0.0
     far_more: float = 0.0
     far_still: float = 0.0
     exchanged_per_s: float = 0.0
@@ -185,11 +192,12 @@ def disturb(
     x_cam: np.ndarray,
     sides: np.ndarray | None = None,
     focal_px: float = 0.0,
+    picture_px: float = PICTURE_PX,
 ) -> Disturbance:
     """Draw the noise for true points `x_cam` (T, J, 3) in metres in the camera frame (not relative to the root).
 
     `sides` (J,): 1 for points of the right leg, -1 of the left one, 0 for all others; `focal_px` turns lengths in the
-    picture into pixels. What the benchmark's noise has is drawn first, so that further fields change nothing of it.
+    picture into pixels; `picture_px`: longer side of the picture. What the benchmark's noise has is drawn first, so that further fields change nothing of it.
     """
     shape = x_cam.shape[:2]
     ray = x_cam / np.linalg.norm(x_cam, axis=-1, keepdims=True)
@@ -205,10 +213,11 @@ def disturb(
     mean_ray = ray.mean(axis=0, keepdims=True)
     depth = np.sum(constant * mean_ray, axis=-1, keepdims=True)
     xyz = xyz + noise.constant_m * constant + (along_m - noise.constant_m) * depth * mean_ray
-    xy = noise.xy_px * rng.standard_normal((*shape, 2))
+    picture = picture_px / PICTURE_PX
+    xy = picture * noise.xy_px * rng.standard_normal((*shape, 2))
     outlier = rng.random(shape) < noise.outlier_share
     xyz += outlier[..., None] * _jump(rng, (*shape, 3), noise.outlier_m)
-    xy += outlier[..., None] * _jump(rng, (*shape, 2), noise.outlier_px)
+    xy += picture * outlier[..., None] * _jump(rng, (*shape, 2), noise.outlier_px)
     spread = noise.confidence + noise.confidence_sd * rng.standard_normal(shape)
     dropped = rng.random(shape) < noise.drop_share
     off = x_cam - x_cam.mean(axis=1, keepdims=True)
@@ -233,6 +242,8 @@ def disturb(
         xy = xy + px_per_m * noise.xy_m * more * slow
     if noise.xy_constant_m:
         xy = xy + px_per_m * noise.xy_constant_m * rng.standard_normal((1, shape[1], 2))
+    if noise.xy_file_px:
+        xy = xy + noise.xy_file_px * remembering(rng, noise.xy_correlation, 1 / 30, time_s, (*shape, 2))
     return Disturbance(xyz, xy, outlier, dropped, np.clip(spread, 0.5, 0.99))
 
 

@@ -204,7 +204,7 @@ def seen_by(
     """Keypoints of true points seen by a camera at `p_nc`, and which of them are outliers (T, J)."""
     x_cam = np.einsum("tba,tjb->tja", R_nc, x_world - p_nc)
     sides = leg_sides(markers)
-    d = disturb(rng, noise, time_s, x_cam, sides, float(camera.matrix[0, 0]))
+    d = disturb(rng, noise, time_s, x_cam, sides, float(camera.matrix[0, 0]), max(image_size_px))
     true_px = picture_px(x_cam, camera)
     root = x_cam.mean(axis=1, keepdims=True) if root_relative else 0.0
     low, high = true_px.min(axis=1), true_px.max(axis=1)

@@ -27,6 +27,7 @@ from pbl_pipeline.progress import track
 from pbl_pipeline.synthetic import (
     DETECTORS,
     IMPAIRMENTS,
+    NO_NOISE,
     DetectorModel,
     Impairment,
     Noise,
@@ -34,7 +35,9 @@ from pbl_pipeline.synthetic import (
     lens,
     observe,
     physique,
+    resized,
     synthesise,
+    zoomed,
 )
 
 from ._motions import Motion, read_motions
@@ -51,6 +54,9 @@ SEVERITIES = (0.3, 0.8)
 _STRIDES_S = (0.8, 1.8)
 #: A recorded walk that turns by more has no view (deg).
 _STRAIGHT_DEG = 45.0
+#: Shorter sides of the pictures (px), and how much of a picture's height a person takes where she is largest: one of
+#: each is drawn for every case.
+PICTURES_PX, BODY_SHARE = (480, 720, 1080, 2160), (0.2, 0.9)
 #: Half of what a standing phone sees beside its line of sight, as a fraction of the distance, with a margin (m).
 _HALF_WIDTH, _MARGIN_M = 0.62, 0.5
 
@@ -109,10 +115,10 @@ class Case:
         """
         model = detector_model(self.detector)
         seed = _number(f"{self.walk.person}|{self.view}|{self.camera}|{self.detector}")
-        camera, size = lens(self.view, self.camera)
         reach = np.ptp(self.walk.qpos[:, _columns("pelvis_tx", "pelvis_tz")], axis=0)
         aside = float(np.hypot(*reach)) if self.camera == "static" and "sagittal" in self.view else 0.0
-        return observe(
+        look = functools.partial(
+            observe,
             self.walk.qpos,
             self.walk.time_s,
             view=self.view,
@@ -121,13 +127,23 @@ class Case:
             root_relative=model.root_relative,
             scale=self.walk.scale,
             site_offset_m=physique(_number(self.walk.person), load_markers(model.marker_set))[1],
-            noise=noise or model.noise,
             seed=seed,
             camera_motion=self.camera,
-            camera=camera,
-            image_size_px=size,
-            only_in_picture=True,
-        ).keypoints
+        )
+        camera, size = lens(self.view, self.camera)
+        rng = np.random.default_rng([_number(self.name), 31])
+        short_px, share = int(rng.choice(PICTURES_PX)), rng.uniform(*BODY_SHARE)
+        truth = look(noise=NO_NOISE, camera=camera, image_size_px=size).keypoints.xy_px
+        camera, size = resized(zoomed(camera, _zoom(truth, size, share)), size, short_px)
+        return look(noise=noise or model.noise, camera=camera, image_size_px=size, only_in_picture=True).keypoints
+
+
+def _zoom(xy_px: Float[np.ndarray, "T J 2"], size_px: tuple[int, int], share: float) -> float:
+    """How many times as long a lens shows the person as so large a share of the picture's height where she is largest;
+    at most such that no point leaves the picture that was in it."""
+    height = np.ptp(xy_px[..., 1], axis=1).max() / size_px[1]
+    from_middle = np.abs(xy_px - (np.array(size_px) - 1) / 2) / (np.array(size_px) / 2)
+    return float(min(share / height, max(1.0, 1.0 / from_middle.max())))
 
 
 def is_held_out(person: str) -> bool:
