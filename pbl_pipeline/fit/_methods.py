@@ -11,8 +11,8 @@ from .per_frame import solve_per_frame
 #: A family is a solver: a function from sessions that are packed to the same sizes, its parameters and the sessions'
 #: starts to a `Solution` of each, or the `PblError` of one that cannot be solved.
 METHODS: Stage[Params] = Stage("fit", "solver", "blazepose")
-METHODS.register("paper-2025", 1, PAPER_2025, solve_sessions)
-METHODS.register("gauss-newton", 3, GAUSS_NEWTON, solve_per_frame)
-METHODS.register("paper-gauss-newton", 1, PAPER_GAUSS_NEWTON)
-METHODS.register("blazepose", 6, BLAZEPOSE)
+METHODS.register("paper-2025", 2, PAPER_2025, solve_sessions)
+METHODS.register("gauss-newton", 4, GAUSS_NEWTON, solve_per_frame)
+METHODS.register("paper-gauss-newton", 2, PAPER_GAUSS_NEWTON)
+METHODS.register("blazepose", 7, BLAZEPOSE)
 METHODS.register("markers", 1, MARKERS)

@@ -103,7 +103,8 @@ def body_metres(
         weight = np.where(confidence[:, 0, trunk] > 0, 1.0, 0.0)
         enough = weight.sum(axis=1) >= 3
         if enough.any():
-            seen = _spread(points[enough, 0][:, trunk], weight[enough])
+            at = np.where(weight[enough, :, None] > 0, points[enough, 0][:, trunk], 0.0)
+            seen = _spread(at, weight[enough])
             ratios.append(_spread(np.broadcast_to(template, (enough.sum(), *template.shape)), weight[enough]) / seen)
     return float(np.median(np.concatenate(ratios))) if ratios else 1.0
 

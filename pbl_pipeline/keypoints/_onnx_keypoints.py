@@ -10,6 +10,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.models import ModelSpec, OnnxModel, find, load_spec
+from pbl_pipeline.paramset import later
 from pbl_pipeline.video import Camera
 
 from ._augment import aligned, augmentations, sd_confidence, spread_mm
@@ -17,7 +18,7 @@ from ._decode_2d import edge_shift, from_heatmap, from_simcc
 from ._flips import FlipParams
 from ._params import KeypointParams
 from ._protocol import PersonKeypoints
-from ._root import absolute_root
+from ._root import HALF_M, absolute_root
 from ._virtual_camera import crops, look_at
 
 #: Frames in one call of the network, by device.
@@ -33,6 +34,7 @@ class ModelParams:
     name: under which it is registered. sha256, spec_sha256: of its graph, and of all in its `model.json` that changes a
     number. licence: as its `model.json` states it. n_augmentations: see `augmentations`; a model with 3D needs two or
     more, because their spread is its confidence. half_mm, width_mm: see `sd_confidence`.
+    half_root_m: see `absolute_root`; 0: half at 5 px of the file, as of methods that were stored before 0.2.
     """
 
     name: str
@@ -42,6 +44,7 @@ class ModelParams:
     n_augmentations: int
     half_mm: float = 30.0
     width_mm: float = 10.0
+    half_root_m: float = later(0.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +82,7 @@ def model_params(name: str, n_augmentations: int | None = None) -> ModelParams:
             key=name,
         )
     n = n_augmentations or (10 if spec.kind == "crop3d" else 2)
-    params = ModelParams(name, spec.sha256, spec.spec_sha256, spec.licence, n)
+    params = ModelParams(name, spec.sha256, spec.spec_sha256, spec.licence, n, half_root_m=HALF_M)
     _check_augmentations(spec, params)
     return params
 
@@ -161,7 +164,7 @@ class OnnxKeypoints:
         together = aligned(xyz)
         mean_xyz = together.mean(axis=1)
         confidence = sd_confidence(spread_mm(together), self._params.half_mm, self._params.width_mm)
-        root = absolute_root(mean_xyz, mean_xy, confidence, camera)
+        root = absolute_root(mean_xyz, mean_xy, confidence, camera, self._params.half_root_m)
         placed = np.asarray(np.isfinite(root).all(axis=1))
         # A shape that fits nowhere in front of the camera is no person.
         confidence = np.where(placed[:, None], confidence, 0.0)

@@ -113,6 +113,8 @@ class Keypoints:
             raise _format_error(f"time stamps that span {span_s(self.time_s):.3g} s", f"at most {MAX_SECONDS:g} s")
         if np.any(~np.isfinite(self.confidence)) or np.any(self.confidence < 0) or np.any(self.confidence > 1):
             raise _format_error("confidence outside 0..1 or not finite", "0 for a missing point, at most 1")
+        if self.crop_px is not None and np.any(np.asarray(self.crop_px) <= 0):
+            raise _format_error("a crop of no size", "crop_px above 0, or NaN where it is not stated")
         check_lens(self.camera.matrix, self.camera.distortion, self.image_size_px)
         self._check_phone()
 

@@ -293,7 +293,8 @@ def _trial(t: TrialReport, m: TrialMetrics | None) -> dict:
         where = ", ".join(f"{number(a, 1)} to {number(b, 1)} s" for a, b in spans[:4])
         texts.append(f"The body is fitted from {where}" if spans else "The body is fitted in no frame")
         if np.isfinite(t.fit.residual_2d_px).any():
-            away = [f"{number(float(np.nanmedian(t.fit.residual_2d_px)), 1)} px"]
+            px, share = float(np.nanmedian(t.fit.residual_2d_px)), 100 * t.fit.residual_2d_share
+            away = [f"{number(px, 1)} px ({number(share, 1)} % of the person's height)"]
             if np.isfinite(t.fit.residual_3d_m).any():
                 away.append(f"{number(100 * float(np.nanmedian(t.fit.residual_3d_m)), 1)} cm")
             texts.append(f"It lies {' and '.join(away)} (median) from the detected points")

@@ -105,7 +105,8 @@ BLAZEPOSE_NOISE = Noise(
 
 #: BlazePose's two networks in the picture and in 3D, against the marker mocap of two phone clips (walk, standing up)
 #: and against four calibrated cameras (balancing): six recordings, `python -m research.detector_errors`. What mocap and
-#: detector call a joint is part of the constants. `far_more` is how much more the points away from the camera err;
+#: detector call a joint is part of the constants. `xy_file_px`: of the same recordings in small pictures (`python -m
+#: tests.benchmarks.picture_size unit`). `far_more` is how much more the points away from the camera err;
 #: `far_still` is of one clip from the side, the demo, where the far knee peaks at 61 deg with the heavy network, at 44
 #: with the full one, and the near one at 80 and 75. Exchanged legs are corrected before the fit; none was left in these
 #: recordings.
@@ -123,6 +124,7 @@ BLAZEPOSE_HEAVY_MEASURED = Noise(
     xy_m=0.023,
     xy_correlation=0.73,
     xy_constant_m=0.017,
+    xy_file_px=0.5,
     far_more=0.34,
     far_still=0.2,
     outlier_share=0.001,
@@ -142,6 +144,7 @@ BLAZEPOSE_MEASURED = Noise(
     xy_m=0.027,
     xy_correlation=0.74,
     xy_constant_m=0.019,
+    xy_file_px=0.5,
     far_more=0.36,
     far_still=0.35,
     outlier_share=0.003,

@@ -48,9 +48,10 @@ _OPENPOSE = {
         }.items()
     },
 }
-#: Lags (s) of a video behind the mocap that are tried, and how robust the resection is (px).
+#: Lags (s) of a video behind the mocap that are tried, and how robust the resection is (px of a picture whose longer
+#: side is `_SOFT_SIDE_PX`).
 _LAGS_S = np.arange(-0.15, 0.151, 0.01)
-_SOFT_PX = 10.0
+_SOFT_PX, _SOFT_SIDE_PX = 10.0, 1280
 _FRAMES = 60
 _LEAST_PAIRS = 200
 
@@ -163,6 +164,7 @@ def resect(
     rows = np.unique(np.linspace(0, len(keypoints.time_s) - 1, _FRAMES).astype(int))
     seen = keypoints.confidence[rows] > 0
     matrix = np.asarray(keypoints.camera.matrix, float)
+    soft_px = _SOFT_PX * max(keypoints.image_size_px) / _SOFT_SIDE_PX
     xy = undistort_px(np.where(seen[..., None], keypoints.xy_px[rows], 0.0), keypoints.camera)
     for lag in lags_s:
         at = _at(time_s, room_m, keypoints.time_s[rows] - lag)
@@ -172,12 +174,12 @@ def resect(
         places, pixels = at[known], xy[known]
         cv2.setRNGSeed(0)
         found, turn, shift, _ = cv2.solvePnPRansac(
-            places, pixels, matrix, None, reprojectionError=4 * _SOFT_PX, iterationsCount=500
+            places, pixels, matrix, None, reprojectionError=4 * soft_px, iterationsCount=500
         )
         if not found:
             continue
         start = np.concatenate([turn.ravel(), shift.ravel(), [] if lens_known else [0.0]])
-        solution = least_squares(_misses, start, args=(places, pixels, matrix), loss="soft_l1", f_scale=_SOFT_PX)
+        solution = least_squares(_misses, start, args=(places, pixels, matrix), loss="soft_l1", f_scale=soft_px)
         cost = float(solution.cost) / len(places)
         if best is None or cost < best[0]:
             best = (cost, float(lag), solution.x)

@@ -30,6 +30,9 @@ PHONE_FOCAL_REL_SD = 0.07
 
 #: Focal lengths over the longer side of the picture: a view of 175 to one of 0.06 degrees.
 _FOCAL_RANGE = (0.02, 1000.0)
+#: A principal point that lies off the middle of the picture by one factor on both axes, alike within the second number
+#: and more than the first, is that of a picture of another size. (A cropped picture is off on one axis, or unlike.)
+_OTHER_SIZE, _ALIKE = 0.2, 0.05
 #: How far the distortion of a lens may move a corner outwards.
 _MOST_STRETCH = 2.0
 
@@ -166,7 +169,7 @@ def check_lens(matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float,
     ------
     PblError
         CAMERA_INVALID: not finite, a skew, a focal length that is no plausible part of the picture's longer side
-        (`_FOCAL_RANGE`), or a distortion that folds back before the corners of the picture or moves them by more than
+        (`_FOCAL_RANGE`), a principal point outside of the picture or of a picture of another size, or a distortion that folds back before the corners of the picture or moves them by more than
         `_MOST_STRETCH`.
     """
     m, d = np.asarray(matrix, np.float64), np.asarray(distortion, np.float64)
@@ -177,6 +180,7 @@ def check_lens(matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float,
     if not (low <= m[0, 0] <= high and low <= m[1, 1] <= high):
         found = f"focal lengths {m[0, 0]:g} and {m[1, 1]:g} px of a {size_px[0]:g}x{size_px[1]:g} px picture"
         raise _invalid(key, found, f"{low:g} to {high:g} px")
+    _check_centre(m, size_px, key)
     if not np.isfinite(d).all():
         raise _invalid(key, f"distortion {d.tolist()}", "k1, k2, p1, p2, k3, finite; zeros for no distortion")
     radial = f"{d[0]:g}, {d[1]:g}, {d[4]:g}"
@@ -194,6 +198,20 @@ def check_lens(matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float,
             f"distortion {radial} (radial), {d[2]:g}, {d[3]:g} (tangential) that moves the corner of the picture "
             f"more than {_MOST_STRETCH:g} times as far out",
             "coefficients k1 k2 p1 p2 k3 as a calibration finds them",
+        )
+
+
+def _check_centre(m: np.ndarray, size_px: tuple[float, float], key: object) -> None:
+    """Refuse a matrix whose principal point shows that it belongs to another picture."""
+    across, down = (float(2 * c / side) for c, side in zip(m[:2, 2], size_px, strict=True))
+    outside = not (0 <= across <= 2 and 0 <= down <= 2)
+    if outside or (min(abs(across - 1), abs(down - 1)) > _OTHER_SIZE and abs(across / down - 1) <= _ALIKE):
+        width, height = size_px
+        raise _invalid(
+            key,
+            f"principal point ({m[0, 2]:g}, {m[1, 2]:g}) in a picture of {width:g}x{height:g} px",
+            f"a point near the middle ({width / 2:g}, {height / 2:g}); this matrix looks like that of a picture of "
+            f"{across * width:.0f}x{down * height:.0f} px: multiply its first two rows by the ratio of the sizes",
         )
 
 

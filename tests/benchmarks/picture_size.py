@@ -43,6 +43,8 @@ from tests.videos import write_video
 
 #: Shorter sides (px) at which recordings are encoded; 0: as it is.
 SIZES = (0, 480, 720, 1080, 2160)
+#: Sizes at which a person is looked at enlarged.
+SMALL = (180, 240, 360)
 FACTORS = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
 DEMO, CALIBRATED = "demo", "demo, calibrated"
 #: Bars: angles (deg), index and intervals (relative) of a mere change of unit; spread over encoded sizes.
@@ -179,6 +181,20 @@ def unit(folder: Path) -> None:
     for label in dict.fromkeys(label for label, _ in quotients):
         cells = [np.std(np.log(list(quotients[label, kind].values())), ddof=1) for kind in ("all", "changing")]
         click.echo(f"{label:34}{cells[0]:14.3f}{cells[1]:10.3f}")
+    click.echo("\nin small pictures, changing part in pixels of a crop of 256 (side of the crop, px)")
+    more = []
+    for name in recordings(SHARED):
+        large = float(np.median([256 * q for key, q in quotients["crop", "changing"].items() if key.split()[0] == name]))
+        cells = []
+        for size in SMALL:
+            k, _, rest = errors_at(name, size, folder)
+            side = crop_px(k)
+            error, crop = 256 * float(np.nanmedian(rest / side[:, None])), float(np.median(side))
+            # A median length is 1.18 standard deviations of an axis.
+            more.append(np.sqrt(max(error**2 - large**2, 0.0)) * crop / 256 / 1.18)
+            cells.append(f"{error:7.2f} ({crop:3.0f})")
+        click.echo(f"{name:6}{'large':>7} {large:.2f}{''.join(cells)}")
+    click.echo(f"beside the fraction of the crop, of each axis: {np.sqrt(np.mean(np.square(more))):.2f} px of the file")
 
 
 # --- what becomes of a fit

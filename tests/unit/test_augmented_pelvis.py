@@ -70,7 +70,7 @@ class Tipped:
 
 def session_of(task):
     made = synthesise(SynthSpec(task, 0, marker_set="blazepose_33", seconds=4.0))
-    session = make_session([made.keypoints], [task], METHODS.find("blazepose").params.view)
+    session = make_session([made.keypoints], [task], METHODS.find("blazepose").params)
     qpos = np.zeros((len(session.problem.weight), 40), np.float32)
     qpos[: len(made.truth.qpos)] = made.truth.qpos
     return session, qpos

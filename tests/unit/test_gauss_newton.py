@@ -258,7 +258,7 @@ def small_session(kind: str) -> Session:
             trials.append(observe_views(qpos, TIME_S, n_views=2, marker_set=few, seed=seed, with_3d=True))
         else:
             trials.append(observe(qpos, TIME_S, marker_set=few, seed=seed, camera_motion=motion).keypoints)
-    session = make_session(trials, ["a", "b"], PARAMS.view, [motion] * 2, few)
+    session = make_session(trials, ["a", "b"], PARAMS, [motion] * 2, few)
     if "pelvis" in kind:
         p, rng = session.problem, np.random.default_rng(6)
         tilt, known = jnp.asarray(rng.normal(0, 0.3, p.pelvis.shape)), jnp.asarray(rng.integers(0, 2, len(p.c_pelvis)))
@@ -534,6 +534,7 @@ def test_a_body_of_three_joints_goes_through_the_same_code(tmp_path):
         R_nc=np.zeros((40, 0, 3, 3)),
         p_nc=np.zeros((40, 0, 3)),
         camera_matrix=np.zeros((40, 0, 3, 3)),
+        pixel_px=np.zeros((40, 0)),
     )
     p = jax.tree.map(jnp.asarray, pack([trial], body, markers))
     params = GaussNewtonParams(smooth_per_rad2=0.01, smooth_per_m2=0.01, cost=CostParams(weight_offset_per_m2=1e6))

@@ -374,7 +374,7 @@ def test_arms_that_do_not_hang_start_in_the_posture_nearest_to_their_points():
         for side in "rl":
             truth[:, names.index(f"{j}_{side}")] = np.deg2rad(degrees)
     seen = observe(truth, TIME_S, marker_set="blazepose_33", seed=5)
-    session = make_session([seen.keypoints], ["a"], ViewParams())
+    session = make_session([seen.keypoints], ["a"], GaussNewtonParams())
     start = placed_poses(session, 0)[session.arrays[0].used]
     for j in ("arm_flex", "elbow_flex"):
         for side in "rl":

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import marker_positions
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import CostParams, ImplicitAdamParams, ViewParams, implicit, problem
+from pbl_pipeline.fit import CostParams, ImplicitAdamParams, implicit, problem
 from pbl_pipeline.fit.implicit import solve_implicit
 from pbl_pipeline.fit.initial_pose import median_orientation, median_pose, paper_pose
 from pbl_pipeline.fit.objective import At, Lphone, State, no_phone, weighted
@@ -43,7 +43,7 @@ RNG = np.random.default_rng(7)
 
 
 def session_of(*seen, motion: str = "static") -> Session:
-    return make_session(seen, [str(i) for i in range(len(seen))], ViewParams(), [motion] * len(seen))
+    return make_session(seen, [str(i) for i in range(len(seen))], ImplicitAdamParams(), [motion] * len(seen))
 
 
 def quick(steps: int, **changes) -> ImplicitAdamParams:
@@ -290,7 +290,7 @@ def test_the_papers_total_at_the_truth_and_beside_it(handheld):
 
 def test_the_papers_total_of_markers_in_the_world_is_not_centred():
     q = walk_qpos(TIME_S, seed=5)
-    session = make_session([observe_markers(q, TIME_S, noise_m=0.0)], ["a"], ViewParams())
+    session = make_session([observe_markers(q, TIME_S, noise_m=0.0)], ["a"], ImplicitAdamParams())
     F = len(session.problem.weight)
     at = np.zeros((F, 40))
     at[session.frames(0)] = q
@@ -306,7 +306,7 @@ def test_markers_in_the_world_and_several_cameras_are_fitted(kind):
     q = walk_qpos(TIME_S, seed=6, path="treadmill")
     markers, views = observe_markers(q, TIME_S, noise_m=0.0), observe_views(q, TIME_S, noise=NO_NOISE)
     trial = markers if kind == "markers" else views
-    session = make_session([trial], ["a"], ViewParams())
+    session = make_session([trial], ["a"], ImplicitAdamParams())
     solution = solve_implicit(session, quick(500))
     assert solution.loss_trace[-1, 1] < 0.5 * solution.loss_trace[0, 1]
     off = pelvis_positions(solution.qpos[session.frames(0)]) - pelvis_positions(q)

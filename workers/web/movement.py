@@ -14,8 +14,9 @@ from schemas.recording_page import RecordingFit
 #: Steps of a metre, of a body's quaternion and of the camera's in which poses are sent: a millimetre; a half step of a
 #: quaternion is 0.01 deg, of the camera's 0.2 px at a focal length of 1,500 px.
 METRE_STEPS, TURN_STEPS, CAMERA_STEPS = 1000, 4096, 8192
-#: Steps of a pixel in which detected points are sent, and how far from the picture one may be.
-POINT_STEPS, _FAR_PX = 2, 4000.0
+#: Steps of a pixel in which detected points are sent, and how far from the picture's corner one may be, in its longer
+#: sides.
+POINT_STEPS, _FAR = 2, 2.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,7 +149,7 @@ def points_bytes(found: RecordingFit) -> bytes:
     if points is None or len(points.time_s) != len(found.fit.time_s):
         return b""
     xy, confidence = np.asarray(points.xy_px, float), np.asarray(points.confidence, float)
-    known = np.isfinite(xy).all(axis=2) & (np.abs(xy) < _FAR_PX).all(axis=2) & (confidence > 0)
+    known = np.isfinite(xy).all(axis=2) & (np.abs(xy) < _FAR * max(points.image_size_px)).all(axis=2) & (confidence > 0)
     held = np.stack([_held(xy[:, j], known[:, j]) for j in range(xy.shape[1])], axis=1)
     channels = np.rint(POINT_STEPS * held).astype(np.int64).reshape(len(xy), -1).T
     shares = np.rint(255 * np.where(known, np.clip(confidence, 0, 1), 0)).astype(np.uint8)
