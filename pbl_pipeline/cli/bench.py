@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from datetime import UTC, datetime
 from pathlib import Path
@@ -52,6 +53,13 @@ def bench() -> None:
     show_default=True,
     help="Of the camera; --long and --robust take static for all.",
 )
+@click.option(
+    "--picture",
+    type=click.IntRange(240, 8640),
+    default=1080,
+    show_default=True,
+    help="Shorter side of the picture, px; its noise grows with it.",
+)
 @click.option("--seeds", type=click.IntRange(1), default=3, show_default=True, help="People; errors are means of them.")
 @click.option("--repeat", type=click.IntRange(1), default=3, show_default=True, help="Warm runs; the best counts.")
 @click.option("--adam-steps", type=click.IntRange(1), help="Steps of implicit-adam instead of the paper's 25,000.")
@@ -67,6 +75,7 @@ def fit(
     trials: tuple[int, ...],
     batch: tuple[int, ...],
     motion: str,
+    picture: int,
     seeds: int,
     repeat: int,
     adam_steps: int | None,
@@ -101,6 +110,7 @@ def fit(
     if not cases:
         raise click.UsageError("nothing to run: batches of more than one are fitted by gauss-newton only")
 
+    cases = [dataclasses.replace(c, data=dataclasses.replace(c.data, short_side_px=picture)) for c in cases]
     rows: list[b.Row] = []
     begun = datetime.now(UTC).isoformat(timespec="seconds")
     for row in b.run_cases(cases, timeout_s, note=lambda what: click.echo(what, err=True)):

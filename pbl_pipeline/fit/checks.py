@@ -46,7 +46,12 @@ def check_fit(
 ) -> tuple[Check, ...]:
     """All checks of one session fit, worst trial per check. `taller`: the person's height over the fitted one's
     (`known_height.in_metres`)."""
-    checks = [_residual_3d(session, trials, solution.metre), _in_view(session), _limits(session, trials), _converged(solution)]
+    checks = [
+        _residual_3d(session, trials, solution.metre),
+        _in_view(session),
+        _limits(session, trials),
+        _converged(solution),
+    ]
     checks += _height(session, solution.scale, taller)
     if not isinstance(session.trials[0], WorldMarkers):
         checks = [_residual_2d(session, trials), *checks, _intrinsics(trials), _orientation(trials)]
@@ -88,8 +93,7 @@ def _residual_3d(session: Session, trials: Sequence[TrialFit], metre: float) -> 
     """In centimetres of the fit, which are the same for small and tall people."""
     counts = np.asarray(session.markers.weight_3d) > 0
     medians = [
-        100 * np.median(r[np.isfinite(r)]) / metre
-        for t in trials if np.isfinite(r := t.residual_3d_m[:, counts]).any()
+        100 * np.median(r[np.isfinite(r)]) / metre for t in trials if np.isfinite(r := t.residual_3d_m[:, counts]).any()
     ]
     if not medians:
         # Pixels alone: nothing to compare with.

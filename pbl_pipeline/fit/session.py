@@ -74,7 +74,8 @@ def make_session(
     ------
     PblError
         FIT_INPUT (no trial, too few frames in view, time stamps out of order, nothing seen, values not finite where
-        confidence is positive, trials of different kinds, a paramset in unknown units), VIEWS_DISAGREE, MARKER_SET_UNKNOWN, PHONE_LOG.
+        confidence is positive, trials of different kinds, a paramset in unknown units), VIEWS_DISAGREE,
+        MARKER_SET_UNKNOWN, PHONE_LOG.
     """
     check_units(params.cost)
     if not trials or len(trials) != len(names):

@@ -18,8 +18,9 @@ from .problem import Problem
 class Outcome:
     """On the F frames of a problem and its J markers; residuals are NaN where nothing was seen.
 
-    x_world_m; residual_2d_px and residual_3d_m: means over the views that saw the marker (3D of a camera: with the mean
-    over the markers removed; in the world: as it is), in pixels of the file; body_axis_m: from between the heels to the head.
+    x_world_m; residual_2d_px (pixels of the file) and residual_3d_m: means over the views that saw the marker (3D of a
+    camera: with the mean over the markers removed; in the world: as it is); body_axis_m: from between the heels to the
+    head.
     """
 
     x_world_m: Float[Array, "F J 3"]

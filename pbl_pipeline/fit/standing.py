@@ -44,9 +44,7 @@ def bodies_at(body: Body, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array(x), np.array(R)
 
 
-def marker_places(
-    x: np.ndarray, R: np.ndarray, markers: MarkerSet, at: np.ndarray | slice = slice(None)
-) -> np.ndarray:
+def marker_places(x: np.ndarray, R: np.ndarray, markers: MarkerSet, at: np.ndarray | slice = slice(None)) -> np.ndarray:
     """(K, m, 3) of the markers `at` on bodies that lie at x and are turned by R."""
     on = markers.body_index[at]
     return x[:, on] + np.einsum("kmij,mj->kmi", R[:, on], markers.position_m[at])

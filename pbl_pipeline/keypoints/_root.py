@@ -25,8 +25,8 @@ def absolute_root(
     Least squares on ``(x + tx) - u (z + tz)`` and the same for y, u and v being the ray of the pixel without
     distortion, linear in the shift. Repeated with weights that divide by the depth, so that distances count as seen in
     the picture, and that fall with a point's distance in the picture from where the last shift puts it (Cauchy's, half
-    at `half_m`; 0: at 5 px of the file, as before 0.2). `confidence` (T, J) weighs the points. NaN where fewer than four have one, or where the person would stand
-    behind the camera.
+    at `half_m`; 0: at 5 px of the file, as before 0.2). `confidence` (T, J) weighs the points. NaN where fewer than
+    four have one, or where the person would stand behind the camera.
     """
     xyz, weight0 = np.asarray(xyz_m, np.float64), np.asarray(confidence, np.float64)
     known = np.isfinite(xyz).all(axis=2) & np.isfinite(xy_px).all(axis=2) & (weight0 > 0)

@@ -200,7 +200,8 @@ def disturb(
     """Draw the noise for true points `x_cam` (T, J, 3) in metres in the camera frame (not relative to the root).
 
     `sides` (J,): 1 for points of the right leg, -1 of the left one, 0 for all others; `focal_px` turns lengths in the
-    picture into pixels; `picture_px`: longer side of the picture. What the benchmark's noise has is drawn first, so that further fields change nothing of it.
+    picture into pixels; `picture_px`: longer side of the picture. What the benchmark's noise has is drawn first,
+    so that further fields change nothing of it.
     """
     shape = x_cam.shape[:2]
     ray = x_cam / np.linalg.norm(x_cam, axis=-1, keepdims=True)

@@ -169,8 +169,8 @@ def check_lens(matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float,
     ------
     PblError
         CAMERA_INVALID: not finite, a skew, a focal length that is no plausible part of the picture's longer side
-        (`_FOCAL_RANGE`), a principal point outside of the picture or of a picture of another size, or a distortion that folds back before the corners of the picture or moves them by more than
-        `_MOST_STRETCH`.
+        (`_FOCAL_RANGE`), a principal point outside of the picture or of a picture of another size, or a distortion that
+        folds back before the corners of the picture or moves them by more than `_MOST_STRETCH`.
     """
     m, d = np.asarray(matrix, np.float64), np.asarray(distortion, np.float64)
     plain = m[0, 1] == m[1, 0] == m[2, 0] == m[2, 1] == 0 and m[2, 2] == 1

@@ -35,7 +35,7 @@ from pbl_pipeline.keypoints import METHODS as KEYPOINT_METHODS
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.methods import Method
 from pbl_pipeline.pipeline import detect_trial
-from pbl_pipeline.video import Camera, load_camera, read_frames
+from pbl_pipeline.video import load_camera, read_frames
 from research.confidence import recordings, truth_of
 from tests.benchmarks.real_clips import CLIPS, changed, fitted_angles, recorded_angles, score
 from tests.conftest import SHARED
@@ -131,8 +131,8 @@ def result(name: str, fit: TrialFit) -> float:
 def candidates(k: Keypoints) -> dict[str, np.ndarray]:
     """What a detector's error may be a fraction of, (T,) each in px of the file."""
     frames = len(k.time_s)
-    seen = [np.nan_to_num(np.asarray(a, float)) for a in (k.xyz_cam_m, k.xy_px)]
-    root = root_positions(*seen, k.confidence, np.tile(k.camera.matrix, (frames, 1, 1)))
+    xyz, xy = (np.nan_to_num(np.asarray(a, float)) for a in (k.xyz_cam_m, k.xy_px))
+    root = root_positions(xyz, xy, k.confidence, np.tile(k.camera.matrix, (frames, 1, 1)))
     return {
         "pixel of the file": np.ones(frames),
         "shorter side of the picture": np.full(frames, float(min(k.image_size_px))),
@@ -175,7 +175,9 @@ def unit(folder: Path) -> None:
                 for kind, error in (("all", whole), ("changing", rest)):
                     quotient = float(np.nanmedian(error / px[:, None]))
                     quotients.setdefault((label, kind), {})[f"{name} {size}"] = quotient
-            shown = ", ".join(f"{kind} {256 * quotients['crop', kind][f'{name} {size}']:.2f}" for kind in ("all", "changing"))
+            shown = ", ".join(
+                f"{kind} {256 * quotients['crop', kind][f'{name} {size}']:.2f}" for kind in ("all", "changing")
+            )
             click.echo(f"{name:6}{size or 'own':>6}: error in pixels of a crop of 256: {shown}")
     click.echo(f"\n{'unit':34}{'spread, all':>14}{'changing':>10}")
     for label in dict.fromkeys(label for label, _ in quotients):
@@ -184,7 +186,9 @@ def unit(folder: Path) -> None:
     click.echo("\nin small pictures, changing part in pixels of a crop of 256 (side of the crop, px)")
     more = []
     for name in recordings(SHARED):
-        large = float(np.median([256 * q for key, q in quotients["crop", "changing"].items() if key.split()[0] == name]))
+        large = float(
+            np.median([256 * q for key, q in quotients["crop", "changing"].items() if key.split()[0] == name])
+        )
         cells = []
         for size in SMALL:
             k, _, rest = errors_at(name, size, folder)

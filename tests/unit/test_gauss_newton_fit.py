@@ -22,7 +22,6 @@ from pbl_pipeline.fit import (
     SessionFit,
     SessionInput,
     TrialFit,
-    ViewParams,
     _fit_session,
     fit_session,
     fit_sessions,
