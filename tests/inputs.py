@@ -28,6 +28,12 @@ def markers(**changes) -> WorldMarkers:
     return WorldMarkers(**{**values, **changes})
 
 
+def lens_of(size_px: tuple[int, int]) -> Camera:
+    """A lens like `LENS` for a picture of another size."""
+    width, height = size_px
+    return Camera(np.array([[1000.0, 0, width / 2], [0, 1000.0, height / 2], [0, 0, 1]]), np.zeros(5), "test")
+
+
 def keypoints(**changes) -> Keypoints:
     values: dict = {
         "time_s": np.arange(T) / 30,
@@ -38,7 +44,7 @@ def keypoints(**changes) -> Keypoints:
         "root_relative": True,
         "confidence": np.ones((T, J)),
         "image_size_px": (1000, 1000),
-        "camera": LENS,
+        "camera": lens_of(changes.get("image_size_px", (1000, 1000))),
         "box_px": np.full((T, 4), np.nan),
     }
     return Keypoints(**{**values, **changes})

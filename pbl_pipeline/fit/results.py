@@ -61,7 +61,8 @@ class TrialFit:
         """Median 2D residual as a fraction of the person's height in the picture, which is the same at any size of it;
         NaN where there is no camera. (The height is that of the standing body at its distance along the camera's axis.)
         """
-        seen = np.isfinite(self.residual_2d_px).any(axis=1)
+        placed = np.isfinite(self.markers_world_m).all(axis=2)
+        seen = np.isfinite(self.residual_2d_px).any(axis=1) & placed.any(axis=1)
         if not seen.any():
             return float("nan")
         away = np.nanmean(self.markers_world_m[seen], axis=1) - self.camera_position_m
