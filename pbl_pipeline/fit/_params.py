@@ -239,7 +239,7 @@ GAUSS_NEWTON = GaussNewtonParams(
         weight_3d=3.0,
         weight_2d=16.0,
         depth_ratio=0.4,
-        huber_3d_cm=6.0,
+        huber_3d_cm=8.0,
         huber_2d_px=2.1,
         weight_offset_per_m2=45.0,
     ),

@@ -95,7 +95,7 @@ def body_metres(
     """How many metres of the unscaled body one of the detector's is: by the points of the trunk, whose distances from
     their middle (root mean square) hardly change with the posture; the median over the frames of all trials.
 
-    1 where no frame shows three of them.
+    1 where no frame shows three of them in different places.
     """
     trunk = trunk_of(markers)
     template, ratios = standing_markers(body, markers)[trunk], []
@@ -105,8 +105,10 @@ def body_metres(
         if enough.any():
             at = np.where(weight[enough, :, None] > 0, points[enough, 0][:, trunk], 0.0)
             seen = _spread(at, weight[enough])
-            ratios.append(_spread(np.broadcast_to(template, (enough.sum(), *template.shape)), weight[enough]) / seen)
-    return float(np.median(np.concatenate(ratios))) if ratios else 1.0
+            own = _spread(np.broadcast_to(template, at.shape), weight[enough])
+            ratios.append(own[seen > 0] / seen[seen > 0])
+    found = np.concatenate(ratios) if ratios else np.zeros(0)
+    return float(np.median(found)) if len(found) else 1.0
 
 
 def _spread(points: Float[np.ndarray, "T J 3"], weight: Float[np.ndarray, "T J"]) -> Float[np.ndarray, " T"]:

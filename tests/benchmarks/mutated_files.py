@@ -86,7 +86,7 @@ def _pack(trial: Any) -> None:
     from pbl_pipeline.fit.session import make_session
 
     motion = "handheld" if getattr(trial, "phone_time_s", None) is not None else "static"
-    make_session([trial], ["walk"], METHODS.find(None).params.view, [motion])
+    make_session([trial], ["walk"], METHODS.find(None).params, [motion])
 
 
 def markers(path: Path) -> None:

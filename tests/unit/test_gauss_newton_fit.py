@@ -253,12 +253,20 @@ def test_standard_deviations_of_every_joint_are_calibrated(name):
     assert np.all(floors < np.deg2rad(30))
 
 
+def fit_metre(fit: TrialFit) -> float:
+    """Metres of the detector in one of the body."""
+    session = make_session([look(5).keypoints], ["a"], METHODS.find(PARAMSET).params)
+    assert fit.scale[0] * session.metre == pytest.approx(1.0, abs=0.1)
+    return 1.0 / session.metre
+
+
 def test_a_least_standard_deviation_is_added_in_squares(one_by_one):
     params = dataclasses.replace(METHODS.find(PARAMSET).params, sd_floor=(("knee", 10.0), ("pelvis_tx", 3.0)))
     given = Paramset.of("fit", "with floors", 1, params)
     fit = fit_session([look(5).keypoints], ["a"], given).trials[0]
     plain = one_by_one[0].trials[0]
-    for name, floor in (("knee_angle_r", np.deg2rad(10)), ("pelvis_tx", 0.03), ("hip_flexion_l", 0.0)):
+    metre = fit_metre(fit)  # slides are in metres of the body until the end
+    for name, floor in (("knee_angle_r", np.deg2rad(10)), ("pelvis_tx", 0.03 * metre), ("hip_flexion_l", 0.0)):
         want = np.hypot(plain.qpos_sd[:, joint(plain, name)], floor)
         np.testing.assert_allclose(fit.qpos_sd[:, joint(fit, name)], want, rtol=1e-2)
 

@@ -28,6 +28,8 @@ from pbl_pipeline.video import Camera, read_frames, viewing_ray
 from tests.videos import constant_rate, write_video
 
 CAMERA = Camera(np.array([[1300.0, 0, 960], [0, 1300.0, 540], [0, 0, 1]]), np.zeros(5), "test")
+#: Of pictures of 200 x 100.
+SMALL = Camera(np.array([[1300.0, 0, 100], [0, 1300.0, 50], [0, 0, 1]]), np.zeros(5), "test")
 LENS = Camera(CAMERA.matrix, np.array([-0.2, 0.05, 0.001, -0.002, 0.0]), "test with distortion")
 
 
@@ -187,7 +189,7 @@ def case(tmp_path):
 def test_two_passes_and_missing_values(case, tmp_path):
     video, tracking = case
     detector = Cross()
-    keypoints = detect_keypoints(video, tracking, 1, CAMERA, detector=detector)
+    keypoints = detect_keypoints(video, tracking, 1, SMALL, detector=detector)
     # Once in 0.1 s, and at the ends of both runs: frames 10..29 and 35..69.
     assert (detector.calls.count(True), detector.calls.count(False)) == (8 + 13, 55)
     there = np.zeros(90, bool)
@@ -243,13 +245,13 @@ def test_an_error_in_a_thread_is_raised(case):
             return super().detect(image, roi_px, camera, quick=quick)
 
     with pytest.raises(ValueError, match="broken"):
-        detect_keypoints(video, tracking, 1, CAMERA, detector=Broken())
+        detect_keypoints(video, tracking, 1, SMALL, detector=Broken())
 
 
 def test_one_pass(case):
     video, tracking = case
     detector = Cross()
-    keypoints = detect_keypoints(video, tracking, 1, CAMERA, KeypointParams(passes=1), detector)
+    keypoints = detect_keypoints(video, tracking, 1, SMALL, KeypointParams(passes=1), detector)
     assert detector.calls == [False] * 55
     np.testing.assert_allclose(keypoints.xy_px[12, 0], [60, 50], atol=1e-3)
 
@@ -271,7 +273,7 @@ def test_unknown_person_detector_and_changed_video(case, tmp_path):
         detect_keypoints(video, tracking, 7, CAMERA, None, Cross())
     assert error.value.code == "SUBJECT_UNKNOWN_PERSON"
     with pytest.raises(PblError) as error:
-        detect_keypoints(video, tracking, 1, CAMERA, KeypointParams(detector="none"))
+        detect_keypoints(video, tracking, 1, SMALL, KeypointParams(detector="none"))
     assert error.value.code == "SOLVER_UNKNOWN"
     shorter = write_video(
         tmp_path / "s.mkv", [np.full((100, 200, 3), 128, np.uint8)] * 40, constant_rate(40), "ffv1", pixel_format="bgr0"
@@ -298,7 +300,7 @@ def standing(n: int = 120) -> Keypoints:
     size = (n, 2, 2), (n, 2), (n, 4)
     shape = [np.zeros(size[0]), np.full(size[1], 0.9), np.zeros(size[2])]
     names = ("left_hip", "right_hip")
-    return Keypoints(constant_rate(n), names, "t", shape[0], xyz, True, shape[1], (9, 9), CAMERA, shape[2])
+    return Keypoints(constant_rate(n), names, "t", shape[0], xyz, True, shape[1], (200, 100), SMALL, shape[2])
 
 
 def test_turning_round_is_no_change_of_sides_but_an_exchange_is():

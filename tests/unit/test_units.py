@@ -169,6 +169,7 @@ def test_metres_are_those_of_the_body():
     assert own == pytest.approx(1.0, abs=0.05)
     assert body_metres(body, markers, [2.0 * x], [c]) == pytest.approx(own / 2)
     assert body_metres(body, markers, [x], [np.zeros_like(c)]) == 1.0
+    assert body_metres(body, markers, [np.zeros_like(x)], [np.ones_like(c)]) == 1.0
 
 
 @pytest.mark.slow
