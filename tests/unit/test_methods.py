@@ -28,7 +28,7 @@ SHIPPED = {
     ("keypoints", "blazepose-heavy", 3): "74bc8449d95c5e03",
     ("fit", "paper-2025", 2): "177d1e2810a04248",
     ("fit", "paper-gauss-newton", 2): "7e7d29aa9b130fbc",
-    ("fit", "gauss-newton", 4): "46404e37ce8a6989",
+    ("fit", "gauss-newton", 4): "2aa1bf299ebeaa9e",
     ("fit", "blazepose", 7): "134f692e65c4c4dc",
     ("fit", "markers", 1): "055842ad943fce0d",
     ("gait", "phase-transformer", 1): "9f9ad11a864dcb24",
