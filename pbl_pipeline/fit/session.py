@@ -22,7 +22,7 @@ from pbl_pipeline.keypoints import (
 )
 from pbl_pipeline.video import undistort_px
 
-from ._params import Params, ViewParams
+from ._params import CostParams, Params, ViewParams
 from ._rotation import mean_rotation, rotation_matrices
 from .problem import CLOCK_RANGE_S, Problem, TrialArrays, pack
 from .units import BODY, FILE, body_metres, check_units, pixel_px
@@ -77,7 +77,8 @@ def make_session(
         confidence is positive, trials of different kinds, a paramset in unknown units), VIEWS_DISAGREE,
         MARKER_SET_UNKNOWN, PHONE_LOG.
     """
-    check_units(params.cost)
+    cost: CostParams = getattr(params, "cost", CostParams())  # a solver of one's own may have none of ours
+    check_units(cost)
     if not trials or len(trials) != len(names):
         raise _input_error(f"{len(trials)} trials and {len(names)} names", "at least one trial and a name for each")
     kinds = {type(t) for t in trials}
@@ -94,11 +95,11 @@ def make_session(
     checked = [check_trial(t, n, params.view, table) for t, n in zip(trials, names, strict=True)]
     arrays, orientation = [], []
     for trial, name, motion, (used, _) in zip(trials, names, motions, checked, strict=True):
-        packed, source = _arrays(trial, name, motion, used, params.cost.pixel)
+        packed, source = _arrays(trial, name, motion, used, cost.pixel)
         arrays.append(packed)
         orientation.append(source)
     body, metre = load_body(), 1.0
-    if params.cost.metre == BODY and isinstance(trials[0], Keypoints):
+    if cost.metre == BODY and isinstance(trials[0], Keypoints):
         metre = body_metres(body, table, [a.x_cam for a in arrays], [a.c_3d * a.used[:, None, None] for a in arrays])
         arrays = [dataclasses.replace(a, x_cam=metre * a.x_cam) for a in arrays]
     return Session(
