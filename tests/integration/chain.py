@@ -62,8 +62,9 @@ def detect_keypoints(video_path, tracking, person_id, camera, params=None) -> Ke
     """The synthetic walker, seen without noise; person 2 is another height in the picture."""
     time = tracking.time_s
     found = observe(plain_walk(time, start_m=(7.0 if person_id == 1 else 9.0, -3.0)), time)
-    matrix = camera.matrix.copy()
-    matrix[:2, 2] = found.camera.matrix[:2, 2]  # the small video's lens, in the middle of the walker's picture
+    # The small video's lens, at the same place of the walker's picture.
+    info, matrix = probe(video_path), camera.matrix.copy()
+    matrix[:2, 2] *= np.array(found.image_size_px) / (info.width_px, info.height_px)
     camera = dataclasses.replace(camera, matrix=matrix)
     try:
         check_lens(camera.matrix, camera.distortion, found.image_size_px)

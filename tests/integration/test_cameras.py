@@ -96,9 +96,11 @@ def test_a_phone_is_registered_once(tmp_path: Path):
     assert row["camera_source"].startswith("measured: camera.json")
     assert row["camera_source"].endswith(", of apple-iphone-13")
     assert (row["keypoints_camera_id"], row["focal_rel_sd"]) == (2, pytest.approx(0.5 / 100.5))
-    np.testing.assert_allclose(matrix_of(ids[0]), [[100, 0, 60], [0, 101, 34], [0, 0, 1]])
+    # The stand-in detector's picture has 1920 x 1080 px, and the lens at the same place of it.
+    np.testing.assert_allclose(matrix_of(ids[0]), [[100, 0, 60 * 1920 / 128], [0, 101, 34 * 1080 / 72], [0, 0, 1]])
     # Turned clockwise: x is what was counted from below, y what was counted from the left.
-    np.testing.assert_allclose(matrix_of(ids[1]), [[101, 0, 71 - 34], [0, 100, 60], [0, 0, 1]])
+    turned = [[101, 0, (71 - 34) * 1920 / 72], [0, 100, 60 * 1080 / 128], [0, 0, 1]]
+    np.testing.assert_allclose(matrix_of(ids[1]), turned)
     after = {r["video_id"]: r["keypoints_computed"] for r in keypoints.Keypoints.proj("keypoints_computed").to_dicts()}
     assert [after[i] == before[i] for i in ids[2:]] == [True] * 3
 
