@@ -3,7 +3,8 @@
     python -m tests.benchmarks.picture_size unit         # the detector's error against what may be its unit
     python -m tests.benchmarks.picture_size scaled       # keypoints, camera and picture multiplied: a change of unit
     python -m tests.benchmarks.picture_size encoded      # the recordings encoded at other sizes, and detected there
-    python -m tests.benchmarks.picture_size encoded --params blazepose-v6 --set cost.weight_2d=0.3
+    python -m tests.benchmarks.picture_size encoded --set cost.pixel="'file'" --set cost.metre="'detector'" \\
+      --set cost.weight_2d=0.2 --set cost.huber_2d_px=5.0 --set cost.weight_3d=0.5  # as `blazepose` version 6
 
 Reads `../shared/data/real/{video_mocap,multiview}` (README there: sources and licences) and the demo recording. A
 recording is resized (averaged where smaller, cubic where larger), encoded as H.264 and detected anew; its keypoints are

@@ -153,7 +153,7 @@ def test_the_fit_that_suits_the_points_is_planned(tables: None, tmp_path: Path, 
     assert len(fit.SessionFit()) == len(DEFAULT_FITS)
     # Who names a fit method means all keypoints of the visit, or those that are named with it.
     ingest([path], Visit("P001"), Methods(keypoint="few-17", fit="paper-2025"))
-    assert plans() == DEFAULT_FITS | {("few-17-v1", "paper-2025-v1")}
+    assert plans() == DEFAULT_FITS | {("few-17-v1", "paper-2025-v2")}
     ingest([path], Visit("P001"), Methods(fit="markers"))
     assert {p for p in plans() if p[1] == "markers-v1"} == {(p[0], "markers-v1") for p in DEFAULT_FITS}
 

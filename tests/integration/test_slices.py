@@ -147,7 +147,7 @@ def test_what_cannot_be_frozen(cohort: Path):
         (lambda: slices.freeze("first"), "USAGE"),
         (lambda: slices.freeze("x", "no such cohort"), "DB_NOT_FOUND"),
         (lambda: slices.freeze("x", roles=("5_years",)), "DB_NOT_FOUND"),
-        (lambda: slices.freeze("x", methods={"fit_method": "paper-2025-v1"}), "DB_NOT_FOUND"),
+        (lambda: slices.freeze("x", methods={"fit_method": "paper-2025-v2"}), "DB_NOT_FOUND"),
         (lambda: slices.freeze("x", methods={"solver": "a"}), "USAGE"),
         (lambda: slices.study_data("absent"), "DB_NOT_FOUND"),
         (lambda: slices.changes("absent"), "DB_NOT_FOUND"),
