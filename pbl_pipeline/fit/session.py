@@ -77,7 +77,7 @@ def make_session(
         confidence is positive, trials of different kinds, a paramset in unknown units), VIEWS_DISAGREE,
         MARKER_SET_UNKNOWN, PHONE_LOG.
     """
-    cost: CostParams = getattr(params, "cost", CostParams())  # a solver of one's own may have none of ours
+    cost: CostParams = getattr(params, "cost", CostParams())  # a laboratory's own solver may have none
     check_units(cost)
     if not trials or len(trials) != len(names):
         raise _input_error(f"{len(trials)} trials and {len(names)} names", "at least one trial and a name for each")

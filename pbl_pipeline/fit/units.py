@@ -29,7 +29,7 @@ from .standing import standing_markers, trunk_of
 PIXELS = FILE, PAPER, CROP = "file", "1080x1920", "crop"
 #: What a metre of the cost is (`CostParams.metre`): the detector's, or that of a person as large as the unscaled body.
 METRES = DETECTOR, BODY = "detector", "body"
-#: Side of the crop in which a pixel is one of its own: the input of BlazePose's landmark networks.
+#: Side of a crop that is not resized: the input of BlazePose's landmark networks.
 CROP_SIZE = 256
 #: Longer side of the paper's pictures.
 PAPER_SIDE_PX = 1920
