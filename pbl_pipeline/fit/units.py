@@ -3,7 +3,8 @@
 A detector cuts the person out of the picture, looks at the crop at a fixed size, and errs by a fraction of that crop:
 in pixels of the file the same error is four times as large at 4K as at 540p, or when the person is four times nearer.
 So residuals of the picture, their weight and their Huber width are in pixels of a crop of 256 pixels, frame by frame.
-On the recordings with a truth, at five sizes each, that unit predicts a recording's error best (docs/benchmarks.md).
+On recordings with a truth, at several sizes each, that unit predicts the error as well as the person's box or distance
+does, and far better than the file's pixel (docs/benchmarks.md); it needs neither depth nor focal length.
 
 In the same way the metres of a single camera's 3D points are those of the person whom the detector assumes. They are
 scaled to the size of the unscaled body, so that a detector that assumes a taller person gives the same angles.
@@ -34,8 +35,8 @@ CROP_SIZE = 256
 #: Longer side of the paper's pictures.
 PAPER_SIDE_PX = 1920
 #: The crop of keypoints that do not state it: so many times the longer side of the box that holds all but the outermost
-#: 5 % of the points on each side (`blazepose-heavy` on the recordings with a truth: 1.45 to 1.50), as a median over a
-#: time (s) in which legs swing.
+#: 5 % of the points on each side (`blazepose-heavy`: 1.45 to 1.50 on phone clips, 1.54 to 1.73 on a person who balances
+#: with raised arms), as a median over a time (s) in which legs swing.
 CROP_OF_BOX, BOX_PERCENT, BOX_S = 1.48, (5.0, 95.0), 1.0
 
 
