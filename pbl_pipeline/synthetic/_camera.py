@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.video import Camera
+from pbl_pipeline.video import Camera, scaled_matrix
 
 from ._gait import wander
 
@@ -33,11 +33,8 @@ FOLLOW_DELAY_S, FOLLOW_SMOOTH_S = 0.2, 0.25
 def resized(camera: Camera, size_px: tuple[int, int], short_side_px: int) -> tuple[Camera, tuple[int, int]]:
     """The same camera with a picture of another size: its shorter side has so many pixels."""
     factor = short_side_px / min(size_px)
-    matrix = camera.matrix.copy()
-    matrix[:2] *= factor
-    matrix[:2, 2] += (factor - 1) / 2  # coordinates count from the first pixel's centre, sizes from its edge
     width, height = (round(factor * side) for side in size_px)
-    return dataclasses.replace(camera, matrix=matrix), (width, height)
+    return dataclasses.replace(camera, matrix=scaled_matrix(camera.matrix, factor)), (width, height)
 
 
 def zoomed(camera: Camera, factor: float) -> Camera:

@@ -3,7 +3,7 @@
 from ._attitude import Attitude, camera_in_device, check_attitude
 from ._board import Board
 from ._calibrate import Calibration, calibrate_video
-from ._camera import check_lens, guess_camera, load_camera, undistort_px, viewing_ray
+from ._camera import check_lens, guess_camera, load_camera, scaled_matrix, undistort_px, viewing_ray
 from ._camera_pose import CameraPose, load_camera_poses
 from ._cut import cut_image
 from ._draw_calibration import draw_calibration
@@ -64,6 +64,7 @@ __all__ = [
     "read_frames",
     "read_metadata",
     "read_phone_log",
+    "scaled_matrix",
     "sha256_of",
     "turned_camera",
     "undistort_px",

@@ -156,10 +156,15 @@ def _scale(
         )
     if factor == 1.0:
         return matrix, ""
+    return scaled_matrix(matrix, factor), f", scaled by {factor:.4g} from {width:g}x{height:g} px"
+
+
+def scaled_matrix(matrix: np.ndarray, factor: float) -> np.ndarray:
+    """The camera matrix (3, 3) of the same picture with `factor` times as many pixels along each side."""
     scaled = matrix.copy()
     scaled[:2] *= factor
     scaled[:2, 2] += (factor - 1) / 2  # coordinates count from the first pixel's centre, sizes from its edge
-    return scaled, f", scaled by {factor:.4g} from {width:g}x{height:g} px"
+    return scaled
 
 
 def check_lens(matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float, float], key: object = None) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from ._camera import scaled_matrix
 from ._types import Camera, VideoInfo
 
 #: Standard deviation of a preset's focal length as a fraction of it. The two recording formats that are published of
@@ -46,10 +47,9 @@ def preset_camera(video: VideoInfo) -> Camera | None:
         matrix, distortion = quarter_turn(matrix, distortion, width)
         width, height = height, width
     factor = long_side / max(width, height)
-    matrix[:2] *= factor
-    # Pixel centres have whole numbers, so the middle of n pixels is at (n - 1) / 2.
-    for row, (old, new) in enumerate(((width, video.width_px), (height, video.height_px))):
-        matrix[row, 2] += (new - 1) / 2 - (old - 1) / 2 * factor
+    matrix = scaled_matrix(matrix, factor)
+    matrix[0, 2] += (video.width_px - factor * width) / 2  # cut or widened about the middle
+    matrix[1, 2] += (video.height_px - factor * height) / 2
     focal = (matrix[0, 0] + matrix[1, 1]) / 2
     same = f", from {camera['size_px'][0]}x{camera['size_px'][1]} px" if factor != 1 else ""
     cut = "" if abs(width * factor - video.width_px) + abs(height * factor - video.height_px) <= 2 else ", cut to shape"
