@@ -87,7 +87,7 @@ def write_sheet(about: Candidates, out_path: Path) -> Path:
             "TRACK_NO_PERSON",
             found="nobody in the video",
             expected="at least one person",
-            next_step="film from nearer, in light, so that the whole body is in the picture",
+            next_step="film in light, from where the whole body is in the picture and fills much of its height",
             key=about.name,
         )
     stored = [s for s in (tracking.SubjectChoice & about.key).to_arrays("contact_sheet") if s is not None]

@@ -51,6 +51,6 @@ def _nobody(tracking: Tracking, video_path: str | Path) -> PblError:
         "TRACK_NO_PERSON",
         found="no person in any frame",
         expected="a person who takes at least about a fifth of the picture's height",
-        next_step="film from nearer, in light, so that the whole body is in the picture",
+        next_step="film in light, from where the whole body is in the picture and fills much of its height",
         key=str(video_path),
     )
