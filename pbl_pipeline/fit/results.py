@@ -62,7 +62,7 @@ class TrialFit:
         NaN where there is no camera. (The height is that of the standing body at its distance along the camera's axis.)
         """
         placed = np.isfinite(self.markers_world_m).all(axis=2)
-        seen = np.isfinite(self.residual_2d_px).any(axis=1) & placed.any(axis=1)
+        seen = np.isfinite(self.residual_2d_px).any(axis=1) & placed.any(axis=-1)
         if not seen.any():
             return float("nan")
         away = np.nanmean(self.markers_world_m[seen], axis=1) - self.camera_position_m
