@@ -80,14 +80,14 @@ def write_sheet(about: Candidates, out_path: Path) -> Path:
     PblError
         TRACK_NO_PERSON, FILE_UNWRITABLE, FILE_FORMAT (the stored picture is lost), VIDEO_MISSING, VIDEO_CHANGED.
     """
-    from pbl_pipeline.tracking import save_contact_sheet
+    from pbl_pipeline.tracking import FILM_THE_WHOLE_BODY, save_contact_sheet
 
     if not about.scores:
         raise PblError(
             "TRACK_NO_PERSON",
             found="nobody in the video",
             expected="at least one person",
-            next_step="film in light, from where the whole body is in the picture and fills much of its height",
+            next_step=FILM_THE_WHOLE_BODY,
             key=about.name,
         )
     stored = [s for s in (tracking.SubjectChoice & about.key).to_arrays("contact_sheet") if s is not None]

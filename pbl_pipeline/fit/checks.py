@@ -54,7 +54,7 @@ def check_fit(
     ]
     checks += _height(session, solution.scale, taller)
     if not isinstance(session.trials[0], WorldMarkers):
-        checks = [_residual_2d(trials), *checks, _intrinsics(trials), _orientation(trials)]
+        checks = [_residual_2d(session, trials), *checks, _intrinsics(trials), _orientation(trials)]
         checks += [*_depth(session, trials), *_assumed(session)]
     if solution.qpos_sd is not None:
         checks += [_observed(trials)]
@@ -70,8 +70,16 @@ def _grade(value: float, warn: float, fail: float) -> str:
     return FAIL if not value < fail else WARN if value > warn else PASS
 
 
-def _residual_2d(trials: Sequence[TrialFit]) -> Check:
-    value = float(np.max([t.residual_2d_share for t in trials]))
+def _residual_2d(session: Session, trials: Sequence[TrialFit]) -> Check:
+    shares = []
+    for arrays, trial in zip(session.arrays, trials, strict=True):
+        seen = (arrays.c_2d > 0) & arrays.used[:, None, None]
+        y = np.where(seen, arrays.xy_px[..., 1], np.nan)
+        y = y[np.isfinite(y).any(axis=-1)]
+        height = np.median(np.nanmax(y, axis=-1) - np.nanmin(y, axis=-1))
+        residual = trial.residual_2d_px
+        shares.append(np.median(residual[np.isfinite(residual)]) / height)
+    value = float(np.max(shares))
     return Check(
         "residual_2d_share_of_body_height",
         _grade(value, RESIDUAL_2D_WARN, RESIDUAL_2D_FAIL),

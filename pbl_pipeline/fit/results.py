@@ -60,6 +60,7 @@ class TrialFit:
     def residual_2d_share(self) -> float:
         """Median 2D residual as a fraction of the person's height in the picture, which is the same at any size of it;
         NaN where there is no camera. (The height is that of the standing body at its distance along the camera's axis.)
+        For people to read: the check divides by the extent of the points, which a body placed wrongly does not change.
         """
         placed = np.isfinite(self.markers_world_m).all(axis=2)
         seen = np.isfinite(self.residual_2d_px).any(axis=1) & placed.any(axis=-1)

@@ -10,7 +10,7 @@ from ._methods import METHODS, SUBJECT_METHODS
 from ._params import TrackingParams
 from ._registered import detector_params
 from ._reidentify import JoinParams
-from ._require import require_subject
+from ._require import FILM_THE_WHOLE_BODY, require_subject
 from ._sheet import contact_sheet, contact_sheet_jpeg, save_contact_sheet
 from ._subject import SubjectParams, time_in_view_s
 from ._tiles import tiles
@@ -20,6 +20,7 @@ from ._types import Detection, PersonDetector, PersonTrack, SubjectChoice, Track
 from ._yolox import YoloxDetector
 
 __all__ = [
+    "FILM_THE_WHOLE_BODY",
     "METHODS",
     "SUBJECT_METHODS",
     "AssociationParams",

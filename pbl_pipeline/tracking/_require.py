@@ -12,6 +12,8 @@ from ._types import SubjectChoice, Tracking
 
 #: With fewer frames nobody can be followed, whoever is in the picture.
 LEAST_FRAMES = 10
+#: What to do where no person was found: she may be too small in the picture or too near.
+FILM_THE_WHOLE_BODY = "film in light, from where the whole body is in the picture and fills much of its height"
 
 
 def require_subject(choice: SubjectChoice, tracking: Tracking, video_path: str | Path, sheet: Path) -> int:
@@ -51,6 +53,6 @@ def _nobody(tracking: Tracking, video_path: str | Path) -> PblError:
         "TRACK_NO_PERSON",
         found="no person in any frame",
         expected="a person who takes at least about a fifth of the picture's height",
-        next_step="film in light, from where the whole body is in the picture and fills much of its height",
+        next_step=FILM_THE_WHOLE_BODY,
         key=str(video_path),
     )
