@@ -48,10 +48,10 @@ def fit(
     named like the cameras of the calibration or in its order. Writes <name>.fit.npz and <name>.angles.csv for each
     trial, and session.json.
     """
-    from pbl_pipeline.export import write_angles_csv
     from pbl_pipeline.files import check_out_folder
     from pbl_pipeline.fit import default_method, fit_session
-    from pbl_pipeline.pipeline import distinct_names, write_session_json
+    from pbl_pipeline.pipeline import distinct_names
+    from pbl_pipeline.visit import Recording, Solution, Visit, save_visit
 
     check_out_folder(out)
     fit_paramset(solver, params)  # a wrong name is said before anything is read
@@ -68,13 +68,11 @@ def fit(
     markers = {} if table is None else {"markers": table}
     motion = motions[0] if len(set(motions)) == 1 else motions
     session = fit_session(trials, names, paramset, motion, height_m=height_m, **markers)
-    out.mkdir(parents=True, exist_ok=True)
-    for trial in session.trials:
-        trial.save(out / f"{trial.name}.fit.npz")
-        write_angles_csv(trial, out / f"{trial.name}.angles.csv")
-        click.echo(f"{out / trial.name}.fit.npz, .angles.csv")
-    write_session_json(session, out / "session.json")
-    click.echo(f"{out / 'session.json'}: {session.seconds:.0f} s, of which {session.compile_seconds:.0f} s compiling")
+    recordings = tuple(Recording.of(trial.name, trial) for trial in session.trials)
+    visit = Visit(recordings, Solution.of(session), session.qc, methods={"Fit": paramset.key})
+    for path in save_visit(visit, out):
+        click.echo(path)
+    click.echo(f"fitted in {session.seconds:.0f} s, of which {session.compile_seconds:.0f} s compiling")
     for check in session.qc:
         if check.outcome != "PASS":
             click.echo(f"{check.outcome} {check.check}: {check.advice}")

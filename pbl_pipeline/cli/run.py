@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 from pathlib import Path
 
@@ -71,7 +72,7 @@ def run(
     """
     from pbl_pipeline.errors import PblError
     from pbl_pipeline.files import check_out_folder
-    from pbl_pipeline.pipeline import fit_default, run_session, write_results
+    from pbl_pipeline.pipeline import fit_default, run_visit, write_results
 
     # What can be wrong with the call is found before minutes of work.
     if person is not None and len(videos) > 1:
@@ -92,16 +93,18 @@ def run(
     check_out_folder(out)
     method, finder = keypoint_method(keypoints, device), tracking_method(people)
     paramset = fit_paramset(solver, params, default=fit_default(method))
-    session = run_session(
+    visit, problems = run_visit(
         videos, out, camera, person, paramset, camera_motion, norm, attitude, method, finder, height_m
     )
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
-    paths = write_results(out, session, subject_code=subject, date=f"computed {today}")
-    click.echo(session.judged.table())
-    for origin in sorted({t.keypoints.origin for t in session.trials if t.keypoints.origin}):
+    visit = dataclasses.replace(visit, subject=subject, label=f"computed {today}")
+    paths = write_results(out, visit)
+    assert visit.measures is not None
+    click.echo(visit.measures.table())
+    for origin in sorted({r.keypoints.origin for r in visit.fitted if r.keypoints and r.keypoints.origin}):
         click.echo(f"keypoints by {origin}")
-    for name, error in session.problems.items():
+    for name, error in problems.items():
         click.echo(f"left out {name}\n{error.text()}", err=True)
     click.echo("\n".join(str(p) for p in paths))
-    if session.problems:
+    if problems:
         raise click.exceptions.Exit(1)

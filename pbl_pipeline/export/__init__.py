@@ -1,27 +1,14 @@
 """Results in the formats of other programs (docs/export.md)."""
 
-from pbl_pipeline.export._angles import angles_table, write_angles_csv
-from pbl_pipeline.export._from_files import log_shift_s, session_of_files
-from pbl_pipeline.export._trial import ExportTrial
-from pbl_pipeline.export._write import (
-    FORMATS,
-    GAIT_FORMATS,
-    ExportOptions,
-    ExportSession,
-    check_export,
-    write_export,
-)
+from pbl_pipeline.export._write import FORMATS, GAIT_FORMATS, ExportOptions, check_export, write_export
+from pbl_pipeline.fit.angles_file import angles_table, write_angles_csv
 
 __all__ = [
     "FORMATS",
     "GAIT_FORMATS",
     "ExportOptions",
-    "ExportSession",
-    "ExportTrial",
     "angles_table",
     "check_export",
-    "log_shift_s",
-    "session_of_files",
     "write_angles_csv",
     "write_export",
 ]

@@ -8,11 +8,11 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 import numpy as np
 
 from pbl_pipeline.body import SLIDES, angle_of
+from pbl_pipeline.fit.angles_file import angles_table
 from pbl_pipeline.gait import ANGLE_NAMES, MEASURES, GaitCycle, GaitMetrics, Gdi, Spatiotemporal, TrialMetrics
 from pbl_pipeline.gait import cycle_measures as measures_of
 from pbl_pipeline.words import unit_of
 
-from ._angles import angles_table
 from ._columns import Column, Labels, Table, joined
 from ._trial import ExportTrial
 

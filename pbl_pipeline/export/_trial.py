@@ -16,6 +16,7 @@ from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import BodyPoses, TrialMetrics, trial_poses
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.video import PhoneLog
+from pbl_pipeline.visit import Recording, Visit
 
 #: Frames whose stamps are this close (s) to a grid of one rate are exported as they are.
 EVEN_WITHIN_S = 5e-4
@@ -44,6 +45,23 @@ class ExportTrial:
     log_shift_s: float = 0.0
     methods: Mapping[str, str] = dataclasses.field(default_factory=dict)
     fitted_with: str = ""
+
+    @classmethod
+    def of(cls, recording: Recording, visit: Visit) -> ExportTrial:
+        """Return a fitted recording of a visit as it is exported. Raises what loading its arrays raises."""
+        assert recording.fit is not None
+        log, shift = recording.log or (None, 0.0)
+        return cls(
+            name=recording.name,
+            fit=recording.fit,
+            markers=recording.markers,
+            keypoints=recording.keypoints,
+            measured=recording.measured,
+            log=log,
+            log_shift_s=shift,
+            methods=visit.methods,
+            fitted_with="" if visit.solution is None else visit.solution.software,
+        )
 
     @functools.cached_property
     def poses(self) -> BodyPoses:

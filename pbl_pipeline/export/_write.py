@@ -18,6 +18,7 @@ from pbl_pipeline.files import check_out_folder
 from pbl_pipeline.gait import GaitMetrics
 from pbl_pipeline.names import check_label
 from pbl_pipeline.qc import Check, failed
+from pbl_pipeline.visit import Visit
 
 from ._c3d import check_frames, write_c3d
 from ._columns import Table, dictionary, write_csv, write_parquet
@@ -46,15 +47,6 @@ _ASCII = ("trc", "mot", "osim", "c3d")
 #: What OpenSim refuses in the name of a component.
 _NOT_IN_OPENSIM = frozenset(" \t/\\*+")
 _LONGEST_NAME = 64
-
-
-@dataclasses.dataclass(frozen=True)
-class ExportSession:
-    """A visit to export: its trials, the measures of all together (None where nobody asked), the checks of its fit."""
-
-    trials: tuple[ExportTrial, ...]
-    metrics: GaitMetrics | None = None
-    fit_checks: tuple[Check, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,11 +100,10 @@ def check_export(formats: Sequence[str], out: Path, options: ExportOptions) -> N
         )
 
 
-def write_export(
-    session: ExportSession, formats: Sequence[str], out: Path, options: ExportOptions | None = None
-) -> list[Path]:
-    """Write a visit: `<trial>/<trial>.trc` and so on for each trial, the tables with their data dictionary and
-    `export.json` above. Returns the paths, `export.json` last.
+def write_export(visit: Visit, formats: Sequence[str], out: Path, options: ExportOptions | None = None) -> list[Path]:
+    """Write the fitted recordings of a visit and return the paths, `export.json` last.
+
+    `<recording>/<recording>.trc` and so on for each, the tables with their data dictionary and `export.json` above.
 
     Raises
     ------
@@ -124,14 +115,14 @@ def write_export(
     options = options or ExportOptions()
     formats = [f for f in FORMATS if f in formats] + [f for f in formats if f not in FORMATS]
     check_export(formats, out, options)
+    trials = tuple(ExportTrial.of(r, visit) for r in visit.fitted)
     if options.number_trials:
-        named = tuple(dataclasses.replace(t, name=f"trial_{i}") for i, t in enumerate(session.trials, 1))
-        session = dataclasses.replace(session, trials=named)
-    _check_session(session, formats, options)
+        trials = tuple(dataclasses.replace(t, name=f"trial_{i}") for i, t in enumerate(trials, 1))
+    _check_visit(trials, visit.fit_checks, formats, options)
     body, paths, about = load_body(), [], {}
-    for trial in session.trials:
+    for trial in trials:
         origin = origin_of(trial, body)
-        if bad := failed(session.fit_checks):
+        if bad := failed(visit.fit_checks):
             origin["failed_checks"] = ", ".join(bad)
         about[trial.name] = {**origin, **summary(trial)}
         folder = out / trial.name
@@ -139,7 +130,7 @@ def write_export(
             folder.mkdir(parents=True, exist_ok=True)
             paths.append(_written(folder / f"{trial.name}{ending}", write))
     out.mkdir(parents=True, exist_ok=True)
-    paths += _write_tables(session, formats, out, _common(about))
+    paths += _write_tables(trials, visit.measures, formats, out, _common(about))
     content = {
         "software": f"pbl-pipeline {code_version()}",
         "exported": datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
@@ -168,10 +159,16 @@ def _writers(
     return {FORMATS[f]: every[f] for f in formats if f in every}
 
 
-def _write_tables(session: ExportSession, formats: Sequence[str], out: Path, about: Mapping[str, str]) -> list[Path]:
+def _write_tables(
+    trials: Sequence[ExportTrial],
+    measures: GaitMetrics | None,
+    formats: Sequence[str],
+    out: Path,
+    about: Mapping[str, str],
+) -> list[Path]:
     if not {"csv", "parquet"} & set(formats):
         return []
-    tables, paths = session_tables(session.trials, session.metrics), []
+    tables, paths = session_tables(trials, measures), []
 
     def parquet(table: Table) -> Callable[[Path], object]:
         return lambda path: write_parquet(table, path, about)
@@ -206,17 +203,19 @@ def _common(about: Mapping[str, Mapping[str, object]]) -> dict[str, str]:
 
 
 # -------------------------------------------------------------------------------------------------------------- checks
-def _check_session(session: ExportSession, formats: Sequence[str], options: ExportOptions) -> None:
-    if not session.trials:
+def _check_visit(
+    trials: Sequence[ExportTrial], fit_checks: Sequence[Check], formats: Sequence[str], options: ExportOptions
+) -> None:
+    if not trials:
         raise _input("no trial", "at least one fit", "pass the fit.npz files of a visit")
-    if (checks := failed(session.fit_checks)) and not options.allow_failed:
+    if (checks := failed(fit_checks)) and not options.allow_failed:
         raise _input(
             f"a fit that failed its check {', '.join(checks)}: the body does not lie on the person",
             "a fit without a failed check",
             "look at the overlay and fit again, or pass --allow-failed: the files then name the failed checks",
-            session.trials[0].name,
+            trials[0].name,
         )
-    for trial in session.trials:
+    for trial in trials:
         try:
             _check_trial(trial, formats, options.body_points)
         except PblError as error:

@@ -150,7 +150,9 @@ class Gdi:
         """`gdi` of metrics.json."""
         rounded = {k: _rounded(getattr(self, k)) for k in ("left", "right", "mean", "sd", "minimal_change")}
         interval = None if self.interval is None else [_rounded(v) for v in self.interval]
-        return {**rounded, "interval": interval, "n": self.n, "norm": self.norm}
+        counted = {"n": self.n, "n_left": self.n_left, "n_right": self.n_right, "norm": self.norm}
+        cycles = [dataclasses.asdict(c) for c in self.cycles]
+        return {**rounded, "interval": interval, **counted, "params_hash": self.params_hash, "cycles": cycles}
 
 
 def interval_90(mean: float | None, sd: float | None) -> tuple[float, float] | None:

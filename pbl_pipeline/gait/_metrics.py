@@ -50,7 +50,16 @@ class TrialMetrics:
     pooled: bool = True
 
     def to_dict(self) -> dict:
-        return {"name": self.name, **_measures(self)}
+        """Return the trial's part of metrics.json, from which `metrics_file.metrics_of` makes it again."""
+        found = {f.name: getattr(self.events, f.name) for f in dataclasses.fields(self.events) if f.name != "events"}
+        events = {**found, "walking_s": [list(bout) for bout in found["walking_s"]]}
+        events["qc"] = [c.to_dict() for c in self.events.qc]
+        cycles = [
+            {k: v for k, v in dataclasses.asdict(c).items() if k not in ("trial", "curves", "curves_sd")}
+            for c in self.cycles
+        ]
+        more = {"pooled": self.pooled, "events": events, "gait_cycles": cycles}
+        return {"name": self.name, **_measures(self), **more}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,9 +100,15 @@ class GaitMetrics:
 
     def to_dict(self) -> dict:
         """The content of metrics.json."""
-        judged = {"outcome": self.outcome, "qc": [c.to_dict() for c in self.checks]}
+        judged = {
+            "outcome": self.outcome,
+            "qc": [c.to_dict() for c in self.checks],
+            "qc_before_gait": len(dict.fromkeys(self.before)),
+        }
+        session = _measures(self)
+        del session["gdi"]["cycles"]  # those of its trials
         return {
-            "session": {**_measures(self), **judged},
+            "session": {**session, **judged},
             "trials": [t.to_dict() for t in self.trials],
             "gdi_model": self.gdi.model,
             "params_hash": self.params_hash,
@@ -322,7 +337,7 @@ def _measures(part: TrialMetrics | GaitMetrics) -> dict:
         "gdi": part.gdi.to_dict(),
         "profile_deg": None if part.gdi.profile is None else part.gdi.profile.to_dict(),
         "reasons": reasons,
-        "cycles": {"found": values.n_cycles_found, "used": values.n_cycles_used},
+        "cycles": {"found": values.n_cycles_found, "used": values.n_cycles_used, "steps": values.n_steps_used},
         "outcome": worst(part.qc),
         "qc": [c.to_dict() for c in part.qc],
     }

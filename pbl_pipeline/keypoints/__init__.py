@@ -33,6 +33,7 @@ from ._types import Keypoints
 from ._view import view_rotation
 from ._view_agreement import MOST_MISS_M, check_views_agree, ray_miss_m
 from ._world_markers import WorldMarkers
+from .phone_clock import log_shift_s
 
 __all__ = [
     "BOUND_TRUNK",
@@ -68,6 +69,7 @@ __all__ = [
     "confidence_curves",
     "confidence_text",
     "detect_keypoints",
+    "log_shift_s",
     "longest_run_s",
     "probability_within",
     "ray_miss_m",

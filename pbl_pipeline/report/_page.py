@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 
 import numpy as np
 
 import pbl_pipeline
-from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import (
     GILLETTE_MODEL,
     Gdi,
     Measure,
     NormalBands,
     NormativeSet,
-    TrialMetrics,
     far_leg_of,
     leg_length_m,
     load_norm,
@@ -24,7 +23,7 @@ from pbl_pipeline.gait import (
 from pbl_pipeline.keypoints import confidence_text, visibility
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, OUTCOMES, PASS, WARN, Check, in_session
 from pbl_pipeline.report import _figures
-from pbl_pipeline.report._types import SessionReport, TrialReport
+from pbl_pipeline.report._types import Picture
 from pbl_pipeline.report._words import (
     HEADLINES,
     OUTCOME_WORDS,
@@ -34,38 +33,39 @@ from pbl_pipeline.report._words import (
     sentence,
     size,
 )
+from pbl_pipeline.visit import Recording, Visit
 from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, number, significant
 
 _CONVERGED = {True: "converged", False: "not converged", None: "convergence not recorded"}
 
 
-def page_of(report: SessionReport) -> dict:
-    """Everything the template shows. Raises `PblError` FILE_FORMAT where trials and metrics do not belong together."""
-    pairs = _paired(report)
-    norm = _norm(report)
-    checks = _checks(report)
-    empty = report.metrics is None or report.metrics.status != PASS
+def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str, norm: NormativeSet | None) -> dict:
+    """Return everything that the template shows. `norm`: as in `write_report`."""
+    norm = _norm(visit) if norm is None else norm
+    recordings = visit.fitted or visit.recordings
+    checks = _checks(visit, recordings)
+    metrics = visit.measures
+    empty = metrics is None or metrics.status != PASS
     page: dict = {
-        "title": report.title,
+        "title": title,
         "meta": [
-            ("Subject", report.subject_code),
-            ("Visit", report.date),
-            ("Recordings", ", ".join(t.name for t in report.trials)),
+            ("Subject", visit.subject),
+            ("Visit", visit.date or visit.label),
+            ("Recordings", ", ".join(r.name for r in recordings)),
         ],
-        "verdict": _verdict(report, checks),
+        "verdict": _verdict(visit, recordings, checks),
         "checks": [_check_row(c) for c in checks],
-        "trials": [_trial(t, m) for t, m in pairs],
+        "trials": [_trial(r, pictures.get(r.name, ())) for r in recordings],
         "open_time_charts": empty,
         "key_cycles": _figures.legend("left", "right", "cycles", "norm", "foot off"),
         "key_contacts": _figures.legend("stance", "foot down", "foot up", "in view"),
         "key_time": _figures.legend("left", "right", "stance"),
-        "notes": _notes(report, norm),
-        "origin": _origin(report, pairs, norm),
+        "notes": _notes(visit, norm),
+        "origin": _origin(visit, recordings, norm),
         "footer": f"Made by the PBL pipeline {pbl_pipeline.__version__}. Research software: not a medical device, "
         "and no diagnosis. Everything on this page is contained in it; nothing is loaded from elsewhere.",
     }
-    if report.metrics is not None and not empty:
-        metrics = report.metrics
+    if metrics is not None and not empty:
         values = metrics.spatiotemporal
         cycles = metrics.cycles
         page["tiles"] = [*(_tile(k, values[k], values.reasons.get(k, "")) for k in HEADLINES), _gdi_tile(metrics.gdi)]
@@ -77,62 +77,44 @@ def page_of(report: SessionReport) -> dict:
             "of both sides, n counts them; CV is the spread within a side in percent of the mean; asymmetry is right "
             "minus left in percent of their mean."
         )
-        bands = _bands(report)
+        bands = _bands(visit)
         page["cycle_charts"] = _figures.cycle_charts(cycles, bands)
         page["cycles_note"] = _cycles_note(bands, far_leg_of(cycles))
         page["index"] = _index(metrics.gdi)
     return page
 
 
-def _paired(report: SessionReport) -> list[tuple[TrialReport, TrialMetrics | None]]:
-    """Each trial with its measures: those with a fit stand in `metrics` in the same order."""
-    measured = list(report.metrics.trials) if report.metrics is not None else []
-    fitted = [t for t in report.trials if t.fit is not None]
-    if measured and [m.name for m in measured] != [t.fit.name for t in fitted if t.fit is not None]:
-        raise PblError(
-            "FILE_FORMAT",
-            found=f"measures of {[m.name for m in measured]} for the fitted trials {[t.name for t in fitted]}",
-            expected="the measures of the same trials in the same order",
-            next_step="compute the measures from these fits",
-            key=report.title,
-        )
-    rest = iter(measured)
-    return [(t, next(rest, None) if t.fit is not None else None) for t in report.trials]
-
-
-def _norm(report: SessionReport) -> NormativeSet | None:
-    if report.norm is not None or report.metrics is None:
-        return report.norm
-    name = report.metrics.gdi.norm
+def _norm(visit: Visit) -> NormativeSet | None:
+    """Return the set that the index names, where it is one that ships."""
+    name = "" if visit.measures is None else visit.measures.gdi.norm
     return load_norm(name) if name in norm_names() else None
 
 
-def _bands(report: SessionReport) -> NormalBands:
-    """Normal curves at the person's speed."""
-    fit = next((t.fit for t in report.trials if t.fit is not None), None)
+def _bands(visit: Visit) -> NormalBands:
+    """Return the normal curves at the person's speed."""
+    fit = next((r.fit for r in visit.fitted), None)
     leg = None if fit is None else leg_length_m(fit.scale)
-    return normal_bands(None if report.metrics is None else report.metrics.spatiotemporal, leg)
+    return normal_bands(None if visit.measures is None else visit.measures.spatiotemporal, leg)
 
 
-def _checks(report: SessionReport) -> list[Check]:
-    """All checks, earlier stages first, each once: what a trial and its session both say is said by the session."""
-    checks = list(report.checks)
-    for t in report.trials:
-        if t.choice is not None and t.choice.status == "NEEDS_CHOICE":
-            checks.append(Check("subject_choice", NEEDS_CHOICE, None, None, f"{t.name}: {t.choice.reason}"))
-        elif t.choice is not None and t.choice.status == "NO_PERSON":
-            checks.append(Check("subject_choice", FAIL, None, None, f"{t.name}: {t.choice.reason}"))
-    if report.session is not None:
-        checks += report.session.qc
-    if report.metrics is not None:
-        for t in report.metrics.trials:
-            checks += t.events.qc if t.events is not None else ()
-        checks += report.metrics.qc
+def _checks(visit: Visit, recordings: Sequence[Recording]) -> list[Check]:
+    """Return all checks, earlier stages first, each once: what a trial and its visit both say is said by the visit."""
+    checks = [c for c in visit.checks if c not in visit.fit_checks]
+    for r in recordings:
+        if r.choice is not None and r.choice.status == "NEEDS_CHOICE":
+            checks.append(Check("subject_choice", NEEDS_CHOICE, None, None, f"{r.name}: {r.choice.reason}"))
+        elif r.choice is not None and r.choice.status == "NO_PERSON":
+            checks.append(Check("subject_choice", FAIL, None, None, f"{r.name}: {r.choice.reason}"))
+    checks += visit.fit_checks
+    if visit.measures is not None:
+        for t in visit.measures.trials:
+            checks += t.events.qc
+        checks += visit.measures.qc
     return list(dict.fromkeys(checks))
 
 
-def _verdict(report: SessionReport, checks: list[Check]) -> dict:
-    metrics = report.metrics
+def _verdict(visit: Visit, recordings: Sequence[Recording], checks: list[Check]) -> dict:
+    metrics = visit.measures
     measured = metrics is not None and metrics.status == PASS
     outcomes = [in_session(c.outcome, measured) for c in checks]
     outcome = max(outcomes, key=OUTCOMES.index, default=PASS)
@@ -141,12 +123,12 @@ def _verdict(report: SessionReport, checks: list[Check]) -> dict:
     elif metrics is not None and not measured and outcome in (PASS, WARN):
         outcome = EMPTY
     notable = [c for c, o in zip(checks, outcomes, strict=True) if o == outcome and outcome not in (PASS, EMPTY)]
-    problems = [f"{t.name}: {t.problem}" for t in report.trials if t.problem]
+    problems = [f"{r.name}: {r.problem}" for r in recordings if r.problem]
     asking = f"{len(notable)} of {plural(len(checks), 'check')} {'asks' if len(notable) == 1 else 'ask'}"
     texts = {
         PASS: "All checks passed.",
         WARN: f"{asking} for attention:",
-        EMPTY: _why_empty(report),
+        EMPTY: _why_empty(visit),
         NEEDS_CHOICE: "Several people are in view and none is clearly the subject:",
         FAIL: "The chain ended before there was anything to measure:"
         if metrics is None
@@ -161,8 +143,8 @@ def _verdict(report: SessionReport, checks: list[Check]) -> dict:
     }
 
 
-def _why_empty(report: SessionReport) -> str:
-    metrics = report.metrics
+def _why_empty(visit: Visit) -> str:
+    metrics = visit.measures
     if metrics is None or not metrics.reason:
         return "Nobody walks in these recordings."
     if len(metrics.trials) == 1:
@@ -280,12 +262,14 @@ def _profile(gdi: Gdi) -> list[dict]:
     return rows
 
 
-def _trial(t: TrialReport, m: TrialMetrics | None) -> dict:
-    v = t.video
-    texts = [
-        f"{number(v.duration_s, 1)} s, {v.n_frames} frames of {v.width_px} x {v.height_px} px, "
-        f"{number(v.fps, 1)} frames/s{' (variable)' if v.variable_frame_rate else ''}"
-    ]
+def _trial(t: Recording, pictures: Sequence[Picture]) -> dict:
+    v, m = t.video, t.measured
+    texts = []
+    if v is not None:
+        texts.append(
+            f"{number(v.duration_s, 1)} s, {v.n_frames} frames of {v.width_px} x {v.height_px} px, "
+            f"{number(v.fps, 1)} frames/s{' (variable)' if v.variable_frame_rate else ''}"
+        )
     if t.choice is not None and t.choice.reason:
         texts.append(t.choice.reason)
     if t.fit is not None:
@@ -308,7 +292,7 @@ def _trial(t: TrialReport, m: TrialMetrics | None) -> dict:
         "sentence": " ".join(sentence(x) for x in texts),
         "contacts": _figures.contact_chart(t.fit, events) if t.fit is not None and events is not None else None,
         "time_charts": _figures.time_charts(t.fit, events) if t.fit is not None else [],
-        "pictures": [_figures.picture(t.name, p) for p in t.pictures],
+        "pictures": [_figures.picture(t.name, p) for p in pictures],
     }
 
 
@@ -348,22 +332,22 @@ _EVENT_NOTES = {
 }
 
 
-def _event_methods(report: SessionReport) -> list[str]:
-    """The event methods of the trials, each once."""
-    trials = () if report.metrics is None else report.metrics.trials
+def _event_methods(visit: Visit) -> list[str]:
+    """Return the event methods of the trials, each once."""
+    trials = () if visit.measures is None else visit.measures.trials
     return [m for m in dict.fromkeys(t.events.method for t in trials) if m in _EVENT_NOTES]
 
 
-def _notes(report: SessionReport, norm: NormativeSet | None) -> list[str]:
+def _notes(visit: Visit, norm: NormativeSet | None) -> list[str]:
     notes = [
         "Angles are those of a model of the body that was fitted to the picture. Flexion, adduction, internal rotation "
         "and dorsiflexion are positive, on both sides.",
-        *(_EVENT_NOTES[m] for m in _event_methods(report)),
+        *(_EVENT_NOTES[m] for m in _event_methods(visit)),
         "The GDI of three angles follows Schwartz and Rozumalski 2008 (Gait & Posture 28:351-357) with hip flexion, "
         "hip adduction and knee flexion only: 100 is the mean of the norm, each 10 points one standard deviation, "
         "lower is further away. It is not the original index of nine angles.",
     ]
-    if any(t.fit is not None and t.fit.orientation_source != "measured: calibration" for t in report.trials):
+    if any(r.fit is not None and r.fit.orientation_source != "measured: calibration" for r in visit.fitted):
         notes.append(
             "Speed and lengths are known only where the camera stands still, and are then scaled by an assumed body "
             "size: one camera sees no scale. On one recording with marker motion capture the speed "
@@ -381,48 +365,25 @@ def _notes(report: SessionReport, norm: NormativeSet | None) -> list[str]:
     return notes
 
 
-def _origin(
-    report: SessionReport, pairs: list[tuple[TrialReport, TrialMetrics | None]], norm: NormativeSet | None
-) -> list[dict]:
-    """Groups of (name, value, is code)."""
-    groups = []
-    for t, m in pairs:
-        v = t.video
-        device = " ".join(x for x in (v.make, v.model) if x)
-        rows = [
-            ("File", PurePath(v.path).name, False),
-            ("SHA-256", v.sha256, True),
-            ("Size, coding", f"{size(v.size_bytes)}, {v.codec} in {v.container}", False),
-            ("Recorded", f"{v.recorded_utc or 'time unknown'}{', ' + device if device else ''}", False),
-        ]
-        if t.keypoints is not None:
-            rows.append(("Keypoints", f"{t.keypoints.marker_set}, {plural(len(t.keypoints.names), 'point')}", False))
-            rows.append(("In view", visibility(t.keypoints).text(), False))
-            rows.append(("Confidence", confidence_text(t.keypoints), False))
-        camera = t.fit.camera if t.fit is not None else t.keypoints.camera if t.keypoints is not None else None
-        if camera is not None:
-            rows.append(("Camera", f"{camera.source}; focal length {camera.matrix[0, 0]:.0f} px", False))
-        rows += [("Remark", note, False) for note in v.notes]
-        if m is not None and m.events is not None:
-            rows.append(("Gait events", f"{m.events.method}, parameters {m.events.params_hash}", True))
-        groups.append({"name": f"Recording {t.name}", "rows": rows})
-    s = report.session
+def _origin(visit: Visit, recordings: Sequence[Recording], norm: NormativeSet | None) -> list[dict]:
+    """Return groups of (name, value, is code)."""
+    groups = [{"name": f"Recording {r.name}", "rows": _recording_origin(r)} for r in recordings]
+    s = visit.solution
     if s is not None:
-        fit = next((t.fit for t in report.trials if t.fit is not None), None)
         rows = [
             ("Solver", f"{s.solver}, parameters {s.params_hash}", True),
             ("Steps", f"{s.iterations}, {_CONVERGED[s.converged]}", False),
             ("Time", f"{s.seconds:.1f} s, of these {s.compile_seconds:.1f} s compiling, on {s.device}", False),
         ]
-        if fit is not None:
-            rows.append(("Body model (SHA-256)", fit.body_sha256, True))
-            rows.append(("Camera motion", ", ".join(sorted({t.camera_motion for t in s.trials})), False))
-            rows.append(("Vertical", ", ".join(sorted({t.orientation_source for t in s.trials})), False))
+        if fits := [r.fit for r in visit.fitted if r.fit is not None]:
+            rows.append(("Body model (SHA-256)", fits[0].body_sha256, True))
+            rows.append(("Camera motion", ", ".join(sorted({f.camera_motion for f in fits})), False))
+            rows.append(("Vertical", ", ".join(sorted({f.orientation_source for f in fits})), False))
         groups.append({"name": "Fit", "rows": rows})
-    if report.metrics is not None:
-        gdi = report.metrics.gdi
+    if visit.measures is not None:
+        gdi = visit.measures.gdi
         rows = [
-            ("Parameters", report.metrics.params_hash, True),
+            ("Parameters", visit.measures.params_hash, True),
             (gdi.title, f"{gdi.model}, parameters {gdi.params_hash}", True),
             ("Normative set", gdi.norm, True),
         ]
@@ -430,9 +391,38 @@ def _origin(
             rows += [("Source of the norm", norm.source, False), ("Licence of the norm", norm.licence, False)]
             rows.append(("Norm (SHA-256)", norm.sha256, True))
         groups.append({"name": "Gait measures", "rows": rows})
-    for heading, values in report.origin.items():
-        groups.append({"name": heading, "rows": [(k, v, False) for k, v in values.items()]})
+    if visit.methods:
+        groups.append({"name": "Methods", "rows": [(k, v, False) for k, v in visit.methods.items()]})
+    software = {"pbl-pipeline": pbl_pipeline.__version__}
+    software |= {
+        f"keypoints of {r.name}": r.keypoints.origin for r in visit.fitted if r.keypoints and r.keypoints.origin
+    }
+    groups.append({"name": "Software", "rows": [(k, v, False) for k, v in software.items()]})
     return groups
+
+
+def _recording_origin(r: Recording) -> list[tuple[str, str, bool]]:
+    v, m, rows = r.video, r.measured, []
+    if v is not None:
+        device = " ".join(x for x in (v.make, v.model) if x)
+        rows += [
+            ("File", PurePath(v.path).name, False),
+            ("SHA-256", v.sha256, True),
+            ("Size, coding", f"{size(v.size_bytes)}, {v.codec} in {v.container}", False),
+            ("Recorded", f"{v.recorded_utc or 'time unknown'}{', ' + device if device else ''}", False),
+        ]
+    if r.keypoints is not None:
+        rows.append(("Keypoints", f"{r.keypoints.marker_set}, {plural(len(r.keypoints.names), 'point')}", False))
+        rows.append(("In view", visibility(r.keypoints).text(), False))
+        rows.append(("Confidence", confidence_text(r.keypoints), False))
+    camera = r.fit.camera if r.fit is not None else r.keypoints.camera if r.keypoints is not None else None
+    if camera is not None and np.isfinite(camera.matrix).all():
+        rows.append(("Camera", f"{camera.source}; focal length {camera.matrix[0, 0]:.0f} px", False))
+    if v is not None:
+        rows += [("Remark", note, False) for note in v.notes]
+    if m is not None:
+        rows.append(("Gait events", f"{m.events.method}, parameters {m.events.params_hash}", True))
+    return rows
 
 
 def _sd_decimals(decimals: int) -> int:

@@ -109,16 +109,18 @@ def export(
 
 def _of_files(
     files: tuple[Path, ...], formats: tuple[str, ...], attitude: tuple[Path, ...], marker_set: Path | None
-) -> ExportSession:
+) -> Visit:
     from pbl_pipeline.body import load_marker_set
-    from pbl_pipeline.cli.gait import fit_checks
-    from pbl_pipeline.export import GAIT_FORMATS, session_of_files
-    from pbl_pipeline.fit import TrialFit
+    from pbl_pipeline.export import GAIT_FORMATS
+    from pbl_pipeline.pipeline import measured
+    from pbl_pipeline.visit import visit_of_fits
 
     markers = None if marker_set is None else load_marker_set(marker_set)
-    checks = fit_checks(files, [TrialFit.load(path) for path in files])
     gait = bool(GAIT_FORMATS & set(formats))
-    return session_of_files(files, attitude=attitude, markers=markers, gait=gait, fit_checks=checks)
+    visit = visit_of_fits(files, markers=markers, measures=gait).with_logs(attitude)
+    if gait and any(r.measured is None for r in visit.fitted):
+        return measured(visit)
+    return visit
 
 
 def _of_tables(restriction: dict[str, str | None], formats: tuple[str, ...]) -> ExportSession:

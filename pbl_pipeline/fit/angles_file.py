@@ -9,7 +9,8 @@ import pandas as pd
 
 from pbl_pipeline.body import angle_of, joint_angles
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import TrialFit
+
+from .results import TrialFit
 
 
 def angles_table(fit: TrialFit) -> pd.DataFrame:

@@ -1,0 +1,155 @@
+"""Gait measures read back from `metrics.json` (docs/files.md), with the events and curves in the files beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pbl_pipeline.paramset import structured
+from pbl_pipeline.qc import EMPTY, PASS, Check
+
+from ._cycles import GaitCycle
+from ._exclusion import Exclusion
+from ._gdi import Gdi, GdiCycle
+from ._ground import Lengths
+from ._metrics import GaitMetrics, TrialMetrics
+from ._profile import MovementProfile
+from ._spatiotemporal import MEASURES, Measure, Spatiotemporal
+from .curves_file import Curves
+from .events import GaitEvent, GaitEvents
+
+#: Checks of the index among the checks of a trial or session; the others are of its measures.
+INDEX_CHECKS = ("gdi_cycles", "gdi_explained", "norm_convention")
+#: Rounding of the times in events.csv (s).
+_ROUNDED_S = 1e-3
+
+
+def metrics_of(
+    content: Mapping[str, Any],
+    events: Mapping[str, Sequence[GaitEvent]],
+    curves: Mapping[str, Mapping[int, Curves]],
+) -> GaitMetrics:
+    """Return the measures that `GaitMetrics.to_dict` wrote.
+
+    Parameters
+    ----------
+    content
+        Of metrics.json. Files of version 0.1 lack the facts about events and cycles of a trial: it then has no cycles.
+    events, curves
+        By the name of the trial: what events.csv and cycles.npz hold.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError, AttributeError
+        Where the content is not that of a metrics.json.
+    """
+    session, model = content["session"], str(content["gdi_model"])
+    trials = tuple(_trial(t, model, events.get(t["name"], ()), curves.get(t["name"], {})) for t in content["trials"])
+    checks = _checks(session)
+    n_before = int(session.get("qc_before_gait", len(checks)))
+    of_events = {c for t in trials for c in t.events.qc}
+    own = tuple(c for c in checks[n_before:] if c not in of_events)
+    cycles = tuple(c for t in trials if t.pooled for c in t.gdi.cycles)
+    return GaitMetrics(
+        trials=trials,
+        status=str(session["status"]),
+        reason=str(session["reason"]),
+        spatiotemporal=_spatiotemporal(session, sum(t.spatiotemporal.n_steps_used for t in trials if t.pooled)),
+        gdi=_index(session, model, own, cycles),
+        qc=own,
+        params_hash=str(content["params_hash"]),
+        before=checks[:n_before],
+    )
+
+
+def _trial(
+    content: Mapping[str, Any], model: str, events: Sequence[GaitEvent], curves: Mapping[int, Curves]
+) -> TrialMetrics:
+    name, checks = str(content["name"]), _checks(content)
+    return TrialMetrics(
+        name=name,
+        status=str(content["status"]),
+        reason=str(content["reason"]),
+        events=_events(content, events, checks),
+        cycles=tuple(_cycle(c, name, curves) for c in content.get("gait_cycles", ())),
+        spatiotemporal=_spatiotemporal(content),
+        gdi=_index(content, model, checks, None),
+        qc=checks,
+        pooled=bool(content.get("pooled", True)),
+    )
+
+
+def _events(content: Mapping[str, Any], events: Sequence[GaitEvent], checks: Sequence[Check]) -> GaitEvents:
+    told = content.get("events")
+    if told is None:  # version 0.1
+        status = PASS if events else EMPTY
+        return GaitEvents(status, tuple(events), "" if events else str(content["reason"]), "unknown", "", "fit")
+    bouts = tuple((float(a), float(b)) for a, b in told["walking_s"])
+    return GaitEvents(
+        status=str(told["status"]),
+        events=tuple(GaitEvent(e.time_s, e.side, e.event, e.probability, _bout(e.time_s, bouts)) for e in events),
+        reason=str(told["reason"]),
+        method=str(told["method"]),
+        params_hash=str(told["params_hash"]),
+        source=str(told["source"]),
+        walking_s=bouts,
+        n_candidates=int(told["n_candidates"]),
+        n_order_breaks=int(told["n_order_breaks"]),
+        qc=tuple(structured(c, Check) for c in told["qc"]),
+    )
+
+
+def _bout(time_s: float, bouts: Sequence[tuple[float, float]]) -> int:
+    return next((i for i, (a, b) in enumerate(bouts) if a - _ROUNDED_S <= time_s <= b + _ROUNDED_S), 0)
+
+
+def _cycle(content: Mapping[str, Any], trial: str, curves: Mapping[int, Curves]) -> GaitCycle:
+    nested = {
+        "exclusion": structured(content["exclusion"], Exclusion),
+        "lengths": structured(content["lengths"], Lengths),
+    }
+    known = curves.get(int(content["number"]), Curves({}, {}))
+    return GaitCycle(trial=trial, **{**content, **nested}, curves=known.deg, curves_sd=known.sd_deg)
+
+
+def _spatiotemporal(content: Mapping[str, Any], n_steps: int = 0) -> Spatiotemporal:
+    measures = {n: None if content[n] is None else structured(content[n], Measure) for n in MEASURES if n in content}
+    counts = content["cycles"]
+    return Spatiotemporal(
+        status=PASS if int(counts["used"]) else EMPTY,
+        reason=str(content["reason"]),
+        measures=measures,
+        reasons={n: str(r) for n, r in content["reasons"].items() if n != "gdi"},
+        n_cycles_found=int(counts["found"]),
+        n_cycles_used=int(counts["used"]),
+        n_steps_used=int(counts.get("steps", n_steps)),
+    )
+
+
+def _index(content: Mapping[str, Any], model: str, checks: Sequence[Check], cycles: Sequence[GdiCycle] | None) -> Gdi:
+    """Return the index of a trial or session. `cycles`: those of a session's trials, None for those in the content."""
+    told, profile = content["gdi"], content.get("profile_deg")
+    own = tuple(structured(c, GdiCycle) for c in told.get("cycles", ())) if cycles is None else tuple(cycles)
+    known = None if profile is None else MovementProfile(**profile)
+    return Gdi(
+        status=PASS if told["mean"] is not None else EMPTY,
+        reason=str(content["reasons"].get("gdi", "")),
+        left=told["left"],
+        right=told["right"],
+        mean=told["mean"],
+        n=int(told["n"]),
+        n_left=int(told.get("n_left", sum(c.side == "left" for c in own))),
+        n_right=int(told.get("n_right", sum(c.side == "right" for c in own))),
+        norm=str(told["norm"]),
+        model=model,
+        params_hash=str(told.get("params_hash", "")),
+        cycles=own,
+        qc=tuple(c for c in checks if c.check in INDEX_CHECKS),
+        profile=known,
+        sd=told.get("sd"),
+        minimal_change=told.get("minimal_change"),
+    )
+
+
+def _checks(content: Mapping[str, Any]) -> tuple[Check, ...]:
+    return tuple(structured(c, Check) for c in content["qc"])

@@ -1,0 +1,25 @@
+"""A visit with everything that was computed of it, and its folder of files.
+
+`pipeline.run_visit` makes a `Visit` from videos, `load_visit` reads it from its folder, and `schemas.load_visit` from
+the tables. Report, overlay, exports and web pages take a `Visit` and compute nothing themselves.
+"""
+
+from .files import FIT, METRICS, OVERLAY, REPORT, SESSION, load_visit, save_beside, save_visit, visit_of_fits
+from .types import Held, Recording, Solution, Visit, stage_checks
+
+__all__ = [
+    "FIT",
+    "METRICS",
+    "OVERLAY",
+    "REPORT",
+    "SESSION",
+    "Held",
+    "Recording",
+    "Solution",
+    "Visit",
+    "load_visit",
+    "save_beside",
+    "save_visit",
+    "stage_checks",
+    "visit_of_fits",
+]

@@ -1,0 +1,350 @@
+"""How a visit lies in a folder: the one place that knows its files (docs/files.md)."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.body import SCALE_NAMES, MarkerSet
+from pbl_pipeline.bounded import read_json
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import load_npz
+from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.fit.angles_file import write_angles_csv
+from pbl_pipeline.gait import GaitEvent, TrialMetrics, load_events
+from pbl_pipeline.gait.curves_file import Curves, load_curves, save_curves
+from pbl_pipeline.gait.metrics_file import metrics_of
+from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.names import distinct
+from pbl_pipeline.paramset import structured
+from pbl_pipeline.qc import WARN, Check
+from pbl_pipeline.tracking import SubjectChoice
+from pbl_pipeline.video import VideoInfo
+
+from .types import Held, Recording, Solution, Visit
+
+#: Files of a visit. `overlay.mp4` and `report.html` are drawn by `pipeline.write_results`.
+SESSION, METRICS, REPORT = "session.json", "metrics.json", "report.html"
+#: Files of a recording, after its name and a dot.
+KEYPOINTS, FIT, ANGLES, EVENTS, CYCLES, OVERLAY = (
+    "keypoints.npz",
+    "fit.npz",
+    "angles.csv",
+    "events.csv",
+    "cycles.npz",
+    "overlay.mp4",
+)
+_AGAIN = "`pbl run` again"
+
+
+def save_visit(visit: Visit, folder: Path) -> list[Path]:
+    """Write the visit into a folder and return the paths (docs/files.md).
+
+    For each fitted recording `<name>.keypoints.npz`, `.fit.npz`, `.angles.csv`, `.events.csv`, `.cycles.npz`; for
+    the visit `metrics.json` and, last, `session.json`.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for recording in visit.fitted:
+        paths += _save_recording(recording, folder)
+    if visit.measures is not None:
+        visit.measures.save(folder / METRICS)
+        paths.append(folder / METRICS)
+    (folder / SESSION).write_text(json.dumps(_session(visit), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    return [*paths, folder / SESSION]
+
+
+def _session(visit: Visit) -> dict[str, Any]:
+    """Return the content of session.json."""
+    fits = {r.name: r.fit for r in visit.fitted if r.fit is not None}
+    content: dict[str, Any] = {
+        "trials": list(fits),
+        "orientation_source": {n: f.orientation_source for n, f in fits.items()},
+        "phone_clock_offset_s": {n: _known(f.phone_clock_offset_s) for n, f in fits.items()},
+        "height_m": next((_known(f.height_m) for f in fits.values()), None),
+    }
+    if visit.solution is not None:
+        s = visit.solution
+        content |= {
+            "solver": s.solver,
+            "params_hash": s.params_hash,
+            "iterations": int(s.iterations),
+            "converged": None if s.converged is None else bool(s.converged),
+            "scale": dict(zip(SCALE_NAMES, (round(float(v), 5) for v in s.scale), strict=True)),
+            "loss_trace": [[int(step), round(float(loss), 5)] for step, loss in s.loss_trace],
+            "seconds": round(s.seconds, 3),
+            "compile_seconds": round(s.compile_seconds, 3),
+            "device": s.device,
+            "qc": [c.to_dict() for c in visit.fit_checks],
+            "code_version": s.software,
+        }
+    whose = {"subject": visit.subject, "label": visit.label, "date": visit.date, "kind": visit.kind}
+    return {
+        **content,
+        "visit": {**whose, "methods": dict(visit.methods), "recordings": [_facts(r) for r in visit.recordings]},
+    }
+
+
+def load_visit(folder: Path, *, measures: bool = True) -> Visit:
+    """Read the visit that `save_visit` wrote. Arrays are loaded when they are asked for; `lacks` names what is missing.
+
+    `measures`: also those of its metrics.json. Raises `PblError` FILE_MISSING without a session.json, FILE_FORMAT
+    for content that `save_visit` did not write.
+    """
+    path = folder / SESSION
+    content = _read(path)
+    with _coded(path):
+        names, told = [str(n) for n in content["trials"]], content.get("visit", {})
+        facts = {r["name"]: r for r in told.get("recordings", ())}
+        fits = [folder / f"{name}.{FIT}" for name in names]
+        visit = Visit(
+            recordings=(
+                *(_recording(fit, facts.get(n, {})) for n, fit in zip(names, fits, strict=True) if fit.is_file()),
+                *(_left_out(r) for r in facts.values() if r["name"] not in names),
+            ),
+            solution=_solution(content),
+            fit_checks=_checks(content),
+            subject=str(told.get("subject", "-")),
+            label=str(told.get("label", "")),
+            date=str(told.get("date", "")),
+            kind=str(told.get("kind", "single")),
+            methods={str(k): str(v) for k, v in told.get("methods", {}).items()},
+            lacks=tuple(f"no {fit.name}: {_AGAIN}" for fit in fits if not fit.is_file()),
+        )
+    return _with_stored_measures(visit, folder) if measures else visit
+
+
+def visit_of_fits(paths: Sequence[Path], *, markers: MarkerSet | None = None, measures: bool = True) -> Visit:
+    """Return the visit of these fit.npz files, loaded, with what lies beside them where it is of these fits.
+
+    Of several folders, or of some of a folder's fits, each recording has its own measures, and there are none over
+    all of them. `markers`: the lab's own table, of which the fits are. Raises as `load_visit`, and as `TrialFit.load`.
+    """
+    folders = {p.parent: None for p in paths}
+    known = {f: load_visit(f, measures=measures) for f in folders if (f / SESSION).is_file()}
+    stems = [p.name.removesuffix(".npz").removesuffix(".fit") for p in paths]
+    recordings, checks, unknown = [], [], []
+    for path, stem, name in zip(paths, stems, distinct(stems, range(1, len(stems) + 1)), strict=True):
+        fit, visit = TrialFit.load(path), known.get(path.parent)
+        own = (
+            None
+            if visit is None or visit.solution is None or visit.solution.params_hash != fit.params_hash
+            else next((r for r in visit.fitted if r.name == stem), None)
+        )
+        if own is None or visit is None:
+            unknown.append(fit.name)
+            own = _recording(path, {})
+        else:
+            checks += visit.fit_checks
+        recordings.append(dataclasses.replace(own, name=name, markers=markers, load_fit=Held(fit)))
+    if unknown:
+        checks.append(_checks_unknown(unknown))
+    whole = next(iter(known.values()), None)
+    if whole is not None and not unknown and len(folders) == 1 and stems == [r.name for r in whole.fitted]:
+        return dataclasses.replace(whole, recordings=(*recordings, *whole.left_out))
+    return Visit(tuple(recordings), fit_checks=tuple(dict.fromkeys(checks)))
+
+
+# ------------------------------------------------------------------------------------------------------------- writing
+def _save_recording(recording: Recording, folder: Path) -> list[Path]:
+    fit, points, measured = recording.fit, recording.keypoints, recording.measured
+    assert fit is not None
+    fit.save(_file(folder, recording.name, FIT))
+    write_angles_csv(fit, _file(folder, recording.name, ANGLES))
+    written = [FIT, ANGLES]
+    if points is not None:
+        points.save(_file(folder, recording.name, KEYPOINTS))
+        written.append(KEYPOINTS)
+    if measured is not None:
+        written += _save_measured(measured, folder, recording.name)
+    return [_file(folder, recording.name, end) for end in (KEYPOINTS, FIT, ANGLES, EVENTS, CYCLES) if end in written]
+
+
+def save_beside(measured: Sequence[TrialMetrics], fits: Sequence[Path], metrics: Path) -> None:
+    """Write events and cycles that belong to a metrics.json, for those of the fits that it is written beside."""
+    for trial, path in zip(measured, fits, strict=True):
+        if path.name == f"{trial.name}.{FIT}" and path.resolve().parent == metrics.resolve().parent:
+            _save_measured(trial, metrics.parent, trial.name)
+
+
+def _save_measured(measured: TrialMetrics, folder: Path, name: str) -> list[str]:
+    """Write events and cycles of a recording and return the files' endings."""
+    measured.events.save(_file(folder, name, EVENTS))
+    save_curves(measured.cycles, _file(folder, name, CYCLES))
+    return [EVENTS, CYCLES]
+
+
+def _file(folder: Path, name: str, end: str) -> Path:
+    return folder / f"{name}.{end}"
+
+
+def _facts(recording: Recording) -> dict[str, Any]:
+    """Return what session.json holds of a recording: facts, no arrays, and of its path the file's name alone."""
+    video, choice = recording.video, recording.choice
+    facts: dict[str, Any] = {"name": recording.name, "problem": recording.problem, "video": None, "choice": None}
+    if video is not None:
+        own = {k: v for k, v in dataclasses.asdict(video).items() if k not in ("time_s", "path")}
+        facts["video"] = {**_json(own), "file": Path(video.path).name}
+    if choice is not None:
+        facts["choice"] = _json(dataclasses.asdict(choice))
+    return facts
+
+
+def _json(value: Any) -> Any:
+    """Return a value for JSON: NaN as null, tuples as lists, keys as texts."""
+    if isinstance(value, Mapping):
+        return {str(k): _json(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_json(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _known(value: float) -> float | None:
+    """Return the number for JSON; None where it is NaN."""
+    return round(float(value), 4) if math.isfinite(value) else None
+
+
+# ------------------------------------------------------------------------------------------------------------- reading
+@contextlib.contextmanager
+def _coded(path: Path) -> Iterator[None]:
+    """Turn what reading a file of a visit raises into a `PblError` FILE_FORMAT."""
+    try:
+        yield
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise PblError(
+            "FILE_FORMAT",
+            found=f"{type(error).__name__}: {error}",
+            expected=f"the {path.name} that `pbl run` or `pbl fit` wrote with the files beside it",
+            next_step=f"{_AGAIN}; or move the file away: then what it holds is not known",
+            key=str(path),
+        ) from error
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise PblError(
+            "FILE_MISSING",
+            found=f"no {path.name}",
+            expected="the files of `pbl run` as it wrote them",
+            next_step=_AGAIN,
+            key=str(path),
+        )
+    with _coded(path):
+        content = read_json(path)
+        if not isinstance(content, dict):
+            raise TypeError("not a JSON object")
+        return content
+
+
+def _recording(fit: Path, facts: Mapping[str, Any]) -> Recording:
+    """Return a fitted recording from its files; `facts`: what session.json holds of it."""
+    name = fit.name.removesuffix(".npz").removesuffix(".fit")
+    points = fit.with_name(f"{name}.{KEYPOINTS}")
+    video, choice = facts.get("video"), facts.get("choice")
+    return Recording(
+        name,
+        video=None if video is None else _video(video, points),
+        choice=None if choice is None else _choice(choice),
+        load_keypoints=functools.partial(_keypoints_of, points, fit),
+        load_fit=functools.partial(TrialFit.load, fit),
+    )
+
+
+def _left_out(facts: Mapping[str, Any]) -> Recording:
+    choice = facts["choice"]
+    return Recording(
+        str(facts["name"]),
+        choice=None if choice is None else _choice(choice),
+        problem=str(facts["problem"]),
+    )
+
+
+def _video(facts: Mapping[str, Any], points: Path) -> VideoInfo:
+    """Return the facts of a video; its time stamps are those of the keypoints, NaN where these are gone."""
+    own = dict(facts)
+    file, n = str(own.pop("file")), int(own["n_frames"])
+    time = load_npz(points, ["time_s"])["time_s"] if points.is_file() else np.full(n, np.nan)
+    fps, length = (math.nan if own[k] is None else float(own[k]) for k in ("fps", "duration_s"))
+    return VideoInfo(
+        **{**own, "path": file, "time_s": time, "fps": fps, "duration_s": length, "notes": tuple(own["notes"])}
+    )
+
+
+def _choice(facts: Mapping[str, Any]) -> SubjectChoice:
+    unknown = {k: math.nan if facts[k] is None else float(facts[k]) for k in ("score", "runner_up_score")}
+    scores = {int(k): math.nan if v is None else float(v) for k, v in facts["scores"].items()}
+    return SubjectChoice(**{**facts, **unknown, "scores": scores})
+
+
+def _keypoints_of(path: Path, fit_path: Path) -> Keypoints | None:
+    """Return the keypoints of a fit; None where there is no such file or it is of another recording."""
+    if not path.is_file():
+        return None
+    found, fit = Keypoints.load(path), TrialFit.load(fit_path)
+    same = np.shape(found.time_s) == np.shape(fit.time_s) and np.allclose(found.time_s, fit.time_s, atol=1e-3)
+    return found if same else None
+
+
+def _solution(content: Mapping[str, Any]) -> Solution:
+    return Solution(
+        solver=str(content["solver"]),
+        params_hash=str(content["params_hash"]),
+        iterations=int(content["iterations"]),
+        converged=None if content["converged"] is None else bool(content["converged"]),
+        scale=np.array([float(content["scale"][n]) for n in SCALE_NAMES]),
+        loss_trace=np.array(content["loss_trace"], float).reshape(-1, 2),
+        seconds=float(content["seconds"]),
+        compile_seconds=float(content["compile_seconds"]),
+        device=str(content["device"]),
+        software=str(content.get("code_version", "")),
+    )
+
+
+def _checks(content: Mapping[str, Any]) -> tuple[Check, ...]:
+    checks = tuple(structured(c, Check) for c in content["qc"])
+    if not all(v is None or math.isfinite(v) for c in checks for v in (c.value, c.threshold)):
+        raise ValueError("a check whose value is not finite")
+    return checks
+
+
+def _checks_unknown(names: Sequence[str]) -> Check:
+    advice = (
+        f"no session.json of {', '.join(names)} lies beside the fit: whether the body lies on the person is not known; "
+        "look at what `pbl fit` printed"
+    )
+    return Check("fit_checks_known", WARN, float(len(names)), 0.0, advice)
+
+
+def _with_stored_measures(visit: Visit, folder: Path) -> Visit:
+    """Return the visit with the measures of its metrics.json, and with what is missing of them in `lacks`."""
+    path, lacks = folder / METRICS, list(visit.lacks)
+    again = f"`pbl gait *.fit.npz --out {METRICS}` in its folder writes it"
+    if not path.is_file():
+        return dataclasses.replace(visit, lacks=(*lacks, f"no {METRICS}: {again}"))
+    events: dict[str, Sequence[GaitEvent]] = {}
+    curves: dict[str, Mapping[int, Curves]] = {}
+    for recording in visit.fitted:
+        for end in (EVENTS, CYCLES):
+            file = _file(folder, recording.name, end)
+            if not file.is_file():
+                lacks.append(f"no {file.name}: {again}")
+            elif end == EVENTS:
+                events[recording.name] = load_events(file)
+            else:
+                curves[recording.name] = load_curves(file)
+    content = _read(path)
+    with _coded(path):
+        measures = metrics_of(content, events, curves)
+        by_name = {t.name: t for t in measures.trials}
+        if not set(by_name) >= {r.name for r in visit.fitted}:
+            raise ValueError(f"measures of {', '.join(by_name) or 'no trial'}")
+    measures = dataclasses.replace(measures, trials=tuple(by_name[r.name] for r in visit.fitted))
+    return dataclasses.replace(visit.with_measures(measures), lacks=tuple(lacks))

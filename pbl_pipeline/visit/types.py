@@ -1,0 +1,249 @@
+"""A visit and its recordings: what the chain computes and every consumer reads."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from pbl_pipeline.body import MarkerSet
+from pbl_pipeline.code_version import code_version
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import SessionFit, TrialFit
+from pbl_pipeline.gait import GaitMetrics, TrialMetrics
+from pbl_pipeline.keypoints import Keypoints, check_keypoints, log_shift_s
+from pbl_pipeline.qc import WARN, Check
+from pbl_pipeline.tracking import SubjectChoice
+from pbl_pipeline.video import PhoneLog, VideoInfo, check_timing, read_phone_log
+
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class Held(Generic[T]):
+    """A value where a `Recording` wants a function that loads it."""
+
+    value: T
+
+    def __call__(self) -> T:
+        return self.value
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """One recording of a visit. What a stage did not produce is None, and `problem` says why there is no fit.
+
+    Parameters
+    ----------
+    name
+        Of its files: the video's name without its ending, distinct within the visit.
+    path
+        The video; None where it is not known (results alone, markers of a laboratory).
+    video, choice
+        Facts of the video; the choice of the person who is measured.
+    measured
+        Events, cycles, measures and index.
+    problem
+        Why there is no fit, in a sentence; empty where there is one.
+    shown
+        The recording whose pictures may be shown: `path`, or a copy with hidden heads.
+    markers
+        The marker table of the fit, where the lab has its own.
+    number
+        In the tables the `video_id`.
+    load_keypoints, load_fit, load_log
+        Load the arrays when they are asked for; None where there are none.
+    """
+
+    name: str
+    path: Path | None = None
+    video: VideoInfo | None = None
+    choice: SubjectChoice | None = None
+    measured: TrialMetrics | None = None
+    problem: str = ""
+    shown: Path | None = None
+    markers: MarkerSet | None = None
+    number: int | None = None
+    load_keypoints: Callable[[], Keypoints | None] | None = None
+    load_fit: Callable[[], TrialFit] | None = None
+    load_log: Callable[[], tuple[PhoneLog, float] | None] | None = None
+
+    @classmethod
+    def of(cls, name: str, fit: TrialFit | None = None, keypoints: Keypoints | None = None, **fields: Any) -> Recording:
+        """Return a recording whose arrays are in memory."""
+        held = None if fit is None else Held(fit)
+        return cls(name, load_fit=held, load_keypoints=None if keypoints is None else Held(keypoints), **fields)
+
+    @property
+    def fitted(self) -> bool:
+        """Whether a body was fitted."""
+        return self.load_fit is not None
+
+    @functools.cached_property
+    def fit(self) -> TrialFit | None:
+        """The fitted movement. Raises `PblError` FILE_MISSING, FILE_FORMAT for a file that cannot be read."""
+        return None if self.load_fit is None else self.load_fit()
+
+    @functools.cached_property
+    def keypoints(self) -> Keypoints | None:
+        """What the body was fitted to; None for markers of a laboratory. Raises as `fit`."""
+        return None if self.load_keypoints is None else self.load_keypoints()
+
+    @functools.cached_property
+    def log(self) -> tuple[PhoneLog, float] | None:
+        """The phone's sensor log and what added to its times gives the video's (s). Raises `PblError` PHONE_LOG."""
+        return None if self.load_log is None else self.load_log()
+
+    @property
+    def checks(self) -> tuple[Check, ...]:
+        """Checks of the video's time stamps and of the keypoints."""
+        timing = () if self.video is None else check_timing(self.video)
+        return (*timing, *(() if self.keypoints is None else check_keypoints(self.keypoints)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Solution:
+    """How the body of a visit was fitted, without the fitted movements. `software`: version and commit of the code.
+
+    scale (8,): multipliers of `body.SCALE_NAMES`; loss_trace (K, 2): step, loss; converged None: not recorded.
+    """
+
+    solver: str
+    params_hash: str
+    iterations: int
+    converged: bool | None
+    scale: np.ndarray
+    loss_trace: np.ndarray
+    seconds: float
+    compile_seconds: float
+    device: str
+    software: str = ""
+
+    @classmethod
+    def of(cls, fit: SessionFit, software: str = "") -> Solution:
+        """Return what a session fit says of itself."""
+        own = [f.name for f in dataclasses.fields(cls) if f.name != "software"]
+        return cls(**{name: getattr(fit, name) for name in own}, software=software or code_version())
+
+
+@dataclasses.dataclass(frozen=True)
+class Visit:
+    """A visit: whose, when, by which methods, and what was computed.
+
+    Parameters
+    ----------
+    recordings
+        In the order of the fit, those without a fit after them.
+    solution, fit_checks, measures
+        How the body was fitted and how well; None where the chain ended before. The trials of `measures` are the fitted
+        recordings in their order.
+    subject, label, date
+        Code of the person (never a name), label and day of the visit (YYYY-MM-DD, empty where unknown).
+    kind
+        "single" (recordings of one camera), "rig" (several cameras) or "markers" (a laboratory's).
+    methods
+        Name of a stage to the method that computed it, in words.
+    lacks
+        What its files lack, in sentences: those of an older version, or of a run that was ended.
+    key
+        In the tables the primary key of its result.
+    """
+
+    recordings: tuple[Recording, ...]
+    solution: Solution | None = None
+    fit_checks: tuple[Check, ...] = ()
+    measures: GaitMetrics | None = None
+    subject: str = "-"
+    label: str = ""
+    date: str = ""
+    kind: str = "single"
+    methods: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    lacks: tuple[str, ...] = ()
+    key: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def fitted(self) -> tuple[Recording, ...]:
+        """The recordings with a fit, in its order."""
+        return tuple(r for r in self.recordings if r.fitted)
+
+    @property
+    def left_out(self) -> tuple[Recording, ...]:
+        """The recordings without a fit."""
+        return tuple(r for r in self.recordings if not r.fitted)
+
+    @property
+    def checks(self) -> tuple[Check, ...]:
+        """Checks before the gait measures: of each recording, of those left out, of the fit."""
+        if self.measures is not None and self.measures.before:
+            return self.measures.before
+        return (*stage_checks(self.recordings), *self.fit_checks)
+
+    @property
+    def title(self) -> str:
+        """Subject and label, as a list shows them."""
+        return " ".join(t for t in (self.subject if self.subject != "-" else "", self.label or self.date) if t)
+
+    def recording(self, name: str) -> Recording:
+        """Return the recording of that name. Raises KeyError."""
+        found = next((r for r in self.recordings if r.name == name), None)
+        if found is None:
+            raise KeyError(name)
+        return found
+
+    def with_measures(self, measures: GaitMetrics) -> Visit:
+        """Return the visit with these measures, judged by all of its checks.
+
+        Raises `PblError` FILE_FORMAT where they are not of the fitted recordings in their order.
+        """
+        fitted = [r.name for r in self.fitted]
+        if [t.name for t in measures.trials] != fitted:
+            raise PblError(
+                "FILE_FORMAT",
+                found=f"measures of {[t.name for t in measures.trials]} for the fitted recordings {fitted}",
+                expected="the measures of the same recordings in the same order",
+                next_step="compute the measures from these fits",
+                key=self.title,
+            )
+        of_trial = iter(measures.trials)
+        recordings = tuple(dataclasses.replace(r, measured=next(of_trial)) if r.fitted else r for r in self.recordings)
+        judged = measures if measures.before else measures.with_checks(self.checks)
+        return dataclasses.replace(self, recordings=recordings, measures=judged)
+
+    def with_logs(self, logs: Sequence[Path]) -> Visit:
+        """Return the visit with a sensor log of the phone for each fitted recording, in their order, or with none.
+
+        Raises `PblError` USAGE for another number of logs.
+        """
+        if not logs:
+            return self
+        if len(logs) != len(self.fitted):
+            raise PblError(
+                "USAGE",
+                found=f"{len(logs)} times --attitude for {len(self.fitted)} fits",
+                expected="none, or one for each fit, in the same order",
+                next_step="name a log for each fit",
+            )
+        of_fit = iter(logs)
+        recordings = tuple(
+            dataclasses.replace(r, load_log=functools.partial(_log_of, next(of_fit), r)) if r.fitted else r
+            for r in self.recordings
+        )
+        return dataclasses.replace(self, recordings=recordings)
+
+
+def stage_checks(recordings: Sequence[Recording]) -> tuple[Check, ...]:
+    """Return the checks of each fitted recording, with its name where there are several, and of those left out."""
+    fitted = [r for r in recordings if r.fitted]
+    named = [(f" ({r.name})" if len(fitted) > 1 else "", c) for r in fitted for c in r.checks]
+    found = [dataclasses.replace(c, check=c.check + name) for name, c in named]
+    missing = (r for r in recordings if not r.fitted and r.problem)
+    return (*found, *(Check(f"trial {r.name}", WARN, None, None, f"left out: {r.problem}") for r in missing))
+
+
+def _log_of(path: Path, recording: Recording) -> tuple[PhoneLog, float]:
+    log = read_phone_log(path)
+    return log, log_shift_s(log, recording.keypoints, str(path))
