@@ -1,4 +1,4 @@
-"""The report page: what stands in it, that it is whole and asks for nothing, and pages of sessions that went wrong."""
+"""The report page: what stands in it, that it is whole and asks for nothing, and pages of visits that went wrong."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import pbl_pipeline
 from pbl_pipeline.body import load_body
 from pbl_pipeline.charts import cycle_chart, mean_curve, nice_ticks
-from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit, TrialFit
 from pbl_pipeline.gait import GaitMetrics, gait_metrics, load_norm
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, PASS, WARN, Check
-from pbl_pipeline.report import Picture, SessionReport, TrialReport, write_report
+from pbl_pipeline.report import Picture, write_report
 from pbl_pipeline.report._words import check_name, plural, sentence, size
 from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.video import VideoInfo
+from pbl_pipeline.visit import Recording, Solution, Visit
 from pbl_pipeline.words import number, significant
 from tests.walking_fit import walking_fit
 
@@ -95,10 +96,30 @@ def _video(name: str = "walk.mp4") -> VideoInfo:
 CHOICE = SubjectChoice("CHOSEN", 2, 0.9, 1, 0.2, {1: 0.2, 2: 0.9}, "person 2 walks through the picture")
 
 
-def _session(*fits: TrialFit, qc: tuple[Check, ...] = (Check("residual_3d_cm", PASS, 3.1, 6.0),)) -> SessionFit:
-    f = fits[0]
-    trace = np.array([[0.0, 99.0], [100.0, 9.0]])
-    return SessionFit(fits, f.scale, f.site_offset_m, trace, 7, True, f.solver, f.params_hash, 31.2, 12.0, "cpu", qc)
+FIT_CHECKS = (Check("residual_3d_cm", PASS, 3.1, 6.0),)
+PICTURES = {"walk": tuple(Picture(i, i / FPS, np.full((90, 120, 3), i, np.uint8)) for i in (30, 90, 150))}
+
+
+def _visit(*recordings: Recording, measures: GaitMetrics | None = None) -> Visit:
+    """A visit of these recordings, fitted where one of them is."""
+    fits = tuple(r.fit for r in recordings if r.fit is not None)
+    solution = None
+    if fits:
+        f, trace = fits[0], np.array([[0.0, 99.0], [100.0, 9.0]])
+        solution = Solution.of(
+            SessionFit(
+                fits, f.scale, f.site_offset_m, trace, 7, True, f.solver, f.params_hash, 31.2, 12.0, "cpu", FIT_CHECKS
+            )
+        )
+    visit = Visit(
+        recordings,
+        solution,
+        FIT_CHECKS if fits else (),
+        subject="S-014",
+        date="2026-11-20",
+        methods={"Keypoints": "blazepose-v2"},
+    )
+    return visit if measures is None else visit.with_measures(measures)
 
 
 @pytest.fixture(scope="module")
@@ -119,28 +140,22 @@ def measured(walk: TrialFit) -> GaitMetrics:
 
 
 @pytest.fixture(scope="module")
-def report(walk: TrialFit, measured: GaitMetrics) -> SessionReport:
-    pictures = tuple(Picture(i, i / FPS, np.full((90, 120, 3), i, np.uint8)) for i in (30, 90, 150))
-    trial = TrialReport("walk", _video(), CHOICE, walk, None, pictures)
-    return SessionReport(
-        title="Visit 1",
-        subject_code="S-014",
-        date="2026-11-20",
-        trials=(trial,),
-        metrics=measured,
-        session=_session(walk),
-        origin={"Software": {"Version": "0.1.0"}},
-    )
+def visit(walk: TrialFit, measured: GaitMetrics) -> Visit:
+    return _visit(Recording.of("walk", walk, video=_video(), choice=CHOICE), measures=measured)
 
 
-def _page(report: SessionReport, folder: Path) -> Page:
-    page = Page(write_report(folder / "report.html", report).read_text(encoding="utf-8"))
+def _written(visit: Visit, path: Path, title: str = "Visit 1") -> Path:
+    return write_report(path, visit, PICTURES, title)
+
+
+def _page(visit: Visit, folder: Path) -> Page:
+    page = Page(_written(visit, folder / "report.html").read_text(encoding="utf-8"))
     assert page.problems == []
     return page
 
 
-def test_page_is_whole_and_asks_for_nothing(report: SessionReport, tmp_path: Path) -> None:
-    path = write_report(tmp_path / "new" / "report.html", report)
+def test_page_is_whole_and_asks_for_nothing(visit: Visit, tmp_path: Path) -> None:
+    path = _written(visit, tmp_path / "new" / "report.html")
     text = path.read_text(encoding="utf-8")
     page = Page(text)
     assert page.problems == []
@@ -158,8 +173,8 @@ def test_page_is_whole_and_asks_for_nothing(report: SessionReport, tmp_path: Pat
     assert [p.name for p in path.parent.iterdir()] == ["report.html"]
 
 
-def test_page_shows_the_measures(report: SessionReport, measured: GaitMetrics, tmp_path: Path) -> None:
-    page = _page(report, tmp_path)
+def test_page_shows_the_measures(visit: Visit, measured: GaitMetrics, tmp_path: Path) -> None:
+    page = _page(visit, tmp_path)
     values = measured.spatiotemporal
     cadence, stride, stance = (values[k] for k in ("cadence_steps_per_min", "stride_time_s", "stance_percent"))
     assert cadence is not None
@@ -187,7 +202,8 @@ def test_page_shows_the_measures(report: SessionReport, measured: GaitMetrics, t
         "walk.mp4",
         "Acme Phone 9",
         measured.params_hash,
-        "Version 0.1.0",
+        f"pbl-pipeline {pbl_pipeline.__version__}",
+        "Keypoints blazepose-v2",
         "not the original",
         "Kalman smoother",
     ):
@@ -195,8 +211,8 @@ def test_page_shows_the_measures(report: SessionReport, measured: GaitMetrics, t
     assert "/somewhere/secret" not in page.text  # a file's name is provenance, a folder of the laboratory is not
 
 
-def test_gdi_is_always_named_with_its_three_angles(report: SessionReport, tmp_path: Path) -> None:
-    text = _page(report, tmp_path).text
+def test_gdi_is_always_named_with_its_three_angles(visit: Visit, tmp_path: Path) -> None:
+    text = _page(visit, tmp_path).text
     matches = list(re.finditer(r"\bGDI\b", text))
     assert matches
     for match in matches:
@@ -205,8 +221,8 @@ def test_gdi_is_always_named_with_its_three_angles(report: SessionReport, tmp_pa
         assert follows.startswith((" of three angles", " cycles", " explained", "_Calc", " with 100")), follows
 
 
-def test_charts_and_pictures_have_words(report: SessionReport, tmp_path: Path) -> None:
-    page = _page(report, tmp_path)
+def test_charts_and_pictures_have_words(visit: Visit, tmp_path: Path) -> None:
+    page = _page(visit, tmp_path)
     labels = [a.get("aria-label") or "" for a in page.all("svg") if a.get("role") == "img"]
     # 9 angles over the cycle, the index, the contacts, 5 angles over time
     assert len(labels) == 9 + 1 + 1 + 5
@@ -218,23 +234,21 @@ def test_charts_and_pictures_have_words(report: SessionReport, tmp_path: Path) -
     assert all(a.get("scope") in ("col", "row") for a in page.all("th"))
 
 
-def test_names_are_escaped_everywhere(report: SessionReport, walk: TrialFit, tmp_path: Path) -> None:
+def test_names_are_escaped_everywhere(visit: Visit, walk: TrialFit, tmp_path: Path) -> None:
     fit = dataclasses.replace(walk, name=EVIL, camera=dataclasses.replace(walk.camera, source=EVIL))
     choice = dataclasses.replace(CHOICE, reason=EVIL)
     video = dataclasses.replace(_video(EVIL.replace("/", "")), model=EVIL, recorded_utc=EVIL)
-    trial = dataclasses.replace(report.trials[0], name=EVIL, fit=fit, choice=choice, video=video, problem=EVIL)
+    recording = Recording.of(EVIL, fit, choice=choice, video=video, problem=EVIL)
+    whole = _visit(recording, measures=gait_metrics([fit]).with_checks([Check(EVIL, WARN, None, None, EVIL)]))
+    assert whole.solution is not None
     evil = dataclasses.replace(
-        report,
-        title=EVIL,
-        subject_code=EVIL,
+        whole,
+        subject=EVIL,
         date=EVIL,
-        trials=(trial,),
-        metrics=gait_metrics([fit]),
-        session=dataclasses.replace(_session(fit), solver=EVIL, device=EVIL),
-        checks=(Check(EVIL, WARN, None, None, EVIL),),
-        origin={EVIL: {EVIL: EVIL}},
+        solution=dataclasses.replace(whole.solution, solver=EVIL, device=EVIL),
+        methods={EVIL: EVIL},
     )
-    path = write_report(tmp_path / "report.html", evil)
+    path = _written(evil, tmp_path / "report.html", EVIL)
     text = path.read_text(encoding="utf-8")
     page = Page(text)
     assert page.problems == []
@@ -247,23 +261,21 @@ def _verdict(page: Page) -> str:
     return (verdict.get("class") or "").split()[-1]
 
 
-def test_verdict_is_the_worst_check(report: SessionReport, tmp_path: Path) -> None:
-    page = _page(report, tmp_path)
+def test_verdict_is_the_worst_check(visit: Visit, tmp_path: Path) -> None:
+    page = _page(visit, tmp_path)
     assert _verdict(page) == WARN
     assert "Usable with care" in page.text
-    bad = dataclasses.replace(report, checks=(Check("residual_2d_px", FAIL, 99.0, 9.0, "look at the overlay"),))
-    page = _page(bad, tmp_path)
+    seen = Check("residual_2d_px", FAIL, 99.0, 9.0, "look at the overlay")
+    assert visit.measures is not None
+    page = _page(visit.with_measures(visit.measures.with_checks([*visit.checks, seen])), tmp_path)
     assert _verdict(page) == FAIL
     assert "Residual 2D (px): look at the overlay." in page.text
 
 
-def test_session_without_gait_says_so_and_draws_the_angles(
-    report: SessionReport, stand: TrialFit, tmp_path: Path
-) -> None:
+def test_session_without_gait_says_so_and_draws_the_angles(stand: TrialFit, tmp_path: Path) -> None:
     metrics = gait_metrics([stand])
     assert metrics.status == EMPTY
-    trial = TrialReport("stand", _video(), CHOICE, stand)
-    page = _page(dataclasses.replace(report, trials=(trial,), metrics=metrics, session=_session(stand)), tmp_path)
+    page = _page(_visit(Recording.of("stand", stand, video=_video(), choice=CHOICE), measures=metrics), tmp_path)
     assert _verdict(page) == EMPTY
     assert "No gait to measure" in page.text
     assert sentence(metrics.trials[0].reason) in page.text
@@ -274,49 +286,41 @@ def test_session_without_gait_says_so_and_draws_the_angles(
 
 
 def test_one_recording_without_gait_does_not_empty_the_session(
-    report: SessionReport, walk: TrialFit, stand: TrialFit, tmp_path: Path
+    visit: Visit, walk: TrialFit, stand: TrialFit, tmp_path: Path
 ) -> None:
     metrics = gait_metrics([walk, stand])
-    trials = (report.trials[0], TrialReport("stand", _video("stand.mp4"), CHOICE, stand))
-    page = _page(dataclasses.replace(report, trials=trials, metrics=metrics, session=_session(walk, stand)), tmp_path)
+    standing = Recording.of("stand", stand, video=_video("stand.mp4"), choice=CHOICE)
+    page = _page(_visit(visit.recordings[0], standing, measures=metrics), tmp_path)
     assert _verdict(page) == WARN
     assert "steps/min" in page.text
     assert "No gait measures: " + metrics.trials[1].reason in page.text
 
 
-def test_session_that_waits_for_a_choice(report: SessionReport, tmp_path: Path) -> None:
+def test_session_that_waits_for_a_choice(tmp_path: Path) -> None:
     choice = SubjectChoice("NEEDS_CHOICE", None, 0.5, 2, 0.48, {1: 0.5, 2: 0.48}, "two people walk alike")
-    waiting = dataclasses.replace(report, trials=(TrialReport("walk", _video(), choice),), metrics=None, session=None)
-    page = _page(waiting, tmp_path)
+    page = _page(_visit(Recording("walk", video=_video(), choice=choice)), tmp_path)
     assert _verdict(page) == NEEDS_CHOICE
     assert "two people walk alike" in page.text
 
 
-def test_session_whose_chain_broke(report: SessionReport, tmp_path: Path) -> None:
-    trial = TrialReport("walk", _video(), None, problem="TRACK_TOO_SHORT: in view for 0.4 s")
-    page = _page(dataclasses.replace(report, trials=(trial,), metrics=None, session=None), tmp_path)
+def test_session_whose_chain_broke(tmp_path: Path) -> None:
+    recording = Recording("walk", video=_video(), problem="TRACK_TOO_SHORT: in view for 0.4 s")
+    page = _page(_visit(recording), tmp_path)
     assert _verdict(page) == FAIL
     assert "in view for 0.4 s" in page.text
     assert "steps/min" not in page.text
 
 
-def test_fit_without_a_known_frame_is_drawn_without_curves(report: SessionReport, stand: TrialFit, tmp_path) -> None:
+def test_fit_without_a_known_frame_is_drawn_without_curves(stand: TrialFit, tmp_path: Path) -> None:
     unknown = dataclasses.replace(
         stand,
         qpos=np.full_like(stand.qpos, np.nan),
         residual_2d_px=np.full_like(stand.residual_2d_px, np.nan),
         residual_3d_m=np.full_like(stand.residual_3d_m, np.nan),
     )
-    trial = TrialReport("stand", _video(), CHOICE, unknown, problem="nobody was seen")
-    page = _page(dataclasses.replace(report, trials=(trial,), metrics=None, session=_session(unknown)), tmp_path)
+    recording = Recording.of("stand", unknown, video=_video(), choice=CHOICE, problem="nobody was seen")
+    page = _page(_visit(recording), tmp_path)
     assert "The body is fitted in no frame." in page.text
-
-
-def test_measures_of_other_fits_are_refused(report: SessionReport, stand: TrialFit, tmp_path: Path) -> None:
-    with pytest.raises(PblError) as caught:
-        write_report(tmp_path / "r.html", dataclasses.replace(report, metrics=gait_metrics([stand])))
-    assert caught.value.code == "FILE_FORMAT"
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_norm_band_is_the_norm() -> None:
