@@ -144,15 +144,16 @@ def measured(visit: Visit, gait: GaitParams | None = None, norm: str | None = No
 def write_results(out: Path, visit: Visit, title: str = "Gait report") -> list[Path]:
     """Write everything that a person or program reads of a visit into `out` and return the paths, the report first.
 
-    The files of `visit.save_visit`, `<name>.overlay.mp4` of each recording and `report.html` (docs/files.md). Where
-    PBL_DEIDENTIFY says so, overlays and pictures show the recordings with hidden heads.
+    The files of `visit.save_visit`, `<name>.overlay.mp4` of each recording whose video is known, and `report.html`
+    (docs/files.md). Where PBL_DEIDENTIFY says so, overlays and pictures show the recordings with hidden heads.
 
     Raises the `PblError`s of `render_overlay` and `deidentify.to_show`.
     """
     out.mkdir(parents=True, exist_ok=True)
     with _as_shown(visit) as shown:
-        overlays = [out / f"{r.name}.{OVERLAY}" for r in shown.fitted]
-        for recording, path in zip(shown.fitted, overlays, strict=True):
+        filmed = [r for r in shown.fitted if r.shown or r.path]
+        overlays = [out / f"{r.name}.{OVERLAY}" for r in filmed]
+        for recording, path in zip(filmed, overlays, strict=True):
             draw_overlay(recording, path)
         report = write_visit_report(out / REPORT, shown, title)
     return [report, *(p for p in overlays if p.exists()), *save_visit(visit, out)]
@@ -166,7 +167,7 @@ def draw_overlay(recording: Recording, path: Path) -> None:
     video = recording.shown or recording.path
     assert recording.fit is not None
     assert video is not None
-    events = recording.measured.events.events if recording.measured else ()
+    events = recording.events.events if recording.events else ()
     render_overlay(video, recording.fit, path, keypoints=recording.keypoints, events=events)
 
 

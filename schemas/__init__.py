@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ._activate import STAGES, activate
 
 if TYPE_CHECKING:
-    from .results import SessionResults
+    from pbl_pipeline.visit import Visit
 
 
 def computed_tables() -> list[Any]:
@@ -20,11 +20,11 @@ def computed_tables() -> list[Any]:
     return tables()
 
 
-def load_session(restriction: Any) -> SessionResults:
-    """Everything the tables hold of one session, as the library's objects: see `schemas.results.load_session`."""
-    from .results import load_session as load
+def load_visit(restriction: Any) -> Visit:
+    """Return everything that the tables hold of one visit: see `schemas.reading.load_visit`."""
+    from .reading import load_visit as load
 
     return load(restriction)
 
 
-__all__ = ["STAGES", "activate", "computed_tables", "load_session"]
+__all__ = ["STAGES", "activate", "computed_tables", "load_visit"]

@@ -11,7 +11,7 @@ from pbl_pipeline.errors import PblError
 
 from . import tracking, video
 from .method_rows import stored_key
-from .results import load_tracking
+from .reading.objects import load_tracking
 from .stored_files import file_ref, stored_file
 
 

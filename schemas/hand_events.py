@@ -14,8 +14,8 @@ from . import fit, gait, gdi, keypoints, video
 from .decide import meanwhile, record
 from .method_rows import method_row, register
 from .plan import locked
+from .reading.objects import load_trial_fit
 from .recording_page import trial_key
-from .results import load_trial_fit
 from .review import Decision
 from .rows import delete_below, utc_now
 

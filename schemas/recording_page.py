@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline.errors import PblError
 
 from . import fit, gait, keypoints, session, video
-from .results import load_keypoints, load_trial_fit
+from .reading.objects import load_keypoints, load_trial_fit
 from .video import unknown_video
 from .why import why
 

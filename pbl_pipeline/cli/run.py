@@ -99,8 +99,8 @@ def run(
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
     visit = dataclasses.replace(visit, subject=subject, label=f"computed {today}")
     paths = write_results(out, visit)
-    assert visit.measures is not None
-    click.echo(visit.measures.table())
+    if (judged := visit.judged) is not None:
+        click.echo(judged.table())
     for origin in sorted({r.keypoints.origin for r in visit.fitted if r.keypoints and r.keypoints.origin}):
         click.echo(f"keypoints by {origin}")
     for name, error in problems.items():

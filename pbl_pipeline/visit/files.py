@@ -55,8 +55,8 @@ def save_visit(visit: Visit, folder: Path) -> list[Path]:
     paths = []
     for recording in visit.fitted:
         paths += _save_recording(recording, folder)
-    if visit.measures is not None:
-        visit.measures.save(folder / METRICS)
+    if (judged := visit.judged) is not None:
+        judged.save(folder / METRICS)
         paths.append(folder / METRICS)
     (folder / SESSION).write_text(json.dumps(_session(visit), indent=2, allow_nan=False) + "\n", encoding="utf-8")
     return [*paths, folder / SESSION]

@@ -14,7 +14,7 @@ from pbl_pipeline.body import MarkerSet
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit, TrialFit
-from pbl_pipeline.gait import GaitMetrics, TrialMetrics
+from pbl_pipeline.gait import Condition, GaitCycle, GaitEvents, GaitMetrics, TrialMetrics
 from pbl_pipeline.keypoints import Keypoints, check_keypoints, log_shift_s
 from pbl_pipeline.qc import WARN, Check
 from pbl_pipeline.tracking import SubjectChoice
@@ -45,8 +45,12 @@ class Recording:
         The video; None where it is not known (results alone, markers of a laboratory).
     video, choice
         Facts of the video; the choice of the person who is measured.
+    condition
+        Activity and pace.
+    events, cycles
+        Gait events and cycles; those of `measured` where there is one.
     measured
-        Events, cycles, measures and index.
+        All of the gait: events, cycles, measures and index.
     problem
         Why there is no fit, in a sentence; empty where there is one.
     shown
@@ -63,6 +67,9 @@ class Recording:
     path: Path | None = None
     video: VideoInfo | None = None
     choice: SubjectChoice | None = None
+    condition: Condition = dataclasses.field(default_factory=Condition)
+    events: GaitEvents | None = None
+    cycles: tuple[GaitCycle, ...] = ()
     measured: TrialMetrics | None = None
     problem: str = ""
     shown: Path | None = None
@@ -77,6 +84,10 @@ class Recording:
         """Return a recording whose arrays are in memory."""
         held = None if fit is None else Held(fit)
         return cls(name, load_fit=held, load_keypoints=None if keypoints is None else Held(keypoints), **fields)
+
+    def with_measured(self, measured: TrialMetrics) -> Recording:
+        """Return the recording with its gait."""
+        return dataclasses.replace(self, events=measured.events, cycles=measured.cycles, measured=measured)
 
     @property
     def fitted(self) -> bool:
@@ -183,6 +194,13 @@ class Visit:
         return (*stage_checks(self.recordings), *self.fit_checks)
 
     @property
+    def judged(self) -> GaitMetrics | None:
+        """The measures, judged by all checks of the visit: what metrics.json, terminal and report show."""
+        if self.measures is None or self.measures.before:
+            return self.measures
+        return self.measures.with_checks(self.checks)
+
+    @property
     def title(self) -> str:
         """Subject and label, as a list shows them."""
         return " ".join(t for t in (self.subject if self.subject != "-" else "", self.label or self.date) if t)
@@ -195,7 +213,7 @@ class Visit:
         return found
 
     def with_measures(self, measures: GaitMetrics) -> Visit:
-        """Return the visit with these measures, judged by all of its checks.
+        """Return the visit with these measures.
 
         Raises `PblError` FILE_FORMAT where they are not of the fitted recordings in their order.
         """
@@ -209,9 +227,8 @@ class Visit:
                 key=self.title,
             )
         of_trial = iter(measures.trials)
-        recordings = tuple(dataclasses.replace(r, measured=next(of_trial)) if r.fitted else r for r in self.recordings)
-        judged = measures if measures.before else measures.with_checks(self.checks)
-        return dataclasses.replace(self, recordings=recordings, measures=judged)
+        recordings = tuple(r.with_measured(next(of_trial)) if r.fitted else r for r in self.recordings)
+        return dataclasses.replace(self, recordings=recordings, measures=measures)
 
     def with_logs(self, logs: Sequence[Path]) -> Visit:
         """Return the visit with a sensor log of the phone for each fitted recording, in their order, or with none.

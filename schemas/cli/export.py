@@ -12,7 +12,8 @@ from pbl_pipeline.errors import PblError
 from ._kind import kind_option
 
 if TYPE_CHECKING:
-    from pbl_pipeline.export import ExportOptions, ExportSession
+    from pbl_pipeline.export import ExportOptions
+    from pbl_pipeline.visit import Visit
 
 _EPILOG = """\b
 Example: pbl export walk1.fit.npz walk2.fit.npz --to osim --to trc --to mot --out for_opensim
@@ -99,11 +100,11 @@ def export(
         )
         return
     if files:
-        session = _of_files(files, formats, attitude, marker_set)
+        visit = _of_files(files, formats, attitude, marker_set)
     else:
         wanted = {"subject": subject, "session_label": label, "fit_method": fit_method, "fit_set_kind": fit_set_kind}
-        session = _of_tables(wanted, formats)
-    for path in write_export(session, formats, out, options):
+        visit = _of_tables(wanted, formats)
+    for path in write_export(visit, formats, out, options):
         click.echo(path)
 
 
@@ -123,19 +124,14 @@ def _of_files(
     return visit
 
 
-def _of_tables(restriction: dict[str, str | None], formats: tuple[str, ...]) -> ExportSession:
+def _of_tables(restriction: dict[str, str | None], formats: tuple[str, ...]) -> Visit:
     import schemas
-    from schemas.export import session_of_tables
+    from pbl_pipeline.export import GAIT_FORMATS
+    from schemas.reading import fitted_visit
 
     schemas.activate(methods=False)
-    return session_of_tables({k: v for k, v in restriction.items() if v is not None}, **_wanted(formats))
-
-
-def _wanted(formats: tuple[str, ...]) -> dict[str, bool]:
-    """What of a visit these formats hold."""
-    from pbl_pipeline.export import GAIT_FORMATS
-
-    return {"sensors": "c3d" in formats, "gait": bool(GAIT_FORMATS & set(formats))}
+    wanted = {k: v for k, v in restriction.items() if v is not None}
+    return fitted_visit(wanted, gait=bool(GAIT_FORMATS & set(formats)))
 
 
 def _write_many(
@@ -148,21 +144,22 @@ def _write_many(
     """Each visit into its folder; those that cannot be exported are named at the end of their line."""
     import schemas
     from pbl_pipeline import progress
-    from pbl_pipeline.export import write_export
-    from schemas.export import sessions_of_tables, visits_of_tables
+    from pbl_pipeline.export import GAIT_FORMATS, write_export
+    from schemas.reading import list_fitted, load_visits
 
     schemas.activate(methods=False)
-    visits = visits_of_tables({k: v for k, v in restriction.items() if v is not None}, slice_name)
+    visits = list_fitted({k: v for k, v in restriction.items() if v is not None}, slice_name)
+    gait = bool(GAIT_FORMATS & set(formats))
     refused = 0
     with progress.bar("export", len(visits), "visit") as update:
-        for visit, session in sessions_of_tables(visits, **_wanted(formats)):
+        for row, visit in load_visits(visits, measures=gait):
             try:
-                if isinstance(session, PblError):
-                    raise session
-                write_export(session, formats, out / visit["folder"], options)
+                if isinstance(visit, PblError):
+                    raise visit
+                write_export(visit, formats, out / row["folder"], options)
             except PblError as error:
                 refused += 1
-                click.echo(f"{visit['folder']}: {error.code}: {error.found}. Next: {error.next_step}", err=True)
+                click.echo(f"{row['folder']}: {error.code}: {error.found}. Next: {error.next_step}", err=True)
             update()
     click.echo(f"{len(visits) - refused} of {len(visits)} visits in {out}")
     if refused:

@@ -19,10 +19,10 @@ def report(subject: str, label: str | None, fit_method: str | None, fit_set_kind
     """Write report.html, overlay videos, angles and events of one visit from the tables."""
     import schemas
     from pbl_pipeline.files import check_out_folder
-    from schemas.report import write_session
+    from schemas.report import write_visit
 
     check_out_folder(out)
     schemas.activate(methods=False)
     wanted = {"subject": subject, "session_label": label, "fit_method": fit_method, "fit_set_kind": fit_set_kind}
-    for path in write_session({k: v for k, v in wanted.items() if v is not None}, out):
+    for path in write_visit({k: v for k, v in wanted.items() if v is not None}, out):
         click.echo(path)

@@ -1,0 +1,39 @@
+"""Reading the tables: visits and recordings as the library's objects."""
+
+from .objects import (
+    load_cycles,
+    load_events,
+    load_fit_checks,
+    load_keypoints,
+    load_metrics,
+    load_tracking,
+    load_trial_fit,
+)
+from .visits import (
+    find_visit,
+    fitted_visit,
+    list_fitted,
+    load_recording,
+    load_visit,
+    load_visits,
+    newest_events,
+    trial_key,
+)
+
+__all__ = [
+    "find_visit",
+    "fitted_visit",
+    "list_fitted",
+    "load_cycles",
+    "load_events",
+    "load_fit_checks",
+    "load_keypoints",
+    "load_metrics",
+    "load_recording",
+    "load_tracking",
+    "load_trial_fit",
+    "load_visit",
+    "load_visits",
+    "newest_events",
+    "trial_key",
+]

@@ -1,61 +1,130 @@
-"""Visits from the tables as `pbl_pipeline.export` takes them; nothing is computed anew."""
+"""Visits from the tables as the library's `Visit`; nothing is computed anew."""
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
 
-from . import fit, gdi, keypoints, session, video
-from . import gait as gait_tables
-from .archive import plain_name
-from .method_names import with_keys
-from .report import methods_of
-from .results import (
-    find_session,
+from .. import fit, gait, gdi, keypoints, session, tracking, video
+from ..archive import plain_name
+from ..chain import before
+from ..coded_errors import error_code, error_found
+from ..jobs import jobs_of
+from ..method_names import with_keys
+from ..rows import ReadAhead, Rows, inside, row_of, stored_rows
+from ..slices import chain_of
+from ..stored_files import file_ref, stored_file
+from ..usable import unusable
+from .objects import (
+    load_choice,
+    load_cycles,
+    load_events,
     load_fit_checks,
     load_keypoints,
     load_metrics,
-    load_session,
+    load_solution,
     load_trial_fit,
-    not_finished,
-    of_markers,
     videos_of,
 )
-from .rows import ReadAhead, Rows, inside, row_of, stored_rows
-from .slices import chain_of
-from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
-    from pbl_pipeline.export import ExportSession, ExportTrial
-    from pbl_pipeline.gait import TrialMetrics
+    from pbl_pipeline.tracking import SubjectChoice
+    from pbl_pipeline.video import PhoneLog
+    from pbl_pipeline.visit import Recording, Visit
 
 #: Visits whose rows are read together: few questions to the database, and memory that does not grow with the visits.
 _TOGETHER = 50
+#: Column -> the option of `pbl report` and `pbl export` that names it.
+_OPTIONS = {
+    "subject": "--subject",
+    "session_label": "--session",
+    "fit_set_kind": "--kind",
+    "fit_method": "--fit-method",
+}
 
 
-def session_of_tables(restriction: Any, *, sensors: bool = True, gait: bool = True) -> ExportSession:
-    """The fitted trials of one session; with `sensors` the phones' logs, with `gait` events, cycles and measures.
+def find_visit(restriction: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return one session (row of Session) and the key of its current fit and measures, as far as there are any.
+
+    `restriction` and errors are those of `load_visit`. Of corrected and automatic events the corrected ones are meant,
+    unless the restriction names a `gait_method`.
+    """
+    if isinstance(restriction, Mapping):
+        restriction = with_keys(restriction)
+    found = (session.Session & restriction).to_dicts()
+    if not found:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no session for {restriction}",
+            expected="a registered session",
+            next_step="`pbl ingest` prints subject and session of each video",
+        )
+    visit = _single(found, "visits", ("subject", "session_label"))
+    current = fit.SessionFit * fit.current() * fit.FitSet.proj("fit_set_kind")
+    fits = (current & {"session_id": visit["session_id"]} & restriction).proj("fit_set_kind").to_dicts()
+    key: dict[str, Any] = {}
+    if fits:
+        key = dict(_single(fits, "fits", ("fit_set_kind", *fit.SessionFit.primary_key[::-1])))
+        measured = gait.without_uncorrected((gdi.SessionGdi & _of(fit.SessionFit, key) & restriction).keys())
+        if measured:
+            key |= _single(measured, "results", gdi.SessionGdi.primary_key)
+    return visit, key
+
+
+def load_visit(restriction: Any, *, measures: bool = True) -> Visit:
+    """Return everything that the tables hold of one visit. Arrays are loaded when they are asked for.
+
+    Parameters
+    ----------
+    restriction
+        What picks one session and, where several methods were used, one chain of methods: a dict such as
+        `{"subject": "P017", "session_label": "2026-03-01", "fit_method": "paper-2025"}`; `fit_set_kind` where it has
+        recordings of one camera, of several, or markers.
+    measures
+        Also events, cycles, measures and index.
 
     Raises
     ------
     PblError
-        DB_NOT_FOUND when the session is unknown or not fitted yet, USAGE when several match, PHONE_LOG for a stored log
-        that is not the one the keypoints were made with.
+        DB_NOT_FOUND when no session matches, USAGE when several sessions or chains match, SOLVER_UNKNOWN and
+        NORM_UNKNOWN for unknown methods.
     """
-    visit, key = find_session(restriction)
-    if not key:
-        raise not_finished(load_session(restriction), "fit")
-    return _session({**visit, **key}, stored_rows, sensors, gait)
+    found, key = find_visit(restriction)
+    rows = (video.Video & {"session_id": found["session_id"]}).to_dicts(order_by="video_id")
+    return _visit({**found, **key}, rows, stored_rows, measures)
 
 
-def visits_of_tables(restriction: Mapping[str, Any], slice_name: str | None = None) -> list[dict[str, Any]]:
-    """The fitted visits that a restriction allows, in the order of subject and session: rows with `subject`,
-    `session_label`, `folder` (subject and session as the names of a folder in a folder) and the key of the fit and its
-    measures.
+def fitted_visit(restriction: Any, *, gait: bool = True, whole: bool = False) -> Visit:
+    """Return a visit that has a fit: with its measures where `gait`, and not without them where `whole`.
+
+    Raises what `load_visit` raises, and `PblError` DB_NOT_FOUND where it is not computed yet.
+    """
+    visit = load_visit(restriction, measures=gait)
+    if visit.solution is None or (whole and visit.measures is None):
+        problems = "; ".join(f"{r.name}: {r.problem}" for r in visit.left_out if r.problem)
+        what = "fit and measures" if whole else "fit"
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no finished {what} of session {visit.label!r}. {problems}".strip(),
+            expected="a session that was populated",
+            next_step="run `pbl populate`, then `pbl status`",
+            key=f"subject {visit.subject}",
+        )
+    return visit
+
+
+def list_fitted(restriction: Mapping[str, Any], slice_name: str | None = None) -> list[dict[str, Any]]:
+    """Return the fitted visits that a restriction allows, in the order of subject and session.
+
+    Rows with `subject`, `session_label`, `folder` (subject and session as the names of a folder in a folder) and the
+    key of the fit and its measures.
 
     Parameters
     ----------
@@ -76,13 +145,13 @@ def visits_of_tables(restriction: Mapping[str, Any], slice_name: str | None = No
         chain, counted = chain_of(slice_name)
         restriction, sets = {**restriction, **chain}, fit.FitSelection & inside("fit_set", counted)
     fits = fit.SessionFit.proj("session_id") * fit.FitSet.proj("fit_set_kind") * sets.proj()
-    fits = fits * session.Session.proj("subject", "session_label") & restriction
+    fits = fits * session.Session.proj("subject", "session_label", "session_date") & restriction
     found = {
         (r["fit_set"], r["fit_method"]): r for r in fits.to_dicts(order_by="subject, session_id, fit_set, fit_method")
     }
     measured: dict[tuple, list[dict[str, Any]]] = {}
     of_sets = (gdi.SessionGdi.proj() & sets.proj() & restriction).to_dicts(order_by="KEY")
-    for row in gait_tables.without_uncorrected(of_sets):
+    for row in gait.without_uncorrected(of_sets):
         measured.setdefault((row["fit_set"], row["fit_method"]), []).append(row)
     visits = [{**row, **more} for key, row in found.items() for more in measured.get(key, [{}])]
     if not visits:
@@ -92,13 +161,10 @@ def visits_of_tables(restriction: Mapping[str, Any], slice_name: str | None = No
             expected="at least one",
             next_step="`pbl populate`; `pbl list visits` shows what is computed",
         )
+    chain_columns = ("fit_set_kind", "fit_method", "gait_method", "gdi_method", "norm")
     for one, other in itertools.pairwise(visits):
         if one["session_id"] == other["session_id"]:
-            differ = [
-                k
-                for k in ("fit_set_kind", "fit_method", "gait_method", "gdi_method", "norm")
-                if one.get(k) != other.get(k)
-            ]
+            differ = [k for k in chain_columns if one.get(k) != other.get(k)]
             raise PblError(
                 "USAGE",
                 key=f"subject {one['subject']}, session {one['session_label']}",
@@ -112,67 +178,183 @@ def visits_of_tables(restriction: Mapping[str, Any], slice_name: str | None = No
     return [{**v, "folder": name} for v, name in zip(visits, names, strict=True)]
 
 
-def sessions_of_tables(
-    visits: Sequence[Mapping[str, Any]], *, sensors: bool = True, gait: bool = True
-) -> Iterator[tuple[Mapping[str, Any], ExportSession | PblError]]:
-    """Each of `visits_of_tables` with what `session_of_tables` returns or raises. One visit is held at a time; the rows
-    of some dozen are read together."""
-    for start in range(0, len(visits), _TOGETHER):
-        some = visits[start : start + _TOGETHER]
-        videos = (fit.FitSet.Video & inside("fit_set", [v["fit_set"] for v in some])).to_arrays("video_id")
-        rows = ReadAhead(some, videos)
-        for visit in some:
+def load_visits(
+    listed: Sequence[Mapping[str, Any]], *, measures: bool = True
+) -> Iterator[tuple[Mapping[str, Any], Visit | PblError]]:
+    """Yield each row of `list_fitted` with what `load_visit` returns or raises.
+
+    One visit is held at a time; the rows of some dozen are read together.
+    """
+    for start in range(0, len(listed), _TOGETHER):
+        some = listed[start : start + _TOGETHER]
+        of_sessions: dict[int, list[dict[str, Any]]] = {}
+        videos = video.Video & inside("session_id", {int(v["session_id"]) for v in some})
+        for row in videos.to_dicts(order_by="video_id"):
+            of_sessions.setdefault(int(row["session_id"]), []).append(row)
+        rows = ReadAhead(some, [int(r["video_id"]) for of_one in of_sessions.values() for r in of_one])
+        for one in some:
             try:
-                yield visit, _session(visit, rows, sensors, gait)
+                yield one, _visit(one, of_sessions[int(one["session_id"])], rows, measures)
             except PblError as error:
-                yield visit, error
+                yield one, error
 
 
-def _session(visit: Mapping[str, Any], rows: Rows, sensors: bool, gait: bool) -> ExportSession:
-    from pbl_pipeline.export import ExportSession
+def load_recording(video_id: int) -> Recording:
+    """Return one recording with the fit that is shown of it (`trial_key`) and its newest events and cycles, also where
+    its measures are not computed yet. Raises `PblError` DB_NOT_FOUND for a number that none has."""
+    found = stored_rows(video.Video, {"video_id": video_id})
+    if not found:
+        raise video.unknown_video(video_id)
+    key = trial_key(video_id)
+    recording = _recording(found[0], key, stored_rows)
+    events = None if key is None else newest_events(key)
+    if events is None:
+        return recording
+    cycles = load_cycles(events, recording.name) if gait.GaitCycle & events else ()
+    return dataclasses.replace(recording, events=load_events(events), cycles=tuple(cycles))
 
-    of_fit = {k: visit[k] for k in fit.SessionFit.primary_key}
-    if row_of(fit.FitSet, {"fit_set": visit["fit_set"]}, rows)["fit_set_kind"] == fit.MARKERS:
-        raise of_markers(visit["subject"], visit["session_label"])
-    methods = methods_of(visit, rows)
-    version = row_of(fit.SessionFit, of_fit, rows)["fit_code_version"]
-    metrics = load_metrics(visit, rows) if gait and "norm" in visit else None
-    numbers = videos_of(of_fit, rows)
-    measured = metrics.trials if metrics is not None else (None,) * len(numbers)
-    trials = tuple(
-        _trial({**of_fit, "video_id": number}, of_trial, methods, version, sensors, rows)
-        for number, of_trial in zip(numbers, measured, strict=True)
+
+def trial_key(video_id: int) -> dict[str, Any] | None:
+    """Return the key of the fit of a recording, the last computed of its current sets; None without one."""
+    current = fit.current().proj()
+    trials = fit.SessionFit.Trial.proj() * fit.SessionFit.proj("fit_computed") * current & {"video_id": video_id}
+    rows = trials.to_dicts(order_by="fit_computed DESC", limit=1)
+    return {k: rows[0][k] for k in fit.SessionFit.Trial.primary_key} if rows else None
+
+
+def newest_events(key: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the key of the events of a fit that were computed last; None where they are not computed yet."""
+    rows = (gait.GaitEvents.proj("events_computed") & key).to_dicts(order_by="events_computed DESC")
+    return {k: rows[0][k] for k in gait.GaitEvents.primary_key} if rows else None
+
+
+def methods_of(key: Mapping[str, Any], rows: Rows = stored_rows) -> dict[str, str]:
+    """Return name and version of the method behind each stage that a key of a result names; of several cameras also
+    their names."""
+    members = rows(fit.FitSet.Video, {"fit_set": key["fit_set"]})
+    member = members[0]
+    cameras = sorted({r["rig_camera"] for m in members for r in rows(video.RigView, {"video_id": m["video_id"]})})
+    ahead = {"Tracking": member["tracking_method"], "Keypoints": member["keypoint_method"]}
+    found = {stage: method or fit.LABORATORY for stage, method in ahead.items()} | {"Fit": key["fit_method"]}
+    if cameras:
+        found = {"Cameras": ", ".join(cameras), **found}
+    if "gdi_method" in key:
+        found |= {"Gait events": key["gait_method"], "Index": f"{key['gdi_method']}, norm {key['norm']}"}
+    return found
+
+
+# ----------------------------------------------------------------------------------------------------------- one visit
+def _visit(found: Mapping[str, Any], videos: Sequence[dict[str, Any]], rows: Rows, measures: bool) -> Visit:
+    """Return a visit: row of its session with the key of its fit and measures, rows of its videos."""
+    from pbl_pipeline.visit import Visit
+
+    day = found["session_date"]
+    about = {"subject": found["subject"], "label": found["session_label"], "date": "" if day is None else str(day)}
+    fit_key = _of(fit.SessionFit, found)
+    if not fit_key:
+        return Visit(tuple(_recording(row, None, rows) for row in videos), **about)
+    # Videos of one camera, of several, and markers are fitted apart: beside a fit of one kind the others are not left
+    # out.
+    kind = row_of(fit.FitSet, {"fit_set": fit_key["fit_set"]}, rows)["fit_set_kind"]
+    views = [v for row in videos for v in rows(video.RigView, {"video_id": int(row["video_id"])})]
+    trial_of = {int(v["video_id"]): int(v["rig_trial"]) for v in views}
+    leads = {
+        n: row for row in videos if trial_of.get(n := int(row["video_id"]), n) == n and _kind_of(row, trial_of) == kind
+    }
+    fitted = videos_of(fit_key, rows)
+    recordings = [_recording(leads[n], {**fit_key, "video_id": n}, rows) for n in fitted]
+    recordings += [_recording(row, None, rows) for n, row in leads.items() if n not in fitted]
+    key = {k: found[k] for k in gdi.SessionGdi.primary_key if k in found}
+    visit = Visit(
+        tuple(recordings),
+        load_solution(fit_key, rows),
+        tuple(load_fit_checks(fit_key, rows)),
+        kind=kind,
+        methods=methods_of(key, rows),
+        key=key,
+        **about,
     )
-    return ExportSession(trials, metrics, tuple(load_fit_checks(of_fit, rows)))
+    return visit.with_measures(load_metrics(key, rows)) if measures and "norm" in key else visit
 
 
-def _trial(
-    key: Mapping[str, Any],
-    measured: TrialMetrics | None,
-    methods: dict[str, str],
-    version: str,
-    sensors: bool,
-    rows: Rows,
-) -> ExportTrial:
-    from pbl_pipeline.export import ExportTrial, log_shift_s
+def _recording(row: Mapping[str, Any], key: Mapping[str, Any] | None, rows: Rows) -> Recording:
+    """Return a recording: row of its video, and key of its fit, None where it has none."""
+    from pbl_pipeline.visit import Recording
+
+    number = int(row["video_id"])
+    of_video = {"video_id": number}
+    markers = row["camera_motion"] == video.NO_CAMERA
+    about: dict[str, Any] = {
+        "path": None if markers else Path(row["video_path"]),
+        "condition": video.condition(number, rows),
+        "number": number,
+    }
+    if probed := rows(video.VideoInfo, of_video):
+        about["video"] = video.info_of_row({**row, **probed[0]}, probed[0]["frame_time"].load())
+    if key is None:
+        choices = rows(tracking.SubjectChoice, of_video)
+        choice = load_choice(choices[0]) if len(choices) == 1 else None
+        return Recording(Path(row["video_name"]).stem, choice=choice, problem=_problem(number, choice), **about)
+    member = row_of(fit.FitSet.Video, {"fit_set": key["fit_set"], **of_video}, rows)
+    if member["keypoint_method"]:
+        points = {k: member[k] for k in keypoints.Keypoints.primary_key}
+        about["choice"] = load_choice(row_of(tracking.SubjectChoice, _of(tracking.SubjectChoice, points), rows))
+        about["load_keypoints"] = functools.partial(load_keypoints, points, rows)
+        about["load_log"] = functools.partial(_log_of, number, points, rows)
+    name = row_of(fit.SessionFit.Trial, key, rows)["trial_name"]
+    return Recording(name, load_fit=functools.partial(load_trial_fit, key, rows), **about)
+
+
+def _log_of(number: int, points: Mapping[str, Any], rows: Rows) -> tuple[PhoneLog, float] | None:
+    """Return the stored log of the phone and what added to its times gives the video's (s); None without one."""
+    from pbl_pipeline.keypoints import log_shift_s
     from pbl_pipeline.video import read_phone_log
 
-    of_video = {"video_id": key["video_id"]}
-    member = row_of(fit.FitSet.Video, {"fit_set": key["fit_set"], **of_video}, rows)
-    points = load_keypoints({k: member[k] for k in keypoints.Keypoints.primary_key}, rows)
-    fitted = load_trial_fit(key, rows)
-    log, shift = None, 0.0
-    if logs := rows(video.PhoneAttitude, of_video) if sensors else []:
-        with stored_file(video.PhoneAttitude(), file_ref(logs[0]["attitude_file"])) as path:
-            log = read_phone_log(path)
-        shift = log_shift_s(log, points, f"video {key['video_id']}")
-    return ExportTrial(
-        name=fitted.name,
-        fit=fitted,
-        keypoints=points,
-        measured=measured,
-        log=log,
-        log_shift_s=shift,
-        methods=methods,
-        fitted_with=version,
+    stored = rows(video.PhoneAttitude, {"video_id": number})
+    if not stored:
+        return None
+    with stored_file(video.PhoneAttitude(), file_ref(stored[0]["attitude_file"])) as path:
+        log = read_phone_log(path)
+    return log, log_shift_s(log, load_keypoints(points, rows), f"video {number}")
+
+
+def _kind_of(row: Mapping[str, Any], trial_of: Mapping[int, int]) -> str:
+    """Return the kind of set that a recording (row of Video) belongs to."""
+    if row["camera_motion"] == video.NO_CAMERA:
+        return fit.MARKERS
+    return fit.RIG if int(row["video_id"]) in trial_of else fit.SINGLE
+
+
+def _problem(video_id: int, choice: SubjectChoice | None) -> str:
+    """Return why a recording has no fit, in a sentence."""
+    if mark := unusable([video_id]):
+        return f"not usable: {mark[video_id].text}"
+    for table in before(fit.SessionFit):
+        for row in (jobs_of(table).errors & {"video_id": video_id}).to_dicts():
+            message = row["error_message"]
+            return f"{table.__name__}: {error_code(message)}, {error_found(message)}"
+    if choice is not None and choice.status not in tracking.CHOSEN:
+        return choice.reason
+    return "not computed yet"
+
+
+def _of(table: Any, key: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what of a key belongs to a table; empty where it lacks a part."""
+    found = {name: key[name] for name in table.primary_key if name in key}
+    return found if len(found) == len(table.primary_key) else {}
+
+
+def _single(rows: list[dict], what: str, columns: Sequence[str]) -> dict:
+    """Return the one row; `columns`: what can tell several apart, by which the error names them."""
+    if len(rows) == 1:
+        return rows[0]
+    values = {c: sorted({str(row[c]) for row in rows}) for c in columns}
+    differ = [c for c in columns if len(values[c]) > 1]
+    first = differ[0]
+    ways = [f"`{_OPTIONS[first]} {v}`" for v in values[first][:4]] if first in _OPTIONS else []
+    raise PblError(
+        "USAGE",
+        found=f"{len(rows)} {what} match: " + "; ".join(f"{c} {', '.join(values[c][:8])}" for c in differ),
+        expected="one",
+        next_step=" or ".join(["add " + ways[0], *ways[1:]]) if ways else f"name one {first} in the restriction",
     )

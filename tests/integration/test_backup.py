@@ -17,10 +17,9 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import _dump, backup, backup_files, connection, lab, video, views
+from schemas import _dump, backup, backup_files, connection, lab, load_visit, video, views
 from schemas._declare import declare_all
 from schemas.ingest import Visit, ingest
-from schemas.results import load_session
 from tests.command import pbl
 from tests.database import installation
 from tests.rows import everything, everything_but_refreshes, remove_all
@@ -88,7 +87,7 @@ def test_there_and_back(elsewhere: Any, tmp_path: Path, monkeypatch: pytest.Monk
     assert lab.Subject.fetch1("subject_height") == HEIGHT
     assert lab.Project.fetch1("project_title") == TITLE
     assert views.session_summary()["subject"].tolist() == ["P001"]
-    results = load_session({"subject": "P001"})
+    results = load_visit({"subject": "P001"})
     assert results.fitted
     assert np.isfinite(results.fitted[0].fit.qpos).any()
     kept = everything_but_refreshes()

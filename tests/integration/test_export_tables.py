@@ -15,9 +15,9 @@ import pbl_pipeline.gait
 from pbl_pipeline.body import marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit
-from schemas import export, fit, gait, gdi, session
-from schemas.export import session_of_tables
+from schemas import fit, gait, gdi, session
 from schemas.ingest import Methods, Visit, ingest
+from schemas.reading import fitted_visit, list_fitted, load_visits
 from schemas.sensors import Sensors
 from tests.command import pbl
 from tests.exported import with_markers
@@ -46,7 +46,7 @@ def test_a_visit_of_the_tables(tables: None, tmp_path: Path, monkeypatch: pytest
     for path, files in zip(paths, (Sensors(attitude=tmp_path / "log.csv"), Sensors()), strict=True):
         assert ingest([path], Visit("P001", session_label="2026-03-01"), files=[files])[0].status == "registered"
     with pytest.raises(PblError, match="no finished fit"):
-        session_of_tables({"subject": "P001"})
+        fitted_visit({"subject": "P001"})
     populate()
     monkeypatch.setattr(pbl_pipeline.gait, "detect_events", None)  # nothing is computed anew
     formats = [word for f in ("trc", "mot", "osim", "c3d", "dlc", "csv") for word in ("--to", f)]
@@ -84,7 +84,7 @@ def test_many_visits_are_each_as_alone(tables: None, tmp_path: Path, monkeypatch
         register(chain.small_video(tmp_path, f"walk{i}"), subject=subject, session_label=label)
     register(chain.small_video(tmp_path, "nobody", people="nobody"), subject="P004", session_label="1")
     populate()
-    monkeypatch.setattr(export, "_TOGETHER", 3)
+    monkeypatch.setattr(reading_visits, "_TOGETHER", 3)
     wanted = ("--to", "trc", "--to", "csv")
     done = pbl("export", "--all", *wanted, "--out", tmp_path / "all")
     assert done.code == 0, done.err
@@ -124,11 +124,11 @@ def test_many_visits_take_as_many_questions_as_one(tables: None, tmp_path: Path,
         asked.append(text)
         return query(text, *args, **options)
 
-    visits = export.visits_of_tables({})
+    listed = list_fitted({})
     monkeypatch.setattr(fit.schema.connection, "query", counted)
-    assert len([s for _, s in export.sessions_of_tables(visits) if not isinstance(s, PblError)]) == 3
+    assert len([s for _, s in load_visits(listed) if not isinstance(s, PblError)]) == 3
     three, asked[:] = len(asked), []
-    list(export.sessions_of_tables(visits[:1]))
+    list(load_visits(listed[:1]))
     assert three == len(asked) > 10
 
 

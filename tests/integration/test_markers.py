@@ -14,11 +14,10 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, fit_session
 from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.synthetic import observe_markers, plain_walk
-from schemas import fit, gait, gdi, norms, slices, video, views
+from schemas import fit, gait, gdi, load_visit, norms, slices, video, views
 from schemas.forget import forget
 from schemas.ingest import Visit, ingest
 from schemas.marker_recordings import ingest_markers
-from schemas.results import load_session
 from schemas.study_import import import_sheets
 from schemas.why import why
 from tests.command import pbl
@@ -83,19 +82,19 @@ def test_a_phone_and_a_laboratory_measure_the_same_walk(fitted: None, tmp_path: 
     current = gdi.SessionGdi & (fit.FitSelection & {"fit_current": True})
     for kind, index in (("markers", laboratory), ("single", phone)):
         assert (current & (fit.FitSet & {"fit_set_kind": kind})).to_arrays("session_gdi").tolist() == [index]
-    # What was computed is not planned again; the phone's report is of the phone, the markers have none.
+    # What was computed is not planned again; the phone's report is of the phone; that of the markers has no pictures.
     populate()
     assert len(fit.SessionFit()) == 2
-    shown = load_session({"subject": "P001", "fit_method": PHONE})
-    assert [t.name for t in shown.trials] == ["walk"]
+    shown = load_visit({"subject": "P001", "fit_method": PHONE})
+    assert [r.name for r in shown.recordings] == ["walk"]
     assert len(shown.fitted) == 1
-    of_lab = load_session({"subject": "P001", "fit_method": LAB})
-    assert [t.name for t in of_lab.trials] == ["lab"]
-    with pytest.raises(PblError, match="USAGE"):
-        _ = of_lab.fitted
+    of_lab = load_visit({"subject": "P001", "fit_method": LAB})
+    assert [(r.name, r.fitted, r.keypoints, r.video) for r in of_lab.recordings] == [("lab", True, None, None)]
     assert why(ids["none"]).verdict == "everything is computed"
     report = pbl("report", "--subject", "P001", "--fit-method", LAB, "--out", tmp_path / "out")
-    assert report.error_code == "USAGE"
+    assert report.code == 0, report.err
+    assert not (tmp_path / "out" / "lab.overlay.mp4").exists()
+    assert "Recording lab" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     with pytest.raises(PblError, match="laboratory markers"):
         norms.build_norm("both", populations=(), subjects=("P001",))
     # A study is of the one chain or of the other.

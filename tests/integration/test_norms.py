@@ -15,10 +15,9 @@ import pbl_pipeline.gait
 import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GaitMetrics
-from schemas import fit, gait, gdi, lab, norms, session, views
+from schemas import fit, gait, gdi, lab, load_visit, norms, session, views
 from schemas.cli.norm import norm as command
 from schemas.ingest import Methods, Visit, ingest
-from schemas.results import load_session
 from tests.rows import remove_all
 from workers.populate import populate
 
@@ -95,7 +94,7 @@ def _used_by_a_session(walkers: Path, expected) -> None:
 
 
 def metrics_of(restriction: dict[str, str]) -> GaitMetrics:
-    found = load_session(restriction).metrics
+    found = load_visit(restriction).measures
     assert found is not None
     return found
 

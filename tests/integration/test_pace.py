@@ -11,11 +11,10 @@ import pytest
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GDI_METHODS
 from pbl_pipeline.paramset import Paramset
-from schemas import fit, gait, gdi, norms, session, video, views
+from schemas import fit, gait, gdi, load_visit, norms, session, video, views
 from schemas.conditions import set_condition
 from schemas.ingest import Methods, Visit, ingest
 from schemas.method_rows import insert_methods
-from schemas.results import load_session
 from tests.command import pbl
 from tests.rows import register
 from workers.populate import populate
@@ -47,10 +46,10 @@ def test_only_walking_at_one_pace_is_pooled(tables: None, tmp_path: Path):
         # Every trial has its own measures all the same.
         assert len(gait.Spatiotemporal & {"measures_status": "PASS"}) == 3
         assert len(gdi.GDI & {"gdi_status": "PASS"}) == 6
-        shown = load_session({"subject": "P001", "gdi_method": plain})
-        assert shown.metrics is not None
-        assert [t.pooled for t in shown.metrics.trials] == [True, False, False]
-        assert shown.metrics.gdi.n == shown.metrics.gdi.n_left + shown.metrics.gdi.n_right == used[ids["slow"]]
+        shown = load_visit({"subject": "P001", "gdi_method": plain})
+        assert shown.measures is not None
+        assert [t.pooled for t in shown.measures.trials] == [True, False, False]
+        assert shown.measures.gdi.n == shown.measures.gdi.n_left + shown.measures.gdi.n_right == used[ids["slow"]]
         curves = views.cycle_curves({"gdi_method": plain})
         assert int(curves["n"].to_numpy().max()) <= used[ids["slow"]]
         # What is changed is computed anew, and nothing else is.
@@ -87,9 +86,9 @@ def test_a_stated_height_reaches_the_fit_and_a_corrected_one_fits_anew(tables: N
     populate()
     told = {r["subject"]: r["fit_height"] for r in (fit.SessionFit * session.Session).to_dicts()}
     assert told == {"P001": None, "P002": 1.8}
-    fitted = load_session({"subject": "P002"}).fit
+    fitted = load_visit({"subject": "P002"}).fitted
     assert fitted is not None
-    assert fitted.trials[0].height_m == 1.8
+    assert fitted[0].fit.height_m == 1.8
     refused = pbl("ingest", walk, "--subject", "P001", "--height-m", "172")
     assert (refused.code, "body height of 172 m" in refused.err) == (1, True)
     done = pbl("ingest", walk, "--subject", "P001", "--height-m", "1.72")

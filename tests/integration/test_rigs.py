@@ -16,14 +16,13 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import fit_session
 from pbl_pipeline.keypoints import Keypoints, MultiView
 from pbl_pipeline.synthetic import NO_NOISE, observe_views, plain_walk
-from schemas import fit, gait, gdi, jobs, norms, slices, validation, video, views
+from schemas import fit, gait, gdi, jobs, load_visit, norms, slices, validation, video, views
 from schemas.coded_errors import error_code
 from schemas.decide import decide_person
 from schemas.forget import forget
 from schemas.ingest import Visit, ingest
 from schemas.plan import fit_set_hash
-from schemas.report import methods_of
-from schemas.results import load_session
+from schemas.reading.visits import methods_of
 from schemas.rigs import ingest_rig
 from schemas.study_import import import_sheets
 from schemas.why import why
@@ -133,16 +132,16 @@ def test_a_phone_and_three_cameras_measure_the_same_walk(rig: pytest.MonkeyPatch
     assert trial["trial_orientation"] == "measured: calibration"
     assert (trial["trial_name"], len(fit.SessionFit.Trial())) == ("cam_01", 2)
     # The stand-in gives the phone's movement exactly, so what differs is the error of the fit of the views.
-    by_kind = {k: load_session({"subject": "P001", "fit_set_kind": k}) for k in ("single", "rig")}
+    by_kind = {k: load_visit({"subject": "P001", "fit_set_kind": k}) for k in ("single", "rig")}
     truth, seen = (s.fitted[0].fit for s in by_kind.values())
     for joint in ("knee_angle_r", "hip_flexion_l"):
         column = truth.joint_names.index(joint)
         assert np.degrees(np.nanmedian(np.abs(seen.qpos - truth.qpos)[:, column])) < 2.0, joint
     assert methods_of(by_kind["rig"].key)["Cameras"] == "cam_01, cam_02, cam_03"
     assert "Cameras" not in methods_of(by_kind["single"].key)
-    assert [[t.name for t in s.trials] for s in by_kind.values()] == [["walk"], ["cam_01"]]
+    assert [[r.name for r in s.recordings] for s in by_kind.values()] == [["walk"], ["cam_01"]]
     with pytest.raises(PblError, match="USAGE"):
-        load_session({"subject": "P001"})
+        load_visit({"subject": "P001"})
     # What was computed is not planned again.
     populate()
     assert len(fit.SessionFit()) == 2

@@ -10,7 +10,7 @@ import pytest
 import pbl_pipeline.fit
 import pbl_pipeline.video
 from pbl_pipeline.keypoints import Keypoints
-from schemas import fit, keypoints, lab, load_session, qc, video
+from schemas import fit, keypoints, lab, load_visit, qc, video
 from schemas.ingest import Visit, ingest
 from schemas.sensors import Sensors
 from schemas.stored_files import file_ref, stored_file
@@ -157,7 +157,7 @@ def test_the_lens_of_the_file_and_slow_motion(tmp_path: Path):
     assert row["focal_rel_sd"] == pytest.approx(0.03)
     assert stored_keypoints().camera.focal_rel_sd == pytest.approx(0.03)
     assert "intrinsics of the keypoints: 1 metadata" in pbl("status").out
-    found = load_session({"subject": "P001"}).trials[0].info
+    found = load_visit({"subject": "P001"}).recordings[0].video
     assert found is not None
     assert (found.focal_35mm, found.capture_fps) == (27.0, 240.0)
     # Every duration is eight times too long: nobody may take the visit's measures for good.

@@ -24,16 +24,14 @@ import schemas
 import workers.populate
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import Paramset
-from pbl_pipeline.pipeline import Session, Trial
 from pbl_pipeline.qc import Check
 from pbl_pipeline.video import Camera
-from schemas import fit, gait, gdi, keypoints, lab, qc, session, table_map, tracking, video, views
+from schemas import fit, gait, gdi, keypoints, lab, load_visit, qc, reading, session, table_map, tracking, video, views
 from schemas.choose import candidates, write_sheet
 from schemas.decide import decide_person
 from schemas.ingest import Methods, Visit, ingest
 from schemas.method_rows import resolve_method
 from schemas.plan import plan_fit_sets
-from schemas.results import load_session
 from schemas.status import pipeline_status
 from tests.command import pbl
 from tests.rows import register
@@ -50,7 +48,7 @@ def errors(run) -> dict[str, dict[str, int]]:
 
 def camera_of(number: int) -> Camera:
     """The camera that the keypoints of the session's video of this number (from 0) were computed with."""
-    found = load_session({"subject": "P001"}).trials[number].keypoints
+    found = load_visit({"subject": "P001"}).recordings[number].keypoints
     assert found is not None
     return found.camera
 
@@ -110,18 +108,19 @@ def test_a_bad_file_leaves_one_error_row_while_the_others_finish(tables: None, t
 
 def _everything_comes_back(paths: list[Path]) -> None:
     """What was stored is what the library made."""
-    results = load_session({"subject": "P001"})
-    assert [t.problem == "" for t in results.trials] == [True, True, False]
-    assert results.trials[2].problem.startswith("VideoInfo: VIDEO_NOT_A_VIDEO")
-    assert results.fit is not None
-    assert results.metrics is not None
+    results = load_visit({"subject": "P001"})
+    assert [r.problem == "" for r in results.recordings] == [True, True, False]
+    assert results.recordings[2].problem.startswith("VideoInfo: VIDEO_NOT_A_VIDEO")
+    assert results.solution is not None
+    assert results.measures is not None
     for path, trial in zip(paths, results.fitted, strict=True):
         info = pbl_pipeline.video.probe(path)
-        assert trial.info.time_s.tolist() == info.time_s.tolist()
+        assert trial.video.time_s.tolist() == info.time_s.tolist()
         for field in ("sha256", "n_frames", "width_px", "height_px", "codec", "container", "rotation_deg", "notes"):
-            assert getattr(trial.info, field) == getattr(info, field), field
+            assert getattr(trial.video, field) == getattr(info, field), field
         tracks = chain.track_people(path)
-        np.testing.assert_allclose(trial.tracking.persons[1].box_px, tracks.persons[1].box_px, rtol=1e-6)
+        tracked = reading.load_tracking({"video_id": trial.number})
+        np.testing.assert_allclose(tracked.persons[1].box_px, tracks.persons[1].box_px, rtol=1e-6)
         assert trial.choice.person_id == 1
         points = chain.detect_keypoints(path, tracks, 1, pbl_pipeline.video.guess_camera(info))
         np.testing.assert_allclose(trial.keypoints.xy_px, points.xy_px, rtol=1e-5)
@@ -135,12 +134,12 @@ def _everything_comes_back(paths: list[Path]) -> None:
         assert trial.events is not None
         assert trial.events.status == "PASS"
         assert any(c.used and c.curves for c in trial.cycles)
-    assert (results.fit.iterations, results.fit.converged) == (7, True)
+    assert (results.solution.iterations, results.solution.converged) == (7, True)
     lib = pbl_pipeline.gait
-    fresh = lib.gait_metrics(results.fit.trials)
-    assert results.metrics.params_hash == fresh.params_hash
-    assert results.metrics.gdi.mean == pytest.approx(fresh.gdi.mean, abs=1e-3)
-    stored, made = results.metrics.to_dict()["session"], fresh.to_dict()["session"]
+    fresh = lib.gait_metrics([r.fit for r in results.fitted])
+    assert results.measures.params_hash == fresh.params_hash
+    assert results.measures.gdi.mean == pytest.approx(fresh.gdi.mean, abs=1e-3)
+    stored, made = results.measures.to_dict()["session"], fresh.to_dict()["session"]
     for name in lib.MEASURES:
         assert (stored[name] is None) == (made[name] is None)
         if made[name] is not None:
@@ -175,7 +174,7 @@ def test_nobody_walks_and_nobody_there(tables: None, tmp_path: Path, monkeypatch
     assert gdi.SessionGdi.fetch1("session_reason")
     assert qc.SessionQc.fetch1("qc_outcome") == "EMPTY"
     assert len(keypoints.Keypoints()) == 1
-    found = load_session({"subject": "P001"}).metrics
+    found = load_visit({"subject": "P001"}).measures
     assert found is not None
     assert found.status == "EMPTY"
     assert not populate().did_something
@@ -224,12 +223,10 @@ def test_a_failed_fit_gives_no_measures_in_tables_and_files(
         ("Spatiotemporal", "walk1.mp4"): why,
         ("Spatiotemporal", "walk2.mp4"): why,
     }
-    found = load_session({"subject": "P001"})
-    trials = tuple(Trial(t.name, t.path, t.info, t.choice, t.keypoints) for t in found.fitted)
-    assert found.fit is not None
-    assert found.metrics is not None
-    judged = Session(trials, found.fit, found.metrics).judged
-    fresh = pbl_pipeline.gait.gait_metrics(found.fit.trials, fit_checks=found.fit.qc)
+    found = load_visit({"subject": "P001"})
+    judged = found.judged
+    assert judged is not None
+    fresh = pbl_pipeline.gait.gait_metrics([r.fit for r in found.fitted], fit_checks=found.fit_checks)
     assert judged.to_dict()["session"]["outcome"] == "FAIL"
     assert {k: v for k, v in judged.to_dict()["session"].items() if k not in ("outcome", "qc")} == {
         k: v for k, v in fresh.to_dict()["session"].items() if k not in ("outcome", "qc")
@@ -675,12 +672,12 @@ def test_several_current_sets_are_repaired(tables: None, tmp_path: Path, waits: 
     for key in list(fit.FitSelection.keys()):
         fit.FitSelection.update1({**key, "fit_current": True})
     with pytest.raises(PblError, match="USAGE"):
-        load_session({"subject": "P001"})
+        load_visit({"subject": "P001"})
     if waits:  # a third recording that is not computed yet must not leave the visit without results
         register(chain.small_video(tmp_path, "walk3"))
     assert plan_fit_sets() == []
     assert (fit.FitSet & (fit.FitSelection & {"fit_current": True})).to_arrays("fit_set_n").tolist() == [2]
-    assert len(load_session({"subject": "P001"}).fitted) == 2
+    assert len(load_visit({"subject": "P001"}).fitted) == 2
 
 
 # ------------------------------------------------------------------------------------------- errors and stuck jobs

@@ -12,11 +12,10 @@ import pytest
 
 import pbl_pipeline.gait
 from pbl_pipeline.errors import PblError
-from schemas import decide, fit, gait, gdi, hand_events, move, qc, slices, study
+from schemas import decide, fit, gait, gdi, hand_events, load_visit, move, qc, slices, study
 from schemas.export import visits_of_tables
 from schemas.forget import forget
 from schemas.recording_page import recording_about, recording_fit, trial_key
-from schemas.results import load_session
 from schemas.review import Decision
 from schemas.visit_list import Filter, visit_page
 from schemas.visit_page import visit_about
@@ -116,8 +115,8 @@ def test_corrected_events_are_a_method_of_their_own(visit: str):
     assert [r.automatic for r in about.results] == [visit, ""]
     assert about.results[0].methods[1] == "by-hand-v1"
     assert "events by hand" in browser.get("/visits/1").text
-    assert load_session({"session_id": 1}).key["gait_method"] == "by-hand-v1"
-    assert load_session({"session_id": 1, "gait_method": visit}).key["gait_method"] == visit
+    assert load_visit({"session_id": 1}).key["gait_method"] == "by-hand-v1"
+    assert load_visit({"session_id": 1, "gait_method": visit}).key["gait_method"] == visit
     assert [v["gait_method"] for v in visits_of_tables({})] == ["by-hand-v1"]
     assert browser.get("/visits/1/export?result=0").status_code == browser.get("/visits/1/export?result=1").status_code
     assert not populate().did_something

@@ -158,12 +158,12 @@ def test_a_fit_of_another_body_says_so(looked_at, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_lost_file_of_the_fit_says_so(looked_at, monkeypatch: pytest.MonkeyPatch):
-    from schemas import results
+    from schemas.reading import objects
 
     _, walk, _ = looked_at
     assert fit.SessionFit.Trial & {"video_id": walk}
     assert video.Video & {"video_id": walk}
-    monkeypatch.setattr(results, "file_ref", lambda value: {"path": "gone.npz", "store": "arrays", "size": 1})
+    monkeypatch.setattr(objects, "file_ref", lambda value: {"path": "gone.npz", "store": "arrays", "size": 1})
     answer = web.client().get(f"/recordings/{walk}/movement")
     assert answer.status_code == 409
     assert "restore the object store" in answer.text

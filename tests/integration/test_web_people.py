@@ -12,7 +12,7 @@ import pytest
 import pbl_pipeline.tracking
 from pbl_pipeline.tracking import Tracking
 from pbl_pipeline.video import VideoInfo, probe
-from schemas import results, tracking
+from schemas import reading, tracking
 from schemas.review import Decision
 from tests.integration import chain, web
 from tests.integration.chain import small_video
@@ -46,7 +46,7 @@ def test_boxes_are_those_of_the_tracking(two_alike: int):
     browser = web.client(role="reader")
     found = browser.get(f"/recordings/{two_alike}/boxes?method=0").json()
     (key,) = tracking.Tracking().keys()
-    tracked = results.load_tracking(key)
+    tracked = reading.load_tracking(key)
     assert found["size"] == list(tracked.image_size_px)
     assert len(found["time"]) == len(tracked.time_s)
     for one, person in zip(found["people"], tracked.persons, strict=True):
@@ -69,7 +69,7 @@ def test_from_a_click_on_a_person_to_the_row(chromium: Any, two_alike: int, way:
         # It lies where the tracking saw the person in the frame that is shown.
         frame, shown = int(page.locator(".boxes").get_attribute("data-frame")), box.bounding_box()
         stage = page.locator(".stage").bounding_box()
-        tracked = results.load_tracking(tracking.Tracking().keys()[0])
+        tracked = reading.load_tracking(tracking.Tracking().keys()[0])
         x0, y0, *_ = tracked.persons[1].box_px[frame] / [*tracked.image_size_px, *tracked.image_size_px]
         assert shown["x"] == pytest.approx(stage["x"] + x0 * stage["width"], abs=2)
         assert shown["y"] == pytest.approx(stage["y"] + y0 * stage["height"], abs=2)

@@ -11,11 +11,10 @@ import pytest
 import pbl_pipeline.fit
 import pbl_pipeline.keypoints
 from pbl_pipeline.errors import PblError
-from schemas import decide, fit, gdi, listing, qc, slices, study, tracking, usable, video, visit_list
+from schemas import decide, fit, gdi, listing, load_visit, qc, slices, study, tracking, usable, video, visit_list
 from schemas.ingest import Visit
 from schemas.marker_recordings import ingest_markers
 from schemas.plan import plan_fit_sets
-from schemas.results import load_session
 from schemas.review import Decision
 from schemas.rigs import ingest_rig
 from schemas.visit_list import Filter, visit_page
@@ -90,7 +89,7 @@ def test_a_marked_recording_leaves_its_visit_and_comes_back(visit: tuple[int, in
     german = browser.get("/recordings/2", headers={"accept-language": "de"}).text
     assert "der Gang wurde unterbrochen" in german
     assert "interrupted" in why(2).verdict
-    assert [t.problem for t in load_session({"session_id": 1}).trials][1].startswith("not usable: the walk was")
+    assert [r.problem for r in load_visit({"session_id": 1}).recordings][1].startswith("not usable: the walk was")
     # Back: what was computed is there at once.
     assert send(browser, 2, usable="yes").status_code == 303
     assert (state(), current()) == ("computed", [[1, 2]])

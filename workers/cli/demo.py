@@ -62,7 +62,7 @@ def _run(out: Path) -> None:
     import schemas
     from schemas import connection, embedded, views
     from schemas.ingest import Visit, ingest
-    from schemas.report import write_session
+    from schemas.report import write_visit
     from workers.cli.populate import summary
     from workers.populate import populate
 
@@ -87,7 +87,7 @@ def _run(out: Path) -> None:
         raise click.exceptions.Exit(130)
     _step(5, "result")
     here = {"subject": SUBJECT, "session_label": SESSION}
-    paths = write_session(here, out)
+    paths = write_visit(here, out)
     summary_rows = views.session_summary(here)
     click.echo(rows_text(summary_rows, views.trial_summary(here)))
     click.echo()
