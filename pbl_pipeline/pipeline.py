@@ -138,7 +138,8 @@ def measured(visit: Visit, gait: GaitParams | None = None, norm: str | None = No
     Raises what `gait_metrics` raises.
     """
     fits = [dataclasses.replace(r.fit, name=r.name) for r in visit.fitted if r.fit is not None]
-    return visit.with_measures(gait_metrics(fits, norm, gait, fit_checks=visit.fit_checks))
+    conditions = [r.condition for r in visit.fitted]
+    return visit.with_measures(gait_metrics(fits, norm, gait, fit_checks=visit.fit_checks, conditions=conditions))
 
 
 def write_results(out: Path, visit: Visit, title: str = "Gait report") -> list[Path]:

@@ -15,7 +15,7 @@ from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.extras import needed
 from pbl_pipeline.files import check_out_folder
-from pbl_pipeline.gait import GaitMetrics
+from pbl_pipeline.gait import GaitMetrics, TrialMetrics
 from pbl_pipeline.names import check_label
 from pbl_pipeline.qc import Check, failed
 from pbl_pipeline.visit import Visit
@@ -109,8 +109,8 @@ def write_export(visit: Visit, formats: Sequence[str], out: Path, options: Expor
     ------
     PblError
         USAGE, PACKAGE_MISSING, FILE_UNWRITABLE (`check_export`); EXPORT_INPUT: a fit that failed, without one pose, of
-        another body, or names that a format cannot hold; MARKER_SET_UNKNOWN: the body lacks the fit's markers. Nothing
-        is written then.
+        another body, measures whose events or cycles are missing, or names that a format cannot hold;
+        MARKER_SET_UNKNOWN: the body lacks the fit's markers. Nothing is written then.
     """
     options = options or ExportOptions()
     formats = [f for f in FORMATS if f in formats] + [f for f in formats if f not in FORMATS]
@@ -243,6 +243,8 @@ def _check_trial(trial: ExportTrial, formats: Sequence[str], body_points: bool) 
         wanted_markers(trial)
     if "c3d" in formats:
         check_frames(trial)
+    if GAIT_FORMATS & set(formats) and trial.measured is not None:
+        _check_gait(trial.measured, formats)
     if ascii_only := [f for f in formats if f in _ASCII]:
         _check_names(trial, ascii_only)
     if "dlc" in formats and trial.keypoints is None:
@@ -251,6 +253,24 @@ def _check_trial(trial: ExportTrial, formats: Sequence[str], body_points: bool) 
             "the keypoints.npz of the trial beside the fit, named alike and with the same frames",
             "put the keypoints of `pbl detect` or `pbl run` beside the fit, or leave out --to dlc",
         )
+
+
+def _check_gait(measured: TrialMetrics, formats: Sequence[str]) -> None:
+    """Refuse measures whose events, or for tables whose cycles, are missing: the export would look complete."""
+    n_cycles = measured.spatiotemporal.n_cycles_found
+    cycles_whole = len(measured.cycles) == n_cycles and all(c.curves or c.curves_missing for c in measured.cycles)
+    if n_cycles and not measured.events.events:
+        missing = "gait events"
+    elif not cycles_whole and {"csv", "parquet"} & set(formats):
+        missing = "gait cycles"
+    else:
+        return
+    raise _input(
+        f"gait measures without the {missing} that they are made of, as in files of an older version",
+        "metrics.json of this version, and beside each fit its events.csv and cycles.npz",
+        "run `pbl gait *.fit.npz --out metrics.json` in their folder, with --norm, --index and --method as before, and "
+        "export again",
+    )
 
 
 def _check_names(trial: ExportTrial, formats: Sequence[str]) -> None:

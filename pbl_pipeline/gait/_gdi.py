@@ -149,10 +149,11 @@ class Gdi:
     def to_dict(self) -> dict:
         """`gdi` of metrics.json."""
         rounded = {k: _rounded(getattr(self, k)) for k in ("left", "right", "mean", "sd", "minimal_change")}
-        interval = None if self.interval is None else [_rounded(v) for v in self.interval]
+        interval = interval_90(rounded["mean"], rounded["sd"])  # as a reader of the file computes it
         counted = {"n": self.n, "n_left": self.n_left, "n_right": self.n_right, "norm": self.norm}
         cycles = [dataclasses.asdict(c) for c in self.cycles]
-        return {**rounded, "interval": interval, **counted, "params_hash": self.params_hash, "cycles": cycles}
+        of_mean = None if interval is None else [_rounded(v) for v in interval]
+        return {**rounded, "interval": of_mean, **counted, "params_hash": self.params_hash, "cycles": cycles}
 
 
 def interval_90(mean: float | None, sd: float | None) -> tuple[float, float] | None:

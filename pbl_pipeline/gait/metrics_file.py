@@ -22,6 +22,7 @@ from .events import GaitEvent, GaitEvents
 INDEX_CHECKS = ("gdi_cycles", "gdi_explained", "norm_convention")
 #: Rounding of the times in events.csv (s).
 _ROUNDED_S = 1e-3
+_CYCLE_TIMES = ("start_s", "opposite_foot_up_s", "opposite_foot_down_s", "foot_up_s", "end_s")
 
 
 def metrics_of(
@@ -104,22 +105,26 @@ def _bout(time_s: float, bouts: Sequence[tuple[float, float]]) -> int:
 
 
 def _cycle(content: Mapping[str, Any], trial: str, curves: Mapping[int, Curves]) -> GaitCycle:
-    nested = {
+    checked = {
+        **{name: float(content[name]) for name in _CYCLE_TIMES},
+        "number": int(content["number"]),
+        "bout": int(content["bout"]),
         "exclusion": structured(content["exclusion"], Exclusion),
         "lengths": structured(content["lengths"], Lengths),
     }
     known = curves.get(int(content["number"]), Curves({}, {}))
-    return GaitCycle(trial=trial, **{**content, **nested}, curves=known.deg, curves_sd=known.sd_deg)
+    return GaitCycle(trial=trial, **{**content, **checked}, curves=known.deg, curves_sd=known.sd_deg)
 
 
 def _spatiotemporal(content: Mapping[str, Any], n_steps: int = 0) -> Spatiotemporal:
     measures = {n: None if content[n] is None else structured(content[n], Measure) for n in MEASURES if n in content}
-    counts = content["cycles"]
+    counts, used = content["cycles"], bool(content["cycles"]["used"])
+    reasons = {n: str(r) for n, r in content["reasons"].items() if n != "gdi"}
     return Spatiotemporal(
-        status=PASS if int(counts["used"]) else EMPTY,
-        reason=str(content["reason"]),
+        status=PASS if used else EMPTY,
+        reason="" if used else reasons.get(MEASURES[0], ""),  # without cycles every measure has this reason
         measures=measures,
-        reasons={n: str(r) for n, r in content["reasons"].items() if n != "gdi"},
+        reasons=reasons,
         n_cycles_found=int(counts["found"]),
         n_cycles_used=int(counts["used"]),
         n_steps_used=int(counts.get("steps", n_steps)),
@@ -130,13 +135,12 @@ def _index(content: Mapping[str, Any], model: str, checks: Sequence[Check], cycl
     """Return the index of a trial or session. `cycles`: those of a session's trials, None for those in the content."""
     told, profile = content["gdi"], content.get("profile_deg")
     own = tuple(structured(c, GdiCycle) for c in told.get("cycles", ())) if cycles is None else tuple(cycles)
-    known = None if profile is None else MovementProfile(**profile)
+    known = None if profile is None else structured(profile, MovementProfile)
+    numbers = {n: told[n] for n in ("left", "right", "mean")} | {n: told.get(n) for n in ("sd", "minimal_change")}
     return Gdi(
-        status=PASS if told["mean"] is not None else EMPTY,
+        **{n: None if value is None else float(value) for n, value in numbers.items()},
+        status=PASS if numbers["mean"] is not None else EMPTY,
         reason=str(content["reasons"].get("gdi", "")),
-        left=told["left"],
-        right=told["right"],
-        mean=told["mean"],
         n=int(told["n"]),
         n_left=int(told.get("n_left", sum(c.side == "left" for c in own))),
         n_right=int(told.get("n_right", sum(c.side == "right" for c in own))),
@@ -146,8 +150,6 @@ def _index(content: Mapping[str, Any], model: str, checks: Sequence[Check], cycl
         cycles=own,
         qc=tuple(c for c in checks if c.check in INDEX_CHECKS),
         profile=known,
-        sd=told.get("sd"),
-        minimal_change=told.get("minimal_change"),
     )
 
 

@@ -372,7 +372,7 @@ def _origin(visit: Visit, recordings: Sequence[Recording], norm: NormativeSet | 
     if s is not None:
         rows = [
             ("Solver", f"{s.solver}, parameters {s.params_hash}", True),
-            ("Steps", f"{s.iterations}, {_CONVERGED[s.converged]}", False),
+            ("Steps", f"{'not recorded' if s.iterations is None else s.iterations}, {_CONVERGED[s.converged]}", False),
             ("Time", f"{s.seconds:.1f} s, of these {s.compile_seconds:.1f} s compiling, on {s.device}", False),
         ]
         if fits := [r.fit for r in visit.fitted if r.fit is not None]:

@@ -19,7 +19,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import load_npz
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.fit.angles_file import write_angles_csv
-from pbl_pipeline.gait import GaitEvent, TrialMetrics, load_events
+from pbl_pipeline.gait import Condition, GaitEvent, TrialMetrics, load_events
 from pbl_pipeline.gait.curves_file import Curves, load_curves, save_curves
 from pbl_pipeline.gait.metrics_file import metrics_of
 from pbl_pipeline.keypoints import Keypoints
@@ -43,6 +43,7 @@ KEYPOINTS, FIT, ANGLES, EVENTS, CYCLES, OVERLAY = (
     "overlay.mp4",
 )
 _AGAIN = "`pbl run` again"
+_MEASURE = f"`pbl gait *.fit.npz --out {METRICS}` in its folder writes it"
 
 
 def save_visit(visit: Visit, folder: Path) -> list[Path]:
@@ -70,20 +71,20 @@ def _session(visit: Visit) -> dict[str, Any]:
         "orientation_source": {n: f.orientation_source for n, f in fits.items()},
         "phone_clock_offset_s": {n: _known(f.phone_clock_offset_s) for n, f in fits.items()},
         "height_m": next((_known(f.height_m) for f in fits.values()), None),
+        "qc": [c.to_dict() for c in visit.fit_checks],
     }
     if visit.solution is not None:
         s = visit.solution
         content |= {
             "solver": s.solver,
             "params_hash": s.params_hash,
-            "iterations": int(s.iterations),
+            "iterations": None if s.iterations is None else int(s.iterations),
             "converged": None if s.converged is None else bool(s.converged),
             "scale": dict(zip(SCALE_NAMES, (round(float(v), 5) for v in s.scale), strict=True)),
             "loss_trace": [[int(step), round(float(loss), 5)] for step, loss in s.loss_trace],
             "seconds": round(s.seconds, 3),
             "compile_seconds": round(s.compile_seconds, 3),
             "device": s.device,
-            "qc": [c.to_dict() for c in visit.fit_checks],
             "code_version": s.software,
         }
     whose = {"subject": visit.subject, "label": visit.label, "date": visit.date, "kind": visit.kind}
@@ -103,21 +104,23 @@ def load_visit(folder: Path, *, measures: bool = True) -> Visit:
     content = _read(path)
     with _coded(path):
         names, told = [str(n) for n in content["trials"]], content.get("visit", {})
-        facts = {r["name"]: r for r in told.get("recordings", ())}
+        facts = {str(r["name"]): r for r in told.get("recordings", ())}
         fits = [folder / f"{name}.{FIT}" for name in names]
+        wanted = [*fits, *(_file(folder, n, KEYPOINTS) for n in names if facts.get(n, {}).get("video"))]
+        old = () if "visit" in content else (f"facts of the videos, the subject and the methods: {_AGAIN}",)
         visit = Visit(
             recordings=(
                 *(_recording(fit, facts.get(n, {})) for n, fit in zip(names, fits, strict=True) if fit.is_file()),
                 *(_left_out(r) for r in facts.values() if r["name"] not in names),
             ),
-            solution=_solution(content),
+            solution=_solution(content) if "solver" in content else None,
             fit_checks=_checks(content),
             subject=str(told.get("subject", "-")),
             label=str(told.get("label", "")),
             date=str(told.get("date", "")),
             kind=str(told.get("kind", "single")),
             methods={str(k): str(v) for k, v in told.get("methods", {}).items()},
-            lacks=tuple(f"no {fit.name}: {_AGAIN}" for fit in fits if not fit.is_file()),
+            lacks=(*old, *(f"no {p.name}: {_AGAIN}" for p in wanted if not p.is_file())),
         )
     return _with_stored_measures(visit, folder) if measures else visit
 
@@ -126,7 +129,8 @@ def visit_of_fits(paths: Sequence[Path], *, markers: MarkerSet | None = None, me
     """Return the visit of these fit.npz files, loaded, with what lies beside them where it is of these fits.
 
     Of several folders, or of some of a folder's fits, each recording has its own measures, and there are none over
-    all of them. `markers`: the lab's own table, of which the fits are. Raises as `load_visit`, and as `TrialFit.load`.
+    all of them; of several folders the facts of the visit are unknown, too. `markers`: the lab's own table, of which
+    the fits are. Raises as `load_visit`, and as `TrialFit.load`.
     """
     folders = {p.parent: None for p in paths}
     known = {f: load_visit(f, measures=measures) for f in folders if (f / SESSION).is_file()}
@@ -147,10 +151,12 @@ def visit_of_fits(paths: Sequence[Path], *, markers: MarkerSet | None = None, me
         recordings.append(dataclasses.replace(own, name=name, markers=markers, load_fit=Held(fit)))
     if unknown:
         checks.append(_checks_unknown(unknown))
-    whole = next(iter(known.values()), None)
-    if whole is not None and not unknown and len(folders) == 1 and stems == [r.name for r in whole.fitted]:
-        return dataclasses.replace(whole, recordings=(*recordings, *whole.left_out))
-    return Visit(tuple(recordings), fit_checks=tuple(dict.fromkeys(checks)))
+    visit = next(iter(known.values()), None)
+    if visit is None or unknown or len(folders) > 1:
+        return Visit(tuple(recordings), fit_checks=tuple(dict.fromkeys(checks)))
+    if stems == [r.name for r in visit.fitted]:
+        return dataclasses.replace(visit, recordings=(*recordings, *visit.left_out))
+    return dataclasses.replace(visit, recordings=tuple(recordings), measures=None)
 
 
 # ------------------------------------------------------------------------------------------------------------- writing
@@ -190,6 +196,7 @@ def _facts(recording: Recording) -> dict[str, Any]:
     """Return what session.json holds of a recording: facts, no arrays, and of its path the file's name alone."""
     video, choice = recording.video, recording.choice
     facts: dict[str, Any] = {"name": recording.name, "problem": recording.problem, "video": None, "choice": None}
+    facts["condition"] = dataclasses.asdict(recording.condition)
     if video is not None:
         own = {k: v for k, v in dataclasses.asdict(video).items() if k not in ("time_s", "path")}
         facts["video"] = {**_json(own), "file": Path(video.path).name}
@@ -214,8 +221,8 @@ def _known(value: float) -> float | None:
 
 # ------------------------------------------------------------------------------------------------------------- reading
 @contextlib.contextmanager
-def _coded(path: Path) -> Iterator[None]:
-    """Turn what reading a file of a visit raises into a `PblError` FILE_FORMAT."""
+def _coded(path: Path, again: str = _AGAIN) -> Iterator[None]:
+    """Turn what reading a file of a visit raises into a `PblError` FILE_FORMAT. `again`: what writes the file."""
     try:
         yield
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
@@ -223,24 +230,26 @@ def _coded(path: Path) -> Iterator[None]:
             "FILE_FORMAT",
             found=f"{type(error).__name__}: {error}",
             expected=f"the {path.name} that `pbl run` or `pbl fit` wrote with the files beside it",
-            next_step=f"{_AGAIN}; or move the file away: then what it holds is not known",
+            next_step=f"{again}; or move the file away: then what it holds is not known",
             key=str(path),
         ) from error
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path, again: str = _AGAIN) -> dict[str, Any]:
+    """Return the object in a JSON file without NaN. Raises `PblError` FILE_MISSING, FILE_FORMAT."""
     if not path.is_file():
         raise PblError(
             "FILE_MISSING",
             found=f"no {path.name}",
             expected="the files of `pbl run` as it wrote them",
-            next_step=_AGAIN,
+            next_step=again,
             key=str(path),
         )
-    with _coded(path):
+    with _coded(path, again):
         content = read_json(path)
         if not isinstance(content, dict):
             raise TypeError("not a JSON object")
+        json.dumps(content, allow_nan=False)  # raises ValueError for NaN and infinity, which no file of ours holds
         return content
 
 
@@ -253,25 +262,31 @@ def _recording(fit: Path, facts: Mapping[str, Any]) -> Recording:
         name,
         video=None if video is None else _video(video, points),
         choice=None if choice is None else _choice(choice),
+        condition=Condition(**facts.get("condition", {})),
+        problem=str(facts.get("problem", "")),
         load_keypoints=functools.partial(_keypoints_of, points, fit),
         load_fit=functools.partial(TrialFit.load, fit),
     )
 
 
 def _left_out(facts: Mapping[str, Any]) -> Recording:
-    choice = facts["choice"]
+    video, choice = facts["video"], facts["choice"]
     return Recording(
         str(facts["name"]),
+        video=None if video is None else _video(video, None),
         choice=None if choice is None else _choice(choice),
+        condition=Condition(**facts["condition"]),
         problem=str(facts["problem"]),
     )
 
 
-def _video(facts: Mapping[str, Any], points: Path) -> VideoInfo:
-    """Return the facts of a video; its time stamps are those of the keypoints, NaN where these are gone."""
+def _video(facts: Mapping[str, Any], points: Path | None) -> VideoInfo:
+    """Return the facts of a video. Its time stamps are those of its keypoints, NaN where there are none."""
     own = dict(facts)
     file, n = str(own.pop("file")), int(own["n_frames"])
-    time = load_npz(points, ["time_s"])["time_s"] if points.is_file() else np.full(n, np.nan)
+    time = None if points is None or not points.is_file() else load_npz(points, ["time_s"]).get("time_s")
+    if np.shape(time) != (n,):
+        time = np.full(n, np.nan)
     fps, length = (math.nan if own[k] is None else float(own[k]) for k in ("fps", "duration_s"))
     return VideoInfo(
         **{**own, "path": file, "time_s": time, "fps": fps, "duration_s": length, "notes": tuple(own["notes"])}
@@ -297,8 +312,8 @@ def _solution(content: Mapping[str, Any]) -> Solution:
     return Solution(
         solver=str(content["solver"]),
         params_hash=str(content["params_hash"]),
-        iterations=int(content["iterations"]),
-        converged=None if content["converged"] is None else bool(content["converged"]),
+        iterations=None if content.get("iterations") is None else int(content["iterations"]),
+        converged=None if content.get("converged") is None else bool(content["converged"]),
         scale=np.array([float(content["scale"][n]) for n in SCALE_NAMES]),
         loss_trace=np.array(content["loss_trace"], float).reshape(-1, 2),
         seconds=float(content["seconds"]),
@@ -309,10 +324,7 @@ def _solution(content: Mapping[str, Any]) -> Solution:
 
 
 def _checks(content: Mapping[str, Any]) -> tuple[Check, ...]:
-    checks = tuple(structured(c, Check) for c in content["qc"])
-    if not all(v is None or math.isfinite(v) for c in checks for v in (c.value, c.threshold)):
-        raise ValueError("a check whose value is not finite")
-    return checks
+    return tuple(structured(c, Check) for c in content["qc"])
 
 
 def _checks_unknown(names: Sequence[str]) -> Check:
@@ -326,25 +338,26 @@ def _checks_unknown(names: Sequence[str]) -> Check:
 def _with_stored_measures(visit: Visit, folder: Path) -> Visit:
     """Return the visit with the measures of its metrics.json, and with what is missing of them in `lacks`."""
     path, lacks = folder / METRICS, list(visit.lacks)
-    again = f"`pbl gait *.fit.npz --out {METRICS}` in its folder writes it"
     if not path.is_file():
-        return dataclasses.replace(visit, lacks=(*lacks, f"no {METRICS}: {again}"))
+        return dataclasses.replace(visit, lacks=(*lacks, f"no {METRICS}: {_MEASURE}"))
     events: dict[str, Sequence[GaitEvent]] = {}
     curves: dict[str, Mapping[int, Curves]] = {}
     for recording in visit.fitted:
         for end in (EVENTS, CYCLES):
             file = _file(folder, recording.name, end)
             if not file.is_file():
-                lacks.append(f"no {file.name}: {again}")
+                lacks.append(f"no {file.name}: {_MEASURE}")
             elif end == EVENTS:
                 events[recording.name] = load_events(file)
             else:
                 curves[recording.name] = load_curves(file)
-    content = _read(path)
-    with _coded(path):
+    content = _read(path, _MEASURE)
+    with _coded(path, _MEASURE):
         measures = metrics_of(content, events, curves)
         by_name = {t.name: t for t in measures.trials}
         if not set(by_name) >= {r.name for r in visit.fitted}:
             raise ValueError(f"measures of {', '.join(by_name) or 'no trial'}")
+        if other := [c.check for c in visit.fit_checks if c not in measures.before]:
+            raise ValueError(f"measures of another fit, whose check {other[0]} is not the same")
     measures = dataclasses.replace(measures, trials=tuple(by_name[r.name] for r in visit.fitted))
     return dataclasses.replace(visit.with_measures(measures), lacks=tuple(lacks))

@@ -120,12 +120,13 @@ class Recording:
 class Solution:
     """How the body of a visit was fitted, without the fitted movements. `software`: version and commit of the code.
 
-    scale (8,): multipliers of `body.SCALE_NAMES`; loss_trace (K, 2): step, loss; converged None: not recorded.
+    scale (8,): multipliers of `body.SCALE_NAMES`; loss_trace (K, 2): step, loss; iterations, converged: None where they
+    were not recorded.
     """
 
     solver: str
     params_hash: str
-    iterations: int
+    iterations: int | None
     converged: bool | None
     scale: np.ndarray
     loss_trace: np.ndarray

@@ -11,7 +11,7 @@ import pytest
 
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.export import angles_table, write_angles_csv
+from pbl_pipeline.fit.angles_file import angles_table, write_angles_csv
 from tests.walking_fit import walking_fit
 
 

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 import pbl_pipeline.body
 from pbl_pipeline.body import Y_UP_TO_Z_UP, load_body, load_marker_set
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.export import FORMATS, ExportOptions, ExportSession, ExportTrial, session_of_files, write_export
+from pbl_pipeline.export import FORMATS, ExportOptions, write_export
 from pbl_pipeline.export._text import lines, number_cells, text_cells
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import GaitMetrics, gait_metrics, trial_poses
@@ -27,8 +27,10 @@ from pbl_pipeline.keypoints import Keypoints, WorldMarkers
 from pbl_pipeline.qc import FAIL, Check
 from pbl_pipeline.validation import reference_of_mot
 from pbl_pipeline.video import Camera, PhoneLog, Sensor
+from pbl_pipeline.visit import Held, Recording, Visit, save_visit, visit_of_fits
 from tests.command import pbl
 from tests.exported import marked_fit, with_markers
+from tests.unit.visits import solution_of
 from tests.walking_fit import foot_events
 
 SCALAR = ("scope", "trial", "measure", "statistic")
@@ -67,21 +69,21 @@ def metrics(fit: TrialFit) -> GaitMetrics:
 
 
 @pytest.fixture(scope="module")
-def trial(fit: TrialFit, keypoints: Keypoints, metrics: GaitMetrics) -> ExportTrial:
-    return ExportTrial("walk", fit, keypoints=keypoints, measured=metrics.trials[0])
+def trial(fit: TrialFit, keypoints: Keypoints, metrics: GaitMetrics) -> Recording:
+    return Recording.of("walk", fit, keypoints).with_measured(metrics.trials[0])
 
 
 @pytest.fixture(scope="module")
-def out(trial: ExportTrial, metrics: GaitMetrics, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def out(trial: Recording, metrics: GaitMetrics, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One export of everything."""
     folder = tmp_path_factory.mktemp("export") / "visit"
-    write_export(ExportSession((trial,), metrics), list(FORMATS), folder)
+    write_export(Visit((trial,), measures=metrics), list(FORMATS), folder)
     return folder
 
 
-def written(trial: ExportTrial, folder: Path, *formats: str, **options: Any) -> Path:
+def written(trial: Recording, folder: Path, *formats: str, **options: Any) -> Path:
     """A trial alone, in some formats; its folder."""
-    write_export(ExportSession((trial,)), formats, folder, ExportOptions(**options))
+    write_export(Visit((trial,)), formats, folder, ExportOptions(**options))
     return folder / trial.name
 
 
@@ -101,7 +103,7 @@ def test_our_own_reader_finds_the_markers_in_the_trc(out, fit):
 
 
 def test_the_trc_is_in_opensims_ground_and_in_millimetres(fit, tmp_path):
-    path = written(ExportTrial("walk", fit), tmp_path / "a", "trc", body_points=False) / "walk.trc"
+    path = written(Recording.of("walk", fit), tmp_path / "a", "trc", body_points=False) / "walk.trc"
     lines = path.read_text().splitlines()
     assert lines[2].split("\t") == ["30", "30", "165", "33", "mm", "30", "1", "165"]
     first = [float(v) for v in lines[6].split("\t")]
@@ -116,7 +118,7 @@ def test_frames_without_a_pose_are_left_out_and_a_missing_marker_is_an_empty_cel
     qpos[50:53] = np.nan
     gap = with_markers(dataclasses.replace(fit, qpos=qpos))
     gap.markers_world_m[60, [4, 32]] = np.nan
-    folder = written(ExportTrial("walk", gap), tmp_path / "a", "trc", "mot", body_points=False)
+    folder = written(Recording.of("walk", gap), tmp_path / "a", "trc", "mot", body_points=False)
     seen = WorldMarkers.from_trc(folder / "walk.trc", gap.marker_set)
     kept = np.delete(np.arange(10, 175), np.arange(40, 43))
     np.testing.assert_allclose(seen.time_s, fit.time_s[kept], atol=1e-6)
@@ -205,7 +207,7 @@ def opensim_kinematics(osim: Path, mot: Path) -> tuple[list[str], np.ndarray]:
 @pytest.mark.parametrize("markers", ["blazepose_33", "bml_movi_87"])
 def test_model_and_motion_give_the_fitted_markers(markers, tmp_path):
     fit = marked_fit(markers, n_frames=60, seed=3)
-    folder = written(ExportTrial("walk", fit), tmp_path / "a", "osim", "mot")
+    folder = written(Recording.of("walk", fit), tmp_path / "a", "osim", "mot")
     names, xyz = opensim_kinematics(folder / "walk.osim", folder / "walk.mot")
     assert names[: len(fit.marker_names)] == list(fit.marker_names)
     np.testing.assert_allclose(xyz[:, : len(fit.marker_names)] @ Y_UP_TO_Z_UP.T, fit.markers_world_m, atol=1e-5)
@@ -213,7 +215,7 @@ def test_model_and_motion_give_the_fitted_markers(markers, tmp_path):
 
 def test_masses_move_and_swing_as_scaled_bodies_of_the_same_mass(tmp_path):
     fit = dataclasses.replace(marked_fit(n_frames=3), scale=np.full(8, 1.2))
-    path = written(ExportTrial("walk", with_markers(fit)), tmp_path / "a", "osim") / "walk.osim"
+    path = written(Recording.of("walk", with_markers(fit)), tmp_path / "a", "osim") / "walk.osim"
     bodies = {b.get("name"): b for b in ET.parse(path).getroot().iter("Body")}
     assert len(bodies) == 21
     femur = bodies["femur_l"]  # MJCF: 10.7199 kg, 0 -0.15451 0, 0.139448 0.0343037 0.139448
@@ -298,7 +300,7 @@ def test_uneven_frames_are_brought_to_one_rate(tmp_path):
     kept = np.unique(kept)
     fields = {f: getattr(even, f)[kept] for f in ("time_s", "qpos", "qpos_sd", "markers_world_m", "phone_quat_wxyz")}
     uneven = dataclasses.replace(even, **fields)
-    file = ezc3d.c3d(str(written(ExportTrial("walk", uneven), tmp_path / "a", "c3d") / "walk.c3d"))
+    file = ezc3d.c3d(str(written(Recording.of("walk", uneven), tmp_path / "a", "c3d") / "walk.c3d"))
     assert file["parameters"]["PBL"]["TIMES"]["value"] == ["interpolated to an even rate"]
     points = file["data"]["points"][:3].transpose(2, 1, 0)
     assert points.shape == (121, 33, 3)
@@ -313,7 +315,7 @@ def test_a_recording_that_starts_later_keeps_its_times(tmp_path):
     ezc3d = pytest.importorskip("ezc3d")
     fit = marked_fit(n_frames=60)
     late = dataclasses.replace(fit, time_s=fit.time_s + 2.0)
-    path = written(ExportTrial("walk", late), tmp_path / "a", "c3d") / "walk.c3d"
+    path = written(Recording.of("walk", late), tmp_path / "a", "c3d") / "walk.c3d"
     assert ezc3d.c3d(str(path))["header"]["points"]["first_frame"] == 60  # from 0: the 61st, 2 s after the first
 
 
@@ -323,7 +325,7 @@ def test_sensors_of_the_phone_are_analog_channels_on_the_videos_clock(fit, tmp_p
     xyz = np.column_stack([time, 2 * time, np.full_like(time, 9.81)])  # straight lines: interpolation is exact
     log = PhoneLog(time, np.tile([1.0, 0, 0, 0], (len(time), 1)), "camera", None, "own", None, {}, "CSV")
     log = dataclasses.replace(log, sensors={"accelerometer": Sensor(time, xyz), "gyroscope": Sensor(time, xyz)})
-    file = ezc3d.c3d(str(written(ExportTrial("w", fit, log=log, log_shift_s=0.5), tmp_path / "a", "c3d") / "w.c3d"))
+    file = ezc3d.c3d(str(written(Recording.of("w", fit, load_log=Held((log, 0.5))), tmp_path / "a", "c3d") / "w.c3d"))
     analog = file["parameters"]["ANALOG"]
     assert analog["LABELS"]["value"][:4] == [*(f"phone_accelerometer_{a}" for a in "xyz"), "phone_gyroscope_x"]
     assert analog["UNITS"]["value"][:4] == ["m/s^2"] * 3 + ["rad/s"]
@@ -414,8 +416,8 @@ def test_the_dictionary_explains_every_column(out):
 
 def test_several_trials_share_their_tables(fit, tmp_path):
     other = marked_fit(n_frames=40, seed=9)
-    session = ExportSession((ExportTrial("one", fit), ExportTrial("two", other)))
-    write_export(session, ["csv"], tmp_path / "a")
+    visit = Visit((Recording.of("one", fit), Recording.of("two", other)))
+    write_export(visit, ["csv"], tmp_path / "a")
     frame = table(tmp_path / "a" / "angles_wide.csv")
     assert frame.groupby("trial").size().to_dict() == {"one": 180, "two": 40}
     two = frame[frame.trial == "two"]
@@ -465,7 +467,7 @@ def test_opensim_agrees(markers, tmp_path, monkeypatch):
     fit = marked_fit(markers, n_frames=104, seed=2)
     fit.qpos[50:54] = np.nan  # out of view for a moment
     fit = with_markers(fit)
-    folder = written(ExportTrial("walk", fit), tmp_path / "a", "osim", "mot", "trc")
+    folder = written(Recording.of("walk", fit), tmp_path / "a", "osim", "mot", "trc")
     model = opensim.Model(str(folder / "walk.osim"))
     state = model.initSystem()
     motion = opensim.TimeSeriesTable(str(folder / "walk.mot"))
@@ -519,8 +521,8 @@ def test_an_export_says_what_made_it(out):
 
 
 def test_nobody_is_named_unless_asked(trial, metrics, tmp_path):
-    named = dataclasses.replace(trial, name="Doe-Jane", fit=dataclasses.replace(trial.fit, name="Doe-Jane"))
-    write_export(ExportSession((named,), metrics), list(FORMATS), tmp_path / "a", ExportOptions(number_trials=True))
+    named = dataclasses.replace(trial, name="Doe-Jane", load_fit=Held(dataclasses.replace(trial.fit, name="Doe-Jane")))
+    write_export(Visit((named,), measures=metrics), list(FORMATS), tmp_path / "a", ExportOptions(number_trials=True))
     files = [p for p in (tmp_path / "a").rglob("*") if p.is_file()]
     assert len(files) > 10
     assert [p.name for p in files if b"Doe" in p.read_bytes() or "Doe" in str(p.relative_to(tmp_path))] == []
@@ -529,7 +531,7 @@ def test_nobody_is_named_unless_asked(trial, metrics, tmp_path):
 
 
 # ---------------------------------------------------------------------------------------------------------- bad input
-def refused(code: str, trial: ExportTrial, folder: Path, *formats: str, **options: Any) -> str:
+def refused(code: str, trial: Recording, folder: Path, *formats: str, **options: Any) -> str:
     """The text of the error; nothing was written."""
     with pytest.raises(PblError) as caught:
         written(trial, folder, *formats, **options)
@@ -539,7 +541,7 @@ def refused(code: str, trial: ExportTrial, folder: Path, *formats: str, **option
 
 
 def test_a_fit_that_failed_is_refused_unless_asked(trial, tmp_path):
-    bad = ExportSession((trial,), None, (Check("residual_3d_cm", FAIL, 20.0, 6.0, "look"),))
+    bad = Visit((trial,), fit_checks=(Check("residual_3d_cm", FAIL, 20.0, 6.0, "look"),))
     with pytest.raises(PblError, match="residual_3d_cm") as caught:
         write_export(bad, ["mot"], tmp_path / "a")
     assert caught.value.code == "EXPORT_INPUT"
@@ -550,48 +552,48 @@ def test_a_fit_that_failed_is_refused_unless_asked(trial, tmp_path):
 
 def test_a_fit_without_a_pose_or_of_another_body_is_refused(fit, tmp_path):
     empty = dataclasses.replace(fit, qpos=np.full_like(fit.qpos, np.nan))
-    assert "without one pose" in refused("EXPORT_INPUT", ExportTrial("w", empty), tmp_path / "a", "mot")
+    assert "without one pose" in refused("EXPORT_INPUT", Recording.of("w", empty), tmp_path / "a", "mot")
     other = dataclasses.replace(fit, body_sha256="0" * 64)
-    assert "000000000000" in refused("EXPORT_INPUT", ExportTrial("w", other), tmp_path / "a", "osim")
+    assert "000000000000" in refused("EXPORT_INPUT", Recording.of("w", other), tmp_path / "a", "osim")
     backwards = dataclasses.replace(fit, time_s=fit.time_s[::-1])
-    assert "time stamps" in refused("EXPORT_INPUT", ExportTrial("w", backwards), tmp_path / "a", "mot")
+    assert "time stamps" in refused("EXPORT_INPUT", Recording.of("w", backwards), tmp_path / "a", "mot")
     blind = dataclasses.replace(fit, markers_world_m=np.full_like(fit.markers_world_m, np.nan))
-    assert "without one marker" in refused("EXPORT_INPUT", ExportTrial("w", blind), tmp_path / "a", "trc")
+    assert "without one marker" in refused("EXPORT_INPUT", Recording.of("w", blind), tmp_path / "a", "trc")
 
 
 def test_markers_that_the_body_lacks_are_refused_and_a_table_helps(fit, tmp_path):
     own = dataclasses.replace(fit, marker_set="our_lab")
-    text = refused("MARKER_SET_UNKNOWN", ExportTrial("w", own), tmp_path / "a", "osim")
+    text = refused("MARKER_SET_UNKNOWN", Recording.of("w", own), tmp_path / "a", "osim")
     assert "--marker-set" in text
     table = tmp_path / "our_lab.csv"
     shipped = Path(pbl_pipeline.body.__file__).parent / "data" / "markers_blazepose_33.csv"
     table.write_text(shipped.read_text())
-    folder = written(ExportTrial("w", own, markers=load_marker_set(table)), tmp_path / "b", "osim", "mot")
+    folder = written(Recording.of("w", own, markers=load_marker_set(table)), tmp_path / "b", "osim", "mot")
     _, xyz = opensim_kinematics(folder / "w.osim", folder / "w.mot")
     np.testing.assert_allclose(xyz[:, :33] @ Y_UP_TO_Z_UP.T, fit.markers_world_m[10:175], atol=1e-5)
     fewer = dataclasses.replace(fit, marker_names=("snout", *fit.marker_names[1:]))
-    assert "snout" in refused("MARKER_SET_UNKNOWN", ExportTrial("w", fewer), tmp_path / "a", "osim")
+    assert "snout" in refused("MARKER_SET_UNKNOWN", Recording.of("w", fewer), tmp_path / "a", "osim")
 
 
 def test_names_that_a_format_cannot_hold_are_refused(fit, keypoints, tmp_path):
-    text = refused("EXPORT_INPUT", ExportTrial("gäng", fit), tmp_path / "a", "c3d")
+    text = refused("EXPORT_INPUT", Recording.of("gäng", fit), tmp_path / "a", "c3d")
     assert "--number-trials" in text
-    assert written(ExportTrial("gäng", fit, keypoints=keypoints), tmp_path / "b", "csv", "dlc").is_dir()
-    refused("USAGE", ExportTrial("w", fit), tmp_path / "a", "c3d", name="Jürgen")
-    refused("USAGE", ExportTrial("w", fit), tmp_path / "a", "mot", name="two\nlines")
-    refused("EXPORT_INPUT", ExportTrial("../w", fit), tmp_path / "a", "csv")
+    assert written(Recording.of("gäng", fit, keypoints=keypoints), tmp_path / "b", "csv", "dlc").is_dir()
+    refused("USAGE", Recording.of("w", fit), tmp_path / "a", "c3d", name="Jürgen")
+    refused("USAGE", Recording.of("w", fit), tmp_path / "a", "mot", name="two\nlines")
+    refused("EXPORT_INPUT", Recording.of("../w", fit), tmp_path / "a", "csv")
     spaced = dataclasses.replace(fit, marker_names=("left eye", *fit.marker_names[1:]))
-    assert "left eye" in refused("EXPORT_INPUT", ExportTrial("w", spaced), tmp_path / "a", "trc", body_points=False)
+    assert "left eye" in refused("EXPORT_INPUT", Recording.of("w", spaced), tmp_path / "a", "trc", body_points=False)
 
 
 def test_other_refusals(fit, tmp_path, monkeypatch):
-    assert "svg" in refused("USAGE", ExportTrial("w", fit), tmp_path / "a", "svg")
-    assert "keypoints" in refused("EXPORT_INPUT", ExportTrial("w", fit), tmp_path / "a", "dlc")
+    assert "svg" in refused("USAGE", Recording.of("w", fit), tmp_path / "a", "svg")
+    assert "keypoints" in refused("EXPORT_INPUT", Recording.of("w", fit), tmp_path / "a", "dlc")
     long = dataclasses.replace(fit, time_s=fit.time_s + 3000.0)
-    assert "65535" in refused("EXPORT_INPUT", ExportTrial("w", long), tmp_path / "a", "c3d")
+    assert "65535" in refused("EXPORT_INPUT", Recording.of("w", long), tmp_path / "a", "c3d")
     for module, form in (("ezc3d", "c3d"), ("pyarrow", "parquet")):
         monkeypatch.setitem(sys.modules, module, None)
-        assert "pbl-pipeline[export]" in refused("PACKAGE_MISSING", ExportTrial("w", fit), tmp_path / "a", form)
+        assert "pbl-pipeline[export]" in refused("PACKAGE_MISSING", Recording.of("w", fit), tmp_path / "a", form)
 
 
 def test_a_folder_with_files_is_kept_unless_asked(fit, tmp_path):
@@ -599,11 +601,11 @@ def test_a_folder_with_files_is_kept_unless_asked(fit, tmp_path):
     note.parent.mkdir()
     note.write_text("mine")
     with pytest.raises(PblError) as caught:
-        written(ExportTrial("w", fit), tmp_path / "a", "mot")
+        written(Recording.of("w", fit), tmp_path / "a", "mot")
     assert caught.value.code == "FILE_UNWRITABLE"
     assert "--overwrite" in caught.value.text()
-    written(ExportTrial("w", fit), tmp_path / "a", "mot", overwrite=True)
-    written(ExportTrial("w", fit), tmp_path / "a", "mot", overwrite=True)
+    written(Recording.of("w", fit), tmp_path / "a", "mot", overwrite=True)
+    written(Recording.of("w", fit), tmp_path / "a", "mot", overwrite=True)
     assert note.read_text() == "mine"
     assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) == ["export.json", "note.txt", "w.mot"]
 
@@ -613,14 +615,11 @@ def test_a_folder_with_files_is_kept_unless_asked(fit, tmp_path):
 def files(fit: TrialFit, keypoints: Keypoints, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """`walk.fit.npz` with keypoints and session.json beside it."""
     folder = tmp_path_factory.mktemp("fits")
-    fit.save(folder / "walk.fit.npz")
     time = np.arange(0.0, 8.0, 0.02)
     seen = dataclasses.replace(
         keypoints, phone_time_s=time - 1.25, phone_quat_wxyz=np.tile([0.5, -0.5, 0.5, -0.5], (len(time), 1))
     )
-    seen.save(folder / "walk.keypoints.npz")
-    content = {"trials": ["walk"], "params_hash": fit.params_hash, "qc": [], "code_version": "0.1.0+gabc"}
-    (folder / "session.json").write_text(json.dumps(content))
+    save_visit(Visit((Recording.of("walk", fit, seen),), solution_of(fit)), folder)
     log = {"time_s": time, "qw": 0.5, "qx": -0.5, "qy": 0.5, "qz": -0.5, "ax": 0.0, "ay": 9.81, "az": time}
     pd.DataFrame(log).to_csv(folder / "log.csv", index=False)
     return folder
@@ -681,6 +680,6 @@ def test_keypoints_of_another_recording_are_not_taken(files, fit, tmp_path):
     shorter = marked_fit(n_frames=90)
     shorter.save(tmp_path / "walk.fit.npz")
     (tmp_path / "walk.keypoints.npz").write_bytes((files / "walk.keypoints.npz").read_bytes())
-    session = session_of_files([tmp_path / "walk.fit.npz"], gait=False)
-    assert session.trials[0].keypoints is None
+    visit = visit_of_fits([tmp_path / "walk.fit.npz"])
+    assert visit.recordings[0].keypoints is None
     assert load_body().sha256 == fit.body_sha256

@@ -32,6 +32,8 @@ from pbl_pipeline.gait.normative import load_norm
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.qc import Check
 from pbl_pipeline.video import Camera
+from pbl_pipeline.visit import Recording, Visit, save_visit
+from tests.unit.visits import solution_of
 
 STRIDE_S = 1.1
 CAMERA = Camera(np.array([[1000.0, 0, 500], [0, 1000, 500], [0, 0, 1]]), np.zeros(5), "test")
@@ -512,8 +514,8 @@ def test_the_checks_of_the_fit_lie_beside_it(tmp_path):
 
     def write(outcome: str, **changes) -> None:
         check = Check("residual_3d_cm", outcome, 20.0, 6.0, "they disagree")
-        content = {"trials": ["walk"], "params_hash": fit.params_hash, "qc": [check.to_dict()]}
-        beside.write_text(json.dumps({**content, **changes}))
+        save_visit(Visit((Recording.of("walk", fit),), solution_of(fit), (check,)), tmp_path)
+        beside.write_text(json.dumps({**json.loads(beside.read_text()), **changes}))
 
     alone = session()
     assert alone["status"] == "PASS"

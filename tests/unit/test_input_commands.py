@@ -267,18 +267,19 @@ def test_logs_go_with_their_videos_into_the_fit(fits, monkeypatch, tmp_path):
     monkeypatch.setattr(pipeline, "check_trial", lambda *_: None)
     videos = [chain.small_video(tmp_path, name) for name in ("a", "b")]
     logs = [csv_log(tmp_path / f"{a}.csv", about(0, a), {"frame": "device"}, n=400) for a in (90, 70)]
-    session = pipeline.run_session(videos, tmp_path / "out", attitude_files=logs)
+    visit, _ = pipeline.run_visit(videos, tmp_path / "out", attitude_files=logs)
     (call,) = fits
     assert call["motion"] == "handheld"
-    for trial, log in zip(session.trials, logs, strict=True):
-        np.testing.assert_array_equal(trial.keypoints.phone_quat_wxyz, load_attitude(log).quat_wxyz)
-    pipeline.run_session(videos, tmp_path / "out")
+    for recording, log in zip(visit.fitted, logs, strict=True):
+        assert recording.keypoints is not None
+        np.testing.assert_array_equal(recording.keypoints.phone_quat_wxyz, load_attitude(log).quat_wxyz)
+    pipeline.run_visit(videos, tmp_path / "out")
     assert fits[1]["motion"] == "static"
     assert all(k.phone_time_s is None for k in fits[1]["trials"])
     logs[1].write_text("nothing")
     monkeypatch.setattr(pipeline, "track_people", lambda *a, **k: pytest.fail("work was begun"))
     with pytest.raises(PblError) as error:
-        pipeline.run_session(videos, tmp_path / "out", attitude_files=logs)
+        pipeline.run_visit(videos, tmp_path / "out", attitude_files=logs)
     assert code_of(error) == "PHONE_LOG"
 
 
@@ -291,8 +292,8 @@ def test_a_session_is_fitted_as_its_points_want(fits, monkeypatch, tmp_path, mar
     model = ModelParams("still", "1" * 64, "2" * 64, "MIT", 10)
     method = METHODS.make("still", 1, ModelKeypointParams(model_sha256=model.sha256, model=model))
     video = chain.small_video(tmp_path, "a")
-    pipeline.run_session([video], tmp_path / "out", keypoints=method)
-    pipeline.run_session([video], tmp_path / "out", keypoints=method, paramset="markers")
+    pipeline.run_visit([video], tmp_path / "out", keypoints=method)
+    pipeline.run_visit([video], tmp_path / "out", keypoints=method, paramset="markers")
     assert [c["paramset"].name for c in fits] == [expected, "markers"]
 
 

@@ -5,16 +5,19 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 from click.testing import CliRunner
 
 from pbl_pipeline import pipeline
+from pbl_pipeline.body import load_body
 from pbl_pipeline.cli.run import run
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import Check
+from pbl_pipeline.report import write_report
+from pbl_pipeline.visit import Recording, Visit
 from tests.integration import chain
+from tests.walking_fit import walking_fit
 
 
 def test_names_are_distinct_whatever_the_files_are_called():
@@ -31,13 +34,14 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         info = pipeline.probe(path)
         points = chain.detect_keypoints(path, chain.track_people(path), 1, pipeline.find_camera(info))
         points = dataclasses.replace(points, image_size_px=(1920, 1080))
-        return pipeline.Trial(path.stem, path, info, pipeline.choose_subject(chain.track_people(path)), points)
+        choice = pipeline.choose_subject(chain.track_people(path))
+        return Recording.of(path.stem, keypoints=points, path=path, video=info, choice=choice)
 
     def fit(trials, names, paramset=None, camera_motion="static", height_m=None):
         calls.append(list(names))
         return chain.fit_session(trials, names, paramset, camera_motion, height_m)
 
-    monkeypatch.setattr(pipeline, "detect_trial", detect)
+    monkeypatch.setattr(pipeline, "detect_recording", detect)
     monkeypatch.setattr(pipeline, "check_trial", lambda *_: None)
     monkeypatch.setattr(pipeline, "fit_session", fit)
     return calls
@@ -47,15 +51,19 @@ def test_a_video_named_twice_counts_once(fitted: list[list[str]], tmp_path: Path
     first = chain.small_video(tmp_path, "walk", n=120)
     copy = tmp_path / "copy.mp4"
     copy.write_bytes(first.read_bytes())
-    session = pipeline.run_session([first, copy], tmp_path / "out")
+    visit, problems = pipeline.run_visit([first, copy], tmp_path / "out")
     assert fitted == [["walk"]]
-    assert session.problems["copy"].code == "USAGE"
-    assert "same bytes as walk" in session.problems["copy"].found
+    assert problems["copy"].code == "USAGE"
+    assert "same bytes as walk" in problems["copy"].found
+    assert [(r.name, r.fitted, r.problem) for r in visit.recordings] == [
+        ("walk", True, ""),
+        ("copy", False, problems["copy"].text()),
+    ]
 
 
 def test_an_unknown_norm_is_refused_before_the_fit(fitted: list[list[str]], tmp_path: Path):
     with pytest.raises(PblError) as error:
-        pipeline.run_session([chain.small_video(tmp_path, "walk", n=120)], tmp_path / "out", norm="no-such-norm")
+        pipeline.run_visit([chain.small_video(tmp_path, "walk", n=120)], tmp_path / "out", norm="no-such-norm")
     assert error.value.code == "NORM_UNKNOWN"
     assert not fitted
 
@@ -69,15 +77,16 @@ def test_report_and_metrics_agree_on_the_outcome(
 
     written = []
     seen = Check("leg_confidence", outcome, 0.1, 0.5, "the legs are hidden" if outcome == "FAIL" else "")
-    monkeypatch.setattr(pipeline, "check_keypoints", lambda _: (seen,))
+    monkeypatch.setattr("pbl_pipeline.visit.types.check_keypoints", lambda _: (seen,))
     monkeypatch.setattr(pipeline, "render_overlay", lambda *_, **__: None)
     monkeypatch.setattr(pipeline, "_pictures", lambda *_: ())
-    monkeypatch.setattr(pipeline, "write_report", lambda path, report: written.append(report))
-    session = pipeline.run_session([chain.small_video(tmp_path, "walk")], tmp_path / "out")
-    pipeline.write_results(tmp_path / "out", session)
+    monkeypatch.setattr(pipeline, "write_report", lambda _, visit, *more: written.append((visit, *more)))
+    visit, _ = pipeline.run_visit([chain.small_video(tmp_path, "walk")], tmp_path / "out")
+    pipeline.write_results(tmp_path / "out", visit)
     content = json.loads((tmp_path / "out" / "metrics.json").read_text())["session"]
-    page = page_of(written[0])
-    assert content["outcome"] == page["verdict"]["outcome"] == session.judged.outcome
+    page = page_of(*written[0], None)
+    assert visit.judged is not None
+    assert content["outcome"] == page["verdict"]["outcome"] == visit.judged.outcome
     assert content["outcome"] == ("FAIL" if outcome == "FAIL" else "WARN")
     assert {c["check"] for c in content["qc"]} >= {"leg_confidence", "residual_3d_cm", "walking", "cycles_used"}
     assert len(page["checks"]) == len(content["qc"])
@@ -113,26 +122,21 @@ def test_overlay_and_pictures_are_of_the_copy_where_the_setting_says_so(
     monkeypatch.setattr(pipeline, "report_indices", lambda _: [])
     monkeypatch.setattr(pipeline, "write_report", lambda *_: None)
     recording = chain.small_video(tmp_path, "walk")
-    pipeline.write_results(tmp_path / "out", pipeline.run_session([recording], tmp_path / "out"))
+    pipeline.write_results(tmp_path / "out", pipeline.run_visit([recording], tmp_path / "out")[0])
     assert len(used) == 2
     assert all((path == recording) is (not how) for path in used)
     assert not [p for p in used if p != recording and p.exists()]
 
 
-def test_the_report_of_a_visit_names_the_recordings_it_lacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    import schemas.report
-    from schemas.results import SessionResults, TrialResults
-
-    anything: Any = object()
-    trials = (
-        TrialResults(1, "walk", tmp_path / "walk.mp4", anything, anything, anything, anything, anything),
-        TrialResults(2, "dark", tmp_path / "dark.mp4", problem="SubjectChoice: nobody was found"),
-    )
-    found = SessionResults(1, "P1", "visit", None, trials, fit=anything, metrics=anything)
-    monkeypatch.setattr(schemas.report, "load_session", lambda _: found)
-    monkeypatch.setattr(schemas.report, "methods_of", lambda _: {})
-    written = []
-    monkeypatch.setattr(pipeline, "write_results", lambda out, session, **_: written.append(session) or [])
-    schemas.report.write_session({}, tmp_path)
-    assert [t.name for t in written[0].trials] == ["walk"]
-    assert written[0].left_out == {"dark": "SubjectChoice: nobody was found"}
+def test_the_report_of_a_visit_names_the_recordings_it_lacks(tmp_path: Path):
+    dark = Recording("dark", problem="SubjectChoice: nobody was found")
+    body = load_body()
+    fit = walking_fit(body.joint_names, body.sha256)
+    visit = pipeline.measured(Visit((Recording.of("walk", fit), dark), subject="P1", label="visit"))
+    assert [r.name for r in visit.fitted] == ["walk"]
+    assert {r.name: r.problem for r in visit.left_out} == {"dark": "SubjectChoice: nobody was found"}
+    text = write_report(tmp_path / "report.html", visit).read_text(encoding="utf-8")
+    assert "left out: SubjectChoice: nobody was found" in text
+    pipeline.write_results(tmp_path, visit)
+    told = {c["check"]: c["advice"] for c in json.loads((tmp_path / "metrics.json").read_text())["session"]["qc"]}
+    assert told["trial dark"] == "left out: SubjectChoice: nobody was found"
