@@ -12,7 +12,7 @@ import pytest
 
 import pbl_pipeline.gait
 from pbl_pipeline.errors import PblError
-from schemas import decide, fit, gait, gdi, hand_events, move, qc, slices, study
+from schemas import decide, fit, gait, gdi, event_corrections, move, qc, slices, study
 from schemas.export import visits_of_tables
 from schemas.forget import forget
 from schemas.recording_page import recording_about, recording_fit, trial_key
@@ -37,7 +37,7 @@ def visit(tables: None, tmp_path: Path) -> str:
 
 def moved(number: int = 1, by: float = 0.1, which: int = 6) -> list[tuple[float, str, str]]:
     """The events of a recording, one of them later by so many seconds."""
-    found = hand_events.shown(number)
+    found = event_corrections.shown(number)
     assert found is not None
     events = [e[:3] for e in found.events]
     time, side, kind = events[which]
@@ -45,9 +45,9 @@ def moved(number: int = 1, by: float = 0.1, which: int = 6) -> list[tuple[float,
 
 
 def save(number: int, events: list[tuple[float, str, str]], by: str = "A. First") -> dict[str, int]:
-    found = hand_events.shown(number)
+    found = event_corrections.shown(number)
     assert found is not None
-    return hand_events.save(number, events, by, found.state)
+    return event_corrections.save(number, events, by, found.state)
 
 
 def form_of(browser: Any, number: int) -> dict[str, str]:
@@ -180,15 +180,15 @@ def test_what_is_refused_changes_nothing(visit: str):
 
 
 def test_two_people_correct_at_the_same_moment(visit: str):
-    found = hand_events.shown(1)
+    found = event_corrections.shown(1)
     assert found is not None
     calls = [(1, moved(by=d), name, found.state) for d, name in ((0.1, "A. First"), (0.05, "B. Second"))]
-    late, done = decide_target.at_once("schemas.hand_events.save", *calls)
+    late, done = decide_target.at_once("schemas.event_corrections.save", *calls)
     assert (done, late[0]) == (("done", ""), "DECIDED_MEANWHILE")
     assert f"{gait.HandEvents.fetch1('hand_by')} decided for by hand, changed 1" in late[1]
     assert len(Decision()) == 1
     with pytest.raises(PblError, match="decided for by hand"):
-        hand_events.save(1, moved(by=-0.05), "C", "old")
+        event_corrections.save(1, moved(by=-0.05), "C", "old")
 
 
 def test_a_correction_while_the_measures_are_computed(visit: str, monkeypatch: pytest.MonkeyPatch):
@@ -249,7 +249,7 @@ def test_corrections_are_of_the_person_that_was_measured(visit: str):
     populate()
     decide.decide_person(1, 2)
     populate()
-    found = hand_events.shown(1)
+    found = event_corrections.shown(1)
     assert found is not None
     assert (found.hand, found.stale) == (None, True)
     rows = (gait.GaitEvents & {"video_id": 1, "gait_method": "by-hand-v1"} & fit.current()).to_dicts()
@@ -294,7 +294,7 @@ def test_trend_slices_move_and_forget(visit: str, tmp_path: Path):
 @pytest.mark.needs_extra
 @pytest.mark.slow
 def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str):
-    before = hand_events.shown(1)
+    before = event_corrections.shown(1)
     assert before is not None
     with web.shown(chromium, name="A. First", size=(1200, 900), refused=True) as page:
         page.goto("/recordings/1")
@@ -336,7 +336,7 @@ def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str):
         with page.expect_navigation():
             page.get_by_role("button", name="Save the events").click()
         page.wait_for_selector("[data-ready]")
-    found = hand_events.shown(1)
+    found = event_corrections.shown(1)
     assert found is not None
     assert found.hand is not None
     set_by_hand = [e for e in found.hand if e[3] is None]

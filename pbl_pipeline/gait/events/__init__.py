@@ -1,6 +1,6 @@
 """Initial contact and toe-off (`foot_down`, `foot_up`) of both sides."""
 
-from ._by_hand import BY_HAND, ByHandParams, check_by_hand, events_by_hand
+from ._correction import BY_HAND, ByHandParams, check_by_hand, events_by_hand
 from ._detect import detect_events
 from ._foot_velocity import FootVelocityParams
 from ._methods import METHODS

@@ -6,7 +6,7 @@ from typing import Any
 
 from pbl_pipeline.methods import Stage
 
-from ._by_hand import BY_HAND, ByHandParams, detect_without_hands
+from ._correction import BY_HAND, ByHandParams, detect_without_hands
 from ._coordinates import detect_by_coordinates
 from ._foot_velocity import FootVelocityParams, detect_by_foot_velocity
 from ._phase import PhaseParams, detect_by_phase
