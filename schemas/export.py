@@ -10,7 +10,6 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
 
 from . import fit, gdi, keypoints, session, video
-from . import gait as gait_tables
 from .archive import plain_name
 from .method_names import with_keys
 from .report import methods_of
@@ -82,7 +81,7 @@ def visits_of_tables(restriction: Mapping[str, Any], slice_name: str | None = No
     }
     measured: dict[tuple, list[dict[str, Any]]] = {}
     of_sets = (gdi.SessionGdi.proj() & sets.proj() & restriction).to_dicts(order_by="KEY")
-    for row in gait_tables.without_uncorrected(of_sets):
+    for row in of_sets:
         measured.setdefault((row["fit_set"], row["fit_method"]), []).append(row)
     visits = [{**row, **more} for key, row in found.items() for more in measured.get(key, [{}])]
     if not visits:

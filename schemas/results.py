@@ -104,8 +104,7 @@ def of_markers(subject: str, session_label: str) -> PblError:
 def find_session(restriction: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     """One session (row of Session) and the key of its current fit and of its measures, as far as there are any.
 
-    restriction and errors are those of `load_session`. Of corrected and automatic events the corrected ones are meant,
-    unless the restriction names a `gait_method`.
+    restriction and errors are those of `load_session`.
     """
     if isinstance(restriction, Mapping):
         restriction = with_keys(restriction)
@@ -123,7 +122,7 @@ def find_session(restriction: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     key = (
         _of(fit.SessionFit, _single(fits, "fits", ("fit_set_kind", *fit.SessionFit.primary_key[::-1]))) if fits else {}
     )
-    measured = gait.without_uncorrected((gdi.SessionGdi & key & restriction).keys()) if key else []
+    measured = (gdi.SessionGdi & key & restriction).keys() if key else []
     return visit, {**key, **(_single(measured, "results", gdi.SessionGdi.primary_key) if measured else {})}
 
 
@@ -311,23 +310,8 @@ def load_choice(key: Any) -> tracking_lib.SubjectChoice:
 
 
 def load_events(key: Any, rows: Rows = stored_rows) -> lib.GaitEvents:
-    """The library's `GaitEvents` of one row."""
-    from pbl_pipeline.gait import GaitEvents
-
-    row = row_of(gait.GaitEvents, key, rows)
-    events = rows(gait.GaitEvents.Event, key)
-    return GaitEvents(
-        status=row["events_status"],
-        events=tuple(gait.event_of_row(e) for e in events),
-        reason=row["events_reason"],
-        method=row["events_detector"],
-        params_hash=row["events_method_hash"],
-        source=row["events_source"],
-        walking_s=tuple((float(a), float(b)) for a, b in row["walking_bouts"]),
-        n_candidates=int(row["n_candidates"]),
-        n_order_breaks=int(row["n_order_breaks"]),
-        qc=tuple(_checks(rows(gait.GaitEvents.Check, key), "events")),
-    )
+    """The library's `GaitEvents` that the cycles of a trial were made from: detected ones, or corrected by hand."""
+    return gait.load_events(key, rows)
 
 
 def load_cycles(key: Any, trial: str, rows: Rows = stored_rows) -> tuple[lib.GaitCycle, ...]:

@@ -404,7 +404,8 @@ def _origin(
             rows.append(("Camera", f"{camera.source}; focal length {camera.matrix[0, 0]:.0f} px", False))
         rows += [("Remark", note, False) for note in v.notes]
         if m is not None and m.events is not None:
-            rows.append(("Gait events", f"{m.events.method}, parameters {m.events.params_hash}", True))
+            by_hand = ", corrected by hand" if m.events.corrected else ""
+            rows.append(("Gait events", f"{m.events.method}, parameters {m.events.params_hash}{by_hand}", True))
         groups.append({"name": f"Recording {t.name}", "rows": rows})
     s = report.session
     if s is not None:

@@ -10,7 +10,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 
 from pbl_pipeline.words import UNUSABLE
-from schemas import decide, fit, event_corrections, usable
+from schemas import decide, event_corrections, fit, usable
 
 from .access import Refused, Session, form_of
 from .computing import queue_visit_of
