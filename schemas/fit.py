@@ -456,6 +456,13 @@ def _marker_table(rows: Sequence[Mapping[str, Any]]) -> tuple[str, dict] | None:
     return rows[0]["recording_marker_set"], file_ref(rows[0]["marker_table_file"])
 
 
+def trial_key(video_id: int) -> dict[str, Any] | None:
+    """Key of the fit of a recording: of its current sets the one that was computed last; None where there is none."""
+    trials = SessionFit.Trial.proj() * SessionFit.proj("fit_computed") * current().proj() & {"video_id": video_id}
+    rows = trials.to_dicts(order_by="fit_computed DESC", limit=1)
+    return {k: rows[0][k] for k in SessionFit.Trial.primary_key} if rows else None
+
+
 def fit_checks(key: Mapping[str, Any]) -> list[tuple]:
     """The checks of one session fit as arguments of the library's `Check`: what `make_fetch` may hand on."""
     rows = (SessionFit.Check & {k: key[k] for k in SessionFit.primary_key}).to_dicts(order_by="fit_check")

@@ -12,7 +12,7 @@ from pbl_pipeline import methods
 
 from . import fit, keypoints, session, video  # noqa: F401  a definition refers to video
 from ._datajoint import dj
-from .checks import check_columns, check_row
+from .checks import check_columns, check_row, check_values
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .rows import Rows, number, one, row_of, stored_rows
@@ -20,7 +20,6 @@ from .stored_files import file_ref, new_folder, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib
-    from pbl_pipeline.fit import TrialFit
 
 schema = dj.Schema()
 
@@ -62,112 +61,72 @@ class GaitPlan(dj.Manual):
 
 
 @schema
-class HandEvents(dj.Manual):
+class EventCorrection(dj.Manual):
     definition = """
-    # events of a trial as a person corrected them; the methods by-hand take them where the same person is measured
+    # events of a trial by a method as a person set them; the last row of the person who is measured counts, the others are history
     -> video.Video
+    -> GaitEventMethod
+    correction_no            : int16           # in order of time, from 1
     ---
-    -> GaitEventMethod.proj(hand_from='gait_method')  # the automatic method that it began from
-    hand_changed       : int16                 # events that were moved, added or taken away
-    hand_tracking=null : varchar(48)           # tracking_method in which the measured person has its number, null for markers
-    hand_person=null   : int16                 # number of the measured person, null for markers
-    hand_by            : varchar(64)           # name of who corrected
-    hand_at            : datetime              # when, UTC
+    correction_withdrawn     : bool            # true: the detected events count again; it has no Event
+    correction_changed       : int16           # events that were moved, added or removed
+    correction_tracking=null : varchar(48)     # tracking_method in which the measured person has its number, null for markers
+    correction_person=null   : int16           # number of the measured person, null for markers
+    correction_by            : varchar(64)     # name of who corrected
+    correction_at            : datetime        # when, UTC
     """  # noqa: E501
 
     class Event(dj.Part):
         definition = """
         -> master
-        hand_no            : int16             # in order of time, from 1
+        corrected_no       : int16             # in order of time, from 1
         ---
-        hand_time          : float64           # (s) time of the trial
-        hand_side          : enum('left', 'right')
-        hand_kind          : enum('foot_down', 'foot_up')
-        hand_probability=null : float64        # (0..1) of the automatic method that found it there; null: set by hand
+        corrected_time     : float64           # (s) time of the trial
+        corrected_side     : enum('left', 'right')
+        corrected_kind     : enum('foot_down', 'foot_up')
+        corrected_probability=null : float64   # (0..1) of the detection, which found it there; null: set by hand
         """
 
 
-def is_by_hand(gait_method: str) -> bool:
-    """Whether a key of GaitEventMethod is of corrected events."""
-    return gait_method.rpartition("-v")[0] == "by-hand"
+def correction_of(key: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Key of the correction that counts of the events of a trial (key of GaitEvents): the last one of the person who is
+    measured in its set; None where there is none or the last one was withdrawn.
 
-
-def corrected(key: Mapping[str, Any], videos: Sequence[int]) -> dict[int, dict[str, Any]]:
-    """Corrected events of trials of a set (key with `fit_set`): `n_changed` and `events` (time, side, kind,
-    probability) by the trial's number; without those in which another person was measured than in the set.
-
-    It waits for a decision that is being written, and inside a transaction keeps others waiting until its end, so that
-    what is computed of these rows and what is decided about them never cross.
+    Waits for a decision that is being written, and inside a transaction keeps others waiting until its end, so that
+    what is computed from these rows and what is decided about them never cross.
     """
-    server, session_of_set = session.Session.connection, fit.FitSet.full_table_name
-    # Names are DataJoint's own; a locking read sees what was committed, whenever this transaction began.
-    server.query(
-        f"SELECT s.session_id FROM {session.Session.full_table_name} s JOIN {session_of_set} f USING (session_id)"  # noqa: S608
-        " WHERE f.fit_set = %s LOCK IN SHARE MODE",
-        args=(key["fit_set"],),
-    )
-    of_set = (fit.FitSet.Video & {"fit_set": key["fit_set"]}) * keypoints.Keypoints.proj("keypoints_person_id")
-    measured = {int(r["video_id"]): (r["tracking_method"], int(r["keypoints_person_id"])) for r in of_set.to_dicts()}
-    columns, parts = "hand_tracking, hand_person, hand_changed", "hand_time, hand_side, hand_kind, hand_probability"
-    out = {}
-    for video_id in videos:
-        row, events = (
-            server.query(
-                f"SELECT {names} FROM {table} WHERE video_id = %s {order} LOCK IN SHARE MODE",  # noqa: S608
-                args=(video_id,),
-            ).fetchall()
-            for names, table, order in (
-                (columns, HandEvents.full_table_name, ""),
-                (parts, HandEvents.Event.full_table_name, "ORDER BY hand_no"),
-            )
-        )
-        if row and (row[0][0], row[0][1]) == measured.get(video_id, (None, None)):
-            found = [(float(t), str(side), str(kind), number(p)) for t, side, kind, p in events]
-            out[video_id] = {"n_changed": int(row[0][2]), "events": found}
-    return out
+    fit.session_of_set(key)
+    # A locking read sees what is committed, whenever this transaction began.
+    of_trial = {k: key[k] for k in ("video_id", "gait_method")}
+    row = EventCorrection.connection.query(
+        f"SELECT correction_no, correction_withdrawn FROM {EventCorrection.full_table_name} WHERE video_id = %s"  # noqa: S608
+        " AND gait_method = %s AND correction_tracking <=> %s AND correction_person <=> %s"
+        " ORDER BY correction_no DESC LIMIT 1 LOCK IN SHARE MODE",
+        args=(*of_trial.values(), *measured_person(key)),
+    ).fetchone()
+    return None if row is None or row[1] else {**of_trial, "correction_no": int(row[0])}
 
 
-def automatic_of() -> dict[str, str]:
-    """The automatic method that each method by hand began from, by their keys."""
-    rows = (GaitEventMethod & {"gait_method_name": "by-hand"}).to_dicts()
-    return {r["gait_method"]: str(r["gait_params"]["automatic"]) for r in rows}
+def newest_events(key: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Key of the events of a fitted trial (key of SessionFit.Trial) that are shown: corrected ones before others, then
+    those that were detected last; None where none were detected yet."""
+    rows = (GaitEvents.proj("events_computed") & key).to_dicts(order_by="events_computed DESC")
+    keys = [{k: row[k] for k in GaitEvents.primary_key} for row in rows]
+    return next((k for k in keys if correction_of(k) is not None), keys[0] if keys else None)
 
 
-def without_uncorrected(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Results (rows with `gait_method`) without those for which there is one of corrected events beside: what is meant
-    where nobody names a method of the events."""
-    automatic = automatic_of() if any(is_by_hand(r["gait_method"]) for r in rows) else {}
-
-    def rest(row: Mapping[str, Any]) -> tuple:
-        return tuple((k, v) for k, v in row.items() if k != "gait_method")
-
-    replaced = [(rest(r), automatic[r["gait_method"]]) for r in rows if r["gait_method"] in automatic]
-    return [dict(r) for r in rows if (rest(r), r["gait_method"]) not in replaced]
-
-
-def events_of(
-    trial: TrialFit, method: methods.Method[Any], automatic: methods.Method[Any], by_hand: Mapping[str, Any] | None
-) -> lib.GaitEvents:
-    """The events of a trial: corrected ones (of `corrected`) by `method`, else those of the automatic method."""
-    from pbl_pipeline.gait import GaitEvent, detect_events, events_by_hand, feet_from_fit
-
-    if by_hand is None:
-        return detect_events(feet_from_fit(trial), automatic)
-    found = [GaitEvent(t, side, kind, 1.0 if p is None else p) for t, side, kind, p in by_hand["events"]]
-    return events_by_hand(found, method, "fit", by_hand["n_changed"])
-
-
-def automatic_row(row: Mapping[str, Any]) -> dict[str, Any]:
-    """The row (`method_row`) of the automatic method that a method by hand began from; of others itself."""
-    if row["name"] != "by-hand":
-        return dict(row)
-    return method_row(GaitEventMethod, {"gait_method": row["params"]["automatic"]})
+def measured_person(key: Mapping[str, Any]) -> tuple[str | None, int | None]:
+    """Tracking method and number of the person who is measured in a trial (key of SessionFit.Trial); None for both of
+    laboratory markers."""
+    trial = {k: key[k] for k in ("fit_set", "video_id")}
+    rows = ((fit.FitSet.Video & trial) * keypoints.Keypoints.proj("keypoints_person_id")).to_dicts()
+    return (rows[0]["tracking_method"], int(rows[0]["keypoints_person_id"])) if rows else (None, None)
 
 
 @schema
 class GaitEvents(dj.Computed):
     definition = f"""
-    # foot down and foot up of both sides; EMPTY: ran well, nobody walks
+    # initial contacts and toe-offs of both sides as a method detects them; EMPTY: ran well, nobody walks
     -> fit.SessionFit.Trial
     -> GaitEventMethod
     ---
@@ -208,25 +167,16 @@ class GaitEvents(dj.Computed):
         return (fit.SessionFit.Trial.proj() * GaitEventMethod.proj()) & planned
 
     def make_fetch(self, key: dict) -> tuple:
-        by_hand = corrected(key, [key["video_id"]]) if is_by_hand(key["gait_method"]) else {}
-        ref = file_ref(one(fit.SessionFit.Trial & key, "trial_file"))
-        method = method_row(GaitEventMethod, key)
-        return ref, method, automatic_row(method), by_hand.get(key["video_id"])
+        return file_ref(one(fit.SessionFit.Trial & key, "trial_file")), method_row(GaitEventMethod, key)
 
     @computes
-    def make_compute(
-        self,
-        key: dict,
-        ref: dict,
-        method: Mapping[str, Any],
-        automatic: Mapping[str, Any],
-        by_hand: Mapping[str, Any] | None,
-    ) -> tuple[lib.GaitEvents, str]:
+    def make_compute(self, key: dict, ref: dict, method: Mapping[str, Any]) -> tuple[lib.GaitEvents, str]:
         from pbl_pipeline.fit import TrialFit
+        from pbl_pipeline.gait import detect_events, feet_from_fit
 
         with stored_file(self, ref) as path:
             trial = TrialFit.load(path)
-        return events_of(trial, methods.stored(**method), methods.stored(**automatic), by_hand), method["sha"]
+        return detect_events(feet_from_fit(trial), methods.stored(**method)), method["sha"]
 
     def make_insert(self, key: dict, found: lib.GaitEvents, sha: str, origin: Origin) -> None:
         self.insert1(
@@ -262,10 +212,11 @@ class GaitEvents(dj.Computed):
 @schema
 class GaitCycle(dj.Computed):
     definition = f"""
-    # strides of a trial, foot down to the next foot down of the same side
+    # strides of a trial by its detected events, or by those of a correction (null: none), foot down to the next foot down of the same side
     -> GaitEvents
     ---
     -> session.Session
+    -> [nullable] EventCorrection
     n_cycles        : int16                    # all complete cycles
     n_cycles_used   : int16                    # without first and last steps, odd lengths and odd curves
     curves          : <object@arrays>          # npz: cycle_no (N), names (A), percent (P) of the cycle, curve and curve_sd (N,A,P) deg
@@ -301,30 +252,36 @@ class GaitCycle(dj.Computed):
         """
 
     def make_fetch(self, key: dict) -> tuple:
-        events = (GaitEvents.Event & key).to_dicts(order_by="event_no")
-        ref = file_ref(one(fit.SessionFit.Trial & key, "trial_file"))
-        return [{k: v for k, v in e.items() if k.startswith("event_")} for e in events], ref, fit.fit_checks(key)
+        correction = correction_of(key)
+        events = events_of(one(GaitEvents & key), correction)
+        return events, file_ref(one(fit.SessionFit.Trial & key, "trial_file")), fit.fit_checks(key), correction
 
     @computes
     def make_compute(
-        self, key: dict, events: Sequence[Mapping[str, Any]], ref: dict, checks: Sequence[tuple]
-    ) -> tuple[tuple[lib.GaitCycle, ...]]:
+        self,
+        key: dict,
+        events: lib.GaitEvents,
+        ref: dict,
+        checks: Sequence[tuple],
+        correction: Mapping[str, Any] | None,
+    ) -> tuple[tuple[lib.GaitCycle, ...], int | None]:
         from pbl_pipeline.fit import TrialFit
         from pbl_pipeline.gait import find_cycles
         from pbl_pipeline.qc import Check
 
         with stored_file(self, ref) as path:
             trial = TrialFit.load(path)
-        about_fit = [Check(*check) for check in checks]
-        return (find_cycles([event_of_row(e) for e in events], trial, fit_checks=about_fit),)
+        cycles = find_cycles(events, trial, fit_checks=[Check(*check) for check in checks])
+        return cycles, None if correction is None else correction["correction_no"]
 
-    def make_insert(self, key: dict, cycles: Sequence[lib.GaitCycle], origin: Origin) -> None:
+    def make_insert(self, key: dict, cycles: Sequence[lib.GaitCycle], correction: int | None, origin: Origin) -> None:
         with new_folder() as folder:
             save_curves(cycles, folder / "curves.npz")
             self.insert1(
                 {
                     **key,
                     "session_id": fit.session_of_set(key),
+                    "correction_no": correction,
                     "n_cycles": len(cycles),
                     "n_cycles_used": sum(c.used for c in cycles),
                     "curves": folder / "curves.npz",
@@ -469,6 +426,44 @@ def measure_rows(
         row |= {f"{prefix}_{column}": None if m is None else number(getattr(m, k)) for column, k in _MEASURE_PARTS}
         rows.append({**row, f"{prefix}_n": 0 if m is None else m.n})
     return rows
+
+
+def events_of(
+    row: Mapping[str, Any], correction: Mapping[str, Any] | None = None, rows: Rows = stored_rows
+) -> lib.GaitEvents:
+    """The library's `GaitEvents` of a row of GaitEvents: the detected ones, or those that a correction (key of
+    EventCorrection) sets instead."""
+    from pbl_pipeline import gait as lib
+    from pbl_pipeline.qc import Check
+
+    key = {k: row[k] for k in GaitEvents.primary_key}
+    detected = lib.GaitEvents(
+        status=row["events_status"],
+        events=tuple(event_of_row(e) for e in rows(GaitEvents.Event, key)),
+        reason=row["events_reason"],
+        method=row["events_detector"],
+        params_hash=row["events_method_hash"],
+        source=row["events_source"],
+        walking_s=tuple((float(a), float(b)) for a, b in row["walking_bouts"]),
+        n_candidates=int(row["n_candidates"]),
+        n_order_breaks=int(row["n_order_breaks"]),
+        qc=tuple(Check(*check_values("events", check)) for check in rows(GaitEvents.Check, key)),
+    )
+    if correction is None:
+        return detected
+    changed = row_of(EventCorrection, correction, rows)["correction_changed"]
+    names = ("corrected_time", "corrected_side", "corrected_kind", "corrected_probability")
+    found = [[e[name] for name in names] for e in rows(EventCorrection.Event, correction)]
+    events = [lib.GaitEvent(float(t), side, kind, 1.0 if p is None else float(p)) for t, side, kind, p in found]
+    return lib.apply_correction(detected, events, int(changed))
+
+
+def load_events(key: Mapping[str, Any], rows: Rows = stored_rows) -> lib.GaitEvents:
+    """The library's `GaitEvents` that the row of GaitCycle of this key was made from."""
+    row = row_of(GaitEvents, {k: key[k] for k in GaitEvents.primary_key}, rows)
+    cycles = row_of(GaitCycle, {k: row[k] for k in GaitEvents.primary_key}, rows)
+    names = EventCorrection.primary_key
+    return events_of(row, None if cycles["correction_no"] is None else {k: cycles[k] for k in names}, rows)
 
 
 def event_of_row(row: Mapping[str, Any]) -> lib.GaitEvent:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import methods
@@ -14,7 +13,7 @@ from ._datajoint import dj
 from .checks import check_columns, check_row
 from .method_rows import method_columns, method_row, resolve_method
 from .origin import Origin, computes, origin_columns
-from .rows import Rows, number, one, row_of, stored_rows, utc_now
+from .rows import InputChanged, Rows, number, one, row_of, stored_rows, utc_now
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -196,6 +195,7 @@ class SessionGdi(dj.Computed):
     session_gps_left=null       : float64      # (deg)
     session_gps_right=null      : float64      # (deg)
     session_cycles              : int16        # used cycles
+    session_corrected           : int16        # trials of the set whose events a person corrected
     session_params_hash         : char(16)     # hash over the parameters of events and index together
     session_cadence=null        : float64      # (steps/min)
     session_stride_time=null    : float64      # (s)
@@ -206,6 +206,14 @@ class SessionGdi(dj.Computed):
     {origin_columns("session_gdi")}
     index (session_status)
     """  # noqa: E501
+
+    class Trial(dj.Part):
+        definition = """
+        # the trials of the set; those that are walked at the pace of the index are pooled
+        -> master
+        -> GDI
+        -> gait.Spatiotemporal
+        """
 
     class Measure(dj.Part):
         definition = f"""
@@ -225,58 +233,79 @@ class SessionGdi(dj.Computed):
         {check_columns("gdi")}
         """
 
+    waits_for = (GDI, gait.Spatiotemporal)
+
     @property
     def key_source(self) -> Any:
+        """Sets all of whose trials have their cycles, measures and index: the rows that the visit pools."""
         planned = fit.FitSet.proj("session_id") * gait.GaitPlan * GdiPlan
-        keys = fit.SessionFit.proj() * gait.GaitEventMethod.proj() * GdiModel.proj() * NormativeSet.proj()
-        return keys & planned
+        methods_ = gait.GaitEventMethod.proj() * GdiModel.proj() * NormativeSet.proj()
+        trials = fit.SessionFit.Trial.proj() * methods_ & planned
+        ready = GDI.proj() * gait.Spatiotemporal.proj()
+        return (fit.SessionFit.proj() * methods_ & planned) - (trials - ready).proj()
 
     def make_fetch(self, key: dict) -> tuple:
-        rows = (fit.SessionFit.Trial & key).to_dicts(order_by="video_id")
-        videos, by_hand = [int(r["video_id"]) for r in rows], None
-        if gait.is_by_hand(key["gait_method"]):
-            found = gait.corrected(key, videos)
-            by_hand = [found.get(v) for v in videos]
-        events = method_row(gait.GaitEventMethod, key)
+        fit.session_of_set(key)  # waits for a decision that is being written
+        of_trials = (
+            fit.SessionFit.Trial.proj("trial_name")
+            * gait.GaitEvents.proj("events_reason")
+            * gait.GaitCycle.proj("curves", "correction_no", "cycles_computed")
+            * gait.Spatiotemporal.proj("measures_reason")
+            * GDI.proj()
+        )
+        trials = (of_trials & key).to_dicts(order_by="video_id")
+        if len(trials) != len(fit.SessionFit.Trial & key):
+            raise InputChanged("cycles or index of a trial are gone", key)
+        done = video.conditions([{"video_id": r["video_id"]} for r in trials])
         return (
-            [file_ref(r["trial_file"]) for r in rows],
+            [{**r, "curves": file_ref(r["curves"])} for r in trials],
+            (gait.GaitCycle.Cycle & key).to_dicts(order_by="video_id, cycle_no"),
+            [(c.activity, c.pace) for c in done.values()],
             norm_ref(key),
-            (events, gait.automatic_row(events), by_hand),
+            method_row(gait.GaitEventMethod, key),
             method_row(GdiModel, key),
-            fit.fit_checks(key),
-            [(c.activity, c.pace) for c in video.conditions([{"video_id": r["video_id"]} for r in rows]).values()],
         )
 
     @computes
     def make_compute(
         self,
         key: dict,
-        refs: Sequence[dict],
-        norm: tuple,
-        events: tuple[Mapping[str, Any], Mapping[str, Any], Sequence[Mapping[str, Any] | None] | None],
-        index: Mapping[str, Any],
-        checks: Sequence[tuple],
+        trials: Sequence[Mapping[str, Any]],
+        cycles: Sequence[Mapping[str, Any]],
         conditions: Sequence[tuple[str, str]],
-    ) -> tuple[lib.GaitMetrics, str, str]:
+        norm: tuple,
+        events: Mapping[str, Any],
+        index: Mapping[str, Any],
+    ) -> tuple[lib.SessionMetrics, Sequence[Mapping[str, Any]], str, str]:
         from pbl_pipeline import gait as lib
-        from pbl_pipeline.fit import TrialFit
-        from pbl_pipeline.qc import Check
 
         model = methods.stored(**index)
-        method, automatic = (methods.stored(**row) for row in events[:2])
-        params = lib.GaitParams(method.paramset, model.params)
-        with ExitStack() as stack:
-            paths = [stack.enter_context(stored_file(self, ref)) for ref in refs]
-            trials = [TrialFit.load(path) for path in paths]
-        about_fit = [Check(*check) for check in checks]
+        params = lib.GaitParams(methods.stored(**events).paramset, model.params)
+        pooled = []
+        for trial in trials:
+            with stored_file(self, trial["curves"]) as path:
+                curves = gait.load_curves(path)
+            rows = [r for r in cycles if r["video_id"] == trial["video_id"]]
+            detected = trial["events_reason"] if trial["correction_no"] is None else ""
+            pooled.append(
+                lib.TrialCycles(
+                    trial["trial_name"],
+                    detected or trial["measures_reason"],
+                    tuple(gait.cycle_of_row(r, trial["trial_name"], curves.get(int(r["cycle_no"]))) for r in rows),
+                )
+            )
         done = [lib.Condition(*c) for c in conditions]
-        found = None
-        if events[2] is not None:
-            found = [gait.events_of(t, method, automatic, h) for t, h in zip(trials, events[2], strict=True)]
-        result = lib.gait_metrics(trials, norm_of_row(*norm), params, about_fit, model, conditions=done, events=found)
-        return result, model.hash, norm[1]
+        return lib.pool_trials(pooled, norm_of_row(*norm), params, model, conditions=done), trials, model.hash, norm[1]
 
-    def make_insert(self, key: dict, result: lib.GaitMetrics, sha: str, norm_sha: str, origin: Origin) -> None:
+    def make_insert(
+        self,
+        key: dict,
+        result: lib.SessionMetrics,
+        trials: Sequence[Mapping[str, Any]],
+        sha: str,
+        norm_sha: str,
+        origin: Origin,
+    ) -> None:
         measures, index = result.spatiotemporal, result.gdi
         columns = ("cadence", "stride_time", "step_time", "stance", "swing", "double_support")
         by_column = {column: name for name, column in gait.MEASURE_COLUMNS.items()}
@@ -295,11 +324,13 @@ class SessionGdi(dj.Computed):
                 "session_gdi_n": index.n,
                 **gps_row(index.profile, "session"),
                 "session_cycles": measures.n_cycles_used,
+                "session_corrected": sum(r["correction_no"] is not None for r in trials),
                 "session_params_hash": result.params_hash,
                 **{f"session_{c}": gait.mean_of(measures.measures[by_column[c]]) for c in columns},
                 **origin.row("session_gdi", method_hash=sha, model_sha256=norm_sha),
             }
         )
+        self.Trial.insert({**key, "video_id": r["video_id"]} for r in trials)
         rows = gait.measure_rows(measures.measures, measures.reasons, prefix="session_measure")
         self.Measure.insert({**key, **row} for row in rows)
         self.Profile.insert({**key, **row} for row in profile_rows(index.profile, "session"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -52,20 +53,16 @@ class SessionQc(dj.Computed):
         qc_advice         : varchar(1000)      # what to do about it
         """
 
-    waits_for = (gait.GaitEvents,)
-
-    @property
-    def key_source(self) -> Any:
-        """Sessions whose trials have all been searched for events: with several workers the measures may come first."""
-        trials = gdi.SessionGdi.proj() * fit.SessionFit.Trial.proj()
-        return gdi.SessionGdi.proj() - (trials - gait.GaitEvents.proj()).proj()
-
     def make_fetch(self, key: dict) -> tuple:
         found = []
+        corrected = (gait.GaitCycle & key & "correction_no IS NOT NULL").keys()
         for stage, table, prefix in SOURCES:
-            for row in (table & _of_set(table, key)).to_dicts(order_by="KEY"):
-                values = dict(zip(COLUMNS, check_values(prefix, row), strict=True))
-                found.append({"qc_stage": stage, "qc_video_id": row.get("video_id"), **values})
+            rows = (table & _of_set(table, key)) - (corrected if table is gait.GaitEvents.Check else [])
+            checks = [(row.get("video_id"), check_values(prefix, row)) for row in rows.to_dicts(order_by="KEY")]
+            if table is gait.GaitEvents.Check:
+                checks += [(k["video_id"], dataclasses.astuple(c)) for k in corrected for c in gait.load_events(k).qc]
+            for video_id, check in checks:
+                found.append({"qc_stage": stage, "qc_video_id": video_id, **dict(zip(COLUMNS, check, strict=True))})
         return found, one(gdi.SessionGdi & key, "session_status")
 
     @computes

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline.errors import PblError
 
 from . import fit, gait, keypoints, session, video
+from .fit import trial_key
 from .reading.objects import load_keypoints, load_trial_fit
 from .video import unknown_video
 from .why import why
@@ -91,14 +92,6 @@ def recording_about(video_id: int) -> RecordingPage:
     )
 
 
-def trial_key(video_id: int) -> dict[str, Any] | None:
-    """Key of the fit of a recording: of its current sets the one that was computed last; None where there is none."""
-    current = fit.current().proj()
-    trials = fit.SessionFit.Trial.proj() * fit.SessionFit.proj("fit_computed") * current & {"video_id": video_id}
-    rows = trials.to_dicts(order_by="fit_computed DESC", limit=1)
-    return {k: rows[0][k] for k in fit.SessionFit.Trial.primary_key} if rows else None
-
-
 def fitted_key(video_id: int) -> dict[str, Any]:
     """`trial_key` of a recording that has a fit. Raises `PblError` DB_NOT_FOUND for one that has none, or none now."""
     key = trial_key(video_id)
@@ -115,10 +108,10 @@ def fitted_key(video_id: int) -> dict[str, Any]:
 def computed(key: dict[str, Any]) -> tuple[Any, ...]:
     """What tells the computations apart that a recording's fit of `trial_key` and its newest events come from."""
     fitted = (fit.SessionFit & key).to_arrays("fit_computed")
-    found = _newest_events(key)
+    found = gait.newest_events(key)
     events = () if found is None else (gait.GaitEvents & found).to_arrays("events_computed")
-    by_hand = (gait.HandEvents & key).to_arrays("hand_at")
-    return (*key.values(), *map(str, fitted), *(found or {}).values(), *map(str, (*events, *by_hand)))
+    correction = None if found is None else gait.correction_of(found)
+    return (*key.values(), *map(str, fitted), *(found or {}).values(), *map(str, (*events, correction)))
 
 
 def recording_fit(key: dict[str, Any]) -> RecordingFit:
@@ -128,7 +121,7 @@ def recording_fit(key: dict[str, Any]) -> RecordingFit:
     points = None
     if members and members[0]["keypoint_method"]:
         points = load_keypoints({k: members[0][k] for k in keypoints.Keypoints.primary_key})
-    found = _newest_events(key)
+    found = gait.newest_events(key)
     cycles = () if found is None else tuple(
         gait.cycle_of_row(r, trial.name) for r in (gait.GaitCycle.Cycle & found).to_dicts(order_by="cycle_no")
     )  # fmt: skip
@@ -136,20 +129,8 @@ def recording_fit(key: dict[str, Any]) -> RecordingFit:
 
 
 def _events(key: dict[str, Any]) -> tuple[lib.GaitEvent, ...]:
-    from pbl_pipeline.gait import GaitEvent
-
-    by_hand = gait.corrected(key, [key["video_id"]])
-    if by_hand:  # at once, before anything is computed of them
-        rows = by_hand[key["video_id"]]["events"]
-        return tuple(GaitEvent(t, side, kind, 1.0 if p is None else p) for t, side, kind, p in rows)
-    found = _newest_events(key)
-    rows = [] if found is None else (gait.GaitEvents.Event & found).to_dicts(order_by="event_no")
-    return tuple(gait.event_of_row(row) for row in rows)
-
-
-def _newest_events(key: dict[str, Any]) -> dict[str, Any] | None:
-    """Key of the events of a fit: of the corrected ones where there are any, None where they are not computed yet."""
-    rows = (gait.GaitEvents.proj("events_computed") & key).to_dicts(order_by="events_computed DESC")
-    if gait.corrected(key, [key["video_id"]]):
-        rows = [row for row in rows if gait.is_by_hand(row["gait_method"])]
-    return {k: rows[0][k] for k in gait.GaitEvents.primary_key} if rows else None
+    """The events that count: corrected ones at once, before anything is computed from them."""
+    found = gait.newest_events(key)
+    if found is None:
+        return ()
+    return gait.events_of((gait.GaitEvents & found).fetch1(), gait.correction_of(found)).events

@@ -57,8 +57,7 @@ def freeze(
     roles
         Visits of these roles alone; empty: all.
     methods
-        Key of StudySlice (`fit_method`, ...) -> method, where the tables hold several chains. Corrected events
-        (`by-hand`) are taken only where they are named.
+        Key of StudySlice (`fit_method`, ...) -> method, where the tables hold several chains.
     event
         What the days of the visits count from, such as surgery.
     note
@@ -198,8 +197,6 @@ def _chain(visits: Any, methods: Mapping[str, str]) -> dict[str, str | None]:
     if unknown := sorted(set(methods) - set(CHAIN)):
         raise _usage(f"methods of {', '.join(unknown)}", f"of {', '.join(CHAIN)}")
     found = [tuple(r[c] for c in CHAIN) for r in (dj.U(*CHAIN) & (_measured(visits) & dict(methods))).to_dicts()]
-    if "gait_method" not in methods:  # one method for everybody: visits that nobody corrected have no corrected events
-        found = [chain for chain in found if not gait.is_by_hand(chain[CHAIN.index("gait_method")])] or found
     if not found:
         raise _none("no measures of these visits", "visits with measures", "`pbl populate`, `pbl status`")
     if len(found) > 1:

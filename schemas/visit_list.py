@@ -14,7 +14,7 @@ import datetime
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from . import computed_tables, fit, gait, gdi, qc, session, study, tracking, video
+from . import computed_tables, fit, gdi, qc, session, study, tracking, video
 from .catalog import quote
 from .coded_errors import error_code
 from .rows import number
@@ -51,8 +51,7 @@ class Result:
     """Index and checks of the current set of a visit by one chain of methods.
 
     sd: of the error of the index; minimal_change: smallest change between two such visits that is no chance (90 %).
-    outcome: worst check, empty before the checks are computed; worst: its names. automatic: the method of the events
-    that the corrections began from, empty where nobody corrected them.
+    outcome: worst check, empty before the checks are computed; worst: its names. corrected: a person corrected events.
     """
 
     kind: str
@@ -64,12 +63,7 @@ class Result:
     minimal_change: float | None
     outcome: str
     worst: tuple[str, ...]
-    automatic: str = ""
-
-    @property
-    def uncorrected(self) -> tuple[str, ...]:
-        """The methods, of corrected events the automatic one that they began from."""
-        return (self.methods[0], self.automatic or self.methods[1], *self.methods[2:])
+    corrected: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,7 +153,8 @@ def change_since(result: Result, before: Result) -> Change | None:
         return None
     change = result.index - before.index
     least = [m for m in (result.minimal_change, before.minimal_change) if m is not None]
-    comparable = len(least) == 2 and (result.kind, result.methods) == (before.kind, before.methods)
+    same = (result.kind, result.methods, result.corrected) == (before.kind, before.methods, before.corrected)
+    comparable = len(least) == 2 and same
     return Change(change, abs(change) >= max(least) if comparable else None)
 
 
@@ -179,8 +174,7 @@ def choices() -> dict[str, list[str]]:
 
 
 def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
-    """Results of the current sets of visits, by session: videos of one camera first, then those of corrected events,
-    then the newest methods."""
+    """Results of the current sets of visits, by session: videos of one camera first, then the newest methods."""
     ids = [int(s) for s in sessions]
     found: dict[int, list[Result]] = {i: [] for i in ids}
     if not ids:
@@ -189,7 +183,7 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
     rows = _ask(
         "SELECT f.session_id, f.fit_set_kind, g.fit_method, g.gait_method, g.gdi_method, g.norm, g.session_status,"
         " g.session_reason, g.session_gdi_reason, g.session_gdi, g.session_gdi_sd, g.session_gdi_minimal_change,"
-        " COALESCE(q.qc_outcome, ''), COALESCE(q.qc_worst, '')"
+        " g.session_corrected, COALESCE(q.qc_outcome, ''), COALESCE(q.qc_worst, '')"
         f" FROM {_name(fit.FitSet)} f"
         f" JOIN {_name(fit.FitSelection)} c ON c.fit_set = f.fit_set AND c.fit_current = 1"
         f" JOIN {_name(gdi.SessionGdi)} g ON g.fit_set = c.fit_set AND g.fit_method = c.fit_method"
@@ -197,10 +191,8 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
         f" WHERE f.session_id IN ({_places(ids)}) ORDER BY g.session_gdi_computed DESC",
         ids,
     )
-    automatic = gait.automatic_of() if any(gait.is_by_hand(str(row[3])) for row in rows) else {}
-    for session_id, kind, fit_method, gait_method, model, norm, status, why, no_index, *values, outcome, worst in rows:
-        index, sd, change = (number(v) for v in values)
-        methods = (str(fit_method), str(gait_method), str(model), str(norm))
+    for session_id, kind, *four, status, why, no_index, index, sd, change, corrected, outcome, worst in rows:
+        methods = (str(four[0]), str(four[1]), str(four[2]), str(four[3]))
         names = tuple(n for n in str(worst).split(", ") if n)
         reason = str(why or no_index or "")
         found[int(session_id)].append(
@@ -209,18 +201,15 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
                 methods,
                 str(status),
                 reason,
-                index,
-                sd,
-                change,
+                number(index),
+                number(sd),
+                number(change),
                 str(outcome),
                 names,
-                automatic.get(methods[1], ""),
+                bool(corrected),
             )
         )
-    return {
-        i: sorted(r, key=lambda one: (order.get(one.kind, 9), not gait.is_by_hand(one.methods[1])))
-        for i, r in found.items()
-    }
+    return {i: sorted(r, key=lambda one: order.get(one.kind, 9)) for i, r in found.items()}
 
 
 # --------------------------------------------------------------------------------------------------------- the filter
@@ -437,10 +426,9 @@ def _trend(
     for before, session_id in sorted(of_person, reverse=True):
         if before >= day:
             continue
-        # Corrected events against automatic ones where nobody corrected that visit: no error of the change is known.
-        alike = [o for o in results[session_id] if o.kind == result.kind and o.uncorrected == result.uncorrected]
-        for other in sorted(alike, key=lambda o: o.methods != result.methods):
-            if other.index is not None:
+        # Corrected events against detected ones: `change_since` does not judge such a change.
+        for other in results[session_id]:
+            if (other.kind, other.methods) == (result.kind, result.methods):
                 change = change_since(result, other)
                 if change is not None:
                     return Trend(session_id, before, change.by, change.sure)

@@ -26,7 +26,8 @@ def origin_of(trial: ExportTrial, body: Body) -> dict[str, str]:
     }
     if trial.measured is not None:
         events = trial.measured.events
-        lines["event_method"] = source.get("Gait events") or f"{events.method} ({events.params_hash})"
+        by_hand = ", corrected by hand" if events.corrected else ""
+        lines["event_method"] = (source.get("Gait events") or f"{events.method} ({events.params_hash})") + by_hand
         gdi = trial.measured.gdi
         lines["index_method"] = source.get("Index") or f"{gdi.model}, norm {gdi.norm}"
     if trial.keypoints is not None and trial.keypoints.origin:

@@ -212,7 +212,7 @@ def _curves_wide(cycles: Sequence[_Cycle]) -> Table:
 
 
 def _curves_long(cycles: Sequence[_Cycle]) -> Table:
-    own = [(name, c, angle) for name, c, _ in cycles for angle in c.curves]
+    own = [(name, c, angle) for name, c, _ in cycles for angle in ANGLE_NAMES if angle in c.curves]
     n = len(own[0][1].curves[own[0][2]]) if own else 0
     sd = [c.curves_sd.get(angle, np.full(n, np.nan)) for _, c, angle in own]
     columns = [

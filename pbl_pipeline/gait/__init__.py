@@ -9,7 +9,7 @@ from ._bands import NormalBands, leg_length_m, normal_bands
 from ._camera_side import camera_side, mostly
 from ._condition import ACTIVITIES, ANY_PACE, PACES, SELF_SELECTED, UNKNOWN, Condition
 from ._curve_frame import CURVE_FRAME_COLUMNS, curve_frame
-from ._cycles import REPORT_PERCENT, GaitCycle, cycle_curves, find_cycles
+from ._cycles import REPORT_PERCENT, cycle_curves, find_cycles
 from ._exclusion import Exclusion
 from ._gdi import (
     GDI_METHODS,
@@ -24,24 +24,32 @@ from ._gdi import (
     interval_90,
     score_gdi,
 )
-from ._ground import Lengths, cycle_lengths
+from ._ground import cycle_lengths
 from ._laboratory import PLUG_IN_GAIT_POINTS, LabTrial, read_lab_feet, read_lab_trial
-from ._metrics import GaitMetrics, GaitParams, TrialMetrics, cycle_checks, gait_metrics
+from ._metrics import (
+    GaitMetrics,
+    GaitParams,
+    SessionMetrics,
+    TrialCycles,
+    TrialMetrics,
+    cycle_checks,
+    gait_metrics,
+    pool_trials,
+)
 from ._own_norm import norm_from_cycles
 from ._profile import MovementProfile, movement_profile, variable_scores
 from ._spatiotemporal import MEASURES, Measure, Spatiotemporal, cycle_measures, far_leg_of, spatiotemporal
+from ._types import GaitCycle, Lengths
+from .events import METHODS as EVENT_METHODS
 from .events import (
-    BY_HAND,
-    ByHandParams,
     EventParams,
     GaitEvent,
     GaitEvents,
-    check_by_hand,
+    apply_correction,
+    check_correction,
     detect_events,
-    events_by_hand,
     load_events,
 )
-from .events import METHODS as EVENT_METHODS
 from .motion import (
     FOOT_MARKER_SETS,
     BodyPoses,
@@ -71,7 +79,6 @@ __all__ = [
     "ANGLE_NAMES",
     "ANY_PACE",
     "BODY_ANGLES",
-    "BY_HAND",
     "CURVE_FRAME_COLUMNS",
     "DEFAULT_NORM",
     "EVENT_METHODS",
@@ -93,7 +100,6 @@ __all__ = [
     "Z90",
     "AngleSeries",
     "BodyPoses",
-    "ByHandParams",
     "Condition",
     "EventParams",
     "Exclusion",
@@ -112,18 +118,20 @@ __all__ = [
     "MovementProfile",
     "NormalBands",
     "NormativeSet",
+    "SessionMetrics",
     "Spatiotemporal",
+    "TrialCycles",
     "TrialMetrics",
     "angle_series",
+    "apply_correction",
     "camera_side",
-    "check_by_hand",
+    "check_correction",
     "curve_frame",
     "cycle_checks",
     "cycle_curves",
     "cycle_lengths",
     "cycle_measures",
     "detect_events",
-    "events_by_hand",
     "far_leg_of",
     "feet_from_fit",
     "feet_from_keypoints",
@@ -145,6 +153,7 @@ __all__ = [
     "normal_bands",
     "offset_deg",
     "pelvis_angles",
+    "pool_trials",
     "read_lab_feet",
     "read_lab_trial",
     "score_gdi",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ._bands import NormalBands
-from ._cycles import GaitCycle
+from ._types import GaitCycle
 from .events import SIDES
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from pbl_pipeline.paramset import Paramset, later
 from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
 
 from ._condition import SELF_SELECTED
-from ._cycles import GaitCycle
 from ._profile import MovementProfile, movement_profile, variable_scores
+from ._types import GaitCycle
 from .events import LEFT, RIGHT
 from .normative import (
     DEFAULT_NORM,

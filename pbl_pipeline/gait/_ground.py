@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ._types import GaitCycle, Lengths
 from .events import LEFT
 from .motion import FootTrajectories
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit
-
-    from ._cycles import GaitCycle
 
 #: The part of a stride after its foot down in which the foot lies flat (fraction of the stride).
 FLAT_FROM, FLAT_TO = 0.08, 0.32
@@ -28,25 +27,6 @@ _MIN_FRAMES = 3
 FOLLOWS = "the phone moves while filming: where the feet are on the floor is not known"
 SLIDES = "the standing foot slides over the floor: a treadmill, or a camera that moves"
 UNSEEN = "too few frames of the standing foot"
-
-
-@dataclasses.dataclass(frozen=True)
-class Lengths:
-    """Lengths (m) of one cycle, None where not known (`missing` says why).
-
-    `stride_length_m` between two places of the own foot; `step_length_m` of the step that ends the cycle, from the
-    other foot to the own one along the stride; `step_width_m` between that other foot and the line of the stride.
-    `slide`: speed of the standing feet over the floor against that relative to the pelvis (median of the three).
-    `metric` is False where the metres are those of a detector that guesses how tall a person is; where her height was
-    stated they are hers, but the step width stays unknown.
-    """
-
-    stride_length_m: float | None = None
-    step_length_m: float | None = None
-    step_width_m: float | None = None
-    missing: str = ""
-    metric: bool = False
-    slide: float | None = None
 
 
 def is_metric(fit: TrialFit) -> bool:

@@ -14,10 +14,11 @@ from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import EMPTY, OUTCOMES, PASS, WARN, Check, in_session, worst
 
 from ._condition import Condition
-from ._cycles import GaitCycle, find_cycles
+from ._cycles import find_cycles
 from ._gdi import GDI_METHODS, GDI_MODEL, GILLETTE_MODEL, Gdi, GdiParams, norm_of, params_of, score_gdi
 from ._laboratory import LabTrial
 from ._spatiotemporal import MEASURES, Spatiotemporal, far_leg_of, spatiotemporal
+from ._types import GaitCycle
 from .events import METHODS, GaitEvents, detect_events
 from .motion import BodyPoses, feet_from_fit, trial_poses
 from .normative import NormativeSet
@@ -35,15 +36,21 @@ class GaitParams:
 
 
 @dataclasses.dataclass(frozen=True)
-class TrialMetrics:
+class TrialCycles:
+    """Cycles of one trial, as a session pools them (`pool_trials`). `reason`: why none is used, empty where one is."""
+
+    name: str
+    reason: str
+    cycles: tuple[GaitCycle, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class TrialMetrics(TrialCycles):
     """Everything of one trial. `pooled` is false where the session's measures leave it out: no walking, or walking at
     another pace than that of the method."""
 
-    name: str
     status: str
-    reason: str
     events: GaitEvents
-    cycles: tuple[GaitCycle, ...]
     spatiotemporal: Spatiotemporal
     gdi: Gdi
     qc: tuple[Check, ...]
@@ -63,19 +70,25 @@ class TrialMetrics:
 
 
 @dataclasses.dataclass(frozen=True)
-class GaitMetrics:
-    """A session: its trials, and the measures over all cycles of the pooled trials together.
+class SessionMetrics:
+    """Measures and index over all used cycles of the pooled trials of a session, with their checks `qc`.
 
-    `qc` are the checks of its measures and index, `before` those of the stages before (`with_checks`).
+    `params_hash` identifies the method of the events and the parameters of the index together.
     """
 
-    trials: tuple[TrialMetrics, ...]
     status: str
     reason: str
     spatiotemporal: Spatiotemporal
     gdi: Gdi
     qc: tuple[Check, ...]
     params_hash: str
+
+
+@dataclasses.dataclass(frozen=True)
+class GaitMetrics(SessionMetrics):
+    """The measures of a session and its trials. `before`: checks of the stages before (`with_checks`)."""
+
+    trials: tuple[TrialMetrics, ...]
     before: tuple[Check, ...] = ()
 
     def with_checks(self, checks: Sequence[Check]) -> GaitMetrics:
@@ -149,18 +162,16 @@ def gait_metrics(
     model: Method[GdiParams] | str | None = None,
     version: int | None = None,
     conditions: Sequence[Condition] | None = None,
-    events: Sequence[GaitEvents | None] | None = None,
 ) -> GaitMetrics:
-    """Measures of the trials of one session and of the session (all used cycles of its pooled trials).
+    """Measures of the trials of one session and of the session: events, cycles and measures of each trial, then
+    `pool_trials`.
 
     Trials are fits, or recordings of a laboratory, whose first and last steps in view count. `model` and `version` are
-    those of `score_gdi`. `conditions` says what is done in each trial (None: unknown): the session pools walking at the
-    pace of `params.gdi`, the other trials have measures of their own alone. `events`: those of each fit where they are
-    known already, such as by hand; None: they are searched by the method of `params`.
+    those of `score_gdi`, `conditions` those of `pool_trials`.
 
-    A trial without walking has status EMPTY and takes no part in the session; the session is EMPTY where no trial
-    has a used cycle. Where one of `fit_checks`, the checks of the session fit, FAILs, there is none: measures and index
-    are None with that reason. Raises `PblError` NORM_UNKNOWN, NORM_INVALID, GAIT_INPUT (no finite frame in a trial).
+    A trial without walking has status EMPTY and takes no part in the session. Where one of `fit_checks`, the checks of
+    the session fit, FAILs, no cycle is used: measures and index are None with that reason. Raises `PblError`
+    NORM_UNKNOWN, NORM_INVALID, GAIT_INPUT (no finite frame in a trial).
     """
     if not trials:
         raise PblError(
@@ -170,15 +181,42 @@ def gait_metrics(
     params = params or GaitParams(gdi=params_of(basis, model))
     index = {"norm": basis, "params": params.gdi, "model": model, "version": version}
     given = [Condition()] * len(trials) if conditions is None else conditions
-    found = [None] * len(trials) if events is None else events
     done = tuple(
-        dataclasses.replace(_trial(t, e, params.events, index, fit_checks), pooled=c.pooled(params.gdi.pace))
-        for t, e, c in zip(trials, found, given, strict=True)
+        dataclasses.replace(_trial(t, params.events, index, fit_checks), pooled=c.pooled(params.gdi.pace))
+        for t, c in zip(trials, given, strict=True)
     )
-    pooled = [t for t in done if t.pooled]
+    return GaitMetrics(**vars(pool_trials(done, basis, params, model, version, given)), trials=done)
+
+
+def pool_trials(
+    trials: Sequence[TrialCycles],
+    norm: NormativeSet,
+    params: GaitParams,
+    model: Method[GdiParams] | str | None = None,
+    version: int | None = None,
+    conditions: Sequence[Condition] | None = None,
+) -> SessionMetrics:
+    """Measures and index of a session over all used cycles of its pooled trials.
+
+    Parameters
+    ----------
+    trials
+        Cycles of each trial; two trials may have one name.
+    norm, params, model, version
+        Norm and method of the index (`score_gdi`); `params.events` only enters `params_hash`.
+    conditions
+        What is done in each trial (None: unknown): walking at the pace of `params.gdi` is pooled.
+
+    Returns
+    -------
+    SessionMetrics
+        EMPTY, with a reason, where no pooled trial has a used cycle. Raises `PblError` as `score_gdi`.
+    """
+    given = [Condition()] * len(trials) if conditions is None else conditions
+    pooled = [t for t, c in zip(trials, given, strict=True) if c.pooled(params.gdi.pace)]
     cycles = [c for t in pooled for c in t.cycles]
     # Two trials may carry one name; their cycles are told apart by it.
-    measures, gdi = spatiotemporal(_distinct(pooled)), score_gdi(cycles, **index)
+    measures, gdi = spatiotemporal(_distinct(pooled)), score_gdi(cycles, norm, params.gdi, model, version)
     status = PASS if measures.status == PASS else EMPTY
     reason = "" if status == PASS else "; ".join(dict.fromkeys(f"{t.name}: {t.reason}" for t in pooled))
     if not pooled:
@@ -186,8 +224,7 @@ def gait_metrics(
         reason = f"no trial of walking at the pace {params.gdi.pace!r} (there are: {there})"
         measures = dataclasses.replace(measures, reason=reason, reasons=dict.fromkeys(measures.reasons, reason))
         gdi = dataclasses.replace(gdi, reason=reason)
-    return GaitMetrics(
-        trials=done,
+    return SessionMetrics(
         status=status,
         reason=reason,
         spatiotemporal=measures,
@@ -198,26 +235,22 @@ def gait_metrics(
 
 
 def _trial(
-    trial: TrialFit | LabTrial,
-    known: GaitEvents | None,
-    event_method: Paramset,
-    index: dict[str, Any],
-    fit_checks: Sequence[Check],
+    trial: TrialFit | LabTrial, event_method: Paramset, index: dict[str, Any], fit_checks: Sequence[Check]
 ) -> TrialMetrics:
     if isinstance(trial, LabTrial):
         events = trial.events
         cycles = find_cycles(events, trial=trial.name, series=trial.series, feet=trial.feet, keep_ends=True)
     else:
-        poses, events = (trial_poses(trial), known) if known is not None else _events(trial, event_method)
+        poses, events = _events(trial, event_method)
         cycles = find_cycles(events, trial, poses=poses, fit_checks=fit_checks)
     measures, gdi = spatiotemporal(cycles), score_gdi(cycles, **index)
     reason = events.reason or measures.reason
     return TrialMetrics(
         name=trial.name,
-        status=EMPTY if reason else PASS,
         reason=reason,
-        events=events,
         cycles=cycles,
+        status=EMPTY if reason else PASS,
+        events=events,
         spatiotemporal=measures,
         gdi=gdi,
         qc=(*events.qc, *cycle_checks(measures, cycles), *gdi.qc),
@@ -233,7 +266,7 @@ def _events(trial: TrialFit, method: Paramset) -> tuple[BodyPoses, GaitEvents]:
         raise error.about(trial.name) from error.__cause__
 
 
-def _distinct(trials: Sequence[TrialMetrics]) -> list[GaitCycle]:
+def _distinct(trials: Sequence[TrialCycles]) -> list[GaitCycle]:
     return [dataclasses.replace(c, trial=f"{i} {c.trial}") for i, t in enumerate(trials) for c in t.cycles]
 
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from ._cycles import GaitCycle
+from ._types import GaitCycle
 
 #: A stride longer than this times the typical one holds a step that was missed (at least half a stride more) or a
 #: pause; one shorter than its inverse an event that is none. Strides of one walk vary by a few percent, in ataxia ten.

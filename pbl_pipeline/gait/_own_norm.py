@@ -10,8 +10,8 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import PASS, WARN, Check
 
-from ._cycles import GaitCycle
 from ._gdi import MODEL_ANGLES
+from ._types import GaitCycle
 from .normative import MIN_VECTORS, NINE_ANGLES, THREE_ANGLES, NormativeSet, fit_norm
 
 #: Fewer people, or a larger fraction of the cycles from one person, give a warning.

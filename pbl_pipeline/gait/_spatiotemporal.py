@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ._camera_side import mostly
-from ._cycles import GaitCycle
+from ._types import GaitCycle
 from .events import LEFT, RIGHT
 
 #: Measures in the order of metrics.json; the unit is in the name.

@@ -421,7 +421,8 @@ def _recording_origin(r: Recording) -> list[tuple[str, str, bool]]:
     if v is not None:
         rows += [("Remark", note, False) for note in v.notes]
     if m is not None:
-        rows.append(("Gait events", f"{m.events.method}, parameters {m.events.params_hash}", True))
+        by_hand = ", corrected by hand" if m.events.corrected else ""
+        rows.append(("Gait events", f"{m.events.method}, parameters {m.events.params_hash}{by_hand}", True))
     return rows
 
 

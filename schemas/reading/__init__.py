@@ -16,8 +16,6 @@ from .visits import (
     load_recording,
     load_visit,
     load_visits,
-    newest_events,
-    trial_key,
 )
 
 __all__ = [
@@ -34,6 +32,4 @@ __all__ = [
     "load_trial_fit",
     "load_visit",
     "load_visits",
-    "newest_events",
-    "trial_key",
 ]

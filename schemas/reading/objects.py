@@ -107,23 +107,8 @@ def load_choice(row: Mapping[str, Any]) -> tracking_lib.SubjectChoice:
 
 
 def load_events(key: Any, rows: Rows = stored_rows) -> lib.GaitEvents:
-    """The library's `GaitEvents` of one row."""
-    from pbl_pipeline.gait import GaitEvents
-
-    row = row_of(gait.GaitEvents, key, rows)
-    events = rows(gait.GaitEvents.Event, key)
-    return GaitEvents(
-        status=row["events_status"],
-        events=tuple(gait.event_of_row(e) for e in events),
-        reason=row["events_reason"],
-        method=row["events_detector"],
-        params_hash=row["events_method_hash"],
-        source=row["events_source"],
-        walking_s=tuple((float(a), float(b)) for a, b in row["walking_bouts"]),
-        n_candidates=int(row["n_candidates"]),
-        n_order_breaks=int(row["n_order_breaks"]),
-        qc=tuple(_checks(rows(gait.GaitEvents.Check, key), "events")),
-    )
+    """Return the library's `GaitEvents` that the cycles of a trial were made from: detected or corrected by hand."""
+    return gait.load_events(key, rows)
 
 
 def load_cycles(key: Any, trial: str, rows: Rows = stored_rows) -> tuple[lib.GaitCycle, ...]:

@@ -25,7 +25,6 @@ from ..usable import unusable
 from .objects import (
     load_choice,
     load_cycles,
-    load_events,
     load_fit_checks,
     load_keypoints,
     load_metrics,
@@ -53,8 +52,7 @@ _OPTIONS = {
 def find_visit(restriction: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return one session (row of Session) and the key of its current fit and measures, as far as there are any.
 
-    `restriction` and errors are those of `load_visit`. Of corrected and automatic events the corrected ones are meant,
-    unless the restriction names a `gait_method`.
+    `restriction` and errors are those of `load_visit`.
     """
     if isinstance(restriction, Mapping):
         restriction = with_keys(restriction)
@@ -72,7 +70,7 @@ def find_visit(restriction: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     key: dict[str, Any] = {}
     if fits:
         key = dict(_single(fits, "fits", ("fit_set_kind", *fit.SessionFit.primary_key[::-1])))
-        measured = gait.without_uncorrected((gdi.SessionGdi & _of(fit.SessionFit, key) & restriction).keys())
+        measured = (gdi.SessionGdi & _of(fit.SessionFit, key) & restriction).keys()
         if measured:
             key |= _single(measured, "results", gdi.SessionGdi.primary_key)
     return visit, key
@@ -151,7 +149,7 @@ def list_fitted(restriction: Mapping[str, Any], slice_name: str | None = None) -
     }
     measured: dict[tuple, list[dict[str, Any]]] = {}
     of_sets = (gdi.SessionGdi.proj() & sets.proj() & restriction).to_dicts(order_by="KEY")
-    for row in gait.without_uncorrected(of_sets):
+    for row in of_sets:
         measured.setdefault((row["fit_set"], row["fit_method"]), []).append(row)
     visits = [{**row, **more} for key, row in found.items() for more in measured.get(key, [{}])]
     if not visits:
@@ -200,32 +198,20 @@ def load_visits(
 
 
 def load_recording(video_id: int) -> Recording:
-    """Return one recording with the fit that is shown of it (`trial_key`) and its newest events and cycles, also where
+    """Return one recording with the fit that is shown of it (`fit.trial_key`) and its newest events and cycles, also where
     its measures are not computed yet. Raises `PblError` DB_NOT_FOUND for a number that none has."""
     found = stored_rows(video.Video, {"video_id": video_id})
     if not found:
         raise video.unknown_video(video_id)
-    key = trial_key(video_id)
+    key = fit.trial_key(video_id)
     recording = _recording(found[0], key, stored_rows)
-    events = None if key is None else newest_events(key)
+    events = None if key is None else gait.newest_events(key)
     if events is None:
         return recording
+    # Corrected events at once, before anything is computed from them.
+    counting = gait.events_of(row_of(gait.GaitEvents, events), gait.correction_of(events))
     cycles = load_cycles(events, recording.name) if gait.GaitCycle & events else ()
-    return dataclasses.replace(recording, events=load_events(events), cycles=tuple(cycles))
-
-
-def trial_key(video_id: int) -> dict[str, Any] | None:
-    """Return the key of the fit of a recording, the last computed of its current sets; None without one."""
-    current = fit.current().proj()
-    trials = fit.SessionFit.Trial.proj() * fit.SessionFit.proj("fit_computed") * current & {"video_id": video_id}
-    rows = trials.to_dicts(order_by="fit_computed DESC", limit=1)
-    return {k: rows[0][k] for k in fit.SessionFit.Trial.primary_key} if rows else None
-
-
-def newest_events(key: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the key of the events of a fit that were computed last; None where they are not computed yet."""
-    rows = (gait.GaitEvents.proj("events_computed") & key).to_dicts(order_by="events_computed DESC")
-    return {k: rows[0][k] for k in gait.GaitEvents.primary_key} if rows else None
+    return dataclasses.replace(recording, events=counting, cycles=tuple(cycles))
 
 
 def methods_of(key: Mapping[str, Any], rows: Rows = stored_rows) -> dict[str, str]:

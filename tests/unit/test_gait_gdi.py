@@ -18,6 +18,7 @@ from pbl_pipeline.gait import (
     GdiParams,
     NormativeSet,
     fit_norm,
+    interval_90,
     load_norm,
     norm_names,
     score_gdi,

@@ -113,8 +113,7 @@ def _name(one: compare.Compared) -> str:
     label = one.about.visit.label
     if len(one.about.results) < 2 or one.result is None:
         return label
-    by_hand = f", {one.result.methods[1]}" if one.result.automatic else ""
-    return f"{label}, {one.result.kind}, {one.result.methods[0]}{by_hand}"
+    return f"{label}, {one.result.kind}, {one.result.methods[0]}"
 
 
 def _first_cycle(own: Sequence[compare.Cycle], of_all: Sequence[Sequence[compare.Cycle]]) -> int | None:

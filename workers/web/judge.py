@@ -10,7 +10,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 
 from pbl_pipeline.words import UNUSABLE
-from schemas import decide, fit, hand_events, usable
+from schemas import decide, event_corrections, fit, usable
 
 from .access import Refused, Session, form_of
 from .computing import queue_visit_of
@@ -29,7 +29,7 @@ class Judged:
     mark: usable.Unusable | None
     usable_state: str
     views: int
-    events: hand_events.Shown | None
+    events: event_corrections.Shown | None
     reasons: tuple[str, ...] = tuple(UNUSABLE)
 
 
@@ -37,7 +37,7 @@ def judged(video_id: int) -> Judged:
     """Of a registered recording. Reads tables."""
     views = fit.videos_of(fit.trial_of(video_id))
     mark = usable.unusable([video_id]).get(video_id)
-    return Judged(mark, decide.usable_state(video_id), len(views), hand_events.shown(video_id))
+    return Judged(mark, decide.usable_state(video_id), len(views), event_corrections.shown(video_id))
 
 
 def routes(tables: Tables) -> list[Route]:
@@ -62,10 +62,10 @@ def routes(tables: Tables) -> list[Route]:
         session: Session = request.state.session
         number, seen = number_of(request), fields.get("seen", "")
         if fields.get("back") == "automatic":
-            await tables.ask(hand_events.take_back, number, session.name, seen)
+            await tables.ask(event_corrections.take_back, number, session.name, seen)
         else:
             found = _events(fields.get("events", ""))
-            await tables.ask(hand_events.save, number, found, session.name, seen)
+            await tables.ask(event_corrections.save, number, found, session.name, seen)
         await tables.ask(queue_visit_of, number)
         return RedirectResponse(f"/recordings/{number}", 303)
 

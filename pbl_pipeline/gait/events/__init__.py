@@ -1,6 +1,6 @@
 """Initial contact and toe-off (`foot_down`, `foot_up`) of both sides."""
 
-from ._by_hand import BY_HAND, ByHandParams, check_by_hand, events_by_hand
+from ._correction import apply_correction, check_correction
 from ._detect import detect_events
 from ._foot_velocity import FootVelocityParams
 from ._methods import METHODS
@@ -23,7 +23,6 @@ from ._types import (
 from ._walking import WalkingParams
 
 __all__ = [
-    "BY_HAND",
     "EVENTS",
     "FOOT_DOWN",
     "FOOT_UP",
@@ -32,7 +31,6 @@ __all__ = [
     "PHASE_ORDER",
     "RIGHT",
     "SIDES",
-    "ByHandParams",
     "EventParams",
     "FilterParams",
     "FootVelocityParams",
@@ -40,11 +38,11 @@ __all__ = [
     "GaitEvents",
     "PhaseParams",
     "WalkingParams",
+    "apply_correction",
     "candidates",
-    "check_by_hand",
+    "check_correction",
     "check_preconditions",
     "detect_events",
-    "events_by_hand",
     "load_events",
     "no_events",
 ]

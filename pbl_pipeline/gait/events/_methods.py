@@ -6,7 +6,6 @@ from typing import Any
 
 from pbl_pipeline.methods import Stage
 
-from ._by_hand import BY_HAND, ByHandParams, detect_without_hands
 from ._coordinates import detect_by_coordinates
 from ._foot_velocity import FootVelocityParams, detect_by_foot_velocity
 from ._phase import PhaseParams, detect_by_phase
@@ -20,5 +19,3 @@ METHODS: Stage[Any] = Stage("gait", "family", "phase-transformer")
 METHODS.register("phase-transformer", 1, PhaseParams(MODEL, MODEL_SHA256), detect_by_phase)
 METHODS.register("zeni-2008", 1, EventParams(), detect_by_coordinates)
 METHODS.register("oconnor-2007", 2, FootVelocityParams(), detect_by_foot_velocity)
-# Its methods are made where somebody corrects events: each names the automatic one that it began from.
-METHODS.register_family(BY_HAND, ByHandParams, detect_without_hands)

@@ -7,31 +7,35 @@ import dataclasses
 import pytest
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.gait import (
-    BY_HAND,
-    EVENT_METHODS,
-    ByHandParams,
-    GaitEvent,
-    check_by_hand,
-    events_by_hand,
-    find_cycles,
-)
+from pbl_pipeline.gait import GaitEvent, GaitEvents, apply_correction, check_correction, find_cycles
+from pbl_pipeline.qc import Check
 from tests.unit.test_gait_cycles import DOWNS, EVENTS, walk
 
-METHOD = EVENT_METHODS.make(BY_HAND, 1, ByHandParams("zeni-2008-v1", "0" * 16))
+DETECTED = GaitEvents(
+    "PASS",
+    tuple(EVENTS),
+    "",
+    "zeni-2008",
+    "0" * 16,
+    "fit",
+    ((1.0, 4.9),),
+    40,
+    3,
+    (Check("heading", "WARN", None, None),),
+)
 KNOWN = [(e.time_s, e.side, e.event) for e in EVENTS]
 
 
 def refused(events: list[GaitEvent], known=()) -> PblError:
     with pytest.raises(PblError) as error:
-        check_by_hand(events, 0.0, 6.0, known)
+        check_correction(events, 0.0, 6.0, known)
     assert error.value.code == "EVENTS_IMPLAUSIBLE"
     return error.value
 
 
 def test_a_walk_passes_in_whatever_order_it_is_sent():
-    assert check_by_hand(EVENTS[::-1], 0.0, 6.0) == tuple(sorted(EVENTS, key=lambda e: e.time_s))
-    assert check_by_hand([], 0.0, 6.0) == ()
+    assert check_correction(EVENTS[::-1], 0.0, 6.0) == tuple(sorted(EVENTS, key=lambda e: e.time_s))
+    assert check_correction([], 0.0, 6.0) == ()
 
 
 @pytest.mark.parametrize(
@@ -62,29 +66,30 @@ def test_what_the_automatic_method_left_may_stay():
     refused(missed)
     refused(missed, KNOWN)  # who takes it away has to say what is there instead
     known = [(e.time_s, e.side, e.event) for e in missed]
-    assert len(check_by_hand(missed, 0.0, 6.0, known)) == len(missed)
+    assert len(check_correction(missed, 0.0, 6.0, known)) == len(missed)
     refused([dataclasses.replace(e, time_s=2.65) if e.time_s == 2.6 else e for e in missed], known)
 
 
-def test_bouts_and_cycles_of_events_by_hand():
+def test_bouts_and_cycles_of_corrected_events():
     again = [dataclasses.replace(e, time_s=e.time_s + 10.0) for e in walk(DOWNS[:4], {"left": 0.12, "right": 0.10})]
-    checked = check_by_hand([*EVENTS, *again], 0.0, 20.0)
-    found = events_by_hand(checked, METHOD, "fit", 3)
-    assert (found.status, found.method, found.params_hash, found.n_order_breaks) == ("PASS", BY_HAND, METHOD.hash, 0)
+    checked = check_correction([*EVENTS, *again], 0.0, 20.0)
+    found = apply_correction(DETECTED, checked, 3)
+    assert (found.status, found.reason, found.n_candidates, found.n_order_breaks) == ("PASS", "", 24, 0)
     assert [e.bout for e in found.events] == [0] * 16 + [1] * 8
     assert [round(t, 6) for bout in found.walking_s for t in bout] == [1.0, 4.9, 11.0, 12.7]
     assert [(c.check, c.outcome, c.value) for c in found.qc] == [("events_by_hand", "PASS", 3.0)]
     assert len(find_cycles(found)) == 6 + 2
     # A step that is missing ends a bout, and its cycles are none.
-    broken = events_by_hand([e for e in checked[:16] if e.time_s != 2.6], METHOD, "fit", 1)
+    broken = apply_correction(DETECTED, [e for e in checked[:16] if e.time_s != 2.6], 1)
     assert broken.n_order_breaks == 1
     assert {e.bout for e in broken.events} == {0, 1}
-    none = events_by_hand([], METHOD, "fit", 16)
+    none = apply_correction(DETECTED, [], 16)
     assert (none.status, none.events, none.qc[0].outcome) == ("EMPTY", (), "EMPTY")
 
 
-def test_the_method_names_the_automatic_one_it_began_from():
-    other = EVENT_METHODS.make(BY_HAND, 1, ByHandParams("zeni-2008-v1", "1" * 16))
-    assert METHOD.hash != other.hash
-    assert EVENT_METHODS.of(METHOD.paramset).params == METHOD.params
-    assert BY_HAND not in EVENT_METHODS  # nobody searches by it
+@pytest.mark.parametrize("events", [tuple(EVENTS), ()])
+def test_a_correction_says_whose_detection_it_corrects(events: tuple[GaitEvent, ...]):
+    found = apply_correction(DETECTED, events, 2)
+    assert (found.method, found.params_hash, found.source) == ("zeni-2008", "0" * 16, "fit")
+    assert (found.corrected, DETECTED.corrected) == (True, False)
+    assert [c.value for c in found.qc if c.check == "events_by_hand"] == [2.0]

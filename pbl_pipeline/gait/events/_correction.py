@@ -1,4 +1,4 @@
-"""Events that a person corrected by hand: their check, and what they become for the stages after."""
+"""Corrections of detected events by a person: their validation, and the events that then count."""
 
 from __future__ import annotations
 
@@ -7,15 +7,11 @@ import itertools
 from collections.abc import Collection, Iterable, Sequence
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.gait.motion import FootTrajectories
-from pbl_pipeline.methods import Method
 from pbl_pipeline.qc import PASS, Check
 
 from ._order import PLACE
-from ._types import FOOT_DOWN, FOOT_UP, SIDES, GaitEvent, GaitEvents, no_events
+from ._types import CORRECTED, FOOT_DOWN, FOOT_UP, SIDES, GaitEvent, GaitEvents, no_events
 
-#: Name of the family, and of its methods.
-BY_HAND = "by-hand"
 #: Shortest time between two events of a side (s): a swing or a stance; the fastest walkers swing for 0.25 s.
 SHORTEST_PHASE_S = 0.1
 #: Shortest time between two events of one kind and side (s): 240 steps a minute.
@@ -28,46 +24,29 @@ LONGEST_PHASE_S = 1.5
 MOST_EVENTS = 5000
 
 
-@dataclasses.dataclass(frozen=True)
-class ByHandParams:
-    """The automatic method that the corrections began from, which trials that nobody corrected keep: its key and its
-    hash."""
-
-    automatic: str
-    automatic_hash: str
-
-
-def detect_without_hands(feet: FootTrajectories, method: Method[ByHandParams]) -> GaitEvents:
-    """The events of the automatic method, where nobody corrected any. Raises `PblError` as that method does, and
-    SOLVER_UNKNOWN where it is not registered."""
-    from ._methods import METHODS
-
-    automatic = METHODS.find(method.params.automatic)
-    return automatic.function(feet, automatic)
-
-
-def check_by_hand(
-    events: Iterable[GaitEvent], first_s: float, last_s: float, known: Collection[tuple[float, str, str]] = ()
+def check_correction(
+    events: Iterable[GaitEvent], first_s: float, last_s: float, detected: Collection[tuple[float, str, str]] = ()
 ) -> tuple[GaitEvent, ...]:
-    """Events that a person set, in order of time, or what is wrong with one of them.
+    """Return the events that a person set in order of time, or say what is wrong with one of them.
 
-    Within a side initial contact and toe-off alternate, at least `SHORTEST_PHASE_S` apart, events of one kind at least
-    `SHORTEST_CYCLE_S`; of one kind more than `LONGEST_CYCLE_S` apart nothing is asked for in between, because the
-    person may have stood or left the view. Two that the automatic method left side by side may stay so.
+    Initial contacts and toe-offs of a side alternate, at least `SHORTEST_PHASE_S` apart; two events of one kind and
+    side are at least `SHORTEST_CYCLE_S` apart. Nothing is required between two that are more than `LONGEST_CYCLE_S`
+    apart, because the person may have stood still or left the view. Neighbours that the method detected as such may
+    stay.
 
     Parameters
     ----------
     events
-        As they were set; times in s.
+        As the person set them; times in s.
     first_s, last_s
-        First and last frame of the recording (s).
-    known
-        Time (s), side and kind of the automatic events.
+        Times of the first and the last frame of the recording (s).
+    detected
+        Time (s), side and kind of the detected events.
 
     Raises
     ------
     PblError
-        EVENTS_IMPLAUSIBLE, which says which event and what is expected there.
+        EVENTS_IMPLAUSIBLE, which names the event and what is expected there.
     """
     found = sorted(events, key=lambda e: e.time_s)
     if len(found) > MOST_EVENTS:
@@ -75,7 +54,7 @@ def check_by_hand(
     outside = next((e for e in found if not first_s <= e.time_s <= last_s), None)
     if outside is not None:
         raise _implausible(f"{_said(outside)}", f"a time inside the recording, {first_s:.2f} to {last_s:.2f} s")
-    left_so = _neighbours([GaitEvent(t, side, event, 1.0) for t, side, event in known])
+    left_so = _neighbours([GaitEvent(t, side, event, 1.0) for t, side, event in detected])
     for side in SIDES:
         own = [e for e in found if e.side == side]
         for before, e in itertools.pairwise(own):
@@ -97,22 +76,25 @@ def check_by_hand(
     return tuple(found)
 
 
-def events_by_hand(
-    events: Sequence[GaitEvent], method: Method[ByHandParams], source: str, n_changed: int
-) -> GaitEvents:
-    """What events that `check_by_hand` passed are for the stages after: in bouts of walking.
+def apply_correction(detected: GaitEvents, events: Sequence[GaitEvent], n_changed: int) -> GaitEvents:
+    """Return the events that count where a person corrected the `detected` ones, in bouts of walking.
 
     A bout ends where the next event is not the next in the order of walking, or comes later than `LONGEST_PHASE_S`.
+    Method, parameters and source stay those of the detection; the check `CORRECTED` tells corrected events apart.
 
     Parameters
     ----------
-    source
-        Of the trajectories that the person looked at, such as "fit".
+    detected
+        The events that the method found.
+    events
+        All events that there are now, as `check_correction` returned them.
     n_changed
-        How many the person moved, added or took away.
+        Number of events that the person moved, added or removed.
     """
+    changes = Check(CORRECTED, PASS, float(n_changed), None)
     if not events:
-        return no_events(method.name, method.hash, source, "a person took every event away")
+        none = no_events(detected.method, detected.params_hash, detected.source, "a person removed every event")
+        return dataclasses.replace(none, qc=(*none.qc, changes))
     bouts: list[list[GaitEvent]] = [[]]
     breaks = 0
     for e in events:
@@ -128,13 +110,13 @@ def events_by_hand(
         PASS,
         numbered,
         "",
-        method.name,
-        method.hash,
-        source,
+        detected.method,
+        detected.params_hash,
+        detected.source,
         tuple((bout[0].time_s, bout[-1].time_s) for bout in bouts),
         n_candidates=len(events),
         n_order_breaks=breaks,
-        qc=(Check("events_by_hand", PASS, float(n_changed), None),),
+        qc=(changes,),
     )
 
 
