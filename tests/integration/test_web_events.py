@@ -14,7 +14,7 @@ import pbl_pipeline.gait
 from pbl_pipeline.errors import PblError
 from schemas import decide, fit, gait, gdi, hand_events, move, qc, slices, study
 from schemas.export import visits_of_tables
-from schemas.forget import forget
+from schemas.operations.forget import forget
 from schemas.recording_page import recording_about, recording_fit, trial_key
 from schemas.results import load_session
 from schemas.review import Decision
