@@ -17,6 +17,7 @@ import shutil
 import tempfile
 import threading
 from collections.abc import Callable, Hashable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -30,43 +31,34 @@ log = logging.getLogger(__name__)
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """A function to run, and how.
+    """A function to run, and how."""
 
-    Attributes
-    ----------
-    function, args
-        Importable by name; arguments that can be pickled.
-    broken
-        The error to report where the process died or exceeded a limit, from a description of what happened.
-    file
-        Name of the file that the function writes, if any: the path of the file is then its first argument.
-    open_files
-        Closed when the function has ended.
-    seconds, n_bytes
-        Limits of `limited`.
-    end_s
-        Seconds that the process is given to end when the queue is closed.
-    """
-
-    function: Callable[..., object]
+    function: Callable[..., object]  # importable by name
     args: tuple[Any, ...]
-    broken: Callable[[str], PblError]
-    file: str = ""
-    open_files: contextlib.ExitStack = dataclasses.field(default_factory=contextlib.ExitStack)
-    seconds: float = math.inf
+    broken: Callable[[str], PblError]  # error to report where the process died or exceeded a limit, from what happened
+    file: str = ""  # name of the file that the function writes: its path is the first argument then
+    open_files: contextlib.ExitStack = dataclasses.field(default_factory=contextlib.ExitStack)  # closed at the end
+    seconds: float = math.inf  # limits of `limited`
     n_bytes: int | None = None
-    end_s: float = 0.0
+    end_s: float = 0.0  # time that the process has to end when the queue is closed (s)
 
 
-@dataclasses.dataclass
 class Work:
     """A task in the queue."""
 
-    task: Task
-    state: str = "waiting"  # then "running" and "ended"
-    path: Path | None = None  # the file, once it is complete
-    error: PblError | None = None  # why the function did not succeed
-    _done: Any = dataclasses.field(default_factory=lambda: multiprocessing.get_context("spawn").Value("d", 0.0))
+    def __init__(self, begin: Callable[[Any], Future[Path | None]]) -> None:
+        self._done = multiprocessing.get_context("spawn").Value("d", 0.0)
+        self._future = begin(self._done)
+
+    @property
+    def state(self) -> str:
+        """ "waiting", "running" or "ended"."""
+        return "ended" if self._future.done() else "running" if self._future.running() else "waiting"
+
+    @property
+    def ended(self) -> bool:
+        """True once it succeeded, failed, or was given up because the queue was closed."""
+        return self._future.done()
 
     @property
     def share(self) -> float:
@@ -74,35 +66,15 @@ class Work:
         return 1.0 if self.path is not None else self._done.value
 
     @property
-    def ended(self) -> bool:
-        """True once it succeeded or failed."""
-        return self.state == "ended"
+    def error(self) -> PblError | None:
+        """Why the task failed; None where it did not."""
+        found = self._future.exception() if self.ended and not self._future.cancelled() else None
+        return found if isinstance(found, PblError) else None
 
-    def run(self, folder: Path, stop: threading.Event) -> None:
-        """Run the task to its end; failures are reported by `error`."""
-        task, args, part = self.task, self.task.args, folder / f"part-{self.task.file}"
-        try:
-            if task.file:
-                folder.mkdir()
-                args = (part, *args)
-            limits = {"seconds": task.seconds, "n_bytes": task.n_bytes, "end_s": task.end_s}
-            limited(_reporting, self._done, task.function, args, **limits, stop=stop)
-            if task.file:
-                self.path = part.rename(folder / task.file)
-        except PblError as error:
-            self.error = error
-        except (LimitExceeded, OSError) as error:
-            self.error = task.broken(str(error))
-        except Exception as error:
-            log.exception("running %s", task.function.__name__)
-            self.error = PblError(
-                "INTERNAL",
-                found=f"{type(error).__name__}: {error}",
-                expected="a result",
-                next_step="report the text that is in the terminal of `pbl web`",
-            )
-        if self.error is not None:
-            shutil.rmtree(folder, ignore_errors=True)
+    @property
+    def path(self) -> Path | None:
+        """The file, once it is complete."""
+        return self._future.result() if self.ended and not self._future.cancelled() and self.error is None else None
 
 
 class ProcessQueue:
@@ -120,20 +92,19 @@ class ProcessQueue:
         self._most, self._kept = most, kept
         self._folder = tempfile.TemporaryDirectory(prefix="pbl-web-")
         self._works: collections.OrderedDict[Hashable, Work] = collections.OrderedDict()
-        self._waiting: collections.deque[Work] = collections.deque()
-        self._changed, self._stop = threading.Condition(), threading.Event()
-        self._thread: threading.Thread | None = None
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="process queue")
+        self._lock, self._stop = threading.Lock(), threading.Event()
 
     def find(self, key: Hashable) -> Work | None:
         """Return the work of a key; None where nothing was begun, or it is no longer kept."""
-        with self._changed:
+        with self._lock:
             if key in self._works:
                 self._works.move_to_end(key)
             return self._works.get(key)
 
     def drop(self, key: Hashable) -> None:
         """Forget a work that failed, so that it can be begun again."""
-        with self._changed:
+        with self._lock:
             if key in self._works and self._works[key].error is not None:
                 del self._works[key]
 
@@ -145,39 +116,34 @@ class ProcessQueue:
         PblError
             USAGE where too many wait.
         """
-        with self._changed:
-            earlier = self._works.get(key)
-            if earlier is not None and (not earlier.ended or earlier.path is not None):
+        with self._lock:
+            earlier = self._works.pop(key, None)
+            if earlier is None or (earlier.ended and earlier.path is None):
+                if sum(w.state == "waiting" for w in self._works.values()) >= self._most:
+                    task.open_files.close()
+                    raise PblError(
+                        "USAGE",
+                        found=f"{self._most} tasks are waiting",
+                        expected="fewer at a time",
+                        next_step="load this page again when some of them are done",
+                    )
+                earlier = Work(functools.partial(self._submit, task))
+            else:
                 task.open_files.close()
-                return earlier
-            if len(self._waiting) >= self._most:
-                task.open_files.close()
-                raise PblError(
-                    "USAGE",
-                    found=f"{self._most} tasks are waiting",
-                    expected="fewer at a time",
-                    next_step="load this page again when some of them are done",
-                )
-            work = self._works[key] = Work(task)
-            self._works.move_to_end(key)
-            self._waiting.append(work)
+            self._works[key] = earlier
             self._forget()
-            self._changed.notify()
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="process queue", daemon=True)
-                self._thread.start()
-            return work
+            return earlier
 
     def close(self) -> None:
         """End what is running and remove the files."""
         self._stop.set()
-        with self._changed:
-            self._changed.notify()
-        if self._thread is not None:
-            self._thread.join()
-        for work in self._waiting:
-            work.task.open_files.close()
+        self._thread.shutdown(cancel_futures=True)
         self._folder.cleanup()
+
+    def _submit(self, task: Task, done: Any) -> Future[Path | None]:
+        future = self._thread.submit(_run, task, done, Path(self._folder.name), self._stop)
+        future.add_done_callback(lambda _: task.open_files.close())
+        return future
 
     def _forget(self) -> None:
         ended = [key for key, work in self._works.items() if work.ended]
@@ -186,19 +152,35 @@ class ProcessQueue:
             if path is not None:
                 shutil.rmtree(path.parent, ignore_errors=True)
 
-    def _run(self) -> None:
-        number = 0
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._waiting or self._stop.is_set())
-                if self._stop.is_set():
-                    return
-                work = self._waiting.popleft()
-                work.state = "running"
-            number += 1
-            with work.task.open_files:
-                work.run(Path(self._folder.name) / str(number), self._stop)
-            work.state = "ended"
+
+def _run(task: Task, done: Any, root: Path, stop: threading.Event) -> Path | None:
+    """Run a task to its end; return the file that it made, if it makes one.
+
+    Raises
+    ------
+    PblError
+        What the function raised, `task.broken`, or INTERNAL for what is not foreseen.
+    """
+    folder = Path(tempfile.mkdtemp(dir=root))
+    part = folder / f"part-{task.file}"
+    args = (part, *task.args) if task.file else task.args
+    limits = {"seconds": task.seconds, "n_bytes": task.n_bytes, "end_s": task.end_s}
+    try:
+        limited(_reporting, done, task.function, args, **limits, stop=stop)
+        return part.rename(folder / task.file) if task.file else None
+    except BaseException as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        if isinstance(error, PblError):
+            raise
+        if isinstance(error, LimitExceeded | OSError):
+            raise task.broken(str(error)) from error
+        log.exception("running %s", task.function.__name__)
+        raise PblError(
+            "INTERNAL",
+            found=f"{type(error).__name__}: {error}",
+            expected="a result",
+            next_step="report the text that is in the terminal of `pbl web`",
+        ) from error
 
 
 def _reporting(done: Any, function: Callable[..., object], args: tuple[Any, ...]) -> None:
