@@ -37,13 +37,13 @@ import pymysql
 
 from pbl_pipeline.errors import PblError
 
-from . import embedded
 from ._datajoint import UTC, LostConnectionError, backend_of, datajoint, dj
 from ._datajoint import DuplicateError as DuplicateError  # these four for the workers
 from ._datajoint import IntegrityError as IntegrityError
 from ._datajoint import inserting as inserting
-from .embedded import APP_USER, HOST, Folder, not_running
-from .secret_files import secret
+from .operations import embedded
+from .operations.embedded import APP_USER, HOST, Folder, not_running
+from .operations.secret_files import secret
 from .store import further_stores, store_spec
 
 #: How long a server may take to answer before it counts as not running.

@@ -12,9 +12,9 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from . import computed_tables, connection, keypoints, tracking, usable, video, worker
-from .catalog import quote
 from .coded_errors import error_code, error_found, error_next_step
 from .jobs import jobs_of
+from .operations.catalog import quote
 
 #: Fewer videos than this, and keys are counted that nobody has queued yet.
 SMALL = 5000

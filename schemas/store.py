@@ -15,7 +15,7 @@ from pbl_pipeline.errors import PblError
 
 from ._datajoint import full_path
 from .folders import private_folder
-from .secret_files import secret
+from .operations.secret_files import secret
 
 #: Folder of the bucket under which everything of ours lies; the phones' uploads may have another one beside it.
 LOCATION = "arrays"

@@ -15,8 +15,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from . import computed_tables, fit, gdi, qc, session, study, tracking, video
-from .catalog import quote
 from .coded_errors import error_code
+from .operations.catalog import quote
 from .rows import number
 from .status import queue_name
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 from . import computed_tables
-from .catalog import quote
 from .coded_errors import error_code, error_found, error_next_step
+from .operations.catalog import quote
 from .scope import of_visit
 from .status import queue_counts, queue_name
 from .video import Video

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from schemas import embedded
+from schemas.operations import embedded
 
 
 def new_home() -> Path:

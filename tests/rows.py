@@ -7,8 +7,9 @@ from contextlib import closing
 from pathlib import Path
 
 from pbl_pipeline import settings
-from schemas import _dump, catalog, connection
+from schemas import connection
 from schemas.ingest import Visit, ingest
+from schemas.operations import catalog, dump
 
 
 def register(*paths: Path, **visit) -> list[int]:
@@ -22,7 +23,7 @@ def everything() -> dict[str, list[tuple]]:
     """Every row of every table, as the server prints it."""
     with closing(connection.plain_connection(conv={})) as server:
         return {
-            f"{schema}.{table}": sorted(_dump.rows_of(server, schema, table, columns), key=str)
+            f"{schema}.{table}": sorted(dump.rows_of(server, schema, table, columns), key=str)
             for (schema, table), columns in catalog.tables().items()
         }
 
@@ -35,7 +36,7 @@ def everything_but_refreshes() -> dict[str, list[tuple]]:
 
 def remove_all() -> None:
     """Leave the tables as `schemas.activate` makes them: every row and every job goes but the methods (`#`), and so do
-    the lists of what was removed of whom (`schemas.forget.manifest_path`), by which a person is forgotten again.
+    the lists of what was removed of whom (`forget.manifest_path`), by which a person is forgotten again.
 
     In one transaction of plain statements: what depends on what was deleted is not looked up, which takes DataJoint
     seconds. That results go with their person is a test of its own (test_validation.py).

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pbl_pipeline.errors import PblError
 from schemas import connection, worker
-from schemas.backup import Backup, Say, backup
+from schemas.operations.backup import Backup, Say, backup
 
 #: Names of the backups that are made here; nothing else in the folder is touched.
 _NAME, _PATTERN = "%Y-%m-%dT%H%M%SZ", re.compile(r"\d{4}-\d\d-\d\dT\d{6}Z")
@@ -38,7 +38,7 @@ def backup_regularly(root: Path, keep: int, say: Say = lambda _: None) -> Backup
     Raises
     ------
     PblError
-        What `schemas.backup.backup` raises; nothing is removed then.
+        What `schemas.operations.backup.backup` raises; nothing is removed then.
     """
     with worker.alone("backup", connection.connect()) as obtained:
         if not obtained:

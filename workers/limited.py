@@ -1,10 +1,12 @@
-"""A function in a process of its own, which is ended when it takes too long or too much memory."""
+"""A function in a process of its own, which is ended when it takes too much time or memory."""
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -18,9 +20,10 @@ class LimitExceeded(Exception):
 def limited(
     function: Callable[..., object],
     *args: Any,
-    seconds: float,
-    n_bytes: int,
+    seconds: float = math.inf,
+    n_bytes: int | None = None,
     stop: threading.Event | None = None,
+    end_s: float = 0.0,
 ) -> None:
     """Call a function for what it raises; its result is dropped.
 
@@ -31,14 +34,16 @@ def limited(
     seconds
         Time it may take, the start of the process (about a second) included.
     n_bytes
-        Memory the process may allocate beside what its imports take.
+        Memory the process may allocate in addition to what its imports take; None: any amount.
     stop
         Ends the process when it is set.
+    end_s
+        Time that the process has to end by itself when it is stopped (SIGTERM), before it is killed (s).
 
     Raises
     ------
     LimitExceeded
-        In words what it took too much of, or that it was stopped. Whatever `function` raises is raised here.
+        What it took too much of, or that it was stopped or died. Whatever `function` raises is raised here.
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
@@ -47,8 +52,11 @@ def limited(
     theirs.close()
     try:
         end = time.monotonic() + seconds
-        while not ours.poll(min(0.2, max(0.0, end - time.monotonic())) if stop else seconds):
+        while not ours.poll(min(0.2, max(0.0, end - time.monotonic()))):
             if stop and stop.is_set():
+                if end_s:
+                    process.terminate()
+                    process.join(end_s)
                 raise LimitExceeded("it was stopped")
             if time.monotonic() >= end:
                 raise LimitExceeded(f"more than {seconds:g} s")
@@ -62,12 +70,25 @@ def limited(
         process.join()
         ours.close()
     if isinstance(error, MemoryError):
-        raise LimitExceeded(f"more than {n_bytes / 2**20:.0f} MiB of memory")
+        limit = "there is" if n_bytes is None else f"{n_bytes / 2**20:.0f} MiB"
+        raise LimitExceeded(f"more than {limit} of memory")
     if error is not None:
         raise error
 
 
-def _call(pipe: Connection, n_bytes: int, function: Callable[..., object], args: tuple) -> None:
+def _call(pipe: Connection, n_bytes: int | None, function: Callable[..., object], args: tuple) -> None:
+    if n_bytes is not None:
+        _limit_memory(n_bytes)
+    try:
+        function(*args)
+    except Exception as error:  # noqa: BLE001  raised where the function was called
+        error.add_note(traceback.format_exc())
+        pipe.send(error)
+    else:
+        pipe.send(None)
+
+
+def _limit_memory(n_bytes: int) -> None:
     try:
         import resource
 
@@ -77,9 +98,3 @@ def _call(pipe: Connection, n_bytes: int, function: Callable[..., object], args:
         resource.setrlimit(resource.RLIMIT_DATA, (most, most))
     except (ImportError, OSError, ValueError):  # another system than Linux, or a lower limit that may not be raised
         pass
-    try:
-        function(*args)
-    except Exception as error:  # noqa: BLE001  raised where the function was called
-        pipe.send(error)
-    else:
-        pipe.send(None)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from schemas import chain, fit, review, tracking, video, worker
-from schemas.scope import Scope
+from schemas.scope import Scope, of_visit
 from schemas.worker import alone
 
 from . import queue, recover
@@ -140,6 +140,16 @@ def refresh_scope(scope: Scope) -> Refreshed:
             if n := queue.fill(table, where=where):
                 out.queued[table.__name__] = n
     return out
+
+
+def queue_visit(session_id: int) -> None:
+    """Queue what a decision made computable of a visit, so that pages and workers see it at once."""
+    refresh_scope(of_visit(session_id))
+
+
+def queue_visit_of(video_id: int) -> None:
+    """`queue_visit` of the visit that a recording belongs to."""
+    queue_visit(int((video.Video & {"video_id": video_id}).fetch1("session_id")))
 
 
 def _refresh(tables: Sequence[Any], lately: Scope | None) -> Refreshed:

@@ -14,7 +14,6 @@ from pbl_pipeline.code_version import code_version
 from pbl_pipeline.files import check_out_folder
 from pbl_pipeline.stats import CurveTest, Estimate
 from pbl_pipeline.study import StudyData, content_hash
-from pbl_pipeline.svg_pdf import can_write_pdf, svg_to_pdf
 
 from ._figures import (
     AFTER,
@@ -22,12 +21,12 @@ from ._figures import (
     GROUP_COLOURS,
     Figure,
     colours_of,
-    curves_axes,
-    forest_axes,
-    groups_axes,
-    means_axes,
-    paired_axes,
-    scatter_axes,
+    draw_curves,
+    draw_forest,
+    draw_groups,
+    draw_means,
+    draw_pairs,
+    draw_scatter,
 )
 from ._results import StudyResults, score_classes, study_results
 from ._tables import PageTable, all_tables, number, p_text, short_of, title_of, unit_of
@@ -37,13 +36,18 @@ PAGE = "report.html"
 
 
 def write_study_report(
-    study: StudyData, folder: str | Path, change_from: str = "", change_to: str = "", change_group: str = ""
+    study: StudyData,
+    folder: str | Path,
+    change_from: str = "",
+    change_to: str = "",
+    change_group: str = "",
+    pdf: bool = True,
 ) -> list[Path]:
     """Write `report.html`, `figures/*.svg` and `*.pdf`, `tables/*.csv` and `*.tex`; returns the paths, the page first.
 
-    PDF where reportlab is installed (the extra `export`). The page asks for nothing from elsewhere. What the values do
-    not support stands there as a code with its reason.
-    `change_from`, `change_to` (roles) and `change_group` go before those of the study's description.
+    The page asks for nothing from elsewhere. What the values do not support stands there as a code with its reason.
+    `change_from`, `change_to` (roles) and `change_group` take precedence over those of the study's description. Without
+    `pdf` the figures are SVG alone, in a third of the time.
 
     Raises
     ------
@@ -60,13 +64,13 @@ def write_study_report(
     for sub in ("figures", "tables"):
         (folder / sub).mkdir(parents=True, exist_ok=True)
     paths = [folder / PAGE]
-    paths[0].write_text(_render(head, tables, sections, results), encoding="utf-8")
+    paths[0].write_text(_render(head, tables, sections, results, "SVG and PDF" if pdf else "SVG"), encoding="utf-8")
     for figure in (f for figures in sections.values() for f in figures):
         paths.append(folder / "figures" / f"{figure.name}.svg")
-        paths[-1].write_text(svg := figure.standalone(footer), encoding="utf-8")
-        if can_write_pdf():
+        paths[-1].write_text(figure.svg(footer), encoding="utf-8")
+        if pdf:
             paths.append(paths[-1].with_suffix(".pdf"))
-            paths[-1].write_bytes(svg_to_pdf(svg))
+            paths[-1].write_bytes(figure.pdf(footer))
     for name, frame in _frames(results).items():
         paths.append(folder / "tables" / f"{name}.csv")
         frame.to_csv(paths[-1], index=False, float_format="%.8g", lineterminator="\n")
@@ -102,6 +106,7 @@ def _render(
     tables: dict[str, PageTable],
     sections: dict[str, list[Figure]],
     results: StudyResults,
+    formats: str,
 ) -> str:
     text = resources.files("pbl_pipeline.study_report").joinpath("templates/report.html").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
@@ -110,7 +115,7 @@ def _render(
         tables=tables,
         sections=sections,
         plan=results.plan,
-        formats="SVG and PDF" if can_write_pdf() else "SVG",
+        formats=formats,
     )
 
 
@@ -166,8 +171,8 @@ def _paper_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]:
         by_class = {str(c): at.loc[labels == c, measure].dropna().to_numpy(float) for c in labels.cat.categories}
         if by_class := {c: v for c, v in by_class.items() if len(v)}:
             note = f"{where}; {_tests(results, measure, score)}"
-            axes = groups_axes(by_class, unit)
-            yield Figure(_file("5B", score), f"B  {title} by class of {short_of(score)}", note, axes)
+            drawing = draw_groups(by_class, unit)
+            yield Figure(_file("5B", score), f"B  {title} by class of {short_of(score)}", note, drawing)
     ordinal = {score_column(study, i): bool(o) for i, o in study.instruments[["instrument", "ordinal"]].to_numpy()}
     colours = colours_of(results.plan.groups)
     for score in results.plan.scores:
@@ -176,15 +181,15 @@ def _paper_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]:
         parts = {g: (v[score].to_numpy(float), v[measure].to_numpy(float)) for g, v in own.items() if len(v)}
         if parts:
             letter = "E" if ordinal[score] else "C"
-            axes = scatter_axes(parts, (title_of(study, score), title), [colours[g] for g in parts], not ordinal[score])
-            note = f"{where}; {_correlations(results, measure, score)}"
             key = {g: colours[g] for g in parts}
-            yield Figure(_file(f"5{letter}", score), f"{letter}  {title} and {short_of(score)}", note, axes, key)
+            drawing = draw_scatter(parts, (title_of(study, score), title), list(key.values()), not ordinal[score])
+            note = f"{where}; {_correlations(results, measure, score)}"
+            yield Figure(_file(f"5{letter}", score), f"{letter}  {title} and {short_of(score)}", note, drawing, key)
     values = {g: at.loc[at["group"] == g, measure].dropna().to_numpy(float) for g in results.plan.groups}
     values = {g: v for g, v in values.items() if len(v)}
     if len(values) > 1:
         note = f"{where}; {_tests(results, measure, 'group')}"
-        yield Figure("5D_groups", f"D  {title} by group", note, groups_axes(values, unit, colours))
+        yield Figure("5D_groups", f"D  {title} by group", note, draw_groups(values, unit, colours))
 
 
 def _correlations(results: StudyResults, measure: str, score: str) -> str:
@@ -222,7 +227,7 @@ def _srm_figure(results: StudyResults) -> Iterator[Figure]:
         note = f"{plan.change_group}, {plan.change_from} to {plan.change_to}; 95 % interval by the jackknife"
         colours = {"gait measures": GROUP_COLOURS[0], "clinical scores": GROUP_COLOURS[1]}
         title = "Standardised response mean of gait measures and clinical scores"
-        yield Figure("srm", title, note, forest_axes(rows), colours)
+        yield Figure("srm", title, note, draw_forest(rows), colours)
 
 
 def _mean_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]:
@@ -234,8 +239,10 @@ def _mean_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]:
             groups = [g for g in plan.groups if g in set(own["group"])]
             counts = "; ".join(f"{g} n {', '.join(map(str, own.loc[own['group'] == g, 'n']))}" for g in groups)
             colours = {g: c for g, c in colours_of(plan.groups).items() if g in groups}
-            axes = means_axes(own, plan.roles, plan.groups, unit_of(study, name))
-            yield Figure(_file("visits", name), title_of(study, name), f"mean, 95 % interval; {counts}", axes, colours)
+            drawing = draw_means(own, plan.roles, plan.groups, unit_of(study, name))
+            yield Figure(
+                _file("visits", name), title_of(study, name), f"mean, 95 % interval; {counts}", drawing, colours
+            )
 
 
 def _paired_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]:
@@ -247,8 +254,10 @@ def _paired_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]
             continue
         row = frame[(frame["name"] == name) & (frame["statistic"] == "effect_size")].iloc[0]
         test = row["code"] or f"Wilcoxon p = {p_text(row['p'])}, r = {number(row['value'], 2)}"
-        axes = paired_axes(both, (plan.change_from, plan.change_to), unit_of(study, name))
-        yield Figure(_file("paired", name), title_of(study, name), f"{plan.change_group}, n {len(both)}; {test}", axes)
+        drawing = draw_pairs(both, (plan.change_from, plan.change_to), unit_of(study, name))
+        yield Figure(
+            _file("paired", name), title_of(study, name), f"{plan.change_group}, n {len(both)}; {test}", drawing
+        )
 
 
 def _curve_figures(study: StudyData, results: StudyResults, comparison: str) -> Iterator[Figure]:
@@ -273,7 +282,7 @@ def _curve_figures(study: StudyData, results: StudyResults, comparison: str) -> 
         legend = {c.names[1]: colours[0], c.names[0]: colours[1]}
         title = f"{letter}{title_of(study, c.angle)}, {who}"
         yield Figure(
-            _file(prefix, name), title, f"mean, one sd; {n}{left}; {test}", curves_axes(c, colours, unit), legend
+            _file(prefix, name), title, f"mean, one sd; {n}{left}; {test}", draw_curves(c, colours, unit), legend
         )
 
 

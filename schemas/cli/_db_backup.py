@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from schemas.backup import Backup
+    from schemas.operations.backup import Backup
 
 
 @click.command()
@@ -24,7 +24,7 @@ def backup(folder: Path, database_only: bool, with_recordings: bool) -> None:
     Example: pbl db backup /backup/2026-03-01
     Example: pbl db backup --recordings /backup/2026-03-01
     """
-    from schemas.backup import backup as save
+    from schemas.operations.backup import backup as save
 
     say(save(folder, not database_only, click.echo, with_recordings))
 
@@ -56,7 +56,7 @@ def restore(folder: Path, only_check: bool, again: bool) -> None:
     Example: pbl db restore --check /backup/2026-03-01
     Example: PBL_HOME=/srv/pbl-new pbl db start && PBL_HOME=/srv/pbl-new pbl db restore /backup/2026-03-01
     """
-    from schemas import backup
+    from schemas.operations import backup
 
     if only_check:
         manifest = backup.check(folder, click.echo)

@@ -24,7 +24,7 @@ def config(out: Path, overwrite: bool) -> None:
 
     Example: pbl db config --out notebooks
     """
-    from schemas.client_config import is_mariadb, write_config
+    from schemas.operations.client_config import is_mariadb, write_config
 
     for path in write_config(out, overwrite):
         click.echo(path)

@@ -60,7 +60,7 @@ def roles(
     Example: pbl db roles --role analyst --user maria --from % --schema mylab
     """
     from schemas import connection
-    from schemas import roles as lib
+    from schemas.operations import roles as lib
 
     if (user or remove) and len(names) != 1:
         raise PblError(

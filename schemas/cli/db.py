@@ -41,7 +41,7 @@ def start() -> None:
     """
     if _uses_external():
         return
-    from schemas import embedded
+    from schemas.operations import embedded
 
     embedded.start(click.echo)
 
@@ -52,7 +52,7 @@ def stop() -> None:
 
     Example: pbl db stop
     """
-    from schemas import embedded
+    from schemas.operations import embedded
 
     embedded.stop(click.echo)
 
@@ -64,8 +64,8 @@ def status(as_json: bool) -> None:
 
     Example: pbl db status --json
     """
-    from schemas import embedded
-    from schemas.server_status import database_status
+    from schemas.operations import embedded
+    from schemas.operations.server_status import database_status
 
     known = database_status()
     _print(known, as_json)
@@ -85,11 +85,12 @@ def init() -> None:
 
     Example: pbl db init
     """
-    from schemas import catalog, store
+    from schemas import store
     from schemas._declare import declare_all
+    from schemas.operations import catalog
 
     if not _uses_external():
-        from schemas import embedded
+        from schemas.operations import embedded
 
         embedded.start(click.echo)
     click.echo("Creating the tables as far as they are missing, and the method rows of this version")

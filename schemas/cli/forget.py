@@ -29,7 +29,7 @@ def forget(subject: str, yes: bool, videos: bool) -> None:
     """
     import schemas
     from schemas import archive
-    from schemas import forget as lib
+    from schemas.operations import forget as lib
 
     schemas.activate(methods=False)
     if not yes:

@@ -6,9 +6,10 @@ import dataclasses
 import re
 from typing import Any
 
-from schemas import catalog, connection
+from schemas import connection
 from schemas._datajoint import dj
 from schemas.chain import tables
+from schemas.operations import catalog
 
 #: A line of a definition that makes a column of the table's own: its name.
 _OWN = re.compile(r"^\s*([a-z]\w*)\s*[:=]", re.MULTILINE)

@@ -14,11 +14,12 @@ import pymysql
 
 from pbl_pipeline import __version__
 from pbl_pipeline.errors import PblError
-from schemas import catalog, connection
+from schemas import connection
 from schemas._activate import STAGES, modules
 from schemas._datajoint import dj, read_heading_again
 from schemas._declare import declare_all
 from schemas.chain import tables
+from schemas.operations import catalog
 from schemas.rows import utc_now
 
 from ._differences import differences, missing_columns

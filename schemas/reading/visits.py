@@ -198,8 +198,10 @@ def load_visits(
 
 
 def load_recording(video_id: int) -> Recording:
-    """Return one recording with the fit that is shown of it (`fit.trial_key`) and its newest events and cycles, also where
-    its measures are not computed yet. Raises `PblError` DB_NOT_FOUND for a number that none has."""
+    """Return one recording with the fit that is shown of it (`fit.trial_key`) and its newest events and cycles.
+
+    They may be there before the measures are. Raises `PblError` DB_NOT_FOUND for an unknown number.
+    """
     found = stored_rows(video.Video, {"video_id": video_id})
     if not found:
         raise video.unknown_video(video_id)

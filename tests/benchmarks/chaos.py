@@ -105,7 +105,7 @@ class Site:
     @property
     def server(self) -> int:
         """Process number of the database."""
-        from schemas import embedded
+        from schemas.operations import embedded
 
         return int(embedded.Folder(self.home / "db").state()["pid"])
 
@@ -155,7 +155,7 @@ class Site:
 
     def kill_server(self) -> None:
         """Inside an insert, where one begins within some seconds."""
-        from schemas import embedded
+        from schemas.operations import embedded
 
         inserts, until = Path(os.environ[INSERTS]), time.monotonic() + 10.0
         while not (inside := any(inserts.iterdir())) and time.monotonic() < until:
@@ -228,7 +228,7 @@ def main(minutes: float, seed: int, supervisors: int) -> None:
         finally:
             site.end_bosses()
             database.remove_home(home / "nothing")
-            from schemas import embedded
+            from schemas.operations import embedded
 
             embedded.remove(embedded.Folder(home / "db"))
     for line in wrong:
@@ -253,8 +253,8 @@ def _disks(home: Path, minutes: float) -> Iterator[bool]:
 
 
 def _run(site: Site, minutes: float, supervisors: int, can_fill: bool) -> list[str]:
-    from schemas import embedded
     from schemas._declare import declare_all
+    from schemas.operations import embedded
 
     embedded.start(folder=embedded.Folder(site.home / "db"))
     declare_all()
@@ -353,7 +353,7 @@ def _drain(site: Site, supervisors: int, until: float) -> list[str]:
 def _left(registered: int) -> list[str]:
     """What is not as it should be: results that are missing, jobs and files that were left behind."""
     from schemas import computed_tables, connection, fit
-    from schemas.orphans import orphans
+    from schemas.operations.orphans import orphans
 
     connection.connect()
     wrong = []

@@ -188,7 +188,7 @@ def main(people: int, minutes: float) -> None:
     import pytest
 
     import schemas
-    from schemas import embedded
+    from schemas.operations import embedded
     from schemas.review import Decision
     from tests.integration import chain
     from tests.rows import register

@@ -235,8 +235,9 @@ def _first_set() -> str:
 )
 def speed(keys: int, work_ms: float) -> None:
     """Jobs a second of one table (VideoInfo) by 1 to 4 workers, each key exactly once; what the database could do."""
-    from schemas import embedded, tracking, video
+    from schemas import tracking, video
     from schemas.bulk import register_many
+    from schemas.operations import embedded
     from workers import queue
 
     def begin() -> None:

@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 
 import schemas
-from schemas import catalog, connection
+from schemas import connection
 from schemas.connection import dj, schema_name
+from schemas.operations import catalog
 from tests import notebook
 from tests.command import pbl
 from tests.rows import remove_all

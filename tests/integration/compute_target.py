@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import time
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
@@ -15,7 +14,7 @@ from workers.web.computing import compute_visit
 from . import chain
 
 
-def compute(session_id: int, again: bool, pipe: Connection) -> None:
+def compute(session_id: int, again: bool) -> None:
     """`compute_visit` with stand-ins. A file in the folder PBL_TEST_HOLD holds it up (`hold`) or kills it (`kill`)."""
     folder = Path(os.environ["PBL_TEST_HOLD"])
     if (folder / "kill").exists():
@@ -23,4 +22,4 @@ def compute(session_id: int, again: bool, pipe: Connection) -> None:
     while (folder / "hold").exists():
         time.sleep(0.05)
     chain.install(pytest.MonkeyPatch())
-    compute_visit(session_id, again, pipe)
+    compute_visit(session_id, again)

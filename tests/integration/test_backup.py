@@ -17,9 +17,10 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import _dump, backup, backup_files, connection, lab, load_visit, video, views
+from schemas import connection, lab, load_visit, video, views
 from schemas._declare import declare_all
 from schemas.ingest import Visit, ingest
+from schemas.operations import backup, backup_files, dump
 from tests.command import pbl
 from tests.database import installation
 from tests.rows import everything, everything_but_refreshes, remove_all
@@ -56,7 +57,7 @@ def elsewhere(filled: None) -> Iterator[Any]:
 
 
 def test_there_and_back(elsewhere: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(_dump, "STATEMENT", 500)  # several inserts of a table
+    monkeypatch.setattr(dump, "STATEMENT", 500)  # several inserts of a table
     saved = tmp_path / "backup"
     before = everything()
     done = pbl("db", "backup", "--recordings", saved)
@@ -105,7 +106,7 @@ def test_a_restore_that_was_broken_off_is_repeated_on_demand(
     before = everything()
     backup.backup(tmp_path / "backup")
     elsewhere()
-    lines = _dump.read_lines
+    lines = dump.read_lines
 
     def broken(path: Path) -> Iterator[str]:
         for i, line in enumerate(lines(path)):
@@ -114,7 +115,7 @@ def test_a_restore_that_was_broken_off_is_repeated_on_demand(
             yield line
 
     with monkeypatch.context() as patch:
-        patch.setattr(_dump, "read_lines", broken)
+        patch.setattr(dump, "read_lines", broken)
         with pytest.raises(KeyboardInterrupt):
             backup.restore(tmp_path / "backup")
     assert pbl("db", "restore", tmp_path / "backup").error_code == "DB_REFUSED"
@@ -125,7 +126,7 @@ def test_a_restore_that_was_broken_off_is_repeated_on_demand(
 
 
 def test_it_is_of_one_moment_while_others_write(filled: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    create = _dump.create_statement
+    create = dump.create_statement
     late: list[str] = []
 
     def slow(server: Any, schema: str, table: str) -> str:
@@ -137,7 +138,7 @@ def test_it_is_of_one_moment_while_others_write(filled: None, tmp_path: Path, mo
             assert not writer.is_alive(), "the backup holds up who writes"
         return create(server, schema, table)
 
-    monkeypatch.setattr(_dump, "create_statement", slow)
+    monkeypatch.setattr(dump, "create_statement", slow)
     rows = backup.backup(tmp_path / "backup").rows
     assert len(lab.Subject()) == 2
     assert rows["pbl_lab.subject"] == 1

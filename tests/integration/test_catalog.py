@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import schemas
-from schemas import catalog
+from schemas.operations import catalog
 
 
 def test_tables_and_columns_of_this_installation(declared: None):

@@ -20,8 +20,8 @@ import boto3
 import pytest
 from moto.server import ThreadedMotoServer
 
-from schemas import embedded
-from schemas.embedded import _process
+from schemas.operations import embedded
+from schemas.operations.embedded import process
 from tests import image
 from tests.database import new_home, remove_home
 from tests.slurm import until
@@ -91,7 +91,7 @@ def encrypted_database() -> Iterator[embedded.Folder]:
         file.chmod(0o644)
     with pytest.MonkeyPatch.context() as patch:
         tls = (f"--ssl-cert={files['server']}", f"--ssl-key={files['server-key']}")
-        patch.setattr(_process, "OPTIONS", (*_process.OPTIONS, *tls))
+        patch.setattr(process, "OPTIONS", (*process.OPTIONS, *tls))
         embedded.start(folder=embedded.Folder(home / "db"))
     try:
         yield embedded.Folder(home / "db")

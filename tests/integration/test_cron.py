@@ -17,7 +17,7 @@ import schemas
 from pbl_pipeline.errors import PblError
 from schemas import connection, lab, session, tracking, uploads, video
 from schemas.bulk import Recording, register_many
-from schemas.orphans import orphans, remove
+from schemas.operations.orphans import orphans, remove
 from tests.rows import register
 from workers import incoming
 from workers.cli.cron import cron

@@ -17,8 +17,9 @@ from pathlib import Path
 import pytest
 
 from schemas import archive as layout
-from schemas import backup, connection, forget, lab, session, uploads, video, worker
+from schemas import connection, lab, session, uploads, video, worker
 from schemas.ingest import Visit, ingest
+from schemas.operations import backup, forget
 from schemas.stored_files import new_folder, remove_left_folders
 from tests.command import pbl
 from workers import incoming

@@ -19,9 +19,9 @@ import pytest
 from click.testing import CliRunner
 
 from pbl_pipeline.errors import PblError
-from schemas import embedded
 from schemas.cli.db import db
-from schemas.embedded import _account, _apt, _binaries, _process, _setup
+from schemas.operations import embedded
+from schemas.operations.embedded import account, apt, binaries, process, setup
 from tests.database import new_home, remove_home
 
 pytestmark = pytest.mark.database
@@ -175,7 +175,7 @@ def test_a_server_that_cannot_start_says_why():
 def test_too_little_space_is_said_before_anything_is_written(monkeypatch: pytest.MonkeyPatch):
     home = new_home()
     try:
-        monkeypatch.setattr(_setup.shutil, "disk_usage", lambda _: types.SimpleNamespace(free=30 * 2**20))
+        monkeypatch.setattr(setup.shutil, "disk_usage", lambda _: types.SimpleNamespace(free=30 * 2**20))
         with pytest.raises(PblError, match="DB_UNAVAILABLE") as caught:
             embedded.start(folder=folder(home))
         assert caught.value.found.startswith("30 MB")
@@ -198,7 +198,7 @@ def test_the_log_is_read_for_advice(tmp_path: Path, line: str, advice: str):
     where = embedded.Folder(tmp_path)
     where.run.mkdir()
     where.log.write_text(f"2026-11-20 [Note] Starting MariaDB as process 128\n{line}\n")
-    assert advice in _process._advice(where)
+    assert advice in process._advice(where)
 
 
 # ---------------------------------------------------------------- who may do what
@@ -303,7 +303,7 @@ def test_the_server_enters_its_folder_and_nobody_else_writes_there_under_any_uma
     home, before = new_home(), os.umask(umask)
     folder = embedded.Folder(home / "deeper/db")
     try:
-        folder.create(_account.server_account(folder.data))
+        folder.create(account.server_account(folder.data))
         assert [stat.S_IMODE(p.stat().st_mode) for p in (folder.path.parent, folder.path, folder.data)] == [
             0o755,
             0o755,
@@ -316,10 +316,10 @@ def test_the_server_enters_its_folder_and_nobody_else_writes_there_under_any_uma
 
 def test_root_leaves_a_database_with_its_owner(tmp_path: Path):
     data = tmp_path / "data"
-    assert _account.server_account(data).name in _account.UNPRIVILEGED
+    assert account.server_account(data).name in account.UNPRIVILEGED
     data.mkdir()
     os.chown(data, 12345, 12345)
-    assert _account.server_account(data).uid == 12345
+    assert account.server_account(data).uid == 12345
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
@@ -336,7 +336,7 @@ def without_server(monkeypatch: pytest.MonkeyPatch, home: Path) -> None:
     """Make this machine look like one without MariaDB."""
     monkeypatch.setenv("PBL_HOME", str(home))
     monkeypatch.setenv("PATH", str(home / "bin"))
-    monkeypatch.setattr(_binaries, "PLACES", ())
+    monkeypatch.setattr(binaries, "PLACES", ())
 
 
 def test_no_server_and_no_apt_points_to_docker(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
@@ -390,7 +390,7 @@ def test_an_unpacked_server_is_found_with_its_libraries(monkeypatch: pytest.Monk
 def test_the_servers_environment_holds_none_of_ours(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("DJ_PASS", "secret")
     assert "secret" not in embedded.Binaries(Path("a"), Path("b"), Path("c")).environment().values()
-    assert _apt.PACKAGES == ("mariadb-server-core", "mariadb-client-core")
+    assert apt.PACKAGES == ("mariadb-server-core", "mariadb-client-core")
 
 
 # ---------------------------------------------------------------- the connection
@@ -474,7 +474,8 @@ def test_a_datajoint_json_nearby_changes_nothing(database: Path, tmp_path: Path)
 
 TABLES = '''
 import numpy as np
-from schemas import connection, embedded
+from schemas import connection
+from schemas.operations import embedded
 from schemas.connection import dj
 schema = dj.Schema()
 @schema

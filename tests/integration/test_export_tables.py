@@ -18,6 +18,7 @@ from pbl_pipeline.fit import SessionFit
 from schemas import fit, gait, gdi, session
 from schemas.ingest import Methods, Visit, ingest
 from schemas.reading import fitted_visit, list_fitted, load_visits
+from schemas.reading import visits as reading_visits
 from schemas.sensors import Sensors
 from tests.command import pbl
 from tests.exported import with_markers

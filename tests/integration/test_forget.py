@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from schemas import connection, forget, keypoints, lab, session, video
+from schemas import connection, keypoints, lab, session, video
 from schemas._declare import declare_all
 from schemas.ingest import Visit, ingest
+from schemas.operations import forget
 from tests.command import pbl
 from tests.rows import everything_but_refreshes, register, remove_all
 from workers.populate import populate

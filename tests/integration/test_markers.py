@@ -15,9 +15,9 @@ from pbl_pipeline.fit import METHODS, fit_session
 from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.synthetic import observe_markers, plain_walk
 from schemas import fit, gait, gdi, load_visit, norms, slices, video, views
-from schemas.forget import forget
 from schemas.ingest import Visit, ingest
 from schemas.marker_recordings import ingest_markers
+from schemas.operations.forget import forget
 from schemas.study_import import import_sheets
 from schemas.why import why
 from tests.command import pbl

@@ -19,7 +19,7 @@ import schemas
 from schemas import connection, fit, session, tracking, video, worker
 from schemas.coded_errors import error_code
 from schemas.jobs import jobs_of
-from schemas.orphans import orphans
+from schemas.operations.orphans import orphans
 from schemas.stored_files import remove_left_over
 from tests.rows import register
 from workers import queue, recover, refresh, run_job

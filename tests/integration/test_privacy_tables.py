@@ -15,7 +15,7 @@ from pbl_pipeline.deidentify import Head, Heads
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import VideoInfo, probe, sha256_of
 from schemas import jobs, privacy
-from schemas.forget import forget
+from schemas.operations.forget import forget
 from schemas.status import pipeline_status
 from schemas.stored_files import file_ref, stored_file
 from schemas.why import why

@@ -19,8 +19,8 @@ from pbl_pipeline.synthetic import NO_NOISE, observe_views, plain_walk
 from schemas import fit, gait, gdi, jobs, load_visit, norms, slices, validation, video, views
 from schemas.coded_errors import error_code
 from schemas.decide import decide_person
-from schemas.forget import forget
 from schemas.ingest import Visit, ingest
+from schemas.operations.forget import forget
 from schemas.plan import fit_set_hash
 from schemas.reading.visits import methods_of
 from schemas.rigs import ingest_rig

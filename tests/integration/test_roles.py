@@ -13,11 +13,12 @@ import yaml
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection, embedded, gdi, lab, roles, session, views, worker
+from schemas import connection, gdi, lab, session, views, worker
 from schemas._datajoint import dj
 from schemas._declare import declare_all
 from schemas.chain import ON_REQUEST
 from schemas.ingest import Visit, ingest
+from schemas.operations import embedded, roles
 from tests.command import pbl
 from tests.rows import remove_all
 from workers import refresh

@@ -18,8 +18,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from pbl_pipeline.errors import PblError
-from schemas import connection, embedded
-from schemas.embedded import Folder, _process
+from schemas import connection
+from schemas.operations import embedded
+from schemas.operations.embedded import Folder, process
 from tests.database import new_home, remove_home
 
 pytestmark = pytest.mark.database
@@ -65,9 +66,9 @@ def encrypted() -> Iterator[tuple[Path, dict[str, Path]]]:
     files = make_certificates(home, "localhost")
     for file in files.values():
         file.chmod(0o644)  # the server's account reads them; they are worth nothing after the test
-    options = (*_process.OPTIONS, f"--ssl-cert={files['server']}", f"--ssl-key={files['server-key']}")
+    options = (*process.OPTIONS, f"--ssl-cert={files['server']}", f"--ssl-key={files['server-key']}")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_process, "OPTIONS", options)
+        patch.setattr(process, "OPTIONS", options)
         embedded.start(folder=Folder(home / "db"))
     yield home, files
     remove_home(home)
@@ -179,9 +180,9 @@ def test_no_secret_is_printed_or_logged(database: Path, use: Use, tmp_path: Path
         running.append(
             subprocess.Popen(command, text=True, env=env, cwd=tmp_path, stdout=pipe, stderr=subprocess.STDOUT)
         )
-    for process in running:  # beside each other
-        with process:
-            said += process.communicate(timeout=120)[0]
+    for child in running:  # beside each other
+        with child:
+            said += child.communicate(timeout=120)[0]
     assert "DB_REFUSED" in said
     assert "STORE_UNAVAILABLE" in said
     for file in (p for p in tmp_path.rglob("*") if p.is_file() and p not in (wrong, s3)):

@@ -15,8 +15,9 @@ from pathlib import Path
 
 import pytest
 
-from schemas import embedded, tracking, video
-from schemas.orphans import orphans
+from schemas import tracking, video
+from schemas.operations import embedded
+from schemas.operations.orphans import orphans
 from schemas.status import queue_counts
 from tests import slurm
 from tests.rows import register

@@ -13,7 +13,8 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import forget, lab, session, study
+from schemas import lab, session, study
+from schemas.operations import forget
 from schemas.rows import utc_now
 from tests.rows import remove_all
 

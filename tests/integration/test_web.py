@@ -304,7 +304,7 @@ def test_filters_that_do_not_exist_are_left_out(four_visits: None, query: str):
 
 
 def test_the_database_away_is_a_page_that_says_what_to_do(four_visits: None, monkeypatch: pytest.MonkeyPatch):
-    from schemas import embedded
+    from schemas.operations import embedded
 
     browser = web.client()
     assert browser.get("/visits").status_code == 200

@@ -126,7 +126,7 @@ def test_the_commands(cheap: None, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_a_backup_has_no_accounts(tables: None, tmp_path: Path, cheap: None):
-    from schemas.backup import backup
+    from schemas.operations.backup import backup
 
     Accounts().add("A", ["reader"], WORDS)
     try:

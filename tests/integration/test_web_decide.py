@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 
 from pbl_pipeline.errors import PblError
-from schemas import decide, fit, forget, qc, recording_page, tracking
+from schemas import decide, fit, qc, recording_page, tracking
 from schemas._datajoint import dj
+from schemas.operations import forget
 from schemas.review import Decision
 from schemas.rows import delete_below
 from tests.command import pbl

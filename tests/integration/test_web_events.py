@@ -15,7 +15,7 @@ import pytest
 import pbl_pipeline.gait
 from pbl_pipeline.errors import PblError
 from schemas import decide, event_corrections, fit, gait, gdi, load_visit, move, qc, slices, study
-from schemas.forget import forget
+from schemas.operations.forget import forget
 from schemas.reading import list_fitted
 from schemas.recording_page import recording_about, recording_fit
 from schemas.review import Decision

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from pbl_pipeline.errors import PblError
-from schemas import embedded, forget
+from schemas.operations import embedded, forget
 from schemas.review import Viewing
 from tests.command import pbl
 from tests.integration import web

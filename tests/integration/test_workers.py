@@ -23,9 +23,10 @@ import pbl_pipeline.video
 import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS
-from schemas import connection, embedded, fit, gait, gdi, lab, qc, tracking, video, worker
+from schemas import connection, fit, gait, gdi, lab, qc, tracking, video, worker
 from schemas.chain import ON_REQUEST
 from schemas.cli.why import why as why_command
+from schemas.operations import embedded
 from schemas.status import live_workers, pipeline_status, queue_counts
 from schemas.why import why
 from tests.benchmarks import worker_replay

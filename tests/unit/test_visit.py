@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ import pandas as pd
 import pytest
 
 from pbl_pipeline.body import load_body
-from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import FORMATS, ExportOptions, write_export
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import (
@@ -25,12 +23,10 @@ from pbl_pipeline.gait import (
     Condition,
     GaitCycle,
     GaitEvent,
-    GaitMetrics,
     GaitParams,
     Gdi,
     Measure,
     MovementProfile,
-    gait_metrics,
 )
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.pipeline import measured
@@ -38,8 +34,7 @@ from pbl_pipeline.qc import FAIL, PASS, WARN, Check
 from pbl_pipeline.report._page import page_of
 from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.video import Camera, VideoInfo
-from pbl_pipeline.visit import Recording, Solution, Visit, load_visit, save_visit, visit_of_fits
-from tests.command import pbl
+from pbl_pipeline.visit import Recording, Solution, Visit, load_visit, save_visit
 from tests.exported import marked_fit
 from tests.unit.visits import solution_of
 from tests.walking_fit import walking_fit

@@ -166,7 +166,7 @@ def disk(days: float | None, least_gb: float) -> None:
     Example: pbl cron disk --remove-older-than 30
     """
     import schemas
-    from schemas.orphans import orphans, remove
+    from schemas.operations.orphans import orphans, remove
     from workers.summary import disks
 
     schemas.activate(methods=False)

@@ -38,7 +38,7 @@ def demo(context: click.Context, out: Path, no_database: bool) -> None:
             next_step="unset DJ_HOST, or use `pbl ingest` and `pbl populate` on your server",
         )
     from pbl_pipeline.files import check_out_folder
-    from schemas import embedded
+    from schemas.operations import embedded
 
     check_out_folder(out)
     begin = time.monotonic()
@@ -60,8 +60,9 @@ def _fetched() -> dict[str, Path]:
 
 def _run(out: Path) -> None:
     import schemas
-    from schemas import connection, embedded, views
+    from schemas import connection, views
     from schemas.ingest import Visit, ingest
+    from schemas.operations import embedded
     from schemas.report import write_visit
     from workers.cli.populate import summary
     from workers.populate import populate

@@ -20,6 +20,7 @@ from starlette.staticfiles import StaticFiles
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
+from ..process_queue import ProcessQueue
 from . import (
     access,
     compare,
@@ -37,9 +38,8 @@ from . import (
     way_in,
 )
 from .accounts import Accounts, Attempts
-from .computing import Computing, Target, compute_visit
+from .computing import Target, compute_visit
 from .looks import Looks
-from .making import Making
 from .pages import Pages
 from .tables import Files, Tables
 from .videos import Videos
@@ -76,8 +76,8 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
         sessions = access.Sessions(idle_hours=access.IDLE_HOURS, still=accounts.current)
     sessions = sessions or access.Sessions()
     way = way_in.WayIn(sessions, access.Cookie(options.secure), accounts, Attempts())
-    pages, tables, videos, making = Pages(accounts is not None), Tables(), Videos(), Making()
-    computing = Computing(options.target)
+    pages, tables, videos, making = Pages(accounts is not None), Tables(), Videos(), ProcessQueue(most=20, kept=8)
+    computing = ProcessQueue(most=50, kept=50)
     files = Path(__file__).parent
 
     @contextlib.asynccontextmanager
@@ -135,7 +135,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
             *judge.routes(tables),
             *take.routes(pages, tables),
             *drawn.routes(pages, tables, making),
-            *compute.routes(pages, tables, computing),
+            *compute.routes(pages, tables, computing, options.target),
             *compare.routes(pages, tables, videos),
             *entry.routes(pages, tables),
             *operate.routes(pages, tables),

@@ -8,15 +8,16 @@ from starlette.routing import Route
 
 from schemas.visit_progress import visit_progress
 
+from ..process_queue import ProcessQueue
 from .access import Refused, form_of
-from .computing import Computing, told
+from .computing import Target, begin, told
 from .find import number_of
 from .look import own_address
 from .pages import Pages
 from .tables import Tables
 
 
-def routes(pages: Pages, tables: Tables, computing: Computing) -> list[Route]:
+def routes(pages: Pages, tables: Tables, computing: ProcessQueue, target: Target) -> list[Route]:
     """The addresses of this part."""
 
     async def compute(request: Request) -> Response:
@@ -25,7 +26,7 @@ def routes(pages: Pages, tables: Tables, computing: Computing) -> list[Route]:
         if fields.get("again") not in ("yes", "no"):
             raise Refused("form")
         await tables.ask(_must_be_there, number)
-        computing.begin(number, fields["again"] == "yes")
+        begin(computing, target, number, fields["again"] == "yes")
         return RedirectResponse(own_address(fields.get("back", f"/visits/{number}")), 303)
 
     async def progress(request: Request) -> Response:

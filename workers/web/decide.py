@@ -13,8 +13,8 @@ from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from schemas import choose, decide, video
 
+from ..refresh import queue_visit_of
 from .access import Refused, Session, form_of
-from .computing import queue_visit_of
 from .find import LARGEST, number_of
 from .pages import Pages
 from .tables import Tables

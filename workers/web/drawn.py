@@ -15,15 +15,18 @@ from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from schemas import privacy, recording_page, video
 
+from ..process_queue import ProcessQueue, Task, Work
 from .access import REPORT_POLICY
 from .find import number_of, shown_of
-from .making import Making, Task, Work
 from .pages import Pages
 from .tables import Tables
 from .take import result_of
 
+#: Time (s) and memory (byte) that one file may take: a minute of 4K video is drawn in a few minutes.
+SECONDS, N_BYTES = 3600.0, 8 * 2**30
 
-def routes(pages: Pages, tables: Tables, making: Making) -> list[Route]:
+
+def routes(pages: Pages, tables: Tables, making: ProcessQueue) -> list[Route]:
     """The addresses of this part."""
 
     async def work_of(request: Request, key: Callable[..., Any], load: Callable[..., Task], *args: int) -> Work:
@@ -101,7 +104,7 @@ def load_overlay(video_id: int) -> Task:
     found = recording_page.recording_fit(recording_page.fitted_key(video_id))
     with contextlib.ExitStack() as stack:
         path = stack.enter_context(privacy.shown(video_id)) or video.present_file(video_id)
-        return Task("overlay.mp4", _draw, (path, found.fit, found.keypoints, found.events), stack.pop_all())
+        return _task("overlay.mp4", _draw, stack.pop_all(), path, found.fit, found.keypoints, found.events)
 
 
 def report_key(session_id: int, shown: int) -> tuple[Any, ...]:
@@ -119,7 +122,21 @@ def load_report(session_id: int, shown: int) -> Task:
     wanted = {"session_id": session_id, **about.key, "fit_set_kind": about.results[shown].kind}
     with contextlib.ExitStack() as stack:
         loaded = load_session_files(wanted, stack)
-        return Task("report.html", _write, (loaded.session, loaded.words), stack.pop_all())
+        return _task("report.html", _write, stack.pop_all(), loaded.session, loaded.words)
+
+
+def _task(file: str, function: Callable[..., None], open_files: contextlib.ExitStack, *args: Any) -> Task:
+    """A file that is made by `function(path, *args)`, within limits."""
+    return Task(function, args, _not_made, file, open_files, SECONDS, N_BYTES)
+
+
+def _not_made(found: str) -> PblError:
+    return PblError(
+        "WEB_NOT_MADE",
+        found=found,
+        expected="a file that is written to its end",
+        next_step="load the page again to have it made again; `pbl report` writes it without limits",
+    )
 
 
 def _copy_of(video_id: int) -> str:

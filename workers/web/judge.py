@@ -12,8 +12,8 @@ from starlette.routing import Route
 from pbl_pipeline.words import UNUSABLE
 from schemas import decide, event_corrections, fit, usable
 
+from ..refresh import queue_visit_of
 from .access import Refused, Session, form_of
-from .computing import queue_visit_of
 from .find import number_of
 from .tables import Tables
 

@@ -14,7 +14,7 @@ from starlette.routing import Route
 
 from schemas import decide, fit
 from schemas.ingest import in_transaction
-from schemas.server_status import database_status
+from schemas.operations.server_status import database_status
 from schemas.status import ErrorRow, Running, Status, pipeline_status, running, span
 
 from ..requeue import retry

@@ -219,7 +219,8 @@ def _opened_by_links(where: Where, port: int, options: Options, visit: int | Non
 @contextlib.contextmanager
 def database() -> Iterator[None]:
     """The embedded database, started where it is used and not running, and stopped again then."""
-    from schemas import connection, embedded
+    from schemas import connection
+    from schemas.operations import embedded
 
     started = connection.external() is None and not embedded.status().running
     if started:

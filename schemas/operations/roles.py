@@ -25,9 +25,10 @@ import pymysql
 from pymysql.converters import escape_string
 
 from pbl_pipeline.errors import PblError
+from schemas import connection
+from schemas._activate import STAGES
 
-from . import connection, embedded
-from ._activate import STAGES
+from . import embedded
 from .catalog import pattern
 
 #: Role -> rights in the schemas of the prefix.

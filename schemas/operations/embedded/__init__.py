@@ -5,11 +5,11 @@ listens on 127.0.0.1 only; `stop()` ends it; `status()` looks and changes nothin
 MySQL 8 server is used by naming it in DJ_HOST, DJ_PORT, DJ_USER and DJ_PASS.
 """
 
-from ._binaries import Binaries, find_server, get_server
-from ._folder import ADMIN_USER, APP_USER, Credentials, Folder
-from ._port import HOST
-from ._process import admin
-from ._server import Status, allow_prefix, not_running, remove, start, status, stop
+from .binaries import Binaries, find_server, get_server
+from .folder import ADMIN_USER, APP_USER, Credentials, Folder
+from .port import HOST
+from .process import admin
+from .server import Status, allow_prefix, not_running, remove, start, status, stop
 
 __all__ = [
     "ADMIN_USER",

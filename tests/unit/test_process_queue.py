@@ -1,4 +1,4 @@
-"""Files that the review page makes in processes of their own: whole or not there, and ended with the page."""
+"""Files made in processes of their own: complete or absent, and ended with their queue."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pbl_pipeline.errors import PblError
-from workers.web.making import Making, Task
+from workers.process_queue import ProcessQueue, Task
 
 
 def write(path: Path, text: str) -> None:
@@ -30,6 +30,10 @@ def sleep(path: Path) -> None:
     time.sleep(600)
 
 
+def broken(found: str) -> PblError:
+    return PblError("WEB_NOT_MADE", found=found, expected="y", next_step="z")
+
+
 class Opened:
     """Counts what is closed."""
 
@@ -39,7 +43,7 @@ class Opened:
     def task(self, function: Any, *args: Any) -> Task:
         stack = contextlib.ExitStack()
         stack.callback(lambda: setattr(self, "closed", self.closed + 1))
-        return Task("file.txt", function, args, stack)
+        return Task(function, args, broken, "file.txt", stack)
 
 
 def ended(work: Any) -> Any:
@@ -50,7 +54,7 @@ def ended(work: Any) -> Any:
 
 
 def test_a_half_written_file_is_never_there():
-    making, opened = Making(), Opened()
+    making, opened = ProcessQueue(most=2, kept=2), Opened()
     try:
         died = ended(making.begin("a", opened.task(die)))
         assert died.path is None
@@ -71,7 +75,7 @@ def test_a_half_written_file_is_never_there():
 
 
 def test_the_page_ends_while_something_is_made():
-    making, opened = Making(), Opened()
+    making, opened = ProcessQueue(most=2, kept=2), Opened()
     work = making.begin("a", opened.task(sleep))
     waits = making.begin("b", opened.task(write, "x"))
     time.sleep(1.0)

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from pbl_pipeline.errors import PblError
-
-from . import connection
-from ._datajoint import dj
-from .folders import private_folder
-from .json_files import write_json
+from schemas import connection
+from schemas._datajoint import dj
+from schemas.folders import private_folder
+from schemas.json_files import write_json
 
 #: Names that DataJoint looks for, in the working directory and above it.
 CONFIG, SECRETS = "datajoint.json", ".secrets"

@@ -11,7 +11,7 @@ from pathlib import Path
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
-from ._apt import install, unpack
+from .apt import install, unpack
 
 #: Where the server lies when it is not on PATH (Debian, Fedora, Homebrew).
 PLACES = ("/usr/sbin", "/usr/local/sbin", "/usr/libexec", "/opt/homebrew/bin", "/usr/local/bin")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 
-from . import connection
+from schemas import connection
 
 #: The comment that DataJoint gives a column whose values name files of the store.
 _STORED = re.compile(r":<(object|npy|blob|attach|hash)@")

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from pbl_pipeline.errors import PblError
 
-from ._account import Account
-from ._binaries import Binaries
-from ._folder import ADMIN_USER, APP_USER, Credentials, Folder, indent
-from ._port import HOST, free_port
-from ._process import LOG_SIZE
+from .account import Account
+from .binaries import Binaries
+from .folder import ADMIN_USER, APP_USER, Credentials, Folder, indent
+from .port import HOST, free_port
+from .process import LOG_SIZE
 
 SETUP_TIMEOUT_S = 300.0
 #: An empty database takes 290 MB, nearly all of it the log that is laid out in advance.

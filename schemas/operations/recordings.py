@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from . import archive, video
-from .archive import archive_dir
-from .stored_files import remove_left_folders
-from .uploads import Bucket, Folder, Upload, drop_folder
+from schemas import archive, video
+from schemas.archive import archive_dir
+from schemas.stored_files import remove_left_folders
+from schemas.uploads import Bucket, Folder, Upload, drop_folder
 
 
 def delete_registered(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict[str, str]]:

@@ -16,7 +16,7 @@ from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from schemas.json_files import write_json
 
-from ._account import Account, check_enterable
+from .account import Account, check_enterable
 
 #: Accounts inside the database.
 APP_USER = "pbl"

@@ -20,16 +20,17 @@ from typing import Any
 
 from pbl_pipeline import progress, settings
 from pbl_pipeline.errors import PblError
+from schemas import archive, connection, fit, lab, session, video, worker
+from schemas._datajoint import full_path
+from schemas.codes import check_subject
+from schemas.folders import remove_empty
+from schemas.json_files import write_json
+from schemas.rows import delete_below
+from schemas.store import files_below, purge, store_error
 
-from . import archive, catalog, connection, fit, lab, session, video, worker
-from ._datajoint import full_path
+from . import catalog
 from .catalog import Column, quote
-from .codes import check_subject
-from .folders import remove_empty
-from .json_files import write_json
 from .recordings import delete_archived, delete_left_over, delete_registered, delete_uploads, find_recordings
-from .rows import delete_below
-from .store import files_below, purge, store_error
 
 #: Columns that identify the person of a row. `fit_set` is a hash over one session's videos.
 IDENTITIES = ("subject", "session_id", "video_id", "fit_set")

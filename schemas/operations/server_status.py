@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from . import connection, embedded, store
+from schemas import connection, store
+
+from . import embedded
 
 
 def database_status() -> dict[str, Any]:

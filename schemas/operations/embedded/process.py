@@ -14,10 +14,10 @@ import pymysql
 
 from pbl_pipeline.errors import PblError
 
-from ._account import Account
-from ._binaries import Binaries
-from ._folder import ADMIN_USER, Folder, folder_error, indent
-from ._port import HOST, free_port, port_free
+from .account import Account
+from .binaries import Binaries
+from .folder import ADMIN_USER, Folder, folder_error, indent
+from .port import HOST, free_port, port_free
 
 START_TIMEOUT_S = 60.0
 LOG_SIZE = "--innodb-log-file-size=256M"

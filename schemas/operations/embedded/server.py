@@ -11,12 +11,12 @@ import pymysql
 
 from pbl_pipeline.errors import PblError
 
-from ._account import server_account
-from ._binaries import Say, check_obtainable, get_server, silent
-from ._folder import Folder
-from ._port import HOST
-from ._process import admin, alive, launch, running_pid, terminate, wait_until_answers
-from ._setup import grant, initialise
+from .account import server_account
+from .binaries import Say, check_obtainable, get_server, silent
+from .folder import Folder
+from .port import HOST
+from .process import admin, alive, launch, running_pid, terminate, wait_until_answers
+from .setup import grant, initialise
 
 STOP_TIMEOUT_S = 60.0
 

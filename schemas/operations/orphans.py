@@ -10,9 +10,10 @@ from contextlib import closing
 
 from pymysql.cursors import SSCursor
 
-from . import connection
+from schemas import connection
+from schemas.store import files_below
+
 from .catalog import quote, tables
-from .store import files_below
 
 #: A file younger than this may belong to a row that is about to be written (s).
 YOUNG_S = 3600.0

@@ -26,13 +26,14 @@ import pymysql
 
 from pbl_pipeline import __version__, progress
 from pbl_pipeline.errors import PblError
+from schemas import connection
+from schemas.folders import make_private, private_folder
+from schemas.json_files import write_json
+from schemas.store import store_error
 
-from . import _dump, backup_files, catalog, connection
+from . import backup_files, catalog, dump
 from .backup_files import PARTS, listed, safe_path, sha256_of, unwritable
 from .catalog import Column, quote
-from .folders import make_private, private_folder
-from .json_files import write_json
-from .store import store_error
 
 FORMAT = 1
 #: Schema (after the prefix) with the marker of a restore that has not ended.
@@ -209,7 +210,7 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
             say(f"Bringing {len(manifest['rows'])} tables back")
             total = sum(manifest["rows"].values())
             with progress.bar("restore", total=total, unit="row") as update:
-                for statement in _dump.read_lines(folder / "database.sql.gz"):
+                for statement in dump.read_lines(folder / "database.sql.gz"):
                     n = cursor.execute(statement)
                     update(n if statement.startswith("INSERT") else 0)
             _check_rows(cursor, manifest["rows"])
@@ -254,12 +255,12 @@ def _save_tables(
         gzip.open(path, "wb", compresslevel=6) as out,
         progress.bar("tables", total=len(tables), unit="table") as update,
     ):
-        for statement in _dump.HEADER:
-            _dump.write_line(out, statement)
+        for statement in dump.HEADER:
+            dump.write_line(out, statement)
         for schema in dict.fromkeys(schema for schema, _ in tables):
-            _dump.write_line(out, f"CREATE DATABASE IF NOT EXISTS {quote(schema)}")
+            dump.write_line(out, f"CREATE DATABASE IF NOT EXISTS {quote(schema)}")
         for (schema, table), columns in tables.items():
-            rows[f"{schema}.{table}"], named = _dump.save_table(server, schema, table, columns, out)
+            rows[f"{schema}.{table}"], named = dump.save_table(server, schema, table, columns, out)
             files |= named
             update(1)
     return rows, files

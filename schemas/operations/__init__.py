@@ -1,0 +1,1 @@
+"""Operating a database server: start it, back it up, manage accounts, configure clients, remove a person."""
