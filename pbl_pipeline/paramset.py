@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import cattrs
+import numpy as np
 
 P = TypeVar("P")
 _LATER = "later"
@@ -103,3 +104,4 @@ def _reason(error: BaseException, kind: type | None) -> str:
 _CONVERTER = cattrs.Converter(forbid_extra_keys=True)
 for _kind in (bool, int, float, str):
     _CONVERTER.register_structure_hook(_kind, _exactly)
+_CONVERTER.register_structure_hook(np.ndarray, lambda value, _: np.asarray(value, float))

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
 
 from . import fit, gait, study, video, views
-from .visit_list import Change, Result, change_since, results_of
-from .visit_page import MeasureRow, VisitPage, visit_about
+from .reading.shown import ShownVisit, shown_visit
+from .visit_list import Change, change_since, results_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -51,23 +51,15 @@ class Score:
 
 
 @dataclasses.dataclass(frozen=True)
-class Compared:
-    """One of the results. number: of the result among those of its visit, None where there is none yet; curves: the
-    frame of `views.cycle_curves`; change: of the index against the reference, None for the reference itself."""
+class Side:
+    """One of the visits that are compared, with its changes against the reference."""
 
-    about: VisitPage
-    number: int | None
-    curves: pd.DataFrame
+    about: ShownVisit
+    curves: pd.DataFrame  # of `views.cycle_curves`
     cycles: tuple[Cycle, ...]
-    measures: dict[str, MeasureRow]
     scores: dict[str, Score]
-    change: Change | None
+    change: Change | None  # of the index; None for the reference itself
     changes: dict[str, MeasureChange]
-
-    @property
-    def result(self) -> Result | None:
-        """The result, None where there is none yet."""
-        return None if self.number is None else self.about.results[self.number]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,14 +67,14 @@ class Comparison:
     """The results in the order of their days; `reference`: the place of the one that the others are compared with.
     instruments: rows of ClinicalInstrument of which any visit has a score, by name."""
 
-    compared: tuple[Compared, ...]
+    compared: tuple[Side, ...]
     reference: int
     instruments: dict[str, dict[str, Any]]
 
     @property
     def same_methods(self) -> bool:
         """Whether one chain of methods made all results that there are."""
-        return len({(r.kind, r.methods) for c in self.compared if (r := c.result) is not None}) <= 1
+        return len({(r.kind, r.methods) for c in self.compared if (r := c.about.result) is not None}) <= 1
 
 
 def compare(chosen: Sequence[tuple[int, int | None]], reference: tuple[int, int | None] | None = None) -> Comparison:
@@ -112,19 +104,19 @@ def compare(chosen: Sequence[tuple[int, int | None]], reference: tuple[int, int 
     results = results_of({i for i, _ in chosen})
     counts = Counter((r.kind, r.methods) for found in results.values() for r in found)
     usual = max(counts, key=lambda chain: counts[chain], default=None)
-    pages: list[tuple[tuple[int, int | None], VisitPage]] = []
+    pages: list[tuple[tuple[int, int | None], ShownVisit]] = []
     for one in chosen:
         session_id, number = one
         chains = [(r.kind, r.methods) for r in results[session_id]]
         if number is None:
             number = chains.index(usual) if usual in chains else 0
-        page = visit_about(session_id, number)
-        if all((p.visit.session_id, p.shown) != (session_id, page.shown) for _, p in pages):
+        page = shown_visit(session_id, number)
+        if all((p.row.session_id, p.shown) != (session_id, page.shown) for _, p in pages):
             pages.append((one, page))
-    pages.sort(key=lambda p: (p[1].visit.day is None, p[1].visit.day, p[1].visit.session_id))
+    pages.sort(key=lambda p: (p[1].row.day is None, p[1].row.day, p[1].row.session_id))
     at = next((i for i, (one, _) in enumerate(pages) if one == reference), 0)
     first = pages[at][1]
-    ids = {p.visit.session_id for _, p in pages}
+    ids = {p.row.session_id for _, p in pages}
     scores = _scores(ids)
     names = {n for of_visit in scores.values() for n in of_visit}
     known = (study.ClinicalInstrument & [{"instrument": n} for n in names]).to_dicts() if names else []
@@ -134,25 +126,22 @@ def compare(chosen: Sequence[tuple[int, int | None]], reference: tuple[int, int 
 
 
 def _compared(
-    about: VisitPage, first: VisitPage, scores: dict[int, dict[str, float]], instruments: dict[str, dict[str, Any]]
-) -> Compared:
-    measures = {m.name: m for m in about.measures}
+    about: ShownVisit, first: ShownVisit, scores: dict[int, dict[str, float]], instruments: dict[str, dict[str, Any]]
+) -> Side:
     change, changes = None, {}
     if about is not first:
-        if about.shown is not None and first.shown is not None:
-            change = change_since(about.results[about.shown], first.results[first.shown])
-        for other in first.measures:
-            mine = measures.get(other.name)
-            if mine is not None and mine.value is not None and other.value is not None:
-                changes[other.name] = MeasureChange(mine.value.mean - other.value.mean)
-    before = scores[first.visit.session_id] if about is not first else {}
-    return Compared(
+        if about.result is not None and first.result is not None:
+            change = change_since(about.result, first.result)
+        for name, (other, _) in first.measures.items():
+            mine, _ = about.measures.get(name, (None, ""))
+            if mine is not None and other is not None:
+                changes[name] = MeasureChange(mine.mean - other.mean)
+    before = scores[first.row.session_id] if about is not first else {}
+    return Side(
         about=about,
-        number=about.shown,
         curves=views.cycle_curves(about.key or False),
         cycles=_cycles(about.key) if about.key else (),
-        measures=measures,
-        scores={n: _score(v, before.get(n), instruments[n]) for n, v in scores[about.visit.session_id].items()},
+        scores={n: _score(v, before.get(n), instruments[n]) for n, v in scores[about.row.session_id].items()},
         change=change,
         changes=changes,
     )
@@ -172,7 +161,7 @@ def _score(value: float, before: float | None, instrument: dict[str, Any]) -> Sc
     return Score(value, value - before, None if least is None else abs(value - before) >= least)
 
 
-def _cycles(key: dict[str, Any]) -> tuple[Cycle, ...]:
+def _cycles(key: Mapping[str, Any]) -> tuple[Cycle, ...]:
     """The cycles of a result that count, in the order of recordings and time; those without pictures left out."""
     cycles = gait.GaitCycle.Cycle * fit.FitSet.proj() * video.Video.proj("video_name", "camera_motion")
     of_result = {k: key[k] for k in ("fit_set", "fit_method", "gait_method")}

@@ -20,32 +20,22 @@ def write_visit(restriction: Any, out: Path) -> list[Path]:
     Raises
     ------
     PblError
-        What `visit_to_show` raises; VIDEO_MISSING when a recording is no longer where it was.
+        DB_NOT_FOUND when the visit is unknown or not computed yet, USAGE when several match; what `to_show` raises;
+        VIDEO_MISSING when a recording is no longer where it was.
     """
     # The library's drawing half is heavy; commands that only look at rows do not pay for it.
     from pbl_pipeline.pipeline import write_results
 
     with contextlib.ExitStack() as open_files:
-        return write_results(out, visit_to_show(restriction, open_files))
+        return write_results(out, to_show(fitted_visit(restriction, whole=True), open_files))
 
 
-def visit_to_show(restriction: Any, open_files: contextlib.ExitStack) -> Visit:
-    """Return a computed visit with the recordings whose pictures may be shown.
+def to_show(visit: Visit, open_files: contextlib.ExitStack) -> Visit:
+    """Return a visit of the tables with the recordings whose pictures may be shown.
 
-    Parameters
-    ----------
-    restriction
-        As `reading.load_visit` takes it.
-    open_files
-        Holds the de-identified copies that are shown, where PBL_DEIDENTIFY is set: close it when all is written.
-
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND when the visit is unknown or not computed yet, USAGE when several match. Where PBL_DEIDENTIFY is
-        set: DB_NOT_FOUND without a de-identified copy, HEAD_NOT_FOUND where nothing was covered in it.
+    `open_files` holds the de-identified copies where PBL_DEIDENTIFY is set: close it when all is drawn. Raises, where
+    it is set, `PblError` DB_NOT_FOUND without a de-identified copy, HEAD_NOT_FOUND where nothing was covered in it.
     """
-    visit = fitted_visit(restriction, whole=True)
     recordings = tuple(
         dataclasses.replace(r, shown=open_files.enter_context(privacy.shown(r.number)))
         if r.fitted and r.path is not None and r.number is not None

@@ -9,9 +9,7 @@ from pbl_pipeline.paramset import structured
 from pbl_pipeline.qc import EMPTY, PASS, Check
 
 from ._cycles import GaitCycle
-from ._exclusion import Exclusion
 from ._gdi import Gdi, GdiCycle
-from ._ground import Lengths
 from ._metrics import GaitMetrics, TrialMetrics
 from ._profile import MovementProfile
 from ._spatiotemporal import MEASURES, Measure, Spatiotemporal
@@ -22,7 +20,6 @@ from .events import GaitEvent, GaitEvents
 INDEX_CHECKS = ("gdi_cycles", "gdi_explained", "norm_convention")
 #: Rounding of the times in events.csv (s).
 _ROUNDED_S = 1e-3
-_CYCLE_TIMES = ("start_s", "opposite_foot_up_s", "opposite_foot_down_s", "foot_up_s", "end_s")
 
 
 def metrics_of(
@@ -105,15 +102,8 @@ def _bout(time_s: float, bouts: Sequence[tuple[float, float]]) -> int:
 
 
 def _cycle(content: Mapping[str, Any], trial: str, curves: Mapping[int, Curves]) -> GaitCycle:
-    checked = {
-        **{name: float(content[name]) for name in _CYCLE_TIMES},
-        "number": int(content["number"]),
-        "bout": int(content["bout"]),
-        "exclusion": structured(content["exclusion"], Exclusion),
-        "lengths": structured(content["lengths"], Lengths),
-    }
     known = curves.get(int(content["number"]), Curves({}, {}))
-    return GaitCycle(trial=trial, **{**content, **checked}, curves=known.deg, curves_sd=known.sd_deg)
+    return structured({**content, "trial": trial, "curves": known.deg, "curves_sd": known.sd_deg}, GaitCycle)
 
 
 def _spatiotemporal(content: Mapping[str, Any], n_steps: int = 0) -> Spatiotemporal:

@@ -4,7 +4,19 @@
 the tables. Report, overlay, exports and web pages take a `Visit` and compute nothing themselves.
 """
 
-from .files import FIT, METRICS, OVERLAY, REPORT, SESSION, load_visit, save_beside, save_visit, visit_of_fits
+from .files import (
+    FIT,
+    METRICS,
+    OVERLAY,
+    REPORT,
+    SESSION,
+    load_visit,
+    recording_facts,
+    save_beside,
+    save_visit,
+    visit_facts,
+    visit_of_fits,
+)
 from .types import Held, Recording, Solution, Visit, stage_checks
 
 __all__ = [
@@ -18,8 +30,10 @@ __all__ = [
     "Solution",
     "Visit",
     "load_visit",
+    "recording_facts",
     "save_beside",
     "save_visit",
     "stage_checks",
+    "visit_facts",
     "visit_of_fits",
 ]

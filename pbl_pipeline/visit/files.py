@@ -59,11 +59,11 @@ def save_visit(visit: Visit, folder: Path) -> list[Path]:
     if (judged := visit.judged) is not None:
         judged.save(folder / METRICS)
         paths.append(folder / METRICS)
-    (folder / SESSION).write_text(json.dumps(_session(visit), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    (folder / SESSION).write_text(json.dumps(visit_facts(visit), indent=2, allow_nan=False) + "\n", encoding="utf-8")
     return [*paths, folder / SESSION]
 
 
-def _session(visit: Visit) -> dict[str, Any]:
+def visit_facts(visit: Visit) -> dict[str, Any]:
     """Return the content of session.json."""
     fits = {r.name: r.fit for r in visit.fitted if r.fit is not None}
     content: dict[str, Any] = {
@@ -90,7 +90,11 @@ def _session(visit: Visit) -> dict[str, Any]:
     whose = {"subject": visit.subject, "label": visit.label, "date": visit.date, "kind": visit.kind}
     return {
         **content,
-        "visit": {**whose, "methods": dict(visit.methods), "recordings": [_facts(r) for r in visit.recordings]},
+        "visit": {
+            **whose,
+            "methods": dict(visit.methods),
+            "recordings": [recording_facts(r) for r in visit.recordings],
+        },
     }
 
 
@@ -192,7 +196,7 @@ def _file(folder: Path, name: str, end: str) -> Path:
     return folder / f"{name}.{end}"
 
 
-def _facts(recording: Recording) -> dict[str, Any]:
+def recording_facts(recording: Recording) -> dict[str, Any]:
     """Return what session.json holds of a recording: facts, no arrays, and of its path the file's name alone."""
     video, choice = recording.video, recording.choice
     facts: dict[str, Any] = {"name": recording.name, "problem": recording.problem, "video": None, "choice": None}
@@ -287,16 +291,14 @@ def _video(facts: Mapping[str, Any], points: Path | None) -> VideoInfo:
     time = None if points is None or not points.is_file() else load_npz(points, ["time_s"]).get("time_s")
     if np.shape(time) != (n,):
         time = np.full(n, np.nan)
-    fps, length = (math.nan if own[k] is None else float(own[k]) for k in ("fps", "duration_s"))
-    return VideoInfo(
-        **{**own, "path": file, "time_s": time, "fps": fps, "duration_s": length, "notes": tuple(own["notes"])}
-    )
+    unknown = {k: math.nan for k in ("fps", "duration_s") if own[k] is None}
+    return structured({**own, **unknown, "path": file, "time_s": time}, VideoInfo)
 
 
 def _choice(facts: Mapping[str, Any]) -> SubjectChoice:
-    unknown = {k: math.nan if facts[k] is None else float(facts[k]) for k in ("score", "runner_up_score")}
-    scores = {int(k): math.nan if v is None else float(v) for k, v in facts["scores"].items()}
-    return SubjectChoice(**{**facts, **unknown, "scores": scores})
+    unknown = {k: math.nan for k in ("score", "runner_up_score") if facts[k] is None}
+    scores = {int(k): math.nan if v is None else v for k, v in facts["scores"].items()}
+    return structured({**facts, **unknown, "scores": scores}, SubjectChoice)
 
 
 def _keypoints_of(path: Path, fit_path: Path) -> Keypoints | None:

@@ -109,6 +109,15 @@ class Recording:
         """The phone's sensor log and what added to its times gives the video's (s). Raises `PblError` PHONE_LOG."""
         return None if self.load_log is None else self.load_log()
 
+    def loaded(self) -> Recording:
+        """Return the recording with its fit and keypoints in memory, for another process or thread."""
+        return dataclasses.replace(
+            self,
+            load_fit=None if self.fit is None else Held(self.fit),
+            load_keypoints=None if self.keypoints is None else Held(self.keypoints),
+            load_log=None,
+        )
+
     @property
     def checks(self) -> tuple[Check, ...]:
         """Checks of the video's time stamps and of the keypoints."""
@@ -193,6 +202,10 @@ class Visit:
         if self.measures is not None and self.measures.before:
             return self.measures.before
         return (*stage_checks(self.recordings), *self.fit_checks)
+
+    def loaded(self) -> Visit:
+        """Return the visit with the arrays of its recordings in memory."""
+        return dataclasses.replace(self, recordings=tuple(r.loaded() for r in self.recordings))
 
     @property
     def judged(self) -> GaitMetrics | None:

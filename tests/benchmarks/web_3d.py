@@ -29,7 +29,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from pbl_pipeline.body import load_body
-from schemas.recording_page import RecordingFit
+from pbl_pipeline.visit import Recording
 from tests.walking_fit import walking_fit
 from workers.web import texts
 from workers.web.movement import Movement
@@ -69,7 +69,7 @@ async ([width, height]) => {
 def app_of(n_frames: int) -> Starlette:
     """The page's scripts over a walk of so many frames."""
     body, files = load_body(), Path(texts.__file__).parent
-    found = Movement.of(RecordingFit(walking_fit(body.joint_names, body.sha256, n_frames=n_frames), (), (), None))
+    found = Movement.of(Recording.of("walk", walking_fit(body.joint_names, body.sha256, n_frames=n_frames)))
 
     async def page(request: Request) -> Response:
         return HTMLResponse(PAGE)

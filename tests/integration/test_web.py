@@ -13,14 +13,14 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from schemas import gdi, lab, qc, session, study, visit_list
-from schemas import visit_page as visit_page_module
+from schemas.reading.shown import shown_visit
 from schemas.rows import utc_now
 from schemas.visit_list import Filter, visit_page
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
 from workers.populate import populate
-from workers.web import Options, create_app, take
+from workers.web import Options, create_app
 from workers.web.access import HOURS, Sessions
 
 
@@ -112,14 +112,14 @@ def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Pa
     assert "Residual 3D (cm)" in page
     assert "VIDEO_MISSING" in page
     for number in (1, 2):  # each page shows the result of its own visit
-        assert visit_page_module.visit_about(number).key["fit_set"] == visit_list_key(number)["fit_set"]
+        assert shown_visit(number).key["fit_set"] == visit_list_key(number)["fit_set"]
     visit = web.client().get(f"/visits/{later.session_id}").text
     assert "Cadence" in visit
     assert "look at the overlay" in visit  # the advice of the check
     stopped = web.client().get(f"/visits/{rows['P0032026-02-02'].session_id}").text
     assert "VIDEO_MISSING" in html.unescape(stopped)
     assert "a fit without one marker" in web.client().get(f"/visits/{later.session_id}/export").text
-    monkeypatch.setattr(take, "FORMATS", ("csv", "mot"))  # the stand-in of the fit has no markers for a .trc
+    monkeypatch.setattr(export, "FORMATS", ("csv", "mot"))  # the stand-in of the fit has no markers for a .trc
     taken = web.client().get(f"/visits/{later.session_id}/export")
     assert taken.status_code == 200, taken.text
     assert taken.headers["content-disposition"] == f'attachment; filename="visit_{later.session_id}.zip"'

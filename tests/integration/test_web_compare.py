@@ -44,7 +44,7 @@ def visits(database: Path, tmp_path_factory: pytest.TempPathFactory):
         populate()
         register(small_video(folder, "later"), session_label="2026-09-10")
         for number, index in ((1, 80.0), (2, 86.0), (3, 95.0)):
-            key = compare.visit_about(number).key
+            key = compare.shown_visit(number).key
             row = {k: key[k] for k in gdi.SessionGdi.primary_key}
             values = {"session_gdi": index, "session_gdi_sd": 3.0, "session_gdi_minimal_change": 5.0 + number}
             gdi.SessionGdi.update1({**row, **values})
@@ -87,7 +87,7 @@ def test_changes_against_the_reference(visits: None):
 
 
 def test_results_by_other_methods_are_not_judged(visits: None, monkeypatch: pytest.MonkeyPatch):
-    one, other = compare.visit_about(1).results[0], compare.visit_about(2).results[0]
+    one, other = compare.shown_visit(1).results[0], compare.shown_visit(2).results[0]
     assert compare.change_since(other, one) == compare.Change(6.0, False)
     strange = dataclasses.replace(other, methods=("another", *other.methods[1:]))
     assert compare.change_since(strange, one) == compare.Change(6.0, None)

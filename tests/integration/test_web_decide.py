@@ -11,9 +11,10 @@ from typing import Any
 import pytest
 
 from pbl_pipeline.errors import PblError
-from schemas import decide, fit, qc, recording_page, tracking
+from schemas import decide, fit, qc, tracking
 from schemas._datajoint import dj
 from schemas.operations import forget
+from schemas.reading import shown
 from schemas.review import Decision
 from schemas.rows import delete_below
 from tests.command import pbl
@@ -141,7 +142,7 @@ def test_a_fit_that_is_deleted_while_its_page_loads_is_pending(two_alike: int, m
     assert send(browser, two_alike, form_of(browser, two_alike), 2).status_code == 303
     populate()
     gone = lambda key: tuple(delete_below(fit.SessionFit, fit.SessionFit().keys()))  # noqa: E731
-    monkeypatch.setattr(recording_page, "computed", gone)
+    monkeypatch.setattr(shown, "computations", gone)
     answer = browser.get(f"/recordings/{two_alike}/movement")
     assert (answer.status_code, "DB_NOT_FOUND" in answer.text) == (404, True)
 

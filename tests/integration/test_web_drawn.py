@@ -11,13 +11,13 @@ import av
 import pytest
 
 from pbl_pipeline.video import sha256_of
-from schemas import privacy, recording_page
+from schemas import fit, privacy
 from schemas.origin import Origin
 from tests.integration import web
 from tests.rows import register, remove_all
 from tests.videos import constant_rate, numbered_frames, write_video
 from workers.populate import populate
-from workers.web import drawn
+from workers.web import reports
 
 FRAMES = 60
 
@@ -132,15 +132,14 @@ def copied(path: Path) -> dict[str, Any]:
 
 
 def test_what_is_computed_anew_is_drawn_anew(visit: Path):
-    from schemas import fit
 
-    key = recording_page.trial_key(1)
+    key = fit.trial_key(1)
     assert key is not None
-    before = drawn.overlay_key(1)
-    assert drawn.overlay_key(1) == before
+    before = reports.overlay_key(1)
+    assert reports.overlay_key(1) == before
     row = (fit.SessionFit & key).proj("fit_computed").fetch1()
     fit.SessionFit.update1({**row, "fit_computed": "2030-01-01 00:00:00"})
-    assert drawn.overlay_key(1) != before
+    assert reports.overlay_key(1) != before
     fit.SessionFit.update1(row)
 
 

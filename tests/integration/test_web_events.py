@@ -17,17 +17,15 @@ from pbl_pipeline.errors import PblError
 from schemas import decide, event_corrections, fit, gait, gdi, load_visit, move, qc, slices, study
 from schemas.operations.forget import forget
 from schemas.reading import list_fitted
-from schemas.recording_page import recording_about, recording_fit
+from schemas.reading.shown import shown_recording, shown_visit
 from schemas.review import Decision
 from schemas.rows import delete_below
 from schemas.visit_list import Filter, visit_page
-from schemas.visit_page import visit_about
 from tests.integration import decide_target, web
 from tests.integration.chain import small_video
 from tests.rows import everything_but_refreshes, register
 from workers.populate import populate
-from workers.web import take
-from workers.web.judge import _events
+from workers.web.corrections import _events
 
 
 @pytest.fixture
@@ -103,7 +101,7 @@ def test_corrected_events_count_instead_of_the_detected_ones(visit: str, monkeyp
     page = browser.get("/recordings/1").text
     assert "1 events corrected by A. First" in page
     assert page.count("by hand</td>") == 1
-    shown = recording_about(1).events
+    shown = shown_recording(1).recording.events.events
     assert next(e for e in shown if e.probability == 1.0).time_s == pytest.approx(time + 0.1, abs=1e-4)
     # What follows is computed again: of the corrected trial and of the visit alone.
     run = {t.table: t.done for t in populate().tables if t.done}
@@ -118,17 +116,17 @@ def test_corrected_events_count_instead_of_the_detected_ones(visit: str, monkeyp
     assert checks == {1: 1.0}
     assert not qc.SessionQc.Check & {"qc_stage": "gait", "qc_video_id": 1} & "qc_check != 'events_by_hand'"
     # Everything that reads the visit reads the corrected events.
-    (result,) = visit_about(1).results
+    (result,) = shown_visit(1).results
     assert (result.methods[1], result.corrected) == (visit, True)
     assert "A person corrected events of this visit" in browser.get("/visits/1").text
     found = load_visit({"session_id": 1})
-    assert found.metrics is not None
-    one, two = (t.events for t in found.metrics.trials)
+    assert found.measures is not None
+    one, two = (t.events for t in found.measures.trials)
     assert (one.corrected, two.corrected) == (True, False)
     assert (one.method, one.params_hash) == (two.method, two.params_hash)
     assert [e.time_s for e in one.events] == [e[0] for e in (event_corrections.shown(1).hand or ())]
     assert [v["gait_method"] for v in list_fitted({})] == [visit]
-    monkeypatch.setattr(take, "FORMATS", ("csv",))  # the stand-in of the fit has no markers for a .trc
+    monkeypatch.setattr(export, "FORMATS", ("csv",))  # the stand-in of the fit has no markers for a .trc
     archive = zipfile.ZipFile(io.BytesIO(browser.get("/visits/1/export?result=0").content))
     (name,) = [n for n in archive.namelist() if n.endswith("export.json")]
     trials = json.loads(archive.read(name))["trials"].values()
@@ -278,7 +276,7 @@ def test_corrections_are_of_the_person_that_was_measured(visit: str):
     decide.decide_person(1, 1)
     populate()
     assert (gait.GaitCycle & {"video_id": 1} & fit.current()).fetch1("correction_no") == 1
-    assert recording_fit(fit.trial_key(1) or {}).cycles  # those of the corrected events
+    assert shown_recording(1).recording.cycles  # those of the corrected events
     # The last correction of each person counts: of the other one there was none to take back.
     decide.decide_person(1, 2)
     populate()

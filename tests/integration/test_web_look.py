@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.render import body_track
-from schemas import fit, recording_page, video
+from schemas import fit, reading, video
 from tests.integration import web
 from tests.integration.chain import N_FRAMES, small_video
 from tests.rows import register
@@ -56,9 +56,9 @@ def test_the_body_that_is_sent_is_that_of_the_fit(looked_at):
     _, walk, _ = looked_at
     browser = web.client()
     body = browser.get(f"/recordings/{walk}/movement").json()["body"]
-    key = recording_page.trial_key(walk)
+    key = fit.trial_key(walk)
     assert key is not None
-    track = body_track(recording_page.recording_fit(key).fit)
+    track = body_track(reading.load_recording(walk).fit)
     low, high = np.frombuffer(browser.get(f"/recordings/{walk}/body").content, np.uint8).reshape(2, -1, N_FRAMES)
     again = (low.astype(np.uint16) | high.astype(np.uint16) << 8).astype(np.int16).astype(np.int64)
     changes = np.concatenate([again[:, :1], np.cumsum(again[:, 1:], axis=1)], axis=1)
@@ -74,13 +74,13 @@ def test_curves_events_and_what_is_uncertain(looked_at):
 
     _, walk, _ = looked_at
     found = web.client().get(f"/recordings/{walk}/movement").json()
-    key = recording_page.trial_key(walk)
+    key = fit.trial_key(walk)
     assert key is not None
-    about = recording_page.recording_fit(key)
+    about = reading.load_recording(walk)
     assert len(found["time"]) == N_FRAMES
     knee = next(c for c in found["curves"] if c["name"] == "Knee flexion")
     np.testing.assert_allclose(knee["left"]["value"], leg_angles(about.fit)["left"]["knee_flexion"], atol=0.006)
-    assert len(found["events"]) == len(about.events) > 4
+    assert len(found["events"]) == len(about.events.events) > 4
     far = {c.far_leg for c in about.cycles}
     for side in ("left", "right"):
         spans = found["uncertain"][side]
@@ -149,9 +149,12 @@ def test_where_heads_are_to_be_hidden_the_original_is_never_sent(looked_at, monk
 def test_a_fit_of_another_body_says_so(looked_at, monkeypatch: pytest.MonkeyPatch):
     import dataclasses
 
+    from schemas.reading import visits
+
     _, walk, _ = looked_at
-    load = recording_page.load_trial_fit
-    monkeypatch.setattr(recording_page, "load_trial_fit", lambda k: dataclasses.replace(load(k), body_sha256="0" * 64))
+    load = visits.load_trial_fit
+    other_body = lambda *a: dataclasses.replace(load(*a), body_sha256="0" * 64)  # noqa: E731
+    monkeypatch.setattr(visits, "load_trial_fit", other_body)
     answer = web.client().get(f"/recordings/{walk}/body")
     assert answer.status_code == 409
     assert "install the version that made the fit" in answer.text

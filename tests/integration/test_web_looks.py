@@ -15,7 +15,7 @@ from tests.command import pbl
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
-from workers.web import Where, looks, serve
+from workers.web import Where, audit, serve
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def test_each_look_is_a_row_before_anything_is_shown(audited: int, monkeypatch: 
     browser.get("/visits/1/export")
     browser.get("/visits/1/enter")
     assert rows()[4:] == [("A. First", "export", None, 1)]
-    monkeypatch.setattr(looks, "AGAIN_S", 0.0)  # later it is another look
+    monkeypatch.setattr(audit, "AGAIN_S", 0.0)  # later it is another look
     browser.get(f"/recordings/{audited}/video")
     assert len(rows()) == 6
     listed = json.loads(pbl("list", "looks", "--subject", "P001", "--json").out)

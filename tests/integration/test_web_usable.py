@@ -15,10 +15,10 @@ from schemas import decide, fit, gdi, listing, load_visit, qc, slices, study, tr
 from schemas.ingest import Visit
 from schemas.marker_recordings import ingest_markers
 from schemas.plan import plan_fit_sets
+from schemas.reading.shown import shown_visit
 from schemas.review import Decision
 from schemas.rigs import ingest_rig
 from schemas.visit_list import Filter, visit_page
-from schemas.visit_page import visit_about
 from schemas.why import why
 from tests.command import pbl
 from tests.integration import decide_target, test_markers, test_rigs, web
@@ -82,7 +82,7 @@ def test_a_marked_recording_leaves_its_visit_and_comes_back(visit: tuple[int, in
     assert run["SessionFit"] == run["SessionGdi"] == run["SessionQc"] == 1
     assert not {"Tracking", "SubjectChoice", "Keypoints", "TrialInput"} & set(run)
     assert state() == "computed"
-    assert visit_about(1).results[0].status == "PASS"
+    assert shown_visit(1).results[0].status == "PASS"
     for page in (browser.get("/visits/1").text, browser.get("/recordings/2").text):
         assert "the walk was interrupted" in page
         assert "&lt;b&gt;stumbled at the turn" in page
@@ -106,7 +106,7 @@ def test_a_visit_without_a_usable_recording_has_no_set(visit: tuple[int, int]):
     assert state() == "unusable"
     page = web.client().get("/visits/1").text
     assert "no usable recording" in page
-    assert visit_about(1).results == ()
+    assert shown_visit(1).results == ()
     decide.take_back(1)
     assert (state(), current()) == ("pending", [[1]])
     decide.take_back(1)  # is used already

@@ -17,7 +17,7 @@ from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.render import body_track, to_camera, to_pixels
 from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.video import Camera
-from schemas.recording_page import RecordingFit
+from pbl_pipeline.visit import Recording
 from tests.walker import observe
 from tests.walking_fit import LEVEL_CAMERA_QUAT_WXYZ, walking_fit
 from workers.web import texts
@@ -77,7 +77,7 @@ def spelled(points: Keypoints) -> tuple[list, list]:
 @needs_node
 def test_scripts_of_the_page(tmp_path: Path):
     points = detected(handheld_walk())
-    found = RecordingFit(handheld_walk(), (), (), points)
+    found = Recording.of("walk", handheld_walk(), points)
     shutil.copytree(STATIC, tmp_path / "static")
     for file in TESTS.glob("*.mjs"):
         shutil.copy(file, tmp_path)
@@ -105,16 +105,16 @@ def test_a_recording_without_a_camera_or_a_pose_is_sent_too():
         camera_position_m=np.full(3, np.nan),
         image_size_px=(0, 0),
     )
-    body, numbers = body_json(RecordingFit(markers, (), (), None))
+    body, numbers = body_json(Recording.of("walk", markers))
     assert body["camera"] is None
     assert body["known"] == [[5, 79]]
     assert len(numbers) == 2 * 90 * (3 + 4 * len(body["sides"]) + 4)
     nobody = dataclasses.replace(fit, qpos=np.full_like(fit.qpos, np.nan))
-    sent = json.loads(Movement.of(RecordingFit(nobody, (), (), None)).movement)
+    sent = json.loads(Movement.of(Recording.of("walk", nobody)).movement)
     assert (sent["body"]["known"], sent["body"]["floor"]) == ([], None)
 
 
 def test_the_floor_is_under_the_feet():
     """The walker's pelvis is 0.95 m above the floor, which lies 1.15 m under the camera (`walking_fit`)."""
-    body, _ = body_json(RecordingFit(walking_fit(load_body().joint_names, load_body().sha256), (), (), None))
+    body, _ = body_json(Recording.of("walk", walking_fit(load_body().joint_names, load_body().sha256)))
     assert body["floor"] == pytest.approx(-1.15, abs=0.06)

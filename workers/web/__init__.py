@@ -1,7 +1,7 @@
 """The review page (`pbl web`): find a visit, look at its recordings, decide, in a browser. docs/web.md describes it."""
 
 from .app import Options, create_app
-from .results_folder import ResultsFolder
+from .folder import ResultsFolder
 from .serve import Where, serve
 
 __all__ = ["Options", "ResultsFolder", "Where", "create_app", "serve"]

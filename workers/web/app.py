@@ -23,25 +23,26 @@ from pbl_pipeline.errors import PblError
 from ..process_queue import ProcessQueue
 from . import (
     access,
+    audit,
     compare,
     compute,
+    corrections,
     decide,
-    drawn,
     entry,
-    find,
-    judge,
-    look,
+    export,
+    folder,
     operate,
     people,
-    results_folder,
-    take,
-    way_in,
+    recordings,
+    reports,
+    sign_in,
+    visits,
 )
 from .accounts import Accounts, Attempts
 from .computing import Target, compute_visit
-from .looks import Looks
 from .pages import Pages
-from .tables import Files, Tables
+from .source import Source, TablesSource
+from .tables import Asks, Files, Tables
 from .videos import Videos
 
 log = logging.getLogger(__name__)
@@ -65,7 +66,7 @@ class Options:
     on_entry: Callable[[str], None] | None = None
     accounts: Accounts | None = None
     secure: bool = False
-    folder: results_folder.ResultsFolder | None = None
+    folder: folder.ResultsFolder | None = None
     target: Target = compute_visit
 
 
@@ -75,7 +76,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
     if sessions is None and accounts is not None:
         sessions = access.Sessions(idle_hours=access.IDLE_HOURS, still=accounts.current)
     sessions = sessions or access.Sessions()
-    way = way_in.WayIn(sessions, access.Cookie(options.secure), accounts, Attempts())
+    way = sign_in.WayIn(sessions, access.Cookie(options.secure), accounts, Attempts())
     pages, tables, videos, making = Pages(accounts is not None), Tables(), Videos(), ProcessQueue(most=20, kept=8)
     computing = ProcessQueue(most=50, kept=50)
     files = Path(__file__).parent
@@ -98,7 +99,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
 
     async def language(request: Request) -> Response:
         fields = await access.form_of(request, "")
-        response = RedirectResponse(look.own_address(fields.get("back", "")), 303)
+        response = RedirectResponse(recordings.own_address(fields.get("back", "")), 303)
         response.set_cookie("pbl_language", fields.get("language", "")[:2], path="/", httponly=True, samesite="strict")
         return response
 
@@ -119,31 +120,35 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
     def failed(request: Request, error: PblError) -> Response:
         return pages.error(request, error, STATUS.get(error.code, 409))
 
-    audit = []
+    looks = []
+    asks: Asks
+    source: Source
     if options.folder is not None:
-        parts = [
-            *results_folder.routes(pages, Files(), options.folder),
-            *look.routes(pages, Files(), options.folder),
-        ]
+        asks, source = Files(), options.folder
+        parts = folder.routes(pages, asks, options.folder)
     else:
-        audit = [Middleware(Looks, tables=tables, failed=failed)] if settings.audit_looks() else []
+        asks, source = tables, TablesSource(videos)
+        looks = [Middleware(audit.Looks, tables=tables, failed=failed)] if settings.audit_looks() else []
         parts = [
-            *find.routes(pages, tables),
-            *look.routes(pages, tables, look.OfTables(videos)),
+            *visits.list_routes(pages, tables),
             *decide.routes(pages, tables),
             *people.routes(pages, tables),
-            *judge.routes(tables),
-            *take.routes(pages, tables),
-            *drawn.routes(pages, tables, making),
+            *corrections.routes(tables),
+            *reports.routes(pages, tables, making),
             *compute.routes(pages, tables, computing, options.target),
             *compare.routes(pages, tables, videos),
             *entry.routes(pages, tables),
             *operate.routes(pages, tables),
         ]
+    parts += [
+        *visits.routes(pages, asks, source),
+        *recordings.routes(pages, asks, source),
+        *export.routes(asks, source),
+    ]
     app = Starlette(
         routes=[
             Route("/", home),
-            *way_in.routes(pages, way, link_used),
+            *sign_in.routes(pages, way, link_used),
             Route("/language", language, methods=["POST"]),
             *parts,
             Mount("/static", StaticFiles(directory=files / "static")),
@@ -164,7 +169,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
                 open_paths=("/enter", "/static/", "/vendor/"),
                 cookie=way.cookie,
             ),
-            *audit,
+            *looks,
             Middleware(GZipMiddleware, minimum_size=1000),
         ],
         lifespan=life,

@@ -21,8 +21,8 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, number
 from schemas import compare
 
-from .find import LARGEST, interval
-from .pages import Pages
+from .address import LARGEST, interval
+from .pages import Pages, page
 from .tables import Tables
 from .videos import Videos
 
@@ -60,7 +60,7 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
             found=found,
             names=names,
             keys=[charts.series_key(i) for i in range(len(names))],
-            measures=[n for n in MEASURES if any(n in c.measures for c in found.compared)],
+            measures=[n for n in MEASURES if any(n in c.about.measures for c in found.compared)],
             charts=charts_of(found, names),
             plot=charts.CYCLE_PLOT,
             first_cycle=[_first_cycle(c, cycles) for c in cycles],
@@ -72,7 +72,7 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
             version=code_version(),
         )
 
-    return [Route("/compare", show)]
+    return page("/compare", show)
 
 
 def charts_of(found: compare.Comparison, names: Sequence[str]) -> list[Chart]:
@@ -108,12 +108,12 @@ def _norm(frame: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     return (columns[0], columns[1], columns[2]) if np.isfinite(columns[1]).all() else None
 
 
-def _name(one: compare.Compared) -> str:
+def _name(one: compare.Side) -> str:
     """What tells a result from the others, without the person's code."""
-    label = one.about.visit.label
-    if len(one.about.results) < 2 or one.result is None:
+    label = one.about.row.label
+    if len(one.about.results) < 2 or one.about.result is None:
         return label
-    return f"{label}, {one.result.kind}, {one.result.methods[0]}"
+    return f"{label}, {one.about.result.kind}, {one.about.result.methods[0]}"
 
 
 def _first_cycle(own: Sequence[compare.Cycle], of_all: Sequence[Sequence[compare.Cycle]]) -> int | None:
@@ -138,5 +138,7 @@ def _read(text: str) -> tuple[int, int | None]:
 
 def _address(found: compare.Comparison, reference: int) -> str:
     """The same comparison with another reference."""
-    named = [f"{c.about.visit.session_id}" + ("" if c.number is None else f".{c.number}") for c in found.compared]
+    named = [
+        f"{c.about.row.session_id}" + ("" if c.about.shown is None else f".{c.about.shown}") for c in found.compared
+    ]
     return "/compare?" + urlencode([*(("v", n) for n in named), ("ref", named[reference])])

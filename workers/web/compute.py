@@ -10,10 +10,10 @@ from schemas.visit_progress import visit_progress
 
 from ..process_queue import ProcessQueue
 from .access import Refused, form_of
+from .address import number_of
 from .computing import Target, begin, told
-from .find import number_of
-from .look import own_address
 from .pages import Pages
+from .recordings import own_address
 from .tables import Tables
 
 

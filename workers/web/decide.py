@@ -15,7 +15,7 @@ from schemas import choose, decide, video
 
 from ..refresh import queue_visit_of
 from .access import Refused, Session, form_of
-from .find import LARGEST, number_of
+from .address import LARGEST, number_of
 from .pages import Pages
 from .tables import Tables
 
@@ -34,14 +34,14 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
         return RedirectResponse(f"/recordings/{number}", 303)
 
     async def accept(request: Request) -> Response:
-        from schemas.visit_page import visit_about
+        from schemas.reading.shown import shown_visit
 
         fields = await form_of(request, "decide")
         session: Session = request.state.session
         number, shown = number_of(request), _number(fields.get("result", ""))
 
         def write() -> None:
-            about = visit_about(number, shown)
+            about = shown_visit(number, shown)
             if not about.key or about.computed != fields.get("computed"):
                 raise PblError(
                     "DECIDED_MEANWHILE",

@@ -12,7 +12,7 @@ from pbl_pipeline.errors import PblError
 from schemas import enter
 
 from .access import Session, form_of
-from .find import number_of
+from .address import number_of
 from .pages import Pages
 from .tables import Tables
 

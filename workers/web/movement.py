@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from schemas.recording_page import RecordingFit
+from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.visit import Recording
 
 #: Steps of a metre, of a body's quaternion and of the camera's in which poses are sent: a millimetre; a half step of a
 #: quaternion is 0.01 deg, of the camera's 0.2 px at a focal length of 1,500 px.
@@ -28,13 +29,13 @@ class Movement:
     points: bytes
 
     @classmethod
-    def of(cls, found: RecordingFit) -> Movement:
+    def of(cls, found: Recording) -> Movement:
         """All three. Raises as they do."""
         body, numbers = body_json(found)
         return cls(movement_json(found, body), numbers, points_bytes(found))
 
 
-def movement_json(found: RecordingFit, body: dict[str, Any]) -> bytes:
+def movement_json(found: Recording, body: dict[str, Any]) -> bytes:
     """Times, joint angles with their 90 % half widths (deg), events, stance, and where a side is uncertain, as JSON.
 
     `time` (T) s; `curves`: name, by side `value` and `half` (T) deg, null where unknown; `events`: time, side, kind,
@@ -46,7 +47,7 @@ def movement_json(found: RecordingFit, body: dict[str, Any]) -> bytes:
     from pbl_pipeline.runs import runs
     from pbl_pipeline.words import ANGLES
 
-    fit = found.fit
+    fit, events = _fit(found), found.events.events if found.events else ()
     one = interval_90(0.0, 1.0)
     assert one is not None
     angles, sd = leg_angles(fit), leg_angles_sd(fit)
@@ -67,8 +68,8 @@ def movement_json(found: RecordingFit, body: dict[str, Any]) -> bytes:
         "time": [round(float(t), 5) for t in fit.time_s],
         "size": [int(v) for v in fit.image_size_px],
         "curves": [c for c in curves if len(c) > 1],
-        "events": [[round(e.time_s, 4), e.side, e.event, round(e.probability, 3)] for e in found.events],
-        "stance": {s: stance_spans(found.events, s) for s in ("left", "right")},
+        "events": [[round(e.time_s, 4), e.side, e.event, round(e.probability, 3)] for e in events],
+        "stance": {s: stance_spans(events, s) for s in ("left", "right")},
         "uncertain": {
             side: [(float(fit.time_s[r][0]), float(fit.time_s[r][-1])) for r in runs(mask)]
             for side, mask in unsure.items()
@@ -79,7 +80,7 @@ def movement_json(found: RecordingFit, body: dict[str, Any]) -> bytes:
     return json.dumps(out, allow_nan=False, separators=(",", ":")).encode()
 
 
-def body_json(found: RecordingFit) -> tuple[dict[str, Any], bytes]:
+def body_json(found: Recording) -> tuple[dict[str, Any], bytes]:
     """The fitted body and the camera as the page's script draws them (`static/body.js`).
 
     Returns
@@ -102,7 +103,8 @@ def body_json(found: RecordingFit) -> tuple[dict[str, Any], bytes]:
     """
     from pbl_pipeline.render import NEAR_M, body_track, turning_radius2
 
-    fit, track = found.fit, body_track(found.fit)
+    fit = _fit(found)
+    track = body_track(fit)
     t = len(track.root_m)
     known = _finite(track.quat_wxyz) & _finite(track.root_m)
     quat, position = np.asarray(fit.phone_quat_wxyz, float), np.asarray(fit.camera_position_m, float)
@@ -142,11 +144,11 @@ def body_json(found: RecordingFit) -> tuple[dict[str, Any], bytes]:
     return body, _packed(np.rint(channels).astype(np.int64).T, fit.name)
 
 
-def points_bytes(found: RecordingFit) -> bytes:
+def points_bytes(found: Recording) -> bytes:
     """The detected points: channels (2 J, T) x, y in half pixels, packed as those of `body_json`, then their confidence
     (J, T) in 255ths as bytes, 0 where a point is not known. Empty where the fit is of markers."""
     points = found.keypoints
-    if points is None or len(points.time_s) != len(found.fit.time_s):
+    if points is None or len(points.time_s) != len(_fit(found).time_s):
         return b""
     xy, confidence = np.asarray(points.xy_px, float), np.asarray(points.confidence, float)
     known = np.isfinite(xy).all(axis=2) & (np.abs(xy) < _FAR * max(points.image_size_px)).all(axis=2) & (confidence > 0)
@@ -155,7 +157,12 @@ def points_bytes(found: RecordingFit) -> bytes:
     shares = np.rint(255 * np.where(known, np.clip(confidence, 0, 1), 0)).astype(np.uint8)
     # A point that is known does not become unknown by rounding.
     shares[known & (shares == 0)] = 1
-    return _packed(channels, found.fit.name) + shares.T.tobytes()
+    return _packed(channels, _fit(found).name) + shares.T.tobytes()
+
+
+def _fit(found: Recording) -> TrialFit:
+    assert found.fit is not None  # only fitted recordings are asked for
+    return found.fit
 
 
 def _packed(channels: np.ndarray, name: str) -> bytes:

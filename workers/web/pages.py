@@ -3,22 +3,36 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import jinja2
 from starlette.requests import Request
-from starlette.responses import HTMLResponse, Response
+from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.routing import Route
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.words import ANGLES, MEASURES, check_words, number, significant
 
 from . import texts
 from .access import HEADERS, HOURS, Session
+from .plain_values import plain
 
+#: Ending of the address of a page as JSON.
+JSON = ".json"
 #: Status of the answer to a request that may not pass, by its reason.
 _REFUSED = {"session": 401, "host": 400, "token": 403, "right": 403, "size": 413, "form": 415}
+
+
+def page(path: str, answer: Callable[..., Any], **options: Any) -> list[Route]:
+    """Return the addresses of a page: as HTML, and as JSON of the same values."""
+    return [Route(path + JSON, answer), Route(path, answer, **options)]
+
+
+def as_json(request: Request) -> bool:
+    """Return whether the page is asked for as JSON."""
+    return request.url.path.endswith(JSON)
 
 
 class Pages:
@@ -50,7 +64,10 @@ class Pages:
         headers: Mapping[str, str] | None = None,
         **values: Any,
     ) -> Response:
-        """A page. `values`: what its template names."""
+        """Return a page, or what it shows as JSON where the address ends so. `values`: what its template names."""
+        if as_json(request):
+            shown = {name: plain(value) for name, value in values.items() if not callable(value)}
+            return JSONResponse(shown, status, dict(headers or {}))
         language = texts.language_of(request.cookies.get("pbl_language"), request.headers.get("accept-language", ""))
         session: Session | None = getattr(request.state, "session", None)
         page = self._environment.get_template(template).render(

@@ -11,9 +11,9 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from schemas import choose, results, video
+from schemas import choose, reading, video
 
-from .find import number_of
+from .address import number_of
 from .pages import Pages
 from .tables import Tables
 
@@ -31,7 +31,7 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
             found = choose.candidates(number)
             if not asked.isdecimal() or len(asked) > 3 or int(asked) >= len(found):
                 raise video.unknown_video(number)
-            return results.load_tracking(found[int(asked)].key)
+            return reading.load_tracking(found[int(asked)].key)
 
         tracked = await tables.ask(load)
         return Response(await asyncio.to_thread(boxes_json, tracked), media_type="application/json")

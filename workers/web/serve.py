@@ -22,7 +22,7 @@ from .access import Sessions
 from .accounts import Accounts
 from .app import Options, create_app
 from .connections import Connection
-from .results_folder import ResultsFolder
+from .folder import ResultsFolder
 
 #: Addresses of this machine alone, and those that mean all of its addresses.
 LOOPBACK, EVERYWHERE = ("127.0.0.1", "::1", "localhost"), ("0.0.0.0", "::", "")  # noqa: S104

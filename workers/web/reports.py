@@ -1,11 +1,12 @@
-"""Take along: the overlay video of a recording and the report of a visit, made when somebody asks for them."""
+"""The overlay video of a recording and the report of a visit, drawn on request."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response
@@ -13,14 +14,17 @@ from starlette.routing import Route
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
-from schemas import privacy, recording_page, video
+from schemas import privacy, video
+from schemas.reading import shown as reading
 
 from ..process_queue import ProcessQueue, Task, Work
 from .access import REPORT_POLICY
-from .find import number_of, shown_of
+from .address import number_of, shown_of
 from .pages import Pages
 from .tables import Tables
-from .take import result_of
+
+if TYPE_CHECKING:
+    from pbl_pipeline.visit import Recording, Visit
 
 #: Time (s) and memory (byte) that one file may take: a minute of 4K video is drawn in a few minutes.
 SECONDS, N_BYTES = 3600.0, 8 * 2**30
@@ -42,7 +46,7 @@ def routes(pages: Pages, tables: Tables, making: ProcessQueue) -> list[Route]:
 
     async def overlay(request: Request) -> Response:
         number = number_of(request)
-        about = await tables.ask(recording_page.recording_about, number)
+        about = await tables.ask(reading.shown_recording, number)
         work = await work_of(request, overlay_key, load_overlay, number)
         return pages.show(request, "overlay.html", about=about, work=work)
 
@@ -88,41 +92,41 @@ def overlay_key(video_id: int) -> tuple[Any, ...]:
 
     Raises `PblError` DB_NOT_FOUND for a recording without pictures or a fit.
     """
-    about = recording_page.recording_about(video_id)
-    if about.key is None or not about.has_pictures:
+    about = reading.shown_recording(video_id)
+    if not about.recording.fitted or about.recording.path is None:
         raise PblError(
             "DB_NOT_FOUND",
-            found=f"no pictures with a fit of video_id {video_id}. {about.problem}".strip(),
+            found=f"no pictures with a fit of video_id {video_id}. {about.recording.problem}".strip(),
             expected="a recording to which a body is fitted",
             next_step="`pbl populate`; `pbl why` says what stops it",
         )
-    return ("overlay", video_id, *recording_page.computed(about.key), about.hidden_heads, _copy_of(video_id))
+    return ("overlay", video_id, *reading.computations(video_id), about.hidden_heads, _copy_of(video_id))
 
 
 def load_overlay(video_id: int) -> Task:
-    """How the overlay of a recording is drawn."""
-    found = recording_page.recording_fit(recording_page.fitted_key(video_id))
+    """Return how the overlay of a recording is drawn."""
+    found = reading.shown_recording(video_id).fitted().loaded()
     with contextlib.ExitStack() as stack:
         path = stack.enter_context(privacy.shown(video_id)) or video.present_file(video_id)
-        return _task("overlay.mp4", _draw, stack.pop_all(), path, found.fit, found.keypoints, found.events)
+        return _task("overlay.mp4", _draw, stack.pop_all(), dataclasses.replace(found, shown=path))
 
 
 def report_key(session_id: int, shown: int) -> tuple[Any, ...]:
-    """What the report of a result of a visit depends on."""
-    about = result_of(session_id, shown)
-    copies = [_copy_of(r.video_id) for r in about.recordings]
+    """Return what the report of a result of a visit depends on."""
+    about = reading.computed_visit(session_id, shown)
+    copies = [_copy_of(r.number) for r in about.recordings if r.number is not None]
     return ("report", session_id, *about.key.values(), about.computed, settings.deidentify_how(), *copies)
 
 
 def load_report(session_id: int, shown: int) -> Task:
-    """How the report of a result of a visit is written."""
-    from schemas.report import load_session_files
+    """Return how the report of a result of a visit is written."""
+    from schemas.report import to_show
 
-    about = result_of(session_id, shown)
-    wanted = {"session_id": session_id, **about.key, "fit_set_kind": about.results[shown].kind}
+    about = reading.computed_visit(session_id, shown)
+    assert about.visit is not None
     with contextlib.ExitStack() as stack:
-        loaded = load_session_files(wanted, stack)
-        return _task("report.html", _write, stack.pop_all(), loaded.session, loaded.words)
+        visit = to_show(about.visit, stack).loaded()
+        return _task("report.html", _write, stack.pop_all(), visit)
 
 
 def _task(file: str, function: Callable[..., None], open_files: contextlib.ExitStack, *args: Any) -> Task:
@@ -145,13 +149,13 @@ def _copy_of(video_id: int) -> str:
 
 
 # -------------------------------------------------------------------------------------------- in processes of their own
-def _draw(out: Path, path: Path, fit: Any, keypoints: Any, events: Any) -> None:
-    from pbl_pipeline.render import render_overlay
+def _draw(out: Path, recording: Recording) -> None:
+    from pbl_pipeline.pipeline import draw_overlay
 
-    render_overlay(path, fit, out, keypoints, events=events)
+    draw_overlay(recording, out)
 
 
-def _write(out: Path, session: Any, words: dict[str, Any]) -> None:
-    from pbl_pipeline.pipeline import write_session_report
+def _write(out: Path, visit: Visit) -> None:
+    from pbl_pipeline.pipeline import write_visit_report
 
-    write_session_report(out, session, **words)
+    write_visit_report(out, visit)

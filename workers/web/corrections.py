@@ -14,7 +14,7 @@ from schemas import decide, event_corrections, fit, usable
 
 from ..refresh import queue_visit_of
 from .access import Refused, Session, form_of
-from .find import number_of
+from .address import number_of
 from .tables import Tables
 
 _EVENT = re.compile(r"(\d{1,5}(?:\.\d{1,6})?)([lr])([du])", re.ASCII)

@@ -14,7 +14,7 @@ from pbl_pipeline.errors import PblError
 from schemas.viewings import record_viewing
 
 from .access import Session
-from .find import LARGEST
+from .address import LARGEST
 from .tables import Tables
 
 #: Seconds in which what a page asks for again and again (ranges of a video) is one look.

@@ -1,4 +1,4 @@
-"""Find a visit: the list with its filters, and the visit's own page."""
+"""The list of visits with its filters, and the page of a visit."""
 
 from __future__ import annotations
 
@@ -12,23 +12,36 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 
-from schemas import decide, visit_list
-from schemas.enter import entry
-from schemas.visit_progress import visit_progress
+from schemas import visit_list
 
 from .access import Session, form_of
+from .address import LARGEST, interval, number_of, shown_of
 from .computing import told as told_of
-from .pages import Pages
-from .tables import Tables
+from .pages import Pages, as_json, page
+from .plain_values import plain
+from .source import Source
+from .tables import Asks, Tables
 
-#: Numbers of rows: DataJoint's int32.
-LARGEST = 2**31 - 1
 _AFTER = re.compile(r"(\d{4}-\d{2}-\d{2})~(\d{1,10})")
 _FIELDS = ("cohort", "role", "quality", "state", "first_day", "last_day")
 
 
-def routes(pages: Pages, tables: Tables) -> list[Route]:
-    """The addresses of this part."""
+def routes(pages: Pages, asks: Asks, source: Source) -> list[Route]:
+    """Return the address of a visit, which tables and folder have."""
+
+    async def visit(request: Request) -> Response:
+        about = await asks.ask(source.visit, number_of(request), shown_of(request))
+        if as_json(request):  # where arrays may be loaded
+            return pages.show(request, "", about=await asks.ask(plain, about))
+        told = told_of(request, await asks.ask(source.progress, about.row.session_id))
+        around = await asks.ask(source.around, about)
+        return pages.show(request, "visit.html", about=about, interval=interval, told=told, **around)
+
+    return page("/visits/{number:int}", visit)
+
+
+def list_routes(pages: Pages, tables: Tables) -> list[Route]:
+    """Return the address of the list of the tables' visits."""
 
     async def visits(request: Request) -> Response:
         if request.method == "POST":
@@ -41,13 +54,13 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
         for name in ("cohort", "role"):
             bad = bad or (bool(getattr(wanted, name)) and getattr(wanted, name) not in choices[name])
         after = _after(asked.get("after", ""))
-        page = await tables.ask(visit_list.visit_page, wanted, after)
+        listed = await tables.ask(visit_list.visit_page, wanted, after)
         kept = {k: asked[k] for k in ("q", *_FIELDS) if asked.get(k)}
-        older = urlencode({**kept, "after": f"{page.after[0]}~{page.after[1]}"}) if page.after else ""
+        older = urlencode({**kept, "after": f"{listed.after[0]}~{listed.after[1]}"}) if listed.after else ""
         return pages.show(
             request,
             "visits.html",
-            page=page,
+            page=listed,
             wanted=wanted,
             choices={**choices, "quality": visit_list.OUTCOMES, "state": visit_list.STATES},
             bad=bad,
@@ -57,49 +70,7 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
             interval=interval,
         )
 
-    async def visit(request: Request) -> Response:
-        from schemas.visit_page import visit_about
-
-        about = await tables.ask(visit_about, number_of(request), shown_of(request))
-        decided = await tables.ask(decide.decisions, about.visit.session_id)
-        accepted = await tables.ask(decide.accepted, about.key) if about.key else {}
-        entered = await tables.ask(entry, about.visit.session_id)
-        told = told_of(request, await tables.ask(visit_progress, about.visit.session_id))
-        return pages.show(
-            request,
-            "visit.html",
-            about=about,
-            decisions=decided,
-            accepted=accepted,
-            entry=entered,
-            interval=interval,
-            told=told,
-        )
-
-    return [
-        Route("/visits", visits, methods=["GET", "POST"]),
-        Route("/visits/{number:int}", visit),
-    ]
-
-
-def number_of(request: Request) -> int:
-    """The number in the address; one that no row can have becomes 0, which none has."""
-    number = int(request.path_params["number"])
-    return number if number <= LARGEST else 0
-
-
-def shown_of(request: Request) -> int:
-    """Which result of a visit is asked for; one that none can be becomes `LARGEST`, which none has."""
-    asked = request.query_params.get("result", "0")
-    return int(asked) if asked.isdecimal() and len(asked) < 4 else LARGEST
-
-
-def interval(result: visit_list.Result) -> str:
-    """ "78 to 87" as numbers; empty where the error of the index is not known."""
-    from pbl_pipeline.gait import interval_90
-
-    bounds = interval_90(result.index, result.sd)
-    return "" if bounds is None else f"{bounds[0]:.0f}\N{EN DASH}{bounds[1]:.0f}"
+    return page("/visits", visits, methods=["GET", "POST"])
 
 
 def _address(session: Session, fields: Mapping[str, str]) -> str:

@@ -1,0 +1,219 @@
+"""Visits and recordings as pages show them: the library's `Visit` or `Recording` with what people decided around it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from pbl_pipeline import settings
+from pbl_pipeline.errors import PblError
+
+from .. import fit, gait, gdi, listing, qc, session, video
+from ..usable import Unusable, unusable
+from ..visit_list import Result, VisitRow, results_of, visits_of
+from ..why import why
+from .visits import load_recording, load_visit
+
+if TYPE_CHECKING:
+    from pbl_pipeline.gait import Measure
+    from pbl_pipeline.qc import Check
+    from pbl_pipeline.visit import Recording, Visit
+
+
+@dataclasses.dataclass(frozen=True)
+class ShownCheck:
+    """A check of a visit."""
+
+    number: int  # of its row (`qc_no`), by which it is accepted
+    check: Check
+    recording: int | None  # number of the recording that it is about; None: the visit
+
+
+@dataclasses.dataclass(frozen=True)
+class ShownVisit:
+    """A visit, the result that is shown of it and the others that there are."""
+
+    row: VisitRow  # its line in the list of visits
+    recordings: tuple[Recording, ...]  # all of the visit, without their arrays; of any kind and result
+    visit: Visit | None = None  # of the shown result; None where there is none yet
+    results: tuple[Result, ...] = ()  # by every chain of methods
+    shown: int | None = None  # number of the shown one among `results`
+    checks: tuple[ShownCheck, ...] = ()  # of the shown result, in the order of the chain
+    of_person: tuple[VisitRow, ...] = ()  # all visits of the person
+    marks: Mapping[int, Unusable] = dataclasses.field(default_factory=dict)  # recordings marked as not usable
+    computed: str = ""  # when the checks were computed
+
+    @property
+    def result(self) -> Result | None:
+        """The shown result in one line."""
+        return None if self.shown is None else self.results[self.shown]
+
+    @property
+    def key(self) -> Mapping[str, Any]:
+        """Primary key of the shown result; empty without one."""
+        return {} if self.visit is None else self.visit.key
+
+    @property
+    def measures(self) -> dict[str, tuple[Measure | None, str]]:
+        """Each measure by its name, with the reason where it is not known."""
+        from pbl_pipeline.words import MEASURES
+
+        if self.visit is None or self.visit.measures is None:
+            return {}
+        found = self.visit.measures.spatiotemporal
+        return {n: (found[n], found.reasons.get(n, "")) for n in MEASURES if n in found.measures or n in found.reasons}
+
+
+@dataclasses.dataclass(frozen=True)
+class ShownRecording:
+    """A recording and the visit that it is of."""
+
+    recording: Recording
+    number: int
+    session_id: int
+    subject: str
+    label: str
+    hidden_heads: str = ""  # how heads are hidden in what is shown; empty for the original
+    lead: int | None = None  # the recording with the fit, where several cameras filmed the trial and this is another
+
+    def fitted(self) -> Recording:
+        """Return the recording, which has a fit. Raises `PblError` DB_NOT_FOUND where it has none."""
+        if self.recording.fitted:
+            return self.recording
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no fit of recording {self.number}: {self.recording.problem}",
+            expected="a recording to which a body is fitted",
+            next_step="`pbl populate`; `pbl why` says what stops it",
+        )
+
+    @property
+    def has_pictures(self) -> bool:
+        """Whether it is a video; markers of a laboratory have none."""
+        return self.recording.path is not None or self.recording.video is not None
+
+
+def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
+    """Return a visit by its number; `shown`: which of its results.
+
+    Raises `PblError` DB_NOT_FOUND for an unknown visit or result.
+    """
+    subjects = (session.Session & {"session_id": session_id}).to_arrays("subject")
+    if not len(subjects):
+        raise session.unknown_visit(session_id)
+    of_person = visits_of(str(subjects[0]))
+    results = tuple(results_of([session_id])[session_id])
+    if not 0 <= shown < max(1, len(results)):
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no result {shown} of session_id {session_id}",
+            expected=f"one of its {len(results)} results",
+            next_step="open the visit from the list",
+        )
+    recordings = _recordings(session_id)
+    about = ShownVisit(
+        row=next(v for v in of_person if v.session_id == session_id),
+        recordings=recordings,
+        of_person=of_person,
+        marks=unusable([r.number for r in recordings if r.number is not None]),
+    )
+    if not results:
+        return about
+    key = _key_of(session_id, results[shown])
+    return dataclasses.replace(
+        about,
+        visit=load_visit({"session_id": session_id, **key, "fit_set_kind": results[shown].kind}),
+        results=results,
+        shown=shown,
+        checks=_checks_of(key),
+        computed="".join(str(t) for t in (qc.SessionQc & key).to_arrays("qc_computed")),
+    )
+
+
+def computed_visit(session_id: int, shown: int) -> ShownVisit:
+    """Return `shown_visit` of a visit that has a result. Raises also `PblError` DB_NOT_FOUND where it has none."""
+    about = shown_visit(session_id, shown)
+    if about.visit is None:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no result of session_id {session_id}",
+            expected="a visit that was computed",
+            next_step="`pbl populate`; `pbl status` says what stops it",
+        )
+    return about
+
+
+def shown_recording(video_id: int) -> ShownRecording:
+    """Return a recording by its number, without opening its arrays.
+
+    Raises `PblError` DB_NOT_FOUND for an unknown number.
+    """
+    recording = load_recording(video_id)
+    named = (video.Video.proj() * session.Session.proj("subject", "session_label") & {"video_id": video_id}).fetch1()
+    lead = fit.trial_of(video_id)
+    if not recording.fitted:
+        recording = dataclasses.replace(recording, problem=why(video_id).verdict)
+    return ShownRecording(
+        recording=recording,
+        number=video_id,
+        session_id=int((video.Video & {"video_id": video_id}).fetch1("session_id")),
+        subject=named["subject"],
+        label=named["session_label"],
+        hidden_heads=settings.deidentify_how() if recording.path is not None else "",
+        lead=lead if lead != video_id else None,
+    )
+
+
+def computations(video_id: int) -> tuple[Any, ...]:
+    """Return what tells apart the computations that the shown fit of a recording and its events come from.
+
+    Raises as `ShownRecording.fitted`.
+    """
+    key = fit.trial_key(video_id)
+    if key is None:
+        shown_recording(video_id).fitted()
+        return ()
+    fitted = (fit.SessionFit & key).to_arrays("fit_computed")
+    found = gait.newest_events(key)
+    events = () if found is None else (gait.GaitEvents & found).to_arrays("events_computed")
+    correction = None if found is None else gait.correction_of(found)
+    return (*key.values(), *map(str, fitted), *(found or {}).values(), *map(str, (*events, correction)))
+
+
+def _key_of(session_id: int, result: Result) -> dict[str, Any]:
+    """Return the key of SessionGdi of a result of a visit."""
+    names = ("fit_method", "gait_method", "gdi_method", "norm")
+    chain = dict(zip(names, result.methods, strict=True))
+    # Restricted before it is projected: DataJoint leaves out conditions on columns that are not there.
+    sets = (fit.FitSet & {"session_id": session_id, "fit_set_kind": result.kind}).proj()
+    current = fit.current().proj() * sets
+    return dict((gdi.SessionGdi.proj() & current.proj() & chain).keys()[0])
+
+
+def _checks_of(key: Mapping[str, Any]) -> tuple[ShownCheck, ...]:
+    """Return the checks of a result in the order of the chain."""
+    from pbl_pipeline.qc import Check
+
+    out = []
+    for row in (qc.SessionQc.Check & key).to_dicts(order_by="qc_no"):
+        about = row["qc_video_id"]
+        check = Check(*(row[c] for c in qc.COLUMNS))
+        out.append(ShownCheck(int(row["qc_no"]), check, None if about is None else int(about)))
+    return tuple(out)
+
+
+def _recordings(session_id: int) -> tuple[Recording, ...]:
+    """Return the recordings of a visit, with why one has no fit."""
+    from pbl_pipeline.gait import Condition
+    from pbl_pipeline.visit import Recording
+
+    rows = listing.videos({"session_id": session_id}).to_dict("records")
+    marked = unusable(int(row["video_id"]) for row in rows)
+    out = []
+    for row in rows:
+        number = int(row["video_id"])
+        problem = "" if row["fits"] or number in marked else why(number).verdict
+        condition = Condition(row["activity"], row["pace"] or "")
+        out.append(Recording(row["video_name"], condition=condition, problem=problem, number=number))
+    return tuple(out)

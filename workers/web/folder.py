@@ -1,0 +1,291 @@
+"""A folder that `pbl run` wrote, or one of such folders, as the source of the pages."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Hashable, Iterator
+from pathlib import Path
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import FileResponse, Response
+from starlette.routing import Route
+
+from pbl_pipeline import settings
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.qc import PASS
+from pbl_pipeline.visit import FIT, METRICS, OVERLAY, REPORT, SESSION, Visit, load_visit
+from schemas.reading.shown import ShownCheck, ShownRecording, ShownVisit
+from schemas.visit_list import Page, Result, VisitRow
+from schemas.visit_progress import Progress
+
+from .access import REPORT_POLICY
+from .address import interval, number_of
+from .corrections import Judged
+from .pages import Pages, page
+from .tables import Asks
+
+#: Most visits of a folder, and how deep in it they are looked for.
+_MOST, _DEEP = 1000, 3
+#: Visits that are kept in memory at a time.
+_KEPT = 4
+#: Endings of a recording that is looked for beside its results.
+_VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Place:
+    """Where a visit lies: its name, its folder, and the numbers that its recordings have here."""
+
+    name: str
+    path: Path
+    recordings: dict[str, int]
+
+
+class ResultsFolder:
+    """Visits below a folder, each a folder with a `session.json` and fits.
+
+    Parameters
+    ----------
+    path
+        Of `pbl run --out`, or a folder of such folders.
+    videos
+        Where the recordings are looked for, by their names: the results hold none. None: beside the results and in the
+        folder above.
+
+    Raises
+    ------
+    PblError
+        FILE_MISSING where no results are in it.
+    """
+
+    def __init__(self, path: Path, videos: Path | None = None) -> None:
+        found = [p.parent for p in sorted(_sessions(path, _DEEP))][:_MOST]
+        if not found:
+            raise PblError(
+                "FILE_MISSING",
+                found=f"no {SESSION} in {path}",
+                expected="a folder that `pbl run` wrote, or a folder of such folders",
+                next_step="`pbl run VIDEO --out FOLDER`, then `pbl web --folder FOLDER`",
+                key=str(path),
+            )
+        self._videos, number = videos, 0
+        self._places: dict[int, _Place] = {}
+        for i, folder in enumerate(found, 1):
+            names = [fit.name.removesuffix(f".{FIT}") for fit in sorted(folder.glob(f"*.{FIT}"))]
+            name = folder.relative_to(path).as_posix() if folder != path else folder.resolve().name
+            self._places[i] = _Place(name, folder, {n: number + j for j, n in enumerate(names, 1)})
+            number += len(names)
+        self._load = functools.lru_cache(_KEPT)(self._read)
+
+    def listed(self) -> Page:
+        """Return a line for each visit; one whose files cannot be read keeps its line, with the error."""
+        return Page(tuple(self._row(number) for number in self._places), None, len(self._places))
+
+    def visit(self, number: int, result: int) -> ShownVisit:
+        """Return a visit. Raises `PblError` DB_NOT_FOUND; FILE_MISSING, FILE_FORMAT for files that cannot be read."""
+        visit, row = self._visit(number), self._row(number)
+        checks = () if visit.judged is None else visit.judged.checks
+        return ShownVisit(
+            row=row,
+            recordings=visit.recordings,
+            visit=visit,
+            results=() if row.result is None else (row.result,),
+            shown=None if row.result is None else 0,
+            checks=tuple(ShownCheck(i, check, None) for i, check in enumerate(checks, 1)),
+        )
+
+    def recording(self, number: int) -> ShownRecording:
+        """Return a recording. Raises as `visit`."""
+        of, name = self._of_recording(number)
+        return ShownRecording(self._visit(of).recording(name), number, of, "", self._places[of].name)
+
+    def state(self, number: int) -> Hashable:
+        """Return what tells apart what was fitted to a recording."""
+        of, name = self._of_recording(number)
+        path = self._places[of].path / f"{name}.{FIT}"
+        return str(path), path.stat().st_mtime_ns
+
+    def video(self, number: int) -> Path:
+        """Return the video. Raises `PblError` DB_NOT_FOUND; VIDEO_MISSING where it is not found.
+
+        Also where only pictures with hidden heads may be shown (PBL_DEIDENTIFY).
+        """
+        of, name = self._of_recording(number)
+        results = self._places[of].path
+        if how := settings.deidentify_how():
+            raise _no_video(
+                name,
+                f"PBL_DEIDENTIFY={how}: the recording is not shown",
+                "look at the video with the body drawn in, which `pbl run` made of a copy with hidden heads",
+            )
+        wanted = {f"{name}{end}".lower() for end in _VIDEOS}
+        for folder in (self._videos,) if self._videos else (results, results.parent):
+            for file in sorted(folder.iterdir()) if folder.is_dir() else ():
+                if file.name.lower() in wanted and file.is_file():
+                    return file
+        raise _no_video(
+            name,
+            f"no {name}.mp4, .mov, ... beside the results",
+            "start the page with --videos and the folder of the recordings; below is the video with the body drawn in",
+        )
+
+    def overlay(self, number: int) -> Path:
+        """Return the video with the body drawn over it. Raises `PblError` DB_NOT_FOUND, VIDEO_MISSING."""
+        of, name = self._of_recording(number)
+        path = self._places[of].path / f"{name}.{OVERLAY}"
+        if not path.is_file():
+            raise _no_video(path.name, f"no {path.name}", "`pbl run` again")
+        return path
+
+    def report(self, number: int) -> Path:
+        """Return the report. Raises `PblError` DB_NOT_FOUND where there is none."""
+        path = self._place(number).path / REPORT
+        if not path.is_file():
+            raise _unknown("report of visit", number)
+        return path
+
+    def to_export(self, number: int, result: int) -> Visit:
+        """Return a visit. Raises as `visit`."""
+        return self._visit(number)
+
+    def people(self, about: ShownRecording) -> tuple[list[Any], list[str]]:
+        """Return nothing: results hold one person."""
+        return [], []
+
+    def judged(self, number: int) -> Judged:
+        """Return nothing: nothing is decided about results in a folder."""
+        return Judged(None, "", 0, None)
+
+    def progress(self, session_id: int) -> Progress:
+        """Return nothing: all is computed."""
+        return Progress(session_id, 0, (), ())
+
+    def around(self, about: ShownVisit) -> dict[str, Any]:
+        """Return nothing: decisions and entered scores are in tables alone."""
+        return {"decisions": None, "accepted": {}, "entry": None}
+
+    def _place(self, number: int) -> _Place:
+        if number not in self._places:
+            raise _unknown("visit", number)
+        return self._places[number]
+
+    def _of_recording(self, number: int) -> tuple[int, str]:
+        """Return the number of the visit of a recording, and the recording's name."""
+        for of, place in self._places.items():
+            for name, own in place.recordings.items():
+                if own == number:
+                    return of, name
+        raise _unknown("recording", number)
+
+    def _visit(self, number: int) -> Visit:
+        files = [p for p in sorted(self._place(number).path.iterdir()) if p.name in (SESSION, METRICS) or FIT in p.name]
+        return self._load(number, tuple((p.name, p.stat().st_mtime_ns) for p in files))
+
+    def _read(self, number: int, changed: tuple[tuple[str, int], ...]) -> Visit:
+        place = self._places[number]
+        visit = load_visit(place.path)
+        recordings = tuple(dataclasses.replace(r, number=place.recordings.get(r.name)) for r in visit.recordings)
+        return dataclasses.replace(visit, recordings=recordings)
+
+    def _row(self, number: int) -> VisitRow:
+        place = self._place(number)
+        try:
+            visit, problem = self._visit(number), ""
+        except PblError as error:
+            visit, problem = None, f"{error.code}: {error.found}. {error.next_step}"
+        return VisitRow(
+            session_id=number,
+            subject="" if visit is None or visit.subject == "-" else visit.subject,
+            label=place.name,
+            day=None,
+            role="",
+            videos=len(place.recordings),
+            state="computed"
+            if visit is not None and visit.measures is not None
+            else "failed"
+            if problem
+            else "pending",
+            problem=problem,
+            result=None if visit is None else _result(visit),
+            more=0,
+            trend=None,
+        )
+
+
+def routes(pages: Pages, files: Asks, folder: ResultsFolder) -> list[Route]:
+    """Return the addresses that a folder answers in its own way: the list, and files that are there already."""
+
+    async def visits(request: Request) -> Response:
+        listed = await files.ask(folder.listed)
+        return pages.show(
+            request,
+            "visits.html",
+            page=listed,
+            choices={},
+            bad=False,
+            older="",
+            newest="",
+            is_first=True,
+            interval=interval,
+        )
+
+    async def report(request: Request) -> Response:
+        headers = {"content-security-policy": REPORT_POLICY}
+        return FileResponse(folder.report(number_of(request)), media_type="text/html; charset=utf-8", headers=headers)
+
+    async def overlay(request: Request) -> Response:
+        return FileResponse(await files.ask(folder.overlay, number_of(request)), media_type="video/mp4")
+
+    return [
+        *page("/visits", visits),
+        Route("/visits/{number:int}/report", report),
+        Route("/recordings/{number:int}/overlay", overlay),
+    ]
+
+
+def _result(visit: Visit) -> Result | None:
+    """Return the result of a visit in one line; None before its measures are computed."""
+    measures = visit.judged
+    if measures is None:
+        return None
+    index, outcome = measures.gdi, measures.outcome
+    events = measures.trials[0].events.method if measures.trials else ""
+    return Result(
+        kind=visit.kind,
+        methods=(visit.methods.get("Fit", ""), events, index.model, index.norm),
+        status=measures.status,
+        reason=measures.reason or index.reason,
+        index=index.mean,
+        sd=index.sd,
+        minimal_change=index.minimal_change,
+        outcome=outcome,
+        worst=tuple(c.check for c in measures.checks if c.outcome == outcome != PASS),
+    )
+
+
+def _sessions(path: Path, deep: int) -> Iterator[Path]:
+    """Files `session.json` in a folder and those below it, without following links."""
+    if not path.is_dir():
+        return
+    if (file := path / SESSION).is_file():
+        yield file
+    if deep:
+        for folder in sorted(path.iterdir()):
+            if folder.is_dir() and not folder.is_symlink():
+                yield from _sessions(folder, deep - 1)
+
+
+def _unknown(what: str, number: int) -> PblError:
+    return PblError(
+        "DB_NOT_FOUND",
+        found=f"no {what} {number} in this folder",
+        expected="one that the list leads to",
+        next_step="open the list; after another `pbl run` start the page again",
+    )
+
+
+def _no_video(key: str, found: str, next_step: str) -> PblError:
+    expected = "the recording that the results were made of"
+    return PblError("VIDEO_MISSING", found=found, expected=expected, next_step=next_step, key=key)

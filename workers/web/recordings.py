@@ -1,0 +1,97 @@
+"""The page of a recording: its video, the fitted body, curves and events on one time line."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import re
+from collections.abc import Hashable
+
+from starlette.requests import Request
+from starlette.responses import FileResponse, Response
+from starlette.routing import Route
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.visit import Recording
+
+from .address import number_of
+from .computing import told as told_of
+from .movement import Movement
+from .pages import Pages, page
+from .source import Source
+from .tables import Asks
+
+#: Recordings whose movement is kept in memory at a time: some hundred kB each.
+_KEPT = 8
+_OWN = re.compile(r"/(visits|recordings)(/\d{1,10}(/enter)?)?|/operate")
+#: How browsers call a file by its ending; others are offered as MP4, and a browser that cannot play one says so.
+_KINDS = {".webm": "video/webm", ".mkv": "video/x-matroska", ".mov": "video/mp4", ".mp4": "video/mp4"}
+
+
+def routes(pages: Pages, asks: Asks, source: Source) -> list[Route]:
+    """Return the addresses of this part."""
+
+    async def recording(request: Request) -> Response:
+        about = await asks.ask(source.recording, number_of(request))
+        problem: PblError | None = None
+        if about.has_pictures:
+            try:
+                await asks.ask(source.video, about.number)
+            except PblError as error:
+                problem = error
+        people, seen = await asks.ask(source.people, about) if about.has_pictures else ([], [])
+        judged = await asks.ask(source.judged, about.number)
+        told = told_of(request, await asks.ask(source.progress, about.session_id))
+        return pages.show(
+            request, "recording.html", about=about, no_video=problem, people=people, seen=seen, judged=judged, told=told
+        )
+
+    async def video(request: Request) -> Response:
+        path = await asks.ask(source.video, number_of(request))
+        return FileResponse(path, media_type=_KINDS.get(path.suffix.lower(), "video/mp4"))
+
+    kept: collections.OrderedDict[Hashable, asyncio.Future[Movement]] = collections.OrderedDict()
+
+    async def prepared(request: Request) -> Movement:
+        """What a recording's page asks for, made once for the requests of several."""
+        number = number_of(request)
+        key = await asks.ask(source.state, number)
+        if key not in kept:
+            kept[key] = asyncio.ensure_future(prepare(number))
+            while len(kept) > _KEPT:
+                kept.popitem(last=False)
+        kept.move_to_end(key)
+        try:
+            return await asyncio.shield(kept[key])
+        except Exception:
+            kept.pop(key, None)  # what was wrong may be put right
+            raise
+
+    async def prepare(number: int) -> Movement:
+        return await asyncio.to_thread(Movement.of, await asks.ask(loaded, number))
+
+    def loaded(number: int) -> Recording:
+        """Load the arrays in the thread that may."""
+        return source.recording(number).fitted().loaded()
+
+    async def movement(request: Request) -> Response:
+        return Response((await prepared(request)).movement, media_type="application/json")
+
+    async def body(request: Request) -> Response:
+        return Response((await prepared(request)).body, media_type="application/octet-stream")
+
+    async def points(request: Request) -> Response:
+        return Response((await prepared(request)).points, media_type="application/octet-stream")
+
+    return [
+        *page("/recordings/{number:int}", recording),
+        Route("/recordings/{number:int}/video", video),
+        Route("/recordings/{number:int}/movement", movement),
+        Route("/recordings/{number:int}/body", body),
+        Route("/recordings/{number:int}/points", points),
+    ]
+
+
+def own_address(text: str) -> str:
+    """An address of this page that a form names, else the first page."""
+    return text if _OWN.fullmatch(text) else "/"

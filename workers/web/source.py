@@ -1,0 +1,110 @@
+"""Where visits and recordings come from: the tables, or a folder that `pbl run` wrote (`folder.ResultsFolder`)."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.visit import Visit
+from schemas import choose, decide
+from schemas.reading import shown
+from schemas.visit_progress import Progress, visit_progress
+
+from .corrections import Judged, judged
+from .videos import Videos
+
+
+class Source(Protocol):
+    """Visits and recordings by their numbers, for the pages that both sources have.
+
+    All methods may be slow: they are called away from the loop that answers browsers. An unknown number is a `PblError`
+    DB_NOT_FOUND.
+    """
+
+    def visit(self, number: int, result: int) -> shown.ShownVisit:
+        """Return a visit with one of its results."""
+        ...
+
+    def recording(self, number: int) -> shown.ShownRecording:
+        """Return a recording; its arrays are loaded when they are asked for."""
+        ...
+
+    def state(self, number: int) -> Hashable:
+        """Return what tells apart what was fitted to a recording. Raises `PblError` DB_NOT_FOUND without a fit."""
+        ...
+
+    def video(self, number: int) -> Path:
+        """Return the video that may be shown of a recording. Raises `PblError` VIDEO_MISSING."""
+        ...
+
+    def to_export(self, number: int, result: int) -> Visit:
+        """Return a computed visit. Raises `PblError` DB_NOT_FOUND where it has no result."""
+        ...
+
+    def people(self, about: shown.ShownRecording) -> tuple[Sequence[choose.Candidates], list[str]]:
+        """Return who can be chosen, by tracking method, and the state in which that is shown."""
+        ...
+
+    def judged(self, number: int) -> Judged:
+        """Return what people decided about a recording."""
+        ...
+
+    def progress(self, session_id: int) -> Progress:
+        """Return what is still to be computed of a visit."""
+        ...
+
+    def around(self, about: shown.ShownVisit) -> dict[str, Any]:
+        """Return what the page of a visit shows around it: decisions, accepted checks, entered scores."""
+        ...
+
+
+class TablesSource:
+    """The visits of the tables."""
+
+    def __init__(self, videos: Videos) -> None:
+        self._videos = videos
+
+    def visit(self, number: int, result: int) -> shown.ShownVisit:
+        return shown.shown_visit(number, result)
+
+    def recording(self, number: int) -> shown.ShownRecording:
+        return shown.shown_recording(number)
+
+    def state(self, number: int) -> Hashable:
+        return shown.computations(number)
+
+    def video(self, number: int) -> Path:
+        return self._videos.path(number)
+
+    def to_export(self, number: int, result: int) -> Visit:
+        about = shown.computed_visit(number, result)
+        assert about.visit is not None
+        return about.visit
+
+    def people(self, about: shown.ShownRecording) -> tuple[Sequence[choose.Candidates], list[str]]:
+        """None before people are searched."""
+        try:
+            found = choose.candidates(about.number)
+        except PblError as error:
+            if error.code != "DB_NOT_FOUND":
+                raise
+            return [], []
+        return found, [decide.person_state(about.number, c.key["tracking_method"]) for c in found]
+
+    def judged(self, number: int) -> Judged:
+        return judged(number)
+
+    def progress(self, session_id: int) -> Progress:
+        return visit_progress(session_id)
+
+    def around(self, about: shown.ShownVisit) -> dict[str, Any]:
+        from schemas.enter import entry
+
+        number = about.row.session_id
+        return {
+            "decisions": decide.decisions(number),
+            "accepted": decide.accepted(about.key) if about.key else {},
+            "entry": entry(number),
+        }
