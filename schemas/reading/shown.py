@@ -150,14 +150,15 @@ def shown_recording(video_id: int) -> ShownRecording:
     Raises `PblError` DB_NOT_FOUND for an unknown number.
     """
     recording = load_recording(video_id)
-    named = (video.Video.proj() * session.Session.proj("subject", "session_label") & {"video_id": video_id}).fetch1()
+    visits = video.Video.proj("session_id") * session.Session.proj("subject", "session_label")
+    named = (visits & {"video_id": video_id}).fetch1()
     lead = fit.trial_of(video_id)
     if not recording.fitted:
         recording = dataclasses.replace(recording, problem=why(video_id).verdict)
     return ShownRecording(
         recording=recording,
         number=video_id,
-        session_id=int((video.Video & {"video_id": video_id}).fetch1("session_id")),
+        session_id=int(named["session_id"]),
         subject=named["subject"],
         label=named["session_label"],
         hidden_heads=settings.deidentify_how() if recording.path is not None else "",
