@@ -127,6 +127,8 @@ def _index(content: Mapping[str, Any], model: str, checks: Sequence[Check], cycl
     own = tuple(structured(c, GdiCycle) for c in told.get("cycles", ())) if cycles is None else tuple(cycles)
     known = None if profile is None else structured(profile, MovementProfile)
     numbers = {n: told[n] for n in ("left", "right", "mean")} | {n: told.get(n) for n in ("sd", "minimal_change")}
+    if (numbers["sd"] is None) != (numbers["minimal_change"] is None):
+        raise ValueError("an index with one of sd and minimal_change")
     return Gdi(
         **{n: None if value is None else float(value) for n, value in numbers.items()},
         status=PASS if numbers["mean"] is not None else EMPTY,
