@@ -126,7 +126,7 @@ def measured_person(key: Mapping[str, Any]) -> tuple[str | None, int | None]:
 @schema
 class GaitEvents(dj.Computed):
     definition = f"""
-    # initial contacts and toe-offs of both sides as a method detects them; EMPTY: ran well, nobody walks
+    # foot down and foot up of both sides; EMPTY: ran well, nobody walks
     -> fit.SessionFit.Trial
     -> GaitEventMethod
     ---
@@ -212,7 +212,7 @@ class GaitEvents(dj.Computed):
 @schema
 class GaitCycle(dj.Computed):
     definition = f"""
-    # strides of a trial by its detected events, or by those of a correction (null: none), foot down to the next foot down of the same side
+    # strides of a trial, foot down to the next foot down of the same side
     -> GaitEvents
     ---
     -> session.Session

@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 from . import queue, run_job
 from .queue import Claim
 from .run_job import Computed, Outcome
 
-if TYPE_CHECKING:
-    from .loop import Worker
+
+class Runs(Protocol):
+    """What batches need of the worker (`loop.Worker`) whose jobs they are."""
+
+    stop: threading.Event
+    heartbeat: Any
+    batch: int
+
+    report: Callable[[Claim, Outcome | None], None]
+
+    def one(self, job: Claim, computed: Computed | None = None) -> Outcome: ...
+    def follow(self, outcomes: Sequence[Outcome]) -> None: ...
 
 
-def run_fits(first: list[Claim], worker: Worker) -> None:
+def run_fits(first: list[Claim], worker: Runs) -> None:
     """Do the jobs of `first` and, as long as there are more of that table, the next batches.
 
     Threads compute and touch no database; this one reserves, fetches and inserts, so that the device always has the

@@ -26,10 +26,10 @@ from ._multi_view import SAME_TIME_S, MultiView, cameras_of_files, check_same_ti
 from ._onnx_keypoints import ModelKeypointParams, ModelParams, OnnxKeypoints
 from ._params import KeypointParams
 from ._picture import Picture, PictureMeter
-from ._protocol import KeypointDetector, PersonKeypoints
+from ._protocol import KeypointDetector
 from ._quality import check_keypoints, side_changes
 from ._trc import read_trc
-from ._types import Keypoints
+from ._types import Keypoints, PersonKeypoints
 from ._view import view_rotation
 from ._view_agreement import MOST_MISS_M, check_views_agree, ray_miss_m
 from ._world_markers import WorldMarkers

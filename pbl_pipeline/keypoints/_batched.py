@@ -12,7 +12,8 @@ import numpy as np
 
 from pbl_pipeline.video import Camera, Frame
 
-from ._protocol import Look, PersonKeypoints
+from ._protocol import Look
+from ._types import PersonKeypoints
 
 _Item = tuple[Frame, np.ndarray, bool, "Future[PersonKeypoints]"]
 

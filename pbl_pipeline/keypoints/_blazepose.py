@@ -7,7 +7,6 @@ GHUM Holistic" for the metric points, and the graph configuration beside the mod
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -21,15 +20,13 @@ from pbl_pipeline.video import Camera, cut_image
 
 from ._flips import mirror_of
 from ._mirror_looks import MirrorLooks
-from ._protocol import PersonKeypoints
+from ._params import MARKER_SET, MODEL_SHA256, ROOT_RELATIVE, KeypointParams
+from ._types import PersonKeypoints
 from ._view import crop_matrix, view_rotation
 
-if TYPE_CHECKING:
-    from ._params import KeypointParams
-
+HEAVY_SHA256 = assets.ASSETS["blazepose_landmarks_heavy"].sha256
 #: The networks by their SHA-256: the asset that each is. They have the same inputs and outputs.
-_NETWORKS = {assets.ASSETS[name].sha256: name for name in ("blazepose_landmarks", "blazepose_landmarks_heavy")}
-MODEL_SHA256, HEAVY_SHA256 = _NETWORKS
+_NETWORKS = {MODEL_SHA256: "blazepose_landmarks", HEAVY_SHA256: "blazepose_landmarks_heavy"}
 INPUT_SIZE = 256
 #: The crop is this much larger than the region of interest.
 CROP_MARGIN = 1.25
@@ -88,8 +85,8 @@ class BlazePoseLandmarks:
 
     name = "blazepose"
     names: tuple[str, ...] = NAMES
-    marker_set = "blazepose_33"
-    root_relative = True
+    marker_set = MARKER_SET
+    root_relative = ROOT_RELATIVE
 
     #: One for each core: calls of one thread side by side are faster than one call of several threads.
     per_core = True

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ._params import KeypointParams
-from ._protocol import PersonKeypoints
+from ._types import PersonKeypoints
 
 #: The Gaussian kernel is cut off at so many standard deviations.
 REACH_SD = 4.0

@@ -28,8 +28,8 @@ from ._methods import METHODS
 from ._params import KeypointParams
 from ._passes import ParallelInference, n_workers, two_passes
 from ._picture import Picture, PictureMeter
-from ._protocol import KeypointDetector, Look, MirrorDetector, PersonKeypoints
-from ._types import Keypoints
+from ._protocol import KeypointDetector, Look, MirrorDetector
+from ._types import Keypoints, PersonKeypoints
 
 
 def detect_keypoints(

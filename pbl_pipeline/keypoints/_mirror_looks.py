@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.special import expit
 
 from ._flips import leg_points, mirror_of
-from ._protocol import PersonKeypoints
+from ._types import PersonKeypoints
 
 #: The two answers are taken to have other sides where they lie apart by more than this fraction of the region's side,
 #: in the mean, and by less than half of that with the sides exchanged.

@@ -17,8 +17,8 @@ from ._augment import aligned, augmentations, sd_confidence, spread_mm
 from ._decode_2d import edge_shift, from_heatmap, from_simcc
 from ._flips import FlipParams
 from ._params import KeypointParams
-from ._protocol import PersonKeypoints
 from ._root import HALF_M, absolute_root
+from ._types import PersonKeypoints
 from ._virtual_camera import crops, look_at
 
 #: Frames in one call of the network, by device.

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 
+from pbl_pipeline import assets
 from pbl_pipeline.paramset import later
 
-from ._blazepose import MODEL_SHA256, BlazePoseLandmarks
 from ._flips import FlipParams
+
+#: BlazePose's lighter network, and what its points are.
+MODEL_SHA256 = assets.ASSETS["blazepose_landmarks"].sha256
+MARKER_SET, ROOT_RELATIVE = "blazepose_33", True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,4 +55,4 @@ class KeypointParams:
 
     def points(self) -> tuple[str, bool]:
         """Marker set of the keypoints, and whether their 3D is relative to the root of the body."""
-        return BlazePoseLandmarks.marker_set, BlazePoseLandmarks.root_relative
+        return MARKER_SET, ROOT_RELATIVE

@@ -20,7 +20,8 @@ import numpy as np
 from pbl_pipeline.video import Camera, Frame
 
 from ._crops import Regions
-from ._protocol import CropDetector, KeypointDetector, Look, MirrorDetector, PersonKeypoints
+from ._protocol import CropDetector, KeypointDetector, Look, MirrorDetector
+from ._types import PersonKeypoints
 
 #: More detectors than this bring little and cost memory.
 _MAX_WORKERS = 8

@@ -2,35 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import enum
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from pbl_pipeline.video import Camera
 
-if TYPE_CHECKING:
-    from ._mirror_looks import MirrorLooks
-
-
-@dataclasses.dataclass(frozen=True)
-class PersonKeypoints:
-    """One person in one frame.
-
-    xy_px (J, 2) in the upright, distorted picture; xyz_cam_m (J, 3) camera frame (x right, y down, z forward);
-    confidence (J,) in 0..1; presence: how sure the detector is that the crop shows a person at all, 0..1;
-    roi_px (4,) centre x, centre y, side, rotation of the region as these keypoints show it (NaN: not known),
-    a better crop for the same frame than the one they were found in; crop_px: longer side of the crop that
-    the network saw, in pixels of the picture (NaN: not stated).
-    """
-
-    xy_px: np.ndarray
-    xyz_cam_m: np.ndarray
-    confidence: np.ndarray
-    presence: float
-    roi_px: np.ndarray
-    crop_px: float = float("nan")
+from ._mirror_looks import MirrorLooks
+from ._types import PersonKeypoints
 
 
 class Look(enum.Enum):

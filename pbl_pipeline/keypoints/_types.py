@@ -29,6 +29,25 @@ _NO_SOURCE = "not stated in the keypoints file"
 
 
 @dataclasses.dataclass(frozen=True)
+class PersonKeypoints:
+    """One person in one frame.
+
+    xy_px (J, 2) in the upright, distorted picture; xyz_cam_m (J, 3) camera frame (x right, y down, z forward);
+    confidence (J,) in 0..1; presence: how sure the detector is that the crop shows a person at all, 0..1;
+    roi_px (4,) centre x, centre y, side, rotation of the region as these keypoints show it (NaN: not known),
+    a better crop for the same frame than the one they were found in; crop_px: longer side of the crop that
+    the network saw, in pixels of the picture (NaN: not stated).
+    """
+
+    xy_px: np.ndarray
+    xyz_cam_m: np.ndarray
+    confidence: np.ndarray
+    presence: float
+    roi_px: np.ndarray
+    crop_px: float = float("nan")
+
+
+@dataclasses.dataclass(frozen=True)
 class Keypoints:
     """One trial. Missing values are NaN with confidence 0.
 

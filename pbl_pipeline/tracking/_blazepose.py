@@ -9,19 +9,15 @@ circle around the whole body, straight above the hips in the body's own directio
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pbl_pipeline import assets
 from pbl_pipeline.models import SsdLayout, SsdModel
 
+from ._params import MODEL_SHA256, TrackingParams
 from ._types import Detection
 
-if TYPE_CHECKING:
-    from ._params import TrackingParams
-
-MODEL_SHA256 = "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c"
 LAYOUT = SsdLayout(input_size=224, layers=((8, 2), (16, 2), (32, 6)), n_keypoints=4)
 #: Half width of a standing body in units of the circle's radius; arms hang within it.
 BODY_HALF_WIDTH = 0.4

@@ -18,9 +18,10 @@ from ._phone_lens import (
     phone_lens,
     turned_camera,
 )
-from ._phone_log import SENSORS, VIDEO_CLOCK, PhoneLog, Sensor, read_phone_log
+from ._phone_log import SENSORS, VIDEO_CLOCK, PhoneLog, Sensor
 from ._probe import packet_times, probe, read_first, read_metadata, sha256_of
 from ._read import read_frames
+from ._read_phone_log import read_phone_log
 from ._timing import check_timing
 from ._types import CAMERA_KINDS, Camera, FirstPicture, Frame, VideoInfo
 from ._write import write_h264

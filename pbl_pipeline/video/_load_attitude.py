@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from ._attitude import DEVICE, Attitude, camera_in_device, check_roll, held_deg, log_error
 from ._clock import align_clock
-from ._phone_log import PhoneLog, read_phone_log
+from ._phone_log import PhoneLog
+from ._read_phone_log import read_phone_log
 from ._types import VideoInfo
 
 

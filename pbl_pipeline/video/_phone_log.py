@@ -1,7 +1,7 @@
 """The sensor log of a phone that filmed: orientation, and what else it measured, as a recording app wrote it.
 
-Two forms of the project's own (CSV, JSON; docs/phone_capture.md) and the exports of Sensor Logger are read. Nothing is
-turned or shifted here: `load_attitude` brings a log to a video.
+Here are the two forms of the project's own (CSV, JSON; docs/phone_capture.md). Nothing is turned or shifted:
+`load_attitude` brings a log to a video.
 """
 
 from __future__ import annotations
@@ -16,11 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from pbl_pipeline import bounded
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.names import is_plain
 
 from ._attitude import CAMERA, DEVICE, check_attitude, log_error
 
@@ -35,11 +33,8 @@ SENSORS = {
     "gyroscope": (("gx", "gy", "gz"), "rad/s"),
     "magnetometer": (("mx", "my", "mz"), "uT"),
 }
-#: Latest time in a log (s), on whichever clock, and years in which one may begin.
-_LATEST_S, _YEARS = 1e10, range(1990, 2200)
-#: An accelerometer shows gravity where its typical length (m/s^2) lies in this range; it then must agree with the log's
-#: way up within this angle.
-_GRAVITY, _MOST_TILT_DEG = (8.8, 10.8), 25.0
+#: Years in which a log may begin.
+_YEARS = range(1990, 2200)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,31 +72,12 @@ class PhoneLog:
         return float(1.0 / np.median(np.diff(self.time_s)))
 
 
-def read_phone_log(path: str | Path) -> PhoneLog:
-    """Read a log in one of the forms of docs/phone_capture.md; what it is follows from its content.
-
-    Raises
-    ------
-    PblError
-        FILE_MISSING: no such file. PHONE_LOG: none of the forms, a field missing, what `check_attitude` refuses, an
-        unknown frame, sensors whose gravity contradicts the orientation.
-    """
-    from ._sensor_logger import is_sensor_logger, read_sensor_logger
-
-    path = Path(path)
-    if is_sensor_logger(path):
-        log = read_sensor_logger(path)
-    else:
-        text = read_text(path)
-        is_json = text[:1000].lstrip()[:1] in ("{", "[")
-        log = _read_json(path, text) if is_json else _read_csv(path, text)
-    if not is_plain(log.device):
-        raise log_error(f"a phone called {ascii(log.device)[:80]}", "a name without control characters", path)
-    if np.abs(log.time_s).max() > _LATEST_S or bounded.span_s(log.time_s) > bounded.MAX_SECONDS:
-        found = f"times from {log.time_s[0]:.6g} to {log.time_s[-1]:.6g} s"
-        raise log_error(found, f"seconds, {bounded.MAX_SECONDS:g} at most", path)
-    _check_gravity(path, log)
-    return log
+def read_own_form(path: Path) -> PhoneLog:
+    """Read a log in one of the project's own forms, by what its text begins with. Raises `PblError` FILE_MISSING,
+    PHONE_LOG."""
+    text = read_text(path)
+    is_json = text[:1000].lstrip()[:1] in ("{", "[")
+    return _read_json(path, text) if is_json else _read_csv(path, text)
 
 
 def read_text(path: Path) -> str:
@@ -263,24 +239,3 @@ def _sensor(path: Path, name: str, time: np.ndarray, xyz: np.ndarray) -> Sensor:
     if np.any(np.diff(time) < 0):
         raise log_error(f"{name}: stamps that run backwards", "increasing times", path)
     return Sensor(time, xyz)
-
-
-def _check_gravity(path: Path, log: PhoneLog) -> None:
-    """Compare the way up of the orientation with that of the accelerometer. Android counts it upwards, iOS downwards,
-    so the line counts. It tells a wrong frame from a right one; heading it does not see."""
-    sensor = log.sensors.get("gravity") or log.sensors.get("accelerometer")
-    if sensor is None or log.frame != DEVICE or len(sensor.time_s) < 2:
-        return
-    length = np.linalg.norm(sensor.xyz, axis=1)
-    if not _GRAVITY[0] <= np.median(length) <= _GRAVITY[1]:
-        return
-    near = np.clip(np.searchsorted(log.time_s, sensor.time_s), 0, len(log.time_s) - 1)
-    up = Rotation.from_quat(log.quat_wxyz[near], scalar_first=True).inv().apply([0.0, 0.0, 1.0])
-    cos = np.abs(np.sum(up * sensor.xyz, axis=1)) / np.maximum(length, 1e-9)
-    off = float(np.degrees(np.median(np.arccos(np.clip(cos, 0, 1)))))
-    if off > _MOST_TILT_DEG:
-        raise log_error(
-            f"an orientation whose vertical lies {off:.0f} deg from the accelerometer's",
-            f"at most {_MOST_TILT_DEG:.0f} deg: quaternions that turn the phone's axes into a world with z up",
-            path,
-        )

@@ -5,6 +5,8 @@ Beside the package's own migrations the tests write some into a folder that the 
 
 from __future__ import annotations
 
+import contextlib
+import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -15,7 +17,7 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection, gait, gdi, jobs, lab, migrations, session, video, views
+from schemas import connection, event_corrections, gait, gdi, jobs, lab, migrations, session, video, views
 from schemas.chain import ON_REQUEST
 from schemas.ingest import Visit, ingest
 from schemas.operations import embedded
@@ -216,6 +218,104 @@ def test_results_from_before_they_had_their_session_get_it(
     assert len(gdi.SessionGdi * session.Session) == len(session.Session()) == 2
     assert len(gait.Spatiotemporal * session.Session * video.Video) == 2
     assert migrations.migrate().steps == []
+
+
+#: The tables of corrections before migration 0004.
+HAND_EVENTS = (
+    "CREATE TABLE pbl_gait.hand_events (video_id INT NOT NULL PRIMARY KEY, hand_from VARCHAR(48) NOT NULL,"
+    " hand_changed SMALLINT NOT NULL, hand_tracking VARCHAR(48), hand_person SMALLINT, hand_by VARCHAR(64) NOT NULL,"
+    " hand_at DATETIME NOT NULL, FOREIGN KEY (video_id) REFERENCES pbl_video.video (video_id) ON UPDATE CASCADE,"
+    " FOREIGN KEY (hand_from) REFERENCES pbl_gait.`#gait_event_method` (gait_method) ON UPDATE CASCADE)",
+    "CREATE TABLE pbl_gait.hand_events__event (video_id INT NOT NULL, hand_no SMALLINT NOT NULL,"
+    " hand_time DOUBLE NOT NULL, hand_side ENUM('left','right') NOT NULL,"
+    " hand_kind ENUM('foot_down','foot_up') NOT NULL, hand_probability DOUBLE, PRIMARY KEY (video_id, hand_no),"
+    " FOREIGN KEY (video_id) REFERENCES pbl_gait.hand_events (video_id) ON UPDATE CASCADE)",
+    "INSERT INTO pbl_gait.hand_events SELECT video_id, gait_method, correction_changed, correction_tracking,"
+    " correction_person, correction_by, correction_at FROM pbl_gait.event_correction",
+    "INSERT INTO pbl_gait.hand_events__event SELECT video_id, corrected_no, corrected_time, corrected_side,"
+    " corrected_kind, corrected_probability FROM pbl_gait.event_correction__event",
+)
+
+
+def _with_methods_by_hand() -> None:
+    """A corrected event as it was before migration 0004: results by hand beside those of the detected events."""
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        cursor.execute("SELECT gait_method FROM pbl_gait.event_correction")
+        ((method,),) = cursor.fetchall()
+        cursor.execute("SET foreign_key_checks = 0")
+        for statement in HAND_EVENTS:
+            cursor.execute(statement)
+        cursor.execute(
+            "INSERT INTO pbl_gait.`#gait_event_method` VALUES ('by-hand-v1', 'by-hand', 1, %s, 'f8f1e2d3c4b5a697')",
+            (json.dumps({"automatic": method, "automatic_hash": "0" * 16}),),
+        )
+        cursor.execute("INSERT INTO pbl_gait.gait_plan SELECT session_id, 'by-hand-v1' FROM pbl_gait.gait_plan")
+        cursor.execute(
+            "ALTER TABLE pbl_gait.__gait_cycle DROP FOREIGN KEY __gait_cycle_ibfk_3, DROP COLUMN correction_no"
+        )
+        cursor.execute("ALTER TABLE pbl_gdi.__session_gdi DROP COLUMN session_corrected")
+        cursor.execute(
+            "DROP TABLE pbl_gdi.__session_gdi__trial, pbl_gait.event_correction__event, pbl_gait.event_correction"
+        )
+        cursor.execute(
+            "SELECT CONCAT(table_schema, '.', table_name), GROUP_CONCAT(column_name ORDER BY ordinal_position)"
+            " FROM information_schema.columns WHERE table_schema IN ('pbl_gait', 'pbl_gdi', 'pbl_qc')"
+            " AND table_name LIKE '\\_\\_%%' GROUP BY 1 HAVING SUM(column_name = 'gait_method')"
+        )
+        for table, columns in cursor.fetchall():
+            by_hand = columns.replace("gait_method", "'by-hand-v1'")
+            cursor.execute(f"INSERT INTO {table} SELECT {by_hand} FROM {table}")
+        cursor.execute("UPDATE pbl_gait.__gait_events SET events_detector = 'by-hand' WHERE gait_method = 'by-hand-v1'")
+        # Those of the detected events have other numbers.
+        for table, column in (("gait.__spatiotemporal", "stance"), ("gdi.__session_gdi", "session_stance")):
+            cursor.execute(f"UPDATE pbl_{table} SET {column} = 1.5 WHERE gait_method = %s", (method,))
+        cursor.execute("UPDATE pbl_gdi.__g_d_i__cycle SET cycle_z = 1.5 WHERE gait_method = %s", (method,))
+
+
+@pytest.mark.parametrize("killed_before", [None, 4, 60])
+def test_corrections_by_a_method_become_rows(
+    empty: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_before: int | None
+):
+    chain.install(monkeypatch)
+    schemas.activate()
+    register(chain.small_video(tmp_path, "a"), session_label="2026-03-01")
+    populate(_chain())
+    found = event_corrections.shown(1)
+    assert found is not None
+    (time, side, kind, _), *others = found.events
+    event_corrections.save(1, [(time + 0.02, side, kind), *(e[:3] for e in others)], "A. First", found.state)
+    assert not {t.table: t.errors for t in populate(_chain()).tables if t.errors}
+    new = everything()
+    _with_methods_by_hand()
+    empty()
+    assert len(everything()["pbl_gdi.__session_gdi"]) == 2
+    refused = pbl("populate")
+    assert (refused.code, "__session_gdi.session_corrected" in refused.err) == (1, True)
+    dry = migrations.migrate(dry_run=True)
+    assert (len(dict(dry.steps)["0004 corrections_as_rows"]) > 60, dry.open) == (True, [])
+
+    class Killed(BaseException):
+        pass
+
+    done: list[str] = []
+
+    def say(line: str) -> None:
+        done.append(line)
+        if len(done) == killed_before:
+            raise Killed
+
+    with contextlib.suppress(Killed):
+        migrations.migrate(say=say)
+    assert (migrations.applied()[-1].number == OWN - 1) == (killed_before is None)
+    migrations.migrate()
+    after = everything()
+    assert {t for t in new if after[t] != new[t] and not t.split(".")[1].startswith("~")} == set()
+    assert not [t for t in after if "hand_events" in t]
+    assert migrations.migrate().steps == []
+    # Nothing is pending; going back to the detected events computes theirs again.
+    assert not populate(_chain()).did_something
+    event_corrections.take_back(1, "B. Second", (event_corrections.shown(1) or found).state)
+    assert {t.table: t.done for t in populate(_chain()).tables if t.done}["SessionGdi"] == 1
 
 
 @pytest.mark.parametrize("command", [("populate",), ("list", "videos"), ("worker", "--once"), ("db", "init")])

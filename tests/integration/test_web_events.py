@@ -124,7 +124,9 @@ def test_corrected_events_count_instead_of_the_detected_ones(visit: str, monkeyp
     one, two = (t.events for t in found.measures.trials)
     assert (one.corrected, two.corrected) == (True, False)
     assert (one.method, one.params_hash) == (two.method, two.params_hash)
-    assert [e.time_s for e in one.events] == [e[0] for e in (event_corrections.shown(1).hand or ())]
+    corrected = event_corrections.shown(1)
+    assert corrected is not None
+    assert [e.time_s for e in one.events] == [e[0] for e in corrected.hand or ()]
     assert [v["gait_method"] for v in list_fitted({})] == [visit]
     monkeypatch.setattr(export, "FORMATS", ("csv",))  # the stand-in of the fit has no markers for a .trc
     archive = zipfile.ZipFile(io.BytesIO(browser.get("/visits/1/export?result=0").content))

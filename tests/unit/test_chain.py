@@ -17,8 +17,8 @@ NEEDS = {
     "GaitCycle": ["GaitEvents"],
     "Spatiotemporal": ["GaitCycle"],
     "GDI": ["GaitCycle"],
-    "SessionGdi": ["SessionFit"],
-    "SessionQc": ["GaitEvents", "SessionGdi"],
+    "SessionGdi": ["SessionFit", "Spatiotemporal", "GDI"],
+    "SessionQc": ["SessionGdi"],
     "KinematicError": ["SessionFit"],
     "Deidentified": ["VideoInfo"],
 }

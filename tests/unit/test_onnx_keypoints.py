@@ -32,9 +32,9 @@ from pbl_pipeline.keypoints import (
 from pbl_pipeline.keypoints._augment import Augmentation, aligned, augmentations, sd_confidence, spread_mm
 from pbl_pipeline.keypoints._batched import BatchedInference
 from pbl_pipeline.keypoints._blazepose import CROP_MARGIN, MIRROR, N_ALL
-from pbl_pipeline.keypoints._blazepose import MODEL_SHA256 as BLAZEPOSE_SHA256
 from pbl_pipeline.keypoints._blazepose import NAMES as BLAZEPOSE_NAMES
 from pbl_pipeline.keypoints._decode_2d import from_heatmap, from_simcc
+from pbl_pipeline.keypoints._params import MODEL_SHA256 as BLAZEPOSE_SHA256
 from pbl_pipeline.keypoints._protocol import Look
 from pbl_pipeline.keypoints._root import absolute_root
 from pbl_pipeline.keypoints._virtual_camera import crops, look_at
