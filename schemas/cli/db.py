@@ -69,13 +69,10 @@ def status(as_json: bool) -> None:
 
     known = database_status()
     _print(known, as_json)
-    if known["kind"] == "external":
-        return
-    now = embedded.status()
-    if not now.running:
-        found = "there is no database yet" if not now.initialised else "it is not running"
-        if now.pid is not None:
-            found = f"process {now.pid} runs but does not answer: see run/server.log in the folder"
+    if not known["running"]:
+        found = "there is no database yet" if not known["initialised"] else "it is not running"
+        if known["pid"] is not None:
+            found = f"process {known['pid']} runs but does not answer: see run/server.log in the folder"
         raise embedded.not_running(embedded.Folder.default(), found)
 
 

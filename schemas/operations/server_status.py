@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 from schemas import connection, store
@@ -15,4 +16,4 @@ def database_status() -> dict[str, Any]:
     if (address := connection.external()) is not None:
         version = connection.connect().query("SELECT VERSION()").fetchone()[0]
         return {"kind": "external", "running": True, "address": address, "version": version}
-    return {"kind": "embedded", **embedded.status().to_dict(), "store": store.describe()}
+    return {"kind": "embedded", **dataclasses.asdict(embedded.status()), "store": store.describe()}

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
 import time
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import pymysql
 
@@ -37,10 +35,6 @@ class Status:
     version: str | None = None
     uptime_s: int | None = None
     data_mb: float | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON has it."""
-        return asdict(self)
 
 
 def start(say: Say = silent, folder: Folder | None = None) -> Status:
@@ -150,12 +144,6 @@ def status(folder: Folder | None = None) -> Status:
     except pymysql.err.OperationalError:
         return Status(False, str(folder.path), True, pid, HOST, port, version)
     return Status(True, str(folder.path), True, pid, HOST, port, version, uptime_s, data_mb)
-
-
-def remove(folder: Folder) -> None:
-    """Stop the server and delete its folder with all tables. For tests: no command does this."""
-    stop(folder=folder)
-    shutil.rmtree(folder.path, ignore_errors=True)
 
 
 def allow_prefix(prefix: str, folder: Folder | None = None) -> None:
