@@ -3,7 +3,9 @@
 By hand, and not with mariadb-dump or mysqldump, for three reasons. A backup counts the rows and collects the files that
 they name in the transaction that reads them; a dump program has a snapshot of its own, so that a row deleted in between
 would be restored without its file. mariadb-dump 10.11 writes the single-precision number 0.12345679 as 0.123457. And it
-is in no package that the embedded server needs (Debian: mariadb-client, 63 MB with Perl), nor in the workers' image. The file is plain SQL: `zcat database.sql.gz | mariadb -h HOST -u USER -p` restores it without this module.
+is in no package that the embedded server needs (Debian: mariadb-client, 63 MB with Perl), nor in the workers' image.
+
+The file is plain SQL: `zcat database.sql.gz | mariadb -h HOST -u USER -p` restores it without this module.
 """
 
 from __future__ import annotations
