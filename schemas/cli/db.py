@@ -19,7 +19,7 @@ from ._db_roles import roles
 
 @click.group()
 def db() -> None:
-    """The database: a private server in a folder of its own (PBL_HOME), no system service.
+    """The database: a private server in the folder PBL_HOME, not a system service.
 
     With DJ_HOST, DJ_PORT, DJ_USER and DJ_PASS set, that server is used and nothing is started here.
 

@@ -63,12 +63,12 @@ def write_config(folder: Path, overwrite: bool = False) -> list[Path]:
 
 
 def is_mariadb() -> bool:
-    """Whether the server is one that plain DataJoint has not been repaired for (`schemas._datajoint`)."""
+    """Return True for MariaDB, which plain DataJoint needs a repair for (`schemas._datajoint`)."""
     return "MariaDB" in str(connection.connect().query("SELECT VERSION()").fetchone()[0])
 
 
 def _without_secrets(stores: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
-    """The stores without their secrets, and these by the name of the file that DataJoint reads them from."""
+    """Return the stores without their secrets, and the secrets by the name of the file that DataJoint reads."""
     plain, secrets = {}, {}
     for name, spec in stores.items():
         if isinstance(spec, dict):

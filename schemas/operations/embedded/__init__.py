@@ -1,4 +1,4 @@
-"""The database that comes with the project: a private MariaDB server in a folder of its own, no system service.
+"""The database that comes with the project: a private MariaDB server in a separate folder, not a system service.
 
 `start()` gets the server when it is absent, creates the folder on first use and leaves a process running that
 listens on 127.0.0.1 only; `stop()` ends it; `status()` looks and changes nothing. Only MariaDB is started here: a

@@ -1,4 +1,4 @@
-"""What lies in the folder of the embedded server, and who may read it."""
+"""Content of the folder of the embedded server, and its permissions."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class Folder:
         try:
             missing = [p for p in (self.path, *self.path.parents) if not p.exists()]
             self.path.mkdir(parents=True, exist_ok=True)
-            for folder in missing:  # whatever the umask: the server's account enters, nobody else writes
+            for folder in missing:  # under any umask: the server's account enters, no one else writes
                 folder.chmod(0o755)
         except OSError as error:
             raise folder_error(self.path, error) from error
@@ -221,5 +221,5 @@ def _write(path: Path, content: dict[str, Any], mode: int) -> None:
 
 
 def indent(text: str) -> str:
-    """Quoted lines, set in under the line of the error that introduces them."""
+    """Return lines indented, to stand below the line of an error that introduces them."""
     return "\n".join(f"      {line}" for line in text.splitlines())

@@ -21,7 +21,7 @@ STOP_TIMEOUT_S = 60.0
 
 @dataclass(frozen=True)
 class Status:
-    """What is known about the server; entries are None where it does not run.
+    """Status of the server; entries are None where it does not run.
 
     `running` means that it answers; a process that does not answer has a `pid` and `running` False.
     """
@@ -105,7 +105,7 @@ def stop(say: Say = silent, folder: Folder | None = None) -> bool:
             with admin(folder) as connection, connection.cursor() as cursor:
                 cursor.execute("SHUTDOWN")
         except pymysql.err.Error:
-            # It answers no more, or not yet: the signal asks for the same orderly end.
+            # It no longer answers, or not yet: the signal asks for the same orderly end.
             terminate(pid)
         deadline = time.monotonic() + STOP_TIMEOUT_S
         while alive(pid, folder):
@@ -147,7 +147,7 @@ def status(folder: Folder | None = None) -> Status:
 
 
 def allow_prefix(prefix: str, folder: Folder | None = None) -> None:
-    """Let the application use the schemas `<prefix>_...`; the server keeps the right, `server.json` the memory of it.
+    """Let the application use the schemas `<prefix>_...`; grants access and records it in `server.json`.
 
     Raises
     ------
