@@ -170,15 +170,9 @@ def cycle_chart(
         The side whose curves are less certain.
     """
     opacity = {side: 0.4 if side == faint else 1.0 for side in cycles}
-    values = [np.asarray(c, float) for curves in cycles.values() for c in curves]
+    axes = _cycle_axes([c for curves in cycles.values() for c in curves], norm)
     if norm is not None:
-        values += [norm[1] - norm[2], norm[1] + norm[2]]
-    ticks = nice_ticks(*_extent(values, least=20.0))
-    axes = Axes(_CYCLE_SIZE, (0, 100), (ticks[0], ticks[-1]), margin=_CYCLE_MARGIN)
-    if norm is not None:
-        axes.band(norm[0], norm[1] - norm[2], norm[1] + norm[2])
         axes.curve(norm[0], norm[1], "#9aa3ad", 1.2)
-    axes.grid([0, 25, 50, 75, 100], ticks, "\N{NO-BREAK SPACE}%", "\N{DEGREE SIGN}")
     for side, curves in cycles.items():
         colour = SIDE_COLOUR[side]
         for c in curves:
@@ -216,20 +210,24 @@ def compare_chart(
         Place of the curve that is drawn thicker.
     """
     drawn = [(*SERIES[i], i, *c) for i, c in enumerate(curves) if c is not None]
-    values = [edge for *_, mean, sd in drawn for edge in (mean, mean - sd, mean + sd)]
-    if norm is not None:
-        values += [norm[1] - norm[2], norm[1] + norm[2]]
-    ticks = nice_ticks(*_extent(values, least=20.0))
-    axes = Axes(_CYCLE_SIZE, (0, 100), (ticks[0], ticks[-1]), margin=_CYCLE_MARGIN)
-    if norm is not None:
-        axes.band(norm[0], norm[1] - norm[2], norm[1] + norm[2])
-    axes.grid([0, 25, 50, 75, 100], ticks, "\N{NO-BREAK SPACE}%", "\N{DEGREE SIGN}")
+    axes = _cycle_axes([edge for *_, mean, sd in drawn for edge in (mean, mean - sd, mean + sd)], norm)
     for colour, _, _, mean, sd in drawn:
         if np.isfinite(sd).all():
             axes.band(percent, mean - sd, mean + sd, colour, 0.14)
     for colour, dash, i, mean, _ in drawn:
         axes.curve(percent, mean, colour, 2.6 if i == reference else 1.8, 1.0, dash)
     return axes.svg(label)
+
+
+def _cycle_axes(values: Sequence[np.ndarray], norm: tuple[np.ndarray, np.ndarray, np.ndarray] | None) -> Axes:
+    """Return the plot area of an angle (deg) over the gait cycle (%) with room for `values` and the norm's band."""
+    edges = [] if norm is None else [norm[1] - norm[2], norm[1] + norm[2]]
+    ticks = nice_ticks(*_extent([*values, *edges], least=20.0))
+    axes = Axes(_CYCLE_SIZE, (0, 100), (ticks[0], ticks[-1]), margin=_CYCLE_MARGIN)
+    if norm is not None:
+        axes.band(norm[0], *edges)
+    axes.grid([0, 25, 50, 75, 100], ticks, "\N{NO-BREAK SPACE}%", "\N{DEGREE SIGN}")
+    return axes
 
 
 def series_key(place: int) -> Markup:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -42,15 +44,31 @@ def fields_of(path: str | Path) -> frozenset[str]:
 
 
 @contextmanager
-def one_process(path: Path) -> Iterator[None]:
-    """Let one process in at a time, by a lock of the file `path`; where the system has none, all."""
+def one_process(path: Path, timeout_s: float = math.inf) -> Iterator[None]:
+    """Let one process in at a time, by a lock of the file `path`; where the system has no such locks, all.
+
+    Raises
+    ------
+    TimeoutError
+        Another process holds the lock for longer than `timeout_s`.
+    OSError
+        The file cannot be opened.
+    """
     try:
         import fcntl
     except ImportError:
         yield
         return
-    with path.open("a", encoding="utf-8") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    deadline = time.monotonic() + timeout_s
+    with open(path, "a", encoding="utf-8", opener=lambda p, flags: os.open(p, flags, 0o660)) as file:
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    raise TimeoutError(f"{path} was locked for {timeout_s:.0f} s") from None
+            time.sleep(0.05)
         yield
 
 

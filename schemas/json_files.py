@@ -9,7 +9,12 @@ from typing import Any
 
 
 def write_json(path: Path, content: dict[str, Any], mode: int = 0o600) -> None:
-    """Write a JSON file with these permissions: aside and renamed, so that a reader or a power cut meets no half file.
+    """Write a JSON file as `write_text` does."""
+    write_text(path, json.dumps(content, indent=1), mode)
+
+
+def write_text(path: Path, text: str, mode: int = 0o600) -> None:
+    """Write a file with these permissions: aside and renamed, so that no reader and no power cut leaves half of it.
 
     Raises
     ------
@@ -21,7 +26,7 @@ def write_json(path: Path, content: dict[str, Any], mode: int = 0o600) -> None:
         with os.fdopen(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "w", encoding="utf-8") as out:
             if hasattr(os, "fchmod"):  # not on Windows before Python 3.13
                 os.fchmod(out.fileno(), mode)
-            json.dump(content, out, indent=1)
+            out.write(text)
             out.flush()
             os.fsync(out.fileno())
         aside.replace(path)

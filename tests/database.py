@@ -25,7 +25,7 @@ def new_home() -> Path:
 
 def remove_home(home: Path) -> None:
     """Stop the server of this home, if any, and delete everything."""
-    embedded.remove(embedded.Folder(home / "db"))
+    embedded.stop(folder=embedded.Folder(home / "db"))
     shutil.rmtree(home, ignore_errors=True)
 
 

@@ -1,4 +1,4 @@
-"""A function in a process of its own, which is ended when it takes too much time or memory."""
+"""A function in a separate process, which is ended when it takes too much time or memory."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def limited(
     Raises
     ------
     LimitExceeded
-        What it took too much of, or that it was stopped or died. Whatever `function` raises is raised here.
+        Too much time or memory, or the process was stopped or died. Exceptions of `function` are raised here.
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
@@ -92,7 +92,7 @@ def _limit_memory(n_bytes: int) -> None:
     try:
         import resource
 
-        # What the imports took does not count: with many cores numpy alone reserves a gigabyte for its threads.
+        # The memory of imports does not count: with many cores numpy alone reserves a gigabyte for its threads.
         pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[5])
         most = pages * resource.getpagesize() + n_bytes
         resource.setrlimit(resource.RLIMIT_DATA, (most, most))

@@ -1,4 +1,4 @@
-"""A queue of functions, each run in a process of its own, one after the other, with progress, limits and a result.
+"""A queue of functions, each run in a separate process, one after the other, with progress, limits and a result.
 
 `pbl web` has two: files that are made on request, and visits that are computed on request, which take far longer. The
 loop that answers browsers and the thread that reads the tables continue meanwhile.
@@ -159,7 +159,7 @@ def _run(task: Task, done: Any, root: Path, stop: threading.Event) -> Path | Non
     Raises
     ------
     PblError
-        What the function raised, `task.broken`, or INTERNAL for what is not foreseen.
+        The error that the function raised, `task.broken`, or INTERNAL for any other exception.
     """
     folder = Path(tempfile.mkdtemp(dir=root))
     part = folder / f"part-{task.file}"

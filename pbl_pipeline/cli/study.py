@@ -51,8 +51,8 @@ def check(folder: Path) -> None:
 def report(folder: Path | None, name: str | None, out: Path, change_from: str, change_to: str, group: str) -> None:
     """One page of a study's FOLDER or slice: who is in and out, repeatability, correlation with scores, change, curves.
 
-    Figures are written as SVG and PDF, tables as CSV and LaTeX. What the values do not support is a code with its
-    reason.
+    Figures are written as SVG and PDF, tables as CSV and LaTeX. Statistics that the values do not support are a
+    code with its reason.
     """
     from pbl_pipeline.study import read_study
     from pbl_pipeline.study_report import write_study_report

@@ -45,7 +45,7 @@ def write_study_report(
 ) -> list[Path]:
     """Write `report.html`, `figures/*.svg` and `*.pdf`, `tables/*.csv` and `*.tex`; returns the paths, the page first.
 
-    The page asks for nothing from elsewhere. What the values do not support stands there as a code with its reason.
+    The page asks for nothing from elsewhere. Statistics that the values do not support are a code with its reason.
     `change_from`, `change_to` (roles) and `change_group` take precedence over those of the study's description. Without
     `pdf` the figures are SVG alone, in a third of the time.
 
@@ -81,7 +81,7 @@ def write_study_report(
 
 
 def _head(study: StudyData, results: StudyResults) -> dict[str, str]:
-    """What the report is of."""
+    """Return what the report says about its data."""
     given, counted = study.description, results.table
     return {
         "name": given.name or "Study",

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("--database-only", is_flag=True, help="Leave the store's files out (where it is saved by other means).")
-@click.option("--recordings", "with_recordings", is_flag=True, help="Save the registered videos, too.")
+@click.option("--recordings", "with_recordings", is_flag=True, help="Also save the registered videos.")
 def backup(folder: Path, database_only: bool, with_recordings: bool) -> None:
     """Save all tables and the files they name into the new folder FOLDER, as of one moment. Workers may keep running.
 

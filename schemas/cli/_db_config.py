@@ -13,7 +13,7 @@ import click
     type=click.Path(path_type=Path),
     default=Path("."),
     show_default=True,
-    help="Folder of the notebooks or programs; what lies below it finds the files, too.",
+    help="Folder of the notebooks or programs; programs in folders below find the files as well.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace the files of an earlier call (the port may have changed).")
 def config(out: Path, overwrite: bool) -> None:

@@ -29,7 +29,7 @@ def migrate(dry_run: bool) -> None:
         for statement in statements if dry_run else ():
             click.echo(f"  {statement};")
     for line in outcome.open:
-        click.echo(f"  needs a migration of its own: {line}")
+        click.echo(f"  needs its own migration: {line}")
     if outcome.open:
         raise click.exceptions.Exit(1)
     done = not outcome.created and not any(s for _, s in outcome.steps)

@@ -1,4 +1,4 @@
-"""`pbl db roles`: accounts with no more rights than their work needs."""
+"""`pbl db roles`: accounts that have only the rights their work needs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from pbl_pipeline.errors import PblError
     "own",
     multiple=True,
     metavar="NAME",
-    help="With --user: a schema of its own (on the server pbl_NAME) for tables below ours; once for each.",
+    help="With --user: a custom schema (pbl_NAME on the server) for tables that refer to ours; may be repeated.",
 )
 @click.option("--from", "host", metavar="HOST", help="Where it may come from; % is anywhere (default: this machine).")
 @click.option(

@@ -19,7 +19,7 @@ from ._db_roles import roles
 
 @click.group()
 def db() -> None:
-    """The database: a private server in a folder of its own (PBL_HOME), no system service.
+    """The database: a private server in the folder PBL_HOME, not a system service.
 
     With DJ_HOST, DJ_PORT, DJ_USER and DJ_PASS set, that server is used and nothing is started here.
 
@@ -69,13 +69,10 @@ def status(as_json: bool) -> None:
 
     known = database_status()
     _print(known, as_json)
-    if known["kind"] == "external":
-        return
-    now = embedded.status()
-    if not now.running:
-        found = "there is no database yet" if not now.initialised else "it is not running"
-        if now.pid is not None:
-            found = f"process {now.pid} runs but does not answer: see run/server.log in the folder"
+    if not known["running"]:
+        found = "there is no database yet" if not known["initialised"] else "it is not running"
+        if known["pid"] is not None:
+            found = f"process {known['pid']} runs but does not answer: see run/server.log in the folder"
         raise embedded.not_running(embedded.Folder.default(), found)
 
 

@@ -44,15 +44,15 @@ Say = Callable[[str], None]
 
 @dataclasses.dataclass(frozen=True)
 class Backup:
-    """What was saved or brought back. rows: `schema.table` -> how many. left: recordings that were not, and why."""
+    """A backup that was made or restored."""
 
     folder: Path
-    created: str
-    rows: dict[str, int]
-    n_files: int
-    n_bytes: int
+    created: str  # ISO 8601, UTC
+    rows: dict[str, int]  # `schema.table` -> number of rows
+    n_files: int  # of the store
+    n_bytes: int  # of files and recordings
     n_recordings: int = 0
-    left: dict[str, str] = dataclasses.field(default_factory=dict)
+    left: dict[str, str] = dataclasses.field(default_factory=dict)  # path of a recording left out -> reason
 
 
 def backup(
@@ -73,9 +73,9 @@ def backup(
     say
         Called with a sentence for each step.
     with_recordings
-        Save the registered videos, too. One that is gone or changed is left out and named.
+        Also save the registered videos. One that is gone or changed is left out and named.
     previous
-        An earlier backup, of whose recordings links are made in place of copies.
+        An earlier backup: recordings that it holds are linked instead of copied.
 
     Raises
     ------
@@ -133,21 +133,21 @@ def backup(
 
 
 def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
-    """Compare a backup with its checksums, every byte; returns the manifest.
+    """Compare every byte of a backup with its checksums; return the manifest.
 
     Raises
     ------
     PblError
-        BACKUP_INVALID naming what is missing or changed.
+        BACKUP_INVALID, which names the missing or changed files.
     """
     try:
         manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
         parts = manifest["sha256"]
-        manifest.setdefault("n_recordings", 0)  # a backup of before they were saved
+        manifest.setdefault("n_recordings", 0)  # a backup from before they were saved
         if manifest["format"] != FORMAT:
             raise _invalid(folder, f"format {manifest['format']}", f"format {FORMAT}")
     except FileNotFoundError as error:
-        found = "no manifest.json: this is no backup, or an interrupted one"
+        found = "no manifest.json: this is not a backup, or an interrupted one"
         raise _invalid(folder, found, "manifest.json, written last") from error
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise _invalid(
@@ -175,12 +175,12 @@ def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
 
 
 def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Backup:
-    """Bring a backup back into an empty database and its store. Everything is checked before anything is written.
+    """Restore a backup into an empty database and its store. Everything is checked before anything is written.
 
     Parameters
     ----------
     folder
-        What `backup` made.
+        A folder that `backup` made.
     again
         After an interrupted restore: remove the tables it left, then start again.
     say
@@ -229,7 +229,7 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
 
 # ----------------------------------------------------------------------------------------------------------- saving
 def _snapshot(server: pymysql.Connection[Any]) -> str:
-    """From here on this connection sees the rows of this moment; the server's version."""
+    """Fix the rows that this connection sees to those of this moment; return the version of the server."""
     with server.cursor() as cursor:
         cursor.execute("SELECT VERSION()")
         version = str((cursor.fetchone() or ("",))[0])
@@ -240,7 +240,7 @@ def _snapshot(server: pymysql.Connection[Any]) -> str:
 
 
 def _videos(server: pymysql.Connection[Any], prefix: str) -> list[tuple[str, str]]:
-    """Path and SHA-256 of the registered videos."""
+    """Return path and SHA-256 of the registered videos."""
     with server.cursor() as cursor:
         cursor.execute(f"SELECT video_path, video_sha256 FROM {quote(f'{prefix}_video', 'video')}")  # noqa: S608
         return [(str(path), str(sha)) for path, sha in cursor.fetchall()]
@@ -300,7 +300,7 @@ def _save_files(paths: list[str], folder: Path) -> int:
 
 # -------------------------------------------------------------------------------------------------------- restoring
 def _make_room(cursor: Any, prefix: str, again: bool) -> None:
-    """Refuse where there are tables; set the marker. Where the marker stands, an earlier restore left the tables."""
+    """Refuse where there are tables, and set the marker; a marker that is there is from an interrupted restore."""
     marker = f"{prefix}_{_MARKER}"
     if marker in catalog.schemas():
         if not again:

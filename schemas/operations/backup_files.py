@@ -19,7 +19,7 @@ PARTS = ("store", RECORDINGS)
 
 
 def safe_path(path: str) -> PurePosixPath:
-    """A path of the store, refused where it would leave it. Raises BACKUP_INVALID."""
+    """Return a path of the store, checked not to leave it. Raises BACKUP_INVALID."""
     parts = PurePosixPath(path)
     if parts.is_absolute() or ".." in parts.parts or not parts.parts or "\n" in path or "\\" in path:
         raise PblError(
@@ -33,20 +33,20 @@ def safe_path(path: str) -> PurePosixPath:
 
 
 def listed(folder: Path, part: str) -> Iterable[tuple[str, str]]:
-    """SHA-256 and path of the files of a part of a backup. Raises BACKUP_INVALID for a path that leaves it."""
+    """Yield SHA-256 and path of the files of a part of a backup. Raises BACKUP_INVALID for a path that leaves it."""
     for line in (folder / f"{part}.sha256").read_text(encoding="utf-8").splitlines():
         sha, _, path = line.partition("  ")
         yield sha, str(safe_path(path))
 
 
 def sha256_of(path: Path) -> str:
-    """SHA-256 of a file, in hex."""
+    """Return the SHA-256 of a file in hex (light, unlike `pbl_pipeline.video`, which has the same for recordings)."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def unwritable(path: Path, error: OSError) -> PblError:
-    """What a folder without room or rights is reported as."""
+    """Return the error for a folder without room or rights."""
     return PblError(
         "FILE_UNWRITABLE",
         key=path,
@@ -58,17 +58,17 @@ def unwritable(path: Path, error: OSError) -> PblError:
 
 @dataclasses.dataclass
 class Recordings:
-    """What was copied. paths: registered paths, n_bytes: of their files. left: what was not copied, and why."""
+    """Recordings that were copied."""
 
-    paths: list[str] = dataclasses.field(default_factory=list)
+    paths: list[str] = dataclasses.field(default_factory=list)  # where they were registered
     n_bytes: int = 0
-    left: dict[str, str] = dataclasses.field(default_factory=dict)
+    left: dict[str, str] = dataclasses.field(default_factory=dict)  # path of one that was left out -> reason
 
 
 def save_recordings(videos: Iterable[tuple[str, str]], folder: Path, previous: Path | None = None) -> Recordings:
     """Copy videos, given as (path, SHA-256), into a backup, and list them in `recordings.sha256`.
 
-    What an earlier backup has is linked, which takes no room. A video that is gone or changed is left out, with why.
+    Those that an earlier backup holds are linked, which takes no room. A video that is gone or changed is left out.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def save_recordings(videos: Iterable[tuple[str, str]], folder: Path, previous: P
 
 
 def _save_recording(path: Path, sha: str, target: Path, old: Path | None) -> str:
-    """Link or copy one recording; why it was left out, "" where it was not."""
+    """Link or copy one recording; return the reason where it was left out, else ""."""
     try:
         safe_path(str(path).lstrip("/"))
         with path.open("rb"):
@@ -159,7 +159,7 @@ def restore_recordings(folder: Path) -> Recordings:
 
 @contextlib.contextmanager
 def _private() -> Iterator[None]:
-    """New files and folders are for their owner only."""
+    """Make new files and folders readable by their owner only."""
     before = os.umask(0o077)
     try:
         yield

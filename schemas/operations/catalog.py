@@ -13,10 +13,10 @@ _STORED = re.compile(r":<(object|npy|blob|attach|hash)@")
 
 @dataclasses.dataclass(frozen=True)
 class Column:
-    """A column that holds values of its own. type: as `information_schema.columns.data_type`, in small letters."""
+    """A column of a table that is not computed from others by the server."""
 
     name: str
-    type: str
+    type: str  # `information_schema.columns.data_type` in small letters
     comment: str
 
     @property
@@ -26,7 +26,7 @@ class Column:
 
 
 def schemas() -> list[str]:
-    """The schemas under the prefix, also empty ones."""
+    """Return the schemas under the prefix, including empty ones."""
     rows = connection.connect().query(
         "SELECT schema_name FROM information_schema.schemata WHERE schema_name LIKE %s ORDER BY schema_name",
         args=(f"{pattern()}%",),
@@ -35,7 +35,7 @@ def schemas() -> list[str]:
 
 
 def tables() -> dict[tuple[str, str], list[Column]]:
-    """(schema, table) -> columns, for every table under the prefix, also DataJoint's own that begin with `~`."""
+    """Return (schema, table) -> columns for every table under the prefix, including DataJoint's own (`~...`)."""
     rows = connection.connect().query(
         "SELECT c.table_schema, c.table_name, c.column_name, c.data_type, c.column_comment "
         "FROM information_schema.columns c JOIN information_schema.tables t USING (table_schema, table_name) "
@@ -50,10 +50,10 @@ def tables() -> dict[tuple[str, str], list[Column]]:
 
 
 def pattern() -> str:
-    r"""The beginning of the schemas' names for LIKE and GRANT (`pbl\_`): unescaped, `_` is any character there."""
+    r"""Return the beginning of the schemas' names for LIKE and GRANT (`pbl\_`); an unescaped `_` is any character."""
     return f"{connection.prefix()}_".replace("_", r"\_")
 
 
 def quote(*names: str) -> str:
-    """A name as SQL has it: `quote("pbl_lab", "subject")` returns `` `pbl_lab`.`subject` ``."""
+    """Return a name quoted for SQL: `quote("pbl_lab", "subject")` returns `` `pbl_lab`.`subject` ``."""
     return ".".join("`" + name.replace("`", "``") + "`" for name in names)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ from pbl_pipeline.errors import PblError
 from schemas import connection
 from schemas._datajoint import dj
 from schemas.folders import private_folder
-from schemas.json_files import write_json
+from schemas.json_files import write_json, write_text
 
 #: Names that DataJoint looks for, in the working directory and above it.
 CONFIG, SECRETS = "datajoint.json", ".secrets"
@@ -52,10 +51,7 @@ def write_config(folder: Path, overwrite: bool = False) -> list[Path]:
         folder.mkdir(parents=True, exist_ok=True)
         kept = private_folder(folder / SECRETS)
         for name, value in {".gitignore": "*\n", **secrets}.items():
-            (kept / name).unlink(missing_ok=True)  # what else lies there stays
-            handle = os.open(kept / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(value)
+            write_text(kept / name, value)  # other files in this folder stay
         write_json(here, content, 0o644)
     except OSError as error:
         raise _unwritable(folder, error.strerror or str(error), "pass another place with --out") from error
@@ -63,12 +59,12 @@ def write_config(folder: Path, overwrite: bool = False) -> list[Path]:
 
 
 def is_mariadb() -> bool:
-    """Whether the server is one that plain DataJoint has not been repaired for (`schemas._datajoint`)."""
+    """Return True for MariaDB, which plain DataJoint needs a repair for (`schemas._datajoint`)."""
     return "MariaDB" in str(connection.connect().query("SELECT VERSION()").fetchone()[0])
 
 
 def _without_secrets(stores: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
-    """The stores without their secrets, and these by the name of the file that DataJoint reads them from."""
+    """Return the stores without their secrets, and the secrets by the name of the file that DataJoint reads."""
     plain, secrets = {}, {}
     for name, spec in stores.items():
         if isinstance(spec, dict):

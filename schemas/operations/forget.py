@@ -1,4 +1,4 @@
-"""Removing a person: every row, every queued job, every stored file, and a list that proves it.
+"""Remove a person: every row, every queued job, every stored file, and write a list that proves it.
 
 Recordings (in the archive, the drop folder and where they were registered) go only where that is asked for; copies and
 temporary files that killed processes left go in any case.
@@ -41,42 +41,40 @@ Ids = dict[str, list[Any]]
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """What there is of a person. rows: table -> how many. files: paths in the store, those without a row as well.
-    videos: path, SHA-256 and size of the registered video files. running: jobs in a worker's hands. recordings: files
-    in the person's folders of the archive and, where PBL_INCOMING is set, of the drop folder."""
+    """Everything there is of a person."""
 
-    rows: dict[str, int]
-    files: list[str]
-    videos: list[dict[str, Any]]
-    running: list[str]
-    recordings: list[str]
+    rows: dict[str, int]  # table -> number of rows
+    files: list[str]  # paths in the store, including files without a row
+    videos: list[dict[str, Any]]  # path, SHA-256 and size of the registered video files
+    running: list[str]  # jobs that a worker is computing
+    recordings: list[str]  # in the archive and, where PBL_INCOMING is set, in the drop folder
 
     @property
     def nothing(self) -> bool:
-        """True when no row and no stored file is left."""
+        """True when there is no row and no stored file."""
         return not self.rows and not self.files
 
 
 @dataclasses.dataclass(frozen=True)
 class Forgotten:
-    """The outcome. left: what still names the person, empty if nothing does. kept: remaining videos, and why."""
+    """The outcome of a removal."""
 
     manifest: Path
-    rows: dict[str, int]
-    files: list[str]
-    videos: list[str]
-    kept: dict[str, str]
-    left: list[str]
+    rows: dict[str, int]  # table -> number of rows removed
+    files: list[str]  # removed from the store
+    videos: list[str]  # deleted recordings
+    kept: dict[str, str]  # path of a recording that remains -> reason
+    left: list[str]  # places that still name the person; empty if none does
 
 
 def manifest_path(subject: str) -> Path:
-    """Where the list of what is removed is kept: `PBL_HOME/forgotten/<subject>.json`. USAGE for what is no code."""
+    """Return the path of the list: `PBL_HOME/forgotten/<subject>.json`. Raises USAGE for an invalid code."""
     check_subject(subject, "check the code")
     return settings.home_dir() / "forgotten" / f"{subject}.json"
 
 
 def find(subject: str) -> tuple[Ids, Found]:
-    """Everything there is of a person; changes nothing.
+    """Return everything there is of a person; change nothing.
 
     Raises
     ------
@@ -183,7 +181,7 @@ def _identities(subject: str) -> Ids:
 
 
 def _still_free(ids: Ids) -> Ids:
-    """The numbers of an earlier run that are unused now: in a rebuilt database another person may have them."""
+    """Return the numbers of an earlier run that are unused now: in a rebuilt database another person may have them."""
     owners = {"session_id": session.Session, "video_id": video.Video, "fit_set": fit.FitSet}
     return {
         name: [v for v in values if name not in owners or not owners[name] & {name: v}] for name, values in ids.items()
@@ -216,13 +214,13 @@ def _find(ids: Ids, earlier: dict[str, Any], recordings: list[str]) -> Found:
 
 
 def personal_tables() -> list[tuple[str, str, list[Column]]]:
-    """Schema, name and columns of the tables that can hold a row of a person."""
+    """Return schema, name and columns of the tables that can hold a row of a person."""
     found = catalog.tables().items()
     return [(*name, columns) for name, columns in found if {*IDENTITIES} & {c.name for c in columns}]
 
 
 def _whose(columns: Sequence[Column], ids: Ids) -> tuple[str, tuple]:
-    """A condition that holds for the person's rows, and its values; empty where the table can hold none."""
+    """Return an SQL condition for the person's rows, and its values; empty where the table can hold none."""
     names = {c.name for c in columns}
     parts, values = [], []
     for name in IDENTITIES:
@@ -234,7 +232,7 @@ def _whose(columns: Sequence[Column], ids: Ids) -> tuple[str, tuple]:
 
 
 def _without_row(ids: Ids) -> list[str]:
-    """Files in the person's folders of the store that no row may name: left by a computation that was killed.
+    """Return all files in the person's folders of the store: a computation that was killed leaves some without a row.
 
     A path is `_schema/<schema>/<table>/<key>=<value>/...`, the key in the order of the table.
     """
@@ -243,7 +241,7 @@ def _without_row(ids: Ids) -> list[str]:
 
 
 def _folders(ids: Ids) -> list[str]:
-    """The person's folders of the store."""
+    """Return the person's folders of the store."""
     root = connection.store_root()
     return [
         f"{root}/{schema}/{table}/{name}={value}"
@@ -291,7 +289,7 @@ def _delete_where(conn: Any, tables: Sequence[tuple[str, str, list[Column]]], id
 
 
 def _cameras(ids: Ids) -> list[int]:
-    """Calibrations of the person's videos, whose note may name a file. Deleted if no other video has them."""
+    """Return the calibrations of the person's videos, whose note may name a file."""
     if not ids["video_id"]:
         return []
     rows = video.Video & [{"video_id": v} for v in ids["video_id"]] & "camera_id IS NOT NULL"
@@ -318,7 +316,7 @@ def _delete_files(files: Sequence[str], ids: Ids, say: Say) -> None:
 
 # ------------------------------------------------------------------------------------------------------------- proof
 def _mentions(subject: str, videos: Sequence[dict[str, Any]]) -> list[str]:
-    """Columns anywhere that still hold the subject's code, or the path or checksum of one of the videos."""
+    """Return the columns that still hold the subject's code, or the path or checksum of one of the videos."""
     terms = [t for v in videos for t in (v["path"], v["sha256"])]
     conn, out = connection.connect(), []
     for (schema, table), columns in catalog.tables().items():
@@ -342,7 +340,7 @@ def _mentions(subject: str, videos: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def read_manifest(subject: str) -> dict[str, Any]:
-    """The list that an earlier run wrote; empty where there is none."""
+    """Return the list that an earlier run wrote; empty where there is none."""
     try:
         return json.loads(manifest_path(subject).read_text(encoding="utf-8"))
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Files of the store that no row names, and rows whose file is gone: what killed computations and full disks leave."""
+"""Files of the store that no row names, and rows whose file is gone; killed computations and full disks leave them."""
 
 from __future__ import annotations
 
@@ -21,22 +21,21 @@ YOUNG_S = 3600.0
 
 @dataclasses.dataclass(frozen=True)
 class StoredFile:
-    """A file of the store: path in it, size in bytes, age in seconds."""
+    """A file of the store."""
 
-    path: str
-    size: int
+    path: str  # in the store
+    size: int  # (byte)
     age_s: float
 
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """n_files, n_bytes: all of the store. orphans: older than `YOUNG_S`, without a row. lost: named by a row, not
-    there."""
+    """Comparison of the store with the rows."""
 
-    n_files: int
+    n_files: int  # all of the store
     n_bytes: int
-    orphans: list[StoredFile]
-    lost: list[str]
+    orphans: list[StoredFile]  # without a row, older than `YOUNG_S`
+    lost: list[str]  # named by a row, but absent
 
 
 def orphans(young_s: float = YOUNG_S) -> Report:
@@ -67,7 +66,7 @@ def remove(found: Report, older_than_s: float) -> int:
 
 
 def _is_named(path: str, named: set[str]) -> bool:
-    """Whether a row names the file or a folder it lies in."""
+    """Return True if a row names the file or a folder that contains it."""
     parts = path.split("/")
     return any("/".join(parts[:i]) in named for i in range(len(parts), 0, -1))
 
@@ -83,7 +82,7 @@ def _files() -> Iterator[StoredFile]:
 
 
 def _named() -> Iterator[str]:
-    """The paths of the store that rows name, read through a connection of its own, a row at a time."""
+    """Yield the paths of the store that rows name, read through a separate connection, a row at a time."""
     with closing(connection.plain_connection()) as server:
         for (schema, table), columns in tables().items():
             for column in (quote(c.name) for c in columns if c.names_files):

@@ -15,7 +15,7 @@ from schemas.uploads import Bucket, Folder, Upload, drop_folder
 
 
 def delete_registered(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict[str, str]]:
-    """Delete videos that still are what was registered; paths that are gone, and path -> why of those that are kept."""
+    """Delete videos that are unchanged since registration; return deleted paths, and path -> reason of those kept."""
     from pbl_pipeline.video import sha256_of
 
     gone, kept = [], {}
@@ -24,7 +24,7 @@ def delete_registered(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict
         if not os.path.lexists(path):
             continue
         if path.is_symlink() or not path.is_file():
-            kept[str(path)] = "it is no plain file"
+            kept[str(path)] = "it is not a plain file"
         elif video.Video & {"video_path": str(path)}:
             kept[str(path)] = "another row names this path"
         elif path.stat().st_size != item["size"] or sha256_of(path) != item["sha256"]:
@@ -39,7 +39,7 @@ def delete_registered(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict
 
 
 def find_recordings(subject: str) -> list[str]:
-    """The person's files in the archive, copies of a killed import included, and in the drop folder."""
+    """Return the person's files in the archive, copies of a killed import included, and in the drop folder."""
     parts = ("", archive.REFUSED, archive.COPIES)
     return [str(p) for p in archive.of_person(archive_dir(), subject, parts)] + list(_uploads(_drop(), subject))
 
@@ -54,7 +54,7 @@ def _uploads(drop: Folder | Bucket | None, subject: str) -> dict[str, Upload]:
 
 
 def delete_uploads(subject: str) -> list[str]:
-    """Delete the person's uploads and their folders; what cannot be removed is found again."""
+    """Delete the person's uploads and their folders; return their paths."""
     gone, drop = [], _drop()
     if drop is None:
         return gone
@@ -67,7 +67,7 @@ def delete_uploads(subject: str) -> list[str]:
 
 
 def delete_archived(subject: str) -> tuple[list[str], dict[str, str]]:
-    """Delete the person's files in the archive; paths that are gone, and path -> why of those kept."""
+    """Delete the person's files in the archive; return deleted paths, and path -> reason of those kept."""
     gone, kept = [], {}
     for path in archive.of_person(archive_dir(), subject):
         if video.Video & {"video_path": str(path)}:  # a file that was moved here
@@ -80,7 +80,7 @@ def delete_archived(subject: str) -> tuple[list[str], dict[str, str]]:
 
 
 def delete_left_over(subject: str) -> list[str]:
-    """Remove what killed processes left; returns what may still hold something of the person."""
+    """Remove the remains of killed processes; return those that may still hold something of the person."""
     archive.remove_copies(archive_dir(), subject)
     seen = archive.load_seen(archive_dir())
     others = {name: about for name, about in seen.items() if not name.startswith(f"{subject}/")}

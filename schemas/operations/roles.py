@@ -1,4 +1,4 @@
-"""Accounts on the database server with no more rights than their work needs.
+"""Accounts on the database server that have only the rights their work needs.
 
 | role | may |
 |---|---|
@@ -38,23 +38,22 @@ ROLES: dict[str, tuple[str, ...]] = {
     "analyst": ("SELECT", "SHOW VIEW"),
 }
 
-#: Role -> end of the default account's name, after the prefix. The embedded server has a `pbl_admin` of its own.
+#: Role -> end of the default account's name, after the prefix. The embedded server has its own `pbl_admin`.
 _ENDINGS = {"admin": "owner", "worker": "worker", "analyst": "analyst"}
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
-#: Names of schemas of a lab's own, after the prefix.
+#: Names of custom schemas of a lab, after the prefix.
 _SCHEMA = re.compile(r"[a-z][a-z0-9_]{0,39}")
 _HOST = re.compile(r"[A-Za-z0-9%_.:/-]{1,255}")
 
 
 @dataclasses.dataclass(frozen=True)
 class Account:
-    """An account of a role. `host` is where it may come from, as MySQL has it: `%` is anywhere. schemas: names after
-    the prefix of schemas of its own, in which it may do everything; `mylab` stands for `mylab_...` too."""
+    """An account of a role."""
 
     role: str
     user: str
-    host: str
-    schemas: tuple[str, ...] = ()
+    host: str  # where it may connect from, as in MySQL: `%` is anywhere
+    schemas: tuple[str, ...] = ()  # custom schemas, without the prefix, with all rights; `mylab` includes `mylab_...`
 
     def __post_init__(self) -> None:
         for name in self.schemas:
@@ -91,15 +90,15 @@ class Account:
 
 
 def default_account(role: str, host: str) -> Account:
-    """The account of a role by its usual name: `pbl_worker`, `pbl_analyst`, `pbl_owner` (admin)."""
+    """Return the account of a role by its usual name: `pbl_worker`, `pbl_analyst`, `pbl_owner` (admin)."""
     return Account(role, f"{connection.prefix()}_{_ENDINGS.get(role, role)}", host)
 
 
 def statements(account: Account, password: str, require_tls: bool = False) -> list[str]:
-    """What makes the account exist with this password and exactly the rights of its role. Safe to repeat."""
+    """Return the SQL that creates the account with this password and exactly the rights of its role. Safe to repeat."""
     literal = f"'{escape_string(password)}'"
     own = [p for name in account.schemas for p in (_own(name), _own(name) + r"\_%")]
-    # A foreign key to a table of ours takes a right of its own on MySQL.
+    # A foreign key to a table of the package needs an additional right on MySQL.
     more = [f"GRANT REFERENCES ON `{pattern()}%`.* TO {account.name}"] if own else []
     return [
         f"CREATE USER IF NOT EXISTS {account.name} IDENTIFIED BY {literal}",
@@ -112,12 +111,12 @@ def statements(account: Account, password: str, require_tls: bool = False) -> li
 
 
 def _own(name: str) -> str:
-    """The name of a schema of a lab's own for GRANT."""
+    """Return the name of a custom schema for GRANT."""
     return pattern() + name.replace("_", r"\_")
 
 
 def password_file(folder: Path, account: Account) -> Path:
-    """The file with the account's password, made with a random one of 192 bits where it is missing (mode 0600).
+    """Return the file with the account's password; a missing one is made, with 192 random bits (mode 0600).
 
     Raises
     ------
@@ -143,7 +142,7 @@ def password_file(folder: Path, account: Account) -> Path:
 
 
 def read_password(path: Path) -> str:
-    """The password in a file. Raises FILE_MISSING for none, or for one too short to be a secret."""
+    """Return the password in a file. Raises FILE_MISSING for none, or for one too short to be a secret."""
     try:
         text = path.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError):
@@ -192,7 +191,7 @@ def _run(commands: Sequence[str]) -> None:
 
 
 def _server_admin() -> pymysql.Connection[Any]:
-    """A connection that may manage accounts: the embedded server's administrator, or the login of DJ_USER."""
+    """Return a connection that may manage accounts: the embedded server's administrator, or the login of DJ_USER."""
     if connection.external() is None:
         connection.connect()
         return embedded.admin(embedded.Folder.default())

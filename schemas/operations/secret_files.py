@@ -9,7 +9,7 @@ from pbl_pipeline.errors import PblError
 
 
 def secret(name: str) -> str | None:
-    """The secret `name`: the content of the file that `<name>_FILE` names, else the variable itself, else None.
+    """Return the content of the file that `<name>_FILE` names, else of the variable `name`, else None.
 
     The file wins, and one line break at its end does not count. The secret appears in no error.
 

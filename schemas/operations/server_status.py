@@ -1,7 +1,8 @@
-"""What is known of the database server, for `pbl db status` and the review page."""
+"""Status of the database server, for `pbl db status` and the review page."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 from schemas import connection, store
@@ -10,9 +11,8 @@ from . import embedded
 
 
 def database_status() -> dict[str, Any]:
-    """What `pbl db status` says of a server that answers: its kind (external or embedded), version, and what is known
-    of it."""
+    """Return the kind of the server (external or embedded), whether it runs, and its details."""
     if (address := connection.external()) is not None:
         version = connection.connect().query("SELECT VERSION()").fetchone()[0]
         return {"kind": "external", "running": True, "address": address, "version": version}
-    return {"kind": "embedded", **embedded.status().to_dict(), "store": store.describe()}
+    return {"kind": "embedded", **dataclasses.asdict(embedded.status()), "store": store.describe()}

@@ -230,7 +230,7 @@ def main(minutes: float, seed: int, supervisors: int) -> None:
             database.remove_home(home / "nothing")
             from schemas.operations import embedded
 
-            embedded.remove(embedded.Folder(home / "db"))
+            embedded.stop(folder=embedded.Folder(home / "db"))
     for line in wrong:
         click.echo(f"WRONG: {line}")
     raise SystemExit(1 if wrong else 0)

@@ -17,7 +17,7 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection, lab, load_visit, video, views
+from schemas import connection, gait, lab, load_visit, migrations, video, views
 from schemas._declare import declare_all
 from schemas.ingest import Visit, ingest
 from schemas.operations import backup, backup_files, dump
@@ -98,6 +98,20 @@ def test_there_and_back(elsewhere: Any, tmp_path: Path, monkeypatch: pytest.Monk
     assert again.error_code == "DB_REFUSED"
     assert "nothing is ever restored over another" in again.err
     assert everything_but_refreshes() == kept
+
+
+def test_a_backup_of_an_older_version_is_restored_and_migrated(database: Path):
+    """Made at commit 2e66321: one visit through the stand-ins of the chain, the tables alone."""
+    with installation():
+        found = backup.restore(Path(__file__).parent / "backup_of_2e66321")
+        assert (sum(found.rows.values()), len(found.rows)) == (493, 110)
+        migrations.migrate()
+        schemas.activate()
+        assert lab.Subject.fetch1("subject_height") == HEIGHT
+        assert lab.Project.fetch1("project_title") == TITLE.partition(" $(")[0]
+        assert len(gait.GaitCycle()) == found.rows["pbl_gait.__gait_cycle"] > 0
+        assert [r["video_path"] for r in video.Video.to_dicts()] == ["/tmp/oldwork/walk.mp4", "/tmp/oldwork/notes.mp4"]
+    connection.connect()
 
 
 def test_a_restore_that_was_broken_off_is_repeated_on_demand(

@@ -362,7 +362,7 @@ def _named() -> list[str]:
     """What a dry run finds that no migration removes."""
     dry = pbl("db", "migrate", "--dry-run")
     assert dry.code == 1
-    start = "  needs a migration of its own: "
+    start = "  needs its own migration: "
     return [line.removeprefix(start) for line in dry.out.splitlines() if line.startswith(start)]
 
 

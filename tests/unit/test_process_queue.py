@@ -1,4 +1,4 @@
-"""Files made in processes of their own: complete or absent, and ended with their queue."""
+"""Files made in separate processes: complete or absent, and ended with their queue."""
 
 from __future__ import annotations
 

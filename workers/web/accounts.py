@@ -1,5 +1,8 @@
 """Accounts of people who sign in with a password, where the page serves more than this machine.
 
+Passwords are hashed with `hashlib.scrypt` of Python's own library and not with argon2-cffi: both need memory for each
+guess, and the latter would come beside scrypt, by which those who have an account sign in, not instead of it.
+
 They are in a file of the machine that serves the page, readable by its account alone, and not in a table: a backup, a
 slice, an analyst's account of the database never have them, and a database that was broken into opens no page.
 """

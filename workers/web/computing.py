@@ -17,7 +17,7 @@ from ..process_queue import ProcessQueue, Task
 #: Seconds that a process is given to put its job back when the page ends.
 END_S = 15.0
 
-#: What the process runs: session_id of the visit, and whether errors are tried again.
+#: Function that the process runs, of session_id and whether errors are tried again.
 Target = Callable[[int, bool], None]
 
 

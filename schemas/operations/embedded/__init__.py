@@ -1,4 +1,4 @@
-"""The database that comes with the project: a private MariaDB server in a folder of its own, no system service.
+"""The database that comes with the project: a private MariaDB server in a separate folder, not a system service.
 
 `start()` gets the server when it is absent, creates the folder on first use and leaves a process running that
 listens on 127.0.0.1 only; `stop()` ends it; `status()` looks and changes nothing. Only MariaDB is started here: a
@@ -9,7 +9,7 @@ from .binaries import Binaries, find_server, get_server
 from .folder import ADMIN_USER, APP_USER, Credentials, Folder
 from .port import HOST
 from .process import admin
-from .server import Status, allow_prefix, not_running, remove, start, status, stop
+from .server import Status, allow_prefix, not_running, start, status, stop
 
 __all__ = [
     "ADMIN_USER",
@@ -24,7 +24,6 @@ __all__ = [
     "find_server",
     "get_server",
     "not_running",
-    "remove",
     "start",
     "status",
     "stop",

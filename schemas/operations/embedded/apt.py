@@ -1,4 +1,4 @@
-"""Getting the server's Debian packages: installed by root, or unpacked into a folder by any user.
+"""Get the Debian packages of the server: installed by root, or unpacked into a folder by any user.
 
 By hand, because apt installs for root only; for other users its packages are downloaded and unpacked into a folder.
 """
@@ -8,12 +8,8 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-import threading
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from pathlib import Path
-
-from pbl_pipeline.progress import bar
 
 #: The bare programs: no service, no system user, nothing started.
 PACKAGES = ("mariadb-server-core", "mariadb-client-core")
@@ -37,11 +33,11 @@ def install(say: Say) -> str | None:
     command = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "-q", "-o", "DPkg::Lock::Timeout=120"]
     add = [*command, "install", "-y", "--no-install-recommends", *PACKAGES]
     say(f"  {' '.join([*prefix, 'apt-get install --no-install-recommends', *PACKAGES])}")
-    failure = _run(add, label="apt-get install")
+    failure, _ = _run(add)
     if failure is None:
         return None
     say(f"  the package list may be missing or old ({failure}): apt-get update")
-    return _run([*command, "update"], label="apt-get update") or _run(add, label="apt-get install")
+    return _run([*command, "update"])[0] or _run(add)[0]
 
 
 def unpack(folder: Path, say: Say, apt_options: Sequence[str] = ()) -> str | None:
@@ -78,85 +74,57 @@ def unpack(folder: Path, say: Say, apt_options: Sequence[str] = ()) -> str | Non
 def _download_and_unpack(work: Path, say: Say, apt_options: Sequence[str]) -> str | None:
     # The system's package lists are used as they are; where they are missing, own ones are fetched beside them.
     own_lists = ["-o", f"Dir::State::Lists={work / 'lists'}", "-o", f"Dir::Cache={work}", "-o", "Debug::NoLocking=1"]
-    for lists in ([], own_lists):
-        options = [*apt_options, *lists]
-        if lists:
-            say("  fetching a package list of our own")
-            failure = _run(["apt-get", *options, "-q", "update"], label="apt-get update")
-            if failure:
-                return failure
-        wanted, failure = _missing(options)
-        if failure is None:
-            say(f"  downloading {', '.join(wanted)}")
-            failure = _run(["apt-get", *options, "-q", "download", *wanted], work / "archives", "apt-get download")
-        if failure is None:
-            break
-    else:
-        return failure
+    failure = _download(work, say, apt_options)
+    if failure is not None:
+        say("  fetching a package list of our own")
+        options = [*apt_options, *own_lists]
+        failure = _run(["apt-get", *options, "-q", "update"])[0] or _download(work, say, options)
     for package in sorted((work / "archives").glob("*.deb")):
-        failure = _run(["dpkg", "-x", str(package), str(work / "root")])
-        if failure:
-            return failure
-    return None
+        failure = failure or _run(["dpkg", "-x", str(package), str(work / "root")])[0]
+    return failure
 
 
-def _missing(options: Sequence[str]) -> tuple[list[str], str | None]:
-    """The packages an installation would add: ours and the libraries that are not there, as `name=version`."""
-    simulate = ["apt-get", *options, "-s", "-q", "install", "--no-install-recommends", *PACKAGES]
-    done = subprocess.run(simulate, capture_output=True, text=True, timeout=TIMEOUT_S, env=_env(), check=False)
-    if done.returncode != 0:
-        return [], _reason(done.stderr or done.stdout) or "apt-get failed"
-    names = [line.split()[1] for line in done.stdout.splitlines() if line.startswith("Inst ")]
-    return sorted({*names, *PACKAGES}), None
+def _download(work: Path, say: Say, options: Sequence[str]) -> str | None:
+    """Download what an installation would add: our packages and the libraries that the system lacks."""
+    failure, said = _run(["apt-get", *options, "-s", "-q", "install", "--no-install-recommends", *PACKAGES])
+    if failure is not None:
+        return failure
+    missing = [line.split()[1] for line in said.splitlines() if line.startswith("Inst ")]
+    wanted = sorted({*missing, *PACKAGES})
+    say(f"  downloading {', '.join(wanted)}")
+    return _run(["apt-get", *options, "-q", "download", *wanted], work / "archives")[0]
 
 
 def _privilege() -> list[str] | None:
     if os.geteuid() == 0:
         return []
-    if shutil.which("sudo") and _run(["sudo", "-n", "true"]) is None:
+    if shutil.which("sudo") and _run(["sudo", "-n", "true"])[0] is None:
         return ["sudo", "-n"]
     return None
 
 
-def _run(command: Sequence[str], cwd: Path | None = None, label: str = "") -> str | None:
-    """Run to the end, with a bar that moves with each line when `label` is given; None when well, else why not."""
+def _run(command: Sequence[str], cwd: Path | None = None) -> tuple[str | None, str]:
+    """Run a program to its end; return why it failed, None where it did not, and its output."""
     try:
-        child = subprocess.Popen(
+        done = subprocess.run(
             command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
             errors="replace",
-            env=_env(),
+            env={**os.environ, "LC_ALL": "C", "DEBIAN_FRONTEND": "noninteractive"},  # the output is read here
             cwd=cwd,
+            timeout=TIMEOUT_S,
+            check=False,
         )
     except FileNotFoundError:
-        return f"{command[0]} is not installed"
-    watchdog = threading.Timer(TIMEOUT_S, child.kill)
-    watchdog.start()
-    said = ""
-    try:
-        with bar(label, unit="line") if label else nullcontext() as update:
-            for line in child.stdout or ():
-                said += line
-                if update is not None:
-                    update(1, line.strip()[:50])
-        child.wait()
-    finally:
-        watchdog.cancel()
-        child.kill()
-    if child.returncode == 0:
-        return None
-    return _reason(said) or f"{command[0]} ended with code {child.returncode}"
-
-
-def _env() -> dict[str, str]:
-    # In the C locale, because the output is read here.
-    return {**os.environ, "LC_ALL": "C", "DEBIAN_FRONTEND": "noninteractive"}
-
-
-def _reason(text: str) -> str:
-    """The line that says why: apt's first error (E: ...), else the last line."""
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return next((line for line in lines if line.startswith("E: ")), lines[-1] if lines else "")
+        return f"{command[0]} is not installed", ""
+    except subprocess.TimeoutExpired:
+        return f"{command[0]} took more than {TIMEOUT_S:.0f} s", ""
+    if done.returncode == 0:
+        return None, done.stdout
+    # The line that says why: apt's first error (E: ...), else the last line.
+    lines = [line.strip() for line in done.stdout.splitlines() if line.strip()]
+    errors = [line for line in lines if line.startswith("E: ")]
+    return next(iter([*errors, *lines[-1:]]), f"{command[0]} ended with code {done.returncode}"), done.stdout

@@ -42,16 +42,18 @@ class Binaries:
 
 def find_server() -> Binaries | None:
     """The MariaDB server of this machine, or the one unpacked into `settings.home_dir()/server`; None when absent."""
-    places = [*os.environ.get("PATH", os.defpath).split(os.pathsep), *PLACES]
-    for place in places:
+    ours = _unpack_folder()
+    for place in (*os.environ.get("PATH", os.defpath).split(os.pathsep), *PLACES, ours / "usr" / "sbin"):
         server = Path(place) / "mariadbd"
-        if not os.access(server, os.X_OK):
-            continue
         basedir = server.parent.parent
         for script in (basedir / "bin" / "mariadb-install-db", basedir / "scripts" / "mariadb-install-db"):
-            if os.access(script, os.X_OK):
-                return Binaries(server, script, basedir)
-    return _unpacked()
+            if os.access(server, os.X_OK) and os.access(script, os.X_OK):
+                libraries = sorted(
+                    {str(p.parent) for p in ours.glob("**/lib/**/*.so*")} if basedir == ours / "usr" else ()
+                )
+                env = {"LD_LIBRARY_PATH": os.pathsep.join(libraries)} if libraries else {}
+                return Binaries(server, script, basedir, env)
+    return None
 
 
 def check_obtainable() -> None:
@@ -102,15 +104,6 @@ def get_server(say: Say = silent) -> Binaries:
 
 def _unpack_folder() -> Path:
     return settings.home_dir() / "server"
-
-
-def _unpacked() -> Binaries | None:
-    base = _unpack_folder() / "usr"
-    server, script = base / "sbin" / "mariadbd", base / "bin" / "mariadb-install-db"
-    if not (os.access(server, os.X_OK) and os.access(script, os.X_OK)):
-        return None
-    libraries = sorted({str(p.parent) for p in _unpack_folder().glob("**/lib/**/*.so*")})
-    return Binaries(server, script, base, {"LD_LIBRARY_PATH": os.pathsep.join(libraries)} if libraries else {})
 
 
 def _unavailable(found: str, install: bool = True) -> PblError:

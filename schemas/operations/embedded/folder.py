@@ -1,19 +1,18 @@
-"""What lies in the folder of the embedded server, and who may read it."""
+"""Content of the folder of the embedded server, and its permissions."""
 
 from __future__ import annotations
 
 import json
-import os
 import secrets
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import one_process
 from schemas.json_files import write_json
 
 from .account import Account, check_enterable
@@ -98,7 +97,7 @@ class Folder:
         try:
             missing = [p for p in (self.path, *self.path.parents) if not p.exists()]
             self.path.mkdir(parents=True, exist_ok=True)
-            for folder in missing:  # whatever the umask: the server's account enters, nobody else writes
+            for folder in missing:  # under any umask: the server's account enters, no one else writes
                 folder.chmod(0o755)
         except OSError as error:
             raise folder_error(self.path, error) from error
@@ -120,31 +119,20 @@ class Folder:
         PblError
             DB_UNAVAILABLE when another command holds it for longer than `timeout_s`.
         """
-        import fcntl  # here: Windows has none, and this module is imported there too
-
-        try:
-            handle = os.open(self.lock_file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        except OSError as error:
-            raise folder_error(self.path, error) from error
-        try:
-            deadline = time.monotonic() + timeout_s
-            while True:
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    break
-                except BlockingIOError as error:
-                    if time.monotonic() > deadline:
-                        raise PblError(
-                            "DB_UNAVAILABLE",
-                            key=self.path,
-                            found=f"another command has been starting or stopping the server for {timeout_s:.0f} s",
-                            expected="one command at a time",
-                            next_step="find the `pbl db` command that hangs, end it and try again",
-                        ) from error
-                    time.sleep(0.05)
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(one_process(self.lock_file, timeout_s))
+            except TimeoutError as error:
+                raise PblError(
+                    "DB_UNAVAILABLE",
+                    key=self.path,
+                    found=f"another command has been starting or stopping the server for {timeout_s:.0f} s",
+                    expected="one command at a time",
+                    next_step="find the `pbl db` command that hangs, end it and try again",
+                ) from error
+            except OSError as error:
+                raise folder_error(self.path, error) from error
             yield
-        finally:
-            os.close(handle)
 
     def credentials(self) -> Credentials:
         """The stored passwords.
@@ -221,5 +209,5 @@ def _write(path: Path, content: dict[str, Any], mode: int) -> None:
 
 
 def indent(text: str) -> str:
-    """Quoted lines, set in under the line of the error that introduces them."""
+    """Return lines indented, to stand below the line of an error that introduces them."""
     return "\n".join(f"      {line}" for line in text.splitlines())

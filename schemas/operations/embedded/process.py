@@ -43,7 +43,7 @@ _children: dict[int, subprocess.Popen[str]] = {}
 
 
 def launch(folder: Folder, binaries: Binaries, account: Account) -> None:
-    """Start the server as a process of its own that outlives this one, and wait until it answers.
+    """Start the server as a separate process that outlives this one, and wait until it answers.
 
     Raises
     ------

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
 import time
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import pymysql
 
@@ -23,7 +21,7 @@ STOP_TIMEOUT_S = 60.0
 
 @dataclass(frozen=True)
 class Status:
-    """What is known about the server; entries are None where it does not run.
+    """Status of the server; entries are None where it does not run.
 
     `running` means that it answers; a process that does not answer has a `pid` and `running` False.
     """
@@ -37,10 +35,6 @@ class Status:
     version: str | None = None
     uptime_s: int | None = None
     data_mb: float | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON has it."""
-        return asdict(self)
 
 
 def start(say: Say = silent, folder: Folder | None = None) -> Status:
@@ -111,7 +105,7 @@ def stop(say: Say = silent, folder: Folder | None = None) -> bool:
             with admin(folder) as connection, connection.cursor() as cursor:
                 cursor.execute("SHUTDOWN")
         except pymysql.err.Error:
-            # It answers no more, or not yet: the signal asks for the same orderly end.
+            # It no longer answers, or not yet: the signal asks for the same orderly end.
             terminate(pid)
         deadline = time.monotonic() + STOP_TIMEOUT_S
         while alive(pid, folder):
@@ -152,14 +146,8 @@ def status(folder: Folder | None = None) -> Status:
     return Status(True, str(folder.path), True, pid, HOST, port, version, uptime_s, data_mb)
 
 
-def remove(folder: Folder) -> None:
-    """Stop the server and delete its folder with all tables. For tests: no command does this."""
-    stop(folder=folder)
-    shutil.rmtree(folder.path, ignore_errors=True)
-
-
 def allow_prefix(prefix: str, folder: Folder | None = None) -> None:
-    """Let the application use the schemas `<prefix>_...`; the server keeps the right, `server.json` the memory of it.
+    """Let the application use the schemas `<prefix>_...`; grants access and records it in `server.json`.
 
     Raises
     ------

@@ -44,11 +44,11 @@ def initialise(folder: Folder, binaries: Binaries, account: Account) -> None:
             expected=f"at least {NEEDED_MB} MB for an empty database",
             next_step="free some space, or set PBL_HOME to a folder on another local disk",
         )
-    # What an interrupted first start left is not a database: nothing was ever stored in it.
+    # The remains of an interrupted first start are not a database: nothing was ever stored in it.
     shutil.rmtree(folder.data, ignore_errors=True)
     folder.create(account)
     where = [f"--datadir={folder.data}", f"--basedir={binaries.basedir}", f"--tmpdir={folder.tmp}", LOG_SIZE]
-    # "--force": a machine whose own name does not resolve (a bare container) is no reason to stop; the accounts that
+    # "--force": a machine whose own name does not resolve (a bare container) does not matter; the accounts that
     # carry the name are dropped below.
     install = [str(binaries.install_db), "--no-defaults", "--force", "--auth-root-authentication-method=normal"]
     _run([*install, "--skip-test-db", *where], "", folder, binaries, account)
