@@ -106,7 +106,7 @@ BLAZEPOSE_NOISE = Noise(
 #: BlazePose's two networks in the picture and in 3D, against the marker mocap of two phone clips (walk, standing up)
 #: and against four calibrated cameras (balancing): six recordings, `python -m research.detector_errors`. What mocap and
 #: detector call a joint is part of the constants. `xy_file_px`: of the same recordings in small pictures (`python -m
-#: tests.benchmarks.picture_size unit`). `far_more` is how much more the points away from the camera err;
+#: research.benchmarks.picture_size unit`). `far_more` is how much more the points away from the camera err;
 #: `far_still` is of one clip from the side, the demo, where the far knee peaks at 61 deg with the heavy network, at 44
 #: with the full one, and the near one at 80 and 75. Exchanged legs are corrected before the fit; none was left in these
 #: recordings.

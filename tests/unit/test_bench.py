@@ -27,7 +27,7 @@ from pbl_pipeline.bench._plan import NEVER_SEEN, UNSEEN_S
 from pbl_pipeline.body import load_body
 from pbl_pipeline.cli.bench import bench as command
 from pbl_pipeline.errors import PblError
-from tests.benchmarks.ratios import ratio_text, ratios
+from research.benchmarks.ratios import ratio_text, ratios
 
 NAMES = load_body().joint_names
 

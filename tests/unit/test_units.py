@@ -23,7 +23,7 @@ from pbl_pipeline.fit.units import (
 )
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.synthetic import observe, person, walk_qpos
-from tests.benchmarks.picture_size import multiplied
+from research.benchmarks.picture_size import multiplied
 
 TIME_S = np.arange(60) / 30
 

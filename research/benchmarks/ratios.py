@@ -1,6 +1,6 @@
 """Ratios of the rows of `pbl bench fit --json`: what the project's bars compare.
 
-python -m tests.benchmarks.ratios fit.json
+python -m research.benchmarks.ratios fit.json
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def _over(a: float | None, b: float | None) -> float | None:
     return a / b if a is not None and b else None
 
 
-@click.command(epilog="Example: python -m tests.benchmarks.ratios fit.json")
+@click.command(epilog="Example: python -m research.benchmarks.ratios fit.json")
 @click.argument("json_path", type=click.Path(path_type=Path, exists=True, dir_okay=False))
 def main(json_path: Path) -> None:
     """Print the ratios of the rows in JSON_PATH."""

@@ -1,7 +1,7 @@
 """How far the standard deviations of a fit (`TrialFit.qpos_sd`) tell its errors, on synthetic people.
 
-    python -m tests.benchmarks.uncertainty
-    python -m tests.benchmarks.uncertainty --params blazepose
+    python -m research.benchmarks.uncertainty
+    python -m research.benchmarks.uncertainty --params blazepose
 
 Fits recordings whose truth is known, with all factors 1 and no least standard deviation, and finds per group of joints
 what makes a 90 % interval, 1.645 standard deviations to either side, hold the truth in 90 % of the samples of these

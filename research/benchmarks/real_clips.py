@@ -1,10 +1,10 @@
 """Joint angles of the whole chain on two phone clips against marker motion capture of the same motion.
 
-    python -m tests.benchmarks.real_clips                                  # the default paramset
-    python -m tests.benchmarks.real_clips --params blazepose --params paper-2025 --clip walk
-    python -m tests.benchmarks.real_clips --plots clips                    # angles over time, one page per clip
-    python -m tests.benchmarks.real_clips --keypoints blazepose-33
-    python -m tests.benchmarks.real_clips --set steps=12000 --set cost.weight_3d=0.1
+    python -m research.benchmarks.real_clips                                  # the default paramset
+    python -m research.benchmarks.real_clips --params blazepose --params paper-2025 --clip walk
+    python -m research.benchmarks.real_clips --plots clips                    # angles over time, one page per clip
+    python -m research.benchmarks.real_clips --keypoints blazepose-33
+    python -m research.benchmarks.real_clips --set steps=12000 --set cost.weight_3d=0.1
 
 Reads `../shared/data/real/video_mocap/{walk,STS}`; see the README there for its source, licence and conventions. Key
 points are detected once and kept in the temporary folder (`--fresh` detects anew). The camera is not calibrated, so its

@@ -1,7 +1,7 @@
 """How dark, blurred or small a picture may be: recordings made worse, and how far the detected points move.
 
-    python -m tests.benchmarks.worse_pictures                    # all clips
-    python -m tests.benchmarks.worse_pictures --clip demo        # needs the demo recording only
+    python -m research.benchmarks.worse_pictures                    # all clips
+    python -m research.benchmarks.worse_pictures --clip demo        # needs the demo recording only
 
 The others are `../shared/data/real`'s walk and cam01 (README there: source and licence). Each is tracked once, then
 its frames are made worse on the way to the landmark network, along the same track and crops. Prints, for each change:

@@ -1,9 +1,9 @@
 """Whether `pbl worker --resource gpu` keeps its device busy: figures of docs/operations.md.
 
-    python -m tests.benchmarks.gpu_worker                                  # 256 sessions, batches of 32
-    python -m tests.benchmarks.gpu_worker --batch 1,8,32 --json gpu.json   # what the size of a batch brings
-    python -m tests.benchmarks.gpu_worker --seconds 8                      # trials of one length: fewer programs
-    python -m tests.benchmarks.gpu_worker --sessions 4 --warm-up 2 --batch 2 --alike   # to try it on a CPU
+    python -m research.benchmarks.gpu_worker                                  # 256 sessions, batches of 32
+    python -m research.benchmarks.gpu_worker --batch 1,8,32 --json gpu.json   # what the size of a batch brings
+    python -m research.benchmarks.gpu_worker --seconds 8                      # trials of one length: fewer programs
+    python -m research.benchmarks.gpu_worker --sessions 4 --warm-up 2 --batch 2 --alike   # to try it on a CPU
 
 A database of its own holds sessions of one to three walks with their keypoints (the walker of `pbl synth`, a few walks
 with new noise for each trial), as they lie there when detection is through. One worker fits all of them. The first ones
@@ -30,7 +30,7 @@ from typing import Any
 import click
 import numpy as np
 
-from tests.benchmarks import gpu_worker_watch
+from research.benchmarks import gpu_worker_watch
 from tests.database import installation
 
 #: Trials that a session may have, and cameras.

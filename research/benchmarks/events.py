@@ -1,7 +1,7 @@
 """Gait events against force plates, against synthetic people, and how long they take.
 
-    python -m tests.benchmarks.events
-    python -m tests.benchmarks.events --part lab --part time --method zeni-2008
+    python -m research.benchmarks.events
+    python -m research.benchmarks.events --part lab --part time --method zeni-2008
 
 Parts:
 - `lab`: `../shared/data/real/gait_lab_c3d` (see the README there), 11 walks of children with labels from force plates,

@@ -1,7 +1,7 @@
 """What the marker augmenter knows of the pelvis: laboratories' markers, recorded motions, and our fits of two clips.
 
-    python -m tests.benchmarks.marker_augmenter                       # laboratories and motions
-    python -m tests.benchmarks.marker_augmenter --fits FOLDER         # and fits: real_clips --save FOLDER
+    python -m research.benchmarks.marker_augmenter                       # laboratories and motions
+    python -m research.benchmarks.marker_augmenter --fits FOLDER         # and fits: real_clips --save FOLDER
 
 Reads `../shared/data/real/{marker_ik,motions,video_mocap}`; the README there has sources and licences. The 15 points
 are those of a body that was fitted to all of a laboratory's markers, of recorded joint angles put on our body, or of
@@ -30,8 +30,8 @@ from pbl_pipeline.fit import METHODS, TrialFit, fit_session
 from pbl_pipeline.fit.augmented_pelvis import pelvis_of
 from pbl_pipeline.keypoints import AugmenterParams, MarkerAugmenter
 from pbl_pipeline.validation import read_motions
-from tests.benchmarks import marker_ik
-from tests.benchmarks.real_clips import CLIPS, fitted_angles, recorded_angles, score
+from research.benchmarks import marker_ik
+from research.benchmarks.real_clips import CLIPS, fitted_angles, recorded_angles, score
 from tests.conftest import SHARED
 
 BODY, SITES, SEEN = load_body(), marker_set("opencap_35"), marker_set("halpe_26")

@@ -1,7 +1,7 @@
 """Tracking: what looking only where it is needed costs in accuracy and saves in time, and its memory over a long video.
 
-    python -m tests.benchmarks.tracking accuracy
-    python -m tests.benchmarks.tracking memory --minutes 10
+    python -m research.benchmarks.tracking accuracy
+    python -m research.benchmarks.tracking memory --minutes 10
 
 `accuracy` runs on the demo recording, the two phone clips and the four cameras of `../shared/data/real` (what is absent
 is left out). It compares three ways of detecting with the region that the landmark network shows in each frame, which

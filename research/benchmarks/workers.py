@@ -1,9 +1,9 @@
-"""What the queue costs: figures of docs/operations.md. What it survives: `tests.benchmarks.chaos`.
+"""What the queue costs: figures of docs/operations.md. What it survives: `research.benchmarks.chaos`.
 
-    python -m tests.benchmarks.workers scale              # 300,000 videos: register, status, refresh, cost per job
-    python -m tests.benchmarks.workers speed              # jobs a second of 1 to 4 workers on 5,000 keys
-    python -m tests.benchmarks.workers method             # a new parameter set over 10,000 fitted sessions
-    python -m tests.benchmarks.workers memory             # a worker's memory over 500 jobs
+    python -m research.benchmarks.workers scale              # 300,000 videos: register, status, refresh, cost per job
+    python -m research.benchmarks.workers speed              # jobs a second of 1 to 4 workers on 5,000 keys
+    python -m research.benchmarks.workers method             # a new parameter set over 10,000 fitted sessions
+    python -m research.benchmarks.workers memory             # a worker's memory over 500 jobs
 
 Heavy stages give a recorded result: the point is the queue. Each command starts a database of its own in a temporary
 folder and removes it.
@@ -25,8 +25,8 @@ from typing import Any
 import click
 import pytest
 
+from research.benchmarks import worker_replay, worker_standins
 from tests import database
-from tests.benchmarks import worker_replay, worker_standins
 from tests.integration import chain
 from workers.queue import Claim
 from workers.run_job import Outcome

@@ -1,6 +1,6 @@
 """What the list of visits of `pbl web` costs: for docs/web.md.
 
-    python -m tests.benchmarks.visit_list                 # 50,000 visits of 10,000 people, in a database of its own
+    python -m research.benchmarks.visit_list                 # 50,000 visits of 10,000 people, in a database of its own
 
 The rows are copies of one recorded visit with other days, roles, indices and outcomes; the questions are those of the
 page. Bars: first page 300 ms (median of 50), any filter 500 ms, at the server.
@@ -17,7 +17,7 @@ from typing import Any
 
 import click
 
-from tests.benchmarks import workers as queue
+from research.benchmarks import workers as queue
 
 #: Visits of a person.
 VISITS_EACH = 5

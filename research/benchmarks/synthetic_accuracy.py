@@ -1,8 +1,8 @@
 """Errors of the fit on synthetic people whose joint angles, place and camera are known (`pbl synth`).
 
-    python -m tests.benchmarks.synthetic_accuracy
-    python -m tests.benchmarks.synthetic_accuracy --params blazepose --marker-set blazepose_33 --seeds 2
-    python -m tests.benchmarks.synthetic_accuracy --noise memory         # pixels that err with a memory
+    python -m research.benchmarks.synthetic_accuracy
+    python -m research.benchmarks.synthetic_accuracy --params blazepose --marker-set blazepose_33 --seeds 2
+    python -m research.benchmarks.synthetic_accuracy --noise memory         # pixels that err with a memory
 
 Healthy and impaired walks and other tasks, with the noise of the fitting benchmark, by a phone in the hand (with its
 log) and by one that stands level. Each line: the median over the recordings of the median absolute error over the

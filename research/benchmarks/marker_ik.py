@@ -1,7 +1,7 @@
 """Two walks fitted from laboratory markers, against two experts' inverse kinematics of the same markers.
 
-    python -m tests.benchmarks.marker_ik
-    python -m tests.benchmarks.marker_ik --together --set cost.weight_offset_per_m2=13
+    python -m research.benchmarks.marker_ik
+    python -m research.benchmarks.marker_ik --together --set cost.weight_offset_per_m2=13
 
 Reads `../shared/data/real/marker_ik`; see the README there for its source and licence. The markers' places on the body
 are `data/marker_ik.csv`. Prints, for each walk, the marker RMS and, for each angle and expert, the correlation r, the
@@ -22,7 +22,7 @@ import numpy as np
 from pbl_pipeline.body import MarkerSet, load_marker_set
 from pbl_pipeline.fit import METHODS, TrialFit, fit_session
 from pbl_pipeline.keypoints import WorldMarkers
-from tests.benchmarks.real_clips import changed
+from research.benchmarks.real_clips import changed
 from tests.conftest import SHARED
 
 FOLDER = SHARED / "real" / "marker_ik"

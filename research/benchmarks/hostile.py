@@ -1,4 +1,4 @@
-"""A thousand inputs that were made to break something: python -m tests.benchmarks.hostile
+"""A thousand inputs that were made to break something: python -m research.benchmarks.hostile
 
 Damaged and lying video files under hostile names, and fuzzed sensor logs, through `ingest` and a real worker (probe
 and tracking; nothing is a stand-in). Printed: what became of each kind. The command fails where a worker's process

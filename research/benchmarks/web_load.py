@@ -1,7 +1,7 @@
 """`pbl web` under load: twenty people at once, a worker killed and the database restarted meanwhile.
 
-    python -m tests.benchmarks.web_load                         # 20 people, 5 minutes
-    python -m tests.benchmarks.web_load --people 5 --minutes 1
+    python -m research.benchmarks.web_load                         # 20 people, 5 minutes
+    python -m research.benchmarks.web_load --people 5 --minutes 1
 
 The server is `pbl web` itself over an embedded database of its own, with recordings of the tests' stand-ins. Each
 person opens lists, filters, visits and recordings with their movement and parts of their videos, and chooses who is
@@ -32,7 +32,7 @@ from typing import IO, Any
 import click
 import httpx2 as httpx
 
-from tests.benchmarks.workers import say
+from research.benchmarks.workers import say
 from tests.database import installation
 
 #: Recordings in which nobody has to be chosen, and in which two walk alike.

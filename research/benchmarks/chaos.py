@@ -1,6 +1,6 @@
 """Workers, supervisors, the database and the disks fail at random while recordings come in: what is left afterwards.
 
-    python -m tests.benchmarks.chaos --minutes 20 --seed 1     # as root, who may mount two small disks
+    python -m research.benchmarks.chaos --minutes 20 --seed 1     # as root, who may mount two small disks
 
 Faults, one every few seconds: kill -9 of working processes, of supervisors, and of the database inside an insert,
 before or after its statement; pauses of processes for longer than it takes until they count as dead, and of the
@@ -29,8 +29,8 @@ from typing import Any
 import click
 import pytest
 
+from research.benchmarks import worker_standins, workers
 from tests import database
-from tests.benchmarks import worker_standins, workers
 from tests.integration import chain
 from workers.process import Options
 

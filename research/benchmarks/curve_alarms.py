@@ -1,7 +1,7 @@
 """False alarms of `pbl_pipeline.stats.curve_test`: how often it finds a phase where there is no difference.
 
-    python -m tests.benchmarks.curve_alarms
-    python -m tests.benchmarks.curve_alarms --studies 1000 --only unequal
+    python -m research.benchmarks.curve_alarms
+    python -m research.benchmarks.curve_alarms --studies 1000 --only unequal
 
 Smooth curves of 101 points: a person's own curve plus as much variation from cycle to cycle; 1,000 permutations a
 study, alpha 0.05. Prints the percentage of studies with a significant phase and its standard error.

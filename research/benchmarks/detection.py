@@ -1,7 +1,7 @@
 """The embedded detector in each of four calibrated cameras against what was triangulated from all of them.
 
-    python -m tests.benchmarks.detection
-    python -m tests.benchmarks.detection --out pictures      # pictures of the frames in which sides were exchanged
+    python -m research.benchmarks.detection
+    python -m research.benchmarks.detection --out pictures      # pictures of the frames in which sides were exchanged
 
 Reads `../shared/data/real/multiview`; see the README there for its source and licence: 100 frames at 60 Hz of somebody
 who balances, seen from four sides. Each video goes through the chain alone (probe, tracking, choice, keypoints). The
@@ -36,7 +36,7 @@ from pbl_pipeline.render import to_pixels
 from pbl_pipeline.runs import runs as stretches
 from pbl_pipeline.tracking import choose_subject, track_people
 from pbl_pipeline.video import load_camera, load_camera_poses, probe, read_frames
-from tests.benchmarks.multiview import CALIBRATION, CAMERAS, FOLDER, IMAGE_SIZE_PX, view_of
+from research.benchmarks.multiview import CALIBRATION, CAMERAS, FOLDER, IMAGE_SIZE_PX, view_of
 
 REFERENCE = FOLDER / "S00_P00_T01_BalancingTrial_0-100_filt_butterworth.trc"
 MOST_PX, MOST_FRAMES = 27.0, 3

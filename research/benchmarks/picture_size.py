@@ -1,9 +1,9 @@
 """How much the size of the picture matters: units of the detector's error, and results at several sizes.
 
-    python -m tests.benchmarks.picture_size unit         # the detector's error against what may be its unit
-    python -m tests.benchmarks.picture_size scaled       # keypoints, camera and picture multiplied: a change of unit
-    python -m tests.benchmarks.picture_size encoded      # the recordings encoded at other sizes, and detected there
-    python -m tests.benchmarks.picture_size encoded --set cost.pixel="'file'" --set cost.metre="'detector'" \\
+    python -m research.benchmarks.picture_size unit         # the detector's error against what may be its unit
+    python -m research.benchmarks.picture_size scaled       # keypoints, camera and picture multiplied: a change of unit
+    python -m research.benchmarks.picture_size encoded      # the recordings encoded at other sizes, and detected there
+    python -m research.benchmarks.picture_size encoded --set cost.pixel="'file'" --set cost.metre="'detector'" \\
       --set cost.weight_2d=0.2 --set cost.huber_2d_px=5.0 --set cost.weight_3d=0.5  # as `blazepose` version 6
 
 Reads `../shared/data/real/{video_mocap,multiview}` (README there: sources and licences) and the demo recording. A
@@ -37,8 +37,8 @@ from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.methods import Method
 from pbl_pipeline.pipeline import detect_trial
 from pbl_pipeline.video import load_camera, read_frames
+from research.benchmarks.real_clips import CLIPS, changed, fitted_angles, recorded_angles, score
 from research.confidence import recordings, truth_of
-from tests.benchmarks.real_clips import CLIPS, changed, fitted_angles, recorded_angles, score
 from tests.conftest import SHARED
 from tests.videos import write_video
 

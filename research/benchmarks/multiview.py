@@ -1,7 +1,7 @@
 """One balancing trial seen by four calibrated cameras: fitted together, and from each camera alone.
 
-    python -m tests.benchmarks.multiview
-    python -m tests.benchmarks.multiview --params blazepose --out pictures
+    python -m research.benchmarks.multiview
+    python -m research.benchmarks.multiview --params blazepose --out pictures
 
 Reads `../shared/data/real/multiview`; see the README there for its source and licence: 100 frames at 60 Hz, points of
 OpenPose BODY_25B (on a grid of 5 px), and OpenSim's inverse kinematics of what others triangulated from them. There is
@@ -30,8 +30,8 @@ from pbl_pipeline.fit import METHODS, TrialFit, fit_session
 from pbl_pipeline.keypoints import Keypoints, MultiView
 from pbl_pipeline.render import draw_body, draw_keypoints, to_pixels
 from pbl_pipeline.video import CameraPose, load_camera, read_frames
-from tests.benchmarks.marker_ik import JUDGED, agreement, expert_angles, fitted_angles
-from tests.benchmarks.real_clips import changed
+from research.benchmarks.marker_ik import JUDGED, agreement, expert_angles, fitted_angles
+from research.benchmarks.real_clips import changed
 from tests.conftest import SHARED
 
 FOLDER = SHARED / "real" / "multiview"

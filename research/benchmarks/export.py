@@ -1,6 +1,6 @@
 """How fast visits are exported, and whether memory stays flat.
 
-    python -m tests.benchmarks.export --visits 1000
+    python -m research.benchmarks.export --visits 1000
 
 A visit is a walk of 8 s (240 frames at 30 Hz, blazepose_33). For each one the fit is read from its file, and events,
 cycles and measures are those of one computation before, as they come from the tables; `--measure` computes them for

@@ -1,6 +1,6 @@
 """How fast visits are exported from the tables, and whether memory stays flat.
 
-    python -m tests.benchmarks.export_tables --visits 1000
+    python -m research.benchmarks.export_tables --visits 1000
 
 A visit is a walk of 8 s in one video (240 frames at 30 Hz, blazepose_33), put through the whole chain with stand-ins
 for detection and fit in an embedded database. The other visits are copies of its rows, each of a person of its own;
@@ -17,7 +17,7 @@ from pathlib import Path
 import click
 import pytest
 
-from tests.benchmarks.export import resident_mib
+from research.benchmarks.export import resident_mib
 from tests.command import pbl
 from tests.database import installation
 from tests.integration import chain

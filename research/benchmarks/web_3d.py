@@ -1,6 +1,6 @@
 """How fast the 3D view of `pbl web` draws: for docs/web.md.
 
-    python -m tests.benchmarks.web_3d               # 2,000 frames at 1280 x 720 in a Chromium without windows
+    python -m research.benchmarks.web_3d               # 2,000 frames at 1280 x 720 in a Chromium without windows
 
 Needs `pip install -e .[browser]` and a Chromium of the machine. Without a graphics processor the browser draws in
 software; the renderer is printed. Bar: 50 frames a second. "drawn" waits after each frame until it is finished;

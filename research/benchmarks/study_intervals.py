@@ -1,7 +1,7 @@
 """How often the intervals of `pbl_pipeline.stats` hold the truth, in simulated cohorts of 60 patients and 20 controls.
 
-    python -m tests.benchmarks.study_intervals
-    python -m tests.benchmarks.study_intervals --studies 4000 --only icc
+    python -m research.benchmarks.study_intervals
+    python -m research.benchmarks.study_intervals --studies 4000 --only icc
 
 Three visits of each person, of whom 15 % miss each of the later two where it says "drop-outs"; person sd 8, visit sd 4
 (points of an index). What begins with "cohort" is of whole studies of `research.cohort`, with its drop-outs and

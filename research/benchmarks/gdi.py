@@ -1,8 +1,8 @@
 """The original Gait Deviation Index on the gait cycles of eleven children, as a laboratory measured them.
 
-    python -m tests.benchmarks.gdi
-    python -m tests.benchmarks.gdi --events phase-transformer
-    python -m tests.benchmarks.gdi --conventions
+    python -m research.benchmarks.gdi
+    python -m research.benchmarks.gdi --events phase-transformer
+    python -m research.benchmarks.gdi --conventions
 
 Reads `../shared/data/real/gait_lab_c3d` (see the README there for source and licence): one walk of each child, angles
 by Plug-in Gait, events labelled from force plates. Prints each child's index (`gillette-2008`), profile score and

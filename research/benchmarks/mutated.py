@@ -1,4 +1,4 @@
-"""Files of every kind that is read, with something wrong in them: python -m tests.benchmarks.mutated
+"""Files of every kind that is read, with something wrong in them: python -m research.benchmarks.mutated
 
 Each file is made from a sound one by changing bytes, cutting, repeating, and, by what it is, fields and numbers; then
 it is read and used as the commands do, in a process of its own that may take a minute a file. Printed, by kind: what
@@ -248,7 +248,7 @@ def _nothing(data: bytes, draw: random.Random) -> bytes:
 
 def kinds() -> list[Kind]:
     """All kinds; what reads them is loaded here."""
-    from tests.benchmarks import mutated_files as m
+    from research.benchmarks import mutated_files as m
 
     return [
         Kind("walk.mp4", m.video, m.use_video, _nothing),

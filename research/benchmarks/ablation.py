@@ -1,8 +1,8 @@
 """What limits the accuracy of the fit: one factor at a time against the benchmark's default, on synthetic walks.
 
-    python -m tests.benchmarks.ablation
-    python -m tests.benchmarks.ablation --seeds 4 --duration-s 6 --only camera --only "2D weight"
-    python -m tests.benchmarks.ablation --out results/ablation      # results/ablation.csv and .json
+    python -m research.benchmarks.ablation
+    python -m research.benchmarks.ablation --seeds 4 --duration-s 6 --only camera --only "2D weight"
+    python -m research.benchmarks.ablation --out results/ablation      # results/ablation.csv and .json
 
 Every row has the same people, walks and random numbers as the default where it can (not another marker set or frame
 rate), so rows are compared person by person. Errors are of the first trial of a session. The table is sorted by what
@@ -32,7 +32,7 @@ from pbl_pipeline.bench._accuracy import MAIN_JOINTS, PAPER_JOINTS
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit, fit_sessions
 from pbl_pipeline.synthetic import pelvis_positions
-from tests.benchmarks.ablation_cases import DEFAULT, WALKS, Factor, WalkSource, factors, paramset_of, session
+from research.benchmarks.ablation_cases import DEFAULT, WALKS, Factor, WalkSource, factors, paramset_of, session
 
 #: Standard deviations to either side of a 90 % interval of the normal distribution.
 WIDTH_SD = 1.645

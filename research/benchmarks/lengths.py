@@ -1,7 +1,7 @@
 """Stride length, step length, step width and speed of fits against synthetic walkers whose footprints are known.
 
-    python -m tests.benchmarks.lengths
-    python -m tests.benchmarks.lengths --seeds 2
+    python -m research.benchmarks.lengths
+    python -m research.benchmarks.lengths --seeds 2
 
 One camera that stands still, three views, two marker sets with the noise of `pbl bench fit`; then markers of a
 laboratory with 4 mm of noise. The detector knows how large the person is: what a real one gets wrong there is not in

@@ -1,6 +1,6 @@
 """How soon a recording plays in `pbl web`: for docs/web.md.
 
-    python -m tests.benchmarks.web_video            # 30 s of 1080p in a Chromium without windows
+    python -m research.benchmarks.web_video            # 30 s of 1080p in a Chromium without windows
 
 Makes a database of its own; needs `pip install -e .[browser]` and a Chromium of the machine. From a click on the
 recording's link in its visit: "shown" is when the first frame is on the page, "ready" when body and controls are,
