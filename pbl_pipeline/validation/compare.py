@@ -12,12 +12,12 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import Z90, trial_poses
 
-from ._align import MIN_COMMON, about_vertical, align_path, at_times, best_lag, unwrapped, vertical_turn, wrapped
-from ._joints import JOINTS_OPENCAP, JOINTS_PAPER
-from ._reference import Reference
-from ._rotations import pelvis_angles_deg, pelvis_rotations
-from ._sources import fit_angles, fit_angles_sd
-from ._view import MIXED, view_of_fit
+from .align import MIN_COMMON, about_vertical, align_path, at_times, best_lag, unwrapped, vertical_turn, wrapped
+from .joints import JOINTS_OPENCAP, JOINTS_PAPER
+from .reference import Reference
+from .rotations import pelvis_angles_deg, pelvis_rotations
+from .sources import fit_angles, fit_angles_sd
+from .view import MIXED, view_of_fit
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,11 +13,11 @@ from pbl_pipeline.body import PELVIS_TURNS
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import GaitCycle
 
-from ._align import MAX_GAP_S, unwrapped
-from ._compare import KinematicErrors, compare
-from ._joints import split_side
-from ._reference import Reference
-from ._sources import fit_angles
+from .align import MAX_GAP_S, unwrapped
+from .compare import KinematicErrors, compare
+from .joints import split_side
+from .reference import Reference
+from .sources import fit_angles
 
 #: Phases of the curves in percent of the cycle: 101 points, as SPM1D's examples have.
 CURVE_PERCENT = np.linspace(0.0, 100.0, 101)

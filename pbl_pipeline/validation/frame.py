@@ -7,9 +7,9 @@ from collections.abc import Iterable
 
 import pandas as pd
 
-from ._compare import JointError, KinematicErrors
-from ._joints import split_side
-from ._view import CONTRALATERAL, IPSILATERAL, LATERAL
+from .compare import JointError, KinematicErrors
+from .joints import split_side
+from .view import CONTRALATERAL, IPSILATERAL, LATERAL
 
 STATIC, HANDHELD, SEVERAL = "static", "handheld", "several"
 _JOINT_FIELDS = tuple(f.name for f in dataclasses.fields(JointError))

@@ -11,12 +11,12 @@ import pandas as pd
 
 from pbl_pipeline.errors import PblError
 
-from ._frame import COLUMNS, KEY
-from ._joints import JOINTS_OPENCAP, JOINTS_PAPER, ROWS_PAPER, split_side
-from ._paper import paper_cells, paper_where
-from ._statistics import median_niqr, niqr, pearson, smaller
-from ._table import Cell, Table
-from ._view import BACK, CONTRALATERAL, FRONT, IPSILATERAL, LATERAL, MIXED
+from .frame import COLUMNS, KEY
+from .joints import JOINTS_OPENCAP, JOINTS_PAPER, ROWS_PAPER, split_side
+from .paper import paper_cells, paper_where
+from .statistics import median_niqr, niqr, pearson, smaller
+from .table import Cell, Table
+from .view import BACK, CONTRALATERAL, FRONT, IPSILATERAL, LATERAL, MIXED
 
 MEDIAN, MEAN, RTE = "Median Absolute Error (deg)", "Mean Absolute Error (deg)", "RTE (cm)"
 KNOWN, TRIALS = "Joints compared", "All"

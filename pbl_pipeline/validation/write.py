@@ -12,8 +12,8 @@ import jinja2
 import pbl_pipeline
 from pbl_pipeline.latex import tex_escape
 
-from ._paper import paper_figures
-from ._table import Table
+from .paper import paper_figures
+from .table import Table
 
 
 def write_tables(tables: Mapping[str, Table], folder: str | Path) -> list[Path]:

@@ -29,9 +29,9 @@ from pbl_pipeline.body import body_poses, load_body, marker_positions, marker_se
 from pbl_pipeline.fit import METHODS, TrialFit, fit_session
 from pbl_pipeline.fit.augmented_pelvis import pelvis_of
 from pbl_pipeline.keypoints import AugmenterParams, MarkerAugmenter
-from pbl_pipeline.validation import read_motions
 from research.benchmarks import marker_ik
 from research.benchmarks.real_clips import CLIPS, fitted_angles, recorded_angles, score
+from research.corpus.motions import read_motions
 from tests.conftest import SHARED
 
 BODY, SITES, SEEN = load_body(), marker_set("opencap_35"), marker_set("halpe_26")

@@ -1,4 +1,4 @@
-"""`pbl validate gdi`: the error of the index and of the gait measures over a corpus of known walks."""
+"""`python -m research.corpus`: the error of the index and of the gait measures over a corpus of known walks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 
-@click.command(epilog="Example: pbl validate gdi --quick --motions motions --out gdi-error")
+@click.command(epilog="Example: python -m research.corpus --quick --motions motions --out gdi-error")
 @click.option(
     "--motions",
     type=click.Path(path_type=Path, readable=False),
@@ -28,7 +28,7 @@ import click
 @click.option("--quick", is_flag=True, help="Two synthetic people and one view per impairment: about 60 cases.")
 @click.option("--heights", is_flag=True, help="Tell the fit how tall each person is.")
 @click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Write CSV and JSON there.")
-def gdi(
+def main(
     motions: Path | None,
     method: str | None,
     detector: str,
@@ -48,7 +48,8 @@ def gdi(
     from pbl_pipeline.fit import METHODS, default_for_points
     from pbl_pipeline.gait import GDI_METHODS
     from pbl_pipeline.method_file import named_or_file
-    from pbl_pipeline.validation import corpus, corpus_errors, corpus_tables, detector_model, print_corpus, write_corpus
+    from research.corpus.errors import corpus_errors, corpus_tables, print_corpus, write_corpus
+    from research.corpus.walks import corpus, detector_model
 
     check_out_folder(out)
     start = time.perf_counter()
@@ -82,3 +83,7 @@ def gdi(
         f"\n{len(cases)} cases ({failed} not fitted): walks {made - start:.0f} s, fits and measures "
         f"{time.perf_counter() - made:.0f} s; {', '.join(map(str, paths))}"
     )
+
+
+if __name__ == "__main__":
+    main()

@@ -16,8 +16,7 @@ from pbl_pipeline.fit import SessionFit, SessionInput, TrialFit, fit_sessions
 from pbl_pipeline.gait import Z90, GaitCycle, GdiParams, find_cycles, gait_metrics, score_gdi, spatiotemporal
 from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
-
-from ._corpus import HEALTHY, VIEWS, Case
+from research.corpus.walks import HEALTHY, VIEWS, Case
 
 #: Column -> measure of `gait.MEASURES`.
 MEASURES = {

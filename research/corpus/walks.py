@@ -39,9 +39,8 @@ from pbl_pipeline.synthetic import (
     synthesise,
     zoomed,
 )
-
-from ._motions import Motion, read_motions
-from ._true_fit import fit_of_qpos
+from research.corpus.motions import Motion, read_motions
+from research.corpus.true_fit import fit_of_qpos
 
 #: A trial of the corpus (s, frames a second).
 SECONDS, RATE_HZ = 6.0, 30.0

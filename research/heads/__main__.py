@@ -1,4 +1,4 @@
-"""`pbl validate privacy`: how many heads of real recordings a de-identified video covers."""
+"""`python -m research.heads`: how many heads of real recordings a de-identified video covers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 
-@click.command(epilog="Example: pbl validate privacy --data ../shared/data/real")
+@click.command(epilog="Example: python -m research.heads --data ../shared/data/real")
 @click.option(
     "--data",
     type=click.Path(path_type=Path, file_okay=False),
@@ -16,13 +16,13 @@ import click
     help="Folder of the recordings in which heads were located (docs/privacy.md).",
 )
 @click.option("--clip", "clips", multiple=True, metavar="NAME", help="Only this recording; repeatable.")
-def privacy(data: Path, clips: tuple[str, ...]) -> None:
+def main(data: Path, clips: tuple[str, ...]) -> None:
     """Share of the frames with a head in which `pbl deidentify` covers it.
 
     The heads were located by eye. Recordings on which the margins were chosen are marked; the total is without them.
     """
     from pbl_pipeline.deidentify import find_heads, ranges
-    from pbl_pipeline.validation import BAR, frame_coverage, head_coverage, located_clips
+    from research.heads.coverage import BAR, frame_coverage, head_coverage, located_clips
 
     known = located_clips()
     if unknown := set(clips) - {c.name for c in known}:
@@ -66,3 +66,7 @@ def _flags(frames, n: int):
     flags = np.zeros(n, bool)
     flags[frames] = True
     return flags
+
+
+if __name__ == "__main__":
+    main()

@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -90,8 +89,8 @@ class HeadCoverage:
 
 
 def located_clips() -> tuple[LocatedClip, ...]:
-    """The heads that this package locates (`data/heads.json`)."""
-    content = json.loads(files("pbl_pipeline.validation").joinpath("data/heads.json").read_text(encoding="utf-8"))
+    """Return the recordings whose heads were located by eye (`heads.json`)."""
+    content = json.loads((Path(__file__).parent / "heads.json").read_text(encoding="utf-8"))
     return tuple(
         LocatedClip(c["name"], c["file"], c["tune"], tuple(_located(h) for h in c["heads"])) for c in content["clips"]
     )

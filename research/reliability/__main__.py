@@ -1,4 +1,4 @@
-"""`pbl validate reliability`: what a detector's confidence is worth."""
+"""`python -m research.reliability`: the stated confidence of a detector's points against their measured error."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import click
 _FILE = click.Path(path_type=Path, readable=False)
 
 
-@click.command(epilog="Example: pbl validate reliability walk.keypoints.npz --truth mocap.json.gz --out reliability")
+@click.command(epilog="Example: python -m research.reliability walk.keypoints.npz --truth mocap.json.gz --out errors")
 @click.argument("keypoints", nargs=-1, required=True, type=_FILE)
 @click.option(
     "--truth",
@@ -36,7 +36,7 @@ _FILE = click.Path(path_type=Path, readable=False)
 @click.option("--detector", metavar="NAME", help="Name to report them under (else: the marker set).")
 @click.option("--bins", type=click.IntRange(2, 50), default=10, show_default=True, help="Of equally many points.")
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write reliability.csv and .html there.")
-def reliability(
+def main(
     keypoints: tuple[Path, ...],
     truths: tuple[Path, ...],
     calibration: Path | None,
@@ -53,7 +53,8 @@ def reliability(
     """
     from pbl_pipeline.files import check_out_folder
     from pbl_pipeline.keypoints import Keypoints, confidence_curve
-    from pbl_pipeline.validation import point_errors, reliability_table, write_reliability
+    from research.reliability.page import write_reliability
+    from research.reliability.point_errors import point_errors, reliability_table
 
     if len(truths) != len(keypoints):
         raise click.UsageError(f"{len(truths)} of --truth for {len(keypoints)} KEYPOINTS: one for each")
@@ -99,8 +100,8 @@ def _cameras(truths: Sequence[Path], calibration: Path | None, cameras: Sequence
 def _truth(keypoints, file: Path, calibration: Path | None, camera: str):
     from pbl_pipeline.errors import PblError
     from pbl_pipeline.synthetic import Truth
-    from pbl_pipeline.validation import truth_of_bodies, truth_of_synthetic, truth_of_trc
     from pbl_pipeline.video import load_camera, load_camera_poses
+    from research.reliability.point_truth import truth_of_bodies, truth_of_synthetic, truth_of_trc
 
     if file.suffix == ".npz":
         return truth_of_synthetic(keypoints, Truth.load(file))
@@ -118,3 +119,7 @@ def _truth(keypoints, file: Path, calibration: Path | None, camera: str):
             key=str(calibration),
         )
     return truth_of_trc(keypoints, file, load_camera(calibration, keypoints.image_size_px, camera), poses[camera])
+
+
+if __name__ == "__main__":
+    main()

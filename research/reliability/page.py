@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 
 import jinja2
@@ -14,8 +13,7 @@ from markupsafe import Markup
 import pbl_pipeline
 from pbl_pipeline.charts import Axes, nice_ticks
 from pbl_pipeline.keypoints import BOUND_TRUNK, ConfidenceCurve
-
-from ._reliability import PointErrors, reliability_table
+from research.reliability.point_errors import PointErrors, reliability_table
 
 _POINTS, _CURVE, _MEDIAN, _HIGH = "#1f5fbf", "#b4540a", "#1f5fbf", "#8a939c"
 _SIZE = (440, 280)
@@ -39,7 +37,7 @@ def write_reliability(
 
 def reliability_html(table: pd.DataFrame, curve: ConfidenceCurve | None = None) -> str:
     """One page that asks for nothing from elsewhere, from the rows of `reliability_table`."""
-    text = resources.files("pbl_pipeline.validation").joinpath("templates/reliability.html").read_text(encoding="utf-8")
+    text = (Path(__file__).parent / "reliability.html").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     groups = []
     for detector, dataset in dict.fromkeys(zip(table["detector"], table["dataset"], strict=True)):

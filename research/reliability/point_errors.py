@@ -10,8 +10,7 @@ import pandas as pd
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import BOUND_TRUNK, ConfidenceCurve, Keypoints
-
-from ._point_truth import PointTruth
+from research.reliability.point_truth import PointTruth
 
 #: Columns of `reliability_table`.
 RELIABILITY_COLUMNS = (

@@ -20,9 +20,8 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints, read_trc
 from pbl_pipeline.render import to_pixels
 from pbl_pipeline.synthetic import Truth
+from pbl_pipeline.validation.sources import load_bodies
 from pbl_pipeline.video import Camera, CameraPose, undistort_px
-
-from ._sources import load_bodies
 
 #: Names of shoulders and hips, left and right, in the marker sets: the ends of the trunk.
 TRUNK = (

@@ -13,21 +13,10 @@ from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GDI_METHODS, GdiParams, detect_events, feet_from_fit
 from pbl_pipeline.synthetic import DETECTORS, NO_NOISE, VIEWS_DEG, Noise, observe, plain_walk
-from pbl_pipeline.validation import (
-    Case,
-    Motion,
-    Walk,
-    corpus_errors,
-    corpus_tables,
-    fit_of_qpos,
-    is_held_out,
-    lasting,
-    print_corpus,
-    responsiveness,
-    write_corpus,
-)
-from pbl_pipeline.validation._corpus import joined
-from pbl_pipeline.validation._corpus_errors import view_table
+from research.corpus.errors import corpus_errors, corpus_tables, print_corpus, responsiveness, view_table, write_corpus
+from research.corpus.motions import Motion
+from research.corpus.true_fit import fit_of_qpos
+from research.corpus.walks import Case, Walk, is_held_out, joined, lasting
 
 COLUMN = {n: i for i, n in enumerate(load_body().joint_names)}
 TIME_S = np.arange(180) / 30

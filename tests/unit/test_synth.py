@@ -46,7 +46,7 @@ from pbl_pipeline.synthetic import (
     synthesise,
     true_markers,
 )
-from pbl_pipeline.validation import fit_of_qpos
+from research.corpus.true_fit import fit_of_qpos
 
 pytestmark = pytest.mark.slow
 
