@@ -3,10 +3,10 @@
 Importing this package imports no JAX: the process that only starts others must not take the accelerator.
 """
 
-from ._detect import detect_text, run_detect
-from ._plan import MOTIONS, SOLVERS, Case, Data, long_cases, quick_cases, robust_cases, speed_cases
-from ._run import Row, label, run_cases
-from ._table import accuracy, number, rate, solver_name, table, text
+from .detect import detect_text, run_detect
+from .plan import MOTIONS, SOLVERS, Case, Data, long_cases, quick_cases, robust_cases, speed_cases
+from .run import Row, label, run_cases
+from .table import accuracy, number, rate, solver_name, table, text
 
 __all__ = [
     "MOTIONS",

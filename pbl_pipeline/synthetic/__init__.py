@@ -10,18 +10,18 @@ speed, feet that stand still, impairments, other tasks; `pbl synth`).
 
 from pbl_pipeline.gait.normative import GaitNorm, gait_norm
 
-from ._camera import LEVEL_R_NC, PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor, picture_px, resized, zoomed
-from ._impair import IMPAIRMENTS, Impairment
-from ._noise import BLAZEPOSE_MEASURED, BLAZEPOSE_NOISE, DETECTORS, METRABS_MEMORY, NO_NOISE, DetectorModel, Noise
-from ._observe import Seen, observe, pelvis_positions
+from .camera import LEVEL_R_NC, PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor, picture_px, resized, zoomed
+from .impair import IMPAIRMENTS, Impairment
+from .noise import BLAZEPOSE_MEASURED, BLAZEPOSE_NOISE, DETECTORS, METRABS_MEMORY, NO_NOISE, DetectorModel, Noise
+from .observe import Seen, observe, pelvis_positions
 from ._path import PATHS
-from ._person import person, true_markers
-from ._physique import physique
-from ._scene import VIEWS_DEG
-from ._solve import SOLE_POINTS, sole_points
-from ._synth import TASKS, Synthetic, SynthSpec, Truth, lens, speed_of_group, synthesise
+from .markers import person, true_markers
+from .physique import physique
+from .scene import VIEWS_DEG
+from .solve import SOLE_POINTS, sole_points
+from .synth import TASKS, Synthetic, SynthSpec, Truth, lens, speed_of_group, synthesise
 from ._views import VIEW_CAMERA, VIEW_SIZE_PX, observe_markers, observe_views
-from ._walk import facing, plain_walk, turned, walk_qpos
+from .walk import facing, plain_walk, turned, walk_qpos
 
 __all__ = [
     "BLAZEPOSE_MEASURED",

@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 from pbl_pipeline.body import SCALE_NAMES, MarkerSet, load_body
 
-from ._gait import within
-from ._person import SITE_SD_M
+from .curves import within
+from .markers import SITE_SD_M
 
 #: Standard deviations of the size: overall, of the segments against it, of the left against the right side.
 OVERALL_SD, SEGMENT_SD, SIDE_SD = 0.05, 0.02, 0.005

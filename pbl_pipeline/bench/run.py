@@ -15,7 +15,7 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 
-from ._plan import Case, Data
+from .plan import Case, Data
 
 Row = dict[str, Any]
 

@@ -13,10 +13,10 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.video import Camera
 
-from ._camera import PHONE_CAMERA, PHONE_SIZE_PX, HeldPhone, PhoneSensor, camera_turn, phone_log, picture_px
-from ._noise import Noise, disturb, exchanged
-from ._person import _set, true_markers
-from ._scene import CAMERAS, stage
+from .camera import PHONE_CAMERA, PHONE_SIZE_PX, HeldPhone, PhoneSensor, camera_turn, phone_log, picture_px
+from .noise import Noise, disturb, exchanged
+from .markers import _set, true_markers
+from .scene import CAMERAS, stage
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,8 +9,8 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from ._run import Row
-from ._table import Column, mega, number, table
+from .run import Row
+from .table import Column, mega, number, table
 
 
 def run_detect(
@@ -28,7 +28,7 @@ def run_detect(
     The measured process does nothing else, and a failure in it is a row with `error`. Raises the `PblError`s of
     `demo_clip` and `repeated`, and VIDEO_MISSING.
     """
-    from ._clip import demo_clip, repeated
+    from .clip import demo_clip, repeated
 
     with tempfile.TemporaryDirectory(prefix="pbl-bench-") as name:
         folder = Path(name)

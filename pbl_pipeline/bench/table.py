@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ._run import Row
+from .run import Row
 
 Column = tuple[str, Callable[[Row], str]]
 

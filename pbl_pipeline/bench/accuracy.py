@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ._data import Truth
-from ._plan import AFFECTED_JOINT, UNSEEN_S
+from .data import Truth
+from .plan import AFFECTED_JOINT, UNSEEN_S
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit

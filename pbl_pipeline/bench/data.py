@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ._plan import FPS, MARKER_SET, NEVER_SEEN, OUTLIER_SHARE, UNSEEN_S, Data
+from .plan import FPS, MARKER_SET, NEVER_SEEN, OUTLIER_SHARE, UNSEEN_S, Data
 
 if TYPE_CHECKING:
     from pbl_pipeline.keypoints import Keypoints

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from pbl_pipeline.body import SCALE_NAMES, MarkerSet, load_body, marker_set
 
-from ._gait import within
+from .curves import within
 
 SCALE_SD, SITE_SD_M = 0.05, 0.006
 

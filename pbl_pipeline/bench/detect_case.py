@@ -16,7 +16,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 
-from ._machine import machine, peak_rss
+from .machine import machine, peak_rss
 
 T = TypeVar("T")
 _SAMPLE_S = 0.5

@@ -22,25 +22,25 @@ from pbl_pipeline.gait.normative import gait_norm
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.video import Camera
 
-from . import _tasks
-from ._camera import PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor
-from ._impair import Impairment, style_of
-from ._noise import METRABS_MEMORY, NO_NOISE, Noise
-from ._observe import film, pelvis_positions
-from ._physique import leg_length_m, physique
-from ._plan import Plan
-from ._reference import reference
-from ._scene import CAMERAS, VIEWS_DEG, orientation, phone_path, place
-from ._solve import solve
+from . import tasks
+from .camera import PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor
+from .impair import Impairment, style_of
+from .noise import METRABS_MEMORY, NO_NOISE, Noise
+from .observe import film, pelvis_positions
+from .physique import leg_length_m, physique
+from .plan import Plan
+from .reference import reference
+from .scene import CAMERAS, VIEWS_DEG, orientation, phone_path, place
+from .solve import solve
 
 #: task -> plan of a walker and a time (None: the task's own, or `DEFAULT_SECONDS`).
-TASKS: dict[str, Callable[[_tasks.Walker, float | None], Plan]] = {
-    "walk": lambda w, s: _tasks.walk(w, DEFAULT_SECONDS if s is None else s),
-    "standing": lambda w, s: _tasks.standing(w, DEFAULT_SECONDS if s is None else s),
-    "sit_to_stand": lambda w, s: _tasks.sit_to_stand(w, 2 * DEFAULT_SECONDS if s is None else s),
-    "squat": lambda w, s: _tasks.squat(w, 2 * DEFAULT_SECONDS if s is None else s),
-    "tug": _tasks.timed_up_and_go,
-    "four_square": _tasks.four_square,
+TASKS: dict[str, Callable[[tasks.Walker, float | None], Plan]] = {
+    "walk": lambda w, s: tasks.walk(w, DEFAULT_SECONDS if s is None else s),
+    "standing": lambda w, s: tasks.standing(w, DEFAULT_SECONDS if s is None else s),
+    "sit_to_stand": lambda w, s: tasks.sit_to_stand(w, 2 * DEFAULT_SECONDS if s is None else s),
+    "squat": lambda w, s: tasks.squat(w, 2 * DEFAULT_SECONDS if s is None else s),
+    "tug": tasks.timed_up_and_go,
+    "four_square": tasks.four_square,
 }
 DEFAULT_SECONDS = 5.0
 NOISES = {"benchmark": Noise(), "memory": METRABS_MEMORY, "none": NO_NOISE}
@@ -287,9 +287,9 @@ def synthesise(spec: SynthSpec) -> Synthetic:
     style = style_of(spec.impairments)
     scale, site_offset = physique(spec.seed, markers)
     leg = leg_length_m(scale)
-    walker = _tasks.Walker(leg, HEEL_AHEAD_M * float(scale[0]), spec.seed, style, spec.speed_m_per_s)
+    walker = tasks.Walker(leg, HEEL_AHEAD_M * float(scale[0]), spec.seed, style, spec.speed_m_per_s)
     plan = TASKS[spec.task](walker, spec.seconds)
-    seconds = spec.seconds if spec.seconds is not None else _tasks.duration_s(plan)
+    seconds = spec.seconds if spec.seconds is not None else tasks.duration_s(plan)
     treadmill = spec.ground == "treadmill"
     time_s = np.arange(int(np.floor(seconds * spec.fps + 1e-9))) / spec.fps
     scene = place(plan, spec.view, spec.seed, stays=treadmill)

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
 
-from . import _data
-from ._machine import machine, peak_rss
-from ._plan import PARAMSET_OF, Case, Data
+from . import data
+from .machine import machine, peak_rss
+from .plan import PARAMSET_OF, Case, Data
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import Params, SessionFit
@@ -139,7 +139,7 @@ def _failures(done: dict[int, SessionFit | PblError]) -> dict[str, Any]:
 def _accuracy(done: dict[int, SessionFit | PblError], loaded: dict[int, Any]) -> dict[str, Any]:
     from pbl_pipeline.fit import paper_objective
 
-    from ._accuracy import summary, trial_accuracy
+    from .accuracy import summary, trial_accuracy
 
     trials, losses, checks = [], [], {}
     for i, fit in done.items():

@@ -13,11 +13,11 @@ from scipy.ndimage import gaussian_filter1d
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
 
-from ._camera import HeldPhone, camera_turn
-from ._gait import wander, within
-from ._plan import GRID_STEP_S, Plan
-from ._solve import sole_points
-from ._walk import facing, turned
+from .camera import HeldPhone, camera_turn
+from .curves import wander, within
+from .plan import GRID_STEP_S, Plan
+from .solve import sole_points
+from .walk import facing, turned
 
 #: Direction that the person faces at the start, against the phone's line of sight (deg): 180 comes towards it, 90 shows
 #: the left side. With "follow" the phone is carried behind the person.

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import PELVIS_TURNS, joint_of, load_body
 
-from ._gait import MIDDLE_CURVES_DEG, OFFSET_SD_DEG, SIDE_CURVES_DEG, swing, wander, within
+from .curves import MIDDLE_CURVES_DEG, OFFSET_SD_DEG, SIDE_CURVES_DEG, swing, wander, within
 from ._path import choose_path, floor_path
 
 #: How people differ: stride time and length of healthy adults (Perry and Burnfield 2010: 1.06 to 1.12 s, 1.3 to 1.5 m).
