@@ -3,29 +3,20 @@
 Importing this package imports no JAX: the process that only starts others must not take the accelerator.
 """
 
+from .cases import METHOD, Case, Data, fit_cases
 from .detect import detect_text, run_detect
-from .plan import MOTIONS, SOLVERS, Case, Data, long_cases, quick_cases, robust_cases, speed_cases
-from .run import Row, label, run_cases
-from .table import accuracy, number, rate, solver_name, table, text
+from .run import Programs, Row, run_cases
+from .table import fit_text
 
 __all__ = [
-    "MOTIONS",
-    "SOLVERS",
+    "METHOD",
     "Case",
     "Data",
+    "Programs",
     "Row",
-    "accuracy",
     "detect_text",
-    "label",
-    "long_cases",
-    "number",
-    "quick_cases",
-    "rate",
-    "robust_cases",
+    "fit_cases",
+    "fit_text",
     "run_cases",
     "run_detect",
-    "solver_name",
-    "speed_cases",
-    "table",
-    "text",
 ]

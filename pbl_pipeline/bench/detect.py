@@ -51,7 +51,7 @@ def run_detect(
 
 def _measure(spec: dict, timeout_s: float) -> Row:
     """What a process of its own writes of one case."""
-    command = [sys.executable, "-m", "pbl_pipeline.bench._detect_case", json.dumps(spec)]
+    command = [sys.executable, "-m", "pbl_pipeline.bench.detect_case", json.dumps(spec)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s)
     except subprocess.TimeoutExpired:

@@ -1,4 +1,4 @@
-"""One measured run of probe, tracking and keypoints in a process of its own: `python -m pbl_pipeline.bench._detect_case
+"""One measured run of probe, tracking and keypoints in a process of its own: `python -m pbl_pipeline.bench.detect_case
 JSON`. The JSON names the video, the person, the number of repetitions and the file for the result."""
 
 from __future__ import annotations

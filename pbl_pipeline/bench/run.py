@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import os
 import subprocess
@@ -15,16 +16,29 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 
-from .plan import Case, Data
+from .cases import Case, Data
 
 Row = dict[str, Any]
 
 
-def run_cases(cases: Sequence[Case], timeout_s: float, note: Callable[[str], None] = lambda _: None) -> Iterator[Row]:
-    """One row per case, as soon as it is done: the case itself and the figures of both stages; `error` where it failed.
+@dataclasses.dataclass(frozen=True)
+class Programs:
+    """Modules that make the data of a case and that measure it, each in a process of its own."""
 
-    Each case starts with an empty folder for compiled programs: stage "cold" fills it, stage "warm" finds it. `note` is
-    told what is done next.
+    data: str = "pbl_pipeline.bench.data"
+    case: str = "pbl_pipeline.bench.case"
+
+
+def run_cases(
+    cases: Sequence[Case],
+    timeout_s: float,
+    note: Callable[[str], None] = lambda _: None,
+    programs: Programs = Programs(),
+) -> Iterator[Row]:
+    """Return a row for each case as soon as it is done: the case and the figures of both stages, or `error`.
+
+    Stage "cold" is a new process with an empty cache of compiled programs, which stage "warm" finds. `note` is called
+    with what is done next.
 
     Raises
     ------
@@ -34,24 +48,16 @@ def run_cases(cases: Sequence[Case], timeout_s: float, note: Callable[[str], Non
     with tempfile.TemporaryDirectory(prefix="pbl-bench-") as name:
         root = Path(name)
         for number, case in enumerate(cases):
-            note(f"{number + 1}/{len(cases)} {label(case)}")
-            folder = _data_folder(root, case.data)
-            cache = root / f"cache{number}"
-            cold = _stage(case, "cold", folder, cache, root, timeout_s)
-            warm = {} if "error" in cold else _stage(case, "warm", folder, cache, root, timeout_s)
+            note(f"{number + 1}/{len(cases)} {case.label}")
+            folder = _data_folder(root, case.data, programs.data)
+            stage = functools.partial(_stage, programs.case, case, folder, root / f"cache{number}", root, timeout_s)
+            cold = stage("cold")
+            warm = {} if "error" in cold else stage("warm")
             yield _row(case, cold, warm)
 
 
-def label(case: Case) -> str:
-    """A case in words."""
-    data = case.data
-    parts = [case.solver, f"{data.n_trials} trial{'s' * (data.n_trials > 1)} x {data.n_frames} frames", data.motion]
-    parts += [f"batch {case.batch}"] * (case.batch > 1) + [data.trouble] * (data.trouble != "none")
-    return ", ".join(parts)
-
-
 def _row(case: Case, cold: Row, warm: Row) -> Row:
-    row = {"label": label(case), **dataclasses.asdict(case), **warm}
+    row = {"label": case.label, **dataclasses.asdict(case), **warm}
     # How long a refusal took is no figure of a fit.
     row["cold_seconds"] = None if "error" in cold else cold.get("first_seconds")
     row["start_seconds"] = row.pop("first_seconds", None)
@@ -65,10 +71,10 @@ def _row(case: Case, cold: Row, warm: Row) -> Row:
     return row
 
 
-def _data_folder(root: Path, data: Data) -> Path:
+def _data_folder(root: Path, data: Data, program: str) -> Path:
     folder = root / "data" / data.key
     if not folder.exists():
-        command = [sys.executable, "-m", "pbl_pipeline.bench._data", str(folder), json.dumps(dataclasses.asdict(data))]
+        command = [sys.executable, "-m", program, str(folder), json.dumps(dataclasses.asdict(data))]
         # Off the accelerator: what is measured later should find it free.
         made = subprocess.run(command, env=os.environ | {"JAX_PLATFORMS": "cpu"}, capture_output=True, text=True)
         if made.returncode != 0:
@@ -82,7 +88,7 @@ def _data_folder(root: Path, data: Data) -> Path:
     return folder
 
 
-def _stage(case: Case, stage: str, folder: Path, cache: Path, root: Path, timeout_s: float) -> Row:
+def _stage(program: str, case: Case, folder: Path, cache: Path, root: Path, timeout_s: float, stage: str) -> Row:
     result = root / "result.json"
     result.unlink(missing_ok=True)
     spec = {
@@ -92,7 +98,7 @@ def _stage(case: Case, stage: str, folder: Path, cache: Path, root: Path, timeou
         "stage": stage,
         "started": time.time(),
     }
-    command = [sys.executable, "-m", "pbl_pipeline.bench._case", json.dumps(spec)]
+    command = [sys.executable, "-m", program, json.dumps(spec)]
     env = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache)}
     try:
         done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=timeout_s)

@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.video import Camera, scaled_matrix
+from pbl_pipeline.video import Camera
 
 from .curves import wander
 
@@ -28,20 +28,6 @@ TREMOR_DEG = (1.2, 1.0, 0.8)
 TREMOR_HZ = (0.3, 3.0)
 #: A person who films follows the walker with this delay, and smoothly (s).
 FOLLOW_DELAY_S, FOLLOW_SMOOTH_S = 0.2, 0.25
-
-
-def resized(camera: Camera, size_px: tuple[int, int], short_side_px: int) -> tuple[Camera, tuple[int, int]]:
-    """The same camera with a picture of another size: its shorter side has so many pixels."""
-    factor = short_side_px / min(size_px)
-    width, height = (round(factor * side) for side in size_px)
-    return dataclasses.replace(camera, matrix=scaled_matrix(camera.matrix, factor)), (width, height)
-
-
-def zoomed(camera: Camera, factor: float) -> Camera:
-    """The camera with a lens so many times as long."""
-    matrix = camera.matrix.copy()
-    matrix[[0, 1], [0, 1]] *= factor
-    return dataclasses.replace(camera, matrix=matrix)
 
 
 @dataclasses.dataclass(frozen=True)

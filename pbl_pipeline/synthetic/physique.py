@@ -13,17 +13,16 @@ from jaxtyping import Float
 from pbl_pipeline.body import SCALE_NAMES, MarkerSet, load_body
 
 from .curves import within
-from .markers import SITE_SD_M
 
-#: Standard deviations of the size: overall, of the segments against it, of the left against the right side.
-OVERALL_SD, SEGMENT_SD, SIDE_SD = 0.05, 0.02, 0.005
+#: Standard deviations of the size: overall, of the segments against it, of the left against the right side; of a
+#: marker's place on its body (m, each axis).
+OVERALL_SD, SEGMENT_SD, SIDE_SD, SITE_SD_M = 0.05, 0.02, 0.005, 0.006
 
 
 def physique(seed: int, markers: MarkerSet) -> tuple[Float[np.ndarray, " 8"], Float[np.ndarray, "J 3"]]:
     """Scale (8,) and marker offsets (J, 3) in m of a person.
 
-    Unlike `person`, whose groups vary each for itself, left and right differ little: legs that differ by 5 % in length
-    make no healthy walk.
+    Left and right differ little: nobody whose legs differ by 5 % in length walks like a healthy person.
     """
     rng = np.random.default_rng([seed, 11])
     overall = 1 + within(rng, 0.0, OVERALL_SD)

@@ -10,14 +10,11 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
 
 from .camera import HeldPhone, camera_turn
 from .curves import wander, within
 from .plan import GRID_STEP_S, Plan
-from .solve import sole_points
-from .walk import facing, turned
 
 #: Direction that the person faces at the start, against the phone's line of sight (deg): 180 comes towards it, 90 shows
 #: the left side. With "follow" the phone is carried behind the person.
@@ -74,38 +71,6 @@ def place(plan: Plan, view: str, seed: int, *, stays: bool = False) -> Scene:
         if not stays:
             to[0] = max(to[0], NEAREST_M - xy[:, 0].min())
     return Scene(plan.moved(yaw, (float(to[0]), float(to[1]))), height, view == "follow")
-
-
-def stage(
-    qpos: Float[np.ndarray, "T 40"],
-    scale: Float[np.ndarray, " 8"] | None,
-    view: str,
-    seed: int,
-    distance_m: float | None = None,
-) -> Float[np.ndarray, "T 40"]:
-    """Any motion, where a phone at the origin that stands still sees it from a view, as `place` does with plans.
-
-    The direction is that of the way, of the pelvis where a person stays; the floor is the lowest point of the soles.
-    Raises `PblError` USAGE for an unknown view and for "follow", whose phone moves.
-    """
-    if view not in VIEWS_DEG or view == "follow":
-        known = ", ".join(v for v in VIEWS_DEG if v != "follow")
-        raise PblError("USAGE", found=f"view {view!r}", expected=f"one of {known}", next_step="pass one of these")
-    rng = np.random.default_rng([seed, 21])
-    height, slant = within(rng, *PHONE_HEIGHT_M), np.radians(within(rng, 0.0, 3.0))
-    body = load_body()
-    column = [body.joint_names.index(f"pelvis_t{axis}") for axis in "xzy"]
-    way = qpos[-1, column[:2]] - qpos[0, column[:2]]
-    if np.linalg.norm(way) < 1.0:
-        way = facing(qpos)[[0, 2]]
-    out = turned(qpos, np.radians(VIEWS_DEG[view]) + slant - np.arctan2(-way[1], way[0]))
-    xy = out[:, column[:2]] * [1, -1]
-    low, high = xy.min(axis=0), xy.max(axis=0)
-    to = np.array([distance_m or MIDDLE_M, within(rng, 0.0, 0.1)]) - 0.5 * (low + high)
-    to[0] = max(to[0], NEAREST_M - low[0])
-    sole = min(s[..., 2].min() for s in sole_points(out, scale).values())
-    out[:, column] += [to[0], -to[1], -height - sole]
-    return out
 
 
 def phone_path(scene: Scene, pelvis_m: Float[np.ndarray, "N 3"], seed: int) -> Float[np.ndarray, "N 3"]:

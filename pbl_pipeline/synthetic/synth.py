@@ -25,7 +25,7 @@ from pbl_pipeline.video import Camera
 from . import tasks
 from .camera import PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor
 from .impair import Impairment, style_of
-from .noise import METRABS_MEMORY, NO_NOISE, Noise
+from .noise import CORRELATED_NOISE, NO_NOISE, Noise
 from .observe import film, pelvis_positions
 from .physique import leg_length_m, physique
 from .plan import Plan
@@ -43,7 +43,7 @@ TASKS: dict[str, Callable[[tasks.Walker, float | None], Plan]] = {
     "four_square": tasks.four_square,
 }
 DEFAULT_SECONDS = 5.0
-NOISES = {"benchmark": Noise(), "memory": METRABS_MEMORY, "none": NO_NOISE}
+NOISES = {"benchmark": Noise(), "memory": CORRELATED_NOISE, "none": NO_NOISE}
 GROUNDS = ("overground", "treadmill")
 #: A picture that is wider than high, for a phone that stands and sees people from the side.
 LANDSCAPE_PX = (1920, 1080)
@@ -72,9 +72,9 @@ class SynthSpec:
     `VIEWS_DEG`; camera: "static", "panned" (turned after the person) or "handheld" (with a hand's tremor);
     marker_set; seconds: None for the task's own time (walk, standing: 5 s); fps; speed_m_per_s: None for the person's
     own; ground: "overground" or "treadmill" (walk only: the person stays in place and the belt runs back);
-    noise: "benchmark", "memory" (the same, but pixels err with a memory) or "none"; sensor: the phone's orientation
-    log, None for none with a static camera and the default one otherwise; root_relative: whether the points' distance
-    is lost, as with most detectors.
+    noise: "benchmark", "memory" (the same, but errors in the picture are correlated in time) or "none"; sensor: the
+    phone's orientation log, None for none with a static camera and the default one otherwise; root_relative: whether
+    the points' distance is lost, as with most detectors.
 
     Raises `PblError` USAGE or MARKER_SET_UNKNOWN for values that cannot be.
     """

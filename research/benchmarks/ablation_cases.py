@@ -17,7 +17,9 @@ from pbl_pipeline.fit import METHODS, SessionInput
 from pbl_pipeline.fit._params import POSE_PRIOR_DEG
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
-from pbl_pipeline.synthetic import NO_NOISE, Noise, Seen, observe, person, walk_qpos
+from pbl_pipeline.synthetic import NO_NOISE, Noise, Seen
+from research.walker.observe import observe
+from research.walker.walk import person, walk_qpos
 
 #: Walks: `source(time_s, seed, trial)` gives qpos (T, 40) of a person's trial in the world of `pbl_pipeline.synthetic`.
 WalkSource = Callable[[np.ndarray, int, int], np.ndarray]

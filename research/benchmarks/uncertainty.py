@@ -33,7 +33,10 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, GaussNewtonParams, SessionInput, fit_sessions
 from pbl_pipeline.fit.per_frame import by_joint, floors_of
 from pbl_pipeline.methods import Method
-from pbl_pipeline.synthetic import BLAZEPOSE_NOISE, METRABS_MEMORY, SynthSpec, observe, person, synthesise, walk_qpos
+from pbl_pipeline.synthetic import CORRELATED_NOISE, SynthSpec, synthesise
+from research.walker.detectors import BLAZEPOSE_NOISE
+from research.walker.observe import observe
+from research.walker.walk import person, walk_qpos
 
 #: Prefixes of joint names, one factor each; of two that fit, the later one counts.
 GROUPS = (
@@ -92,7 +95,7 @@ def walk(seed: int) -> tuple[SessionInput, np.ndarray]:
         camera_motion=motion,
         tilt_deg=tilt,
         with_phone=True,
-        noise=METRABS_MEMORY,
+        noise=CORRELATED_NOISE,
     )
     return SessionInput([seen.keypoints], [f"walk {seed}"], motion), qpos
 

@@ -19,8 +19,9 @@ from scipy.ndimage import gaussian_filter1d
 
 from pbl_pipeline.body import SLIDES, load_body
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.synthetic import SOLE_POINTS, facing, sole_points
+from pbl_pipeline.synthetic import SOLE_POINTS, sole_points
 from research.corpus.motion_formats import Recorded, read_recorded
+from research.walker.turns import facing
 
 _LOG = logging.getLogger(__name__)
 

@@ -24,23 +24,11 @@ from pbl_pipeline.gait import detect_events, feet_from_fit
 from pbl_pipeline.gait.events import GaitEvent
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.progress import track
-from pbl_pipeline.synthetic import (
-    DETECTORS,
-    IMPAIRMENTS,
-    NO_NOISE,
-    DetectorModel,
-    Impairment,
-    Noise,
-    SynthSpec,
-    lens,
-    observe,
-    physique,
-    resized,
-    synthesise,
-    zoomed,
-)
+from pbl_pipeline.synthetic import IMPAIRMENTS, NO_NOISE, Impairment, Noise, SynthSpec, lens, physique, synthesise
 from research.corpus.motions import Motion, read_motions
 from research.corpus.true_fit import fit_of_qpos
+from research.walker.detectors import DETECTORS, DetectorModel
+from research.walker.observe import observe, resized, zoomed
 
 #: A trial of the corpus (s, frames a second).
 SECONDS, RATE_HZ = 6.0, 30.0

@@ -8,12 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from pbl_pipeline.body import MarkerSet
+from pbl_pipeline.synthetic import Noise, pelvis_positions, true_markers
+from pbl_pipeline.synthetic.camera import camera_turn
+from pbl_pipeline.synthetic.markers import as_marker_set
+from pbl_pipeline.synthetic.observe import seen_by
 from pbl_pipeline.video import Camera
-
-from ._camera import camera_turn
-from ._noise import Noise
-from ._observe import pelvis_positions, seen_by
-from ._person import _set, true_markers
 
 if TYPE_CHECKING:
     from pbl_pipeline.keypoints import MultiView, WorldMarkers
@@ -50,7 +49,7 @@ def observe_views(
     from pbl_pipeline.keypoints import MultiView
     from pbl_pipeline.video import CameraPose
 
-    markers, noise = _set(marker_set), noise or Noise()
+    markers, noise = as_marker_set(marker_set), noise or Noise()
     x_world = true_markers(qpos, markers, scale, site_offset_m)
     path = pelvis_positions(qpos)
     middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
@@ -95,7 +94,7 @@ def observe_markers(
     """Markers of a laboratory on a walk: white noise of `noise_m` per axis, `drop_share` of the points missing."""
     from pbl_pipeline.keypoints import WorldMarkers
 
-    markers = _set(marker_set)
+    markers = as_marker_set(marker_set)
     rng = np.random.default_rng([seed, 7])
     x_world = true_markers(qpos, markers, scale, site_offset_m)
     seen = rng.random(x_world.shape[:2]) >= drop_share
