@@ -1,4 +1,4 @@
-"""Where the shipped files lie."""
+"""Where the shipped files and the development recordings lie."""
 
 from pathlib import Path
 
@@ -6,3 +6,5 @@ import pbl_pipeline
 
 #: The folder of the package in this checkout.
 PACKAGE = Path(pbl_pipeline.__file__).parent
+#: The development recordings beside the project.
+SHARED = PACKAGE.parent.parent / "shared" / "data"

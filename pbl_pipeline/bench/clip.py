@@ -1,9 +1,8 @@
-"""Videos for the benchmark of detection: the demo recording at 1080p without a jump, and any video made longer."""
+"""The video of the benchmark of detection: the demo recording at 1080p, without a jump."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -11,7 +10,6 @@ import cv2
 import numpy as np
 
 from pbl_pipeline import assets, progress
-from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import read_frames
 
 #: The frames of the demo recording in which the woman is wholly in the picture and not near its border.
@@ -42,43 +40,3 @@ def _write(path: Path, images: Iterator[np.ndarray], n: int) -> None:
         for image in progress.track(images, "making the clip", total=n):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
         container.mux(stream.encode(None))
-
-
-def repeated(source: Path, path: Path, seconds: float) -> Path:
-    """Write `source` again and again, without encoding anew, until it lasts `seconds`.
-
-    Raises
-    ------
-    PblError
-        VIDEO_TIMESTAMPS: pictures without a stamp, which cannot be put one after the other.
-    """
-    with av.open(str(path), "w") as out:
-        stream, begin, last_dts = None, 0, -1
-        while True:
-            with av.open(str(source)) as container:
-                video = container.streams.video[0]
-                base = video.time_base
-                if stream is None:
-                    stream = out.add_stream_from_template(video)
-                packets = [p for p in container.demux(video) if p.size]
-                if base is None or not packets or any(p.pts is None or p.dts is None for p in packets):
-                    raise PblError(
-                        "VIDEO_TIMESTAMPS",
-                        found="packets without a time stamp",
-                        expected="a video in MP4 or MKV, whose packets have stamps",
-                        next_step="leave out --minutes, or convert the video",
-                        key=str(source),
-                    )
-                stamps = sorted(int(p.pts) for p in packets if p.pts is not None)
-                step = round((stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1)) or 1
-                shift = begin - stamps[0]
-                for packet in packets:
-                    assert packet.pts is not None
-                    assert packet.dts is not None
-                    packet.pts, packet.dts = packet.pts + shift, max(packet.dts + shift, last_dts + 1)
-                    last_dts = packet.dts
-                    packet.stream = stream
-                    out.mux(packet)
-                begin += stamps[-1] - stamps[0] + step
-                if begin * Fraction(base) >= seconds:
-                    return path

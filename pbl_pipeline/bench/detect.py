@@ -15,20 +15,19 @@ from .table import Column, mega, number, table
 
 def run_detect(
     video: Path | None,
-    minutes: float | None,
     person: int | None,
     repeat: int,
     timeout_s: float,
     note: Callable[[str], None] = lambda _: None,
     keypoints: Sequence[str] = (),
 ) -> Iterator[Row]:
-    """Figures of probe, tracking and keypoints on `video` (None: `demo_clip`), repeated until it lasts `minutes`: a row
-    for each keypoint method of `keypoints` (none: the default), one after the other.
+    """Measure probe, tracking and keypoints on `video` (None: `demo_clip`): a row for each keypoint method of
+    `keypoints` (none: the default), one after the other.
 
     The measured process does nothing else, and a failure in it is a row with `error`. Raises the `PblError`s of
-    `demo_clip` and `repeated`, and VIDEO_MISSING.
+    `demo_clip`, and VIDEO_MISSING.
     """
-    from .clip import demo_clip, repeated
+    from .clip import demo_clip
 
     with tempfile.TemporaryDirectory(prefix="pbl-bench-") as name:
         folder = Path(name)
@@ -40,8 +39,6 @@ def run_detect(
 
             sha256_of(video)  # raises what is wrong with the file before anything is measured
             path = video
-        if minutes is not None:
-            path = repeated(path, folder / f"long{path.suffix}", 60 * minutes)
         for method in keypoints or [""]:
             note(f"measuring {method}".strip())
             label = (str(video) if video else "demo recording at 1080p") + (f", {method}" if method else "")

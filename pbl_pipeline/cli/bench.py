@@ -72,26 +72,22 @@ def fit(
     click.echo(b.fit_text(rows))
 
 
-@bench.command(epilog="Example: pbl bench detect walk.mp4 --minutes 10 --json detect.json")
+@bench.command(epilog="Example: pbl bench detect walk.mp4 --repeat 1 --json detect.json")
 @click.argument("video", required=False, type=click.Path(path_type=Path, readable=False))
-@click.option(
-    "--minutes", type=click.FloatRange(0, 600, min_open=True), help="Repeat the video until it lasts so long."
-)
 @click.option(
     "--person",
     type=click.IntRange(1),
     help="ID of the person; else the subject, or the longest in view.",
 )
 @click.option("--keypoints", multiple=True, metavar="NAME", help="Keypoint method; repeat it to compare several.")
-@click.option("--repeat", type=click.IntRange(1), help="Runs; the fastest counts. Default: 3, with --minutes 1.")
+@click.option("--repeat", type=click.IntRange(1), default=3, show_default=True, help="Runs; the fastest counts.")
 @click.option("--timeout-s", type=click.FloatRange(1), default=7200.0, show_default=True, help="Of the measurement.")
 @click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write all figures to this file.")
 def detect(
     video: Path | None,
-    minutes: float | None,
     person: int | None,
     keypoints: tuple[str, ...],
-    repeat: int | None,
+    repeat: int,
     timeout_s: float,
     json_path: Path | None,
 ) -> None:
@@ -104,8 +100,7 @@ def detect(
 
     if json_path is not None:
         check_out_file(json_path)
-    runs = repeat or (3 if minutes is None else 1)
-    found = b.run_detect(video, minutes, person, runs, timeout_s, lambda w: click.echo(w, err=True), keypoints)
+    found = b.run_detect(video, person, repeat, timeout_s, lambda w: click.echo(w, err=True), keypoints)
     rows = keep("detect", found, json_path)
     click.echo("\n\n".join(b.detect_text(row) for row in rows))
     if any("error" in row for row in rows):

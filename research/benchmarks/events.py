@@ -40,7 +40,7 @@ from pbl_pipeline.gait import (
 )
 from pbl_pipeline.gait.events import EVENTS, METHODS, SIDES, GaitEvent, PhaseParams
 from pbl_pipeline.synthetic import IMPAIRMENTS, Impairment, SynthSpec, Truth, synthesise
-from tests.conftest import SHARED
+from research.paths import SHARED
 
 #: A label and an event of its kind that are no further apart are the same event (s).
 NEAR_S = 0.1

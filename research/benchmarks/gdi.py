@@ -33,7 +33,7 @@ from pbl_pipeline.gait import (
     load_norm,
     read_lab_trial,
 )
-from tests.conftest import SHARED
+from research.paths import SHARED
 
 #: Angles whose sign is a convention. Tilt and flexions cannot be taken for their opposite.
 SIGNED = ("pelvis_obliquity", "pelvis_rotation", "hip_adduction", "hip_rotation", "foot_progression")

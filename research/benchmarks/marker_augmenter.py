@@ -32,7 +32,7 @@ from pbl_pipeline.keypoints import AugmenterParams, MarkerAugmenter
 from research.benchmarks import marker_ik
 from research.benchmarks.real_clips import CLIPS, fitted_angles, recorded_angles, score
 from research.corpus.motions import read_motions
-from tests.conftest import SHARED
+from research.paths import SHARED
 
 BODY, SITES, SEEN = load_body(), marker_set("opencap_35"), marker_set("halpe_26")
 PELVIS = BODY.body_names.index("pelvis")

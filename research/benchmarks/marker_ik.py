@@ -23,7 +23,7 @@ from pbl_pipeline.body import MarkerSet, load_marker_set
 from pbl_pipeline.fit import METHODS, TrialFit, fit_session
 from pbl_pipeline.keypoints import WorldMarkers
 from research.benchmarks.real_clips import changed
-from tests.conftest import SHARED
+from research.paths import SHARED
 
 FOLDER = SHARED / "real" / "marker_ik"
 TABLE = Path(__file__).parent / "data" / "marker_ik.csv"

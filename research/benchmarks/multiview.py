@@ -32,7 +32,7 @@ from pbl_pipeline.render import draw_body, draw_keypoints, to_pixels
 from pbl_pipeline.video import CameraPose, load_camera, read_frames
 from research.benchmarks.marker_ik import JUDGED, agreement, expert_angles, fitted_angles
 from research.benchmarks.real_clips import changed
-from tests.conftest import SHARED
+from research.paths import SHARED
 
 FOLDER = SHARED / "real" / "multiview"
 CALIBRATION = FOLDER / "Calib_scene.toml"

@@ -39,7 +39,7 @@ from pbl_pipeline.pipeline import detect_trial
 from pbl_pipeline.video import load_camera, read_frames
 from research.benchmarks.real_clips import CLIPS, changed, fitted_angles, recorded_angles, score
 from research.confidence import recordings, truth_of
-from tests.conftest import SHARED
+from research.paths import SHARED
 from tests.videos import write_video
 
 #: Shorter sides (px) at which recordings are encoded; 0: as it is.

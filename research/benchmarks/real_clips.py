@@ -33,7 +33,7 @@ from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.methods import Method
 from pbl_pipeline.pipeline import detect_trial
 from pbl_pipeline.validation import BODY_ROTATIONS, fit_angles, fit_angles_sd, reference_of_bodies
-from tests.conftest import SHARED
+from research.paths import SHARED
 
 CLIPS = ("walk", "STS")
 ANGLES = ("hip_flexion", "hip_adduction", "hip_rotation", "knee_flexion", "ankle_angle")

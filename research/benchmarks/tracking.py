@@ -25,7 +25,7 @@ import click
 import numpy as np
 
 from pbl_pipeline import assets
-from pbl_pipeline.bench.clip import demo_clip, repeated
+from pbl_pipeline.bench.clip import demo_clip
 from pbl_pipeline.keypoints import BlazePoseLandmarks
 from pbl_pipeline.keypoints._crops import smooth_rois
 from pbl_pipeline.models import box_iou
@@ -41,7 +41,8 @@ from pbl_pipeline.tracking import (
 )
 from pbl_pipeline.tracking import _track as tracks
 from pbl_pipeline.video import VideoInfo, find_camera, probe, read_frames
-from tests.conftest import SHARED
+from research.benchmarks.longer_video import repeated
+from research.paths import SHARED
 
 REAL = SHARED / "real"
 SMOOTH_S = 0.1

@@ -27,7 +27,7 @@ from pbl_pipeline.keypoints import KeypointParams, Keypoints, check_keypoints, d
 from pbl_pipeline.keypoints import _detect as detection
 from pbl_pipeline.tracking import PersonTrack, choose_subject, track_people
 from pbl_pipeline.video import Frame, guess_camera, probe, read_frames
-from tests.conftest import SHARED
+from research.paths import SHARED
 
 CLIPS = {
     "walk": SHARED / "real" / "video_mocap" / "walk" / "video.mp4",
