@@ -1,4 +1,4 @@
-"""Benchmarks that `pbl bench` runs: each case in processes of its own, so that memory and cold times are honest.
+"""Benchmarks that `pbl bench` runs: each case in separate processes, so that memory and cold times are honest.
 
 Importing this package imports no JAX: the process that only starts others must not take the accelerator.
 """

@@ -1,4 +1,4 @@
-"""One measured case in a process of its own: `python -m pbl_pipeline.bench.case JSON`.
+"""One measured case in a separate process: `python -m pbl_pipeline.bench.case JSON`.
 
 The JSON names the case, the folder of its data, the file for the result, the stage and the time at which the process
 was started. Stage "cold" ends after the first result. Stage "warm" goes on: repeated runs, all sessions, accuracy.
@@ -28,7 +28,7 @@ Judge = Callable[[Mapping[Path, "SessionFit"]], dict[str, Any]]
 
 
 def main(judge: Judge | None = None) -> None:
-    """Measure the case of the command line and write its result; `judge` in place of `accuracy_of`."""
+    """Measure the case of the command line and write its result; `judge` instead of `accuracy_of`."""
     spec = json.loads(sys.argv[1])
     case = {k: spec["case"][k] for k in ("method", "batch", "repeat", "camera_motion")}
     try:

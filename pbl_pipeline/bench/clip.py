@@ -21,7 +21,7 @@ _FPS = 30
 def demo_clip(path: Path) -> Path:
     """Write the demo recording's walk there and back, 7 s of 1920x1080 H.264 at 30 fps and about 8 Mbit/s.
 
-    Forwards and then backwards: repeated, nobody jumps. Raises those of `assets.fetch`.
+    Forwards and then backwards: repeated, the person does not jump. Raises the errors of `assets.fetch`.
     """
     source = assets.fetch("demo_video")
     forward = [cv2.resize(f.image, _SIZE, interpolation=cv2.INTER_CUBIC) for f in read_frames(source, _FIRST, _STOP)]

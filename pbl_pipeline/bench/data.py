@@ -1,4 +1,4 @@
-"""The benchmark's data on disk: made by a process of its own, read by those that are measured.
+"""The benchmark's data on disk: made by a separate process, read by those that are measured.
 
 `python -m pbl_pipeline.bench.data FOLDER JSON` writes one session after the other; files are keypoints.npz as the
 commands read them, and truth.npz beside them.

@@ -47,7 +47,7 @@ def run_detect(
 
 
 def _measure(spec: dict, timeout_s: float) -> Row:
-    """What a process of its own writes of one case."""
+    """Return the figures of one case, measured in a separate process."""
     command = [sys.executable, "-m", "pbl_pipeline.bench.detect_case", json.dumps(spec)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s)

@@ -1,4 +1,4 @@
-"""One measured run of probe, tracking and keypoints in a process of its own: `python -m pbl_pipeline.bench.detect_case
+"""One measured run of probe, tracking and keypoints in a separate process: `python -m pbl_pipeline.bench.detect_case
 JSON`. The JSON names the video, the person, the number of repetitions and the file for the result."""
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ def _run(video: Path, person: int | None, keypoints: str | None) -> dict[str, An
     info = _timed(stages, "decode", lambda: probe(video))
     tracking = _timed(stages, "tracking", lambda: track_people(video, info=info))
     subject = choose_subject(tracking, override=person).person_id
-    if subject is None and tracking.persons:  # a benchmark measures somebody: whoever is in view for longest
+    if subject is None and tracking.persons:  # without a clear subject: the person in view for longest
         subject = max(tracking.persons, key=lambda p: time_in_view_s(p, tracking.time_s)).person_id
-    # Nobody: number 0 is unknown, and the error says so.
+    # No person: ID 0 is unknown, and the error says so.
     camera = guess_camera(info)
     found = _timed(
         stages, "keypoints", lambda: detect_keypoints(video, tracking, subject or 0, camera, params=keypoints)

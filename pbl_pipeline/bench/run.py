@@ -1,4 +1,4 @@
-"""Runs cases, each in processes of its own, and gathers their figures."""
+"""Runs each case in separate processes and gathers the figures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Row = dict[str, Any]
 
 @dataclasses.dataclass(frozen=True)
 class Programs:
-    """Modules that make the data of a case and that measure it, each in a process of its own."""
+    """Modules that make the data of a case and that measure it, each in a separate process."""
 
     data: str = "pbl_pipeline.bench.data"
     case: str = "pbl_pipeline.bench.case"
@@ -58,7 +58,7 @@ def run_cases(
 
 def _row(case: Case, cold: Row, warm: Row) -> Row:
     row = {"label": case.label, **dataclasses.asdict(case), **warm}
-    # How long a refusal took is no figure of a fit.
+    # The time of a refused fit is not the time of a fit.
     row["cold_seconds"] = None if "error" in cold else cold.get("first_seconds")
     row["start_seconds"] = row.pop("first_seconds", None)
     for key in ("host_bytes", "device_bytes"):
@@ -105,6 +105,6 @@ def _stage(program: str, case: Case, folder: Path, cache: Path, root: Path, time
     except subprocess.TimeoutExpired:
         return {"error": f"over {timeout_s:g} s"}
     if result.exists():
-        # NaN is no JSON: what is not known is null in the file that people read.
+        # JSON has no NaN: unknown values are null in the file.
         return json.loads(result.read_text(encoding="utf-8"), parse_constant=lambda _: None)
     return {"error": f"died, exit {done.returncode}", "error_text": done.stderr[-2000:]}

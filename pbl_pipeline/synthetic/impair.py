@@ -46,7 +46,7 @@ class Impairment:
 
 @dataclasses.dataclass
 class Style:
-    """What impairments change; the defaults are a healthy walk. Pairs are {"r": ..., "l": ...}.
+    """Changes of a walk by impairments; the defaults are a healthy walk. Pairs are {"r": ..., "l": ...}.
 
     All in degrees unless named otherwise. `stance_*` is added over the whole cycle, `swing_*` only around the middle of
     the swing. `swing_knee` multiplies the knee's flexion of the swing above that of the stance.
@@ -145,7 +145,7 @@ IMPAIRMENTS: dict[str, Callable[[Style, float, str], None]] = {
     "trunk_sway": _trunk_sway,
     "widened_base": _widened_base,
 }
-#: Which may be on one side, and which of them are on the right side where nobody says.
+#: Impairments that may be on one side, and those of them that are on the right side by default.
 SIDED = ("crouch", "stiff_knee", "drop_foot", "weakness")
 ONE_SIDE = ("stiff_knee", "drop_foot", "weakness")
 

@@ -1,4 +1,4 @@
-"""What a detector does to the true points: noise correlated in time, gross outliers, points not found."""
+"""Errors of a detector: noise correlated in time, gross outliers, points not found."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ OVERALL_SD, SEGMENT_SD, SIDE_SD, SITE_SD_M = 0.05, 0.02, 0.005, 0.006
 def physique(seed: int, markers: MarkerSet) -> tuple[Float[np.ndarray, " 8"], Float[np.ndarray, "J 3"]]:
     """Scale (8,) and marker offsets (J, 3) in m of a person.
 
-    Left and right differ little: nobody whose legs differ by 5 % in length walks like a healthy person.
+    Left and right differ little: people whose legs differ by 5 % in length do not walk like healthy people.
     """
     rng = np.random.default_rng([seed, 11])
     overall = 1 + within(rng, 0.0, OVERALL_SD)

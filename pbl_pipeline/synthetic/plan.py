@@ -1,4 +1,4 @@
-"""What a motion is before it is solved: where the pelvis goes, which foot stands where and when."""
+"""Plan of a motion before it is solved: the way of the pelvis, and where and when each foot stands."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ LANDSCAPE_PX = (1920, 1080)
 OUTSIDE_SHARE = 0.2
 
 
-#: What stands in the name of a trial where it is not the default, so that no other trial's files are overwritten.
+#: Fields that appear in the name of a trial if they are not the default, so that files of other trials are kept.
 _IN_NAME: dict[str, Callable[[Any], str]] = {
     "ground": str,
     "speed_m_per_s": "{:g}mps".format,
@@ -66,7 +66,7 @@ _IN_NAME: dict[str, Callable[[Any], str]] = {
 
 @dataclasses.dataclass(frozen=True)
 class SynthSpec:
-    """What is asked for; the same spec gives the same result.
+    """Options of a trial; the same options give the same result.
 
     task: one of `TASKS`; seed: of the person, the motion, the camera and the noise; impairments; view: one of
     `VIEWS_DEG`; camera: "static", "panned" (turned after the person) or "handheld" (with a hand's tremor);
@@ -160,7 +160,7 @@ class Truth:
     outlier : (T, J)
         Points that were thrown far off.
     spec
-        What was asked for.
+        Options that the trial was made with.
     """
 
     time_s: Float[np.ndarray, " T"]

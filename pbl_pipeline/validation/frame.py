@@ -46,7 +46,7 @@ def error_frame(rows: Iterable[TrialErrors]) -> pd.DataFrame:
     """One row per trial and joint; no rows give an empty frame with the same columns (`COLUMNS`).
 
     `joint` is without its side (`hip_flexion`), `side` is `r`, `l` or ``""``. `view` is the side's own; a joint of the
-    middle seen from either side has "lateral". Of several cameras there is no one view (``""``).
+    middle seen from either side has "lateral". Several cameras have no single view (``""``).
     `trial_median_abs_deg` is the trial's error over all joints of `JOINTS_PAPER` (`KinematicErrors.median_abs_deg`).
     """
     out = []

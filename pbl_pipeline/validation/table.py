@@ -30,7 +30,7 @@ class Table:
     name
         Stem of its files.
     title
-        What it shows, with the unit and what stands in brackets.
+        Quantity, with its unit and the meaning of the brackets.
     rows, columns
         Their names, in order.
     cells

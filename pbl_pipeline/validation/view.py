@@ -8,7 +8,7 @@ from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import BodyPoses, camera_side, mostly
 
 FRONT, BACK, IPSILATERAL, CONTRALATERAL, MIXED = "front", "back", "ipsilateral", "contralateral", "mixed"
-#: What a joint of the middle has where the camera stands on one side.
+#: View of a joint of the middle if the camera stands on one side.
 LATERAL = "lateral"
 
 

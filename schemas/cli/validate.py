@@ -148,7 +148,7 @@ def _show(frame: pd.DataFrame, where: Sequence[str], out: Path | None, in_databa
     "--of-trial",
     type=int,
     metavar="VIDEO_ID",
-    help="In place of a file: the current fit of a trial of several cameras, or of a marker recording, in the tables.",
+    help="Instead of a file: the current fit of a trial of several cameras, or of a marker recording, in the tables.",
 )
 @click.option("--fit-method", metavar="KEY", help="With --of-trial, where that was fitted by several methods.")
 @click.option("--dataset", metavar="NAME", help="Collection of recordings to report it with (else: unnamed).")
