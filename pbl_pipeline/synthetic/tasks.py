@@ -34,7 +34,7 @@ TUG_WAY_M, SQUARE_M = 3.0, 0.65
 
 @dataclasses.dataclass(frozen=True)
 class Walker:
-    """Properties of a person that the plans need: leg length, pelvis to calcaneus ahead when standing (m), seed, style."""
+    """Data of a person for the plans: leg length, pelvis to calcaneus ahead when standing (m), seed, style."""
 
     leg_m: float
     heel_ahead_m: float

@@ -1,4 +1,4 @@
-"""Reference that a fit is compared with: joint angles and the path of the pelvis over time, and where they come from."""
+"""Reference of a fit: joint angles and the path of the pelvis over time, and where they come from."""
 
 from __future__ import annotations
 
