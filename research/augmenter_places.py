@@ -21,8 +21,8 @@ import numpy as np
 
 from pbl_pipeline.body import body_poses, load_body, marker_positions, marker_set
 from pbl_pipeline.keypoints import MarkerAugmenter
-from pbl_pipeline.validation import Motion, read_motions
-from research._paths import PACKAGE
+from research.corpus.motions import Motion, read_motions
+from research.paths import PACKAGE
 
 TABLE = PACKAGE / "body" / "data" / "markers_opencap_35.csv"
 #: Beginnings of the index's names.

@@ -18,8 +18,8 @@ from typing import Any
 
 import click
 
-from research._body_shapes import RGBA, SHAPES, mirrored
-from research._paths import PACKAGE
+from research.body_shapes import RGBA, SHAPES, mirrored
+from research.paths import PACKAGE
 
 MODEL_NAME = "pbl_body_40"
 MODEL_VERSION = "1"

@@ -5,7 +5,7 @@
 
 Writes the folder of a study (docs/study.md) and `truth.csv`, what the statistics of such a study would be without
 chance. Index, measures, scores and curves are drawn from the truth and an error model, without videos. All of it is a
-function of the seed. `tests/benchmarks/study_intervals.py` draws the same cohort.
+function of the seed. `research/benchmarks/study_intervals.py` draws the same cohort.
 
 A value of person i at visit v is mean + P_i + C_i (v > 0) + e_iv: P between persons, C the true change after surgery
 (patients only), e between visits, of which a part is the mean of the cycles' own deviations. Persons and visits

@@ -20,8 +20,8 @@ import pandas as pd
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionInput, fit_sessions
 from pbl_pipeline.gait import find_cycles, gait_metrics, score_gdi
-from pbl_pipeline.validation import Case, synthetic_walk
 from research.cohort import CONTROLS, INDEX, PATIENTS, ROLES
+from research.corpus.walks import Case, synthetic_walk
 
 IMPAIRMENT = "stiff_knee"
 #: Of the patients' impairment at the visits, and how each visit is filmed.

@@ -22,16 +22,11 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import BOUND_TRUNK, METHODS, ConfidenceCurve, KeypointParams, Keypoints
 from pbl_pipeline.methods import Method
 from pbl_pipeline.pipeline import detect_trial
-from pbl_pipeline.validation import (
-    PointErrors,
-    PointTruth,
-    point_errors,
-    truth_of_bodies,
-    truth_of_trc,
-    write_reliability,
-)
 from pbl_pipeline.video import load_camera, load_camera_poses
-from research._paths import PACKAGE
+from research.paths import PACKAGE
+from research.reliability.page import write_reliability
+from research.reliability.point_errors import PointErrors, point_errors
+from research.reliability.point_truth import PointTruth, truth_of_bodies, truth_of_trc
 
 CURVES = PACKAGE / "keypoints" / "data" / "confidence_curves.json"
 MOCAP_CLIPS = ("walk", "STS")

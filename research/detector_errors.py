@@ -1,4 +1,4 @@
-"""How a keypoint method errs, as the corpus of `pbl validate gdi` draws it: `python -m research.detector_errors DATA`.
+"""How a keypoint method errs, as `research.corpus` draws it: `python -m research.detector_errors DATA`.
 
 DATA is the folder of the development recordings, as for `research.confidence`, whose truth is taken. Prints a line for
 each recording and, of all of them, the fields of `pbl_pipeline.synthetic.Noise` that they tell.
@@ -19,8 +19,8 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.keypoints import METHODS, Keypoints
-from pbl_pipeline.validation import PointTruth
 from research.confidence import detected, keypoints_option, truth_of
+from research.reliability.point_truth import PointTruth
 
 _GROSS_M = 0.2
 _AXES = ("right", "down", "ahead")

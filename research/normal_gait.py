@@ -16,7 +16,7 @@ import click
 import numpy as np
 
 from pbl_pipeline.gait.normative import harmonic_sum
-from research._paths import PACKAGE
+from research.paths import PACKAGE
 
 GROUPS = ("very_slow", "slow", "free", "fast", "very_fast")
 #: Our name -> the name in the file.

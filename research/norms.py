@@ -27,7 +27,7 @@ from pbl_pipeline.gait.normative import (
     fit_norm,
     offset_deg,
 )
-from research._paths import PACKAGE
+from research.paths import PACKAGE
 
 POINTS = 51
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import click
 
-from research._paths import PACKAGE
+from research.paths import PACKAGE
 
 SOURCE = (
     "OpenCap's calibrations of iPhones (stanfordnmbl/opencap-core, commit d5a5258, Apache-2.0; "

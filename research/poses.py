@@ -8,11 +8,11 @@ A mixture of two normal distributions over the joints of pelvis, lumbar spine an
 maximisation, because no laboratory measured all joints) plus that between people, which so few of them cannot tell and
 which is set by anatomy: a pelvis that is tilted stands under an upright trunk and over upright legs, and who walks with
 bent knees bends hips and ankles by half as much, on both sides. Means are round figures near those of recorded walks;
-they and how differently bent people walk were chosen on the persons of `pbl validate gdi` who are not held out. Left
+they and how differently bent people walk were chosen on the persons of `research.corpus` who are not held out. Left
 and right are alike: every recording counts once as it is and once mirrored, and who squats or sits bends both hips and
 knees together (hips of two persons who squat: 0.4 and 1.4 deg apart in the mean), also in the postures that stand
 beside the recorded ones. The spine of the LBMC recordings is another joint than the body's and counts as unknown.
-Persons whom `pbl validate gdi` holds out are left out.
+Persons whom `research.corpus` holds out are left out.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from jaxtyping import Float
 
 from pbl_pipeline.body import PELVIS_TURNS, load_body
 from pbl_pipeline.fit.priors import DATA, rises
-from pbl_pipeline.validation import Motion, is_held_out, read_motions
+from research.corpus.motions import Motion, read_motions
+from research.corpus.walks import is_held_out
 
 MIDDLE = ("pelvis_tilt", "pelvis_list", "lumbar_extension", "lumbar_bending", "lumbar_rotation")
 SIDED = ("hip_flexion", "hip_adduction", "hip_rotation", "knee_angle", "ankle_angle", "subtalar_angle")

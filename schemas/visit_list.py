@@ -1,7 +1,7 @@
 """A list of visits to look through: searched, filtered, a page at a time, each with its index, its trend and its state.
 
 Plain SQL with arguments: what a person types is never part of a statement, and a page of 50,000 visits is one question
-for the numbers and a few for the rows that are shown (`python -m tests.benchmarks.visit_list`).
+for the numbers and a few for the rows that are shown (`python -m research.benchmarks.visit_list`).
 """
 
 # Names of tables are DataJoint's own, quoted, and every value is an argument.

@@ -6,10 +6,10 @@ import dataclasses
 
 import numpy as np
 
-from pbl_pipeline import synthetic
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.synthetic import NO_NOISE
 from pbl_pipeline.video import Camera
+from research.walker.observe import observe as observe_by_phone
 
 CAMERA = Camera(np.array([[1500.0, 0, 960], [0, 1500.0, 540], [0, 0, 1]]), np.zeros(5), "measured: synthetic")
 SIZE = (1920, 1080)
@@ -26,7 +26,7 @@ def observe(
 ) -> Keypoints:
     """Keypoints with independent noise of every frame, point and axis."""
     noise = dataclasses.replace(NO_NOISE, across_m=noise_m, along_m=noise_m, correlation=0.0, xy_px=noise_px)
-    return synthetic.observe(
+    return observe_by_phone(
         qpos,
         time_s,
         marker_set=marker_set,

@@ -1,31 +1,22 @@
-"""Benchmarks that `pbl bench` runs: each case in processes of its own, so that memory and cold times are honest.
+"""Benchmarks that `pbl bench` runs: each case in separate processes, so that memory and cold times are honest.
 
 Importing this package imports no JAX: the process that only starts others must not take the accelerator.
 """
 
-from ._detect import detect_text, run_detect
-from ._plan import MOTIONS, SOLVERS, Case, Data, long_cases, quick_cases, robust_cases, speed_cases
-from ._run import Row, label, run_cases
-from ._table import accuracy, number, rate, solver_name, table, text
+from .cases import METHOD, Case, Data, fit_cases
+from .detect import detect_text, run_detect
+from .run import Programs, Row, run_cases
+from .table import fit_text
 
 __all__ = [
-    "MOTIONS",
-    "SOLVERS",
+    "METHOD",
     "Case",
     "Data",
+    "Programs",
     "Row",
-    "accuracy",
     "detect_text",
-    "label",
-    "long_cases",
-    "number",
-    "quick_cases",
-    "rate",
-    "robust_cases",
+    "fit_cases",
+    "fit_text",
     "run_cases",
     "run_detect",
-    "solver_name",
-    "speed_cases",
-    "table",
-    "text",
 ]

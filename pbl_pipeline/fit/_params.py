@@ -126,7 +126,7 @@ SD_FACTOR: tuple[tuple[str, float], ...] = (
     ("pro_sup", 1.26),
     ("wrist", 1.47),
 )
-#: The same of `gauss-newton`, of pixels that err with a memory (`python -m tests.benchmarks.uncertainty` prints them
+#: The same of `gauss-newton`, of pixels that err with a memory (`python -m research.benchmarks.uncertainty` prints them
 #: and checks them on other walks).
 SD_FACTOR_METRABS: tuple[tuple[str, float], ...] = (
     ("pelvis_t", 1.76),
@@ -151,7 +151,7 @@ SD_FACTOR_METRABS: tuple[tuple[str, float], ...] = (
 )
 #: Least standard deviations of `blazepose` (deg, slides cm): a detector that leans a person, or marks another place
 #: than the model, does so in every frame, and no residual shows it. Such that 90 % intervals hold 90 % of the samples
-#: of walks seen with the detector's errors: hip, knee and ankle of the tuning persons of `pbl validate gdi --quick`;
+#: of walks seen with the detector's errors: hip, knee and ankle of the tuning persons of `research.corpus --quick`;
 #: pelvis, trunk and arms of twelve recorded walks of nine persons, each with a pose prior learned without them; slides,
 #: neck, mtp, forearm and wrist of the synthetic walker.
 SD_FLOOR_BLAZEPOSE: tuple[tuple[str, float], ...] = (
@@ -248,7 +248,7 @@ GAUSS_NEWTON = GaussNewtonParams(
 #: held by postures of people. Its depth is much less certain than its pixels, so it counts half. Its points were marked
 #: by eye in pictures and not felt on bone, so they may lie further from the marker set's places than a laboratory's.
 #: Weights were chosen on the two phone clips with marker mocap and on recorded walks with the detector's errors,
-#: persons held out of the prior (`pbl validate gdi`, tests/benchmarks/real_clips.py); that of the augmenter's pelvis on
+#: persons held out of the prior (`research.corpus`, research/benchmarks/real_clips); that of the augmenter's pelvis on
 #: recorded squats with the same errors, too. Its 33 points weigh less than MeTRAbs's 87, and so does what smooths them.
 BLAZEPOSE = GaussNewtonParams(
     smooth_per_rad2=20.0,

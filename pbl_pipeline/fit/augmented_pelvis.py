@@ -3,7 +3,7 @@
 Two hip points do not tell. The 15 points that the network sees are those of the body of a first solution, whose legs
 and trunk were seen; of its 35 markers the four iliac spines place the pelvis. It is not asked about people who walk:
 how far each of them tips the pelvis it does not know (slope 0.30 over eight persons), how the pelvis turns in a squat
-it does (`tests/benchmarks/marker_augmenter.py`).
+it does (`research/benchmarks/marker_augmenter.py`).
 """
 
 from __future__ import annotations

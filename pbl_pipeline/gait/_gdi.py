@@ -82,7 +82,7 @@ GDI_MODEL, GILLETTE_MODEL = "pbl-2025-three-angles", "gillette-2008"
 MODEL_ANGLES: dict[str, tuple[str, ...]] = {GDI_MODEL: THREE_ANGLES, GILLETTE_MODEL: NINE_ANGLES}
 #: Version 1 of the index of three angles had the norm `gillette-166-three-angles`; version 2 is the mean of the indices
 #: of the cycles, as the paper's; version 3 took all of the angles' error as lasting and the same on both sides. The
-#: correlation of the sides' lasting errors on the tuning persons of `pbl validate gdi`: hip flexion 0.5 to 0.8, knee 0
+#: correlation of the sides' lasting errors on the tuning persons of `research.corpus`: hip flexion 0.5 to 0.8, knee 0
 #: to 0.4, adduction -0.9 to 0.2. `lengthening` is the one of 0, 0.05, 0.1 ... with which the index and its change
 #: between two visits err least with 33 points on these persons (the sum of both mean squares); version 4 had 0.2.
 GDI_METHODS: Stage[GdiParams] = Stage("gdi", "family", GDI_MODEL)

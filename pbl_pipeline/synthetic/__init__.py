@@ -1,46 +1,33 @@
-"""A walker with known truth: joint angles, body, camera and clock, seen by phones, cameras or markers.
+"""A walker with known truth: joint angles, gait events, body, camera and clock, seen by a phone (docs/synth.md).
 
-For tests, for `pbl bench fit` and for the calibration of the fit's uncertainties. Everything is a function of a seed.
-World frame: z up, metres, the phone at the origin and 1.2 m above the floor, the walk ahead of it along x.
-
-One walker in three depths: `plain_walk` (textbook curves and nothing else), `walk_qpos` (the same curves, and persons
-who differ and vary; what the benchmark's figures were measured with) and `synthesise` (legs by published curves at any
-speed, feet that stand still, impairments, other tasks; `pbl synth`).
+For `pbl synth`, `pbl bench fit`, the self-test of workers, and tests. Everything is a function of a seed. World frame:
+z up, metres, the phone at the origin and 1.2 m above the floor, the walk ahead of it along x. `synthesise` makes the
+trials of `pbl synth`: legs by published curves at any speed, feet that stand still, impairments, other tasks;
+`plain_walk` is textbook curves and nothing else.
 """
 
-from pbl_pipeline.gait.normative import GaitNorm, gait_norm
-
-from ._camera import LEVEL_R_NC, PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor, picture_px, resized, zoomed
-from ._impair import IMPAIRMENTS, Impairment
-from ._noise import BLAZEPOSE_MEASURED, BLAZEPOSE_NOISE, DETECTORS, METRABS_MEMORY, NO_NOISE, DetectorModel, Noise
-from ._observe import Seen, observe, pelvis_positions
-from ._path import PATHS
-from ._person import person, true_markers
-from ._physique import physique
-from ._scene import VIEWS_DEG
-from ._solve import SOLE_POINTS, sole_points
-from ._synth import TASKS, Synthetic, SynthSpec, Truth, lens, speed_of_group, synthesise
-from ._views import VIEW_CAMERA, VIEW_SIZE_PX, observe_markers, observe_views
-from ._walk import facing, plain_walk, turned, walk_qpos
+from .camera import LEVEL_R_NC, PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor, picture_px
+from .impair import IMPAIRMENTS, Impairment
+from .markers import true_markers
+from .noise import CORRELATED_NOISE, NO_NOISE, Disturbance, Noise, correlated
+from .observe import Seen, film, hide, pelvis_positions, seen_by
+from .physique import physique
+from .scene import VIEWS_DEG
+from .solve import SOLE_POINTS, sole_points
+from .synth import TASKS, Synthetic, SynthSpec, Truth, lens, speed_of_group, synthesise
+from .walk import plain_walk
 
 __all__ = [
-    "BLAZEPOSE_MEASURED",
-    "BLAZEPOSE_NOISE",
-    "DETECTORS",
+    "CORRELATED_NOISE",
     "IMPAIRMENTS",
     "LEVEL_R_NC",
-    "METRABS_MEMORY",
     "NO_NOISE",
-    "PATHS",
     "PHONE_CAMERA",
     "PHONE_SIZE_PX",
     "SOLE_POINTS",
     "TASKS",
     "VIEWS_DEG",
-    "VIEW_CAMERA",
-    "VIEW_SIZE_PX",
-    "DetectorModel",
-    "GaitNorm",
+    "Disturbance",
     "Impairment",
     "Noise",
     "PhoneSensor",
@@ -48,23 +35,17 @@ __all__ = [
     "SynthSpec",
     "Synthetic",
     "Truth",
-    "facing",
-    "gait_norm",
+    "correlated",
+    "film",
+    "hide",
     "lens",
-    "observe",
-    "observe_markers",
-    "observe_views",
     "pelvis_positions",
-    "person",
     "physique",
     "picture_px",
     "plain_walk",
-    "resized",
+    "seen_by",
     "sole_points",
     "speed_of_group",
     "synthesise",
     "true_markers",
-    "turned",
-    "walk_qpos",
-    "zoomed",
 ]

@@ -10,10 +10,6 @@ import click
 
 from pbl_pipeline.errors import PblError
 
-from ._gdi import gdi
-from ._privacy import privacy
-from ._reliability import reliability
-
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -56,14 +52,7 @@ def validate() -> None:
     Example: pbl validate add walk1.mp4 --reference walk1.mot --dataset OURLAB
     Example: pbl populate && pbl validate --out accuracy
     Example: pbl validate walk1.fit.npz --reference walk1.mot
-    Example: pbl validate reliability walk1.keypoints.npz --truth walk1.truth.npz
-    Example: pbl validate privacy --data ../shared/data/real
     """
-
-
-validate.add_command(reliability)
-validate.add_command(gdi)
-validate.add_command(privacy)
 
 
 @validate.command(epilog="Example: pbl validate --dataset OURLAB --where population=healthy --out accuracy")
@@ -159,7 +148,7 @@ def _show(frame: pd.DataFrame, where: Sequence[str], out: Path | None, in_databa
     "--of-trial",
     type=int,
     metavar="VIDEO_ID",
-    help="In place of a file: the current fit of a trial of several cameras, or of a marker recording, in the tables.",
+    help="Instead of a file: the current fit of a trial of several cameras, or of a marker recording, in the tables.",
 )
 @click.option("--fit-method", metavar="KEY", help="With --of-trial, where that was fitted by several methods.")
 @click.option("--dataset", metavar="NAME", help="Collection of recordings to report it with (else: unnamed).")

@@ -1,6 +1,6 @@
 """The detector in two of the four cameras of the development recording.
 
-All four: `python -m tests.benchmarks.detection`.
+All four: `python -m research.benchmarks.detection`.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import pytest
 
 from pbl_pipeline.keypoints import METHODS
-from tests.benchmarks.detection import MOST_FRAMES, MOST_PX, REFERENCE, compare, detected, read_trc, runs
+from research.benchmarks.detection import MOST_FRAMES, MOST_PX, REFERENCE, compare, detected, read_trc, runs
 from tests.unit.test_blazepose import asset
 
 pytestmark = pytest.mark.slow

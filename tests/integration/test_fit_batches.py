@@ -10,9 +10,9 @@ import pymysql
 import pytest
 
 import pbl_pipeline.fit
+from research.benchmarks import gpu_worker
 from schemas import fit
 from schemas.jobs import jobs_of
-from tests.benchmarks import gpu_worker
 from workers import batches, queue
 from workers.heartbeat import Silent
 from workers.loop import Worker

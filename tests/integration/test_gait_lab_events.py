@@ -12,7 +12,7 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import detect_events, feet_from_markers
-from tests.benchmarks.events import Tally, cross_validated, lab_walks, reduced
+from research.benchmarks.events import Tally, cross_validated, lab_walks, reduced
 
 pytestmark = pytest.mark.slow
 

@@ -26,7 +26,7 @@ from pbl_pipeline.gait import (
 )
 from pbl_pipeline.gait._laboratory import _read
 from pbl_pipeline.gait.normative import gait_norm
-from tests.benchmarks.gdi import children, conventions
+from research.benchmarks.gdi import children, conventions
 
 MARKERS = ("LASI", "RASI", "LHEE", "RHEE", "LTOE", "RTOE")
 

@@ -13,7 +13,8 @@ from pbl_pipeline.body import marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, fit_session
 from pbl_pipeline.keypoints import WorldMarkers
-from pbl_pipeline.synthetic import observe_markers, plain_walk
+from pbl_pipeline.synthetic import plain_walk
+from research.walker.views import observe_markers
 from schemas import fit, gait, gdi, load_visit, norms, slices, video, views
 from schemas.ingest import Visit, ingest
 from schemas.marker_recordings import ingest_markers

@@ -15,7 +15,8 @@ import pbl_pipeline.tracking
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import fit_session
 from pbl_pipeline.keypoints import Keypoints, MultiView
-from pbl_pipeline.synthetic import NO_NOISE, observe_views, plain_walk
+from pbl_pipeline.synthetic import NO_NOISE, plain_walk
+from research.walker.views import observe_views
 from schemas import fit, gait, gdi, jobs, load_visit, norms, slices, validation, video, views
 from schemas.coded_errors import error_code
 from schemas.decide import decide_person

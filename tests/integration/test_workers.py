@@ -23,13 +23,13 @@ import pbl_pipeline.video
 import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS
+from research.benchmarks import worker_replay
 from schemas import connection, fit, gait, gdi, lab, qc, tracking, video, worker
 from schemas.chain import ON_REQUEST
 from schemas.cli.why import why as why_command
 from schemas.operations import embedded
 from schemas.status import live_workers, pipeline_status, queue_counts
 from schemas.why import why
-from tests.benchmarks import worker_replay
 from tests.rows import register
 from workers import queue, recover, refresh, registry, requeue, run_job
 from workers.heartbeat import Heartbeat, Silent

@@ -1,4 +1,4 @@
-"""The arithmetic of the ablation (`tests/benchmarks/ablation.py`): errors, their parts, and what a row changes."""
+"""The arithmetic of the ablation (`research/benchmarks/ablation.py`): errors, their parts, and what a row changes."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pbl_pipeline.bench._accuracy import MAIN_JOINTS, PAPER_JOINTS
+from pbl_pipeline.bench.accuracy import MAIN_JOINTS, PAPER_JOINTS
 from pbl_pipeline.fit import METHODS, GaussNewtonParams
 from pbl_pipeline.keypoints import Keypoints
-from tests.benchmarks.ablation import figures_of, path_error_m, row_of, table
-from tests.benchmarks.ablation_cases import DEFAULT, Setup, factors, leant, paramset_of, session, slow, squashed
+from research.benchmarks.ablation import figures_of, path_error_m, row_of, table
+from research.benchmarks.ablation_cases import DEFAULT, Setup, factors, leant, paramset_of, session, slow, squashed
 
 RAY = np.array([[0.0, 0.0, 1.0]])
 

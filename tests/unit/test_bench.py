@@ -1,4 +1,4 @@
-"""The benchmark of the fit: its cases, its measures against hand-worked numbers, one real case and one that fails."""
+"""The benchmarks of the fit: their cases, their measures against hand-worked numbers, one real case, one that fails."""
 
 from __future__ import annotations
 
@@ -14,20 +14,13 @@ from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline import bench
-from pbl_pipeline.bench import Case, Data, _case, _data
-from pbl_pipeline.bench._accuracy import (
-    MAIN_JOINTS,
-    PAPER_JOINTS,
-    camera_error_deg,
-    joint_errors_deg,
-    mean_over,
-    summary,
-)
-from pbl_pipeline.bench._plan import NEVER_SEEN, UNSEEN_S
+from pbl_pipeline.bench import Case, Data, case, data
+from pbl_pipeline.bench.accuracy import MAIN_JOINTS, PAPER_JOINTS, joint_errors_deg, mean_over, summary
 from pbl_pipeline.body import load_body
 from pbl_pipeline.cli.bench import bench as command
-from pbl_pipeline.errors import PblError
-from tests.benchmarks.ratios import ratio_text, ratios
+from research.benchmarks import fit as comparison
+from research.benchmarks import fit_data
+from research.benchmarks.fit_case import accuracy_of, camera_error_deg
 
 NAMES = load_body().joint_names
 
@@ -35,27 +28,27 @@ NAMES = load_body().joint_names
 # --- what is run
 
 
-def test_the_cases_are_solver_by_trials_by_camera_by_batch():
-    cases = bench.speed_cases(bench.SOLVERS, (1, 10), bench.MOTIONS, (1, 16, 64), 3, 3, 2000)
-    assert len(cases) == 2 * 2 * 3 + 2 * 2
-    assert {c.batch for c in cases if c.solver == "implicit-adam"} == {1}
-    assert {c.adam_steps for c in cases if c.solver == "implicit-adam"} == {2000}
-    assert {c.adam_steps for c in cases if c.solver == "gauss-newton"} == {None}
+def test_the_cases_are_trials_by_batch():
+    cases = bench.fit_cases("gauss-newton", (1, 10), (1, 16, 64), 3, 2)
+    assert [(c.data.n_trials, c.batch) for c in cases] == [(n, b) for n in (1, 10) for b in (1, 16, 64)]
     assert all(c.data.n_sessions == (c.batch if c.batch > 1 else 3) for c in cases)
-    assert len({bench.label(c) for c in cases}) == len(cases)
+    assert len({c.label for c in cases}) == len(cases)
+
+
+def test_the_cases_of_the_comparison_are_solver_by_trials_by_camera_by_batch():
+    methods = list(comparison.METHOD_OF.values())
+    cases = comparison.speed_cases(methods, (1, 10), fit_data.MOTIONS, (1, 16, 64), 3, 3)
+    assert len(cases) == 2 * 2 * 3 + 2 * 2
+    assert {c.batch for c in cases if c.method == "paper-2025"} == {1}
+    assert all(c.data.n_sessions == (c.batch if c.batch > 1 else 3) for c in cases)
+    assert len({c.label for c in cases}) == len(cases)
 
 
 @pytest.mark.parametrize(
-    ("options", "sections", "n"),
-    [
-        (["--quick"], {"speed"}, 3),
-        (["--solver", "gauss-newton", "--trials", "1", "--batch", "1,64", "--motion", "handheld"], {"speed"}, 2),
-        (["--long"], {"long"}, 2),
-        (["--robust"], {"robust"}, 5),
-        (["--long", "--robust", "--solver", "all", "--motion", "handheld"], {"long", "robust"}, 7),
-    ],
+    ("options", "n"),
+    [(["--quick"], 1), (["--trials", "1", "--batch", "1,64"], 2), (["--method", "paper-2025", "--batch", "1"], 2)],
 )
-def test_options_choose_the_cases(options, sections, n, monkeypatch, tmp_path):
+def test_options_choose_the_cases(options, n, monkeypatch, tmp_path):
     asked = []
 
     def run_cases(cases, timeout_s, note):
@@ -66,17 +59,38 @@ def test_options_choose_the_cases(options, sections, n, monkeypatch, tmp_path):
     done = CliRunner().invoke(command, ["fit", *options, "--json", str(tmp_path / "a.json")])
     assert done.exit_code == 0, done.output
     assert json.loads((tmp_path / "a.json").read_text())["rows"][0]["warm_seconds"] == 2.0
-    assert {c.section for c in asked} == sections
     assert len(asked) == n
 
 
-@pytest.mark.parametrize("options", [["--trials", "one"], ["--batch", "0"], ["--solver", "adam"], ["--seeds", "0"]])
+@pytest.mark.parametrize(
+    ("options", "n"),
+    [
+        (["--quick"], 4),
+        (["--solver", "gauss-newton", "--trials", "1", "--batch", "1,64", "--motion", "handheld"], 2),
+        (["--long"], 2),
+        (["--long", "--solver", "all", "--motion", "handheld"], 2),
+    ],
+)
+def test_options_choose_the_cases_of_the_comparison(options, n, monkeypatch):
+    asked = []
+
+    def run_cases(cases, timeout_s, note, programs):
+        asked.extend(cases)
+        return [compared(row())]
+
+    monkeypatch.setattr(comparison, "run_cases", run_cases)
+    done = CliRunner().invoke(comparison.main, options)
+    assert done.exit_code == 0, done.output
+    assert len(asked) == n
+
+
+@pytest.mark.parametrize("options", [["--trials", "one"], ["--batch", "0"], ["--seeds", "0"]])
 def test_wrong_options_are_refused(options):
     assert CliRunner().invoke(command, ["fit", *options]).exit_code == 2
 
 
 def test_batches_of_the_paper_solver_alone_are_no_benchmark():
-    done = CliRunner().invoke(command, ["fit", "--solver", "implicit-adam", "--batch", "16"])
+    done = CliRunner().invoke(comparison.main, ["--solver", "implicit-adam", "--batch", "16"])
     assert done.exit_code == 2
     assert "gauss-newton" in done.output
 
@@ -90,20 +104,31 @@ def test_the_process_that_starts_others_imports_no_jax():
 
 
 def test_data_are_written_and_read_again(tmp_path):
-    data = Data(n_trials=2, motion="handheld", n_frames=200, trouble="all", n_sessions=2)
-    _data.write(tmp_path, data)
-    keypoints, truth = _data.read(tmp_path, data, 1)
+    what = Data(n_trials=2, n_sessions=2, n_frames=200)
+    data.write(tmp_path, what)
+    first, second = data.sessions(tmp_path)
+    keypoints, truth = data.read_keypoints(second), data.read_truth(second)
     assert len(keypoints) == len(truth) == 2
-    k = keypoints[0]
-    assert k.xy_px.shape == (200, 87, 2)
-    assert truth[0].qpos.shape == (200, 40)
-    assert truth[0].clock_offset_s == 0.04
-    assert not np.allclose(truth[0].qpos, truth[1].qpos)
-    assert np.all(k.confidence[:, k.names.index(NEVER_SEEN)] == 0)
-    gone = np.flatnonzero(k.confidence.max(axis=1) == 0) / 30
-    assert gone[0] == UNSEEN_S[0]
-    assert len(gone) == 30
-    assert data.key != dataclasses.replace(data, motion="static").key
+    assert keypoints[0].xy_px.shape == (200, 87, 2)
+    assert truth[0].shape == (200, 40)
+    assert not np.allclose(truth[0], truth[1])
+    assert not np.allclose(truth[0], data.read_truth(first)[0])
+    # All of the person in the picture; the benchmark's fraction of missing points.
+    seen = keypoints[0].xy_px[keypoints[0].confidence > 0]
+    assert np.mean(keypoints[0].confidence == 0) == pytest.approx(0.05, abs=0.01)
+    assert np.mean(np.all((seen > 0) & (seen < [1080, 1920]), axis=1)) > 0.99
+    assert what.key != dataclasses.replace(what, n_trials=1).key
+
+
+def test_data_of_the_comparison_have_a_camera(tmp_path):
+    what = fit_data.WalkerData(n_trials=1, n_sessions=1, n_frames=60, motion="handheld", short_side_px=720)
+    fit_data.write(tmp_path, what)
+    (session,) = data.sessions(tmp_path)
+    (keypoints,) = data.read_keypoints(session)
+    assert keypoints.image_size_px == (720, 1280)
+    assert data.read_truth(session, "R_nc")[0].shape == (60, 3, 3)
+    assert float(data.read_truth(session, "clock_offset_s")[0]) == 0.04
+    assert what.key != dataclasses.replace(what, motion="static").key
 
 
 # --- the measures
@@ -141,61 +166,42 @@ def test_the_mean_over_trials_leaves_out_what_is_unknown():
 # --- the table
 
 
-def row(solver="gauss-newton", motion="static", batch=1, warm=2.0, main=1.0, section="speed", **more):
-    case = Case(section, solver, Data(motion=motion, n_frames=more.pop("n_frames", 300)), batch)
-    figures = {
-        "cold_seconds": 20.0,
-        "start_seconds": 6.0,
-        "warm_seconds": warm,
-        "host_bytes": 1e9,
-        "device_bytes": None,
-    }
-    accuracy = {"all_deg": 2 * main, "main_deg": main, "camera_deg": 0.5, "unknown_share": 0.0}
-    out = {"label": bench.label(case), **dataclasses.asdict(case), **figures, "paper_loss": 9.0, "accuracy": accuracy}
+def row(method="gauss-newton", batch=1, **more):
+    """A row of `pbl bench fit`."""
+    of = Case(method, Data(), batch)
+    figures = {"cold_seconds": 20.0, "start_seconds": 6.0, "warm_seconds": 2.0, "host_bytes": 1e9, "device_bytes": None}
+    accuracy = {"all_deg": 2.0, "main_deg": 1.0, "unknown_share": 0.0}
+    out = {"label": of.label, **dataclasses.asdict(of), **figures, "accuracy": accuracy}
     return {**out, "device": "cpu", "cores": 2, "jax": "0", **more}
 
 
-def test_ratios_compare_what_the_bars_compare():
-    rows = [
-        row(),
-        row("implicit-adam", warm=50.0, main=1.1, paper_loss=8.91, adam_steps=2000),
-        row(motion="handheld", main=1.05),
-        row(batch=64, warm=6.4),
-    ]
-    found = {r["what"]: r for r in ratios(rows)}
-    assert len(found) == 3
-    solvers = found["implicit-adam 2,000 steps / gauss-newton, 1 trial, static"]
-    assert solvers["seconds"] == pytest.approx(25)
-    assert solvers["main_error"] == pytest.approx(1.1)
-    assert solvers["loss"] == pytest.approx(0.99)
-    held = found["handheld / static, gauss-newton, 1 trial"]
-    assert held["all_error"] == pytest.approx(1.05)
-    # A figure of the ratio must not be taken for an error code.
-    text = ratio_text(rows)
-    assert sum(line.startswith("handheld / static") and line.endswith("1.000") for line in text.splitlines()) == 1
-    batch = found["batch 64 / one by one, gauss-newton, 1 trial, static"]
-    assert batch["sessions_per_s"] == pytest.approx((64 / 6.4) / (1 / 2.0))
-
-
-def test_ratio_of_twice_the_frames():
-    rows = [row(section="long", n_frames=5400, warm=20.0), row(section="long", n_frames=10800, warm=42.0)]
-    (found,) = ratios(rows)
-    assert found["seconds"] == pytest.approx(2.1)
-    assert found["memory"] == pytest.approx(1.0)
+def compared(of, motion="handheld"):
+    """The row as the comparison of solvers has it."""
+    data = dataclasses.asdict(fit_data.WalkerData(motion=motion))
+    return {**of, "data": data, "paper_loss": 9.0, "accuracy": {**of["accuracy"], "camera_deg": 0.5, "clock_ms": 1.0}}
 
 
 def test_the_table_shows_every_row_and_the_code_of_one_that_failed():
-    failed = {**row("implicit-adam", motion="handheld"), "error": "FIT_DIVERGED", "error_text": "FIT_DIVERGED: why"}
-    failed = {k: v for k, v in failed.items() if k not in ("accuracy", "warm_seconds", "paper_loss")}
-    text = bench.text([row(), row(motion="handheld"), failed])
+    failed = {**row("paper-2025"), "error": "FIT_DIVERGED", "error_text": "FIT_DIVERGED: why"}
+    failed = {k: v for k, v in failed.items() if k not in ("accuracy", "warm_seconds")}
+    text = bench.fit_text([row(), row(batch=64), failed])
     lines = text.splitlines()
-    assert sum(line.startswith(("gauss-newton   ", "implicit-adam  ")) for line in lines) == 3
-    (bad,) = [line for line in lines if line.startswith("implicit-adam  ")]
+    assert sum(line.startswith(("gauss-newton   ", "paper-2025  ")) for line in lines) == 3
+    (bad,) = [line for line in lines if line.startswith("paper-2025  ")]
     assert bad.endswith("FIT_DIVERGED")
     assert "FIT_DIVERGED: why" in text
-    assert "2.000" in lines[3]
-    assert "extrapolated" not in text
-    assert "extrapolated" in bench.text([row("implicit-adam", adam_steps=10)])
+    assert "2.000" in lines[2]
+    assert "32.00" in lines[3]  # sessions a second
+
+
+def test_the_table_of_the_comparison_has_the_camera_of_a_held_phone_only():
+    rows = [compared(row()), compared(row("paper-2025"), "static"), compared(row("some/adam-500.json"))]
+    text = comparison.text(rows)
+    held, still, short = text.splitlines()[2:5]
+    assert held.split()[-3:] == ["0.50", "1.0", "9.00"]
+    assert still.split()[-3:] == ["-", "-", "9.00"]
+    assert short.startswith("adam-500 ")
+    assert "the paper's objective" in text
 
 
 # --- real runs
@@ -204,11 +210,10 @@ def test_the_table_shows_every_row_and_the_code_of_one_that_failed():
 @pytest.mark.slow
 def test_a_case_is_measured(tmp_path):
     """In this process and with its cache, so what is tested is that every figure is there, not how fast it was."""
-    data = Data(n_frames=64, n_sessions=2)
-    _data.write(tmp_path, data)
-    case = Case("speed", "gauss-newton", data, repeat=2)
+    data.write(tmp_path, Data(n_frames=64, n_sessions=2))
     begin = time.time()
-    got = _case.measure(case, tmp_path, "warm", begin - 100.0)
+    how = {"method": "gauss-newton", "batch": 1, "repeat": 2, "camera_motion": "static", "judge": case.accuracy_of}
+    got = case.measure(tmp_path, "warm", begin - 100.0, **how)
     assert 100 < got["first_seconds"] < 100 + time.time() - begin
     assert len(got["warm_seconds_each"]) == 2
     assert got["warm_seconds"] == min(got["warm_seconds_each"])
@@ -216,48 +221,43 @@ def test_a_case_is_measured(tmp_path):
     assert got["host_bytes"] > 1e8
     assert got["n_sessions"] == 2
     assert 0 < got["accuracy"]["main_deg"] < 6
-    assert got["accuracy"]["sd_all_deg"] > 0
-    assert 1 < got["paper_loss"] < 100
     assert "error" not in got
-    assert _case.machine()["cores"] >= 1
+    assert case.machine()["cores"] >= 1
 
 
 @pytest.mark.slow
-def test_a_batch_is_measured_and_compared_with_the_sessions_alone(tmp_path):
-    data = Data(n_frames=64, n_sessions=2, motion="handheld")
-    _data.write(tmp_path, data)
-    got = _case.measure(Case("speed", "gauss-newton", data, batch=2, repeat=1), tmp_path, "warm", time.time())
+def test_a_batch_of_the_comparison_is_measured_and_compared_with_the_sessions_alone(tmp_path):
+    fit_data.write(tmp_path, fit_data.WalkerData(n_frames=64, n_sessions=2, motion="handheld"))
+    how = {"method": "gauss-newton", "batch": 2, "repeat": 1, "camera_motion": "handheld", "judge": accuracy_of}
+    got = case.measure(tmp_path, "warm", time.time(), **how)
     assert got["n_sessions"] == 2
     assert got["batch_difference_rad"] < 1e-3
     assert got["accuracy"]["camera_deg"] < 5
     assert got["accuracy"]["clock_ms"] < 40
-
-
-def test_fewer_steps_are_another_paramset():
-    assert _case.paramset_of("implicit-adam", 20).name == "paper-2025, 20 steps"
-    assert _case.paramset_of("implicit-adam", None).name == "paper-2025"
-    assert _case.paramset_of("implicit-adam", 25_000).name == "paper-2025"
+    assert 1 < got["paper_loss"] < 100
 
 
 @pytest.mark.slow
-def test_a_case_in_its_own_process_that_fails_is_a_row_with_its_code(tmp_path):
+def test_fewer_steps_are_another_method_of_its_own_process(tmp_path):
     """Twenty frames are under a second: the fit refuses them."""
-    (got,) = bench.run_cases([Case("speed", "implicit-adam", Data(n_frames=20, n_sessions=1), repeat=1)], 120.0)
+    short = comparison.shorter(tmp_path, 20)
+    (got,) = bench.run_cases([Case(short, Data(n_frames=20, n_sessions=1), repeat=1)], 120.0)
+    assert got["label"].startswith("adam-20, ")
     assert got["error"] == "FIT_INPUT"
     assert got["cold_seconds"] is None
     assert got["start_seconds"] is None
-    assert "FIT_INPUT" in bench.text([got])
+    assert "FIT_INPUT" in bench.fit_text([got])
     json.dumps(got, allow_nan=False)
 
 
 @pytest.mark.slow
 def test_a_case_that_hangs_is_ended():
-    (got,) = bench.run_cases([Case("speed", "implicit-adam", Data(n_frames=40, n_sessions=1))], 0.5)
+    (got,) = bench.run_cases([Case("paper-2025", Data(n_frames=40, n_sessions=1))], 0.5)
     assert got["error"] == "over 0.5 s"
 
 
-def test_an_unknown_solver_has_a_code(monkeypatch):
-    monkeypatch.setitem(_case.PARAMSET_OF, "gauss-newton", "no-such")
-    with pytest.raises(PblError, match="no-such") as error:
-        _case.paramset_of("gauss-newton", None)
-    assert error.value.code == "SOLVER_UNKNOWN"
+@pytest.mark.slow
+def test_an_unknown_method_has_a_code():
+    (got,) = bench.run_cases([Case("no-such", Data(n_frames=40, n_sessions=1))], 120.0)
+    assert got["error"] == "SOLVER_UNKNOWN"
+    assert "no-such" in got["error_text"]

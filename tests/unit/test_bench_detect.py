@@ -10,10 +10,10 @@ from click.testing import CliRunner
 
 from pbl_pipeline import assets
 from pbl_pipeline.bench import detect_text
-from pbl_pipeline.bench._clip import repeated
-from pbl_pipeline.bench._detect_case import growth
+from pbl_pipeline.bench.detect_case import growth
 from pbl_pipeline.cli.bench import bench
 from pbl_pipeline.video import probe, read_frames
+from research.benchmarks.longer_video import repeated
 from tests.unit.test_blazepose import asset
 from tests.videos import constant_rate, numbered_frames, write_video
 

@@ -20,18 +20,12 @@ from pbl_pipeline.keypoints import (
     probability_within,
 )
 from pbl_pipeline.synthetic import Synthetic, SynthSpec, synthesise
-from pbl_pipeline.validation import (
-    PointErrors,
-    point_errors,
-    reliability_table,
-    resect,
-    truth_of_synthetic,
-    truth_of_trc,
-    write_reliability,
-)
 from pbl_pipeline.video import CameraPose
 from research.confidence import curve_params, fit_curve, leave_one_out, save_curve
-from schemas.cli.validate import validate
+from research.reliability.__main__ import main
+from research.reliability.page import write_reliability
+from research.reliability.point_errors import PointErrors, point_errors, reliability_table
+from research.reliability.point_truth import resect, truth_of_synthetic, truth_of_trc
 from tests.unit.test_shortcomings import person
 
 
@@ -263,11 +257,11 @@ def test_page_and_csv_name_every_dataset(tmp_path):
 def test_the_command_on_a_synthetic_trial(trial, tmp_path):
     paths = trial.save(tmp_path, "walk")
     keypoints, truth = (next(str(p) for p in paths if end in p.name) for end in ("keypoints", "truth"))
-    done = CliRunner().invoke(validate, ["reliability", keypoints, "--truth", truth, "--out", str(tmp_path / "out")])
+    done = CliRunner().invoke(main, [keypoints, "--truth", truth, "--out", str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
     assert (tmp_path / "out" / "reliability.html").exists()
     assert "within 20 %" in done.output
-    wrong = CliRunner().invoke(validate, ["reliability", keypoints, "--truth", truth, "--truth", truth])
+    wrong = CliRunner().invoke(main, [keypoints, "--truth", truth, "--truth", truth])
     assert wrong.exit_code == 2
-    no_camera = CliRunner().invoke(validate, ["reliability", keypoints, "--truth", truth, "--camera", "a"])
+    no_camera = CliRunner().invoke(main, [keypoints, "--truth", truth, "--camera", "a"])
     assert no_camera.exit_code == 2

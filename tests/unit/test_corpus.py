@@ -12,25 +12,18 @@ import pytest
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GDI_METHODS, GdiParams, detect_events, feet_from_fit
-from pbl_pipeline.synthetic import DETECTORS, NO_NOISE, VIEWS_DEG, Noise, observe, plain_walk
-from pbl_pipeline.validation import (
-    Case,
-    Motion,
-    Walk,
-    corpus_errors,
-    corpus_tables,
-    fit_of_qpos,
-    is_held_out,
-    lasting,
-    print_corpus,
-    responsiveness,
-    write_corpus,
-)
-from pbl_pipeline.validation._corpus import joined
-from pbl_pipeline.validation._corpus_errors import view_table
+from pbl_pipeline.synthetic import NO_NOISE, VIEWS_DEG, Noise, plain_walk
+from research.corpus.errors import corpus_errors, corpus_tables, print_corpus, responsiveness, view_table, write_corpus
+from research.corpus.motions import Motion
+from research.corpus.true_fit import fit_of_qpos
+from research.corpus.walks import Case, Walk, is_held_out, joined, lasting
+from research.walker.detectors import DETECTORS, DetectorNoise
+from research.walker.observe import observe
 
 COLUMN = {n: i for i, n in enumerate(load_body().joint_names)}
 TIME_S = np.arange(180) / 30
+#: A detector that errs in nothing.
+QUIET = DetectorNoise(**dataclasses.asdict(NO_NOISE))
 
 
 def _walk(person: str = "somebody", condition: str = "healthy", severity: float = 0.0, knee_deg: float = 0.0) -> Walk:
@@ -108,7 +101,7 @@ def _errors_of(noise: Noise, view: str = "frontal", seeds: int = 4) -> list[tupl
 
 
 def test_pixels_err_with_a_memory_by_constants_and_with_distance():
-    noise = dataclasses.replace(NO_NOISE, xy_m=0.02, xy_correlation=0.9, xy_constant_m=0.015)
+    noise = dataclasses.replace(QUIET, xy_m=0.02, xy_correlation=0.9, xy_constant_m=0.015)
     errors = [e for e, _ in _errors_of(noise)]
     constant = np.array([e.mean(axis=0) for e in errors])
     moving = np.concatenate([e - e.mean(axis=0) for e in errors], axis=1)
@@ -118,7 +111,7 @@ def test_pixels_err_with_a_memory_by_constants_and_with_distance():
 
 
 def test_the_far_leg_loses_movement_from_the_side_and_not_from_the_front():
-    noise = dataclasses.replace(NO_NOISE, far_still=0.5)
+    noise = dataclasses.replace(QUIET, far_still=0.5)
     for view, lost in (("sagittal", True), ("frontal", False)):
         ((xy, _),) = _errors_of(noise, view, seeds=1)
         near, far = (np.abs(xy[:, j]).max() for j in (27, 28))  # left and right ankle: the left side is near
@@ -126,19 +119,11 @@ def test_the_far_leg_loses_movement_from_the_side_and_not_from_the_front():
         assert (far > 0.08) == lost
 
 
-def test_legs_are_exchanged_for_a_while():
-    noise = dataclasses.replace(NO_NOISE, exchanged_per_s=0.5, exchanged_s=0.3)
-    moved = np.concatenate([np.abs(x[:, 27]).max(axis=-1) > 0.05 for _, x in _errors_of(noise)])
-    kept = np.concatenate([np.abs(x[:, 11]).max(axis=-1) for _, x in _errors_of(noise)])
-    assert 0.02 < moved.mean() < 0.4
-    assert kept.max() < 1e-9
-
-
 def test_the_benchmarks_noise_is_what_it_was():
     """Fields that came later draw nothing where they are off: figures of the benchmark stay comparable."""
     seen = observe(plain_walk(TIME_S), TIME_S, seed=3)
     assert np.isnan(seen.keypoints.xy_px).any(axis=(1, 2)).any()
-    again = observe(plain_walk(TIME_S), TIME_S, seed=3, noise=dataclasses.replace(Noise(), wander_correlation=0.5))
+    again = observe(plain_walk(TIME_S), TIME_S, seed=3, noise=DetectorNoise(wander_correlation=0.5))
     assert np.array_equal(seen.keypoints.xy_px, again.keypoints.xy_px, equal_nan=True)
 
 

@@ -32,15 +32,8 @@ from pbl_pipeline.deidentify._types import BODY, DISAGREE, HELD, KEYPOINTS, NONE
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import BlazePoseLandmarks, Keypoints
 from pbl_pipeline.tracking import PersonTrack
-from pbl_pipeline.validation import (
-    HeadCoverage,
-    LocatedClip,
-    LocatedHead,
-    frame_coverage,
-    head_coverage,
-    located_clips,
-)
 from pbl_pipeline.video import Camera, probe, read_frames, read_metadata, write_h264
+from research.heads.coverage import HeadCoverage, LocatedClip, LocatedHead, frame_coverage, head_coverage, located_clips
 from tests.command import pbl
 from tests.unit.test_blazepose import asset
 from tests.videos import constant_rate, numbered_frames, write_video

@@ -26,7 +26,7 @@ from pbl_pipeline.gait.events._phase import double_support_s
 from pbl_pipeline.gait.events.network.predict import load, model_path
 from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.synthetic import Impairment, SynthSpec, Truth, synthesise
-from pbl_pipeline.validation import fit_of_qpos
+from research.corpus.true_fit import fit_of_qpos
 from research.events._gaits import curve_foot_off, gait_angles
 from research.events._leg import leg_points
 from research.events._rhythm import Rhythm, draw_run, leg_phase, schedule

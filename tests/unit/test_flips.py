@@ -11,11 +11,11 @@ import pytest
 from pbl_pipeline.body import SCALE_NAMES
 from pbl_pipeline.keypoints import Keypoints, check_keypoints
 from pbl_pipeline.keypoints._flips import Exchange, FlipParams, exchange_sides, exchanged, lowered, mirror_of
-from pbl_pipeline.synthetic import SynthSpec, _synth, synthesise
+from pbl_pipeline.synthetic import SynthSpec, synth, synthesise
 
 pytestmark = pytest.mark.slow
 
-_synth_physique = _synth.physique
+_synth_physique = synth.physique
 
 
 @functools.cache
@@ -80,7 +80,7 @@ def test_legs_of_very_different_length_are_neither_exchanged_nor_mistaken(monkey
         scale, offsets = _synth_physique(seed, markers)
         return np.where(np.isin(SCALE_NAMES, short), 0.7, 1.0) * scale, offsets
 
-    monkeypatch.setattr(_synth, "physique", physique)
+    monkeypatch.setattr(synth, "physique", physique)
     keypoints = seen.__wrapped__(view=view)
     hip, knee, ankle = (keypoints.xyz_cam_m[:, keypoints.names.index(f"left_{n}")] for n in ("hip", "knee", "ankle"))
     assert not judged(keypoints).table.any()

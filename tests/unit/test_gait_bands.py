@@ -7,7 +7,7 @@ import pytest
 
 from pbl_pipeline.gait import BODY_ANGLES, PLUG_IN_GAIT, Measure, Spatiotemporal, leg_length_m, normal_bands
 from pbl_pipeline.gait.normative import GRAVITY, gait_norm
-from pbl_pipeline.synthetic._physique import leg_length_m as by_mujoco
+from pbl_pipeline.synthetic.physique import leg_length_m as by_mujoco
 
 LEG_M = 0.9
 PHASE = 2 * np.pi * np.linspace(0, 1, 51)

@@ -49,7 +49,9 @@ from pbl_pipeline.fit.problem import SAMPLE_S, TrialArrays, bend_weights, pack, 
 from pbl_pipeline.fit.session import Session, make_session
 from pbl_pipeline.fit.solvers import linear
 from pbl_pipeline.fit.solvers.linear import BorderedBandedSystem, marginal_variance, solve
-from pbl_pipeline.synthetic import observe, observe_markers, observe_views, walk_qpos
+from research.walker.observe import observe
+from research.walker.views import observe_markers, observe_views
+from research.walker.walk import walk_qpos
 
 pytestmark = pytest.mark.slow
 

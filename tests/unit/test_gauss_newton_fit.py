@@ -35,16 +35,10 @@ from pbl_pipeline.fit.solution import Solution
 from pbl_pipeline.fit.vertical import on_their_feet, vertical
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
-from pbl_pipeline.synthetic import (
-    METRABS_MEMORY,
-    Noise,
-    Seen,
-    observe,
-    observe_markers,
-    observe_views,
-    person,
-    walk_qpos,
-)
+from pbl_pipeline.synthetic import CORRELATED_NOISE, Noise, Seen
+from research.walker.observe import observe
+from research.walker.views import observe_markers, observe_views
+from research.walker.walk import person, walk_qpos
 
 PARAMSET = METHODS["gauss-newton"]
 pytestmark = pytest.mark.slow
@@ -134,7 +128,7 @@ def test_intervals_of_90_percent_hold_the_truth():
     vertical from the walk moves."""
     inside = []
     for seed in SEEDS:
-        trial = fit_session([look(seed, noise=METRABS_MEMORY).keypoints], ["a"], PARAMSET).trials[0]
+        trial = fit_session([look(seed, noise=CORRELATED_NOISE).keypoints], ["a"], PARAMSET).trials[0]
         known = np.isfinite(trial.qpos).all(axis=1)
         error = np.angle(np.exp(1j * (trial.qpos - walk(seed))[known]))
         inside.append(np.abs(error) < 1.645 * trial.qpos_sd[known])

@@ -12,7 +12,9 @@ import pytest
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, SessionInput, fit_sessions, problem
 from pbl_pipeline.keypoints import Keypoints
-from pbl_pipeline.synthetic import observe, observe_markers, walk_qpos
+from research.walker.observe import observe
+from research.walker.views import observe_markers
+from research.walker.walk import walk_qpos
 
 pytestmark = pytest.mark.slow
 

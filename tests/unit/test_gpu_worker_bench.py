@@ -1,10 +1,10 @@
-"""The arithmetic of `tests/benchmarks/gpu_worker.py` on spans made by hand."""
+"""The arithmetic of `research/benchmarks/gpu_worker.py` on spans made by hand."""
 
 from __future__ import annotations
 
 import pytest
 
-from tests.benchmarks.gpu_worker import Plan, figures, plans, union_s, windows
+from research.benchmarks.gpu_worker import Plan, figures, plans, union_s, windows
 
 
 def span(name: str, begin: float, end: float, n: float = 1, compiling: float = 0.0) -> dict:

@@ -9,7 +9,7 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import probe
-from tests.benchmarks.hostile import KINDS
+from research.benchmarks.hostile import KINDS
 from tests.integration import chain
 
 

@@ -25,15 +25,10 @@ from pbl_pipeline.fit.priors import PAPER_PHONE_DEG, Weights
 from pbl_pipeline.fit.session import Session, make_session
 from pbl_pipeline.fit.solvers.adam import Schedule, optimiser
 from pbl_pipeline.fit.trajectory import encode, evaluate, fit_ranges, frequencies, initial_trajectories
-from pbl_pipeline.synthetic import (
-    NO_NOISE,
-    PhoneSensor,
-    observe,
-    observe_markers,
-    observe_views,
-    pelvis_positions,
-    walk_qpos,
-)
+from pbl_pipeline.synthetic import NO_NOISE, PhoneSensor, pelvis_positions
+from research.walker.observe import observe
+from research.walker.views import observe_markers, observe_views
+from research.walker.walk import walk_qpos
 
 pytestmark = pytest.mark.slow
 

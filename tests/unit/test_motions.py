@@ -11,8 +11,9 @@ import pytest
 
 from pbl_pipeline.body import joint_angles, load_body
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.synthetic import pelvis_positions, plain_walk, sole_points, turned
-from pbl_pipeline.validation import read_index, read_motion, read_motions, stride_s
+from pbl_pipeline.synthetic import pelvis_positions, plain_walk, sole_points
+from research.corpus.motions import read_index, read_motion, read_motions, stride_s
+from research.walker.turns import turned
 
 BODY = load_body()
 COLUMN = {n: i for i, n in enumerate(BODY.joint_names)}

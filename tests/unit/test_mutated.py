@@ -1,4 +1,4 @@
-"""A few files of each kind of `tests.benchmarks.mutated`, and those whose fault chance seldom finds."""
+"""A few files of each kind of `research.benchmarks.mutated`, and those whose fault chance seldom finds."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.errors import PblError
-from tests.benchmarks import mutated_files as files
-from tests.benchmarks.mutated import kinds, outcomes
+from research.benchmarks import mutated_files as files
+from research.benchmarks.mutated import kinds, outcomes
 from tests.guard import guarded
 
 KINDS = {kind.name: kind for kind in kinds()}

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.fit.priors import learned_poses
-from pbl_pipeline.validation import is_held_out, read_motions
+from research.corpus.motions import read_motions
+from research.corpus.walks import is_held_out
 from research.poses import JOINTS, MIDDLE, learn, mirrored
 from tests.conftest import SHARED
 

@@ -1,7 +1,7 @@
 """Marker sets for real recordings: laboratory markers of two walks, OpenPose's points from four cameras.
 
 The fits here take a little over a second of movement each, the least that is accepted; the commands
-`tests/benchmarks/{marker_ik,multiview}.py` print the whole of it.
+`research/benchmarks/{marker_ik,multiview}.py` print the whole of it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import pytest
 from pbl_pipeline.body import load_body, marker_positions, marker_set
 from pbl_pipeline.fit import METHODS, fit_session
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
-from tests.benchmarks import marker_ik, multiview
+from research.benchmarks import marker_ik, multiview
 
 #: Computed by others from the same markers, so no observations.
 NOT_MARKERS = {"L_HJC", "L_HJC_reg", "R_HJC", "R_HJC_reg"}

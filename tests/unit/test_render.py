@@ -33,8 +33,9 @@ from pbl_pipeline.render import (
     to_pixels,
     uncertain_sides,
 )
-from pbl_pipeline.synthetic import NO_NOISE, observe, plain_walk
+from pbl_pipeline.synthetic import NO_NOISE, plain_walk
 from pbl_pipeline.video import Camera, probe, read_frames
+from research.walker.observe import observe
 from tests.videos import write_video
 from tests.walking_fit import LEVEL_CAMERA_QUAT_WXYZ, walking_fit
 

@@ -11,7 +11,7 @@ from scipy import stats
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.stats import CURVE_METHODS, curve_test
-from tests.benchmarks.curve_alarms import CASES, alarms, smooth, walks
+from research.benchmarks.curve_alarms import CASES, alarms, smooth, walks
 
 
 def curves(seed: int, n: int, points: int = 101) -> np.ndarray:
@@ -159,7 +159,7 @@ def test_own_examples_of_spm1d(name):
 
 @pytest.mark.parametrize("name", [n for n in CASES if "unequal" in n and ("17" in n or "1 to 20" in n)])
 def test_false_alarms_of_a_few_studies(name):
-    """The command `python -m tests.benchmarks.curve_alarms` has 4,000; here the bounds of 100 at 5 %."""
+    """The command `python -m research.benchmarks.curve_alarms` has 4,000; here the bounds of 100 at 5 %."""
     assert 0.01 <= alarms(CASES[name], "max-t", 100, 3, 200) <= 0.12
 
 

@@ -1,10 +1,10 @@
-"""Intervals hold the truth of simulated cohorts: few studies here, 400 by `tests.benchmarks.study_intervals`."""
+"""Intervals hold the truth of simulated cohorts: few studies here, 400 by `research.benchmarks.study_intervals`."""
 
 from __future__ import annotations
 
 import pytest
 
-from tests.benchmarks.study_intervals import cases, held
+from research.benchmarks.study_intervals import cases, held
 
 CASES = cases()
 

@@ -31,6 +31,7 @@ from pbl_pipeline.gait import (
     score_gdi,
 )
 from pbl_pipeline.gait.events import load_events
+from pbl_pipeline.gait.normative import gait_norm
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.synthetic import (
     IMPAIRMENTS,
@@ -40,13 +41,12 @@ from pbl_pipeline.synthetic import (
     Synthetic,
     SynthSpec,
     Truth,
-    gait_norm,
     picture_px,
     speed_of_group,
     synthesise,
     true_markers,
 )
-from pbl_pipeline.validation import fit_of_qpos
+from research.corpus.true_fit import fit_of_qpos
 
 pytestmark = pytest.mark.slow
 

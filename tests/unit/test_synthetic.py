@@ -18,14 +18,12 @@ from pbl_pipeline.synthetic import (
     PHONE_SIZE_PX,
     Noise,
     PhoneSensor,
-    observe,
-    observe_markers,
-    observe_views,
     pelvis_positions,
-    person,
     true_markers,
-    walk_qpos,
 )
+from research.walker.observe import observe
+from research.walker.views import observe_markers, observe_views
+from research.walker.walk import person, walk_qpos
 
 TIME_S = np.arange(300) / 30
 FINE_S = np.arange(0, 4, 1 / 200)

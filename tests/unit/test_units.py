@@ -22,8 +22,9 @@ from pbl_pipeline.fit.units import (
     pixel_px,
 )
 from pbl_pipeline.keypoints import Keypoints
-from pbl_pipeline.synthetic import observe, person, walk_qpos
-from tests.benchmarks.picture_size import multiplied
+from research.benchmarks.picture_size import multiplied
+from research.walker.observe import observe
+from research.walker.walk import person, walk_qpos
 
 TIME_S = np.arange(60) / 30
 

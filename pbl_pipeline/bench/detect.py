@@ -1,0 +1,83 @@
+"""Frames a second, processor time and memory of detection on one video."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from .run import Row
+from .table import Column, mega, number, table
+
+
+def run_detect(
+    video: Path | None,
+    person: int | None,
+    repeat: int,
+    timeout_s: float,
+    note: Callable[[str], None] = lambda _: None,
+    keypoints: Sequence[str] = (),
+) -> Iterator[Row]:
+    """Measure probe, tracking and keypoints on `video` (None: `demo_clip`): a row for each keypoint method of
+    `keypoints` (none: the default), one after the other.
+
+    The measured process does nothing else, and a failure in it is a row with `error`. Raises the `PblError`s of
+    `demo_clip`, and VIDEO_MISSING.
+    """
+    from .clip import demo_clip
+
+    with tempfile.TemporaryDirectory(prefix="pbl-bench-") as name:
+        folder = Path(name)
+        if video is None:
+            note("making a clip of 1920x1080 from the demo recording")
+            path = demo_clip(folder / "demo1080.mp4")
+        else:
+            from pbl_pipeline.video import sha256_of
+
+            sha256_of(video)  # raises what is wrong with the file before anything is measured
+            path = video
+        for method in keypoints or [""]:
+            note(f"measuring {method}".strip())
+            label = (str(video) if video else "demo recording at 1080p") + (f", {method}" if method else "")
+            spec = {"video": str(path), "person": person, "repeat": repeat, "keypoints": method or None}
+            yield {"label": label} | _measure(spec | {"result": str(folder / f"{method}.json")}, timeout_s)
+
+
+def _measure(spec: dict, timeout_s: float) -> Row:
+    """Return the figures of one case, measured in a separate process."""
+    command = [sys.executable, "-m", "pbl_pipeline.bench.detect_case", json.dumps(spec)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s)
+    except subprocess.TimeoutExpired:
+        return {"error": f"over {timeout_s:g} s"}
+    result = Path(spec["result"])
+    if not result.exists():
+        return {"error": f"died, exit {done.returncode}", "error_text": done.stderr[-2000:]}
+    return json.loads(result.read_text(encoding="utf-8"))
+
+
+def detect_text(row: Row) -> str:
+    """The row as a table of stages with what was measured above it."""
+    if "error" in row:
+        return f"{row['label']}: {row['error']}\n{row.get('error_text', '')}".strip()
+    frames = row["frames"]
+    columns: list[Column] = [
+        ("stage", lambda r: r["stage"]),
+        ("frames/s", lambda r: number(frames / r["seconds"], 1)),
+        ("ms a frame", lambda r: number(1e3 * r["seconds"] / frames, 1)),
+        ("CPU ms a frame", lambda r: number(1e3 * r["cpu_seconds"] / frames, 1)),
+        ("memory MB", lambda r: mega(r["host_bytes"])),
+        ("growth MB", lambda r: mega(r["growth_bytes"])),
+    ]
+    rows = [{"stage": name, **figures} for name, figures in row["stages"].items()]
+    rows.append({"stage": "all", **{k: row[k] for k in ("seconds", "cpu_seconds", "host_bytes")}, "growth_bytes": None})
+    head = (
+        f"{row['label']}: {row['width_px']}x{row['height_px']} {row['codec']}, {row['mbit_per_s']:.1f} Mbit/s, "
+        f"{frames:,} frames in {row['video_seconds']:.1f} s; people tracked: {row['persons']}, the measured one "
+        f"in view in {row['frames_in_view']:,} frames; {row['cores']} cores; "
+        f"the fastest of {len(row['runs_seconds'])} runs"
+    )
+    return f"{head}\n\n{table(rows, columns)}"

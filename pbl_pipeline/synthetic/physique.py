@@ -1,0 +1,61 @@
+"""A person for `pbl synth`: size, where the markers sit, and the body's kinematics at that size."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+# MuJoCo is a compiled module without type stubs.
+import mujoco  # pyright: ignore[reportMissingTypeStubs]
+import numpy as np
+from jaxtyping import Float
+
+from pbl_pipeline.body import SCALE_NAMES, MarkerSet, load_body
+
+from .curves import within
+
+#: Standard deviations of the size: overall, of the segments against it, of the left against the right side; of a
+#: marker's place on its body (m, each axis).
+OVERALL_SD, SEGMENT_SD, SIDE_SD, SITE_SD_M = 0.05, 0.02, 0.005, 0.006
+
+
+def physique(seed: int, markers: MarkerSet) -> tuple[Float[np.ndarray, " 8"], Float[np.ndarray, "J 3"]]:
+    """Scale (8,) and marker offsets (J, 3) in m of a person.
+
+    Left and right differ little: people whose legs differ by 5 % in length do not walk like healthy people.
+    """
+    rng = np.random.default_rng([seed, 11])
+    overall = 1 + within(rng, 0.0, OVERALL_SD)
+    segment = {name: within(rng, 0.0, SEGMENT_SD) for name in ("pelvis", "thigh", "leg_and_foot", "arm")}
+    scale = np.full(len(SCALE_NAMES), overall)
+    for i, name in enumerate(SCALE_NAMES):
+        part = name.removeprefix("left_").removeprefix("right_")
+        if part in segment:
+            own = within(rng, 0.0, SIDE_SD) if part != name else 0.0
+            scale[i] = overall + segment[part] + own
+    return scale, rng.normal(0, SITE_SD_M, (len(markers), 3))
+
+
+def scaled_model(scale: Float[np.ndarray, " 8"]) -> Any:
+    """The body as a C MuJoCo model with the origins of a person's size (for kinematics only)."""
+    body = load_body()
+    model = copy.copy(body.mj_model)
+    parent = body.parent_index
+    model.body_pos[1:] *= np.where(parent >= 0, np.asarray(scale)[body.scale_index[parent]], 1.0)[:, None]
+    return model
+
+
+def leg_length_m(scale: Float[np.ndarray, " 8"]) -> float:
+    """From the hip to the floor, standing upright, mean of both legs (m)."""
+    model = scaled_model(scale)
+    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
+    mujoco.mj_kinematics(model, data)  # pyright: ignore[reportAttributeAccessIssue]
+    names = load_body().body_names
+    at = {n: data.xpos[1 + names.index(n)] for n in ("femur_r", "calcn_r", "femur_l", "calcn_l")}
+    sole = [SOLE_M * scale[load_body().scale_index[names.index(f"calcn_{s}")]] for s in "rl"]
+    legs = [at[f"femur_{s}"][2] - at[f"calcn_{s}"][2] + h for s, h in zip("rl", sole, strict=True)]
+    return float(np.mean(legs))
+
+
+#: Height (m, unscaled) of the calcaneus' origin above the floor with the foot flat: the body stands at qpos = 0.
+SOLE_M = 0.015

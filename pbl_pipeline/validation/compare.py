@@ -1,0 +1,291 @@
+"""A fit against a reference: the errors of every joint they share."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from pbl_pipeline.body import PELVIS_TURNS
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.gait import Z90, trial_poses
+
+from .align import MIN_COMMON, about_vertical, align_path, at_times, best_lag, unwrapped, vertical_turn, wrapped
+from .joints import JOINTS_OPENCAP, JOINTS_PAPER
+from .reference import Reference
+from .rotations import pelvis_angles_deg, pelvis_rotations
+from .sources import fit_angles, fit_angles_sd
+from .view import MIXED, view_of_fit
+
+
+@dataclasses.dataclass(frozen=True)
+class JointError:
+    """Error of one joint over the common frames, error = fit - reference, degrees.
+
+    n: frames with both values. median_abs_deg, mean_abs_deg: of |error|. bias_deg: mean error. sd_deg: sd of the error
+    (ddof 0), which is its rms without the constant part. rms_deg: bias and sd together. correlation: Pearson's, NaN
+    where one of the two does not move. within_90: fraction of the frames inside 1.645 sd of the fit, NaN without sd.
+    """
+
+    joint: str
+    n: int
+    median_abs_deg: float
+    mean_abs_deg: float
+    bias_deg: float
+    sd_deg: float
+    rms_deg: float
+    correlation: float
+    within_90: float
+
+
+@dataclasses.dataclass(frozen=True)
+class KinematicErrors:
+    """Errors of one trial against its reference.
+
+    Attributes
+    ----------
+    lag_s
+        Of the video behind the reference (positive: the video is later).
+    n
+        Frames in which at least one joint could be compared.
+    joints
+        One entry per joint that both know, in the order of the reference.
+    median_abs_deg
+        Median of |error| over all frames and all joints of `JOINTS_PAPER` that are known: the paper's error of a trial.
+    rte_m
+        Mean distance of the pelvis path to the reference's, NaN where one is not known.
+    view
+        "right" and "left" -> "front", "back", "ipsilateral", "contralateral" or "mixed" (`view_classes`).
+    residual_2d_px, residual_3d_cm
+        Medians of the fit's residuals over frames and markers.
+    trial, reference, source, convention
+        Names of fit and reference, and of what kind the reference is.
+    max_lag_s
+        The search went this far to both sides; a lag at its end is suspicious (`lag_at_limit`).
+    """
+
+    lag_s: float
+    n: int
+    joints: tuple[JointError, ...]
+    median_abs_deg: float
+    rte_m: float
+    view: Mapping[str, str]
+    residual_2d_px: float
+    residual_3d_cm: float
+    trial: str = ""
+    reference: str = ""
+    source: str = ""
+    convention: str = ""
+    max_lag_s: float = float("nan")
+
+    @property
+    def lag_at_limit(self) -> bool:
+        """Whether the best lag is the largest that was tried: the true one may be larger."""
+        return self.max_lag_s > 0 and abs(self.lag_s) >= self.max_lag_s - 1e-9
+
+    def joint(self, name: str) -> JointError:
+        """The errors of one joint. Raises `PblError` REFERENCE_INPUT where it was not compared."""
+        for error in self.joints:
+            if error.joint == name:
+                return error
+        raise _refused(self.trial, f"no joint {name}", f"one of {', '.join(e.joint for e in self.joints)}")
+
+    def mean_abs_deg(self, joints: Sequence[str] = JOINTS_OPENCAP) -> float:
+        """Mean over those of `joints` that were compared of their mean absolute errors; NaN where none was."""
+        values = [e.mean_abs_deg for e in self.joints if e.joint in joints and np.isfinite(e.mean_abs_deg)]
+        return float(np.mean(values)) if values else float("nan")
+
+
+def compare(
+    fit: TrialFit, reference: Reference, max_lag_s: float = 0.1, *, same_world: bool = False
+) -> KinematicErrors:
+    """Errors of a fit against a reference, aligned in time and space.
+
+    Time: the reference is interpolated linearly at the video's time stamps, shifted by the lag that minimises the
+    offset-free rms over all joints together (`best_lag`). Frames outside the reference, in its holes and outside the
+    person's view do not count. Space: unless both live in the `same_world`, the pelvis' orientation is turned about
+    the vertical by the one angle that fits the reference best before its angles are compared, and the pelvis' path is
+    turned about the vertical and shifted (`align_path`).
+
+    Raises
+    ------
+    PblError
+        REFERENCE_INPUT: no common joint, no common time, fewer than 10 common frames. GAIT_INPUT: a fit without frames.
+    """
+    poses = trial_poses(fit)
+    result = compare_angles(
+        fit.time_s,
+        fit_angles(fit, reference.convention, poses),
+        reference,
+        sd_deg=fit_angles_sd(fit, reference.convention),
+        pelvis_m=poses.position_m[:, poses.index("pelvis")],
+        max_lag_s=max_lag_s,
+        same_world=same_world,
+        trial=fit.name,
+    )
+    return dataclasses.replace(
+        result,
+        view=view_of_fit(fit, poses),
+        residual_2d_px=_median(fit.residual_2d_px),
+        residual_3d_cm=100 * _median(fit.residual_3d_m),
+    )
+
+
+def compare_references(ours: Reference, reference: Reference, max_lag_s: float = 0.1) -> KinematicErrors:
+    """The same for kinematics of another system, which have neither sd, nor view, nor residuals.
+
+    Raises `PblError` REFERENCE_INPUT, also where the conventions differ.
+    """
+    if ours.convention != reference.convention:
+        raise _refused(ours.name, f"conventions {ours.convention} and {reference.convention}", "the same convention")
+    return compare_angles(
+        ours.time_s, ours.angles_deg, reference, pelvis_m=ours.pelvis_m, max_lag_s=max_lag_s, trial=ours.name
+    )
+
+
+def compare_angles(
+    time_s: np.ndarray,
+    angles_deg: Mapping[str, np.ndarray],
+    reference: Reference,
+    *,
+    sd_deg: Mapping[str, np.ndarray] | None = None,
+    pelvis_m: np.ndarray | None = None,
+    max_lag_s: float = 0.1,
+    same_world: bool = False,
+    trial: str = "",
+) -> KinematicErrors:
+    """The errors of angles (T,) at `time_s` (T,) under the reference's names: what `compare` does without a fit.
+
+    Raises `PblError` REFERENCE_INPUT: no common joint, no common time, fewer than 10 common frames.
+    """
+    names = [n for n in reference.angles_deg if n in angles_deg]
+    if not names:
+        raise _refused(trial, "no joint that both know", f"some of {', '.join(angles_deg)} in the reference")
+    time_s = np.asarray(time_s, float)
+    ours = np.column_stack([np.asarray(angles_deg[n], float) for n in names])
+    theirs = unwrapped(np.column_stack([reference.angles_deg[n] for n in names]))
+    # Angles of the pelvis depend on the world's heading, so the lag is found by the joints wherever there are any.
+    moving = [i for i, n in enumerate(names) if n not in PELVIS_TURNS] or list(range(len(names)))
+    _check_overlap(trial, time_s, ours, reference, max_lag_s)
+    lag = best_lag(time_s, unwrapped(ours[:, moving]), reference.time_s, theirs[:, moving], max_lag_s)
+    if not np.isfinite(lag):
+        raise _refused(trial, "too few frames in which both know a joint", f"at least {MIN_COMMON}")
+    there = at_times(time_s - lag, reference.time_s, theirs)
+    if not same_world and all(n in names for n in PELVIS_TURNS):
+        ours = _headed_alike(ours, there, [names.index(n) for n in PELVIS_TURNS])
+    difference = wrapped(ours - there)
+    known = np.isfinite(difference)
+    n = int(np.count_nonzero(known.any(axis=1)))
+    if n < MIN_COMMON:
+        raise _refused(trial, f"{n} frames in which both know a joint", f"at least {MIN_COMMON}")
+    sd = sd_deg or {}
+    joints = tuple(
+        _joint_error(name, difference[:, i], ours[:, i], there[:, i], sd.get(name)) for i, name in enumerate(names)
+    )
+    paper = difference[:, [i for i, name in enumerate(names) if name in JOINTS_PAPER]]
+    return KinematicErrors(
+        trial=trial,
+        reference=reference.name,
+        source=reference.source,
+        convention=reference.convention,
+        lag_s=lag,
+        max_lag_s=max_lag_s,
+        n=n,
+        joints=joints,
+        median_abs_deg=_median(np.abs(paper)),
+        rte_m=_rte(time_s - lag, pelvis_m, reference, same_world),
+        view={"right": MIXED, "left": MIXED},
+        residual_2d_px=float("nan"),
+        residual_3d_cm=float("nan"),
+    )
+
+
+def _joint_error(
+    name: str, difference: np.ndarray, ours: np.ndarray, theirs: np.ndarray, sd: np.ndarray | None
+) -> JointError:
+    known = np.isfinite(difference)
+    n = int(known.sum())
+    if n == 0:
+        return JointError(name, 0, *[float("nan")] * 7)
+    error = difference[known]
+    inside = float("nan")
+    if sd is not None:
+        given = known & np.isfinite(sd)
+        if given.any():
+            inside = float(np.mean(np.abs(difference[given]) <= Z90 * np.asarray(sd)[given]))
+    return JointError(
+        joint=name,
+        n=n,
+        median_abs_deg=float(np.median(np.abs(error))),
+        mean_abs_deg=float(np.mean(np.abs(error))),
+        bias_deg=float(np.mean(error)),
+        sd_deg=float(np.std(error)),
+        rms_deg=float(np.sqrt(np.mean(error**2))),
+        correlation=_correlation(theirs[known] + error, theirs[known]),
+        within_90=inside,
+    )
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    if len(a) < 3 or np.std(a) < 1e-6 or np.std(b) < 1e-6:
+        return float("nan")
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+def _headed_alike(ours: np.ndarray, theirs: np.ndarray, columns: list[int]) -> np.ndarray:
+    """`ours` with the angles of the pelvis after one turn about the vertical towards those of the reference."""
+    known = np.all(np.isfinite(ours[:, columns]), axis=1)
+    both = known & np.all(np.isfinite(theirs[:, columns]), axis=1)
+    if not both.any():
+        return ours
+    turn = vertical_turn(pelvis_rotations(*ours[both][:, columns].T), pelvis_rotations(*theirs[both][:, columns].T))
+    out = ours.copy()
+    turned = about_vertical(turn) @ pelvis_rotations(*ours[known][:, columns].T)
+    out[np.ix_(known, columns)] = pelvis_angles_deg(turned)
+    return out
+
+
+def _rte(at_s: np.ndarray, pelvis_m: np.ndarray | None, reference: Reference, same_world: bool) -> float:
+    if pelvis_m is None or reference.pelvis_m is None:
+        return float("nan")
+    there = at_times(at_s, reference.time_s, reference.pelvis_m)
+    known = np.all(np.isfinite(there), axis=1) & np.all(np.isfinite(pelvis_m), axis=1)
+    if np.count_nonzero(known) < MIN_COMMON:
+        return float("nan")
+    here = pelvis_m[known] if same_world else align_path(pelvis_m[known], there[known])
+    return float(np.mean(np.linalg.norm(here - there[known], axis=1)))
+
+
+def _check_overlap(trial: str, time_s: np.ndarray, ours: np.ndarray, reference: Reference, max_lag_s: float) -> None:
+    seen = time_s[np.any(np.isfinite(ours), axis=1)]
+    if len(seen) < MIN_COMMON or len(reference.time_s) < 2:
+        raise _refused(
+            trial,
+            f"{len(seen)} frames of the fit and {len(reference.time_s)} of the reference with values",
+            f"at least {MIN_COMMON} frames of the fit",
+        )
+    first, last = reference.time_s[0] - max_lag_s, reference.time_s[-1] + max_lag_s
+    if not np.any((seen >= first) & (seen <= last)):
+        raise _refused(
+            trial,
+            f"no common time: the fit has {seen[0]:.2f} to {seen[-1]:.2f} s, the reference "
+            f"{reference.time_s[0]:.2f} to {reference.time_s[-1]:.2f} s",
+            "recordings of the same movement on one clock, within the largest lag",
+        )
+
+
+def _median(values: np.ndarray) -> float:
+    finite = np.asarray(values, float)[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else float("nan")
+
+
+def _refused(key: str, found: str, expected: str) -> PblError:
+    return PblError(
+        "REFERENCE_INPUT",
+        found=found,
+        expected=expected,
+        next_step="check that both are of one movement; set the reference's time stamps to the video's clock",
+        key=key or None,
+    )

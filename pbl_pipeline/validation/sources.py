@@ -1,0 +1,185 @@
+"""References from what there is: a fit, rotations of bodies, an OpenSim motion; and the same angles of our fit."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pbl_pipeline.body import Y_UP_TO_Z_UP, angle_of, joint_angles, joint_angles_sd, load_body
+from pbl_pipeline.bounded import count_rows, read_json, read_text
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.gait import BodyPoses, trial_poses
+
+from .joints import JOINTS_CLIP
+from .reference import BODY_ROTATIONS, CONVENTIONS, QPOS, Reference
+from .rotations import body_rotation_angles
+
+_PELVIS_PATH = ("pelvis_tx", "pelvis_ty", "pelvis_tz")
+
+
+def fit_angles(fit: TrialFit, convention: str = QPOS, poses: BodyPoses | None = None) -> dict[str, np.ndarray]:
+    """(T,) degrees per joint at the fit's time stamps, NaN where the person is out of view.
+
+    Raises `PblError` REFERENCE_INPUT (unknown convention), GAIT_INPUT (a fit of another body, or without a frame).
+    """
+    _check_convention(convention)
+    if convention == QPOS:
+        return joint_angles(fit.joint_names, fit.qpos)
+    poses = poses or trial_poses(fit)
+    seen = np.flatnonzero(np.all(np.isfinite(poses.rotation), axis=(1, 2, 3)))
+    turned = {n: Rotation.from_matrix(poses.rotation[seen, i]) for i, n in enumerate(poses.body.body_names)}
+    out = {}
+    for name, values in body_rotation_angles(turned).items():
+        out[name] = np.full(len(fit.time_s), np.nan)
+        out[name][seen] = values
+    return out
+
+
+def fit_angles_sd(fit: TrialFit, convention: str = QPOS) -> dict[str, np.ndarray]:
+    """(T,) standard deviations in degrees of `fit_angles`, NaN where the solver gives none.
+
+    For "body_rotations" that of the model's own joint of the same name: its axis is not quite the same.
+    """
+    _check_convention(convention)
+    sd = joint_angles_sd(fit.joint_names, fit.qpos_sd)
+    return sd if convention == QPOS else {k: sd[k] for k in JOINTS_CLIP if k in sd}
+
+
+def reference_of_qpos(
+    name: str,
+    source: str,
+    time_s: np.ndarray,
+    joint_names: Sequence[str],
+    qpos: np.ndarray,
+    pelvis_m: np.ndarray | None = None,
+) -> Reference:
+    """Known joint values of our body, (T, 40) in m and rad, such as a synthetic walker's. `pelvis_m` in a z-up world.
+
+    Without `pelvis_m` the path comes from pelvis_tx, ty, tz, which move the pelvis from its place in the body model
+    along the ground's x, y, z.
+    """
+    if pelvis_m is None and all(n in joint_names for n in _PELVIS_PATH):
+        index = [list(joint_names).index(n) for n in _PELVIS_PATH]
+        rest = load_body().mj_model.body("pelvis").pos
+        pelvis_m = rest + np.asarray(qpos, float)[:, index] @ Y_UP_TO_Z_UP.T
+    return Reference(name, source, QPOS, time_s, joint_angles(joint_names, qpos), pelvis_m)
+
+
+def reference_of_fit(fit: TrialFit, source: str, convention: str = QPOS) -> Reference:
+    """A fit as the reference of another: several cameras, or a laboratory's markers."""
+    poses = trial_poses(fit)
+    pelvis = poses.position_m[:, poses.index("pelvis")]
+    return Reference(fit.name, source, convention, fit.time_s, fit_angles(fit, convention, poses), pelvis)
+
+
+def reference_of_bodies(path: str | Path, source: str = "optical markers") -> Reference:
+    """Read a `.json.gz` (or `.json`) of body rotations and positions: `time` (T,) in s, `bodies` -> name ->
+    `rotation` (T, 3), body-fixed XYZ Euler angles in rad, and `translation` (T, 3) in m, in a y-up ground.
+
+    Raises `PblError` FILE_MISSING, FILE_FORMAT.
+    """
+    bodies = load_bodies(path)
+    try:
+        pelvis = bodies.position_m["pelvis"] @ Y_UP_TO_Z_UP.T
+        angles = body_rotation_angles(bodies.rotation)
+    except (KeyError, ValueError) as error:
+        raise _unreadable(Path(path), error, _BODIES) from error
+    return Reference(Path(path).name.split(".")[0], source, BODY_ROTATIONS, bodies.time_s, angles, pelvis)
+
+
+@dataclasses.dataclass(frozen=True)
+class Bodies:
+    """Moving bodies of a model: `time_s` (T,); by body `rotation` (T), `position_m` (T, 3) in the y-up ground of the
+    file, and `scale` (3,) of the body's own axes (ones where the file has none)."""
+
+    time_s: np.ndarray
+    rotation: dict[str, Rotation]
+    position_m: dict[str, np.ndarray]
+    scale: dict[str, np.ndarray]
+
+
+_BODIES = "a file with `time` and `bodies`, each with `rotation` and `translation`"
+
+
+def load_bodies(path: str | Path) -> Bodies:
+    """The bodies of a file as `reference_of_bodies` reads it. Raises `PblError` FILE_MISSING, FILE_FORMAT."""
+    path = Path(path)
+    try:
+        data = read_json(path)
+        bodies = data["bodies"]
+        return Bodies(
+            np.asarray(data["time"], float),
+            {n: Rotation.from_euler("XYZ", np.asarray(b["rotation"], float)) for n, b in bodies.items()},
+            {n: np.asarray(b["translation"], float) for n, b in bodies.items()},
+            {n: np.asarray(b.get("scaleFactors", (1.0, 1.0, 1.0)), float) for n, b in bodies.items()},
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        raise _unreadable(path, error, _BODIES) from error
+
+
+def reference_of_mot(path: str | Path, source: str = "optical markers", convention: str = QPOS) -> Reference:
+    """Read an OpenSim motion (.mot): columns by OpenSim's names, degrees or radians as its header says (`inDegrees`).
+
+    `knee_angle_r/_l` is positive in flexion in some models and negative in others, and the file does not say which:
+    the larger excursion over both knees counts as flexion. pelvis_tx, ty, tz are metres in a y-up ground.
+
+    Raises `PblError` FILE_MISSING, FILE_FORMAT.
+    """
+    path = Path(path)
+    try:
+        lines = read_text(path).splitlines()
+        count_rows(len(lines))
+        end = next(i for i, line in enumerate(lines) if line.strip().lower() == "endheader")
+        header = dict(line.split("=", 1) for line in lines[:end] if "=" in line)
+        in_degrees = {"yes": True, "no": False}[{k.strip(): v.strip().lower() for k, v in header.items()}["inDegrees"]]
+        rows = [line for line in lines[end + 1 :] if line.strip()]
+        names, values = rows[0].split(), np.loadtxt(rows[1:], ndmin=2, comments=None)
+        column = {n: values[:, i] for i, n in enumerate(names)}
+        time = column.pop("time")
+    except (OSError, StopIteration, KeyError, ValueError, IndexError) as error:
+        raise _unreadable(
+            path, error, "an OpenSim motion with `inDegrees=yes` or `no`, `endheader` and `time`"
+        ) from error
+    angles, knee_sign = {}, _knee_sign([v for n, v in column.items() if angle_of(n)[1] < 0])
+    for name, series in column.items():
+        if name.endswith(("_tx", "_ty", "_tz", "_beta")):
+            continue
+        degrees = series if in_degrees else np.degrees(series)
+        ours, turned = angle_of(name)
+        angles[ours] = degrees if turned > 0 else knee_sign * degrees
+    pelvis = None
+    if all(n in column for n in _PELVIS_PATH):
+        pelvis = np.column_stack([column[n] for n in _PELVIS_PATH]) @ Y_UP_TO_Z_UP.T
+    return Reference(path.stem, source, convention, time, angles, pelvis)
+
+
+def _knee_sign(knees: Sequence[np.ndarray]) -> float:
+    """+1 where flexion is positive, -1 where it is negative: knees bend further than they overextend."""
+    known = [v[np.isfinite(v)] for v in knees if np.any(np.isfinite(v))]
+    return -1.0 if known and min(v.min() for v in known) < -max(v.max() for v in known) else 1.0
+
+
+def _check_convention(convention: str) -> None:
+    if convention not in CONVENTIONS:
+        raise PblError(
+            "REFERENCE_INPUT",
+            found=f"convention {convention!r}",
+            expected=" or ".join(CONVENTIONS),
+            next_step="see docs/validation.md, section The reference",
+        )
+
+
+def _unreadable(path: Path, error: Exception, expected: str) -> PblError:
+    absent = isinstance(error, FileNotFoundError | IsADirectoryError | NotADirectoryError | PermissionError)
+    return PblError(
+        "FILE_MISSING" if absent else "FILE_FORMAT",
+        found=f"{type(error).__name__}: {error}",
+        expected=expected,
+        next_step="check the path" if absent else "see docs/validation.md, section The reference",
+        key=str(path),
+    )

@@ -1,0 +1,393 @@
+"""What the queue costs: figures of docs/operations.md. What it survives: `research.benchmarks.chaos`.
+
+    python -m research.benchmarks.workers scale              # 300,000 videos: register, status, refresh, cost per job
+    python -m research.benchmarks.workers speed              # jobs a second of 1 to 4 workers on 5,000 keys
+    python -m research.benchmarks.workers method             # a new parameter set over 10,000 fitted sessions
+    python -m research.benchmarks.workers memory             # a worker's memory over 500 jobs
+
+Heavy stages give a recorded result: the point is the queue. Each command starts a database of its own in a temporary
+folder and removes it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import math
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+
+from research.benchmarks import worker_replay, worker_standins
+from tests import database
+from tests.integration import chain
+from workers.queue import Claim
+from workers.run_job import Outcome
+
+#: What a worker reports of a job (see `workers.loop.Worker`), and when.
+Report = tuple[float, Claim, Outcome | None]
+#: Videos of a session.
+EACH = 6
+#: The command `pbl` of this interpreter.
+_PBL = "from pbl_pipeline.cli import main; main()"
+#: Jobs that follow from a session: nine for each video, three for all.
+_JOBS_OF_A_SESSION = 9 * EACH + 3
+
+
+@contextlib.contextmanager
+def installation() -> Iterator[Path]:
+    """A database and store of its own, the recorded stages in this process too; yields the folder."""
+    import schemas
+
+    with database.installation() as home, pytest.MonkeyPatch.context() as patch:
+        schemas.activate()
+        patch.setenv(worker_standins.RECORDED, str(chain.small_video(home, "recorded")))
+        worker_standins.install(patch)
+        yield home
+
+
+def recordings(first: int, n: int) -> Iterator[Any]:
+    """Numbered recordings, `EACH` of a session, one session of a subject."""
+    from schemas.bulk import Recording
+
+    for i in range(first, first + n):
+        sha256 = hashlib.sha256(str(i).encode()).hexdigest()
+        yield Recording(f"/recordings/{i:07d}.mp4", sha256, 1000 + i, f"S{i // EACH:07d}", "1")
+
+
+def say(what: str, value: float, unit: str, bar: str = "") -> None:
+    """One line of the table."""
+    click.echo(f"{what:<66}{value:>10.3g} {unit:<10}{bar}")
+
+
+def work(processes: int, heard: list[Report] | None = None, **options: Any) -> float:
+    """Work until nothing is left; the seconds from the first job in hand to the last one ended.
+
+    `heard`: takes what the workers report, with the time.
+    """
+    from workers.metrics import Metrics
+    from workers.process import Options
+    from workers.supervisor import Supervisor
+
+    said = [] if heard is None else heard
+
+    class Clock(Metrics):
+        def heard(self, job: Claim, outcome: Outcome | None) -> None:
+            said.append((time.monotonic(), job, outcome))
+            super().heard(job, outcome)
+
+    once = {"once": True, "selftest": False, "processes": processes, **options}
+    assert Supervisor(Options(**once), Clock(), worker_standins.work).run() == 0
+    return said[-1][0] - said[0][0]
+
+
+# --------------------------------------------------------------------------------------------------------------- scale
+@click.group()
+def main() -> None:
+    """Benchmarks of the queue."""
+
+
+@main.command()
+@click.option("--videos", default=300_000, show_default=True)
+def scale(videos: int) -> None:
+    """Register, look, refresh, work, with as many videos."""
+    from schemas import computed_tables, video
+    from schemas.bulk import register_many
+    from schemas.status import pipeline_status
+    from workers import refresh
+
+    with installation():
+        small = 3000
+        register_many(recordings(0, EACH))
+        work(1)  # the session whose rows are copied
+        register_many(recordings(EACH, small - EACH))
+        copy_results(0, small // EACH)
+        few = _cost_per_job(small, sessions=40)
+        begin = small + 40 * EACH
+        t = time.monotonic()
+        registered = register_many(recordings(begin, videos - begin)).new
+        seconds = time.monotonic() - t
+        say(f"{videos:,} videos registered", seconds * videos / max(registered, 1), "s", "bar 300")
+        copy_results(begin // EACH, videos // EACH)
+        t = time.monotonic()
+        state = pipeline_status()
+        say("what pbl status asks the database", time.monotonic() - t, "s")
+        assert {s.table: s.done for s in state.tables} == {t.__name__: len(t()) for t in computed_tables()}
+        t = time.monotonic()
+        subprocess.run([sys.executable, "-c", _PBL, "status"], check=True, capture_output=True)
+        say("pbl status, the whole command", time.monotonic() - t, "s", "bar 3")
+        click.echo("".join(f"  {s.table} {s.done}" for s in state.tables))
+        t = time.monotonic()
+        assert refresh.refresh(True) is not None
+        say("a look at everything (once an hour)", time.monotonic() - t, "s")
+        video.Video.connection.query(f"UPDATE {video.Video.full_table_name} SET video_created = '2026-01-01'")
+        register_many(recordings(videos, 1002))
+        t = time.monotonic()
+        found = refresh.refresh()
+        assert found is not None
+        say(f"refresh with 1,002 new videos ({found.queued})", time.monotonic() - t, "s", "bar 10")
+        many = _cost_per_job(videos + 1002, sessions=40)
+        say("cost of a job beside its work, 2 workers, 3,000 videos", 1000 * few, "ms", "bar 25")
+        say(f"cost of a job beside its work, 2 workers, {videos:,} videos", 1000 * many, "ms", "bar 25")
+        say("ratio of the two", many / few, "", "bar 1.5")
+
+
+def _cost_per_job(first: int, sessions: int) -> float:
+    """Seconds a job of two workers costs beside make_compute, over a whole chain of new sessions."""
+    from schemas import computed_tables
+    from schemas.bulk import register_many
+
+    before = {t.__name__: _computed(t) for t in computed_tables()}
+    register_many(recordings(first, sessions * EACH))
+    seconds = work(2)
+    n, compute = 0, 0.0
+    for table in computed_tables():
+        rows, total = _computed(table)
+        n += rows - before[table.__name__][0]
+        compute += total - before[table.__name__][1]
+    return (2 * seconds - compute) / n
+
+
+def _computed(table: Any) -> tuple[int, float]:
+    """Rows of a table and the seconds their computation took."""
+    column = next(n for n in table.heading.names if n.endswith("_seconds") and n != "compile_seconds")
+    n, total = table.connection.query(f"SELECT COUNT(*), SUM({column}) FROM {table.full_table_name}").fetchone()
+    return int(n), float(total or 0.0)
+
+
+def copy_results(first_session: int, last_session: int) -> None:
+    """Give sessions the rows of session 1, in the tables that the queue reads, without the parts it does not read."""
+    from schemas import fit, gait, gdi, keypoints, qc, tracking, video
+
+    copied = (
+        video.VideoInfo,
+        tracking.Tracking,
+        tracking.SubjectChoice,
+        keypoints.Keypoints,
+        fit.TrialInput,
+        fit.FitSet,
+        fit.FitSet.Video,
+        fit.FitSelection,
+        fit.SessionFit,
+        fit.SessionFit.Trial,
+        gait.GaitEvents,
+        gait.GaitCycle,
+        gait.Spatiotemporal,
+        gdi.GDI,
+        gdi.SessionGdi,
+        qc.SessionQc,
+    )
+    first = max(first_session, 1)
+    template = _first_set()
+    names_of_sets = _names_of_sets(first, last_session)
+    for table in copied:
+        names = [f"`{n}`" for n in table.heading.names]
+        values = {
+            "`video_id`": f"t.video_id + {EACH} * s.seq",
+            "`session_id`": "t.session_id + s.seq",
+            "`fit_set`": "s.name",
+        }
+        where = "t.fit_set = %s" if "fit_set" in table.heading.names else f"t.video_id <= {EACH} AND %s != ''"
+        table.connection.query(
+            f"INSERT INTO {table.full_table_name} ({','.join(names)})"
+            f" SELECT {','.join(values.get(n, f't.{n}') for n in names)} FROM {table.full_table_name} AS t"
+            f" JOIN {names_of_sets} AS s WHERE {where}",
+            args=(template,),
+        )
+
+
+def _names_of_sets(first: int, last: int) -> str:
+    """A temporary table of the sessions `range(first, last)` and the names that planning would give their sets."""
+    from schemas import fit
+    from schemas.plan import fit_set_hash
+
+    methods = (fit.FitSet.Video & {"fit_set": _first_set()}).to_dicts(limit=1)[0]
+    name = f"`{fit.FitSet.database}`.`names_of_sets`"
+    query = fit.FitSet.connection.query
+    query(f"CREATE OR REPLACE TEMPORARY TABLE {name} (seq INT PRIMARY KEY, name CHAR(16))")
+    for start in range(first, last, 1000):
+        values = []
+        for i in range(start, min(start + 1000, last)):
+            rows = [{"video_sha256": r.sha256, "keypoints_person_id": 1} for r in recordings(i * EACH, EACH)]
+            values += [i, fit_set_hash({**methods, "session_id": 1 + i}, rows)]
+        query(f"INSERT INTO {name} VALUES {','.join(['(%s,%s)'] * (len(values) // 2))}", args=values)
+    return name
+
+
+def _first_set() -> str:
+    from schemas import fit
+
+    return str((fit.FitSet & {"session_id": 1}).fetch1("fit_set"))
+
+
+# --------------------------------------------------------------------------------------------------------------- speed
+@main.command()
+@click.option("--keys", default=5000, show_default=True)
+@click.option(
+    "--work-ms", default=0.0, show_default=True, help="What a job takes that needs no processor of this machine."
+)
+def speed(keys: int, work_ms: float) -> None:
+    """Jobs a second of one table (VideoInfo) by 1 to 4 workers, each key exactly once; what the database could do."""
+    from schemas import tracking, video
+    from schemas.bulk import register_many
+    from schemas.operations import embedded
+    from workers import queue
+
+    def begin() -> None:
+        """All keys wait, nothing is done."""
+        for rows in (video.VideoInfo, tracking.Tracking.jobs, video.VideoInfo.jobs):
+            rows.delete_quick()
+        assert queue.fill(video.VideoInfo) == keys
+
+    with installation() as home:
+        server = embedded.Folder(home / "db").state()["pid"]
+        register_many(recordings(0, keys))
+        os.environ[worker_standins.SLEEP] = str(work_ms / 1000)
+        click.echo(
+            f"{keys} keys, {work_ms:g} ms of work each, {os.cpu_count()} cores for workers and database together"
+        )
+        alone = 0.0
+        for processes in (1, 2, 3, 4):
+            begin()
+            heard: list[Report] = []
+            before = _processor_s(server)
+            work(processes, heard, resource="decode")
+            ended = [(t, outcome) for t, _, outcome in heard if outcome is not None]
+            once = {outcome.job.hash: outcome.what for _, outcome in ended}
+            assert len(ended) == len(once) == len(video.VideoInfo()) == keys
+            assert set(once.values()) == {"done"}
+            # Workers start one after the other: counted from when all of them had begun.
+            begun = max(min(t for t, job, _ in heard if job.connection_id == c) for c in _connections(heard, processes))
+            rate = sum(t > begun for t, _ in ended) / (ended[-1][0] - begun)
+            alone = alone or rate
+            say(f"{processes} workers, each key done once", rate, "jobs/s", f"{rate / alone:.2f} times one")
+            say("  processor time of the database", 1000 * (_processor_s(server) - before) / keys, "ms a job")
+        begin()
+        steps = worker_replay.record([video.VideoInfo])
+        for n in (1, 2, 4, 8):
+            begin()
+            seconds, repeated = worker_replay.replay(steps, n)
+            assert len(video.VideoInfo()) == keys
+            again = f"{repeated} steps again after a deadlock" if repeated else ""
+            say(f"the same statements without the workers, {n} connections", keys / seconds, "jobs/s", again)
+        say("statements of a job", sum(map(len, steps)) / keys, "")
+
+
+def _connections(heard: list[Report], n: int) -> set[int]:
+    """The workers' connections, from their reports; all of them must have worked."""
+    found = {job.connection_id for _, job, _ in heard}
+    assert len(found) == n, found
+    return found
+
+
+def _processor_s(pid: int) -> float:
+    """Processor time of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+# -------------------------------------------------------------------------------------------------------------- method
+@main.command()
+@click.option("--sessions", default=10_000, show_default=True)
+@click.option("--worked", default=20, show_default=True, help="Sessions whose new fits are computed then.")
+def method(sessions: int, worked: int) -> None:
+    """A new parameter set of the fit over fitted sessions: what becomes pending, and that no old row changes."""
+    from schemas import computed_tables, fit
+    from schemas.bulk import register_many
+    from workers import refresh, requeue
+
+    with installation():
+        register_many(recordings(0, EACH))
+        work(1)  # the session whose rows are copied
+        register_many(recordings(EACH, (sessions - 1) * EACH))
+        copy_results(0, sessions)
+        refresh.refresh(True)
+        tables = computed_tables()
+        assert not any(_pending(tables).values()), "the copied sessions are not complete"
+        old = {t.__name__: _contents(t) for t in tables}
+        t = time.monotonic()
+        plan = requeue.plan_new_method("SessionFit", "paper-2025")
+        say("planned", time.monotonic() - t, "s", f"{len(plan.add)} selections")
+        t = time.monotonic()
+        for _ in requeue.carry_out(plan):
+            pass
+        say("queued", time.monotonic() - t, "s")
+        refresh.refresh(True)
+        pending = {name: n for name, n in _pending(tables).items() if n}
+        click.echo(f"pending: {pending}")
+        assert pending == {"TrialInput": sessions * EACH}  # from which the fits are planned
+        assert {t.__name__: _contents(t) for t in tables} == old
+        jobs = fit.TrialInput.jobs
+        jobs.connection.query(f"UPDATE {jobs.full_table_name} SET priority = 1 WHERE video_id <= {worked * EACH}")
+        work(2, resource="light", max_jobs=worked * EACH // 2)
+        work(2, resource="fit")
+        made = len(fit.SessionFit()) - sessions
+        click.echo(f"{made} new fits; pending: { {name: n for name, n in _pending(tables).items() if n} }")
+        assert made == worked
+        new = plan.add[0]["fit_method"]
+        for table in tables:
+            assert _contents(table, new) == old[table.__name__], table.__name__
+        click.echo(f"old rows of {len(tables)} tables unchanged (number and sum over every column of every row)")
+
+
+def _pending(tables: list[Any]) -> dict[str, int]:
+    return {t.__name__: len(t.jobs.pending) for t in tables}
+
+
+def _contents(table: Any, but: str = "") -> tuple[int, int]:
+    """Number of rows, and a sum over a hash of every column of each; those of the fit method `but` left out."""
+    columns = ",".join(f"COALESCE(`{n}`,'')" for n in table.heading.names)
+    query = f"SELECT COUNT(*), COALESCE(SUM(CRC32(CONCAT_WS('|',{columns}))),0) FROM {table.full_table_name}"
+    if "fit_method" in table.heading.names:
+        query += " WHERE fit_method <> %s"
+        n, total = table.connection.query(query, args=(but,)).fetchone()
+    else:
+        n, total = table.connection.query(query).fetchone()
+    return int(n), int(total)
+
+
+# -------------------------------------------------------------------------------------------------------------- memory
+@main.command()
+@click.option("--jobs", default=500, show_default=True)
+def memory(jobs: int) -> None:
+    """Resident memory of one worker, started as in production: after 20 jobs, after all, after as many again."""
+    from schemas.bulk import register_many
+    from workers.metrics import Metrics
+    from workers.process import Options
+    from workers.supervisor import Supervisor
+
+    with installation():
+        register_many(recordings(0, EACH * math.ceil(2 * jobs / _JOBS_OF_A_SESSION)))
+        sizes: list[tuple[str, float]] = []
+
+        class Watch(Metrics):
+            def heard(self, job: Claim, outcome: Outcome | None) -> None:
+                if outcome is not None:
+                    (child,) = [c.process.pid for c in boss._children]
+                    pages = int(Path(f"/proc/{child}/statm").read_text().split()[1])
+                    sizes.append((job.table.__name__, pages * os.sysconf("SC_PAGE_SIZE") / 2**20))
+
+        boss = Supervisor(Options(once=True), Watch(), worker_standins.work)
+        assert boss.run() == 0
+        mib = [size for _, size in sizes]
+        assert len(mib) >= 2 * jobs
+        first = {name: i for i, (name, _) in reversed([*enumerate(sizes)])}
+        for name, i in sorted(first.items(), key=lambda f: f[1]):
+            say(f"job {i + 1}, the first of {name}", mib[i], "MiB", f"{mib[i] - mib[max(i - 1, 0)]:+.1f}")
+        say("memory after 20 jobs", mib[19], "MiB")
+        say(
+            f"memory after {jobs} jobs", mib[jobs - 1], "MiB", f"{100 * (mib[jobs - 1] / mib[19] - 1):+.1f} %, bar +5 %"
+        )
+        again = 100 * (mib[2 * jobs - 1] / mib[jobs - 1] - 1)
+        say(f"memory after {2 * jobs} jobs", mib[2 * jobs - 1], "MiB", f"{again:+.1f} % since then")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The stated confidence of a detector's points against their measured error."""
