@@ -18,7 +18,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import write_angles_csv
 from pbl_pipeline.fit import METHODS as FIT_METHODS
 from pbl_pipeline.fit import Params as FitParams
-from pbl_pipeline.fit import SessionFit, TrialFit, check_trial, default_for_points, fit_session
+from pbl_pipeline.fit import SessionFit, TrialFit, check_trial, default_fit, fit_session
 from pbl_pipeline.gait import DEFAULT_NORM, GaitMetrics, gait_metrics, load_norm
 from pbl_pipeline.keypoints import METHODS as KEYPOINT_METHODS
 from pbl_pipeline.keypoints import KeypointParams, Keypoints, check_keypoints, detect_keypoints
@@ -78,11 +78,11 @@ class Session:
 
 
 def fit_default(keypoints: Method[KeypointParams]) -> str:
-    """Name of the fit's method for the keypoints of that method, where nobody names one (`default_for_points`).
+    """Name of the fit's method for the keypoints of that method, where nobody names one (`fit.default_fit`).
 
     Raises `PblError` MODEL_MISSING, MODEL_INVALID for a model that is not registered here.
     """
-    return default_for_points(*keypoints.params.points())
+    return default_fit(keypoints.params.points())
 
 
 def detect_trial(

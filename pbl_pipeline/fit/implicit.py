@@ -23,9 +23,9 @@ from pbl_pipeline import progress
 from pbl_pipeline.body import Body, marker_positions, mjx_frames, scale_multipliers
 from pbl_pipeline.errors import PblError
 
-from ._params import ImplicitAdamParams
 from .initial_pose import median_orientation, median_pose, paper_pose
 from .objective import OF_SINGLE_FRAMES, At, State, no_phone, total
+from .params import ImplicitAdamParams
 from .priors import Weights
 from .problem import Problem, frames_at, pad_frames
 from .session import Session

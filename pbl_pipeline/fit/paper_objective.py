@@ -16,12 +16,12 @@ from jaxtyping import Array, ArrayLike, Float
 from pbl_pipeline.body import Body, MarkerSet, marker_positions, scale_multipliers
 from pbl_pipeline.keypoints import Keypoints
 
-from ._params import PAPER_2025, CostParams
-from ._rotation import matrices_of
 from .objective import PAPER, At, State, no_phone, total
+from .params import PAPER_2025, CostParams
 from .priors import Weights
 from .problem import Problem
 from .results import SessionFit
+from .rotations import matrices_of
 from .session import Session, Trial, make_session
 
 #: The paper's own (section Total loss and optimization), whatever the defaults of `CostParams` become.

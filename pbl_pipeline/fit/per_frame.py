@@ -20,13 +20,13 @@ from pbl_pipeline import progress
 from pbl_pipeline.body import Body, scale_multipliers
 from pbl_pipeline.jax_setup import compile_seconds
 
-from ._params import GaussNewtonParams
-from ._phone_error import phone_variance
-from ._threads import one_blas_thread
 from .augmented_pelvis import with_augmented_pelvis
+from .blas_threads import one_blas_thread
 from .initial_pose import placed_poses
 from .normal_equations import Linearised, linearise, moved
 from .objective import State
+from .params import GaussNewtonParams
+from .phone_error import phone_variance
 from .priors import Weights, pixels_alone
 from .problem import Problem, power_of_2
 from .session import Session

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from pbl_pipeline.body import PELVIS_TURNS, Body
 from pbl_pipeline.errors import PblError
 
-from ._params import CostParams, GaussNewtonParams, ImplicitAdamParams
+from .params import CostParams, GaussNewtonParams, ImplicitAdamParams
 from .problem import Problem
 
 #: Priors that were learned from people (`research/poses.py`).

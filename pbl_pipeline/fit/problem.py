@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from pbl_pipeline.body import Body, MarkerSet
 
-from ._rotation import quat_wxyz, rotation_matrices
+from .rotations import quat_wxyz, rotation_matrices
 
 #: Sizes to which markers are padded; larger sets are padded to a multiple of 64.
 MARKER_SIZES = (24, 40, 64, 96, 128)

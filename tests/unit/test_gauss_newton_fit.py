@@ -22,11 +22,11 @@ from pbl_pipeline.fit import (
     SessionFit,
     SessionInput,
     TrialFit,
-    _fit_session,
     fit_session,
     fit_sessions,
     per_frame,
     problem,
+    session_fit,
 )
 from pbl_pipeline.fit.initial_pose import placed_poses
 from pbl_pipeline.fit.per_frame import by_joint, floors_of
@@ -317,7 +317,7 @@ def test_sessions_with_other_terms_are_not_solved_together(walkers, monkeypatch)
         nan = Solution(**(values | {"seconds": 0.0, "compile_seconds": 0.0, "iterations": 1, "converged": False}))
         return [nan] * len(sessions)
 
-    monkeypatch.setattr(_fit_session, "_solve", nothing)
+    monkeypatch.setattr(session_fit, "_solve", nothing)
     found = fit_sessions([pixels, *walkers], PARAMSET, batch=8)
     assert asked == [["pixels"], [w.names[0] for w in walkers]]
     assert [e.code for e in found if isinstance(e, PblError)] == ["FIT_DIVERGED"] * 4
