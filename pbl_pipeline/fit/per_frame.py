@@ -24,15 +24,14 @@ from .augmented_pelvis import with_augmented_pelvis
 from .blas_threads import one_blas_thread
 from .initial_pose import placed_poses
 from .normal_equations import Linearised, linearise, moved
-from .objective import State
 from .params import GaussNewtonParams
 from .phone_error import phone_variance
-from .priors import Weights, pixels_alone
-from .problem import Problem, power_of_2
+from .problem import Problem, State, pixels_alone, power_of_2
 from .session import Session
 from .solution import Outcome, Solution, outcome
 from .solvers.gauss_newton import Limits, Progress, before_first, minimise
 from .solvers.linear import marginal_variance
+from .weights import Weights
 
 #: A point that stands is slower than this fraction of its own fastest, or than this (m/s); speeds are means over some
 #: time (s, standard deviation).

@@ -21,10 +21,9 @@ from pbl_pipeline.video import Camera
 from .checks import check_fit
 from .known_height import in_metres
 from .methods import METHODS
-from .objective import State
 from .params import Params
 from .per_frame import start_of
-from .priors import pixels_alone
+from .problem import State, pixels_alone
 from .results import SessionFit, TrialFit
 from .rotations import quat_wxyz
 from .session import Session, Trial, make_session

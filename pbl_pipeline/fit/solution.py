@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .objective import in_camera, mean_weights, offset_m, residual_2d_px, residual_3d_cm, square
+from .keypoint_terms import in_camera, mean_weights, offset_m, residual_2d_px, residual_3d_cm
 from .problem import Problem
+from .term import square
 
 
 @jax.tree_util.register_dataclass
