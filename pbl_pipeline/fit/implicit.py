@@ -30,6 +30,7 @@ from .problem import Problem, State, frames_at, pad_frames
 from .session import Session
 from .solution import Solution, outcome
 from .solvers.adam import Schedule, optimiser, run
+from .solvers.result import Result
 from .term import At, Phone
 from .trajectory import Trajectory, encode, evaluate, fit_ranges, frequencies, initial_trajectories, pose_of, raw_of
 from .weights import Weights
@@ -143,6 +144,7 @@ def solve_implicit(session: Session, params: ImplicitAdamParams) -> Solution:
         if pending is not None:
             record(*pending)
     qpos, R_nc = _on_all_frames(session, unknowns.trajectories, data)
+    ended = len(trace) > 1 and trace[(len(trace) - 1) // 2][1] < (1 + FALL_CONVERGED) * trace[-1][1]
     return Solution(
         qpos=qpos,
         R_nc=R_nc,
@@ -154,7 +156,7 @@ def solve_implicit(session: Session, params: ImplicitAdamParams) -> Solution:
         compile_seconds=compile_seconds,
         seconds=time.perf_counter() - begin,
         iterations=params.steps,
-        converged=len(trace) > 1 and trace[(len(trace) - 1) // 2][1] < (1 + FALL_CONVERGED) * trace[-1][1],
+        result=Result.SMALL_GAIN if ended else Result.BOUND,
         outcome=jax.device_get(_outcome(data, unknowns, jnp.asarray(qpos), jnp.asarray(R_nc))),
     )
 

@@ -13,13 +13,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from pbl_pipeline.body import Body, MarkerJacobian, marker_jacobian, scale_multipliers
@@ -36,6 +37,8 @@ from .solvers.linear import BorderedBandedSystem
 from .term import At, Rows, SharedTerm, Term, Unknowns, frame_count
 from .weights import Weights
 
+#: Terms that are added by way of the markers' positions (`_marker_blocks`).
+OF_MARKERS = (Unknowns.MARKER, Unknowns.CENTRED_MARKER)
 #: Frames whose markers are differentiated at once: bounds the memory of long sessions.
 CHUNK = 512
 
@@ -57,12 +60,13 @@ class Linearised:
 
 
 class _Blocks(NamedTuple):
-    """What the terms add up to: H (F, U, U) and g (F, U) of the frames, `link` (F, U, U) of each with the next one, B
-    (F, U, K), C (K, K) and h (K,) of what is shared."""
+    """What the terms add up to: H (F, U, U) and g (F, U) of the frames, `link` (F, U, U) of each with the next one and
+    the diagonals `link_2` (F, U) of that with the one after, B (F, U, K), C (K, K) and h (K,) of what is shared."""
 
     H: Array
     g: Array
     link: Array
+    link_2: Array
     B: Array
     C: Array
     h: Array
@@ -73,34 +77,31 @@ def linearise(body: Body, p: Problem, w: Weights, state: State) -> Linearised:
     # GPUs round the factors of float32 products to ten bits unless told otherwise.
     with jax.default_matmul_precision("highest"):
         columns = _columns_of(state, p.moving)
-        x, soles, blocks = _keypoint_terms(body, p, w, state, columns)
+        x, soles, sum_ = _keypoint_terms(body, p, w, state, columns)
         markers, at_floor, _ = p.split(x)
         at = At(p, w, state, markers, at_floor, phone_at(p, state))
-        blocks = _add_soles(blocks, at, soles, columns)
-        blocks = _add_shared(blocks, at, columns)
-        blocks = _add_phone(blocks, at, columns)
-        blocks, next_2 = _add_joints(blocks, at)
-        system = BorderedBandedSystem(blocks.H, blocks.link, next_2, blocks.B, blocks.C)
+        for term in TERMS:
+            if isinstance(term, Term) and term.unknowns not in OF_MARKERS and not term.empty(at):
+                sum_ = _add_term(sum_, term, at, soles, columns)
+        sum_ = _hold(_add_shared(sum_, at, columns), p)
+        system = BorderedBandedSystem(sum_.H, sum_.link, sum_.link_2, sum_.B, sum_.C)
         values = {term: term.value(at) for term in TERMS}
         seen = functools.reduce(jnp.add, [values[term] for term in KEYPOINTS])
         dispersion = 2 * seen * frame_count(p) / jnp.maximum(_observed_numbers(p), 1.0)
         cost = functools.reduce(jnp.add, values.values())
-        return Linearised(cost, system, blocks.g, blocks.h, x, dispersion)
+        return Linearised(cost, system, sum_.g, sum_.h, x, dispersion)
 
 
 def moved(state: State, dx: Float[Array, "F U"], dy: Float[Array, " K"]) -> State:
     """The state after a step of the unknowns."""
     q = state.qpos.shape[1]
-    columns = _columns_of(state, dx.shape[1] > q)
-    turn = jaxlie.SO3.exp(dx[:, q:]).as_matrix() if columns.clock else None
-    R_nc = state.R_nc if turn is None else jnp.einsum("fij,fvjk->fvik", turn, state.R_nc, precision="highest")
-    shared = _with_shared(state, _shared(state, columns) + dy, columns)
-    return dataclasses.replace(shared, qpos=state.qpos + dx[:, :q], R_nc=R_nc)
-
-
-def _terms(at: At, *unknowns: Unknowns) -> Iterator[Term]:
-    """The terms of these unknowns that the problem has something for."""
-    return (t for t in TERMS if isinstance(t, Term) and t.unknowns in unknowns and not t.empty(at))
+    moving = dx.shape[1] > q
+    R_nc = state.R_nc
+    if moving:
+        turn = jaxlie.SO3.exp(dx[:, q:]).as_matrix()
+        R_nc = jnp.einsum("fij,fvjk->fvik", turn, R_nc, precision="highest")
+    y, with_shared = _shared(state, moving)
+    return dataclasses.replace(with_shared(y + dy), qpos=state.qpos + dx[:, :q], R_nc=R_nc)
 
 
 # --- where the shared unknowns lie
@@ -109,7 +110,7 @@ def _terms(at: At, *unknowns: Unknowns) -> Iterator[Term]:
 class _Columns(NamedTuple):
     s: slice
     offset: slice
-    clock: slice | None
+    clock: slice
     floor: slice
     detector: slice
     frame: int  # unknowns of a frame
@@ -117,33 +118,35 @@ class _Columns(NamedTuple):
 
 
 def _columns_of(state: State, moving: bool) -> _Columns:
-    of_detector = state.lean.size + state.depth_m.size
-    sizes = [state.s.size, state.site_offset_m.size, state.clock_s.size * moving, state.floor.size, of_detector]
-    ends = [sum(sizes[: i + 1]) for i in range(5)]
+    sizes = [a.size for a in _shared_parts(state, moving)]
+    ends = np.cumsum(sizes).tolist()
     s, offset, clock, floor, detector = (slice(end - size, end) for end, size in zip(ends, sizes, strict=True))
-    return _Columns(s, offset, clock if moving else None, floor, detector, state.qpos.shape[1] + 3 * moving, ends[-1])
+    return _Columns(s, offset, clock, floor, detector, state.qpos.shape[1] + 3 * moving, ends[-1])
 
 
-def _shared(state: State, columns: _Columns) -> Float[Array, " K"]:
-    """The shared unknowns of a state."""
+def _shared_parts(state: State, moving: bool) -> tuple[Array, ...]:
+    """The shared unknowns of a state; clocks where a camera moves."""
     detector = jnp.concatenate([state.lean, state.depth_m], axis=1)
-    clock = [state.clock_s] if columns.clock else []
-    parts = [state.s, state.site_offset_m, *clock, state.floor, detector]
-    return jnp.concatenate([a.reshape(-1) for a in parts])
+    return state.s, state.site_offset_m, state.clock_s if moving else state.clock_s[:0], state.floor, detector
 
 
-def _with_shared(state: State, y: Float[Array, " K"], columns: _Columns) -> State:
-    """A state with other shared unknowns."""
-    detector = y[columns.detector].reshape(state.lean.shape[0], 3 + state.depth_m.shape[1])
-    return dataclasses.replace(
-        state,
-        s=y[columns.s],
-        site_offset_m=y[columns.offset].reshape(-1, 3),
-        clock_s=y[columns.clock] if columns.clock else state.clock_s,
-        floor=y[columns.floor].reshape(-1, 3),
-        lean=detector[:, :3],
-        depth_m=detector[:, 3:],
-    )
+def _shared(state: State, moving: bool) -> tuple[Float[Array, " K"], Callable[[Array], State]]:
+    """The shared unknowns of a state, and the state with other ones."""
+    y, parts_of = ravel_pytree(_shared_parts(state, moving))
+
+    def with_shared(y: Float[Array, " K"]) -> State:
+        s, offset, clock, floor, detector = parts_of(y)
+        return dataclasses.replace(
+            state,
+            s=s,
+            site_offset_m=offset,
+            clock_s=clock if moving else state.clock_s,
+            floor=floor,
+            lean=detector[:, :3],
+            depth_m=detector[:, 3:],
+        )
+
+    return y, with_shared
 
 
 def _observed_numbers(p: Problem) -> Array:
@@ -207,15 +210,13 @@ def _marker_blocks(at: At, jac: MarkerJacobian, detector: DetectorError) -> tupl
 
     # Force on each marker, and its curvature (F, J, 3, 3): of terms as they are, and of centred ones in each view.
     f, M = jnp.zeros_like(x), jnp.zeros((*x.shape, 3), x.dtype)
-    for term in _terms(at, Unknowns.MARKER):
-        c, r, D = term.rows(at)
+    for c, r, D in _rows(at, Unknowns.MARKER):
         f += jnp.einsum("fvm,fvmij,fvmi->fmj", c, D, r)
         M += jnp.einsum("fvm,fvmik,fvmil->fmkl", c, D, D)
     centred = mean_weights(p.c_3d, p.weight_3d)
     force = jnp.zeros((*centred.shape, 3), x.dtype)
     W = jnp.zeros((*force.shape, 3), x.dtype)
-    for term in _terms(at, Unknowns.CENTRED_MARKER):
-        c, r, D = term.rows(at)
+    for c, r, D in _rows(at, Unknowns.CENTRED_MARKER):
         force += jnp.einsum("fvm,fvmij,fvmi->fvmj", c, D, r)
         W += jnp.einsum("fvm,fvmik,fvmil->fvmkl", c, D, D)
     f_3d = jnp.sum(force - centred[..., None] * jnp.sum(force, axis=2, keepdims=True), axis=1)
@@ -260,10 +261,16 @@ def _marker_blocks(at: At, jac: MarkerJacobian, detector: DetectorError) -> tupl
     return (G[:, :q, :q], -pulled[:, :q], B), (C, -h)
 
 
+def _rows(at: At, unknowns: Unknowns) -> Iterator[Rows]:
+    """The terms of these unknowns, linearised."""
+    return (t.rows(at) for t in TERMS if isinstance(t, Term) and t.unknowns is unknowns and not t.empty(at))
+
+
 def _with_room(H: Array, g: Array, B: Array, C: Array, h: Array, columns: _Columns) -> _Blocks:
     """The keypoints' blocks with room for all shared unknowns and no links yet."""
     among_all = functools.partial(_spread, at=(columns.s, columns.offset, columns.detector), size=columns.size)
-    return _Blocks(H, g, jnp.zeros_like(H), among_all(B), among_all(among_all(C).T).T, among_all(h))
+    none = jnp.zeros_like(H)
+    return _Blocks(H, g, none, none[..., 0], among_all(B), among_all(among_all(C).T).T, among_all(h))
 
 
 def _spread(a: Float[Array, "*n A"], at: Sequence[slice], size: int) -> Float[Array, "*n {size}"]:
@@ -283,126 +290,113 @@ def _cross_matrix(x: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
     return jnp.stack([zero, -c, b, c, zero, -a, -b, a, zero], axis=-1).reshape(*x.shape, 3)
 
 
-# --- joints
+# --- all other terms
 
 
-def _add_joints(sum_: _Blocks, at: At) -> tuple[_Blocks, Array]:
-    """Terms of a frame's joints and of a joint over frames, and the diagonals (F, U) of the links with the frame after
-    the next. Frames that count for nothing stay where they are.
-    """
-    p, qpos = at.problem, at.state.qpos
-    diagonal = force = next_1 = next_2 = jnp.zeros_like(qpos)
-    curvature = jnp.zeros((*qpos.shape, qpos.shape[1]), qpos.dtype)
-    for term in _terms(at, Unknowns.JOINT):
-        c, r, D = term.rows(at)
-        diagonal += jnp.sum(c[..., None] * D[..., 0] ** 2, axis=-1)
-        force += jnp.sum(c[..., None] * D[..., 0] * r, axis=-1)
-    for term in _terms(at, Unknowns.JOINTS):
-        own_force, own = term.by_hand(at) if term.by_hand else _joint_squares(term.rows(at))
-        force += own_force
-        curvature += own
-    for term in _terms(at, Unknowns.JOINT_IN_THREE_FRAMES):
-        c, r, D = term.rows(at)
-        # The difference at t involves t - 1, t and t + 1; that at t + 1 the following three.
-        before, now, after = (c * jnp.sum(D[..., k] * r, axis=-1) for k in range(3))
-        force += shift(before, -1) + now + shift(after, 1)
-        both = {(i, k): c * jnp.sum(D[..., i] * D[..., k], axis=-1) for i in range(3) for k in range(i, 3)}
-        diagonal += shift(both[0, 0], -1) + both[1, 1] + shift(both[2, 2], 1)
-        next_1 += both[1, 2] + shift(both[0, 1], -1)
-        next_2 += shift(both[0, 2], -1)
-    bent = p.bend[:, 1] ** 2 + shift(p.bend[:, 0], -1) ** 2 + shift(p.bend[:, 2], 1) ** 2
-    empty = (p.weight == 0) & (bent == 0)
-    wide = lambda a: jnp.pad(a, [(0, 0), (0, sum_.g.shape[-1] - a.shape[-1])])  # noqa: E731
-    on_diagonal = lambda a: a[..., None] * jnp.eye(a.shape[-1], dtype=a.dtype)  # noqa: E731
-    q = qpos.shape[1]
-    H = (sum_.H + on_diagonal(wide(diagonal) + empty[:, None])).at[:, :q, :q].add(curvature)
-    link = sum_.link + on_diagonal(wide(next_1))
-    return sum_._replace(H=H, g=sum_.g - wide(force), link=link), wide(next_2)
+def _add_term(sum_: _Blocks, term: Term, at: At, soles: _Soles, columns: _Columns) -> _Blocks:
+    """Add a term, by how its variables move with the unknowns."""
+    p, q = at.problem, soles.by_q.shape[-1]
+    if term.by_hand:
+        force, curvature = term.by_hand(at)
+        return sum_._replace(H=sum_.H + _room(curvature, columns.frame, 0), g=sum_.g - _room(force, columns.frame, 0))
+    rows = term.rows(at)
+    D, trials = rows.D, jax.nn.one_hot(p.trial, p.has_phone.shape[0], dtype=sum_.H.dtype)
+    match term.unknowns:
+        case Unknowns.JOINT:
+            return _add_bands(sum_, rows._replace(D=jnp.pad(D, [(0, 0)] * (D.ndim - 1) + [(1, 1)])))
+        case Unknowns.JOINT_IN_THREE_FRAMES:
+            return _add_bands(sum_, rows)
+        case Unknowns.JOINTS:
+            return _add_squares(sum_, columns, rows, D)
+        case Unknowns.PHONE:
+            one = Rows(*(a[:, None] for a in rows))
+            by_clock = one.D[..., 3:] * trials[:, None, None]
+            return _add_squares(sum_, columns, one, one.D[..., :3], [by_clock], [columns.clock], first=q)
+        case Unknowns.SOLE_AND_FLOOR:
+            by_floor = D[..., None, 3:] * trials[:, None, None, :, None]
+            shared = [D[..., :3] @ soles.by_s, by_floor.reshape(*D.shape[:-1], -1)]
+            return _add_squares(sum_, columns, rows, D[..., :3] @ soles.by_q, shared, [columns.s, columns.floor])
+        case Unknowns.SOLE_IN_TWO_FRAMES:
+            here, there = D[..., :3], D[..., 3:]
+            by_s = here @ soles.by_s + there @ later(soles.by_s)
+            following = there @ later(soles.by_q)
+            return _add_squares(sum_, columns, rows, here @ soles.by_q, [by_s], [columns.s], following)
+    raise AssertionError(term.unknowns)
 
 
-def _joint_squares(rows: Rows) -> tuple[Float[Array, "F Q"], Float[Array, "F Q Q"]]:
-    """Force and curvature of the joints of a frame."""
-    curvature, force = _squares(rows.D, rows.c, rows.r)
-    return force, curvature
-
-
-# --- shared unknowns, phone, soles
-
-
-def _add_shared(sum_: _Blocks, at: At, columns: _Columns) -> _Blocks:
-    """Terms of the shared unknowns alone, all quadratic."""
-
-    def cost(y: Array) -> Array:
-        there = at._replace(state=_with_shared(at.state, y, columns))
-        values = [term.value(there) for term in TERMS if isinstance(term, SharedTerm)]
-        return frame_count(at.problem) * functools.reduce(jnp.add, values)
-
-    y = _shared(at.state, columns)
-    return sum_._replace(C=sum_.C + jax.hessian(cost)(y), h=sum_.h - jax.grad(cost)(y))
-
-
-def _add_phone(sum_: _Blocks, at: At, columns: _Columns) -> _Blocks:
-    """Terms of the camera's orientation: its rotations (the last 3 unknowns of a frame) and the clocks."""
-    p, clock = at.problem, columns.clock
-    for term in _terms(at, Unknowns.PHONE):
-        c, r, D = term.rows(at)
-        K = jnp.einsum("f,fik,fil->fkl", c, D, D)
-        force = jnp.einsum("f,fik,fi->fk", c, D, r)
-        trials = jax.nn.one_hot(p.trial, p.has_phone.shape[0], dtype=K.dtype)
-        sum_ = sum_._replace(
-            H=sum_.H.at[:, -3:, -3:].add(K[:, :3, :3]),
-            g=sum_.g.at[:, -3:].add(-force[:, :3]),
-            B=sum_.B.at[:, -3:, clock].add(K[:, :3, 3:] * trials[:, None]),
-            C=sum_.C.at[clock, clock].add(jnp.diag(K[:, 3, 3] @ trials)),
-            h=sum_.h.at[clock].add(-force[:, 3] @ trials),
-        )
-    if not p.moving:
+def _add_squares(
+    sum_: _Blocks,
+    columns: _Columns,
+    rows: Rows,
+    here: Float[Array, "F P D n"],
+    shared: Sequence[Float[Array, "F P D _"]] = (),
+    at: Sequence[slice] = (),
+    following: Float[Array, "F P D n"] | None = None,
+    first: int = 0,
+) -> _Blocks:
+    """Add weighted squares of residuals. `here`: their derivatives by the unknowns of the frame from `first` on;
+    `following`: by those of the next frame; `shared`: by the shared unknowns that lie `at` some places."""
+    n, parts = here.shape[-1], [here] if following is None else [here, following]
+    m, J = n * len(parts), jnp.concatenate([*parts, *shared], axis=-1)
+    K = jnp.einsum("fpia,fp,fpib->fab", J, rows.c, J)
+    force = jnp.einsum("fpia,fp,fpi->fa", J, rows.c, rows.r)
+    H, B, g, link = K[:, :n, :n], K[:, :n, m:], force[:, :n], sum_.link
+    if following is not None:
+        second = slice(n, m)
+        H, B, g = H + shift(K[:, second, second], 1), B + shift(K[:, second, m:], 1), g + shift(force[:, second], 1)
+        link += _room(K[:, :n, second], columns.frame, first)
+    room = functools.partial(_room, size=columns.frame, first=first)
+    sum_ = sum_._replace(H=sum_.H + room(H), g=sum_.g - room(g), link=link)
+    if not shared:
         return sum_
-    # A frame without orientation keeps its camera.
-    hold = (1e-3 + 1e6 * (1 - p.has_phone[p.trial]))[:, None, None] * jnp.eye(3, dtype=sum_.H.dtype)
-    return sum_._replace(H=sum_.H.at[:, -3:, -3:].add(hold))
-
-
-def _add_soles(sum_: _Blocks, at: At, soles: _Soles, columns: _Columns) -> _Blocks:
-    """Terms of the soles: over the floor of their trial, and in two frames, which couples the joints of these."""
-    p, q, n_s = at.problem, soles.by_q.shape[-1], soles.by_s.shape[-1]
-    n = at.state.floor.shape[0]
-    one_hot = jax.nn.one_hot(p.trial, n, dtype=soles.x.dtype)[:, None, None, :, None]
-    H, g = jnp.zeros((len(soles.x), q, q), soles.x.dtype), jnp.zeros((len(soles.x), q), soles.x.dtype)
-    B, C = jnp.zeros((*g.shape, n_s + 3 * n), g.dtype), jnp.zeros((n_s + 3 * n,) * 2, g.dtype)
-    h, link = C[0], H
-    for term in _terms(at, Unknowns.SOLE_AND_FLOOR):
-        c, r, D = term.rows(at)
-        by_floor = (D[..., None, 3:] * one_hot).reshape(*D.shape[:-1], 3 * n)
-        by_all = jnp.concatenate([D[..., :3] @ soles.by_q, D[..., :3] @ soles.by_s, by_floor], axis=-1)
-        K, force = _squares(by_all, c, r)
-        H, B, C = H + K[:, :q, :q], B + K[:, :q, q:], C + jnp.sum(K[:, q:, q:], axis=0)
-        g, h = g + force[:, :q], h + jnp.sum(force[:, q:], axis=0)
-    first, second, both = slice(q), slice(q, 2 * q), slice(2 * q, None)
-    for term in _terms(at, Unknowns.SOLE_IN_TWO_FRAMES):
-        c, r, D = term.rows(at)
-        here, there = D[..., :3], D[..., 3:]
-        by_s = here @ soles.by_s + there @ later(soles.by_s)
-        by_all = jnp.concatenate([here @ soles.by_q, there @ later(soles.by_q), by_s], axis=-1)
-        K, force = _squares(by_all, c, r)
-        H += K[:, first, first] + shift(K[:, second, second], 1)
-        link += K[:, first, second]
-        B = B.at[..., :n_s].add(K[:, first, both] + shift(K[:, second, both], 1))
-        C = C.at[:n_s, :n_s].add(jnp.sum(K[:, both, both], axis=0))
-        g += force[:, first] + shift(force[:, second], 1)
-        h = h.at[:n_s].add(jnp.sum(force[:, both], axis=0))
-    # The shared unknowns of the soles are s and the floors, which do not lie side by side.
-    among_all = functools.partial(_spread, at=(columns.s, columns.floor), size=columns.size)
+    among_all = functools.partial(_spread, at=at, size=columns.size)
+    below = [(0, 0), (first, columns.frame - first - n), (0, 0)]
     return sum_._replace(
-        H=sum_.H.at[:, :q, :q].add(H),
-        g=sum_.g.at[:, :q].add(-g),
-        link=sum_.link.at[:, :q, :q].add(link),
-        B=sum_.B.at[:, :q].add(among_all(B)),
-        C=sum_.C + among_all(among_all(C).T).T,
-        h=sum_.h - among_all(h),
+        B=sum_.B + jnp.pad(among_all(B), below),
+        C=sum_.C + among_all(among_all(jnp.sum(K[:, m:, m:], axis=0)).T).T,
+        h=sum_.h - among_all(jnp.sum(force[:, m:], axis=0)),
     )
 
 
-def _squares(J: Float[Array, "F P D A"], c: Float[Array, "F P"], r: Float[Array, "F P D"]) -> tuple[Array, Array]:
-    """Curvature (F, A, A) and gradient (F, A) of half the weighted squares of residuals with a Jacobian."""
-    return jnp.einsum("fpia,fp,fpib->fab", J, c, J), jnp.einsum("fpia,fp,fpi->fa", J, c, r)
+def _add_bands(sum_: _Blocks, rows: Rows) -> _Blocks:
+    """Add weighted squares of residuals (F, Q, E) of each joint in the frame before, at and after, by derivatives (F,
+    Q, E, 3). That at t involves t - 1, t and t + 1, and that at t + 1 the following three."""
+    c, r, D = rows
+    before, now, after = (c * jnp.sum(D[..., k] * r, axis=-1) for k in range(3))
+    both = {(i, k): c * jnp.sum(D[..., i] * D[..., k], axis=-1) for i in range(3) for k in range(i, 3)}
+    wide = lambda a: jnp.pad(a, [(0, 0), (0, sum_.g.shape[-1] - a.shape[-1])])  # noqa: E731
+    on_diagonal = lambda a: wide(a)[..., None] * jnp.eye(sum_.g.shape[-1], dtype=a.dtype)  # noqa: E731
+    return sum_._replace(
+        H=sum_.H + on_diagonal(shift(both[0, 0], -1) + both[1, 1] + shift(both[2, 2], 1)),
+        g=sum_.g - wide(shift(before, -1) + now + shift(after, 1)),
+        link=sum_.link + on_diagonal(both[1, 2] + shift(both[0, 1], -1)),
+        link_2=sum_.link_2 + wide(shift(both[0, 2], -1)),
+    )
+
+
+def _add_shared(sum_: _Blocks, at: At, columns: _Columns) -> _Blocks:
+    """Add the terms of the shared unknowns alone, all quadratic."""
+    y, with_shared = _shared(at.state, at.problem.moving)
+
+    def cost(y: Array) -> Array:
+        there = at._replace(state=with_shared(y))
+        values = [term.value(there) for term in TERMS if isinstance(term, SharedTerm)]
+        return frame_count(at.problem) * functools.reduce(jnp.add, values)
+
+    return sum_._replace(C=sum_.C + jax.hessian(cost)(y), h=sum_.h - jax.grad(cost)(y))
+
+
+def _hold(sum_: _Blocks, p: Problem) -> _Blocks:
+    """Frames that count for nothing stay where they are, and a frame without orientation keeps its camera."""
+    bent = p.bend[:, 1] ** 2 + shift(p.bend[:, 0], -1) ** 2 + shift(p.bend[:, 2], 1) ** 2
+    empty = jnp.broadcast_to(((p.weight == 0) & (bent == 0))[:, None], sum_.g.shape)
+    if p.moving:
+        turns = jnp.arange(sum_.g.shape[1]) >= sum_.g.shape[1] - 3
+        empty = empty + turns * (1e-3 + 1e6 * (1 - p.has_phone[p.trial]))[:, None]
+    return sum_._replace(H=sum_.H + empty[..., None] * jnp.eye(empty.shape[1], dtype=sum_.H.dtype))
+
+
+def _room(a: Array, size: int, first: int) -> Array:
+    """Values (F, n) or (F, n, n) of some unknowns of a frame, from `first` on, among all of them."""
+    beside = (first, size - first - a.shape[-1])
+    return jnp.pad(a, [(0, 0)] + [beside] * (a.ndim - 1))

@@ -31,6 +31,7 @@ from .session import Session
 from .solution import Outcome, Solution, outcome
 from .solvers.gauss_newton import Limits, Progress, before_first, minimise
 from .solvers.linear import marginal_variance
+from .solvers.result import Result
 from .weights import Weights
 
 #: A point that stands is slower than this fraction of its own fastest, or than this (m/s); speeds are means over some
@@ -178,7 +179,7 @@ def _step_by_step(body: Body, p: Problem, w: Weights, begin: Progress, limits: L
         for n in range(most + 1):  # the first one evaluates the start
             at = _one(body, p, w, at, dataclasses.replace(limits, iterations=jnp.asarray(n, jnp.int32)))
             update(min(n, 1), f"of at most {most}, cost {float(at.cost):.4g}")
-            if bool(at.converged):
+            if int(at.result) != Result.BOUND:
                 break
     return at
 
@@ -256,7 +257,7 @@ def _solution(
         compile_seconds=compiled,
         seconds=seconds,
         iterations=len(trace),
-        converged=bool(found.end.converged),
+        result=Result(int(found.end.result)),
         outcome=found.outcome,
         # The phone's part was in the recordings on which the factors were found, so they are of both.
         qpos_sd=np.sqrt((variance + phone_variance(session, state.qpos)) * factor**2 + floor**2),

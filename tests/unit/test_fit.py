@@ -35,6 +35,7 @@ from pbl_pipeline.fit.keypoint_terms import (
 )
 from pbl_pipeline.fit.priors import learned_poses, pose_prior, scale_precision
 from pbl_pipeline.fit.solution import Outcome, Solution
+from pbl_pipeline.fit.solvers.result import Result
 from pbl_pipeline.fit.term import huber, square
 from pbl_pipeline.fit.trajectory import fit_ranges, pose_of, raw_of
 from pbl_pipeline.keypoints import bridge_gaps, longest_run_s, whole_person_in_view
@@ -362,7 +363,7 @@ def test_convergence_is_judged_by_the_second_half_and_needs_a_trace():
             compile_seconds=0.0,
             seconds=0.0,
             iterations=len(loss),
-            converged=True,
+            result=Result.SMALL_STEP,
             outcome=Outcome(jnp.zeros((1, 33, 3)), jnp.zeros((1, 33)), jnp.zeros((1, 33)), jnp.zeros((1, 3))),
         )
         return _converged(solution).outcome

@@ -32,6 +32,7 @@ from pbl_pipeline.fit.initial_pose import placed_poses
 from pbl_pipeline.fit.per_frame import by_joint, floors_of
 from pbl_pipeline.fit.session import make_session
 from pbl_pipeline.fit.solution import Solution
+from pbl_pipeline.fit.solvers.result import Result
 from pbl_pipeline.fit.vertical import on_their_feet, vertical
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
@@ -314,7 +315,7 @@ def test_sessions_with_other_terms_are_not_solved_together(walkers, monkeypatch)
         values: dict[str, Any] = {k: np.full(v, np.nan) for k, v in sizes.items()}
         for field in dataclasses.fields(Solution):
             values.setdefault(field.name, None)
-        nan = Solution(**(values | {"seconds": 0.0, "compile_seconds": 0.0, "iterations": 1, "converged": False}))
+        nan = Solution(**(values | {"seconds": 0.0, "compile_seconds": 0.0, "iterations": 1, "result": Result.BOUND}))
         return [nan] * len(sessions)
 
     monkeypatch.setattr(session_fit, "_solve", nothing)
