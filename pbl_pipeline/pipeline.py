@@ -12,7 +12,7 @@ from pbl_pipeline.deidentify import to_show
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS as FIT_METHODS
 from pbl_pipeline.fit import Params as FitParams
-from pbl_pipeline.fit import TrialFit, check_trial, default_for_points, fit_session
+from pbl_pipeline.fit import TrialFit, check_trial, default_fit, fit_session
 from pbl_pipeline.gait import DEFAULT_NORM, EVENT_METHODS, GDI_METHODS, GaitParams, gait_metrics, load_norm
 from pbl_pipeline.keypoints import METHODS as KEYPOINT_METHODS
 from pbl_pipeline.keypoints import KeypointParams, detect_keypoints
@@ -28,11 +28,11 @@ from pbl_pipeline.visit import OVERLAY, REPORT, Held, Recording, Solution, Visit
 
 
 def fit_default(keypoints: Method[KeypointParams]) -> str:
-    """Name of the fit's method for the keypoints of that method, where nobody names one (`default_for_points`).
+    """Name of the fit's method for the keypoints of that method, where nobody names one (`fit.default_fit`).
 
     Raises `PblError` MODEL_MISSING, MODEL_INVALID for a model that is not registered here.
     """
-    return default_for_points(*keypoints.params.points())
+    return default_fit(keypoints.params.points())
 
 
 def detect_recording(

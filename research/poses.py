@@ -4,7 +4,7 @@
     python -m research.poses ../shared/data/real/motions --everybody --out all.json
 
 A mixture of two normal distributions over the joints of pelvis, lumbar spine and legs, the pelvis against the vertical
-(`fit.priors.posture`). The covariance of each is that within a recording (around the person's own mean, by expectation
+(`joint_terms.posture`). The covariance of each is that within a recording (around the person's own mean, by expectation
 maximisation, because no laboratory measured all joints) plus that between people, which so few of them cannot tell and
 which is set by anatomy: a pelvis that is tilted stands under an upright trunk and over upright legs, and who walks with
 bent knees bends hips and ankles by half as much, on both sides. Means are round figures near those of recorded walks;
@@ -28,7 +28,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pbl_pipeline.body import PELVIS_TURNS, load_body
-from pbl_pipeline.fit.priors import DATA, rises
+from pbl_pipeline.fit.joint_terms import rises
+from pbl_pipeline.fit.priors import DATA
 from research.corpus.motions import Motion, read_motions
 from research.corpus.walks import is_held_out
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pbl_pipeline.body import MarkerSet
     from pbl_pipeline.fit import MarkerFile
 
-#: Method of the fit that markers get where nobody names one (`pbl_pipeline.fit.default_method`).
+#: Method of the fit that markers get where nobody names one (`pbl_pipeline.fit.default_fit`).
 DEFAULT_FIT = "markers"
 
 

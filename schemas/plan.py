@@ -27,10 +27,10 @@ def default_fit(keypoint_method: str) -> str:
 
     Raises `PblError` MODEL_MISSING, MODEL_INVALID where the method's model is not registered on this machine.
     """
-    from pbl_pipeline.pipeline import fit_default
+    from pbl_pipeline.fit import default_fit as suited
 
     row = method_row(keypoints.KeypointMethod, {"keypoint_method": keypoint_method})
-    return resolve_method(fit.FitMethod, fit_default(methods.stored(**row)))
+    return resolve_method(fit.FitMethod, suited(methods.stored(**row).params.points()))
 
 
 def unsuited(fit_method: str, keypoint_method: str | None) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,7 @@ from pbl_pipeline.bounded import read_json
 from pbl_pipeline.errors import PblError
 
 if TYPE_CHECKING:
-    from pbl_pipeline.fit import Params
+    from pbl_pipeline.fit import Params, Points
     from pbl_pipeline.keypoints import KeypointParams
     from pbl_pipeline.methods import Method
     from pbl_pipeline.tracking import TrackingParams
@@ -96,20 +96,20 @@ class Person(click.ParamType):
         return self.fail(f"{value!r} is neither 'auto' nor the number of a person", param, ctx)
 
 
-def fit_paramset(solver: str | None, params: str | None, default: str | None = None) -> Method[Params]:
-    """The fit's method that `--solver` and `--params` ask for; `default` stands in for the project's default.
+def fit_paramset(solver: str | None, params: str | None, points: Sequence[Points] = ()) -> Method[Params]:
+    """Return the fit's method that `--solver` and `--params` ask for; `points`: of the trials, for the default.
 
     `--params` is a name, or a JSON file of changes to the method that its key "base" names. Without either, and without
     "base", it is the default method; with `--solver` alone the default one of that solver.
 
     Raises `PblError` SOLVER_UNKNOWN (also where the method is of another solver than `--solver`), FILE_FORMAT.
     """
-    from pbl_pipeline.fit import METHODS
+    from pbl_pipeline.fit import METHODS, default_fit
     from pbl_pipeline.method_file import changed
 
     if solver is not None and solver not in METHODS.families:
         raise _unknown(f"solver {solver!r}", METHODS.families)
-    base = _default_of(solver, default)
+    base = default_fit(*points, solver=solver)
     if params is None:
         return METHODS[base]
     if (method := METHODS.registered(params)) is not None:
@@ -136,14 +136,6 @@ def fit_paramset(solver: str | None, params: str | None, default: str | None = N
             next_step='correct the file; the key "base" names the paramset that it changes',
             key=path,
         ) from error
-
-
-def _default_of(solver: str | None, default: str | None) -> str:
-    """Name of the default method, or where that is of another solver, of the first that is of this one."""
-    from pbl_pipeline.fit import METHODS
-
-    names = [default or METHODS.default, METHODS.default, *METHODS]
-    return next(n for n in names if solver in (None, METHODS[n].family.name))
 
 
 def _of_solver(method: Method[Params], solver: str | None) -> Method[Params]:

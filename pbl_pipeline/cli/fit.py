@@ -49,7 +49,7 @@ def fit(
     trial, and session.json.
     """
     from pbl_pipeline.files import check_out_folder
-    from pbl_pipeline.fit import default_method, fit_session
+    from pbl_pipeline.fit import fit_session, points_of
     from pbl_pipeline.pipeline import distinct_names
     from pbl_pipeline.visit import Recording, Solution, Visit, save_visit
 
@@ -57,7 +57,7 @@ def fit(
     fit_paramset(solver, params)  # a wrong name is said before anything is read
     table = _marker_set(marker_set)
     trials: Sequence[Any] = [_load(path, table, up) for path in files]
-    paramset = fit_paramset(solver, params, default=default_method(trials))
+    paramset = fit_paramset(solver, params, points_of(trials))
     stems = [_stem(path) for path in files]
     if cameras:
         trial, name = _views_of_one(trials, stems, cameras)

@@ -72,7 +72,7 @@ def run(
     """
     from pbl_pipeline.errors import PblError
     from pbl_pipeline.files import check_out_folder
-    from pbl_pipeline.pipeline import fit_default, run_visit, write_results
+    from pbl_pipeline.pipeline import run_visit, write_results
 
     # What can be wrong with the call is found before minutes of work.
     if person is not None and len(videos) > 1:
@@ -92,7 +92,7 @@ def run(
         )
     check_out_folder(out)
     method, finder = keypoint_method(keypoints, device), tracking_method(people)
-    paramset = fit_paramset(solver, params, default=fit_default(method))
+    paramset = fit_paramset(solver, params, [method.params.points()])
     visit, problems = run_visit(
         videos, out, camera, person, paramset, camera_motion, norm, attitude, method, finder, height_m
     )

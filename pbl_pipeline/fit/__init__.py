@@ -1,25 +1,25 @@
 """The session fit: keypoints of 1..N trials to joint angles, one body for all."""
 
-from ._default import default_for_points, default_method, unsuited
-from ._fit_session import (
-    LEVEL_CAMERA_QUAT_WXYZ,
-    SessionInput,
-    check_trial,
-    fit_session,
-    fit_sessions,
-)
-from ._marker_files import MarkerFile, read_markers
-from ._methods import METHODS
-from ._params import (
+from .marker_files import MarkerFile, read_markers
+from .method_choice import Points, default_fit, points_of, unsuited
+from .methods import METHODS
+from .paper_objective import paper_objective
+from .params import (
     CostParams,
     GaussNewtonParams,
     ImplicitAdamParams,
     Params,
     ViewParams,
 )
-from .paper_objective import paper_objective
 from .results import SessionFit, TrialFit
 from .session import LEVEL_CAMERA_R_NC, Trial
+from .session_fit import (
+    LEVEL_CAMERA_QUAT_WXYZ,
+    SessionInput,
+    check_trial,
+    fit_session,
+    fit_sessions,
+)
 
 __all__ = [
     "LEVEL_CAMERA_QUAT_WXYZ",
@@ -30,17 +30,18 @@ __all__ = [
     "ImplicitAdamParams",
     "MarkerFile",
     "Params",
+    "Points",
     "SessionFit",
     "SessionInput",
     "Trial",
     "TrialFit",
     "ViewParams",
     "check_trial",
-    "default_for_points",
-    "default_method",
+    "default_fit",
     "fit_session",
     "fit_sessions",
     "paper_objective",
+    "points_of",
     "read_markers",
     "unsuited",
 ]

@@ -80,7 +80,7 @@ def pelvis_of(markers: Float[np.ndarray, "T 35 3"]) -> Float[np.ndarray, "T 3 3"
 
 
 def inclination_of(pelvis: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, "T 2"]:
-    """Tilt (backwards positive) and list (rad) of a pelvis against the vertical, as `priors.inclination`."""
+    """Tilt (backwards positive) and list (rad) of a pelvis against the vertical, as `joint_terms.inclination`."""
     return np.arcsin(0.999 * np.stack([pelvis[:, 2, 0], -pelvis[:, 2, 2]], axis=-1))
 
 

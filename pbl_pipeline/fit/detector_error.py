@@ -1,4 +1,4 @@
-"""What a detector's 3D points are wrong by in all frames of a trial, as unknowns of the normal equations."""
+"""A detector's errors common to all frames of a trial, as unknowns of the normal equations."""
 
 from __future__ import annotations
 
@@ -8,17 +8,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .keypoint_terms import corrected
 from .linearised import linearised, times
-from .objective import State, corrected
-from .problem import Problem
+from .problem import Problem, State
 
 
 class DetectorError(NamedTuple):
-    """The corrected 3D points; how a marker less its detected point (world axes) moves with the lean of its trial and
-    with its own depth; and the trial of each frame as rows of 0 and 1. L is 3 and D the number of trials, or both are 0
-    without these unknowns."""
+    """How a marker less its detected point (world axes) moves with the lean of its trial and with its own depth; and
+    the trial of each frame as rows of 0 and 1. L is 3 and D the number of trials, or both are 0 without these unknowns.
+    """
 
-    x_cam: Array  # (F, V, M, 3)
     by_lean: Array  # (F, M, 3, L)
     by_depth: Array  # (F, 3)
     trials: Array  # (F, D)
@@ -30,11 +29,11 @@ def detector_error(p: Problem, state: State, R_nc: Array) -> DetectorError:
     if n == 0:
         frames, _, markers, _ = p.x_cam.shape
         none = jnp.zeros((frames, markers, 3, 0), R_nc.dtype)
-        return DetectorError(p.x_cam, none, jnp.zeros((frames, 3), R_nc.dtype), trials)
+        return DetectorError(none, jnp.zeros((frames, 3), R_nc.dtype), trials)
     lean = jnp.broadcast_to(state.lean[p.trial][:, None], p.x_cam[:, 0].shape)
     depth_m = state.depth_m[p.trial]
-    x_cam, by_lean = linearised(lambda z: corrected(p.x_cam[:, 0, :, None], z, depth_m[..., None])[..., 0, :], lean)
-    return DetectorError(x_cam[:, None], -times(R_nc, by_lean), -R_nc[:, 0, :, 2], trials)
+    _, by_lean = linearised(lambda z: corrected(p.x_cam[:, 0, :, None], z, depth_m[..., None])[..., 0, :], lean)
+    return DetectorError(-times(R_nc, by_lean), -R_nc[:, 0, :, 2], trials)
 
 
 def detector_blocks(

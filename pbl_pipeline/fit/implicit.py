@@ -23,15 +23,17 @@ from pbl_pipeline import progress
 from pbl_pipeline.body import Body, marker_positions, mjx_frames, scale_multipliers
 from pbl_pipeline.errors import PblError
 
-from ._params import ImplicitAdamParams
 from .initial_pose import median_orientation, median_pose, paper_pose
-from .objective import OF_SINGLE_FRAMES, At, State, no_phone, total
-from .priors import Weights
-from .problem import Problem, frames_at, pad_frames
+from .objective import OF_SINGLE_FRAMES, total
+from .params import ImplicitAdamParams
+from .problem import Problem, State, frames_at, pad_frames
 from .session import Session
 from .solution import Solution, outcome
 from .solvers.adam import Schedule, optimiser, run
+from .solvers.result import Result
+from .term import At, Phone
 from .trajectory import Trajectory, encode, evaluate, fit_ranges, frequencies, initial_trajectories, pose_of, raw_of
+from .weights import Weights
 
 #: Steps per compiled call: the granularity of the progress bar and of the loss trace.
 CHUNK = 250
@@ -142,6 +144,7 @@ def solve_implicit(session: Session, params: ImplicitAdamParams) -> Solution:
         if pending is not None:
             record(*pending)
     qpos, R_nc = _on_all_frames(session, unknowns.trajectories, data)
+    ended = len(trace) > 1 and trace[(len(trace) - 1) // 2][1] < (1 + FALL_CONVERGED) * trace[-1][1]
     return Solution(
         qpos=qpos,
         R_nc=R_nc,
@@ -153,7 +156,7 @@ def solve_implicit(session: Session, params: ImplicitAdamParams) -> Solution:
         compile_seconds=compile_seconds,
         seconds=time.perf_counter() - begin,
         iterations=params.steps,
-        converged=len(trace) > 1 and trace[(len(trace) - 1) // 2][1] < (1 + FALL_CONVERGED) * trace[-1][1],
+        result=Result.SMALL_GAIN if ended else Result.BOUND,
         outcome=jax.device_get(_outcome(data, unknowns, jnp.asarray(qpos), jnp.asarray(R_nc))),
     )
 
@@ -254,14 +257,14 @@ def _points(data: Data, state: State) -> Array:
     return marker_positions(data.body, p.points, state.qpos, scale, offsets, forward=mjx_frames)
 
 
-def _phone(drawn: Draw, data: Data, raw: Float[Array, "N C O"]) -> tuple[jaxlie.SO3, jaxlie.SO3, Array]:
+def _phone(drawn: Draw, data: Data, raw: Float[Array, "N C O"]) -> Phone | None:
     """Fitted and measured orientations of the phone samples and their weights."""
     if not data.problem.moving:
-        return no_phone()
+        return None
     measured = data.phone_quat_wxyz.at[drawn.phone.reshape(-1)].get(mode="promise_in_bounds")
     per_trial = data.trial_weight * (data.phone_count > 0) / drawn.phone.shape[1]
     weights = jnp.broadcast_to(per_trial[:, None], drawn.phone.shape).reshape(-1)
-    return data.turn(raw.reshape(-1, raw.shape[-1])), jaxlie.SO3(measured), weights
+    return Phone(data.turn(raw.reshape(-1, raw.shape[-1])), lambda _: jaxlie.SO3(measured), weights)
 
 
 def draw(key: Array, data: Data) -> Draw:

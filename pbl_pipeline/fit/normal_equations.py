@@ -1,56 +1,44 @@
-"""The normal equations of a session: every residual of `objective.py`, differentiated, as one bordered banded system.
+"""The normal equations of a session: the terms of `objective.py`, linearised, as one bordered banded system.
 
-A keypoint's residual depends on the joints, the camera and what the session shares only through one marker's position,
-so its derivative is that of a function of three numbers (`linearised`) times the kinematic Jacobian. Robust costs enter
-as weighted squares (iteratively reweighted least squares).
+Each term states its own residuals and weights (`Term.rows`); here is how their variables move with the unknowns. A
+marker's or a sole's residual depends on the joints, the camera and what the session shares only through positions, so
+its derivative is that of a function of a few numbers times the kinematic Jacobian.
 
 Unknowns of a frame: qpos (Q) and, where the camera moves, a small rotation of it (3, world axes, from the left).
 Shared: s (S), marker offsets (3 J), clocks (N, where the camera moves), floors (3 N) and, where the paramset asks for
-them, what the detector gets wrong in all frames of a trial (lean 3, depth J; N times).
+them, the detector's errors common to all frames of a trial (lean 3, depth J; N times).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from pbl_pipeline.body import Body, MarkerJacobian, marker_jacobian, scale_multipliers
 
 from .detector_error import DetectorError, detector_blocks, detector_error
-from .linearised import linearised, times
-from .objective import (
-    At,
-    Loffset,
-    State,
-    detector_prior,
-    frame_count,
-    huber_weight,
-    in_camera,
-    later,
-    mean_weights,
-    no_phone,
-    offset_m,
-    residual_2d_px,
-    residual_3d_cm,
-    residual_floor_cm,
-    residual_phone_deg,
-    residual_slide_cm,
-    shared_prior,
-    slide_contact,
-    weighted,
-)
-from .priors import Weights, bent, beyond_limit_deg, inclination, pose_z, posture, responsibilities, shift
-from .problem import Problem, frames_at
+from .feet_terms import later
+from .joint_terms import shift
+from .keypoint_terms import mean_weights
+from .linearised import times
+from .objective import KEYPOINTS, TERMS
+from .phone_term import phone_at
+from .problem import Problem, State, frames_at
 from .solvers.linear import BorderedBandedSystem
+from .term import At, Rows, SharedTerm, Term, Unknowns, frame_count
+from .weights import Weights
 
+#: Terms that are added by way of the markers' positions (`_marker_blocks`).
+OF_MARKERS = (Unknowns.MARKER, Unknowns.CENTRED_MARKER)
 #: Frames whose markers are differentiated at once: bounds the memory of long sessions.
 CHUNK = 512
 
@@ -72,12 +60,13 @@ class Linearised:
 
 
 class _Blocks(NamedTuple):
-    """What the terms add up to: H (F, U, U) and g (F, U) of the frames, `link` (F, U, U) of each with the next one, B
-    (F, U, K), C (K, K) and h (K,) of what is shared."""
+    """What the terms add up to: H (F, U, U) and g (F, U) of the frames, `link` (F, U, U) of each with the next one and
+    the diagonals `link_2` (F, U) of that with the one after, B (F, U, K), C (K, K) and h (K,) of what is shared."""
 
     H: Array
     g: Array
     link: Array
+    link_2: Array
     B: Array
     C: Array
     h: Array
@@ -88,47 +77,31 @@ def linearise(body: Body, p: Problem, w: Weights, state: State) -> Linearised:
     # GPUs round the factors of float32 products to ten bits unless told otherwise.
     with jax.default_matmul_precision("highest"):
         columns = _columns_of(state, p.moving)
-        x, soles, blocks = _keypoint_terms(body, p, w, state, columns)
-        blocks = _add_soles(blocks, p, w, state, soles, columns)
-        blocks = _add_shared(blocks, p, w, state, columns)
-        if p.moving:
-            blocks = _add_phone(blocks, p, w, state, columns)
-        blocks, next_2 = _add_joints(blocks, p, w, state)
-        system = BorderedBandedSystem(blocks.H, blocks.link, next_2, blocks.B, blocks.C)
+        x, soles, sum_ = _keypoint_terms(body, p, w, state, columns)
         markers, at_floor, _ = p.split(x)
-        at = At(p, w, state, markers, at_floor, _phone(p, state))
-        terms = weighted(at)
-        dispersion = 2 * (terms["L3D"] + terms["L2D"]) * frame_count(p) / jnp.maximum(_observed_numbers(p), 1.0)
-        cost = functools.reduce(jnp.add, terms.values())
-        return Linearised(cost, system, blocks.g, blocks.h, x, dispersion)
+        at = At(p, w, state, markers, at_floor, phone_at(p, state))
+        for term in TERMS:
+            if isinstance(term, Term) and term.unknowns not in OF_MARKERS and not term.empty(at):
+                sum_ = _add_term(sum_, term, at, soles, columns)
+        sum_ = _hold(_add_shared(sum_, at, columns), p)
+        system = BorderedBandedSystem(sum_.H, sum_.link, sum_.link_2, sum_.B, sum_.C)
+        values = {term: term.value(at) for term in TERMS}
+        seen = functools.reduce(jnp.add, [values[term] for term in KEYPOINTS])
+        dispersion = 2 * seen * frame_count(p) / jnp.maximum(_observed_numbers(p), 1.0)
+        cost = functools.reduce(jnp.add, values.values())
+        return Linearised(cost, system, sum_.g, sum_.h, x, dispersion)
 
 
 def moved(state: State, dx: Float[Array, "F U"], dy: Float[Array, " K"]) -> State:
     """The state after a step of the unknowns."""
-    sizes = _columns_of(state, dx.shape[1] > state.qpos.shape[1])
-    turn = jaxlie.SO3.exp(dx[:, state.qpos.shape[1] :]).as_matrix() if sizes.clock else None
-    R_nc = state.R_nc if turn is None else jnp.einsum("fij,fvjk->fvik", turn, state.R_nc, precision="highest")
-    detector = dy[sizes.detector].reshape(state.lean.shape[0], 3 + state.depth_m.shape[1])
-    return State(
-        qpos=state.qpos + dx[:, : state.qpos.shape[1]],
-        R_nc=R_nc,
-        s=state.s + dy[sizes.s],
-        site_offset_m=state.site_offset_m + dy[sizes.offset].reshape(-1, 3),
-        clock_s=state.clock_s + dy[sizes.clock] if sizes.clock else state.clock_s,
-        floor=state.floor + dy[sizes.floor].reshape(-1, 3),
-        lean=state.lean + detector[:, :3],
-        depth_m=state.depth_m + detector[:, 3:],
-    )
-
-
-def measured_orientation(p: Problem, clock_s: Float[Array, " F"]) -> jaxlie.SO3:
-    """The phone's logged orientation (F,) at the frames, with its trial's clock ahead of the video's by `clock_s`."""
-    quats = p.sample_quat_wxyz[p.trial]
-    at = jnp.clip((p.time_s + clock_s - p.sample_start_s[p.trial]) / p.sample_step_s, 0.0, quats.shape[1] - 1.001)
-    i = jnp.floor(at).astype(jnp.int32)
-    take = jax.vmap(lambda q, k: q[k])
-    before, after = jaxlie.SO3(take(quats, i)), jaxlie.SO3(take(quats, i + 1))
-    return jaxlie.SO3.exp((after @ before.inverse()).log() * (at - i)[:, None]) @ before
+    q = state.qpos.shape[1]
+    moving = dx.shape[1] > q
+    R_nc = state.R_nc
+    if moving:
+        turn = jaxlie.SO3.exp(dx[:, q:]).as_matrix()
+        R_nc = jnp.einsum("fij,fvjk->fvik", turn, R_nc, precision="highest")
+    y, with_shared = _shared(state, moving)
+    return dataclasses.replace(with_shared(y + dy), qpos=state.qpos + dx[:, :q], R_nc=R_nc)
 
 
 # --- where the shared unknowns lie
@@ -137,7 +110,7 @@ def measured_orientation(p: Problem, clock_s: Float[Array, " F"]) -> jaxlie.SO3:
 class _Columns(NamedTuple):
     s: slice
     offset: slice
-    clock: slice | None
+    clock: slice
     floor: slice
     detector: slice
     frame: int  # unknowns of a frame
@@ -145,18 +118,35 @@ class _Columns(NamedTuple):
 
 
 def _columns_of(state: State, moving: bool) -> _Columns:
-    of_detector = state.lean.size + state.depth_m.size
-    sizes = [state.s.size, state.site_offset_m.size, state.clock_s.size * moving, state.floor.size, of_detector]
-    ends = [sum(sizes[: i + 1]) for i in range(5)]
+    sizes = [a.size for a in _shared_parts(state, moving)]
+    ends = np.cumsum(sizes).tolist()
     s, offset, clock, floor, detector = (slice(end - size, end) for end, size in zip(ends, sizes, strict=True))
-    return _Columns(s, offset, clock if moving else None, floor, detector, state.qpos.shape[1] + 3 * moving, ends[-1])
+    return _Columns(s, offset, clock, floor, detector, state.qpos.shape[1] + 3 * moving, ends[-1])
 
 
-def _phone(p: Problem, state: State) -> tuple[jaxlie.SO3, jaxlie.SO3, Array]:
-    if not p.moving:
-        return no_phone()
-    weights = p.weight * p.has_phone[p.trial] / frame_count(p)
-    return jaxlie.SO3.from_matrix(state.R_nc[:, 0]), measured_orientation(p, state.clock_s[p.trial]), weights
+def _shared_parts(state: State, moving: bool) -> tuple[Array, ...]:
+    """The shared unknowns of a state; clocks where a camera moves."""
+    detector = jnp.concatenate([state.lean, state.depth_m], axis=1)
+    return state.s, state.site_offset_m, state.clock_s if moving else state.clock_s[:0], state.floor, detector
+
+
+def _shared(state: State, moving: bool) -> tuple[Float[Array, " K"], Callable[[Array], State]]:
+    """The shared unknowns of a state, and the state with other ones."""
+    y, parts_of = ravel_pytree(_shared_parts(state, moving))
+
+    def with_shared(y: Float[Array, " K"]) -> State:
+        s, offset, clock, floor, detector = parts_of(y)
+        return dataclasses.replace(
+            state,
+            s=s,
+            site_offset_m=offset,
+            clock_s=clock if moving else state.clock_s,
+            floor=floor,
+            lean=detector[:, :3],
+            depth_m=detector[:, 3:],
+        )
+
+    return y, with_shared
 
 
 def _observed_numbers(p: Problem) -> Array:
@@ -189,7 +179,8 @@ def _keypoint_terms(
         at = slice(first_sole, first_sole + n_soles)
         soles = _Soles(jac.x_world_m[:, at], jac.per_qpos[:, at], jac.per_scale[:, at])
         markers: MarkerJacobian = jax.tree.map(lambda a: a[:, :first_sole], jac)
-        (H, g, B), shared = _marker_blocks(part, w, markers, R_nc, detector_error(part, state, R_nc))
+        at = At(part, w, dataclasses.replace(state, qpos=qpos, R_nc=R_nc), markers.x_world_m, soles.x)
+        (H, g, B), shared = _marker_blocks(at, markers, detector_error(part, state, R_nc))
         return (jac.x_world_m, soles, H, g, B), shared
 
     if size == frames:
@@ -206,39 +197,29 @@ def _keypoint_terms(
     return x, soles, _with_room(H, g, B, C, h, columns)
 
 
-def _marker_blocks(
-    p: Problem, w: Weights, jac: MarkerJacobian, R_nc: Array, detector: DetectorError
-) -> tuple[tuple, tuple]:
-    """Blocks of the keypoint terms: H (F, U, U), g (F, U), B (F, U, K) and C (K, K), h (K,), of s, offsets and what the
-    detector gets wrong."""
-    x, U = jac.x_world_m, jac.per_offset
+def _marker_blocks(at: At, jac: MarkerJacobian, detector: DetectorError) -> tuple[tuple, tuple]:
+    """Blocks of the keypoint terms: H (F, U, U), g (F, U), B (F, U, K) and C (K, K), h (K,), of s, offsets and the
+    detector's errors."""
+    p, x, U = at.problem, jac.x_world_m, jac.per_offset
     by_frame = [jac.per_qpos]
     if p.moving:
         by_frame.append(_cross_matrix(x))  # a camera that turns sees every point turn the other way
     A = jnp.concatenate([*by_frame, jac.per_scale], axis=-1)
     n_s, n = jac.per_scale.shape[-1], A.shape[-1]
     q = n - n_s
-    frame = p.weight[:, None]
 
+    # Force on each marker, and its curvature (F, J, 3, 3): of terms as they are, and of centred ones in each view.
     f, M = jnp.zeros_like(x), jnp.zeros((*x.shape, 3), x.dtype)
-    if p.c_world.shape[1]:
-        r, D = linearised(lambda x: residual_3d_cm(x, p.x_world), x)
-        c = w.weight_3d * frame * p.c_world * p.weight_3d * huber_weight(r, w.huber_3d_cm)
-        f += jnp.einsum("fm,fmij,fmi->fmj", c, D, r)
-        M += jnp.einsum("fm,fmik,fmil->fmkl", c, D, D)
-
-    r, D = linearised(lambda x: residual_2d_px(in_camera(x, R_nc, p.p_nc), p.xy_px, p.camera_matrix), x)
-    c = w.weight_2d * frame[..., None] * p.c_2d * huber_weight(r, w.huber_2d_px)
-    f += jnp.einsum("fvm,fvmij,fvmi->fmj", c, D, r)
-    M += jnp.einsum("fvm,fvmik,fvmil->fmkl", c, D, D)
-
+    for c, r, D in _rows(at, Unknowns.MARKER):
+        f += jnp.einsum("fvm,fvmij,fvmi->fmj", c, D, r)
+        M += jnp.einsum("fvm,fvmik,fvmil->fmkl", c, D, D)
     centred = mean_weights(p.c_3d, p.weight_3d)
-    away = offset_m(in_camera(x, R_nc, p.p_nc), detector.x_cam, centred)
-    r, D = linearised(lambda x: residual_3d_cm(in_camera(x, R_nc, p.p_nc) - away, detector.x_cam, w.depth_ratio), x)
-    c = w.weight_3d * frame[..., None] * p.c_3d * p.weight_3d * huber_weight(r, w.huber_3d_cm)
-    force = jnp.einsum("fvm,fvmij,fvmi->fvmj", c, D, r)
+    force = jnp.zeros((*centred.shape, 3), x.dtype)
+    W = jnp.zeros((*force.shape, 3), x.dtype)
+    for c, r, D in _rows(at, Unknowns.CENTRED_MARKER):
+        force += jnp.einsum("fvm,fvmij,fvmi->fvmj", c, D, r)
+        W += jnp.einsum("fvm,fvmik,fvmil->fvmkl", c, D, D)
     f_3d = jnp.sum(force - centred[..., None] * jnp.sum(force, axis=2, keepdims=True), axis=1)
-    W = jnp.einsum("fvm,fvmik,fvmil->fvmkl", c, D, D)
 
     frames, markers = x.shape[:2]
     flat = lambda a: a.reshape(frames, markers * 3, -1)  # noqa: E731
@@ -280,10 +261,16 @@ def _marker_blocks(
     return (G[:, :q, :q], -pulled[:, :q], B), (C, -h)
 
 
+def _rows(at: At, unknowns: Unknowns) -> Iterator[Rows]:
+    """The terms of these unknowns, linearised."""
+    return (t.rows(at) for t in TERMS if isinstance(t, Term) and t.unknowns is unknowns and not t.empty(at))
+
+
 def _with_room(H: Array, g: Array, B: Array, C: Array, h: Array, columns: _Columns) -> _Blocks:
     """The keypoints' blocks with room for all shared unknowns and no links yet."""
     among_all = functools.partial(_spread, at=(columns.s, columns.offset, columns.detector), size=columns.size)
-    return _Blocks(H, g, jnp.zeros_like(H), among_all(B), among_all(among_all(C).T).T, among_all(h))
+    none = jnp.zeros_like(H)
+    return _Blocks(H, g, none, none[..., 0], among_all(B), among_all(among_all(C).T).T, among_all(h))
 
 
 def _spread(a: Float[Array, "*n A"], at: Sequence[slice], size: int) -> Float[Array, "*n {size}"]:
@@ -303,145 +290,113 @@ def _cross_matrix(x: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
     return jnp.stack([zero, -c, b, c, zero, -a, -b, a, zero], axis=-1).reshape(*x.shape, 3)
 
 
-# --- joints
+# --- all other terms
 
 
-def _add_joints(sum_: _Blocks, p: Problem, w: Weights, state: State) -> tuple[_Blocks, Array]:
-    """Limits, pose prior and smoothness, and the diagonals (F, U) of the links with the frame after the next. Frames
-    that count for nothing stay where they are.
-    """
-    r, D = linearised(lambda q: beyond_limit_deg(q[..., 0], w.low, w.high)[..., None], state.qpos[..., None])
-    each = w.weight_limit * p.weight[:, None]
-    diagonal, force = each * D[..., 0, 0] ** 2, each * D[..., 0, 0] * r[..., 0]
-    each = w.weight_pose * p.weight[:, None]
-    z = pose_z(posture(state.qpos, w.pelvis), w.neutral, w.whitener)
-    own = each * responsibilities(z, w.pose_log_weight)
-    towards = jnp.einsum("fc,fcp,cpq->fq", own, z, w.whitener)
-    curvature = jnp.einsum("fc,cqr->fqr", own, jnp.einsum("cpq,cpr->cqr", w.whitener, w.whitener))
-    if w.pelvis.shape[0]:
-        # Only the pelvis' own three joints are seen through its tilt and list.
-        inclined, by_pelvis = linearised(inclination, state.qpos[:, w.pelvis])
-        # Among a posture's values these two are the pelvis' own.
-        each = w.weight_pelvis * p.weight * p.c_pelvis / w.pelvis_sd**2
-        towards = towards.at[:, w.pelvis[:2]].add(each[:, None] * (inclined - p.pelvis))
-        curvature = curvature.at[:, w.pelvis[:2], w.pelvis[:2]].add(each[:, None])
-        through = lambda a: _through(a, by_pelvis, w.pelvis)  # noqa: E731
-        towards = through(towards[:, None])[:, 0]
-        curvature = jnp.swapaxes(through(jnp.swapaxes(through(curvature), 1, 2)), 1, 2)
-    force += towards
-    r, transposed = jax.vjp(lambda q: bent(q, p.bend), state.qpos)
-    force += transposed(w.smooth * r)[0]
-    # The difference at t involves t - 1, t and t + 1; that at t + 1 the following three.
-    at, after = p.bend[:, 1], p.bend[:, 2]
-    later_before, later_at, later_after = shift(p.bend, -1).T
-    around = at**2 + later_before**2 + shift(after, 1) ** 2
-    diagonal += around[:, None] * w.smooth
-    next_1 = (at * after + later_before * later_at)[:, None] * w.smooth
-    next_2 = (later_before * later_after)[:, None] * w.smooth
+def _add_term(sum_: _Blocks, term: Term, at: At, soles: _Soles, columns: _Columns) -> _Blocks:
+    """Add a term, by how its variables move with the unknowns."""
+    p, q = at.problem, soles.by_q.shape[-1]
+    if term.by_hand:
+        force, curvature = term.by_hand(at)
+        return sum_._replace(H=sum_.H + _room(curvature, columns.frame, 0), g=sum_.g - _room(force, columns.frame, 0))
+    rows = term.rows(at)
+    D, trials = rows.D, jax.nn.one_hot(p.trial, p.has_phone.shape[0], dtype=sum_.H.dtype)
+    match term.unknowns:
+        case Unknowns.JOINT:
+            return _add_bands(sum_, rows._replace(D=jnp.pad(D, [(0, 0)] * (D.ndim - 1) + [(1, 1)])))
+        case Unknowns.JOINT_IN_THREE_FRAMES:
+            return _add_bands(sum_, rows)
+        case Unknowns.JOINTS:
+            return _add_squares(sum_, columns, rows, D)
+        case Unknowns.PHONE:
+            one = Rows(*(a[:, None] for a in rows))
+            by_clock = one.D[..., 3:] * trials[:, None, None]
+            return _add_squares(sum_, columns, one, one.D[..., :3], [by_clock], [columns.clock], first=q)
+        case Unknowns.SOLE_AND_FLOOR:
+            by_floor = D[..., None, 3:] * trials[:, None, None, :, None]
+            shared = [D[..., :3] @ soles.by_s, by_floor.reshape(*D.shape[:-1], -1)]
+            return _add_squares(sum_, columns, rows, D[..., :3] @ soles.by_q, shared, [columns.s, columns.floor])
+        case Unknowns.SOLE_IN_TWO_FRAMES:
+            here, there = D[..., :3], D[..., 3:]
+            by_s = here @ soles.by_s + there @ later(soles.by_s)
+            following = there @ later(soles.by_q)
+            return _add_squares(sum_, columns, rows, here @ soles.by_q, [by_s], [columns.s], following)
+    raise AssertionError(term.unknowns)
+
+
+def _add_squares(
+    sum_: _Blocks,
+    columns: _Columns,
+    rows: Rows,
+    here: Float[Array, "F P D n"],
+    shared: Sequence[Float[Array, "F P D _"]] = (),
+    at: Sequence[slice] = (),
+    following: Float[Array, "F P D n"] | None = None,
+    first: int = 0,
+) -> _Blocks:
+    """Add weighted squares of residuals. `here`: their derivatives by the unknowns of the frame from `first` on;
+    `following`: by those of the next frame; `shared`: by the shared unknowns that lie `at` some places."""
+    n, parts = here.shape[-1], [here] if following is None else [here, following]
+    m, J = n * len(parts), jnp.concatenate([*parts, *shared], axis=-1)
+    K = jnp.einsum("fpia,fp,fpib->fab", J, rows.c, J)
+    force = jnp.einsum("fpia,fp,fpi->fa", J, rows.c, rows.r)
+    H, B, g, link = K[:, :n, :n], K[:, :n, m:], force[:, :n], sum_.link
+    if following is not None:
+        second = slice(n, m)
+        H, B, g = H + shift(K[:, second, second], 1), B + shift(K[:, second, m:], 1), g + shift(force[:, second], 1)
+        link += _room(K[:, :n, second], columns.frame, first)
+    room = functools.partial(_room, size=columns.frame, first=first)
+    sum_ = sum_._replace(H=sum_.H + room(H), g=sum_.g - room(g), link=link)
+    if not shared:
+        return sum_
+    among_all = functools.partial(_spread, at=at, size=columns.size)
+    below = [(0, 0), (first, columns.frame - first - n), (0, 0)]
+    return sum_._replace(
+        B=sum_.B + jnp.pad(among_all(B), below),
+        C=sum_.C + among_all(among_all(jnp.sum(K[:, m:, m:], axis=0)).T).T,
+        h=sum_.h - among_all(jnp.sum(force[:, m:], axis=0)),
+    )
+
+
+def _add_bands(sum_: _Blocks, rows: Rows) -> _Blocks:
+    """Add weighted squares of residuals (F, Q, E) of each joint in the frame before, at and after, by derivatives (F,
+    Q, E, 3). That at t involves t - 1, t and t + 1, and that at t + 1 the following three."""
+    c, r, D = rows
+    before, now, after = (c * jnp.sum(D[..., k] * r, axis=-1) for k in range(3))
+    both = {(i, k): c * jnp.sum(D[..., i] * D[..., k], axis=-1) for i in range(3) for k in range(i, 3)}
     wide = lambda a: jnp.pad(a, [(0, 0), (0, sum_.g.shape[-1] - a.shape[-1])])  # noqa: E731
-    empty = (p.weight == 0) & (around == 0)
-    on_diagonal = lambda a: a[..., None] * jnp.eye(a.shape[-1], dtype=a.dtype)  # noqa: E731
-    q = state.qpos.shape[1]
-    H = (sum_.H + on_diagonal(wide(diagonal) + empty[:, None])).at[:, :q, :q].add(curvature)
-    link = sum_.link + on_diagonal(wide(next_1))
-    return sum_._replace(H=H, g=sum_.g - wide(force), link=link), wide(next_2)
+    on_diagonal = lambda a: wide(a)[..., None] * jnp.eye(sum_.g.shape[-1], dtype=a.dtype)  # noqa: E731
+    return sum_._replace(
+        H=sum_.H + on_diagonal(shift(both[0, 0], -1) + both[1, 1] + shift(both[2, 2], 1)),
+        g=sum_.g - wide(shift(before, -1) + now + shift(after, 1)),
+        link=sum_.link + on_diagonal(both[1, 2] + shift(both[0, 1], -1)),
+        link_2=sum_.link_2 + wide(shift(both[0, 2], -1)),
+    )
 
 
-def _through(a: Float[Array, "F R Q"], by_pelvis: Float[Array, "F 2 3"], pelvis: Array) -> Float[Array, "F R Q"]:
-    """Rows by a posture's values as rows by the joint values."""
-    of_pelvis = a[..., pelvis[:1]] * by_pelvis[:, :1] + a[..., pelvis[1:2]] * by_pelvis[:, 1:]
-    return a.at[..., pelvis].set(of_pelvis.at[..., 2].add(a[..., pelvis[2]]))
-
-
-# --- shared unknowns, phone, soles
-
-
-def _add_shared(sum_: _Blocks, p: Problem, w: Weights, state: State, columns: _Columns) -> _Blocks:
-    """Marker offsets and the priors of scale, clocks, floors and the detector's errors, all quadratic."""
+def _add_shared(sum_: _Blocks, at: At, columns: _Columns) -> _Blocks:
+    """Add the terms of the shared unknowns alone, all quadratic."""
+    y, with_shared = _shared(at.state, at.problem.moving)
 
     def cost(y: Array) -> Array:
-        clock = y[columns.clock] if columns.clock else jnp.zeros(1)
-        floor = y[columns.floor].reshape(-1, 3)
-        lean, depth_m = jnp.split(
-            y[columns.detector].reshape(state.lean.shape[0], 3 + state.depth_m.shape[1]), [3], axis=1
-        )
-        offset = w.weight_offset_per_m2 * Loffset(y[columns.offset].reshape(-1, 3))
-        detector = w.weight_detector * detector_prior(p, w, lean, depth_m)
-        return frame_count(p) * (offset + detector + shared_prior(p, w, y[columns.s], clock, floor))
+        there = at._replace(state=with_shared(y))
+        values = [term.value(there) for term in TERMS if isinstance(term, SharedTerm)]
+        return frame_count(at.problem) * functools.reduce(jnp.add, values)
 
-    detector = jnp.concatenate([state.lean, state.depth_m], axis=1)
-    parts = [state.s, state.site_offset_m, *([state.clock_s] if columns.clock else []), state.floor, detector]
-    y = jnp.concatenate([a.reshape(-1) for a in parts])
     return sum_._replace(C=sum_.C + jax.hessian(cost)(y), h=sum_.h - jax.grad(cost)(y))
 
 
-def _add_phone(sum_: _Blocks, p: Problem, w: Weights, state: State, columns: _Columns) -> _Blocks:
-    """The phone's orientation: rotations of the camera (the last 3 unknowns of a frame) and the clocks."""
-    R_nc, clock = jaxlie.SO3.from_matrix(state.R_nc[:, 0]), state.clock_s[p.trial]
-
-    def residual(z: Array) -> Array:
-        return residual_phone_deg(jaxlie.SO3.exp(z[:, :3]) @ R_nc, measured_orientation(p, clock + z[:, 3]))
-
-    r, D = linearised(residual, jnp.zeros((clock.shape[0], 4), clock.dtype))
-    has_phone = p.has_phone[p.trial]
-    c = w.weight_phone / w.huber_phone_deg * p.weight * has_phone * huber_weight(r, w.huber_phone_deg)
-    K = jnp.einsum("f,fik,fil->fkl", c, D, D)
-    force = jnp.einsum("f,fik,fi->fk", c, D, r)
-    # A frame without orientation keeps its camera.
-    hold = (1e-3 + 1e6 * (1 - has_phone))[:, None, None] * jnp.eye(3, dtype=K.dtype)
-    trials = jax.nn.one_hot(p.trial, p.has_phone.shape[0], dtype=K.dtype)
-    at = columns.clock
-    return sum_._replace(
-        H=sum_.H.at[:, -3:, -3:].add(K[:, :3, :3] + hold),
-        g=sum_.g.at[:, -3:].add(-force[:, :3]),
-        B=sum_.B.at[:, -3:, at].add(K[:, :3, 3:] * trials[:, None]),
-        C=sum_.C.at[at, at].add(jnp.diag(K[:, 3, 3] @ trials)),
-        h=sum_.h.at[at].add(-force[:, 3] @ trials),
-    )
+def _hold(sum_: _Blocks, p: Problem) -> _Blocks:
+    """Frames that count for nothing stay where they are, and a frame without orientation keeps its camera."""
+    bent = p.bend[:, 1] ** 2 + shift(p.bend[:, 0], -1) ** 2 + shift(p.bend[:, 2], 1) ** 2
+    empty = jnp.broadcast_to(((p.weight == 0) & (bent == 0))[:, None], sum_.g.shape)
+    if p.moving:
+        turns = jnp.arange(sum_.g.shape[1]) >= sum_.g.shape[1] - 3
+        empty = empty + turns * (1e-3 + 1e6 * (1 - p.has_phone[p.trial]))[:, None]
+    return sum_._replace(H=sum_.H + empty[..., None] * jnp.eye(empty.shape[1], dtype=sum_.H.dtype))
 
 
-def _add_soles(sum_: _Blocks, p: Problem, w: Weights, state: State, soles: _Soles, columns: _Columns) -> _Blocks:
-    """Feet on the floor, which also couple a frame's joints with the next one's."""
-    n, q = state.floor.shape[0], soles.by_q.shape[-1]
-    x, floor = soles.x, jnp.broadcast_to(state.floor[p.trial][:, None], soles.x.shape)
-    frame = p.weight[:, None]
-
-    at_floor = jnp.concatenate([x, floor], axis=-1)
-    r, D = linearised(lambda z: residual_floor_cm(z[..., :3], z[..., 3:]), at_floor)
-    one_hot = jax.nn.one_hot(p.trial, n, dtype=x.dtype)[:, None, None, :, None]
-    by_floor = (D[..., None, 3:] * one_hot).reshape(*D.shape[:-1], 3 * n)
-    by_all = jnp.concatenate([D[..., :3] @ soles.by_q, D[..., :3] @ soles.by_s, by_floor], axis=-1)
-    c = frame * p.contact * w.weight_floor * huber_weight(r, w.huber_floor_cm)
-    K, force = _squares(by_all, c, r)
-    H, B, C = K[:, :q, :q], K[:, :q, q:], jnp.sum(K[:, q:, q:], axis=0)
-    g, h = force[:, :q], jnp.sum(force[:, q:], axis=0)
-
-    now_and_next = jnp.concatenate([x, later(x)], axis=-1)
-    r, D = linearised(lambda z: residual_slide_cm(z[..., :3], z[..., 3:], p.rate[:, None]), now_and_next)
-    here, there = D[..., :3], D[..., 3:]
-    by_s = here @ soles.by_s + there @ later(soles.by_s)
-    by_all = jnp.concatenate([here @ soles.by_q, there @ later(soles.by_q), by_s], axis=-1)
-    c = frame * slide_contact(p) * w.weight_slide * huber_weight(r, w.huber_slide_cm)
-    K, force = _squares(by_all, c, r)
-    n_s, first, second, both = by_s.shape[-1], slice(q), slice(q, 2 * q), slice(2 * q, None)
-    H += K[:, first, first] + shift(K[:, second, second], 1)
-    B = B.at[..., :n_s].add(K[:, first, both] + shift(K[:, second, both], 1))
-    C = C.at[:n_s, :n_s].add(jnp.sum(K[:, both, both], axis=0))
-    g += force[:, first] + shift(force[:, second], 1)
-    h = h.at[:n_s].add(jnp.sum(force[:, both], axis=0))
-
-    # The shared unknowns of the soles are s and the floors, which do not lie side by side.
-    among_all = functools.partial(_spread, at=(columns.s, columns.floor), size=columns.size)
-    return sum_._replace(
-        H=sum_.H.at[:, :q, :q].add(H),
-        g=sum_.g.at[:, :q].add(-g),
-        link=sum_.link.at[:, :q, :q].add(K[:, first, second]),
-        B=sum_.B.at[:, :q].add(among_all(B)),
-        C=sum_.C + among_all(among_all(C).T).T,
-        h=sum_.h - among_all(h),
-    )
-
-
-def _squares(J: Float[Array, "F P D A"], c: Float[Array, "F P"], r: Float[Array, "F P D"]) -> tuple[Array, Array]:
-    """Curvature (F, A, A) and gradient (F, A) of half the weighted squares of residuals with a Jacobian."""
-    return jnp.einsum("fpia,fp,fpib->fab", J, c, J), jnp.einsum("fpia,fp,fpi->fa", J, c, r)
+def _room(a: Array, size: int, first: int) -> Array:
+    """Values (F, n) or (F, n, n) of some unknowns of a frame, from `first` on, among all of them."""
+    beside = (first, size - first - a.shape[-1])
+    return jnp.pad(a, [(0, 0)] + [beside] * (a.ndim - 1))

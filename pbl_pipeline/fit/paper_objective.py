@@ -16,13 +16,14 @@ from jaxtyping import Array, ArrayLike, Float
 from pbl_pipeline.body import Body, MarkerSet, marker_positions, scale_multipliers
 from pbl_pipeline.keypoints import Keypoints
 
-from ._params import PAPER_2025, CostParams
-from ._rotation import matrices_of
-from .objective import PAPER, At, State, no_phone, total
-from .priors import Weights
-from .problem import Problem
+from .objective import PAPER, total
+from .params import PAPER_2025, CostParams
+from .problem import Problem, State
 from .results import SessionFit
+from .rotations import matrices_of
 from .session import Session, Trial, make_session
+from .term import At, Phone
+from .weights import Weights
 
 #: The paper's own (section Total loss and optimization), whatever the defaults of `CostParams` become.
 PAPER_COST = CostParams(
@@ -82,8 +83,8 @@ def _total(body: Body, p: Problem, w: Weights, state: State) -> Array:
     with jax.default_matmul_precision("highest"):
         offsets = p.point_offsets(state.site_offset_m)
         x, soles, _ = p.split(marker_positions(body, p.points, state.qpos, scale_multipliers(state.s), offsets))
-        phone = no_phone()
+        phone = None
         if p.moving:
             fitted, measured = (jaxlie.SO3.from_matrix(jnp.asarray(R)[:, 0]) for R in (state.R_nc, p.R_nc))
-            phone = fitted, measured, p.weight * jnp.asarray(p.has_phone)[p.trial]
+            phone = Phone(fitted, lambda _: measured, p.weight * jnp.asarray(p.has_phone)[p.trial])
         return total(At(p, w, state, x, soles, phone), PAPER)

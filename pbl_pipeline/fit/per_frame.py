@@ -20,19 +20,19 @@ from pbl_pipeline import progress
 from pbl_pipeline.body import Body, scale_multipliers
 from pbl_pipeline.jax_setup import compile_seconds
 
-from ._params import GaussNewtonParams
-from ._phone_error import phone_variance
-from ._threads import one_blas_thread
 from .augmented_pelvis import with_augmented_pelvis
+from .blas_threads import one_blas_thread
 from .initial_pose import placed_poses
 from .normal_equations import Linearised, linearise, moved
-from .objective import State
-from .priors import Weights, pixels_alone
-from .problem import Problem, power_of_2
+from .params import GaussNewtonParams
+from .phone_error import phone_variance
+from .problem import Problem, State, pixels_alone, power_of_2
 from .session import Session
 from .solution import Outcome, Solution, outcome
 from .solvers.gauss_newton import Limits, Progress, before_first, minimise
 from .solvers.linear import marginal_variance
+from .solvers.result import Result
+from .weights import Weights
 
 #: A point that stands is slower than this fraction of its own fastest, or than this (m/s); speeds are means over some
 #: time (s, standard deviation).
@@ -179,7 +179,7 @@ def _step_by_step(body: Body, p: Problem, w: Weights, begin: Progress, limits: L
         for n in range(most + 1):  # the first one evaluates the start
             at = _one(body, p, w, at, dataclasses.replace(limits, iterations=jnp.asarray(n, jnp.int32)))
             update(min(n, 1), f"of at most {most}, cost {float(at.cost):.4g}")
-            if bool(at.converged):
+            if int(at.result) != Result.BOUND:
                 break
     return at
 
@@ -257,7 +257,7 @@ def _solution(
         compile_seconds=compiled,
         seconds=seconds,
         iterations=len(trace),
-        converged=bool(found.end.converged),
+        result=Result(int(found.end.result)),
         outcome=found.outcome,
         # The phone's part was in the recordings on which the factors were found, so they are of both.
         qpos_sd=np.sqrt((variance + phone_variance(session, state.qpos)) * factor**2 + floor**2),

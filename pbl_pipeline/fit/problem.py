@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from pbl_pipeline.body import Body, MarkerSet
 
-from ._rotation import quat_wxyz, rotation_matrices
+from .rotations import quat_wxyz, rotation_matrices
 
 #: Sizes to which markers are padded; larger sets are padded to a multiple of 64.
 MARKER_SIZES = (24, 40, 64, 96, 128)
@@ -103,6 +103,27 @@ class Problem:
     def point_offsets(self, site_offset_m: Float[Array, "J 3"]) -> Float[Array, "P 3"]:
         """Offsets of all points: those of the markers, 0 for the others."""
         return jnp.pad(site_offset_m, [(0, self.points.position_m.shape[-2] - site_offset_m.shape[-2]), (0, 0)])
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class State:
+    """The unknowns of a session at F frames. `s`: the paper's scale parameters; `clock_s`: sensor time minus video time
+    of each trial; `floor`: its height (m) and slopes along the world's x and y, of each trial.
+
+    What a detector's 3D points are wrong by in all frames of a trial, where the paramset asks for it (D is N, else 0):
+    `lean`, the rotation (rotation vector in rad, camera axes) that sets them upright, and `depth_m`, what must be added
+    to each marker's depth.
+    """
+
+    qpos: Float[Array, "F Q"]
+    R_nc: Float[Array, "F V 3 3"]
+    s: Float[Array, " S"]
+    site_offset_m: Float[Array, "J 3"]
+    clock_s: Float[Array, " N"]
+    floor: Float[Array, "N 3"]
+    lean: Float[Array, "D 3"] = dataclasses.field(default_factory=lambda: jnp.zeros((0, 3)))
+    depth_m: Float[Array, "D J"] = dataclasses.field(default_factory=lambda: jnp.zeros((0, 0)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -285,3 +306,9 @@ def frames_at(p: Problem, index: Int[Array, " K"]) -> Problem:
     """The keypoints and cameras of some frames, by their numbers; other fields are left as they are."""
     take = lambda a: a.at[index].get(mode="promise_in_bounds")  # noqa: E731
     return dataclasses.replace(p, **{k: take(getattr(p, k)) for k in PER_FRAME})
+
+
+def pixels_alone(problem: Problem) -> bool:
+    """Whether one camera without 3D points is all there is."""
+    none = lambda c: not np.any(np.asarray(c) > 0)  # noqa: E731
+    return none(problem.c_3d) and none(problem.c_world) and problem.c_2d.shape[1] == 1

@@ -22,9 +22,9 @@ from pbl_pipeline.keypoints import (
 )
 from pbl_pipeline.video import undistort_px
 
-from ._params import CostParams, Params, ViewParams
-from ._rotation import mean_rotation, rotation_matrices
+from .params import CostParams, Params, ViewParams
 from .problem import CLOCK_RANGE_S, Problem, TrialArrays, pack
+from .rotations import mean_rotation, rotation_matrices
 from .units import BODY, FILE, body_metres, check_units, pixel_px
 
 #: R_nc of a level camera that looks along world +x: columns are the camera's x (right), y (down), z (forward).

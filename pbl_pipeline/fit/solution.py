@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .objective import in_camera, mean_weights, offset_m, residual_2d_px, residual_3d_cm, square
+from .keypoint_terms import in_camera, mean_weights, offset_m, residual_2d_px, residual_3d_cm
 from .problem import Problem
+from .solvers.result import Result
+from .term import square
 
 
 @jax.tree_util.register_dataclass
@@ -36,7 +38,8 @@ class Solution:
     qpos in m and rad; R_nc: camera to world; s: the paper's scale parameters; scale: their multipliers; clock_s: sensor
     time minus video time of each trial, 0 where not estimated; loss_trace: (step, loss) of K steps; qpos_sd: standard
     deviations, None where the solver computes none; pelvis_told: 1 where the marker augmenter told how the pelvis is
-    tipped, None where the method does not ask it; metre: metres of the solution in one of the fit.
+    tipped, None where the method does not ask it; metre: metres of the solution in one of the fit; result: why the
+    solver ended.
     """
 
     qpos: Float[np.ndarray, "F Q"]
@@ -49,11 +52,16 @@ class Solution:
     compile_seconds: float
     seconds: float
     iterations: int
-    converged: bool
+    result: Result
     outcome: Outcome
     qpos_sd: Float[np.ndarray, "F Q"] | None = None
     pelvis_told: Float[np.ndarray, " F"] | None = None
     metre: float = 1.0
+
+    @property
+    def converged(self) -> bool:
+        """Whether the solver ended at a minimum."""
+        return self.result.converged
 
 
 def outcome(p: Problem, x: Float[Array, "F P 3"], R_nc: Float[Array, "F V 3 3"]) -> Outcome:

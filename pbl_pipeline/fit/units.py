@@ -22,7 +22,7 @@ from pbl_pipeline.body import Body, MarkerSet
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints
 
-from ._params import CostParams
+from .params import CostParams
 from .standing import standing_markers, trunk_of
 
 #: What a pixel of the cost is (`CostParams.pixel`): one of the file; one of a picture of 1080 x 1920, as the paper's

@@ -14,7 +14,7 @@ import numpy as np
 
 from pbl_pipeline.body import SCALE_NAMES
 from pbl_pipeline.fit import METHODS, SessionInput
-from pbl_pipeline.fit._params import POSE_PRIOR_DEG
+from pbl_pipeline.fit.params import POSE_PRIOR_DEG
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.synthetic import NO_NOISE, Noise, Seen

@@ -35,7 +35,7 @@ def watch(path: Path) -> None:
     import jax
     import numpy as np
 
-    from pbl_pipeline.fit import _fit_session, per_frame
+    from pbl_pipeline.fit import per_frame, session_fit
     from schemas import fit
     from workers import queue, run_job
 
@@ -53,9 +53,9 @@ def watch(path: Path) -> None:
         (run_job, "fetch_batch", number_of),
         (run_job, "compute_batch", number_of),
         (run_job, "run", None),
-        (_fit_session, "make_session", None),
-        (_fit_session, "start_of", None),
-        (_fit_session, "_session_fit", None),
+        (session_fit, "make_session", None),
+        (session_fit, "start_of", None),
+        (session_fit, "_session_fit", None),
         (per_frame, "_on_floor", None),
         (per_frame, "_solve", number_of),
         (fit.SessionFit, "_loaded", None),

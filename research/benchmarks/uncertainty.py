@@ -14,7 +14,7 @@ points 25 mm from the marker set's places), half by a phone that stands tilted b
 these errors are the same in many frames and in no residual, so a least standard deviation is found
 (`SD_FLOOR_BLAZEPOSE`).
 
-Prints them as they stand in pbl_pipeline/fit/_params.py. Exit code 1 where a group holds less than 85 % or more than
+Prints them as they stand in pbl_pipeline/fit/params.py. Exit code 1 where a group holds less than 85 % or more than
 95 % of the other recordings' samples.
 """
 

@@ -45,7 +45,7 @@ def main(
     held out; parameters are to be chosen on the others only.
     """
     from pbl_pipeline.files import check_out_folder
-    from pbl_pipeline.fit import METHODS, default_for_points
+    from pbl_pipeline.fit import METHODS, default_fit
     from pbl_pipeline.gait import GDI_METHODS
     from pbl_pipeline.method_file import named_or_file
     from research.corpus.errors import corpus_errors, corpus_tables, print_corpus, write_corpus
@@ -54,7 +54,7 @@ def main(
     check_out_folder(out)
     start = time.perf_counter()
     model = detector_model(detector)
-    chosen = named_or_file(METHODS, method or default_for_points(model.marker_set, model.root_relative))
+    chosen = named_or_file(METHODS, method or default_fit((model.marker_set, model.root_relative)))
     scored = named_or_file(GDI_METHODS, index)
     cases = corpus(detector, motions, quick=quick, together=together.split(",") if together else ())
     people = len({c.walk.person for c in cases})

@@ -14,7 +14,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, augmented_pelvis
 from pbl_pipeline.fit.augmented_pelvis import folds, inclination_of, pelvis_of, with_augmented_pelvis
 from pbl_pipeline.fit.checks import _pelvis_told
-from pbl_pipeline.fit.priors import inclination
+from pbl_pipeline.fit.joint_terms import inclination
 from pbl_pipeline.fit.session import make_session
 from pbl_pipeline.keypoints import AnatomicalMarkers, MarkerAugmenter
 from pbl_pipeline.synthetic import SynthSpec, synthesise

@@ -80,7 +80,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
         shutil.copytree(ROOT / name, folder / name, ignore=ignored)
     for path, texts in blocks().items():
         file = folder / path
-        assert file.exists() == (file.name == "_methods.py"), f"{path}: a method is a new file and a line"
+        assert file.exists() == file.name.endswith("methods.py"), f"{path}: a method is a new file and a line"
         with file.open("a") as f:
             f.writelines(texts)
     command = [sys.executable, "-c", RUN, str(folder)]
@@ -117,7 +117,7 @@ def test_a_solver(results):
 
 def test_a_registration_is_one_line():
     for path, texts in blocks().items():
-        if path.endswith("_methods.py"):
+        if path.endswith("methods.py"):
             for text in texts:
                 lines = [line for line in text.splitlines() if line and not line.startswith("from ")]
                 assert len(lines) == 1, path

@@ -24,18 +24,19 @@ from pbl_pipeline.fit import (
 )
 from pbl_pipeline.fit.checks import _converged
 from pbl_pipeline.fit.initial_pose import root_positions
-from pbl_pipeline.fit.objective import (
-    huber,
+from pbl_pipeline.fit.joint_terms import inclination, pose_cost, pose_z, posture
+from pbl_pipeline.fit.keypoint_terms import (
     in_camera,
     mean_weights,
     offset_m,
     project_px,
     residual_2d_px,
     residual_3d_cm,
-    square,
 )
-from pbl_pipeline.fit.priors import inclination, learned_poses, pose_cost, pose_prior, pose_z, posture, scale_precision
+from pbl_pipeline.fit.priors import learned_poses, pose_prior, scale_precision
 from pbl_pipeline.fit.solution import Outcome, Solution
+from pbl_pipeline.fit.solvers.result import Result
+from pbl_pipeline.fit.term import huber, square
 from pbl_pipeline.fit.trajectory import fit_ranges, pose_of, raw_of
 from pbl_pipeline.keypoints import bridge_gaps, longest_run_s, whole_person_in_view
 from pbl_pipeline.paramset import Paramset
@@ -216,7 +217,7 @@ def test_pose_prior_by_hand():
     q = jnp.deg2rad(jnp.array([[20.0, 77, -10, 60, 0], [0, 0, 0, 90, 0]]))
     z = pose_z(q, neutral, whitener)
     np.testing.assert_allclose(z[:, 0], [[2, 0, -1, -1, 0], [0, 0, 0, 0, 0]], atol=1e-6)
-    np.testing.assert_allclose(pose_cost(z, log_weight), [3, 0], atol=1e-6)
+    np.testing.assert_allclose(pose_cost(square(z), log_weight), [3, 0], atol=1e-6)
 
 
 def test_a_learned_prior_is_the_density_of_its_mixture():
@@ -228,7 +229,8 @@ def test_a_learned_prior_is_the_density_of_its_mixture():
     pose = np.zeros((6, len(names)))
     pose[:, index] = rng.normal(0, 0.3, (6, len(index)))
     pose[:, [names.index(f"pro_sup_{s}") for s in "rl"]] = np.pi / 2
-    cost = pose_cost(pose_z(jnp.asarray(pose), jnp.asarray(neutral), jnp.asarray(whitener)), jnp.asarray(log_weight))
+    z = pose_z(jnp.asarray(pose), jnp.asarray(neutral), jnp.asarray(whitener))
+    cost = pose_cost(square(z), jnp.asarray(log_weight))
     density = sum(
         c["weight"] * multivariate_normal(c["mean_deg"], c["covariance_deg2"]).pdf(np.degrees(pose[:, index]))
         for c in learned["components"]
@@ -361,7 +363,7 @@ def test_convergence_is_judged_by_the_second_half_and_needs_a_trace():
             compile_seconds=0.0,
             seconds=0.0,
             iterations=len(loss),
-            converged=True,
+            result=Result.SMALL_STEP,
             outcome=Outcome(jnp.zeros((1, 33, 3)), jnp.zeros((1, 33)), jnp.zeros((1, 33)), jnp.zeros((1, 3))),
         )
         return _converged(solution).outcome

@@ -23,32 +23,28 @@ from pbl_pipeline.body import (
     scale_multipliers,
 )
 from pbl_pipeline.fit import CostParams, GaussNewtonParams, ViewParams
-from pbl_pipeline.fit.linearised import linearised
-from pbl_pipeline.fit.normal_equations import linearise, measured_orientation, moved
-from pbl_pipeline.fit.objective import (
-    At,
-    State,
+from pbl_pipeline.fit.feet_terms import later, residual_floor_cm, residual_slide_cm, slide_contact
+from pbl_pipeline.fit.joint_terms import bent, beyond_limit_deg, three_frames
+from pbl_pipeline.fit.keypoint_terms import (
     in_camera,
-    later,
     mean_weights,
-    no_phone,
     offset_m,
     project_px,
     residual_2d_px,
     residual_3d_cm,
-    residual_floor_cm,
-    residual_phone_deg,
-    residual_slide_cm,
-    slide_contact,
-    square,
-    total,
 )
+from pbl_pipeline.fit.linearised import linearised
+from pbl_pipeline.fit.normal_equations import linearise, moved
+from pbl_pipeline.fit.objective import TERMS, total
 from pbl_pipeline.fit.per_frame import begin_of, finish, fit_problem, limits_of, standing, start_of
-from pbl_pipeline.fit.priors import Weights, bent, beyond_limit_deg
-from pbl_pipeline.fit.problem import SAMPLE_S, TrialArrays, bend_weights, pack, point_table
+from pbl_pipeline.fit.phone_term import measured_orientation, phone_at, residual_phone_deg
+from pbl_pipeline.fit.problem import SAMPLE_S, State, TrialArrays, bend_weights, pack, point_table
 from pbl_pipeline.fit.session import Session, make_session
 from pbl_pipeline.fit.solvers import linear
 from pbl_pipeline.fit.solvers.linear import BorderedBandedSystem, marginal_variance, solve
+from pbl_pipeline.fit.solvers.result import Result
+from pbl_pipeline.fit.term import At, Term, Unknowns, square
+from pbl_pipeline.fit.weights import Weights
 from research.walker.observe import observe
 from research.walker.views import observe_markers, observe_views
 from research.walker.walk import walk_qpos
@@ -291,16 +287,12 @@ def away(session: Session, seed: int = 3, detector: bool = False) -> State:
     )
 
 
-def cost(session: Session, w: Weights, state: State) -> jax.Array:
-    """The total at a state, without the normal equations."""
+def at_state(session: Session, w: Weights, state: State) -> At:
+    """What terms are evaluated at, without the normal equations."""
     p, scale = session.problem, scale_multipliers(state.s)
     x = marker_positions(session.body, p.points, state.qpos, scale, p.point_offsets(state.site_offset_m))
     markers, soles, _ = p.split(x)
-    phone = no_phone()
-    if p.moving:
-        weights = p.weight * p.has_phone[p.trial] / jnp.sum(p.weight)
-        phone = jaxlie.SO3.from_matrix(state.R_nc[:, 0]), measured_orientation(p, state.clock_s[p.trial]), weights
-    return total(At(p, w, state, markers, soles, phone))
+    return At(p, w, state, markers, soles, phone_at(p, state))
 
 
 @pytest.mark.parametrize("kind", ["moving", "views", "world", "floor", "moving floor", "moving detector", "pelvis"])
@@ -313,7 +305,7 @@ def test_normal_equations_hold_the_gradient_of_the_cost(kind):
     assert 30 < n < len(p.weight)  # and padding
 
     def changed(dx, dy):
-        return n * cost(session, w, moved(state, dx, dy))
+        return n * total(at_state(session, w, moved(state, dx, dy)))
 
     at = jax.jit(lambda s: linearise(session.body, p, w, s))(state)
     value, (want_g, want_h) = jax.jit(jax.value_and_grad(changed, (0, 1)))(jnp.zeros_like(at.g), jnp.zeros_like(at.h))
@@ -364,8 +356,7 @@ def test_curvature_of_the_soles_is_that_of_their_residuals():
     session = small_session("floor")
     params = dataclasses.replace(PARAMS, huber_floor_cm=1e6, huber_slide_cm=1e6)
     w, state, p = Weights.of(session.body, params), away(session), session.problem
-    nothing = jnp.zeros(())
-    without = dataclasses.replace(w, weight_floor=nothing, weight_slide=nothing)
+    without = Weights.of(session.body, dataclasses.replace(params, weight_floor=0.0, weight_slide=0.0))
     system = [jax.jit(lambda s, w=w: linearise(session.body, p, w, s))(state).system for w in (w, without)]
     own = jax.tree.map(lambda a, b: np.asarray(a - b, np.float64), *system)
 
@@ -375,8 +366,8 @@ def test_curvature_of_the_soles_is_that_of_their_residuals():
         height = residual_floor_cm(x, floor[p.trial][:, None])
         slide = residual_slide_cm(x, later(x), p.rate[:, None])
         return (
-            jnp.sqrt(p.weight[:, None] * p.contact * w.weight_floor)[..., None] * height,
-            jnp.sqrt(p.weight[:, None] * slide_contact(p) * w.weight_slide)[..., None] * slide,
+            jnp.sqrt(p.weight[:, None] * p.contact * w["weight_floor"])[..., None] * height,
+            jnp.sqrt(p.weight[:, None] * slide_contact(p) * w["weight_slide"])[..., None] * slide,
         )
 
     rng = np.random.default_rng(6)
@@ -388,6 +379,26 @@ def test_curvature_of_the_soles_is_that_of_their_residuals():
     got = np.einsum("fa,fab,fb", q, own.diagonal, q) + 2 * np.einsum("fa,fab,fb", q[:-1], own.next_1[:-1], q[1:])
     got += 2 * np.einsum("fa,fak,k", q, own.border, y) + y @ own.corner @ y
     assert got == pytest.approx(want, rel=1e-4)
+
+
+@pytest.mark.parametrize("pelvis", [False, True])
+def test_what_is_made_by_hand_is_what_follows_from_the_term(pelvis):
+    """Force and curvature by hand against those of the linearised residuals, where a body has a pelvis that inclines
+    and where it has none."""
+    session = small_session("pelvis")
+    prior = dataclasses.replace(PARAMS.cost, pose_prior="people-3" if pelvis else "")
+    w, state = Weights.of(session.body, dataclasses.replace(PARAMS, cost=prior)), away(session)
+    assert (w.pelvis.shape[0] > 0) == pelvis
+    at = at_state(session, w, state)
+    terms = [t for t in TERMS if isinstance(t, Term) and t.by_hand]
+    assert [t.name for t in terms] == ["pose prior"]
+    for term in terms:
+        assert term.unknowns == Unknowns.JOINTS
+        force, curvature = term.by_hand(at)  # pyright: ignore[reportOptionalCall]
+        c, r, D = term.rows(at)
+        want = np.einsum("fcpq,fc,fcp->fq", D, c, r), np.einsum("fcpq,fc,fcpr->fqr", D, c, D)
+        for ours, other in zip((force, curvature), want, strict=True):
+            np.testing.assert_allclose(ours, other, atol=1e-4 * np.abs(other).max())
 
 
 def test_soles_that_stand():
@@ -421,7 +432,7 @@ def test_second_difference_of_a_parabola_with_uneven_time_stamps():
     # The second derivative, -9 per s^2, for a step of 1/30 s; none of a straight line.
     want = np.zeros((7, 2))
     want[1:-1, 0] = -9 / 900
-    np.testing.assert_allclose(bent(q, jnp.asarray(bend, jnp.float32)), want, atol=2e-5)
+    np.testing.assert_allclose(bent(three_frames(q), jnp.asarray(bend, jnp.float32)), want, atol=2e-5)
     even = bend_weights(np.arange(5) / 30, np.ones(5, bool))
     np.testing.assert_allclose(even[1:-1], [[1, -2, 1]] * 3, atol=1e-9)
 
@@ -553,13 +564,13 @@ def test_a_body_of_three_joints_goes_through_the_same_code(tmp_path):
     solve = jax.jit(fit_problem, static_argnames="body")
     begin = begin_of(body, p, w, start)
     end = solve(body, p, w, begin, limits)
-    assert bool(end.converged)
+    assert int(end.result) in (Result.SMALL_STEP, Result.SMALL_GAIN)
     # One iteration a call, as where a bar is drawn, takes the same steps.
     at = begin
     for n in range(int(end.iteration) + 1):
-        assert not bool(at.converged)
+        assert int(at.result) == Result.BOUND
         at = solve(body, p, w, at, dataclasses.replace(limits, iterations=jnp.asarray(n, jnp.int32)))
-    assert bool(at.converged)
+    assert int(at.result) == int(end.result)
     jax.tree.map(np.testing.assert_array_equal, at, end)
     np.testing.assert_allclose(end.state.qpos[:40], truth, atol=5e-3)
     np.testing.assert_allclose(scale_multipliers(end.state.s), scale, atol=5e-3)

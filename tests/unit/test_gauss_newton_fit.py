@@ -22,16 +22,17 @@ from pbl_pipeline.fit import (
     SessionFit,
     SessionInput,
     TrialFit,
-    _fit_session,
     fit_session,
     fit_sessions,
     per_frame,
     problem,
+    session_fit,
 )
 from pbl_pipeline.fit.initial_pose import placed_poses
 from pbl_pipeline.fit.per_frame import by_joint, floors_of
 from pbl_pipeline.fit.session import make_session
 from pbl_pipeline.fit.solution import Solution
+from pbl_pipeline.fit.solvers.result import Result
 from pbl_pipeline.fit.vertical import on_their_feet, vertical
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
@@ -308,10 +309,10 @@ def test_sessions_with_other_terms_are_not_solved_together(walkers, monkeypatch)
         values: dict[str, Any] = {k: np.full(v, np.nan) for k, v in sizes.items()}
         for field in dataclasses.fields(Solution):
             values.setdefault(field.name, None)
-        nan = Solution(**(values | {"seconds": 0.0, "compile_seconds": 0.0, "iterations": 1, "converged": False}))
+        nan = Solution(**(values | {"seconds": 0.0, "compile_seconds": 0.0, "iterations": 1, "result": Result.BOUND}))
         return [nan] * len(sessions)
 
-    monkeypatch.setattr(_fit_session, "_solve", nothing)
+    monkeypatch.setattr(session_fit, "_solve", nothing)
     found = fit_sessions([pixels, *walkers], PARAMSET, batch=8)
     assert asked == [["pixels"], [w.names[0] for w in walkers]]
     assert [e.code for e in found if isinstance(e, PblError)] == ["FIT_DIVERGED"] * 4

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -19,12 +20,15 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import CostParams, ImplicitAdamParams, implicit, problem
 from pbl_pipeline.fit.implicit import solve_implicit
 from pbl_pipeline.fit.initial_pose import median_orientation, median_pose, paper_pose
-from pbl_pipeline.fit.objective import At, Lphone, State, no_phone, weighted
+from pbl_pipeline.fit.keypoint_terms import L2D, L3D
 from pbl_pipeline.fit.paper_objective import PAPER_COST, objective_of
-from pbl_pipeline.fit.priors import PAPER_PHONE_DEG, Weights
+from pbl_pipeline.fit.phone_term import LPHONE
+from pbl_pipeline.fit.problem import State
 from pbl_pipeline.fit.session import Session, make_session
 from pbl_pipeline.fit.solvers.adam import Schedule, optimiser
+from pbl_pipeline.fit.term import At, Phone
 from pbl_pipeline.fit.trajectory import encode, evaluate, fit_ranges, frequencies, initial_trajectories
+from pbl_pipeline.fit.weights import PAPER_PHONE_DEG, Weights
 from pbl_pipeline.synthetic import NO_NOISE, PhoneSensor, pelvis_positions
 from research.walker.observe import observe
 from research.walker.views import observe_markers, observe_views
@@ -70,7 +74,8 @@ def test_keypoint_terms_against_the_formula_in_double_precision(handheld):
     def terms(state):
         x, soles, _ = p.split(marker_positions(body, p.points, state.qpos, jnp.ones(8), p.point_offsets(zero)))
         w = Weights.of(body, dataclasses.replace(PAPER_2025, cost=cost))
-        return x, weighted(At(p, w, state, x, soles, no_phone()), ("L3D", "L2D"))
+        at = At(p, w, state, x, soles)
+        return x, {term.name: term.value(at) for term in (L3D, L2D)}
 
     x, got = terms(state)
     weight, x, marker_weight = (np.asarray(a, float) for a in (p.weight, x, p.weight_3d))
@@ -96,7 +101,14 @@ def test_angle_between_orientations_and_its_gradient_where_they_agree():
     a = Rotation.from_rotvec([0.3, -0.2, 0.9])
     b = Rotation.from_rotvec(np.deg2rad(25) * np.array([0.6, 0.8, 0])) * a
     q = lambda r: jnp.asarray(r.as_quat(scalar_first=True), jnp.float32)  # noqa: E731
-    angle = lambda a, b: Lphone(jaxlie.SO3(a), jaxlie.SO3(b), PAPER_PHONE_DEG)  # noqa: E731
+
+    def angle(a, b):
+        frame: Any = SimpleNamespace(weight=jnp.ones(1))
+        numbers: Any = {"weight_phone": 1.0, "huber_phone_deg": PAPER_PHONE_DEG}
+        nothing: Any = None
+        phone = Phone(jaxlie.SO3(a[None]), lambda _: jaxlie.SO3(b[None]), frame.weight)
+        return LPHONE.value(At(frame, numbers, nothing, nothing, nothing, phone))
+
     assert float(angle(q(a), q(b))) == pytest.approx(25, rel=1e-4)
     assert float(angle(-q(a), q(b))) == pytest.approx(25, rel=1e-4)
     assert float(angle(q(a), q(a))) == pytest.approx(0, abs=1e-4)

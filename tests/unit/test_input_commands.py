@@ -11,7 +11,7 @@ from pbl_pipeline import pipeline
 from pbl_pipeline.body import load_marker_set
 from pbl_pipeline.cli._options import fit_paramset
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import GaussNewtonParams, ImplicitAdamParams, Params, default_method
+from pbl_pipeline.fit import GaussNewtonParams, ImplicitAdamParams, Params, default_fit, points_of
 from pbl_pipeline.keypoints import METHODS, Keypoints, ModelKeypointParams, ModelParams, MultiView, WorldMarkers
 from pbl_pipeline.methods import Stage
 from pbl_pipeline.video import load_attitude
@@ -157,7 +157,7 @@ def paramsets(monkeypatch: pytest.MonkeyPatch) -> None:
     methods.register("usual", 1, GaussNewtonParams(), len)
     methods.register("other", 1, GaussNewtonParams(max_iterations=7))
     methods.register("markers", 1, GaussNewtonParams(max_iterations=8))
-    for module in ("fit", "fit._default"):
+    for module in ("fit", "fit.method_choice"):
         monkeypatch.setattr(f"pbl_pipeline.{module}.METHODS", methods)
 
 
@@ -171,8 +171,8 @@ def test_solver_and_paramset():
         ("gauss-newton", "other"): "other",
     }
     assert {k: fit_paramset(*k).name for k in expected} == expected
-    assert fit_paramset(None, None, "markers").name == "markers"
-    assert fit_paramset("implicit-adam", None, "markers").name == "paper"
+    assert fit_paramset(None, None, [None]).name == "markers"
+    assert fit_paramset("implicit-adam", None, [None]).name == "paper"
     for solver, params in (("newton", None), ("implicit-adam", "other"), (None, "none")):
         with pytest.raises(PblError) as error:
             fit_paramset(solver, params)
@@ -209,7 +209,7 @@ def test_the_fit_follows_from_the_points(fits, tmp_path, markers, root_relative,
     succeeds(pbl("fit", path, "--out", tmp_path / "out", "--params", "markers"))
     assert [c["paramset"].name for c in fits] == [expected, "markers"]
     other = keypoints(marker_set="bml_movi_87", root_relative=False)
-    assert default_method([seen, other]) == ("gauss-newton" if expected == "gauss-newton" else "blazepose")
+    assert default_fit(*points_of([seen, other])) == ("gauss-newton" if expected == "gauss-newton" else "blazepose")
 
 
 def test_changes_to_a_named_paramset(tmp_path):

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .linear import BorderedBandedSystem, solve
+from .result import Result
 
 #: A step of a frame's unknown is cut to this.
 LONGEST_STEP = 0.5
@@ -67,7 +68,8 @@ class Progress:
     iteration: Array
     #: Accepted steps in a row that gained next to nothing.
     idle: Array
-    converged: Array
+    #: A `Result`.
+    result: Array
     trace: Array
 
 
@@ -83,7 +85,7 @@ def before_first(evaluate: Callable[[S], Quadratic], start: S) -> Progress:
         damping=jnp.asarray(DAMPING_START, jnp.float32),
         iteration=jnp.asarray(-1, jnp.int32),
         idle=jnp.asarray(0, jnp.int32),
-        converged=jnp.asarray(False),
+        result=jnp.asarray(Result.BOUND, jnp.int32),
         trace=jnp.full(MOST_ITERATIONS, jnp.nan, jnp.float32),
     )
 
@@ -116,6 +118,8 @@ def minimise(
         gained = p.cost - now.cost > limits.gain * p.cost
         # A step that was refused says nothing of the minimum: the next one is damped more.
         idle = jnp.where(better, jnp.where(gained, 0, p.idle + 1), p.idle)
+        result = jnp.where(idle >= 2, Result.SMALL_GAIN, Result.BOUND)
+        result = jnp.where(better & (p.step < limits.step), Result.SMALL_STEP, result)
         dx, dy = solve(_damped(latest.system, damping), latest.g, latest.h)
         dx = jnp.clip(dx, -LONGEST_STEP, LONGEST_STEP)
         return Progress(
@@ -127,12 +131,12 @@ def minimise(
             damping=damping,
             iteration=p.iteration + 1,
             idle=idle,
-            converged=(better & (p.step < limits.step)) | (idle >= 2),
+            result=result.astype(jnp.int32),
             trace=p.trace.at[jnp.where(first, MOST_ITERATIONS, p.iteration)].set(cost, mode="drop"),
         )
 
     most = jnp.minimum(limits.iterations, MOST_ITERATIONS)
-    return jax.lax.while_loop(lambda p: ~p.converged & (p.iteration < most), step, begin)
+    return jax.lax.while_loop(lambda p: (p.result == Result.BOUND) & (p.iteration < most), step, begin)
 
 
 def _damped(system: BorderedBandedSystem, damping: Array) -> BorderedBandedSystem:

@@ -18,15 +18,14 @@ from pbl_pipeline.names import check_height
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.video import Camera
 
-from ._methods import METHODS
-from ._params import Params
-from ._rotation import quat_wxyz
 from .checks import check_fit
 from .known_height import in_metres
-from .objective import State
+from .methods import METHODS
+from .params import Params
 from .per_frame import start_of
-from .priors import pixels_alone
+from .problem import State, pixels_alone
 from .results import SessionFit, TrialFit
+from .rotations import quat_wxyz
 from .session import Session, Trial, make_session
 from .session import check_trial as _check_trial
 from .solution import Solution

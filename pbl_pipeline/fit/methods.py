@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pbl_pipeline.methods import Stage
 
-from ._params import BLAZEPOSE, GAUSS_NEWTON, MARKERS, PAPER_2025, PAPER_GAUSS_NEWTON, Params
 from .implicit import solve_sessions
+from .params import BLAZEPOSE, GAUSS_NEWTON, MARKERS, PAPER_2025, PAPER_GAUSS_NEWTON, Params
 from .per_frame import solve_per_frame
 
 #: A family is a solver: a function from sessions that are packed to the same sizes, its parameters and the sessions'

@@ -1,0 +1,164 @@
+"""A term of the cost: a residual, its weight, its robust width and the unknowns it depends on, stated once.
+
+`objective.py` lists the terms and adds up their values; `normal_equations.py` adds up their derivatives, which follow
+from the same statement. A term is added as one object in one file and a line of the list; its parameters are fields of
+the paramset (`params.py`), which a term reads by name (`Weights`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, ArrayLike, Float
+
+from .linearised import linearised
+from .problem import Problem, State
+from .weights import Weights
+
+
+class Unknowns(enum.Enum):
+    """What the variables of a term depend on, and thereby the blocks of the normal equations that it enters."""
+
+    MARKER = "joints, camera, scale, marker offsets"
+    CENTRED_MARKER = "joints, camera, scale, marker offsets, detector's lean and depths"
+    PHONE = "camera, clock"
+    JOINT = "a joint"
+    JOINTS = "joints of a frame"
+    JOINT_IN_THREE_FRAMES = "a joint in three frames"
+    SOLE_AND_FLOOR = "joints, scale, floor"
+    SOLE_IN_TWO_FRAMES = "joints of two frames, scale"
+    SHARED = "what all frames share"
+
+
+class Phone(NamedTuple):
+    """Orientations of a phone (M,): `fitted`; `measured`, as a function of a change (M,) of the clock's offset (s);
+    `weight` (M,) as of frames."""
+
+    fitted: jaxlie.SO3
+    measured: Callable[[Array], jaxlie.SO3]
+    weight: Float[Array, " M"]
+
+
+class At(NamedTuple):
+    """What the terms are evaluated at: the frames of a problem, the parameters, the unknowns, and the markers and
+    soles where the unknowns put them in the world (m). `phone`: None where no camera turns."""
+
+    problem: Problem
+    weights: Weights
+    state: State
+    x: Float[Array, "F J 3"]
+    soles: Float[Array, "F P 3"]
+    phone: Phone | None = None
+
+
+class Rows(NamedTuple):
+    """A linearised term: the weights c (F, ...) of the squares of its residuals r (F, ..., E), and their derivatives D
+    (F, ..., E, V) by the variables. Gradient and curvature, times the number of frames, are D' c r and D' c D.
+    """
+
+    c: Array
+    r: Array
+    D: Array
+
+
+def huber(e2: Float[Array, ...], width: ArrayLike) -> Float[Array, ...]:
+    """Huber cost of a distance given its square: `e2 / 2` up to `width`, then linear.
+
+    Takes the square so that the gradient at distance zero is zero and not 0/0: the root is only taken of values that
+    are at least `width` squared.
+    """
+    far = e2 > width**2
+    distance = jnp.sqrt(jnp.where(far, e2, width**2))
+    return jnp.where(far, width * (distance - 0.5 * width), 0.5 * e2)
+
+
+def square(r: Float[Array, "*n D"]) -> Float[Array, "*n"]:
+    """Squared length of residuals."""
+    return jnp.sum(r**2, axis=-1)
+
+
+def frame_count(problem: Problem) -> Float[Array, ""]:
+    """Sum of the frames' weights."""
+    return jnp.maximum(jnp.sum(problem.weight), 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Term:
+    """A mean over frames of robust costs of residuals.
+
+    Its value is ``sum over frames of frames(at) sum(count(at) robust(|residual|^2)) / number of frames``. Where
+    `count` is empty the problem has nothing that the term compares, and it is left out.
+    """
+
+    name: str
+    #: Parameter of the weight; "": 1.
+    weight: str
+    unknowns: Unknowns
+    #: What the residual is a function of (F, ..., V). Each residual depends on its own variables alone.
+    variables: Callable[[At], Array]
+    #: Residuals (F, ..., E) of the variables.
+    residual: Callable[[At, Array], Array]
+    #: Weights of the residuals in a frame, such as the confidence of each marker.
+    count: Callable[[At], Array | float]
+    #: Parameter of the width of the Huber cost; "": half the square.
+    width: str = ""
+    #: Weights of the frames.
+    frames: Callable[[At], Array] = lambda at: at.problem.weight
+    #: A cost of squared residuals (F, ...) that is not Huber's.
+    robust: Callable[[At, Array], Array] | None = None
+    #: Force (F, Q) and curvature (F, Q, Q) by hand, of a term of the joints of a frame: faster than `rows`.
+    by_hand: Callable[[At], tuple[Array, Array]] | None = None
+
+    def value(self, at: At) -> Float[Array, ""]:
+        """Return the weighted cost."""
+        if self.empty(at):
+            return jnp.zeros(())
+        each = self.count(at) * self._robust(at, square(self.residual(at, self.variables(at))))
+        per_frame = jnp.sum(each, axis=tuple(range(1, each.ndim)))
+        return weight_of(self, at) * (jnp.sum(self.frames(at) * per_frame) / frame_count(at.problem))
+
+    def rows(self, at: At) -> Rows:
+        """Return the term as weighted squares (iteratively reweighted least squares)."""
+        r, D = linearised(lambda z: self.residual(at, z), self.variables(at))
+        cost, pull = jax.vjp(lambda e2: self._robust(at, e2), square(r))
+        each = self.frame_weights(at).reshape(-1, *[1] * (cost.ndim - 1)) * self.count(at)
+        return Rows(2 * pull(jnp.broadcast_to(each, cost.shape))[0], r, D)
+
+    def frame_weights(self, at: At) -> Float[Array, " F"]:
+        """Return the weights of the frames times that of the term."""
+        return weight_of(self, at) * self.frames(at)
+
+    def empty(self, at: At) -> bool:
+        """Whether the problem has nothing that the term compares."""
+        return jnp.size(self.count(at)) == 0
+
+    def _robust(self, at: At, e2: Array) -> Array:
+        if self.robust is not None:
+            return self.robust(at, e2)
+        return huber(e2, at.weights[self.width]) if self.width else 0.5 * e2
+
+
+@dataclasses.dataclass(frozen=True)
+class SharedTerm:
+    """A quadratic cost of what all frames share: of the fields of `State` without frames."""
+
+    name: str
+    #: Parameter of the weight; "": 1.
+    weight: str
+    cost: Callable[[At], Array]
+    unknowns: Unknowns = Unknowns.SHARED
+
+    def value(self, at: At) -> Float[Array, ""]:
+        """Return the weighted cost."""
+        return weight_of(self, at) * self.cost(at)
+
+
+def weight_of(term: Term | SharedTerm, at: At) -> Array | float:
+    """Return the weight of a term."""
+    return at.weights[term.weight] if term.weight else 1.0

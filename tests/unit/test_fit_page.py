@@ -1,0 +1,72 @@
+"""docs/fit.md states the cost that is minimised: its table has the terms of the list, their parameters and unknowns."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pbl_pipeline.fit import CostParams, GaussNewtonParams
+from pbl_pipeline.fit.objective import PAPER, TERMS
+from pbl_pipeline.fit.weights import Weights
+from tests.unit.test_gauss_newton import PARAMS, at_state, away, small_session
+
+pytestmark = pytest.mark.slow
+
+PAGE = (Path(__file__).resolve().parents[2] / "docs/fit.md").read_text()
+#: Parameters that become arrays before a term sees them.
+OF_ARRAYS = {"pose_prior_deg", "pose_prior", "scale_sd", "scale_sides_sd"}
+
+
+def rows() -> list[list[str]]:
+    """The cells of the table of terms."""
+    table = PAGE.split("## The terms")[1].split("\n\n## ")[0]
+    lines = [line for line in table.splitlines() if line.startswith("| ")]
+    return [[c.strip().replace("\\|", "|") for c in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines[1:]]
+
+
+class Noted(dict):
+    """Numbers of a paramset that note which are read."""
+
+    def __init__(self, numbers: dict) -> None:
+        super().__init__(numbers)
+        self.read: set[str] = set()
+
+    def __getitem__(self, name: str) -> Any:
+        self.read.add(name)
+        return super().__getitem__(name)
+
+
+@pytest.fixture(scope="module")
+def read() -> dict[str, set[str]]:
+    """Term -> parameters that its value reads, where the problem has something for it."""
+    params = dataclasses.replace(PARAMS, weight_pelvis=0.5)
+    found: dict[str, set[str]] = {}
+    for kind in ("moving floor pelvis detector", "world"):
+        session = small_session(kind)
+        w = Weights.of(session.body, params)
+        at = at_state(session, w, away(session, detector="detector" in kind))
+        for term in TERMS:
+            numbers = Noted(w.numbers)
+            term.value(at._replace(weights=dataclasses.replace(w, numbers=numbers)))
+            found[term.name] = found.get(term.name, set()) | numbers.read
+    return found
+
+
+def test_the_table_has_the_terms_of_the_list():
+    assert [r[0] for r in rows()] == [t.name for t in TERMS]
+    assert [r[4] for r in rows()] == [t.unknowns.value for t in TERMS]
+    assert {t.name for t in PAPER} == {r[0] for r in rows()[:5]}
+
+
+def test_the_table_names_the_parameters_that_a_term_reads(read):
+    fields = {f.name for cls in (CostParams, GaussNewtonParams) for f in dataclasses.fields(cls)}
+    for name, residual, weight, more, _ in rows():
+        named = set(re.findall(r"`(\w+)`", weight + more))
+        assert named <= fields
+        assert named - OF_ARRAYS == read[name], (name, residual)
+    of_terms = {n for n in fields if re.match("weight_|huber_|smooth_", n) or n in OF_ARRAYS}
+    assert of_terms == of_terms & {n for r in rows() for n in re.findall(r"`(\w+)`", r[2] + r[3])}
