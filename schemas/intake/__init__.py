@@ -1,0 +1,1 @@
+"""Registration of recordings and of what belongs to them."""
