@@ -26,8 +26,8 @@ from .results import (
     videos_of,
 )
 from .rows import ReadAhead, Rows, inside, row_of, stored_rows
-from .slices import chain_of
 from .stored_files import file_ref, stored_file
+from .studies.slices import chain_of
 
 if TYPE_CHECKING:
     from pbl_pipeline.export import ExportSession, ExportTrial

@@ -10,8 +10,8 @@ from typing import Any
 
 from . import archive, video
 from .archive import archive_dir
+from .intake.uploads import Bucket, Folder, Upload, drop_folder
 from .stored_files import remove_left_folders
-from .uploads import Bucket, Folder, Upload, drop_folder
 
 
 def delete_registered(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict[str, str]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pbl_pipeline import settings
 from schemas import _dump, catalog, connection
-from schemas.ingest import Visit, ingest
+from schemas.intake import Visit, ingest
 
 
 def register(*paths: Path, **visit) -> list[int]:

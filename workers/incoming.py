@@ -40,9 +40,8 @@ from schemas.archive import (
 from schemas.codes import check_subject
 from schemas.connection import dj
 from schemas.folders import private_folder, remove_empty, sync_folders
-from schemas.ingest import Visit, ingest
-from schemas.sensors import Sensors
-from schemas.uploads import LOG_ENDINGS, Bucket, Folder, StillChanging, Upload, drop_folder, incoming_url
+from schemas.intake import OneCamera, Sensors, Visit, register
+from schemas.intake.uploads import LOG_ENDINGS, Bucket, Folder, StillChanging, Upload, drop_folder, incoming_url
 
 from .limited import LimitExceeded, limited
 
@@ -65,8 +64,8 @@ _OURS = ("DB_NOT_RUNNING", "DB_UNAVAILABLE", "DB_REFUSED", "STORE_UNAVAILABLE")
 class Taken:
     """What one run did, by the uploads' names.
 
-    registered, known: taken; the latter are registered already, with what `ingest` notes of them. refused: moved aside,
-    with the reason. left: whole, but not taken this time, with the reason. ignored: what is no recording in its place,
+    registered, known: taken; the latter are registered already, with the note of `register`. refused: moved aside, with
+    the reason. left: whole, but not taken this time, with the reason. ignored: what is no recording in its place,
     and why. uploading: how many are not whole yet. later: how many the time did not suffice for.
     """
 
@@ -272,8 +271,8 @@ def _register(name: PurePosixPath, copies: Sequence[_Copy], archive: Path) -> st
     for copy, to in zip(copies, (target, *(target.with_suffix(log.path.suffix) for log in logs)), strict=True):
         copy.path = copy.path.replace(to)
     sync_folders(folder, archive)
-    sensors = [Sensors(attitude=log.path) for log in logs]
-    (result,) = ingest([target], Visit(subject=subject, session_label=session), files=sensors)
+    sensors = Sensors(attitude=logs[0].path if logs else None)
+    (result,) = register([OneCamera(target, Visit(subject, session), sensors)])
     if result.error is not None:
         raise result.error
     if result.status == "registered":

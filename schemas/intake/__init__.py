@@ -1,1 +1,22 @@
-"""Registration of recordings and of what belongs to them."""
+"""Registration of recordings and of what belongs to them: `register` and the records that it takes."""
+
+from __future__ import annotations
+
+from .markers import LaboratoryMarkers
+from .records import Methods, Registered, Visit
+from .registration import register
+from .rigs import SeveralCameras
+from .sensors import Sensors
+from .videos import OneCamera, ingest
+
+__all__ = [
+    "LaboratoryMarkers",
+    "Methods",
+    "OneCamera",
+    "Registered",
+    "Sensors",
+    "SeveralCameras",
+    "Visit",
+    "ingest",
+    "register",
+]

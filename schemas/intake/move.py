@@ -13,15 +13,18 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 
-from . import fit, gait, gdi, keypoints, lab, session, video, worker
-from ._datajoint import dj
-from .archive import LOCK, archive_dir, folder_of, plain_name
-from .codes import check_subject
-from .folders import private_folder, remove_empty, sync_folders
-from .ingest import Visit, forget_errors, in_transaction, session_of
+from .. import fit, gait, gdi, keypoints, lab, session, video, worker
+from .._datajoint import dj
+from ..archive import LOCK, archive_dir, folder_of, plain_name
+from ..codes import check_subject
+from ..folders import private_folder, remove_empty, sync_folders
+from ..jobs import forget_errors
+from ..rows import delete_below
+from ..transactions import in_transaction
+from ..video import unknown_video
+from .records import Visit
 from .rigs import check_same_number
-from .rows import delete_below
-from .video import unknown_video
+from .visits import session_ids
 
 #: Plans of a visit that follow a video into its new one.
 _PLANS = (fit.FitPlan, gait.GaitPlan, gdi.GdiPlan)
@@ -107,7 +110,7 @@ def carry_out(plan: Move) -> None:
         again = plan_move(plan.video_id, *plan.after)
         old = int((video.Video & {"video_id": plan.video_id}).fetch1("session_id"))
         delete_below(fit.FitSet, again.sets)
-        new = session_of(Visit(*plan.after))
+        (new,) = session_ids([Visit(*plan.after)]).values()
         for number, path in paths.items():
             video.Video.update1({"video_id": number, "session_id": new, "video_path": str(path)})
         points = keypoints.KeypointSelection & of_these

@@ -1,9 +1,8 @@
-"""What the names of files say of their visit: `pbl ingest --name-pattern`."""
+"""Statements in the names of files (`pbl ingest --name-pattern`)."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 from pbl_pipeline.errors import PblError
@@ -58,11 +57,3 @@ def read_name(pattern: re.Pattern[str], path: Path) -> dict[str, str]:
             key=ascii(str(path)),
         )
     return {name: text for name, text in match.groupdict().items() if text}
-
-
-def together(stated: Sequence[dict[str, str]]) -> list[list[int]]:
-    """Positions of those that state the same, in the order in which they come first."""
-    groups: dict[tuple[tuple[str, str], ...], list[int]] = {}
-    for i, said in enumerate(stated):
-        groups.setdefault(tuple(sorted(said.items())), []).append(i)
-    return list(groups.values())

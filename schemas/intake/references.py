@@ -14,9 +14,9 @@ from pbl_pipeline.files import fields_of
 from pbl_pipeline.names import check_label
 from pbl_pipeline.paramset import canonical_json
 
-from . import fit, validation, video
-from .rows import utc_now
-from .stored_files import file_ref, new_folder, stored_file
+from .. import fit, validation, video
+from ..rows import utc_now
+from ..stored_files import file_ref, new_folder, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import validation as lib

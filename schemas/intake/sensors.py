@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
 
-from . import keypoints, video
-from .rows import delete_below, utc_now
-from .stored_files import new_folder
+from .. import keypoints, video
+from ..rows import delete_below, utc_now
+from ..stored_files import new_folder
 
 if TYPE_CHECKING:
     from pbl_pipeline.video import PhoneLog
@@ -39,87 +39,99 @@ class Sensors:
         """Whether a log comes with it."""
         return self.attitude is not None and str(self.attitude) != NONE
 
+    def read(self) -> PhoneLog | None:
+        """Read the log, if there is one, and check that the other files exist.
 
-@dataclasses.dataclass(frozen=True)
-class Read:
-    """Files that were found good, before anything is inserted."""
+        Raises
+        ------
+        PblError
+            FILE_MISSING, PHONE_LOG; FILE_FORMAT for a file without bytes.
+        """
+        from pbl_pipeline.video import read_phone_log
 
-    given: Sensors
-    log: PhoneLog | None = None
-
-
-def read(given: Sensors) -> Read:
-    """Read the log and see that the other files are there.
-
-    Raises
-    ------
-    PblError
-        FILE_MISSING, PHONE_LOG; FILE_FORMAT for a file without bytes.
-    """
-    from pbl_pipeline.video import read_phone_log
-
-    for path in (given.depth, *given.imu):
-        if path is not None:
-            _check_there(path)
-    log = given.attitude if given.has_log else None
-    return Read(given, None if log is None else read_phone_log(log))
+        for path in (self.depth, *self.imu):
+            if path is not None:
+                _check_there(path)
+        return read_phone_log(self.attitude) if self.has_log and self.attitude is not None else None
 
 
-def register(video_id: int, found: Read) -> list[str]:
-    """Insert what the video does not have yet, in words. Call it in a transaction.
+def attach(video_id: int, given: Sensors, log: PhoneLog | None) -> list[str]:
+    """Insert what the video does not have yet; returns it in words. Call it in a transaction.
 
     Another log (or none) takes the older one's place, and what was computed with that is deleted: keypoints and after.
     """
     key = {"video_id": video_id}
     done = []
-    if found.given.attitude is not None:
-        done += _register_log(key, found)
-    if found.given.depth is not None:
-        done += _register_depth(key, found.given.depth)
-    for path in found.given.imu:
-        done += _register_imu(key, path)
+    if given.attitude is not None:
+        done += _attach_log(key, given.attitude, log)
+    if given.depth is not None and (how := _keep(video.DepthVideo, "depth", key, given.depth)):
+        done.append(f"depth video {given.depth.name} was {how}")
+    for path in given.imu:
+        done += _attach_imu(key, path)
     return done
 
 
-def _register_log(key: dict[str, Any], found: Read) -> list[str]:
+def _attach_log(key: dict[str, Any], path: Path, log: PhoneLog | None) -> list[str]:
+    table = video.PhoneAttitude & key
+    if log is None:
+        if not table:
+            return []
+        table.delete(prompt=False)
+        return ["the phone's log was removed" + _outdated(key)]
+    about = {
+        "attitude_form": log.form[:32],
+        "attitude_device": log.device[:128],
+        "attitude_n": len(log.time_s),
+        "attitude_rate": log.rate_hz,
+        "attitude_duration": float(log.time_s[-1] - log.time_s[0]),
+        "attitude_start_utc": _utc(log),
+        "attitude_sensors": {name: len(s.time_s) for name, s in log.sensors.items()},
+        "attitude_notes": list(log.notes),
+    }
+    how = _keep(video.PhoneAttitude, "attitude", key, path, about)
+    if not how:
+        return []
+    return [f"the phone's log of {len(log.time_s)} orientations ({log.form}) was {how}" + _outdated(key)]
+
+
+def _attach_imu(key: dict[str, Any], path: Path) -> list[str]:
     from pbl_pipeline.video import sha256_of
 
-    table, path = video.PhoneAttitude, found.given.attitude
-    assert path is not None
+    own = video.WearableImu & key
+    if own & {"imu_sha256": sha256_of(path)}:
+        return []
+    number = max((int(n) for n in own.to_arrays("imu")), default=0) + 1
+    _keep(video.WearableImu, "imu", {**key, "imu": number}, path)
+    return [f"wearable IMU file {path.name} was attached"]
+
+
+def _keep(table: Any, prefix: str, key: dict[str, Any], path: Path, about: dict[str, Any] | None = None) -> str:
+    """Insert a copy of a file as the row with this key, in the place of an older one: "attached" or "replaced"; ""
+    where that has the same bytes."""
+    from pbl_pipeline.video import sha256_of
+
     before = (table & key).to_dicts()
-    if found.log is None:
-        if not before:
-            return []
-        (table & key).delete(prompt=False)
-        return ["the phone's log was removed" + _outdated(key)]
     with new_folder() as folder:
-        copy = folder / f"attitude{path.suffix if path.is_file() else '.zip'}"
-        _copy(path, copy)
-        sha256 = sha256_of(copy)
-        if before and before[0]["attitude_sha256"] == sha256:
-            return []
+        copy = folder / f"{prefix}{path.suffix if path.is_file() else '.zip'}"
+        source = path if path.is_file() else _zipped(path, copy)
+        sha256 = sha256_of(source)
+        if before and before[0][f"{prefix}_sha256"] == sha256:
+            return ""
+        if source != copy:
+            shutil.copyfile(source, copy)
         (table & key).delete(prompt=False)
-        log = found.log
         table.insert1(
             {
                 **key,
-                "attitude_name": path.name[-255:],
-                "attitude_sha256": sha256,
-                "attitude_size": copy.stat().st_size,
-                "attitude_form": log.form[:32],
-                "attitude_device": log.device[:128],
-                "attitude_n": len(log.time_s),
-                "attitude_rate": log.rate_hz,
-                "attitude_duration": float(log.time_s[-1] - log.time_s[0]),
-                "attitude_start_utc": _utc(log),
-                "attitude_sensors": {name: len(s.time_s) for name, s in log.sensors.items()},
-                "attitude_notes": list(log.notes),
-                "attitude_created": utc_now(),
-                "attitude_file": copy,
+                f"{prefix}_name": path.name[-255:],
+                f"{prefix}_sha256": sha256,
+                f"{prefix}_size": copy.stat().st_size,
+                f"{prefix}_created": utc_now(),
+                f"{prefix}_file": copy,
+                **(about or {}),
             }
         )
-    what = f"log of {len(log.time_s)} orientations ({log.form})"
-    return [f"the phone's {what} was {'replaced' if before else 'attached'}" + _outdated(key)]
+    return "replaced" if before else "attached"
 
 
 def _outdated(key: dict[str, Any]) -> str:
@@ -128,51 +140,15 @@ def _outdated(key: dict[str, Any]) -> str:
     return f", and what depends on it was deleted: {rows}" if rows else ""
 
 
-def _register_depth(key: dict[str, Any], path: Path) -> list[str]:
-    from pbl_pipeline.video import sha256_of
-
-    table = video.DepthVideo
-    sha256 = sha256_of(path)
-    before = (table & key).to_dicts()
-    if before and before[0]["depth_sha256"] == sha256:
-        return []
-    (table & key).delete(prompt=False)
-    with new_folder() as folder:
-        copy = folder / f"depth{path.suffix}"
-        _copy(path, copy)
-        row = {"depth_name": path.name[-255:], "depth_sha256": sha256, "depth_size": copy.stat().st_size}
-        table.insert1({**key, **row, "depth_created": utc_now(), "depth_file": copy})
-    return [f"depth video {path.name} was {'replaced' if before else 'attached'}"]
-
-
-def _register_imu(key: dict[str, Any], path: Path) -> list[str]:
-    from pbl_pipeline.video import sha256_of
-
-    table = video.WearableImu
-    sha256 = sha256_of(path)
-    if table & key & {"imu_sha256": sha256}:
-        return []
-    numbers = [int(n) for n in (table & key).to_arrays("imu")]
-    with new_folder() as folder:
-        copy = folder / f"imu{path.suffix}"
-        _copy(path, copy)
-        row = {"imu_name": path.name[-255:], "imu_sha256": sha256, "imu_size": copy.stat().st_size}
-        number = {"imu": max(numbers, default=0) + 1}
-        table.insert1({**key, **number, **row, "imu_created": utc_now(), "imu_file": copy})
-    return [f"wearable IMU file {path.name} was attached"]
-
-
-def _copy(path: Path, copy: Path) -> None:
-    """A file as it is; a folder as a zip whose bytes depend on its files' names and contents only."""
-    if path.is_file():
-        shutil.copyfile(path, copy)
-        return
+def _zipped(path: Path, copy: Path) -> Path:
+    """Write a folder as a zip whose bytes depend on its files' names and contents only."""
     with zipfile.ZipFile(copy, "w") as archive:
         for file in sorted(f for f in path.iterdir() if f.suffix.lower() in (".csv", ".json") and f.is_file()):
             member = zipfile.ZipInfo(file.name)
             member.compress_type = zipfile.ZIP_DEFLATED
             with file.open("rb") as source, archive.open(member, "w") as target:
                 shutil.copyfileobj(source, target)
+    return copy
 
 
 def _check_there(path: Path) -> None:

@@ -19,8 +19,8 @@ import fsspec
 
 from pbl_pipeline.errors import PblError
 
-from .secret_files import secret
-from .store import purge, store_error
+from ..secret_files import secret
+from ..store import purge, store_error
 
 #: What is a sensor log, by the ending.
 LOG_ENDINGS = (".csv", ".json", ".zip")

@@ -14,13 +14,13 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label, is_plain
 from pbl_pipeline.words import unit_of
 
-from . import fit, gait, gdi, lab, session, study, video
-from ._datajoint import dj
-from .ingest import in_transaction
-from .method_names import with_keys
-from .rows import inside, utc_now
-from .stored_files import file_ref, stored_file
-from .views import cycle_rows, frame_of, newest_sets
+from .. import fit, gait, gdi, lab, session, study, video
+from .._datajoint import dj
+from ..method_names import with_keys
+from ..rows import inside, utc_now
+from ..stored_files import file_ref, stored_file
+from ..transactions import in_transaction
+from ..views import cycle_rows, frame_of, newest_sets
 
 if TYPE_CHECKING:
     from pbl_pipeline.study import StudyData

@@ -15,12 +15,12 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 
-from . import lab, session, study, video
-from .codes import check_subject, day_of, folded
-from .conditions import set_condition
-from .ingest import in_transaction, next_id
-from .rows import inside, utc_now
-from .sheets import Row, Sheet, date_of, needed, number_of, read_sheets, refused
+from .. import lab, session, study, video
+from ..codes import check_subject, day_of, folded
+from ..intake.conditions import set_condition
+from ..intake.sheets import Row, Sheet, date_of, needed, number_of, read_sheets, refused
+from ..rows import inside, utc_now
+from ..transactions import in_transaction, next_id
 
 #: Column of a sheet -> column of `study.Visit`.
 VISIT_COLUMNS = {

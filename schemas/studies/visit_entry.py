@@ -13,11 +13,11 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 
-from . import session, study
-from .decide import decisions, record
-from .ingest import in_transaction
-from .sheets import Row, Sheet, refused
-from .study_import import CLEAR, SCORE_COLUMNS, Line, import_rows
+from .. import session, study
+from ..decide import decisions, record
+from ..intake.sheets import Row, Sheet, refused
+from ..transactions import in_transaction
+from .study_sheets import CLEAR, SCORE_COLUMNS, Line, import_rows
 
 #: Name of the field of the role; the others are named by their instruments.
 ROLE = "role"

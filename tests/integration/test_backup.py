@@ -19,7 +19,7 @@ import schemas
 from pbl_pipeline.errors import PblError
 from schemas import _dump, backup, backup_files, connection, lab, video, views
 from schemas._declare import declare_all
-from schemas.ingest import Visit, ingest
+from schemas.intake import Visit, ingest
 from schemas.results import load_session
 from tests.command import pbl
 from tests.database import installation

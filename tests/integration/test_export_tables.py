@@ -17,8 +17,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit
 from schemas import export, fit, gait, gdi, session
 from schemas.export import session_of_tables
-from schemas.ingest import Methods, Visit, ingest
-from schemas.sensors import Sensors
+from schemas.intake import Methods, Sensors, Visit, ingest
 from tests.command import pbl
 from tests.exported import with_markers
 from tests.rows import register

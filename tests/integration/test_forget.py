@@ -11,7 +11,7 @@ import pytest
 
 from schemas import connection, forget, keypoints, lab, session, video
 from schemas._declare import declare_all
-from schemas.ingest import Visit, ingest
+from schemas.intake import Visit, ingest
 from tests.command import pbl
 from tests.rows import everything_but_refreshes, register, remove_all
 from workers.populate import populate

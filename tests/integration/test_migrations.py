@@ -17,7 +17,7 @@ import schemas
 from pbl_pipeline.errors import PblError
 from schemas import connection, embedded, gait, gdi, jobs, lab, migrations, session, video, views
 from schemas.chain import ON_REQUEST
-from schemas.ingest import Visit, ingest
+from schemas.intake import Visit, ingest
 from tests.command import pbl
 from tests.database import new_home, remove_home
 from tests.rows import everything, register

@@ -17,7 +17,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GaitMetrics
 from schemas import fit, gait, gdi, lab, norms, session, views
 from schemas.cli.norm import norm as command
-from schemas.ingest import Methods, Visit, ingest
+from schemas.intake import Methods, Visit, ingest
 from schemas.results import load_session
 from tests.rows import remove_all
 from workers.populate import populate

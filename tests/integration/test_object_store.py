@@ -14,7 +14,7 @@ import schemas
 from pbl_pipeline.errors import PblError
 from schemas import backup, connection, forget, store, tracking, video
 from schemas._declare import declare_all
-from schemas.ingest import Visit, ingest
+from schemas.intake import Visit, ingest
 from schemas.stored_files import file_ref, stored_file
 from tests.rows import remove_all
 from workers.incoming import take_over

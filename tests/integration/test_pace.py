@@ -12,8 +12,8 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GDI_METHODS
 from pbl_pipeline.paramset import Paramset
 from schemas import fit, gait, gdi, norms, session, video, views
-from schemas.conditions import set_condition
-from schemas.ingest import Methods, Visit, ingest
+from schemas.intake import Methods, Visit, ingest
+from schemas.intake.conditions import set_condition
 from schemas.method_rows import insert_methods
 from schemas.results import load_session
 from tests.command import pbl

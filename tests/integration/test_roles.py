@@ -17,7 +17,7 @@ from schemas import connection, embedded, gdi, lab, roles, session, views, worke
 from schemas._datajoint import dj
 from schemas._declare import declare_all
 from schemas.chain import ON_REQUEST
-from schemas.ingest import Visit, ingest
+from schemas.intake import Visit, ingest
 from tests.command import pbl
 from tests.rows import remove_all
 from workers import refresh

@@ -11,8 +11,7 @@ import pbl_pipeline.fit
 import pbl_pipeline.video
 from pbl_pipeline.keypoints import Keypoints
 from schemas import fit, keypoints, lab, load_session, qc, video
-from schemas.ingest import Visit, ingest
-from schemas.sensors import Sensors
+from schemas.intake import Sensors, Visit, ingest
 from schemas.stored_files import file_ref, stored_file
 from tests.command import pbl
 from tests.integration import chain

@@ -30,7 +30,7 @@ from pbl_pipeline.video import Camera
 from schemas import fit, gait, gdi, keypoints, lab, qc, session, table_map, tracking, video, views
 from schemas.choose import candidates, write_sheet
 from schemas.decide import decide_person
-from schemas.ingest import Methods, Visit, ingest
+from schemas.intake import Methods, Visit, ingest
 from schemas.method_rows import resolve_method
 from schemas.plan import plan_fit_sets
 from schemas.results import load_session

@@ -12,12 +12,14 @@ import pytest
 
 import pbl_pipeline.gait
 from pbl_pipeline.errors import PblError
-from schemas import decide, fit, gait, gdi, hand_events, move, qc, slices, study
+from schemas import decide, fit, gait, gdi, hand_events, qc, study
 from schemas.export import visits_of_tables
 from schemas.forget import forget
+from schemas.intake import move
 from schemas.recording_page import recording_about, recording_fit, trial_key
 from schemas.results import load_session
 from schemas.review import Decision
+from schemas.studies import slices
 from schemas.visit_list import Filter, visit_page
 from schemas.visit_page import visit_about
 from tests.integration import decide_target, web

@@ -11,13 +11,12 @@ import pytest
 import pbl_pipeline.fit
 import pbl_pipeline.keypoints
 from pbl_pipeline.errors import PblError
-from schemas import decide, fit, gdi, listing, qc, slices, study, tracking, usable, video, visit_list
-from schemas.ingest import Visit
-from schemas.marker_recordings import ingest_markers
+from schemas import decide, fit, gdi, intake, listing, qc, study, tracking, usable, video, visit_list
+from schemas.intake import LaboratoryMarkers, SeveralCameras, Visit
 from schemas.plan import plan_fit_sets
 from schemas.results import load_session
 from schemas.review import Decision
-from schemas.rigs import ingest_rig
+from schemas.studies import slices
 from schemas.visit_list import Filter, visit_page
 from schemas.visit_page import visit_about
 from schemas.why import why
@@ -221,7 +220,9 @@ def test_all_cameras_of_a_trial_are_marked_together(tables: None, tmp_path: Path
     monkeypatch.setattr(pbl_pipeline.fit, "fit_session", test_rigs.fit_none)
     toml = test_rigs.calibration(tmp_path / "Calib.toml")
     for trial in ("w1.", "w2."):
-        made = ingest_rig(test_rigs.rig_videos(tmp_path, trial), toml, Visit("P001", "2026-01-10"))
+        made = intake.register(
+            [SeveralCameras(test_rigs.rig_videos(tmp_path, trial), toml, Visit("P001", "2026-01-10"))]
+        )
         assert [r.status for r in made] == ["registered"] * 3
     populate()
     assert current() == [[1, 2, 3, 4, 5, 6]]
@@ -239,7 +240,7 @@ def test_marker_recordings_are_marked_too(tables: None, tmp_path: Path, monkeypa
     monkeypatch.setattr(pbl_pipeline.fit, "fit_session", lambda *given, **_: test_rigs.fit_none(*given))
     number = register(small_video(tmp_path, "walk"), session_label="2026-01-10")[0]
     paths = [test_markers.recording(tmp_path / f"{name}.npz", s) for name, s in (("m1", 7.0), ("m2", 8.0))]
-    made = ingest_markers(paths, Visit("P001", "2026-01-10"))
+    made = intake.register([LaboratoryMarkers(p, Visit("P001", "2026-01-10")) for p in paths])
     assert [r.status for r in made] == ["registered"] * 2, made
     populate()
     assert sorted(current()) == [[number], [2, 3]]

@@ -61,7 +61,7 @@ def _fetched() -> dict[str, Path]:
 def _run(out: Path) -> None:
     import schemas
     from schemas import connection, embedded, views
-    from schemas.ingest import Visit, ingest
+    from schemas.intake import Visit, ingest
     from schemas.report import write_session
     from workers.cli.populate import summary
     from workers.populate import populate

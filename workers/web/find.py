@@ -13,7 +13,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 
 from schemas import decide, visit_list
-from schemas.enter import entry
+from schemas.studies.visit_entry import entry
 from schemas.visit_progress import visit_progress
 
 from .access import Session, form_of
