@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..transactions import in_transaction
 from .plans import resolve
-from .records import File, Methods, Read, Visit
+from .records import File, Methods, Visit
 from .registration import check_owner, registered, write
 from .videos import OneCamera
 
@@ -41,8 +41,8 @@ def register_many(recordings: Iterable[OneCamera], methods: Methods | None = Non
     for chunk in _chunks(recordings):
         for one in chunk:
             one.visit.check(one.path)
-        read = [one.read() for one in chunk]
-        new = in_transaction(functools.partial(_write_new, read, chosen))
+            one.read()
+        new = in_transaction(functools.partial(_write_new, chunk, chosen))
         out += Counter(registered=new, known=len(chunk) - new)
     return out
 
@@ -53,7 +53,7 @@ def _chunks(recordings: Iterable[OneCamera]) -> Iterator[list[OneCamera]]:
         yield chunk
 
 
-def _write_new(chunk: Sequence[Read], chosen: Mapping[str, str]) -> int:
+def _write_new(chunk: Sequence[OneCamera], chosen: Mapping[str, str]) -> int:
     known = registered(file for one in chunk for file in one.files)
     for one in chunk:
         check_owner(one, known)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from .. import fit, gdi, video
-from ..rows import delete_below
+from ..rows import counted, delete_below
 
 
 def set_condition(video_id: int, activity: str | None = None, pace: str | None = None) -> list[str]:
@@ -39,12 +37,8 @@ def _set_condition(video_id: int, activity: str | None, pace: str | None) -> lis
     if after.pace != before.pace:
         video.Pace.insert1({**key, "pace": after.pace}, replace=True)
         changes.append(f"pace is {after.pace} now")
-    if after.pool != before.pool and (deleted := _delete_pooled(key)):
-        rows = ", ".join(f"{n} of {name}" for name, n in deleted.items())
-        changes.append(f"what pooled it was deleted: {rows}")
+    if after.pool != before.pool:
+        sets = fit.FitSet & (fit.FitSet.Video & key).proj()
+        if rows := counted(delete_below(gdi.SessionGdi, (gdi.SessionGdi & sets).keys())):
+            changes.append(f"what pooled it was deleted: {rows}")
     return changes
-
-
-def _delete_pooled(key: dict[str, Any]) -> dict[str, int]:
-    sets = (fit.FitSet.Video & key).proj()
-    return delete_below(gdi.SessionGdi, (gdi.SessionGdi & (fit.FitSet & sets)).keys())

@@ -15,14 +15,14 @@ from pbl_pipeline.names import check_label
 from .. import fit, video
 from ..method_rows import method_row
 from ..stored_files import new_folder
-from .records import File, Methods, Read, Recording, Visit, check_path, usage
+from .records import File, Methods, Recording, Visit, check_path, usage
 
 if TYPE_CHECKING:
     from pbl_pipeline.body import MarkerSet
     from pbl_pipeline.fit import MarkerFile
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class LaboratoryMarkers(Recording):
     """A file of laboratory markers (`.trc`, or the `.npz` of docs/files.md).
 
@@ -35,23 +35,25 @@ class LaboratoryMarkers(Recording):
     marker_set: str | None = None  # name of a shipped set, or path of a table (.csv) of one's own; needed for .trc
     up: str = "y"  # vertical axis of .trc files, "y" or "z"
     markers: ClassVar[bool] = True
+    motion: ClassVar[str] = video.NO_CAMERA  # type: ignore[misc]
+    found: MarkerFile = dataclasses.field(init=False)
+    about: dict[str, str] = dataclasses.field(default_factory=dict, init=False)  # which set: columns of MarkerRecording
+    in_view_share: float = dataclasses.field(default=np.nan, init=False)
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """The file."""
         return (Path(self.path).absolute(),)
 
     def check(self, methods: Methods) -> None:
-        """Raise `PblError` USAGE for a visit with a camera or a person's number, or a method of tracking or keypoints;
-        MARKER_SET_UNKNOWN, FILE_FORMAT for the marker set."""
+        """Raise what `Recording.check` raises; MARKER_SET_UNKNOWN, FILE_FORMAT for the marker set."""
         super().check(methods)
         stated = self.visit
         if stated.camera_file is not None or stated.camera_motion is not None or stated.person is not None:
-            raise usage("a camera or a person's number for markers", "neither: markers are one person's, in the world")
+            found = "a camera or a person's number for markers"
+            raise usage(found, "neither: markers are one person's, in the world")
         if methods.tracking or methods.keypoint or methods.subject:
-            raise usage(
-                "a method of tracking or keypoints for markers", "methods of the fit, of events and of the index"
-            )
+            found = "a method of tracking or keypoints for markers"
+            raise usage(found, "methods of the fit, of events and of the index")
         self._set()
 
     @property
@@ -68,74 +70,22 @@ class LaboratoryMarkers(Recording):
             return load_marker_set(self._table)
         return None if self.marker_set is None else marker_set(self.marker_set)
 
-    def read(self) -> ReadMarkers:
+    def read(self) -> None:
         """Read the markers. Raises `PblError` FILE_MISSING, FILE_FORMAT, MARKER_SET_UNKNOWN, USAGE."""
         from pbl_pipeline.fit import read_markers
         from pbl_pipeline.video import sha256_of
 
-        (path,), table = self.paths, self._table
+        (path,) = self.paths
         check_path(path)
-        found = read_markers(path, self._set(), self.up)
-        about = {
-            "recording_marker_set": found.markers.name,
-            "marker_table_sha256": "" if table is None else sha256_of(table),
+        self.found = read_markers(path, self._set(), self.up)
+        self.files = (File.of(path),)
+        self.about = {
+            "recording_marker_set": self.found.markers.name,
+            "marker_table_sha256": "" if self._table is None else sha256_of(self._table),
         }
-        up = self.up if path.suffix.lower() == ".trc" else "z"
-        return ReadMarkers(self.visit, (File.of(path),), video.NO_CAMERA, (None,), found, table, about, up)
 
-
-@dataclasses.dataclass
-class ReadMarkers(Read):
-    """Laboratory markers that were read."""
-
-    found: MarkerFile
-    table: Path | None
-    about: dict[str, str]  # columns of MarkerRecording that say which marker set
-    up: str
-    in_view_share: float = np.nan
-
-    def complete(self, chosen: Mapping[str, str]) -> None:
-        """Check that the chosen method can fit them. Raises `PblError` FIT_INPUT."""
-        from pbl_pipeline.fit import check_trial
-
-        method = library_methods.stored(**method_row(fit.FitMethod, chosen))
-        _, self.in_view_share = check_trial(self.found.trial, self.files[0].path.stem, method, self.found.markers)
-
-    def check_session(self, session_id: int) -> None:
-        """Raise `PblError` USAGE where the session has recordings with another marker set: one body is fitted."""
-        there = video.MarkerRecording * video.Video.proj("session_id") & {"session_id": session_id}
-        for row in there.proj(*self.about).to_dicts():
-            if self._other_set(row):
-                raise usage(
-                    f"marker set {self.about['recording_marker_set']} in a session with another, or another table of "
-                    "that name",
-                    f"{row['recording_marker_set']}, as video_id {row['video_id']} of the session",
-                    self.files[0].path,
-                    "register it with that set, or in a session of its own",
-                )
-
-    def insert(self, numbers: Sequence[int]) -> list[str]:
-        """Insert the recording with its copy."""
-        trial = self.found.trial
-        row = {
-            "video_id": numbers[0],
-            **self.about,
-            "vertical_axis": self.up,
-            "recording_n_frames": len(trial.time_s),
-            "recording_n_markers": int(np.sum(np.any(trial.confidence > 0, axis=0))),
-            "recording_duration": float(trial.time_s[-1] - trial.time_s[0]),
-            "recording_in_view_share": self.in_view_share,
-        }
-        with new_folder() as folder:
-            trial.save(folder / "markers.npz")
-            files = {"markers_file": folder / "markers.npz", "marker_table_file": self.table}
-            video.MarkerRecording.insert1({**row, **files})
-        unused = f"; not in the marker set: {', '.join(self.found.unused)}" if self.found.unused else ""
-        return [self.found.text() + unused]
-
-    def check_known(self, rows: Sequence[Mapping[str, Any] | None]) -> None:
-        """Raise `PblError` USAGE where the bytes are registered as a video, or with another marker set."""
-        number, path = int(rows[0]["video_id"]) if rows[0] else 0, self.files[0].path
+    def check_known(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        number, path = int(rows[0]["video_id"]), self.files[0].path
         recorded = (video.MarkerRecording & {"video_id": number}).to_dicts()
         if not recorded:
             raise usage(
@@ -154,3 +104,40 @@ class ReadMarkers(Read):
 
     def _other_set(self, row: Mapping[str, Any]) -> bool:
         return any(row[name] != value for name, value in self.about.items())
+
+    def complete(self, chosen: Mapping[str, str]) -> None:
+        """Check that the chosen method can fit them. Raises `PblError` FIT_INPUT."""
+        from pbl_pipeline.fit import check_trial
+
+        method = library_methods.stored(**method_row(fit.FitMethod, chosen))
+        _, self.in_view_share = check_trial(self.found.trial, self.files[0].path.stem, method, self.found.markers)
+
+    def check_session(self, session_id: int) -> None:
+        there = video.MarkerRecording * video.Video.proj("session_id") & {"session_id": session_id}
+        for row in there.proj(*self.about).to_dicts():
+            if self._other_set(row):  # one body is fitted to all
+                raise usage(
+                    f"marker set {self.about['recording_marker_set']} in a session with another, or another table of "
+                    "that name",
+                    f"{row['recording_marker_set']}, as video_id {row['video_id']} of the session",
+                    self.files[0].path,
+                    "register it with that set, or in a session of its own",
+                )
+
+    def insert(self, numbers: Sequence[int]) -> list[str]:
+        trial = self.found.trial
+        row = {
+            "video_id": numbers[0],
+            **self.about,
+            "vertical_axis": self.up if self.files[0].path.suffix.lower() == ".trc" else "z",
+            "recording_n_frames": len(trial.time_s),
+            "recording_n_markers": int(np.sum(np.any(trial.confidence > 0, axis=0))),
+            "recording_duration": float(trial.time_s[-1] - trial.time_s[0]),
+            "recording_in_view_share": self.in_view_share,
+        }
+        with new_folder() as folder:
+            trial.save(folder / "markers.npz")
+            files = {"markers_file": folder / "markers.npz", "marker_table_file": self._table}
+            video.MarkerRecording.insert1({**row, **files})
+        unused = f"; not in the marker set: {', '.join(self.found.unused)}" if self.found.unused else ""
+        return [self.found.text() + unused]

@@ -13,7 +13,7 @@ from ..rows import inside
 from ..transactions import in_transaction
 from ..video import CAMERA_MOTIONS
 from .plans import resolve
-from .records import Methods, Read, Visit
+from .records import Methods, Visit
 from .registration import check_owner, registered, write
 from .sensors import Sensors
 from .sheets import (
@@ -57,26 +57,27 @@ def ingest_sheet(sheet: Path, methods: Methods | None = None, dry_run: bool = Fa
     lines = [Line(row.where) for row in rows]
     visits = [_visit(row, line, sheet.absolute().parent) for row, line in zip(rows, lines, strict=True)]
     _check_people(visits, lines)
-    new: list[tuple[Row, Line, Read]] = []
+    new: list[tuple[Row, Line, OneCamera]] = []
     seen: dict[str, str] = {}
     for row, line, visit in track(list(zip(rows, lines, visits, strict=True)), "reading", unit="file"):
         if visit is None or line.errors:
             continue
         with line.about():
-            read = _recording(row, visit, sheet.absolute().parent).read()
-            sha256, file = read.files[0].sha256, row.cells["file"]
+            one = _recording(row, visit, sheet.absolute().parent)
+            one.read()
+            sha256, file = one.files[0].sha256, row.cells["file"]
             if (first := seen.setdefault(sha256, row.where)) != row.where:
                 raise conflict(f"the same bytes as in {first}", "each recording once", "remove one of the rows")
-            if known := registered(read.files):
-                _check_place(read, known)
+            if known := registered(one.files):
+                _check_place(one, known)
                 line.kept = f"{file}: video_id {known[sha256]['video_id']}: registered already, left as it is"
             else:
-                read.complete(chosen)
-                new.append((row, line, read))
+                one.complete(chosen)
+                new.append((row, line, one))
                 line.changes = [f"{file}: new: {visit.subject}/{visit.session_label}"]
     done = not dry_run and not any(line.errors for line in lines)
     if done and new:
-        made = in_transaction(lambda: write([read for *_, read in new], chosen))
+        made = in_transaction(lambda: write([one for *_, one in new], chosen))
         for (row, line, _), result in zip(new, made, strict=True):
             line.changes = [f"{row.cells['file']}: video_id {result.video_id}: registered ({result.note})"]
     return Imported(lines, done)
@@ -169,10 +170,10 @@ def _recording(row: Row, visit: Visit, folder: Path) -> OneCamera:
     return OneCamera(folder / row.cells["file"], visit, Sensors(attitude=folder / log if log else None))
 
 
-def _check_place(read: Read, known: Mapping[str, Mapping]) -> None:
+def _check_place(one: OneCamera, known: Mapping[str, Mapping]) -> None:
     """Raise `PblError` where a video is registered for another person or visit."""
-    check_owner(read, known)
-    row, visit = known[read.files[0].sha256], read.visit
+    check_owner(one, known)
+    row, visit = known[one.files[0].sha256], one.visit
     if row["session_label"] != visit.session_label:
         raise conflict(
             f"video_id {row['video_id']} of visit {row['session_label']} has these bytes",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 import datetime
 import os
@@ -77,50 +76,62 @@ class Registered:
 
 @dataclasses.dataclass(frozen=True)
 class File:
-    """A file with the SHA-256 of its bytes and its length (bytes)."""
+    """A file with the SHA-256 of its bytes and its length (bytes); camera: the row of its calibration."""
 
     path: Path
     sha256: str
     size: int
+    camera: Mapping[str, Any] | None = None
 
     @classmethod
     def of(cls, path: Path) -> File:
-        """Read the bytes of a file. Raises `PblError` VIDEO_MISSING; USAGE for a path that no row can hold."""
+        """Read the bytes of a file. Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY; USAGE for a path that no row can
+        hold."""
         from pbl_pipeline.video import sha256_of
 
+        if not os.path.isfile(path):  # not Path.is_file: that raises where a folder on the way may not be entered
+            raise _no_video("VIDEO_MISSING", "it is not a file" if os.path.exists(path) else "no such file", path)
         check_path(path)
+        if not path.stat().st_size:
+            raise _no_video("VIDEO_EMPTY", "0 bytes", path)
         return cls(path, sha256_of(path), path.stat().st_size)
 
 
-class Recording(abc.ABC):
-    """A recording that is to be registered: `OneCamera`, `SeveralCameras` or `LaboratoryMarkers`."""
+class Recording:
+    """A recording that is to be registered: `OneCamera`, `SeveralCameras` or `LaboratoryMarkers`.
+
+    `register` calls the methods in the order in which they stand here. What a kind of recording lacks does nothing.
+    """
 
     visit: Visit
-    #: Whether it goes straight to the fit, without tracking and keypoints.
-    markers: ClassVar[bool] = False
+    files: tuple[File, ...] = ()  # what `read` read
+    markers: ClassVar[bool] = False  # whether it goes straight to the fit, without tracking and keypoints
 
     @property
-    @abc.abstractmethod
     def paths(self) -> tuple[Path, ...]:
         """Its files, absolute."""
+        raise NotImplementedError
+
+    @property
+    def motion(self) -> str:
+        """Value of camera_motion in Video."""
+        raise NotImplementedError
 
     def check(self, methods: Methods) -> None:
         """Raise what `Visit.check` raises, and `PblError` USAGE for what does not apply to this kind of recording."""
         self.visit.check()
 
-    @abc.abstractmethod
-    def read(self) -> Read:
-        """Read its files and check them, without a look at the tables. Raises `PblError`, `RefusedFile`."""
+    def read(self) -> None:
+        """Read its files, without a look at the tables. Raises `PblError`, or `RefusedFile` where one of them cannot be
+        registered, and the others with it."""
+        raise NotImplementedError
 
+    def check_known(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Raise `PblError` USAGE where its files are registered (`rows` of Video) as something else."""
 
-@dataclasses.dataclass
-class Read:
-    """A recording that was read and found good; nothing of it is in the tables yet."""
-
-    visit: Visit
-    files: tuple[File, ...]
-    motion: str  # a value of video.camera_motion
-    cameras: tuple[dict[str, Any] | None, ...]  # of each file the row of its calibration
+    def update(self, row: Mapping[str, Any]) -> list[str]:
+        """Add to a registered file (its row of Video) what is new of its own kind; returns the changes in words."""
+        return []
 
     def complete(self, chosen: Mapping[str, str]) -> None:
         """Read what only a new recording needs; `chosen`: keys of its methods. Raises `PblError`."""
@@ -131,13 +142,6 @@ class Read:
     def insert(self, numbers: Sequence[int]) -> list[str]:
         """Insert the rows of its own kind, in a transaction; returns a note on each file."""
         return [""] * len(numbers)
-
-    def check_known(self, rows: Sequence[Mapping[str, Any] | None]) -> None:
-        """Raise `PblError` USAGE where its files are registered (`rows` of Video) as something else."""
-
-    def update(self, row: Mapping[str, Any]) -> list[str]:
-        """Add to a registered file (its row of Video) what is new of its own kind; returns the changes in words."""
-        return []
 
 
 class RefusedFile(Exception):
@@ -173,24 +177,9 @@ def check_path(path: Path) -> None:
         raise usage(found, "at most 1000", path, "move the file to a shorter path")
 
 
-def check_video(path: Path) -> None:
-    """Raise `PblError` VIDEO_MISSING or VIDEO_EMPTY unless there is a file with content."""
-    if not os.path.isfile(path):  # not Path.is_file: that raises where a folder on the way may not be entered
-        raise PblError(
-            "VIDEO_MISSING",
-            found="no such file" if not os.path.exists(path) else "it is not a file",
-            expected="a video file",
-            next_step="check the path",
-            key=path,
-        )
-    if not path.stat().st_size:
-        raise PblError(
-            "VIDEO_EMPTY",
-            found="0 bytes",
-            expected="a video file",
-            next_step="copy it from the phone again",
-            key=path,
-        )
+def _no_video(code: str, found: str, path: Path) -> PblError:
+    next_step = "check the path" if code == "VIDEO_MISSING" else "copy it from the phone again"
+    return PblError(code, found=found, expected="a video file", next_step=next_step, key=path)
 
 
 def usage(found: str, expected: str, key: object = None, next_step: str = "see `pbl ingest --help`") -> PblError:

@@ -21,7 +21,7 @@ from ..transactions import in_transaction, next_id
 from .calibrations import camera_id_of
 from .conditions import set_condition
 from .plans import named_keys, plan_all, plan_named, resolve
-from .records import File, Methods, Read, Recording, RefusedFile, Registered
+from .records import File, Methods, Recording, RefusedFile, Registered
 from .visits import session_ids, set_height, set_population
 
 #: Errors that say that the file was not where, or what, it should be.
@@ -55,7 +55,8 @@ def register(recordings: Iterable[Recording], methods: Methods | None = None) ->
     done: list[Registered] = []
     for recording in recordings:
         try:
-            done += _register(recording.read(), chosen[recording.markers], named_keys(named))
+            recording.read()
+            done += _register(recording, chosen[recording.markers], named_keys(named))
         except RefusedFile as wrong:
             done += [Registered(path, "refused", error=wrong.error_of(path)) for path in recording.paths]
         except PblError as error:
@@ -63,7 +64,7 @@ def register(recordings: Iterable[Recording], methods: Methods | None = None) ->
     return done
 
 
-def _register(one: Read, chosen: Mapping[str, str], named: set[str]) -> list[Registered]:
+def _register(one: Recording, chosen: Mapping[str, str], named: set[str]) -> list[Registered]:
     if known := registered(one.files):
         return _update(one, known, chosen, named)
     one.complete(chosen)
@@ -82,7 +83,7 @@ def registered(files: Iterable[File]) -> dict[str, dict[str, Any]]:
     return {row["video_sha256"]: row for row in rows}
 
 
-def check_owner(one: Read, known: Mapping[str, Mapping[str, Any]]) -> None:
+def check_owner(one: Recording, known: Mapping[str, Mapping[str, Any]]) -> None:
     """Raise `PblError` VIDEO_DUPLICATE where the bytes of a file are registered (`known`) for another subject."""
     visit = one.visit
     for file in one.files:
@@ -99,7 +100,7 @@ def check_owner(one: Read, known: Mapping[str, Mapping[str, Any]]) -> None:
             )
 
 
-def write(recordings: Sequence[Read], chosen: Mapping[str, str]) -> list[Registered]:
+def write(recordings: Sequence[Recording], chosen: Mapping[str, str]) -> list[Registered]:
     """Insert recordings that are new, with people, sessions, selections and plans. Call it in a transaction.
 
     `chosen`: keys of the methods (`plans.resolve`). Returns the outcome of each file.
@@ -128,12 +129,12 @@ def write(recordings: Sequence[Read], chosen: Mapping[str, str]) -> list[Registe
     ]
 
 
-def _video_rows(one: Read, session_id: int, numbers: Sequence[int]) -> Iterable[dict[str, Any]]:
-    for number, file, camera in zip(numbers, one.files, one.cameras, strict=True):
+def _video_rows(one: Recording, session_id: int, numbers: Sequence[int]) -> Iterable[dict[str, Any]]:
+    for number, file in zip(numbers, one.files, strict=True):
         yield {
             "video_id": number,
             "session_id": session_id,
-            "camera_id": camera_id_of(camera) if camera else None,
+            "camera_id": camera_id_of(file.camera) if file.camera else None,
             "video_path": str(file.path),
             "video_name": file.path.name[-255:],
             "video_sha256": file.sha256,
@@ -145,16 +146,16 @@ def _video_rows(one: Read, session_id: int, numbers: Sequence[int]) -> Iterable[
 
 
 def _update(
-    one: Read, known: Mapping[str, Mapping[str, Any]], chosen: Mapping[str, str], named: set[str]
+    one: Recording, known: Mapping[str, Mapping[str, Any]], chosen: Mapping[str, str], named: set[str]
 ) -> list[Registered]:
     """Add what is new to a recording whose bytes are registered."""
     check_owner(one, known)
-    one.check_known([known.get(file.sha256) for file in one.files])
+    one.check_known([known[file.sha256] for file in one.files if file.sha256 in known])
     return [_update_file(one, file, known[file.sha256], chosen, named) for file in one.files]
 
 
 def _update_file(
-    one: Read, file: File, row: Mapping[str, Any], chosen: Mapping[str, str], named: set[str]
+    one: Recording, file: File, row: Mapping[str, Any], chosen: Mapping[str, str], named: set[str]
 ) -> Registered:
     number, visit = int(row["video_id"]), one.visit
     status, notes = "known", [f"already video_id {number} of subject {row['subject']}, session {row['session_label']}"]

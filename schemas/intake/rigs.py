@@ -6,7 +6,7 @@ import dataclasses
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
@@ -17,10 +17,10 @@ from ..rows import utc_now
 from ..stored_files import new_folder
 from ..transactions import next_id
 from .calibrations import camera_row
-from .records import File, Methods, Read, Recording, RefusedFile, Visit, check_video, usage
+from .records import File, Methods, Recording, RefusedFile, Visit, usage
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class SeveralCameras(Recording):
     """The videos of one trial, one of each camera, and the calibration of the cameras; registered together or not.
 
@@ -32,22 +32,24 @@ class SeveralCameras(Recording):
     videos: Sequence[Path]
     calibration: Path
     visit: Visit
+    motion: ClassVar[str] = video.ONE_OF_SEVERAL  # type: ignore[misc]
+    rig: dict[str, Any] = dataclasses.field(default_factory=dict, init=False)  # columns of Rig
+    seen_by: list[str] = dataclasses.field(default_factory=list, init=False)  # the camera of each video
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """The videos."""
         return tuple(Path(p).absolute() for p in self.videos)
 
     def check(self, methods: Methods) -> None:
-        """Raise `PblError` USAGE for a visit with a camera or a person's number."""
         super().check(methods)
-        stated = self.visit
-        if stated.camera_file is not None or stated.person is not None:
-            raise _own_cameras()
-        if stated.camera_motion not in (None, video.ONE_OF_SEVERAL):
-            raise _own_cameras()
+        own_camera = self.visit.camera_file is not None or self.visit.camera_motion not in (None, self.motion)
+        if own_camera or self.visit.person is not None:
+            raise usage(
+                "a camera, its motion or a person's number with --rig",
+                "the calibration alone, and cameras that stand still",
+            )
 
-    def read(self) -> ReadRig:
+    def read(self) -> None:
         """Read the calibration, the bytes and first picture of each video, and the time stamps of its container: videos
         that were not started together are refused.
 
@@ -62,8 +64,7 @@ class SeveralCameras(Recording):
         from pbl_pipeline.keypoints import cameras_of_files, check_same_times
         from pbl_pipeline.video import load_camera_poses, packet_times, sha256_of
 
-        paths, calibration = self.paths, Path(self.calibration)
-        names = list(load_camera_poses(calibration))
+        paths, names = self.paths, list(load_camera_poses(self.calibration))
         if len(paths) < 2:
             raise PblError(
                 "FIT_INPUT",
@@ -74,41 +75,41 @@ class SeveralCameras(Recording):
             )
         for name in names:
             check_label("camera of the calibration", name, 64)
-        _, seen_by = cameras_of_files([p.stem for p in paths], calibration)
-        files, lenses, times = [], [], []
-        for path, name in zip(paths, seen_by, strict=True):
+        _, self.seen_by = cameras_of_files([p.stem for p in paths], self.calibration)
+        files, times = [], []
+        for path, name in zip(paths, self.seen_by, strict=True):
             try:
-                check_video(path)
-                files.append(File.of(path))
-                lenses.append(_lens(calibration, name, path))
+                files.append(dataclasses.replace(File.of(path), camera=_lens(self.calibration, name, path)))
                 times.append(packet_times(path))
             except PblError as error:
                 raise RefusedFile(path, error) from error
         sha256 = [file.sha256 for file in files]
-        if len(set(sha256)) < len(sha256):
-            twice = next(p for i, p in enumerate(paths) if sha256[i] in sha256[:i])
-            raise usage(
-                "the same video as two cameras", "a video of each camera", twice, "name each camera's own video"
-            )
+        if twice := [p for i, p in enumerate(paths) if sha256[i] in sha256[:i]]:
+            found = "the same video as two cameras"
+            raise usage(found, "a video of each camera", twice[0], "name each camera's own video")
         check_same_times(times, paths[0])
-        rig = {"rig_sha256": sha256_of(calibration), "rig_cameras": names}
-        return ReadRig(self.visit, tuple(files), video.ONE_OF_SEVERAL, tuple(lenses), calibration, rig, seen_by)
+        self.files = tuple(files)
+        self.rig = {"rig_sha256": sha256_of(self.calibration), "rig_cameras": names}
 
-
-@dataclasses.dataclass
-class ReadRig(Read):
-    """A trial of several cameras that was read."""
-
-    calibration: Path
-    rig: dict[str, Any]  # columns of Rig
-    seen_by: list[str]  # the camera of each file
+    def check_known(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        numbers = [int(row["video_id"]) for row in rows]
+        views = video.RigView * video.Rig.proj("rig_sha256") & [{"video_id": v} for v in numbers]
+        found = {int(r["video_id"]): r for r in views.to_dicts()}
+        stated = [(camera, self.rig["rig_sha256"]) for camera in self.seen_by]
+        same = len(found) == len(self.files) and len({r["rig_trial"] for r in found.values()}) == 1
+        if not same or [(found[v]["rig_camera"], found[v]["rig_sha256"]) for v in numbers] != stated:
+            raise usage(
+                f"{len(self.files)} videos, {len(numbers)} of them registered "
+                f"(video_id {', '.join(map(str, numbers))}), not as these cameras of one trial with this calibration",
+                "videos that are new, or registered together with this calibration",
+                self.files[0].path,
+                "register them as they were, or delete these rows of video.Video and register them again",
+            )
 
     def check_session(self, session_id: int) -> None:
-        """Raise `PblError` USAGE where the session has trials of another number of cameras."""
         check_same_number(session_id, len(self.files), self.files[0].path)
 
     def insert(self, numbers: Sequence[int]) -> list[str]:
-        """Insert the rig, where it is new, and the views."""
         rig_id = self._rig_id()
         video.RigView.insert(
             {"video_id": number, "rig_id": rig_id, "rig_trial": numbers[0], "rig_camera": camera}
@@ -117,6 +118,7 @@ class ReadRig(Read):
         return [f"trial {numbers[0]}, camera {camera}" for camera in self.seen_by]
 
     def _rig_id(self) -> int:
+        """The number of the rig of this calibration, which is registered where it is new."""
         found = (video.Rig & {"rig_sha256": self.rig["rig_sha256"]}).to_arrays("rig_id")
         if len(found):
             return int(found[0])
@@ -126,22 +128,6 @@ class ReadRig(Read):
             copy = Path(shutil.copyfile(self.calibration, folder / "rig.toml"))
             video.Rig.insert1({"rig_id": number, **self.rig, "rig_created": utc_now(), "rig_file": copy})
         return number
-
-    def check_known(self, rows: Sequence[Mapping[str, Any] | None]) -> None:
-        """Raise `PblError` USAGE where the videos are not registered as these views of one trial."""
-        numbers = [int(row["video_id"]) for row in rows if row is not None]
-        views = video.RigView * video.Rig.proj("rig_sha256") & [{"video_id": v} for v in numbers]
-        found = {int(r["video_id"]): r for r in views.to_dicts()}
-        stated = [(camera, self.rig["rig_sha256"]) for camera in self.seen_by]
-        same = len(found) == len(numbers) == len(rows) and len({r["rig_trial"] for r in found.values()}) == 1
-        if not same or [(found[v]["rig_camera"], found[v]["rig_sha256"]) for v in numbers] != stated:
-            raise usage(
-                f"{len(rows)} videos, {len(numbers)} of them registered (video_id {', '.join(map(str, numbers))}), not "
-                "as these cameras of one trial with this calibration",
-                "videos that are new, or registered together with this calibration",
-                self.files[0].path,
-                "register them as they were, or delete these rows of video.Video and register them again",
-            )
 
 
 def check_same_number(session_id: int, n: int, path: Path) -> None:
@@ -164,9 +150,3 @@ def _lens(calibration: Path, camera: str, path: Path) -> dict[str, Any]:
     first = read_first(path)
     size = (first.width_px, first.height_px)
     return camera_row(load_camera(calibration, size, camera), size)
-
-
-def _own_cameras() -> PblError:
-    return usage(
-        "a camera, its motion or a person's number with --rig", "the calibration alone, and cameras that stand still"
-    )

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline.errors import PblError
 
 from .. import keypoints, video
-from ..rows import delete_below, utc_now
+from ..rows import counted, delete_below, utc_now
 from ..stored_files import new_folder
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def _attach_log(key: dict[str, Any], path: Path, log: PhoneLog | None) -> list[s
         if not table:
             return []
         table.delete(prompt=False)
-        return ["the phone's log was removed" + _outdated(key)]
+        return ["the phone's log was removed" + delete_keypoints(key["video_id"])]
     about = {
         "attitude_form": log.form[:32],
         "attitude_device": log.device[:128],
@@ -91,7 +91,9 @@ def _attach_log(key: dict[str, Any], path: Path, log: PhoneLog | None) -> list[s
     how = _keep(video.PhoneAttitude, "attitude", key, path, about)
     if not how:
         return []
-    return [f"the phone's log of {len(log.time_s)} orientations ({log.form}) was {how}" + _outdated(key)]
+    return [
+        f"the phone's log of {len(log.time_s)} orientations ({log.form}) was {how}" + delete_keypoints(key["video_id"])
+    ]
 
 
 def _attach_imu(key: dict[str, Any], path: Path) -> list[str]:
@@ -134,9 +136,10 @@ def _keep(table: Any, prefix: str, key: dict[str, Any], path: Path, about: dict[
     return "replaced" if before else "attached"
 
 
-def _outdated(key: dict[str, Any]) -> str:
-    deleted = delete_below(keypoints.Keypoints, (keypoints.Keypoints & key).keys())
-    rows = ", ".join(f"{n} of {name}" for name, n in deleted.items())
+def delete_keypoints(video_id: int) -> str:
+    """Delete the keypoints of a video with what was computed from them; returns it in words, "" for none."""
+    key = {"video_id": video_id}
+    rows = counted(delete_below(keypoints.Keypoints, (keypoints.Keypoints & key).keys()))
     return f", and what depends on it was deleted: {rows}" if rows else ""
 
 

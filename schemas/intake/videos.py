@@ -9,20 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
 
-from .. import fit, keypoints, video
+from .. import fit, video
 from ..jobs import forget_errors
-from ..rows import delete_below
 from ..transactions import in_transaction
 from .calibrations import camera_id_of, camera_row, known_camera
-from .records import File, Methods, Read, Recording, Registered, Visit, check_video, usage
+from .records import File, Methods, Recording, Registered, Visit, usage
 from .registration import register
-from .sensors import NONE, Sensors, attach
+from .sensors import NONE, Sensors, attach, delete_keypoints
 
 if TYPE_CHECKING:
     from pbl_pipeline.video import PhoneLog
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class OneCamera(Recording):
     """A video of one camera, with the files that its phone or the person's sensors recorded beside it.
 
@@ -33,49 +32,22 @@ class OneCamera(Recording):
     visit: Visit
     sensors: Sensors = dataclasses.field(default_factory=Sensors)
     file: File | None = None
+    log: PhoneLog | None = dataclasses.field(default=None, init=False)
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """The video."""
         return (Path(self.path).absolute(),)
 
-    def read(self) -> ReadVideo:
-        """Read the video's bytes and its sensor files; no picture is decoded.
+    @property
+    def motion(self) -> str:
+        return self.visit.camera_motion or ("handheld" if self.sensors.has_log else "static")
 
-        Raises
-        ------
-        PblError
-            VIDEO_MISSING, VIDEO_EMPTY, USAGE (a path that no row can hold), FILE_MISSING, PHONE_LOG.
-        """
-        (path,) = self.paths
-        if self.file is None:
-            check_video(path)
-        motion = self.visit.camera_motion or ("handheld" if self.sensors.has_log else "static")
-        log = self.sensors.read()
-        file = self.file or File.of(path)
-        return ReadVideo(self.visit, (file,), motion, (None,), self.sensors, log)
+    def read(self) -> None:
+        self.files = (self.file or File.of(*self.paths),)  # no picture is decoded
+        self.log = self.sensors.read()
 
-
-@dataclasses.dataclass
-class ReadVideo(Read):
-    """A video of one camera that was read."""
-
-    sensors: Sensors
-    log: PhoneLog | None
-
-    def complete(self, chosen: Mapping[str, str]) -> None:
-        """Read the calibration for the size of the first picture. Raises `PblError` CAMERA_INVALID."""
-        if self.visit.camera_file:
-            self.cameras = (_camera(self.visit.camera_file, self.files[0].path),)
-
-    def insert(self, numbers: Sequence[int]) -> list[str]:
-        """Insert the files of its sensors."""
-        return ["; ".join(attach(numbers[0], self.sensors, self.log))]
-
-    def check_known(self, rows: Sequence[Mapping[str, Any] | None]) -> None:
-        """Raise `PblError` USAGE where the bytes are laboratory markers, or a new calibration is for one of several
-        cameras."""
-        number, path = int(rows[0]["video_id"]) if rows[0] else 0, self.files[0].path
+    def check_known(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        number, path = int(rows[0]["video_id"]), self.files[0].path
         if video.MarkerRecording & {"video_id": number}:
             raise usage(
                 f"bytes that are registered as laboratory markers, video_id {number}",
@@ -92,31 +64,26 @@ class ReadVideo(Read):
             )
 
     def update(self, row: Mapping[str, Any]) -> list[str]:
-        """Give a registered video the calibration and the sensor files; delete what was computed with others."""
-        changes = self._new_camera(row) if self.visit.camera_file else []
-        if not self.sensors:
-            return changes
-        done = in_transaction(lambda: self._new_sensors(row))
+        done = self._new_camera(row) if self.visit.camera_file else []
+        if self.sensors:
+            done += in_transaction(lambda: self._new_sensors(row))
         if done:
-            forget_errors(int(row["video_id"]))
-        return changes + done
+            forget_errors(int(row["video_id"]))  # what failed with the other camera or log may succeed with this one
+        return done
 
     def _new_camera(self, row: Mapping[str, Any]) -> list[str]:
         self.complete({})
-        number, camera = int(row["video_id"]), self.cameras[0]
+        number, camera = int(row["video_id"]), self.files[0].camera
         if camera is None:
             return ["the camera was not attached, because no picture of the video can be decoded"]
         if row["camera_id"] is not None and int(row["camera_id"]) == known_camera(camera):
             return []
 
-        def replace() -> dict[str, int]:
+        def replace() -> str:
             video.Video.update1({"video_id": number, "camera_id": camera_id_of(camera)})
-            return delete_below(keypoints.Keypoints, (keypoints.Keypoints & {"video_id": number}).keys())
+            return delete_keypoints(number)
 
-        deleted = in_transaction(replace)
-        forget_errors(number)  # what failed with the other camera may succeed with this one
-        rows = ", ".join(f"{n} of {name}" for name, n in deleted.items())
-        return ["the camera was attached" + (f", and what depends on it was deleted: {rows}" if rows else "")]
+        return ["the camera was attached" + in_transaction(replace)]
 
     def _new_sensors(self, row: Mapping[str, Any]) -> list[str]:
         number = int(row["video_id"])
@@ -126,6 +93,14 @@ class ReadVideo(Read):
             video.Video.update1({"video_id": number, "camera_motion": "handheld"})
             done.append("the camera counts as handheld now")
         return done
+
+    def complete(self, chosen: Mapping[str, str]) -> None:
+        if self.visit.camera_file:
+            (file,) = self.files
+            self.files = (dataclasses.replace(file, camera=_camera(self.visit.camera_file, file.path)),)
+
+    def insert(self, numbers: Sequence[int]) -> list[str]:
+        return ["; ".join(attach(numbers[0], self.sensors, self.log))]
 
 
 def _camera(camera_file: str | Path, path: Path) -> dict[str, Any] | None:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from .. import fit, lab, session
 from ..codes import day_of
-from ..rows import delete_below, inside, number, utc_now
+from ..rows import counted, delete_below, inside, number, utc_now
 from ..transactions import next_id
 from .records import Visit
 
@@ -79,7 +79,6 @@ def set_height(subject: str, height_m: float | None) -> list[str]:
     lab.Subject.update1({**key, "subject_height": height_m})
     changes = [f"height of {subject} is {height_m:g} m now"]
     sets = fit.FitSet & {"fit_set_kind": fit.SINGLE} & (session.Session & key).proj()
-    if deleted := delete_below(fit.SessionFit, (fit.SessionFit & sets.proj()).keys()):
-        rows = ", ".join(f"{n} of {name}" for name, n in deleted.items())
+    if rows := counted(delete_below(fit.SessionFit, (fit.SessionFit & sets.proj()).keys())):
         changes.append(f"what was fitted without it was deleted: {rows}")
     return changes

@@ -136,14 +136,14 @@ def test_the_same_bytes_under_another_name_are_kept_once(drop: Path, tmp_path: P
 def test_breaking_off_anywhere_loses_nothing_and_registers_once(drop: Path, tmp_path: Path, monkeypatch):
     archive = tmp_path / "archive"
     upload(drop, "P001/1/walk.mp4")
-    real = incoming.ingest
+    real = incoming.register
 
     def dies(*args, **kwargs):
         real(*args, **kwargs)
         raise KeyboardInterrupt  # after the row was committed, before the upload is removed
 
     with monkeypatch.context() as patch:
-        patch.setattr(incoming, "ingest", dies)
+        patch.setattr(incoming, "register", dies)
         with pytest.raises(KeyboardInterrupt):
             twice(drop, archive)
     assert files(drop) == ["P001/1/walk.mp4"]

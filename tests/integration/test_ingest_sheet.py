@@ -134,7 +134,7 @@ def test_other_columns_are_refused_whole(tables, recordings, header, words):
 
 
 def test_a_database_that_fails_in_the_middle_leaves_nothing(tables, recordings, monkeypatch):
-    real, calls = videos.ReadVideo.insert, []
+    real, calls = videos.OneCamera.insert, []
 
     def fails(one, numbers):
         calls.append(one)
@@ -142,7 +142,7 @@ def test_a_database_that_fails_in_the_middle_leaves_nothing(tables, recordings, 
             raise OSError("the connection is gone")
         return real(one, numbers)
 
-    monkeypatch.setattr(videos.ReadVideo, "insert", fails)
+    monkeypatch.setattr(videos.OneCamera, "insert", fails)
     with pytest.raises(OSError, match="gone"):
         ingest_sheet(sheet(recordings, *GOOD))
     assert (len(video.Video()), len(session.Session()), len(lab.Subject())) == (0, 0, 0)
