@@ -55,10 +55,10 @@ class Line:
     kept: str = ""  # what is stored already, in words
 
     @contextlib.contextmanager
-    def about(self) -> Iterator[None]:
+    def about(self) -> Iterator[Line]:
         """An error in the block is one of this row; its key begins with the row."""
         try:
-            yield
+            yield self
         except PblError as error:
             key = str(error.key if error.key is not None else self.where)
             key = key if key.startswith(self.where) else f"{self.where}: {key}"

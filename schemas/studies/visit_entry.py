@@ -15,9 +15,9 @@ from pbl_pipeline.errors import PblError
 
 from .. import session, study
 from ..decide import decisions, record
-from ..intake.sheets import Row, Sheet, refused
+from ..intake.sheets import Line, Row, Sheet, refused
 from ..transactions import in_transaction
-from .study_sheets import CLEAR, SCORE_COLUMNS, Line, import_rows
+from .study_sheets import CLEAR, SCORE_COLUMNS, import_rows
 
 #: Name of the field of the role; the others are named by their instruments.
 ROLE = "role"
