@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .markers import LaboratoryMarkers
-from .records import Methods, Registered, Visit
+from .records import Methods, Recording, Registered, Visit
 from .registration import register
 from .rigs import SeveralCameras
 from .sensors import Sensors
@@ -13,6 +13,7 @@ __all__ = [
     "LaboratoryMarkers",
     "Methods",
     "OneCamera",
+    "Recording",
     "Registered",
     "Sensors",
     "SeveralCameras",
