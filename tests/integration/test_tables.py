@@ -237,22 +237,6 @@ def test_a_failed_fit_gives_no_measures_in_tables_and_files(
 
 
 # ------------------------------------------------------------------------------------------------------- ingest
-def test_the_same_bytes_are_registered_once(tables: None, tmp_path: Path):
-    first = chain.small_video(tmp_path, "walk")
-    copy = tmp_path / "copy.mp4"
-    copy.write_bytes(first.read_bytes())
-    (number,) = register(first)
-    (result,) = ingest([copy], Visit("P002"))
-    assert (result.status, result.video_id) == ("refused", None)  # another person's, which is never guessed at
-    assert "P001" in str(result.error)
-    assert video.Video().fetch1("video_id") == number
-    assert len(lab.Subject()) == 1
-    first.unlink()
-    (result,) = ingest([copy], Visit("P001"))
-    assert result.status == "moved"
-    assert video.Video.fetch1("video_path") == str(copy)
-
-
 def test_a_moved_file_is_computed_without_being_told(tables: None, tmp_path: Path):
     first = chain.small_video(tmp_path, "walk")
     register(first)
@@ -261,6 +245,7 @@ def test_a_moved_file_is_computed_without_being_told(tables: None, tmp_path: Pat
     assert errors(populate(["Tracking"])) == {"Tracking": {"VIDEO_MISSING": 1}}
     (result,) = ingest([moved], Visit("P001"))
     assert result.status == "moved"
+    assert video.Video.fetch1("video_path") == str(moved)
     assert not pipeline_status().errors
     assert done(populate(["Tracking"])) == {"Tracking": 1}
 
