@@ -327,8 +327,7 @@ def _unwritable(archive: Path, error: OSError) -> PblError:
 def _named(name: str, error: Exception) -> PblError:
     """The coded error about what was uploaded, by its name there and not by that of our copy."""
     if isinstance(error, PblError):
-        key = error.key if error.code == "UPLOAD_REFUSED" else name
-        return PblError(error.code, found=error.found, expected=error.expected, next_step=error.next_step, key=key)
+        return error if error.code == "UPLOAD_REFUSED" else error.with_key(name)
     return PblError(
         "INTERNAL",
         found=f"{type(error).__name__}: {error}",

@@ -237,41 +237,39 @@ def _visits(
 def _one_kind(
     videos: tuple[Path, ...], markers: tuple[Path, ...], marker_set: str | None, with_files: bool, rig: bool
 ) -> None:
-    """Raises `click.UsageError` unless there are videos, or markers or views of a rig without a phone's files."""
-    if not videos and not markers:
-        raise click.UsageError("Missing argument 'VIDEOS...' (or --markers FILE).")
-    if videos and markers:
-        raise click.UsageError("Videos and --markers in one call: register each in a call of its own.")
-    if (markers or rig) and with_files:
-        raise click.UsageError(
-            "--attitude, --depth and --imu belong to videos of one camera, not to --markers or --rig."
-        )
-    if markers and rig:
-        raise click.UsageError("--rig goes with videos, not with --markers.")
-    if marker_set is not None and not markers:
-        raise click.UsageError("--marker-set goes with --markers.")
+    """Raise `click.UsageError` unless there are videos, or markers or views of a rig without a phone's files."""
+    for wrong, text in (
+        (not videos and not markers, "Missing argument 'VIDEOS...' (or --markers FILE)."),
+        (videos and markers, "Videos and --markers in one call: register each in a call of its own."),
+        (
+            (markers or rig) and with_files,
+            "--attitude, --depth and --imu belong to videos of one camera, not to --markers or --rig.",
+        ),
+        (markers and rig, "--rig goes with videos, not with --markers."),
+        (marker_set is not None and not markers, "--marker-set goes with --markers."),
+    ):
+        if wrong:
+            raise click.UsageError(text)
 
 
 def _files(n: int, attitude: tuple[Path, ...], depth: tuple[Path, ...], imu: tuple[Path, ...]) -> list[Sensors]:
-    """What belongs to each of the n videos. Raises `PblError` USAGE where files and videos do not match."""
-    from pbl_pipeline.errors import PblError
+    """Sensor files of each of the n videos. Raises `PblError` USAGE where files and videos do not match."""
     from schemas.intake import Sensors
+    from schemas.intake.records import usage
 
     for what, given in (("--attitude", attitude), ("--depth", depth)):
         if given and len(given) != n:
-            raise PblError(
-                "USAGE",
-                found=f"{len(given)} times {what} for {n} videos",
-                expected="none, or one for each video, in the same order",
+            no_file = (
+                ", 'none' for one without a log" if what == "--attitude" else "; ingest the others in another call"
+            )
+            raise usage(
+                f"{len(given)} times {what} for {n} videos",
+                "none, or one for each video, in the same order",
                 next_step="name a file for each video"
-                + (", 'none' for one without a log" if what == "--attitude" else "; ingest the others in another call"),
+                + (no_log if what == "--attitude" else "; ingest the others in another call"),
             )
     if imu and n > 1:
-        raise PblError(
-            "USAGE",
-            found=f"--imu for {n} videos",
-            expected="IMU files with one video",
-            next_step="ingest that video in a call of its own",
-        )
+        alone = "ingest that video in a call of its own"
+        raise usage(f"--imu for {n} videos", "IMU files with one video", next_step=alone)
     logs, depths = (list(given) or [None] * n for given in (attitude, depth))
     return [Sensors(a, d, imu) for a, d in zip(logs, depths, strict=True)]

@@ -62,9 +62,7 @@ class Line:
         except PblError as error:
             key = str(error.key if error.key is not None else self.where)
             key = key if key.startswith(self.where) else f"{self.where}: {key}"
-            self.errors.append(
-                PblError(error.code, found=error.found, expected=error.expected, next_step=error.next_step, key=key)
-            )
+            self.errors.append(error.with_key(key))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,12 +230,9 @@ def _sheet(name: str, lines: list[list[str]]) -> Sheet | None:
     _, header = numbered[0]
     while header and not header[-1]:
         header = header[:-1]
-    twice = sorted({c for c in header if header.count(c) > 1})
-    if twice:
-        what = "a column without a name" if not twice[0] else f"column {twice[0]!r} twice"
+    if wrong := sorted({c for c in header if not c or header.count(c) > 1}):
+        what = f"column {wrong[0]!r} twice" if wrong[0] else "a column without a name"
         raise refused(name, what, "a header row that names each column once", "name the columns")
-    if "" in header:
-        raise refused(name, "a column without a name", "a header row that names each column once", "name the columns")
     rows = []
     for number, line in numbered[1:]:
         where = f"{name}, row {number}"

@@ -188,7 +188,9 @@ class _Plan:
     def _identity(self, row: Row, code: str) -> None:
         """Compare what identifies a person, and store none of it."""
         if record := row.cells.get("record"):
-            _one_person(self.records.setdefault(record, code), code, f"record {record}")
+            if (first := self.records.setdefault(record, code)) != code:
+                found = f"the codes {first} and {code} for record {record}"
+                raise conflict(found, "one code for one person", "write the same code in all rows")
             mine = [r for r, c in self.records.items() if c == code]
             if len(mine) > 1:
                 raise conflict(f"{len(mine)} records of {code}", "one record for a person", "correct code or record")
@@ -501,10 +503,3 @@ def _shown(value: Any) -> str:
     if value is None or value == "":
         return "nothing"
     return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _one_person(first: str, code: str, what: str) -> None:
-    if first != code:
-        raise conflict(
-            f"the codes {first} and {code} for {what}", "one code for one person", "write the same code in all rows"
-        )
