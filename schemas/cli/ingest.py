@@ -259,14 +259,11 @@ def _files(n: int, attitude: tuple[Path, ...], depth: tuple[Path, ...], imu: tup
 
     for what, given in (("--attitude", attitude), ("--depth", depth)):
         if given and len(given) != n:
-            no_file = (
-                ", 'none' for one without a log" if what == "--attitude" else "; ingest the others in another call"
-            )
             raise usage(
                 f"{len(given)} times {what} for {n} videos",
                 "none, or one for each video, in the same order",
                 next_step="name a file for each video"
-                + (no_log if what == "--attitude" else "; ingest the others in another call"),
+                + (", 'none' for one without a log" if what == "--attitude" else "; ingest the others in another call"),
             )
     if imu and n > 1:
         alone = "ingest that video in a call of its own"
