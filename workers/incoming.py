@@ -62,20 +62,15 @@ _OURS = ("DB_NOT_RUNNING", "DB_UNAVAILABLE", "DB_REFUSED", "STORE_UNAVAILABLE")
 
 @dataclasses.dataclass
 class Taken:
-    """What one run did, by the uploads' names.
-
-    registered, known: taken; the latter are registered already, with the note of `register`. refused: moved aside, with
-    the reason. left: whole, but not taken this time, with the reason. ignored: what is no recording in its place,
-    and why. uploading: how many are not whole yet. later: how many the time did not suffice for.
-    """
+    """The outcome of a run, by the names of the uploads."""
 
     registered: list[str] = dataclasses.field(default_factory=list)
-    known: dict[str, str] = dataclasses.field(default_factory=dict)
-    refused: dict[str, PblError] = dataclasses.field(default_factory=dict)
-    left: dict[str, PblError] = dataclasses.field(default_factory=dict)
-    ignored: dict[str, str] = dataclasses.field(default_factory=dict)
-    uploading: int = 0
-    later: int = 0
+    known: dict[str, str] = dataclasses.field(default_factory=dict)  # registered already: the note of `register`
+    refused: dict[str, PblError] = dataclasses.field(default_factory=dict)  # moved aside
+    left: dict[str, PblError] = dataclasses.field(default_factory=dict)  # whole, but not taken this time
+    ignored: dict[str, str] = dataclasses.field(default_factory=dict)  # not a recording in its place: why
+    uploading: int = 0  # not whole yet
+    later: int = 0  # left to the next run for lack of time
 
 
 @dataclasses.dataclass

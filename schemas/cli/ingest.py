@@ -28,7 +28,7 @@ _METHODS = {
     type=click.Path(path_type=Path, readable=False),
     multiple=True,
     metavar="FILE",
-    help="Markers of a laboratory (.trc or .npz) in place of videos; repeat it for each recording.",
+    help="Markers of a laboratory (.trc or .npz) instead of videos; repeat it for each recording.",
 )
 @click.option("--marker-set", metavar="SET", help="Of --markers: a name, or a table (CSV) of your own; for .trc files.")
 @click.option(
@@ -44,7 +44,7 @@ _METHODS = {
     "--sheet",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="In place of VIDEOS: a sheet (.csv, .xlsx) with a row for each, of any people and visits (docs/files.md).",
+    help="Instead of VIDEOS: a sheet (.csv, .xlsx) with a row for each, of any people and visits (docs/files.md).",
 )
 @click.option("--dry-run", is_flag=True, help="With --sheet: read all, change nothing, say what would happen.")
 @click.option("--subject", metavar="CODE", help="Pseudonymous code of the person, never a name.")
@@ -240,7 +240,7 @@ def _one_kind(
     """Raise `click.UsageError` unless there are videos, or markers or views of a rig without a phone's files."""
     for wrong, text in (
         (not videos and not markers, "Missing argument 'VIDEOS...' (or --markers FILE)."),
-        (videos and markers, "Videos and --markers in one call: register each in a call of its own."),
+        (videos and markers, "Videos and --markers in one call: register each in a separate call."),
         (
             (markers or rig) and with_files,
             "--attitude, --depth and --imu belong to videos of one camera, not to --markers or --rig.",
@@ -266,7 +266,7 @@ def _files(n: int, attitude: tuple[Path, ...], depth: tuple[Path, ...], imu: tup
                 + (", 'none' for one without a log" if what == "--attitude" else "; ingest the others in another call"),
             )
     if imu and n > 1:
-        alone = "ingest that video in a call of its own"
+        alone = "ingest that video in a separate call"
         raise usage(f"--imu for {n} videos", "IMU files with one video", next_step=alone)
     logs, depths = (list(given) or [None] * n for given in (attitude, depth))
     return [Sensors(a, d, imu) for a, d in zip(logs, depths, strict=True)]

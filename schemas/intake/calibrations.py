@@ -74,7 +74,7 @@ class Change:
 
 
 def add_calibration(file: str | Path, like: str | Path | None = None) -> Change:
-    """Register the calibration in `file` for all videos of its phone's lens, size and rate that have none of their own.
+    """Register the calibration in `file` for all videos of its phone's lens, size and rate without another calibration.
     It takes the place of an older one. `like`: a recording of the phone, where the file does not name it.
 
     Raises

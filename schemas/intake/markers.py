@@ -32,7 +32,7 @@ class LaboratoryMarkers(Recording):
 
     path: Path
     visit: Visit
-    marker_set: str | None = None  # name of a shipped set, or path of a table (.csv) of one's own; needed for .trc
+    marker_set: str | None = None  # name of a shipped set, or path of a custom table (.csv); needed for .trc
     up: str = "y"  # vertical axis of .trc files, "y" or "z"
     markers: ClassVar[bool] = True
     motion: ClassVar[str] = video.NO_CAMERA  # type: ignore[misc]
@@ -121,7 +121,7 @@ class LaboratoryMarkers(Recording):
                     "that name",
                     f"{row['recording_marker_set']}, as video_id {row['video_id']} of the session",
                     self.files[0].path,
-                    "register it with that set, or in a session of its own",
+                    "register it with that set, or in a separate session",
                 )
 
     def insert(self, numbers: Sequence[int]) -> list[str]:

@@ -103,7 +103,7 @@ def _rows(path: Path) -> list[Row]:
 
 
 def _visit(row: Row, line: Line, folder: Path) -> Visit | None:
-    """What a row states of its visit; None where it is refused."""
+    """Return the visit that a row states; None where it is refused."""
     with line.about():
         needed(row, "file")
         cells = row.cells

@@ -100,7 +100,7 @@ class File:
 class Recording:
     """A recording that is to be registered: `OneCamera`, `SeveralCameras` or `LaboratoryMarkers`.
 
-    `register` calls the methods in the order in which they stand here. What a kind of recording lacks does nothing.
+    `register` calls the methods in the order in which they stand here. A method that does not apply to a kind does nothing.
     """
 
     visit: Visit
@@ -130,7 +130,7 @@ class Recording:
         """Raise `PblError` USAGE where its files are registered (`rows` of Video) as something else."""
 
     def update(self, row: Mapping[str, Any]) -> list[str]:
-        """Add to a registered file (its row of Video) what is new of its own kind; returns the changes in words."""
+        """Add to a registered file (its row of Video) what is new of its kind; returns the changes in words."""
         return []
 
     def complete(self, chosen: Mapping[str, str]) -> None:
@@ -140,7 +140,7 @@ class Recording:
         """Raise `PblError` USAGE where it cannot be fitted together with what the session has."""
 
     def insert(self, numbers: Sequence[int]) -> list[str]:
-        """Insert the rows of its own kind, in a transaction; returns a note on each file."""
+        """Insert its rows beside those of Video, in a transaction; returns a note on each file."""
         return [""] * len(numbers)
 
 

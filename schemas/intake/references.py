@@ -30,12 +30,11 @@ _LONGEST = {"dataset": 32, "source": 64, "origin": 1000}
 
 @dataclasses.dataclass(frozen=True)
 class Added:
-    """What became of a reference: "registered", "replaced" (an older one of this source is no longer current),
-    "updated" (dataset or origin changed, or current again) or "known"."""
+    """The outcome for a reference."""
 
     video_id: int
     reference: str
-    status: str
+    status: str  # registered, replaced (an older one of its source is outdated), updated (also: current again), known
     note: str
 
 

@@ -29,7 +29,7 @@ _FILE_ERRORS = ("VIDEO_MISSING", "VIDEO_CHANGED")
 
 
 def register(recordings: Iterable[Recording], methods: Methods | None = None) -> list[Registered]:
-    """Register recordings with the methods they go through, each in a transaction of its own.
+    """Register recordings with the methods they go through, each in a separate transaction.
 
     A file whose bytes are registered already takes what is new: a calibration or sensor log of the phone (what was
     computed with another is deleted: keypoints and after), activity, pace, population, height, and the methods that are

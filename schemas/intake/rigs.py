@@ -124,7 +124,7 @@ class SeveralCameras(Recording):
             return int(found[0])
         number = next_id(video.Rig, "rig_id")
         with new_folder() as folder:
-            # Not its own name, which may name somebody.
+            # Not its own name, which may identify a person.
             copy = Path(shutil.copyfile(self.calibration, folder / "rig.toml"))
             video.Rig.insert1({"rig_id": number, **self.rig, "rig_created": utc_now(), "rig_file": copy})
         return number
@@ -139,7 +139,7 @@ def check_same_number(session_id: int, n: int, path: Path) -> None:
                 f"{n} cameras in a session whose trial {row['rig_trial']} has {row['n_views']}",
                 "the same cameras in all trials of a session: they are fitted with one body",
                 path,
-                "register it in a session of its own",
+                "register it in a separate session",
             )
 
 

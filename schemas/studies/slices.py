@@ -48,7 +48,7 @@ def freeze(
     event: str = "",
     note: str = "",
 ) -> Slice:
-    """Freeze the visits of a cohort (None: of everybody) with the measures that they have now.
+    """Freeze the visits of a cohort (None: of all people) with the measures that they have now.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def freeze(
         Key of StudySlice (`fit_method`, ...) -> method, where the tables hold several chains. Corrected events
         (`by-hand`) are taken only where they are named.
     event
-        What the days of the visits count from, such as surgery.
+        The event from which the days of the visits count, such as surgery.
     note
         Shown on the report, with how many people of the cohort have no visit, and why they were excluded.
 
@@ -160,7 +160,7 @@ def chain_of(name: str) -> tuple[dict[str, str], list[str]]:
 
 
 def changes(name: str) -> list[str]:
-    """What of a slice's rows is not as it was when it was frozen, in words; empty where the same frames come out.
+    """Return in words which rows of a slice changed since it was frozen; empty where the same frames come out.
 
     Raises
     ------
@@ -198,7 +198,7 @@ def _chain(visits: Any, methods: Mapping[str, str]) -> dict[str, str | None]:
     if unknown := sorted(set(methods) - set(CHAIN)):
         raise _usage(f"methods of {', '.join(unknown)}", f"of {', '.join(CHAIN)}")
     found = [tuple(r[c] for c in CHAIN) for r in (dj.U(*CHAIN) & (_measured(visits) & dict(methods))).to_dicts()]
-    if "gait_method" not in methods:  # one method for everybody: visits that nobody corrected have no corrected events
+    if "gait_method" not in methods:  # one method for all: visits without corrections have no corrected events
         found = [chain for chain in found if not gait.is_by_hand(chain[CHAIN.index("gait_method")])] or found
     if not found:
         raise _none("no measures of these visits", "visits with measures", "`pbl populate`, `pbl status`")

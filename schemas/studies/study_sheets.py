@@ -98,7 +98,7 @@ class _Stated:
 
 
 class _Plan:
-    """What sheets state, compared with the tables."""
+    """The statements of sheets, compared with the tables."""
 
     def __init__(self, sheets: Sequence[Sheet], distinct_codes: bool) -> None:
         self.lines: dict[str, Line] = {}

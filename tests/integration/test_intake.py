@@ -162,6 +162,6 @@ def test_a_recording_is_registered_once_for_one_person_with_its_plans(tables: No
     before = everything_but_refreshes()
     assert adapter(paths, visit) == "known"
     assert everything_but_refreshes() == before
-    # And the same bytes are nobody else's.
+    # The same bytes cannot be another person's.
     assert adapter(paths, Visit("P002", "2026-03-01")) == "VIDEO_DUPLICATE"
     assert everything_but_refreshes() == before
