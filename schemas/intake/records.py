@@ -100,7 +100,7 @@ class File:
 class Recording:
     """A recording that is to be registered: `OneCamera`, `SeveralCameras` or `LaboratoryMarkers`.
 
-    `register` calls the methods in the order in which they stand here. A method that does not apply to a kind does nothing.
+    `register` calls the methods in the order in which they stand here. One that does not apply to a kind does nothing.
     """
 
     visit: Visit

@@ -1,7 +1,7 @@
 """The drop folder: what phones upload, in a folder of this machine or under a prefix of an object store.
 
-The person who uploads decides which files lie there and when they change. A folder is therefore read through handles of its folders,
-no link is followed, and only a regular file of the account that owns the drop folder is opened.
+The person who uploads decides which files lie there and when they change. A folder is therefore read through handles of
+its folders, no link is followed, and only a regular file of the account that owns the drop folder is opened.
 """
 
 from __future__ import annotations
