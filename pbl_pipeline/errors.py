@@ -112,7 +112,11 @@ class PblError(Exception):
 
     def about(self, key: object) -> PblError:
         """This error where it says what it is about, else the same about `key`: who reads several files knows which."""
-        return self if self.key is not None else _rebuild(self.code, self.found, self.expected, self.next_step, key)
+        return self if self.key is not None else self.with_key(key)
+
+    def with_key(self, key: object) -> PblError:
+        """Return the same error about something else, such as the name of a file before it was copied."""
+        return _rebuild(self.code, self.found, self.expected, self.next_step, key)
 
     def __reduce__(self):
         parts = (self.code, self.found, self.expected, self.next_step, self.key)

@@ -12,11 +12,11 @@ from pbl_pipeline.words import UNUSABLE
 
 from . import fit, qc, tracking, usable, video
 from .choose import selection_of
-from .ingest import next_id
 from .jobs import jobs_of
 from .plan import locked, plan_anew, queues_before_fit
 from .review import Decision
 from .rows import utc_now
+from .transactions import next_id
 from .usable import Unusable
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import pymysql
@@ -10,6 +10,8 @@ import pymysql
 from pbl_pipeline.errors import PblError
 
 from ._datajoint import AccessError
+from .chain import computed_tables
+from .coded_errors import error_code
 
 #: Columns that DataJoint's job table lacks, 0 for each new job, and what they count.
 COUNTS = {
@@ -45,6 +47,18 @@ def jobs_of(table: Any) -> Any:
         return jobs
 
     return _kept(_jobs, table, declared)
+
+
+def forget_errors(video_id: int, codes: Collection[str] | None = None) -> None:
+    """Delete the error rows of a video (with these codes), so that the next populate tries again. Not in a transaction:
+    it may declare job tables."""
+    for table in computed_tables():
+        if "video_id" not in table.primary_key:
+            continue
+        jobs = jobs_of(table)
+        for row in (jobs.errors & {"video_id": video_id}).to_dicts():
+            if codes is None or error_code(row["error_message"]) in codes:
+                (jobs & {k: row[k] for k in jobs.primary_key}).delete_quick()
 
 
 def _kept(made: dict[Any, Any], table: Any, make: Callable[[], Any]) -> Any:

@@ -142,6 +142,11 @@ def inside(column: str, values: Iterable[str | int]) -> Any:
     return f"{column} IN ({listed})" if listed else False
 
 
+def counted(deleted: Mapping[str, int]) -> str:
+    """Numbers of deleted rows by table (`delete_below`) in words."""
+    return ", ".join(f"{n} of {name}" for name, n in deleted.items())
+
+
 #: Times that a cascade is begun anew where somebody inserts below it meanwhile.
 _DELETES = 5
 

@@ -1,15 +1,15 @@
-"""Who looked at which recording: rows that the review page writes where PBL_AUDIT_LOOKS asks for them."""
+"""Record of who viewed which recording: rows that the review page writes where PBL_AUDIT_LOOKS asks for them."""
 
 from __future__ import annotations
 
 from . import session, video
-from .ingest import in_transaction, next_id
 from .review import Viewing
 from .rows import utc_now
+from .transactions import in_transaction, next_id
 
 
 def record_viewing(of: str, number: int, what: str, by: str) -> None:
-    """Insert a row of Viewing. Nothing happens for a number that there is not.
+    """Insert a row of Viewing. An unknown number inserts nothing.
 
     Parameters
     ----------

@@ -40,9 +40,8 @@ from schemas.archive import (
 from schemas.codes import check_subject
 from schemas.connection import dj
 from schemas.folders import private_folder, remove_empty, sync_folders
-from schemas.ingest import Visit, ingest
-from schemas.sensors import Sensors
-from schemas.uploads import LOG_ENDINGS, Bucket, Folder, StillChanging, Upload, drop_folder, incoming_url
+from schemas.intake import OneCamera, Sensors, Visit, register
+from schemas.intake.uploads import LOG_ENDINGS, Bucket, Folder, StillChanging, Upload, drop_folder, incoming_url
 
 from .limited import LimitExceeded, limited
 
@@ -63,20 +62,15 @@ _OURS = ("DB_NOT_RUNNING", "DB_UNAVAILABLE", "DB_REFUSED", "STORE_UNAVAILABLE")
 
 @dataclasses.dataclass
 class Taken:
-    """What one run did, by the uploads' names.
-
-    registered, known: taken; the latter are registered already, with what `ingest` notes of them. refused: moved aside,
-    with the reason. left: whole, but not taken this time, with the reason. ignored: what is no recording in its place,
-    and why. uploading: how many are not whole yet. later: how many the time did not suffice for.
-    """
+    """The outcome of a run, by the names of the uploads."""
 
     registered: list[str] = dataclasses.field(default_factory=list)
-    known: dict[str, str] = dataclasses.field(default_factory=dict)
-    refused: dict[str, PblError] = dataclasses.field(default_factory=dict)
-    left: dict[str, PblError] = dataclasses.field(default_factory=dict)
-    ignored: dict[str, str] = dataclasses.field(default_factory=dict)
-    uploading: int = 0
-    later: int = 0
+    known: dict[str, str] = dataclasses.field(default_factory=dict)  # registered already: the note of `register`
+    refused: dict[str, PblError] = dataclasses.field(default_factory=dict)  # moved aside
+    left: dict[str, PblError] = dataclasses.field(default_factory=dict)  # whole, but not taken this time
+    ignored: dict[str, str] = dataclasses.field(default_factory=dict)  # not a recording in its place: why
+    uploading: int = 0  # not whole yet
+    later: int = 0  # left to the next run for lack of time
 
 
 @dataclasses.dataclass
@@ -272,8 +266,8 @@ def _register(name: PurePosixPath, copies: Sequence[_Copy], archive: Path) -> st
     for copy, to in zip(copies, (target, *(target.with_suffix(log.path.suffix) for log in logs)), strict=True):
         copy.path = copy.path.replace(to)
     sync_folders(folder, archive)
-    sensors = [Sensors(attitude=log.path) for log in logs]
-    (result,) = ingest([target], Visit(subject=subject, session_label=session), files=sensors)
+    sensors = Sensors(attitude=logs[0].path if logs else None)
+    (result,) = register([OneCamera(target, Visit(subject, session), sensors)])
     if result.error is not None:
         raise result.error
     if result.status == "registered":
@@ -328,8 +322,7 @@ def _unwritable(archive: Path, error: OSError) -> PblError:
 def _named(name: str, error: Exception) -> PblError:
     """The coded error about what was uploaded, by its name there and not by that of our copy."""
     if isinstance(error, PblError):
-        key = error.key if error.code == "UPLOAD_REFUSED" else name
-        return PblError(error.code, found=error.found, expected=error.expected, next_step=error.next_step, key=key)
+        return error if error.code == "UPLOAD_REFUSED" else error.with_key(name)
     return PblError(
         "INTERNAL",
         found=f"{type(error).__name__}: {error}",

@@ -10,8 +10,8 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 from schemas import computed_tables, fit, gait, gdi, keypoints, tracking, video
 from schemas.connection import dj
-from schemas.ingest import Methods
-from schemas.ingest import resolve as resolve_ingest
+from schemas.intake import Methods
+from schemas.intake.plans import resolve as resolve_ingest
 from schemas.jobs import jobs_of
 from schemas.method_names import keys_named
 from schemas.method_rows import resolve_method

@@ -123,9 +123,8 @@ def main(inputs: int, seed: int) -> None:
     import schemas
     from schemas import tracking, video
     from schemas.coded_errors import error_code
-    from schemas.ingest import Visit, ingest
+    from schemas.intake import Sensors, Visit, ingest
     from schemas.jobs import jobs_of
-    from schemas.sensors import Sensors
     from workers.process import Options
     from workers.supervisor import Supervisor
 

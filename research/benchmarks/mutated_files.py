@@ -175,7 +175,7 @@ def reference(path: Path) -> None:
 
 def use_reference(path: Path) -> None:
     from pbl_pipeline.validation import QPOS, compare
-    from schemas.references import read_reference
+    from schemas.intake.references import read_reference
 
     found = read_reference(path)
     if found.convention == QPOS:

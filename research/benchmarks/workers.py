@@ -55,11 +55,12 @@ def installation() -> Iterator[Path]:
 
 def recordings(first: int, n: int) -> Iterator[Any]:
     """Numbered recordings, `EACH` of a session, one session of a subject."""
-    from schemas.bulk import Recording
+    from schemas.intake import Visit
+    from schemas.intake.bulk import archived
 
     for i in range(first, first + n):
         sha256 = hashlib.sha256(str(i).encode()).hexdigest()
-        yield Recording(f"/recordings/{i:07d}.mp4", sha256, 1000 + i, f"S{i // EACH:07d}", "1")
+        yield archived(f"/recordings/{i:07d}.mp4", sha256, 1000 + i, Visit(f"S{i // EACH:07d}", "1"))
 
 
 def say(what: str, value: float, unit: str, bar: str = "") -> None:
@@ -99,7 +100,7 @@ def main() -> None:
 def scale(videos: int) -> None:
     """Register, look, refresh, work, with as many videos."""
     from schemas import computed_tables, video
-    from schemas.bulk import register_many
+    from schemas.intake.bulk import register_many
     from schemas.status import pipeline_status
     from workers import refresh
 
@@ -112,7 +113,7 @@ def scale(videos: int) -> None:
         few = _cost_per_job(small, sessions=40)
         begin = small + 40 * EACH
         t = time.monotonic()
-        registered = register_many(recordings(begin, videos - begin)).new
+        registered = register_many(recordings(begin, videos - begin))["registered"]
         seconds = time.monotonic() - t
         say(f"{videos:,} videos registered", seconds * videos / max(registered, 1), "s", "bar 300")
         copy_results(begin // EACH, videos // EACH)
@@ -142,7 +143,7 @@ def scale(videos: int) -> None:
 def _cost_per_job(first: int, sessions: int) -> float:
     """Seconds a job of two workers costs beside make_compute, over a whole chain of new sessions."""
     from schemas import computed_tables
-    from schemas.bulk import register_many
+    from schemas.intake.bulk import register_many
 
     before = {t.__name__: _computed(t) for t in computed_tables()}
     register_many(recordings(first, sessions * EACH))
@@ -236,7 +237,7 @@ def _first_set() -> str:
 def speed(keys: int, work_ms: float) -> None:
     """Jobs a second of one table (VideoInfo) by 1 to 4 workers, each key exactly once; what the database could do."""
     from schemas import tracking, video
-    from schemas.bulk import register_many
+    from schemas.intake.bulk import register_many
     from schemas.operations import embedded
     from workers import queue
 
@@ -300,7 +301,7 @@ def _processor_s(pid: int) -> float:
 def method(sessions: int, worked: int) -> None:
     """A new parameter set of the fit over fitted sessions: what becomes pending, and that no old row changes."""
     from schemas import computed_tables, fit
-    from schemas.bulk import register_many
+    from schemas.intake.bulk import register_many
     from workers import refresh, requeue
 
     with installation():
@@ -358,7 +359,7 @@ def _contents(table: Any, but: str = "") -> tuple[int, int]:
 @click.option("--jobs", default=500, show_default=True)
 def memory(jobs: int) -> None:
     """Resident memory of one worker, started as in production: after 20 jobs, after all, after as many again."""
-    from schemas.bulk import register_many
+    from schemas.intake.bulk import register_many
     from workers.metrics import Metrics
     from workers.process import Options
     from workers.supervisor import Supervisor

@@ -30,7 +30,7 @@ def add(file: Path, like: Path | None) -> None:
     What was computed with another calibration than now counts is deleted and listed; `pbl populate` computes it anew.
     """
     import schemas
-    from schemas import cameras
+    from schemas.intake import calibrations as cameras
 
     schemas.activate(methods=False)
     _say(cameras.add_calibration(file, like))
@@ -40,7 +40,7 @@ def add(file: Path, like: Path | None) -> None:
 def list_() -> None:
     """The registered calibrations: number, phone, focal length and how many keypoints were made with each."""
     import schemas
-    from schemas import cameras
+    from schemas.intake import calibrations as cameras
 
     schemas.activate(methods=False)
     rows = cameras.calibrations()
@@ -62,7 +62,7 @@ def remove(camera_id: int) -> None:
     What was computed with it is deleted and listed. Videos that were ingested with it keep it.
     """
     import schemas
-    from schemas import cameras
+    from schemas.intake import calibrations as cameras
 
     schemas.activate(methods=False)
     for change in cameras.remove_calibration(camera_id):

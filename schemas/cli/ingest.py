@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 if TYPE_CHECKING:
-    from schemas.ingest import Ingested, Methods
-    from schemas.sensors import Sensors
+    from schemas.intake import Methods, Registered, Sensors, Visit
+
+
+#: Options that name methods -> field of `Methods`.
+_METHODS = {
+    "tracking_method": "tracking",
+    "keypoint_method": "keypoint",
+    "fit_method": "fit",
+    "index": "gdi",
+    "norm": "norm",
+}
 
 
 @click.command()
@@ -19,7 +28,7 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path, readable=False),
     multiple=True,
     metavar="FILE",
-    help="Markers of a laboratory (.trc or .npz) in place of videos; repeat it for each recording.",
+    help="Markers of a laboratory (.trc or .npz) instead of videos; repeat it for each recording.",
 )
 @click.option("--marker-set", metavar="SET", help="Of --markers: a name, or a table (CSV) of your own; for .trc files.")
 @click.option(
@@ -35,7 +44,7 @@ if TYPE_CHECKING:
     "--sheet",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="In place of VIDEOS: a sheet (.csv, .xlsx) with a row for each, of any people and visits (docs/files.md).",
+    help="Instead of VIDEOS: a sheet (.csv, .xlsx) with a row for each, of any people and visits (docs/files.md).",
 )
 @click.option("--dry-run", is_flag=True, help="With --sheet: read all, change nothing, say what would happen.")
 @click.option("--subject", metavar="CODE", help="Pseudonymous code of the person, never a name.")
@@ -51,7 +60,13 @@ if TYPE_CHECKING:
     help="What the files' names, without suffix, say: named groups subject, session, pace, activity.",
 )
 @click.option("--project", metavar="NAME", help="Study or clinic, for a subject that is new.")
-@click.option("--camera", type=click.Path(path_type=Path), metavar="FILE", help="Calibration of the camera.")
+@click.option(
+    "--camera",
+    "camera_file",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Calibration of the camera.",
+)
 @click.option(
     "--camera-motion",
     type=click.Choice(["static", "handheld", "one of several"]),
@@ -88,31 +103,17 @@ if TYPE_CHECKING:
 @click.option("--norm", metavar="NAME", help="Normative set of the Gait Deviation Index (else: the index's own).")
 def ingest(
     videos: tuple[Path, ...],
+    sheet: Path | None,
+    dry_run: bool,
     markers: tuple[Path, ...],
     marker_set: str | None,
     up: str,
     rig: Path | None,
-    sheet: Path | None,
-    dry_run: bool,
-    subject: str | None,
-    session_label: str | None,
     name_pattern: str | None,
-    project: str | None,
-    camera: Path | None,
-    camera_motion: str | None,
     attitude: tuple[Path, ...],
     depth: tuple[Path, ...],
     imu: tuple[Path, ...],
-    activity: str | None,
-    pace: str | None,
-    population: str | None,
-    height_m: float | None,
-    person: int | None,
-    tracking_method: str | None,
-    keypoint_method: str | None,
-    fit_method: str | None,
-    index: str | None,
-    norm: str | None,
+    **stated: Any,
 ) -> None:
     """Register videos, with --rig the views of one trial by several calibrated cameras, or with --markers recordings of
     laboratory markers, of one visit; `pbl populate` then computes them. No video is decoded here.
@@ -133,17 +134,13 @@ def ingest(
     Example: pbl ingest --markers walk1.trc --marker-set our_lab.csv --subject P017 --session 2026-03-01
     """
     import schemas
-    from schemas.ingest import Methods, Visit
-    from schemas.ingest import ingest as register
-    from schemas.marker_recordings import ingest_markers
-    from schemas.rigs import ingest_rig
-    from schemas.session import UNLABELLED
+    from schemas.intake import LaboratoryMarkers, Methods, OneCamera, SeveralCameras, register
+    from schemas.intake.videos import check_person
 
-    methods = Methods(tracking=tracking_method, keypoint=keypoint_method, fit=fit_method, gdi=index, norm=norm)
+    methods = Methods(**{field: stated.pop(option) for option, field in _METHODS.items()})
+    stated = {option: value for option, value in stated.items() if value is not None}
     if sheet is not None:
-        of_rows = (videos, markers, marker_set, rig, subject, session_label, name_pattern, project, camera)
-        of_rows += (camera_motion, attitude, depth, imu, activity, pace, population, height_m, person)
-        if any(of_rows):
+        if any((videos, markers, marker_set, rig, name_pattern, attitude, depth, imu, stated)):
             raise click.UsageError("--sheet: its columns state files, people and visits; only methods are options.")
         _sheet(sheet, methods, dry_run)
         return
@@ -151,58 +148,44 @@ def ingest(
         raise click.UsageError("--dry-run goes with --sheet.")
     _one_kind(videos, markers, marker_set, bool(attitude or depth or imu), rig is not None)
     files = _files(len(videos), attitude, depth, imu)
-    options = {"subject": subject, "session": session_label, "pace": pace, "activity": activity}
-    calls, results = _visits(videos or markers, name_pattern, {k: v for k, v in options.items() if v is not None})
-    if person is not None and len(videos) > 1 and len(calls) > 1:
-        raise click.UsageError("--person goes with one video: people are numbered anew in each.")
-    if rig is not None and (results or len(calls) > 1):
+    visits, results = _visits(videos or markers, name_pattern, stated)
+    if rig is not None and (results or len({visit for _, visit in visits}) > 1):
         raise click.UsageError("--rig: all videos are of one trial, so their names must state the same.")
+    if videos and rig is None:
+        check_person(stated.get("person"), len(videos))
     schemas.activate()
-    if fit_method is not None:
+    if methods.fit is not None:
         _warn(methods, bool(markers))
-    for said, numbers in calls:
-        visit = Visit(
-            subject=said["subject"],
-            session_label=said.get("session", UNLABELLED),
-            project=project,
-            camera_file=camera,
-            camera_motion=camera_motion,
-            activity=said.get("activity"),
-            person=person,
-            population=population,
-            pace=said.get("pace"),
-            height_m=height_m,
-        )
-        if markers:
-            results += ingest_markers([markers[i] for i in numbers], visit, marker_set, up, methods)
-        elif rig is not None:
-            results += ingest_rig([videos[i] for i in numbers], rig, visit, methods)
-        else:
-            results += register([videos[i] for i in numbers], visit, methods, [files[i] for i in numbers])
+    if rig is not None:
+        results += register([SeveralCameras(videos, rig, visits[0][1])], methods)
+    elif markers:
+        results += register([LaboratoryMarkers(markers[i], visit, marker_set, up) for i, visit in visits], methods)
+    else:
+        results += register([OneCamera(videos[i], visit, files[i]) for i, visit in visits], methods)
     for result in results:
         if result.error is not None:
             click.echo(result.error.text(), err=True)
         else:
             click.echo(f"video_id {result.video_id}: {result.path.name} {result.status} ({result.note})")
-        if result.status in ("known", "moved", "updated") and person is not None:
-            click.echo(f"  to measure another person of it: pbl choose {result.video_id} {person}")
+        if result.status in ("known", "moved", "updated") and "person" in stated:
+            click.echo(f"  to measure another person of it: pbl choose {result.video_id} {stated['person']}")
     if any(r.error for r in results):
         raise click.exceptions.Exit(1)
 
 
 def _warn(methods: Methods, markers: bool) -> None:
-    """Say on the terminal where the fit method was made for other points."""
-    from schemas.ingest import resolve
+    """Print a warning where the fit method was made for other points."""
+    from schemas.intake.plans import resolve
     from schemas.plan import unsuited
 
-    chosen = resolve(methods)
-    if said := unsuited(chosen["fit_method"], None if markers else chosen["keypoint_method"]):
+    chosen = resolve(methods, markers)
+    if said := unsuited(chosen["fit_method"], chosen.get("keypoint_method")):
         click.echo(f"warning: {said}", err=True)
 
 
 def _sheet(sheet: Path, methods: Methods, dry_run: bool) -> None:
     import schemas
-    from schemas.ingest_sheet import ingest_sheet
+    from schemas.intake.recording_sheet import ingest_sheet
 
     schemas.activate()
     if methods.fit is not None:
@@ -211,84 +194,79 @@ def _sheet(sheet: Path, methods: Methods, dry_run: bool) -> None:
     for line in found.lines:
         for error in line.errors:
             click.echo(error.text(), err=True)
-        if line.note and not line.errors:
-            number = "" if line.video_id is None else f"video_id {line.video_id}: "
-            click.echo(f"{line.where}: {line.file}: {number}{line.note}")
+        for text in filter(None, (*line.changes, line.kept)):
+            click.echo(f"{line.where}: {text}")
     wrong = sum(bool(line.errors) for line in found.lines)
-    known = sum(line.note.startswith("registered already") for line in found.lines if not line.errors)
+    new = sum(bool(line.changes) for line in found.lines)
     word = "registered" if found.done else "would be registered" if dry_run and not wrong else "not registered"
-    click.echo(f"{len(found.lines) - wrong - known} videos {word}, {known} known, {wrong} rows refused")
+    click.echo(f"{new} videos {word}, {len(found.lines) - wrong - new} known, {wrong} rows refused")
     if wrong:
         raise click.exceptions.Exit(1)
 
 
 def _visits(
-    paths: tuple[Path, ...], name_pattern: str | None, options: dict[str, str]
-) -> tuple[list[tuple[dict[str, str], list[int]]], list[Ingested]]:
-    """(what is stated, positions of the files it is stated of), and the files whose name does not fit the pattern.
+    paths: tuple[Path, ...], name_pattern: str | None, stated: dict[str, Any]
+) -> tuple[list[tuple[int, Visit]], list[Registered]]:
+    """(position of a file, its visit), and the files whose name does not fit the pattern.
 
-    Raises `PblError` USAGE for a pattern that is none; `click.UsageError` where it and an option state the same, or
-    nobody states the subject.
+    Raises `PblError` USAGE for an invalid pattern; `click.UsageError` where it and an option state the same, or neither
+    states the subject.
     """
     from pbl_pipeline.errors import PblError
-    from schemas.ingest import Ingested
-    from schemas.name_pattern import compiled, read_name, together
+    from schemas.intake import Registered, Visit
+    from schemas.intake.name_pattern import compiled, read_name
 
     pattern = compiled(name_pattern) if name_pattern is not None else None
-    if pattern is not None and (twice := sorted(set(pattern.groupindex) & set(options))):
+    options = {option.removesuffix("_label") for option in stated}
+    if pattern is not None and (twice := sorted(set(pattern.groupindex) & options)):
         raise click.UsageError(f"--{twice[0]} and the name pattern state the same: leave one out.")
-    stated, positions, refused = [], [], []
+    visits, refused = [], []
     for i, path in enumerate(paths):
         try:
-            said = options | (read_name(pattern, path) if pattern is not None else {})
+            said = read_name(pattern, path) if pattern is not None else {}
         except PblError as error:
-            refused.append(Ingested(path, "refused", error=error))
+            refused.append(Registered(path, "refused", error=error))
             continue
-        if "subject" not in said:
+        said: dict[str, Any] = {"session_label" if k == "session" else k: text for k, text in said.items()}
+        if "subject" not in said | stated:
             raise click.UsageError("Missing option '--subject' (or a group 'subject' in --name-pattern).")
-        stated.append(said)
-        positions.append(i)
-    return [(stated[g[0]], [positions[i] for i in g]) for g in together(stated)], refused
+        visits.append((i, Visit(**stated, **said)))
+    return visits, refused
 
 
 def _one_kind(
     videos: tuple[Path, ...], markers: tuple[Path, ...], marker_set: str | None, with_files: bool, rig: bool
 ) -> None:
-    """Raises `click.UsageError` unless there are videos, or markers or views of a rig without a phone's files."""
-    if not videos and not markers:
-        raise click.UsageError("Missing argument 'VIDEOS...' (or --markers FILE).")
-    if videos and markers:
-        raise click.UsageError("Videos and --markers in one call: register each in a call of its own.")
-    if (markers or rig) and with_files:
-        raise click.UsageError(
-            "--attitude, --depth and --imu belong to videos of one camera, not to --markers or --rig."
-        )
-    if markers and rig:
-        raise click.UsageError("--rig goes with videos, not with --markers.")
-    if marker_set is not None and not markers:
-        raise click.UsageError("--marker-set goes with --markers.")
+    """Raise `click.UsageError` unless there are videos, or markers or views of a rig without a phone's files."""
+    for wrong, text in (
+        (not videos and not markers, "Missing argument 'VIDEOS...' (or --markers FILE)."),
+        (videos and markers, "Videos and --markers in one call: register each in a separate call."),
+        (
+            (markers or rig) and with_files,
+            "--attitude, --depth and --imu belong to videos of one camera, not to --markers or --rig.",
+        ),
+        (markers and rig, "--rig goes with videos, not with --markers."),
+        (marker_set is not None and not markers, "--marker-set goes with --markers."),
+    ):
+        if wrong:
+            raise click.UsageError(text)
 
 
 def _files(n: int, attitude: tuple[Path, ...], depth: tuple[Path, ...], imu: tuple[Path, ...]) -> list[Sensors]:
-    """What belongs to each of the n videos. Raises `PblError` USAGE where files and videos do not match."""
-    from pbl_pipeline.errors import PblError
-    from schemas.sensors import Sensors
+    """Sensor files of each of the n videos. Raises `PblError` USAGE where files and videos do not match."""
+    from schemas.intake import Sensors
+    from schemas.intake.records import usage
 
     for what, given in (("--attitude", attitude), ("--depth", depth)):
         if given and len(given) != n:
-            raise PblError(
-                "USAGE",
-                found=f"{len(given)} times {what} for {n} videos",
-                expected="none, or one for each video, in the same order",
+            raise usage(
+                f"{len(given)} times {what} for {n} videos",
+                "none, or one for each video, in the same order",
                 next_step="name a file for each video"
                 + (", 'none' for one without a log" if what == "--attitude" else "; ingest the others in another call"),
             )
     if imu and n > 1:
-        raise PblError(
-            "USAGE",
-            found=f"--imu for {n} videos",
-            expected="IMU files with one video",
-            next_step="ingest that video in a call of its own",
-        )
+        alone = "ingest that video in a separate call"
+        raise usage(f"--imu for {n} videos", "IMU files with one video", next_step=alone)
     logs, depths = (list(given) or [None] * n for given in (attitude, depth))
     return [Sensors(a, d, imu) for a, d in zip(logs, depths, strict=True)]

@@ -24,7 +24,7 @@ def move(video_id: int, target: str, yes: bool) -> None:
     if not slash or not label:
         raise click.UsageError(f"--to {target}: expected SUBJECT/SESSION, such as P018/2026-03-01.")
     import schemas
-    from schemas.move import carry_out, plan_move
+    from schemas.intake.move import carry_out, plan_move
 
     schemas.activate(methods=False)
     plan = plan_move(video_id, subject, label)

@@ -27,7 +27,7 @@ def import_(sheets: tuple[Path, ...], dry_run: bool, distinct_codes: bool) -> No
     imported or none: exit code 1 where one is refused.
     """
     import schemas
-    from schemas.study_import import import_sheets
+    from schemas.studies.study_sheets import import_sheets
 
     schemas.activate()
     found = import_sheets(sheets, dry_run, distinct_codes)
@@ -66,7 +66,8 @@ def slice_(name: str | None, cohort: str | None, roles: tuple[str, ...], event: 
     Methods are named by their key, such as blazepose-v5, or short, such as blazepose: the newest version with results.
     """
     import schemas
-    from schemas import slices, study
+    from schemas import study
+    from schemas.studies import slices
 
     schemas.activate()
     if name is None:
@@ -113,7 +114,7 @@ def export(name: str, out: Path, key: Path | None, keep_codes: bool, no_curves: 
 def load_slice(name: str, curves: bool = True) -> StudyData:
     """The `StudyData` of a slice; what changed since it was frozen is said on stderr. Raises as `slices.study_data`."""
     import schemas
-    from schemas import slices
+    from schemas.studies import slices
 
     schemas.activate(methods=False)
     data = slices.study_data(name, curves)

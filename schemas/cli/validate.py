@@ -175,7 +175,7 @@ def add(
     Example: pbl validate add 3 --of-trial 4 --dataset OURLAB
     """
     import schemas
-    from schemas.references import add_reference, add_trial
+    from schemas.intake.references import add_reference, add_trial
 
     if (reference is None) == (of_trial is None):
         raise click.UsageError("Name one reference: --reference FILE or --of-trial VIDEO_ID.")
@@ -208,7 +208,7 @@ def _of_files(
     """Errors of fits in files, by the library alone; what was refused beside."""
     from pbl_pipeline.fit import TrialFit
     from pbl_pipeline.validation import TrialErrors, compare, error_frame
-    from schemas.references import read_reference
+    from schemas.intake.references import read_reference
 
     if len(references) not in (1, len(fits)):
         raise click.UsageError(f"{len(references)} of --reference for {len(fits)} FITS: one for all, or one for each")

@@ -10,8 +10,8 @@ from typing import Any
 
 from schemas import archive, video
 from schemas.archive import archive_dir
+from schemas.intake.uploads import Bucket, Folder, Upload, drop_folder
 from schemas.stored_files import remove_left_folders
-from schemas.uploads import Bucket, Folder, Upload, drop_folder
 
 
 def delete_registered(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict[str, str]]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from schemas import fit, keypoints, lab, video
-from schemas.ingest import Visit, ingest
+from schemas.intake import Visit, ingest
 from schemas.stored_files import file_ref, stored_file
 from tests.command import pbl
 from tests.integration import chain

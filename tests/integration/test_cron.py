@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import errno
 import os
 import re
@@ -15,9 +14,22 @@ from click.testing import CliRunner
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection, lab, session, tracking, uploads, video
-from schemas.bulk import Recording, register_many
-from schemas.operations.orphans import orphans, remove
+from schemas import connection
+from schemas import lab
+from schemas import session
+from schemas import tracking
+from schemas import uploads
+from schemas import video
+from schemas.bulk import Recording
+from schemas.bulk import register_many
+from schemas.operations.orphans import orphans
+from schemas.operations.orphans import remove
+from schemas.intake import Visit
+from schemas.intake import uploads
+from schemas.intake.bulk import archived
+from schemas.intake.bulk import register_many
+from schemas.orphans import orphans
+from schemas.orphans import remove
 from tests.rows import register
 from workers import incoming
 from workers.cli.cron import cron
@@ -136,14 +148,14 @@ def test_the_same_bytes_under_another_name_are_kept_once(drop: Path, tmp_path: P
 def test_breaking_off_anywhere_loses_nothing_and_registers_once(drop: Path, tmp_path: Path, monkeypatch):
     archive = tmp_path / "archive"
     upload(drop, "P001/1/walk.mp4")
-    real = incoming.ingest
+    real = incoming.register
 
     def dies(*args, **kwargs):
         real(*args, **kwargs)
         raise KeyboardInterrupt  # after the row was committed, before the upload is removed
 
     with monkeypatch.context() as patch:
-        patch.setattr(incoming, "ingest", dies)
+        patch.setattr(incoming, "register", dies)
         with pytest.raises(KeyboardInterrupt):
             twice(drop, archive)
     assert files(drop) == ["P001/1/walk.mp4"]
@@ -219,11 +231,12 @@ def test_the_command_says_what_it_needs(tables: None, monkeypatch):
 
 
 def test_another_persons_bytes_are_refused_among_many(tables: None):
-    one = Recording("a.mp4", "1" * 64, 9, "P001", "2026-01-02")
-    assert register_many([one, one]).new == 1
+    visit = Visit("P001", "2026-01-02")
+    one = archived("a.mp4", "1" * 64, 9, visit)
+    assert register_many([one, one]) == {"registered": 1, "known": 1}
     with pytest.raises(PblError, match=r"(?s)P001, session 2026-01-02.*subject P002") as error:
         register_many(
-            [dataclasses.replace(one, path="b.mp4", subject="P002"), dataclasses.replace(one, sha256="2" * 64)]
+            [archived("b.mp4", "1" * 64, 9, Visit("P002", "2026-01-02")), archived("a.mp4", "2" * 64, 9, visit)]
         )
     assert error.value.code == "VIDEO_DUPLICATE"
     assert len(video.Video()) == 1
@@ -231,7 +244,7 @@ def test_another_persons_bytes_are_refused_among_many(tables: None):
 
 def test_all_other_jobs_run(tables: None, tmp_path: Path):
     path = chain.small_video(tmp_path, "walk")
-    register_many([Recording(str(path), "0" * 64, path.stat().st_size, "P001")])
+    register_many([archived(str(path), "0" * 64, path.stat().st_size, Visit("P001"))])
     for words, said in (
         (["refresh"], "1 of VideoInfo"),
         (["release"], "no dead"),

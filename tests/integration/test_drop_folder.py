@@ -17,9 +17,21 @@ from pathlib import Path
 import pytest
 
 from schemas import archive as layout
-from schemas import connection, lab, session, uploads, video, worker
-from schemas.ingest import Visit, ingest
-from schemas.operations import backup, forget
+from schemas import connection
+from schemas import lab
+from schemas import session
+from schemas import uploads
+from schemas import video
+from schemas import worker
+from schemas.ingest import Visit
+from schemas.ingest import ingest
+from schemas.operations import backup
+from schemas.operations import forget
+from schemas import backup
+from schemas import forget
+from schemas.intake import Visit
+from schemas.intake import ingest
+from schemas.intake import uploads
 from schemas.stored_files import new_folder, remove_left_folders
 from tests.command import pbl
 from workers import incoming
@@ -199,14 +211,14 @@ def test_an_error_that_nobody_foresaw_keeps_one_upload_and_takes_the_others(
     archive = tmp_path / "archive"
     bad, good = upload(drop, "P001/1/walk.mp4"), upload(drop, "P002/1/walk.mp4", "other")
     content = bad.read_bytes()
-    real = incoming.ingest
+    real = incoming.register
 
-    def fails(paths, visit, **given):
-        if visit.subject == "P001":
+    def fails(recordings):
+        if recordings[0].visit.subject == "P001":
             raise ZeroDivisionError("a defect")
-        return real(paths, visit, **given)
+        return real(recordings)
 
-    monkeypatch.setattr(incoming, "ingest", fails)
+    monkeypatch.setattr(incoming, "register", fails)
     taken = twice(drop, archive)
     assert (taken.registered, codes(taken)) == ([str(good.relative_to(drop))], {"P001/1/walk.mp4": "INTERNAL"})
     (kept,) = (archive / "_refused" / "P001").glob("*.mp4")

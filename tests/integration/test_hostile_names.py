@@ -22,8 +22,8 @@ from research.benchmarks import mutated_files as files
 from schemas import fit, video
 from schemas.chain import ON_REQUEST
 from schemas.coded_errors import error_next_step
-from schemas.ingest import Visit, ingest
-from schemas.references import add_reference
+from schemas.intake import Visit, ingest
+from schemas.intake.references import add_reference
 from schemas.report import write_session
 from tests.command import pbl
 from workers.populate import populate

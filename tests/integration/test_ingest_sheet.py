@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from schemas import lab, session, video
-from schemas.ingest_sheet import ingest_sheet
+from schemas.intake import videos
+from schemas.intake.recording_sheet import ingest_sheet
 from tests.command import pbl
 from tests.rows import everything
 
@@ -133,17 +134,15 @@ def test_other_columns_are_refused_whole(tables, recordings, header, words):
 
 
 def test_a_database_that_fails_in_the_middle_leaves_nothing(tables, recordings, monkeypatch):
-    import schemas.ingest_sheet as module
+    real, calls = videos.OneCamera.insert, []
 
-    real, calls = module.insert, []
-
-    def fails(one, chosen):
+    def fails(one, numbers):
         calls.append(one)
         if len(calls) == 3:
             raise OSError("the connection is gone")
-        return real(one, chosen)
+        return real(one, numbers)
 
-    monkeypatch.setattr(module, "insert", fails)
+    monkeypatch.setattr(videos.OneCamera, "insert", fails)
     with pytest.raises(OSError, match="gone"):
         ingest_sheet(sheet(recordings, *GOOD))
     assert (len(video.Video()), len(session.Session()), len(lab.Subject())) == (0, 0, 0)

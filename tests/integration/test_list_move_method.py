@@ -11,11 +11,10 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS
-from schemas import fit, gait, gdi, keypoints, lab, session, video
-from schemas.ingest import Methods, Visit, ingest
+from schemas import fit, gait, gdi, intake, keypoints, lab, session, video
+from schemas.intake import Methods, SeveralCameras, Visit, ingest
+from schemas.intake.move import carry_out, plan_move
 from schemas.method_names import keys_named, with_keys
-from schemas.move import carry_out, plan_move
-from schemas.rigs import ingest_rig
 from tests.command import pbl
 from tests.rows import everything, register
 from workers import incoming
@@ -132,10 +131,12 @@ def test_a_fit_method_for_other_points_is_warned_of(tables, tmp_path):
 
 def test_all_cameras_of_a_trial_move_together(tables, tmp_path):
     toml = test_rigs.calibration(tmp_path / "rig.toml")
-    done = ingest_rig(test_rigs.rig_videos(tmp_path / "three"), toml, Visit("P001", "2026-03-01"))
+    three = SeveralCameras(test_rigs.rig_videos(tmp_path / "three"), toml, Visit("P001", "2026-03-01"))
+    done = intake.register([three])
     numbers = {int(r.video_id or 0) for r in done}
     pair = test_rigs.calibration(tmp_path / "pair.toml", test_rigs.CAMERAS[:2])
-    ingest_rig(test_rigs.rig_videos(tmp_path / "two", "b_", 250, test_rigs.CAMERAS[:2]), pair, Visit("P003", "1"))
+    two = test_rigs.rig_videos(tmp_path / "two", "b_", 250, test_rigs.CAMERAS[:2])
+    intake.register([SeveralCameras(two, pair, Visit("P003", "1"))])
     assert pbl("move", max(numbers), "--to", "P003/1", "--yes").error_code == "USAGE"  # two cameras there
     assert pbl("move", max(numbers), "--to", "P002/1", "--yes").code == 0
     moved = video.Video * session.Session.proj("subject") & {"subject": "P002"}
@@ -154,7 +155,7 @@ def test_a_recording_of_the_archive_goes_to_the_folder_of_its_new_person(drop, t
     number, old = video.Video.fetch1("video_id", "video_path")
     assert Path(old).is_relative_to(archive / "P001")
     plan = plan_move(int(number), "P002", "2")
-    monkeypatch.setattr("schemas.move.session_of", lambda visit: 1 / 0)
+    monkeypatch.setattr("schemas.intake.move.session_ids", lambda visits: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         carry_out(plan)
     assert (video.Video.fetch1("video_path"), len(list(archive.rglob("*.mp4")))) == (old, 1)

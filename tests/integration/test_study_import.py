@@ -12,8 +12,10 @@ from openpyxl import Workbook
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import lab, session, sheets, study, study_import, video
+from schemas import lab, session, study, video
 from schemas.cli.study import import_
+from schemas.intake import sheets
+from schemas.studies import study_sheets
 from tests.rows import everything_but_refreshes, register, remove_all
 
 from . import chain
@@ -41,8 +43,8 @@ def sheet(folder: Path, text: str, name: str = "visits.csv") -> Path:
     return path
 
 
-def run(*paths: Path, **options: bool) -> study_import.Imported:
-    return study_import.import_sheets(paths, **options)
+def run(*paths: Path, **options: bool) -> study_sheets.Imported:
+    return study_sheets.import_sheets(paths, **options)
 
 
 def stored() -> dict[tuple[str, str], dict]:

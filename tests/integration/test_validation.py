@@ -20,8 +20,8 @@ from pbl_pipeline.validation import Reference, compare, reference_of_fit
 from schemas import lab, validation, video, views
 from schemas.chain import is_wanted
 from schemas.cli.validate import validate
-from schemas.ingest import Visit, ingest
-from schemas.references import add_reference, find_video, read_reference
+from schemas.intake import Visit, ingest
+from schemas.intake.references import add_reference, find_video, read_reference
 from schemas.status import pipeline_status
 from tests.conftest import SHARED
 from tests.rows import everything_but_refreshes, register

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from schemas import lab, session, study
-from schemas.enter import enter, entry
 from schemas.review import Decision
 from schemas.rows import utc_now
+from schemas.studies.visit_entry import enter, entry
 from tests.integration import web
 from tests.rows import everything
 

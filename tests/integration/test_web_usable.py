@@ -11,13 +11,28 @@ import pytest
 import pbl_pipeline.fit
 import pbl_pipeline.keypoints
 from pbl_pipeline.errors import PblError
-from schemas import decide, fit, gdi, listing, load_visit, qc, slices, study, tracking, usable, video, visit_list
+from schemas import decide
+from schemas import fit
+from schemas import gdi
+from schemas import listing
+from schemas import load_visit
+from schemas import qc
+from schemas import slices
+from schemas import study
+from schemas import tracking
+from schemas import usable
+from schemas import video
+from schemas import visit_list
 from schemas.ingest import Visit
 from schemas.marker_recordings import ingest_markers
+from schemas import intake
+from schemas.intake import LaboratoryMarkers
+from schemas.intake import SeveralCameras
+from schemas.intake import Visit
 from schemas.plan import plan_fit_sets
 from schemas.reading.shown import shown_visit
 from schemas.review import Decision
-from schemas.rigs import ingest_rig
+from schemas.studies import slices
 from schemas.visit_list import Filter, visit_page
 from schemas.why import why
 from tests.command import pbl
@@ -220,7 +235,9 @@ def test_all_cameras_of_a_trial_are_marked_together(tables: None, tmp_path: Path
     monkeypatch.setattr(pbl_pipeline.fit, "fit_session", test_rigs.fit_none)
     toml = test_rigs.calibration(tmp_path / "Calib.toml")
     for trial in ("w1.", "w2."):
-        made = ingest_rig(test_rigs.rig_videos(tmp_path, trial), toml, Visit("P001", "2026-01-10"))
+        made = intake.register(
+            [SeveralCameras(test_rigs.rig_videos(tmp_path, trial), toml, Visit("P001", "2026-01-10"))]
+        )
         assert [r.status for r in made] == ["registered"] * 3
     populate()
     assert current() == [[1, 2, 3, 4, 5, 6]]
@@ -238,7 +255,7 @@ def test_marker_recordings_are_marked_too(tables: None, tmp_path: Path, monkeypa
     monkeypatch.setattr(pbl_pipeline.fit, "fit_session", lambda *given, **_: test_rigs.fit_none(*given))
     number = register(small_video(tmp_path, "walk"), session_label="2026-01-10")[0]
     paths = [test_markers.recording(tmp_path / f"{name}.npz", s) for name, s in (("m1", 7.0), ("m2", 8.0))]
-    made = ingest_markers(paths, Visit("P001", "2026-01-10"))
+    made = intake.register([LaboratoryMarkers(p, Visit("P001", "2026-01-10")) for p in paths])
     assert [r.status for r in made] == ["registered"] * 2, made
     populate()
     assert sorted(current()) == [[number], [2, 3]]

@@ -1,4 +1,4 @@
-"""Enter: the role of a visit and its clinical scores. Each change is a row (`schemas.enter`)."""
+"""Enter: the role of a visit and its clinical scores. Each change is a row (`schemas.studies.visit_entry`)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 
 from pbl_pipeline.errors import PblError
-from schemas import enter
+from schemas.studies import visit_entry as enter
 
 from .access import Session, form_of
 from .address import number_of

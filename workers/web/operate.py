@@ -15,7 +15,9 @@ from starlette.routing import Route
 from schemas import decide, fit
 from schemas.ingest import in_transaction
 from schemas.operations.server_status import database_status
+from schemas.server_status import database_status
 from schemas.status import ErrorRow, Running, Status, pipeline_status, running, span
+from schemas.transactions import in_transaction
 
 from ..requeue import retry
 from ..summary import disks

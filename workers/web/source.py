@@ -100,7 +100,7 @@ class TablesSource:
         return visit_progress(session_id)
 
     def around(self, about: shown.ShownVisit) -> dict[str, Any]:
-        from schemas.enter import entry
+        from schemas.studies.visit_entry import entry
 
         number = about.row.session_id
         return {

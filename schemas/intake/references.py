@@ -14,9 +14,9 @@ from pbl_pipeline.files import fields_of
 from pbl_pipeline.names import check_label
 from pbl_pipeline.paramset import canonical_json
 
-from . import fit, validation, video
-from .rows import utc_now
-from .stored_files import file_ref, new_folder, stored_file
+from .. import fit, validation, video
+from ..rows import utc_now
+from ..stored_files import file_ref, new_folder, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import validation as lib
@@ -30,12 +30,11 @@ _LONGEST = {"dataset": 32, "source": 64, "origin": 1000}
 
 @dataclasses.dataclass(frozen=True)
 class Added:
-    """What became of a reference: "registered", "replaced" (an older one of this source is no longer current),
-    "updated" (dataset or origin changed, or current again) or "known"."""
+    """The outcome for a reference."""
 
     video_id: int
     reference: str
-    status: str
+    status: str  # registered, replaced (an older one of its source is outdated), updated (also: current again), known
     note: str
 
 
@@ -60,29 +59,20 @@ def read_reference(path: str | Path, source: str | None = None, shift_s: float =
     from pbl_pipeline import validation as lib
 
     path = Path(path)
-    name = path.name.lower()
     if not path.is_file():
-        raise PblError(
-            "FILE_MISSING",
-            found="no such file",
-            expected="a reference: .npz, fit.npz, truth.npz, .json.gz or .mot",
-            next_step="check the path",
-            key=str(path),
-        )
-    if name.endswith(".npz"):
-        found = _read_npz(path)
-    elif name.endswith((".json", ".json.gz")):
-        found = lib.reference_of_bodies(path)
-    elif name.endswith(".mot"):
-        found = lib.reference_of_mot(path)
-    else:
-        raise PblError(
-            "FILE_FORMAT",
-            found=f"a file that ends in {path.suffix or 'nothing'}",
-            expected="a reference: .npz, fit.npz, truth.npz, .json.gz or .mot",
-            next_step="see docs/files.md, section on references; markers (.trc) go through `pbl fit` first",
-            key=str(path),
-        )
+        raise _no_reference("FILE_MISSING", "no such file", "check the path", path)
+    readers = {
+        ".npz": _read_npz,
+        ".json": lib.reference_of_bodies,
+        ".json.gz": lib.reference_of_bodies,
+        ".mot": lib.reference_of_mot,
+    }
+    reader = next((read for ending, read in readers.items() if path.name.lower().endswith(ending)), None)
+    if reader is None:
+        found = f"a file that ends in {path.suffix or 'nothing'}"
+        next_step = "see docs/files.md, section on references; markers (.trc) go through `pbl fit` first"
+        raise _no_reference("FILE_FORMAT", found, next_step, path)
+    found = reader(path)
     if not len(found.time_s) or not found.angles_deg:
         raise PblError(
             "REFERENCE_INPUT",
@@ -92,6 +82,11 @@ def read_reference(path: str | Path, source: str | None = None, shift_s: float =
             key=str(path),
         )
     return dataclasses.replace(found, source=source or found.source, time_s=found.time_s + shift_s)
+
+
+def _no_reference(code: str, found: str, next_step: str, path: Path) -> PblError:
+    expected = "a reference: .npz, fit.npz, truth.npz, .json.gz or .mot"
+    return PblError(code, found=found, expected=expected, next_step=next_step, key=str(path))
 
 
 def _read_npz(path: Path) -> lib.Reference:

@@ -1,14 +1,13 @@
-"""What the names of files say of their visit: `pbl ingest --name-pattern`."""
+"""Statements in the names of files (`pbl ingest --name-pattern`)."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 from pbl_pipeline.errors import PblError
 
-#: What a pattern may name, each once.
+#: Names of the groups of a pattern, each once.
 GROUPS = ("subject", "session", "pace", "activity")
 
 
@@ -18,7 +17,7 @@ def compiled(text: str) -> re.Pattern[str]:
     Raises
     ------
     PblError
-        USAGE for what is no regular expression, has no named group, or groups of other names than `GROUPS`.
+        USAGE for an invalid regular expression, one without named groups, or with others than `GROUPS`.
     """
     try:
         pattern = re.compile(text)
@@ -54,15 +53,7 @@ def read_name(pattern: re.Pattern[str], path: Path) -> dict[str, str]:
             "USAGE",
             found=f"the name {ascii(path.stem)[:100]}",
             expected=f"one that fits the whole name pattern {pattern.pattern}",
-            next_step="rename the file, correct the pattern, or ingest the file in a call of its own",
+            next_step="rename the file, correct the pattern, or ingest the file in a separate call",
             key=ascii(str(path)),
         )
     return {name: text for name, text in match.groupdict().items() if text}
-
-
-def together(stated: Sequence[dict[str, str]]) -> list[list[int]]:
-    """Positions of those that state the same, in the order in which they come first."""
-    groups: dict[tuple[tuple[str, str], ...], list[int]] = {}
-    for i, said in enumerate(stated):
-        groups.setdefault(tuple(sorted(said.items())), []).append(i)
-    return list(groups.values())

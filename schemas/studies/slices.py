@@ -14,13 +14,13 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label, is_plain
 from pbl_pipeline.words import unit_of
 
-from . import fit, gait, gdi, lab, session, study, video
-from ._datajoint import dj
-from .ingest import in_transaction
-from .method_names import with_keys
-from .rows import inside, utc_now
-from .stored_files import file_ref, stored_file
-from .views import cycle_rows, frame_of, newest_sets
+from .. import fit, gait, gdi, lab, session, study, video
+from .._datajoint import dj
+from ..method_names import with_keys
+from ..rows import inside, utc_now
+from ..stored_files import file_ref, stored_file
+from ..transactions import in_transaction
+from ..views import cycle_rows, frame_of, newest_sets
 
 if TYPE_CHECKING:
     from pbl_pipeline.study import StudyData
@@ -48,7 +48,7 @@ def freeze(
     event: str = "",
     note: str = "",
 ) -> Slice:
-    """Freeze the visits of a cohort (None: of everybody) with the measures that they have now.
+    """Freeze the visits of a cohort (None: of all people) with the measures that they have now.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def freeze(
     methods
         Key of StudySlice (`fit_method`, ...) -> method, where the tables hold several chains.
     event
-        What the days of the visits count from, such as surgery.
+        The event from which the days of the visits count, such as surgery.
     note
         Shown on the report, with how many people of the cohort have no visit, and why they were excluded.
 
@@ -159,7 +159,7 @@ def chain_of(name: str) -> tuple[dict[str, str], list[str]]:
 
 
 def changes(name: str) -> list[str]:
-    """What of a slice's rows is not as it was when it was frozen, in words; empty where the same frames come out.
+    """Return in words which rows of a slice changed since it was frozen; empty where the same frames come out.
 
     Raises
     ------

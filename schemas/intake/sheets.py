@@ -1,4 +1,4 @@
-"""Sheets of a study as rows of texts: CSV, and XLSX without anything that hides a value."""
+"""Sheets as rows of texts (CSV, and XLSX without anything that hides a value), and what becomes of each row."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ import io
 import math
 import re
 import zipfile
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from pbl_pipeline.bounded import MAX_ROWS, MIB, opened_zip, read_bytes
 from pbl_pipeline.errors import PblError
+
+from ..codes import folded
 
 #: Bytes of a sheet, and of all parts of a workbook unpacked.
 _MAX_BYTES, _MAX_UNPACKED = 32 * MIB, 128 * MIB
@@ -23,10 +26,10 @@ _MAX_BYTES, _MAX_UNPACKED = 32 * MIB, 128 * MIB
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """A row: where it stands, for errors, and its cells that are not empty, by column."""
+    """A row of a sheet."""
 
-    where: str
-    cells: dict[str, str]
+    where: str  # for errors
+    cells: dict[str, str]  # those that are not empty, by column
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +39,43 @@ class Sheet:
     name: str
     columns: tuple[str, ...]
     rows: tuple[Row, ...]
+
+    def plain_names(self) -> dict[str, str]:
+        """Return the name of each column in lower case, with underscores for spaces."""
+        return {column: column.lower().replace(" ", "_") for column in self.columns}
+
+
+@dataclasses.dataclass
+class Line:
+    """The outcome for a row of a sheet."""
+
+    where: str
+    changes: list[str] = dataclasses.field(default_factory=list)  # in words; none: it is stored already
+    errors: list[PblError] = dataclasses.field(default_factory=list)  # why it is refused
+    kept: str = ""  # what is stored already, in words
+
+    @contextlib.contextmanager
+    def about(self) -> Iterator[Line]:
+        """An error in the block is one of this row; its key begins with the row."""
+        try:
+            yield self
+        except PblError as error:
+            key = str(error.key if error.key is not None else self.where)
+            key = key if key.startswith(self.where) else f"{self.where}: {key}"
+            self.errors.append(error.with_key(key))
+
+
+@dataclasses.dataclass(frozen=True)
+class Imported:
+    """The outcome for every row of the sheets."""
+
+    lines: list[Line]
+    done: bool  # whether the changes were made, which is when no row is refused and it is not a dry run
+
+    @property
+    def errors(self) -> list[PblError]:
+        """Why rows are refused."""
+        return [e for line in self.lines for e in line.errors]
 
 
 def read_sheets(path: Path) -> list[Sheet]:
@@ -67,6 +107,28 @@ def read_sheets(path: Path) -> list[Sheet]:
 def refused(where: str, found: str, expected: str, next_step: str) -> PblError:
     """A `PblError` SHEET_FORMAT about a sheet or row."""
     return PblError("SHEET_FORMAT", found=found, expected=expected, next_step=next_step, key=where)
+
+
+def conflict(found: str, expected: str, next_step: str) -> PblError:
+    """A `PblError` SHEET_CONFLICT about rows that cannot all be true."""
+    return PblError("SHEET_CONFLICT", found=found, expected=expected, next_step=next_step)
+
+
+def check_same(first: Any, value: Any, what: str, whose: str, expected: str = "one value") -> None:
+    """Raise `PblError` SHEET_CONFLICT unless a value is the one that was stated first."""
+    if first != value:
+        raise conflict(f"{what} {first} and {value} of {whose}", expected, "correct the row that is wrong")
+
+
+def similar_codes(stated: Iterable[str], registered: Iterable[str]) -> dict[str, list[str]]:
+    """Return the stated codes of people that differ from others only in case, zeros or hyphens, with those others;
+    codes that are all registered are different people."""
+    stated, registered = set(stated), set(registered)
+    alike: dict[str, set[str]] = defaultdict(set)
+    for code in stated | registered:
+        alike[folded(code)].add(code)
+    found = {code: alike[folded(code)] for code in stated}
+    return {code: sorted(same - {code}) for code, same in found.items() if len(same) > 1 and not same <= registered}
 
 
 def needed(row: Row, column: str) -> str:
@@ -168,12 +230,9 @@ def _sheet(name: str, lines: list[list[str]]) -> Sheet | None:
     _, header = numbered[0]
     while header and not header[-1]:
         header = header[:-1]
-    twice = sorted({c for c in header if header.count(c) > 1})
-    if twice:
-        what = "a column without a name" if not twice[0] else f"column {twice[0]!r} twice"
+    if wrong := sorted({c for c in header if not c or header.count(c) > 1}):
+        what = f"column {wrong[0]!r} twice" if wrong[0] else "a column without a name"
         raise refused(name, what, "a header row that names each column once", "name the columns")
-    if "" in header:
-        raise refused(name, "a column without a name", "a header row that names each column once", "name the columns")
     rows = []
     for number, line in numbered[1:]:
         where = f"{name}, row {number}"

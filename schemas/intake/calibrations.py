@@ -1,4 +1,4 @@
-"""Calibrations that serve every video of a phone's lens: register, list, remove (`pbl camera`).
+"""Calibrations of cameras as rows, and those that serve every video of a phone's lens (`pbl camera`).
 
 Which one counts for a video is `video.camera_of`, asked when its keypoints are computed. A calibration that is
 registered, corrected or removed deletes exactly the keypoints that were made with another one than counts now, and what
@@ -8,35 +8,73 @@ was computed from them; the next populate computes them anew.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import math
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.paramset import canonical_json
 
-from . import keypoints, lab, video
-from .ingest import camera_id_of, camera_row, forget_errors, in_transaction
-from .rows import delete_below, number, utc_now
+from .. import keypoints, lab, video
+from ..jobs import forget_errors
+from ..rows import delete_below, number, utc_now
+from ..transactions import in_transaction, next_id
 
 if TYPE_CHECKING:
-    from pbl_pipeline.video import PhoneLens
+    from pbl_pipeline.video import Camera, PhoneLens
+
+
+def camera_row(camera: Camera, size_px: tuple[int, int]) -> dict[str, Any]:
+    """The library's `Camera` of upright pictures (width, height) as a row of CameraCalibration, without its number."""
+    row = {
+        "camera_width": size_px[0],
+        "camera_height": size_px[1],
+        "camera_fx": float(camera.matrix[0, 0]),
+        "camera_fy": float(camera.matrix[1, 1]),
+        "camera_cx": float(camera.matrix[0, 2]),
+        "camera_cy": float(camera.matrix[1, 2]),
+        "camera_distortion": [float(d) for d in camera.distortion],
+        "camera_origin": "measured",
+        "camera_note": camera.source.removeprefix("file:").strip()[:255],
+        # Only where it is known: calibrations that were stored without it keep their hash.
+        **({"camera_focal_sd": sd} if math.isfinite(sd := camera.focal_rel_sd * camera.focal_px) else {}),
+    }
+    return {**row, "camera_sha256": hashlib.sha256(canonical_json(row).encode()).hexdigest()}
+
+
+def known_camera(camera: Mapping[str, Any]) -> int | None:
+    """Number of the calibration of this `camera_row`; None where it is not registered."""
+    known = (lab.CameraCalibration & {"camera_sha256": camera["camera_sha256"]}).keys()
+    return int(known[0]["camera_id"]) if known else None
+
+
+def camera_id_of(camera: Mapping[str, Any]) -> int:
+    """Number of the calibration of this `camera_row`, which is inserted where it is new."""
+    known = known_camera(camera)
+    if known is not None:
+        return known
+    camera_id = next_id(lab.CameraCalibration, "camera_id")
+    lab.CameraCalibration.insert1({**camera, "camera_id": camera_id})
+    return camera_id
 
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """What became of a device's calibration: its number now (None: removed) and before (None: there was none), and the
-    deleted rows by table."""
+    """A change of a device's calibration."""
 
     device: str
-    camera_id: int | None
-    before: int | None
-    deleted: dict[str, int]
+    camera_id: int | None  # its number now, None: removed
+    before: int | None  # its number before, None: there was none
+    deleted: dict[str, int]  # deleted rows by table
 
 
 def add_calibration(file: str | Path, like: str | Path | None = None) -> Change:
-    """Register the calibration in `file` for all videos of its phone's lens, size and rate that have none of their own.
+    """Register the calibration in `file` for all videos of its phone's lens, size and rate without another calibration.
     It takes the place of an older one. `like`: a recording of the phone, where the file does not name it.
 
     Raises
@@ -47,29 +85,20 @@ def add_calibration(file: str | Path, like: str | Path | None = None) -> Change:
     from pbl_pipeline.video import load_lens_calibration
 
     found = load_lens_calibration(file, like)
-    done: list[Change] = []
-    outdated: list[dict[str, Any]] = []
 
-    def insert() -> None:
+    def insert() -> list[_Outdated]:
         key = {"device": _device(found.lens), **lab.mode_columns(found.lens)}
-        before = (lab.DeviceCalibration & key).to_dicts()
-        camera_id = camera_id_of(camera_row(found.camera, found.size_px))
         row = {
             **key,
-            "camera_id": camera_id,
+            "camera_id": camera_id_of(camera_row(found.camera, found.size_px)),
             "stored_rotation": found.rotation_deg,
             "device_focal_35mm": found.lens.focal_35mm,
             "device_calibrated": utc_now(),
         }
-        (lab.DeviceCalibration & key).delete_quick()
-        lab.DeviceCalibration.insert1(row)
-        outdated[:] = _outdated(key)
-        deleted = delete_below(keypoints.Keypoints, outdated)
-        done[:] = [Change(key["device"], camera_id, int(before[0]["camera_id"]) if before else None, deleted)]
+        return [_replace(key, row)]
 
-    in_transaction(insert)
-    _retry(outdated)
-    return done[0]
+    (change,) = _retried(in_transaction(insert))
+    return change
 
 
 def remove_calibration(camera_id: int) -> list[Change]:
@@ -89,22 +118,30 @@ def remove_calibration(camera_id: int) -> list[Change]:
             expected=f"one of {', '.join(map(str, there))}" if there else "a device with a calibration",
             next_step="`pbl camera list` shows the numbers",
         )
-    done: list[Change] = []
-    outdated: list[dict[str, Any]] = []
+    keys = [{k: row[k] for k in lab.DeviceCalibration.primary_key} for row in rows]
+    return _retried(in_transaction(lambda: [_replace(key, None) for key in keys]))
 
-    def withdraw() -> None:
-        done.clear()
-        outdated.clear()
-        for row in rows:
-            key = {k: row[k] for k in lab.DeviceCalibration.primary_key}
-            (lab.DeviceCalibration & key).delete_quick()
-            keys = _outdated(key)
-            outdated.extend(keys)
-            done.append(Change(row["device"], None, camera_id, delete_below(keypoints.Keypoints, keys)))
 
-    in_transaction(withdraw)
-    _retry(outdated)
-    return done
+#: A change, and the keys of the keypoints that it makes outdated.
+_Outdated = tuple[Change, list[dict[str, Any]]]
+
+
+def _replace(key: dict[str, Any], row: dict[str, Any] | None) -> _Outdated:
+    """Put a row of DeviceCalibration, or none, in the place of that with this key; delete the outdated keypoints."""
+    before = (lab.DeviceCalibration & key).to_dicts()
+    (lab.DeviceCalibration & key).delete_quick()
+    if row is not None:
+        lab.DeviceCalibration.insert1(row)
+    outdated = _outdated(key)
+    now, old = (None if r is None else int(r["camera_id"]) for r in (row, before[0] if before else None))
+    return Change(key["device"], now, old, delete_below(keypoints.Keypoints, outdated)), outdated
+
+
+def _retried(changes: Sequence[_Outdated]) -> list[Change]:
+    """Forget errors of the other calibration. Not in a transaction: it may declare job tables."""
+    for video_id in sorted({key["video_id"] for _, outdated in changes for key in outdated}):
+        forget_errors(video_id)
+    return [change for change, _ in changes]
 
 
 def calibrations() -> list[dict[str, Any]]:
@@ -138,12 +175,6 @@ def _device(lens: PhoneLens) -> str:
     name = next(n for n in names if n not in taken)
     lab.Device.insert1({"device": name, **columns})
     return name
-
-
-def _retry(outdated: list[dict[str, Any]]) -> None:
-    """What failed with the other calibration may do with this one. Not in a transaction: it may declare job tables."""
-    for video_id in sorted({key["video_id"] for key in outdated}):
-        forget_errors(video_id)
 
 
 def _outdated(key: dict[str, Any]) -> list[dict[str, Any]]:

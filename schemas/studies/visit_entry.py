@@ -1,4 +1,4 @@
-"""What a person enters about a visit: its role in a study and clinical scores, each change a row of Decision.
+"""Entry of the role of a visit in a study and its clinical scores by a person, each change a row of Decision.
 
 The rows are checked and written as those of a sheet of `pbl study import` are.
 """
@@ -13,11 +13,11 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 
-from . import session, study
-from .decide import decisions, record
-from .ingest import in_transaction
-from .sheets import Row, Sheet, refused
-from .study_import import CLEAR, SCORE_COLUMNS, Line, import_rows
+from .. import session, study
+from ..decide import decisions, record
+from ..intake.sheets import Line, Row, Sheet, refused
+from ..transactions import in_transaction
+from .study_sheets import CLEAR, SCORE_COLUMNS, import_rows
 
 #: Name of the field of the role; the others are named by their instruments.
 ROLE = "role"
@@ -47,7 +47,7 @@ class Entered:
 
 
 def entry(session_id: int) -> Entry:
-    """What can be entered about a visit. Raises `PblError` DB_NOT_FOUND for a number that no visit has."""
+    """Return what can be entered about a visit. Raises `PblError` DB_NOT_FOUND for an unknown number."""
     rows = (session.Session & {"session_id": session_id}).to_dicts()
     if not rows:
         raise session.unknown_visit(session_id)
@@ -76,7 +76,7 @@ def enter(session_id: int, values: Mapping[str, str], by: str, seen: str, reason
     Raises
     ------
     PblError
-        DB_NOT_FOUND; USAGE for a field that there is not; DECIDED_MEANWHILE where something else is stored by now.
+        DB_NOT_FOUND; USAGE for an unknown field; DECIDED_MEANWHILE where another value was stored meanwhile.
         What is wrong with a value is in the result.
     """
     return in_transaction(lambda: _enter(session_id, values, by, seen, reason))

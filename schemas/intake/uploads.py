@@ -1,7 +1,7 @@
 """The drop folder: what phones upload, in a folder of this machine or under a prefix of an object store.
 
-Whoever uploads decides what lies there and when it changes. A folder is therefore read through handles of its folders,
-no link is followed, and only a regular file of the account that owns the drop folder is opened.
+The person who uploads decides which files lie there and when they change. A folder is therefore read through handles of
+its folders, no link is followed, and only a regular file of the account that owns the drop folder is opened.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import fsspec
 
 from pbl_pipeline.errors import PblError
 
-from .operations.secret_files import secret
-from .store import purge, store_error
+from ..operations.secret_files import secret
+from ..store import purge, store_error
 
 #: What is a sensor log, by the ending.
 LOG_ENDINGS = (".csv", ".json", ".zip")
@@ -37,13 +37,12 @@ class StillChanging(Exception):
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Upload:
-    """What lies at a place: name below the drop folder, size (bytes), a stamp that changes with the content; `file` is
-    False for what cannot be a recording (a folder, a name that leads elsewhere)."""
+    """An entry of the drop folder."""
 
-    name: PurePosixPath
-    size: int = 0
-    stamp: str = ""
-    file: bool = True
+    name: PurePosixPath  # below the drop folder
+    size: int = 0  # bytes
+    stamp: str = ""  # changes with the content
+    file: bool = True  # False for a folder, or a name that leads elsewhere
 
 
 def incoming_url() -> str:
@@ -60,7 +59,7 @@ def incoming_url() -> str:
 
 
 def drop_folder(url: str) -> Folder | Bucket:
-    """The drop folder at a path or URL. Raises `PblError` FILE_MISSING where it is no folder."""
+    """Return the drop folder at a path or URL. Raises `PblError` FILE_MISSING unless it is a folder."""
     return Bucket(url) if "://" in url else Folder(Path(url).absolute())
 
 
@@ -82,8 +81,8 @@ class Folder:
             ) from error
 
     def uploads(self, subject: str | None = None) -> Iterator[Upload]:
-        """Everything that lies there or in the folder of one person: of two levels what is no folder, of the third
-        everything."""
+        """Yield all entries, or those of one person: every entry of the third level, and above it those that are not
+        folders."""
         yield from self._below((subject,) if subject else ())
 
     def _below(self, parts: tuple[str, ...]) -> Iterator[Upload]:
@@ -110,7 +109,7 @@ class Folder:
         Raises
         ------
         PblError
-            UPLOAD_REFUSED: it is no regular file of the folder's owner, or too large.
+            UPLOAD_REFUSED: it is not a regular file of the folder's owner, or too large.
         StillChanging
             It is another one than was listed.
         """
@@ -171,8 +170,8 @@ class Folder:
                 os.rmdir(subject, dir_fd=root)
 
     def move(self, upload: Upload, to: Path) -> None:
-        """Move a file out of the drop folder without opening it. What holds no bytes of its own (it is no regular file,
-        or has another name) is removed.
+        """Move a file out of the drop folder without opening it. An entry that is not a regular file, or has another
+        name, is removed.
 
         Raises
         ------
@@ -183,7 +182,7 @@ class Folder:
             about = os.stat(upload.name.name, dir_fd=handle, follow_symlinks=False)
             if stat.S_ISREG(about.st_mode) and about.st_nlink == 1:
                 os.rename(upload.name.name, to, src_dir_fd=handle)
-                with contextlib.suppress(OSError):  # it may belong to somebody else; the folder is closed to others
+                with contextlib.suppress(OSError):  # it may belong to another account; the folder is closed to others
                     to.chmod(0o600)
             elif not stat.S_ISDIR(about.st_mode):
                 os.unlink(upload.name.name, dir_fd=handle)

@@ -13,15 +13,18 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 
-from . import fit, gait, gdi, keypoints, lab, session, video, worker
-from ._datajoint import dj
-from .archive import LOCK, archive_dir, folder_of, plain_name
-from .codes import check_subject
-from .folders import private_folder, remove_empty, sync_folders
-from .ingest import Visit, forget_errors, in_transaction, session_of
+from .. import fit, gait, gdi, keypoints, lab, session, video, worker
+from .._datajoint import dj
+from ..archive import LOCK, archive_dir, folder_of, plain_name
+from ..codes import check_subject
+from ..folders import private_folder, remove_empty, sync_folders
+from ..jobs import forget_errors
+from ..rows import delete_below
+from ..transactions import in_transaction
+from ..video import unknown_video
+from .records import Visit
 from .rigs import check_same_number
-from .rows import delete_below
-from .video import unknown_video
+from .visits import session_ids
 
 #: Plans of a visit that follow a video into its new one.
 _PLANS = (fit.FitPlan, gait.GaitPlan, gdi.GdiPlan)
@@ -29,20 +32,17 @@ _PLANS = (fit.FitPlan, gait.GaitPlan, gdi.GdiPlan)
 
 @dataclasses.dataclass(frozen=True)
 class Move:
-    """What moving a video would change. `files`: number -> path of the videos that move: it, or all of its trial where
-    several cameras filmed it. `before` and `after` are (subject, session label); new_subject, new_session: those are to
-    be made; sets: keys of the fits' sets of the old visit that hold one of them, which are deleted with all that was
-    computed from them (`deleted`: table -> rows); left: videos that the old visit keeps."""
+    """The changes that moving a video would make."""
 
     video_id: int
-    files: Mapping[int, Path]
-    before: tuple[str, str]
+    files: Mapping[int, Path]  # number -> path of the videos that move: of several cameras all of the trial
+    before: tuple[str, str]  # subject, session label
     after: tuple[str, str]
-    new_subject: bool
+    new_subject: bool  # whether it is to be made
     new_session: bool
-    sets: tuple[dict[str, Any], ...]
-    deleted: dict[str, int]
-    left: int
+    sets: tuple[dict[str, Any], ...]  # keys of the sets of the old visit that hold one of them: deleted
+    deleted: dict[str, int]  # rows by table, with all that was computed from these sets
+    left: int  # videos that the old visit keeps
 
 
 def plan_move(video_id: int, subject: str, session_label: str) -> Move:
@@ -92,7 +92,7 @@ def carry_out(plan: Move) -> None:
     """Put the video into its new visit, with the plans of the methods that it went through.
 
     Detection and keypoints stay: they depend on the video alone. The sets of fits that hold it are deleted with all
-    that was computed from them; what is left of the old visit, and the new one, are fitted by the next populate. A
+    that was computed from them; the rest of the old visit, and the new one, are fitted by the next populate. A
     recording in the archive goes to the folder of its new person, so that `pbl forget` finds it there.
 
     Raises
@@ -107,7 +107,7 @@ def carry_out(plan: Move) -> None:
         again = plan_move(plan.video_id, *plan.after)
         old = int((video.Video & {"video_id": plan.video_id}).fetch1("session_id"))
         delete_below(fit.FitSet, again.sets)
-        new = session_of(Visit(*plan.after))
+        (new,) = session_ids([Visit(*plan.after)]).values()
         for number, path in paths.items():
             video.Video.update1({"video_id": number, "session_id": new, "video_path": str(path)})
         points = keypoints.KeypointSelection & of_these

@@ -1,0 +1,23 @@
+"""Registration of recordings and of what belongs to them: `register` and the records that it takes."""
+
+from __future__ import annotations
+
+from .markers import LaboratoryMarkers
+from .records import Methods, Recording, Registered, Visit
+from .registration import register
+from .rigs import SeveralCameras
+from .sensors import Sensors
+from .videos import OneCamera, ingest
+
+__all__ = [
+    "LaboratoryMarkers",
+    "Methods",
+    "OneCamera",
+    "Recording",
+    "Registered",
+    "Sensors",
+    "SeveralCameras",
+    "Visit",
+    "ingest",
+    "register",
+]

@@ -1,0 +1,182 @@
+"""Videos of many people and visits from one sheet (`pbl ingest --sheet`, docs/files.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from pbl_pipeline.progress import track
+
+from .. import lab, session
+from ..codes import day_of
+from ..rows import inside
+from ..transactions import in_transaction
+from ..video import CAMERA_MOTIONS
+from .plans import resolve
+from .records import Methods, Visit
+from .registration import check_owner, registered, write
+from .sensors import Sensors
+from .sheets import (
+    Imported,
+    Line,
+    Row,
+    check_same,
+    conflict,
+    date_of,
+    needed,
+    number_of,
+    read_sheets,
+    refused,
+    similar_codes,
+)
+from .videos import OneCamera
+
+#: Columns that must have a value, and those that may.
+NEEDED = ("file", "subject", "visit")
+COLUMNS = (
+    *NEEDED,
+    *("date", "pace", "activity", "camera", "camera_motion", "attitude", "person", "population", "height_m", "project"),
+)
+_ONE_VISIT = "one value; two visits need two labels"
+
+
+def ingest_sheet(sheet: Path, methods: Methods | None = None, dry_run: bool = False) -> Imported:
+    """Register the videos of a sheet in one transaction, a row for each: all of them, or none where a row is refused.
+
+    Paths are relative to the sheet's folder. A video that is registered already for the same visit is left as it is.
+    Every file is read, also in a dry run.
+
+    Raises
+    ------
+    PblError
+        FILE_MISSING, SHEET_FORMAT: a sheet that cannot be read, unknown columns, no rows; SOLVER_UNKNOWN, NORM_UNKNOWN.
+        What is wrong with a row is in the result.
+    """
+    rows = _rows(sheet)
+    chosen = resolve(methods or Methods())
+    lines = [Line(row.where) for row in rows]
+    visits = [_visit(row, line, sheet.absolute().parent) for row, line in zip(rows, lines, strict=True)]
+    _check_people(visits, lines)
+    new: list[tuple[Row, Line, OneCamera]] = []
+    seen: dict[str, str] = {}
+    for row, line, visit in track(list(zip(rows, lines, visits, strict=True)), "reading", unit="file"):
+        if visit is None or line.errors:
+            continue
+        with line.about():
+            one = _recording(row, visit, sheet.absolute().parent)
+            one.read()
+            sha256, file = one.files[0].sha256, row.cells["file"]
+            if (first := seen.setdefault(sha256, row.where)) != row.where:
+                raise conflict(f"the same bytes as in {first}", "each recording once", "remove one of the rows")
+            if known := registered(one.files):
+                _check_place(one, known)
+                line.kept = f"{file}: video_id {known[sha256]['video_id']}: registered already, left as it is"
+            else:
+                one.complete(chosen)
+                new.append((row, line, one))
+                line.changes = [f"{file}: new: {visit.subject}/{visit.session_label}"]
+    done = not dry_run and not any(line.errors for line in lines)
+    if done and new:
+        made = in_transaction(lambda: write([one for *_, one in new], chosen))
+        for (row, line, _), result in zip(new, made, strict=True):
+            line.changes = [f"{row.cells['file']}: video_id {result.video_id}: registered ({result.note})"]
+    return Imported(lines, done)
+
+
+def _rows(path: Path) -> list[Row]:
+    """The rows of a sheet with the names of the columns as `COLUMNS` has them."""
+    rows = []
+    for sheet in read_sheets(path):
+        names = sheet.plain_names()
+        unknown = [c for c, name in names.items() if name not in COLUMNS]
+        if unknown or set(NEEDED) - set(names.values()) or len(set(names.values())) < len(names):
+            raise refused(
+                sheet.name,
+                f"unknown column {', '.join(map(repr, unknown[:5]))}" if unknown else f"the columns {list(names)}",
+                f"{', '.join(NEEDED)}, and any of {', '.join(COLUMNS[len(NEEDED) :])}",
+                "rename or remove columns; clinical scores and roles of visits go into a sheet of `pbl study import`",
+            )
+        rows += [Row(row.where, {names[c]: text for c, text in row.cells.items()}) for row in sheet.rows]
+    if not rows:
+        raise refused(str(path), "no rows", "a row for each video", "write them below the header")
+    return rows
+
+
+def _visit(row: Row, line: Line, folder: Path) -> Visit | None:
+    """Return the visit that a row states; None where it is refused."""
+    with line.about():
+        needed(row, "file")
+        cells = row.cells
+        motion, person = cells.get("camera_motion"), cells.get("person")
+        if motion is not None and motion not in CAMERA_MOTIONS:
+            raise refused(row.where, f"camera_motion {motion!r}", f"one of {', '.join(CAMERA_MOTIONS)}", "correct it")
+        if person is not None and not (person.isdecimal() and 1 <= int(person) < 1000):
+            raise refused(row.where, f"person {person!r}", "the number of a person, from 1", "correct it")
+        visit = Visit(
+            subject=needed(row, "subject"),
+            session_label=needed(row, "visit"),
+            project=cells.get("project"),
+            camera_file=folder / cells["camera"] if "camera" in cells else None,
+            camera_motion=motion,
+            activity=cells.get("activity"),
+            person=None if person is None else int(person),
+            population=cells.get("population"),
+            pace=cells.get("pace"),
+            height_m=number_of(row, "height_m", cells["height_m"]) if "height_m" in cells else None,
+            date=date_of(row, "date") if "date" in cells else None,
+        )
+        visit.check()
+        day = day_of(visit.session_label)
+        if visit.date is not None and day not in (None, visit.date):
+            found = f"date {visit.date} of the visit {visit.session_label}"
+            raise conflict(found, f"{day}, which its label says", "correct one of them")
+        return visit
+    return None
+
+
+def _check_people(visits: Sequence[Visit | None], lines: Sequence[Line]) -> None:
+    """Refuse rows that cannot all be true: one label for two days, one person in two groups or under two codes."""
+    codes = {visit.subject for visit in visits if visit is not None}
+    stored = (session.Session & inside("subject", codes)).to_dicts()
+    dates = {(r["subject"], r["session_label"]): r["session_date"] for r in stored}
+    similar = similar_codes(codes, map(str, lab.Subject().to_arrays("subject")))
+    first: dict[tuple[str, ...], object] = {}
+    for visit, line in zip(visits, lines, strict=True):
+        if visit is None:
+            continue
+        key, whose = (visit.subject, visit.session_label), f"{visit.subject}, {visit.session_label}"
+        with line.about():
+            if others := similar.get(visit.subject):
+                raise conflict(
+                    f"the codes {visit.subject} and {', '.join(others)}",
+                    "one code for one person, or codes that differ by more than case, zeros and hyphens",
+                    "write the same code",
+                )
+            if visit.date is not None and dates.get(key) not in (None, visit.date):
+                raise conflict(
+                    f"date {visit.date} of {whose}, registered with {dates[key]}",
+                    "one day for one visit",
+                    "two visits need two labels; a wrong day is corrected by `pbl study import`",
+                )
+            for what in ("date", "population", "project", "height_m"):
+                value = getattr(visit, what)
+                if value is not None:
+                    of = (*key, what) if what == "date" else (visit.subject, what)
+                    check_same(first.setdefault(of, value), value, what, whose, _ONE_VISIT)
+
+
+def _recording(row: Row, visit: Visit, folder: Path) -> OneCamera:
+    log = row.cells.get("attitude")
+    return OneCamera(folder / row.cells["file"], visit, Sensors(attitude=folder / log if log else None))
+
+
+def _check_place(one: OneCamera, known: Mapping[str, Mapping]) -> None:
+    """Raise `PblError` where a video is registered for another person or visit."""
+    check_owner(one, known)
+    row, visit = known[one.files[0].sha256], one.visit
+    if row["session_label"] != visit.session_label:
+        raise conflict(
+            f"video_id {row['video_id']} of visit {row['session_label']} has these bytes",
+            f"a recording of visit {visit.session_label}",
+            f"correct the row, or: pbl move {row['video_id']} --to {visit.subject}/{visit.session_label}",
+        )

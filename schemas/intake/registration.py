@@ -1,0 +1,183 @@
+"""Registration of recordings: the one way into the tables, whatever names them.
+
+The commands, sheets, the drop folder and archives make records (`OneCamera`, `SeveralCameras`, `LaboratoryMarkers`);
+their files are read and checked (`Recording.read`), and then written, or compared with what is registered.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pbl_pipeline.errors import PblError
+
+from .. import session, tracking, video
+from .._datajoint import DuplicateError
+from ..jobs import forget_errors
+from ..rows import utc_now
+from ..transactions import in_transaction, next_id
+from .calibrations import camera_id_of
+from .conditions import set_condition
+from .plans import named_keys, plan_all, plan_named, resolve
+from .records import File, Methods, Recording, RefusedFile, Registered
+from .visits import session_ids, set_height, set_population
+
+#: Errors that say that the file was not where, or what, it should be.
+_FILE_ERRORS = ("VIDEO_MISSING", "VIDEO_CHANGED")
+
+
+def register(recordings: Iterable[Recording], methods: Methods | None = None) -> list[Registered]:
+    """Register recordings with the methods they go through, each in a separate transaction.
+
+    A file whose bytes are registered already takes what is new: a calibration or sensor log of the phone (what was
+    computed with another is deleted: keypoints and after), activity, pace, population, height, and the methods that are
+    named, which are added to its selections and the plans of its session.
+
+    Returns
+    -------
+    list of Registered
+        One for each file, in their order. Missing, empty and unreadable files are refused with their error, all videos
+        of a trial of several cameras together; the other recordings are registered.
+
+    Raises
+    ------
+    PblError
+        USAGE for a subject code that could be a name, a label too long, or a statement that does not apply to the kind
+        of recording; FIT_INPUT for a height; MARKER_SET_UNKNOWN, FILE_FORMAT for a marker set; SOLVER_UNKNOWN,
+        NORM_UNKNOWN for unknown methods. Nothing is registered then.
+    """
+    recordings, named = list(recordings), methods or Methods()
+    for recording in recordings:
+        recording.check(named)
+    chosen = {markers: resolve(named, markers) for markers in {r.markers for r in recordings}}
+    done: list[Registered] = []
+    for recording in recordings:
+        try:
+            recording.read()
+            done += _register(recording, chosen[recording.markers], named_keys(named))
+        except RefusedFile as wrong:
+            done += [Registered(path, "refused", error=wrong.error_of(path)) for path in recording.paths]
+        except PblError as error:
+            done += [Registered(path, "refused", error=error) for path in recording.paths]
+    return done
+
+
+def _register(one: Recording, chosen: Mapping[str, str], named: set[str]) -> list[Registered]:
+    if known := registered(one.files):
+        return _update(one, known, chosen, named)
+    one.complete(chosen)
+    try:
+        return in_transaction(lambda: write([one], chosen), until=lambda: bool(registered(one.files)))
+    except DuplicateError:
+        if not (known := registered(one.files)):
+            raise
+        return _update(one, known, chosen, named)
+
+
+def registered(files: Iterable[File]) -> dict[str, dict[str, Any]]:
+    """Return the rows of Video with the bytes of these files, by SHA-256, with subject and label of the session."""
+    videos = video.Video * session.Session.proj("subject", "session_label")
+    rows = (videos & [{"video_sha256": file.sha256} for file in files]).to_dicts()
+    return {row["video_sha256"]: row for row in rows}
+
+
+def check_owner(one: Recording, known: Mapping[str, Mapping[str, Any]]) -> None:
+    """Raise `PblError` VIDEO_DUPLICATE where the bytes of a file are registered (`known`) for another subject."""
+    visit = one.visit
+    for file in one.files:
+        row = known.get(file.sha256)
+        if row is not None and row["subject"] != visit.subject:
+            owner = f"subject {row['subject']}, session {row['session_label']}"
+            raise PblError(
+                "VIDEO_DUPLICATE",
+                found=f"video_id {row['video_id']} of {owner}, has these bytes",
+                expected=f"a recording of subject {visit.subject} (session {visit.session_label}) and of no one else",
+                next_step=f"find out whose recording it is; if not {row['subject']}'s: "
+                f"pbl move {row['video_id']} --to {visit.subject}/{visit.session_label}",
+                key=file.path,
+            )
+
+
+def write(recordings: Sequence[Recording], chosen: Mapping[str, str]) -> list[Registered]:
+    """Insert recordings that are new, with people, sessions, selections and plans. Call it in a transaction.
+
+    `chosen`: keys of the methods (`plans.resolve`). Returns the outcome of each file.
+    """
+    sessions = session_ids(one.visit for one in recordings)
+    of_session = [sessions[one.visit.subject, one.visit.session_label] for one in recordings]
+    first = next_id(video.Video, "video_id", sum(len(one.files) for one in recordings))
+    counter = itertools.count(first)
+    numbers = [[next(counter) for _ in one.files] for one in recordings]
+    for one, session_id in zip(recordings, of_session, strict=True):
+        one.check_session(session_id)
+    new = list(zip(recordings, of_session, numbers, strict=True))
+    video.Video.insert(row for one, session_id, own in new for row in _video_rows(one, session_id, own))
+    paced = [(number, one.visit.pace) for one, _, own in new for number in own if one.visit.pace is not None]
+    for number, pace in paced:
+        set_condition(number, pace=pace)
+    notes = [one.insert(own) for one, _, own in new]
+    plan_all([n for own in numbers for n in own], {*of_session}, chosen)
+    for one, _, own in new:
+        if one.visit.person is not None:
+            tracking.set_override({"video_id": own[0], "tracking_method": chosen["tracking_method"]}, one.visit.person)
+    return [
+        Registered(file.path, "registered", number, "; ".join(filter(None, (one.visit.text(), note))))
+        for (one, _, own), noted in zip(new, notes, strict=True)
+        for file, number, note in zip(one.files, own, noted, strict=True)
+    ]
+
+
+def _video_rows(one: Recording, session_id: int, numbers: Sequence[int]) -> Iterable[dict[str, Any]]:
+    for number, file in zip(numbers, one.files, strict=True):
+        yield {
+            "video_id": number,
+            "session_id": session_id,
+            "camera_id": camera_id_of(file.camera) if file.camera else None,
+            "video_path": str(file.path),
+            "video_name": file.path.name[-255:],
+            "video_sha256": file.sha256,
+            "video_size": file.size,
+            "activity": one.visit.activity or "walking",
+            "camera_motion": one.motion,
+            "video_created": utc_now(),
+        }
+
+
+def _update(
+    one: Recording, known: Mapping[str, Mapping[str, Any]], chosen: Mapping[str, str], named: set[str]
+) -> list[Registered]:
+    """Add what is new to a recording whose bytes are registered."""
+    check_owner(one, known)
+    one.check_known([known[file.sha256] for file in one.files if file.sha256 in known])
+    return [_update_file(one, file, known[file.sha256], chosen, named) for file in one.files]
+
+
+def _update_file(
+    one: Recording, file: File, row: Mapping[str, Any], chosen: Mapping[str, str], named: set[str]
+) -> Registered:
+    number, visit = int(row["video_id"]), one.visit
+    status, notes = "known", [f"already video_id {number} of subject {row['subject']}, session {row['session_label']}"]
+    if str(file.path) != row["video_path"] and not Path(row["video_path"]).is_file():
+        video.Video.update1({"video_id": number, "video_path": str(file.path), "video_name": file.path.name[-255:]})
+        forget_errors(number, _FILE_ERRORS)
+        status = "moved"
+        notes.append(f"it was {row['video_path']}, which is gone")
+
+    def work() -> list[str]:
+        return [
+            *plan_named(number, int(row["session_id"]), chosen, named),
+            *set_condition(number, visit.activity, visit.pace),
+            *set_population(row["subject"], visit.population),
+            *set_height(row["subject"], visit.height_m),
+        ]
+
+    changes = one.update(row) + in_transaction(work)
+    if changes and status == "known":
+        status = "updated"
+    if visit.camera_motion not in (None, row["camera_motion"]):
+        changes.append(f"camera motion {visit.camera_motion} was ignored, it stays {row['camera_motion']}")
+    if status == "known" and not changes:
+        changes = ["nothing was inserted"]
+    return Registered(file.path, status, number, "; ".join(notes + changes))

@@ -1,0 +1,185 @@
+"""Files that belong to a video, copied to the store: the phone's sensor log, depth video, wearable IMUs."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import shutil
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pbl_pipeline.errors import PblError
+
+from .. import keypoints, video
+from ..rows import counted, delete_below, utc_now
+from ..stored_files import new_folder
+
+if TYPE_CHECKING:
+    from pbl_pipeline.video import PhoneLog
+
+#: As a path of `--attitude`: no log for this video, or no longer.
+NONE = "none"
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensors:
+    """What is registered with one video; None and () leave things as they are. attitude: a log, or `NONE`."""
+
+    attitude: Path | None = None
+    depth: Path | None = None
+    imu: Sequence[Path] = ()
+
+    def __bool__(self) -> bool:
+        return self.attitude is not None or self.depth is not None or bool(self.imu)
+
+    @property
+    def has_log(self) -> bool:
+        """Whether a log comes with it."""
+        return self.attitude is not None and str(self.attitude) != NONE
+
+    def read(self) -> PhoneLog | None:
+        """Read the log, if there is one, and check that the other files exist.
+
+        Raises
+        ------
+        PblError
+            FILE_MISSING, PHONE_LOG; FILE_FORMAT for a file without bytes.
+        """
+        from pbl_pipeline.video import read_phone_log
+
+        for path in (self.depth, *self.imu):
+            if path is not None:
+                _check_there(path)
+        return read_phone_log(self.attitude) if self.has_log and self.attitude is not None else None
+
+
+def attach(video_id: int, given: Sensors, log: PhoneLog | None) -> list[str]:
+    """Insert what the video does not have yet; returns it in words. Call it in a transaction.
+
+    Another log (or none) takes the older one's place, and what was computed with that is deleted: keypoints and after.
+    """
+    key = {"video_id": video_id}
+    done = []
+    if given.attitude is not None:
+        done += _attach_log(key, given.attitude, log)
+    if given.depth is not None and (how := _keep(video.DepthVideo, "depth", key, given.depth)):
+        done.append(f"depth video {given.depth.name} was {how}")
+    for path in given.imu:
+        done += _attach_imu(key, path)
+    return done
+
+
+def _attach_log(key: dict[str, Any], path: Path, log: PhoneLog | None) -> list[str]:
+    table = video.PhoneAttitude & key
+    if log is None:
+        if not table:
+            return []
+        table.delete(prompt=False)
+        return ["the phone's log was removed" + delete_keypoints(key["video_id"])]
+    about = {
+        "attitude_form": log.form[:32],
+        "attitude_device": log.device[:128],
+        "attitude_n": len(log.time_s),
+        "attitude_rate": log.rate_hz,
+        "attitude_duration": float(log.time_s[-1] - log.time_s[0]),
+        "attitude_start_utc": _utc(log),
+        "attitude_sensors": {name: len(s.time_s) for name, s in log.sensors.items()},
+        "attitude_notes": list(log.notes),
+    }
+    how = _keep(video.PhoneAttitude, "attitude", key, path, about)
+    if not how:
+        return []
+    return [
+        f"the phone's log of {len(log.time_s)} orientations ({log.form}) was {how}" + delete_keypoints(key["video_id"])
+    ]
+
+
+def _attach_imu(key: dict[str, Any], path: Path) -> list[str]:
+    from pbl_pipeline.video import sha256_of
+
+    own = video.WearableImu & key
+    if own & {"imu_sha256": sha256_of(path)}:
+        return []
+    number = max((int(n) for n in own.to_arrays("imu")), default=0) + 1
+    _keep(video.WearableImu, "imu", {**key, "imu": number}, path)
+    return [f"wearable IMU file {path.name} was attached"]
+
+
+def _keep(table: Any, prefix: str, key: dict[str, Any], path: Path, about: dict[str, Any] | None = None) -> str:
+    """Insert a copy of a file as the row with this key, in the place of an older one: "attached" or "replaced"; ""
+    where that has the same bytes."""
+    from pbl_pipeline.video import sha256_of
+
+    before = (table & key).to_dicts()
+    with new_folder() as folder:
+        copy = folder / f"{prefix}{path.suffix if path.is_file() else '.zip'}"
+        source = path if path.is_file() else _zipped(path, copy)
+        sha256 = sha256_of(source)
+        if before and before[0][f"{prefix}_sha256"] == sha256:
+            return ""
+        if source != copy:
+            shutil.copyfile(source, copy)
+        (table & key).delete(prompt=False)
+        table.insert1(
+            {
+                **key,
+                f"{prefix}_name": path.name[-255:],
+                f"{prefix}_sha256": sha256,
+                f"{prefix}_size": copy.stat().st_size,
+                f"{prefix}_created": utc_now(),
+                f"{prefix}_file": copy,
+                **(about or {}),
+            }
+        )
+    return "replaced" if before else "attached"
+
+
+def delete_keypoints(video_id: int) -> str:
+    """Delete the keypoints of a video with what was computed from them; returns it in words, "" for none."""
+    key = {"video_id": video_id}
+    rows = counted(delete_below(keypoints.Keypoints, (keypoints.Keypoints & key).keys()))
+    return f", and what depends on it was deleted: {rows}" if rows else ""
+
+
+def _zipped(path: Path, copy: Path) -> Path:
+    """Write a folder as a zip whose bytes depend on its files' names and contents only."""
+    with zipfile.ZipFile(copy, "w") as archive:
+        for file in sorted(f for f in path.iterdir() if f.suffix.lower() in (".csv", ".json") and f.is_file()):
+            member = zipfile.ZipInfo(file.name)
+            member.compress_type = zipfile.ZIP_DEFLATED
+            with file.open("rb") as source, archive.open(member, "w") as target:
+                shutil.copyfileobj(source, target)
+    return copy
+
+
+def _check_there(path: Path) -> None:
+    try:
+        size = path.stat().st_size if path.is_file() else -1
+    except OSError:
+        size = -1
+    if size < 0:
+        raise PblError(
+            "FILE_MISSING",
+            found="no such file, or it cannot be read",
+            expected="a file to keep with the video",
+            next_step="check the path",
+            key=str(path),
+        )
+    if size == 0:
+        raise PblError(
+            "FILE_FORMAT",
+            found="0 bytes",
+            expected="a file as the app or the instrument wrote it",
+            next_step="copy it again",
+            key=str(path),
+        )
+
+
+def _utc(log: PhoneLog) -> str | None:
+    """Moment of the first orientation, where the log counts in UTC."""
+    if log.start_utc_s is None:
+        return None
+    when = datetime.datetime.fromtimestamp(log.start_utc_s + float(log.time_s[0]), datetime.UTC)
+    return when.isoformat(timespec="milliseconds").replace("+00:00", "Z")

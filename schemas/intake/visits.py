@@ -1,0 +1,84 @@
+"""People and their sessions: registered where they are new, changed where something else is stated of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from .. import fit, lab, session
+from ..codes import day_of
+from ..rows import counted, delete_below, inside, number, utc_now
+from ..transactions import next_id
+from .records import Visit
+
+
+def session_ids(visits: Iterable[Visit]) -> dict[tuple[str, str], int]:
+    """Return the number of the session of each visit, by subject and label; people and sessions are registered where
+    they are new, and population, height and date are changed where they are stated. Call it in a transaction.
+    """
+    visits = list(dict.fromkeys(visits))
+    add_people(visits)
+    keys = list(dict.fromkeys((v.subject, v.session_label) for v in visits))
+    rows = (session.Session & inside("subject", {v.subject for v in visits})).to_dicts()
+    stored = {(r["subject"], r["session_label"]): r for r in rows}
+    missing = [key for key in keys if key not in stored]
+    numbers = {key: int(r["session_id"]) for key, r in stored.items()}
+    if missing:
+        first = next_id(session.Session, "session_id", len(missing))
+        numbers |= {key: first + i for i, key in enumerate(missing)}
+    dates = {(v.subject, v.session_label): v.date for v in visits if v.date is not None}
+    session.Session.insert(
+        {
+            "session_id": numbers[key],
+            "subject": key[0],
+            "session_label": key[1],
+            "session_date": dates.get(key) or day_of(key[1]),
+            "session_created": utc_now(),
+        }
+        for key in missing
+    )
+    for key, date in dates.items():
+        if key in stored and stored[key]["session_date"] != date:
+            session.Session.update1({"session_id": numbers[key], "session_date": date})
+    return {key: numbers[key] for key in keys}
+
+
+def add_people(visits: Iterable[Visit]) -> None:
+    """Register the people of visits with their projects; change population and height where they are stated."""
+    visits = list(visits)
+    codes = list(dict.fromkeys(v.subject for v in visits))
+    projects = {v.subject: v.project for v in reversed(visits) if v.project}
+    lab.Project.insert(({"project": p} for p in {*projects.values()}), skip_duplicates=True)
+    known = set((lab.Subject & inside("subject", codes)).to_arrays("subject"))
+    about = {"population": "unknown", "subject_created": utc_now()}
+    new = ({"subject": code, "project": projects.get(code), **about} for code in codes if code not in known)
+    lab.Subject.insert(new, skip_duplicates=True)
+    for v in visits:
+        set_population(v.subject, v.population)
+        set_height(v.subject, v.height_m)
+
+
+def set_population(subject: str, population: str | None) -> list[str]:
+    """Put a registered person into a population (None: as it is); returns what changed, in words."""
+    key = {"subject": subject}
+    if not population or (lab.Subject & key).fetch1("population") == population:
+        return []
+    lab.Population.insert1({"population": population, "population_description": ""}, skip_duplicates=True)
+    lab.Subject.update1({**key, "population": population})
+    return [f"population of {subject} is {population} now"]
+
+
+def set_height(subject: str, height_m: float | None) -> list[str]:
+    """State the body height (m) of a registered person (None: as it is); returns what changed, in words.
+
+    Fits of videos of one camera that were told another height are deleted with what was computed from them, so that the
+    next populate computes them anew. Call it inside a transaction.
+    """
+    key = {"subject": subject}
+    if height_m is None or number((lab.Subject & key).fetch1("subject_height")) == height_m:
+        return []
+    lab.Subject.update1({**key, "subject_height": height_m})
+    changes = [f"height of {subject} is {height_m:g} m now"]
+    sets = fit.FitSet & {"fit_set_kind": fit.SINGLE} & (session.Session & key).proj()
+    if rows := counted(delete_below(fit.SessionFit, (fit.SessionFit & sets.proj()).keys())):
+        changes.append(f"what was fitted without it was deleted: {rows}")
+    return changes

@@ -1,0 +1,1 @@
+"""Studies: visits and scores from sheets and forms, and frozen slices."""
