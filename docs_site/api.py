@@ -22,7 +22,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "schemas.intake.bulk": ("archived", "register_many"),
     "schemas.method_rows": ("insert_methods", "method_columns"),
     "schemas.origin": (),
-    "schemas.results": (),
+    "schemas.reading": (),
     "schemas.rows": ("InputChanged", "one"),
     "schemas.status": ("pipeline_status",),
     "schemas.views": (),

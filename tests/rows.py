@@ -8,14 +8,8 @@ from pathlib import Path
 
 from pbl_pipeline import settings
 from schemas import connection
-from schemas.ingest import Visit
-from schemas.ingest import ingest
-from schemas.operations import catalog
-from schemas.operations import dump
-from schemas import _dump
-from schemas import catalog
-from schemas.intake import Visit
-from schemas.intake import ingest
+from schemas.intake import Visit, ingest
+from schemas.operations import catalog, dump
 
 
 def register(*paths: Path, **visit) -> list[int]:

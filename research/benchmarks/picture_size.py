@@ -35,7 +35,7 @@ from pbl_pipeline.gait import gait_metrics
 from pbl_pipeline.keypoints import METHODS as KEYPOINT_METHODS
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.methods import Method
-from pbl_pipeline.pipeline import detect_trial
+from pbl_pipeline.pipeline import detect_recording
 from pbl_pipeline.video import load_camera, read_frames
 from research.benchmarks.real_clips import CLIPS, changed, fitted_angles, recorded_angles, score
 from research.confidence import recordings, truth_of
@@ -75,7 +75,7 @@ def keypoints_at(name: str, short_px: int, folder: Path) -> Keypoints:
             video = videos()[name]
             if short_px:
                 video = encoded(video, short_px, Path(scratch) / "video.mp4")
-            found = detect_trial(video, Path(scratch) / "people.png", keypoints=KEYPOINT_METHODS.find()).keypoints
+            found = detect_recording(video, Path(scratch) / "people.png", keypoints=KEYPOINT_METHODS.find()).keypoints
         found.save(kept)
     return Keypoints.load(kept)
 

@@ -31,7 +31,7 @@ from pbl_pipeline.fit import METHODS, TrialFit, fit_session
 from pbl_pipeline.keypoints import METHODS as KEYPOINT_METHODS
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.methods import Method
-from pbl_pipeline.pipeline import detect_trial
+from pbl_pipeline.pipeline import detect_recording
 from pbl_pipeline.validation import BODY_ROTATIONS, fit_angles, fit_angles_sd, reference_of_bodies
 from research.paths import SHARED
 
@@ -152,7 +152,7 @@ def keypoints_of(clip: str, fresh: bool = False, method: str | None = None) -> K
     if fresh or not cached.exists():
         cached.parent.mkdir(exist_ok=True)
         video, people = SHARED / "real" / "video_mocap" / clip / "video.mp4", cached.with_suffix(".png")
-        detect_trial(video, people, keypoints=detector).keypoints.save(cached)
+        detect_recording(video, people, keypoints=detector).keypoints.save(cached)
     return Keypoints.load(cached)
 
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from schemas import connection
-from schemas.catalog import quote
+from schemas.operations.catalog import quote
 
 #: Tables by full name -> those that refer to them, each with pairs of its column and the one it refers to.
 Children = Mapping[str, list[tuple[str, list[tuple[str, str]]]]]

@@ -19,8 +19,8 @@ from ..coded_errors import error_code, error_found
 from ..jobs import jobs_of
 from ..method_names import with_keys
 from ..rows import ReadAhead, Rows, inside, row_of, stored_rows
-from ..studies.slices import chain_of
 from ..stored_files import file_ref, stored_file
+from ..studies.slices import chain_of
 from ..usable import unusable
 from .objects import (
     load_choice,

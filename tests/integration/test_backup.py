@@ -19,14 +19,8 @@ import schemas
 from pbl_pipeline.errors import PblError
 from schemas import connection, gait, lab, load_visit, migrations, video, views
 from schemas._declare import declare_all
-from schemas.ingest import Visit
-from schemas.ingest import ingest
-from schemas.operations import backup
-from schemas.operations import backup_files
-from schemas.operations import dump
-from schemas.intake import Visit
-from schemas.intake import ingest
-from schemas.results import load_session
+from schemas.intake import Visit, ingest
+from schemas.operations import backup, backup_files, dump
 from tests.command import pbl
 from tests.database import installation
 from tests.rows import everything, everything_but_refreshes, remove_all

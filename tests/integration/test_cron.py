@@ -14,22 +14,10 @@ from click.testing import CliRunner
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection
-from schemas import lab
-from schemas import session
-from schemas import tracking
-from schemas import uploads
-from schemas import video
-from schemas.bulk import Recording
-from schemas.bulk import register_many
-from schemas.operations.orphans import orphans
-from schemas.operations.orphans import remove
-from schemas.intake import Visit
-from schemas.intake import uploads
-from schemas.intake.bulk import archived
-from schemas.intake.bulk import register_many
-from schemas.orphans import orphans
-from schemas.orphans import remove
+from schemas import connection, lab, session, tracking, video
+from schemas.intake import Visit, uploads
+from schemas.intake.bulk import archived, register_many
+from schemas.operations.orphans import orphans, remove
 from tests.rows import register
 from workers import incoming
 from workers.cli.cron import cron

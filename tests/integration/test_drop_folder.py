@@ -17,21 +17,9 @@ from pathlib import Path
 import pytest
 
 from schemas import archive as layout
-from schemas import connection
-from schemas import lab
-from schemas import session
-from schemas import uploads
-from schemas import video
-from schemas import worker
-from schemas.ingest import Visit
-from schemas.ingest import ingest
-from schemas.operations import backup
-from schemas.operations import forget
-from schemas import backup
-from schemas import forget
-from schemas.intake import Visit
-from schemas.intake import ingest
-from schemas.intake import uploads
+from schemas import connection, lab, session, video, worker
+from schemas.intake import Visit, ingest, uploads
+from schemas.operations import backup, forget
 from schemas.stored_files import new_folder, remove_left_folders
 from tests.command import pbl
 from workers import incoming

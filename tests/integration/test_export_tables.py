@@ -15,24 +15,10 @@ import pbl_pipeline.gait
 from pbl_pipeline.body import marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit
-from schemas import fit
-from schemas import gait
-from schemas import gdi
-from schemas import session
-from schemas.ingest import Methods
-from schemas.ingest import Visit
-from schemas.ingest import ingest
-from schemas.reading import fitted_visit
-from schemas.reading import list_fitted
-from schemas.reading import load_visits
+from schemas import fit, gait, gdi, session
+from schemas.intake import Methods, Sensors, Visit, ingest
+from schemas.reading import fitted_visit, list_fitted, load_visits
 from schemas.reading import visits as reading_visits
-from schemas.sensors import Sensors
-from schemas import export
-from schemas.export import session_of_tables
-from schemas.intake import Methods
-from schemas.intake import Sensors
-from schemas.intake import Visit
-from schemas.intake import ingest
 from tests.command import pbl
 from tests.exported import with_markers
 from tests.rows import register

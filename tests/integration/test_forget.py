@@ -11,11 +11,8 @@ import pytest
 
 from schemas import connection, keypoints, lab, session, video
 from schemas._declare import declare_all
-from schemas.ingest import Visit
-from schemas.ingest import ingest
+from schemas.intake import Visit, ingest
 from schemas.operations import forget
-from schemas.intake import Visit
-from schemas.intake import ingest
 from tests.command import pbl
 from tests.rows import everything_but_refreshes, register, remove_all
 from workers.populate import populate

@@ -15,27 +15,9 @@ from pbl_pipeline.fit import METHODS, fit_session
 from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.synthetic import plain_walk
 from research.walker.views import observe_markers
-from schemas import fit
-from schemas import gait
-from schemas import gdi
-from schemas import load_visit
-from schemas import norms
-from schemas import slices
-from schemas import video
-from schemas import views
-from schemas.ingest import Visit
-from schemas.ingest import ingest
-from schemas.marker_recordings import ingest_markers
+from schemas import fit, gait, gdi, load_visit, norms, video, views
+from schemas.intake import LaboratoryMarkers, Registered, Visit, ingest, register
 from schemas.operations.forget import forget
-from schemas.study_import import import_sheets
-from pbl_pipeline.synthetic import observe_markers
-from schemas.forget import forget
-from schemas.intake import LaboratoryMarkers
-from schemas.intake import Registered
-from schemas.intake import Visit
-from schemas.intake import ingest
-from schemas.intake import register
-from schemas.results import load_session
 from schemas.studies import slices
 from schemas.studies.study_sheets import import_sheets
 from schemas.why import why

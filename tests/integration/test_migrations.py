@@ -19,11 +19,8 @@ import schemas
 from pbl_pipeline.errors import PblError
 from schemas import connection, event_corrections, gait, gdi, jobs, lab, migrations, session, video, views
 from schemas.chain import ON_REQUEST
-from schemas.ingest import Visit
-from schemas.ingest import ingest
+from schemas.intake import Visit, ingest
 from schemas.operations import embedded
-from schemas.intake import Visit
-from schemas.intake import ingest
 from tests.command import pbl
 from tests.database import new_home, remove_home
 from tests.rows import everything, register

@@ -17,13 +17,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GaitMetrics
 from schemas import fit, gait, gdi, lab, load_visit, norms, session, views
 from schemas.cli.norm import norm as command
-from schemas.ingest import Methods
-from schemas.ingest import Visit
-from schemas.ingest import ingest
-from schemas.intake import Methods
-from schemas.intake import Visit
-from schemas.intake import ingest
-from schemas.results import load_session
+from schemas.intake import Methods, Visit, ingest
 from tests.rows import remove_all
 from workers.populate import populate
 

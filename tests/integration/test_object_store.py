@@ -14,12 +14,8 @@ import schemas
 from pbl_pipeline.errors import PblError
 from schemas import connection, store, tracking, video
 from schemas._declare import declare_all
-from schemas.ingest import Visit
-from schemas.ingest import ingest
-from schemas.operations import backup
-from schemas.operations import forget
-from schemas.intake import Visit
-from schemas.intake import ingest
+from schemas.intake import Visit, ingest
+from schemas.operations import backup, forget
 from schemas.stored_files import file_ref, stored_file
 from tests.rows import remove_all
 from workers.incoming import take_over

@@ -11,21 +11,8 @@ import pytest
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GDI_METHODS
 from pbl_pipeline.paramset import Paramset
-from schemas import fit
-from schemas import gait
-from schemas import gdi
-from schemas import load_visit
-from schemas import norms
-from schemas import session
-from schemas import video
-from schemas import views
-from schemas.conditions import set_condition
-from schemas.ingest import Methods
-from schemas.ingest import Visit
-from schemas.ingest import ingest
-from schemas.intake import Methods
-from schemas.intake import Visit
-from schemas.intake import ingest
+from schemas import fit, gait, gdi, load_visit, norms, session, video, views
+from schemas.intake import Methods, Visit, ingest
 from schemas.intake.conditions import set_condition
 from schemas.method_rows import insert_methods
 from tests.command import pbl

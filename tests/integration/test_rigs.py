@@ -15,36 +15,15 @@ import pbl_pipeline.tracking
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import fit_session
 from pbl_pipeline.keypoints import Keypoints, MultiView
-from pbl_pipeline.synthetic import NO_NOISE
-from pbl_pipeline.synthetic import plain_walk
+from pbl_pipeline.synthetic import NO_NOISE, plain_walk
 from research.walker.views import observe_views
-from schemas import fit
-from schemas import gait
-from schemas import gdi
-from schemas import jobs
-from schemas import load_visit
-from schemas import norms
-from schemas import slices
-from schemas import validation
-from schemas import video
-from schemas import views
+from schemas import fit, gait, gdi, jobs, load_visit, norms, validation, video, views
 from schemas.coded_errors import error_code
 from schemas.decide import decide_person
-from schemas.ingest import Visit
-from schemas.ingest import ingest
+from schemas.intake import SeveralCameras, Visit, ingest, register
 from schemas.operations.forget import forget
 from schemas.plan import fit_set_hash
 from schemas.reading.visits import methods_of
-from schemas.rigs import ingest_rig
-from schemas.study_import import import_sheets
-from pbl_pipeline.synthetic import observe_views
-from schemas.forget import forget
-from schemas.intake import SeveralCameras
-from schemas.intake import Visit
-from schemas.intake import ingest
-from schemas.intake import register
-from schemas.report import methods_of
-from schemas.results import load_session
 from schemas.studies import slices
 from schemas.studies.study_sheets import import_sheets
 from schemas.why import why

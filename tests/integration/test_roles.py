@@ -17,12 +17,8 @@ from schemas import connection, gdi, lab, session, views, worker
 from schemas._datajoint import dj
 from schemas._declare import declare_all
 from schemas.chain import ON_REQUEST
-from schemas.ingest import Visit
-from schemas.ingest import ingest
-from schemas.operations import embedded
-from schemas.operations import roles
-from schemas.intake import Visit
-from schemas.intake import ingest
+from schemas.intake import Visit, ingest
+from schemas.operations import embedded, roles
 from tests.command import pbl
 from tests.rows import remove_all
 from workers import refresh

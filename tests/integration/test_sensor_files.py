@@ -10,19 +10,8 @@ import pytest
 import pbl_pipeline.fit
 import pbl_pipeline.video
 from pbl_pipeline.keypoints import Keypoints
-from schemas import fit
-from schemas import keypoints
-from schemas import lab
-from schemas import load_visit
-from schemas import qc
-from schemas import video
-from schemas.ingest import Visit
-from schemas.ingest import ingest
-from schemas.sensors import Sensors
-from schemas import load_session
-from schemas.intake import Sensors
-from schemas.intake import Visit
-from schemas.intake import ingest
+from schemas import fit, keypoints, lab, load_visit, qc, video
+from schemas.intake import Sensors, Visit, ingest
 from schemas.stored_files import file_ref, stored_file
 from tests.command import pbl
 from tests.integration import chain

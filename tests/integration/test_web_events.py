@@ -14,36 +14,20 @@ import pytest
 
 import pbl_pipeline.gait
 from pbl_pipeline.errors import PblError
-from schemas import decide
-from schemas import event_corrections
-from schemas import fit
-from schemas import gait
-from schemas import gdi
-from schemas import load_visit
-from schemas import move
-from schemas import qc
-from schemas import slices
-from schemas import study
+from schemas import decide, event_corrections, fit, gait, gdi, load_visit, qc, study
+from schemas.intake import move
 from schemas.operations.forget import forget
 from schemas.reading import list_fitted
-from schemas.reading.shown import shown_recording
-from schemas.reading.shown import shown_visit
+from schemas.reading.shown import shown_recording, shown_visit
 from schemas.review import Decision
 from schemas.rows import delete_below
-from schemas import hand_events
-from schemas.export import visits_of_tables
-from schemas.forget import forget
-from schemas.intake import move
-from schemas.recording_page import recording_about
-from schemas.recording_page import recording_fit
-from schemas.recording_page import trial_key
-from schemas.results import load_session
 from schemas.studies import slices
 from schemas.visit_list import Filter, visit_page
 from tests.integration import decide_target, web
 from tests.integration.chain import small_video
 from tests.rows import everything_but_refreshes, register
 from workers.populate import populate
+from workers.web import export
 from workers.web.corrections import _events
 
 

@@ -11,24 +11,8 @@ import pytest
 import pbl_pipeline.fit
 import pbl_pipeline.keypoints
 from pbl_pipeline.errors import PblError
-from schemas import decide
-from schemas import fit
-from schemas import gdi
-from schemas import listing
-from schemas import load_visit
-from schemas import qc
-from schemas import slices
-from schemas import study
-from schemas import tracking
-from schemas import usable
-from schemas import video
-from schemas import visit_list
-from schemas.ingest import Visit
-from schemas.marker_recordings import ingest_markers
-from schemas import intake
-from schemas.intake import LaboratoryMarkers
-from schemas.intake import SeveralCameras
-from schemas.intake import Visit
+from schemas import decide, fit, gdi, intake, listing, load_visit, qc, study, tracking, usable, video, visit_list
+from schemas.intake import LaboratoryMarkers, SeveralCameras, Visit
 from schemas.plan import plan_fit_sets
 from schemas.reading.shown import shown_visit
 from schemas.review import Decision

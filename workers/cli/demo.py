@@ -60,16 +60,10 @@ def _fetched() -> dict[str, Path]:
 
 def _run(out: Path) -> None:
     import schemas
-    from schemas import connection
-    from schemas import views
-    from schemas.ingest import Visit
-    from schemas.ingest import ingest
+    from schemas import connection, views
+    from schemas.intake import Visit, ingest
     from schemas.operations import embedded
     from schemas.report import write_visit
-    from schemas import embedded
-    from schemas.intake import Visit
-    from schemas.intake import ingest
-    from schemas.report import write_session
     from workers.cli.populate import summary
     from workers.populate import populate
 

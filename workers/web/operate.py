@@ -13,9 +13,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 
 from schemas import decide, fit
-from schemas.ingest import in_transaction
 from schemas.operations.server_status import database_status
-from schemas.server_status import database_status
 from schemas.status import ErrorRow, Running, Status, pipeline_status, running, span
 from schemas.transactions import in_transaction
 
