@@ -13,7 +13,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS as FIT_METHODS
 from pbl_pipeline.fit import Params as FitParams
 from pbl_pipeline.fit import TrialFit, check_trial, default_fit, fit_session
-from pbl_pipeline.gait import DEFAULT_NORM, EVENT_METHODS, GDI_METHODS, GaitParams, gait_metrics, load_norm
+from pbl_pipeline.gait import DEFAULT_NORM, GaitParams, gait_metrics, load_norm
 from pbl_pipeline.keypoints import METHODS as KEYPOINT_METHODS
 from pbl_pipeline.keypoints import KeypointParams, detect_keypoints
 from pbl_pipeline.methods import Method
@@ -92,7 +92,7 @@ def run_visit(
     # A wrong name or log must not cost a fit.
     keypoints, people = KEYPOINT_METHODS.find(keypoints), TRACKING_METHODS.find(people)
     method = FIT_METHODS.find(paramset or fit_default(keypoints))
-    basis = load_norm(norm or DEFAULT_NORM)
+    load_norm(norm or DEFAULT_NORM)
     check_height(height_m)
     logs = [(file, read_phone_log(file)) for file in attitude_files] or [None] * len(paths)
     camera_motion = camera_motion or ("handheld" if attitude_files else "static")
@@ -125,9 +125,7 @@ def run_visit(
     )
     fitted = [dataclasses.replace(r, load_fit=Held(t)) for r, t in zip(recordings, fit.trials, strict=True)]
     left_out = [Recording(name, problem=error.text()) for name, error in problems.items()]
-    events, index = EVENT_METHODS.find(), GDI_METHODS.find()
     methods = {"Tracking": people.key, "Keypoints": keypoints.key, "Fit": method.key}
-    methods |= {"Gait events": events.key, "Index": f"{index.key}, norm {basis.name}"}
     visit = Visit((*fitted, *left_out), Solution.of(fit), fit.qc, methods=methods)
     return measured(visit, norm=norm), problems
 

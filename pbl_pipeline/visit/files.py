@@ -42,6 +42,8 @@ KEYPOINTS, FIT, ANGLES, EVENTS, CYCLES, OVERLAY = (
     "cycles.npz",
     "overlay.mp4",
 )
+#: Stages whose methods metrics.json holds: `pbl gait` may measure the same fits again by others.
+_MEASURED_BY = ("Gait events", "Index")
 _AGAIN = "`pbl run` again"
 _MEASURE = f"`pbl gait *.fit.npz --out {METRICS}` in its folder writes it"
 
@@ -92,7 +94,7 @@ def visit_facts(visit: Visit) -> dict[str, Any]:
         **content,
         "visit": {
             **whose,
-            "methods": dict(visit.methods),
+            "methods": {stage: name for stage, name in visit.methods.items() if stage not in _MEASURED_BY},
             "recordings": [recording_facts(r) for r in visit.recordings],
         },
     }
@@ -288,9 +290,10 @@ def _video(facts: Mapping[str, Any], points: Path | None) -> VideoInfo:
     """Return the facts of a video. Its time stamps are those of its keypoints, NaN where there are none."""
     own = dict(facts)
     file, n = str(own.pop("file")), int(own["n_frames"])
-    time = None if points is None or not points.is_file() else load_npz(points, ["time_s"]).get("time_s")
-    if np.shape(time) != (n,):
-        time = np.full(n, np.nan)
+    time = np.full(n, np.nan)
+    if points is not None and points.is_file():
+        stamps = load_npz(points, ["time_s"]).get("time_s", time)
+        time = stamps if stamps.shape == time.shape else time
     unknown = {k: math.nan for k in ("fps", "duration_s") if own[k] is None}
     return structured({**own, **unknown, "path": file, "time_s": time}, VideoInfo)
 

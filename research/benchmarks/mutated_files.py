@@ -339,19 +339,27 @@ def use_norm(path: Path) -> None:
 
 
 def session(path: Path) -> None:
-    found = _fit()
-    check = {"check": "residual_3d_cm", "outcome": "WARN", "value": 7.0, "threshold": 6.0, "advice": "see"}
-    path.write_text(json.dumps({"trials": [found.name], "params_hash": found.params_hash, "qc": [check]}))
+    from pbl_pipeline.qc import WARN, Check
+    from pbl_pipeline.visit import Recording, Solution, Visit, save_visit
+
+    fit, trace = _fit(), np.array([[0.0, 99.0], [100.0, 9.0]])
+    solution = Solution(fit.solver, fit.params_hash, 7, True, fit.scale, trace, 31.2, 12.0, "cpu")
+    check = Check("residual_3d_cm", WARN, 7.0, 6.0, "see")
+    folder = path.parent / "visit"
+    save_visit(Visit((Recording.of(fit.name, fit),), solution, (check,)), folder)
+    (folder / "session.json").replace(path)
 
 
 def use_session(path: Path) -> None:
-    from pbl_pipeline.cli.gait import fit_checks
-    from pbl_pipeline.gait import gait_metrics
+    from pbl_pipeline.pipeline import measured
+    from pbl_pipeline.visit import save_visit, visit_of_fits
 
     if path.name != "session.json":
         path = path.rename(path.with_name("session.json"))
-    checks = fit_checks([path.parent / "walk.fit.npz"], [_fit()])
-    gait_metrics([_fit()], fit_checks=checks).with_checks(checks).save(path.with_name("metrics.json"))
+    fit = path.with_name(f"{_fit().name}.fit.npz")
+    _fit().save(fit)
+    visit = measured(visit_of_fits([fit], measures=False))
+    save_visit(visit, path.parent / "again")
 
 
 def model(path: Path) -> None:

@@ -119,8 +119,16 @@ def _of_files(
     markers = None if marker_set is None else load_marker_set(marker_set)
     gait = bool(GAIT_FORMATS & set(formats))
     visit = visit_of_fits(files, markers=markers, measures=gait).with_logs(attitude)
-    if gait and any(r.measured is None for r in visit.fitted):
-        return measured(visit)
+    unmeasured = [r.name for r in visit.fitted if r.measured is None] if gait else []
+    if len(unmeasured) == len(visit.fitted):
+        return measured(visit) if unmeasured else visit
+    if unmeasured:
+        raise PblError(
+            "EXPORT_INPUT",
+            found=f"no measures of {', '.join(unmeasured)} beside fits that have some",
+            expected="fits that were all measured, by methods that their files name, or none",
+            next_step="`pbl gait *.fit.npz --out metrics.json` in the folder of these fits, then export again",
+        )
     return visit
 
 
