@@ -393,7 +393,7 @@ def test_what_is_made_by_hand_is_what_follows_from_the_term(pelvis):
     for term in terms:
         assert term.unknowns == Unknowns.JOINTS
         force, curvature = term.by_hand(at)  # pyright: ignore[reportOptionalCall]
-        c, r, D = term.rows(at)
+        c, r, D, _ = term.rows(at)
         want = np.einsum("fcpq,fc,fcp->fq", D, c, r), np.einsum("fcpq,fc,fcpr->fqr", D, c, D)
         for ours, other in zip((force, curvature), want, strict=True):
             np.testing.assert_allclose(ours, other, atol=1e-4 * np.abs(other).max())
