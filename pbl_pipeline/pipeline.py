@@ -78,7 +78,7 @@ class Session:
 
 
 def fit_default(keypoints: Method[KeypointParams]) -> str:
-    """Name of the fit's method for the keypoints of that method, where nobody names one (`fit.default_fit`).
+    """Name of the fit's default method for the keypoints of that method (`fit.default_fit`).
 
     Raises `PblError` MODEL_MISSING, MODEL_INVALID for a model that is not registered here.
     """

@@ -61,7 +61,7 @@ class Linearised:
 
 
 class _Blocks(NamedTuple):
-    """What the terms add up to: H (F, U, U) and g (F, U) of the frames, `link` (F, U, U) of each with the next one,
+    """Sum of the terms: H (F, U, U) and g (F, U) of the frames, `link` (F, U, U) of each with the next one,
     B (F, U, K), C (K, K) and h (K,) of what is shared; and the diagonals (F, U) that are to be added to H (`own`) and
     `link` (`next_1`), and that of the link with the frame after the next (`next_2`)."""
 

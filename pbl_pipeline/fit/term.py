@@ -23,7 +23,7 @@ from .weights import Weights
 
 
 class Unknowns(enum.Enum):
-    """What the variables of a term depend on, and thereby the blocks of the normal equations that it enters."""
+    """Unknowns that the variables of a term depend on: they decide which blocks of the normal equations it enters."""
 
     MARKER = "joints, camera, scale, marker offsets"
     CENTRED_MARKER = "joints, camera, scale, marker offsets, detector's lean and depths"
@@ -46,7 +46,7 @@ class Phone(NamedTuple):
 
 
 class At(NamedTuple):
-    """What the terms are evaluated at: the frames of a problem, the parameters, the unknowns, and the markers and
+    """Arguments of the terms: the frames of a problem, the parameters, the unknowns, and the markers and
     soles where the unknowns put them in the world (m). `phone`: None where no camera turns."""
 
     problem: Problem
@@ -102,7 +102,7 @@ class Term:
     #: Parameter of the weight; "": 1.
     weight: str
     unknowns: Unknowns
-    #: What the residual is a function of (F, ..., V). Each residual depends on its own variables alone.
+    #: Variables (F, ..., V) of the residuals. Each residual depends on its own variables alone.
     variables: Callable[[At], Array]
     #: Residuals (F, ..., E) of the variables.
     residual: Callable[[At, Array], Array]

@@ -286,7 +286,7 @@ def away(session: Session, seed: int = 3, detector: bool = False) -> State:
 
 
 def at_state(session: Session, w: Weights, state: State) -> At:
-    """What terms are evaluated at, without the normal equations."""
+    """Arguments of the terms at a state, without the normal equations."""
     p, scale = session.problem, scale_multipliers(state.s)
     x = marker_positions(session.body, p.points, state.qpos, scale, p.point_offsets(state.site_offset_m))
     markers, soles, _ = p.split(x)
