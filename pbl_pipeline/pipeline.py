@@ -28,7 +28,7 @@ from pbl_pipeline.visit import OVERLAY, REPORT, Held, Recording, Solution, Visit
 
 
 def fit_default(keypoints: Method[KeypointParams]) -> str:
-    """Name of the fit's method for the keypoints of that method, where nobody names one (`fit.default_fit`).
+    """Name of the fit's default method for the keypoints of that method (`fit.default_fit`).
 
     Raises `PblError` MODEL_MISSING, MODEL_INVALID for a model that is not registered here.
     """

@@ -30,7 +30,7 @@ from .feet_terms import later
 from .joint_terms import shift
 from .keypoint_terms import mean_weights
 from .linearised import times
-from .objective import KEYPOINTS, TERMS
+from .objective import TERMS
 from .phone_term import phone_at
 from .problem import Problem, State, frames_at
 from .solvers.linear import BorderedBandedSystem
@@ -39,6 +39,7 @@ from .weights import Weights
 
 #: Terms that are added by way of the markers' positions (`_marker_blocks`).
 OF_MARKERS = (Unknowns.MARKER, Unknowns.CENTRED_MARKER)
+OF_OTHERS = tuple(u for u in Unknowns if u not in OF_MARKERS)
 #: Frames whose markers are differentiated at once: bounds the memory of long sessions.
 CHUNK = 512
 
@@ -60,13 +61,16 @@ class Linearised:
 
 
 class _Blocks(NamedTuple):
-    """What the terms add up to: H (F, U, U) and g (F, U) of the frames, `link` (F, U, U) of each with the next one and
-    the diagonals `link_2` (F, U) of that with the one after, B (F, U, K), C (K, K) and h (K,) of what is shared."""
+    """Sum of the terms: H (F, U, U) and g (F, U) of the frames, `link` (F, U, U) of each with the next one,
+    B (F, U, K), C (K, K) and h (K,) of what is shared; and the diagonals (F, U) that are to be added to H (`own`) and
+    `link` (`next_1`), and that of the link with the frame after the next (`next_2`)."""
 
     H: Array
     g: Array
     link: Array
-    link_2: Array
+    own: Array
+    next_1: Array
+    next_2: Array
     B: Array
     C: Array
     h: Array
@@ -77,18 +81,20 @@ def linearise(body: Body, p: Problem, w: Weights, state: State) -> Linearised:
     # GPUs round the factors of float32 products to ten bits unless told otherwise.
     with jax.default_matmul_precision("highest"):
         columns = _columns_of(state, p.moving)
-        x, soles, sum_ = _keypoint_terms(body, p, w, state, columns)
+        x, soles, costs, sum_ = _keypoint_terms(body, p, w, state, columns)
         markers, at_floor, _ = p.split(x)
         at = At(p, w, state, markers, at_floor, phone_at(p, state))
-        for term in TERMS:
-            if isinstance(term, Term) and term.unknowns not in OF_MARKERS and not term.empty(at):
-                sum_ = _add_term(sum_, term, at, soles, columns)
-        sum_ = _hold(_add_shared(sum_, at, columns), p)
-        system = BorderedBandedSystem(sum_.H, sum_.link, sum_.link_2, sum_.B, sum_.C)
-        values = {term: term.value(at) for term in TERMS}
-        seen = functools.reduce(jnp.add, [values[term] for term in KEYPOINTS])
+        values = [term.mean(at, cost) for term, cost in zip(_terms(at, *OF_MARKERS), costs, strict=True)]
+        seen = functools.reduce(jnp.add, values)
+        sum_, cost = _add_shared(sum_, at, columns)
+        cost += seen
+        for term in _terms(at, *OF_OTHERS):
+            sum_, value = _add_term(sum_, term, at, soles, columns)
+            cost += value
+        on_diagonal = lambda a: a[..., None] * jnp.eye(a.shape[-1], dtype=a.dtype)  # noqa: E731
+        H, link = sum_.H + on_diagonal(sum_.own + _held(p, columns)), sum_.link + on_diagonal(sum_.next_1)
+        system = BorderedBandedSystem(H, link, sum_.next_2, sum_.B, sum_.C)
         dispersion = 2 * seen * frame_count(p) / jnp.maximum(_observed_numbers(p), 1.0)
-        cost = functools.reduce(jnp.add, values.values())
         return Linearised(cost, system, sum_.g, sum_.h, x, dispersion)
 
 
@@ -165,8 +171,9 @@ class _Soles(NamedTuple):
 
 def _keypoint_terms(
     body: Body, p: Problem, w: Weights, state: State, columns: _Columns
-) -> tuple[Array, _Soles, _Blocks]:
-    """All points, the soles with their derivatives, and the blocks of the keypoint terms, some frames at a time."""
+) -> tuple[Array, _Soles, list[Array], _Blocks]:
+    """All points, the soles with their derivatives, and costs (F,) and blocks of the keypoint terms, some frames at a
+    time."""
     frames = p.weight.shape[0]
     size = next(s for s in (frames, CHUNK, CHUNK * 3 // 4) if frames % s == 0 and s <= CHUNK)
     offsets, scale = p.point_offsets(state.site_offset_m), scale_multipliers(state.s)
@@ -180,12 +187,12 @@ def _keypoint_terms(
         soles = _Soles(jac.x_world_m[:, at], jac.per_qpos[:, at], jac.per_scale[:, at])
         markers: MarkerJacobian = jax.tree.map(lambda a: a[:, :first_sole], jac)
         at = At(part, w, dataclasses.replace(state, qpos=qpos, R_nc=R_nc), markers.x_world_m, soles.x)
-        (H, g, B), shared = _marker_blocks(at, markers, detector_error(part, state, R_nc))
-        return (jac.x_world_m, soles, H, g, B), shared
+        costs, blocks, shared = _marker_blocks(at, markers, detector_error(part, state, R_nc))
+        return (jac.x_world_m, soles, costs, blocks), shared
 
     if size == frames:
-        (x, soles, H, g, B), (C, h) = some(p, state.qpos, state.R_nc)
-        return x, soles, _with_room(H, g, B, C, h, columns)
+        (x, soles, costs, (H, g, B)), (C, h) = some(p, state.qpos, state.R_nc)
+        return x, soles, costs, _with_room(H, g, B, C, h, columns)
 
     def step(carry: tuple[Array, Array], index: Array):
         out, (C, h) = some(frames_at(p, index), state.qpos[index], state.R_nc[index])
@@ -193,13 +200,13 @@ def _keypoint_terms(
 
     k = state.s.size + state.site_offset_m.size + state.lean.size + state.depth_m.size
     (C, h), out = jax.lax.scan(step, (jnp.zeros((k, k)), jnp.zeros(k)), jnp.arange(frames).reshape(-1, size))
-    x, soles, H, g, B = jax.tree.map(lambda a: a.reshape(frames, *a.shape[2:]), out)
-    return x, soles, _with_room(H, g, B, C, h, columns)
+    x, soles, costs, (H, g, B) = jax.tree.map(lambda a: a.reshape(frames, *a.shape[2:]), out)
+    return x, soles, costs, _with_room(H, g, B, C, h, columns)
 
 
-def _marker_blocks(at: At, jac: MarkerJacobian, detector: DetectorError) -> tuple[tuple, tuple]:
-    """Blocks of the keypoint terms: H (F, U, U), g (F, U), B (F, U, K) and C (K, K), h (K,), of s, offsets and the
-    detector's errors."""
+def _marker_blocks(at: At, jac: MarkerJacobian, detector: DetectorError) -> tuple[list[Array], tuple, tuple]:
+    """Costs (F,) of each keypoint term, and blocks of all: H (F, U, U), g (F, U), B (F, U, K), and C (K, K), h (K,), of
+    s, offsets and the detector's errors."""
     p, x, U = at.problem, jac.x_world_m, jac.per_offset
     by_frame = [jac.per_qpos]
     if p.moving:
@@ -208,15 +215,16 @@ def _marker_blocks(at: At, jac: MarkerJacobian, detector: DetectorError) -> tupl
     n_s, n = jac.per_scale.shape[-1], A.shape[-1]
     q = n - n_s
 
+    linear = [(term, term.rows(at)) for term in _terms(at, *OF_MARKERS)]
     # Force on each marker, and its curvature (F, J, 3, 3): of terms as they are, and of centred ones in each view.
     f, M = jnp.zeros_like(x), jnp.zeros((*x.shape, 3), x.dtype)
-    for c, r, D in _rows(at, Unknowns.MARKER):
+    for c, r, D, _ in (rows for t, rows in linear if t.unknowns is Unknowns.MARKER):
         f += jnp.einsum("fvm,fvmij,fvmi->fmj", c, D, r)
         M += jnp.einsum("fvm,fvmik,fvmil->fmkl", c, D, D)
     centred = mean_weights(p.c_3d, p.weight_3d)
     force = jnp.zeros((*centred.shape, 3), x.dtype)
     W = jnp.zeros((*force.shape, 3), x.dtype)
-    for c, r, D in _rows(at, Unknowns.CENTRED_MARKER):
+    for c, r, D, _ in (rows for t, rows in linear if t.unknowns is Unknowns.CENTRED_MARKER):
         force += jnp.einsum("fvm,fvmij,fvmi->fvmj", c, D, r)
         W += jnp.einsum("fvm,fvmik,fvmil->fvmkl", c, D, D)
     f_3d = jnp.sum(force - centred[..., None] * jnp.sum(force, axis=2, keepdims=True), axis=1)
@@ -258,19 +266,20 @@ def _marker_blocks(at: At, jac: MarkerJacobian, detector: DetectorError) -> tupl
         B_d, C_d, C_dd, h_d = detector_blocks(detector, centred[:, 0], W_all, U_t, cross, G, f_3d, q)
         B, h = jnp.concatenate([B, B_d], axis=-1), jnp.concatenate([h, h_d])
         C = jnp.block([[C, C_d], [C_d.T, C_dd]])
-    return (G[:, :q, :q], -pulled[:, :q], B), (C, -h)
+    return [rows.cost for _, rows in linear], (G[:, :q, :q], -pulled[:, :q], B), (C, -h)
 
 
-def _rows(at: At, unknowns: Unknowns) -> Iterator[Rows]:
-    """The terms of these unknowns, linearised."""
-    return (t.rows(at) for t in TERMS if isinstance(t, Term) and t.unknowns is unknowns and not t.empty(at))
+def _terms(at: At, *unknowns: Unknowns) -> Iterator[Term]:
+    """The terms of these unknowns that the problem has something for."""
+    return (t for t in TERMS if isinstance(t, Term) and t.unknowns in unknowns and not t.empty(at))
 
 
 def _with_room(H: Array, g: Array, B: Array, C: Array, h: Array, columns: _Columns) -> _Blocks:
     """The keypoints' blocks with room for all shared unknowns and no links yet."""
     among_all = functools.partial(_spread, at=(columns.s, columns.offset, columns.detector), size=columns.size)
-    none = jnp.zeros_like(H)
-    return _Blocks(H, g, none, none[..., 0], among_all(B), among_all(among_all(C).T).T, among_all(h))
+    none = jnp.zeros_like(g)
+    of_shared = among_all(B), among_all(among_all(C).T).T, among_all(h)
+    return _Blocks(H, g, jnp.zeros_like(H), none, none, none, *of_shared)
 
 
 def _spread(a: Float[Array, "*n A"], at: Sequence[slice], size: int) -> Float[Array, "*n {size}"]:
@@ -293,15 +302,20 @@ def _cross_matrix(x: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
 # --- all other terms
 
 
-def _add_term(sum_: _Blocks, term: Term, at: At, soles: _Soles, columns: _Columns) -> _Blocks:
-    """Add a term, by how its variables move with the unknowns."""
-    p, q = at.problem, soles.by_q.shape[-1]
+def _add_term(sum_: _Blocks, term: Term, at: At, soles: _Soles, columns: _Columns) -> tuple[_Blocks, Array]:
+    """The sum with a term, and the term's value."""
     if term.by_hand:
         force, curvature = term.by_hand(at)
-        return sum_._replace(H=sum_.H + _room(curvature, columns.frame, 0), g=sum_.g - _room(force, columns.frame, 0))
+        room = functools.partial(_room, size=columns.frame, first=0)
+        return sum_._replace(H=sum_.H + room(curvature), g=sum_.g - room(force)), term.value(at)
     rows = term.rows(at)
-    D, trials = rows.D, jax.nn.one_hot(p.trial, p.has_phone.shape[0], dtype=sum_.H.dtype)
-    match term.unknowns:
+    return _add_rows(sum_, rows, term.unknowns, at, soles, columns), term.mean(at, rows.cost)
+
+
+def _add_rows(sum_: _Blocks, rows: Rows, unknowns: Unknowns, at: At, soles: _Soles, columns: _Columns) -> _Blocks:
+    """Add a linearised term by how its variables move with the unknowns."""
+    D, trials = rows.D, jax.nn.one_hot(at.problem.trial, at.state.floor.shape[0], dtype=sum_.H.dtype)
+    match unknowns:
         case Unknowns.JOINT:
             return _add_bands(sum_, rows._replace(D=jnp.pad(D, [(0, 0)] * (D.ndim - 1) + [(1, 1)])))
         case Unknowns.JOINT_IN_THREE_FRAMES:
@@ -311,7 +325,9 @@ def _add_term(sum_: _Blocks, term: Term, at: At, soles: _Soles, columns: _Column
         case Unknowns.PHONE:
             one = Rows(*(a[:, None] for a in rows))
             by_clock = one.D[..., 3:] * trials[:, None, None]
-            return _add_squares(sum_, columns, one, one.D[..., :3], [by_clock], [columns.clock], first=q)
+            return _add_squares(
+                sum_, columns, one, one.D[..., :3], [by_clock], [columns.clock], first=soles.by_q.shape[-1]
+            )
         case Unknowns.SOLE_AND_FLOOR:
             by_floor = D[..., None, 3:] * trials[:, None, None, :, None]
             shared = [D[..., :3] @ soles.by_s, by_floor.reshape(*D.shape[:-1], -1)]
@@ -321,7 +337,7 @@ def _add_term(sum_: _Blocks, term: Term, at: At, soles: _Soles, columns: _Column
             by_s = here @ soles.by_s + there @ later(soles.by_s)
             following = there @ later(soles.by_q)
             return _add_squares(sum_, columns, rows, here @ soles.by_q, [by_s], [columns.s], following)
-    raise AssertionError(term.unknowns)
+    raise AssertionError(unknowns)
 
 
 def _add_squares(
@@ -361,39 +377,39 @@ def _add_squares(
 def _add_bands(sum_: _Blocks, rows: Rows) -> _Blocks:
     """Add weighted squares of residuals (F, Q, E) of each joint in the frame before, at and after, by derivatives (F,
     Q, E, 3). That at t involves t - 1, t and t + 1, and that at t + 1 the following three."""
-    c, r, D = rows
+    c, r, D, _ = rows
     before, now, after = (c * jnp.sum(D[..., k] * r, axis=-1) for k in range(3))
     both = {(i, k): c * jnp.sum(D[..., i] * D[..., k], axis=-1) for i in range(3) for k in range(i, 3)}
     wide = lambda a: jnp.pad(a, [(0, 0), (0, sum_.g.shape[-1] - a.shape[-1])])  # noqa: E731
-    on_diagonal = lambda a: wide(a)[..., None] * jnp.eye(sum_.g.shape[-1], dtype=a.dtype)  # noqa: E731
     return sum_._replace(
-        H=sum_.H + on_diagonal(shift(both[0, 0], -1) + both[1, 1] + shift(both[2, 2], 1)),
         g=sum_.g - wide(shift(before, -1) + now + shift(after, 1)),
-        link=sum_.link + on_diagonal(both[1, 2] + shift(both[0, 1], -1)),
-        link_2=sum_.link_2 + wide(shift(both[0, 2], -1)),
+        own=sum_.own + wide(shift(both[0, 0], -1) + both[1, 1] + shift(both[2, 2], 1)),
+        next_1=sum_.next_1 + wide(both[1, 2] + shift(both[0, 1], -1)),
+        next_2=sum_.next_2 + wide(shift(both[0, 2], -1)),
     )
 
 
-def _add_shared(sum_: _Blocks, at: At, columns: _Columns) -> _Blocks:
-    """Add the terms of the shared unknowns alone, all quadratic."""
+def _add_shared(sum_: _Blocks, at: At, columns: _Columns) -> tuple[_Blocks, Array]:
+    """The sum with the terms of the shared unknowns alone, all quadratic, and their value."""
     y, with_shared = _shared(at.state, at.problem.moving)
 
     def cost(y: Array) -> Array:
         there = at._replace(state=with_shared(y))
-        values = [term.value(there) for term in TERMS if isinstance(term, SharedTerm)]
-        return frame_count(at.problem) * functools.reduce(jnp.add, values)
+        return functools.reduce(jnp.add, [term.value(there) for term in TERMS if isinstance(term, SharedTerm)])
 
-    return sum_._replace(C=sum_.C + jax.hessian(cost)(y), h=sum_.h - jax.grad(cost)(y))
+    n = frame_count(at.problem)
+    slope, push = jax.linearize(jax.grad(cost), y)
+    curvature = jax.vmap(push)(jnp.eye(columns.size, dtype=y.dtype))
+    return sum_._replace(C=sum_.C + n * curvature, h=sum_.h - n * slope), cost(y)
 
 
-def _hold(sum_: _Blocks, p: Problem) -> _Blocks:
-    """Frames that count for nothing stay where they are, and a frame without orientation keeps its camera."""
+def _held(p: Problem, columns: _Columns) -> Float[Array, "F U"]:
+    """What is added to the diagonal of each frame: a frame that counts for nothing stays where it is, and one without
+    an orientation keeps its camera."""
     bent = p.bend[:, 1] ** 2 + shift(p.bend[:, 0], -1) ** 2 + shift(p.bend[:, 2], 1) ** 2
-    empty = jnp.broadcast_to(((p.weight == 0) & (bent == 0))[:, None], sum_.g.shape)
-    if p.moving:
-        turns = jnp.arange(sum_.g.shape[1]) >= sum_.g.shape[1] - 3
-        empty = empty + turns * (1e-3 + 1e6 * (1 - p.has_phone[p.trial]))[:, None]
-    return sum_._replace(H=sum_.H + empty[..., None] * jnp.eye(empty.shape[1], dtype=sum_.H.dtype))
+    empty = ((p.weight == 0) & (bent == 0))[:, None]
+    turns = (1e-3 + 1e6 * (1 - p.has_phone[p.trial]))[:, None] if p.moving else 0.0
+    return empty + turns * (jnp.arange(columns.frame) >= columns.frame - 3)
 
 
 def _room(a: Array, size: int, first: int) -> Array:

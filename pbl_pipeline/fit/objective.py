@@ -16,7 +16,7 @@ from .shared_terms import CLOCK, DETECTOR, FLOOR, LOFFSET, SCALE, SIZE
 from .term import At, SharedTerm, Term
 
 AnyTerm = Term | SharedTerm
-#: What the detector or a laboratory saw.
+#: Of points seen by a detector or a laboratory.
 KEYPOINTS = (L3D, L_MARKERS, L2D)
 #: The paper's own terms; markers of a laboratory count as its L3D.
 PAPER = (*KEYPOINTS, LPHONE, LOFFSET)

@@ -1,4 +1,4 @@
-"""What all frames share: marker offsets, body size, clocks, floors and the detector's errors, all quadratic."""
+"""Quadratic terms of the unknowns that all frames share: marker offsets, body size, clocks, floors, detector errors."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from .weights import Weights
 
 
 class Unknowns(enum.Enum):
-    """What the variables of a term depend on, and thereby the blocks of the normal equations that it enters."""
+    """Unknowns that the variables of a term depend on: they decide which blocks of the normal equations it enters."""
 
     MARKER = "joints, camera, scale, marker offsets"
     CENTRED_MARKER = "joints, camera, scale, marker offsets, detector's lean and depths"
@@ -46,7 +46,7 @@ class Phone(NamedTuple):
 
 
 class At(NamedTuple):
-    """What the terms are evaluated at: the frames of a problem, the parameters, the unknowns, and the markers and
+    """Arguments of the terms: the frames of a problem, the parameters, the unknowns, and the markers and
     soles where the unknowns put them in the world (m). `phone`: None where no camera turns."""
 
     problem: Problem
@@ -58,13 +58,15 @@ class At(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """A linearised term: the weights c (F, ...) of the squares of its residuals r (F, ..., E), and their derivatives D
-    (F, ..., E, V) by the variables. Gradient and curvature, times the number of frames, are D' c r and D' c D.
+    """A linearised term: the weights c (F, ...) of the squares of its residuals r (F, ..., E), their derivatives D (F,
+    ..., E, V) by the variables, and the cost of each frame (F,) without its weights. Gradient and curvature, times the
+    number of frames, are D' c r and D' c D.
     """
 
     c: Array
     r: Array
     D: Array
+    cost: Array
 
 
 def huber(e2: Float[Array, ...], width: ArrayLike) -> Float[Array, ...]:
@@ -100,7 +102,7 @@ class Term:
     #: Parameter of the weight; "": 1.
     weight: str
     unknowns: Unknowns
-    #: What the residual is a function of (F, ..., V). Each residual depends on its own variables alone.
+    #: Variables (F, ..., V) of the residuals. Each residual depends on its own variables alone.
     variables: Callable[[At], Array]
     #: Residuals (F, ..., E) of the variables.
     residual: Callable[[At, Array], Array]
@@ -119,16 +121,19 @@ class Term:
         """Return the weighted cost."""
         if self.empty(at):
             return jnp.zeros(())
-        each = self.count(at) * self._robust(at, square(self.residual(at, self.variables(at))))
-        per_frame = jnp.sum(each, axis=tuple(range(1, each.ndim)))
-        return weight_of(self, at) * (jnp.sum(self.frames(at) * per_frame) / frame_count(at.problem))
+        cost = self._robust(at, square(self.residual(at, self.variables(at))))
+        return self.mean(at, self._of_frames(at, cost))
+
+    def mean(self, at: At, cost: Float[Array, " F"]) -> Float[Array, ""]:
+        """Return the weighted cost from that of each frame."""
+        return weight_of(self, at) * (jnp.sum(self.frames(at) * cost) / frame_count(at.problem))
 
     def rows(self, at: At) -> Rows:
         """Return the term as weighted squares (iteratively reweighted least squares)."""
         r, D = linearised(lambda z: self.residual(at, z), self.variables(at))
         cost, pull = jax.vjp(lambda e2: self._robust(at, e2), square(r))
         each = self.frame_weights(at).reshape(-1, *[1] * (cost.ndim - 1)) * self.count(at)
-        return Rows(2 * pull(jnp.broadcast_to(each, cost.shape))[0], r, D)
+        return Rows(2 * pull(jnp.broadcast_to(each, cost.shape))[0], r, D, self._of_frames(at, cost))
 
     def frame_weights(self, at: At) -> Float[Array, " F"]:
         """Return the weights of the frames times that of the term."""
@@ -137,6 +142,10 @@ class Term:
     def empty(self, at: At) -> bool:
         """Whether the problem has nothing that the term compares."""
         return jnp.size(self.count(at)) == 0
+
+    def _of_frames(self, at: At, cost: Float[Array, "F ..."]) -> Float[Array, " F"]:
+        each = self.count(at) * cost
+        return jnp.sum(each, axis=tuple(range(1, each.ndim)))
 
     def _robust(self, at: At, e2: Array) -> Array:
         if self.robust is not None:

@@ -288,7 +288,7 @@ def away(session: Session, seed: int = 3, detector: bool = False) -> State:
 
 
 def at_state(session: Session, w: Weights, state: State) -> At:
-    """What terms are evaluated at, without the normal equations."""
+    """Arguments of the terms at a state, without the normal equations."""
     p, scale = session.problem, scale_multipliers(state.s)
     x = marker_positions(session.body, p.points, state.qpos, scale, p.point_offsets(state.site_offset_m))
     markers, soles, _ = p.split(x)
@@ -395,7 +395,7 @@ def test_what_is_made_by_hand_is_what_follows_from_the_term(pelvis):
     for term in terms:
         assert term.unknowns == Unknowns.JOINTS
         force, curvature = term.by_hand(at)  # pyright: ignore[reportOptionalCall]
-        c, r, D = term.rows(at)
+        c, r, D, _ = term.rows(at)
         want = np.einsum("fcpq,fc,fcp->fq", D, c, r), np.einsum("fcpq,fc,fcpr->fqr", D, c, D)
         for ours, other in zip((force, curvature), want, strict=True):
             np.testing.assert_allclose(ours, other, atol=1e-4 * np.abs(other).max())
