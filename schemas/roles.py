@@ -27,8 +27,8 @@ from pymysql.converters import escape_string
 from pbl_pipeline.errors import PblError
 
 from . import connection, embedded
-from ._activate import STAGES
 from .catalog import pattern
+from .stages import STAGES
 
 #: Role -> rights in the schemas of the prefix.
 ROLES: dict[str, tuple[str, ...]] = {
