@@ -89,7 +89,8 @@ def _modules(package: str) -> dict[str, set[str]]:
 
 
 def _in_circles(imports: dict[str, set[str]]) -> dict[str, list[str]]:
-    """What is left when all that imports nothing of the rest is taken away, again and again, from either end."""
+    """The modules that remain when those are removed, again and again, that import none of the others or that none of
+    them imports."""
     left = imports
     while True:
         used = {target for targets in left.values() for target in targets}
