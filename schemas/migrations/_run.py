@@ -63,7 +63,7 @@ def available() -> list[Migration]:
     ValueError
         A number that is missing or used twice: a mistake in the code.
     """
-    found, package = [], importlib.import_module(__package__)
+    found, package = [], importlib.import_module("schemas.migrations")
     for module in pkgutil.iter_modules(package.__path__):
         match = _NAME.fullmatch(module.name)
         if match:
