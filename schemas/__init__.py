@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from ._activate import STAGES, activate
+from ._activate import activate
+from .stages import STAGES
 
 if TYPE_CHECKING:
     from pbl_pipeline.visit import Visit

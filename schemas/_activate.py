@@ -2,33 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-from types import ModuleType
-
-#: Modules of tables, each its own schema on the server, in the order of dependency.
-STAGES = (
-    "lab",
-    "session",
-    "video",
-    "tracking",
-    "keypoints",
-    "fit",
-    "gait",
-    "gdi",
-    "qc",
-    "validation",
-    "privacy",
-    "study",
-    "review",
-    "worker",
-)
+from .stages import STAGES, modules
 
 _methods_done: set[str] = set()
-
-
-def modules() -> list[ModuleType]:
-    """The table modules, imported."""
-    return [importlib.import_module(f"schemas.{stage}") for stage in STAGES]
 
 
 def activate(start: bool = False, methods: bool = True) -> None:
@@ -47,12 +23,13 @@ def activate(start: bool = False, methods: bool = True) -> None:
     PblError
         What `schemas.connection.connect` raises; DB_MIGRATION for tables of an older version.
     """
-    from . import connection, migrations
+    from . import connection, fit, older, plan
 
     connection.connect(start=start)
-    migrations.refuse_older()
+    older.refuse_older()
     for stage, module in zip(STAGES, modules(), strict=True):
         connection.bind(stage, module.schema)
+    fit.SessionFit.plan = staticmethod(plan.plan_fit_sets)
     if methods and connection.prefix() not in _methods_done:
         from ._methods import insert_all
 

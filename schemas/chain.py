@@ -11,8 +11,8 @@ import inspect
 import re
 from typing import Any
 
-from ._activate import STAGES, modules
 from ._datajoint import dj
+from .stages import STAGES, modules
 
 _REFERENCE = re.compile(r"\s*->\s*(?:\[[^\]]*\]\s*)?([\w.]+?)(?:\.proj\((\w+)=.*)?\s*$")
 

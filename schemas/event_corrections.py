@@ -163,7 +163,7 @@ def _decide(before: Shown, events: tuple[Event, ...] | None, by: str, seen: str)
 
 
 def _of_events(key: Mapping[str, Any]) -> dict[str, Any]:
-    """What corrections are of: a trial and the method that detected its events."""
+    """The trial and the method whose events are corrected, of a key of GaitEvents."""
     return {k: key[k] for k in ("video_id", "gait_method")}
 
 

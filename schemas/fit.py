@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -236,15 +236,16 @@ class SessionFit(dj.Computed):
         {check_columns("fit")}
         """
 
+    #: Plans the sets of all sessions; `schemas.activate` puts `plan.plan_fit_sets` here, which knows this table.
+    plan: Callable[[], Any]
+
     @property
     def key_source(self) -> Any:
         return current()
 
     def populate(self, *restrictions: Any, **options: Any) -> dict[str, Any]:
         """DataJoint's own, after the fits of all sessions whose trials are decided have been planned."""
-        from .plan import plan_fit_sets
-
-        plan_fit_sets()
+        self.plan()
         return super().populate(*restrictions, **options)
 
     def make_fetch(self, key: dict) -> tuple:

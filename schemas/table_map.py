@@ -6,9 +6,9 @@ import re
 import sys
 from typing import Any
 
-from ._activate import STAGES, modules
 from ._datajoint import dj
 from .chain import references, renamed, tables
+from .stages import STAGES, modules
 
 _ORIGIN = ("code_version", "method_hash", "model_sha256", "host", "seconds", "computed")
 _KINDS = {dj.Manual: "manual", dj.Lookup: "lookup", dj.Computed: "computed", dj.Part: "part"}

@@ -14,7 +14,7 @@ from .run_job import Computed, Outcome
 
 
 class Runs(Protocol):
-    """What batches need of the worker (`loop.Worker`) whose jobs they are."""
+    """The part of a worker (`loop.Worker`) that batches use."""
 
     stop: threading.Event
     heartbeat: Any

@@ -191,8 +191,6 @@ def _queue_at_low_priority(table: Any) -> None:
     """Queue what a new selection made computable: of this table, or of the one that plans its keys."""
     planned = table.__name__ == "SessionFit"
     queue.fill(table_named("TrialInput") if planned else table, None, AGAIN)
-    if table.__name__ == "GDI":
-        queue.fill(table_named("SessionGdi"), None, AGAIN)
 
 
 def _since(day: datetime.date | None) -> Any:

@@ -1,7 +1,7 @@
 """Corrections of events as rows of EventCorrection, no longer methods; the trials that a visit's measures pool.
 
 Until now a correction made a second chain of results beside that of the detected events, by a method `by-hand-vN`. Its
-results now are those of the method whose events were corrected, in place of the ones from uncorrected events. A row is
+results now are those of the method whose events were corrected, instead of the ones from uncorrected events. A row is
 copied to its new key before it is deleted, so that a run that was broken off can go on.
 """
 
@@ -62,7 +62,7 @@ def _corrections(conn: Any) -> list[str]:
         " SELECT e.video_id, h.hand_from, 1, e.hand_no, e.hand_time, e.hand_side, e.hand_kind, e.hand_probability"
         f" FROM {_gait('hand_events__event')} AS e JOIN {hand} AS h USING (video_id)",
     ]
-    # What stands beside a correction of the person who is measured in the set was computed from other events.
+    # Results by the method of a correction that counts in their set were computed from uncorrected events.
     counts = (
         f"EXISTS (SELECT 1 FROM {corrections} AS c JOIN {members} AS v ON v.video_id = c.video_id"
         f" LEFT JOIN {keypoints} AS k ON k.video_id = v.video_id AND k.tracking_method = v.tracking_method"

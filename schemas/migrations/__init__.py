@@ -10,6 +10,6 @@ DataJoint before the migrations run. The table `~migrations` in the schema `lab`
 applied, when, by which version, with which statements.
 """
 
-from ._run import Applied, Migration, Outcome, applied, available, migrate, refuse_older
+from ._run import Applied, Migration, Outcome, applied, available, migrate
 
-__all__ = ["Applied", "Migration", "Outcome", "applied", "available", "migrate", "refuse_older"]
+__all__ = ["Applied", "Migration", "Outcome", "applied", "available", "migrate"]

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from typing import Any
 
 from schemas import connection
 from schemas._datajoint import dj
 from schemas.chain import tables
 from schemas.operations import catalog
-
-#: A line of a definition that makes a column of the table's own: its name.
-_OWN = re.compile(r"^\s*([a-z]\w*)\s*[:=]", re.MULTILINE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,19 +23,6 @@ class Difference:
     def text(self) -> str:
         """As one line."""
         return f"{self.table}: {self.what}"
-
-
-def missing_columns() -> list[str]:
-    """Columns that tables on the server lack, as `table.column`; tables that are missing do not count.
-
-    One query, for every start: columns that a foreign key brings are left to `differences`.
-    """
-    there = {names: {c.name for c in columns} for names, columns in catalog.tables().items()}
-    out = []
-    for path, cls in tables().items():
-        names = connection.schema_name(path.split(".")[0]), cls.table_name
-        out += [f"{names[1]}.{c}" for c in _OWN.findall(cls.definition) if c not in there.get(names, {c})]
-    return out
 
 
 def differences() -> list[Difference]:

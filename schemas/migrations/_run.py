@@ -15,14 +15,14 @@ import pymysql
 from pbl_pipeline import __version__
 from pbl_pipeline.errors import PblError
 from schemas import connection
-from schemas._activate import STAGES, modules
 from schemas._datajoint import dj, read_heading_again
 from schemas._declare import declare_all
 from schemas.chain import tables
 from schemas.operations import catalog
 from schemas.rows import utc_now
+from schemas.stages import STAGES, modules
 
-from ._differences import differences, missing_columns
+from ._differences import differences
 
 _NAME = re.compile(r"(\d{4})_(\w+)")
 Say = Callable[[str], None]
@@ -64,9 +64,7 @@ def available() -> list[Migration]:
     ValueError
         A number that is missing or used twice: a mistake in the code.
     """
-    import schemas.migrations as package
-
-    found = []
+    found, package = [], importlib.import_module("schemas.migrations")
     for module in pkgutil.iter_modules(package.__path__):
         match = _NAME.fullmatch(module.name)
         if match:
@@ -127,24 +125,6 @@ def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
         )
     declare_all()
     return Outcome(steps, created, [])
-
-
-def refuse_older() -> None:
-    """Refuse a database of an older version: one of its tables lacks columns of this version's definition.
-
-    Raises
-    ------
-    PblError
-        DB_MIGRATION.
-    """
-    if missing := missing_columns():
-        more = f" and {len(missing) - 4} more" if len(missing) > 4 else ""
-        raise _error(
-            f"tables of an older version, without {', '.join(missing[:4])}{more}",
-            f"tables as pbl-pipeline {__version__} defines them",
-            "`pbl db migrate --dry-run` says what will be done, `pbl db migrate` does it; a database of which it says "
-            "that no migration does (of a development version): set PBL_HOME to a new folder, ingest the videos again",
-        )
 
 
 def _refuse_newer() -> None:

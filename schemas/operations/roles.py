@@ -26,7 +26,7 @@ from pymysql.converters import escape_string
 
 from pbl_pipeline.errors import PblError
 from schemas import connection
-from schemas._activate import STAGES
+from schemas.stages import STAGES
 
 from . import embedded
 from .catalog import pattern

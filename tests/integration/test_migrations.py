@@ -17,7 +17,7 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection, event_corrections, gait, gdi, jobs, lab, migrations, session, video, views
+from schemas import connection, event_corrections, gait, gdi, jobs, lab, migrations, session, stages, video, views
 from schemas.chain import ON_REQUEST
 from schemas.intake import Visit, ingest
 from schemas.operations import embedded
@@ -127,7 +127,7 @@ def _unbind(patch: pytest.MonkeyPatch) -> None:
 
     patch.setattr(jobs, "_jobs", {})
     patch.setattr(schemas._activate, "_methods_done", set())
-    for module in schemas._activate.modules():
+    for module in stages.modules():
         patch.setattr(module.schema, "database", None)
         patch.setattr(module.schema, "connection", None)
     for cls in tables().values():

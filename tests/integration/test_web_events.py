@@ -106,7 +106,7 @@ def test_corrected_events_count_instead_of_the_detected_ones(visit: str, monkeyp
     assert page.count("by hand</td>") == 1
     shown = shown_recording(1).recording.events.events
     assert next(e for e in shown if e.probability == 1.0).time_s == pytest.approx(time + 0.1, abs=1e-4)
-    # What follows is computed again: of the corrected trial and of the visit alone.
+    # The corrected trial and the visit are computed again, and nothing else.
     run = {t.table: t.done for t in populate().tables if t.done}
     assert run == dict.fromkeys(("GaitCycle", "Spatiotemporal", "GDI", "SessionGdi", "SessionQc"), 1)
     assert dict(zip(*gait.GaitCycle.to_arrays("video_id", "correction_no"), strict=True)) == {1: 1, 2: None}

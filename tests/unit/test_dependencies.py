@@ -38,7 +38,7 @@ def test_the_library_imports_with_the_tables_blocked():
 LIGHT = """
 import sys
 import schemas
-from schemas._activate import modules
+from schemas.stages import modules
 modules()
 print(*(name for name in ("jax", "mujoco", "cv2", "scipy", "onnxruntime", "ai_edge_litert") if name in sys.modules))
 """
@@ -69,32 +69,68 @@ def test_no_import_against_the_direction(package: str, forbidden: set[str]):
     assert not found
 
 
+def _modules(package: str) -> dict[str, set[str]]:
+    """Module of a package -> modules of it that are imported there, also inside functions and for types alone."""
+    files = sorted((ROOT / package).rglob("*.py"))
+    module_of = {f: ".".join(f.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for f in files}
+    known = set(module_of.values())
+    found: dict[str, set[str]] = {}
+    for file, name in module_of.items():
+        within = name if file.name == "__init__.py" else name.rsplit(".", 1)[0]
+        targets: set[str] = set()
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Import):
+                targets |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                base = within.rsplit(".", node.level - 1)[0] if node.level else ""
+                base = ".".join(part for part in (base, node.module) if part)
+                targets |= {full if (full := f"{base}.{a.name}") in known else base for a in node.names}
+        found[name] = (targets & known) - {name}
+    return found
+
+
+def _in_circles(imports: dict[str, set[str]]) -> dict[str, list[str]]:
+    """The modules that remain when those are removed, again and again, that import none of the others or that none of
+    them imports."""
+    left = imports
+    while True:
+        used = {target for targets in left.values() for target in targets}
+        kept = {name for name, targets in left.items() if targets & left.keys() and name in used}
+        if len(kept) == len(left):
+            return {name: sorted(targets) for name, targets in sorted(left.items())}
+        left = {name: left[name] & kept for name in kept}
+
+
+@pytest.mark.parametrize("package", ["pbl_pipeline", "schemas", "workers"])
+def test_no_module_imports_one_that_imports_it(package: str):
+    """Types below, methods above: no circle of imports, however long and wherever in a module they stand."""
+    imports = _modules(package)
+    assert len(imports) > 20
+    assert _in_circles(imports) == {}
+
+
+def test_a_circle_is_found():
+    chain = {"a": {"b"}, "b": {"c"}, "c": set(), "d": {"a"}}
+    assert _in_circles(chain) == {}
+    assert _in_circles({**chain, "c": {"b"}}) == {"b": ["c"], "c": ["b"]}
+    assert _in_circles({**chain, "c": {"a"}}) == {"a": ["b"], "b": ["c"], "c": ["a"]}
+
+
 @functools.cache
 def _rooms() -> dict[str, dict[str, set[str]]]:
     """Room -> room that it imports -> modules imported there. A room is a package's own folder, without its
-    subpackages; a module beside the packages (`pbl_pipeline/errors.py`) is a room of its own. All imports count:
-    those inside functions and those for types alone, too."""
-    files = sorted((ROOT / "pbl_pipeline").rglob("*.py"))
-    module_of = {f: ".".join(f.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for f in files}
-    room_of = {
-        name: name if file.name == "__init__.py" or file.parent.name == "pbl_pipeline" else name.rsplit(".", 1)[0]
-        for file, name in module_of.items()
-    }
-    found: dict[str, dict[str, set[str]]] = {room: {} for room in set(room_of.values())}
-    for file, name in module_of.items():
-        package = name if file.name == "__init__.py" else name.rsplit(".", 1)[0]
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.Import):
-                targets = [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom):
-                base = package.rsplit(".", node.level - 1)[0] if node.level else ""
-                base = ".".join(part for part in (base, node.module) if part)
-                targets = [full if (full := f"{base}.{a.name}") in room_of else base for a in node.names]
-            else:
-                continue
-            for target in targets:
-                if target in room_of and room_of[target] != room_of[name]:
-                    found[room_of[name]].setdefault(room_of[target], set()).add(target)
+    subpackages; a module beside the packages (`pbl_pipeline/errors.py`) is a room of its own."""
+    imports = _modules("pbl_pipeline")
+    packages = {name for name in imports if (ROOT / Path(*name.split(".")) / "__init__.py").is_file()}
+
+    def room_of(name: str) -> str:
+        return name if name in packages or name.count(".") == 1 else name.rsplit(".", 1)[0]
+
+    found: dict[str, dict[str, set[str]]] = {room_of(name): {} for name in imports}
+    for name, targets in imports.items():
+        for target in targets:
+            if room_of(target) != room_of(name):
+                found[room_of(name)].setdefault(room_of(target), set()).add(target)
     return found
 
 
@@ -102,12 +138,7 @@ def test_the_rooms_of_the_library_import_each_other_in_one_direction():
     """No circle, and a package stands above its subpackages: types below, dispatch above."""
     below = {room: set(into) for room, into in _rooms().items()}
     assert len(below) > 20
-    while True:  # take away, again and again, the rooms that import none of those that are left
-        free = {room for room, into in below.items() if not into & below.keys()}
-        if not free:
-            break
-        below = {room: into for room, into in below.items() if room not in free}
-    assert not {room: sorted(into & below.keys()) for room, into in below.items()}
+    assert _in_circles(below) == {}
 
 
 def test_a_private_module_is_used_in_its_own_folder_only():

@@ -10,7 +10,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import PASS, Check
 
 from ._order import PLACE
-from ._types import CORRECTED, FOOT_DOWN, FOOT_UP, SIDES, GaitEvent, GaitEvents, no_events
+from ._types import FOOT_DOWN, FOOT_UP, SIDES, GaitEvent, GaitEvents, no_events
 
 #: Shortest time between two events of a side (s): a swing or a stance; the fastest walkers swing for 0.25 s.
 SHORTEST_PHASE_S = 0.1
@@ -80,7 +80,7 @@ def apply_correction(detected: GaitEvents, events: Sequence[GaitEvent], n_change
     """Return the events that count where a person corrected the `detected` ones, in bouts of walking.
 
     A bout ends where the next event is not the next in the order of walking, or comes later than `LONGEST_PHASE_S`.
-    Method, parameters and source stay those of the detection; the check `CORRECTED` tells corrected events apart.
+    Method, parameters and source stay those of the detection; the check `events_by_hand` tells corrected events apart.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def apply_correction(detected: GaitEvents, events: Sequence[GaitEvent], n_change
     n_changed
         Number of events that the person moved, added or removed.
     """
-    changes = Check(CORRECTED, PASS, float(n_changed), None)
+    changes = Check("events_by_hand", PASS, float(n_changed), None)
     if not events:
         none = no_events(detected.method, detected.params_hash, detected.source, "a person removed every event")
         return dataclasses.replace(none, qc=(*none.qc, changes))

@@ -17,8 +17,6 @@ FOOT_DOWN, FOOT_UP = "foot_down", "foot_up"
 SIDES = (LEFT, RIGHT)
 EVENTS = (FOOT_DOWN, FOOT_UP)
 COLUMNS = ("time_s", "side", "event", "probability")
-#: Name of the check of events that a person corrected; its value is the number of changed events.
-CORRECTED = "events_by_hand"
 #: Of a file of events (bytes): some ten thousand.
 _LARGEST = MIB
 
@@ -111,7 +109,7 @@ class GaitEvents:
     @property
     def corrected(self) -> bool:
         """Whether a person corrected the detected events."""
-        return any(c.check == CORRECTED for c in self.qc)
+        return any(c.check == "events_by_hand" for c in self.qc)
 
     def times(self, side: str, event: str) -> list[float]:
         """Times in seconds of one kind of event."""

@@ -1,0 +1,29 @@
+"""The modules of tables, by name: this module imports none of them before it is asked."""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+
+#: Modules of tables, each its own schema on the server, in the order of dependency.
+STAGES = (
+    "lab",
+    "session",
+    "video",
+    "tracking",
+    "keypoints",
+    "fit",
+    "gait",
+    "gdi",
+    "qc",
+    "validation",
+    "privacy",
+    "study",
+    "review",
+    "worker",
+)
+
+
+def modules() -> list[ModuleType]:
+    """The table modules, imported."""
+    return [importlib.import_module(f"schemas.{stage}") for stage in STAGES]
