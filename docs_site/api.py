@@ -22,7 +22,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "schemas.ingest": ("Ingested", "Methods", "Visit", "ingest"),
     "schemas.method_rows": ("insert_methods", "method_columns"),
     "schemas.origin": (),
-    "schemas.results": (),
+    "schemas.reading": (),
     "schemas.rows": ("InputChanged", "one"),
     "schemas.status": ("pipeline_status",),
     "schemas.views": (),

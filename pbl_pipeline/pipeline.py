@@ -124,7 +124,7 @@ def run_visit(
         height_m=height_m,
     )
     fitted = [dataclasses.replace(r, load_fit=Held(t)) for r, t in zip(recordings, fit.trials, strict=True)]
-    left_out = [Recording(name, problem=error.text()) for name, error in problems.items()]
+    left_out = [Recording(name, problem=error.short()) for name, error in problems.items()]
     events, index = EVENT_METHODS.find(), GDI_METHODS.find()
     methods = {"Tracking": people.key, "Keypoints": keypoints.key, "Fit": method.key}
     methods |= {"Gait events": events.key, "Index": f"{index.key}, norm {basis.name}"}
