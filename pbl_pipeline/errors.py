@@ -70,6 +70,7 @@ CODES: dict[str, str] = {
     "WORKER_CRASH": "a job took its worker's process down more than once",
     "DECIDED_MEANWHILE": "somebody else decided, or it was computed anew, since the page was loaded",
     "WEB_NOT_MADE": "a file that the review page was making was not finished",
+    "WEB_REFUSED": "a request to the review page may not be answered: no session, no right, or a form of another page",
     "WEB_PORT": "the review page cannot listen on that port",
     "WEB_TLS": "the review page would be reached without encryption, or its certificate cannot be used",
     "WEB_ACCOUNT": "an account of the review page is not there, or cannot be as it was asked for",
@@ -109,6 +110,10 @@ class PblError(Exception):
         lines.append(f"  found:    {harmless(self.found)}")
         lines += [f"  expected: {self.expected}", f"  next:     {self.next_step}"]
         return "\n".join(lines)
+
+    def short(self) -> str:
+        """Return code and what was found on one line: what a result that lacks something says of it."""
+        return f"{self.code}: {harmless(self.found, lines=False)}"
 
     def about(self, key: object) -> PblError:
         """This error where it says what it is about, else the same about `key`: who reads several files knows which."""

@@ -124,7 +124,7 @@ def run_visit(
         height_m=height_m,
     )
     fitted = [dataclasses.replace(r, load_fit=Held(t)) for r, t in zip(recordings, fit.trials, strict=True)]
-    left_out = [Recording(name, problem=error.text()) for name, error in problems.items()]
+    left_out = [Recording(name, problem=error.short()) for name, error in problems.items()]
     methods = {"Tracking": people.key, "Keypoints": keypoints.key, "Fit": method.key}
     visit = Visit((*fitted, *left_out), Solution.of(fit), fit.qc, methods=methods)
     return measured(visit, norm=norm), problems

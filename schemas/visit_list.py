@@ -24,6 +24,8 @@ from .status import queue_name
 PAGE = 50
 #: What is asked of the state of a visit; empty: nobody is in any of its usable videos; unusable: it has none.
 STATES = ("computed", "pending", "waiting", "failed", "empty", "unusable")
+#: State of a visit in a folder without its measures.
+INCOMPLETE = "incomplete"
 #: Outcomes of the checks that can be asked for.
 OUTCOMES = ("PASS", "WARN", "EMPTY", "NEEDS_CHOICE", "FAIL")
 #: Checks (q) of measures (g).
@@ -88,7 +90,7 @@ class Change:
 
 @dataclasses.dataclass(frozen=True)
 class VisitRow:
-    """A visit of the list. state: one of `STATES`; problem: code of the error where it failed. more: further results of
+    """A visit of the list. state: one of `STATES` or `INCOMPLETE`; problem: code of the error where it failed. more: further results of
     other chains of methods or kinds of recordings."""
 
     session_id: int

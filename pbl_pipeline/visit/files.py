@@ -103,30 +103,33 @@ def visit_facts(visit: Visit) -> dict[str, Any]:
 def load_visit(folder: Path, *, measures: bool = True) -> Visit:
     """Read the visit that `save_visit` wrote. Arrays are loaded when they are asked for; `lacks` names what is missing.
 
-    `measures`: also those of its metrics.json. Raises `PblError` FILE_MISSING without a session.json, FILE_FORMAT
-    for content that `save_visit` did not write.
+    `measures`: also those of its metrics.json. A folder without a session.json, which is written last, is that of a run
+    that was ended: its fits are read. Raises `PblError` FILE_MISSING where there are none either, FILE_FORMAT for
+    content that `save_visit` did not write.
     """
     path = folder / SESSION
-    content = _read(path)
+    found = [] if path.is_file() else [name_of_fit(fit) for fit in sorted(folder.glob(f"*.{FIT}"))]
+    content = {"trials": found, "qc": []} if found else _read(path)
     with _coded(path):
         names, told = [str(n) for n in content["trials"]], content.get("visit", {})
         facts = {str(r["name"]): r for r in told.get("recordings", ())}
         fits = [folder / f"{name}.{FIT}" for name in names]
         wanted = [*fits, *(_file(folder, n, KEYPOINTS) for n in names if facts.get(n, {}).get("video"))]
         old = () if "visit" in content else (f"facts of the videos, the subject and the methods: {_AGAIN}",)
+        ended = (f"no {SESSION}: {_AGAIN}",) if found else ()
         visit = Visit(
             recordings=(
                 *(_recording(fit, facts.get(n, {})) for n, fit in zip(names, fits, strict=True) if fit.is_file()),
                 *(_left_out(r) for r in facts.values() if r["name"] not in names),
             ),
             solution=_solution(content) if "solver" in content else None,
-            fit_checks=_checks(content),
+            fit_checks=(_checks_unknown(names),) if found and not (folder / METRICS).is_file() else _checks(content),
             subject=str(told.get("subject", "-")),
             label=str(told.get("label", "")),
             date=str(told.get("date", "")),
             kind=str(told.get("kind", "single")),
             methods={str(k): str(v) for k, v in told.get("methods", {}).items()},
-            lacks=(*old, *(f"no {p.name}: {_AGAIN}" for p in wanted if not p.is_file())),
+            lacks=(*(ended or old), *(f"no {p.name}: {_AGAIN}" for p in wanted if not p.is_file())),
         )
     return _with_stored_measures(visit, folder) if measures else visit
 
@@ -140,7 +143,7 @@ def visit_of_fits(paths: Sequence[Path], *, markers: MarkerSet | None = None, me
     """
     folders = {p.parent: None for p in paths}
     known = {f: load_visit(f, measures=measures) for f in folders if (f / SESSION).is_file()}
-    stems = [p.name.removesuffix(".npz").removesuffix(".fit") for p in paths]
+    stems = [name_of_fit(p) for p in paths]
     recordings, checks, unknown = [], [], []
     for path, stem, name in zip(paths, stems, distinct(stems, range(1, len(stems) + 1)), strict=True):
         fit, visit = TrialFit.load(path), known.get(path.parent)
@@ -192,6 +195,11 @@ def _save_measured(measured: TrialMetrics, folder: Path, name: str) -> list[str]
     measured.events.save(_file(folder, name, EVENTS))
     save_curves(measured.cycles, _file(folder, name, CYCLES))
     return [EVENTS, CYCLES]
+
+
+def name_of_fit(path: Path) -> str:
+    """Return the name of the recording whose fit is in this file."""
+    return path.name.removesuffix(".npz").removesuffix(".fit")
 
 
 def _file(folder: Path, name: str, end: str) -> Path:
@@ -261,7 +269,7 @@ def _read(path: Path, again: str = _AGAIN) -> dict[str, Any]:
 
 def _recording(fit: Path, facts: Mapping[str, Any]) -> Recording:
     """Return a fitted recording from its files; `facts`: what session.json holds of it."""
-    name = fit.name.removesuffix(".npz").removesuffix(".fit")
+    name = name_of_fit(fit)
     points = fit.with_name(f"{name}.{KEYPOINTS}")
     video, choice = facts.get("video"), facts.get("choice")
     return Recording(

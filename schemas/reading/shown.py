@@ -74,6 +74,11 @@ class ShownRecording:
     session_id: int
     subject: str
     label: str
+    pictures: bool  # whether it was filmed; markers of a laboratory have no pictures
+    duration_s: float | None = None  # with the next three None before the recording is probed, and without pictures
+    n_frames: int | None = None
+    width_px: int | None = None
+    height_px: int | None = None
     hidden_heads: str = ""  # how heads are hidden in what is shown; empty for the original
     lead: int | None = None  # the recording with the fit, where several cameras filmed the trial and this is another
 
@@ -87,11 +92,6 @@ class ShownRecording:
             expected="a recording to which a body is fitted",
             next_step="`pbl populate`; `pbl why` says what stops it",
         )
-
-    @property
-    def has_pictures(self) -> bool:
-        """Whether it is a video; markers of a laboratory have none."""
-        return self.recording.path is not None or self.recording.video is not None
 
 
 def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
@@ -161,9 +161,18 @@ def shown_recording(video_id: int) -> ShownRecording:
         session_id=int(named["session_id"]),
         subject=named["subject"],
         label=named["session_label"],
+        pictures=recording.path is not None,
+        **video_facts(recording),
         hidden_heads=settings.deidentify_how() if recording.path is not None else "",
         lead=lead if lead != video_id else None,
     )
+
+
+def video_facts(recording: Recording) -> dict[str, float | None]:
+    """Return duration (s), number of frames, width and height (px) of a recording's video; empty where not known."""
+    info = recording.video
+    names = ("duration_s", "n_frames", "width_px", "height_px")
+    return {} if info is None else {name: getattr(info, name) for name in names}
 
 
 def computations(video_id: int) -> tuple[Any, ...]:

@@ -320,7 +320,7 @@ def _problem(video_id: int, choice: SubjectChoice | None) -> str:
     for table in before(fit.SessionFit):
         for row in (jobs_of(table).errors & {"video_id": video_id}).to_dicts():
             message = row["error_message"]
-            return f"{table.__name__}: {error_code(message)}, {error_found(message)}"
+            return f"{error_code(message)}: {error_found(message)}"
     if choice is not None and choice.status not in tracking.CHOSEN:
         return choice.reason
     return "not computed yet"

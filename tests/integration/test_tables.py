@@ -110,7 +110,7 @@ def _everything_comes_back(paths: list[Path]) -> None:
     """What was stored is what the library made."""
     results = load_visit({"subject": "P001"})
     assert [r.problem == "" for r in results.recordings] == [True, True, False]
-    assert results.recordings[2].problem.startswith("VideoInfo: VIDEO_NOT_A_VIDEO")
+    assert results.recordings[2].problem.startswith("VIDEO_NOT_A_VIDEO: ")
     assert results.solution is not None
     assert results.measures is not None
     for path, trial in zip(paths, results.fitted, strict=True):

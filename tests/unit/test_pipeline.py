@@ -57,7 +57,7 @@ def test_a_video_named_twice_counts_once(fitted: list[list[str]], tmp_path: Path
     assert "same bytes as walk" in problems["copy"].found
     assert [(r.name, r.fitted, r.problem) for r in visit.recordings] == [
         ("walk", True, ""),
-        ("copy", False, problems["copy"].text()),
+        ("copy", False, problems["copy"].short()),
     ]
 
 

@@ -3,26 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import io
 import json
+import re
 import zipfile
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from starlette.testclient import TestClient
 
 from pbl_pipeline.body import load_body, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import gait_metrics
+from pbl_pipeline.visit import save_beside
 from tests.exported import with_markers
 from tests.walking_fit import walking_fit
 from workers.web import Options, ResultsFolder, Where, create_app, serve
+from workers.web.plain_values import plain
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two visits, one with a recording beside it; and one whose files are not those of `pbl run`."""
+    """Two visits, one with a recording beside it; one whose files are not those of `pbl run`; one whose measures are
+    missing; and one of a run that was ended."""
     folder, body = tmp_path_factory.mktemp("results"), load_body()
     for name in ("2026-01-10", "2026-06-10 <b>"):
         out = folder / name
@@ -35,11 +41,16 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
         fit.save(out / "walk.fit.npz")
         metrics = gait_metrics([fit])
         metrics.save(out / "metrics.json")
+        save_beside(metrics.trials, [out / "walk.fit.npz"], out / "metrics.json")
         (out / "session.json").write_text(json.dumps({"trials": [fit.name], "params_hash": fit.params_hash, "qc": []}))
         (out / "report.html").write_text("<!doctype html><title>report</title>")
     (folder / "2026-01-10" / "WALK.MP4").write_bytes(b"0123456789")
     (folder / "other").mkdir()
     (folder / "other" / "session.json").write_text("{")
+    for name, files in (("unmeasured", ("walk.fit.npz", "session.json")), ("was ended", ("walk.fit.npz",))):
+        (folder / name).mkdir()
+        for file in files:
+            (folder / name / file).write_bytes((folder / "2026-01-10" / file).read_bytes())
     return folder
 
 
@@ -57,7 +68,8 @@ def test_a_folder_is_found_looked_at_and_taken_along(results):
     index = json.loads((results / "2026-01-10" / "metrics.json").read_text())["session"]["gdi"]["mean"]
     assert "2026-01-10" in first
     assert f"{index:.1f}" in first
-    assert "FILE_MISSING" in first  # the folder without metrics keeps its line
+    assert "FILE_FORMAT" in first  # the folder whose files cannot be read keeps its line
+    assert first.count("files are missing") == 2  # and so do those without measures
     visit = browser.get("/visits/1").text
     assert "Cadence" in visit
     assert 'href="/recordings/1"' in visit
@@ -87,10 +99,80 @@ def test_what_is_not_there_is_said(results, monkeypatch: pytest.MonkeyPatch):
         "/recordings/2/overlay",
     ):
         assert browser.get(path).status_code == 404, path
-    assert "FILE_MISSING" in browser.get("/visits/3").text
+    assert "FILE_FORMAT" in browser.get("/visits/3").text
     monkeypatch.setenv("PBL_DEIDENTIFY", "blur")
     assert "PBL_DEIDENTIFY" in browser.get("/recordings/1").text
     assert browser.get("/recordings/1/video").status_code == 404
+
+
+@pytest.mark.parametrize(("number", "file"), [(4, "metrics.json"), (5, "session.json")])
+def test_a_visit_without_all_of_its_files_shows_what_is_there_and_names_what_is_missing(results, number, file):
+    browser = browser_of(ResultsFolder(results))
+    visit = browser.get(f"/visits/{number}").text
+    assert f"no {file}: `pbl " in visit.replace("&#39;", "'")
+    assert "There are no measures of this visit yet" in visit
+    assert "/report" not in visit
+    files = zipfile.ZipFile(io.BytesIO(browser.get(f"/visits/{number}/export").content)).namelist()
+    assert any(name.endswith(".mot") for name in files)  # the movement, which is there
+    assert ("whether the body lies on the person is not known" in visit) is (file == "session.json")
+    recording = browser.get("/recordings/" + re.findall(r"/recordings/(\d+)", visit)[0]).text
+    assert "240 frames" in recording
+
+
+def test_each_page_as_json(results):
+    browser = browser_of(ResultsFolder(results))
+    listed = browser.get("/visits.json").json()["page"]["visits"]
+    assert [(v["session_id"], v["label"], v["state"]) for v in listed] == [
+        (1, "2026-01-10", "computed"),
+        (2, "2026-06-10 <b>", "computed"),
+        (3, "other", "failed"),
+        (4, "unmeasured", "incomplete"),
+        (5, "was ended", "incomplete"),
+    ]
+    stored = json.loads((results / "2026-01-10" / "metrics.json").read_text())
+    visit = browser.get("/visits/1.json").json()["about"]
+    assert visit["visit"]["metrics"] == stored
+    assert visit["row"]["result"]["index"] == stored["session"]["gdi"]["mean"]
+    recording = browser.get("/recordings/1.json").json()["about"]
+    assert (recording["number"], recording["n_frames"]) == (1, 240)
+    times = [e["time_s"] for e in recording["recording"]["events"]]
+    movement = browser.get("/recordings/1/movement").json()["events"]
+    assert times == pytest.approx([e[0] for e in movement], abs=1e-4)
+
+
+def test_no_json_has_a_path_or_a_number_that_is_not_finite(results, monkeypatch: pytest.MonkeyPatch):
+    browser = browser_of(ResultsFolder(results))
+    pages = ["/visits.json", *(f"/visits/{n}.json" for n in range(1, 7)), *(f"/recordings/{n}.json" for n in range(6))]
+    for page in pages:
+        answer = browser.get(page)
+        assert answer.headers["content-type"] == "application/json", page
+        assert answer.headers["cache-control"] == "no-store", page
+        assert str(results) not in answer.text, page
+        content = json.loads(answer.text, parse_constant=lambda name: pytest.fail(f"{name} in {page}"))
+        if answer.status_code != 200:
+            assert set(content["error"]) == {"code", "found", "expected", "next_step", "key"}, page
+            assert all(content["error"][k] for k in ("code", "found", "expected", "next_step")), page
+    damaged = browser.get("/visits/3.json")
+    assert (damaged.status_code, damaged.json()["error"]["code"]) == (409, "FILE_FORMAT")
+    assert damaged.json()["error"]["key"] == "session.json"
+    assert browser.get("/visits/9.json").json()["error"]["code"] == "DB_NOT_FOUND"
+    assert browser.get("/no/such/page.json").json()["error"]["code"] == "DB_NOT_FOUND"
+    browser.cookies.clear()
+    refused = browser.get("/visits.json")
+    assert (refused.status_code, refused.json()["error"]["code"]) == (401, "WEB_REFUSED")
+
+
+def test_what_plain_values_are_of():
+    frame = pd.DataFrame({"percent": [0, 1], "mean_deg": [np.nan, 2.5]})
+    assert plain(frame) == [{"percent": 0, "mean_deg": None}, {"percent": 1, "mean_deg": 2.5}]
+    assert plain({"at": datetime.date(2026, 3, 1), "p": Path("/a/b.mp4"), "x": np.float32(np.inf), "y": np.zeros(3)}) == {
+        "at": "2026-03-01",
+        "p": "b.mp4",
+        "x": None,
+        "y": None,
+    }
+    assert plain("no file at /data/visits/2026/walk.mp4: gone") == "no file at walk.mp4: gone"
+    assert plain("/visits/3, 1.2 m/s, https://a.org/b/c") == "3, 1.2 m/s, https://a.org/b/c"
 
 
 def test_nothing_is_decided_in_a_folder(results):
@@ -100,7 +182,7 @@ def test_nothing_is_decided_in_a_folder(results):
 
 
 def test_a_folder_without_results_and_one_for_others_are_refused(results, tmp_path):
-    with pytest.raises(PblError, match="no session") as error:
+    with pytest.raises(PblError, match="no session.json and no fit") as error:
         ResultsFolder(tmp_path)
     assert error.value.code == "FILE_MISSING"
     with pytest.raises(PblError, match="--folder for more than this machine"):
@@ -117,4 +199,6 @@ def test_results_are_found_again_when_they_were_made_anew(results, tmp_path):
     body = load_body()
     walking_fit(body.joint_names, body.sha256, name="walk", n_frames=200).save(out / "walk.fit.npz")
     assert folder.state(1) != before
-    assert len(folder.load(1).fit.time_s) == 200
+    found = folder.recording(1).recording.fit
+    assert found is not None
+    assert len(found.time_s) == 200

@@ -21,7 +21,7 @@ from .tables import Tables
 AGAIN_S = 600.0
 #: A recording with all that belongs to it; and files of a visit. Its page has measures, no pictures of a person.
 _OF = (
-    ("video_id", re.compile(r"/recordings/(\d{1,10})(?:/([a-z_]+).*)?")),
+    ("video_id", re.compile(r"/recordings/(\d{1,10})(?:\.json|/([a-z_]+).*)?")),
     ("session_id", re.compile(r"/visits/(\d{1,10})/(?!enter)([a-z_]+).*")),
 )
 

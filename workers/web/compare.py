@@ -22,7 +22,8 @@ from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, num
 from schemas import compare
 
 from .address import LARGEST, interval
-from .pages import Pages, page
+from .pages import Pages, as_json, page
+from .plain_values import plain
 from .tables import Tables
 from .videos import Videos
 
@@ -54,6 +55,8 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
                 shown[video_id] = None
             except PblError as error:
                 shown[video_id] = error
+        if as_json(request):  # loads arrays, which not every thread may
+            return pages.show(request, "", **await tables.ask(plain, {"found": found, "names": names}))
         return pages.show(
             request,
             "compare.html",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import functools
 from collections.abc import Hashable, Iterator
 from pathlib import Path
@@ -15,9 +16,9 @@ from starlette.routing import Route
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import PASS
-from pbl_pipeline.visit import FIT, METRICS, OVERLAY, REPORT, SESSION, Visit, load_visit
-from schemas.reading.shown import ShownCheck, ShownRecording, ShownVisit
-from schemas.visit_list import Page, Result, VisitRow
+from pbl_pipeline.visit import FIT, METRICS, OVERLAY, REPORT, SESSION, Recording, Visit, load_visit, name_of_fit
+from schemas.reading.shown import ShownCheck, ShownRecording, ShownVisit, video_facts
+from schemas.visit_list import INCOMPLETE, Page, Result, VisitRow
 from schemas.visit_progress import Progress
 
 from .access import REPORT_POLICY
@@ -44,7 +45,7 @@ class _Place:
 
 
 class ResultsFolder:
-    """Visits below a folder, each a folder with a `session.json` and fits.
+    """Visits below a folder, each a folder with a `session.json` or, of a run that was ended, with fits alone.
 
     Parameters
     ----------
@@ -61,11 +62,11 @@ class ResultsFolder:
     """
 
     def __init__(self, path: Path, videos: Path | None = None) -> None:
-        found = [p.parent for p in sorted(_sessions(path, _DEEP))][:_MOST]
+        found = sorted(_visits(path, _DEEP))[:_MOST]
         if not found:
             raise PblError(
                 "FILE_MISSING",
-                found=f"no {SESSION} in {path}",
+                found=f"no {SESSION} and no fit in {path}",
                 expected="a folder that `pbl run` wrote, or a folder of such folders",
                 next_step="`pbl run VIDEO --out FOLDER`, then `pbl web --folder FOLDER`",
                 key=str(path),
@@ -73,7 +74,7 @@ class ResultsFolder:
         self._videos, number = videos, 0
         self._places: dict[int, _Place] = {}
         for i, folder in enumerate(found, 1):
-            names = [fit.name.removesuffix(f".{FIT}") for fit in sorted(folder.glob(f"*.{FIT}"))]
+            names = [name_of_fit(fit) for fit in sorted(folder.glob(f"*.{FIT}"))]
             name = folder.relative_to(path).as_posix() if folder != path else folder.resolve().name
             self._places[i] = _Place(name, folder, {n: number + j for j, n in enumerate(names, 1)})
             number += len(names)
@@ -86,7 +87,7 @@ class ResultsFolder:
     def visit(self, number: int, result: int) -> ShownVisit:
         """Return a visit. Raises `PblError` DB_NOT_FOUND; FILE_MISSING, FILE_FORMAT for files that cannot be read."""
         visit, row = self._visit(number), self._row(number)
-        checks = () if visit.judged is None else visit.judged.checks
+        checks = visit.checks if visit.judged is None else visit.judged.checks
         return ShownVisit(
             row=row,
             recordings=visit.recordings,
@@ -98,8 +99,20 @@ class ResultsFolder:
 
     def recording(self, number: int) -> ShownRecording:
         """Return a recording. Raises as `visit`."""
-        of, name = self._of_recording(number)
-        return ShownRecording(self._visit(of).recording(name), number, of, "", self._places[of].name)
+        of, _ = self._of_recording(number)
+        visit = self._visit(of)
+        found = next((r for r in visit.recordings if r.number == number), None)
+        if found is None:
+            raise _unknown("recording", number)
+        return ShownRecording(
+            found,
+            number,
+            of,
+            subject=_subject(visit),
+            label=self._places[of].name,
+            pictures=visit.kind != "markers",
+            **(video_facts(found) or _facts_of_fit(found)),
+        )
 
     def state(self, number: int) -> Hashable:
         """Return what tells apart what was fitted to a recording."""
@@ -195,18 +208,15 @@ class ResultsFolder:
             visit, problem = self._visit(number), ""
         except PblError as error:
             visit, problem = None, f"{error.code}: {error.found}. {error.next_step}"
+        state = "failed" if visit is None else INCOMPLETE if visit.measures is None else "computed"
         return VisitRow(
             session_id=number,
-            subject="" if visit is None or visit.subject == "-" else visit.subject,
+            subject="" if visit is None else _subject(visit),
             label=place.name,
-            day=None,
+            day=None if visit is None else _day(visit),
             role="",
-            videos=len(place.recordings),
-            state="computed"
-            if visit is not None and visit.measures is not None
-            else "failed"
-            if problem
-            else "pending",
+            videos=len(place.recordings) if visit is None else len(visit.recordings),
+            state=state,
             problem=problem,
             result=None if visit is None else _result(visit),
             more=0,
@@ -265,16 +275,39 @@ def _result(visit: Visit) -> Result | None:
     )
 
 
-def _sessions(path: Path, deep: int) -> Iterator[Path]:
-    """Files `session.json` in a folder and those below it, without following links."""
+def _subject(visit: Visit) -> str:
+    """Return the code of the person; empty where the files do not have one."""
+    return "" if visit.subject == "-" else visit.subject
+
+
+def _day(visit: Visit) -> datetime.date | None:
+    """Return the day of a visit; None where the files have none, or text that is not a day."""
+    try:
+        return datetime.date.fromisoformat(visit.date)
+    except ValueError:
+        return None
+
+
+def _facts_of_fit(recording: Recording) -> dict[str, float | None]:
+    """Return what `video_facts` returns, from the fit: files of an older version have no facts of the video."""
+    fit = recording.fit
+    if fit is None or not fit.image_size_px[0]:
+        return {}
+    width, height = (int(v) for v in fit.image_size_px)
+    duration = float(fit.time_s[-1] - fit.time_s[0])
+    return {"duration_s": duration, "n_frames": len(fit.time_s), "width_px": width, "height_px": height}
+
+
+def _visits(path: Path, deep: int) -> Iterator[Path]:
+    """Folders of visits: this one and those below it, without following links."""
     if not path.is_dir():
         return
-    if (file := path / SESSION).is_file():
-        yield file
+    if (path / SESSION).is_file() or any(path.glob(f"*.{FIT}")):
+        yield path
     if deep:
         for folder in sorted(path.iterdir()):
             if folder.is_dir() and not folder.is_symlink():
-                yield from _sessions(folder, deep - 1)
+                yield from _visits(folder, deep - 1)
 
 
 def _unknown(what: str, number: int) -> PblError:

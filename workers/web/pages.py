@@ -83,10 +83,12 @@ class Pages:
 
     def refused(self, request: Request, reason: str) -> Response:
         """The answer to a request that may not pass."""
-        if reason == "session" and self._sign_in:
-            return self.show(request, "sign_in.html", _REFUSED[reason], problem="", wait=0)
         name = "enter.title" if reason == "session" else f"enter.{reason}_title"
         text = "enter.text" if reason == "session" else f"enter.{reason}"
+        if as_json(request):
+            return self.error(request, _refusal(texts.text("en", name), texts.text("en", text)), _REFUSED[reason])
+        if reason == "session" and self._sign_in:
+            return self.show(request, "sign_in.html", _REFUSED[reason], problem="", wait=0)
         return self.show(request, "refused.html", _REFUSED[reason], title=name, text=text, hours=f"{HOURS:g}")
 
     def error(self, request: Request, error: PblError, status: int) -> Response:
@@ -95,8 +97,35 @@ class Pages:
 
     def missing(self, request: Request, status: int, headers: Mapping[str, str] | None) -> Response:
         """The answer for an address that there is not."""
+        if as_json(request):
+            return self.error(request, _not_there(), status)
         return self.show(request, "missing.html", status, headers)
 
     def unforeseen(self, request: Request) -> Response:
         """The answer where the program itself failed; the traceback is in the terminal."""
+        if as_json(request):
+            return JSONResponse({"error": plain(_unforeseen())}, 500, HEADERS)
         return self.show(request, "unforeseen.html", 500, HEADERS)
+
+
+def _refusal(found: str, next_step: str) -> PblError:
+    expected = "a request of somebody who is signed in and has the right"
+    return PblError("WEB_REFUSED", found=found, expected=expected, next_step=next_step)
+
+
+def _not_there() -> PblError:
+    return PblError(
+        "DB_NOT_FOUND",
+        found="no page at this address",
+        expected="/visits.json, /visits/NUMBER.json, /recordings/NUMBER.json or /compare.json",
+        next_step="take the numbers from /visits.json",
+    )
+
+
+def _unforeseen() -> PblError:
+    return PblError(
+        "INTERNAL",
+        found="an unforeseen error of the page",
+        expected="an answer",
+        next_step="report what the terminal of `pbl web` says",
+    )

@@ -34,12 +34,12 @@ def routes(pages: Pages, asks: Asks, source: Source) -> list[Route]:
     async def recording(request: Request) -> Response:
         about = await asks.ask(source.recording, number_of(request))
         problem: PblError | None = None
-        if about.has_pictures:
+        if about.pictures:
             try:
                 await asks.ask(source.video, about.number)
             except PblError as error:
                 problem = error
-        people, seen = await asks.ask(source.people, about) if about.has_pictures else ([], [])
+        people, seen = await asks.ask(source.people, about) if about.pictures else ([], [])
         judged = await asks.ask(source.judged, about.number)
         told = told_of(request, await asks.ask(source.progress, about.session_id))
         return pages.show(

@@ -31,11 +31,11 @@ def routes(pages: Pages, asks: Asks, source: Source) -> list[Route]:
 
     async def visit(request: Request) -> Response:
         about = await asks.ask(source.visit, number_of(request), shown_of(request))
-        if as_json(request):  # where arrays may be loaded
-            return pages.show(request, "", about=await asks.ask(plain, about))
         told = told_of(request, await asks.ask(source.progress, about.row.session_id))
-        around = await asks.ask(source.around, about)
-        return pages.show(request, "visit.html", about=about, interval=interval, told=told, **around)
+        values = {"about": about, "told": told, **await asks.ask(source.around, about)}
+        if as_json(request):  # loads arrays, which not every thread may
+            values = await asks.ask(plain, values)
+        return pages.show(request, "visit.html", interval=interval, **values)
 
     return page("/visits/{number:int}", visit)
 
