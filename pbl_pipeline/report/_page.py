@@ -394,9 +394,7 @@ def _origin(visit: Visit, recordings: Sequence[Recording], norm: NormativeSet | 
     if visit.methods:
         groups.append({"name": "Methods", "rows": [(k, v, False) for k, v in visit.methods.items()]})
     software = {"pbl-pipeline": pbl_pipeline.__version__}
-    software |= {
-        f"keypoints of {r.name}": r.keypoints.origin for r in visit.fitted if r.keypoints and r.keypoints.origin
-    }
+    software |= {f"keypoints of {r.name}": r.keypoints.origin for r in recordings if r.keypoints and r.keypoints.origin}
     groups.append({"name": "Software", "rows": [(k, v, False) for k, v in software.items()]})
     return groups
 

@@ -8,7 +8,6 @@ from typing import Any
 from schemas import connection
 from schemas._datajoint import dj
 from schemas.chain import tables
-from schemas.operations import catalog
 
 
 @dataclasses.dataclass(frozen=True)

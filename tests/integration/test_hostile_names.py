@@ -24,7 +24,7 @@ from schemas.chain import ON_REQUEST
 from schemas.coded_errors import error_next_step
 from schemas.intake import Visit, ingest
 from schemas.intake.references import add_reference
-from schemas.report import write_session
+from schemas.report import write_visit
 from tests.command import pbl
 from workers.populate import populate
 
@@ -94,7 +94,7 @@ def test_names_go_through_tables_and_report_as_text(tables: None, tmp_path: Path
     monkeypatch.setattr(pbl_pipeline.pipeline, "render_overlay", lambda *a, **k: None)
     monkeypatch.setattr(pbl_pipeline.pipeline, "_pictures", lambda *a: ())
     out = tmp_path / "out"
-    written = write_session({"subject": "P001"}, out)
+    written = write_visit({"subject": "P001"}, out)
     assert all(p.resolve().parent == out.resolve() for p in written)
     assert {p.parent for p in out.rglob("*")} == {out}
     page = Page((out / "report.html").read_text(encoding="utf-8"))

@@ -6,8 +6,6 @@ import functools
 import json
 import threading
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -39,9 +37,10 @@ from pbl_pipeline.keypoints._protocol import Look
 from pbl_pipeline.keypoints._root import absolute_root
 from pbl_pipeline.keypoints._virtual_camera import crops, look_at
 from pbl_pipeline.models import LiteModel
-from pbl_pipeline.pipeline import _models
+from pbl_pipeline.report._page import page_of
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.video import Camera, Frame, probe, read_frames, viewing_ray
+from pbl_pipeline.visit import Recording, Visit
 from tests import dot_models
 from tests.command import pbl
 from tests.dot_models import NAMES, lens, person, picture, project, region
@@ -560,8 +559,9 @@ def test_pbl_detect_shows_the_licence_before_the_work(video, registered, tmp_pat
 def test_the_report_names_the_model(video, registered):
     path, tracking = video
     found = detect_keypoints(path, tracking, 1, CAMERA, "dots-simcc")
-    session: Any = SimpleNamespace(trials=[SimpleNamespace(name="walk", keypoints=found)])
-    assert _models(session) == {"keypoints of walk": found.origin}
+    groups = page_of(Visit((Recording.of("walk", keypoints=found),)), {}, "Report", None)["origin"]
+    (software,) = (group["rows"] for group in groups if group["name"] == "Software")
+    assert ("keypoints of walk", found.origin, False) in software
 
 
 def test_rotation_of_the_crop_is_the_roll_that_was_asked():
