@@ -20,7 +20,7 @@ from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
 from workers.populate import populate
-from workers.web import Options, create_app
+from workers.web import Options, create_app, export
 from workers.web.access import HOURS, Sessions
 
 

@@ -25,6 +25,7 @@ from tests.integration import decide_target, web
 from tests.integration.chain import small_video
 from tests.rows import everything_but_refreshes, register
 from workers.populate import populate
+from workers.web import export
 from workers.web.corrections import _events
 
 

@@ -165,7 +165,9 @@ def test_no_json_has_a_path_or_a_number_that_is_not_finite(results, monkeypatch:
 def test_what_plain_values_are_of():
     frame = pd.DataFrame({"percent": [0, 1], "mean_deg": [np.nan, 2.5]})
     assert plain(frame) == [{"percent": 0, "mean_deg": None}, {"percent": 1, "mean_deg": 2.5}]
-    assert plain({"at": datetime.date(2026, 3, 1), "p": Path("/a/b.mp4"), "x": np.float32(np.inf), "y": np.zeros(3)}) == {
+    assert plain(
+        {"at": datetime.date(2026, 3, 1), "p": Path("/a/b.mp4"), "x": np.float32(np.inf), "y": np.zeros(3)}
+    ) == {
         "at": "2026-03-01",
         "p": "b.mp4",
         "x": None,

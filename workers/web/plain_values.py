@@ -15,6 +15,7 @@ import pandas as pd
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.visit import Recording, Visit, recording_facts, visit_facts
+
 #: The folders of an absolute path in a text.
 _FOLDERS = re.compile(r"(?<![\w:/.])/(?:[^\s/'\"]+/)+(?=[^\s/'\"])")
 
