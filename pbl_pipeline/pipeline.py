@@ -35,32 +35,6 @@ def fit_default(keypoints: Method[KeypointParams]) -> str:
     return default_fit(keypoints.params.points())
 
 
-def detect_recording(
-    path: Path,
-    sheet: Path,
-    camera_file: Path | None = None,
-    person: int | None = None,
-    keypoints: Method[KeypointParams] | None = None,
-    people: Method[TrackingParams] | None = None,
-) -> Recording:
-    """Video to keypoints of the subject. `sheet` is the picture of the people that is written when one must be chosen.
-    `keypoints` and `people` are the methods, None the default.
-
-    Raises
-    ------
-    PblError
-        The VIDEO_ codes, TRACK_NO_PERSON, TRACK_TOO_SHORT, SUBJECT_NEEDS_CHOICE, SUBJECT_UNKNOWN_PERSON, ASSET_ codes,
-        CAMERA_INVALID, MODEL_ codes, DEVICE_UNAVAILABLE.
-    """
-    info = probe(path)
-    camera = find_camera(info, camera_file)
-    tracking = track_people(path, people, info=info)
-    choice = choose_subject(tracking, override=person)
-    subject = require_subject(choice, tracking, path, sheet)
-    points = detect_keypoints(path, tracking, subject, camera, params=keypoints)
-    return Recording.of(path.stem, keypoints=points, path=path, video=info, choice=choice)
-
-
 def run_visit(
     paths: Sequence[Path],
     out: Path,
@@ -86,8 +60,9 @@ def run_visit(
     Raises
     ------
     PblError
-        The error of the video where no video of the visit can be fitted; NORM_UNKNOWN, NORM_INVALID; FILE_MISSING,
-        PHONE_LOG for a log that cannot be read.
+        The error of the video where no video of the visit can be fitted: the VIDEO_ codes, TRACK_NO_PERSON,
+        TRACK_TOO_SHORT, SUBJECT_NEEDS_CHOICE, SUBJECT_UNKNOWN_PERSON, ASSET_ codes, CAMERA_INVALID, MODEL_ codes,
+        DEVICE_UNAVAILABLE. NORM_UNKNOWN, NORM_INVALID; FILE_MISSING, PHONE_LOG for a log that cannot be read.
     """
     # A wrong name or log must not cost a fit.
     keypoints, people = KEYPOINT_METHODS.find(keypoints), TRACKING_METHODS.find(people)
@@ -96,24 +71,29 @@ def run_visit(
     check_height(height_m)
     logs = [(file, read_phone_log(file)) for file in attitude_files] or [None] * len(paths)
     camera_motion = camera_motion or ("handheld" if attitude_files else "static")
-    recordings: list[Recording] = []
+    found: list[Recording] = []
     problems: dict[str, PblError] = {}
     seen: dict[str, str] = {}
     for path, name, log in zip(paths, distinct_names(paths), logs, strict=True):
+        video = choice = None
         try:
             first = seen.setdefault(sha256_of(path), name)
             if first != name:
                 raise _named_twice(path, first)
-            sheet = out / f"{name}.persons.png"
-            recording = detect_recording(path, sheet, camera_file, person, keypoints, people)
-            points = recording.keypoints
-            assert points is not None
-            if log is not None and recording.video is not None:
-                points = points.with_attitude(attitude_of(log[1], log[0], recording.video))
+            video = probe(path)
+            tracking = track_people(path, people, info=video)
+            choice = choose_subject(tracking, override=person)
+            subject = require_subject(choice, tracking, path, out / f"{name}.persons.png")
+            points = detect_keypoints(path, tracking, subject, find_camera(video, camera_file), params=keypoints)
+            if log is not None:
+                points = points.with_attitude(attitude_of(log[1], log[0], video))
             check_trial(points, name, method)
-            recordings.append(dataclasses.replace(recording, name=name, load_keypoints=Held(points)))
+            found.append(Recording.of(name, keypoints=points, path=path, video=video, choice=choice))
         except PblError as error:
             problems[name] = error
+            problem = choice.reason if choice is not None and choice.person_id is None else error.short()
+            found.append(Recording(name, path, video, choice, problem=problem))
+    recordings = [r for r in found if not r.problem]
     if not recordings:
         raise next(iter(problems.values()))
     fit = fit_session(
@@ -124,7 +104,7 @@ def run_visit(
         height_m=height_m,
     )
     fitted = [dataclasses.replace(r, load_fit=Held(t)) for r, t in zip(recordings, fit.trials, strict=True)]
-    left_out = [Recording(name, problem=error.short()) for name, error in problems.items()]
+    left_out = [r for r in found if r.problem]
     methods = {"Tracking": people.key, "Keypoints": keypoints.key, "Fit": method.key}
     visit = Visit((*fitted, *left_out), Solution.of(fit), fit.qc, methods=methods)
     return measured(visit, norm=norm), problems

@@ -21,8 +21,8 @@ from scipy.optimize import isotonic_regression
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import BOUND_TRUNK, METHODS, ConfidenceCurve, KeypointParams, Keypoints
 from pbl_pipeline.methods import Method
-from pbl_pipeline.pipeline import detect_recording
 from pbl_pipeline.video import load_camera, load_camera_poses
+from research.clip_keypoints import clip_keypoints
 from research.paths import PACKAGE
 from research.reliability.page import write_reliability
 from research.reliability.point_errors import PointErrors, point_errors
@@ -63,7 +63,7 @@ def detected(data: Path, folder: Path, method: Method[KeypointParams]) -> Iterat
         kept = folder / f"{name}.keypoints.npz"
         if not kept.exists():
             folder.mkdir(parents=True, exist_ok=True)
-            detect_recording(video, kept.with_suffix(".png"), keypoints=method).keypoints.save(kept)
+            clip_keypoints(video, kept.with_suffix(".png"), keypoints=method).save(kept)
         yield name, Keypoints.load(kept)
 
 

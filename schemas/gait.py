@@ -434,7 +434,7 @@ def events_of(
     """The library's `GaitEvents` of a row of GaitEvents: the detected ones, or those that a correction (key of
     EventCorrection) sets instead."""
     from pbl_pipeline import gait as lib
-    from pbl_pipeline.qc import Check
+    from pbl_pipeline.qc import Check, in_order
 
     key = {k: row[k] for k in GaitEvents.primary_key}
     detected = lib.GaitEvents(
@@ -447,7 +447,7 @@ def events_of(
         walking_s=tuple((float(a), float(b)) for a, b in row["walking_bouts"]),
         n_candidates=int(row["n_candidates"]),
         n_order_breaks=int(row["n_order_breaks"]),
-        qc=tuple(Check(*check_values("events", check)) for check in rows(GaitEvents.Check, key)),
+        qc=in_order(Check(*check_values("events", check)) for check in rows(GaitEvents.Check, key)),
     )
     if correction is None:
         return detected

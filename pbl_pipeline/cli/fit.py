@@ -50,6 +50,7 @@ def fit(
     """
     from pbl_pipeline.files import check_out_folder
     from pbl_pipeline.fit import fit_session, points_of
+    from pbl_pipeline.keypoints import WorldMarkers
     from pbl_pipeline.pipeline import distinct_names
     from pbl_pipeline.visit import Recording, Solution, Visit, save_visit
 
@@ -69,7 +70,9 @@ def fit(
     motion = motions[0] if len(set(motions)) == 1 else motions
     session = fit_session(trials, names, paramset, motion, height_m=height_m, **markers)
     recordings = tuple(Recording.of(trial.name, trial) for trial in session.trials)
-    visit = Visit(recordings, Solution.of(session), session.qc, methods={"Fit": paramset.key})
+    laboratory = all(isinstance(trial, WorldMarkers) for trial in trials)
+    kind = "rig" if cameras else "markers" if laboratory else "single"
+    visit = Visit(recordings, Solution.of(session), session.qc, kind=kind, methods={"Fit": paramset.key})
     for path in save_visit(visit, out):
         click.echo(path)
     click.echo(f"fitted in {session.seconds:.0f} s, of which {session.compile_seconds:.0f} s compiling")

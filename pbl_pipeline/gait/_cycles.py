@@ -70,7 +70,7 @@ def find_cycles(
         series, feet = angle_series(fit, poses), feet_from_fit(fit, poses)
         no_lengths, metric, far = why_no_lengths(fit), is_metric(fit), far_leg(fit, poses)
         stated = bool(np.isfinite(fit.height_m))
-    cycles = []
+    cycles, slides = [], []
     for bout in sorted({e.bout for e in found}):
         inside = sorted((e for e in found if e.bout == bout), key=lambda e: e.time_s)
         downs = [e for e in inside if e.event == FOOT_DOWN]
@@ -87,10 +87,10 @@ def find_cycles(
             if series is not None:
                 curves, missing = cycle_curves(series, start.side, start.time_s, end.time_s)
                 curves_sd = _curves_sd(series, start, end) if curves else {}
-            lengths = Lengths(missing=no_lengths)
+            lengths, slide = Lengths(missing=no_lengths), None
             if feet is not None and not no_lengths:
                 times = (start.time_s, inner[1].time_s, end.time_s)
-                lengths = cycle_lengths(feet, start.side, *times, metric=metric or stated, width=metric)
+                lengths, slide = cycle_lengths(feet, start.side, *times, metric=metric or stated, width=metric)
             cycle = GaitCycle(
                 trial=name,
                 number=0,
@@ -112,7 +112,8 @@ def find_cycles(
                 far_leg="" if fit is None or far is None else mostly(_during(far, fit.time_s, start, end)),
             )
             cycles.append(cycle)
-    cycles = without_odd_curves(without_odd_lengths(where_feet_stand(cycles)))
+            slides.append(slide)
+    cycles = without_odd_curves(without_odd_lengths(where_feet_stand(cycles, slides)))
     if checks := failed(fit_checks):
         cycles = [dataclasses.replace(c, exclusion=Exclusion(failed_checks=checks)) for c in cycles]
     cycles.sort(key=lambda c: c.start_s)

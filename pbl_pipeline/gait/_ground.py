@@ -41,8 +41,11 @@ def why_no_lengths(fit: TrialFit) -> str:
 
 def cycle_lengths(
     feet: FootTrajectories, side: str, start_s: float, other_down_s: float, end_s: float, *, metric: bool, width: bool
-) -> Lengths:
-    """Lengths of the cycle of `side` from `start_s` to `end_s`, whose other foot comes down at `other_down_s`.
+) -> tuple[Lengths, float | None]:
+    """Return the lengths of the cycle of `side` from `start_s` to `end_s`; the other foot lands at `other_down_s`.
+
+    Also the speed of its standing feet over the floor against that relative to the pelvis (median of the three), None
+    without lengths.
 
     The place of a foot is the median of its heel over the frames in which it lies flat. With A and C the own foot's
     places at the start and the end and B the other's in between, all on the floor: stride length |C - A|, step length
@@ -56,27 +59,29 @@ def cycle_lengths(
     for foot, down in ((own, start_s), (other, other_down_s), (own, end_s)):
         place, slide = _place(feet, foot, down, stride_s)
         if place is None:
-            return Lengths(missing=UNSEEN)
+            return Lengths(missing=UNSEEN), None
         places.append(place)
         slides.append(slide)
     a, b, c = places
     stride = float(np.linalg.norm(c - a))
     if not stride > 1e-6:
-        return Lengths(missing=SLIDES)
+        return Lengths(missing=SLIDES), None
     along = (c - a) / stride
     step = float((c - b) @ along)
     across = float(np.linalg.norm((b - a) - ((b - a) @ along) * along))
-    return Lengths(stride, step, across if width else None, metric=metric, slide=float(np.median(slides)))
+    return Lengths(stride, step, across if width else None, metric=metric), float(np.median(slides))
 
 
-def where_feet_stand(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
-    """The cycles of a trial, without lengths where its standing feet slide (`MAX_SLIDE`)."""
-    slides = [c.lengths.slide for c in cycles if c.lengths.slide is not None]
-    if not slides or np.median(slides) <= MAX_SLIDE:
+def where_feet_stand(cycles: Sequence[GaitCycle], slides: Sequence[float | None]) -> list[GaitCycle]:
+    """Return the cycles of a trial, without lengths where its standing feet slide (`MAX_SLIDE`).
+
+    `slides`: of each cycle what `cycle_lengths` returned, None where it has no lengths.
+    """
+    known = [s for s in slides if s is not None]
+    if not known or np.median(known) <= MAX_SLIDE:
         return list(cycles)
-    return [
-        dataclasses.replace(c, lengths=Lengths(missing=SLIDES)) if c.lengths.slide is not None else c for c in cycles
-    ]
+    sliding = Lengths(missing=SLIDES)
+    return [c if s is None else dataclasses.replace(c, lengths=sliding) for c, s in zip(cycles, slides, strict=True)]
 
 
 def _place(feet: FootTrajectories, foot: int, down_s: float, stride_s: float) -> tuple[np.ndarray | None, float]:

@@ -19,7 +19,6 @@ class Lengths:
 
     `stride_length_m` between two places of the own foot; `step_length_m` of the step that ends the cycle, from the
     other foot to the own one along the stride; `step_width_m` between that other foot and the line of the stride.
-    `slide`: speed of the standing feet over the floor against that relative to the pelvis (median of the three).
     `metric` is False where the metres are those of a detector that guesses how tall a person is; where her height was
     stated they are hers, but the step width stays unknown.
     """
@@ -29,7 +28,6 @@ class Lengths:
     step_width_m: float | None = None
     missing: str = ""
     metric: bool = False
-    slide: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)

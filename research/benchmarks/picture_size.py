@@ -35,9 +35,9 @@ from pbl_pipeline.gait import gait_metrics
 from pbl_pipeline.keypoints import METHODS as KEYPOINT_METHODS
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.methods import Method
-from pbl_pipeline.pipeline import detect_recording
 from pbl_pipeline.video import load_camera, read_frames
 from research.benchmarks.real_clips import CLIPS, changed, fitted_angles, recorded_angles, score
+from research.clip_keypoints import clip_keypoints
 from research.confidence import recordings, truth_of
 from research.paths import SHARED
 from tests.videos import write_video
@@ -75,7 +75,7 @@ def keypoints_at(name: str, short_px: int, folder: Path) -> Keypoints:
             video = videos()[name]
             if short_px:
                 video = encoded(video, short_px, Path(scratch) / "video.mp4")
-            found = detect_recording(video, Path(scratch) / "people.png", keypoints=KEYPOINT_METHODS.find()).keypoints
+            found = clip_keypoints(video, Path(scratch) / "people.png", keypoints=KEYPOINT_METHODS.find())
         found.save(kept)
     return Keypoints.load(kept)
 

@@ -31,8 +31,8 @@ from pbl_pipeline.fit import METHODS, TrialFit, fit_session
 from pbl_pipeline.keypoints import METHODS as KEYPOINT_METHODS
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.methods import Method
-from pbl_pipeline.pipeline import detect_recording
 from pbl_pipeline.validation import BODY_ROTATIONS, fit_angles, fit_angles_sd, reference_of_bodies
+from research.clip_keypoints import clip_keypoints
 from research.paths import SHARED
 
 CLIPS = ("walk", "STS")
@@ -152,7 +152,7 @@ def keypoints_of(clip: str, fresh: bool = False, method: str | None = None) -> K
     if fresh or not cached.exists():
         cached.parent.mkdir(exist_ok=True)
         video, people = SHARED / "real" / "video_mocap" / clip / "video.mp4", cached.with_suffix(".png")
-        detect_recording(video, people, keypoints=detector).keypoints.save(cached)
+        clip_keypoints(video, people, keypoints=detector).save(cached)
     return Keypoints.load(cached)
 
 

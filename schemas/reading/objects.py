@@ -117,15 +117,16 @@ def load_cycles(key: Any, trial: str, rows: Rows = stored_rows) -> tuple[lib.Gai
 
 
 def _checks(rows: Sequence[Mapping[str, Any]], prefix: str) -> list[Check]:
-    from pbl_pipeline.qc import Check
+    from pbl_pipeline.qc import Check, in_order
 
-    return [Check(*check_values(prefix, row)) for row in rows]
+    return list(in_order(Check(*check_values(prefix, row)) for row in rows))
 
 
 def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
     """The library's `GaitMetrics` of one row of SessionGdi, from the rows of its trials and its own: nothing is
     computed anew but the checks of a trial's cycles."""
     from pbl_pipeline import gait as lib
+    from pbl_pipeline.gait.metrics_file import INDEX_CHECKS
 
     row = row_of(gdi.SessionGdi, key, rows)
     row_key = _of(gdi.SessionGdi, row)
@@ -137,7 +138,7 @@ def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
         for v in videos_of(row_key, rows)
     )
     pooled = [t for t in trials if t.pooled]
-    norm_name, model = _names(row_key, rows)
+    norm_name, model, params_hash = _index_of(row_key, rows)
     checks = _checks(rows(gdi.SessionGdi.Check, row_key), "gdi")
     index = lib.Gdi(
         status="PASS" if row["session_gdi"] is not None else "EMPTY",
@@ -152,9 +153,9 @@ def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
         n_right=sum(t.gdi.n_right for t in pooled),
         norm=norm_name,
         model=model,
-        params_hash=row["session_gdi_method_hash"],
+        params_hash=params_hash,
         cycles=tuple(c for t in pooled for c in t.gdi.cycles),
-        qc=tuple(c for c in checks if c.check in _INDEX_CHECKS),
+        qc=tuple(c for c in checks if c.check in INDEX_CHECKS),
         profile=gdi.profile_of_rows(rows(gdi.SessionGdi.Profile, row_key), row, "session"),
     )
     measures = _spatiotemporal(
@@ -175,10 +176,6 @@ def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
         qc=tuple(checks),
         params_hash=row["session_params_hash"],
     )
-
-
-#: Checks of the index among the checks of a session; the others are of the measures.
-_INDEX_CHECKS = ("gdi_cycles", "gdi_explained", "norm_convention")
 
 
 def _trial_metrics(key: Mapping[str, Any], rows: Rows) -> lib.TrialMetrics:
@@ -217,7 +214,7 @@ def load_gdi(key: Any, trial: str, rows: Rows = stored_rows) -> lib.Gdi:
     from pbl_pipeline import gait as lib
 
     row = row_of(gdi.GDI, key, rows)
-    norm_name, model = _names(row, rows)
+    norm_name, model, params_hash = _index_of(row, rows)
     sides = {int(r["cycle_no"]): r["cycle_side"] for r in rows(gait.GaitCycle.Cycle, _of(gait.GaitCycle, row))}
     cycles = tuple(
         lib.GdiCycle(
@@ -243,16 +240,21 @@ def load_gdi(key: Any, trial: str, rows: Rows = stored_rows) -> lib.Gdi:
         n_right=sum(c.side == "right" for c in cycles),
         norm=norm_name,
         model=model,
-        params_hash=row["gdi_method_hash"],
+        params_hash=params_hash,
         cycles=cycles,
         qc=tuple(_checks(rows(gdi.GDI.Check, key), "index")),
         profile=gdi.profile_of_rows(rows(gdi.GDI.Profile, key), row, "gdi"),
     )
 
 
-def _names(key: Mapping[str, Any], rows: Rows) -> tuple[str, str]:
+def _index_of(key: Mapping[str, Any], rows: Rows) -> tuple[str, str, str]:
+    """Names of the norm and the index, and the hash of the index with this norm."""
+    from pbl_pipeline.paramset import Paramset
+
     norm = row_of(gdi.NormativeSet, {"norm": key["norm"]}, rows)["norm_name"]
-    return norm, row_of(gdi.GdiModel, {"gdi_method": key["gdi_method"]}, rows)["gdi_method_name"]
+    row = row_of(gdi.GdiModel, {"gdi_method": key["gdi_method"]}, rows)
+    name, params = row["gdi_method_name"], {**row["gdi_params"], "norm": norm}
+    return norm, name, Paramset(gdi.GdiModel.stage, name, int(row["gdi_method_version"]), params).hash
 
 
 def _spatiotemporal(rows: list[dict], prefix: str, **fields: Any) -> lib.Spatiotemporal:

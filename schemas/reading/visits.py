@@ -227,7 +227,10 @@ def methods_of(key: Mapping[str, Any], rows: Rows = stored_rows) -> dict[str, st
     if cameras:
         found = {"Cameras": ", ".join(cameras), **found}
     if "gdi_method" in key:
-        found |= {"Gait events": key["gait_method"], "Index": f"{key['gdi_method']}, norm {key['norm']}"}
+        norm = row_of(gdi.NormativeSet, {"norm": key["norm"]}, rows)
+        # A set that ships has its name alone, as on files; one that was built anew has its version.
+        name = norm["norm_name"] if norm["norm_version"] == 1 else key["norm"]
+        found |= {"Gait events": key["gait_method"], "Index": f"{key['gdi_method']}, norm {name}"}
     return found
 
 

@@ -103,3 +103,9 @@ def install(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(pbl_pipeline.tracking, "track_people", track_people)
     patch.setattr(pbl_pipeline.keypoints, "detect_keypoints", detect_keypoints)
     patch.setattr(pbl_pipeline.fit, "fit_session", fit_session)
+
+
+def install_on_files(patch: pytest.MonkeyPatch) -> None:
+    """Put the stand-ins in place of what the chain on files calls."""
+    for function in (track_people, detect_keypoints, fit_session):
+        patch.setattr(pbl_pipeline.pipeline, function.__name__, function)

@@ -58,7 +58,7 @@ def visits(database: Path, tmp_path_factory: pytest.TempPathFactory):
 
 def test_changes_against_the_reference(visits: None):
     found = compare.compare([(2, None), (1, None), (4, None)])
-    assert [c.about.visit.session_id for c in found.compared] == [1, 2, 4]  # by day
+    assert [c.about.row.session_id for c in found.compared] == [1, 2, 4]  # by day
     first, second, without = found.compared
     assert (first.change, first.changes) == (None, {})
     assert second.change is not None

@@ -105,7 +105,7 @@ def test_too_few_frames_are_no_place():
 
 def test_one_camera_gives_no_width():
     feet, _ = walk(footprints())
-    lengths = cycle_lengths(feet, "left", 1.0, 1.5, 2.0, metric=False, width=False)
+    lengths, _ = cycle_lengths(feet, "left", 1.0, 1.5, 2.0, metric=False, width=False)
     assert lengths.stride_length_m == pytest.approx(1.2)
     assert (lengths.step_width_m, lengths.metric) == (None, False)
     assert "4 cm" in NO_WIDTH

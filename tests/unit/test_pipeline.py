@@ -30,18 +30,15 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """Names of the trials of each fit; detection and fit are stand-ins."""
     calls: list[list[str]] = []
 
-    def detect(path, sheet, camera_file=None, person=None, keypoints=None, people=None):
-        info = pipeline.probe(path)
-        points = chain.detect_keypoints(path, chain.track_people(path), 1, pipeline.find_camera(info))
-        points = dataclasses.replace(points, image_size_px=(1920, 1080))
-        choice = pipeline.choose_subject(chain.track_people(path))
-        return Recording.of(path.stem, keypoints=points, path=path, video=info, choice=choice)
+    def detect(*args, **options):
+        return dataclasses.replace(chain.detect_keypoints(*args, **options), image_size_px=(1920, 1080))
 
     def fit(trials, names, paramset=None, camera_motion="static", height_m=None):
         calls.append(list(names))
         return chain.fit_session(trials, names, paramset, camera_motion, height_m)
 
-    monkeypatch.setattr(pipeline, "detect_recording", detect)
+    chain.install_on_files(monkeypatch)
+    monkeypatch.setattr(pipeline, "detect_keypoints", detect)
     monkeypatch.setattr(pipeline, "check_trial", lambda *_: None)
     monkeypatch.setattr(pipeline, "fit_session", fit)
     return calls

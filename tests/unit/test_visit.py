@@ -7,7 +7,7 @@ import functools
 import json
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import pytest
 
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.export import FORMATS, ExportOptions, write_export
+from pbl_pipeline.export import FORMATS
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import (
     EVENT_METHODS,
@@ -26,11 +26,8 @@ from pbl_pipeline.gait import (
     MEASURES,
     Condition,
     GaitCycle,
-    GaitEvent,
     GaitParams,
     Gdi,
-    Measure,
-    MovementProfile,
     gait_metrics,
 )
 from pbl_pipeline.keypoints import Keypoints
@@ -39,9 +36,10 @@ from pbl_pipeline.qc import FAIL, PASS, WARN, Check
 from pbl_pipeline.report._page import page_of
 from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.video import Camera, VideoInfo
-from pbl_pipeline.visit import Recording, Solution, Visit, load_visit, save_visit, visit_of_fits
+from pbl_pipeline.visit import Recording, Visit, load_visit, save_visit, visit_of_fits
 from tests.command import pbl
 from tests.exported import marked_fit
+from tests.same_visit import ROUNDED, as_stored, assert_same, assert_same_exports, assert_same_text, fields, leaves
 from tests.unit.visits import solution_of
 from tests.walking_fit import walking_fit
 
@@ -50,11 +48,6 @@ FIT_CHECKS = (Check("residual_3d_cm", WARN, 7.123456789, 6.0, "look at the overl
 CHOICE = SubjectChoice("CHOSEN", 2, 0.9, None, float("nan"), {1: float("nan"), 2: 0.9}, "person 2 walks")
 NOBODY = SubjectChoice("NO_PERSON", None, float("nan"), None, float("nan"), {}, "nobody was found")
 METHODS = {"Tracking": "rtmdet-v1", "Keypoints": "blazepose-v2", "Fit": "gauss-newton-v4"}
-
-#: What the rounding in the files of a visit changes at most, by the class that holds the number: metrics.json rounds a
-#: measure to 4 decimals, index and profile to 3; events.csv times to 4 and probabilities to 3; session.json seconds to
-#: 3, scale and loss to 5. Everything else comes back as it was (curves as float32).
-ROUNDED = {Measure: 5.1e-5, Gdi: 5.1e-4, MovementProfile: 5.1e-4, GaitEvent: 5.1e-4, Solution: 5.1e-4}
 
 
 # -------------------------------------------------------------------------------------------------------------- visits
@@ -210,71 +203,6 @@ def saved(two: Visit, tmp_path: Path) -> Path:
     return tmp_path / "P017"
 
 
-# ----------------------------------------------------------------------------------------------------------- comparing
-def as_stored(visit: Visit) -> Visit:
-    """The visit without what its folder does not hold: paths, and the frames' times of a recording without a fit. Its
-    measures are judged by the checks before them."""
-
-    def stored(r: Recording) -> Recording:
-        video = r.video
-        if video is not None:
-            time = video.time_s if r.fitted else np.full(video.n_frames, np.nan)
-            video = dataclasses.replace(video, path=Path(video.path).name, time_s=time)
-        return dataclasses.replace(r, path=None, video=video)
-
-    judged = visit.judged
-    return dataclasses.replace(visit, recordings=tuple(map(stored, visit.recordings)), measures=judged)
-
-
-def fields(value: Any) -> dict[str, Any]:
-    """The fields of a dataclass; of a recording what its functions load."""
-    found = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
-    if isinstance(value, Recording):
-        loaded = {n.removeprefix("load_"): getattr(value, n.removeprefix("load_")) for n in found if "load_" in n}
-        return {n: v for n, v in found.items() if "load_" not in n} | loaded
-    return found
-
-
-def assert_same(a: Any, b: Any, where: str = "visit", atol: float = 0.0) -> None:
-    """Compare two values field by field, with what the rounding of the files allows (`ROUNDED`)."""
-    if dataclasses.is_dataclass(a):
-        assert type(a) is type(b), where
-        one, other = fields(a), fields(b)
-        for name in one:
-            assert_same(one[name], other[name], f"{where}.{name}", ROUNDED.get(type(a), 0.0))
-    elif isinstance(a, Mapping):
-        assert a.keys() == b.keys(), where
-        for key in a:
-            assert_same(a[key], b[key], f"{where}[{key!r}]", atol)
-    elif isinstance(a, list | tuple):
-        assert len(a) == len(b), where
-        for i, (one, other) in enumerate(zip(a, b, strict=True)):
-            assert_same(one, other, f"{where}[{i}]", atol)
-    elif isinstance(a, np.ndarray) and a.dtype.kind in "fiub":
-        np.testing.assert_allclose(b, a, rtol=1e-6, atol=atol, err_msg=where)
-    elif isinstance(a, float) and isinstance(b, float):
-        assert b == pytest.approx(a, rel=0, abs=atol, nan_ok=True), where
-    else:
-        assert a == b, where
-
-
-def assert_same_text(a: object, b: object, where: str) -> None:
-    """Compare two texts, and each number in them up to one unit of its last digit."""
-    number = r"\d+(?:\.\d+)?"
-    assert re.sub(number, "#", str(a)) == re.sub(number, "#", str(b)), where
-    for one, other in zip(re.findall(number, str(a)), re.findall(number, str(b)), strict=True):
-        decimals = len(one.partition(".")[2])
-        assert float(other) == pytest.approx(float(one), rel=0, abs=1.01 * 10.0**-decimals), where
-
-
-def leaves(value: Any, where: str = "") -> Iterator[tuple[str, Any]]:
-    """Every value of nested mappings and lists with its place."""
-    parts = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list | tuple) else ()
-    yield from ((where, value),) if not isinstance(value, Mapping | list | tuple) else ()
-    for key, part in parts:
-        yield from leaves(part, f"{where}/{key}")
-
-
 # ---------------------------------------------------------------------------------------------------------- round trip
 def test_a_visit_comes_back_from_its_folder(visit: Visit, folder: Path) -> None:
     loaded = load_visit(folder)
@@ -355,37 +283,6 @@ def test_every_export_of_the_loaded_visit_is_the_same(name: str, tmp_path: Path)
     save_visit(visit, tmp_path / "P017")
     formats = [f for f in FORMATS if f != "dlc" or visit.kind != "markers"]
     assert_same_exports(visit, load_visit(tmp_path / "P017"), formats, tmp_path)
-
-
-def assert_same_exports(visit: Visit, loaded: Visit, formats: list[str], tmp_path: Path) -> None:
-    """Compare what both are exported as: measures up to the rounding of metrics.json, events up to that of events.csv,
-    all else exactly."""
-    options = ExportOptions(allow_failed=True)
-    out = [tmp_path / "memory", tmp_path / "files"]
-    files = [write_export(v, formats, o, options) for v, o in zip((visit, loaded), out, strict=True)]
-    assert [p.relative_to(out[0]) for p in files[0]] == [p.relative_to(out[1]) for p in files[1]]
-    for one, other in zip(*files, strict=True):
-        if one.parent == out[0] and one.suffix == ".csv":
-            a, b = (pd.read_csv(p, keep_default_na=False, na_values=[""]) for p in (one, other))
-            pd.testing.assert_frame_equal(a, b, rtol=0, atol=5.1e-4, obj=one.name)
-        elif one.suffix == ".parquet":
-            pd.testing.assert_frame_equal(
-                pd.read_parquet(one), pd.read_parquet(other), rtol=0, atol=5.1e-4, check_categorical=False
-            )
-        elif one.suffix == ".c3d":
-            import ezc3d
-
-            a, b = (ezc3d.c3d(str(p)) for p in (one, other))
-            for kind in ("points", "rotations", "analogs"):
-                np.testing.assert_array_equal(a["data"][kind], b["data"][kind])
-            events = [f["parameters"]["EVENT"] for f in (a, b)]
-            assert events[0].keys() == events[1].keys()
-            if "TIMES" in events[0]:
-                np.testing.assert_allclose(*(e["TIMES"]["value"] for e in events), atol=1e-4)
-                assert events[0]["LABELS"]["value"] == events[1]["LABELS"]["value"]
-                assert events[0]["CONTEXTS"]["value"] == events[1]["CONTEXTS"]["value"]
-        else:
-            assert one.read_bytes() == other.read_bytes(), one.name
 
 
 # -------------------------------------------------------------------------------- the methods that made the files
