@@ -221,7 +221,7 @@ def compare_chart(
 
 def _cycle_axes(values: Sequence[np.ndarray], norm: tuple[np.ndarray, np.ndarray, np.ndarray] | None) -> Axes:
     """Return the plot area of an angle (deg) over the gait cycle (%) with room for `values` and the norm's band."""
-    edges = () if norm is None else (norm[1] - norm[2], norm[1] + norm[2])
+    edges = [] if norm is None else [norm[1] - norm[2], norm[1] + norm[2]]
     ticks = nice_ticks(*_extent([*values, *edges], least=20.0))
     axes = Axes(_CYCLE_SIZE, (0, 100), (ticks[0], ticks[-1]), margin=_CYCLE_MARGIN)
     if norm is not None:

@@ -27,7 +27,7 @@ import pbl_pipeline.tracking
 from pbl_pipeline import pipeline
 from pbl_pipeline.body import marker_set
 from pbl_pipeline.export import FORMATS
-from pbl_pipeline.fit import METHODS, SessionFit, default_method
+from pbl_pipeline.fit import METHODS, SessionFit, default_fit, points_of
 from pbl_pipeline.gait import Condition, GaitEvent, Gdi, apply_correction
 from pbl_pipeline.keypoints import MultiView
 from pbl_pipeline.report._page import page_of
@@ -172,7 +172,7 @@ def several_cameras(folder: Path, patch: pytest.MonkeyPatch) -> Both:
     populate()
     seen = [test_rigs.detect_keypoints(v, track_people(v), 1, None) for v in videos]
     trial = MultiView.from_calibration(seen, toml, list(test_rigs.CAMERAS))
-    method = METHODS.find(default_method([trial]))
+    method = METHODS.find(default_fit(*points_of([trial])))
     session = fit_session([trial], [test_rigs.CAMERAS[0]], method)
     recording = Recording.of(session.trials[0].name, session.trials[0])
     visit = Visit((recording,), Solution.of(session), session.qc, kind="rig", methods={"Fit": method.key})

@@ -66,14 +66,14 @@ def test_changes_against_the_reference(visits: None):
     knee = lambda c: c.curves[(c.curves["angle"] == "knee_flexion") & (c.curves["side"] == "left")]["mean_deg"]  # noqa: E731
     np.testing.assert_allclose(knee(second), LESS * knee(first), atol=0.7)
     name = "stride_time_s"
-    values = [c.measures[name].value for c in (first, second)]
+    values = [c.about.measures[name][0] for c in (first, second)]
     assert values[0] is not None
     assert values[1] is not None
     assert second.changes[name].by == values[1].mean - values[0].mean
     assert second.changes[name].sure is None  # no figure says what is more than chance
     assert (second.scores["mJOA"].change, second.scores["mJOA"].important) == (3.0, True)  # its minimal change is 2
     assert second.scores["mJOA-LE"].change is None  # the reference has none
-    assert (without.result, without.cycles, without.change) == (None, (), None)
+    assert (without.about.result, without.cycles, without.change) == (None, (), None)
     assert len(without.curves) == 0
     turned = compare.compare([(1, None), (2, None)], (2, None))
     assert turned.reference == 1
