@@ -95,8 +95,9 @@ def load_visit(restriction: Any, *, measures: bool = True) -> Visit:
         NORM_UNKNOWN for unknown methods.
     """
     found, key = find_visit(restriction)
-    rows = (video.Video & {"session_id": found["session_id"]}).to_dicts(order_by="video_id")
-    return _visit({**found, **key}, rows, stored_rows, measures)
+    videos = (video.Video & {"session_id": found["session_id"]}).to_dicts(order_by="video_id")
+    rows = ReadAhead([key], [int(r["video_id"]) for r in videos]) if key else stored_rows
+    return _visit({**found, **key}, videos, rows, measures)
 
 
 def fitted_visit(restriction: Any, *, gait: bool = True, whole: bool = False) -> Visit:

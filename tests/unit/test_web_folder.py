@@ -148,7 +148,7 @@ def test_no_json_has_a_path_or_a_number_that_is_not_finite(results, monkeypatch:
         assert answer.headers["content-type"] == "application/json", page
         assert answer.headers["cache-control"] == "no-store", page
         assert str(results) not in answer.text, page
-        content = json.loads(answer.text, parse_constant=lambda name: pytest.fail(f"{name} in {page}"))
+        content = json.loads(answer.text, parse_constant=pytest.fail)  # NaN, Infinity
         if answer.status_code != 200:
             assert set(content["error"]) == {"code", "found", "expected", "next_step", "key"}, page
             assert all(content["error"][k] for k in ("code", "found", "expected", "next_step")), page
@@ -184,7 +184,7 @@ def test_nothing_is_decided_in_a_folder(results):
 
 
 def test_a_folder_without_results_and_one_for_others_are_refused(results, tmp_path):
-    with pytest.raises(PblError, match="no session.json and no fit") as error:
+    with pytest.raises(PblError, match=r"no session\.json and no fit") as error:
         ResultsFolder(tmp_path)
     assert error.value.code == "FILE_MISSING"
     with pytest.raises(PblError, match="--folder for more than this machine"):
