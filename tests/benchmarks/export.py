@@ -19,9 +19,11 @@ from pathlib import Path
 import click
 import numpy as np
 
-from pbl_pipeline.export import FORMATS, ExportSession, ExportTrial, session_of_files, write_export
+from pbl_pipeline.export import FORMATS, write_export
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.pipeline import measured
+from pbl_pipeline.visit import Visit, visit_of_fits
 from tests.exported import marked_fit
 
 
@@ -33,22 +35,22 @@ def main(visits: int, formats: tuple[str, ...], measure: bool) -> None:
     """Visits a second, processor time of each and memory (MiB) before and after."""
     with tempfile.TemporaryDirectory() as folder:
         path = _visit(Path(folder))
-        known = session_of_files([path])
+        known = measured(visit_of_fits([path]))
         click.echo(f"{'formats':<44}{'visits':>7}{'visits/s':>10}{'CPU ms':>9}{'MiB before':>12}{'after':>8}")
         for some in [*([f] for f in FORMATS), [f for f in FORMATS if f not in ("csv", "parquet")]]:
             _run(path, known, some, min(50, visits), measure)
         _run(path, known, list(formats), visits, measure)
 
 
-def _run(path: Path, known: ExportSession, formats: list[str], visits: int, measure: bool) -> None:
+def _run(path: Path, known: Visit, formats: list[str], visits: int, measure: bool) -> None:
     out, seconds = path.parent / "out", []
     cpu = before = 0.0
     for i in range(visits + 10):
         if i == 10:  # what is loaded and compiled once is
             seconds, cpu, before = [], time.process_time(), resident_mib()
         start = time.perf_counter()
-        session = session_of_files([path]) if measure else _as_stored(path, known)
-        write_export(session, formats, out)
+        visit = measured(visit_of_fits([path])) if measure else _as_stored(path, known)
+        write_export(visit, formats, out)
         seconds.append(time.perf_counter() - start)
         shutil.rmtree(out)
     cpu = 1e3 * (time.process_time() - cpu) / visits
@@ -56,15 +58,14 @@ def _run(path: Path, known: ExportSession, formats: list[str], visits: int, meas
     click.echo(f"{name:<44}{visits:>7}{1 / np.mean(seconds):>10.1f}{cpu:>9.1f}{before:>12.0f}{resident_mib():>8.0f}")
 
 
-def _as_stored(path: Path, known: ExportSession) -> ExportSession:
-    """The visit with its files read anew and the measures that were stored."""
-    trial = ExportTrial(
-        name="walk",
-        fit=TrialFit.load(path),
-        keypoints=Keypoints.load(path.with_name("walk.keypoints.npz")),
-        measured=known.trials[0].measured,
+def _as_stored(path: Path, known: Visit) -> Visit:
+    """Return the visit with its files read anew and the measures that were stored."""
+    recording = dataclasses.replace(
+        known.recordings[0],
+        load_fit=lambda: TrialFit.load(path),
+        load_keypoints=lambda: Keypoints.load(path.with_name("walk.keypoints.npz")),
     )
-    return dataclasses.replace(known, trials=(trial,))
+    return dataclasses.replace(known, recordings=(recording,))
 
 
 def _visit(folder: Path) -> Path:
