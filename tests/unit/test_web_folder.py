@@ -110,7 +110,7 @@ def test_a_visit_without_all_of_its_files_shows_what_is_there_and_names_what_is_
     browser = browser_of(ResultsFolder(results))
     visit = browser.get(f"/visits/{number}").text
     assert f"no {file}: `pbl " in visit.replace("&#39;", "'")
-    assert "There are no measures of this visit yet" in visit
+    assert "This visit has no measures yet" in visit
     assert "/report" not in visit
     files = zipfile.ZipFile(io.BytesIO(browser.get(f"/visits/{number}/export").content)).namelist()
     assert any(name.endswith(".mot") for name in files)  # the movement, which is there
