@@ -297,7 +297,7 @@ def _video(facts: Mapping[str, Any], points: Path | None) -> VideoInfo:
     own = dict(facts)
     file, n = str(own.pop("file")), int(own["n_frames"])
     time = None if points is None or not points.is_file() else load_npz(points, ["time_s"]).get("time_s")
-    if np.shape(time) != (n,):
+    if time is None or np.shape(time) != (n,):
         time = np.full(n, np.nan)
     unknown = {k: math.nan for k in ("fps", "duration_s") if own[k] is None}
     return structured({**own, **unknown, "path": file, "time_s": time}, VideoInfo)

@@ -165,7 +165,7 @@ def shown_recording(video_id: int) -> ShownRecording:
     )
 
 
-def video_facts(recording: Recording) -> dict[str, float | None]:
+def video_facts(recording: Recording) -> dict[str, Any]:
     """Return duration (s), number of frames, width and height (px) of a recording's video; empty where not known."""
     info = recording.video
     names = ("duration_s", "n_frames", "width_px", "height_px")

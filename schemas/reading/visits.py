@@ -286,6 +286,10 @@ def _recording(row: Mapping[str, Any], key: Mapping[str, Any] | None, rows: Rows
     if key is None:
         choices = rows(tracking.SubjectChoice, of_video)
         choice = load_choice(choices[0]) if len(choices) == 1 else None
+        detected = rows(keypoints.Keypoints, of_video)
+        if len(detected) == 1:
+            points = {k: detected[0][k] for k in keypoints.Keypoints.primary_key}
+            about["load_keypoints"] = functools.partial(load_keypoints, points, rows)
         return Recording(Path(row["video_name"]).stem, choice=choice, problem=_problem(number, choice), **about)
     member = row_of(fit.FitSet.Video, {"fit_set": key["fit_set"], **of_video}, rows)
     if member["keypoint_method"]:

@@ -73,7 +73,7 @@ def test_changes_against_the_reference(visits: None):
     assert second.changes[name].sure is None  # no figure says what is more than chance
     assert (second.scores["mJOA"].change, second.scores["mJOA"].important) == (3.0, True)  # its minimal change is 2
     assert second.scores["mJOA-LE"].change is None  # the reference has none
-    assert (without.result, without.cycles, without.change) == (None, (), None)
+    assert (without.about.result, without.cycles, without.change) == (None, (), None)
     assert len(without.curves) == 0
     turned = compare.compare([(1, None), (2, None)], (2, None))
     assert turned.reference == 1

@@ -302,7 +302,7 @@ def _day(visit: Visit) -> datetime.date | None:
         return None
 
 
-def _facts_of_fit(recording: Recording) -> dict[str, float | None]:
+def _facts_of_fit(recording: Recording) -> dict[str, Any]:
     """Return what `video_facts` returns, from the fit: files of an older version have no facts of the video."""
     fit = recording.fit
     if fit is None or not fit.image_size_px[0]:
