@@ -100,13 +100,13 @@ def leaves(value: Any, where: str = "") -> Iterator[tuple[str, Any]]:
 
 _NUMBER = r"((?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w.]))"
 #: What float32, as which the tables store movements, changes in an exported number: a part of it, and of a millimetre.
-FLOAT32 = {"rtol": 5e-7, "atol": 2e-6}
+FLOAT32 = (5e-7, 2e-6)
 
 
 def assert_same_exports(visit: Visit, loaded: Visit, formats: list[str], tmp_path: Path, float32: bool = False) -> None:
     """Compare what both are exported as: measures up to the rounding of metrics.json, events up to that of events.csv,
     all else exactly; with `float32` movements up to `FLOAT32`."""
-    movement = FLOAT32 if float32 else {"rtol": 0.0, "atol": 0.0}
+    rtol, atol = FLOAT32 if float32 else (0.0, 0.0)
     options = ExportOptions(allow_failed=True)
     out = [tmp_path / "memory", tmp_path / "files"]
     files = [write_export(v, formats, o, options) for v, o in zip((visit, loaded), out, strict=True)]
@@ -124,9 +124,7 @@ def assert_same_exports(visit: Visit, loaded: Visit, formats: list[str], tmp_pat
 
             a, b = (ezc3d.c3d(str(p)) for p in (one, other))
             for kind in ("points", "rotations", "analogs"):
-                np.testing.assert_allclose(
-                    a["data"][kind], b["data"][kind], err_msg=one.name, rtol=movement["rtol"], atol=movement["atol"]
-                )
+                np.testing.assert_allclose(a["data"][kind], b["data"][kind], err_msg=one.name, rtol=rtol, atol=atol)
             events = [f["parameters"]["EVENT"] for f in (a, b)]
             assert events[0].keys() == events[1].keys()
             if "TIMES" in events[0]:
@@ -137,8 +135,6 @@ def assert_same_exports(visit: Visit, loaded: Visit, formats: list[str], tmp_pat
             texts = [re.split(_NUMBER, p.read_text()) for p in (one, other)]
             assert texts[0][::2] == texts[1][::2], one.name
             numbers = [np.array(t[1::2], float) for t in texts]
-            np.testing.assert_allclose(
-                numbers[0], numbers[1], err_msg=one.name, rtol=movement["rtol"], atol=movement["atol"]
-            )
+            np.testing.assert_allclose(numbers[0], numbers[1], err_msg=one.name, rtol=rtol, atol=atol)
         else:
             assert one.read_bytes() == other.read_bytes(), one.name
