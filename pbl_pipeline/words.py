@@ -55,7 +55,7 @@ UNUSABLE: dict[str, str] = {
     "not_in_view": "the person is not in view, or only in part",
     "too_dark": "too dark or blurred",
     "camera_moved": "the camera was moved, or stood badly",
-    "other_person": "somebody else is filmed",
+    "other_person": "another person is filmed",
     "other_task": "another task than the registered one",
     "helped": "the person was held or led",
     "interrupted": "the walk was interrupted",

@@ -90,8 +90,11 @@ class Change:
 
 @dataclasses.dataclass(frozen=True)
 class VisitRow:
-    """A visit of the list. state: one of `STATES` or `INCOMPLETE`; problem: code of the error where it failed. more:
-    further results of other chains of methods or kinds of recordings."""
+    """A visit of the list.
+
+    state: one of `STATES` or `INCOMPLETE`; problem: code of the error where it failed; more: further results of other
+    chains of methods or kinds of recordings.
+    """
 
     session_id: int
     subject: str

@@ -100,13 +100,13 @@ def leaves(value: Any, where: str = "") -> Iterator[tuple[str, Any]]:
 
 _NUMBER = r"((?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w.]))"
 #: What float32, as which the tables store movements, changes in an exported number: a part of it, and of a millimetre.
-FLOAT32 = {"rtol": 5e-7, "atol": 2e-6}
+FLOAT32 = (5e-7, 2e-6)
 
 
 def assert_same_exports(visit: Visit, loaded: Visit, formats: list[str], tmp_path: Path, float32: bool = False) -> None:
     """Compare what both are exported as: measures up to the rounding of metrics.json, events up to that of events.csv,
     all else exactly; with `float32` movements up to `FLOAT32`."""
-    movement = FLOAT32 if float32 else {"rtol": 0.0, "atol": 0.0}
+    rtol, atol = FLOAT32 if float32 else (0.0, 0.0)
     options = ExportOptions(allow_failed=True)
     out = [tmp_path / "memory", tmp_path / "files"]
     files = [write_export(v, formats, o, options) for v, o in zip((visit, loaded), out, strict=True)]
@@ -114,7 +114,7 @@ def assert_same_exports(visit: Visit, loaded: Visit, formats: list[str], tmp_pat
     for one, other in zip(*files, strict=True):
         if one.parent == out[0] and one.suffix == ".csv":
             tables = [pd.read_csv(p, keep_default_na=False, na_values=[""]) for p in (one, other)]
-            pd.testing.assert_frame_equal(*tables, rtol=0, atol=5.1e-4, obj=one.name)
+            pd.testing.assert_frame_equal(tables[0], tables[1], rtol=0, atol=5.1e-4, obj=one.name)
         elif one.suffix == ".parquet":
             pd.testing.assert_frame_equal(
                 pd.read_parquet(one), pd.read_parquet(other), rtol=0, atol=5.1e-4, check_categorical=False
@@ -124,16 +124,17 @@ def assert_same_exports(visit: Visit, loaded: Visit, formats: list[str], tmp_pat
 
             a, b = (ezc3d.c3d(str(p)) for p in (one, other))
             for kind in ("points", "rotations", "analogs"):
-                np.testing.assert_allclose(a["data"][kind], b["data"][kind], err_msg=one.name, **movement)
+                np.testing.assert_allclose(a["data"][kind], b["data"][kind], err_msg=one.name, rtol=rtol, atol=atol)
             events = [f["parameters"]["EVENT"] for f in (a, b)]
             assert events[0].keys() == events[1].keys()
             if "TIMES" in events[0]:
-                np.testing.assert_allclose(*(e["TIMES"]["value"] for e in events), atol=1e-4)
+                np.testing.assert_allclose(events[0]["TIMES"]["value"], events[1]["TIMES"]["value"], atol=1e-4)
                 assert events[0]["LABELS"]["value"] == events[1]["LABELS"]["value"]
                 assert events[0]["CONTEXTS"]["value"] == events[1]["CONTEXTS"]["value"]
         elif float32:
             texts = [re.split(_NUMBER, p.read_text()) for p in (one, other)]
             assert texts[0][::2] == texts[1][::2], one.name
-            np.testing.assert_allclose(*(np.array(t[1::2], float) for t in texts), err_msg=one.name, **movement)
+            numbers = [np.array(t[1::2], float) for t in texts]
+            np.testing.assert_allclose(numbers[0], numbers[1], err_msg=one.name, rtol=rtol, atol=atol)
         else:
             assert one.read_bytes() == other.read_bytes(), one.name

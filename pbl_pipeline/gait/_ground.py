@@ -42,10 +42,10 @@ def why_no_lengths(fit: TrialFit) -> str:
 def cycle_lengths(
     feet: FootTrajectories, side: str, start_s: float, other_down_s: float, end_s: float, *, metric: bool, width: bool
 ) -> tuple[Lengths, float | None]:
-    """Return the lengths of the cycle of `side` from `start_s` to `end_s`; the other foot lands at `other_down_s`.
+    """Return the lengths of the cycle of `side` from `start_s` to `end_s`, and how its standing feet slide.
 
-    Also the speed of its standing feet over the floor against that relative to the pelvis (median of the three), None
-    without lengths.
+    The other foot comes down at `other_down_s`. The slide is the speed of the standing feet over the floor against that
+    relative to the pelvis (median of the three), None without lengths.
 
     The place of a foot is the median of its heel over the frames in which it lies flat. With A and C the own foot's
     places at the start and the end and B the other's in between, all on the floor: stride length |C - A|, step length

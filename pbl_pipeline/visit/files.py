@@ -298,10 +298,9 @@ def _video(facts: Mapping[str, Any], points: Path | None) -> VideoInfo:
     """Return the facts of a video. Its time stamps are those of its keypoints, NaN where there are none."""
     own = dict(facts)
     file, n = str(own.pop("file")), int(own["n_frames"])
-    time = np.full(n, np.nan)
-    if points is not None and points.is_file():
-        stamps = load_npz(points, ["time_s"]).get("time_s", time)
-        time = stamps if stamps.shape == time.shape else time
+    time = None if points is None or not points.is_file() else load_npz(points, ["time_s"]).get("time_s")
+    if time is None or np.shape(time) != (n,):
+        time = np.full(n, np.nan)
     unknown = {k: math.nan for k in ("fps", "duration_s") if own[k] is None}
     return structured({**own, **unknown, "path": file, "time_s": time}, VideoInfo)
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import settings
@@ -36,10 +37,13 @@ class ShownVisit:
 
     row: VisitRow  # its line in the list of visits
     recordings: tuple[Recording, ...]  # all of the visit, without their arrays; of any kind and result
-    visit: Visit | None = None  # of the shown result; None where there is none yet
+    load_visit: Callable[[], Visit] | None = None  # loads `visit`; None where nothing is computed yet
     results: tuple[Result, ...] = ()  # by every chain of methods
     shown: int | None = None  # number of the shown one among `results`
+    key: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in the tables that of the shown result
+    measures: Mapping[str, tuple[Measure | None, str]] = dataclasses.field(default_factory=dict)  # or why not known
     checks: tuple[ShownCheck, ...] = ()  # of the shown result, in the order of the chain
+    lacks: tuple[str, ...] = ()  # what its files lack
     of_person: tuple[VisitRow, ...] = ()  # all visits of the person
     marks: Mapping[int, Unusable] = dataclasses.field(default_factory=dict)  # recordings marked as not usable
     computed: str = ""  # when the checks were computed
@@ -49,20 +53,10 @@ class ShownVisit:
         """The shown result in one line."""
         return None if self.shown is None else self.results[self.shown]
 
-    @property
-    def key(self) -> Mapping[str, Any]:
-        """Primary key of the shown result; empty without one."""
-        return {} if self.visit is None else self.visit.key
-
-    @property
-    def measures(self) -> dict[str, tuple[Measure | None, str]]:
-        """Each measure by its name, with the reason where it is not known."""
-        from pbl_pipeline.words import MEASURES
-
-        if self.visit is None or self.visit.measures is None:
-            return {}
-        found = self.visit.measures.spatiotemporal
-        return {n: (found[n], found.reasons.get(n, "")) for n in MEASURES if n in found.measures or n in found.reasons}
+    @functools.cached_property
+    def visit(self) -> Visit | None:
+        """The visit with all of the shown result, which the page itself does not need. Raises as `load_visit`."""
+        return None if self.load_visit is None else self.load_visit()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,11 +115,14 @@ def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
     if not results:
         return about
     key = _key_of(session_id, results[shown])
+    of_result = {"session_id": session_id, **key, "fit_set_kind": results[shown].kind}
     return dataclasses.replace(
         about,
-        visit=load_visit({"session_id": session_id, **key, "fit_set_kind": results[shown].kind}),
+        load_visit=functools.partial(load_visit, of_result),
         results=results,
         shown=shown,
+        key=key,
+        measures=_measures_of(key),
         checks=_checks_of(key),
         computed="".join(str(t) for t in (qc.SessionQc & key).to_arrays("qc_computed")),
     )
@@ -134,7 +131,7 @@ def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
 def computed_visit(session_id: int, shown: int) -> ShownVisit:
     """Return `shown_visit` of a visit that has a result. Raises also `PblError` DB_NOT_FOUND where it has none."""
     about = shown_visit(session_id, shown)
-    if about.visit is None:
+    if about.load_visit is None:
         raise PblError(
             "DB_NOT_FOUND",
             found=f"no result of session_id {session_id}",
@@ -168,7 +165,7 @@ def shown_recording(video_id: int) -> ShownRecording:
     )
 
 
-def video_facts(recording: Recording) -> dict[str, float | None]:
+def video_facts(recording: Recording) -> dict[str, Any]:
     """Return duration (s), number of frames, width and height (px) of a recording's video; empty where not known."""
     info = recording.video
     names = ("duration_s", "n_frames", "width_px", "height_px")
@@ -199,6 +196,18 @@ def _key_of(session_id: int, result: Result) -> dict[str, Any]:
     sets = (fit.FitSet & {"session_id": session_id, "fit_set_kind": result.kind}).proj()
     current = fit.current().proj() * sets
     return dict((gdi.SessionGdi.proj() & current.proj() & chain).keys()[0])
+
+
+def _measures_of(key: Mapping[str, Any]) -> dict[str, tuple[Measure | None, str]]:
+    """Return each measure of a result by its name, with the reason where it is not known."""
+    from pbl_pipeline.words import MEASURES
+
+    rows = {r["session_measure"]: r for r in (gdi.SessionGdi.Measure & key).to_dicts()}
+    return {
+        n: (gait.measure_of_row(rows[n], "session_measure"), str(rows[n]["session_measure_missing"]))
+        for n in MEASURES
+        if n in rows
+    }
 
 
 def _checks_of(key: Mapping[str, Any]) -> tuple[ShownCheck, ...]:

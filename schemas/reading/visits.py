@@ -95,8 +95,9 @@ def load_visit(restriction: Any, *, measures: bool = True) -> Visit:
         NORM_UNKNOWN for unknown methods.
     """
     found, key = find_visit(restriction)
-    rows = (video.Video & {"session_id": found["session_id"]}).to_dicts(order_by="video_id")
-    return _visit({**found, **key}, rows, stored_rows, measures)
+    videos = (video.Video & {"session_id": found["session_id"]}).to_dicts(order_by="video_id")
+    rows = ReadAhead([key], [int(r["video_id"]) for r in videos]) if key else stored_rows
+    return _visit({**found, **key}, videos, rows, measures)
 
 
 def fitted_visit(restriction: Any, *, gait: bool = True, whole: bool = False) -> Visit:
@@ -285,6 +286,10 @@ def _recording(row: Mapping[str, Any], key: Mapping[str, Any] | None, rows: Rows
     if key is None:
         choices = rows(tracking.SubjectChoice, of_video)
         choice = load_choice(choices[0]) if len(choices) == 1 else None
+        detected = rows(keypoints.Keypoints, of_video)
+        if len(detected) == 1:
+            points = {k: detected[0][k] for k in keypoints.Keypoints.primary_key}
+            about["load_keypoints"] = functools.partial(load_keypoints, points, rows)
         return Recording(Path(row["video_name"]).stem, choice=choice, problem=_problem(number, choice), **about)
     member = row_of(fit.FitSet.Video, {"fit_set": key["fit_set"], **of_video}, rows)
     if member["keypoint_method"]:

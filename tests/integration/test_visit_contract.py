@@ -125,6 +125,7 @@ def another_norm(folder: Path, patch: pytest.MonkeyPatch) -> Both:
     ingest([video], Whose("P001", "2026-03-01"), methods=Methods(norm=NORM))
     populate()
     both = run([video], folder / "out", norm=NORM)
+    assert both.of_tables.measures is not None
     assert both.of_tables.measures.gdi.norm == NORM
     return both
 
@@ -145,8 +146,8 @@ def corrected_event(folder: Path, patch: pytest.MonkeyPatch) -> Both:
     detect = metrics.detect_events
     patch.setattr(metrics, "detect_events", lambda *args: apply_correction(detect(*args), by_hand, 1))
     both = run([folder / "walk.mp4"], both.folder)
-    assert both.of_files.recordings[0].events.corrected
-    assert both.of_tables.recordings[0].events.corrected
+    events = [v.recordings[0].events for v in (both.of_files, both.of_tables)]
+    assert [e is not None and e.corrected for e in events] == [True, True]
     return both
 
 
@@ -287,19 +288,21 @@ def test_pages_are_the_same(both: Both) -> None:
     """As JSON, up to the rounding of the files, without what only the tables know."""
     browsers = [pages_of(Options()), pages_of(Options(folder=ResultsFolder(both.folder)))]
     visits = [b.get("/visits/1.json").json()["about"] for b in browsers]
-    assert_same(*(common_of_visit(v, both.kind) for v in visits), "visit", ROUNDED[Gdi])
+    of_tables, of_files = (common_of_visit(v, both.kind) for v in visits)
+    assert_same(of_tables, of_files, "visit", ROUNDED[Gdi])
     for recording in both.of_files.fitted:
         lead = both.of_tables.recording(recording.name).number
         number = sorted(p.name for p in both.folder.glob("*.fit.npz")).index(f"{recording.name}.fit.npz") + 1
         pages = [f"/recordings/{n}" for n in (lead, number)]
         shown = [b.get(f"{p}.json").json()["about"] for b, p in zip(browsers, pages, strict=True)]
         assert shown[0]["recording"]["events"]
-        assert_same(*(common_of_recording(v, both.kind) for v in shown), recording.name, ROUNDED[Gdi])
+        of_tables, of_files = (common_of_recording(v, both.kind) for v in shown)
+        assert_same(of_tables, of_files, recording.name, ROUNDED[Gdi])
         movement = [b.get(f"{p}/movement").json() for b, p in zip(browsers, pages, strict=True)]
         body = [b.get(f"{p}/body").content for b, p in zip(browsers, pages, strict=True)]
         assert body[0] == body[1]
         if both.kind == "single":  # without keypoints no frame is known as one in which a leg is hardly seen
-            assert_same(*movement, "movement", ROUNDED[Gdi])
+            assert_same(movement[0], movement[1], "movement", ROUNDED[Gdi])
 
 
 def common_of_visit(page: dict[str, Any], kind: str) -> dict[str, Any]:

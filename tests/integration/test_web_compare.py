@@ -125,7 +125,7 @@ def test_the_page_has_curves_measures_and_videos_without_scripts(visits: None):
     assert "Changes are against 2026-01-10" in turned  # "2.0" was not asked for
     assert "Changes are against 2026-04-10" in browser.get("/compare?v=1.0&v=2.0&ref=2.0").text
     assert "different people" in browser.get("/compare?v=1&v=3").text
-    assert "no measures of this visit yet" in browser.get("/compare?v=1&v=4").text
+    assert "This visit has no measures yet" in browser.get("/compare?v=1&v=4").text
     assert 'name="v" value="2" form="compare"' in browser.get("/visits/1").text
     assert "P001" not in "".join(re.findall(r'(?:href|src|action)="([^"]*)"', page))
 

@@ -142,7 +142,7 @@ def test_a_failure_is_shown_with_its_next_step_and_tried_again(visits: None, bro
         page = browser.get(path).text
         assert "VIDEO_MISSING" in page
         assert "bring the file or its disk back" in page
-    assert "Try again what failed" in browser.get("/visits/1").text
+    assert "Try failed computations again" in browser.get("/visits/1").text
     gone.write_bytes(kept)
     assert populate(visit=1).did_something is False  # what failed is tried again where that is asked for
     assert populate(visit=1, retry_errors=True).retried == 1
@@ -158,7 +158,7 @@ def test_a_process_that_dies_is_told_and_leaves_nothing_half(visits: None, brows
     ended(browser)
     page = browser.get("/visits/1").text
     assert "WORKER_CRASH" in page
-    assert "Try again what failed" in page
+    assert "Try failed computations again" in page
     assert everything_but_refreshes() == before
     assert [t.table for t in populate(visit=1).tables if t.errors] == []
     assert len(qc.SessionQc & fit.current()) == 2

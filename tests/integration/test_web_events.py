@@ -104,9 +104,10 @@ def test_corrected_events_count_instead_of_the_detected_ones(visit: str, monkeyp
     page = browser.get("/recordings/1").text
     assert "1 events corrected by A. First" in page
     assert page.count("by hand</td>") == 1
-    shown = shown_recording(1).recording.events.events
-    assert next(e for e in shown if e.probability == 1.0).time_s == pytest.approx(time + 0.1, abs=1e-4)
-    # The corrected trial and the visit are computed again, and nothing else.
+    shown = shown_recording(1).recording.events
+    assert shown is not None
+    assert next(e for e in shown.events if e.probability == 1.0).time_s == pytest.approx(time + 0.1, abs=1e-4)
+    # What follows is computed again: of the corrected trial and of the visit alone.
     run = {t.table: t.done for t in populate().tables if t.done}
     assert run == dict.fromkeys(("GaitCycle", "Spatiotemporal", "GDI", "SessionGdi", "SessionQc"), 1)
     assert dict(zip(*gait.GaitCycle.to_arrays("video_id", "correction_no"), strict=True)) == {1: 1, 2: None}
@@ -127,9 +128,9 @@ def test_corrected_events_count_instead_of_the_detected_ones(visit: str, monkeyp
     one, two = (t.events for t in found.measures.trials)
     assert (one.corrected, two.corrected) == (True, False)
     assert (one.method, one.params_hash) == (two.method, two.params_hash)
-    corrected = event_corrections.shown(1)
-    assert corrected is not None
-    assert [e.time_s for e in one.events] == [e[0] for e in corrected.hand or ()]
+    counting = event_corrections.shown(1)
+    assert counting is not None
+    assert [e.time_s for e in one.events] == [e[0] for e in (counting.hand or ())]
     assert [v["gait_method"] for v in list_fitted({})] == [visit]
     monkeypatch.setattr(export, "FORMATS", ("csv",))  # the stand-in of the fit has no markers for a .trc
     archive = zipfile.ZipFile(io.BytesIO(browser.get("/visits/1/export?result=0").content))

@@ -60,6 +60,18 @@ def test_each_look_is_a_row_before_anything_is_shown(audited: int, monkeypatch: 
     assert rows() == []
 
 
+def test_a_page_as_json_is_a_look_as_the_page_is(audited: int):
+    browser = web.client(name="A. First")
+    assert browser.get("/visits.json").status_code == browser.get("/visits/1.json").status_code == 200
+    assert rows() == []
+    for _ in range(2):
+        assert browser.get(f"/recordings/{audited}.json").status_code == 200
+    assert rows() == [("A. First", "page", audited, None)] * 2
+    assert browser.get("/recordings/999.json").json()["error"]["code"] == "DB_NOT_FOUND"
+    assert web.client(signed_in=False).get(f"/recordings/{audited}.json").status_code == 401
+    assert len(rows()) == 2
+
+
 def test_no_row_for_what_there_is_not_or_nobody_saw(audited: int, monkeypatch: pytest.MonkeyPatch):
     assert web.client(signed_in=False).get(f"/recordings/{audited}/video").status_code == 401
     assert web.client("operator").get(f"/recordings/{audited}/video").status_code == 403

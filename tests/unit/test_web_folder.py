@@ -110,7 +110,7 @@ def test_a_visit_without_all_of_its_files_shows_what_is_there_and_names_what_is_
     browser = browser_of(ResultsFolder(results))
     visit = browser.get(f"/visits/{number}").text
     assert f"no {file}: `pbl " in visit.replace("&#39;", "'")
-    assert "There are no measures of this visit yet" in visit
+    assert "This visit has no measures yet" in visit
     assert "/report" not in visit
     files = zipfile.ZipFile(io.BytesIO(browser.get(f"/visits/{number}/export").content)).namelist()
     assert any(name.endswith(".mot") for name in files)  # the movement, which is there
@@ -148,7 +148,7 @@ def test_no_json_has_a_path_or_a_number_that_is_not_finite(results, monkeypatch:
         assert answer.headers["content-type"] == "application/json", page
         assert answer.headers["cache-control"] == "no-store", page
         assert str(results) not in answer.text, page
-        content = json.loads(answer.text, parse_constant=lambda name, page=page: pytest.fail(f"{name} in {page}"))
+        content = json.loads(answer.text, parse_constant=pytest.fail)  # NaN, Infinity
         if answer.status_code != 200:
             assert set(content["error"]) == {"code", "found", "expected", "next_step", "key"}, page
             assert all(content["error"][k] for k in ("code", "found", "expected", "next_step")), page

@@ -7,7 +7,7 @@ import datetime
 import functools
 from collections.abc import Hashable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response
@@ -16,7 +16,8 @@ from starlette.routing import Route
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import PASS
-from pbl_pipeline.visit import FIT, METRICS, OVERLAY, REPORT, SESSION, Recording, Visit, load_visit, name_of_fit
+from pbl_pipeline.visit import FIT, METRICS, OVERLAY, REPORT, SESSION, Held, Recording, Visit, load_visit, name_of_fit
+from pbl_pipeline.words import MEASURES
 from schemas.reading.shown import ShownCheck, ShownRecording, ShownVisit, video_facts
 from schemas.visit_list import INCOMPLETE, Page, Result, VisitRow
 from schemas.visit_progress import Progress
@@ -26,6 +27,9 @@ from .address import interval, number_of
 from .corrections import Judged
 from .pages import Pages, page
 from .tables import Asks
+
+if TYPE_CHECKING:
+    from pbl_pipeline.gait import Measure
 
 #: Most visits of a folder, and how deep in it they are looked for.
 _MOST, _DEEP = 1000, 3
@@ -91,7 +95,9 @@ class ResultsFolder:
         return ShownVisit(
             row=row,
             recordings=visit.recordings,
-            visit=visit,
+            load_visit=Held(visit),
+            measures=_measures(visit),
+            lacks=visit.lacks,
             results=() if row.result is None else (row.result,),
             shown=None if row.result is None else 0,
             checks=tuple(ShownCheck(i, check, None) for i, check in enumerate(checks, 1)),
@@ -275,6 +281,14 @@ def _result(visit: Visit) -> Result | None:
     )
 
 
+def _measures(visit: Visit) -> dict[str, tuple[Measure | None, str]]:
+    """Return each measure by its name, with the reason where it is not known; nothing before they are computed."""
+    if visit.measures is None:
+        return {}
+    found = visit.measures.spatiotemporal
+    return {n: (found[n], found.reasons.get(n, "")) for n in MEASURES if n in found.measures or n in found.reasons}
+
+
 def _subject(visit: Visit) -> str:
     """Return the code of the person; empty where the files do not have one."""
     return "" if visit.subject == "-" else visit.subject
@@ -288,7 +302,7 @@ def _day(visit: Visit) -> datetime.date | None:
         return None
 
 
-def _facts_of_fit(recording: Recording) -> dict[str, float | None]:
+def _facts_of_fit(recording: Recording) -> dict[str, Any]:
     """Return what `video_facts` returns, from the fit: files of an older version have no facts of the video."""
     fit = recording.fit
     if fit is None or not fit.image_size_px[0]:

@@ -15,6 +15,7 @@ import pandas as pd
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.visit import Recording, Visit, recording_facts, visit_facts
+from schemas.reading.shown import ShownVisit
 
 #: The folders of an absolute path in a text.
 _FOLDERS = re.compile(r"(?<![\w:/.])/(?:[^\s/'\"]+/)+(?=[^\s/'\"])")
@@ -37,6 +38,9 @@ def plain(value: Any) -> Any:
         return plain({k: str(getattr(value, k) or "") for k in ("code", "found", "expected", "next_step", "key")})
     if isinstance(value, pd.DataFrame):
         return plain(value.to_dict("records"))
+    if isinstance(value, ShownVisit):
+        own = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.name != "load_visit"}
+        return plain({**own, "visit": value.visit})
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, Mapping):
