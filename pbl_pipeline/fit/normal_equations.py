@@ -86,16 +86,15 @@ def linearise(body: Body, p: Problem, w: Weights, state: State) -> Linearised:
         at = At(p, w, state, markers, at_floor, phone_at(p, state))
         values = [term.mean(at, cost) for term, cost in zip(_terms(at, *OF_MARKERS), costs, strict=True)]
         seen = functools.reduce(jnp.add, values)
-        sum_, cost = _add_shared(sum_, at, columns)
-        cost += seen
+        sum_, others = _add_shared(sum_, at, columns)
         for term in _terms(at, *OF_OTHERS):
             sum_, value = _add_term(sum_, term, at, soles, columns)
-            cost += value
+            others += value
         on_diagonal = lambda a: a[..., None] * jnp.eye(a.shape[-1], dtype=a.dtype)  # noqa: E731
         H, link = sum_.H + on_diagonal(sum_.own + _held(p, columns)), sum_.link + on_diagonal(sum_.next_1)
         system = BorderedBandedSystem(H, link, sum_.next_2, sum_.B, sum_.C)
         dispersion = 2 * seen * frame_count(p) / jnp.maximum(_observed_numbers(p), 1.0)
-        return Linearised(cost, system, sum_.g, sum_.h, x, dispersion)
+        return Linearised(seen + others, system, sum_.g, sum_.h, x, dispersion)
 
 
 def moved(state: State, dx: Float[Array, "F U"], dy: Float[Array, " K"]) -> State:
