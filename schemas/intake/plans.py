@@ -22,7 +22,7 @@ METHOD_FIELDS = {
     "gdi_method": "gdi",
     "norm": "norm",
 }
-#: Method of the fit that markers get where none is named (`pbl_pipeline.fit.default_method`).
+#: Method of the fit that markers get where none is named (`pbl_pipeline.fit.default_fit`).
 DEFAULT_MARKER_FIT = "markers"
 
 
