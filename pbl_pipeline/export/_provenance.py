@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from pbl_pipeline.body import Body
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.fit import METHODS, TrialFit
+from pbl_pipeline.gait import EVENT_METHODS, GDI_METHODS
+from pbl_pipeline.methods import Stage
 
 from ._trial import ExportTrial
 
@@ -27,9 +30,9 @@ def origin_of(trial: ExportTrial, body: Body) -> dict[str, str]:
     if trial.measured is not None:
         events = trial.measured.events
         by_hand = ", corrected by hand" if events.corrected else ""
-        lines["event_method"] = (source.get("Gait events") or f"{events.method} ({events.params_hash})") + by_hand
+        lines["event_method"] = _named(EVENT_METHODS, events.method, events.params_hash) + by_hand
         gdi = trial.measured.gdi
-        lines["index_method"] = source.get("Index") or f"{gdi.model}, norm {gdi.norm}"
+        lines["index_method"] = f"{_named(GDI_METHODS, gdi.model, gdi.params_hash)}, norm {gdi.norm}"
     if trial.keypoints is not None and trial.keypoints.origin:
         lines["keypoints_by"] = trial.keypoints.origin
     for stage in ("Tracking", "Keypoints"):
@@ -44,6 +47,11 @@ def fit_method(fit: TrialFit) -> str:
     """Solver and paramset of a fit, the paramset by its name where this version ships it."""
     named = next((m.key for m in METHODS.values() if m.hash == fit.params_hash), "")
     return f"{fit.solver}, {named}" if named else f"{fit.solver}, parameters {fit.params_hash}"
+
+
+def _named(stage: Stage[Any], name: str, sha: str) -> str:
+    """Return a method by its key where this version ships it, else by its name and hash."""
+    return next((m.key for m in stage.values() if m.hash == sha), f"{name} ({sha})")
 
 
 def one_line(text: str) -> str:

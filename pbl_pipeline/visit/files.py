@@ -42,8 +42,6 @@ KEYPOINTS, FIT, ANGLES, EVENTS, CYCLES, OVERLAY = (
     "cycles.npz",
     "overlay.mp4",
 )
-#: Stages whose methods metrics.json holds: `pbl gait` may measure the same fits again by others.
-_MEASURED_BY = ("Gait events", "Index")
 _AGAIN = "`pbl run` again"
 _MEASURE = f"`pbl gait *.fit.npz --out {METRICS}` in its folder writes it"
 
@@ -94,7 +92,7 @@ def visit_facts(visit: Visit) -> dict[str, Any]:
         **content,
         "visit": {
             **whose,
-            "methods": {stage: name for stage, name in visit.methods.items() if stage not in _MEASURED_BY},
+            "methods": dict(visit.methods),
             "recordings": [recording_facts(r) for r in visit.recordings],
         },
     }

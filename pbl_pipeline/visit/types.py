@@ -167,7 +167,7 @@ class Visit:
     kind
         "single" (recordings of one camera), "rig" (several cameras) or "markers" (a laboratory's).
     methods
-        Name of a stage to the method that computed it, in words.
+        Name of a stage up to the fit to the method that computed it, in words; those of the gait are in `measures`.
     lacks
         What its files lack, in sentences: those of an older version, or of a run that was ended.
     key

@@ -218,8 +218,10 @@ def load_recording(video_id: int) -> Recording:
 
 
 def methods_of(key: Mapping[str, Any], rows: Rows = stored_rows) -> dict[str, str]:
-    """Return name and version of the method behind each stage that a key of a result names; of several cameras also
-    their names."""
+    """Return name and version of the method behind each stage up to the fit, by a key of a fit or result.
+
+    Of several cameras also their names. The methods of the gait stand in its measures.
+    """
     members = rows(fit.FitSet.Video, {"fit_set": key["fit_set"]})
     member = members[0]
     cameras = sorted({r["rig_camera"] for m in members for r in rows(video.RigView, {"video_id": m["video_id"]})})
@@ -227,11 +229,6 @@ def methods_of(key: Mapping[str, Any], rows: Rows = stored_rows) -> dict[str, st
     found = {stage: method or fit.LABORATORY for stage, method in ahead.items()} | {"Fit": key["fit_method"]}
     if cameras:
         found = {"Cameras": ", ".join(cameras), **found}
-    if "gdi_method" in key:
-        norm = row_of(gdi.NormativeSet, {"norm": key["norm"]}, rows)
-        # A set that ships has its name alone, as on files; one that was built anew has its version.
-        name = norm["norm_name"] if norm["norm_version"] == 1 else key["norm"]
-        found |= {"Gait events": key["gait_method"], "Index": f"{key['gdi_method']}, norm {name}"}
     return found
 
 

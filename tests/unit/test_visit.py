@@ -300,11 +300,7 @@ def exported(out: Path, *fits: Path, to: str = "csv") -> Path:
 def test_an_export_of_files_has_the_methods_that_made_them(how: str, tmp_path: Path) -> None:
     """What metrics.json says is what is exported: not the measures of the default methods."""
     fit = walk("walk")
-    earlier = {
-        "Gait events": "phase-transformer-v1",
-        "Index": "pbl-2025-three-angles-v5, norm gillette-166-body-angles",
-    }
-    visit = visit_of(fit, methods=METHODS | earlier)
+    visit = visit_of(fit, methods=METHODS)
     save_visit(measured(visit) if how == "run" else visit, tmp_path)
     path, methods = tmp_path / "walk.fit.npz", ("--norm", "gillette-166-three-angles", "--method", "zeni-2008")
     done = pbl("gait", path, "--out", tmp_path / "metrics.json", *methods)
