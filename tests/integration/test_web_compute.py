@@ -102,8 +102,8 @@ def test_a_visit_waits_for_the_one_before_and_says_so(visits: None, browser: Any
     assert "This visit is being computed" in page
     assert "Compute now" not in page
     assert "Load again" in page
-    assert "What is decided meanwhile counts" in page
-    assert "when another one is done" in browser.get("/visits/2/progress").text
+    assert "Decisions made meanwhile count" in page
+    assert "after another one" in browser.get("/visits/2/progress").text
     assert 'data-busy="yes"' in browser.get("/visits/1/progress").text
     mark(browser, 2)  # decided while it is computed: the last decision counts
     decide.take_back(1)

@@ -93,7 +93,7 @@ def test_a_marked_recording_leaves_its_visit_and_comes_back(visit: tuple[int, in
     assert send(browser, 2, usable="yes").status_code == 303
     assert (state(), current()) == ("computed", [[1, 2]])
     assert not populate().did_something
-    assert "Nobody has decided" not in browser.get("/visits/1").text
+    assert "No decisions about this visit" not in browser.get("/visits/1").text
     assert [d.after for d in decide.decisions(1)] == [{"usable": "yes"}, {"usable": "no", "why": "interrupted"}]
 
 
