@@ -81,10 +81,11 @@ def run_visit(
             if first != name:
                 raise _named_twice(path, first)
             video = probe(path)
+            camera = find_camera(video, camera_file)
             tracking = track_people(path, people, info=video)
             choice = choose_subject(tracking, override=person)
             subject = require_subject(choice, tracking, path, out / f"{name}.persons.png")
-            points = detect_keypoints(path, tracking, subject, find_camera(video, camera_file), params=keypoints)
+            points = detect_keypoints(path, tracking, subject, camera, params=keypoints)
             if log is not None:
                 points = points.with_attitude(attitude_of(log[1], log[0], video))
             check_trial(points, name, method)
