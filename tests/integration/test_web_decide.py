@@ -104,7 +104,7 @@ def test_a_forged_form_changes_nothing(two_alike: int, change: dict[str, str]):
 
 def test_a_reader_looks_and_does_not_decide(two_alike: int):
     reader, before = web.client(role="reader"), everything()
-    assert "Your role looks" in reader.get(f"/recordings/{two_alike}").text
+    assert "Your role can look but not decide" in reader.get(f"/recordings/{two_alike}").text
     assert send(reader, two_alike, form_of(reader, two_alike), 1).status_code == 403
     assert everything() == before
 

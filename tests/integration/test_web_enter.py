@@ -111,7 +111,7 @@ def test_the_second_of_two_sees_what_the_first_entered(two_visits: None):
 def test_forged_forms_change_nothing(two_visits: None):
     reviewer, reader, before = web.client(), web.client(role="reader"), everything()
     assert send(reader, 1, mJOA="14").status_code == 403
-    assert "Your role looks" in reader.get("/visits/1/enter").text
+    assert "Your role can look but not enter values" in reader.get("/visits/1/enter").text
     assert send(reviewer, 1, seen="forged", mJOA="14").status_code == 409
     assert send(reviewer, 1, **{"none'--": "3"}).status_code == 400
     assert send(reviewer, 999, seen=entry(1).seen, mJOA="3").status_code == 404

@@ -54,7 +54,7 @@ def test_errors_with_code_words_and_next_step_are_tried_again(three_gone: list[i
     assert _errors() == {three_gone[0], three_gone[2]}
     late = again(browser, **one)  # as the second of two who press it
     assert late.headers["location"] == "/operate?retried=0"
-    assert "there no more" in browser.get("/operate?retried=0").text
+    assert "Nothing was put back" in browser.get("/operate?retried=0").text
     assert again(browser, table="VideoInfo", code="VIDEO_MISSING").headers["location"] == "/operate?retried=2"
     assert _errors() == set()
     rows = Decision().to_dicts(order_by="decision_id")
