@@ -27,14 +27,6 @@ from pbl_pipeline.video import attitude_of, find_camera, probe, read_phone_log, 
 from pbl_pipeline.visit import OVERLAY, REPORT, Held, Recording, Solution, Visit, save_visit
 
 
-def fit_default(keypoints: Method[KeypointParams]) -> str:
-    """Name of the fit's default method for the keypoints of that method (`fit.default_fit`).
-
-    Raises `PblError` MODEL_MISSING, MODEL_INVALID for a model that is not registered here.
-    """
-    return default_fit(keypoints.params.points())
-
-
 def run_visit(
     paths: Sequence[Path],
     out: Path,
@@ -53,8 +45,8 @@ def run_visit(
     A video that fails is left out, and so is one whose bytes were named before, because its steps would count twice;
     the others go on. Into `out` goes only a picture of the people of a video in which one must be chosen.
 
-    `paramset` is the method of the fit; None: the one that suits the keypoints (`fit_default`). `attitude_files` holds
-    a sensor log of the phone for each path, or nothing; one that does not belong to its video leaves that out.
+    `paramset` is the method of the fit; None: the one that suits the keypoints (`fit.default_fit`). `attitude_files`
+    holds a sensor log of the phone for each path, or nothing; one that does not belong to its video leaves that out.
     `camera_motion` None stands for "handheld" where there are logs, else "static". `height_m`: as in `fit_session`.
 
     Raises
@@ -66,7 +58,7 @@ def run_visit(
     """
     # A wrong name or log must not cost a fit.
     keypoints, people = KEYPOINT_METHODS.find(keypoints), TRACKING_METHODS.find(people)
-    method = FIT_METHODS.find(paramset or fit_default(keypoints))
+    method = FIT_METHODS.find(paramset or default_fit(keypoints.params.points()))
     load_norm(norm or DEFAULT_NORM)
     check_height(height_m)
     logs = [(file, read_phone_log(file)) for file in attitude_files] or [None] * len(paths)

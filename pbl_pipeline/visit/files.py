@@ -136,7 +136,7 @@ def visit_of_fits(paths: Sequence[Path], *, markers: MarkerSet | None = None, me
     """Return the visit of these fit.npz files, loaded, with what lies beside them where it is of these fits.
 
     Of several folders, or of some of a folder's fits, each recording has its own measures, and there are none over
-    all of them; of several folders the facts of the visit are unknown, too. `markers`: the lab's own table, of which
+    all of them; of several folders the facts of the visit are also unknown. `markers`: the lab's own table, of which
     the fits are. Raises as `load_visit`, and as `TrialFit.load`.
     """
     folders = {p.parent: None for p in paths}

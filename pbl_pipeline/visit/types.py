@@ -35,7 +35,7 @@ class Held(Generic[T]):
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """One recording of a visit. What a stage did not produce is None, and `problem` says why there is no fit.
+    """One recording of a visit. Results of stages that did not run are None; `problem` says why there is no fit.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class Recording:
 
     @functools.cached_property
     def keypoints(self) -> Keypoints | None:
-        """What the body was fitted to; None for markers of a laboratory. Raises as `fit`."""
+        """Keypoints that the body was fitted to; None for markers of a laboratory. Raises as `fit`."""
         return None if self.load_keypoints is None else self.load_keypoints()
 
     @functools.cached_property

@@ -25,7 +25,6 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import METHODS, ModelKeypointParams
 from pbl_pipeline.models import _spec
 from pbl_pipeline.paramset import Paramset
-from pbl_pipeline.pipeline import fit_default
 from tests import dot_models
 from tests.command import pbl
 
@@ -494,5 +493,5 @@ def test_the_fit_that_suits_the_points(registry, tmp_path, kind, markers, params
     names = list(marker_set(markers).names)
     fields = dot_models.spec(kind, (32, 32), name="still", marker_set=markers, joint_names=names)
     models.add(dot_models.write(tmp_path / "still", still(kind, names), fields))
-    assert fit_default(METHODS.find("still")) == paramset
-    assert fit_default(METHODS.find(None)) == fit.METHODS.default
+    assert fit.default_fit(METHODS.find("still").params.points()) == paramset
+    assert fit.default_fit(METHODS.find(None).params.points()) == fit.METHODS.default
