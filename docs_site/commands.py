@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import click
 
 from pbl_pipeline.cli import TASKS
-from pbl_pipeline.cli._main import cli
+from pbl_pipeline.cli.command_line import cli
 
 FOLDER = "reference/commands"
 

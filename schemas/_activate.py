@@ -31,7 +31,7 @@ def activate(start: bool = False, methods: bool = True) -> None:
         connection.bind(stage, module.schema)
     fit.SessionFit.plan = staticmethod(plan.plan_fit_sets)
     if methods and connection.prefix() not in _methods_done:
-        from ._methods import insert_all
+        from .methods import insert_all
 
         insert_all()
         _methods_done.add(connection.prefix())

@@ -11,7 +11,7 @@ import inspect
 import re
 from typing import Any
 
-from ._datajoint import dj
+from .datajoint_setup import dj
 from .stages import STAGES, modules
 
 _REFERENCE = re.compile(r"\s*->\s*(?:\[[^\]]*\]\s*)?([\w.]+?)(?:\.proj\((\w+)=.*)?\s*$")

@@ -37,10 +37,10 @@ import pymysql
 
 from pbl_pipeline.errors import PblError
 
-from ._datajoint import UTC, LostConnectionError, backend_of, datajoint, dj
-from ._datajoint import DuplicateError as DuplicateError  # these four for the workers
-from ._datajoint import IntegrityError as IntegrityError
-from ._datajoint import inserting as inserting
+from .datajoint_setup import UTC, LostConnectionError, backend_of, datajoint, dj
+from .datajoint_setup import DuplicateError as DuplicateError  # these four for the workers
+from .datajoint_setup import IntegrityError as IntegrityError
+from .datajoint_setup import inserting as inserting
 from .operations import embedded
 from .operations.embedded import APP_USER, HOST, Folder, not_running
 from .operations.secret_files import secret

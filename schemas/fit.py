@@ -16,8 +16,8 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
 
 from . import keypoints, lab, session, video
-from ._datajoint import dj
 from .checks import check_columns, check_row, check_values
+from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .rows import InputChanged, number, one

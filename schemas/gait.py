@@ -11,8 +11,8 @@ import numpy as np
 from pbl_pipeline import methods
 
 from . import fit, keypoints, session, video  # noqa: F401  a definition refers to video
-from ._datajoint import dj
 from .checks import check_columns, check_row, check_values
+from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .rows import Rows, number, one, row_of, stored_rows

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ._datajoint import dj
+from .datajoint_setup import dj
 
 schema = dj.Schema()
 

@@ -9,8 +9,8 @@ from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 
 from . import fit, gdi, keypoints, lab, review, session, video
-from ._datajoint import dj
-from ._methods import METHOD_TABLES
+from .datajoint_setup import dj
+from .methods import METHOD_TABLES
 from .rows import inside
 from .usable import unusable
 from .views import frame_of, newest_sets

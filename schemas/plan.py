@@ -12,8 +12,8 @@ from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 
 from . import fit, keypoints, session, tracking, video
-from ._datajoint import dj
 from .chain import before
+from .datajoint_setup import dj
 from .jobs import jobs_of
 from .method_rows import method_row, resolve_method
 from .rows import utc_now

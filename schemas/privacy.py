@@ -14,7 +14,7 @@ from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
 from . import video
-from ._datajoint import dj
+from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
 from .rows import one
 from .stored_files import file_ref, lasting_folder, stored_file

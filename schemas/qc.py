@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from . import fit, gait, gdi, keypoints, session  # noqa: F401  a definition refers to session
-from ._datajoint import dj
 from .checks import check_values
+from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
 from .rows import one
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from . import session, video  # noqa: F401  the definition refers to them
-from ._datajoint import dj
+from .datajoint_setup import dj
 
 schema = dj.Schema()
 

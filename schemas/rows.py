@@ -10,7 +10,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 
-from ._datajoint import dj
+from .datajoint_setup import dj
 
 #: What returns the rows of a table that agree with a key, in the order of the table's own key: `stored_rows` asks the
 #: database each time, `ReadAhead` for many keys at once.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pbl_pipeline.errors import PblError
 
 from . import lab  # noqa: F401  the definition refers to it
-from ._datajoint import dj
+from .datajoint_setup import dj
 
 schema = dj.Schema()
 

@@ -13,7 +13,7 @@ from typing import Any
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
-from ._datajoint import full_path
+from .datajoint_setup import full_path
 from .folders import private_folder
 from .operations.secret_files import secret
 

@@ -18,7 +18,7 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 
 from . import connection
-from ._datajoint import backend_of, build_object_path, full_path
+from .datajoint_setup import backend_of, build_object_path, full_path
 
 #: How the names of temporary folders begin; the number of the process follows, then its own word, because a container
 #: that is started again has processes of the same numbers.

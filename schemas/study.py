@@ -10,7 +10,7 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 
 from . import fit, gait, gdi, keypoints, lab, session, tracking  # noqa: F401  the definitions refer to them
-from ._datajoint import dj
+from .datajoint_setup import dj
 from .instruments import INSTRUMENTS
 
 schema = dj.Schema()

@@ -6,8 +6,8 @@ import re
 import sys
 from typing import Any
 
-from ._datajoint import dj
 from .chain import references, renamed, tables
+from .datajoint_setup import dj
 from .stages import STAGES, modules
 
 _ORIGIN = ("code_version", "method_hash", "model_sha256", "host", "seconds", "computed")

@@ -12,7 +12,7 @@ from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 
 from . import video
-from ._datajoint import dj
+from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .rows import delete_below, number, one, utc_now

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from . import lab
-from ._datajoint import DuplicateError, dj
+from .datajoint_setup import DuplicateError, dj
 
 T = TypeVar("T")
 

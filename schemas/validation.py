@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from . import fit, session, video  # noqa: F401  definitions refer to session and video
-from ._datajoint import dj
+from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
 from .rows import number, one
 from .stored_files import file_ref, stored_file

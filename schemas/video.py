@@ -12,7 +12,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.words import UNUSABLE
 
 from . import lab, session  # noqa: F401  the definitions refer to them
-from ._datajoint import dj
+from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
 from .rows import Rows, number, one, row_of, stored_rows
 

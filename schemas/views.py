@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from . import fit, gait, gdi, lab, qc, session, study, tracking, validation, video
-from ._datajoint import dj
+from .datajoint_setup import dj
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:

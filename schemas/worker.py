@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from ._datajoint import dj
+from .datajoint_setup import dj
 
 schema = dj.Schema()
 

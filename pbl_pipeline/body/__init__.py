@@ -30,7 +30,7 @@ from pbl_pipeline.body._kinematics import (  # noqa: E402
     scale_multipliers,
 )
 from pbl_pipeline.body._markers import MARKER_SETS, MarkerSet, load_marker_set, marker_set  # noqa: E402
-from pbl_pipeline.body._model import (  # noqa: E402
+from pbl_pipeline.body.model import (  # noqa: E402
     PELVIS_TURNS,
     SCALE_NAMES,
     SLIDES,

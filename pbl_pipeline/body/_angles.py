@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pbl_pipeline.body._model import SLIDES
+from pbl_pipeline.body.model import SLIDES
 
 #: OpenSim's knee is negative in flexion: joint -> angle of the other sign. It is turned here and nowhere else.
 _TURNED = {"knee_angle": "knee_flexion"}

@@ -13,7 +13,7 @@ import math
 import mujoco
 import numpy as np
 
-from pbl_pipeline.body._model import Body
+from pbl_pipeline.body.model import Body
 
 
 @dataclasses.dataclass(frozen=True)

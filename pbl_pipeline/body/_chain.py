@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body._frames import Frames
-from pbl_pipeline.body._model import Body
+from pbl_pipeline.body.model import Body
 
 
 def chain_frames(body: Body, qpos: Float[Array, "N Q"], body_pos: Float[Array, "B 3"]) -> Frames:

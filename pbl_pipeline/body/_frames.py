@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from mujoco import mjx
 
-from pbl_pipeline.body._model import Body
+from pbl_pipeline.body.model import Body
 
 
 class Frames(NamedTuple):

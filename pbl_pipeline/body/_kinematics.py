@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from pbl_pipeline.body._chain import chain_frames
 from pbl_pipeline.body._frames import Frames
-from pbl_pipeline.body._model import Body
+from pbl_pipeline.body.model import Body
 
 #: Forward kinematics: body, joint values (N, Q) and body positions (B, 3) to `Frames`.
 Forward = Callable[[Body, Array, Array], Frames]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pbl_pipeline.body._model import load_body
+from pbl_pipeline.body.model import load_body
 from pbl_pipeline.bounded import read_text
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import is_plain

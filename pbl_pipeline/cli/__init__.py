@@ -1,5 +1,5 @@
 """The `pbl` command. Each command is a module found through the entry-point group `pbl.commands`."""
 
-from ._main import TASKS, main
+from .command_line import TASKS, main
 
 __all__ = ["TASKS", "main"]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ._options import DEVICE, KEYPOINTS, PEOPLE, Person, keypoint_method, tracking_method
+from .options import DEVICE, KEYPOINTS, PEOPLE, Person, keypoint_method, tracking_method
 
 
 @click.command(epilog="Example: pbl detect walk.mp4 --out walk.keypoints.npz --person auto")

@@ -10,7 +10,7 @@ import click
 
 from pbl_pipeline.errors import PblError
 
-from ._options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, HEIGHT, fit_paramset
+from .options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, HEIGHT, fit_paramset
 
 if TYPE_CHECKING:
     from pbl_pipeline.body import MarkerSet

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from ._options import (
+from .options import (
     CAMERA_MOTION_HELP,
     CAMERA_MOTIONS,
     DEVICE,

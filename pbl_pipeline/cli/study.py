@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from ._main import Commands
+from .command_line import Commands
 
 
 class _StudyCommands(Commands):

@@ -1,6 +1,11 @@
 """Videos without faces: heads found, held over gaps and covered (docs/privacy.md)."""
 
-from ._deidentify import (
+from ._faces import FaceDetector
+from ._find import find_heads
+from ._paint import cover, outline
+from ._params import HeadParams
+from .types import REASONS, SOURCES, Head, Heads, ranges
+from .video_copy import (
     HOW,
     KEEP,
     SPREAD_S,
@@ -13,11 +18,6 @@ from ._deidentify import (
     sidecar_of,
     to_show,
 )
-from ._faces import FaceDetector
-from ._find import find_heads
-from ._paint import cover, outline
-from ._params import HeadParams
-from ._types import REASONS, SOURCES, Head, Heads, ranges
 
 __all__ = [
     "HOW",

@@ -16,10 +16,10 @@ from pbl_pipeline.tracking import tiles, track_people
 from pbl_pipeline.video import VideoInfo, find_camera, probe, read_frames
 
 from ._faces import FaceDetector, same_face
-from ._head_of_body import head_of_person
-from ._hold import held
 from ._params import HeadParams
-from ._types import DISAGREE, FACE, KEYPOINTS, NONE, Head, Heads
+from .head_of_body import head_of_person
+from .hold import held
+from .types import DISAGREE, FACE, KEYPOINTS, NONE, Head, Heads
 
 _FRAMES_AHEAD = 4
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from pbl_pipeline.extras import needed
 
-from ._text import lines, number_cells, text_cells
+from .text import lines, number_cells, text_cells
 
 
 @dataclasses.dataclass(frozen=True)

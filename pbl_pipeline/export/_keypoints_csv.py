@@ -10,8 +10,8 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 
-from ._text import lines, number_cells
 from ._trial import ExportTrial
+from .text import lines, number_cells
 
 
 def write_keypoints_csv(trial: ExportTrial, path: Path) -> None:

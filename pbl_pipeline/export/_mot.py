@@ -10,8 +10,8 @@ import numpy as np
 from pbl_pipeline.body import PELVIS_TURNS, SLIDES, load_body
 
 from ._osim import pelvis_rest_m
-from ._text import lines, number_cells
 from ._trial import ExportTrial
+from .text import lines, number_cells
 
 
 def coordinates(trial: ExportTrial) -> tuple[tuple[str, ...], np.ndarray]:

@@ -8,8 +8,8 @@ import numpy as np
 
 from pbl_pipeline.body import Y_UP_TO_Z_UP
 
-from ._text import lines, number_cells
 from ._trial import ExportTrial
+from .text import lines, number_cells
 
 
 def write_trc(trial: ExportTrial, path: Path, title: str = "markers") -> None:

@@ -24,22 +24,9 @@ from ._gdi import (
     interval_90,
     score_gdi,
 )
-from ._ground import cycle_lengths
-from ._laboratory import PLUG_IN_GAIT_POINTS, LabTrial, read_lab_feet, read_lab_trial
-from ._metrics import (
-    GaitMetrics,
-    GaitParams,
-    SessionMetrics,
-    TrialCycles,
-    TrialMetrics,
-    cycle_checks,
-    gait_metrics,
-    pool_trials,
-)
 from ._own_norm import norm_from_cycles
 from ._profile import MovementProfile, movement_profile, variable_scores
-from ._spatiotemporal import MEASURES, Measure, Spatiotemporal, cycle_measures, far_leg_of, spatiotemporal
-from ._types import GaitCycle, Lengths
+from .cycle_measures import MEASURES, Measure, Spatiotemporal, cycle_measures, far_leg_of, spatiotemporal
 from .events import METHODS as EVENT_METHODS
 from .events import (
     EventParams,
@@ -49,6 +36,18 @@ from .events import (
     check_correction,
     detect_events,
     load_events,
+)
+from .ground import cycle_lengths
+from .laboratory import PLUG_IN_GAIT_POINTS, LabTrial, read_lab_feet, read_lab_trial
+from .metrics import (
+    GaitMetrics,
+    GaitParams,
+    SessionMetrics,
+    TrialCycles,
+    TrialMetrics,
+    cycle_checks,
+    gait_metrics,
+    pool_trials,
 )
 from .motion import (
     FOOT_MARKER_SETS,
@@ -72,6 +71,7 @@ from .normative import (
     norm_names,
     offset_deg,
 )
+from .types import GaitCycle, Lengths
 
 __all__ = [
     "ACTIVITIES",

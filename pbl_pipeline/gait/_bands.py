@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from ._spatiotemporal import Spatiotemporal
+from .cycle_measures import Spatiotemporal
 from .normative import BODY_ANGLES, GRAVITY, PLUG_IN_GAIT, gait_norm, offset_deg
 
 #: Height (m, unscaled) of the calcaneus' origin above the floor with the foot flat.

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ._ground import is_metric
 from .events import LEFT, RIGHT
+from .ground import is_metric
 from .motion import BodyPoses
 
 if TYPE_CHECKING:

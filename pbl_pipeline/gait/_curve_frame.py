@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ._bands import NormalBands
-from ._types import GaitCycle
 from .events import SIDES
+from .types import GaitCycle
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -14,12 +14,12 @@ from pbl_pipeline.qc import Check, failed
 from ._angles import AngleSeries, angle_series
 from ._camera_side import far_leg, mostly
 from ._exclusion import Exclusion
-from ._ground import cycle_lengths, is_metric, where_feet_stand, why_no_lengths
-from ._outliers import without_odd_curves, without_odd_lengths
-from ._types import NO_POSITIONS, GaitCycle, Lengths
 from .events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents
+from .ground import cycle_lengths, is_metric, where_feet_stand, why_no_lengths
 from .motion import BodyPoses, FootTrajectories, feet_from_fit, trial_poses
 from .normative import BODY_ANGLES
+from .outliers import without_odd_curves, without_odd_lengths
+from .types import NO_POSITIONS, GaitCycle, Lengths
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit

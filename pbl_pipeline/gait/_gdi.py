@@ -16,7 +16,6 @@ from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
 
 from ._condition import SELF_SELECTED
 from ._profile import MovementProfile, movement_profile, variable_scores
-from ._types import GaitCycle
 from .events import LEFT, RIGHT
 from .normative import (
     DEFAULT_NORM,
@@ -26,6 +25,7 @@ from .normative import (
     check_degrees,
     load_norm,
 )
+from .types import GaitCycle
 
 
 @dataclasses.dataclass(frozen=True)

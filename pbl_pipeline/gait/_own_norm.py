@@ -11,8 +11,8 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import PASS, WARN, Check
 
 from ._gdi import MODEL_ANGLES
-from ._types import GaitCycle
 from .normative import MIN_VECTORS, NINE_ANGLES, THREE_ANGLES, NormativeSet, fit_norm
+from .types import GaitCycle
 
 #: Fewer people, or a larger fraction of the cycles from one person, give a warning.
 ADVISED_PEOPLE, MAX_SHARE = 20, 0.2

@@ -10,11 +10,11 @@ from pbl_pipeline.qc import EMPTY, PASS, Check
 
 from ._cycles import GaitCycle
 from ._gdi import Gdi, GdiCycle
-from ._metrics import GaitMetrics, TrialMetrics
 from ._profile import MovementProfile
-from ._spatiotemporal import MEASURES, Measure, Spatiotemporal
 from .curves_file import Curves
+from .cycle_measures import MEASURES, Measure, Spatiotemporal
 from .events import GaitEvent, GaitEvents
+from .metrics import GaitMetrics, TrialMetrics
 
 #: Checks of the index among the checks of a trial or session; the others are of its measures.
 INDEX_CHECKS = ("gdi_cycles", "gdi_explained", "norm_convention")

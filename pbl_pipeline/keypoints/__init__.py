@@ -1,6 +1,5 @@
 """Keypoints of the tracked person from any detector, views of several cameras, markers of a laboratory."""
 
-from ._blazepose import BlazePoseLandmarks
 from ._confidence import (
     BOUND_TRUNK,
     ConfidenceCurve,
@@ -9,7 +8,6 @@ from ._confidence import (
     confidence_text,
     probability_within,
 )
-from ._detect import detect_keypoints
 from ._in_view import (
     SEEN_SHARE,
     Gap,
@@ -20,20 +18,22 @@ from ._in_view import (
     visibility,
     whole_person_in_view,
 )
-from ._marker_augmenter import AnatomicalMarkers, AugmenterParams, MarkerAugmenter
-from ._methods import METHODS
 from ._multi_view import SAME_TIME_S, MultiView, cameras_of_files, check_same_times
-from ._onnx_keypoints import ModelKeypointParams, ModelParams, OnnxKeypoints
-from ._params import KeypointParams
-from ._picture import Picture, PictureMeter
-from ._protocol import KeypointDetector
 from ._quality import check_keypoints, side_changes
-from ._trc import read_trc
-from ._types import Keypoints, PersonKeypoints
-from ._view import view_rotation
 from ._view_agreement import MOST_MISS_M, check_views_agree, ray_miss_m
 from ._world_markers import WorldMarkers
+from .blazepose import BlazePoseLandmarks
+from .detect import detect_keypoints
+from .marker_augmenter import AnatomicalMarkers, AugmenterParams, MarkerAugmenter
+from .methods import METHODS
+from .onnx_keypoints import ModelKeypointParams, ModelParams, OnnxKeypoints
+from .params import KeypointParams
 from .phone_clock import log_shift_s
+from .picture import Picture, PictureMeter
+from .protocol import KeypointDetector
+from .trc import read_trc
+from .types import Keypoints, PersonKeypoints
+from .view import view_rotation
 
 __all__ = [
     "BOUND_TRUNK",

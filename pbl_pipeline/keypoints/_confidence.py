@@ -20,7 +20,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 
-from ._types import Keypoints
+from .types import Keypoints
 
 #: The bound of all curves: a fraction of the length of the trunk (middle of the shoulders to middle of the hips) in the
 #: picture, as it would be seen from the side. The "percentage of correct points" of pose estimation at 0.2.

@@ -9,7 +9,7 @@ import re
 
 import numpy as np
 
-from ._types import Keypoints
+from .types import Keypoints
 
 #: Fraction of the markers that must have been detected for a frame to say anything about the pose.
 SEEN_SHARE = 0.5

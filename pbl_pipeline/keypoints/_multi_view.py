@@ -12,7 +12,7 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import CameraPose, load_camera, load_camera_poses
 
-from ._types import Keypoints
+from .types import Keypoints
 
 #: Cameras started by one trigger differ by less; a frame of 60 Hz is 17 ms.
 SAME_TIME_S = 1e-3

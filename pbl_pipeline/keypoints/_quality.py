@@ -17,7 +17,7 @@ from pbl_pipeline.qc import EMPTY, FAIL, PASS, WARN, Check
 
 from ._confidence import probability_within
 from ._in_view import SEEN_SHARE, ends, step_s, visibility
-from ._types import Keypoints
+from .types import Keypoints
 
 #: Seconds in view: about three strides; what a fit needs at least.
 SECONDS_WARN, SECONDS_FAIL = 3.0, 1.0

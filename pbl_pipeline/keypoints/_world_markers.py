@@ -13,7 +13,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_numbers, load_npz, text_of, texts_of
 from pbl_pipeline.names import is_plain
 
-from ._trc import read_trc
+from .trc import read_trc
 
 _FIELDS = ("time_s", "names", "marker_set", "xyz_world_m", "confidence")
 

@@ -7,7 +7,7 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import VIDEO_CLOCK, PhoneLog
 
-from ._types import Keypoints
+from .types import Keypoints
 
 
 def log_shift_s(log: PhoneLog, keypoints: Keypoints | None, path: str) -> float:

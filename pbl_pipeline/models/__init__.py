@@ -3,9 +3,9 @@
 from ._device import DEVICES, asked_device, available_devices, providers_for
 from ._onnx import OnnxModel
 from ._registry import ModelStatus, add, find, is_registered, registered, remove, verify
-from ._spec import KINDS, ModelInput, ModelSpec, load_spec, mirror_pairs, model_invalid, parse_spec
 from ._ssd import SsdLayout, SsdModel, box_iou, suppress
 from ._tflite import LiteModel
+from .spec import KINDS, ModelInput, ModelSpec, load_spec, mirror_pairs, model_invalid, parse_spec
 
 __all__ = [
     "DEVICES",

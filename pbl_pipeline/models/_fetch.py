@@ -18,7 +18,7 @@ from pbl_pipeline import progress, settings
 from pbl_pipeline.bounded import DAMAGED, opened_zip
 from pbl_pipeline.errors import PblError
 
-from ._spec import GRAPH_FILE, SPEC_FILE, model_invalid
+from .spec import GRAPH_FILE, SPEC_FILE, model_invalid
 
 _TIMEOUT_S = 60.0
 _CHUNK = 1 << 20

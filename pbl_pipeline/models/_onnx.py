@@ -12,7 +12,7 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 
 from ._device import asked_device, device_of, providers_for, unavailable
-from ._spec import GRAPH_FILE, WITHOUT_POINTS, ModelSpec, load_spec, model_invalid
+from .spec import GRAPH_FILE, WITHOUT_POINTS, ModelSpec, load_spec, model_invalid
 
 _DTYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 

@@ -19,7 +19,7 @@ from pbl_pipeline.errors import PblError
 
 from ._fetch import unpacked
 from ._onnx import OnnxModel, check_graph_file
-from ._spec import GRAPH_FILE, SPEC_FILE, ModelSpec, load_spec
+from .spec import GRAPH_FILE, SPEC_FILE, ModelSpec, load_spec
 
 #: Files that are kept beside graph and spec, where they are there.
 _TEXTS = ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "NOTICE", "README.md")

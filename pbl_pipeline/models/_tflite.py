@@ -10,8 +10,8 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 
-from ._notices import without_notice
-from ._tflite_outputs import keep_outputs
+from .notices import without_notice
+from .tflite_outputs import keep_outputs
 
 #: Two threads are the sweet spot of these small models; more only waits. Not a method parameter.
 NUM_THREADS = 2

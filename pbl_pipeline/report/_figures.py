@@ -13,8 +13,8 @@ from pbl_pipeline import charts
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import GaitCycle, GaitEvents, NormalBands, far_leg_of, leg_angles
 from pbl_pipeline.render import SIDE_COLOUR, stance_spans
-from pbl_pipeline.report._types import Picture
-from pbl_pipeline.report._words import plural
+from pbl_pipeline.report.types import Picture
+from pbl_pipeline.report.words import plural
 from pbl_pipeline.runs import runs
 from pbl_pipeline.words import ANGLES, FOOT_ANGLES, PELVIS_ANGLES, number
 

@@ -11,8 +11,8 @@ import jinja2
 from markupsafe import Markup
 
 from pbl_pipeline.gait import NormativeSet
-from pbl_pipeline.report._page import page_of
-from pbl_pipeline.report._types import Picture
+from pbl_pipeline.report.page import page_of
+from pbl_pipeline.report.types import Picture
 from pbl_pipeline.visit import Visit
 
 

@@ -14,7 +14,7 @@ from ._icc import ICC_INTERVALS, ICC_KINDS, Icc, icc, minimal_detectable_change,
 from ._many import CORRECTIONS, adjust
 from ._paper import NIQR_FACTOR, median_of_medians, niqr
 from ._sample_size import DESIGNS, SampleSize, sample_size
-from ._types import Estimate
+from .types import Estimate
 
 __all__ = [
     "CORRECTIONS",

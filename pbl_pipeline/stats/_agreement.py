@@ -9,7 +9,7 @@ from typing import Any
 from scipy import stats
 
 from ._input import changes, fraction
-from ._types import Estimate
+from .types import Estimate
 
 #: Bland and Altman's multiple of the standard deviation: 95 % of normal differences.
 LIMIT_SD = 1.96

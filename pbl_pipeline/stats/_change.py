@@ -13,7 +13,7 @@ import numpy as np
 from scipy import stats
 
 from ._input import changes, count, fraction, refuse
-from ._types import Estimate, noncentrality
+from .types import Estimate, noncentrality
 
 #: Fewest persons whose change is judged: with fewer a jackknife or bootstrap has nothing to vary.
 MIN_PERSONS = 3

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from ._input import fraction, labels, one_of, refuse, same_length, sample
-from ._types import Estimate, fisher_z
+from .types import Estimate, fisher_z
 
 CORRELATIONS = ("pearson", "spearman", "repeated")
 

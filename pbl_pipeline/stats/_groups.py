@@ -9,7 +9,7 @@ import numpy as np
 from scipy import optimize, special, stats
 
 from ._input import differ, fraction, numbers, refuse, sample
-from ._types import Estimate, noncentrality
+from .types import Estimate, noncentrality
 
 
 @dataclasses.dataclass(frozen=True)

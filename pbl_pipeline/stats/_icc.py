@@ -11,7 +11,7 @@ from scipy import stats
 
 from ._components import MeanSquares, mean_squares
 from ._input import fraction, labels, numbers, one_of, refuse
-from ._types import Estimate
+from .types import Estimate
 
 #: Shrout & Fleiss' kinds: model (1 one-way, 2 two-way random, 3 two-way mixed), and one rating or the mean of k.
 ICC_KINDS = ("1,1", "2,1", "3,1", "1,k", "2,k", "3,k")

@@ -3,7 +3,7 @@
 from ._codes import deidentified
 from ._columns import CURVE_PERCENT, CURVE_POINTS, FRAMES, KEYS, SIDES, Column
 from ._folder import content_hash, data_dictionary, read_study, write_study
-from ._types import FIRST_ROLES, StudyData, StudyDescription, classes_of
+from .types import FIRST_ROLES, StudyData, StudyDescription, classes_of
 
 __all__ = [
     "CURVE_PERCENT",

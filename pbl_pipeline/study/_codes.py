@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from ._columns import FRAMES
-from ._types import StudyData
+from .types import StudyData
 
 
 def deidentified(study: StudyData, prefix: str = "P") -> tuple[StudyData, pd.DataFrame]:

@@ -18,7 +18,7 @@ from pbl_pipeline.files import check_out_folder
 from pbl_pipeline.paramset import structured
 
 from ._columns import FRAMES
-from ._types import StudyData, StudyDescription
+from .types import StudyData, StudyDescription
 
 FORMAT = "pbl-study-1"
 _ABOUT, _DICTIONARY, _SCRIPT = "study.json", "dictionary.csv", "make_report.py"

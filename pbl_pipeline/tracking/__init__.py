@@ -1,23 +1,23 @@
 """People in a video: detection, tracks, choice of the subject."""
 
 from ._appearance import appearance_of, appearance_similarity
-from ._associate import AssociationParams
-from ._blazepose import BlazePoseDetector, body_box, circle_roi
 from ._choose import choose_subject
 from ._detection_schedule import WatchParams
-from ._identity_swaps import UncrossParams
-from ._methods import METHODS, SUBJECT_METHODS
 from ._params import TrackingParams
 from ._registered import detector_params
-from ._reidentify import JoinParams
 from ._require import FILM_THE_WHOLE_BODY, require_subject
 from ._sheet import contact_sheet, contact_sheet_jpeg, save_contact_sheet
 from ._subject import SubjectParams, time_in_view_s
-from ._tiles import tiles
-from ._track import track_people
 from ._transfer_choice import carried_choice, same_person
-from ._types import Detection, PersonDetector, PersonTrack, SubjectChoice, Tracking
-from ._yolox import YoloxDetector
+from .associate import AssociationParams
+from .blazepose import BlazePoseDetector, body_box, circle_roi
+from .identity_swaps import UncrossParams
+from .methods import METHODS, SUBJECT_METHODS
+from .reidentify import JoinParams
+from .tiling import tiles
+from .track import track_people
+from .types import Detection, PersonDetector, PersonTrack, SubjectChoice, Tracking
+from .yolox import YoloxDetector
 
 __all__ = [
     "FILM_THE_WHOLE_BODY",

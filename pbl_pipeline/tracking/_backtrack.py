@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from ._appearance import appearance_of
-from ._associate import AssociationParams, Trail, measure, pair_cost
 from ._detection_schedule import window_around
-from ._tiles import detect_in
-from ._types import PersonDetector
+from .associate import AssociationParams, Trail, measure, pair_cost
+from .tiling import detect_in
+from .types import PersonDetector
 
 #: A person may be missed in so many of the kept frames on the way back.
 MAX_MISSES = 1

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 
-from ._methods import SUBJECT_METHODS
 from ._subject import SubjectParams
-from ._types import SubjectChoice, Tracking
+from .methods import SUBJECT_METHODS
+from .types import SubjectChoice, Tracking
 
 
 def choose_subject(

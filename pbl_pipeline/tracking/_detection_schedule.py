@@ -13,8 +13,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ._associate import Trail
-from ._tiles import Window, tiles
+from .associate import Trail
+from .tiling import Window, tiles
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ._associate import Trail, measure
+from .associate import Trail, measure
 
 
 def line_near(trail: Trail, at_s: float, length_s: float) -> tuple[np.ndarray, np.ndarray, float] | None:

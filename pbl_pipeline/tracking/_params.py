@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 
-from ._associate import AssociationParams
 from ._detection_schedule import WatchParams
-from ._identity_swaps import UncrossParams
-from ._reidentify import JoinParams
+from .associate import AssociationParams
+from .identity_swaps import UncrossParams
+from .reidentify import JoinParams
 
 #: BlazePose's person detector.
 MODEL_SHA256 = "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c"

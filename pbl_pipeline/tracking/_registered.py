@@ -5,8 +5,8 @@ from __future__ import annotations
 from pbl_pipeline import models
 from pbl_pipeline.errors import PblError
 
-from ._associate import AssociationParams
 from ._params import TrackingParams
+from .associate import AssociationParams
 
 
 class RegisteredDetectors:

@@ -8,7 +8,7 @@ from pbl_pipeline.errors import PblError
 
 from ._sheet import save_contact_sheet
 from ._subject import MOST_LISTED
-from ._types import SubjectChoice, Tracking
+from .types import SubjectChoice, Tracking
 
 #: With fewer frames nobody can be followed, whoever is in the picture.
 LEAST_FRAMES = 10

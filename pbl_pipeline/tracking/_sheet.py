@@ -12,7 +12,7 @@ import numpy as np
 
 from pbl_pipeline.video import read_frames
 
-from ._types import PersonTrack, SubjectChoice, Tracking
+from .types import PersonTrack, SubjectChoice, Tracking
 
 #: Width of one moment in the sheet (px), moments at least and at most, moments side by side.
 _WIDTH, _LEAST, _MOST, _COLUMNS = 640, 4, 9, 3

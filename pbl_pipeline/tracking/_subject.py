@@ -26,8 +26,8 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 
-from ._associate import measure
-from ._types import Detection, PersonTrack, SubjectChoice, Tracking
+from .associate import measure
+from .types import Detection, PersonTrack, SubjectChoice, Tracking
 
 #: Of people who are too alike to choose between, so many are described, the best first.
 MOST_LISTED = 6

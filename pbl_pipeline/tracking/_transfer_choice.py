@@ -12,7 +12,7 @@ from pbl_pipeline.paramset import Paramset
 
 from ._choose import choose_subject
 from ._subject import SubjectParams
-from ._types import PersonTrack, SubjectChoice, Tracking
+from .types import PersonTrack, SubjectChoice, Tracking
 
 #: Mean overlap (intersection over union) of the body boxes, over the frames in which either is in view, from which two
 #: tracks may be of one person.

@@ -1,9 +1,6 @@
 """Video files: probe, frames in order with their own time stamps, intrinsics, pose and orientation of the camera."""
 
-from ._attitude import Attitude, camera_in_device, check_attitude
 from ._board import Board
-from ._calibrate import Calibration, calibrate_video
-from ._camera import check_lens, guess_camera, load_camera, scaled_matrix, undistort_px, viewing_ray
 from ._camera_pose import CameraPose, load_camera_poses
 from ._cut import cut_image
 from ._draw_calibration import draw_calibration
@@ -23,8 +20,11 @@ from ._probe import packet_times, probe, read_first, read_metadata, sha256_of
 from ._read import read_frames
 from ._read_phone_log import read_phone_log
 from ._timing import check_timing
-from ._types import CAMERA_KINDS, Camera, FirstPicture, Frame, VideoInfo
 from ._write import write_h264
+from .attitude import Attitude, camera_in_device, check_attitude
+from .calibrate import Calibration, calibrate_video
+from .camera import check_lens, guess_camera, load_camera, scaled_matrix, undistort_px, viewing_ray
+from .types import CAMERA_KINDS, Camera, FirstPicture, Frame, VideoInfo
 
 __all__ = [
     "CAMERA_KINDS",

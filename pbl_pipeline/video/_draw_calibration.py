@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ._calibrate import CELLS, Calibration
+from .calibrate import CELLS, Calibration
 
 #: Longer side of the picture (px) and by how much residuals are drawn larger.
 _SIDE_PX, _ENLARGED = 900, 50.0

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ._camera import guess_camera
 from ._phone_lens import calibrated_camera
-from ._presets import PRESET_REL_SD, preset_camera
-from ._types import Camera, VideoInfo
+from .camera import guess_camera
+from .presets import PRESET_REL_SD, preset_camera
+from .types import Camera, VideoInfo
 
 #: 35 mm film: width and diagonal of its frame (mm).
 _FILM_WIDTH_MM, _FILM_DIAGONAL_MM = 36.0, math.hypot(36.0, 24.0)

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ._attitude import DEVICE, Attitude, camera_in_device, check_roll, held_deg, log_error
-from ._clock import align_clock
 from ._phone_log import PhoneLog
 from ._read_phone_log import read_phone_log
-from ._types import VideoInfo
+from .attitude import DEVICE, Attitude, camera_in_device, check_roll, held_deg, log_error
+from .clock import align_clock
+from .types import VideoInfo
 
 
 def load_attitude(path: str | Path, video: VideoInfo | None = None) -> Attitude:

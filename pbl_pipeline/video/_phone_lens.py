@@ -17,10 +17,10 @@ from typing import Any, TypeGuard
 from pbl_pipeline.bounded import read_json
 from pbl_pipeline.errors import PblError
 
-from ._camera import load_camera
-from ._presets import quarter_turn
 from ._probe import probe
-from ._types import Camera, FirstPicture, VideoInfo
+from .camera import load_camera
+from .presets import quarter_turn
+from .types import Camera, FirstPicture, VideoInfo
 
 #: Rates (1/s) at which phones read their sensor; a recording belongs to the nearest (24 and 25 to 30, 50 to 60).
 RATES = (30, 60, 120, 240)

@@ -20,7 +20,7 @@ import numpy as np
 from pbl_pipeline import bounded
 from pbl_pipeline.errors import PblError
 
-from ._attitude import CAMERA, DEVICE, check_attitude, log_error
+from .attitude import CAMERA, DEVICE, check_attitude, log_error
 
 #: Clocks of a log: the video's own; UTC (`start_utc_s` is known); its own, begun some time before the video.
 VIDEO_CLOCK, UTC_CLOCK, OWN_CLOCK = "video", "utc", "own"

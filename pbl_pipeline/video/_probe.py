@@ -14,11 +14,11 @@ import numpy as np
 from pbl_pipeline import progress
 from pbl_pipeline.names import is_plain
 
-from ._container_tags import Tags, read_tags
-from ._decode import Decoder, check_file
-from ._orientation import Orientation, orientation_of
 from ._timing import speed_notes
-from ._types import FirstPicture, VideoInfo
+from .container_tags import Tags, read_tags
+from .decode import Decoder, check_file
+from .orientation import Orientation, orientation_of
+from .types import FirstPicture, VideoInfo
 
 
 def sha256_of(path: str | Path) -> str:

@@ -11,10 +11,10 @@ import av
 import numpy as np
 from av.video.reformatter import VideoReformatter
 
-from ._cut_planes import cut_planes
-from ._decode import Decoder, check_file
-from ._orientation import Orientation, orientation_of
-from ._types import Frame
+from .cut_planes import cut_planes
+from .decode import Decoder, check_file
+from .orientation import Orientation, orientation_of
+from .types import Frame
 
 
 def read_frames(

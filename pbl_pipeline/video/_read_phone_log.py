@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from pbl_pipeline import bounded
 from pbl_pipeline.names import is_plain
 
-from ._attitude import DEVICE, log_error
 from ._phone_log import PhoneLog, read_own_form
 from ._sensor_logger import is_sensor_logger, read_sensor_logger
+from .attitude import DEVICE, log_error
 
 #: Latest time in a log (s), on whichever clock.
 _LATEST_S = 1e10

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline import bounded
 
-from ._attitude import DEVICE, check_attitude, log_error
 from ._phone_log import OWN_CLOCK, QUATERNION, UTC_CLOCK, PhoneLog, Sensor, numbers, read_table, read_text
+from .attitude import DEVICE, check_attitude, log_error
 
 _ORIENTATION = "Orientation"
 #: Names of its sensors -> ours. "Accelerometer" there is without gravity, which our schema's is with.

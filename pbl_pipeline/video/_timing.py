@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from pbl_pipeline.qc import FAIL, PASS, Check
 
-from ._types import VideoInfo
+from .types import VideoInfo
 
 #: A recorded rate that lies above the stored one by less than this fraction is rounding or a dropped frame.
 _MOST_RATIO = 1.1

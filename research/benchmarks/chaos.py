@@ -253,7 +253,7 @@ def _disks(home: Path, minutes: float) -> Iterator[bool]:
 
 
 def _run(site: Site, minutes: float, supervisors: int, can_fill: bool) -> list[str]:
-    from schemas._declare import declare_all
+    from schemas.declare import declare_all
     from schemas.operations import embedded
 
     embedded.start(folder=embedded.Folder(site.home / "db"))

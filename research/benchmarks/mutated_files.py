@@ -318,7 +318,7 @@ def params(path: Path) -> None:
 
 
 def use_params(path: Path) -> None:
-    from pbl_pipeline.cli._options import fit_paramset
+    from pbl_pipeline.cli.options import fit_paramset
 
     method = fit_paramset(None, str(path))
     assert method.hash

@@ -27,7 +27,7 @@ import numpy as np
 from pbl_pipeline import assets
 from pbl_pipeline.bench.clip import demo_clip
 from pbl_pipeline.keypoints import BlazePoseLandmarks
-from pbl_pipeline.keypoints._crops import smooth_rois
+from pbl_pipeline.keypoints.crops import smooth_rois
 from pbl_pipeline.models import box_iou
 from pbl_pipeline.tracking import (
     BlazePoseDetector,
@@ -39,7 +39,7 @@ from pbl_pipeline.tracking import (
     body_box,
     track_people,
 )
-from pbl_pipeline.tracking import _track as tracks
+from pbl_pipeline.tracking import track as tracks
 from pbl_pipeline.video import VideoInfo, find_camera, probe, read_frames
 from research.benchmarks.longer_video import repeated
 from research.paths import SHARED

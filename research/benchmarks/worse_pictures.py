@@ -24,7 +24,7 @@ import numpy as np
 
 from pbl_pipeline import assets
 from pbl_pipeline.keypoints import KeypointParams, Keypoints, check_keypoints, detect_keypoints
-from pbl_pipeline.keypoints import _detect as detection
+from pbl_pipeline.keypoints import detect as detection
 from pbl_pipeline.tracking import PersonTrack, choose_subject, track_people
 from pbl_pipeline.video import Frame, guess_camera, probe, read_frames
 from research.paths import SHARED

@@ -9,10 +9,10 @@ from typing import Any
 
 import click
 
-from ._db_backup import backup, restore
 from ._db_config import config
 from ._db_migrate import migrate
 from ._db_roles import roles
+from .db_backup import backup, restore
 
 # Each command imports what it needs: `pbl db --help` should not wait for the table engine.
 
@@ -83,7 +83,7 @@ def init() -> None:
     Example: pbl db init
     """
     from schemas import store
-    from schemas._declare import declare_all
+    from schemas.declare import declare_all
     from schemas.operations import catalog
 
     if not _uses_external():

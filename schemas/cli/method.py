@@ -24,8 +24,8 @@ def add(file: Path) -> None:
 
     found = read_method(file)
     import schemas
-    from schemas._methods import METHOD_TABLES
     from schemas.method_rows import register
+    from schemas.methods import METHOD_TABLES
 
     schemas.activate()
     table = next(t for t in METHOD_TABLES if t.stage == found.stage)

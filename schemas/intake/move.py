@@ -14,9 +14,9 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 
 from .. import fit, gait, gdi, keypoints, lab, session, video, worker
-from .._datajoint import dj
 from ..archive import LOCK, archive_dir, folder_of, plain_name
 from ..codes import check_subject
+from ..datajoint_setup import dj
 from ..folders import private_folder, remove_empty, sync_folders
 from ..jobs import forget_errors
 from ..rows import delete_below

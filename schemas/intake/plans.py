@@ -8,7 +8,7 @@ from typing import Any
 from pbl_pipeline.methods import of_stage
 
 from .. import fit, gait, gdi, keypoints, tracking, video
-from .._datajoint import dj
+from ..datajoint_setup import dj
 from ..method_rows import resolve_method
 from ..plan import default_fit
 from .records import Methods

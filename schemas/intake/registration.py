@@ -14,7 +14,7 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 
 from .. import session, tracking, video
-from .._datajoint import DuplicateError
+from ..datajoint_setup import DuplicateError
 from ..jobs import forget_errors
 from ..rows import utc_now
 from ..transactions import in_transaction, next_id

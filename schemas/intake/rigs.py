@@ -12,7 +12,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 
 from .. import video
-from .._datajoint import dj
+from ..datajoint_setup import dj
 from ..rows import utc_now
 from ..stored_files import new_folder
 from ..transactions import next_id

@@ -6,8 +6,8 @@ import dataclasses
 from typing import Any
 
 from schemas import connection
-from schemas._datajoint import dj
 from schemas.chain import tables
+from schemas.datajoint_setup import dj
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,9 +15,9 @@ import pymysql
 from pbl_pipeline import __version__
 from pbl_pipeline.errors import PblError
 from schemas import connection
-from schemas._datajoint import dj, read_heading_again
-from schemas._declare import declare_all
 from schemas.chain import tables
+from schemas.datajoint_setup import dj, read_heading_again
+from schemas.declare import declare_all
 from schemas.operations import catalog
 from schemas.rows import utc_now
 from schemas.stages import STAGES, modules

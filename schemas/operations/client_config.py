@@ -7,7 +7,7 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 from schemas import connection
-from schemas._datajoint import dj
+from schemas.datajoint_setup import dj
 from schemas.folders import private_folder
 from schemas.json_files import write_json, write_text
 
@@ -59,7 +59,7 @@ def write_config(folder: Path, overwrite: bool = False) -> list[Path]:
 
 
 def is_mariadb() -> bool:
-    """Return True for MariaDB, which plain DataJoint needs a repair for (`schemas._datajoint`)."""
+    """Return True for MariaDB, which plain DataJoint needs a repair for (`schemas.datajoint_setup`)."""
     return "MariaDB" in str(connection.connect().query("SELECT VERSION()").fetchone()[0])
 
 

@@ -21,8 +21,8 @@ from typing import Any
 from pbl_pipeline import progress, settings
 from pbl_pipeline.errors import PblError
 from schemas import archive, connection, fit, lab, session, video, worker
-from schemas._datajoint import full_path
 from schemas.codes import check_subject
+from schemas.datajoint_setup import full_path
 from schemas.folders import remove_empty
 from schemas.json_files import write_json
 from schemas.rows import delete_below

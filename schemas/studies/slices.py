@@ -15,7 +15,7 @@ from pbl_pipeline.names import check_label, is_plain
 from pbl_pipeline.words import unit_of
 
 from .. import fit, gait, gdi, lab, session, study, video
-from .._datajoint import dj
+from ..datajoint_setup import dj
 from ..method_names import with_keys
 from ..rows import inside, utc_now
 from ..stored_files import file_ref, stored_file

@@ -18,7 +18,7 @@ import pytest
 import schemas
 from pbl_pipeline.errors import PblError
 from schemas import connection, gait, lab, load_visit, migrations, video, views
-from schemas._declare import declare_all
+from schemas.declare import declare_all
 from schemas.intake import Visit, ingest
 from schemas.operations import backup, backup_files, dump
 from tests.command import pbl

@@ -15,7 +15,7 @@ import pytest
 import schemas
 from pbl_pipeline.errors import PblError
 from schemas import connection
-from schemas._datajoint import dj
+from schemas.datajoint_setup import dj
 from schemas.store import further_stores
 from tests.command import pbl
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from schemas import connection, keypoints, lab, session, video
-from schemas._declare import declare_all
+from schemas.declare import declare_all
 from schemas.intake import Visit, ingest
 from schemas.operations import forget
 from tests.command import pbl

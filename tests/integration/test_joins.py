@@ -10,8 +10,8 @@ import pytest
 
 import schemas
 from schemas import fit, gdi, lab, session, video
-from schemas._datajoint import dj
 from schemas.chain import ON_REQUEST
+from schemas.datajoint_setup import dj
 from tests.rows import register, remove_all
 from workers.populate import populate
 

@@ -24,7 +24,7 @@ from pbl_pipeline.gait import (
     read_lab_feet,
     read_lab_trial,
 )
-from pbl_pipeline.gait._laboratory import _read
+from pbl_pipeline.gait.laboratory import _read
 from pbl_pipeline.gait.normative import gait_norm
 from research.benchmarks.gdi import children, conventions
 
@@ -166,7 +166,7 @@ def test_labels_do_not_make_up_for_odd_markers(walk, tmp_path, monkeypatch, axes
         points[:, at] = points[:, at][..., axes] * signs
         return points, names, time, table
 
-    monkeypatch.setattr("pbl_pipeline.gait._laboratory._read", turned)
+    monkeypatch.setattr("pbl_pipeline.gait.laboratory._read", turned)
     if words is None:
         with pytest.raises(PblError, match="GAIT_INPUT") as error:
             read_lab_trial(walk)

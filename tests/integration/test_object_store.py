@@ -13,7 +13,7 @@ import pbl_pipeline.video
 import schemas
 from pbl_pipeline.errors import PblError
 from schemas import connection, store, tracking, video
-from schemas._declare import declare_all
+from schemas.declare import declare_all
 from schemas.intake import Visit, ingest
 from schemas.operations import backup, forget
 from schemas.stored_files import file_ref, stored_file

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import pbl_pipeline.deidentify._deidentify
+import pbl_pipeline.deidentify.video_copy
 import schemas
 from pbl_pipeline.deidentify import Head, Heads
 from pbl_pipeline.errors import PblError
@@ -39,7 +39,7 @@ def find_heads(video: Path, params: object, info: VideoInfo) -> Heads:
 @pytest.fixture
 def tables(database: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
     schemas.activate()
-    monkeypatch.setattr(pbl_pipeline.deidentify._deidentify, "find_heads", find_heads)
+    monkeypatch.setattr(pbl_pipeline.deidentify.video_copy, "find_heads", find_heads)
     jobs._sources.pop(privacy.Deidentified, None)
     yield monkeypatch
     remove_all()

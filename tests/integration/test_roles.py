@@ -14,9 +14,9 @@ import yaml
 import schemas
 from pbl_pipeline.errors import PblError
 from schemas import connection, gdi, lab, session, views, worker
-from schemas._datajoint import dj
-from schemas._declare import declare_all
 from schemas.chain import ON_REQUEST
+from schemas.datajoint_setup import dj
+from schemas.declare import declare_all
 from schemas.intake import Visit, ingest
 from schemas.operations import embedded, roles
 from tests.command import pbl

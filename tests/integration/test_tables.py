@@ -838,11 +838,11 @@ def test_the_page_of_the_tables_is_up_to_date():
 
 
 def test_methods_are_frozen(declared: None):
-    from schemas import _methods
+    from schemas import methods
     from schemas.method_rows import insert_methods
 
     before = len(tracking.TrackingMethod()), len(fit.BodyModel()), len(gdi.NormativeSet())
-    _methods.insert_all()
+    methods.insert_all()
     assert (len(tracking.TrackingMethod()), len(fit.BodyModel()), len(gdi.NormativeSet())) == before
     known = pbl_pipeline.tracking.METHODS.find()
     other = dataclasses.replace(known.params, min_score=0.99)

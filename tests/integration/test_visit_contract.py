@@ -21,7 +21,7 @@ import pytest
 from starlette.testclient import TestClient
 
 import pbl_pipeline.fit
-import pbl_pipeline.gait._metrics as metrics
+import pbl_pipeline.gait.metrics as metrics
 import pbl_pipeline.keypoints
 import pbl_pipeline.tracking
 from pbl_pipeline import pipeline
@@ -30,7 +30,7 @@ from pbl_pipeline.export import FORMATS
 from pbl_pipeline.fit import METHODS, SessionFit, default_fit, points_of
 from pbl_pipeline.gait import Condition, GaitEvent, Gdi, apply_correction
 from pbl_pipeline.keypoints import MultiView
-from pbl_pipeline.report._page import page_of
+from pbl_pipeline.report.page import page_of
 from pbl_pipeline.tracking import Tracking
 from pbl_pipeline.video import VideoInfo, probe
 from pbl_pipeline.visit import Recording, Solution, Visit, load_visit, save_visit

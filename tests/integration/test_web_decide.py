@@ -12,7 +12,7 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from schemas import decide, fit, qc, tracking
-from schemas._datajoint import dj
+from schemas.datajoint_setup import dj
 from schemas.operations import forget
 from schemas.reading import shown
 from schemas.review import Decision

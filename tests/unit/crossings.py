@@ -9,9 +9,9 @@ import numpy as np
 
 from pbl_pipeline.models import box_iou
 from pbl_pipeline.tracking import AssociationParams, Detection, JoinParams, UncrossParams, body_box
-from pbl_pipeline.tracking._associate import Associator, Trail
-from pbl_pipeline.tracking._identity_swaps import undo_swaps
-from pbl_pipeline.tracking._reidentify import join_trails
+from pbl_pipeline.tracking.associate import Associator, Trail
+from pbl_pipeline.tracking.identity_swaps import undo_swaps
+from pbl_pipeline.tracking.reidentify import join_trails
 
 SIZE = (1920, 1080)
 #: Nearer than so many body heights, the noise decides which detection is whose, and nothing follows from it.

@@ -16,14 +16,14 @@ import pytest
 from pbl_pipeline import assets
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import METHODS, BlazePoseLandmarks, KeypointParams
-from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES, blazepose
-from pbl_pipeline.keypoints._passes import ParallelInference
-from pbl_pipeline.keypoints._protocol import Look
+from pbl_pipeline.keypoints.blazepose import MIRROR, NAMES, blazepose
+from pbl_pipeline.keypoints.passes import ParallelInference
+from pbl_pipeline.keypoints.protocol import Look
 from pbl_pipeline.models import LiteModel, suppress
-from pbl_pipeline.models._tflite_outputs import keep_outputs
+from pbl_pipeline.models.tflite_outputs import keep_outputs
 from pbl_pipeline.tracking import BlazePoseDetector
-from pbl_pipeline.tracking._blazepose import LAYOUT
-from pbl_pipeline.tracking._tiles import detect_in, tiles
+from pbl_pipeline.tracking.blazepose import LAYOUT
+from pbl_pipeline.tracking.tiling import detect_in, tiles
 from pbl_pipeline.video import Camera, Frame, cut_image, read_frames
 
 CAMERA = Camera(np.array([[2520.0, 0, 884], [0, 2520.0, 497], [0, 0, 1]]), np.zeros(5), "Calib_demo.toml of Sports2D")

@@ -59,9 +59,9 @@ def test_only_the_known_lines_are_dropped():
 
 
 def test_load_body_may_be_called_first_inside_a_trace():
-    from pbl_pipeline.body import _model
+    from pbl_pipeline.body import model
 
     def height(x):
-        return x + _model.load_body.__wrapped__().mjx_model.body_pos[1, 2]
+        return x + model.load_body.__wrapped__().mjx_model.body_pos[1, 2]
 
     assert jax.jit(height)(0.0) == jax.numpy.float32(0.975)

@@ -11,7 +11,7 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import Board, calibrate_video, load_camera
-from pbl_pipeline.video._calibrate import View, calibrate, covered, different_views
+from pbl_pipeline.video.calibrate import View, calibrate, covered, different_views
 from tests.board_video import film, varied_poses
 from tests.command import pbl
 from tests.videos import constant_rate, numbered_frames, write_video

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from datajoint import adapters, autopopulate, connection, heading, jobs, storage, table, user_tables
 
-from schemas._datajoint import MySQLOrMariaDB, datajoint
+from schemas.datajoint_setup import MySQLOrMariaDB, datajoint
 
 ROOT = Path(__file__).resolve().parents[2]
-FACE = ROOT / "schemas" / "_datajoint.py"
+FACE = ROOT / "schemas" / "datajoint_setup.py"
 
 
 def _parameters(function: object) -> list[str]:

@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from pbl_pipeline import __version__
-from pbl_pipeline.cli._main import cli
+from pbl_pipeline.cli.command_line import cli
 from tests.command import program
 from tests.image import sent_to_builder
 from workers.supervisor import LAST_S

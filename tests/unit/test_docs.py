@@ -19,7 +19,7 @@ import docs_site
 from docs_site import _notebook, api
 from pbl_pipeline.cli import TASKS
 from pbl_pipeline.errors import CODES
-from pbl_pipeline.report._words import VERDICT_WORDS
+from pbl_pipeline.report.words import VERDICT_WORDS
 from pbl_pipeline.settings import VARIABLES
 from schemas import STAGES, computed_tables
 from tests import pages

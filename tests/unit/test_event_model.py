@@ -22,8 +22,8 @@ from pbl_pipeline.gait import (
     find_cycles,
 )
 from pbl_pipeline.gait.events import METHODS
-from pbl_pipeline.gait.events._phase import double_support_s
 from pbl_pipeline.gait.events.network.predict import load, model_path
+from pbl_pipeline.gait.events.phase import double_support_s
 from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.synthetic import Impairment, SynthSpec, Truth, synthesise
 from research.corpus.true_fit import fit_of_qpos

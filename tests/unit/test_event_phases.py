@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.gait.events import FilterParams, PhaseParams, WalkingParams
-from pbl_pipeline.gait.events._phase_filter import crossings, smooth_phases
-from pbl_pipeline.gait.events._walking import turning_deg_per_s, walking_stretches
 from pbl_pipeline.gait.events.network.features import N_FEATURES, features, heading, leg_length
 from pbl_pipeline.gait.events.network.predict import GRID_HZ, Grid, Phases, on_grid
 from pbl_pipeline.gait.events.network.transformer import Architecture, PhaseTransformer, load_model, save_model
+from pbl_pipeline.gait.events.phase_filter import crossings, smooth_phases
+from pbl_pipeline.gait.events.walking import turning_deg_per_s, walking_stretches
 from research.events._augment import SOURCE, WINDOW, augment
 from research.events._calibrate import _wraps, fit_logistic, probability, reliability
 from research.events._corpus import UNIT_M, load, pack, save

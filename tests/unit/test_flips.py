@@ -10,7 +10,7 @@ import pytest
 
 from pbl_pipeline.body import SCALE_NAMES
 from pbl_pipeline.keypoints import Keypoints, check_keypoints
-from pbl_pipeline.keypoints._flips import Exchange, FlipParams, exchange_sides, exchanged, lowered, mirror_of
+from pbl_pipeline.keypoints.flips import Exchange, FlipParams, exchange_sides, exchanged, lowered, mirror_of
 from pbl_pipeline.synthetic import SynthSpec, synth, synthesise
 
 pytestmark = pytest.mark.slow

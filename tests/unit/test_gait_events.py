@@ -11,7 +11,7 @@ from pbl_pipeline import gait
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import EventParams, load_events
 from pbl_pipeline.gait.events import METHODS, GaitEvent
-from pbl_pipeline.gait.events._order import Candidate, best_sequence
+from pbl_pipeline.gait.events.order import Candidate, best_sequence
 
 from .gait_walker import Walker, errors_s, make_feet
 

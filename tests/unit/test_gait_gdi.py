@@ -23,7 +23,7 @@ from pbl_pipeline.gait import (
     norm_names,
     score_gdi,
 )
-from pbl_pipeline.gait.normative._norm import _checksum, _to_json
+from pbl_pipeline.gait.normative.norm import _checksum, _to_json
 from research.norms import build_gillette, gillette_vectors
 
 PERCENT = np.linspace(0, 98, 50)

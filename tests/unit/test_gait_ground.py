@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.gait import FootTrajectories, cycle_lengths, find_cycles, spatiotemporal
-from pbl_pipeline.gait._ground import FLAT_FROM, FLAT_TO, FOLLOWS, SLIDES, UNSEEN, why_no_lengths
-from pbl_pipeline.gait._spatiotemporal import NO_WIDTH
+from pbl_pipeline.gait.cycle_measures import NO_WIDTH
 from pbl_pipeline.gait.events import GaitEvent
+from pbl_pipeline.gait.ground import FLAT_FROM, FLAT_TO, FOLLOWS, SLIDES, UNSEEN, why_no_lengths
 from pbl_pipeline.synthetic import SynthSpec, synthesise
 
 STRIDE_S, DOUBLE_S = 1.0, 0.1

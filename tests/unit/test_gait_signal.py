@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.gait import EventParams
-from pbl_pipeline.gait.events._coordinates import _walks, prominence
-from pbl_pipeline.gait.events._order import Candidate
-from pbl_pipeline.gait.events._signal import Segment, refine_extremum, uniform_segments
+from pbl_pipeline.gait.events.coordinates import _walks, prominence
+from pbl_pipeline.gait.events.order import Candidate
+from pbl_pipeline.gait.events.signal import Segment, refine_extremum, uniform_segments
 
 ABOUT = {"grid_hz": 100.0, "cutoff_hz": 6.0, "filter_order": 4, "max_gap_s": 0.15, "min_segment_s": 1.0}
 

@@ -9,7 +9,7 @@ import pytest
 
 from pbl_pipeline import pipeline
 from pbl_pipeline.body import load_marker_set
-from pbl_pipeline.cli._options import fit_paramset
+from pbl_pipeline.cli.options import fit_paramset
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import GaussNewtonParams, ImplicitAdamParams, Params, default_fit, points_of
 from pbl_pipeline.keypoints import METHODS, Keypoints, ModelKeypointParams, ModelParams, MultiView, WorldMarkers

@@ -19,10 +19,10 @@ from pbl_pipeline.keypoints import (
     side_changes,
     view_rotation,
 )
-from pbl_pipeline.keypoints._blazepose import MIRROR, NAMES
-from pbl_pipeline.keypoints._crops import corrected, first_pass_rows, smooth_at, smooth_rois
-from pbl_pipeline.keypoints._detect import _detect_all
-from pbl_pipeline.keypoints._view import crop_matrix
+from pbl_pipeline.keypoints.blazepose import MIRROR, NAMES
+from pbl_pipeline.keypoints.crops import corrected, first_pass_rows, smooth_at, smooth_rois
+from pbl_pipeline.keypoints.detect import _detect_all
+from pbl_pipeline.keypoints.view import crop_matrix
 from pbl_pipeline.tracking import PersonTrack, Tracking, body_box
 from pbl_pipeline.video import Camera, read_frames, viewing_ray
 from tests.videos import constant_rate, write_video

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import AugmenterParams, MarkerAugmenter, read_trc
-from pbl_pipeline.keypoints._marker_augmenter import MARKERS, POINTS
+from pbl_pipeline.keypoints.marker_augmenter import MARKERS, POINTS
 from tests.unit.test_blazepose import asset
 
 #: From y up to z up.

@@ -23,7 +23,7 @@ from pbl_pipeline import fit, models
 from pbl_pipeline.body import MARKER_SETS, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import METHODS, ModelKeypointParams
-from pbl_pipeline.models import _spec
+from pbl_pipeline.models import spec
 from pbl_pipeline.paramset import Paramset
 from tests import dot_models
 from tests.command import pbl
@@ -141,9 +141,9 @@ def test_the_page_names_every_field_kind_and_role():
     text = (ROOT / "docs" / "models.md").read_text()
     table = text.split("| field of `model.json` |")[1].split("\n\n")[0]
     fields = {f for line in table.splitlines() for f in re.findall(r"`([a-z0-9_]+)`", line.split("|")[1])}
-    known = {*_spec._REQUIRED, *_spec._POINTS, *_spec._OPTIONAL_POINTS, *_spec._OPTIONAL}
+    known = {*spec._REQUIRED, *spec._POINTS, *spec._OPTIONAL_POINTS, *spec._OPTIONAL}
     assert fields == known
-    assert all(f"`{n}`" in table for n in _spec._INPUT)
+    assert all(f"`{n}`" in table for n in spec._INPUT)
     kinds = text.split("| kind | role |")[1].split("\n\n")[0]
     assert {k for line in kinds.splitlines() for k in re.findall(r"`([a-z0-9_]+)`", line.split("|")[1])} == set(
         models.KINDS

@@ -24,20 +24,20 @@ from pbl_pipeline.keypoints import (
     ModelParams,
     OnnxKeypoints,
     PersonKeypoints,
-    _onnx_keypoints,
     detect_keypoints,
+    onnx_keypoints,
 )
-from pbl_pipeline.keypoints._augment import Augmentation, aligned, augmentations, sd_confidence, spread_mm
-from pbl_pipeline.keypoints._batched import BatchedInference
-from pbl_pipeline.keypoints._blazepose import CROP_MARGIN, MIRROR, N_ALL
-from pbl_pipeline.keypoints._blazepose import NAMES as BLAZEPOSE_NAMES
-from pbl_pipeline.keypoints._decode_2d import from_heatmap, from_simcc
-from pbl_pipeline.keypoints._params import MODEL_SHA256 as BLAZEPOSE_SHA256
-from pbl_pipeline.keypoints._protocol import Look
-from pbl_pipeline.keypoints._root import absolute_root
-from pbl_pipeline.keypoints._virtual_camera import crops, look_at
+from pbl_pipeline.keypoints.augment import Augmentation, aligned, augmentations, sd_confidence, spread_mm
+from pbl_pipeline.keypoints.batched import BatchedInference
+from pbl_pipeline.keypoints.blazepose import CROP_MARGIN, MIRROR, N_ALL
+from pbl_pipeline.keypoints.blazepose import NAMES as BLAZEPOSE_NAMES
+from pbl_pipeline.keypoints.decode_2d import from_heatmap, from_simcc
+from pbl_pipeline.keypoints.params import MODEL_SHA256 as BLAZEPOSE_SHA256
+from pbl_pipeline.keypoints.protocol import Look
+from pbl_pipeline.keypoints.root_position import absolute_root
+from pbl_pipeline.keypoints.virtual_camera import crops, look_at
 from pbl_pipeline.models import LiteModel
-from pbl_pipeline.report._page import page_of
+from pbl_pipeline.report.page import page_of
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.video import Camera, Frame, probe, read_frames, viewing_ray
 from pbl_pipeline.visit import Recording, Visit
@@ -391,7 +391,7 @@ class BlazePoseAsCropModel:
 @pytest.mark.slow
 def test_a_real_network_gives_the_same_by_this_way_and_its_own(monkeypatch):
     """Two looks, plain and mirrored, at a woman about 440 px high; the camera is that of the recording."""
-    monkeypatch.setattr(_onnx_keypoints, "OnnxModel", BlazePoseAsCropModel)
+    monkeypatch.setattr(onnx_keypoints, "OnnxModel", BlazePoseAsCropModel)
     spec = BlazePoseAsCropModel().spec
     assert list(spec.mirror) == list(MIRROR)
     model = OnnxKeypoints(ModelParams(spec.name, "0" * 64, spec.spec_sha256, spec.licence, 2), folder="nowhere")

@@ -14,8 +14,8 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import check_trial
 from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.video import Attitude, load_attitude, probe, read_phone_log
-from pbl_pipeline.video._attitude import held_deg
-from pbl_pipeline.video._clock import match_pictures
+from pbl_pipeline.video.attitude import held_deg
+from pbl_pipeline.video.clock import match_pictures
 from tests.inputs import csv_log
 from tests.phone_film import EPOCH_NS, as_json, as_zip, device_quat, film, hand, sensor_logger
 from tests.unit.test_camera_sources import video

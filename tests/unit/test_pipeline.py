@@ -70,7 +70,7 @@ def test_an_unknown_norm_is_refused_before_the_fit(fitted: list[list[str]], tmp_
 def test_report_and_metrics_agree_on_the_outcome(
     fitted: list[list[str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, outcome: str
 ):
-    from pbl_pipeline.report._page import page_of
+    from pbl_pipeline.report.page import page_of
 
     written = []
     seen = Check("leg_confidence", outcome, 0.1, 0.5, "the legs are hidden" if outcome == "FAIL" else "")
@@ -105,7 +105,7 @@ def test_overlay_and_pictures_are_of_the_copy_where_the_setting_says_so(
     fitted: list[list[str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, how: str
 ):
     """The stand-in copy is another video; both the overlay and the report's pictures are made from it."""
-    import pbl_pipeline.deidentify._deidentify as lib
+    import pbl_pipeline.deidentify.video_copy as lib
 
     def copied(video, out, way, info=None):
         assert (video, way) == (recording, "blur")

@@ -17,7 +17,7 @@ from pbl_pipeline.fit import SessionFit, TrialFit
 from pbl_pipeline.gait import GaitMetrics, gait_metrics, load_norm
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, PASS, WARN, Check
 from pbl_pipeline.report import Picture, write_report
-from pbl_pipeline.report._words import check_name, plural, sentence, size
+from pbl_pipeline.report.words import check_name, plural, sentence, size
 from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.video import VideoInfo
 from pbl_pipeline.visit import Recording, Solution, Visit

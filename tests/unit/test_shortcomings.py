@@ -10,8 +10,8 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints, Picture, PictureMeter, check_keypoints, visibility
-from pbl_pipeline.keypoints._blazepose import NAMES
-from pbl_pipeline.keypoints._picture import detail_of
+from pbl_pipeline.keypoints.blazepose import NAMES
+from pbl_pipeline.keypoints.picture import detail_of
 from pbl_pipeline.video import Camera, Frame
 
 SIZE = (720, 1280)

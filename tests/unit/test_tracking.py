@@ -26,9 +26,9 @@ from pbl_pipeline.tracking import (
     time_in_view_s,
     track_people,
 )
-from pbl_pipeline.tracking._associate import Associator, Trail
-from pbl_pipeline.tracking._reidentify import join_trails
-from pbl_pipeline.tracking._tiles import detect_in, merge, tile_starts, tiles
+from pbl_pipeline.tracking.associate import Associator, Trail
+from pbl_pipeline.tracking.reidentify import join_trails
+from pbl_pipeline.tracking.tiling import detect_in, merge, tile_starts, tiles
 from pbl_pipeline.video import probe
 from tests.videos import constant_rate, write_video
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.tracking import JoinParams, UncrossParams, appearance_of, appearance_similarity
-from pbl_pipeline.tracking._associate import Trail
-from pbl_pipeline.tracking._identity_swaps import undo_swaps
-from pbl_pipeline.tracking._reidentify import join_trails
+from pbl_pipeline.tracking.associate import Trail
+from pbl_pipeline.tracking.identity_swaps import undo_swaps
+from pbl_pipeline.tracking.reidentify import join_trails
 from tests.unit.crossings import Walker, clothes, identities, scene
 from tests.unit.test_tracking import person
 

@@ -19,7 +19,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import (
     Frame,
     VideoInfo,
-    _decode,
+    decode,
     guess_camera,
     load_camera,
     packet_times,
@@ -230,12 +230,12 @@ def test_frames_that_an_edit_list_hides_do_not_count(with_edit_list):
 
 def test_frames_that_are_announced_and_cannot_be_counted_are_lost(with_edit_list, monkeypatch):
     """A header that lies about sizes: FFmpeg opens the file as a player does, and not without its edit list."""
-    monkeypatch.setattr(_decode.Decoder, "n_announced", property(lambda _: 100))
+    monkeypatch.setattr(decode.Decoder, "n_announced", property(lambda _: 100))
 
     def too_large(*_: object) -> int:
         raise MemoryError(12, "Cannot allocate memory")
 
-    monkeypatch.setattr(_decode, "_count_packets", too_large)
+    monkeypatch.setattr(decode, "_count_packets", too_large)
     with pytest.raises(PblError, match="Cannot allocate memory") as error:
         probe(with_edit_list)
     assert error.value.code == "VIDEO_TRUNCATED"

@@ -33,7 +33,7 @@ from pbl_pipeline.gait import (
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.pipeline import measured
 from pbl_pipeline.qc import FAIL, PASS, WARN, Check
-from pbl_pipeline.report._page import page_of
+from pbl_pipeline.report.page import page_of
 from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.video import Camera, VideoInfo
 from pbl_pipeline.visit import Recording, Visit, load_visit, save_visit, visit_of_fits

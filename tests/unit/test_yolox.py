@@ -23,8 +23,8 @@ from pbl_pipeline.tracking import (
     detector_params,
     track_people,
 )
-from pbl_pipeline.tracking._tiles import detect_in
-from pbl_pipeline.tracking._yolox import decode, grid
+from pbl_pipeline.tracking.tiling import detect_in
+from pbl_pipeline.tracking.yolox import decode, grid
 from pbl_pipeline.video import read_frames
 from tests.videos import constant_rate, write_video
 

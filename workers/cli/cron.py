@@ -123,7 +123,7 @@ def backup(keep: int) -> None:
     Example: PBL_BACKUP=/backup pbl cron backup --keep 7
     """
     import schemas
-    from schemas.cli._db_backup import say
+    from schemas.cli.db_backup import say
     from workers.backups import backup_folder, backup_regularly
 
     schemas.activate(methods=False)

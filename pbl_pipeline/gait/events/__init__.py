@@ -3,11 +3,11 @@
 from ._correction import apply_correction, check_correction
 from ._detect import detect_events
 from ._foot_velocity import FootVelocityParams
-from ._methods import METHODS
-from ._phase import PHASE_ORDER, PhaseParams, candidates
-from ._phase_filter import FilterParams
 from ._preconditions import check_preconditions
-from ._types import (
+from .methods import METHODS
+from .phase import PHASE_ORDER, PhaseParams, candidates
+from .phase_filter import FilterParams
+from .types import (
     EVENTS,
     FOOT_DOWN,
     FOOT_UP,
@@ -20,7 +20,7 @@ from ._types import (
     load_events,
     no_events,
 )
-from ._walking import WalkingParams
+from .walking import WalkingParams
 
 __all__ = [
     "EVENTS",

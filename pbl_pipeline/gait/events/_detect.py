@@ -6,8 +6,8 @@ from typing import Any
 
 from pbl_pipeline.gait.motion import FootTrajectories
 
-from ._methods import METHODS
-from ._types import GaitEvents
+from .methods import METHODS
+from .types import GaitEvents
 
 
 def detect_events(feet: FootTrajectories, params: Any = None) -> GaitEvents:

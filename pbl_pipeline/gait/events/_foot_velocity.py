@@ -10,10 +10,10 @@ from scipy.signal import find_peaks
 from pbl_pipeline.gait.motion import FootTrajectories
 from pbl_pipeline.methods import Method
 
-from ._coordinates import Extremum, detect_by_extrema, forward_signals, prominence
 from ._preconditions import check_preconditions
-from ._signal import Segment, refine_extremum
-from ._types import FOOT_DOWN, FOOT_UP, SIDES, EventParams, GaitEvents, no_events
+from .coordinates import Extremum, detect_by_extrema, forward_signals, prominence
+from .signal import Segment, refine_extremum
+from .types import FOOT_DOWN, FOOT_UP, SIDES, EventParams, GaitEvents, no_events
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,8 +11,8 @@ from pbl_pipeline.bounded import MAX_SECONDS, span_s
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait.motion import FootTrajectories
 
-from ._types import SIDES
 from .network.predict import GRID_HZ, MAX_GAP_S, Grid, on_grid
+from .types import SIDES
 
 #: Somebody who sits has the hips at half of this length above the feet and more; below it the legs lie.
 MIN_HIP_HEIGHT = 0.3

@@ -1,0 +1,288 @@
+"""A recording without faces: the pictures, the file around them, and what a person should look at again."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import json
+import os
+import secrets
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline import progress
+from pbl_pipeline.code_version import code_version
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import check_out_file
+from pbl_pipeline.render import draw_skeleton
+from pbl_pipeline.settings import DEIDENTIFY, deidentify_how
+from pbl_pipeline.video import VideoInfo, probe, read_frames, read_metadata, sha256_of, write_h264
+
+from ._find import find_heads
+from ._paint import cover
+from ._params import HeadParams
+from .types import REASONS, Heads, ranges
+
+HOW = DEIDENTIFY
+#: What may be kept of the file's metadata, and how the names of its tags begin.
+KEEP: Mapping[str, tuple[str, ...]] = {
+    "place": ("location", "com.apple.quicktime.location"),
+    "device": (
+        *("make", "model", "com.apple.quicktime.make", "com.apple.quicktime.model", "com.apple.quicktime.software"),
+        *("com.apple.quicktime.camera.", "com.android.manufacturer", "com.android.model", "com.android.version"),
+    ),
+    "time": ("creation_time", "com.apple.quicktime.creationdate", "date"),
+}
+#: Kept without being asked for: it says that time runs slower than the movement did, and nothing of a person.
+_ALWAYS = ("com.android.capture.fps", "com.apple.quicktime.capture.fps")
+#: Status of a result: every frame certain; some to be looked at; nothing was covered.
+STATUSES = ("CERTAIN", "REVIEW", "NO_HEAD")
+SIDECAR_VERSION = 1
+#: A frame also hides where the head is in the frames within this time (s).
+SPREAD_S = 0.05
+_QUALITY = 18  # x264's crf: results computed from the pictures should be those of the original
+
+
+@dataclasses.dataclass(frozen=True)
+class Deidentified:
+    """What became of a video.
+
+    path, sidecar: the files. how: one of `HOW`. n_heads: heads that were found. status: one of `STATUSES`, `reason` a
+    sentence. reasons: for each of the T frames, why it is not certain (names of `REASONS`), empty where it is.
+    """
+
+    path: Path
+    sidecar: Path
+    how: str
+    n_heads: int
+    status: str
+    reason: str
+    reasons: tuple[tuple[str, ...], ...]
+
+    @property
+    def uncertain(self) -> list[tuple[int, int]]:
+        """First and last frame of each run of frames that are not certain."""
+        return ranges([bool(r) for r in self.reasons])
+
+    def why(self, first: int, last: int) -> tuple[str, ...]:
+        """The reasons of a run of frames, in the order of `REASONS`."""
+        found = {r for of_frame in self.reasons[first : last + 1] for r in of_frame}
+        return tuple(r for r in REASONS if r in found)
+
+    @property
+    def n_uncertain(self) -> int:
+        """Frames that are not certain."""
+        return sum(bool(r) for r in self.reasons)
+
+
+def sidecar_of(out: Path) -> Path:
+    """Where what is known of a de-identified video is written: `walk.deidentified.json` for `walk.deidentified.mp4` and
+    for `walk.mp4`."""
+    stem = out.stem.removesuffix(".deidentified")
+    return out.with_name(f"{stem}.deidentified.json")
+
+
+def check_call(video: Path, out: Path, how: str, keep: Collection[str], overwrite: bool) -> None:
+    """What can be wrong before anything is read. Raises `PblError` USAGE, FILE_UNWRITABLE."""
+    if how not in HOW:
+        raise _usage(f"--how {how}", f"one of {', '.join(HOW)}")
+    if unknown := [k for k in keep if k not in KEEP]:
+        raise _usage(f"--keep {', '.join(unknown)}", f"one or several of {', '.join(KEEP)}")
+    if out.suffix.lower() != ".mp4":
+        raise _usage(f"--out {out.name}", "a name that ends in .mp4")
+    if out.exists() and video.exists() and os.path.samefile(out, video):
+        raise _unwritable(out, "the recording itself", "another file than the recording")
+    for path in (out, sidecar_of(out)):
+        check_out_file(path)
+        if path.exists() and not overwrite:
+            raise _unwritable(path, "a file of that name", "a new name")
+
+
+def deidentify(
+    video: str | Path,
+    out: str | Path,
+    how: str = "blur",
+    *,
+    keep: Collection[str] = (),
+    overwrite: bool = False,
+    params: HeadParams | None = None,
+    info: VideoInfo | None = None,
+    heads: Heads | None = None,
+) -> Deidentified:
+    """Write a video in which no head can be recognised, and beside it what a person should look at (docs/files.md).
+
+    Every frame of the original is there, upright, at its own time stamp; sound, and all metadata but those of `keep`
+    (names of `KEEP`), are not. Both files appear complete or not at all. A video in which no head is found is written
+    as it is, and its status says so. Memory does not grow with the length of the video but by a circle per head and
+    frame.
+
+    Parameters
+    ----------
+    video, out
+        The recording, and an .mp4 file.
+    how
+        "blur", "pixelate", or "skeleton": the bodies' keypoints on black.
+    overwrite
+        Replace files of these names.
+    params, info, heads
+        How heads are found; what `video.probe` said; heads that were found before.
+
+    Raises
+    ------
+    PblError
+        USAGE, FILE_UNWRITABLE (`check_call`); VIDEO_* for a file that cannot be read; VIDEO_CHANGED; ASSET_*.
+    """
+    video, out = Path(video), Path(out)
+    check_call(video, out, how, keep, overwrite)
+    params = params or HeadParams()
+    info = info or probe(video)
+    heads = heads or find_heads(video, params, info)
+    reasons = tuple(heads.reasons())
+    status, reason = _status(heads, reasons)
+    sidecar = sidecar_of(out)
+    part, part_of_sidecar = (p.with_name(f"{p.stem}.part{os.getpid()}{p.suffix}") for p in (out, sidecar))
+    try:
+        write_h264(
+            part,
+            _pictures(video, info, heads, how),
+            (info.width_px, info.height_px),
+            info.time_s,
+            _QUALITY,
+            _kept(video, keep),
+        )
+        done = Deidentified(out, sidecar, how, len(heads.heads), status, reason, reasons)
+        content = _content(done, info, sha256_of(part), params, keep)
+        part_of_sidecar.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        part_of_sidecar.replace(sidecar)
+        part.replace(out)
+    finally:
+        part.unlink(missing_ok=True)
+        part_of_sidecar.unlink(missing_ok=True)
+    return done
+
+
+def to_show(video: str | Path, folder: Path, info: VideoInfo | None = None) -> Path:
+    """The recording itself, or where PBL_DEIDENTIFY asks for it a de-identified copy that is written into `folder`.
+
+    Raises the `PblError`s of `deidentify`, and HEAD_NOT_FOUND: what is shown must not be a picture of which nothing
+    was covered.
+    """
+    how = deidentify_how()
+    if not how:
+        return Path(video)
+    done = deidentify(video, folder / f"{secrets.token_hex(8)}.mp4", how, info=info)
+    if done.status == "NO_HEAD" and how != "skeleton":
+        raise nothing_covered(video)
+    return done.path
+
+
+def nothing_covered(about: object) -> PblError:
+    """HEAD_NOT_FOUND about a recording whose pictures are to be shown without heads."""
+    return PblError(
+        "HEAD_NOT_FOUND",
+        found="no head, so nothing of the recording is covered, and PBL_DEIDENTIFY forbids to show it",
+        expected="a person whose head is in the picture",
+        next_step="look at the recording; PBL_DEIDENTIFY=skeleton shows no picture at all",
+        key=str(about),
+    )
+
+
+def covered_picture(image: np.ndarray, heads: Heads, index: int, how: str) -> np.ndarray:
+    """Frame `index` as the de-identified video shows it, from `image` (H, W, 3) uint8 BGR, which stays."""
+    if how == "skeleton":
+        picture = np.zeros_like(image)
+        for head in heads.heads:
+            if head.body_px is not None:
+                draw_skeleton(picture, head.body_names, head.body_px[index])
+        return picture
+    picture = image.copy()
+    cover(picture, heads.circles(index, SPREAD_S), how)
+    return picture
+
+
+def _pictures(video: Path, info: VideoInfo, heads: Heads, how: str) -> Iterator[tuple[float, np.ndarray]]:
+    n = 0
+    for frame in progress.track(read_frames(video), "covering heads", total=info.n_frames):
+        n += 1
+        if n > info.n_frames:
+            break
+        yield frame.time_s, covered_picture(frame.image, heads, frame.index, how)
+    if n != info.n_frames:
+        raise PblError(
+            "VIDEO_CHANGED",
+            found=f"{'more than ' if n > info.n_frames else ''}{min(n, info.n_frames)} frames",
+            expected=f"the {info.n_frames} frames that were probed",
+            next_step="run it again on a file that nobody writes to",
+            key=str(video),
+        )
+
+
+def _status(heads: Heads, reasons: tuple[tuple[str, ...], ...]) -> tuple[str, str]:
+    if not heads.heads:
+        return "NO_HEAD", "no head was found in any frame, so nothing was covered: look at the whole video"
+    n = sum(bool(r) for r in reasons)
+    if not n:
+        return "CERTAIN", f"every frame is certain ({len(heads.heads)} heads)"
+    return "REVIEW", f"{n} of {len(reasons)} frames are not certain: look at them"
+
+
+def _kept(video: Path, keep: Collection[str]) -> dict[str, str]:
+    """The tags of the file that go over to the new one."""
+    begins = tuple(b for name in keep for b in KEEP[name])
+    found = read_metadata(video)
+    return {n: text for n, text in found.items() if n in _ALWAYS or (begins and _is_of(n, begins))}
+
+
+def _is_of(name: str, begins: tuple[str, ...]) -> bool:
+    """Whether a tag is one of these, or below one that ends in a dot, or a language of it (`location-eng`)."""
+    return any(name == b or name.startswith((b,) if b.endswith(".") else (f"{b}-", f"{b}.")) for b in begins)
+
+
+def _content(
+    done: Deidentified, info: VideoInfo, sha256: str, params: HeadParams, keep: Collection[str]
+) -> dict[str, Any]:
+    """What the sidecar says. The original is named by its hash alone: names of files are often names of people."""
+    counts = collections.Counter(r for of_frame in done.reasons for r in of_frame)
+    return {
+        "format": "pbl-deidentified",
+        "version": SIDECAR_VERSION,
+        "status": done.status,
+        "reason": done.reason,
+        "how": done.how,
+        "n_frames": info.n_frames,
+        "n_heads": done.n_heads,
+        "n_uncertain": done.n_uncertain,
+        "uncertain": [
+            {
+                "first": first,
+                "last": last,
+                "first_s": round(float(info.time_s[first]), 4),
+                "last_s": round(float(info.time_s[last]), 4),
+                "why": list(done.why(first, last)),
+            }
+            for first, last in done.uncertain
+        ],
+        "frames_by_reason": {r: counts[r] for r in REASONS if counts[r]},
+        "kept": sorted(keep),
+        "original_sha256": info.sha256,
+        "sha256": sha256,
+        "parameters": dataclasses.asdict(params),
+        "code_version": code_version(),
+    }
+
+
+def _usage(found: str, expected: str) -> PblError:
+    return PblError("USAGE", found=found, expected=expected, next_step="see `pbl deidentify --help`")
+
+
+def _unwritable(path: Path, found: str, expected: str) -> PblError:
+    return PblError(
+        "FILE_UNWRITABLE",
+        found=found,
+        expected=expected,
+        next_step="pass another --out, or --overwrite to replace an earlier result (never the recording)",
+        key=str(path),
+    )

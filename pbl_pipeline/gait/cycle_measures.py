@@ -1,0 +1,198 @@
+"""Cadence, stride and step time, stance, swing, support, lengths and speed from cycles; their spread and asymmetry."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from ._camera_side import mostly
+from .events import LEFT, RIGHT
+from .types import GaitCycle
+
+#: Measures in the order of metrics.json; the unit is in the name.
+MEASURES: tuple[str, ...] = (
+    "cadence_steps_per_min",
+    "stride_time_s",
+    "step_time_s",
+    "stance_time_s",
+    "swing_time_s",
+    "stance_percent",
+    "swing_percent",
+    "single_support_percent",
+    "double_support_percent",
+    "double_support_time_s",
+    "speed_m_per_s",
+    "stride_length_m",
+    "step_length_m",
+    "step_width_m",
+)
+#: Measures that need to know where the feet stand on the floor.
+LENGTHS = ("speed_m_per_s", "stride_length_m", "step_length_m", "step_width_m")
+#: Measures of one leg, of which left and right may differ: those that have an asymmetry.
+SIDED = (
+    "step_time_s",
+    "stance_time_s",
+    "swing_time_s",
+    "stance_percent",
+    "swing_percent",
+    "single_support_percent",
+    "step_length_m",
+)
+NO_WIDTH = "one camera does not tell it: on synthetic walkers it comes out up to 4 cm too wide"
+
+
+@dataclasses.dataclass(frozen=True)
+class Measure:
+    """Mean and sd (n - 1; None for one value) over the n values of both sides; `left`, `right` are means of a side.
+
+    `variability` is the sd within a side, both sides together: the root of the mean of their variances (n - 1), which
+    an asymmetry does not touch; None with fewer than two values of a side. `cv_percent` is that in percent of the mean.
+    `asymmetry_percent` is 100 (right - left) / ((right + left) / 2), None for measures that are not `SIDED` and where
+    one camera saw the same leg behind the other in most cycles (`far_leg_of`).
+    """
+
+    left: float | None
+    right: float | None
+    mean: float
+    sd: float | None
+    n: int
+    variability: float | None = None
+    cv_percent: float | None = None
+    asymmetry_percent: float | None = None
+
+    def to_dict(self) -> dict:
+        return {k: round(v, 4) if isinstance(v, float) else v for k, v in dataclasses.asdict(self).items()}
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """90 % interval of the mean over repetitions, mean +- t sd / sqrt(n) by Student's t, as far as the values vary
+        from cycle to cycle: what camera, detector and fit do to all of them alike is not in it.
+
+        The sd is `variability` where it is known (n - 2 degrees of freedom), else `sd` (n - 1); None without either.
+        """
+        from scipy.stats import t  # takes longer to import than most commands run
+
+        sd, freedom = (self.variability, self.n - 2) if self.variability is not None else (self.sd, self.n - 1)
+        if sd is None or freedom < 1:
+            return None
+        half = float(t.isf(0.05, freedom)) * sd / float(np.sqrt(self.n))
+        return self.mean - half, self.mean + half
+
+
+@dataclasses.dataclass(frozen=True)
+class Spatiotemporal:
+    """Measures by name (`MEASURES`); None where one cannot be trusted, with the reason in `reasons`.
+
+    `n_cycles_found` and `n_cycles_used` count before and after the exclusions of `find_cycles`.
+    """
+
+    status: str
+    reason: str
+    measures: dict[str, Measure | None]
+    reasons: dict[str, str]
+    n_cycles_found: int
+    n_cycles_used: int
+    n_steps_used: int
+
+    def __getitem__(self, name: str) -> Measure | None:
+        return self.measures.get(name)
+
+
+def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
+    """Measures over the used cycles of one or several trials (formulas and sources in docs/measures.md).
+
+    For a cycle with foot down D, opposite foot up U', opposite foot down D', foot up U, next foot down E:
+    stride time E - D; stance U - D and swing E - U, also in percent of the stride; single support
+    100 (D' - U') / (E - D); double support time (U' - D) + (U - D'), also in percent; cadence 120 / (E - D). Step time
+    is between successive foot downs and belongs to the side that lands: D' - D is a step of the other side, E - D' one
+    of this side; a step that is part of two cycles counts once. Lengths are those of `cycle_lengths`, speed is stride
+    length by stride time.
+
+    Status EMPTY with a reason where no cycle is used.
+    """
+    used = [c for c in cycles if c.used]
+    reasons: dict[str, str] = {}
+    measures: dict[str, Measure | None] = dict.fromkeys(MEASURES)
+    if not used:
+        reason = _none_used(cycles)
+        return Spatiotemporal("EMPTY", reason, measures, dict.fromkeys(MEASURES, reason), len(cycles), 0, 0)
+    by_cycle: dict[str, list[tuple[str, float]]] = {name: [] for name in MEASURES}
+    steps: dict[tuple[str, str, float], float] = {}
+    for c in used:
+        for name, value in cycle_measures(c).items():
+            by_cycle[name].append(("" if name == "cadence_steps_per_min" else c.side, value))
+        other = RIGHT if c.side == LEFT else LEFT
+        steps[c.trial, other, c.opposite_foot_down_s] = c.opposite_foot_down_s - c.start_s
+        steps[c.trial, c.side, c.end_s] = c.end_s - c.opposite_foot_down_s
+    by_cycle["step_time_s"] = [(side, value) for (_, side, _), value in steps.items()]
+    alike = not far_leg_of(used)
+    measures.update({name: _measure(name, values, alike) for name, values in by_cycle.items() if values})
+    for name in LENGTHS:
+        if measures[name] is None:
+            reasons[name] = _no_length(name, used)
+    return Spatiotemporal("PASS", "", measures, reasons, len(cycles), len(used), len(steps))
+
+
+def far_leg_of(cycles: Sequence[GaitCycle]) -> str:
+    """The leg that was behind the other in most of the used cycles; empty where both were seen alike."""
+    return mostly(np.array([c.far_leg for c in cycles if c.used]))
+
+
+def cycle_measures(c: GaitCycle) -> dict[str, float]:
+    """The measures of one cycle by name (`MEASURES`) but its step times, which belong to two cycles; those that are not
+    known are left out."""
+    stride, stance = c.stride_time_s, c.foot_up_s - c.start_s
+    both = (c.opposite_foot_up_s - c.start_s) + (c.foot_up_s - c.opposite_foot_down_s)
+    alone = c.opposite_foot_down_s - c.opposite_foot_up_s
+    values = {
+        "cadence_steps_per_min": 120.0 / stride,
+        "stride_time_s": stride,
+        "stance_time_s": stance,
+        "swing_time_s": stride - stance,
+        "stance_percent": 100.0 * stance / stride,
+        "swing_percent": 100.0 - 100.0 * stance / stride,
+        "single_support_percent": 100.0 * alone / stride,
+        "double_support_percent": 100.0 * both / stride,
+        "double_support_time_s": both,
+    }
+    if c.lengths.stride_length_m is not None:
+        values["speed_m_per_s"] = c.lengths.stride_length_m / stride
+    for name in LENGTHS[1:]:
+        if (length := getattr(c.lengths, name)) is not None:
+            values[name] = length
+    return values
+
+
+def _none_used(cycles: Sequence[GaitCycle]) -> str:
+    if not cycles:
+        return "no complete gait cycle"
+    if failed := next((c.excluded for c in cycles if c.fit_failed), ""):
+        return failed
+    found = "only one gait cycle" if len(cycles) == 1 else f"{len(cycles)} gait cycles"
+    odd = ", and so are strides of odd length" if any(c.odd_length for c in cycles) else ""
+    return f"{found}, and the first and last steps of a walk are excluded{odd}"
+
+
+def _no_length(name: str, used: Sequence[GaitCycle]) -> str:
+    if name == "step_width_m" and any(c.lengths.stride_length_m is not None for c in used):
+        return NO_WIDTH
+    return "; ".join(sorted({c.lengths.missing for c in used if c.lengths.missing})) or "not known"
+
+
+def _measure(name: str, values: Sequence[tuple[str, float]], alike: bool) -> Measure:
+    numbers = np.array([v for _, v in values])
+    by_side = {side: [v for s, v in values if s == side] for side in (LEFT, RIGHT)}
+    left, right = (float(np.mean(by_side[s])) if by_side[s] else None for s in (LEFT, RIGHT))
+    mean = float(numbers.mean())
+    sd = float(np.std(numbers, ddof=1)) if len(numbers) > 1 else None
+    # A measure without sides (cadence) has one group.
+    groups = list(by_side.values()) if left is not None or right is not None else [list(numbers)]
+    enough = all(len(g) > 1 for g in groups)
+    within = float(np.sqrt(np.mean([np.var(g, ddof=1) for g in groups]))) if enough else None
+    fraction = None if within is None or mean == 0 else 100.0 * within / abs(mean)
+    asymmetry = None
+    if alike and name in SIDED and left is not None and right is not None and left + right != 0:
+        asymmetry = 100.0 * (right - left) / (0.5 * (right + left))
+    return Measure(left, right, mean, sd, len(numbers), within, fraction, asymmetry)

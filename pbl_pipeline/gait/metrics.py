@@ -1,0 +1,376 @@
+"""All gait measures of a session: events, cycles, spatiotemporal measures, GDI, checks."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.methods import Method
+from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.qc import EMPTY, OUTCOMES, PASS, WARN, Check, in_session, worst
+
+from ._condition import Condition
+from ._cycles import find_cycles
+from ._gdi import GDI_METHODS, GDI_MODEL, GILLETTE_MODEL, Gdi, GdiParams, norm_of, params_of, score_gdi
+from .cycle_measures import MEASURES, Spatiotemporal, far_leg_of, spatiotemporal
+from .events import METHODS, GaitEvents, detect_events
+from .laboratory import LabTrial
+from .motion import BodyPoses, feet_from_fit, trial_poses
+from .normative import NormativeSet
+from .types import GaitCycle
+
+if TYPE_CHECKING:
+    from pbl_pipeline.fit import TrialFit
+
+
+@dataclasses.dataclass(frozen=True)
+class GaitParams:
+    """Method of the events (a row of `events.METHODS`) and parameters of the index together."""
+
+    events: Paramset = dataclasses.field(default_factory=lambda: METHODS.find().paramset)
+    gdi: GdiParams = dataclasses.field(default_factory=lambda: GDI_METHODS.find().params)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrialCycles:
+    """Cycles of one trial, as a session pools them (`pool_trials`). `reason`: why none is used, empty where one is."""
+
+    name: str
+    reason: str
+    cycles: tuple[GaitCycle, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class TrialMetrics(TrialCycles):
+    """Everything of one trial. `pooled` is false where the session's measures leave it out: no walking, or walking at
+    another pace than that of the method."""
+
+    status: str
+    events: GaitEvents
+    spatiotemporal: Spatiotemporal
+    gdi: Gdi
+    qc: tuple[Check, ...]
+    pooled: bool = True
+
+    def to_dict(self) -> dict:
+        """Return the trial's part of metrics.json, from which `metrics_file.metrics_of` makes it again."""
+        found = {f.name: getattr(self.events, f.name) for f in dataclasses.fields(self.events) if f.name != "events"}
+        events = {**found, "walking_s": [list(bout) for bout in found["walking_s"]]}
+        events["qc"] = [c.to_dict() for c in self.events.qc]
+        cycles = [
+            {k: v for k, v in dataclasses.asdict(c).items() if k not in ("trial", "curves", "curves_sd")}
+            for c in self.cycles
+        ]
+        more = {"pooled": self.pooled, "events": events, "gait_cycles": cycles}
+        return {"name": self.name, **_measures(self), **more}
+
+
+@dataclasses.dataclass(frozen=True)
+class SessionMetrics:
+    """Measures and index over all used cycles of the pooled trials of a session, with their checks `qc`.
+
+    `params_hash` identifies the method of the events and the parameters of the index together.
+    """
+
+    status: str
+    reason: str
+    spatiotemporal: Spatiotemporal
+    gdi: Gdi
+    qc: tuple[Check, ...]
+    params_hash: str
+
+
+@dataclasses.dataclass(frozen=True)
+class GaitMetrics(SessionMetrics):
+    """The measures of a session and its trials. `before`: checks of the stages before (`with_checks`)."""
+
+    trials: tuple[TrialMetrics, ...]
+    before: tuple[Check, ...] = ()
+
+    def with_checks(self, checks: Sequence[Check]) -> GaitMetrics:
+        """The same measures, judged together with the checks of keypoints and fit."""
+        return dataclasses.replace(self, before=tuple(checks))
+
+    @property
+    def cycles(self) -> list[GaitCycle]:
+        """The cycles of the pooled trials, those that are not used as well."""
+        return [c for t in self.trials if t.pooled for c in t.cycles]
+
+    @property
+    def checks(self) -> tuple[Check, ...]:
+        """Every check of the session in the order of the chain, each once: `before`, the trials' events, `qc`."""
+        events = [c for t in self.trials for c in t.events.qc]
+        return tuple(dict.fromkeys([*self.before, *events, *self.qc]))
+
+    @property
+    def outcome(self) -> str:
+        """The worst of `checks`, as report and tables judge it."""
+        return max((in_session(c.outcome, self.status == PASS) for c in self.checks), key=OUTCOMES.index, default=PASS)
+
+    def to_dict(self) -> dict:
+        """The content of metrics.json."""
+        judged = {
+            "outcome": self.outcome,
+            "qc": [c.to_dict() for c in self.checks],
+            "qc_before_gait": len(dict.fromkeys(self.before)),
+        }
+        session = _measures(self)
+        del session["gdi"]["cycles"]  # those of its trials
+        return {
+            "session": {**session, **judged},
+            "trials": [t.to_dict() for t in self.trials],
+            "gdi_model": self.gdi.model,
+            "params_hash": self.params_hash,
+        }
+
+    def table(self) -> str:
+        """The session's measures as text for a terminal."""
+        lines = [f"{self.status}: {self.reason}"] if self.reason else []
+        lines.append(f"{'measure':<24}{'left':>9}{'right':>9}{'mean':>9}{'sd':>8}{'n':>5}")
+        for name in MEASURES:
+            m = self.spatiotemporal[name]
+            if m is None:
+                lines.append(f"{name:<24}{'-':>9}{'-':>9}{'-':>9}{'-':>8}{'-':>5}  {self.spatiotemporal.reasons[name]}")
+            else:
+                lines.append(f"{name:<24}{_cell(m.left)}{_cell(m.right)}{_cell(m.mean)}{_cell(m.sd, 8)}{m.n:>5}")
+        g = self.gdi
+        lines.append(f"{_short(g):<24}{_cell(g.left)}{_cell(g.right)}{_cell(g.mean)}{'':>8}{g.n:>5}  {g.reason}")
+        if g.interval is not None:
+            low, high = g.interval
+            lines.append(f"{'its 90 % interval':<24}{low:>9.1f} to {high:.1f}, minimal change {g.minimal_change:.1f}")
+        if g.profile is not None and g.profile.gps is not None:
+            p = g.profile
+            lines.append(f"{'GPS (deg)':<24}{_cell(p.gps_left)}{_cell(p.gps_right)}{_cell(p.gps)}")
+        lines.append(f"quality checks: {self.outcome}")
+        lines += [f"{c.outcome} {c.check}: {c.advice}" for c in self.checks if c.advice]
+        return "\n".join(line.rstrip() for line in lines)
+
+    def save(self, path: str | Path) -> None:
+        """Write `metrics.json`. Missing values are null with a reason in `reasons`."""
+        Path(path).write_text(json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def gait_metrics(
+    trials: Sequence[TrialFit | LabTrial],
+    norm: NormativeSet | str | None = None,
+    params: GaitParams | None = None,
+    fit_checks: Sequence[Check] = (),
+    model: Method[GdiParams] | str | None = None,
+    version: int | None = None,
+    conditions: Sequence[Condition] | None = None,
+) -> GaitMetrics:
+    """Measures of the trials of one session and of the session: events, cycles and measures of each trial, then
+    `pool_trials`.
+
+    Trials are fits, or recordings of a laboratory, whose first and last steps in view count. `model` and `version` are
+    those of `score_gdi`, `conditions` those of `pool_trials`.
+
+    A trial without walking has status EMPTY and takes no part in the session. Where one of `fit_checks`, the checks of
+    the session fit, FAILs, no cycle is used: measures and index are None with that reason. Raises `PblError`
+    NORM_UNKNOWN, NORM_INVALID, GAIT_INPUT (no finite frame in a trial).
+    """
+    if not trials:
+        raise PblError(
+            "GAIT_INPUT", found="no trial", expected="at least one fitted trial", next_step="pass fit.npz files"
+        )
+    basis = norm_of(norm, params.gdi if params else GDI_METHODS.find(model).params)
+    params = params or GaitParams(gdi=params_of(basis, model))
+    index = {"norm": basis, "params": params.gdi, "model": model, "version": version}
+    given = [Condition()] * len(trials) if conditions is None else conditions
+    done = tuple(
+        dataclasses.replace(_trial(t, params.events, index, fit_checks), pooled=c.pooled(params.gdi.pace))
+        for t, c in zip(trials, given, strict=True)
+    )
+    return GaitMetrics(**vars(pool_trials(done, basis, params, model, version, given)), trials=done)
+
+
+def pool_trials(
+    trials: Sequence[TrialCycles],
+    norm: NormativeSet,
+    params: GaitParams,
+    model: Method[GdiParams] | str | None = None,
+    version: int | None = None,
+    conditions: Sequence[Condition] | None = None,
+) -> SessionMetrics:
+    """Measures and index of a session over all used cycles of its pooled trials.
+
+    Parameters
+    ----------
+    trials
+        Cycles of each trial; two trials may have one name.
+    norm, params, model, version
+        Norm and method of the index (`score_gdi`); `params.events` only enters `params_hash`.
+    conditions
+        What is done in each trial (None: unknown): walking at the pace of `params.gdi` is pooled.
+
+    Returns
+    -------
+    SessionMetrics
+        EMPTY, with a reason, where no pooled trial has a used cycle. Raises `PblError` as `score_gdi`.
+    """
+    given = [Condition()] * len(trials) if conditions is None else conditions
+    pooled = [t for t, c in zip(trials, given, strict=True) if c.pooled(params.gdi.pace)]
+    cycles = [c for t in pooled for c in t.cycles]
+    # Two trials may carry one name; their cycles are told apart by it.
+    measures, gdi = spatiotemporal(_distinct(pooled)), score_gdi(cycles, norm, params.gdi, model, version)
+    status = PASS if measures.status == PASS else EMPTY
+    reason = "" if status == PASS else "; ".join(dict.fromkeys(f"{t.name}: {t.reason}" for t in pooled))
+    if not pooled:
+        there = "; ".join(dict.fromkeys(map(str, given)))
+        reason = f"no trial of walking at the pace {params.gdi.pace!r} (there are: {there})"
+        measures = dataclasses.replace(measures, reason=reason, reasons=dict.fromkeys(measures.reasons, reason))
+        gdi = dataclasses.replace(gdi, reason=reason)
+    return SessionMetrics(
+        status=status,
+        reason=reason,
+        spatiotemporal=measures,
+        gdi=gdi,
+        qc=(*cycle_checks(measures, cycles), *gdi.qc),
+        params_hash=Paramset.of("gait", "gait-metrics", 1, params).hash,
+    )
+
+
+def _trial(
+    trial: TrialFit | LabTrial, event_method: Paramset, index: dict[str, Any], fit_checks: Sequence[Check]
+) -> TrialMetrics:
+    if isinstance(trial, LabTrial):
+        events = trial.events
+        cycles = find_cycles(events, trial=trial.name, series=trial.series, feet=trial.feet, keep_ends=True)
+    else:
+        poses, events = _events(trial, event_method)
+        cycles = find_cycles(events, trial, poses=poses, fit_checks=fit_checks)
+    measures, gdi = spatiotemporal(cycles), score_gdi(cycles, **index)
+    reason = events.reason or measures.reason
+    return TrialMetrics(
+        name=trial.name,
+        reason=reason,
+        cycles=cycles,
+        status=EMPTY if reason else PASS,
+        events=events,
+        spatiotemporal=measures,
+        gdi=gdi,
+        qc=(*events.qc, *cycle_checks(measures, cycles), *gdi.qc),
+    )
+
+
+def _events(trial: TrialFit, method: Paramset) -> tuple[BodyPoses, GaitEvents]:
+    """Poses and events of a fit. An error names the trial: a session has several."""
+    try:
+        poses = trial_poses(trial)
+        return poses, detect_events(feet_from_fit(trial, poses), method)
+    except PblError as error:
+        raise error.about(trial.name) from error.__cause__
+
+
+def _distinct(trials: Sequence[TrialCycles]) -> list[GaitCycle]:
+    return [dataclasses.replace(c, trial=f"{i} {c.trial}") for i, t in enumerate(trials) for c in t.cycles]
+
+
+def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple[Check, ...]:
+    """Checks of the cycles that `measures` were made of: `cycles_used`, `cycles_of_odd_length`,
+    `cycles_of_odd_curves`, `legs_seen_alike`, `cadence_plausible`, `lengths_scale`."""
+    odd = sum(c.odd_length for c in cycles)
+    lengths = Check(
+        "cycles_of_odd_length",
+        WARN if odd else PASS,
+        float(odd),
+        0.0,
+        "a step was missed or invented, or the person paused: left out of the measures, see the overlay" if odd else "",
+    )
+    unlike = sum(c.odd_curves for c in cycles)
+    curves = Check(
+        "cycles_of_odd_curves",
+        WARN if unlike else PASS,
+        float(unlike),
+        0.0,
+        "their angles are far from those of the other cycles: left out of the measures, see the overlay"
+        if unlike
+        else "",
+    )
+    if measures.status == EMPTY:
+        return (Check("cycles_used", EMPTY, 0.0, 1.0, measures.reason), *((lengths,) if odd else ()))
+    few = measures.n_cycles_used < 4
+    checks = [
+        Check(
+            "cycles_used",
+            WARN if few else PASS,
+            float(measures.n_cycles_used),
+            4.0,
+            "few cycles: film a longer stretch, or several passes" if few else "",
+        ),
+        lengths,
+        curves,
+    ]
+    if any(c.used for c in cycles):
+        far = far_leg_of(cycles)
+        near = "left" if far == "right" else "right"
+        checks.append(
+            Check(
+                "legs_seen_alike",
+                WARN if far else PASS,
+                None,
+                None,
+                f"the {far} leg was behind the {near} one: its curves and measures are less certain, and the sides are "
+                "not to be compared. Film a pass in each direction"
+                if far
+                else "",
+            )
+        )
+    cadence = measures["cadence_steps_per_min"]
+    if cadence is not None:
+        plausible = 60.0 <= cadence.mean <= 150.0
+        checks.append(
+            Check(
+                "cadence_plausible",
+                PASS if plausible else WARN,
+                round(cadence.mean, 2),
+                60.0 if cadence.mean < 60.0 else 150.0,
+                "" if plausible else "unusual for walking: count the steps in the overlay",
+            )
+        )
+    if measures["stride_length_m"] is not None:
+        guessed = any(c.used and c.lengths.stride_length_m is not None and not c.lengths.metric for c in cycles)
+        checks.append(
+            Check(
+                "lengths_scale",
+                WARN if guessed else PASS,
+                None,
+                None,
+                "lengths and speed are scaled by an assumed body size (one camera sees no scale): state the measured "
+                "body height (--height-m), or compare visits of one person, not people"
+                if guessed
+                else "",
+            )
+        )
+    return tuple(checks)
+
+
+def _short(gdi: Gdi) -> str:
+    return {GDI_MODEL: "GDI of three angles", GILLETTE_MODEL: "GDI of nine angles"}.get(gdi.model, gdi.model)
+
+
+def _cell(value: float | None, width: int = 9) -> str:
+    return f"{'-' if value is None else format(value, '.2f'):>{width}}"
+
+
+def _measures(part: TrialMetrics | GaitMetrics) -> dict:
+    values = part.spatiotemporal
+    reasons = dict(values.reasons)
+    if part.gdi.mean is None:
+        reasons["gdi"] = part.gdi.reason
+    table = {name: None if (m := values[name]) is None else m.to_dict() for name in MEASURES}
+    return {
+        "status": part.status,
+        "reason": part.reason,
+        **table,
+        "gdi": part.gdi.to_dict(),
+        "profile_deg": None if part.gdi.profile is None else part.gdi.profile.to_dict(),
+        "reasons": reasons,
+        "cycles": {"found": values.n_cycles_found, "used": values.n_cycles_used, "steps": values.n_steps_used},
+        "outcome": worst(part.qc),
+        "qc": [c.to_dict() for c in part.qc],
+    }

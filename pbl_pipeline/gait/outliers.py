@@ -1,0 +1,66 @@
+"""Cycles that are not like the others: of an odd length, or with curves far from the rest."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .types import GaitCycle
+
+#: A stride longer than this times the typical one holds a step that was missed (at least half a stride more) or a
+#: pause; one shorter than its inverse an event that is none. Strides of one walk vary by a few percent, in ataxia ten.
+STRIDE_RATIO = 1.35
+#: Fewest cycles of a bout for a typical stride of its own; shorter bouts are compared with the whole trial.
+_OWN_MEDIAN = 5
+
+#: Angles whose curves are compared: those that move most and that every source of curves knows.
+CURVE_ANGLES = ("hip_flexion", "knee_flexion", "ankle_dorsiflexion")
+#: Fewest cycles of a side with curves that say what is usual.
+MIN_CURVES = 5
+#: A cycle is unlike the others where its curves are further from the median curves than this many robust standard
+#: deviations above the usual distance, and at least this far. Both, so that neither a very regular walk nor a very
+#: irregular one loses cycles that are only its own variability: a leg exchanged or a person mistaken is 20 deg off.
+CURVE_SD, CURVE_MIN_DEG = 6.0, 8.0
+
+
+def without_odd_lengths(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
+    """The cycles, those of an odd length marked as not used with the reason."""
+    out = []
+    for c in cycles:
+        own = [o.stride_time_s for o in cycles if o.bout == c.bout]
+        typical = np.median(own if len(own) >= _OWN_MEDIAN else [o.stride_time_s for o in cycles])
+        ratio = float(c.stride_time_s / typical)
+        out.append(c if 1 / STRIDE_RATIO <= ratio <= STRIDE_RATIO else not_used(c, length_ratio=ratio))
+    return out
+
+
+def without_odd_curves(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
+    """The cycles, those whose curves are far from the median of their side marked as not used with the reason.
+
+    Distance: root mean square over `CURVE_ANGLES` and the cycle, in degrees, to the pointwise median of the used cycles
+    of the side. The threshold is the median of these distances plus `CURVE_SD` times 1.4826 of their median absolute
+    deviation, and at least `CURVE_MIN_DEG`. With fewer than `MIN_CURVES` cycles of a side none is marked.
+    """
+    out = list(cycles)
+    for side in sorted({c.side for c in cycles}):
+        chosen = [
+            i for i, c in enumerate(out) if c.side == side and c.used and all(n in c.curves for n in CURVE_ANGLES)
+        ]
+        if len(chosen) < MIN_CURVES:
+            continue
+        curves = np.array([[out[i].curves[n] for n in CURVE_ANGLES] for i in chosen])
+        away = np.sqrt(np.mean((curves - np.median(curves, axis=0)) ** 2, axis=(1, 2)))
+        usual = np.median(away)
+        limit = max(CURVE_MIN_DEG, float(usual + CURVE_SD * 1.4826 * np.median(np.abs(away - usual))))
+        for i, distance in zip(chosen, away, strict=True):
+            if distance > limit:
+                out[i] = not_used(out[i], curve_distance_deg=float(distance), n_curves=len(chosen))
+    return out
+
+
+def not_used(cycle: GaitCycle, **reasons: Any) -> GaitCycle:
+    """The cycle, not used, with further reasons (fields of `Exclusion`)."""
+    return dataclasses.replace(cycle, exclusion=dataclasses.replace(cycle.exclusion, **reasons))

@@ -1,0 +1,181 @@
+"""BlazePose's landmark networks, full and heavy: 33 body points in the picture and, in metres, around the mid-hip.
+
+Layout: Bazarevsky et al. 2020, "BlazePose: On-device Real-time Body Pose tracking", Grishchenko et al. 2022, "BlazePose
+GHUM Holistic" for the metric points, and the graph configuration beside the model in the mediapipe 0.10.21 wheel.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.special import expit
+
+from pbl_pipeline import assets
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.models import LiteModel
+from pbl_pipeline.tracking import circle_roi
+from pbl_pipeline.video import Camera, cut_image
+
+from .flips import mirror_of
+from .mirror_looks import MirrorLooks
+from .params import MARKER_SET, MODEL_SHA256, ROOT_RELATIVE, KeypointParams
+from .types import PersonKeypoints
+from .view import crop_matrix, view_rotation
+
+HEAVY_SHA256 = assets.ASSETS["blazepose_landmarks_heavy"].sha256
+#: The networks by their SHA-256: the asset that each is. They have the same inputs and outputs.
+_NETWORKS = {MODEL_SHA256: "blazepose_landmarks", HEAVY_SHA256: "blazepose_landmarks_heavy"}
+INPUT_SIZE = 256
+#: The crop is this much larger than the region of interest.
+CROP_MARGIN = 1.25
+NAMES: tuple[str, ...] = (
+    "nose",
+    "left_eye_inner",
+    "left_eye",
+    "left_eye_outer",
+    "right_eye_inner",
+    "right_eye",
+    "right_eye_outer",
+    "left_ear",
+    "right_ear",
+    "mouth_left",
+    "mouth_right",
+    "left_shoulder",
+    "right_shoulder",
+    "left_elbow",
+    "right_elbow",
+    "left_wrist",
+    "right_wrist",
+    "left_pinky",
+    "right_pinky",
+    "left_index",
+    "right_index",
+    "left_thumb",
+    "right_thumb",
+    "left_hip",
+    "right_hip",
+    "left_knee",
+    "right_knee",
+    "left_ankle",
+    "right_ankle",
+    "left_heel",
+    "right_heel",
+    "left_foot_index",
+    "right_foot_index",
+)
+N_POINTS = len(NAMES)
+#: The network adds six points; the first two are the middle of the hips and a point of the region of interest.
+N_ALL = 39
+#: Sizes of the networks' outputs: points of the picture, of the world, and whether there is a person.
+_OUTPUTS = (N_ALL * 5, N_ALL * 3, 1)
+#: For each point of the mirrored picture, whose it is: left and right change places.
+MIRROR = np.array(mirror_of(NAMES))
+
+
+class BlazePoseLandmarks:
+    """`KeypointDetector` with BlazePose's 33 points, root-relative (origin between the hips).
+
+    The crop is shown twice, the second time mirrored, and `MirrorLooks` puts the answers together; a quick look is one
+    of `quick_path`'s network, where one is given, at the crop as it is. The confidence that
+    the network states is sigmoid(visibility logit) * sigmoid(presence logit): the point is not hidden; it lies in the
+    picture. presence = the network's own pose flag.
+    """
+
+    name = "blazepose"
+    names: tuple[str, ...] = NAMES
+    marker_set = MARKER_SET
+    root_relative = ROOT_RELATIVE
+
+    #: One for each core: calls of one thread side by side are faster than one call of several threads.
+    per_core = True
+
+    def __init__(
+        self,
+        model_path: str | Path,
+        agree_mm: float = 100.0,
+        agree_width_mm: float = 20.0,
+        num_threads: int = 1,
+        sha256: str = MODEL_SHA256,
+        quick_path: str | Path | None = None,
+    ) -> None:
+        self._model = LiteModel(model_path, sha256, _OUTPUTS, num_threads)
+        self._quick = LiteModel(quick_path, MODEL_SHA256, _OUTPUTS, num_threads) if quick_path else self._model
+        self.model_sha256 = self._model.sha256
+        self.mirror_looks = MirrorLooks(NAMES, agree_mm, agree_width_mm)
+
+    def detect(self, image: np.ndarray, roi_px: np.ndarray, camera: Camera, *, quick: bool = False) -> PersonKeypoints:
+        """See `KeypointDetector`. `image` (H, W, 3) uint8 BGR; what lies beyond it is black to the network."""
+        return self.detect_crop(cut_image(image, *self.crop_of(roi_px)), roi_px, camera, quick=quick)
+
+    def crop_of(self, roi_px: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
+        """See `CropDetector`."""
+        matrix = crop_matrix(_with_margin(roi_px), INPUT_SIZE)
+        # A cut counts from pixel centres of the crop, the network from the crop's edge.
+        matrix[:, 2] += 0.5 * (matrix[:, 0] + matrix[:, 1])
+        return matrix, (INPUT_SIZE, INPUT_SIZE)
+
+    def detect_crop(
+        self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, quick: bool = False
+    ) -> PersonKeypoints:
+        """See `CropDetector`."""
+        if quick:
+            return self._look(self._quick, crop, roi_px, camera, mirrored=False)
+        own, other = (self.detect_once(crop, roi_px, camera, mirrored=m) for m in (False, True))
+        return self.mirror_looks.averaged(own, other)
+
+    def detect_once(
+        self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, mirrored: bool = False
+    ) -> PersonKeypoints:
+        """See `MirrorDetector`."""
+        return self._look(self._model, crop, roi_px, camera, mirrored=mirrored)
+
+    def _look(
+        self, network: LiteModel, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, mirrored: bool
+    ) -> PersonKeypoints:
+        """What a network says of the crop, or of its mirror image, in terms of the picture."""
+        crop = np.multiply(cv2.cvtColor(crop, cv2.COLOR_BGR2RGB), np.float32(1 / 255), dtype=np.float32)
+        output = network(np.ascontiguousarray(crop[:, ::-1] if mirrored else crop))
+        found = output[N_ALL * 5].reshape(N_ALL, 5).astype(np.float64)
+        points, circle, logits = found[:N_POINTS, :2], found[N_POINTS : N_POINTS + 2, :2], found[:N_POINTS, 3:]
+        world = output[N_ALL * 3].reshape(N_ALL, 3)[:N_POINTS].astype(np.float64)
+        confidence = expit(logits[:, 0]) * expit(logits[:, 1])
+        if mirrored:
+            flip, edge = np.array([-1.0, 1.0]), np.array([float(INPUT_SIZE), 0.0])
+            points, circle = points[MIRROR] * flip + edge, circle * flip + edge
+            world, confidence = world[MIRROR] * np.array([-1.0, 1.0, 1.0]), confidence[MIRROR]
+        roi = _with_margin(roi_px)
+        to_picture = crop_matrix(roi, INPUT_SIZE)
+        circle_px = circle @ to_picture[:, :2].T + to_picture[:, 2]
+        return PersonKeypoints(
+            xy_px=points @ to_picture[:, :2].T + to_picture[:, 2],
+            xyz_cam_m=world @ view_rotation(roi, camera).T,
+            confidence=confidence,
+            presence=float(output[1].item()),
+            roi_px=circle_roi(*circle_px),
+            crop_px=float(roi[2]),
+        )
+
+
+def _with_margin(roi_px: np.ndarray) -> np.ndarray:
+    """The region that the network sees."""
+    return np.array([roi_px[0], roi_px[1], roi_px[2] * CROP_MARGIN, roi_px[3]], np.float64)
+
+
+def blazepose(params: KeypointParams) -> BlazePoseLandmarks:
+    """The detector of the method, with the network that its parameters name by hash.
+
+    Raises `PblError` SOLVER_UNKNOWN for another network, and those of `assets.fetch`.
+    """
+    sha256 = params.model_sha256
+    if sha256 not in _NETWORKS:
+        raise PblError(
+            "SOLVER_UNKNOWN",
+            found=f"a BlazePose network with SHA-256 {sha256}",
+            expected=f"one of {', '.join(f'{s} ({n})' for s, n in _NETWORKS.items())}",
+            next_step="use the version of pbl-pipeline that the method was made with, or select another method",
+        )
+    path = assets.fetch(_NETWORKS[sha256])
+    quick = assets.fetch(_NETWORKS[MODEL_SHA256]) if params.lighter_first else None
+    return BlazePoseLandmarks(path, params.agree_mm, params.agree_width_mm, sha256=sha256, quick_path=quick)

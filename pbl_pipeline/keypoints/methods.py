@@ -1,0 +1,34 @@
+"""The keypoint methods."""
+
+from __future__ import annotations
+
+from pbl_pipeline import models
+from pbl_pipeline.methods import Stage
+
+from .blazepose import HEAVY_SHA256, blazepose
+from .onnx_keypoints import ModelKeypointParams, model_keypoint_params, onnx
+from .params import KeypointParams
+
+
+class RegisteredModels:
+    """`Provider` of the keypoint methods: each registered keypoint model is one, under its own name."""
+
+    def names(self) -> list[str]:
+        return [m.name for m in models.registered()]
+
+    def params(self, name: str) -> KeypointParams | None:
+        return model_keypoint_params(name) if models.is_registered(name) else None
+
+
+#: A family is a detector: a function from its parameters to a `KeypointDetector`.
+METHODS: Stage[KeypointParams] = Stage("keypoints", "detector", "blazepose-heavy", RegisteredModels())
+METHODS.register("blazepose-33", 2, KeypointParams(), blazepose)
+#: It shares looks, at 24 frames/s and more: each is dear, and its answers of two frames lie close together.
+METHODS.register(
+    "blazepose-heavy",
+    3,
+    KeypointParams(
+        model_sha256=HEAVY_SHA256, share_looks_s=0.042, confidence_curve="blazepose-heavy-v3", lighter_first=True
+    ),
+)
+METHODS.register_family("onnx", ModelKeypointParams, onnx)

@@ -1,0 +1,116 @@
+"""Two passes over the frames in one reading of the video, shared out to the cores.
+
+The second pass over a frame needs what the first found up to `reach_s` later, so the frames of that time wait in memory
+(not converted, 3 MB each at 1080p) and the video is decoded once. Decoding, converting and the network all leave
+Python's lock, so they run side by side: one detector per core, each with one thread, is faster than one detector with
+several.
+"""
+
+from __future__ import annotations
+
+import collections
+import os
+import queue
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Protocol
+
+import numpy as np
+
+from pbl_pipeline.video import Camera, Frame
+
+from .crops import Regions
+from .protocol import CropDetector, KeypointDetector, Look, MirrorDetector
+from .types import PersonKeypoints
+
+#: More detectors than this bring little and cost memory.
+_MAX_WORKERS = 8
+
+
+def n_workers() -> int:
+    """Detectors to run side by side: the cores this process may use, at most 8."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, _MAX_WORKERS)
+
+
+class Inference(Protocol):
+    """Runs detectors: `ParallelInference`, or `BatchedInference` for a detector that wants many frames at once."""
+
+    n_detectors: int
+
+    def submit(self, frame: Frame, roi_px: np.ndarray, look: Look) -> Future[PersonKeypoints]: ...
+
+
+class ParallelInference:
+    """Detectors at work in threads, one in each. Use as a context: leaving it drops what has not begun."""
+
+    def __init__(self, detectors: Sequence[KeypointDetector], camera: Camera) -> None:
+        self._idle: queue.SimpleQueue[KeypointDetector] = queue.SimpleQueue()
+        for detector in detectors:
+            self._idle.put(detector)
+        self._camera = camera
+        self._pool = ThreadPoolExecutor(len(detectors), "keypoints")
+        self.n_detectors = len(detectors)
+
+    def __enter__(self) -> ParallelInference:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown(cancel_futures=True)
+
+    def submit(self, frame: Frame, roi_px: np.ndarray, look: Look) -> Future[PersonKeypoints]:
+        """Detect in the region `roi_px` (4,) of a frame as soon as a detector is idle, in the order of the calls."""
+        return self._pool.submit(self._detect, frame, roi_px, look)
+
+    def _detect(self, frame: Frame, roi_px: np.ndarray, look: Look) -> PersonKeypoints:
+        detector, quick = self._idle.get(), look is Look.QUICK
+        try:
+            if isinstance(detector, CropDetector):
+                crop = frame.cut(*detector.crop_of(roi_px))
+                if look in (Look.PLAIN, Look.MIRRORED) and isinstance(detector, MirrorDetector):
+                    return detector.detect_once(crop, roi_px, self._camera, mirrored=look is Look.MIRRORED)
+                return detector.detect_crop(crop, roi_px, self._camera, quick=quick)
+            return detector.detect(frame.image, roi_px, self._camera, quick=quick)
+        finally:
+            self._idle.put(detector)
+
+
+def two_passes(
+    frames: Iterable[Frame],
+    inference: Inference,
+    time_s: np.ndarray,
+    regions: Regions,
+    look: Callable[[int], Look] = lambda _: Look.FULL,
+) -> Iterator[tuple[int, PersonKeypoints]]:
+    """What the second pass found, frame by frame in order.
+
+    `frames` are those in which the person is, of the video with stamps `time_s` (T,). The first pass is over those of
+    `regions.first`; a frame's region of the second is asked for once all first results up to `regions.reach_s` after
+    it are known. `look`: how the second pass looks at a frame.
+    """
+    last_needed = np.searchsorted(time_s, time_s + regions.reach_s, side="right") - 1
+    waiting: collections.deque[Frame] = collections.deque()
+    early: collections.deque[tuple[int, Future[PersonKeypoints]]] = collections.deque()
+    late: collections.deque[tuple[int, Future[PersonKeypoints]]] = collections.deque()
+
+    def second(frame: Frame) -> None:
+        while early and early[0][0] <= last_needed[frame.index]:
+            index, future = early.popleft()
+            regions.correct(index, future.result())
+        late.append((frame.index, inference.submit(frame, regions.at(frame.index), look(frame.index))))
+
+    for frame in frames:
+        waiting.append(frame)
+        if frame.index in regions.first:
+            early.append((frame.index, inference.submit(frame, regions.track_px[frame.index], Look.QUICK)))
+        while waiting and last_needed[waiting[0].index] <= frame.index:
+            second(waiting.popleft())
+        # So many frames may be under way that no detector waits, and no more: each is held in memory.
+        while len(late) > 2 * inference.n_detectors:
+            index, future = late.popleft()
+            yield index, future.result()
+    while waiting:
+        second(waiting.popleft())
+    while late:
+        index, future = late.popleft()
+        yield index, future.result()

@@ -1,0 +1,257 @@
+"""Keypoints of one person in one trial: the data of `keypoints.npz`, validated at the door."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.bounded import MAX_SECONDS, span_s
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import check_numbers, load_npz, picture_size, text_of, texts_of
+from pbl_pipeline.video import Attitude, Camera, check_attitude, check_lens
+
+from .picture import Picture
+
+_NEEDED = (
+    *("time_s", "names", "marker_set", "xy_px", "xyz_cam_m", "root_relative", "confidence", "image_size_px"),
+    "camera_matrix",
+)
+#: Fields that files of other programs may lack.
+_ASSUMED = ("distortion", "camera_source", "box_px")
+_OPTIONAL = (
+    *("focal_rel_sd", "sides_changed", "phone_time_s", "phone_quat_wxyz", "confidence_curve", "origin"),
+    *("picture_time_s", "picture_luma", "picture_detail", "crop_px"),
+)
+_NO_SOURCE = "not stated in the keypoints file"
+
+
+@dataclasses.dataclass(frozen=True)
+class PersonKeypoints:
+    """One person in one frame.
+
+    xy_px (J, 2) in the upright, distorted picture; xyz_cam_m (J, 3) camera frame (x right, y down, z forward);
+    confidence (J,) in 0..1; presence: how sure the detector is that the crop shows a person at all, 0..1;
+    roi_px (4,) centre x, centre y, side, rotation of the region as these keypoints show it (NaN: not known),
+    a better crop for the same frame than the one they were found in; crop_px: longer side of the crop that
+    the network saw, in pixels of the picture (NaN: not stated).
+    """
+
+    xy_px: np.ndarray
+    xyz_cam_m: np.ndarray
+    confidence: np.ndarray
+    presence: float
+    roi_px: np.ndarray
+    crop_px: float = float("nan")
+
+
+@dataclasses.dataclass(frozen=True)
+class Keypoints:
+    """One trial. Missing values are NaN with confidence 0.
+
+    Attributes
+    ----------
+    time_s : (T,) float64
+        The container's time stamps.
+    names : tuple of J str
+    marker_set
+        Name of a marker set of the body.
+    xy_px : (T, J, 2)
+        Pixels of the upright, still distorted image.
+    xyz_cam_m : (T, J, 3)
+        Camera frame (x right, y down, z forward), root-relative if `root_relative`.
+    confidence : (T, J)
+        0..1, as stated by the detector.
+    confidence_curve
+        Name of the curve (`confidence_curve`) that says what this is worth; empty where none is known.
+    image_size_px : (width, height)
+    box_px : (T, 4)
+        x0, y0, x1, y1 of the person.
+    crop_px : (T,) or None
+        Longer side of the crop that the detector saw, in pixels of the picture. NaN where nothing was seen; None where
+        it was not stated.
+    phone_time_s, phone_quat_wxyz : (P,), (P, 4) or None
+        Phone orientation, camera to world, at its own stamps: both or neither. Brought to unit length, without jumps
+        of sign, when made (`check_attitude`); how much of the recording it covers is for the fit to judge.
+    origin
+        Which detector and model made them, under which licence and on what; empty where nobody said.
+    sides_changed : (T, 3) bool or None
+        Frames in which left and right of the legs, and of the rest of the body, are not as the detector said but were
+        exchanged, and those in which its body has no width, so that the sides cannot be told; None: nobody looked.
+    assumed
+        Fields that the file did not have, for which a default stands (`load`).
+    picture
+        How light and sharp the picture of the person is, or None where no video was seen.
+
+    Raises
+    ------
+    PblError
+        FILE_FORMAT (shapes, confidence), CAMERA_INVALID, PHONE_LOG.
+    """
+
+    time_s: np.ndarray
+    names: tuple[str, ...]
+    marker_set: str
+    xy_px: np.ndarray
+    xyz_cam_m: np.ndarray
+    root_relative: bool
+    confidence: np.ndarray
+    image_size_px: tuple[int, int]
+    camera: Camera
+    box_px: np.ndarray
+    phone_time_s: np.ndarray | None = None
+    phone_quat_wxyz: np.ndarray | None = None
+    confidence_curve: str = ""
+    picture: Picture | None = None
+    origin: str = ""
+    sides_changed: np.ndarray | None = None
+    crop_px: np.ndarray | None = None
+    assumed: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        n, j = len(self.time_s), len(self.names)
+        shapes = {
+            "time_s": (self.time_s, (n,)),
+            "xy_px": (self.xy_px, (n, j, 2)),
+            "xyz_cam_m": (self.xyz_cam_m, (n, j, 3)),
+            "confidence": (self.confidence, (n, j)),
+            "box_px": (self.box_px, (n, 4)),
+            "camera_matrix": (self.camera.matrix, (3, 3)),
+            "distortion": (self.camera.distortion, (5,)),
+        }
+        if self.sides_changed is not None:
+            shapes["sides_changed"] = (self.sides_changed, (n, 3))
+        if self.crop_px is not None:
+            shapes["crop_px"] = (self.crop_px, (n,))
+        for name, (array, shape) in shapes.items():
+            if np.shape(array) != shape:
+                raise _format_error(f"{name} has shape {np.shape(array)}", f"shape {shape} for {n} frames, {j} names")
+        if span_s(self.time_s) > MAX_SECONDS:
+            raise _format_error(f"time stamps that span {span_s(self.time_s):.3g} s", f"at most {MAX_SECONDS:g} s")
+        if np.any(~np.isfinite(self.confidence)) or np.any(self.confidence < 0) or np.any(self.confidence > 1):
+            raise _format_error("confidence outside 0..1 or not finite", "0 for a missing point, at most 1")
+        if self.crop_px is not None and np.any(np.asarray(self.crop_px) <= 0):
+            raise _format_error("a crop of no size", "crop_px above 0, or NaN where it is not stated")
+        check_lens(self.camera.matrix, self.camera.distortion, self.image_size_px)
+        self._check_phone()
+
+    def _check_phone(self) -> None:
+        if self.phone_time_s is None and self.phone_quat_wxyz is None:
+            return
+        if self.phone_time_s is None or self.phone_quat_wxyz is None:
+            raise PblError(
+                "PHONE_LOG",
+                found=f"phone_time_s {_there(self.phone_time_s)}, phone_quat_wxyz {_there(self.phone_quat_wxyz)}",
+                expected="both or neither",
+                next_step="see docs/files.md, section keypoints.npz",
+            )
+        time_s, quat_wxyz = check_attitude(self.phone_time_s, self.phone_quat_wxyz)
+        object.__setattr__(self, "phone_time_s", time_s)
+        object.__setattr__(self, "phone_quat_wxyz", quat_wxyz)
+
+    def with_attitude(self, attitude: Attitude) -> Keypoints:
+        """The same keypoints with the phone's orientation."""
+        return dataclasses.replace(self, phone_time_s=attitude.time_s, phone_quat_wxyz=attitude.quat_wxyz)
+
+    def save(self, path: str | Path) -> None:
+        """Write `keypoints.npz` (the fields of docs/files.md)."""
+        optional: dict[str, Any] = {}
+        if self.phone_time_s is not None and self.phone_quat_wxyz is not None:
+            optional = {"phone_time_s": self.phone_time_s, "phone_quat_wxyz": self.phone_quat_wxyz}
+        if np.isfinite(self.camera.focal_rel_sd):
+            optional["focal_rel_sd"] = np.asarray(self.camera.focal_rel_sd, np.float64)
+        if self.confidence_curve:
+            optional["confidence_curve"] = np.asarray(self.confidence_curve)
+        if self.origin:
+            optional["origin"] = np.asarray(self.origin)
+        if self.sides_changed is not None:
+            optional["sides_changed"] = np.asarray(self.sides_changed, bool)
+        if self.crop_px is not None:
+            optional["crop_px"] = np.asarray(self.crop_px, np.float32)
+        if self.picture is not None:
+            optional |= self.picture.arrays()
+        np.savez(  # not packed, see `TrialFit.save`
+            path,
+            time_s=np.asarray(self.time_s, np.float64),
+            names=np.asarray(self.names),
+            marker_set=np.asarray(self.marker_set),
+            xy_px=np.asarray(self.xy_px, np.float32),
+            xyz_cam_m=np.asarray(self.xyz_cam_m, np.float32),
+            root_relative=np.asarray(self.root_relative),
+            confidence=np.asarray(self.confidence, np.float32),
+            image_size_px=np.asarray(self.image_size_px, np.int64),
+            camera_matrix=np.asarray(self.camera.matrix, np.float64),
+            distortion=np.asarray(self.camera.distortion, np.float64),
+            camera_source=np.asarray(self.camera.source),
+            box_px=np.asarray(self.box_px, np.float32),
+            **optional,
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> Keypoints:
+        """Read `keypoints.npz`; never unpickles.
+
+        Files of other programs may lack the fields of `_ASSUMED`: no distortion, a camera whose source is not stated,
+        and the box around the points that were seen, stand for them, and `assumed` names them.
+
+        Raises `PblError` FILE_MISSING, FILE_FORMAT, CAMERA_INVALID, PHONE_LOG.
+        """
+        data = load_npz(path, (*_NEEDED, *_ASSUMED, *_OPTIONAL))
+        missing = [k for k in _NEEDED if k not in data]
+        if missing:
+            raise _format_error(f"{path} lacks {', '.join(missing)}", f"the fields {', '.join(_NEEDED)}")
+        assumed = tuple(k for k in _ASSUMED if k not in data)
+        n, j = data["time_s"].size, data["names"].size
+        arrays = {"time_s": (n,), "xy_px": (n, j, 2), "xyz_cam_m": (n, j, 3), "confidence": (n, j)}
+        arrays |= {"image_size_px": (2,), "camera_matrix": (3, 3), "root_relative": ()}
+        arrays |= {k: s for k, s in {"distortion": (5,), "box_px": (n, 4)}.items() if k in data}
+        if "focal_rel_sd" in data:
+            arrays["focal_rel_sd"] = ()
+        if "sides_changed" in data:
+            arrays["sides_changed"] = (n, 3)
+        if "crop_px" in data:
+            arrays["crop_px"] = (n,)
+        check_numbers(path, data, arrays)
+        rel_sd = float(data.get("focal_rel_sd", np.nan))
+        distortion, source = data.get("distortion", np.zeros(5)), _NO_SOURCE
+        if "camera_source" in data:
+            source = text_of(path, data, "camera_source")
+        box_px = data["box_px"] if "box_px" in data else _box(data["xy_px"], data["confidence"])
+        return cls(
+            time_s=data["time_s"].astype(np.float64),
+            names=texts_of(path, data, "names"),
+            marker_set=text_of(path, data, "marker_set"),
+            xy_px=data["xy_px"],
+            xyz_cam_m=data["xyz_cam_m"],
+            root_relative=bool(data["root_relative"]),
+            confidence=data["confidence"],
+            image_size_px=picture_size(path, data["image_size_px"]),
+            camera=Camera(data["camera_matrix"], distortion, source, rel_sd),
+            box_px=box_px,
+            assumed=assumed,
+            phone_time_s=data.get("phone_time_s"),
+            phone_quat_wxyz=data.get("phone_quat_wxyz"),
+            confidence_curve=text_of(path, data, "confidence_curve") if "confidence_curve" in data else "",
+            picture=Picture.from_arrays(path, data),
+            origin=text_of(path, data, "origin") if "origin" in data else "",
+            sides_changed=data["sides_changed"].astype(bool) if "sides_changed" in data else None,
+            crop_px=data.get("crop_px"),
+        )
+
+
+def _box(xy_px: np.ndarray, confidence: np.ndarray) -> np.ndarray:
+    """(T, 4) x0, y0, x1, y1 around the points of each frame that were seen, NaN where none was."""
+    seen = (confidence > 0)[..., None] & np.isfinite(xy_px)
+    low, high = (np.where(seen, xy_px, fill).astype(float) for fill in (np.inf, -np.inf))
+    box = np.concatenate([low.min(axis=1, initial=np.inf), high.max(axis=1, initial=-np.inf)], axis=1)
+    return np.where(np.isfinite(box).all(axis=1, keepdims=True), box, np.nan)
+
+
+def _there(value: object) -> str:
+    return "missing" if value is None else "there"
+
+
+def _format_error(found: str, expected: str) -> PblError:
+    return PblError("FILE_FORMAT", found=found, expected=expected, next_step="see docs/files.md, section keypoints.npz")

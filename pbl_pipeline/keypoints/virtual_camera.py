@@ -1,0 +1,181 @@
+"""Perspective-correct crops: what a camera at the same place would see that looks straight at the person.
+
+A crop that is only cut out of the picture shows a person at the edge turned and stretched, and a lens bends her. The
+virtual camera stands where the real one does, is turned so that the middle of the crop lies on its optical axis, may be
+rolled and mirrored, and has no distortion. The way back is exact: a pixel of the crop is a ray, a ray is a pixel of the
+picture; 3D points are turned back.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from pbl_pipeline.video import Camera, viewing_ray
+
+from .view import view_rotation
+
+#: From this many picture pixels per crop pixel on, the picture is averaged before it is sampled.
+_SHRINK_FROM = 1.5
+#: Shortest way in the picture (px) over which its scale is measured.
+_SHORTEST_PX = 4.0
+
+
+@dataclasses.dataclass(frozen=True)
+class VirtualCamera:
+    """A crop's camera. Coordinates of the crop count from the centre of its first pixel.
+
+    matrix : (3, 3)
+        Intrinsics, principal point in the middle of the crop.
+    turn : (3, 3)
+        x_crop = turn @ x_cam: a rotation, or with `mirrored` one followed by a reflection in x.
+    size_px : (width, height)
+    """
+
+    matrix: np.ndarray
+    turn: np.ndarray
+    size_px: tuple[int, int]
+    mirrored: bool
+
+    def rays(self, xy: np.ndarray) -> np.ndarray:
+        """(..., 3) rays of crop pixels (..., 2) in the real camera's frame."""
+        flat = (np.asarray(xy, np.float64) - self.matrix[:2, 2]) / self.matrix[[0, 1], [0, 1]]
+        return np.concatenate([flat, np.ones((*flat.shape[:-1], 1))], axis=-1) @ self.turn
+
+    def to_picture(self, xy: np.ndarray, camera: Camera) -> np.ndarray:
+        """(..., 2) pixels of the upright, distorted picture that show the crop pixels (..., 2)."""
+        rays = self.rays(xy).reshape(-1, 1, 3)
+        zero = np.zeros(3)
+        out, _ = cv2.projectPoints(rays, zero, zero, *_lens(camera))
+        return out.reshape(np.shape(xy))
+
+    def to_camera(self, xyz: np.ndarray) -> np.ndarray:
+        """(..., 3) vectors of the crop's frame in the real camera's frame."""
+        return np.asarray(xyz, np.float64) @ self.turn
+
+
+def look_at(
+    roi_px: np.ndarray,
+    camera: Camera,
+    size_px: tuple[int, int],
+    margin: float = 1.0,
+    scale: float = 1.0,
+    roll_rad: float = 0.0,
+    mirrored: bool = False,
+) -> VirtualCamera:
+    """The virtual camera of a region of the picture.
+
+    `roi_px` (4,) centre x, centre y, side, rotation (rad, clockwise) as in `tracking.Detection`. The region, `margin`
+    times as large, fills the longer side of the crop of `size_px` (width, height); `scale` enlarges what is seen, and
+    `roll_rad` turns it clockwise in the crop.
+    """
+    width, height = size_px
+    turn = view_rotation(roi_px, camera).T
+    cosine, sine = np.cos(roll_rad), np.sin(roll_rad)
+    turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1.0]]) @ turn
+    if mirrored:
+        turn = np.diag([-1.0, 1.0, 1.0]) @ turn
+    focal = max(width, height) * scale / (margin * roi_px[2] * _per_pixel(roi_px, camera))
+    matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+    return VirtualCamera(matrix, turn, (width, height), mirrored)
+
+
+def crops(image: np.ndarray, views: Sequence[VirtualCamera], camera: Camera) -> np.ndarray:
+    """(N, height, width, 3) uint8: the picture (H, W, 3) as each of the virtual cameras, all of one size, sees it.
+
+    Black beyond the picture, and where the lens model has no answer. A picture that is shown smaller than it is, is
+    averaged first, so that fine patterns do not flicker.
+    """
+    width, height = views[0].size_px
+    matrix, distortion = _lens(camera)
+    maps = [
+        cv2.initUndistortRectifyMap(matrix, distortion, v.turn, v.matrix, (width, height), cv2.CV_32FC1) for v in views
+    ]
+    reach = _reach(camera)
+    if np.isfinite(reach):
+        for view, (map_x, map_y) in zip(views, maps, strict=True):
+            _blank(map_x, map_y, view, reach)
+    steps = [_step(v, camera) for v in views]
+    out = np.zeros((len(views), height, width, 3), np.uint8)
+    for factor in sorted({_factor(s) for s in steps}):
+        chosen = [i for i, s in enumerate(steps) if _factor(s) == factor]
+        small, corner = _shrunk(image, [maps[i] for i in chosen], factor)
+        for i in chosen:
+            map_x, map_y = ((m - c + 0.5) / factor - 0.5 for m, c in zip(maps[i], corner, strict=True))
+            cv2.remap(small, map_x, map_y, cv2.INTER_LINEAR, out[i], cv2.BORDER_CONSTANT)
+    return out
+
+
+def _lens(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix and distortion as OpenCV wants them."""
+    return np.asarray(camera.matrix, np.float64), np.asarray(camera.distortion, np.float64)
+
+
+def _per_pixel(roi_px: np.ndarray, camera: Camera) -> float:
+    """How much a step of one pixel along the region's down axis is at its middle, on the virtual camera's plane z = 1.
+
+    Measured over what of the region lies in the picture's angle: far outside a lens model means nothing.
+    """
+    centre, down = roi_px[:2], np.array([-np.sin(roi_px[3]), np.cos(roi_px[3])])
+    half = max(float(roi_px[2]) / 8, _SHORTEST_PX)
+    ends = np.stack([centre - half * down, centre + half * down])
+    rays = viewing_ray(ends, camera) @ view_rotation(roi_px, camera)
+    flat = rays[:, :2] / rays[:, 2:]
+    return float(np.linalg.norm(flat[1] - flat[0])) / (2 * half)
+
+
+def _reach(camera: Camera) -> float:
+    """Undistorted radius up to which the lens model grows; beyond it the picture would appear a second time."""
+    k1, k2, _, _, k3 = np.asarray(camera.distortion, np.float64)
+    if not (k1 or k2 or k3):
+        return np.inf
+    r = np.linspace(0.0, 4.0, 4001)
+    turns = np.flatnonzero(np.diff(r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6)) <= 0)
+    return float(r[turns[0]]) if len(turns) else np.inf
+
+
+def _blank(map_x: np.ndarray, map_y: np.ndarray, view: VirtualCamera, reach: float) -> None:
+    """Send the pixels beyond the lens model's reach outside the picture."""
+    width, height = view.size_px
+    corners = view.rays(np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]]))
+    if np.all(corners[:, 2] > 0) and np.max(np.hypot(*corners[:, :2].T) / corners[:, 2]) < reach:
+        return
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    rays = view.rays(np.stack([x, y], axis=-1))
+    lost = (rays[..., 2] <= 0) | (np.hypot(rays[..., 0], rays[..., 1]) >= reach * rays[..., 2])
+    map_x[lost] = map_y[lost] = -1e6
+
+
+def _step(view: VirtualCamera, camera: Camera) -> float:
+    """Pixels of the picture per pixel of the crop, at its middle."""
+    ends = view.matrix[:2, 2] + np.array([[-1.0, 0.0], [1.0, 0.0]])
+    a, b = view.to_picture(ends, camera)
+    return float(np.linalg.norm(b - a)) / 2
+
+
+def _factor(step: float) -> int:
+    """Whole pixels of the picture that become one before the crop is sampled."""
+    return round(step) if step >= _SHRINK_FROM else 1
+
+
+def _shrunk(
+    image: np.ndarray, maps: Sequence[tuple[np.ndarray, np.ndarray]], factor: int
+) -> tuple[np.ndarray, tuple[float, float]]:
+    """The part of the picture that the maps need, `factor` times smaller, and its corner (x, y) in the picture."""
+    if factor == 1:
+        return image, (0.0, 0.0)
+    height, width = image.shape[:2]
+    x0, y0 = (max(int(min(np.min(m[k], initial=0, where=m[k] > -1e5) for m in maps)) - factor, 0) for k in (0, 1))
+    x1, y1 = (
+        min(int(max(np.max(m[k], initial=0, where=m[k] > -1e5) for m in maps)) + 2 * factor, n)
+        for k, n in ((0, width), (1, height))
+    )
+    # Whole blocks from the corner on; a rim narrower than one is left out.
+    w, h = max((x1 - x0) // factor, 1), max((y1 - y0) // factor, 1)
+    part = image[y0 : y0 + h * factor, x0 : x0 + w * factor]
+    if part.size == 0:
+        return np.zeros((1, 1, 3), np.uint8), (0.0, 0.0)
+    return cv2.resize(part, (w, h), interpolation=cv2.INTER_AREA), (float(x0), float(y0))

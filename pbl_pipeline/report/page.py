@@ -1,0 +1,428 @@
+"""What stands on the page, section by section, as plain values for the template."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import PurePath
+
+import numpy as np
+
+import pbl_pipeline
+from pbl_pipeline.gait import (
+    GILLETTE_MODEL,
+    Gdi,
+    Measure,
+    NormalBands,
+    NormativeSet,
+    far_leg_of,
+    leg_length_m,
+    load_norm,
+    norm_names,
+    normal_bands,
+)
+from pbl_pipeline.keypoints import confidence_text, visibility
+from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, OUTCOMES, PASS, WARN, Check, in_session
+from pbl_pipeline.report import _figures
+from pbl_pipeline.report.types import Picture
+from pbl_pipeline.report.words import (
+    HEADLINES,
+    OUTCOME_WORDS,
+    VERDICT_WORDS,
+    check_name,
+    plural,
+    sentence,
+    size,
+)
+from pbl_pipeline.visit import Recording, Visit
+from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, number, significant
+
+_CONVERGED = {True: "converged", False: "not converged", None: "convergence not recorded"}
+
+
+def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str, norm: NormativeSet | None) -> dict:
+    """Return everything that the template shows. `norm`: as in `write_report`."""
+    norm = _norm(visit) if norm is None else norm
+    recordings = visit.fitted or visit.recordings
+    checks = _checks(visit, recordings)
+    metrics = visit.measures
+    empty = metrics is None or metrics.status != PASS
+    page: dict = {
+        "title": title,
+        "meta": [
+            ("Subject", visit.subject),
+            ("Visit", visit.date or visit.label),
+            ("Recordings", ", ".join(r.name for r in recordings)),
+        ],
+        "verdict": _verdict(visit, recordings, checks),
+        "checks": [_check_row(c) for c in checks],
+        "trials": [_trial(r, pictures.get(r.name, ())) for r in recordings],
+        "open_time_charts": empty,
+        "key_cycles": _figures.legend("left", "right", "cycles", "norm", "foot off"),
+        "key_contacts": _figures.legend("stance", "foot down", "foot up", "in view"),
+        "key_time": _figures.legend("left", "right", "stance"),
+        "notes": _notes(visit, norm),
+        "origin": _origin(visit, recordings, norm),
+        "footer": f"Made by the PBL pipeline {pbl_pipeline.__version__}. Research software: not a medical device, "
+        "and no diagnosis. Everything on this page is contained in it; nothing is loaded from elsewhere.",
+    }
+    if metrics is not None and not empty:
+        values = metrics.spatiotemporal
+        cycles = metrics.cycles
+        page["tiles"] = [*(_tile(k, values[k], values.reasons.get(k, "")) for k in HEADLINES), _gdi_tile(metrics.gdi)]
+        page["measures"] = [_measure_row(k, values[k], values.reasons.get(k, "")) for k in MEASURES]
+        page["measures"].append(_gdi_row(metrics.gdi))
+        page["measures_note"] = (
+            f"{plural(values.n_cycles_used, 'gait cycle')} used of {values.n_cycles_found} found: the first and the "
+            "last step of each walk are left out, and cycles unlike the others in length or curves. SD over all values "
+            "of both sides, n counts them; CV is the spread within a side in percent of the mean; asymmetry is right "
+            "minus left in percent of their mean."
+        )
+        bands = _bands(visit)
+        page["cycle_charts"] = _figures.cycle_charts(cycles, bands)
+        page["cycles_note"] = _cycles_note(bands, far_leg_of(cycles))
+        page["index"] = _index(metrics.gdi)
+    return page
+
+
+def _norm(visit: Visit) -> NormativeSet | None:
+    """Return the set that the index names, where it is one that ships."""
+    name = "" if visit.measures is None else visit.measures.gdi.norm
+    return load_norm(name) if name in norm_names() else None
+
+
+def _bands(visit: Visit) -> NormalBands:
+    """Return the normal curves at the person's speed."""
+    fit = next((r.fit for r in visit.fitted), None)
+    leg = None if fit is None else leg_length_m(fit.scale)
+    return normal_bands(None if visit.measures is None else visit.measures.spatiotemporal, leg)
+
+
+def _checks(visit: Visit, recordings: Sequence[Recording]) -> list[Check]:
+    """Return all checks, earlier stages first, each once: what a trial and its visit both say is said by the visit."""
+    checks = [c for c in visit.checks if c not in visit.fit_checks]
+    for r in recordings:
+        if r.choice is not None and r.choice.status == "NEEDS_CHOICE":
+            checks.append(Check("subject_choice", NEEDS_CHOICE, None, None, f"{r.name}: {r.choice.reason}"))
+        elif r.choice is not None and r.choice.status == "NO_PERSON":
+            checks.append(Check("subject_choice", FAIL, None, None, f"{r.name}: {r.choice.reason}"))
+    checks += visit.fit_checks
+    if visit.measures is not None:
+        for t in visit.measures.trials:
+            checks += t.events.qc
+        checks += visit.measures.qc
+    return list(dict.fromkeys(checks))
+
+
+def _verdict(visit: Visit, recordings: Sequence[Recording], checks: list[Check]) -> dict:
+    metrics = visit.measures
+    measured = metrics is not None and metrics.status == PASS
+    outcomes = [in_session(c.outcome, measured) for c in checks]
+    outcome = max(outcomes, key=OUTCOMES.index, default=PASS)
+    if metrics is None and outcome in (PASS, WARN, EMPTY):
+        outcome = FAIL
+    elif metrics is not None and not measured and outcome in (PASS, WARN):
+        outcome = EMPTY
+    notable = [c for c, o in zip(checks, outcomes, strict=True) if o == outcome and outcome not in (PASS, EMPTY)]
+    problems = [f"{r.name}: {r.problem}" for r in recordings if r.problem]
+    asking = f"{len(notable)} of {plural(len(checks), 'check')} {'asks' if len(notable) == 1 else 'ask'}"
+    texts = {
+        PASS: "All checks passed.",
+        WARN: f"{asking} for attention:",
+        EMPTY: _why_empty(visit),
+        NEEDS_CHOICE: "Several people are in view and none is clearly the subject:",
+        FAIL: "The chain ended before there was anything to measure:"
+        if metrics is None
+        else "A check failed. What is shown below is what came out, not how the person moves:",
+    }
+    points = [f"{check_name(c)}: {c.advice}" if c.advice else check_name(c) for c in notable]
+    return {
+        "outcome": outcome,
+        "word": VERDICT_WORDS[outcome],
+        "sentence": texts[outcome],
+        "points": [sentence(p) for p in [*points, *problems]],
+    }
+
+
+def _why_empty(visit: Visit) -> str:
+    metrics = visit.measures
+    if metrics is None or not metrics.reason:
+        return "Nobody walks in these recordings."
+    if len(metrics.trials) == 1:
+        return sentence(metrics.trials[0].reason or metrics.reason)
+    return metrics.reason + "."  # begins with the name of a trial, which keeps its spelling
+
+
+def _tile(key: str, m: Measure | None, reason: str) -> dict:
+    name, unit, decimals = MEASURES[key]
+    if m is None:
+        return {"name": name, "value": None, "reason": reason}
+    return {
+        "name": name,
+        "value": number(m.mean, decimals),
+        "unit": unit,
+        "left": None if m.left is None else number(m.left, decimals),
+        "right": None if m.right is None else number(m.right, decimals),
+        "note": f"sd {number(m.sd, _sd_decimals(decimals))}, n {m.n}",
+    }
+
+
+def _gdi_tile(gdi: Gdi) -> dict:
+    if gdi.mean is None:
+        return {"name": gdi.title, "value": None, "reason": gdi.reason}
+    return {
+        "name": gdi.title,
+        "value": number(gdi.mean, 1),
+        "unit": "",
+        "left": number(gdi.left, 1),
+        "right": number(gdi.right, 1),
+        "note": _interval(gdi) or f"sd {number(_gdi_sd(gdi), 1)}, n {gdi.n}",
+    }
+
+
+def _interval(gdi: Gdi) -> str:
+    """The index's 90 % interval and its minimal change; empty where the angles' error is not known."""
+    if gdi.interval is None or gdi.minimal_change is None:
+        return ""
+    low, high = (number(v, 0) for v in gdi.interval)
+    return f"90 % interval {low} to {high}, minimal change {number(gdi.minimal_change, 0)}"
+
+
+def _measure_row(key: str, m: Measure | None, reason: str) -> dict:
+    name, unit, decimals = MEASURES[key]
+    if m is None:
+        return {"name": name, "known": False, "reason": reason or "no reason was recorded"}
+    return {
+        "name": name,
+        "known": True,
+        "left": number(m.left, decimals),
+        "right": number(m.right, decimals),
+        "mean": number(m.mean, decimals),
+        "sd": number(m.sd, _sd_decimals(decimals)),
+        "n": m.n,
+        "cv": number(m.cv_percent, 1),
+        "asymmetry": number(m.asymmetry_percent, 1),
+        "unit": unit,
+    }
+
+
+def _gdi_row(gdi: Gdi) -> dict:
+    if gdi.mean is None:
+        return {"name": gdi.title, "known": False, "reason": gdi.reason}
+    values = {"left": number(gdi.left, 1), "right": number(gdi.right, 1), "mean": number(gdi.mean, 1)}
+    unit = "100 = norm, 10 = 1 sd"
+    more = {"sd": number(_gdi_sd(gdi), 1), "n": gdi.n, "cv": number(None, 1), "asymmetry": number(None, 1)}
+    return {"name": gdi.title, "known": True, **values, **more, "unit": unit}
+
+
+def _gdi_sd(gdi: Gdi) -> float | None:
+    values = [c.gdi for c in gdi.cycles]
+    return float(np.std(values, ddof=1)) if len(values) > 1 else None
+
+
+def _index(gdi: Gdi) -> dict:
+    values = {side: [c.gdi for c in gdi.cycles if c.side == side] for side in ("left", "right")}
+    if gdi.mean is None:
+        text = f"Not known: {gdi.reason}"
+    else:
+        text = (
+            f"Mean {number(gdi.mean, 1)} over {plural(gdi.n, 'cycle')}: left {number(gdi.left, 1)} "
+            f"(n {gdi.n_left}), right {number(gdi.right, 1)} (n {gdi.n_right})"
+        )
+        if interval := _interval(gdi):
+            text += f"; {interval}: less between two visits filmed alike may be chance"
+    which = (
+        "This is the original Gait Deviation Index of nine angles."
+        if gdi.model == GILLETTE_MODEL
+        else "This index uses hip flexion, hip adduction and knee flexion. It is not the original Gait Deviation Index "
+        "of nine angles, and the two must not be compared."
+    )
+    return {
+        "title": gdi.title,
+        "svg": _figures.index_chart(values, gdi.title),
+        "sentence": sentence(text),
+        "note": "Each dot is one gait cycle, the bar the mean of its side; the grey area is within one standard "
+        f"deviation of the norm. {which}",
+        "profile": _profile(gdi),
+    }
+
+
+def _profile(gdi: Gdi) -> list[dict]:
+    """Rows of the Movement Analysis Profile: how far each angle is from the norm's mean curve."""
+    p = gdi.profile
+    if p is None:
+        return []
+    titles = {k: v[0] for k, v in {**ANGLES, **PELVIS_ANGLES, **FOOT_ANGLES}.items()}
+    rows = [
+        {"name": titles.get(a, a), "left": number(p.left.get(a), 1), "right": number(p.right.get(a), 1)}
+        for a in dict.fromkeys([*p.left, *p.right])
+    ]
+    if p.gps is not None:
+        name = f"Gait Profile Score (of the person {number(p.gps, 1)})"
+        rows.append({"name": name, "left": number(p.gps_left, 1), "right": number(p.gps_right, 1)})
+    return rows
+
+
+def _trial(t: Recording, pictures: Sequence[Picture]) -> dict:
+    v, m = t.video, t.measured
+    texts = []
+    if v is not None:
+        texts.append(
+            f"{number(v.duration_s, 1)} s, {v.n_frames} frames of {v.width_px} x {v.height_px} px, "
+            f"{number(v.fps, 1)} frames/s{' (variable)' if v.variable_frame_rate else ''}"
+        )
+    if t.choice is not None and t.choice.reason:
+        texts.append(t.choice.reason)
+    if t.fit is not None:
+        spans = _figures.known_spans(t.fit)
+        where = ", ".join(f"{number(a, 1)} to {number(b, 1)} s" for a, b in spans[:4])
+        texts.append(f"The body is fitted from {where}" if spans else "The body is fitted in no frame")
+        if np.isfinite(t.fit.residual_2d_px).any():
+            px, share = float(np.nanmedian(t.fit.residual_2d_px)), 100 * t.fit.residual_2d_share
+            away = [f"{number(px, 1)} px ({number(share, 1)} % of the person's height)"]
+            if np.isfinite(t.fit.residual_3d_m).any():
+                away.append(f"{number(100 * float(np.nanmedian(t.fit.residual_3d_m)), 1)} cm")
+            texts.append(f"It lies {' and '.join(away)} (median) from the detected points")
+    if m is not None and m.reason:
+        texts.append(f"No gait measures: {m.reason}")
+    if t.problem:
+        texts.append(t.problem)
+    events = m.events if m is not None else None
+    return {
+        "name": t.name,
+        "sentence": " ".join(sentence(x) for x in texts),
+        "contacts": _figures.contact_chart(t.fit, events) if t.fit is not None and events is not None else None,
+        "time_charts": _figures.time_charts(t.fit, events) if t.fit is not None else [],
+        "pictures": [_figures.picture(t.name, p) for p in pictures],
+    }
+
+
+def _check_row(c: Check) -> dict:
+    return {
+        "name": check_name(c),
+        "outcome": c.outcome,
+        "word": OUTCOME_WORDS[c.outcome],
+        "value": significant(c.value),
+        "threshold": significant(c.threshold),
+        "advice": "" if c.outcome == PASS else sentence(c.advice),
+    }
+
+
+def _cycles_note(bands: NormalBands, far: str) -> str:
+    far_note = f"The {far} leg, which was behind the other, is less certain and drawn faintly. " if far else ""
+    return far_note + (
+        "0 % is foot down, 100 % the next foot down of the same foot. Left is dashed. Thin lines are the single "
+        f"cycles that count, thick ones their mean. Norm: typically developing children {bands.words()}; mapped to "
+        f"this body's pelvis; {bands.source}."
+    )
+
+
+#: What a reader should know of each method of the gait events.
+_EVENT_NOTES = {
+    "phase-transformer": "Foot contacts come from a neural network that was trained on synthetic people and a Kalman "
+    "smoother over its phases (after Cotton et al. 2022). Against the force plates of a laboratory, on 11 children "
+    "with markers, they scatter by 12 ms and are 7 ms early, foot down and foot up alike, so that stance and double "
+    "support keep their length. Against the eye, on one recording of an adult, foot down is about 20 ms late.",
+    "zeni-2008": "Foot contacts are found from the position of heel and toe relative to the pelvis (Zeni, Richards and "
+    "Higginson 2008, Gait & Posture 27:710-714). On laboratory markers this method sets foot down some hundredths "
+    "of a second early and foot up a little late, so stance and double support come out too long and swing too "
+    "short. Nothing is corrected for it. Cadence, stride time and step time are hardly touched, and changes "
+    "between visits less than single values.",
+    "oconnor-2007": "Foot contacts are found from the vertical speed of the foot (O'Connor, Thorpe, O'Malley and "
+    "Vaughan 2007, Gait & Posture 25:469-474). On laboratory markers it misses steps that come down flat.",
+}
+
+
+def _event_methods(visit: Visit) -> list[str]:
+    """Return the event methods of the trials, each once."""
+    trials = () if visit.measures is None else visit.measures.trials
+    return [m for m in dict.fromkeys(t.events.method for t in trials) if m in _EVENT_NOTES]
+
+
+def _notes(visit: Visit, norm: NormativeSet | None) -> list[str]:
+    notes = [
+        "Angles are those of a model of the body that was fitted to the picture. Flexion, adduction, internal rotation "
+        "and dorsiflexion are positive, on both sides.",
+        *(_EVENT_NOTES[m] for m in _event_methods(visit)),
+        "The GDI of three angles follows Schwartz and Rozumalski 2008 (Gait & Posture 28:351-357) with hip flexion, "
+        "hip adduction and knee flexion only: 100 is the mean of the norm, each 10 points one standard deviation, "
+        "lower is further away. It is not the original index of nine angles.",
+    ]
+    if any(r.fit is not None and r.fit.orientation_source != "measured: calibration" for r in visit.fitted):
+        notes.append(
+            "Speed and lengths are known only where the camera stands still, and are then scaled by an assumed body "
+            "size: one camera sees no scale. On one recording with marker motion capture the speed "
+            "came out 6 % too high."
+        )
+    notes.insert(
+        1,
+        "The grey bands come from a laboratory's marker model, whose pelvis leans 12 degrees further forward. The "
+        "constant is taken out, but a person's own pelvis may differ from it by some degrees, which shows at hip "
+        "flexion and pelvis tilt. Shapes and changes between visits can be compared; a constant offset from the band "
+        "alone is no finding.",
+    )
+    if norm is not None:
+        notes.append(f"The index compares with the set {norm.name} (n = {norm.n}): {norm.convention}.")
+    return notes
+
+
+def _origin(visit: Visit, recordings: Sequence[Recording], norm: NormativeSet | None) -> list[dict]:
+    """Return groups of (name, value, is code)."""
+    groups = [{"name": f"Recording {r.name}", "rows": _recording_origin(r)} for r in recordings]
+    s = visit.solution
+    if s is not None:
+        rows = [
+            ("Solver", f"{s.solver}, parameters {s.params_hash}", True),
+            ("Steps", f"{'not recorded' if s.iterations is None else s.iterations}, {_CONVERGED[s.converged]}", False),
+            ("Time", f"{s.seconds:.1f} s, of these {s.compile_seconds:.1f} s compiling, on {s.device}", False),
+        ]
+        if fits := [r.fit for r in visit.fitted if r.fit is not None]:
+            rows.append(("Body model (SHA-256)", fits[0].body_sha256, True))
+            rows.append(("Camera motion", ", ".join(sorted({f.camera_motion for f in fits})), False))
+            rows.append(("Vertical", ", ".join(sorted({f.orientation_source for f in fits})), False))
+        groups.append({"name": "Fit", "rows": rows})
+    if visit.measures is not None:
+        gdi = visit.measures.gdi
+        rows = [
+            ("Parameters", visit.measures.params_hash, True),
+            (gdi.title, f"{gdi.model}, parameters {gdi.params_hash}", True),
+            ("Normative set", gdi.norm, True),
+        ]
+        if norm is not None:
+            rows += [("Source of the norm", norm.source, False), ("Licence of the norm", norm.licence, False)]
+            rows.append(("Norm (SHA-256)", norm.sha256, True))
+        groups.append({"name": "Gait measures", "rows": rows})
+    if visit.methods:
+        groups.append({"name": "Methods", "rows": [(k, v, False) for k, v in visit.methods.items()]})
+    software = {"pbl-pipeline": pbl_pipeline.__version__}
+    software |= {f"keypoints of {r.name}": r.keypoints.origin for r in recordings if r.keypoints and r.keypoints.origin}
+    groups.append({"name": "Software", "rows": [(k, v, False) for k, v in software.items()]})
+    return groups
+
+
+def _recording_origin(r: Recording) -> list[tuple[str, str, bool]]:
+    v, m, rows = r.video, r.measured, []
+    if v is not None:
+        device = " ".join(x for x in (v.make, v.model) if x)
+        rows += [
+            ("File", PurePath(v.path).name, False),
+            ("SHA-256", v.sha256, True),
+            ("Size, coding", f"{size(v.size_bytes)}, {v.codec} in {v.container}", False),
+            ("Recorded", f"{v.recorded_utc or 'time unknown'}{', ' + device if device else ''}", False),
+        ]
+    if r.keypoints is not None:
+        rows.append(("Keypoints", f"{r.keypoints.marker_set}, {plural(len(r.keypoints.names), 'point')}", False))
+        rows.append(("In view", visibility(r.keypoints).text(), False))
+        rows.append(("Confidence", confidence_text(r.keypoints), False))
+    camera = r.fit.camera if r.fit is not None else r.keypoints.camera if r.keypoints is not None else None
+    if camera is not None and np.isfinite(camera.matrix).all():
+        rows.append(("Camera", f"{camera.source}; focal length {camera.matrix[0, 0]:.0f} px", False))
+    if v is not None:
+        rows += [("Remark", note, False) for note in v.notes]
+    if m is not None:
+        by_hand = ", corrected by hand" if m.events.corrected else ""
+        rows.append(("Gait events", f"{m.events.method}, parameters {m.events.params_hash}{by_hand}", True))
+    return rows
+
+
+def _sd_decimals(decimals: int) -> int:
+    return decimals + 1 if decimals >= 2 else decimals

@@ -1,0 +1,133 @@
+"""Two people who were close: which of them came out of it as whom, judged from before and after.
+
+While two bodies overlap, a detector sees one of them or a mixture, and an association that only knows the past may go
+on with the wrong one. Here both sides of the encounter are known: where each was going, where each came from, how large
+and how dressed. The two ends are exchanged where that fits clearly better.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ._appearance import appearance_similarity, mean_appearance
+from ._local_motion import line_near
+from .associate import Trail, measure
+
+
+@dataclasses.dataclass(frozen=True)
+class UncrossParams:
+    """near: closer than this many body heights two people are in an encounter; it lasts through `pause_s` apart.
+    velocity_s: the straight line through this much of a track on either side says where it was going to and came from.
+    gate, gate_per_s: what a miss of that line is measured by, in body heights at once and per second of the encounter.
+    size_gate: the same for the natural logarithm of the ratio of sizes, look_gate for one minus the similarity.
+    worst: largest cost of each of the three. margin: an exchange must be better by so much, summed over both people.
+    """
+
+    near: float = 0.5
+    pause_s: float = 0.3
+    velocity_s: float = 0.6
+    gate: float = 0.3
+    gate_per_s: float = 0.4
+    size_gate: float = 0.25
+    look_gate: float = 0.1
+    worst: float = 3.0
+    margin: float = 0.3
+
+
+def undo_swaps(trails: Sequence[Trail], params: UncrossParams) -> list[Trail]:
+    """The trails, with their ends exchanged after encounters where that fits better."""
+    out = list(trails)
+    for i in range(len(out)):
+        for j in range(i + 1, len(out)):
+            if max(out[i].times[0], out[j].times[0]) > min(out[i].times[-1], out[j].times[-1]):
+                continue  # never seen at one time
+            # Each encounter is judged on the trails as the earlier ones left them.
+            n = 0
+            while (spans := list(_encounters(out[i], out[j], params)))[n:]:
+                begin, end = spans[n]
+                if _exchange_fits(out[i], out[j], begin, end, params):
+                    out[i], out[j] = _exchanged(out[i], out[j], _closest(out[i], out[j], begin, end))
+                n += 1
+    return out
+
+
+def _encounters(a: Trail, b: Trail, params: UncrossParams) -> Iterator[tuple[float, float]]:
+    """First and last time of each encounter, in order."""
+    time, apart = _apart(a, b)
+    close = time[apart < params.near]
+    for span in np.split(close, np.flatnonzero(np.diff(close) > params.pause_s) + 1):
+        if len(span):
+            yield float(span[0]), float(span[-1])
+
+
+def _apart(a: Trail, b: Trail) -> tuple[np.ndarray, np.ndarray]:
+    """Times in which both are followed (10 Hz), and their distance there in body heights."""
+    time = np.arange(max(a.times[0], b.times[0]), min(a.times[-1], b.times[-1]) + 1e-9, 0.1)
+    here, there = (_states(t, time) for t in (a, b))
+    return time, np.hypot(*(here - there)[:, :2].T) / np.exp((here[:, 2] + there[:, 2]) / 2)
+
+
+def _states(trail: Trail, time: np.ndarray) -> np.ndarray:
+    seen = np.array([measure(d) for d in trail.detections])
+    return np.stack([np.interp(time, trail.times, v) for v in seen.T], axis=1)
+
+
+def _closest(a: Trail, b: Trail, begin: float, end: float) -> float:
+    time, apart = _apart(a, b)
+    inside = (time >= begin) & (time <= end)
+    return float(time[inside][np.argmin(apart[inside])])
+
+
+def _exchange_fits(a: Trail, b: Trail, begin: float, end: float, params: UncrossParams) -> bool:
+    before = [_part(t, -np.inf, begin) for t in (a, b)]
+    after = [_part(t, end, np.inf) for t in (a, b)]
+    if min(len(p.frames) for p in (*before, *after)) < 3:
+        return False
+    cost = [[_cost(p, q, params) for q in after] for p in before]
+    return cost[0][1] + cost[1][0] + params.margin < cost[0][0] + cost[1][1]
+
+
+def _part(trail: Trail, low: float, high: float) -> Trail:
+    """The sightings of a trail between two times."""
+    rows = slice(int(np.searchsorted(trail.times, low, "right")), int(np.searchsorted(trail.times, high)))
+    return Trail(trail.frames[rows], trail.times[rows], trail.detections[rows], trail.velocity)
+
+
+def _cost(before: Trail, after: Trail, params: UncrossParams) -> float:
+    """How badly one trail continues another across an encounter."""
+    gap = after.times[0] - before.times[-1]
+    one = line_near(before, before.times[-1], params.velocity_s)
+    two = line_near(after, after.times[0], params.velocity_s)
+    cost = 0.0
+    if one is not None and two is not None:
+        (place, going, height), (next_place, coming, next_height) = one, two
+        unit = np.sqrt(height * next_height)
+        miss = max(np.hypot(*(place + going * gap - next_place)), np.hypot(*(next_place - coming * gap - place))) / unit
+        cost += min(miss / (params.gate + params.gate_per_s * gap), params.worst)
+        cost += min(abs(np.log(next_height / height)) / params.size_gate, params.worst)
+    alike = appearance_similarity(appearance_near(before, before.times[-1]), appearance_near(after, after.times[0]))
+    return cost + (min((1 - alike) / params.look_gate, params.worst) if np.isfinite(alike) else 0.0)
+
+
+def appearance_near(trail: Trail, at_s: float, length_s: float = 1.5) -> np.ndarray:
+    """The mean appearance of the sightings within `length_s` of `at_s`; NaN where it is not known."""
+    return mean_appearance(
+        [d.appearance for d, t in zip(trail.detections, trail.times, strict=True) if abs(t - at_s) <= length_s]
+    )
+
+
+def _exchanged(a: Trail, b: Trail, at_s: float) -> tuple[Trail, Trail]:
+    def cut(first: Trail, second: Trail) -> Trail:
+        i = int(np.searchsorted(first.times, at_s))
+        j = int(np.searchsorted(second.times, at_s))
+        return Trail(
+            [*first.frames[:i], *second.frames[j:]],
+            [*first.times[:i], *second.times[j:]],
+            [*first.detections[:i], *second.detections[j:]],
+            second.velocity,
+        )
+
+    return cut(a, b), cut(b, a)

@@ -1,0 +1,20 @@
+"""The methods of tracking and of the choice of the subject."""
+
+from __future__ import annotations
+
+from pbl_pipeline.methods import Stage
+
+from ._params import TrackingParams
+from ._registered import RegisteredDetectors
+from ._subject import SubjectParams, choose_walker
+from .blazepose import blazepose
+from .yolox import yolox
+
+#: A family is a person detector: a function from `TrackingParams` to a `PersonDetector`.
+METHODS: Stage[TrackingParams] = Stage("tracking", "detector", "blazepose-tiles", RegisteredDetectors())
+METHODS.register("blazepose-tiles", 2, TrackingParams(), blazepose)
+METHODS.register_family("yolox", TrackingParams, yolox)
+
+#: A family is a way to choose: a function as `choose_walker`.
+SUBJECT_METHODS: Stage[SubjectParams] = Stage("subject", "family", "walker")
+SUBJECT_METHODS.register("walker", 2, SubjectParams(), choose_walker)

@@ -1,0 +1,116 @@
+"""Detection on a whole frame plus overlapping tiles, merged: finds people who are small in the frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from pbl_pipeline.models import box_iou
+
+from .types import Detection, PersonDetector
+
+#: A box that ends within this fraction of the window's width from its edge is taken as cut by it.
+CUT_SHARE = 0.02
+#: x0, y0, x1, y1 in px; it may reach beyond the picture.
+Window = tuple[int, int, int, int]
+
+
+def tile_starts(length: int, tile: int, overlap: float) -> list[int]:
+    """Where tiles of `tile` pixels start to cover `length`: evenly spread, overlapping by `overlap` or more."""
+    if tile >= length:
+        return [0]
+    n = 1 + math.ceil((length - tile) / (tile * (1.0 - overlap)) - 1e-9)
+    return [round(i * (length - tile) / (n - 1)) for i in range(n)]
+
+
+def tiles(width: int, height: int, fraction: float, overlap: float) -> list[Window]:
+    """Windows x0, y0, x1, y1: the whole frame first, then squares of `fraction` of the shorter side."""
+    side = max(round(min(width, height) * fraction), 1)
+    grid = [
+        (x, y, min(x + side, width), min(y + side, height))
+        for y in tile_starts(height, side, overlap)
+        for x in tile_starts(width, side, overlap)
+    ]
+    whole = (0, 0, width, height)
+    return [whole, *(t for t in grid if t != whole)]
+
+
+def detect_in(
+    detector: PersonDetector, image: np.ndarray, windows: Sequence[Window], passing: Sequence[Window] = ()
+) -> list[Detection]:
+    """Run the detector in each window (clipped to the image) and merge what it found, in pixels of `image`.
+
+    `windows` are laid around people and see them in the right size; `passing` are laid anywhere, are trusted half as
+    much, and so only confirm whom another window saw.
+    """
+    height, width = image.shape[:2]
+    found: list[tuple[float, Detection]] = []
+    for window, weight in [*((w, 1.0) for w in windows), *((w, 0.5 if windows else 1.0) for w in passing)]:
+        x0, y0, x1, y1 = max(window[0], 0), max(window[1], 0), min(window[2], width), min(window[3], height)
+        if x1 - x0 < 16 or y1 - y0 < 16:
+            continue
+        for d in detector.detect(image[y0:y1, x0:x1]):
+            box = d.box_px + np.array([x0, y0, x0, y0])
+            if not np.isfinite(d.roi_px).all() and _cut(box, (x0, y0, x1, y1), (width, height)):
+                continue
+            roi = d.roi_px + np.array([x0, y0, 0, 0])
+            whole = _area(np.clip(box, 0, [width, height, width, height]))
+            inside = _area(np.clip(box, [x0, y0, x0, y0], [x1, y1, x1, y1]))
+            # A person cut by the window's edge is measured worse than in the neighbouring window that holds her whole.
+            trust = weight * d.score * (inside / whole if whole > 0 else 0.0)
+            found.append((trust, Detection(box_px=box, score=d.score, roi_px=roi)))
+    return merge(found)
+
+
+def merge(found: list[tuple[float, Detection]], min_iou: float = 0.4, min_cover: float = 0.6) -> list[Detection]:
+    """One detection per person from pairs (trust, detection): what overlaps the most trusted one is the same person.
+
+    Overlap is judged on body boxes. Above `min_iou` two findings agree and are averaged by trust (those trusted less
+    than half as much as the best only confirm). Otherwise, where one covers the other by more than `min_cover` of the
+    smaller box, they disagree about the size of one person: a picture in which a person is too small to be measured
+    still makes the network answer, with a circle of the wrong size. The less trusted one is dropped.
+    """
+    left = sorted((f for f in found if f[0] > 0), key=lambda f: -f[0])
+    people = []
+    while left:
+        best = left[0][0]
+        box = left[0][1].box_px
+        boxes = np.array([d.box_px for _, d in left])
+        iou, cover = box_iou(box, boxes), _cover(box, boxes)
+        used = [(t, d) for (t, d), o in zip(left, iou, strict=True) if o > min_iou and t >= 0.5 * best]
+        left = [f for f, o, c in zip(left, iou, cover, strict=True) if o <= min_iou and c <= min_cover]
+        weight = np.array([t for t, _ in used])
+        weight /= weight.sum()
+        roi = weight @ np.array([d.roi_px for _, d in used])
+        # Angles average on the circle: a lying person may be seen at +179 and -179 degrees.
+        turn = np.array([d.roi_px[3] for _, d in used])
+        roi[3] = np.arctan2(weight @ np.sin(turn), weight @ np.cos(turn))
+        mean_box = weight @ np.array([d.box_px for _, d in used])
+        people.append(Detection(box_px=mean_box, score=max(d.score for _, d in used), roi_px=roi))
+    return people
+
+
+def _cut(box: np.ndarray, window: Window, size: tuple[int, int]) -> bool:
+    """Whether a bare box reaches an edge of its window that is no edge of the picture: the person goes on beyond it.
+
+    Body circles need no such rule: they reach beyond the window, and `detect_in` trusts them the less.
+    """
+    near = CUT_SHARE * (window[2] - window[0])
+    inner = np.array([window[0] > 0, window[1] > 0, window[2] < size[0], window[3] < size[1]])
+    beyond = np.array([1, 1, -1, -1]) * (box - np.array(window)) < near
+    return bool((inner & beyond).any())
+
+
+def _cover(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Fraction of the smaller of two boxes that lies in the other, for one box (4,) against boxes (N, 4)."""
+    size = np.minimum(box[2:4], boxes[:, 2:4]) - np.maximum(box[0:2], boxes[:, 0:2])
+    intersection = np.prod(np.maximum(size, 0.0), axis=1)
+    areas = np.prod(np.maximum(boxes[:, 2:4] - boxes[:, 0:2], 0.0), axis=1)
+    smaller = np.minimum(_area(box), areas)
+    return np.where(smaller > 0, intersection / np.where(smaller > 0, smaller, 1.0), 0.0)
+
+
+def _area(box: np.ndarray) -> float:
+    return float(max(box[2] - box[0], 0.0) * max(box[3] - box[1], 0.0))

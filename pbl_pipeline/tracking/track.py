@@ -1,0 +1,178 @@
+"""People over a whole video: detection where `Watch` says, association, and what both directions of time tell."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pbl_pipeline import progress
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.methods import Method
+from pbl_pipeline.models import box_iou
+from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.prefetch import prefetched
+from pbl_pipeline.video import VideoInfo, probe, read_frames
+
+from ._appearance import appearance_of
+from ._backtrack import backtrack
+from ._detection_schedule import Watch, window_around
+from ._params import TrackingParams
+from .associate import Associator, Trail, measure
+from .blazepose import body_box
+from .identity_swaps import undo_swaps
+from .methods import METHODS
+from .reidentify import join_trails
+from .tiling import detect_in
+from .types import Detection, PersonDetector, PersonTrack, Tracking
+
+#: A second look must find a new person with at least this overlap of the boxes; nearer to where somebody known is
+#: expected than so many body heights, it is a poor view of that one.
+CONFIRM_IOU, SAME_BODY = 0.3, 0.25
+#: Decoding goes on while a detector looks at a frame, which takes as long as decoding some.
+FRAMES_AHEAD = 8
+
+
+def track_people(
+    video_path: str | Path,
+    params: Method[TrackingParams] | Paramset | TrackingParams | str | None = None,
+    detector: PersonDetector | None = None,
+    info: VideoInfo | None = None,
+) -> Tracking:
+    """Find everybody in a video and follow them. Frames stream: memory does not grow with the video.
+
+    `params` is what `METHODS.find` takes; `detector` replaces the method's. `info` is what `video.probe` said of this
+    file; without it the video is probed, which decodes it once more. Where nobody is found, the `Tracking` has no
+    persons.
+    Raises the `PblError`s of `video.probe` and `assets.fetch`, SOLVER_UNKNOWN for an unknown method or detector, and
+    VIDEO_CHANGED when `info` is of another number of frames; for a registered model MODEL_MISSING, MODEL_INVALID,
+    MODEL_CHECKSUM, DEVICE_UNAVAILABLE.
+    """
+    method = METHODS.find(params)
+    params = method.params
+    finder: PersonDetector = method.function(params) if detector is None else detector
+    info = info or probe(video_path)
+    size = (info.width_px, info.height_px)
+    trails = _follow(video_path, params, finder, info)
+    people = join_trails(undo_swaps([t for t in trails if _is_real(t, params)], params.uncross), size, params.join)
+    longest = params.association.max_gap_s
+    persons = tuple(_to_track(i + 1, t, info.time_s, size, longest) for i, t in enumerate(people))
+    return Tracking(info.time_s, size, persons, finder.name, finder.model_sha256)
+
+
+def _follow(video_path: str | Path, params: TrackingParams, detector: PersonDetector, info: VideoInfo) -> list[Trail]:
+    """One pass over the frames: every trail, the false ones included."""
+    associator = Associator(params.association)
+    slack = 0.5 * float(np.median(np.diff(info.time_s))) if info.n_frames > 1 else 0.0
+    watch = Watch((info.width_px, info.height_px), params.watch, slack)
+    # The frames of the last searches, to follow new people back in: as long as a turn of all windows takes.
+    kept: deque[tuple[int, float, np.ndarray]] = deque(maxlen=watch.n_turn)
+    n_frames = 0
+    frames = prefetched(read_frames(video_path), FRAMES_AHEAD)
+    for frame in progress.track(frames, "people", total=info.n_frames):
+        n_frames, now = n_frames + 1, frame.time_s
+        associator.forget(now)
+        # The last frame too, so that tracks do not end before the video does.
+        due = watch.due(now, associator.live, last=frame.index == info.n_frames - 1)
+        elsewhere = watch.elsewhere(now, associator.live)
+        if not (due or elsewhere):
+            continue
+        found = detect_in(detector, frame.image, watch.around(now, due), elsewhere)
+        found = [_with_appearance(d, frame.image) for d in found]
+        for new in associator.step(frame.index, now, found, due):
+            sure = _confirmed(new, detector, frame.image, now, associator.live, params)
+            if sure is not None:
+                trail = Trail.of(frame.index, now, sure)
+                sizes = params.watch.window_sizes
+                associator.begin(backtrack(trail, kept, associator.trails(), detector, sizes, params.association))
+        watch.detected(now, due, associator.live)
+        if elsewhere:
+            kept.append((frame.index, now, frame.image))
+    if n_frames != info.n_frames:
+        raise PblError(
+            "VIDEO_CHANGED",
+            found=f"{n_frames} frames",
+            expected=f"the {info.n_frames} frames that were probed",
+            next_step="probe the video again",
+            key=str(video_path),
+        )
+    return associator.trails()
+
+
+def _confirmed(
+    new: Detection,
+    detector: PersonDetector,
+    image: np.ndarray,
+    time_s: float,
+    live: Sequence[Trail],
+    params: TrackingParams,
+) -> Detection | None:
+    """Who is seen in a window around a detection that fits nobody known, or None.
+
+    A lone window that was laid anywhere cannot tell a new person from a poor view of a known one: it may cut her or
+    show her too small. Laid around her, it must find her again, in about the same place, where nobody known is.
+    """
+    known = [t.predict(time_s) for t in live]
+    if any(_near(measure(new), k) for k in known):
+        return None
+    window = window_around(measure(new), params.watch.window_sizes)
+    again = [d for d in detect_in(detector, image, [window]) if d.score >= params.association.sure_score]
+    if not again:
+        return None
+    overlap = box_iou(new.box_px, np.array([d.box_px for d in again]))
+    best = again[int(np.argmax(overlap))]
+    if overlap.max() < CONFIRM_IOU or any(_near(measure(best), k) for k in known):
+        return None
+    return _with_appearance(best, image)
+
+
+def _near(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two region of interest lie so close, and are so alike in size, that both are of one person."""
+    apart = np.hypot(*(a[:2] - b[:2])) / np.exp((a[2] + b[2]) / 2)
+    return bool(apart < SAME_BODY)
+
+
+def _with_appearance(detection: Detection, image: np.ndarray) -> Detection:
+    return dataclasses.replace(detection, appearance=appearance_of(image, measure(detection), detection.roi_px[3]))
+
+
+def _is_real(trail: Trail, params: TrackingParams) -> bool:
+    sure = sum(d.score >= params.association.sure_score for d in trail.detections)
+    return sure >= params.min_hits and trail.times[-1] - trail.times[0] >= params.min_track_s
+
+
+def _to_track(person_id: int, trail: Trail, time_s: np.ndarray, size: tuple[int, int], max_gap_s: float) -> PersonTrack:
+    """Rows for every frame; between sightings up to `max_gap_s` apart, centre, size and score are interpolated linearly
+    in time."""
+    n = len(time_s)
+    first, last = trail.frames[0], trail.frames[-1]
+    inside = slice(first, last + 1)
+    roi = np.full((n, 4), np.nan)
+    box = np.full((n, 4), np.nan)
+    score = np.zeros(n)
+    observed = np.zeros(n, bool)
+    observed[trail.frames] = True
+    score[inside] = np.interp(time_s[inside], trail.times, [d.score for d in trail.detections])
+    seen_roi = np.array([d.roi_px for d in trail.detections])
+    if np.all(np.isfinite(seen_roi)):
+        seen_roi[:, 3] = np.unwrap(seen_roi[:, 3])
+        roi[inside] = _interpolate(time_s[inside], trail.times, seen_roi)
+        roi[:, 3] = np.arctan2(np.sin(roi[:, 3]), np.cos(roi[:, 3]))
+        box[inside] = body_box(roi[inside])
+    else:
+        box[inside] = _interpolate(time_s[inside], trail.times, np.array([d.box_px for d in trail.detections]))
+    for a, b in zip(trail.frames, trail.frames[1:], strict=False):
+        if time_s[b] - time_s[a] > max_gap_s + 1e-9:
+            roi[a + 1 : b], box[a + 1 : b], score[a + 1 : b] = np.nan, np.nan, 0.0
+    width, height = size
+    box = np.clip(box, 0.0, [width, height, width, height])
+    # As they are stored; in a long video with many passers-by the arrays are what takes memory.
+    box, roi, score = (a.astype(np.float32) for a in (box, roi, score))
+    return PersonTrack(person_id, box, roi, score, observed)
+
+
+def _interpolate(at: np.ndarray, times: list[float], values: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(at, times, v) for v in values.T], axis=-1)

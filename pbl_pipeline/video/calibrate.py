@@ -1,0 +1,324 @@
+"""Intrinsics from a video of a board: sharp and different views, the lens by least squares, and what they cannot tell.
+
+The formal standard deviation of a least-squares fit takes every corner for an independent measurement. They are not: a
+bent board or a lens that refocuses shifts all corners of a view together. So the views are also left out in groups and
+the lens is fitted again (delete-a-group jackknife); the larger of the two deviations is stated.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from pbl_pipeline import progress
+from pbl_pipeline.errors import PblError
+
+from ._board import Board
+from ._probe import probe
+from ._read import read_frames
+from .camera import reaches_corners
+from .types import Camera, VideoInfo
+
+#: One candidate, the sharpest frame, is taken from each of at most so many equal parts of the video, none shorter (s).
+MOST_CANDIDATES, SHORTEST_PART_S = 160, 0.2
+#: Views that are used: more add time and no knowledge.
+MOST_VIEWS, FEWEST_VIEWS = 40, 8
+#: The picture is cut into so many cells; corners must lie in this fraction of them, or the lens is known in part.
+CELLS, LEAST_COVERAGE = (6, 6), 0.5
+#: Views must differ by this much in tilt (deg), or focal length and distance cannot be told apart.
+LEAST_TILT_DEG = 15.0
+#: Largest deviation (rms) of corners from the fitted lens, px in a picture 1000 px long; and of the focal length.
+MOST_RMS_PX, MOST_REL_SD = 1.0, 0.01
+#: A view that fits worse than this many times the median view has a misplaced corner or is blurred.
+_OUTLIER = 3.0
+_GROUPS = 8
+_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """One picture of the board: frame number, numbers of the corners (K,), their places (K, 2) in px."""
+
+    frame: int
+    ids: np.ndarray
+    xy_px: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibration:
+    """A fitted lens.
+
+    sd: standard deviations of fx, fy, cx, cy (px) and of k1, k2, p1, p2, k3. rms_px: of all corners of the used views;
+    residual_px: (K, 2) of each view, seen minus fitted. coverage: fraction of the picture's cells with a corner.
+    tilt_deg: largest angle between two views of the board.
+    """
+
+    camera: Camera
+    image_size_px: tuple[int, int]
+    sd: np.ndarray
+    rms_px: float
+    views: tuple[View, ...]
+    residual_px: tuple[np.ndarray, ...]
+    coverage: float
+    tilt_deg: float
+    n_found: int
+    n_tried: int
+
+    @property
+    def focal_sd_px(self) -> float:
+        """The larger standard deviation of the two focal lengths."""
+        return float(self.sd[:2].max())
+
+    def save(self, path: str | Path, about: dict[str, Any]) -> None:
+        """Write the camera file that `load_camera` reads, with how it was made and `about` (video, board, phone)."""
+        names = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
+        content = {
+            "camera_matrix": [[round(float(v), 4) for v in row] for row in self.camera.matrix],
+            "distortion": [round(float(v), 7) for v in self.camera.distortion],
+            "image_size_px": list(self.image_size_px),
+            "focal_sd_px": round(self.focal_sd_px, 4),
+            "sd": {n: float(f"{v:.3g}") for n, v in zip(names, self.sd, strict=True)},
+            "rms_px": round(self.rms_px, 4),
+            "n_views": len(self.views),
+            "coverage": round(self.coverage, 3),
+            "tilt_deg": round(self.tilt_deg, 1),
+            **about,
+        }
+        Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def calibrate_video(path: str | Path, board: Board, info: VideoInfo | None = None) -> Calibration:
+    """The lens of the camera that filmed `board`. Reads the video twice; memory does not grow with its length.
+
+    Raises
+    ------
+    PblError
+        The VIDEO_ codes; CALIBRATION_NO_BOARD, CALIBRATION_FEW_VIEWS, CALIBRATION_POOR.
+    """
+    info = info or probe(path)
+    candidates = sharpest_frames(path, info)
+    other, is_other = board.by_corners(), False
+    views, tried = [], 0
+    for frame in progress.track(read_frames(path, stop=candidates[-1] + 1), "board", total=candidates[-1] + 1):
+        if frame.index not in candidates:
+            continue
+        grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
+        found = board.find(grey)
+        if found is not None:
+            views.append(View(frame.index, *found))
+        elif other is not None and not is_other and tried % 4 == 0:
+            is_other = other.find(grey) is not None
+        tried += 1
+    # Of a larger board, too, a part is found here and there.
+    if not views or (is_other and len(views) < FEWEST_VIEWS):
+        raise _no_board(path, board, tried, other if is_other else None)
+    return calibrate(views, board, (info.width_px, info.height_px), tried, key=path)
+
+
+def sharpest_frames(path: str | Path, info: VideoInfo) -> list[int]:
+    """Numbers of the frames with the strongest edges, one of each part of the video."""
+    # A single picture has no length.
+    n_parts = int(np.clip(np.nan_to_num(info.duration_s) / SHORTEST_PART_S, 1, MOST_CANDIDATES))
+    part = np.minimum((np.arange(info.n_frames) * n_parts) // max(info.n_frames, 1), n_parts - 1)
+    best: dict[int, tuple[float, int]] = {}
+    for frame in progress.track(read_frames(path), "sharpness", total=info.n_frames):
+        grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
+        small = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        sharp = float(cv2.Laplacian(small, cv2.CV_32F).var())
+        best[part[frame.index]] = max(best.get(part[frame.index], (-1.0, 0)), (sharp, frame.index))
+    return sorted(index for _, index in best.values())
+
+
+def calibrate(
+    views: Sequence[View], board: Board, image_size_px: tuple[int, int], n_tried: int | None = None, key: object = None
+) -> Calibration:
+    """The lens from views of the board in upright pictures of one size (width, height).
+
+    Raises
+    ------
+    PblError
+        CALIBRATION_FEW_VIEWS, CALIBRATION_POOR (coverage, tilt, residual, uncertainty).
+    """
+    n_found, n_tried = len(views), len(views) if n_tried is None else n_tried
+    _check_number(n_found, n_tried, key)
+    chosen = different_views(views, image_size_px, MOST_VIEWS)
+    coverage = covered(chosen, image_size_px)
+    if coverage < LEAST_COVERAGE:
+        raise _poor(
+            f"corners in {coverage:.0%} of the picture's {CELLS[0] * CELLS[1]} cells",
+            f"{LEAST_COVERAGE:.0%} or more: what lies outside is not known",
+            "bring the board into the corners and to the edges of the picture, and close enough to fill it",
+            key,
+        )
+    fit = _fit(chosen, board, image_size_px)
+    kept = [v for v, rms in zip(chosen, fit.view_rms, strict=True) if rms <= _OUTLIER * np.median(fit.view_rms)]
+    if len(kept) < len(chosen):
+        _check_number(len(kept), n_tried, key)
+        fit = _fit(kept, board, image_size_px)
+    sd = np.maximum(fit.sd, _jackknife(kept, board, image_size_px, fit))
+    tilt = _largest_tilt(fit.rvecs)
+    limit = MOST_RMS_PX * max(image_size_px) / 1000
+    focal = float(fit.matrix[0, 0] + fit.matrix[1, 1]) / 2
+    rel_sd = float(sd[:2].max()) / focal
+    if tilt < LEAST_TILT_DEG:
+        raise _poor(
+            f"views of the board that differ by at most {tilt:.0f} deg in tilt",
+            f"{LEAST_TILT_DEG:.0f} deg or more: facing the camera, a long lens from afar looks as a short one near",
+            "tilt the board (or walk around it) to all four sides by 20 to 45 deg while filming",
+            key,
+        )
+    if fit.rms > limit:
+        raise _poor(
+            f"corners {fit.rms:.2f} px (rms) off the fitted lens",
+            f"{limit:.2f} px or less in a picture of this size",
+            "check --squares, glue the board onto something flat and stiff, film slowly in good light with the focus "
+            "locked; a fisheye or ultra-wide lens cannot be described so",
+            key,
+        )
+    if not rel_sd <= MOST_REL_SD:
+        raise _poor(
+            f"a focal length of {focal:.0f} px with a standard deviation of {100 * rel_sd:.1f} %",
+            f"{100 * MOST_REL_SD:g} % or less",
+            "film the board larger, in more places and more strongly tilted; lock the focus",
+            key,
+        )
+    if not reaches_corners(fit.matrix, fit.distortion, image_size_px):
+        raise _poor(
+            "a distortion that folds back before the corners of the picture",
+            "a lens that is described over the whole picture",
+            "bring the board into the corners of the picture",
+            key,
+        )
+    camera = Camera(fit.matrix, fit.distortion, f"measured: {board.kind}, {len(kept)} views", rel_sd)
+    return Calibration(camera, image_size_px, sd, fit.rms, tuple(kept), fit.residuals, coverage, tilt, n_found, n_tried)
+
+
+def different_views(views: Sequence[View], image_size_px: tuple[int, int], most: int) -> list[View]:
+    """At most `most` views, each chosen to differ most from those before in place, size and slant of the board."""
+    features = np.array([_features(v, image_size_px) for v in views])
+    order = [int(np.argmax([len(v.ids) for v in views]))]
+    distance = np.full(len(views), np.inf)
+    while len(order) < min(most, len(views)):
+        distance = np.minimum(distance, np.linalg.norm(features - features[order[-1]], axis=1))
+        distance[order] = -1.0
+        order.append(int(np.argmax(distance)))
+    return [views[i] for i in sorted(order)]
+
+
+def covered(views: Sequence[View], image_size_px: tuple[int, int]) -> float:
+    """Fraction of the picture's cells in which a corner was seen."""
+    xy = np.concatenate([v.xy_px for v in views])
+    cell = np.clip((xy + 0.5) / image_size_px * CELLS, 0, np.array(CELLS) - 1).astype(int)
+    return len(np.unique(cell, axis=0)) / (CELLS[0] * CELLS[1])
+
+
+# ------------------------------------------------------------------------------------------------------------ the fit
+@dataclasses.dataclass(frozen=True)
+class _Fit:
+    matrix: np.ndarray
+    distortion: np.ndarray
+    sd: np.ndarray
+    rms: float
+    view_rms: np.ndarray
+    residuals: tuple[np.ndarray, ...]
+    rvecs: list[np.ndarray]
+    flags: int
+
+
+def _fit(views: Sequence[View], board: Board, size: tuple[int, int]) -> _Fit:
+    """k3 only where the lens with it holds up to the corners: few corners there let it run wild."""
+    fit = _fit_with(views, board, size, 0)
+    if not reaches_corners(fit.matrix, fit.distortion, size):
+        fit = _fit_with(views, board, size, cv2.CALIB_FIX_K3)
+    return fit
+
+
+def _fit_with(
+    views: Sequence[View], board: Board, size: tuple[int, int], flags: int, start: _Fit | None = None
+) -> _Fit:
+    points = [board.corners_m[v.ids].astype(np.float32) for v in views]
+    places = [v.xy_px.astype(np.float32) for v in views]
+    if start is None:
+        focal = 0.75 * max(size)
+        matrix = np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1.0]])
+        distortion = np.zeros(5)
+    else:
+        matrix, distortion = start.matrix.copy(), start.distortion.copy()
+    _, matrix, distortion, rvecs, tvecs, sd, _, _ = cv2.calibrateCameraExtended(
+        points, places, size, matrix, distortion, flags=flags | cv2.CALIB_USE_INTRINSIC_GUESS, criteria=_STOP
+    )
+    distortion = np.asarray(distortion, np.float64).ravel()[:5]
+    residuals = []
+    for p, xy, r, t in zip(points, places, rvecs, tvecs, strict=True):
+        fitted, _ = cv2.projectPoints(p.astype(np.float64), r, t, matrix, distortion)
+        residuals.append(xy - fitted.reshape(-1, 2))
+    view_rms = np.array([math.sqrt(np.mean(np.sum(r**2, axis=1))) for r in residuals])
+    rms = math.sqrt(np.mean(np.sum(np.concatenate(residuals) ** 2, axis=1)))
+    return _Fit(matrix, distortion, np.asarray(sd).ravel()[:9], rms, view_rms, tuple(residuals), list(rvecs), flags)
+
+
+def _jackknife(views: Sequence[View], board: Board, size: tuple[int, int], fit: _Fit) -> np.ndarray:
+    """Standard deviations (9,) from leaving out one stretch of the video after the other: what changes slowly, such as
+    the focus, is in few of them."""
+    groups = min(_GROUPS, len(views))
+    values = []
+    for left_out in progress.track(np.array_split(np.arange(len(views)), groups), "uncertainty", total=groups):
+        rest = [v for i, v in enumerate(views) if i not in left_out]
+        again = _fit_with(rest, board, size, fit.flags, fit)
+        m = again.matrix
+        values.append([m[0, 0], m[1, 1], m[0, 2], m[1, 2], *again.distortion])
+    off = np.array(values) - np.mean(values, axis=0)
+    return np.sqrt((groups - 1) / groups * np.sum(off**2, axis=0))
+
+
+def _largest_tilt(rvecs: Sequence[np.ndarray]) -> float:
+    """Largest angle (deg) between the board's normals in two views."""
+    normals = np.array([cv2.Rodrigues(np.asarray(r, np.float64))[0][:, 2] for r in rvecs])
+    return float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1).min())))
+
+
+def _features(view: View, size: tuple[int, int]) -> np.ndarray:
+    """(5,) of the corners, in picture sides: the middle, the spread along both axes, its correlation."""
+    xy = view.xy_px / max(size)
+    middle = xy.mean(axis=0)
+    off = xy - middle
+    (xx, xy_), (_, yy) = np.cov(off.T)
+    # The spread says how large the board is, its covariance how it is turned and slanted.
+    return np.array([*middle, 2 * math.sqrt(xx), 2 * math.sqrt(yy), xy_ / max(math.sqrt(xx * yy), 1e-9)])
+
+
+# ------------------------------------------------------------------------------------------------------------- errors
+def _check_number(n: int, tried: int, key: object) -> None:
+    if n < FEWEST_VIEWS:
+        raise PblError(
+            "CALIBRATION_FEW_VIEWS",
+            found=f"{n} usable views of the board in {tried} sharp pictures",
+            expected=f"{FEWEST_VIEWS} or more",
+            next_step="film for 30 to 60 s, slowly, the whole board in the picture (of a ChArUco board a part does), "
+            "without glare",
+            key=key,
+        )
+
+
+def _no_board(path: str | Path, board: Board, tried: int, other: Board | None) -> PblError:
+    hint = "check --board and --squares (squares are counted, not corners), and that the whole board is seen, in light"
+    if other is not None:
+        hint = f"the board has {other.squares[0]}x{other.squares[1]} squares: pass --squares with these"
+    return PblError(
+        "CALIBRATION_NO_BOARD",
+        found=f"no {board.kind} of {board.squares[0]}x{board.squares[1]} squares in {tried} sharp pictures",
+        expected="a video in which the board is seen",
+        next_step=hint,
+        key=path,
+    )
+
+
+def _poor(found: str, expected: str, next_step: str, key: object) -> PblError:
+    return PblError("CALIBRATION_POOR", found=found, expected=expected, next_step=next_step, key=key)

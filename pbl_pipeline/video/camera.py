@@ -1,0 +1,270 @@
+"""Camera intrinsics: from a calibration file, or a stated guess.
+
+Pixel coordinates have (0, 0) at the centre of the top-left pixel, as in OpenCV.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from pbl_pipeline.bounded import read_json, read_toml
+from pbl_pipeline.errors import PblError
+
+from .types import Camera, VideoInfo
+
+#: Focal length over the longer side of the picture: median, least and most of the 78 iPhone calibrations (38 models,
+#: identifiers iPhone8,1 to iPhone17,5; 25 distinct values; video of 720 and 2160 lines) published with OpenCap
+#: (stanfordnmbl/opencap-core, commit d5a5258, Apache-2.0; Uhlrich et al. 2023, PLoS Comput Biol 19(10):e1011462).
+#: Their mean is 0.728, their standard deviation 0.044.
+PHONE_FOCAL_OVER_LONG_SIDE = 0.7169
+PHONE_FOCAL_RANGE = (0.6655, 0.8452)
+#: Root mean square distance of the 25 distinct values from that median, as a fraction of it (0.067). Other phones,
+#: lenses and zooms may lie further off; nothing measured says how far.
+PHONE_FOCAL_REL_SD = 0.07
+
+#: Focal lengths over the longer side of the picture: a view of 175 to one of 0.06 degrees.
+_FOCAL_RANGE = (0.02, 1000.0)
+#: A principal point that lies off the middle of the picture by one factor on both axes, alike within the second number
+#: and more than the first, is that of a picture of another size. (A cropped picture is off on one axis, or unlike.)
+_OTHER_SIZE, _ALIKE = 0.2, 0.05
+#: How far the distortion of a lens may move a corner outwards.
+_MOST_STRETCH = 2.0
+
+_NEXT = "correct the file, or leave it out: then a phone's field of view is guessed and the result says so"
+
+
+def guess_camera(video: VideoInfo | tuple[int, int]) -> Camera:
+    """Intrinsics of a typical phone's main camera for a probed video or an upright (width, height) in px.
+
+    Focal length `PHONE_FOCAL_OVER_LONG_SIDE` times the longer side (70 degrees along it), principal point in the
+    middle, no distortion. `source` begins with "guess" and states the spread of the published values. A zoomed or
+    cropped recording (digital zoom, strong stabilisation, a telephoto lens) has a longer focal length than any of them.
+    `find_camera` asks the file first.
+    """
+    width, height = (video.width_px, video.height_px) if isinstance(video, VideoInfo) else video
+    if width <= 0 or height <= 0:
+        raise ValueError(f"a picture of {width}x{height} px")
+    focal = PHONE_FOCAL_OVER_LONG_SIDE * max(width, height)
+    matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+    low, high = (100 * (f / PHONE_FOCAL_OVER_LONG_SIDE - 1) for f in PHONE_FOCAL_RANGE)
+    angle = math.degrees(2 * math.atan(0.5 / PHONE_FOCAL_OVER_LONG_SIDE))
+    source = (
+        f"guess: a phone's main camera, {angle:.0f} deg along the longer side (focal length {focal:.0f} px, median of "
+        f"78 published iPhone calibrations, which lie {low:.0f} to +{high:.0f} % from it; no distortion; "
+        "wrong for zoomed or cropped video)"
+    )
+    return Camera(matrix, np.zeros(5), source, PHONE_FOCAL_REL_SD)
+
+
+def load_camera(path: str | Path, image_size_px: tuple[int, int], name: str | None = None) -> Camera:
+    """Intrinsics from a calibration file, for the upright picture of `image_size_px` (width, height).
+
+    Two forms are read: the TOML of Pose2Sim and Sports2D, a table per camera with `size` [width, height], `matrix` and
+    `distortions`; and JSON with `camera_matrix`, `distortion` and `image_size_px` [width, height]. Distortion is
+    OpenCV's k1 k2 p1 p2 [k3]. When the recording is larger or smaller than the calibrated picture by one factor for
+    both sides, the matrix is scaled. `name` chooses the camera of a TOML that holds several. The JSON may state the
+    standard deviation of the focal length, `focal_sd_px` (`pbl calibrate` does).
+
+    Raises
+    ------
+    PblError
+        CAMERA_INVALID: the file cannot be read, a field is missing or not usable, the model is a fisheye, several
+        cameras and none chosen, or the shape of the picture differs (a crop or a turn, which no factor describes).
+    """
+    path = Path(path)
+    label, fields = _read(path, name)
+    matrix = _array(path, fields, "matrix", (9,)).reshape(3, 3)
+    distortion = _array(path, fields, "distortion", (4, 5))
+    width, height = _array(path, fields, "size", (2,)).tolist()
+    if fields.get("fisheye"):
+        raise _invalid(path, "a fisheye model", "a pinhole camera with k1 k2 p1 p2 k3 distortion")
+    if min(width, height) <= 0 or not (0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height):
+        raise _invalid(
+            path,
+            f"principal point ({matrix[0, 2]:g}, {matrix[1, 2]:g}) of a {width:g}x{height:g} px picture",
+            "a principal point inside the picture",
+        )
+    distortion = np.concatenate([distortion, np.zeros(5 - len(distortion))])
+    check_lens(matrix, distortion, (width, height), path)
+    rel_sd, spread = math.nan, ""
+    if fields.get("focal_sd") is not None:
+        rel_sd = float(_array(path, fields, "focal_sd", (1,))[0]) * 2 / (matrix[0, 0] + matrix[1, 1])
+        if rel_sd < 0:
+            raise _invalid(path, f"focal_sd_px = {fields['focal_sd']!r}", "a standard deviation in px, 0 or more")
+        spread = f", focal length within {100 * rel_sd:.2g} % (sd)"
+    matrix, scaled = _scale(path, matrix, (width, height), image_size_px)
+    return Camera(matrix, distortion, f"file: {label}{scaled}{spread}", rel_sd)
+
+
+def _read(path: Path, name: str | None) -> tuple[str, Mapping[str, Any]]:
+    """The label of the camera and its fields under the names matrix, distortion, size, fisheye."""
+    try:
+        content = read_toml(path) if path.suffix.lower() == ".toml" else read_json(path)
+    except OSError as error:
+        raise _invalid(path, f"the file cannot be read ({error.strerror})", "a calibration file") from error
+    except ValueError as error:
+        raise _invalid(path, f"the text cannot be parsed ({error})", "a TOML or JSON calibration") from error
+    if not isinstance(content, dict):
+        raise _invalid(path, "no named fields", "a table of fields")
+    if path.suffix.lower() != ".toml":
+        names = {"camera_matrix": "matrix", "distortion": "distortion", "image_size_px": "size", "fisheye": "fisheye"}
+        names["focal_sd_px"] = "focal_sd"
+        return path.name, {new: content[old] for old, new in names.items() if old in content}
+    cameras = {key: value for key, value in content.items() if isinstance(value, dict) and "matrix" in value}
+    if name is None and len(cameras) != 1:
+        found = f"{len(cameras)} cameras" + (f" ({', '.join(cameras)})" if cameras else "")
+        raise _invalid(path, found, "one camera, or the name of one of them")
+    if name is not None and name not in cameras:
+        raise _invalid(path, f"cameras {', '.join(cameras) or '(none)'}", f"a camera named {name}")
+    key = name or next(iter(cameras))
+    camera = cameras[key]
+    fields = {"distortion": camera["distortions"]} if "distortions" in camera else {}
+    return f"{path.name} [{key}]", camera | fields
+
+
+def _array(path: Path, fields: Mapping[str, Any], name: str, lengths: tuple[int, ...]) -> np.ndarray:
+    expected = f"{name}: {' or '.join(map(str, lengths))} finite numbers"
+    if name not in fields:
+        raise _invalid(path, f"no field {name}", expected)
+    try:
+        value = np.asarray(fields[name], dtype=np.float64).ravel()
+    except (TypeError, ValueError, OverflowError) as error:
+        raise _invalid(path, f"{name} = {_shown(fields[name])}", expected) from error
+    if len(value) not in lengths or not np.isfinite(value).all():
+        raise _invalid(path, f"{name} = {_shown(fields[name])}", expected)
+    return value
+
+
+def _scale(
+    path: Path, matrix: np.ndarray, calibrated: tuple[float, float], image_size_px: tuple[int, int]
+) -> tuple[np.ndarray, str]:
+    (width, height), (new_width, new_height) = calibrated, image_size_px
+    factor = new_width / width
+    if abs(new_height - factor * height) > 1.0:  # one pixel of rounding
+        turned = abs(new_width - new_height / width * height) <= 1.0
+        raise _invalid(
+            path,
+            f"calibrated for {width:g}x{height:g} px, the recording is {new_width}x{new_height} px"
+            + (" (the picture is turned)" if turned else ""),
+            "a calibration of the upright picture, of the same shape",
+        )
+    if factor == 1.0:
+        return matrix, ""
+    return scaled_matrix(matrix, factor), f", scaled by {factor:.4g} from {width:g}x{height:g} px"
+
+
+def scaled_matrix(matrix: np.ndarray, factor: float) -> np.ndarray:
+    """The camera matrix (3, 3) of the same picture with `factor` times as many pixels along each side."""
+    scaled = matrix.copy()
+    scaled[:2] *= factor
+    scaled[:2, 2] += (factor - 1) / 2  # coordinates count from the first pixel's centre, sizes from its edge
+    return scaled
+
+
+def check_lens(matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float, float], key: object = None) -> None:
+    """Refuse a lens that no camera has: `matrix` (3, 3) px and `distortion` (5,) of an upright picture (width, height).
+
+    Raises
+    ------
+    PblError
+        CAMERA_INVALID: not finite, a skew, a focal length that is no plausible part of the picture's longer side
+        (`_FOCAL_RANGE`), a principal point outside of the picture or of a picture of another size, or a distortion that
+        folds back before the corners of the picture or moves them by more than `_MOST_STRETCH`.
+    """
+    m, d = np.asarray(matrix, np.float64), np.asarray(distortion, np.float64)
+    plain = m[0, 1] == m[1, 0] == m[2, 0] == m[2, 1] == 0 and m[2, 2] == 1
+    if not np.isfinite(m).all() or not plain or min(m[0, 0], m[1, 1]) <= 0:
+        raise _invalid(key, f"matrix {m.tolist()}", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx and fy positive")
+    low, high = (f * max(size_px) for f in _FOCAL_RANGE)
+    if not (low <= m[0, 0] <= high and low <= m[1, 1] <= high):
+        found = f"focal lengths {m[0, 0]:g} and {m[1, 1]:g} px of a {size_px[0]:g}x{size_px[1]:g} px picture"
+        raise _invalid(key, found, f"{low:g} to {high:g} px")
+    _check_centre(m, size_px, key)
+    if not np.isfinite(d).all():
+        raise _invalid(key, f"distortion {d.tolist()}", "k1, k2, p1, p2, k3, finite; zeros for no distortion")
+    radial = f"{d[0]:g}, {d[1]:g}, {d[4]:g}"
+    corner, r, distorted = _to_corner(m, d, size_px)
+    if not distorted[-1] >= corner:  # also where it overflows
+        raise _invalid(
+            key,
+            f"radial distortion {radial} folds back before the corner of the picture",
+            "coefficients k1 k2 p1 p2 k3 that hold over the whole picture",
+        )
+    straight = max(float(np.interp(corner, distorted, r)), 1e-9)
+    if corner > _MOST_STRETCH * straight or 3 * np.hypot(d[2], d[3]) * straight > _MOST_STRETCH - 1:
+        raise _invalid(
+            key,
+            f"distortion {radial} (radial), {d[2]:g}, {d[3]:g} (tangential) that moves the corner of the picture "
+            f"more than {_MOST_STRETCH:g} times as far out",
+            "coefficients k1 k2 p1 p2 k3 as a calibration finds them",
+        )
+
+
+def _check_centre(m: np.ndarray, size_px: tuple[float, float], key: object) -> None:
+    """Refuse a matrix whose principal point shows that it belongs to another picture."""
+    across, down = (float(2 * c / side) for c, side in zip(m[:2, 2], size_px, strict=True))
+    outside = not (0 <= across <= 2 and 0 <= down <= 2)
+    if outside or (min(abs(across - 1), abs(down - 1)) > _OTHER_SIZE and abs(across / down - 1) <= _ALIKE):
+        width, height = size_px
+        raise _invalid(
+            key,
+            f"principal point ({m[0, 2]:g}, {m[1, 2]:g}) in a picture of {width:g}x{height:g} px",
+            f"a point near the middle ({width / 2:g}, {height / 2:g}); this matrix looks like that of a picture of "
+            f"{across * width:.0f}x{down * height:.0f} px: multiply its first two rows by the ratio of the sizes",
+        )
+
+
+def reaches_corners(matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float, float]) -> bool:
+    """Whether the radial model reaches the corners before it turns back: beyond that, undistorting has no answer."""
+    corner, _, distorted = _to_corner(matrix, distortion, size_px)
+    return bool(distorted[-1] >= corner)
+
+
+def _to_corner(
+    matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float, float]
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Distance of the farthest corner from the axis (focal lengths), distances (N,) of an ideal camera, and where the
+    radial model puts them, up to where it turns back."""
+    k1, k2, _, _, k3 = distortion
+    width, height = size_px
+    x = (np.array([0, width - 1, 0, width - 1]) - matrix[0, 2]) / matrix[0, 0]
+    y = (np.array([0, 0, height - 1, height - 1]) - matrix[1, 2]) / matrix[1, 1]
+    corner = float(np.hypot(x, y).max())
+    r = np.linspace(0.0, 3.0 * max(corner, 1.0), 4000)
+    distorted = r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6)
+    turns = np.flatnonzero(np.diff(distorted) <= 0)
+    end = int(turns[0]) + 1 if len(turns) else len(r)
+    return corner, r[:end], distorted[:end]
+
+
+def _shown(value: object) -> str:
+    """A field's value as it stands in the file, its beginning where it is long."""
+    return repr(value)[:200]
+
+
+def _invalid(path: object, found: str, expected: str) -> PblError:
+    return PblError("CAMERA_INVALID", found=found, expected=expected, next_step=_NEXT, key=path)
+
+
+def viewing_ray(xy_px: np.ndarray, camera: Camera) -> np.ndarray:
+    """(N, 3) rays x/z, y/z, 1 of the picture points (N, 2), distortion removed."""
+    points = np.asarray(xy_px, np.float64).reshape(-1, 1, 2)
+    matrix, distortion = np.asarray(camera.matrix, np.float64), np.asarray(camera.distortion, np.float64)
+    # OpenCV's five iterations leave some tenths of a pixel with a wide lens.
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
+    flat = cv2.undistortPoints(points, matrix, distortion, criteria=stop)
+    return np.column_stack([flat.reshape(-1, 2), np.ones(len(points))])
+
+
+def undistort_px(xy_px: np.ndarray, camera: Camera) -> np.ndarray:
+    """Pixels (..., 2) of the distorted picture as an ideal pinhole camera with the same matrix would see them."""
+    if not np.any(camera.distortion):
+        return np.asarray(xy_px, float)
+    pinhole = viewing_ray(xy_px.reshape(-1, 2), camera) @ np.asarray(camera.matrix, np.float64).T
+    return pinhole[:, :2].reshape(xy_px.shape)
