@@ -83,12 +83,17 @@ class Case:
     view: str
     camera: str
     detector: str
+    #: Which recording of the walk: the picture's size belongs to a visit, the detector's errors to a recording.
+    visit: int = 0
+    recording: int = 0
 
     @property
     def name(self) -> str:
         """Of the case, in a corpus."""
         w = self.walk
-        return f"{w.person}|{w.condition}|{w.severity:g}|{self.view}|{self.camera}|{self.detector}"
+        return f"{w.person}|{w.condition}|{w.severity:g}|{self.view}|{self.camera}|{self.detector}" + (
+            f"|visit {self.visit}" if self.visit else ""
+        )
 
     def trials(self) -> dict[str, Keypoints]:
         """What the detector gives in each view."""
@@ -97,11 +102,13 @@ class Case:
     def keypoints(self, noise: Noise | None = None) -> Keypoints:
         """What the detector gives in the one view of a case, by its error model of `DETECTORS` or another noise.
 
-        The same at each call: the random errors belong to person, view, camera and detector, so that two visits of a
-        person differ by the walk alone.
+        The same at each call. Cases of one visit and recording have the same random errors for person, view, camera and
+        detector, so that they differ by the walk alone; those of another are drawn anew, but for where the points lie
+        on this person's body.
         """
         model = detector_model(self.detector)
-        seed = _number(f"{self.walk.person}|{self.view}|{self.camera}|{self.detector}")
+        drawn = f"|{self.visit}|{self.recording}" if self.visit or self.recording else ""
+        seed = _number(f"{self.walk.person}|{self.view}|{self.camera}|{self.detector}{drawn}")
         reach = np.ptp(self.walk.qpos[:, _columns("pelvis_tx", "pelvis_tz")], axis=0)
         aside = float(np.hypot(*reach)) if self.camera == "static" and "sagittal" in self.view else 0.0
         look = functools.partial(
