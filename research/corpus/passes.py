@@ -29,6 +29,7 @@ from research.corpus.walks import (
     Case,
     Walk,
     detector_model,
+    is_held_out,
     recorded_walks,
     synthetic_seeds,
     synthetic_walk,
@@ -44,10 +45,12 @@ ANGLES = ("hip_flexion", "hip_adduction", "knee_flexion")
 STEP_DEG = 0.01
 
 
-def walks_of(people: int, motions: Path | None) -> Iterator[tuple]:
-    """Arguments of `walk_of`: of `people` synthetic ones, half of them held out, healthy and with each impairment at
-    two severities, and of the recorded ones of a folder."""
-    for seed in synthetic_seeds(people // 2):
+def walks_of(people: int, tuning: int, motions: Path | None) -> Iterator[tuple]:
+    """Arguments of `walk_of`: of `people` synthetic ones, half of them held out, and `tuning` further ones who are not,
+    healthy and with each impairment at two severities, and of the recorded ones of a folder."""
+    seeds = synthetic_seeds(people // 2)
+    further = [s for s in synthetic_seeds(people // 2 + tuning) if s not in seeds and not is_held_out(f"synthetic {s}")]
+    for seed in seeds + further:
         yield ("synthetic", seed, "", 0.0)
         for name in IMPAIRMENTS:
             for severity in SEVERITIES:
@@ -135,20 +138,21 @@ def save_rows(path: Path, rows: Sequence[dict]) -> None:
 @click.command(epilog="Example: python -m research.corpus.passes --motions motions --people 12 --out passes")
 @click.option("--motions", type=click.Path(path_type=Path), metavar="DIR", help="Recorded motions, with index.csv.")
 @click.option("--people", default=12, show_default=True, help="Synthetic people, half of them held out.")
+@click.option("--tuning", default=0, show_default=True, help="Further synthetic people who are not held out.")
 @click.option("--detector", default="blazepose-heavy", show_default=True, metavar="NAME", help="Error model.")
 @click.option("--views", default=",".join(VIEWS), metavar="VIEW,...", help="Which of them (default: all).")
 @click.option("--processes", default=os.cpu_count(), help="Processes that see the walks and measure the fits.")
 @click.option("--seconds", default=1e9, help="Begin no further group of walks after so many seconds.")
 @click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Write passes-N.npz there.")
 def main(
-    motions: Path | None, people: int, detector: str, views: str, processes: int, seconds: float, out: Path
+    motions: Path | None, people: int, tuning: int, detector: str, views: str, processes: int, seconds: float, out: Path
 ) -> None:
     """Fit every pass as a session and keep its curves and measures beside the true ones."""
     begin = time.perf_counter()
     out.mkdir(parents=True, exist_ok=True)
     model = detector_model(detector)
     method = METHODS[default_fit((model.marker_set, model.root_relative))]
-    walks = list(walks_of(people, motions))
+    walks = list(walks_of(people, tuning, motions))
     walks = [walks[i] for i in np.random.default_rng(0).permutation(len(walks))]  # any part of them has all kinds
     os.environ["JAX_PLATFORMS"] = "cpu"  # of the processes, which leave a GPU to this one
     with multiprocessing.get_context("spawn").Pool(processes) as pool:
