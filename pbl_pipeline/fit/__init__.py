@@ -3,7 +3,6 @@
 from .marker_files import MarkerFile, read_markers
 from .method_choice import Points, default_fit, points_of, unsuited
 from .methods import METHODS
-from .paper_objective import paper_objective
 from .params import (
     CostParams,
     GaussNewtonParams,
@@ -14,7 +13,6 @@ from .params import (
 from .results import SessionFit, TrialFit
 from .session import LEVEL_CAMERA_R_NC, Trial
 from .session_fit import (
-    LEVEL_CAMERA_QUAT_WXYZ,
     SessionInput,
     check_trial,
     fit_session,
@@ -22,7 +20,6 @@ from .session_fit import (
 )
 
 __all__ = [
-    "LEVEL_CAMERA_QUAT_WXYZ",
     "LEVEL_CAMERA_R_NC",
     "METHODS",
     "CostParams",
@@ -40,7 +37,6 @@ __all__ = [
     "default_fit",
     "fit_session",
     "fit_sessions",
-    "paper_objective",
     "points_of",
     "read_markers",
     "unsuited",

@@ -23,8 +23,3 @@ def quat_wxyz(R: np.ndarray) -> np.ndarray:
     same = np.sign(np.sum(q[1:] * q[:-1], axis=1))
     q[1:] *= np.cumprod(np.where(same == 0, 1.0, same))[:, None]
     return q
-
-
-def matrices_of(quat_wxyz: np.ndarray) -> np.ndarray:
-    """(T, 3, 3) of (T, 4) quaternions."""
-    return Rotation.from_quat(quat_wxyz, scalar_first=True).as_matrix()

@@ -31,9 +31,6 @@ from .session import check_trial as _check_trial
 from .solution import Solution
 from .vertical import upright
 
-#: `LEVEL_CAMERA_R_NC` as a quaternion (w, x, y, z).
-LEVEL_CAMERA_QUAT_WXYZ = np.array([0.5, -0.5, 0.5, -0.5])
-
 #: Sessions solved at once on a GPU: enough to fill it, few enough that the next ones are packed meanwhile.
 BATCH = 32
 #: Threads that pack them: numpy's larger steps run beside each other.

@@ -141,9 +141,6 @@ class MirrorLooks:
         sigma_mm = 500.0 * np.linalg.norm(own.xyz_cam_m - other.xyz_cam_m, axis=1)
         return expit((self.agree_mm - sigma_mm) / self.agree_width_mm)
 
-    def _confidence(self, own: PersonKeypoints, other: PersonKeypoints) -> np.ndarray:
-        return (own.confidence + other.confidence) / 2 * self._agreement(own, other)
-
 
 def _renamed(person: PersonKeypoints, order: np.ndarray) -> PersonKeypoints:
     return dataclasses.replace(

@@ -1,7 +1,7 @@
 """How far a fit is from a reference: errors per joint, the paper's tables, paired curves (docs/validation.md)."""
 
 from .align import align_path, best_lag
-from .compare import JointError, KinematicErrors, compare, compare_angles, compare_references
+from .compare import JointError, KinematicErrors, compare, compare_angles
 from .curves import CURVE_COLUMNS, cycle_curves, save_curves
 from .frame import COLUMNS, TrialErrors, error_frame
 from .joints import JOINTS_CLIP, JOINTS_OPENCAP, JOINTS_PAPER
@@ -42,7 +42,6 @@ __all__ = [
     "body_rotation_angles",
     "compare",
     "compare_angles",
-    "compare_references",
     "cycle_curves",
     "error_frame",
     "fit_angles",

@@ -133,18 +133,6 @@ def compare(
     )
 
 
-def compare_references(ours: Reference, reference: Reference, max_lag_s: float = 0.1) -> KinematicErrors:
-    """The same for kinematics of another system, which have neither sd, nor view, nor residuals.
-
-    Raises `PblError` REFERENCE_INPUT, also where the conventions differ.
-    """
-    if ours.convention != reference.convention:
-        raise _refused(ours.name, f"conventions {ours.convention} and {reference.convention}", "the same convention")
-    return compare_angles(
-        ours.time_s, ours.angles_deg, reference, pelvis_m=ours.pelvis_m, max_lag_s=max_lag_s, trial=ours.name
-    )
-
-
 def compare_angles(
     time_s: np.ndarray,
     angles_deg: Mapping[str, np.ndarray],

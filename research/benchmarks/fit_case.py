@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.bench import case
 from pbl_pipeline.bench.data import read_keypoints, read_truth
-from pbl_pipeline.fit import SessionFit, paper_objective
+from pbl_pipeline.fit import SessionFit
+from research.paper_objective import paper_objective
 
 
 def camera_error_deg(quat_wxyz: np.ndarray, R_nc: np.ndarray) -> float:

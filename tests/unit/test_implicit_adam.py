@@ -21,7 +21,6 @@ from pbl_pipeline.fit import CostParams, ImplicitAdamParams, implicit, problem
 from pbl_pipeline.fit.implicit import solve_implicit
 from pbl_pipeline.fit.initial_pose import median_orientation, median_pose, paper_pose
 from pbl_pipeline.fit.keypoint_terms import L2D, L3D
-from pbl_pipeline.fit.paper_objective import PAPER_COST, objective_of
 from pbl_pipeline.fit.phone_term import LPHONE
 from pbl_pipeline.fit.problem import State
 from pbl_pipeline.fit.session import Session, make_session
@@ -30,6 +29,7 @@ from pbl_pipeline.fit.term import At, Phone
 from pbl_pipeline.fit.trajectory import encode, evaluate, fit_ranges, frequencies, initial_trajectories
 from pbl_pipeline.fit.weights import PAPER_PHONE_DEG, Weights
 from pbl_pipeline.synthetic import NO_NOISE, PhoneSensor, pelvis_positions
+from research.paper_objective import PAPER_COST, objective_of
 from research.walker.observe import observe
 from research.walker.views import observe_markers, observe_views
 from research.walker.walk import walk_qpos

@@ -1,4 +1,4 @@
-"""The paper's total over a session, by which solvers are compared whatever they minimise themselves."""
+"""The paper's total cost of a session, which compares solvers whatever they minimise themselves."""
 
 from __future__ import annotations
 
@@ -12,18 +12,17 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
+from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import Body, MarkerSet, marker_positions, scale_multipliers
+from pbl_pipeline.fit import CostParams, SessionFit, Trial
+from pbl_pipeline.fit.objective import PAPER, total
+from pbl_pipeline.fit.params import PAPER_2025
+from pbl_pipeline.fit.problem import Problem, State
+from pbl_pipeline.fit.session import Session, make_session
+from pbl_pipeline.fit.term import At, Phone
+from pbl_pipeline.fit.weights import Weights
 from pbl_pipeline.keypoints import Keypoints
-
-from .objective import PAPER, total
-from .params import PAPER_2025, CostParams
-from .problem import Problem, State
-from .results import SessionFit
-from .rotations import matrices_of
-from .session import Session, Trial, make_session
-from .term import At, Phone
-from .weights import Weights
 
 #: The paper's own (section Total loss and optimization), whatever the defaults of `CostParams` become.
 PAPER_COST = CostParams(
@@ -32,7 +31,7 @@ PAPER_COST = CostParams(
 
 
 def paper_objective(fit: SessionFit, trials: Sequence[Trial], markers: MarkerSet | None = None) -> float:
-    """The paper's own total (section Model Fitting) of a session fit, whatever the fit itself minimised."""
+    """Return the paper's own total (section Model Fitting) of a session fit, whatever the fit itself minimised."""
     motions = [t.camera_motion for t in fit.trials]
     session = make_session(trials, [t.name for t in fit.trials], PAPER_2025, motions, markers)
     qpos = np.zeros((session.problem.weight.shape[0], len(session.body.joint_names)))
@@ -40,7 +39,7 @@ def paper_objective(fit: SessionFit, trials: Sequence[Trial], markers: MarkerSet
     for i, trial in enumerate(fit.trials):
         qpos[session.frames(i)] = trial.qpos
         if isinstance(trials[i], Keypoints):
-            R_nc[session.frames(i), 0] = matrices_of(trial.phone_quat_wxyz)
+            R_nc[session.frames(i), 0] = Rotation.from_quat(trial.phone_quat_wxyz, scalar_first=True).as_matrix()
     overall = fit.scale[0] - 1
     s = np.concatenate([[overall], fit.scale[1:] - 1 - overall])
     return objective_of(session, qpos, R_nc, s, fit.site_offset_m)
@@ -53,7 +52,7 @@ def objective_of(
     s: Float[ArrayLike, " S"],
     site_offset_m: Float[ArrayLike, "J 3"],
 ) -> float:
-    """1.0 L3D + 0.1 L2D + 1.0 Lphone + 100 sum offset^2 of a solution.
+    """Return 1.0 L3D + 0.1 L2D + 1.0 Lphone + 100 sum offset^2 of a solution.
 
     Each term is the mean over trials of its mean over the frames that count and the markers; a phone is compared at
     the frames' times, with the video's clock. `qpos` and `R_nc` are on the packed frames, where those that do not
