@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 
 from pbl_pipeline.errors import PblError
 
 from .frame import COLUMNS, KEY
 from .joints import JOINTS_OPENCAP, JOINTS_PAPER, ROWS_PAPER, split_side
-from .paper import paper_cells, paper_where
-from .statistics import median_niqr, niqr, pearson, smaller
+from .paper import paper_cells
+from .statistics import median_niqr, niqr
 from .table import Cell, Table
 from .view import BACK, CONTRALATERAL, FRONT, IPSILATERAL, LATERAL, MIXED
 
@@ -40,13 +42,12 @@ _ALIASES = {
 }
 _OPENCAP = [split_side(j)[0] for j in JOINTS_OPENCAP]
 _PAPER_JOINTS = [split_side(j)[0] for j in JOINTS_PAPER]
-_OF_TRIAL = (*KEY, "recording", "comparison", "residual_2d_px", "residual_3d_cm")
 _POOLED = "Median Absolute Error: of a trial, over all frames and all of the paper's 22 joints that it knows."
 _MEAN = "Mean Absolute Error: of a trial, over OpenCap's joints that it knows (pelvis, hips, knees, ankles, lumbar)."
 
 
 def paper_tables(frame: pd.DataFrame) -> dict[str, Table]:
-    """The tables of the paper's results on accuracy, filled from the rows of `error_frame`.
+    """Return the tables of the paper's results on accuracy, filled from the rows of `error_frame`.
 
     Name -> table: `summary`, `joints_by_dataset`, `joints_by_population`, `by_population`, `by_activity`, `by_view`,
     `view_tests`, `residuals`, and of our own `joint_measures` and `by_method`. Values are medians over trials (nIQR)
@@ -71,7 +72,7 @@ def paper_tables(frame: pd.DataFrame) -> dict[str, Table]:
         _groups("by_population", "by population", trials, "population", _POPULATIONS),
         _groups("by_activity", "by activity", trials, "activity", _ACTIVITIES),
         _by_view(rows),
-        _view_tests(rows),
+        _view_tests(rows[rows["n"] > 0]),
         _residuals(trials),
         _measures(rows),
         _by_method(trials),
@@ -79,11 +80,12 @@ def paper_tables(frame: pd.DataFrame) -> dict[str, Table]:
     return {t.name: t for t in made}
 
 
-def _prepared(frame: pd.DataFrame) -> pd.DataFrame:
-    """Rows with the paper's names, the comparison they belong to, and dataset and camera in one word."""
+def _prepared(frame: pd.DataFrame) -> Any:
+    """Return the rows with the paper's names, their comparison, and dataset and camera in one word."""
+    paper = {name.lower(): name for name in (*_POPULATIONS, *_ACTIVITIES)} | _ALIASES
     rows = frame.copy()
     for column in ("population", "activity"):
-        rows[column] = [_named(str(v)) for v in rows[column]]
+        rows[column] = [paper.get(str(v).lower(), str(v)) for v in rows[column]]
     rows["recording"] = rows["dataset"].astype(str) + " " + rows["camera"].astype(str)
     # Missing values of the trial are part of what it is: a comparison without RTE is still one comparison.
     which = [*KEY, "lag_s", "rte_m", "residual_2d_px", "residual_3d_cm", "trial_median_abs_deg"]
@@ -91,47 +93,28 @@ def _prepared(frame: pd.DataFrame) -> pd.DataFrame:
     return rows
 
 
-def _named(text: str) -> str:
-    paper = {name.lower(): name for name in (*_POPULATIONS, *_ACTIVITIES)}
-    return _ALIASES.get(text.lower()) or paper.get(text.lower()) or text
+def _trials(rows: Any) -> Any:
+    """Return one row per comparison: its median and mean absolute error, RTE and how many joints it knows."""
+    trials = rows.drop_duplicates("comparison").set_index("comparison", drop=False)
+    measured = rows[rows["n"] > 0]
+    of_opencap = measured[measured["joint"].isin(_OPENCAP)].groupby("comparison")
+    of_paper = measured[measured["joint"].isin(_PAPER_JOINTS)].groupby("comparison")
+    methods = zip(trials["detector"].astype(str), trials["solver"].astype(str), strict=True)
+    return trials.assign(
+        method=[", ".join(filter(None, names)) or "not named" for names in methods],
+        median_deg=trials["trial_median_abs_deg"],
+        mean_deg=of_opencap["mean_abs_deg"].mean(),
+        rte_cm=100 * trials["rte_m"],
+        joints=of_paper.size().reindex(trials.index, fill_value=0),
+    )
 
 
-def _trials(rows: pd.DataFrame) -> pd.DataFrame:
-    """One row per comparison: its median and mean absolute error, RTE, residuals and how many joints it knows."""
-    out = []
-    for comparison in range(1 + int(max(_numbers(rows, "comparison"), default=-1))):
-        part = _pick(rows, rows["comparison"] == comparison)
-        first: dict[str, Any] = part.iloc[0].to_dict()
-        measured = _pick(part, part["n"] > 0)
-        opencap = _numbers(_pick(measured, measured["joint"].isin(_OPENCAP)), "mean_abs_deg")
-        out.append(
-            {
-                **{k: first[k] for k in _OF_TRIAL},
-                "method": ", ".join(str(first[k]) for k in ("detector", "solver") if str(first[k])) or "not named",
-                "median_deg": first["trial_median_abs_deg"],
-                "mean_deg": float(opencap.mean()) if opencap.size else math.nan,
-                "rte_cm": 100 * first["rte_m"],
-                "joints": len(_pick(measured, measured["joint"].isin(_PAPER_JOINTS))),
-            }
-        )
-    return pd.DataFrame(out, columns=[*_OF_TRIAL, "method", "median_deg", "mean_deg", "rte_cm", "joints"])
-
-
-def _summary(trials: pd.DataFrame) -> Table:
-    columns = _columns(_DATASETS, trials["recording"])
-    cells = {}
-    for column in columns:
-        part = _pick(trials, trials["recording"] == column)
-        cells[MEDIAN, column] = _over(part, "median_deg")
-        cells[MEAN, column] = _over(part, "mean_deg")
-        cells[RTE, column] = _over(part, "rte_cm")
-        cells[KNOWN, column] = _over(part, "joints")
+def _summary(trials: Any) -> Table:
+    rows = {MEDIAN: _over("median_deg"), MEAN: _over("mean_deg"), RTE: _over("rte_cm"), KNOWN: _over("joints")}
     return _table(
         "summary",
         "Errors by dataset and camera, median over trials (nIQR)",
-        (MEDIAN, MEAN, RTE, KNOWN),
-        columns,
-        cells,
+        _cells(rows, _parts(trials, "recording", _DATASETS)),
         f"{_POOLED} {_MEAN} RTE: mean distance of the pelvis' path after alignment; the phone's own way is not "
         f"observed, so it says little of a phone that is carried along. {KNOWN}: of the 22; an error over fewer of "
         "them is another measure.",
@@ -139,87 +122,63 @@ def _summary(trials: pd.DataFrame) -> Table:
     )
 
 
-def _joints(
-    name: str, by: str, rows: pd.DataFrame, trials: pd.DataFrame, column: str, paper_columns: Sequence[str]
-) -> Table:
-    columns = _columns(paper_columns, trials[column])
-    cells = {}
-    for c in columns:
-        part = _pick(rows, (rows[column] == c) & (rows["n"] > 0))
-        for label, joint in ROWS_PAPER.items():
-            cells[label, c] = _over_sides(_pick(part, part["joint"] == joint), "median_abs_deg")
-        cells[TRIALS, c] = _over(_pick(trials, trials[column] == c), "median_deg")
+def _joints(name: str, by: str, rows: Any, trials: Any, column: str, paper_columns: Sequence[str]) -> Table:
+    of_joints = _cells(_OF_JOINTS, _parts(rows, column, paper_columns))
+    of_trials = _cells({TRIALS: _over("median_deg")}, _parts(trials, column, paper_columns))
     return _table(
         name,
         f"Median absolute error of each joint {by} (deg), median over trials (nIQR)",
-        (*ROWS_PAPER, TRIALS),
-        columns,
-        cells,
+        of_joints | of_trials,
         f"Left and right of a trial count as two values of one trial. Row {TRIALS} is the {_POOLED}",
     )
 
 
-def _groups(name: str, by: str, trials: pd.DataFrame, column: str, paper_columns: Sequence[str]) -> Table:
-    columns = (*_columns(paper_columns, trials[column]), TRIALS)
-    walking = f"{MEAN.removesuffix(' (deg)')}, walking (deg)"
-    labels = (MEDIAN, MEAN, walking) if column == "population" else (MEDIAN, MEAN)
-    cells = {}
-    for c in columns:
-        part = trials if c == TRIALS else _pick(trials, trials[column] == c)
-        cells[MEDIAN, c] = _over(part, "median_deg")
-        cells[MEAN, c] = _mean_over(part, "mean_deg")
-        cells[walking, c] = _mean_over(_pick(part, part["activity"] == "walking"), "mean_deg")
-    cells = {key: cell for key, cell in cells.items() if key[0] in labels}
+def _groups(name: str, by: str, trials: Any, column: str, paper_columns: Sequence[str]) -> Table:
+    rows = {MEDIAN: _over("median_deg"), MEAN: _mean_over}
+    if column == "population":
+        rows[f"{MEAN.removesuffix(' (deg)')}, walking (deg)"] = lambda part: _mean_over(
+            part[part["activity"] == "walking"]
+        )
     return _table(
         name,
         f"Errors {by}: median over trials of the median absolute error, mean over trials of the mean absolute error "
         "(each with nIQR)",
-        labels,
-        columns,
-        cells,
+        _cells(rows, _parts(trials, column, paper_columns) | {TRIALS: trials}),
         f"{_POOLED} {_MEAN} The paper quotes 4.1 deg for OpenCap, healthy walking.",
     )
 
 
-def _by_view(rows: pd.DataFrame) -> Table:
-    columns = _columns((FRONT, BACK, IPSILATERAL, CONTRALATERAL, LATERAL, MIXED), rows.loc[rows["view"] != "", "view"])
-    cells = {}
-    for c in columns:
-        part = _pick(rows, (rows["view"] == c) & (rows["n"] > 0))
-        for label, joint in ROWS_PAPER.items():
-            cells[label, c] = _over_sides(_pick(part, part["joint"] == joint), "median_abs_deg")
+def _by_view(rows: Any) -> Table:
+    views = (FRONT, BACK, IPSILATERAL, CONTRALATERAL, LATERAL, MIXED)
     return _table(
         "by_view",
         "Median absolute error of each joint by the camera's view (deg), median over trials (nIQR)",
-        tuple(ROWS_PAPER),
-        columns,
-        cells,
+        _cells(_OF_JOINTS, _parts(rows[rows["view"] != ""], "view", views)),
         "ipsilateral: the camera is on the side of the joint. lateral: a joint of the middle seen from a side. The "
         "paper shows these errors only as a figure (Fig. 4 C).",
     )
 
 
-def _view_tests(rows: pd.DataFrame) -> Table:
-    frontal = rows["view"].isin((FRONT, BACK))
-    sagittal = rows["view"].isin((IPSILATERAL, CONTRALATERAL))
-    labels, cells = [], {}
+def _view_tests(measured: Any) -> Table:
+    frontal = measured["view"].isin((FRONT, BACK))
+    sagittal = measured["view"].isin((IPSILATERAL, CONTRALATERAL))
+    cells = {}
     for label, better, worse, words in (
         ("Hip Flexion", sagittal, frontal, "sagittal against frontal"),
         ("Knee Flexion", sagittal, frontal, "sagittal against frontal"),
         ("Hip Adduction", frontal, sagittal, "frontal against sagittal"),
     ):
-        of_joint = (rows["joint"] == ROWS_PAPER[label]) & (rows["n"] > 0)
-        a, b = _pick(rows, of_joint & better), _pick(rows, of_joint & worse)
-        difference, p = smaller(_numbers(a, "median_abs_deg"), _numbers(b, "median_abs_deg"))
-        n = len({*_numbers(a, "comparison"), *_numbers(b, "comparison")})
+        of_joint = measured["joint"] == ROWS_PAPER[label]
+        a, b = (measured.loc[of_joint & view, "median_abs_deg"].dropna().to_numpy(float) for view in (better, worse))
+        n = measured.loc[of_joint & (better | worse), "comparison"].nunique()
         row = f"{label}: {words} views"
-        labels.append(row)
+        difference = float(np.median(b) - np.median(a)) if len(a) and len(b) else math.nan
+        test: Any = stats.mannwhitneyu(a, b, alternative="less") if min(len(a), len(b)) > 1 else None
+        p = math.nan if test is None else float(test.pvalue)
         cells[row, "difference (deg)"], cells[row, "p"] = Cell(difference, n=n), Cell(p, n=n)
     return _table(
         "view_tests",
         "Is an angle better in the view of its plane? Difference of the medians (deg) and one-sided Mann-Whitney U",
-        tuple(labels),
-        ("difference (deg)", "p"),
         cells,
         "Positive: the first kind of view has the smaller error. Sides of one trial are not independent, so p is too "
         "small where there are few trials.",
@@ -227,24 +186,26 @@ def _view_tests(rows: pd.DataFrame) -> Table:
     )
 
 
-def _residuals(trials: pd.DataFrame) -> Table:
-    cells, error = {}, _numbers(trials, "median_deg")
+def _residuals(trials: Any) -> Table:
+    cells = {}
     for label, column in (("2D residual (px)", "residual_2d_px"), ("3D residual (cm)", "residual_3d_cm")):
-        r, p, n = pearson(_numbers(trials, column), error)
-        cells[label, "median"] = _over(trials, column)
-        cells[label, "Pearson r"], cells[label, "p"] = Cell(r, n=n), Cell(p, n=n)
+        x, y = trials[[column, "median_deg"]].dropna().to_numpy(float).T
+        # Both are continuous, so Pearson and not Spearman (the paper, Statistics).
+        known = len(x) > 2 and np.ptp(x) > 0 and np.ptp(y) > 0
+        test: Any = stats.pearsonr(x, y) if known else (math.nan, math.nan)
+        r, p = map(float, test)
+        cells[label, "median"] = _over(column)(trials)
+        cells[label, "Pearson r"], cells[label, "p"] = Cell(r, n=len(x)), Cell(p, n=len(x))
     return _table(
         "residuals",
         "Residuals of the fit, median over trials (nIQR), and their correlation with the median absolute error",
-        ("2D residual (px)", "3D residual (cm)"),
-        ("median", "Pearson r", "p"),
         cells,
         "Two continuous variables: Pearson. n: trials; fewer than three give no correlation.",
         {"p": 4},
     )
 
 
-def _measures(rows: pd.DataFrame) -> Table:
+def _measures(rows: Any) -> Table:
     columns = {
         "median |error| (deg)": "median_abs_deg",
         "mean |error| (deg)": "mean_abs_deg",
@@ -253,84 +214,65 @@ def _measures(rows: pd.DataFrame) -> Table:
         "correlation": "correlation",
         "inside 90 %": "within_90",
     }
-    measured = _pick(rows, rows["n"] > 0)
-    cells = {}
-    for label, joint in ROWS_PAPER.items():
-        part = _pick(measured, measured["joint"] == joint)
-        for column, field in columns.items():
-            cells[label, column] = _over_sides(part, field)
     return _table(
         "joint_measures",
         "All measures of each joint, median over trials (nIQR)",
-        tuple(ROWS_PAPER),
-        tuple(columns),
-        cells,
+        {(r, c): _over(field, joint)(rows) for r, joint in ROWS_PAPER.items() for c, field in columns.items()},
         "bias: fit - reference. inside 90 %: share of the frames inside the fit's 90 % interval. All datasets.",
     )
 
 
-def _by_method(trials: pd.DataFrame) -> Table:
-    methods = tuple(dict.fromkeys(trials["method"]))
-    cells = {}
-    for method in methods:
-        part = _pick(trials, trials["method"] == method)
-        for column, field in ((MEDIAN, "median_deg"), (MEAN, "mean_deg"), (RTE, "rte_cm")):
-            cells[method, column] = _over(part, field)
+def _by_method(trials: Any) -> Table:
+    parts = {method: trials[trials["method"] == method] for method in dict.fromkeys(trials["method"])}
+    columns = {MEDIAN: _over("median_deg"), MEAN: _over("mean_deg"), RTE: _over("rte_cm")}
     return _table(
         "by_method",
         "Errors by detector and solver, median over trials (nIQR)",
-        methods,
-        (MEDIAN, MEAN, RTE),
-        cells,
+        {(method, column): cell(part) for method, part in parts.items() for column, cell in columns.items()},
         "The other tables hold all methods together: select rows of one method before making them.",
     )
 
 
-def _columns(paper: Sequence[str], found: Iterable[str]) -> tuple[str, ...]:
-    """Ours that the paper does not have, then the paper's: ours are what the reader came for."""
-    own = sorted({str(v) for v in found} - set(paper))
-    return (*own, *paper)
+def _parts(frame: Any, column: str, paper: Sequence[str]) -> dict[str, Any]:
+    """Return the parts of a frame by the values of a column: first those that the paper does not have, because they are
+    what the reader came for, then the paper's."""
+    own = sorted({str(v) for v in frame[column]} - set(paper))
+    return {name: frame[frame[column] == name] for name in (*own, *paper)}
 
 
-def _pick(frame: pd.DataFrame, mask: Any) -> pd.DataFrame:
-    return frame.loc[np.asarray(mask, bool), :]
+_Cell = Callable[[Any], Cell]
 
 
-def _numbers(frame: pd.DataFrame, column: str) -> np.ndarray:
-    return np.asarray(frame[column], float)
+def _cells(rows: Mapping[str, _Cell], columns: Mapping[str, Any]) -> dict[tuple[str, str], Cell]:
+    """Return the cell of each row of each part of a frame."""
+    return {(row, name): cell(part) for row, cell in rows.items() for name, part in columns.items()}
 
 
-def _over(trials: pd.DataFrame, column: str) -> Cell:
-    values = _numbers(trials, column)
-    return Cell(*median_niqr(values), n=int(np.isfinite(values).sum()))
+def _over(column: str, joint: str = "") -> _Cell:
+    """Return a function from rows (of a joint) to their median; n counts comparisons, not sides."""
+    return functools.partial(_median_over, column=column, joint=joint)
 
 
-def _mean_over(trials: pd.DataFrame, column: str) -> Cell:
-    values = _numbers(trials, column)
-    values = values[np.isfinite(values)]
-    return Cell(float(values.mean()) if values.size else math.nan, niqr(values), n=int(values.size))
+def _median_over(part: Any, column: str, joint: str) -> Cell:
+    known = (part[part["joint"] == joint] if joint else part).dropna(subset=[column])
+    return Cell(*median_niqr(known[column].to_numpy(float)), n=known["comparison"].nunique())
 
 
-def _over_sides(rows: pd.DataFrame, column: str) -> Cell:
-    """Over the values of both sides; n counts trials, not sides."""
-    values, of_trial = _numbers(rows, column), _numbers(rows, "comparison")
-    return Cell(*median_niqr(values), n=len(set(of_trial[np.isfinite(values)])))
+def _mean_over(trials: Any) -> Cell:
+    values = trials["mean_deg"].dropna().to_numpy(float)
+    return Cell(float(values.mean()) if len(values) else math.nan, niqr(values), n=len(values))
+
+
+_OF_JOINTS = {label: _over("median_abs_deg", joint) for label, joint in ROWS_PAPER.items()}
 
 
 def _table(
-    name: str,
-    title: str,
-    rows: Sequence[str],
-    columns: Sequence[str],
-    cells: Mapping[tuple[str, str], Cell],
-    note: str,
-    digits: dict[str, int] | None = None,
+    name: str, title: str, cells: Mapping[tuple[str, str], Cell], note: str, digits: dict[str, int] | None = None
 ) -> Table:
-    """With the paper's figures put in."""
+    """Return a table with the paper's figures put in."""
     paper = paper_cells(name)
     filled = {}
     for (row, column), cell in cells.items():
-        text = paper.get(row, {}).get(column, "")
-        known = math.isfinite(cell.value)
-        filled[row, column] = Cell(cell.value, cell.spread, cell.n if known else 0, text)
-    return Table(name, title, tuple(rows), tuple(columns), filled, paper_where(name), note, digits or {})
+        n = cell.n if math.isfinite(cell.value) else 0
+        filled[row, column] = Cell(cell.value, cell.spread, n, paper.get(row, {}).get(column, ""))
+    return Table(name, title, filled, note, digits or {})

@@ -7,6 +7,8 @@ import math
 
 import pandas as pd
 
+from .paper import paper_where
+
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
@@ -23,41 +25,35 @@ class Cell:
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """A table in the paper's form.
+    """A table in the paper's form."""
 
-    Attributes
-    ----------
-    name
-        Stem of its files.
-    title
-        Quantity, with its unit and the meaning of the brackets.
-    rows, columns
-        Their names, in order.
-    cells
-        (row, column) -> `Cell`; one for every pair.
-    where
-        Where in the paper the figures beside ours stand; empty where there are none.
-    note
-        How ours were made, and how they differ from the paper's.
-    digits
-        Decimals of the values, by name of a row or column; else 2.
-    """
+    name: str  # stem of its files
+    title: str  # quantity, with its unit and the meaning of the brackets
+    cells: dict[tuple[str, str], Cell]  # by (row, column), row by row; one for every pair
+    note: str = ""  # how ours were made, and how they differ from the paper's
+    digits: dict[str, int] = dataclasses.field(default_factory=dict)  # by name of a row or column; else 2
 
-    name: str
-    title: str
-    rows: tuple[str, ...]
-    columns: tuple[str, ...]
-    cells: dict[tuple[str, str], Cell]
-    where: str = ""
-    note: str = ""
-    digits: dict[str, int] = dataclasses.field(default_factory=dict)
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """Names of the rows, in order."""
+        return tuple(dict.fromkeys(row for row, _ in self.cells))
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns, in order."""
+        return tuple(dict.fromkeys(column for _, column in self.cells))
+
+    @property
+    def where(self) -> str:
+        """Where in the paper the figures beside ours stand; empty where there are none."""
+        return paper_where(self.name)
 
     def cell(self, row: str, column: str) -> Cell:
-        """The cell of a row and a column."""
+        """Return the cell of a row and a column."""
         return self.cells[row, column]
 
     def ours(self, row: str, column: str) -> str:
-        """Our value as text: `2.79 (0.86)`; empty where there is none."""
+        """Return our value as text: `2.79 (0.86)`; empty where there is none."""
         cell, digits = self.cells[row, column], self.digits.get(row, self.digits.get(column, 2))
         if not math.isfinite(cell.value):
             return ""
@@ -65,32 +61,21 @@ class Table:
         return f"{cell.value:.{digits}f}{spread}"
 
     def frame(self) -> pd.DataFrame:
-        """Long form: one row per cell with `row, column, value, spread, n, paper, paper_where`."""
+        """Return the long form: one row per cell with `row, column, value, spread, n, paper, paper_where`."""
         cells = [
-            {"row": r, "column": c, **dataclasses.asdict(self.cells[r, c]), "paper_where": self._where(r, c)}
-            for r in self.rows
-            for c in self.columns
+            {"row": r, "column": c, **dataclasses.asdict(cell), "paper_where": self.where if cell.paper else ""}
+            for (r, c), cell in self.cells.items()
         ]
         return pd.DataFrame(cells, columns=["row", "column", "value", "spread", "n", "paper", "paper_where"])
 
     def text(self) -> str:
-        """For a terminal: ours with n in square brackets, and the paper's figure below it after `paper`."""
-        width = max([len(r) for r in self.rows] + [5])
-        body: list[list[str]] = [["", *self.columns]]
+        """Return the table for a terminal: ours with n in square brackets, the paper's figure below it."""
+        body: list[list[str]] = [[" " * 5, *self.columns]]
         for row in self.rows:
-            cells = [self.cells[row, c] for c in self.columns]
-            body.append([row, *(f"{self.ours(row, c)} [{self.cells[row, c].n}]".strip() for c in self.columns)])
-            if any(cell.paper for cell in cells):
-                body.append(["  paper", *(cell.paper for cell in cells)])
-        widths = [width, *(max(len(line[i + 1]) for line in body) for i in range(len(self.columns)))]
-        lines = [
-            "  ".join(
-                [line[0].ljust(widths[0]), *(x.rjust(w) for x, w in zip(line[1:], widths[1:], strict=True))]
-            ).rstrip()
-            for line in body
-        ]
-        tail = [f"paper: {self.where}"] if self.where else []
-        return "\n".join([self.title, *lines, *([self.note] if self.note else []), *tail])
-
-    def _where(self, row: str, column: str) -> str:
-        return self.where if self.cells[row, column].paper else ""
+            cells = {c: self.cells[row, c] for c in self.columns}
+            body.append([row, *(f"{self.ours(row, c)} [{cell.n}]".strip() for c, cell in cells.items())])
+            if any(cell.paper for cell in cells.values()):
+                body.append(["  paper", *(cell.paper for cell in cells.values())])
+        first, *others = (max(map(len, column)) for column in zip(*body, strict=True))
+        lines = ["  ".join([label.ljust(first), *map(str.rjust, texts, others)]).rstrip() for label, *texts in body]
+        return "\n".join([self.title, *lines, *filter(None, [self.note, self.where and f"paper: {self.where}"])])
