@@ -84,6 +84,11 @@ def audit_looks() -> bool:
     return os.environ.get("PBL_AUDIT_LOOKS", "") not in ("", "0")
 
 
+def n_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def offline() -> bool:
     """True when nothing may be fetched."""
     return os.environ.get("PBL_OFFLINE", "") not in ("", "0")

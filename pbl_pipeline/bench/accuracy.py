@@ -7,22 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pbl_pipeline.body import joint_of
+from pbl_pipeline.validation import JOINTS_PAPER
+
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit
 
-_SIDES = ("r", "l")
-MAIN_JOINTS: tuple[str, ...] = (
-    *(f"hip_{n}_{s}" for n in ("flexion", "adduction", "rotation") for s in _SIDES),
-    *(f"{n}_angle_{s}" for n in ("knee", "ankle") for s in _SIDES),
-    *(f"lumbar_{n}" for n in ("extension", "bending", "rotation")),
-)
-#: The joints of the paper's validation (Statistics): those above, neck, shoulders without rotation, elbows.
-PAPER_JOINTS: tuple[str, ...] = (
-    *MAIN_JOINTS,
-    *(f"neck_{n}" for n in ("extension", "bending", "rotation")),
-    *(f"arm_{n}_{s}" for n in ("flex", "add") for s in _SIDES),
-    *(f"elbow_flex_{s}" for s in _SIDES),
-)
+#: The joints of the paper's validation (Statistics): hips, knees, ankles, lumbar, neck, shoulders without rotation,
+#: elbows.
+PAPER_JOINTS = tuple(joint_of(angle)[0] for angle in JOINTS_PAPER)
+MAIN_JOINTS = tuple(j for j in PAPER_JOINTS if j.startswith(("hip_", "knee_", "ankle_", "lumbar_")))
 
 
 def joint_errors_deg(

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 from typing import Any
 
+from pbl_pipeline.settings import n_cores
+
 
 def machine() -> dict[str, Any]:
     """Device and processor as this process saw them."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    out: dict[str, Any] = {"cores": cores}
+    out: dict[str, Any] = {"cores": n_cores()}
     if "jax" in sys.modules:
         import jax
 

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pbl_pipeline.runs import runs
+
 #: How the circle of a head in a frame was obtained, by its number in `Head.source`: keypoints and faces are certain
 #: enough to need no look of a person.
 SOURCES = ("none", "keypoints", "face", "disagree", "body", "held")
@@ -97,7 +99,5 @@ def overlapping(heads: Sequence[Head]) -> np.ndarray:
 
 
 def ranges(flags: Sequence[bool] | np.ndarray) -> list[tuple[int, int]]:
-    """First and last index of each run of True."""
-    padded = np.concatenate([[0], np.asarray(flags, np.int8), [0]])
-    edge = np.flatnonzero(np.diff(padded))
-    return [(int(a), int(b) - 1) for a, b in zip(edge[::2], edge[1::2], strict=True)]
+    """Return the first and last index of each run of True."""
+    return [(run.start, run.stop - 1) for run in runs(flags)]

@@ -36,9 +36,6 @@ def write_trc(trial: ExportTrial, path: Path, title: str = "markers") -> None:
     # OpenSim loses an empty cell at the end of a line: a further tab keeps it.
     kept = np.where(np.isnan(xyz[:, -1, 0]), ord("\t"), 0).astype(np.uint8)[:, None]
     cells = number_cells(xyz.reshape(n, -1), 4)
-    blocks = [number_cells(np.arange(1, n + 1), 0), number_cells(time, 6), cells[:, :-1], _beside(cells[:, -1], kept)]
+    last = np.concatenate([cells[:, -1], kept], axis=1)
+    blocks = [number_cells(np.arange(1, n + 1), 0), number_cells(time, 6), cells[:, :-1], last]
     path.write_bytes(("\n".join(head) + "\n").encode("ascii") + lines(blocks, "\t"))
-
-
-def _beside(cell: np.ndarray, more: np.ndarray) -> np.ndarray:
-    return np.concatenate([cell, more], axis=1)

@@ -11,18 +11,18 @@ import numpy as np
 _EXACT = 2.0**53
 
 
-def number_cells(values: np.ndarray, decimals: int, missing: bytes = b"") -> np.ndarray:
-    """(..., W) bytes of numbers with so many decimals, rounded to the nearest; NaN is `missing`, -0 is 0."""
+def number_cells(values: np.ndarray, decimals: int) -> np.ndarray:
+    """(..., W) bytes of numbers with so many decimals, rounded to the nearest; empty for NaN, -0 is 0."""
     values = np.asarray(values, float)
     known = np.isfinite(values)
     scaled = np.rint(np.where(known, values, 0.0) * 10.0**decimals)
     size = float(np.max(np.abs(scaled), initial=0.0))
     if size >= _EXACT:
-        texts = [f"{v + 0.0:.{decimals}f}".encode() if np.isfinite(v) else missing for v in values.flat]
+        texts = [f"{v + 0.0:.{decimals}f}".encode() if np.isfinite(v) else b"" for v in values.flat]
         return text_cells(texts).reshape(*values.shape, -1)
     left = np.abs(scaled).astype(np.int32 if size < 2**31 else np.int64)
     n_digits = max(len(str(int(size))), decimals + 1)
-    width = max(1 + n_digits + (decimals > 0), len(missing))
+    width = 1 + n_digits + (decimals > 0)
     cells = np.zeros((*values.shape, width), np.uint8)
     cells[..., 0] = np.where(scaled < 0, ord("-"), 0)
     at = width - 1
@@ -34,8 +34,7 @@ def number_cells(values: np.ndarray, decimals: int, missing: bytes = b"") -> np.
         digit = (left - 10 * rest + ord("0")).astype(np.uint8)
         cells[..., at] = digit if k <= decimals else np.where(left > 0, digit, 0)
         left, at = rest, at - 1
-    if not known.all():
-        cells[~known] = np.frombuffer(missing.ljust(width, b"\0"), np.uint8)
+    cells[~known] = 0
     return cells
 
 

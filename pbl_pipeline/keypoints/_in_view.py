@@ -9,6 +9,9 @@ import re
 
 import numpy as np
 
+from pbl_pipeline.runs import runs
+from pbl_pipeline.tracking import step_s
+
 from .types import Keypoints
 
 #: Fraction of the markers that must have been detected for a frame to say anything about the pose.
@@ -167,18 +170,5 @@ def blind_runs(seen: np.ndarray, time_s: np.ndarray, max_blind_s: float) -> np.n
 
 
 def longest_run_s(used: np.ndarray, time_s: np.ndarray) -> float:
-    """Length (s) of the longest unbroken run of used frames."""
-    best, start = 0.0, None
-    for i, u in enumerate(used):
-        if u and start is None:
-            start = i
-        if u and start is not None:
-            best = max(best, float(time_s[i] - time_s[start]))
-        if not u:
-            start = None
-    return best
-
-
-def step_s(time_s: np.ndarray) -> float:
-    """Mean time (s) between frames; 0 for a single one."""
-    return float(time_s[-1] - time_s[0]) / (len(time_s) - 1) if len(time_s) > 1 else 0.0
+    """Return the length (s) of the longest unbroken run of used frames."""
+    return max((float(time_s[run][-1] - time_s[run][0]) for run in runs(used)), default=0.0)

@@ -14,9 +14,10 @@ from __future__ import annotations
 import numpy as np
 
 from pbl_pipeline.qc import EMPTY, FAIL, PASS, WARN, Check
+from pbl_pipeline.tracking import step_s
 
 from ._confidence import probability_within
-from ._in_view import SEEN_SHARE, ends, step_s, visibility
+from ._in_view import SEEN_SHARE, ends, visibility
 from .types import Keypoints
 
 #: Seconds in view: about three strides; what a fit needs at least.

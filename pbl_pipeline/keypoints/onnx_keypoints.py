@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.models import ModelSpec, OnnxModel, find, load_spec
+from pbl_pipeline.models import ModelSpec, OnnxModel, check_frozen, find, load_spec
 from pbl_pipeline.paramset import later
 from pbl_pipeline.video import Camera
 
@@ -69,7 +69,7 @@ class ModelKeypointParams(KeypointParams):
         return spec.marker_set, root_relative(spec)
 
 
-def model_params(name: str, n_augmentations: int | None = None) -> ModelParams:
+def model_params(name: str) -> ModelParams:
     """The parameters of a registered model as it is now: 10 augmentations where it gives 3D, the picture and its mirror
     image where it gives 2D only. Raises `PblError` MODEL_MISSING, MODEL_INVALID, MARKER_SET_UNKNOWN, USAGE."""
     spec = load_spec(find(name))
@@ -81,10 +81,8 @@ def model_params(name: str, n_augmentations: int | None = None) -> ModelParams:
             next_step="choose another one of `pbl models list`",
             key=name,
         )
-    n = n_augmentations or (10 if spec.kind == "crop3d" else 2)
-    params = ModelParams(name, spec.sha256, spec.spec_sha256, spec.licence, n, half_root_m=HALF_M)
-    _check_augmentations(spec, params)
-    return params
+    n = 10 if spec.kind == "crop3d" else 2
+    return ModelParams(name, spec.sha256, spec.spec_sha256, spec.licence, n, half_root_m=HALF_M)
 
 
 class OnnxKeypoints:
@@ -106,7 +104,7 @@ class OnnxKeypoints:
     def __init__(self, params: ModelParams, device: str | None = None, folder: str | Path | None = None) -> None:
         self._model = OnnxModel(folder or find(params.name), device)
         spec = self._model.spec
-        _check_same(spec, params)
+        check_frozen(spec, params.sha256, params.spec_sha256)
         _check_augmentations(spec, params)
         self._spec, self._params = spec, params
         self.model_sha256 = spec.sha256
@@ -122,9 +120,8 @@ class OnnxKeypoints:
     def origin(self) -> str:
         """Where these keypoints come from, for the result."""
         spec = self._spec
-        looks = f"{len(self._augmentations)} augmentations, ONNX on {self.device}" + (
-            f" ({self.note})" if self.note else ""
-        )
+        looks = f"{len(self._augmentations)} augmentations, ONNX on {self.device}"
+        looks += f" ({self.note})" if self.note else ""
         return f"{spec.kind} model {spec.name}, SHA-256 {spec.sha256}, licence: {spec.licence}; {looks}"
 
     def detect(self, image: np.ndarray, roi_px: np.ndarray, camera: Camera, *, quick: bool = False) -> PersonKeypoints:
@@ -223,21 +220,6 @@ def _region(xy: np.ndarray, roi_px: np.ndarray) -> np.ndarray:
     along = xy @ turn.T
     low, high = along.min(axis=0), along.max(axis=0)
     return np.array([*((low + high) / 2 @ turn), _HULL_MARGIN * np.max(high - low), roi_px[3]])
-
-
-def _check_same(spec: ModelSpec, params: ModelParams) -> None:
-    stated, found = (params.sha256, params.spec_sha256), (spec.sha256, spec.spec_sha256)
-    if stated == found:
-        return
-    what = "graph" if stated[0] != found[0] else "model.json"
-    index = 0 if what == "graph" else 1
-    raise PblError(
-        "MODEL_CHECKSUM",
-        found=f"the {what} of the registered model has SHA-256 {found[index]}",
-        expected=f"{stated[index]}, which the method froze",
-        next_step="add the model that the method was made with, or use the method of the model that is registered now",
-        key=params.name,
-    )
 
 
 def _check_augmentations(spec: ModelSpec, params: ModelParams) -> None:

@@ -9,7 +9,6 @@ several.
 from __future__ import annotations
 
 import collections
-import os
 import queue
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -17,6 +16,7 @@ from typing import Protocol
 
 import numpy as np
 
+from pbl_pipeline.settings import n_cores
 from pbl_pipeline.video import Camera, Frame
 
 from .crops import Regions
@@ -29,8 +29,7 @@ _MAX_WORKERS = 8
 
 def n_workers() -> int:
     """Detectors to run side by side: the cores this process may use, at most 8."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, _MAX_WORKERS)
+    return min(n_cores(), _MAX_WORKERS)
 
 
 class Inference(Protocol):

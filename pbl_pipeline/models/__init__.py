@@ -1,7 +1,7 @@
 """Networks: BlazePose (tflite) and any as ONNX: folder with graph and spec, the registry, sessions on CPU or CUDA."""
 
 from ._device import DEVICES, asked_device, available_devices, providers_for
-from ._onnx import OnnxModel
+from ._onnx import OnnxModel, check_frozen
 from ._registry import ModelStatus, add, find, is_registered, registered, remove, verify
 from ._ssd import SsdLayout, SsdModel, box_iou, suppress
 from ._tflite import LiteModel
@@ -21,6 +21,7 @@ __all__ = [
     "asked_device",
     "available_devices",
     "box_iou",
+    "check_frozen",
     "find",
     "is_registered",
     "load_spec",

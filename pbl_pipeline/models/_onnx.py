@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.settings import n_cores
 
 from ._device import asked_device, device_of, providers_for, unavailable
-from .spec import GRAPH_FILE, WITHOUT_POINTS, ModelSpec, load_spec, model_invalid
+from .spec import GRAPH_FILE, SPEC_FILE, WITHOUT_POINTS, ModelSpec, load_spec, model_invalid
 
 _DTYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
@@ -46,7 +46,7 @@ class OnnxModel:
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = _cores()
+        options.intra_op_num_threads = n_cores()
         options.log_severity_level = 4  # what it would print is raised below
         try:
             self._session = onnxruntime.InferenceSession(data, options, providers=providers)
@@ -147,6 +147,23 @@ class OnnxModel:
         return model_invalid(self._path, found, f"{expected}, as its model.json says")
 
 
+def check_frozen(spec: ModelSpec, sha256: str, spec_sha256: str) -> None:
+    """Compare a registered model with the hashes of its graph and `model.json` that a method has.
+
+    Raises `PblError` MODEL_CHECKSUM.
+    """
+    for what, stated, found in (("graph", sha256, spec.sha256), (SPEC_FILE, spec_sha256, spec.spec_sha256)):
+        if stated != found:
+            raise PblError(
+                "MODEL_CHECKSUM",
+                found=f"the {what} of the registered model has SHA-256 {found}",
+                expected=f"SHA-256 {stated}, with which the method was made",
+                next_step="add the model that the method was made with, or use the method of the model that is "
+                "registered now",
+                key=spec.name,
+            )
+
+
 def check_graph_file(folder: str | Path, spec: ModelSpec) -> bytes:
     """The bytes of `model.onnx`. Raises `PblError` MODEL_MISSING, MODEL_CHECKSUM."""
     path = Path(folder) / GRAPH_FILE
@@ -170,10 +187,6 @@ def check_graph_file(folder: str | Path, spec: ModelSpec) -> bytes:
             key=str(path),
         )
     return data
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _first_line(error: Exception) -> str:

@@ -140,12 +140,10 @@ def mean_curves(study: StudyData, angle: str) -> pd.DataFrame:
     return rows[points].groupby(keys, sort=False).mean().mask(unknown)
 
 
-def cycle_values(study: StudyData, to_compare: Plan, measure: str, group: str = "") -> pd.DataFrame:
+def cycle_values(study: StudyData, to_compare: Plan, measure: str) -> pd.DataFrame:
     """`subject, value` of the cycles of one visit per person, in order: that of `change_from`, else the first that
     counts."""
     visits: Any = study.visits[study.visits["included"]]
-    if group:
-        visits = visits[visits["group"] == group]
     order = {r: i for i, r in enumerate([to_compare.change_from, *to_compare.roles])}
     cycles: Any = study.cycles[study.cycles["measure"] == measure]
     rows = cycles.merge(visits.assign(rank=visits["role"].map(order).astype(float))[[*_KEY, "rank"]], on=_KEY)

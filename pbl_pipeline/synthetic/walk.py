@@ -16,6 +16,8 @@ from .curves import MIDDLE_CURVES_DEG, SIDE_CURVES_DEG, swing
 STRIDE_S = 1.10
 #: Way of the pelvis (m) within a stride: up and down, side to side.
 BOB_M, SWAY_M = 0.020, 0.022
+#: Height of the pelvis above the floor (m).
+PELVIS_HEIGHT_M = 0.95
 #: The pelvis' own angles among `MIDDLE_CURVES_DEG`.
 _PELVIS = ("tilt", "list", "rotation")
 #: Turns the body's frame (x forward, y up, z right) into the world's (z up).
@@ -30,7 +32,6 @@ def plain_walk(
     heading_rad: float = np.pi / 2,
     start_m: tuple[float, float] = (6.0, -1.8),
     camera_height_m: float = 1.2,
-    pelvis_height_m: float = 0.95,
 ) -> Float[np.ndarray, "T 40"]:
     """Return joint values (T, 40) of a walk straight ahead along mean curves, each stride like the others.
 
@@ -45,7 +46,7 @@ def plain_walk(
     heading = np.full(len(time_s), float(heading_rad))
     ahead = np.column_stack([np.cos(heading), np.sin(heading)])
     floor = np.asarray(start_m) + speed_m_per_s * time_s[:, None] * ahead
-    height = pelvis_height_m - camera_height_m - BOB_M * np.cos(2 * phase - 0.6)
+    height = PELVIS_HEIGHT_M - camera_height_m - BOB_M * np.cos(2 * phase - 0.6)
     return qpos_of(angles, floor, heading, SWAY_M * np.sin(phase - 0.3), height)
 
 

@@ -7,7 +7,7 @@ from ._params import TrackingParams
 from ._registered import detector_params
 from ._require import FILM_THE_WHOLE_BODY, require_subject
 from ._sheet import contact_sheet, contact_sheet_jpeg, save_contact_sheet
-from ._subject import SubjectParams, time_in_view_s
+from ._subject import SubjectParams, step_s, time_in_view_s
 from ._transfer_choice import carried_choice, same_person
 from .associate import AssociationParams
 from .blazepose import BlazePoseDetector, body_box, circle_roi
@@ -48,6 +48,7 @@ __all__ = [
     "require_subject",
     "same_person",
     "save_contact_sheet",
+    "step_s",
     "tiles",
     "time_in_view_s",
     "track_people",

@@ -143,10 +143,11 @@ def choose_walker(tracking: Tracking, params: SubjectParams, override: int | Non
 
 def time_in_view_s(track: PersonTrack, time_s: np.ndarray) -> float:
     """Seconds in which the person has a box: the number of her frames times the mean frame interval."""
-    return float(np.isfinite(track.box_px[:, 0]).sum()) * _frame_interval(time_s)
+    return float(np.isfinite(track.box_px[:, 0]).sum()) * step_s(time_s)
 
 
-def _frame_interval(time_s: np.ndarray) -> float:
+def step_s(time_s: np.ndarray) -> float:
+    """Return the mean time (s) between frames; 0 for a single one."""
     return float(time_s[-1] - time_s[0]) / (len(time_s) - 1) if len(time_s) > 1 else 0.0
 
 
@@ -155,7 +156,7 @@ def _describe(track: PersonTrack, tracking: Tracking, params: SubjectParams) -> 
     width, height = tracking.image_size_px
     state = np.array([measure(Detection(track.box_px[r], 1.0, track.roi_px[r])) for r in rows])
     time = tracking.time_s[rows]
-    total = _frame_interval(tracking.time_s) * len(tracking.time_s)
+    total = step_s(tracking.time_s) * len(tracking.time_s)
     in_view = time_in_view_s(track, tracking.time_s)
     lean = np.abs(np.nan_to_num(track.roi_px[rows, 3]))
     upright = lean <= params.max_lean_rad
@@ -189,7 +190,7 @@ def _walking(
     size = np.exp(state[:, 2])
     unit = np.median(size)
     # Ten places a second are judged, and the frames around each are as it is.
-    step = max(round(0.1 / _frame_interval(time)), 1) if len(time) > 1 else 1
+    step = max(round(0.1 / step_s(time)), 1) if len(time) > 1 else 1
     walking, towards = np.zeros(len(time), bool), np.zeros(len(time))
     for window in params.walk_windows_s:
         # Near the ends of the track the window moves inwards, so that it keeps its length.

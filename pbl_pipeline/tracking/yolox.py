@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.models import OnnxModel, find, model_invalid
+from pbl_pipeline.models import OnnxModel, check_frozen, find, model_invalid
 
 from .types import Detection
 
@@ -104,16 +104,5 @@ def yolox(params: TrackingParams) -> YoloxDetector:
     `YoloxDetector` raises.
     """
     model = OnnxModel(find(params.model))
-    for what, stated, found in (
-        ("graph", params.model_sha256, model.spec.sha256),
-        ("model.json", params.spec_sha256, model.spec.spec_sha256),
-    ):
-        if stated != found:
-            raise PblError(
-                "MODEL_CHECKSUM",
-                found=f"the {what} of the registered model has SHA-256 {found}",
-                expected=f"SHA-256 {stated}, as the tracking method says",
-                next_step="add the model that the method was made with, or use the method of the one registered now",
-                key=params.model,
-            )
+    check_frozen(model.spec, params.model_sha256, params.spec_sha256)
     return YoloxDetector(model, params.min_score)
