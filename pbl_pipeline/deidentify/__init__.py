@@ -1,9 +1,9 @@
 """Videos without faces: heads found, held over gaps and covered (docs/privacy.md)."""
 
-from ._faces import FaceDetector
-from ._find import find_heads
-from ._paint import cover, outline
-from ._params import HeadParams
+from .cover_heads import cover, outline
+from .faces import FaceDetector
+from .heads_of_video import find_heads
+from .params import HeadParams
 from .types import REASONS, SOURCES, Head, Heads, ranges
 from .video_copy import (
     HOW,

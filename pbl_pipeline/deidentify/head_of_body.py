@@ -7,7 +7,7 @@ import numpy as np
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.tracking import PersonTrack
 
-from ._params import HeadParams
+from .params import HeadParams
 from .types import BODY, DISAGREE, KEYPOINTS, NONE, Head
 
 #: Points that make the face in the marker set `blazepose_33`.

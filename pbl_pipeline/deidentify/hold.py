@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from ._params import HeadParams
+from .params import HeadParams
 from .types import FACE, HELD, KEYPOINTS, NONE, Head
 
 

@@ -21,9 +21,9 @@ from pbl_pipeline.render import draw_skeleton
 from pbl_pipeline.settings import DEIDENTIFY, deidentify_how
 from pbl_pipeline.video import VideoInfo, probe, read_frames, read_metadata, sha256_of, write_h264
 
-from ._find import find_heads
-from ._paint import cover
-from ._params import HeadParams
+from .cover_heads import cover
+from .heads_of_video import find_heads
+from .params import HeadParams
 from .types import REASONS, Heads, ranges
 
 HOW = DEIDENTIFY

@@ -197,7 +197,7 @@ class GaussNewtonParams:
     huber_phone_deg: float = 0.5
     #: Standard deviation (s) of the offset between the phone's clock and the video's.
     clock_sd_s: float = 0.2
-    #: Feet on the floor (`terms/feet.py`): height over it, and way of a sole that stands, per cm^2. 0: none.
+    #: Feet on the floor (`feet_terms.py`): height over it, and way of a sole that stands, per cm^2. 0: none.
     weight_floor: float = 0.0
     weight_slide: float = 0.0
     huber_floor_cm: float = 2.0

@@ -1,14 +1,9 @@
 """Keypoints of the tracked person from any detector, views of several cameras, markers of a laboratory."""
 
-from ._confidence import (
-    BOUND_TRUNK,
-    ConfidenceCurve,
-    confidence_curve,
-    confidence_curves,
-    confidence_text,
-    probability_within,
-)
-from ._in_view import (
+from .blazepose import BlazePoseLandmarks
+from .crop_geometry import view_rotation
+from .detect import detect_keypoints
+from .in_view import (
     SEEN_SHARE,
     Gap,
     Visibility,
@@ -18,22 +13,27 @@ from ._in_view import (
     visibility,
     whole_person_in_view,
 )
-from ._multi_view import SAME_TIME_S, MultiView, cameras_of_files, check_same_times
-from ._quality import check_keypoints, side_changes
-from ._view_agreement import MOST_MISS_M, check_views_agree, ray_miss_m
-from ._world_markers import WorldMarkers
-from .blazepose import BlazePoseLandmarks
-from .detect import detect_keypoints
 from .marker_augmenter import AnatomicalMarkers, AugmenterParams, MarkerAugmenter
 from .methods import METHODS
+from .multi_view import SAME_TIME_S, MultiView, cameras_of_files, check_same_times
 from .onnx_keypoints import ModelKeypointParams, ModelParams, OnnxKeypoints
 from .params import KeypointParams
 from .phone_clock import log_shift_s
 from .picture import Picture, PictureMeter
 from .protocol import KeypointDetector
+from .quality_checks import check_keypoints, side_changes
+from .stated_confidence import (
+    BOUND_TRUNK,
+    ConfidenceCurve,
+    confidence_curve,
+    confidence_curves,
+    confidence_text,
+    probability_within,
+)
 from .trc import read_trc
 from .types import Keypoints, PersonKeypoints
-from .view import view_rotation
+from .view_agreement import MOST_MISS_M, check_views_agree, ray_miss_m
+from .world_markers import WorldMarkers
 
 __all__ = [
     "BOUND_TRUNK",

@@ -20,7 +20,6 @@ from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.tracking import Tracking, time_in_view_s
 from pbl_pipeline.video import Camera, Frame, read_frames
 
-from ._confidence import confidence_curve
 from .batched import BatchDetector, BatchedInference
 from .crops import Regions, smooth_rois
 from .flips import exchange_sides, exchanged, lowered
@@ -29,6 +28,7 @@ from .params import KeypointParams
 from .passes import ParallelInference, n_workers, two_passes
 from .picture import Picture, PictureMeter
 from .protocol import KeypointDetector, Look, MirrorDetector
+from .stated_confidence import confidence_curve
 from .types import Keypoints, PersonKeypoints
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from pbl_pipeline.video import Camera
 
-from .mirror_looks import MirrorLooks
+from .mirrored_inference import MirrorLooks
 from .types import PersonKeypoints
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from pbl_pipeline.video import Camera, viewing_ray
 
-from .view import view_rotation
+from .crop_geometry import view_rotation
 
 #: From this many picture pixels per crop pixel on, the picture is averaged before it is sampled.
 _SHRINK_FROM = 1.5

@@ -1,11 +1,11 @@
 """Networks: BlazePose (tflite) and any as ONNX: folder with graph and spec, the registry, sessions on CPU or CUDA."""
 
-from ._device import DEVICES, asked_device, available_devices, providers_for
-from ._onnx import OnnxModel, check_frozen
-from ._registry import ModelStatus, add, find, is_registered, registered, remove, verify
-from ._ssd import SsdLayout, SsdModel, box_iou, suppress
-from ._tflite import LiteModel
+from .devices import DEVICES, asked_device, available_devices, providers_for
+from .onnx_model import OnnxModel, check_frozen
+from .registry import ModelStatus, add, find, is_registered, registered, remove, verify
 from .spec import KINDS, ModelInput, ModelSpec, load_spec, mirror_pairs, model_invalid, parse_spec
+from .ssd import SsdLayout, SsdModel, box_iou, suppress
+from .tflite import LiteModel
 
 __all__ = [
     "DEVICES",

@@ -12,7 +12,7 @@ import pandas as pd
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import is_plain
 
-from ._columns import FRAMES, KEYS, SIDES, Column
+from .frame_columns import FRAMES, KEYS, SIDES, Column
 
 #: Roles before the event of a study: no other visit of the person may be earlier.
 FIRST_ROLES = ("baseline", "pre")

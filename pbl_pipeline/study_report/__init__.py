@@ -1,10 +1,10 @@
 """The report of a study: statistics, figures, tables, one page (docs/study.md)."""
 
-from ._figures import Figure
-from ._page import study_figures, write_study_report
-from ._results import CurveResult, StudyResults, study_results
-from ._tables import PageTable, all_tables
-from ._values import Plan, mean_curves, pairs, plan, visit_table
+from .figures import Figure
+from .page import study_figures, write_study_report
+from .page_tables import PageTable, all_tables
+from .results import CurveResult, StudyResults, study_results
+from .visit_values import Plan, mean_curves, pairs, plan, visit_table
 
 __all__ = [
     "CurveResult",

@@ -15,7 +15,7 @@ import numpy as np
 from pbl_pipeline import assets
 from pbl_pipeline.models import SsdLayout, SsdModel
 
-from ._params import MODEL_SHA256, TrackingParams
+from .params import MODEL_SHA256, TrackingParams
 from .types import Detection
 
 LAYOUT = SsdLayout(input_size=224, layers=((8, 2), (16, 2), (32, 6)), n_keypoints=4)

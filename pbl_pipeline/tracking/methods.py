@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pbl_pipeline.methods import Stage
 
-from ._params import TrackingParams
-from ._registered import RegisteredDetectors
-from ._subject import SubjectParams, choose_walker
 from .blazepose import blazepose
+from .params import TrackingParams
+from .registered_detectors import RegisteredDetectors
+from .walker_score import SubjectParams, choose_walker
 from .yolox import yolox
 
 #: A family is a person detector: a function from `TrackingParams` to a `PersonDetector`.

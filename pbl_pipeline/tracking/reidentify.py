@@ -12,9 +12,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ._appearance import appearance_similarity, mean_appearance
-from ._local_motion import line_near
+from .appearance import appearance_similarity, mean_appearance
 from .associate import Trail
+from .local_motion import line_near
 
 
 @dataclasses.dataclass(frozen=True)

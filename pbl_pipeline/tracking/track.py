@@ -17,14 +17,14 @@ from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.prefetch import prefetched
 from pbl_pipeline.video import VideoInfo, probe, read_frames
 
-from ._appearance import appearance_of
-from ._backtrack import backtrack
-from ._detection_schedule import Watch, window_around
-from ._params import TrackingParams
+from .appearance import appearance_of
 from .associate import Associator, Trail, measure
+from .backtracking import backtrack
 from .blazepose import body_box
+from .detection_schedule import Watch, window_around
 from .identity_swaps import undo_swaps
 from .methods import METHODS
+from .params import TrackingParams
 from .reidentify import join_trails
 from .tiling import detect_in
 from .types import Detection, PersonDetector, PersonTrack, Tracking

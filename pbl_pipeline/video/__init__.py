@@ -1,12 +1,18 @@
 """Video files: probe, frames in order with their own time stamps, intrinsics, pose and orientation of the camera."""
 
-from ._board import Board
-from ._camera_pose import CameraPose, load_camera_poses
-from ._cut import cut_image
-from ._draw_calibration import draw_calibration
-from ._find_camera import find_camera
-from ._load_attitude import attitude_of, load_attitude
-from ._phone_lens import (
+from .attitude import Attitude, camera_in_device, check_attitude
+from .attitude_of_video import attitude_of, load_attitude
+from .boards import Board
+from .calibrate import Calibration, calibrate_video
+from .calibration_picture import draw_calibration
+from .camera import check_lens, guess_camera, load_camera, scaled_matrix, undistort_px, viewing_ray
+from .camera_pose import CameraPose, load_camera_poses
+from .camera_source import find_camera
+from .cut_region import cut_image
+from .file_facts import packet_times, probe, read_first, read_metadata, sha256_of
+from .frames import read_frames
+from .h264 import write_h264
+from .lens_calibration import (
     LensCalibration,
     PhoneLens,
     about_phone,
@@ -15,15 +21,9 @@ from ._phone_lens import (
     phone_lens,
     turned_camera,
 )
-from ._phone_log import SENSORS, VIDEO_CLOCK, PhoneLog, Sensor
-from ._probe import packet_times, probe, read_first, read_metadata, sha256_of
-from ._read import read_frames
-from ._read_phone_log import read_phone_log
-from ._timing import check_timing
-from ._write import write_h264
-from .attitude import Attitude, camera_in_device, check_attitude
-from .calibrate import Calibration, calibrate_video
-from .camera import check_lens, guess_camera, load_camera, scaled_matrix, undistort_px, viewing_ray
+from .phone_log import SENSORS, VIDEO_CLOCK, PhoneLog, Sensor
+from .phone_log_reader import read_phone_log
+from .timing import check_timing
 from .types import CAMERA_KINDS, Camera, FirstPicture, Frame, VideoInfo
 
 __all__ = [

@@ -20,10 +20,10 @@ import numpy as np
 from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
 
-from ._board import Board
-from ._probe import probe
-from ._read import read_frames
+from .boards import Board
 from .camera import reaches_corners
+from .file_facts import probe
+from .frames import read_frames
 from .types import Camera, VideoInfo
 
 #: One candidate, the sharpest frame, is taken from each of at most so many equal parts of the video, none shorter (s).

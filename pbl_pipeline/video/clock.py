@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from pbl_pipeline.errors import PblError
 
-from ._phone_log import UTC_CLOCK, VIDEO_CLOCK, PhoneLog
-from ._picture_motion import picture_motion
+from .frame_motion import picture_motion
+from .phone_log import UTC_CLOCK, VIDEO_CLOCK, PhoneLog
 from .types import VideoInfo
 
 #: How far the stated time of recording may be off (s): rounded to seconds, and a recording takes time to start.

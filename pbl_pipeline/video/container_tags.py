@@ -12,7 +12,7 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-from ._structure import family, top_boxes
+from .container_structure import family, top_boxes
 
 #: An index larger than this is not read: hours of video have some MB.
 _LARGEST_MOOV = 64 << 20

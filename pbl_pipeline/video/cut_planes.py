@@ -12,7 +12,7 @@ import av
 import cv2
 import numpy as np
 
-from ._cut import coarser, cut_samples, square
+from .cut_region import coarser, cut_samples, square
 from .orientation import Orientation
 
 #: Pixel formats of phones and cameras with one plane each of brightness, blue and red difference: picture pixels per

@@ -21,7 +21,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.memory import return_large_blocks
 from pbl_pipeline.settings import n_cores
 
-from ._structure import family, missing_end
+from .container_structure import family, missing_end
 
 #: Containers that phones, cameras and converters write. Pictures, texts and playlists (which could name other files)
 #: are not videos even where FFmpeg would open them.

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ._cut import cut_image
+from .cut_region import cut_image
 
 
 @dataclasses.dataclass(frozen=True)

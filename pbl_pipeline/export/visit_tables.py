@@ -1,0 +1,306 @@
+"""The long and wide tables of a visit: angles, events, cycles, curves, measures. Units are in the names of columns, or
+stand in a column `unit` beside the values."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Sequence
+
+import numpy as np
+
+from pbl_pipeline.body import SLIDES, angle_of
+from pbl_pipeline.fit.angles_file import angles_table
+from pbl_pipeline.gait import ANGLE_NAMES, MEASURES, GaitCycle, GaitMetrics, Gdi, Spatiotemporal, TrialMetrics
+from pbl_pipeline.gait import cycle_measures as measures_of
+from pbl_pipeline.words import unit_of
+
+from .columns import Column, Labels, Table, joined
+from .trial import ExportTrial
+
+#: The direction in which a joint value grows, by the joint's name without its side.
+JOINT_SIGNS: dict[str, str] = {
+    "pelvis_tilt": "about the ground's z: the front rises",
+    "pelvis_list": "about x, after the tilt: the right side sinks",
+    "pelvis_rotation": "about y, after tilt and list: turned to the left",
+    "pelvis_tx": "along the ground's x, from the body's place in the MJCF",
+    "pelvis_ty": "up, from the body's place in the MJCF",
+    "pelvis_tz": "along the ground's z, from the body's place in the MJCF",
+    "hip_flexion": "flexion",
+    "hip_adduction": "adduction",
+    "hip_rotation": "internal rotation",
+    "knee_angle": "extension: flexion is negative, as in OpenSim",
+    "knee_flexion": "flexion: knee_angle with the sign turned",
+    "ankle_angle": "dorsiflexion",
+    "subtalar_angle": "inversion",
+    "mtp_angle": "extension of the toes",
+    "lumbar_extension": "extension: backwards",
+    "lumbar_bending": "bending to the right",
+    "lumbar_rotation": "turned to the left",
+    "neck_extension": "extension: backwards",
+    "neck_bending": "bending to the right",
+    "neck_rotation": "turned to the left",
+    "arm_flex": "flexion",
+    "arm_add": "adduction",
+    "arm_rot": "internal rotation",
+    "elbow_flex": "flexion",
+    "pro_sup": "pronation",
+    "wrist_flex": "flexion",
+    "wrist_dev": "ulnar deviation",
+}
+_SIDES = {"r": "right", "l": "left"}
+_STATISTICS = {
+    "mean": "mean over both sides",
+    "left": "mean of the left side",
+    "right": "mean of the right side",
+    "sd": "standard deviation over both sides (n - 1)",
+    "n": "number of values",
+    "variability": "standard deviation within a side",
+    "cv_percent": "variability in percent of the mean",
+    "asymmetry_percent": "100 (right - left) / mean of both",
+}
+_TRIAL = "name of the trial"
+
+
+def session_tables(trials: Sequence[ExportTrial], metrics: GaitMetrics | None) -> list[Table]:
+    """All tables of a visit. Those of gait are there where its trials were measured."""
+    wide = [_angles_wide(t) for t in trials]
+    made = [joined(wide), joined([_angles_long(w, t) for w, t in zip(wide, trials, strict=True)])]
+    measured = [(t.name, t.measured) for t in trials if t.measured is not None]
+    if measured:
+        made.append(joined([_events(name, m) for name, m in measured]))
+        cycles = [(name, c, _gdi_of(m.gdi, c)) for name, m in measured for c in m.cycles]
+        pooled = {name for name, m in measured if m.pooled}
+        made += [_cycles_wide(cycles, pooled), _cycles_long(cycles), _curves_wide(cycles), _curves_long(cycles)]
+        parts = [("trial", name, m.spatiotemporal, m.gdi) for name, m in measured]
+        if metrics is not None:
+            parts = [("session", "", metrics.spatiotemporal, metrics.gdi), *parts]
+        made += [_measures_wide(parts), _measures_long(parts)]
+    return made
+
+
+# --------------------------------------------------------------------------------------------------------------- angles
+def _angles_wide(trial: ExportTrial) -> Table:
+    frame = angles_table(trial.fit)
+    columns = _time(trial)
+    for joint, values in zip(frame.columns[1:], frame.to_numpy().T[1:] + 0.0, strict=True):
+        unit, text = ("m" if joint in SLIDES else "deg"), JOINT_SIGNS.get(_sided(joint)[0], "")
+        columns.append(Column(f"{joint}_{unit}", values, unit, f"positive: {text}"))
+    return Table("angles_wide", tuple(columns))
+
+
+def _angles_long(wide: Table, trial: ExportTrial) -> Table:
+    """The frames with a pose, one joint after the other."""
+    fit, seen = trial.fit, np.flatnonzero(trial.known)
+    joints = [(c, c.name.removesuffix(f"_{c.unit}")) for c in wide.columns if c.unit in ("deg", "m")]
+    n, j = len(seen), len(joints)
+    column = {angle: i for i, f in enumerate(fit.joint_names) for angle in (f, angle_of(f)[0])}
+    sd = np.asarray(fit.qpos_sd, float)[seen][:, [column[name] for _, name in joints]]
+    sd = sd * [1.0 if name in SLIDES else 180.0 / np.pi for _, name in joints]
+    base, sides = zip(*(_sided(name) for _, name in joints), strict=True)
+    columns = [
+        Column("trial", Labels.constant(trial.name, n * j), "", _TRIAL),
+        Column("frame", np.tile(seen, j), "", "number of the frame, from 0; those without a pose are left out"),
+        Column("time_s", np.tile(np.asarray(fit.time_s, float)[seen], j), "s", "from the first frame of the video"),
+        Column("angle", _repeated(base, n), "", "OpenSim's name without the side; signs: see angles_wide"),
+        Column("side", _repeated(sides, n), "", "left, right, or empty"),
+        Column("value", np.concatenate([np.asarray(c.values)[seen] for c, _ in joints]), "column unit", "joint value"),
+        Column("sd", sd.T.ravel(), "column unit", "its standard deviation, where the fit knows it"),
+        Column("unit", _repeated([c.unit for c, _ in joints], n), "", "deg or m"),
+    ]
+    return Table("angles_long", tuple(columns))
+
+
+def _time(trial: ExportTrial) -> list[Column]:
+    n = len(trial.fit.time_s)
+    return [
+        Column("trial", Labels.constant(trial.name, n), "", _TRIAL),
+        Column("frame", np.arange(n), "", "number of the frame, from 0"),
+        Column("time_s", np.asarray(trial.fit.time_s, float), "s", "from the first frame of the video"),
+    ]
+
+
+def _sided(joint: str) -> tuple[str, str]:
+    """ "hip_flexion_r" -> ("hip_flexion", "right"); joints without a side -> (name, "")."""
+    base, _, end = joint.rpartition("_")
+    return (base, _SIDES[end]) if end in _SIDES else (joint, "")
+
+
+def _repeated(texts: Sequence[str], n: int) -> Labels:
+    """Each text n times."""
+    one = Labels.of(texts)
+    return Labels(np.repeat(one.codes, n), one.texts)
+
+
+# ----------------------------------------------------------------------------------------------------- events, cycles
+def _events(name: str, measured: TrialMetrics) -> Table:
+    found = measured.events.events
+    columns = [
+        Column("trial", Labels.constant(name, len(found)), "", _TRIAL),
+        Column("time_s", _floats(e.time_s for e in found), "s", "from the first frame of the video"),
+        Column("side", Labels.of([e.side for e in found]), "", "left or right"),
+        Column("event", Labels.of([e.event for e in found]), "", "foot_down: initial contact; foot_up: toe-off"),
+        Column("probability", _floats(e.probability for e in found), "", "that it is real, 0 to 1 (docs/events.md)"),
+        Column("bout", _integers(e.bout for e in found), "", "number of the walking bout, from 0"),
+    ]
+    return Table("events", tuple(columns))
+
+
+_Cycle = tuple[str, GaitCycle, float]
+_CYCLE_TIMES = {
+    "start_s": "initial contact",
+    "opposite_foot_up_s": "toe-off of the other foot",
+    "opposite_foot_down_s": "initial contact of the other foot",
+    "foot_up_s": "toe-off",
+    "end_s": "next initial contact",
+}
+
+
+def _gdi_of(gdi: Gdi, cycle: GaitCycle) -> float:
+    return next((c.gdi for c in gdi.cycles if c.number == cycle.number and c.side == cycle.side), np.nan)
+
+
+def _cycle_keys(cycles: Sequence[_Cycle], each: int = 1) -> list[Column]:
+    return [
+        Column("trial", _repeated([n for n, _, _ in cycles], each), "", _TRIAL),
+        Column(
+            "cycle", np.repeat(np.array([c.number for _, c, _ in cycles], np.int64), each), "", "number in its trial"
+        ),
+        Column("side", _repeated([c.side for _, c, _ in cycles], each), "", "left or right"),
+        Column("used", np.repeat([c.used for _, c, _ in cycles], each).astype(bool), "", "part of the measures"),
+    ]
+
+
+def _cycles_wide(cycles: Sequence[_Cycle], pooled: Collection[str]) -> Table:
+    """`pooled`: names of the trials that the measures of the visit are made of."""
+    values = [measures_of(c) for _, c, _ in cycles]
+    columns = _cycle_keys(cycles)
+    columns.append(Column("bout", _integers(c.bout for _, c, _ in cycles), "", "walking bout, from 0"))
+    columns += [
+        Column(name, _floats(getattr(c, name) for _, c, _ in cycles), "s", f"{text}, from the first frame of the video")
+        for name, text in _CYCLE_TIMES.items()
+    ]
+    for name in (m for m in MEASURES if m != "step_time_s"):
+        column = _floats(v.get(name, np.nan) for v in values)
+        columns.append(Column(name, column, unit_of(name), "of this cycle (docs/measures.md)"))
+    columns += [
+        Column("gdi", _floats(g for _, _, g in cycles), "", "Gait Deviation Index of the cycle"),
+        Column("pooled", np.array([n in pooled for n, _, _ in cycles], bool), "", "whether the visit pools its trial"),
+        Column("far_leg", Labels.of([c.far_leg for _, c, _ in cycles]), "", "leg that the other hid from the camera"),
+        Column("excluded", Labels.of([c.excluded for _, c, _ in cycles]), "", "why it is no part of the measures"),
+    ]
+    return Table("cycles_wide", tuple(columns))
+
+
+def _cycles_long(cycles: Sequence[_Cycle]) -> Table:
+    found = [(n, c, m, v) for n, c, g in cycles for m, v in (measures_of(c) | {"gdi": g}).items() if np.isfinite(v)]
+    columns = _cycle_keys([(n, c, np.nan) for n, c, _, _ in found])
+    columns += [
+        Column("measure", Labels.of([m for _, _, m, _ in found]), "", "docs/measures.md"),
+        Column("value", _floats(v for _, _, _, v in found), "column unit", "of this cycle"),
+        Column("unit", Labels.of([unit_of(m) for _, _, m, _ in found]), "", "empty: none"),
+    ]
+    return Table("cycles_long", tuple(columns))
+
+
+def _curves_wide(cycles: Sequence[_Cycle]) -> Table:
+    own = [row for row in cycles if row[1].curves]
+    n = len(next(iter(own[0][1].curves.values()))) if own else 0
+    columns = [*_cycle_keys(own, n), Column("percent", np.tile(_percent(n), len(own)), "%", "of the cycle's time")]
+    for angle, text in ANGLE_NAMES.items():
+        values = [c.curves.get(angle, np.full(n, np.nan)) for _, c, _ in own]
+        columns.append(Column(f"{angle}_deg", np.concatenate([*values, np.zeros(0)]), "deg", _positive(text)))
+    return Table("curves_wide", tuple(columns))
+
+
+def _curves_long(cycles: Sequence[_Cycle]) -> Table:
+    own = [(name, c, angle) for name, c, _ in cycles for angle in ANGLE_NAMES if angle in c.curves]
+    n = len(own[0][1].curves[own[0][2]]) if own else 0
+    sd = [c.curves_sd.get(angle, np.full(n, np.nan)) for _, c, angle in own]
+    columns = [
+        *_cycle_keys([(name, c, np.nan) for name, c, _ in own], n),
+        Column("angle", _repeated([a for _, _, a in own], n), "", "signs: see curves_wide"),
+        Column("percent", np.tile(_percent(n), len(own)), "%", "of the cycle's time"),
+        Column("value_deg", np.concatenate([*(c.curves[a] for _, c, a in own), np.zeros(0)]), "deg", "angle"),
+        Column("sd_deg", np.concatenate([*sd, np.zeros(0)]), "deg", "its standard deviation, where it is known"),
+    ]
+    return Table("curves_long", tuple(columns))
+
+
+def _percent(n: int) -> np.ndarray:
+    return np.linspace(0.0, 100.0, n)
+
+
+def _positive(text: str) -> str:
+    return text.removeprefix("deg, ")
+
+
+# ------------------------------------------------------------------------------------------------------------ measures
+_Part = tuple[str, str, Spatiotemporal, Gdi]
+
+
+def _values(part: _Part) -> Iterator[tuple[str, str, float, str]]:
+    """Measure, statistic, value and, where there is none, the reason."""
+    _, _, spatiotemporal, gdi = part
+    for name in MEASURES:
+        measure = spatiotemporal[name]
+        if measure is None:
+            yield name, "mean", np.nan, spatiotemporal.reasons.get(name, "")
+            continue
+        for statistic in _STATISTICS:
+            if (value := getattr(measure, statistic)) is not None:
+                yield name, statistic, float(value), ""
+    for statistic in ("mean", "left", "right", "sd", "minimal_change", "n"):
+        value = getattr(gdi, statistic)
+        if value is not None:
+            yield "gdi", statistic, float(value), ""
+        elif statistic == "mean":
+            yield "gdi", statistic, np.nan, gdi.reason
+    if gdi.profile is not None:
+        for side in _SIDES.values():
+            yield from (("gvs_" + a + "_deg", side, float(v), "") for a, v in gdi.profile.of_side(side).items())
+        scores = (("left", gdi.profile.gps_left), ("right", gdi.profile.gps_right), ("mean", gdi.profile.gps))
+        yield from (("gps_deg", statistic, float(v), "") for statistic, v in scores if v is not None)
+
+
+def _measures_long(parts: Sequence[_Part]) -> Table:
+    found = [(part[0], part[1], *row) for part in parts for row in _values(part)]
+    columns = [
+        *_scope([(scope, trial) for scope, trial, *_ in found]),
+        Column("measure", Labels.of([r[2] for r in found]), "", "docs/measures.md; gvs: score of one angle"),
+        Column("statistic", Labels.of([r[3] for r in found]), "", "mean, left, right, sd, n, ... (docs/measures.md)"),
+        Column("value", _floats(r[4] for r in found), "column unit", "missing where it cannot be trusted"),
+        Column("unit", Labels.of([_unit(r[2], r[3]) for r in found]), "", "empty: none"),
+        Column("reason", Labels.of([r[5] for r in found]), "", "why there is no value"),
+    ]
+    return Table("measures_long", tuple(columns))
+
+
+def _measures_wide(parts: Sequence[_Part]) -> Table:
+    rows = [{(m, s): v for m, s, v, _ in _values(part)} for part in parts]
+    wanted = [(m, s) for m in MEASURES for s in ("mean", "left", "right", "sd", "n")]
+    wanted += [("gdi", s) for s in ("mean", "left", "right", "sd", "minimal_change", "n")]
+    wanted += [("gps_deg", s) for s in ("mean", "left", "right")]
+    columns = _scope([(scope, trial) for scope, trial, *_ in parts])
+    for measure, statistic in wanted:
+        values = _floats(row.get((measure, statistic), np.nan) for row in rows)
+        text = _STATISTICS.get(statistic, statistic.replace("_", " "))
+        columns.append(Column(f"{measure}_{statistic}", values, _unit(measure, statistic), text))
+    return Table("measures_wide", tuple(columns))
+
+
+def _scope(keys: Sequence[tuple[str, str]]) -> list[Column]:
+    return [
+        Column("scope", Labels.of([s for s, _ in keys]), "", "session: all trials together; trial: one"),
+        Column("trial", Labels.of([t for _, t in keys]), "", f"{_TRIAL}, empty for the session"),
+    ]
+
+
+def _unit(measure: str, statistic: str) -> str:
+    return {"n": "", "cv_percent": "%", "asymmetry_percent": "%"}.get(statistic, unit_of(measure))
+
+
+def _integers(values: Iterable[int]) -> np.ndarray:
+    return np.array(list(values), np.int64)
+
+
+def _floats(values: Iterable[float | None]) -> np.ndarray:
+    return np.array([np.nan if v is None else v for v in values], float)

@@ -1,0 +1,293 @@
+"""Writes a visit in the formats of other programs: all that can be wrong is found before the first file."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pbl_pipeline.body import load_body
+from pbl_pipeline.code_version import code_version
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.extras import needed
+from pbl_pipeline.files import check_out_folder
+from pbl_pipeline.gait import GaitMetrics, TrialMetrics
+from pbl_pipeline.names import check_label
+from pbl_pipeline.qc import Check, failed
+from pbl_pipeline.visit import Visit
+
+from .c3d import check_frames, write_c3d
+from .columns import Table, dictionary, write_csv, write_parquet
+from .keypoints_csv import write_keypoints_csv
+from .mot import write_mot
+from .osim import write_osim
+from .provenance import origin_of, summary
+from .trc import write_trc
+from .trial import ExportTrial, wanted_markers, with_body_points
+from .visit_tables import session_tables
+
+#: What can be exported, and what of it one trial is: the ending of its file, "" for the tables of the visit.
+FORMATS: Mapping[str, str] = {
+    "trc": ".trc",
+    "mot": ".mot",
+    "osim": ".osim",
+    "c3d": ".c3d",
+    "dlc": ".dlc.csv",
+    "csv": "",
+    "parquet": "",
+}
+#: Formats that need events, cycles and measures.
+GAIT_FORMATS = frozenset({"c3d", "csv", "parquet"})
+#: Formats whose readers take ASCII in names only, and not in every system's paths.
+_ASCII = ("trc", "mot", "osim", "c3d")
+#: What OpenSim refuses in the name of a component.
+_NOT_IN_OPENSIM = frozenset(" \t/\\*+")
+_LONGEST_NAME = 64
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportOptions:
+    """How to export.
+
+    name: written into headers (C3D's subject, titles); empty: nothing that identifies a person. number_trials: call the
+    trials trial_1, trial_2, ... in place of their recordings' names. body_points: three further markers on every body
+    in `.trc` and `.osim`. allow_failed: also a fit with a check that failed. overwrite: into a folder with files.
+    """
+
+    name: str = ""
+    number_trials: bool = False
+    body_points: bool = True
+    allow_failed: bool = False
+    overwrite: bool = False
+
+
+def check_export(formats: Sequence[str], out: Path, options: ExportOptions) -> None:
+    """What can be wrong before anything is read: unknown formats, missing packages, the folder, the name.
+
+    Raises `PblError` USAGE, PACKAGE_MISSING, FILE_UNWRITABLE.
+    """
+    if unknown := [f for f in formats if f not in FORMATS] or ([] if formats else ["nothing"]):
+        raise PblError(
+            "USAGE",
+            found=f"--to {', '.join(unknown)}",
+            expected=f"one or several of {', '.join(FORMATS)}",
+            next_step="pass --to once for each format",
+        )
+    check_label("--name", options.name, _LONGEST_NAME)
+    if not options.name.isascii():
+        raise PblError(
+            "USAGE",
+            found=f"--name {options.name!r}",
+            expected="letters of ASCII: the headers of TRC, MOT and C3D hold no others",
+            next_step="spell the name without accents, or use a code",
+        )
+    if "c3d" in formats:
+        needed("ezc3d", "export", "writing C3D files")
+    if "parquet" in formats:
+        needed("pyarrow", "export", "writing Parquet files")
+    check_out_folder(out)
+    if not options.overwrite and out.is_dir() and any(out.iterdir()):
+        raise PblError(
+            "FILE_UNWRITABLE",
+            found="a folder that has files in it",
+            expected="a new or empty folder",
+            next_step="pass another --out, or --overwrite to replace the files of an earlier export",
+            key=str(out),
+        )
+
+
+def write_export(visit: Visit, formats: Sequence[str], out: Path, options: ExportOptions | None = None) -> list[Path]:
+    """Write the fitted recordings of a visit and return the paths, `export.json` last.
+
+    `<recording>/<recording>.trc` and so on for each, the tables with their data dictionary and `export.json` above.
+
+    Raises
+    ------
+    PblError
+        USAGE, PACKAGE_MISSING, FILE_UNWRITABLE (`check_export`); EXPORT_INPUT: a fit that failed, without one pose, of
+        another body, measures whose events or cycles are missing, or names that a format cannot hold;
+        MARKER_SET_UNKNOWN: the body lacks the fit's markers. Nothing is written then.
+    """
+    options = options or ExportOptions()
+    formats = [f for f in FORMATS if f in formats] + [f for f in formats if f not in FORMATS]
+    check_export(formats, out, options)
+    trials = tuple(ExportTrial.of(r, visit) for r in visit.fitted)
+    if options.number_trials:
+        trials = tuple(dataclasses.replace(t, name=f"trial_{i}") for i, t in enumerate(trials, 1))
+    _check_visit(trials, visit.fit_checks, formats, options)
+    body, paths, about = load_body(), [], {}
+    for trial in trials:
+        origin = origin_of(trial, body)
+        if bad := failed(visit.fit_checks):
+            origin["failed_checks"] = ", ".join(bad)
+        about[trial.name] = {**origin, **summary(trial)}
+        folder = out / trial.name
+        for ending, write in _writers(trial, formats, origin, options).items():
+            folder.mkdir(parents=True, exist_ok=True)
+            paths.append(_written(folder / f"{trial.name}{ending}", write))
+    out.mkdir(parents=True, exist_ok=True)
+    paths += _write_tables(trials, visit.measures, formats, out, _common(about))
+    content = {
+        "software": f"pbl-pipeline {code_version()}",
+        "exported": datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
+        "formats": list(formats),
+        "axes_and_units": "docs/export.md",
+        "trials": about,
+        "files": sorted(p.relative_to(out).as_posix() for p in paths),
+    }
+    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+    return [*paths, _written(out / "export.json", lambda path: path.write_text(text, encoding="utf-8"))]
+
+
+def _writers(
+    trial: ExportTrial, formats: Sequence[str], origin: Mapping[str, str], options: ExportOptions
+) -> dict[str, Callable[[Path], object]]:
+    """Ending of a file to what writes it, of one trial."""
+    name = options.name
+    full = with_body_points(trial) if options.body_points and {"trc", "osim"} & set(formats) else trial
+    every: dict[str, Callable[[Path], object]] = {
+        "trc": lambda path: write_trc(full, path, name or "markers"),
+        "mot": lambda path: write_mot(trial, path, origin, name or "coordinates"),
+        "osim": lambda path: write_osim(full, path, origin, name or "pbl_body"),
+        "c3d": lambda path: write_c3d(trial, path, origin, name),
+        "dlc": lambda path: write_keypoints_csv(trial, path),
+    }
+    return {FORMATS[f]: every[f] for f in formats if f in every}
+
+
+def _write_tables(
+    trials: Sequence[ExportTrial],
+    measures: GaitMetrics | None,
+    formats: Sequence[str],
+    out: Path,
+    about: Mapping[str, str],
+) -> list[Path]:
+    if not {"csv", "parquet"} & set(formats):
+        return []
+    tables, paths = session_tables(trials, measures), []
+
+    def parquet(table: Table) -> Callable[[Path], object]:
+        return lambda path: write_parquet(table, path, about)
+
+    def csv(table: Table) -> Callable[[Path], object]:
+        return lambda path: write_csv(table, path)
+
+    for table in tables:
+        paths += [_written(out / f"{table.name}.csv", csv(table))] if "csv" in formats else []
+        paths += [_written(out / f"{table.name}.parquet", parquet(table))] if "parquet" in formats else []
+    return [*paths, _written(out / "data_dictionary.csv", csv(dictionary(tables)))]
+
+
+def _written(path: Path, write: Callable[[Path], object]) -> Path:
+    """The file under its name once it is whole: who reads the folder meanwhile never sees half of one."""
+    part = path.with_name(f".part-{path.name}")
+    try:
+        write(part)
+        part.replace(path)
+    except BaseException as error:
+        part.unlink(missing_ok=True)
+        if isinstance(error, PblError):
+            raise error.about(path.name) from error.__cause__
+        raise
+    return path
+
+
+def _common(about: Mapping[str, Mapping[str, object]]) -> dict[str, str]:
+    """What all trials have in common, for the metadata of the tables."""
+    first, *others = [{k: v for k, v in a.items() if isinstance(v, str)} for a in about.values()]
+    return {k: v for k, v in first.items() if all(o.get(k) == v for o in others)}
+
+
+# -------------------------------------------------------------------------------------------------------------- checks
+def _check_visit(
+    trials: Sequence[ExportTrial], fit_checks: Sequence[Check], formats: Sequence[str], options: ExportOptions
+) -> None:
+    if not trials:
+        raise _input("no trial", "at least one fit", "pass the fit.npz files of a visit")
+    if (checks := failed(fit_checks)) and not options.allow_failed:
+        raise _input(
+            f"a fit that failed its check {', '.join(checks)}: the body does not lie on the person",
+            "a fit without a failed check",
+            "look at the overlay and fit again, or pass --allow-failed: the files then name the failed checks",
+            trials[0].name,
+        )
+    for trial in trials:
+        try:
+            _check_trial(trial, formats, options.body_points)
+        except PblError as error:
+            raise error.about(trial.name) from error.__cause__
+
+
+def _check_trial(trial: ExportTrial, formats: Sequence[str], body_points: bool) -> None:
+    fit, body = trial.fit, load_body()
+    check_label("the name of a trial", trial.name, 255, least=1)
+    if trial.name in (".", "..") or "/" in trial.name or "\\" in trial.name:
+        raise _input("a name that is a path", "a name of a file", "rename the file, or pass --number-trials")
+    if tuple(fit.joint_names) != body.joint_names or fit.body_sha256 != body.sha256:
+        raise _input(
+            f"a fit of the body {fit.body_sha256[:12]}",
+            f"a fit of this version's body, {body.name} version {body.version} ({body.sha256[:12]})",
+            "fit again with this version, or export with the version that made the fit",
+        )
+    if not np.isfinite(fit.time_s).all() or np.any(np.diff(fit.time_s) <= 0):
+        raise _input("time stamps that are missing or do not increase", "frames in order of time", "fit again")
+    if not trial.known.any():
+        raise _input("a fit without one pose", "a person in at least some frames", "look at the keypoints; fit again")
+    if {"trc", "c3d"} & set(formats) and not np.isfinite(fit.markers_world_m).any():
+        raise _input("a fit without one marker", "fitted markers in at least some frames", "fit again with pbl fit")
+    if "osim" in formats or ("trc" in formats and body_points):
+        wanted_markers(trial)
+    if "c3d" in formats:
+        check_frames(trial)
+    if GAIT_FORMATS & set(formats) and trial.measured is not None:
+        _check_gait(trial.measured, formats)
+    if ascii_only := [f for f in formats if f in _ASCII]:
+        _check_names(trial, ascii_only)
+    if "dlc" in formats and trial.keypoints is None:
+        raise _input(
+            "a fit without its keypoints",
+            "the keypoints.npz of the trial beside the fit, named alike and with the same frames",
+            "put the keypoints of `pbl detect` or `pbl run` beside the fit, or leave out --to dlc",
+        )
+
+
+def _check_gait(measured: TrialMetrics, formats: Sequence[str]) -> None:
+    """Refuse measures whose events, or for tables whose cycles, are missing: the export would look complete."""
+    n_cycles = measured.spatiotemporal.n_cycles_found
+    cycles_whole = len(measured.cycles) == n_cycles and all(c.curves or c.curves_missing for c in measured.cycles)
+    if n_cycles and not measured.events.events:
+        missing = "gait events"
+    elif not cycles_whole and {"csv", "parquet"} & set(formats):
+        missing = "gait cycles"
+    else:
+        return
+    raise _input(
+        f"gait measures without the {missing} that they are made of, as in files of an older version",
+        "metrics.json of this version, and beside each fit its events.csv and cycles.npz",
+        "run `pbl gait *.fit.npz --out metrics.json` in their folder, with --norm, --index and --method as before, and "
+        "export again",
+    )
+
+
+def _check_names(trial: ExportTrial, formats: Sequence[str]) -> None:
+    if not trial.name.isascii():
+        raise _input(
+            f"the name {trial.name!r}",
+            f"ASCII in the names of {', '.join(formats)} files: several of their readers open no others",
+            "rename the files, or pass --number-trials; csv, parquet and dlc take any name",
+        )
+    odd = [n for n in trial.fit.marker_names if not n.isascii() or _NOT_IN_OPENSIM & set(n)]
+    if odd:
+        raise _input(
+            f"the markers {', '.join(map(repr, odd[:5]))}",
+            f"names of ASCII letters without spaces, / \\ * + in {', '.join(formats)}",
+            "rename the markers in the table and fit again; csv, parquet and dlc take any name",
+        )
+
+
+def _input(found: str, expected: str, next_step: str, key: str | None = None) -> PblError:
+    return PblError("EXPORT_INPUT", found=found, expected=expected, next_step=next_step, key=key)

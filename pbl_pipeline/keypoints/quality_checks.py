@@ -1,0 +1,222 @@
+"""Checks of the keypoints of one trial: how much was seen, how well, how sure, and whether left and right stayed.
+
+A body from the front and the same from behind, with the sides exchanged, give nearly one outline. Where the face tells
+nothing (pixelated for privacy, against the light) a network may answer with either, and change its mind within a trial.
+Which of the two is right cannot be told from the movement alone: the sequence that moves least may be the wrong one
+throughout. So such a trial is reported, not repaired.
+
+The thresholds of the picture were set where the detector begins to fall behind what it saw in the clean picture, on
+recordings that were darkened, blurred and shrunk (docs/confidence.md).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pbl_pipeline.qc import EMPTY, FAIL, PASS, WARN, Check
+from pbl_pipeline.tracking import step_s
+
+from .in_view import SEEN_SHARE, ends, visibility
+from .stated_confidence import probability_within
+from .types import Keypoints
+
+#: Seconds in view: about three strides; what a fit needs at least.
+SECONDS_WARN, SECONDS_FAIL = 3.0, 1.0
+#: Fraction of the frames between the first and the last sight of the person in which she is not found.
+ABSENT_WARN, ABSENT_FAIL = 0.05, 0.5
+#: Fraction of the frames in which feet or head are beyond the lower or upper border.
+CUT_WARN, CUT_FAIL = 0.1, 0.5
+#: Head to feet in the picture.
+HEIGHT_WARN_PX, HEIGHT_FAIL_PX = 100.0, 50.0
+#: Brightness (0..255) of the brightest twentieth of the person.
+BRIGHT_WARN, BRIGHT_FAIL = 30.0, 15.0
+#: Finest detail as a fraction of the person's size.
+DETAIL_WARN, DETAIL_FAIL = 0.04, 0.06
+#: Frames a second.
+RATE_WARN_HZ, RATE_FAIL_HZ = 20.0, 10.0
+#: Mean confidence of the legs' points as stated; fraction of them that is right by the bound of the detector's curve.
+LEGS_CONFIDENCE_WARN, LEGS_RIGHT_WARN = 0.6, 0.9
+#: Fraction of the frames in which left and right were exchanged back; where many are, the rest may be the wrong ones.
+EXCHANGED_WARN, EXCHANGED_FAIL = 0.02, 0.3
+#: Nobody turns by this much between neighbouring frames (deg); single frames of noise stay below.
+_TURN_DEG = 90.0
+_LONGEST_STEP_S = 0.2
+_LEGS = ("hip", "knee", "ankle", "heel", "foot_index")
+
+
+def check_keypoints(keypoints: Keypoints) -> tuple[Check, ...]:
+    """The checks of one trial, in the order of the chain. Where no frame shows the person: EMPTY, and why if the
+    picture tells.
+
+    `frames_seen_s`, `whole_person_s`, `frames_without_person_share`, `feet_cut_share`, `head_cut_share`,
+    `body_height_px`, `picture_brightness`, `picture_detail_share`, `frame_rate_hz`, `leg_confidence`,
+    `leg_points_right_share`, `side_changes`, `sides_exchanged_share`. Those that a trial's points or file cannot tell
+    are left out.
+    """
+    seen = keypoints.confidence.max(axis=1) > 0
+    if not seen.any():
+        # Where the picture says why, it is said.
+        why = [c for c in _picture(keypoints) if c is not None and c.outcome != PASS]
+        return (Check("frames_seen_s", EMPTY, 0.0, 1.0, "no frame shows the person"), *why)
+    checks = [*_time(keypoints, seen), *_cut(keypoints), *_picture(keypoints), _rate(keypoints.time_s)]
+    return tuple(c for c in [*checks, *_legs(keypoints, seen), *_sides(keypoints, seen)] if c is not None)
+
+
+def _time(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
+    """How long the person, and the whole of her, is in view."""
+    seconds = float(seen.sum()) * step_s(keypoints.time_s)
+    shown = visibility(keypoints)
+    first, last = np.flatnonzero(seen)[[0, -1]]
+    absent = 1.0 - float(np.mean(seen[first : last + 1]))
+    return [
+        _low(
+            "frames_seen_s",
+            seconds,
+            SECONDS_WARN,
+            0.0,
+            "fewer than about three strides are in view: film a longer walk",
+        ),
+        _low(
+            "whole_person_s",
+            shown.counts_s,
+            SECONDS_WARN,
+            SECONDS_FAIL,
+            f"{shown.text()}: keep head and feet in the picture, step back or film a longer walk",
+        ),
+        _high(
+            "frames_without_person_share",
+            absent,
+            ABSENT_WARN,
+            ABSENT_FAIL,
+            "the person is lost again and again between the first and the last frame: film without others in between, "
+            "in more light, and follow the walk",
+        ),
+    ]
+
+
+def _cut(keypoints: Keypoints) -> list[Check | None]:
+    """Feet and head beyond the border, and how large the person is."""
+    width, height = keypoints.image_size_px
+    xy = np.nan_to_num(np.asarray(keypoints.xy_px, float), nan=-1.0)
+    found = (keypoints.confidence > 0) & np.all((xy >= 0) & (xy <= (width, height)), axis=2)
+    given = found.any(axis=0)
+    seen = found.mean(axis=1) >= SEEN_SHARE * given.mean()
+    checks: list[Check | None] = []
+    (feet, low), (head, high) = ends(keypoints)
+    for name, points, at_border, advice in (
+        ("feet_cut_share", feet, low, "the feet leave the picture below: tilt the phone or step back"),
+        ("head_cut_share", head, high, "the head leaves the picture above: tilt the phone or step back"),
+    ):
+        if points.any() and seen.any():
+            cut = at_border & ~found[:, points].all(axis=1)
+            checks.append(_high(name, float(np.mean(cut[seen])), CUT_WARN, CUT_FAIL, advice))
+    whole = found[:, feet].any(axis=1) & found[:, head].any(axis=1)
+    if whole.any():
+        points = np.where(found[whole][..., None], xy[whole], np.nan)
+        extent = np.nanmax(points, axis=1) - np.nanmin(points, axis=1)
+        checks.append(
+            _low(
+                "body_height_px",
+                float(np.median(extent.max(axis=1))),
+                HEIGHT_WARN_PX,
+                HEIGHT_FAIL_PX,
+                "the person is too small in the picture: film from nearer, or in a higher resolution; do not zoom "
+                "digitally",
+            )
+        )
+    return checks
+
+
+def _picture(keypoints: Keypoints) -> list[Check | None]:
+    """Light and sharpness."""
+    picture = keypoints.picture
+    if picture is None or not len(picture.time_s):
+        return []
+    blurred = (
+        "the picture of the person is blurred: film in more light (a shorter exposure), hold the phone still, wipe "
+    )
+    return [
+        _low(
+            "picture_brightness",
+            picture.bright,
+            BRIGHT_WARN,
+            BRIGHT_FAIL,
+            "the person is too dark: switch lights on, and do not film against a window",
+        ),
+        _high(
+            "picture_detail_share",
+            picture.detail_share,
+            DETAIL_WARN,
+            DETAIL_FAIL,
+            blurred + "the lens, and let it focus on the person",
+        ),
+    ]
+
+
+def _rate(time_s: np.ndarray) -> Check | None:
+    interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    if not interval_s > 0:
+        return None
+    rate = 1.0 / interval_s
+    advice = "too few frames a second for fast movements and the moment of a step: film with 30 or 60"
+    return _low("frame_rate_hz", rate, RATE_WARN_HZ, RATE_FAIL_HZ, advice)
+
+
+def _legs(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
+    """How sure the points of the legs are, as stated and, where it is known, what that is worth."""
+    legs = [i for i, n in enumerate(keypoints.names) if n.startswith(("left_", "right_")) and n.endswith(_LEGS)]
+    if not legs:
+        return []
+    advice = "the legs are hidden or hard to see: film the whole body from the side, in light"
+    mean = float(keypoints.confidence[seen][:, legs].mean())
+    found = [_low("leg_confidence", mean, LEGS_CONFIDENCE_WARN, 0.0, advice)]
+    probability = probability_within(keypoints)
+    if probability is not None:
+        fraction = float(probability[seen][:, legs].mean())
+        found.append(_low("leg_points_right_share", fraction, LEGS_RIGHT_WARN, 0.0, advice))
+    return found
+
+
+def _sides(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
+    if not {"left_hip", "right_hip"} <= set(keypoints.names):
+        return []
+    changes = float(len(side_changes(keypoints)))
+    advice = "left and right change places between frames: look at the overlay; film from the side"
+    found = [_high("side_changes", changes, 0.0, 0.02 * float(seen.sum()), advice)]
+    if keypoints.sides_changed is not None:
+        fraction = float(keypoints.sides_changed[seen].any(axis=1).mean())
+        advice = (
+            "the detector took left for right, or could not tell them, in this share of the frames; their names follow "
+            "the movement now: look at the overlay, film in better light or more from the side"
+        )
+        found.append(_high("sides_exchanged_share", fraction, EXCHANGED_WARN, EXCHANGED_FAIL, advice))
+    return found
+
+
+def side_changes(keypoints: Keypoints) -> np.ndarray:
+    """Frames (K,) at which the axis from left to right hip has turned by more than 90 degrees since the last one seen
+    (at most 0.2 s ago): there the sides were exchanged."""
+    axis = (
+        keypoints.xyz_cam_m[:, keypoints.names.index("right_hip")]
+        - keypoints.xyz_cam_m[:, keypoints.names.index("left_hip")]
+    ).astype(np.float64)
+    rows = np.flatnonzero(np.isfinite(axis).all(axis=1) & (np.linalg.norm(axis, axis=1) > 0))
+    axis = axis[rows] / np.linalg.norm(axis[rows], axis=1, keepdims=True)
+    turned = np.einsum("ij,ij->i", axis[1:], axis[:-1]) < np.cos(np.radians(_TURN_DEG))
+    return rows[1:][turned & (np.diff(keypoints.time_s[rows]) <= _LONGEST_STEP_S)]
+
+
+def _low(check: str, value: float, warn: float, fail: float, advice: str) -> Check | None:
+    """A value that should be high; None where it is not known."""
+    if not np.isfinite(value):
+        return None
+    outcome = FAIL if value < fail else WARN if value < warn else PASS
+    return Check(check, outcome, value, fail if outcome == FAIL else warn, "" if outcome == PASS else advice)
+
+
+def _high(check: str, value: float, warn: float, fail: float, advice: str) -> Check | None:
+    """A value that should be low; None where it is not known."""
+    if not np.isfinite(value):
+        return None
+    outcome = FAIL if value > fail else WARN if value > warn else PASS
+    return Check(check, outcome, value, fail if outcome == FAIL else warn, "" if outcome == PASS else advice)

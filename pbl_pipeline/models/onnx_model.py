@@ -1,0 +1,193 @@
+"""One loaded ONNX model that is what its `model.json` says: checked by its hash, its graph and a black picture."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.settings import n_cores
+
+from .devices import asked_device, device_of, providers_for, unavailable
+from .spec import GRAPH_FILE, SPEC_FILE, WITHOUT_POINTS, ModelSpec, load_spec, model_invalid
+
+_DTYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+
+
+class OnnxModel:
+    """A model's folder, loaded. Not to be shared by threads.
+
+    Attributes
+    ----------
+    spec
+        What `model.json` says.
+    device
+        "cpu" or "cuda": where it computes.
+    note
+        Why it is not the device one would expect; "" where there is nothing to say.
+
+    Raises
+    ------
+    PblError
+        MODEL_MISSING, MODEL_INVALID (also an opset or operator that the runtime does not know, another name or shape
+        of an input or output, another number of points), MODEL_CHECKSUM, MARKER_SET_UNKNOWN, DEVICE_UNAVAILABLE, USAGE.
+    """
+
+    def __init__(self, folder: str | Path, device: str | None = None) -> None:
+        self.folder = Path(folder)
+        self.spec = load_spec(folder)
+        self._path = self.folder / GRAPH_FILE
+        data = check_graph_file(self.folder, self.spec)
+        providers = providers_for(device)
+        # Here and not above: whoever only fits or reads results does not wait for the runtime.
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = n_cores()
+        options.log_severity_level = 4  # what it would print is raised below
+        try:
+            self._session = onnxruntime.InferenceSession(data, options, providers=providers)
+        except Exception as error:
+            if asked_device(device) == "cuda" and "CUDA" in str(error):
+                raise unavailable(_first_line(error)) from error
+            raise model_invalid(
+                self._path, _first_line(error), "a graph that the installed onnxruntime loads"
+            ) from error
+        self.device = device_of(self._session.get_providers())
+        self.note = ""
+        if asked_device(device) == "cuda" and self.device != "cuda":
+            raise unavailable("the CUDA provider is installed but does not start (driver, CUDA or cuDNN)")
+        if len(providers) > 1 and self.device == "cpu":
+            self.note = "the CUDA provider is installed but does not start, so the CPU computes"
+        self._outputs = [self.spec.outputs[role] for role in self.spec.outputs]
+        self._dtype, self.fixed_batch = self._check_names()
+        black = np.zeros((1, self.spec.input.height, self.spec.input.width, 3), np.uint8)
+        try:
+            got = self(black)
+        except Exception as error:
+            raise model_invalid(
+                self._path, f"it does not run: {_first_line(error)}", "a graph that computes"
+            ) from error
+        self._check_shapes(got)
+
+    def __call__(self, crops: np.ndarray, gamma: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """Outputs by role, float32, for `crops` (N, H, W, 3) uint8 BGR; `gamma` (N,) is applied to each on 0..1.
+
+        A graph whose batch is fixed is called as often as it takes.
+        """
+        inputs = self._inputs(crops, gamma)
+        size = self.fixed_batch or len(inputs)
+        parts: list[list[Any]] = []
+        for start in range(0, len(inputs), size):
+            part = inputs[start : start + size]
+            short = size - len(part)
+            padded = np.concatenate([part, np.zeros((short, *part.shape[1:]), part.dtype)]) if short else part
+            got: list[Any] = list(self._session.run(self._outputs, {self.spec.input.name: padded}))
+            parts.append([np.asarray(g)[: len(part)] for g in got])
+        joined = (np.concatenate(p).astype(np.float32) for p in zip(*parts, strict=True))
+        return dict(zip(self.spec.outputs, joined, strict=True))
+
+    def _inputs(self, crops: np.ndarray, gamma: np.ndarray | None) -> np.ndarray:
+        """The crops as the graph wants them, by a table of the 256 values for each crop and channel."""
+        entry = self.spec.input
+        levels = np.arange(256) / 255.0
+        gammas = np.ones(len(crops)) if gamma is None else np.asarray(gamma, float)
+        table = 255.0 * levels[None] ** gammas[:, None]  # (N, 256)
+        out = np.empty((len(crops), 3, entry.height, entry.width), self._dtype)
+        for n, crop in enumerate(crops):
+            for c in range(3):
+                channel = c if entry.colour == "BGR" else 2 - c
+                value = ((table[n] - entry.mean[c]) / entry.std[c]).astype(self._dtype)
+                np.take(value, crop[:, :, channel], out=out[n, c], mode="clip")
+        return out if entry.layout == "NCHW" else np.ascontiguousarray(out.transpose(0, 2, 3, 1))
+
+    def _check_names(self) -> tuple[Any, int | None]:
+        """Type of the input and the batch that it is fixed to (None: any)."""
+        entry = self.spec.input
+        inputs = {i.name: i for i in self._session.get_inputs()}
+        outputs = [o.name for o in self._session.get_outputs()]
+        lacking = [n for n in self._outputs if n not in outputs]
+        if lacking:
+            raise self._wrong(f"no output {', '.join(lacking)} (it has {', '.join(outputs)})", "every output it names")
+        if list(inputs) != [entry.name]:
+            raise self._wrong(f"inputs {', '.join(inputs)}", f"one input, {entry.name}")
+        found = inputs[entry.name]
+        if found.type not in _DTYPES:
+            raise self._wrong(f"an input of type {found.type}", f"one of {', '.join(_DTYPES)}")
+        wanted = (3, entry.height, entry.width) if entry.layout == "NCHW" else (entry.height, entry.width, 3)
+        shape = list(found.shape)
+        fits = len(shape) == 4 and all(not isinstance(s, int) or s == w for s, w in zip(shape[1:], wanted, strict=True))
+        if not fits:
+            raise self._wrong(f"an input of shape {shape}", f"(N, {', '.join(map(str, wanted))}), {entry.layout}")
+        return _DTYPES[found.type], shape[0] if isinstance(shape[0], int) else None
+
+    def _check_shapes(self, got: dict[str, np.ndarray]) -> None:
+        n, entry = len(self.spec.joint_names), self.spec.input
+        if self.spec.kind in WITHOUT_POINTS:
+            return  # the detector that reads it checks its rows
+        along = {"simcc_x": entry.width, "simcc_y": entry.height}
+        for role, array in got.items():
+            if role in ("coords2d", "coords3d"):
+                wanted: tuple[int | str, ...] = (1, n, 2 if role == "coords2d" else 3)
+            elif role in along:
+                wanted = (1, n, round(along[role] * self.spec.simcc_split))
+            else:
+                wanted = (1, n, "h", "w")
+            fits = array.ndim == len(wanted) and all(
+                w == s or isinstance(w, str) for w, s in zip(wanted, array.shape, strict=True)
+            )
+            if not fits:
+                expected = f"({', '.join(map(str, wanted))}): {n} points ({self.spec.marker_set})"
+                raise self._wrong(f"{self.spec.outputs[role]} of shape {array.shape}", expected)
+
+    def _wrong(self, found: str, expected: str) -> PblError:
+        return model_invalid(self._path, found, f"{expected}, as its model.json says")
+
+
+def check_frozen(spec: ModelSpec, sha256: str, spec_sha256: str) -> None:
+    """Compare a registered model with the hashes of its graph and `model.json` that a method has.
+
+    Raises `PblError` MODEL_CHECKSUM.
+    """
+    for what, stated, found in (("graph", sha256, spec.sha256), (SPEC_FILE, spec_sha256, spec.spec_sha256)):
+        if stated != found:
+            raise PblError(
+                "MODEL_CHECKSUM",
+                found=f"the {what} of the registered model has SHA-256 {found}",
+                expected=f"SHA-256 {stated}, with which the method was made",
+                next_step="add the model that the method was made with, or use the method of the model that is "
+                "registered now",
+                key=spec.name,
+            )
+
+
+def check_graph_file(folder: str | Path, spec: ModelSpec) -> bytes:
+    """The bytes of `model.onnx`. Raises `PblError` MODEL_MISSING, MODEL_CHECKSUM."""
+    path = Path(folder) / GRAPH_FILE
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise PblError(
+            "MODEL_MISSING",
+            found=error.strerror or str(error),
+            expected=f"{GRAPH_FILE} beside model.json",
+            next_step="copy the whole folder again",
+            key=str(path),
+        ) from error
+    found = hashlib.sha256(data).hexdigest()
+    if found != spec.sha256:
+        raise PblError(
+            "MODEL_CHECKSUM",
+            found=f"SHA-256 {found}",
+            expected=f"SHA-256 {spec.sha256}, as its model.json says",
+            next_step="copy the model again; where the file is right, correct sha256 in model.json and add it anew",
+            key=str(path),
+        )
+    return data
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:300]

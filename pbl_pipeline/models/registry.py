@@ -1,0 +1,159 @@
+"""The registered models of this machine: one folder for each, under its name, in `settings.models_dir()`.
+
+A method of the tables names a model by its name and the SHA-256 of its graph and of its spec, so a folder that changed
+is refused wherever it is used.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from pbl_pipeline import settings
+from pbl_pipeline.errors import PblError
+
+from .model_archive import unpacked
+from .onnx_model import OnnxModel, check_graph_file
+from .spec import GRAPH_FILE, SPEC_FILE, ModelSpec, load_spec
+
+#: Files that are kept beside graph and spec, where they are there.
+_TEXTS = ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "NOTICE", "README.md")
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelStatus:
+    """A registered model: `spec` and no `error`, or what is wrong with it."""
+
+    name: str
+    folder: Path
+    spec: ModelSpec | None
+    error: PblError | None
+
+
+def registered() -> list[ModelStatus]:
+    """Every registered model by name, with what is wrong with it; checks the bytes of the graphs."""
+    folder = settings.models_dir()
+    if not folder.is_dir():
+        return []
+    names = sorted(p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+    return [_status(name, folder / name) for name in names]
+
+
+def is_registered(name: str) -> bool:
+    """Whether a model of that name is registered here, sound or not."""
+    return "/" not in name and not name.startswith(".") and (settings.models_dir() / name / SPEC_FILE).is_file()
+
+
+def find(name: str) -> Path:
+    """Folder of a registered model. Raises `PblError` MODEL_MISSING."""
+    if not is_registered(name):
+        there = [m.name for m in registered()]
+        raise PblError(
+            "MODEL_MISSING",
+            found=f"no registered model {name!r}",
+            expected=f"one of {', '.join(there)}" if there else "a registered model; none is registered here",
+            next_step="`pbl models add FOLDER_OR_URL` on this machine, or set PBL_MODELS to the folder that holds it",
+            key=name,
+        )
+    return settings.models_dir() / name
+
+
+def add(source: str | Path, sha256: str | None = None, *, replace: bool = False) -> tuple[ModelSpec, OnnxModel]:
+    """Register a model from its folder, or from an archive (.zip, .tar, .tar.gz) in a file or at an http(s) address.
+
+    `sha256` is that of the archive, and must be given for an address. The model is loaded and run once on the CPU
+    before anything is kept. Registering the same bytes again changes nothing.
+
+    Raises
+    ------
+    PblError
+        MODEL_MISSING (also where nothing can be fetched), MODEL_INVALID, MODEL_CHECKSUM, MARKER_SET_UNKNOWN; USAGE
+        where another model has the name and `replace` is not set, or an address comes without `sha256`;
+        FILE_UNWRITABLE.
+    """
+    with unpacked(source, sha256) as folder:
+        model = OnnxModel(folder, "cpu")
+        spec = model.spec
+        there = settings.models_dir() / spec.name
+        if there.exists() and not _same(there, spec) and not replace:
+            raise PblError(
+                "USAGE",
+                found=f"another model is registered as {spec.name}",
+                expected="a name of its own for each model",
+                next_step="give the new one another name in its model.json, or pass --replace: results made with the "
+                "old one stay, and a method that names it then fails until it is added again",
+                key=str(source),
+            )
+        try:
+            there.parent.mkdir(parents=True, exist_ok=True)
+            with _scratch(there.parent) as new:
+                for name in (GRAPH_FILE, SPEC_FILE, *_TEXTS):
+                    if (folder / name).is_file():
+                        shutil.copyfile(folder / name, new / name)
+                with _scratch(there.parent) as old:
+                    if there.exists():  # put aside in one step: nobody meets half of it
+                        os.replace(there, old / "model")
+                    os.replace(new, there)
+        except OSError as error:
+            raise PblError(
+                "FILE_UNWRITABLE",
+                found=error.strerror or str(error),
+                expected=f"a folder of models that you may write to ({there.parent})",
+                next_step="set PBL_MODELS to a folder of your own",
+                key=str(there),
+            ) from error
+    return load_spec(there), model
+
+
+def remove(name: str) -> Path:
+    """Delete a registered model's folder and return where it was. Raises `PblError` MODEL_MISSING, FILE_UNWRITABLE."""
+    folder = find(name)
+    try:
+        shutil.rmtree(folder)
+    except OSError as error:
+        raise PblError(
+            "FILE_UNWRITABLE",
+            found=error.strerror or str(error),
+            expected="a folder of models that you may change",
+            next_step="ask the owner of the folder",
+            key=str(folder),
+        ) from error
+    return folder
+
+
+def verify(name: str, device: str | None = None) -> OnnxModel:
+    """Load a registered model and run it once: checksum, graph, shapes. Raises what `OnnxModel` does."""
+    return OnnxModel(find(name), device)
+
+
+def _status(name: str, folder: Path) -> ModelStatus:
+    try:
+        spec = load_spec(folder)
+        check_graph_file(folder, spec)
+    except PblError as error:
+        return ModelStatus(name, folder, None, error)
+    return ModelStatus(name, folder, spec, None)
+
+
+def _same(folder: Path, spec: ModelSpec) -> bool:
+    try:
+        known = load_spec(folder)
+    except PblError:
+        return False
+    return (known.sha256, known.spec_sha256) == (spec.sha256, spec.spec_sha256)
+
+
+@contextlib.contextmanager
+def _scratch(beside: Path) -> Iterator[Path]:
+    """A folder on the same disk, so that the finished one appears whole or not at all."""
+    folder = Path(tempfile.mkdtemp(dir=beside, prefix=".new-"))
+    folder.chmod(0o755)  # readable for the account a worker runs under
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,124 @@
+"""MediaPipe's single-shot detectors: a square input, boxes with keypoints relative to fixed anchors, suppression.
+
+Person and face detectors differ only in the size of the input, the layers of anchors and the number of keypoints.
+Layout: the graph configurations beside the models in the mediapipe 0.10.21 wheel; Bazarevsky et al. 2019, "BlazeFace",
+arXiv:1907.05047, for the suppression that averages.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.special import expit
+
+from .tflite import LiteModel
+
+
+@dataclasses.dataclass(frozen=True)
+class SsdLayout:
+    """Shape of a detector: side of its input (px), layers of anchors (stride in px of the input, anchors per cell), and
+    keypoints beside each box."""
+
+    input_size: int
+    layers: tuple[tuple[int, int], ...]
+    n_keypoints: int
+
+    @functools.cached_property
+    def anchor_centres(self) -> np.ndarray:
+        """Centres (N, 2) of the anchors, x and y in 0..1 of the input picture. All anchors have size 1."""
+        layers = []
+        for stride, per_cell in self.layers:
+            n = self.input_size // stride
+            y, x = np.mgrid[0:n, 0:n]
+            centres = (np.stack([x, y], axis=-1).reshape(-1, 2) + 0.5) / n
+            layers.append(np.repeat(centres, per_cell, axis=0))
+        return np.concatenate(layers).astype(np.float64)
+
+    @property
+    def n_values(self) -> int:
+        """Values of a box: centre and size, then x and y of each keypoint."""
+        return 4 + 2 * self.n_keypoints
+
+    def decode(self, raw_boxes: np.ndarray, raw_scores: np.ndarray, min_score: float) -> tuple[np.ndarray, np.ndarray]:
+        """Values (M, `n_values`) in 0..1 of the input (x0, y0, x1, y1, keypoints x y) and scores (M,), best first.
+
+        raw_boxes (N, `n_values`): centre, size and keypoints in input pixels relative to the anchor; raw_scores (N,)
+        logits.
+        """
+        score = expit(raw_scores.astype(np.float64))
+        keep = np.flatnonzero(score >= min_score)
+        keep = keep[np.argsort(-score[keep], kind="stable")]
+        raw = raw_boxes[keep].astype(np.float64) / self.input_size
+        anchor = self.anchor_centres[keep]
+        values = np.empty_like(raw)
+        centre = raw[:, 0:2] + anchor
+        values[:, 0:2] = centre - raw[:, 2:4] / 2
+        values[:, 2:4] = centre + raw[:, 2:4] / 2
+        values[:, 4:] = raw[:, 4:] + np.tile(anchor, self.n_keypoints)
+        return values, score[keep].astype(np.float64)
+
+
+class SsdModel:
+    """A loaded detector of a layout. Not to be shared by threads. Raises `PblError` ASSET_CHECKSUM as `LiteModel`."""
+
+    def __init__(
+        self, model_path: str | Path, sha256: str, layout: SsdLayout, min_score: float, min_iou: float = 0.3
+    ) -> None:
+        self._model = LiteModel(model_path, sha256)
+        self.sha256 = self._model.sha256
+        self._layout, self._min_score, self._min_iou = layout, min_score, min_iou
+
+    def find(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of the boxes and keypoints (M, 2 + K, 2) in pixels of `image` (H, W, 3) uint8 BGR, which they may
+        leave, and scores (M,), best first."""
+        size = self._layout.input_size
+        height, width = image.shape[:2]
+        scale = size / max(height, width)
+        w, h = max(round(width * scale), 1), max(round(height * scale), 1)
+        small = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+        left, top = (size - w) // 2, (size - h) // 2
+        canvas = np.zeros((size, size, 3), np.float32)
+        # -1 is black: the letterbox bars must be what the network knows as black, not grey.
+        canvas -= 1.0
+        canvas[top : top + h, left : left + w] = small[:, :, ::-1] * np.float32(2 / 255) - np.float32(1)
+        output = self._model(canvas)
+        n = len(self._layout.anchor_centres)
+        raw_boxes = output[n * self._layout.n_values].reshape(n, -1)
+        values, scores = self._layout.decode(raw_boxes, output[n].reshape(n), self._min_score)
+        values, scores = suppress(values, scores, self._min_iou)
+        points = values.reshape(-1, self._layout.n_values // 2, 2) * size
+        # Half a pixel less: the network counts from the picture's edge, pixel coordinates from the first centre.
+        return (points - [left, top]) * [width / w, height / h] - 0.5, scores
+
+
+def suppress(values: np.ndarray, scores: np.ndarray, min_iou: float) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted non-maximum suppression: boxes that overlap the best one are averaged into it by their scores.
+
+    `values` (N, >=4) starts with x0, y0, x1, y1 and is sorted by falling score. The group keeps its best score.
+    """
+    out_values, out_scores = [], []
+    left = np.arange(len(scores))
+    while len(left):
+        iou = box_iou(values[left[0], :4], values[left, :4])
+        group = iou > min_iou
+        group[0] = True
+        weight = scores[left[group]]
+        out_values.append(weight @ values[left[group]] / weight.sum())
+        out_scores.append(scores[left[0]])
+        left = left[~group]
+    return np.array(out_values).reshape(-1, values.shape[1]), np.array(out_scores)
+
+
+def box_iou(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Intersection over union of one box (4,), or as many (N, 4), with boxes (N, 4), corners x0 y0 x1 y1. Empty boxes
+    give 0."""
+    size = np.minimum(box[..., 2:4], boxes[:, 2:4]) - np.maximum(box[..., 0:2], boxes[:, 0:2])
+    intersection = np.prod(np.maximum(size, 0.0), axis=1)
+    area = np.prod(np.maximum(box[..., 2:4] - box[..., 0:2], 0.0), axis=-1)
+    areas = np.prod(np.maximum(boxes[:, 2:4] - boxes[:, 0:2], 0.0), axis=1)
+    union = area + areas - intersection
+    return np.where(union > 0, intersection / np.where(union > 0, union, 1.0), 0.0)

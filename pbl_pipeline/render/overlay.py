@@ -1,0 +1,271 @@
+"""The fitted body drawn over the recording: a video that browsers play, and single frames for the report."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pbl_pipeline import progress
+from pbl_pipeline.body import Body, capsules, load_body
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.render.drawing import capsule_outline, draw_body, draw_keypoints
+from pbl_pipeline.render.projection import scaled_camera, to_camera
+from pbl_pipeline.render.strip import Event, Strip
+from pbl_pipeline.video import read_frames, write_h264
+
+_BLOCK = 64  # frames whose capsules are computed and kept at a time
+
+
+class _Painter:
+    """Draws one trial's body and keypoints into its frames, at any size of the picture."""
+
+    def __init__(self, fit: TrialFit, keypoints: Keypoints | None) -> None:
+        if keypoints is not None and len(keypoints.time_s) != len(fit.time_s):
+            raise PblError(
+                "FILE_FORMAT",
+                found=f"{len(keypoints.time_s)} frames of keypoints for {len(fit.time_s)} fitted frames",
+                expected="keypoints and fit of the same video",
+                next_step="pass the keypoints.npz this fit was made from",
+                key=fit.name,
+            )
+        body = load_body()
+        check_body(fit, body)
+        self.fit, self._keypoints = fit, keypoints
+        self._known = _known(fit)
+        self._body, self._block, self._capsules = body, -1, None
+
+    def _pose(self, index: int) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, np.ndarray]:
+        """Body names, starts, ends and radii of the capsules in one frame; posed in blocks, so that memory stays."""
+        block, row = divmod(index, _BLOCK)
+        if self._capsules is None or block != self._block:
+            part = self.fit.qpos[block * _BLOCK : (block + 1) * _BLOCK]
+            self._capsules, self._block = capsules(self._body, part, self.fit.scale), block
+        c = self._capsules
+        return c.body_names, c.start[row], c.end[row], c.radius_m
+
+    def known(self, index: int) -> bool:
+        return index < len(self._known) and bool(self._known[index])
+
+    def box_px(self, index: int) -> np.ndarray | None:
+        """x0, y0, x1, y1 around the drawn body in the full-size frame; None where nothing of it is drawn."""
+        if not self.known(index):
+            return None
+        _, start_m, end_m, radius = self._pose(index)
+        quat, position = self.fit.phone_quat_wxyz[index], self.fit.camera_position_m
+        start, end = to_camera(start_m, quat, position), to_camera(end_m, quat, position)
+        outlines = [capsule_outline(start[g], end[g], float(radius[g]), self.fit.camera) for g in range(len(radius))]
+        points = [o for o in outlines if o is not None]
+        if not points:
+            return None
+        every = np.concatenate(points)
+        return np.concatenate([every.min(0), every.max(0)])
+
+    def paint(self, image: np.ndarray, index: int) -> None:
+        """Draw the state of frame `index` into `image` (any size, the whole frame), in place."""
+        width, height = self.fit.image_size_px
+        fx, fy = image.shape[1] / width, image.shape[0] / height
+        if self.known(index):
+            camera = scaled_camera(self.fit.camera, fx, fy)
+            quat, position = self.fit.phone_quat_wxyz[index], self.fit.camera_position_m
+            draw_body(image, *self._pose(index), quat, position, camera)
+        if self._keypoints is not None and index < len(self._keypoints.time_s):
+            xy = (np.asarray(self._keypoints.xy_px[index], float) + 0.5) * [fx, fy] - 0.5
+            draw_keypoints(image, xy, self._keypoints.confidence[index])
+
+
+def check_body(fit: TrialFit, body: Body) -> None:
+    """Raise `PblError` FILE_FORMAT for a fit that was made with another body model than this one."""
+    if fit.body_sha256 != body.sha256:
+        raise PblError(
+            "FILE_FORMAT",
+            found=f"a fit made with the body model {fit.body_sha256[:12]}",
+            expected=f"the installed body model {body.sha256[:12]} ({body.name} {body.version})",
+            next_step="fit the trial again with this version, or install the version that made the fit",
+            key=fit.name,
+        )
+
+
+def render_overlay(
+    video_path: str | Path,
+    fit: TrialFit,
+    out_path: str | Path,
+    keypoints: Keypoints | None = None,
+    *,
+    events: Sequence[Event] = (),
+    max_side_px: int = 1280,
+    crf: int = 23,
+) -> Path:
+    """Write the recording with the fitted body over it as H.264 in MP4, and return its path.
+
+    Every frame of the video is in the output at its own time stamp (variable frame rate is kept); frames in which the
+    fit is unknown show the bare picture. Below the picture runs a strip with the knee flexion of both sides, the foot
+    contacts and the time. Memory does not grow with the length of the video.
+
+    Parameters
+    ----------
+    video_path
+        The recording the fit was made from.
+    fit
+        One trial; its frames are those of the video.
+    out_path
+        An .mp4 file; written beside it first and moved when complete, so that no half file is left under this name.
+    keypoints
+        Detected points, drawn as small dots.
+    events
+        Foot contacts of this trial, `GaitEvents.events`.
+    max_side_px
+        The picture is scaled down until its longer side is at most this.
+    crf
+        x264's quality, 0 (lossless) to 51; 23 is its default.
+
+    Raises
+    ------
+    PblError
+        VIDEO_* when the video cannot be read; VIDEO_CHANGED when its frames are not those of the fit; FILE_FORMAT
+        when the keypoints are of another video.
+    """
+    out_path = Path(out_path)
+    painter = _Painter(fit, keypoints)
+    width, height = _even_size(fit.image_size_px, max_side_px)
+    strip_height = 2 * max(40, round(0.08 * height))
+    strip = Strip(fit, events, width, strip_height)
+    part = out_path.with_name(f"{out_path.stem}.part{os.getpid()}.mp4")
+    out_path.parent.mkdir(parents=True, exist_ok=True)
+    count = 0
+
+    def pictures() -> Iterator[tuple[float, np.ndarray]]:
+        nonlocal count
+        frames = read_frames(video_path)
+        for frame in progress.track(frames, f"overlay {fit.name}", total=len(fit.time_s)):
+            _check_frame(frame.image, frame.index, fit, video_path)
+            picture = np.empty((height + strip_height, width, 3), np.uint8)
+            same = frame.image.shape[:2] == (height, width)
+            picture[:height] = frame.image if same else _resized(frame.image, (width, height))
+            painter.paint(picture[:height], frame.index)
+            picture[height:] = strip.frame(frame.time_s)
+            count += 1
+            yield frame.time_s, picture
+
+    try:
+        write_h264(part, pictures(), (width, height + strip_height), fit.time_s, crf)
+        if count != len(fit.time_s):
+            raise _changed(video_path, f"{count} frames", f"{len(fit.time_s)} frames, as when it was fitted")
+        part.replace(out_path)
+    finally:
+        part.unlink(missing_ok=True)
+    return out_path
+
+
+def overlay_frames(
+    video_path: str | Path,
+    fit: TrialFit,
+    indices: Sequence[int],
+    keypoints: Keypoints | None = None,
+    *,
+    max_side_px: int = 1280,
+    crop_to_body: bool = False,
+) -> list[np.ndarray]:
+    """Frames `indices` with the fitted body drawn, in the order asked for: BGR pictures (H, W, 3) uint8.
+
+    `crop_to_body` cuts each picture to the drawn person with a margin (4:3 where the frame allows it); a frame whose
+    fit is unknown stays whole. The longer side is then scaled down to at most `max_side_px`.
+
+    Raises
+    ------
+    PblError
+        As `render_overlay`; USAGE when a frame does not exist.
+    """
+    wanted = sorted({int(i) for i in indices})
+    if wanted and (wanted[0] < 0 or wanted[-1] >= len(fit.time_s)):
+        raise PblError(
+            "USAGE",
+            found=f"frames {wanted}",
+            expected=f"frames 0 to {len(fit.time_s) - 1}",
+            next_step="ask for frames of this video",
+            key=fit.name,
+        )
+    painter = _Painter(fit, keypoints)
+    pictures: dict[int, np.ndarray] = {}
+    if wanted:
+        for frame in read_frames(video_path, stop=wanted[-1] + 1):
+            if frame.index not in wanted:
+                continue
+            _check_frame(frame.image, frame.index, fit, video_path)
+            image = frame.image.copy()
+            painter.paint(image, frame.index)
+            if crop_to_body and painter.known(frame.index):
+                image = _crop(image, painter.box_px(frame.index))
+            scale = max_side_px / max(image.shape[:2])
+            if scale < 1:
+                image = _resized(image, (round(image.shape[1] * scale), round(image.shape[0] * scale)))
+            pictures[frame.index] = np.ascontiguousarray(image)
+    missing = [i for i in wanted if i not in pictures]
+    if missing:
+        raise _changed(video_path, f"no frame {missing[0]}", f"{len(fit.time_s)} frames, as when it was fitted")
+    return [pictures[int(i)] for i in indices]
+
+
+def report_indices(fit: TrialFit, n: int = 3) -> list[int]:
+    """Frames for the report: `n` of those with a known fit, evenly spread, not at the very ends. Fewer if there are."""
+    known = np.flatnonzero(_known(fit))
+    if not len(known):
+        return []
+    picks = known[np.rint((np.arange(n) + 0.5) / n * (len(known) - 1)).astype(int)]
+    return sorted({int(i) for i in picks})
+
+
+def _known(fit: TrialFit) -> np.ndarray:
+    """(T,) bool: frames whose pose and camera orientation are known."""
+    state = np.concatenate([fit.qpos, fit.phone_quat_wxyz], axis=1)
+    return np.asarray(np.isfinite(state).all(axis=1), bool)
+
+
+def _even_size(size: tuple[int, int], max_side_px: int) -> tuple[int, int]:
+    """Size scaled down to the longest side allowed, both sides even: 4:2:0 colour needs that."""
+    scale = min(1.0, max_side_px / max(size))
+    return max(2, 2 * round(size[0] * scale / 2)), max(2, 2 * round(size[1] * scale / 2))
+
+
+def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    # Averaging areas is slow and needed only where pixels would be skipped.
+    way = cv2.INTER_AREA if size[0] < 0.6 * image.shape[1] else cv2.INTER_LINEAR
+    return cv2.resize(image, (max(1, size[0]), max(1, size[1])), interpolation=way)
+
+
+def _crop(image: np.ndarray, box_px: np.ndarray | None) -> np.ndarray:
+    """The part of the picture around the box: 4:3, the body four fifths of its height, within the picture."""
+    if box_px is None:
+        return image
+    height, width = image.shape[:2]
+    box = np.clip(box_px, 0, [width, height, width, height])
+    if box[2] - box[0] < 2 or box[3] - box[1] < 2:
+        return image
+    h = min(max((box[3] - box[1]) / 0.8, (box[2] - box[0]) / 0.8 * 0.75), height)
+    w = min(h * 4 / 3, width)
+    x0 = round(float(np.clip((box[0] + box[2] - w) / 2, 0, width - w)))
+    y0 = round(float(np.clip((box[1] + box[3] - h) / 2, 0, height - h)))
+    return image[y0 : y0 + round(h), x0 : x0 + round(w)]
+
+
+def _check_frame(image: np.ndarray, index: int, fit: TrialFit, video_path: str | Path) -> None:
+    size = (image.shape[1], image.shape[0])
+    if size != tuple(fit.image_size_px):
+        raise _changed(video_path, f"a frame of {size} px", f"{tuple(fit.image_size_px)} px, as when it was fitted")
+    if index >= len(fit.time_s):
+        raise _changed(video_path, f"a frame {index}", f"{len(fit.time_s)} frames, as when it was fitted")
+
+
+def _changed(video_path: str | Path, found: str, expected: str) -> PblError:
+    return PblError(
+        "VIDEO_CHANGED",
+        found=found,
+        expected=expected,
+        next_step="use the recording that the fit was made from, or run the chain on this one",
+        key=video_path,
+    )

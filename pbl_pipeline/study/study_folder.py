@@ -1,0 +1,193 @@
+"""A study as one folder of tidy CSV files."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from pbl_pipeline.bounded import MAX_ROWS, MIB, read_bytes, read_json
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import check_out_folder
+from pbl_pipeline.paramset import structured
+
+from .frame_columns import FRAMES
+from .types import StudyData, StudyDescription
+
+FORMAT = "pbl-study-1"
+_ABOUT, _DICTIONARY, _SCRIPT = "study.json", "dictionary.csv", "make_report.py"
+#: Bytes of a file that is read; curves are wide.
+_MAX_BYTES = {"curves": 128 * MIB}
+_MAX_HEADER = 64 * 1024
+#: Digits: curves to a thousandth of a degree.
+_DIGITS = {"curves": "%.6g"}
+
+
+def write_study(study: StudyData, folder: str | Path) -> list[Path]:
+    """Write a study as `<frame>.csv`, `dictionary.csv`, `study.json` and `make_report.py`; returns the paths.
+
+    Numbers have 8 digits, curves 6. The folder is made; files of these names in it are replaced.
+
+    Raises
+    ------
+    PblError
+        FILE_UNWRITABLE.
+    """
+    folder = Path(folder)
+    check_out_folder(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    contents = {f"{name}.csv": _csv(name, getattr(study, name)) for name in FRAMES}
+    about = {
+        "format": FORMAT,
+        "n_subjects": study.n_subjects,
+        "n_visits": study.n_visits,
+        **{k: dict(v) if isinstance(v, Mapping) else v for k, v in vars(study.description).items()},
+        "files": {name: _sha256(data) for name, data in contents.items()},
+    }
+    contents[_DICTIONARY] = _to_csv(data_dictionary(study)).encode()
+    contents[_SCRIPT] = (Path(__file__).with_name("templates") / "make_report.py.txt").read_bytes()
+    contents[_ABOUT] = (json.dumps(about, indent=1, ensure_ascii=False) + "\n").encode()
+    paths = []
+    for name, data in contents.items():
+        paths.append(folder / name)
+        paths[-1].write_bytes(data)
+    return paths
+
+
+def read_study(folder: str | Path) -> StudyData:
+    """Read the folder of `write_study`.
+
+    Raises
+    ------
+    PblError
+        FILE_MISSING: no such folder, no `study.json` or a file that it names. FILE_FORMAT: a file that cannot be read,
+        is too large, or is not the one whose SHA-256 `study.json` names (without the key `files` none is compared).
+        STUDY_INVALID: as `StudyData`, and where numbers of persons or visits differ from those of `study.json`.
+    """
+    folder = Path(folder)
+    about = _about(folder / _ABOUT)
+    sums = about.get("files")
+    frames: dict[str, Any] = {}
+    for name in FRAMES:
+        path = folder / f"{name}.csv"
+        if name != "visits" and not path.exists() and not (sums and path.name in sums):
+            continue
+        data = _read(path, _MAX_BYTES.get(name, 32 * MIB))
+        if sums is not None and sums.get(path.name) != _sha256(data):
+            raise _format(
+                path,
+                "another content than study.json names",
+                "the file as it was written",
+                "copy the folder again; if the change is meant, remove the key files from study.json",
+            )
+        frames[name] = _frame(path, name, data)
+    try:
+        fields = {f.name for f in dataclasses.fields(StudyDescription)}
+        description = structured({k: v for k, v in about.items() if k in fields}, StudyDescription)
+    except (TypeError, ValueError) as error:
+        raise _format(folder / _ABOUT, str(error), "the fields of docs/study.md", "export the study again") from error
+    try:
+        study = StudyData(**frames, description=description)
+    except PblError as error:
+        parts = {"found": error.found, "expected": error.expected, "next_step": error.next_step}
+        raise PblError(error.code, **parts, key=folder / f"{error.key}.csv") from error
+    for name in ("n_subjects", "n_visits"):
+        if name in about and about[name] != getattr(study, name):
+            raise PblError(
+                "STUDY_INVALID",
+                found=f"{name} {about[name]} in study.json, {getattr(study, name)} in visits.csv",
+                expected="the same number",
+                next_step="copy the folder again; if the change is meant, remove that key from study.json",
+                key=folder,
+            )
+    return study
+
+
+def data_dictionary(study: StudyData) -> pd.DataFrame:
+    """One row per column of each file: `file, column, kind, unit, meaning`."""
+    rows = [
+        {"file": f"{n}.csv", "column": c.name, "kind": c.kind, "unit": c.unit, "meaning": c.meaning}
+        for n, columns in FRAMES.items()
+        for c in columns
+    ]
+    known = {c.name for c in FRAMES["visits"]}
+    rows += [
+        {"file": "visits.csv", "column": name, "kind": "", "unit": "", "meaning": "carried along from the source"}
+        for name in study.visits
+        if name not in known
+    ]
+    return pd.DataFrame(rows)
+
+
+def content_hash(study: StudyData) -> str:
+    """16 digits of a SHA-256 over the frames as they are written: the same for the same study."""
+    parts = "".join(_sha256(_csv(name, getattr(study, name))) for name in FRAMES)
+    return _sha256(parts.encode())[:16]
+
+
+def _csv(name: str, frame: Any) -> bytes:
+    flags = {c.name: frame[c.name].map({True: "true", False: "false"}) for c in FRAMES[name] if c.kind == "flag"}
+    return _to_csv(frame.assign(**flags), _DIGITS.get(name, "%.8g")).encode()
+
+
+def _to_csv(frame: Any, digits: str = "%.8g") -> str:
+    return frame.to_csv(index=False, float_format=digits, lineterminator="\n")
+
+
+def _about(path: Path) -> dict[str, Any]:
+    try:
+        about = read_json(path)
+    except OSError as error:
+        raise _missing(path, error) from error
+    except ValueError as error:
+        raise _format(path, str(error), "a JSON object", "copy the folder again") from error
+    if not isinstance(about, dict) or about.get("format") != FORMAT or not isinstance(about.get("files", {}), dict):
+        raise _format(path, "another format", f"a study of the format {FORMAT}", "export the study again")
+    return about
+
+
+def _read(path: Path, at_most: int) -> bytes:
+    try:
+        return read_bytes(path, at_most)
+    except OSError as error:
+        raise _missing(path, error) from error
+    except ValueError as error:
+        raise _format(path, str(error), "a CSV file of a study", "split the study") from error
+
+
+def _frame(path: Path, name: str, data: bytes) -> pd.DataFrame:
+    texts: Any = {c.name: str for c in FRAMES[name] if c.kind != "number"}
+    try:
+        if data.count(b"\n") > MAX_ROWS:
+            raise ValueError(f"more than {MAX_ROWS:,} rows")
+        if len(data.split(b"\n", 1)[0]) > _MAX_HEADER:
+            raise ValueError("a header that is too long")
+        return pd.read_csv(
+            io.BytesIO(data), dtype=texts, keep_default_na=False, na_values=[""], encoding="utf-8-sig", low_memory=False
+        )
+    except (ValueError, OverflowError) as error:  # pandas' ParserError and UnicodeDecodeError are ValueErrors
+        raise _format(path, f"{error}"[:200], "a CSV file as docs/study.md describes it", "copy it again") from error
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _missing(path: Path, error: OSError) -> PblError:
+    return PblError(
+        "FILE_MISSING",
+        found=error.strerror or str(error),
+        expected="the folder of a study: study.json, visits.csv, ... (docs/study.md)",
+        next_step="check the path, and that all files of the folder were copied",
+        key=path,
+    )
+
+
+def _format(path: Path, found: str, expected: str, next_step: str) -> PblError:
+    return PblError("FILE_FORMAT", found=found, expected=expected, next_step=next_step, key=path)

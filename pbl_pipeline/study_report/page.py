@@ -1,0 +1,291 @@
+"""The report of a study: one page, and its figures and tables as files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import pandas as pd
+
+from pbl_pipeline.code_version import code_version
+from pbl_pipeline.files import check_out_folder
+from pbl_pipeline.stats import CurveTest, Estimate
+from pbl_pipeline.study import StudyData, content_hash
+
+from .figures import (
+    AFTER,
+    BEFORE,
+    GROUP_COLOURS,
+    Figure,
+    colours_of,
+    draw_curves,
+    draw_forest,
+    draw_groups,
+    draw_means,
+    draw_pairs,
+    draw_scatter,
+)
+from .page_tables import PageTable, all_tables, number, p_text, short_of, title_of, unit_of
+from .results import StudyResults, score_classes, study_results
+from .visit_values import INDEX, pairs, plan, score_column
+
+PAGE = "report.html"
+
+
+def write_study_report(
+    study: StudyData,
+    folder: str | Path,
+    change_from: str = "",
+    change_to: str = "",
+    change_group: str = "",
+    pdf: bool = True,
+) -> list[Path]:
+    """Write `report.html`, `figures/*.svg` and `*.pdf`, `tables/*.csv` and `*.tex`; returns the paths, the page first.
+
+    The page asks for nothing from elsewhere. Statistics that the values do not support are a code with its reason.
+    `change_from`, `change_to` (roles) and `change_group` take precedence over those of the study's description. Without
+    `pdf` the figures are SVG alone, in a third of the time.
+
+    Raises
+    ------
+    PblError
+        FILE_UNWRITABLE; USAGE, STUDY_INVALID as `plan`.
+    """
+    folder = Path(folder)
+    check_out_folder(folder)
+    results = study_results(study, plan(study, change_from, change_to, change_group))
+    tables, sections = all_tables(study, results), _sections(study, results)
+    head = _head(study, results)
+    source = f"Slice {head['slice']}; {head['n']}; values by {head['made_by']}; methods: {head['methods']}"
+    footer = [source, f"Report by PBL pipeline {code_version()}; content {head['content']}"]
+    for sub in ("figures", "tables"):
+        (folder / sub).mkdir(parents=True, exist_ok=True)
+    paths = [folder / PAGE]
+    paths[0].write_text(_render(head, tables, sections, results, "SVG and PDF" if pdf else "SVG"), encoding="utf-8")
+    for figure in (f for figures in sections.values() for f in figures):
+        paths.append(folder / "figures" / f"{figure.name}.svg")
+        paths[-1].write_text(figure.svg(footer), encoding="utf-8")
+        if pdf:
+            paths.append(paths[-1].with_suffix(".pdf"))
+            paths[-1].write_bytes(figure.pdf(footer))
+    for name, frame in _frames(results).items():
+        paths.append(folder / "tables" / f"{name}.csv")
+        frame.to_csv(paths[-1], index=False, float_format="%.8g", lineterminator="\n")
+    for table in tables.values():
+        paths.append(folder / "tables" / f"{table.name}.tex")
+        paths[-1].write_text(table.latex(". ".join(footer)), encoding="utf-8")
+    return paths
+
+
+def _head(study: StudyData, results: StudyResults) -> dict[str, str]:
+    """Return what the report says about its data."""
+    given, counted = study.description, results.table
+    return {
+        "name": given.name or "Study",
+        "slice": f"{given.name or 'none'} {given.hash}".strip(),
+        "content": content_hash(study),
+        "n": _counts(len(set(counted["subject"])), len(counted)),
+        "all": _counts(study.n_subjects, study.n_visits),
+        "methods": "; ".join(f"{stage} {method}" for stage, method in given.methods.items()) or "not stated",
+        "made_by": given.code_version or "unknown code",
+        "code": code_version(),
+        "event": given.event,
+        "note": given.note,
+    }
+
+
+def _counts(persons: int, visits: int) -> str:
+    return f"{persons} person{'s' * (persons != 1)}, {visits} visit{'s' * (visits != 1)}"
+
+
+def _render(
+    head: dict[str, str],
+    tables: dict[str, PageTable],
+    sections: dict[str, list[Figure]],
+    results: StudyResults,
+    formats: str,
+) -> str:
+    text = resources.files("pbl_pipeline.study_report").joinpath("templates/report.html").read_text(encoding="utf-8")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    return environment.from_string(text).render(
+        head=head,
+        tables=tables,
+        sections=sections,
+        plan=results.plan,
+        formats=formats,
+    )
+
+
+def _frames(results: StudyResults) -> dict[str, pd.DataFrame]:
+    """The long tables as they are written."""
+    rows = []
+    for c in results.curves:
+        if isinstance(c.test, CurveTest):
+            t = c.test
+            who = {"variable": c.angle, "a": c.names[0], "b": c.names[1], "n_a": t.n_a, "n_b": t.n_b}
+            points = {"percent": t.percent, "difference": t.difference, "t": t.t, "p": t.p}
+            rows.append(pd.DataFrame(who | points))
+    curve_columns = ["variable", "a", "b", "n_a", "n_b", "percent", "difference", "t", "p"]
+    return {
+        "visits": results.table,
+        "flow": results.flow,
+        "by_visit": results.by_visit,
+        "repeatability": results.repeatability,
+        "validity": results.validity,
+        "change": results.change,
+        "groups": results.groups,
+        "curve_tests": pd.concat(rows) if rows else pd.DataFrame(columns=curve_columns),
+    }
+
+
+def study_figures(study: StudyData, results: StudyResults) -> dict[str, Figure]:
+    """All figures of a report, by name; a notebook shows one as it is."""
+    return {f.name: f for figures in _sections(study, results).values() for f in figures}
+
+
+def _sections(study: StudyData, results: StudyResults) -> dict[str, list[Figure]]:
+    """Figures by section of the page."""
+    return {
+        "paper": sorted(_paper_figures(study, results), key=lambda f: f.title[0]),
+        "srm": list(_srm_figure(results)),
+        "by_visit": list(_mean_figures(study, results)),
+        "paired": list(_paired_figures(study, results)),
+        "curves": list(_curve_figures(study, results, "change")),
+    }
+
+
+def _paper_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]:
+    """As the paper's figure 5: A curves of groups, B the index by class of a score, C over a continuous score, D by
+    group, E over an ordinal score."""
+    yield from _curve_figures(study, results, "")
+    measure = INDEX if INDEX in results.plan.measures else next(iter(results.plan.measures), "")
+    if not measure:
+        return
+    at: Any = results.table[results.table["role"] == results.plan.change_from]
+    title, unit = title_of(study, measure), unit_of(study, measure)
+    where = f"visit {results.plan.change_from}"
+    for score, labels in score_classes(study, results.plan, at).items():
+        by_class = {str(c): at.loc[labels == c, measure].dropna().to_numpy(float) for c in labels.cat.categories}
+        if by_class := {c: v for c, v in by_class.items() if len(v)}:
+            note = f"{where}; {_tests(results, measure, score)}"
+            drawing = draw_groups(by_class, unit)
+            yield Figure(_file("5B", score), f"B  {title} by class of {short_of(score)}", note, drawing)
+    ordinal = {score_column(study, i): bool(o) for i, o in study.instruments[["instrument", "ordinal"]].to_numpy()}
+    colours = colours_of(results.plan.groups)
+    for score in results.plan.scores:
+        both = at.dropna(subset=[measure, score])
+        own = {g: both[both["group"] == g] for g in results.plan.groups}
+        parts = {g: (v[score].to_numpy(float), v[measure].to_numpy(float)) for g, v in own.items() if len(v)}
+        if parts:
+            letter = "E" if ordinal[score] else "C"
+            key = {g: colours[g] for g in parts}
+            drawing = draw_scatter(parts, (title_of(study, score), title), list(key.values()), not ordinal[score])
+            note = f"{where}; {_correlations(results, measure, score)}"
+            yield Figure(_file(f"5{letter}", score), f"{letter}  {title} and {short_of(score)}", note, drawing, key)
+    values = {g: at.loc[at["group"] == g, measure].dropna().to_numpy(float) for g in results.plan.groups}
+    values = {g: v for g, v in values.items() if len(v)}
+    if len(values) > 1:
+        note = f"{where}; {_tests(results, measure, 'group')}"
+        yield Figure("5D_groups", f"D  {title} by group", note, draw_groups(values, unit, colours))
+
+
+def _correlations(results: StudyResults, measure: str, score: str) -> str:
+    """The correlations of a measure with a score, in words."""
+    frame: Any = results.validity
+    words = []
+    for r in frame[(frame["name"] == measure) & (frame["score"] == score)].to_dict("records"):
+        limits = f"{number(r['low'], 2)} to {number(r['high'], 2)}"
+        found = r["code"] or f"{r['kind'].capitalize()} r = {number(r['value'], 2)} ({limits})"
+        words.append(f"{r['persons']} (n {r['n']}): {found}")
+    return "; ".join(words)
+
+
+def _tests(results: StudyResults, measure: str, by: str) -> str:
+    """The tests of a measure between groups, in words."""
+    frame: Any = results.groups
+    rows = frame[(frame["name"] == measure) & (frame["by"] == by)].to_dict("records")
+    words = [f"{r['a']} and {r['b']}: " + (r["code"] or f"{r['test']}, p = {p_text(r['p'])}") for r in rows]
+    return "; ".join(words) or "one group only"
+
+
+def _srm_figure(results: StudyResults) -> Iterator[Figure]:
+    frame: Any = results.change
+    found = frame[(frame["statistic"] == "srm") & (frame["code"] == "")]
+    rows = [
+        (
+            f"{short_of(r['name'])} (n {r['n']})",
+            GROUP_COLOURS[1 if r["name"] in results.plan.scores else 0],
+            Estimate(r["value"], r["low"], r["high"], 0.95),
+        )
+        for r in found.to_dict("records")
+    ]
+    if rows:
+        plan = results.plan
+        note = f"{plan.change_group}, {plan.change_from} to {plan.change_to}; 95 % interval by the jackknife"
+        colours = {"gait measures": GROUP_COLOURS[0], "clinical scores": GROUP_COLOURS[1]}
+        title = "Standardised response mean of gait measures and clinical scores"
+        yield Figure("srm", title, note, draw_forest(rows), colours)
+
+
+def _mean_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]:
+    plan: Any = results.plan
+    frame: Any = results.by_visit
+    for name in (*plan.measures, *plan.scores):
+        own = frame[frame["name"] == name]
+        if len(own):
+            groups = [g for g in plan.groups if g in set(own["group"])]
+            counts = "; ".join(f"{g} n {', '.join(map(str, own.loc[own['group'] == g, 'n']))}" for g in groups)
+            colours = {g: c for g, c in colours_of(plan.groups).items() if g in groups}
+            drawing = draw_means(own, plan.roles, plan.groups, unit_of(study, name))
+            yield Figure(
+                _file("visits", name), title_of(study, name), f"mean, 95 % interval; {counts}", drawing, colours
+            )
+
+
+def _paired_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]:
+    plan: Any = results.plan
+    frame: Any = results.change
+    for name in (*plan.measures, *plan.scores):
+        both = pairs(results.table, plan, name)
+        if not len(both):
+            continue
+        row = frame[(frame["name"] == name) & (frame["statistic"] == "effect_size")].iloc[0]
+        test = row["code"] or f"Wilcoxon p = {p_text(row['p'])}, r = {number(row['value'], 2)}"
+        drawing = draw_pairs(both, (plan.change_from, plan.change_to), unit_of(study, name))
+        yield Figure(
+            _file("paired", name), title_of(study, name), f"{plan.change_group}, n {len(both)}; {test}", drawing
+        )
+
+
+def _curve_figures(study: StudyData, results: StudyResults, comparison: str) -> Iterator[Figure]:
+    """Those of "change", or ("") those between groups, as the paper's figure 5 A."""
+    groups = colours_of(results.plan.groups)
+    for c in results.curves:
+        if (c.comparison == "change") != (comparison == "change") or not len(c.a) or not len(c.b):
+            continue
+        of_change = c.comparison == "change"
+        colours = (BEFORE, AFTER) if of_change else (groups[c.names[1]], groups[c.names[0]])
+        if isinstance(c.test, CurveTest):
+            spans = ", ".join(f"{x.first:.0f} to {x.last:.0f} %" for x in c.test.phases)
+            test = f"differ at {spans}" if spans else f"differ nowhere (p = {p_text(c.test.p_value)})"
+        else:
+            test = c.test.code
+        n = f"n {len(c.a)}" if of_change else f"n {len(c.a)}, {len(c.b)}"
+        left = f"; {c.left_out} left out for unknown points" if c.left_out else ""
+        prefix, letter = ("curves", "") if of_change else ("5A", "A  ")
+        who = f"{c.names[1]} to {c.names[0]}" if of_change else f"{c.names[0]} and {c.names[1]}"
+        name = c.angle if of_change else f"{c.angle}_{c.names[1]}"
+        unit = "\N{DEGREE SIGN}" if unit_of(study, c.angle) == "deg" else unit_of(study, c.angle)
+        legend = {c.names[1]: colours[0], c.names[0]: colours[1]}
+        title = f"{letter}{title_of(study, c.angle)}, {who}"
+        yield Figure(
+            _file(prefix, name), title, f"mean, one sd; {n}{left}; {test}", draw_curves(c, colours, unit), legend
+        )
+
+
+def _file(prefix: str, name: str) -> str:
+    """A stem for a file."""
+    return f"{prefix}_" + "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in name)

@@ -1,0 +1,423 @@
+"""Tables of a study as people read them: the paper's Table 2 and SRM table, and the others."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pbl_pipeline.latex import tex_escape
+from pbl_pipeline.study import StudyData
+from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES
+
+from .results import ALPHA, StudyResults
+from .visit_values import INDEX, score_column
+
+GAIT, SCORES = "Gait measures", "Clinical scores"
+_MINUS = "\N{MINUS SIGN}"
+_STARS = "* p < 0.05, not corrected for the number of tests"
+#: Of a table that shows it.
+_HOLM = "p, Holm: corrected for those"
+
+
+@dataclasses.dataclass(frozen=True)
+class PageTable:
+    """A table as it is shown.
+
+    Attributes
+    ----------
+    name
+        Stem of its files.
+    title, note
+        What it shows; how to read it.
+    body
+        Texts; its columns may have two levels.
+    messages
+        Why cells with a code have no number: (code with its mark, text).
+    """
+
+    name: str
+    title: str
+    note: str
+    body: pd.DataFrame
+    messages: tuple[tuple[str, str], ...] = ()
+
+    def head(self) -> list[list[tuple[str, int]]]:
+        """Rows of the head: (text, columns that it spans)."""
+        rows = []
+        for level in range(self.body.columns.nlevels):
+            cells: list[tuple[str, int]] = []
+            for text in map(str, self.body.columns.get_level_values(level)):
+                if cells and text and cells[-1][0] == text and level + 1 < self.body.columns.nlevels:
+                    cells[-1] = (text, cells[-1][1] + 1)
+                else:
+                    cells.append((text, 1))
+            rows.append(cells)
+        return rows
+
+    def latex(self, footer: str) -> str:
+        """For the booktabs package."""
+        notes = " ".join(f"{mark}: {text}." for mark, text in self.messages)
+        text: str = self.body.replace(_MINUS, "-", regex=True).to_latex(
+            index=False,
+            escape=True,
+            multicolumn_format="c",
+            caption=tex_escape(f"{self.title}. {self.note} {notes} {footer}".replace(_MINUS, "-")),
+            label=f"tab:study_{self.name}",
+            column_format="l" * _labels(self.body) + "r" * (self.body.shape[1] - _labels(self.body)),
+        )
+        return text
+
+
+class _Marks:
+    """Codes of a table's cells, each message once."""
+
+    def __init__(self) -> None:
+        self.found: dict[str, str] = {}
+
+    def __call__(self, code: str, message: str) -> str:
+        mark = self.found.setdefault(f"{code}: {message}", chr(ord("a") + len(self.found) % 26))
+        return f"{code} ({mark})"
+
+    def messages(self) -> tuple[tuple[str, str], ...]:
+        return tuple((mark, text) for text, mark in self.found.items())
+
+
+def _labels(body: pd.DataFrame) -> int:
+    """Columns of texts at the left."""
+    head = [str(c[-1] if isinstance(c, tuple) else c) for c in body.columns]
+    return sum(
+        c in ("", "Measure", "Group", "Visit", "Score", "Persons", "Of", "Kind", "By", "A", "B", "Test")
+        for c in head[:5]
+    )
+
+
+def title_of(study: StudyData, name: str) -> str:
+    """A measure, score or angle as people read it, with its unit."""
+    unit = unit_of(study, name)
+    return f"{short_of(name)} ({unit})" if unit else short_of(name)
+
+
+def short_of(name: str) -> str:
+    """Without its unit."""
+    if name == INDEX:
+        return "GDI"
+    angles = ANGLES | FOOT_ANGLES | PELVIS_ANGLES
+    if name in MEASURES:
+        return MEASURES[name][0]
+    return angles[name][0] if name in angles else name.replace("_", " ")
+
+
+def unit_of(study: StudyData, name: str) -> str:
+    """The unit as the study writes it."""
+    for frame, column in ((study.measures, "measure"), (study.curves, "variable")):
+        rows: Any = frame[frame[column] == name]
+        if len(rows):
+            return str(rows["unit"].iloc[0])
+    for instrument, unit in zip(study.instruments["instrument"], study.instruments["unit"], strict=True):
+        if score_column(study, instrument) == name:
+            return unit
+    return ""
+
+
+def number(value: float, digits: int) -> str:
+    """With a fixed number of decimals and a true minus; "" for NaN."""
+    return "" if not math.isfinite(value) else f"{value:.{digits}f}".replace("-", _MINUS)
+
+
+def digits_of(values: Any) -> int:
+    """Decimals that show three digits of typical values."""
+    known = np.abs(np.asarray(values, float))
+    known = known[np.isfinite(known)]
+    size = float(np.median(known)) if len(known) else 1.0
+    return int(np.clip(2 - math.floor(math.log10(size)), 0, 4)) if size > 0 else 2
+
+
+def p_text(p: float) -> str:
+    """p with two digits, below 0.001 with its power."""
+    if not math.isfinite(p):
+        return ""
+    return f"{p:.2g}" if p >= 0.001 else f"{p:.0e}".replace("e-0", "e-").replace("-", _MINUS)
+
+
+def estimate(row: Any, marks: _Marks, digits: int = 2, star: bool = False) -> str:
+    """`0.84 (0.81 to 0.86)` of a row with `value, low, high, p, code, message`, with a star where p < 0.05."""
+    if row["code"]:
+        return marks(row["code"], row["message"])
+    limits = f"({number(row['low'], digits)} to {number(row['high'], digits)})"
+    shown = limits if math.isfinite(row["low"]) else "(no interval)"
+    return f"{number(row['value'], digits)} {shown}{'*' if star and row['p'] < ALPHA else ''}"
+
+
+def all_tables(study: StudyData, results: StudyResults) -> dict[str, PageTable]:
+    """Every table of the report, by name."""
+    made = (
+        flow(results),
+        table2(results),
+        srm_table(study, results),
+        by_visit(study, results),
+        repeatability(study, results),
+        validity(results),
+        groups(results),
+        phases(results),
+    )
+    return {t.name: t for t in made}
+
+
+def flow(results: StudyResults) -> PageTable:
+    """Who is in and out."""
+    rows = [
+        {
+            "Group": r["group"],
+            "Visit": r["role"],
+            "Persons of the group": r["persons"],
+            "No visit": r["persons"] - r["took_place"],
+            "Took place": r["took_place"],
+            "Left out": r["excluded"],
+            "Count": r["counted"],
+            "Of them without index": r["without_index"],
+            "Why left out": r["reasons"],
+        }
+        for r in results.flow.to_dict("records")
+    ]
+    body = pd.DataFrame(rows).astype(str)
+    return PageTable("flow", "Who is in and out", "Visits by group; what is left out is in no number below.", body)
+
+
+def table2(results: StudyResults) -> PageTable:
+    """The paper's Table 2: repeatability over cycles, correlation with the scores, effect size of change."""
+    plan, marks = results.plan, _Marks()
+    none = "\N{EN DASH}"
+    rows = []
+    for kind, names in ((SCORES, plan.scores), (GAIT, plan.measures)):
+        for i, name in enumerate(names):
+            row: dict[Any, str] = {("", ""): "" if i else kind, (" ", "Measure"): short_of(name)}
+            for icc_kind, head in (("2,1", "ICC2"), ("2,k", "ICC2k")):
+                found = _one(results.repeatability, name=name, of="cycles", kind=icc_kind)
+                row["Repeatability", head] = none if found is None else estimate(found, marks)
+            for score in plan.scores:
+                found = _one(results.validity, name=name, score=score, persons="all")
+                text = none
+                if found is not None:
+                    text = (
+                        marks(found["code"], found["message"])
+                        if found["code"]
+                        else f"{number(found['value'], 2)}{'*' if found['p'] < ALPHA else ''}"
+                    )
+                row["Validity", f"r {short_of(score)}"] = text
+            found = _one(results.change, name=name, statistic="effect_size")
+            row["Responsiveness", "Effect size"] = none if found is None else estimate(found, marks, star=True)
+            rows.append(row)
+    body = pd.DataFrame(rows)
+    body.columns = pd.MultiIndex.from_tuples(list(body.columns))
+    note = (
+        "ICC of cycles (Shrout & Fleiss 2,1 and 2,k), one visit per person, with 95 % interval. r: Spearman for "
+        f"ordinal scores, else Pearson, all persons with both values at the visit {plan.change_from}. Effect size: "
+        f"Wilcoxon's with bootstrap interval, {plan.change_group}, {plan.change_from} to {plan.change_to or 'none'}. "
+        f"{_STARS}."
+    )
+    return PageTable("table2", "Reliability, validity and responsiveness", note, body, marks.messages())
+
+
+def srm_table(study: StudyData, results: StudyResults) -> PageTable:
+    """The paper's SRM table, with the mean change."""
+    plan, marks = results.plan, _Marks()
+    rows = []
+    for kind, names in ((SCORES, plan.scores), (GAIT, plan.measures)):
+        for i, name in enumerate(names):
+            srm, mean = (_one(results.change, name=name, statistic=s) for s in ("srm", "mean"))
+            if srm is None or mean is None:
+                continue
+            digits = digits_of([mean["value"], mean["low"], mean["high"]])
+            rows.append(
+                {
+                    "": "" if i else kind,
+                    "Measure": title_of(study, name),
+                    "SRM": estimate(srm, marks, star=True),
+                    "p, Holm": p_text(srm["p_holm"]),
+                    "Mean change": estimate(mean, marks, digits),
+                    "Persons": str(srm["n"]),
+                }
+            )
+    note = (
+        f"Standardised response mean (mean change / its standard deviation) with the jackknife's 95 % interval; "
+        f"{plan.change_group}, {plan.change_from} to {plan.change_to or 'none'}, persons with both visits. {_STARS}; "
+        f"{_HOLM} of this table."
+    )
+    body = pd.DataFrame(rows, columns=["", "Measure", "SRM", "p, Holm", "Mean change", "Persons"])
+    return PageTable("srm", "Standardised response mean", note, body, marks.messages())
+
+
+def by_visit(study: StudyData, results: StudyResults) -> PageTable:
+    """Mean, interval and spread by visit."""
+    rows = []
+    frame: Any = results.by_visit
+    for name in dict.fromkeys(frame["name"]):
+        own = frame[frame["name"] == name]
+        digits = digits_of(own["mean"])
+        for i, r in enumerate(own.to_dict("records")):
+            interval = (
+                f"{number(r['low'], digits)} to {number(r['high'], digits)}"
+                if math.isfinite(r["low"])
+                else "one person: none"
+            )
+            rows.append(
+                {
+                    "Measure": "" if i else title_of(study, name),
+                    "Group": r["group"],
+                    "Visit": r["role"],
+                    "n": str(r["n"]),
+                    "Mean": number(r["mean"], digits),
+                    "95 % interval": interval,
+                    "SD": number(r["sd"], digits),
+                    "Median": number(r["median"], digits),
+                    "nIQR": number(r["niqr"], digits),
+                }
+            )
+    columns = ["Measure", "Group", "Visit", "n", "Mean", "95 % interval", "SD", "Median", "nIQR"]
+    note = "Student's interval of the mean; nIQR = IQR x 0.7413."
+    return PageTable("by_visit", "Measures by visit", note, pd.DataFrame(rows, columns=columns))
+
+
+def repeatability(study: StudyData, results: StudyResults) -> PageTable:
+    """ICC, SEM, MDC."""
+    marks, rows = _Marks(), []
+    for r in results.repeatability.to_dict("records"):
+        digits = digits_of([r["sem"]])
+        rows.append(
+            {
+                "Measure": title_of(study, r["name"]),
+                "Of": r["of"],
+                "Group": r["group"],
+                "Kind": r["kind"],
+                "ICC": estimate(r, marks),
+                "SEM": number(r["sem"], digits),
+                "MDC90": number(r["mdc90"], digits),
+                "MDC95": number(r["mdc95"], digits),
+                "n": "" if r["code"] else f"{r['n']:.0f}",
+                "k": "" if r["code"] else f"{r['k']:.1f}",
+            }
+        )
+    columns = ["Measure", "Of", "Group", "Kind", "ICC", "SEM", "MDC90", "MDC95", "n", "k"]
+    note = (
+        "SEM and minimal detectable change in the unit of the measure; n persons with k cycles or visits (harmonic "
+        "mean). Visits: 2,1 counts a shift of all persons as error (generalized interval), 3,1 does not. Where persons "
+        "change differently between visits, that counts as error."
+    )
+    return PageTable("repeatability", "Repeatability", note, pd.DataFrame(rows, columns=columns), marks.messages())
+
+
+def validity(results: StudyResults) -> PageTable:
+    """Correlations."""
+    marks, rows = _Marks(), []
+    for r in results.validity.to_dict("records"):
+        rows.append(
+            {
+                "Measure": short_of(r["name"]),
+                "Score": short_of(r["score"]),
+                "Persons": r["persons"],
+                "Kind": r["kind"].capitalize(),
+                "r": estimate(r, marks, star=True),
+                "p": p_text(r["p"]),
+                "p, Holm": p_text(r["p_holm"]),
+                "n": str(r["n"]),
+            }
+        )
+    columns = ["Measure", "Score", "Persons", "Kind", "r", "p", "p, Holm", "n"]
+    note = f"At the visit {results.plan.change_from}, with 95 % interval. {_STARS}; {_HOLM} of the same persons."
+    return PageTable(
+        "validity", "Correlation with clinical scores", note, pd.DataFrame(rows, columns=columns), marks.messages()
+    )
+
+
+def groups(results: StudyResults) -> PageTable:
+    """Differences between groups."""
+    marks, rows = _Marks(), []
+    for r in results.groups.to_dict("records"):
+        size = {
+            "value": r["g"],
+            "low": r["g_low"],
+            "high": r["g_high"],
+            "p": r["p"],
+            "code": r["code"],
+            "message": r["message"],
+        }
+        rows.append(
+            {
+                "Measure": short_of(r["name"]),
+                "By": r["by"],
+                "A": r["a"],
+                "B": r["b"],
+                "Test": r["test"],
+                "Hedges' g (a - b)": estimate(size, marks, star=True),
+                "p": p_text(r["p"]),
+                "p, Holm": p_text(r["p_holm"]),
+                "n": f"{r['n_a']}, {r['n_b']}",
+            }
+        )
+    columns = ["Measure", "By", "A", "B", "Test", "Hedges' g (a - b)", "p", "p, Holm", "n"]
+    note = (
+        f"At the visit {results.plan.change_from}. Student's t where Shapiro-Wilk rejects neither group, else "
+        f"Mann-Whitney U. {_STARS}; {_HOLM} with the same By."
+    )
+    return PageTable(
+        "groups", "Differences between groups", note, pd.DataFrame(rows, columns=columns), marks.messages()
+    )
+
+
+def phases(results: StudyResults) -> PageTable:
+    """Where curves differ."""
+    marks, rows = _Marks(), []
+    for c in results.curves:
+        row = {"Measure": short_of(c.angle), "Of": comparison_of(c)}
+        if not hasattr(c.test, "phases"):
+            error: Any = c.test
+            rows.append(
+                {
+                    **row,
+                    "Phase (% of cycle)": marks(error.code, f"{error.found}; expected {error.expected}"),
+                    "Largest difference (deg)": "",
+                    "p": "",
+                }
+            )
+            continue
+        test: Any = c.test
+        found = test.phases or (None,)
+        for phase in found:
+            inside = slice(None) if phase is None else (test.percent >= phase.first) & (test.percent <= phase.last)
+            part = test.difference[inside]
+            rows.append(
+                {
+                    **row,
+                    "Phase (% of cycle)": "none" if phase is None else f"{phase.first:.0f} to {phase.last:.0f}",
+                    "Largest difference (deg)": number(float(part[np.abs(part).argmax()]), 1),
+                    "p": p_text(test.p_value if phase is None else phase.p),
+                }
+            )
+        for r in rows[-len(found) :]:
+            r["n"] = f"{test.n_a}" if test.paired else f"{test.n_a}, {test.n_b}"
+            r["Left out"] = str(c.left_out)
+    columns = ["Measure", "Of", "Phase (% of cycle)", "Largest difference (deg)", "p", "n", "Left out"]
+    note = (
+        "Permutation test over the gait cycle (max-t), p corrected for the cycle but not for the number of angles; "
+        "left out: persons whose curves have unknown points."
+    )
+    body = pd.DataFrame([{c: r.get(c, "") for c in columns} for r in rows], columns=columns)
+    return PageTable("phases", "Where curves differ", note, body, marks.messages())
+
+
+def comparison_of(result: Any) -> str:
+    """Who is compared with whom, as a - b."""
+    a, b = result.names
+    return f"{a or 'none'} {_MINUS} {b}"
+
+
+def _one(frame: pd.DataFrame, **values: str) -> dict[str, Any] | None:
+    """The row with these values."""
+    found: Any = frame
+    for column, value in values.items():
+        found = found[found[column] == value]
+    return found.iloc[0].to_dict() if len(found) else None

@@ -1,0 +1,418 @@
+"""The statistics of a study as long tables: one row per number, with its interval, or the code that says why not."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy import stats as distributions
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.stats import (
+    CurveTest,
+    Estimate,
+    adjust,
+    compare_groups,
+    correlation,
+    curve_test,
+    hedges_g,
+    icc,
+    ratings_table,
+    srm,
+    wilcoxon,
+)
+from pbl_pipeline.study import StudyData, classes_of
+
+from .visit_values import INDEX, Plan, at_role, cycle_values, mean_curves, pairs, score_column, visit_table
+
+#: Two-sided level of significance (the paper, Statistics).
+ALPHA = 0.05
+
+
+@dataclasses.dataclass(frozen=True)
+class CurveResult:
+    """A comparison of mean curves of an angle.
+
+    Attributes
+    ----------
+    angle, comparison
+        What and between whom; "change" or two names.
+    test
+        The test, or why there is none.
+    left_out
+        Persons whose curves have unknown points.
+    a, b : (N, 101), (M, 101)
+        Curves of the persons tested; of "change" a is after and b before.
+    names
+        Of a and b.
+    """
+
+    angle: str
+    comparison: str
+    test: CurveTest | PblError
+    left_out: int
+    a: np.ndarray
+    b: np.ndarray
+    names: tuple[str, str]
+
+
+@dataclasses.dataclass(frozen=True)
+class StudyResults:
+    """All statistics of a report; every frame is long, `code` and `message` are "" where there is a value.
+
+    Attributes
+    ----------
+    plan
+        What was compared.
+    table
+        `visit_table` of the study.
+    flow
+        `group, role, persons, took_place, excluded, counted, reasons`.
+    by_visit
+        `name, group, role, n, mean, low, high, sd, median, niqr`: mean with Student's interval.
+    repeatability
+        `name, of, kind, value, low, high, sem, mdc90, mdc95, n, k`: cycles of one visit, and visits.
+    validity
+        `name, score, persons, kind, value, low, high, p, n`: at the visit `change_from`.
+    change
+        `name, n, mean_pre, mean_post, mean_change, low, high, statistic ...`: one row per name and statistic of change:
+        "mean", "srm", "effect_size".
+    groups
+        `name, a, b, test, statistic, p, g, low, high, n_a, n_b`: groups, and classes of a score, at `change_from`.
+    curves
+        One per angle and comparison.
+    """
+
+    plan: Plan
+    table: pd.DataFrame
+    flow: pd.DataFrame
+    by_visit: pd.DataFrame
+    repeatability: pd.DataFrame
+    validity: pd.DataFrame
+    change: pd.DataFrame
+    groups: pd.DataFrame
+    curves: tuple[CurveResult, ...]
+
+
+def study_results(study: StudyData, to_compare: Plan, permutations: int = 10_000) -> StudyResults:
+    """All statistics of a study. What the values do not support has the code STATS_INPUT in its row."""
+    table = visit_table(study)
+    return StudyResults(
+        to_compare,
+        table,
+        flow_table(study, to_compare),
+        visit_means(table, to_compare),
+        repeatability(study, to_compare, table),
+        validity(study, to_compare, table),
+        change(to_compare, table),
+        group_differences(study, to_compare, table),
+        tuple(curve_results(study, to_compare, permutations)),
+    )
+
+
+def _tried(function: Callable[..., Any], *values: Any, **options: Any) -> tuple[Any, dict[str, str]]:
+    """What a function returns, with empty `code` and `message`; or None and those of its error."""
+    try:
+        return function(*values, **options), {"code": "", "message": ""}
+    except PblError as error:
+        return None, {"code": error.code, "message": f"{error.found}; expected {error.expected}"}
+
+
+def _interval(found: Estimate | None) -> dict[str, float]:
+    return {k: np.nan if found is None else getattr(found, k) for k in ("value", "low", "high")}
+
+
+def flow_table(study: StudyData, to_compare: Plan) -> pd.DataFrame:
+    """Who is in and out, by group and role; `reasons` as "reason (n); ...". `persons` is that of the whole group."""
+    visits: Any = study.visits
+    roles = [*to_compare.roles, *(r for r in dict.fromkeys(visits["role"]) if r not in to_compare.roles)]
+    names = [*to_compare.groups, *(g for g in sorted(set(visits["group"])) if g not in to_compare.groups)]
+    rows = []
+    for group in names:
+        of_group = visits[visits["group"] == group]
+        for role in roles:
+            own = of_group[of_group["role"] == role]
+            out = own[~own["included"]]
+            counts = out["reason"].value_counts()
+            rows.append(
+                {
+                    "group": group,
+                    "role": role,
+                    "persons": of_group["subject"].nunique(),
+                    "took_place": len(own),
+                    "excluded": len(out),
+                    "counted": len(own) - len(out),
+                    "without_index": int(own.loc[own["included"], INDEX].isna().sum()),
+                    "reasons": "; ".join(f"{reason} ({n})" for reason, n in counts.items()),
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def visit_means(table: pd.DataFrame, to_compare: Plan) -> pd.DataFrame:
+    """Mean with its 95 % interval (Student's t), standard deviation, median and nIQR, by measure, group and role."""
+    rows = []
+    for name in (*to_compare.measures, *to_compare.scores):
+        for group in to_compare.groups:
+            for role in to_compare.roles:
+                values = at_role(table, role, name, group).to_numpy(float)
+                if len(values):
+                    rows.append({"name": name, "group": group, "role": role, "n": len(values), **summary(values)})
+    columns = ["name", "group", "role", "n", "mean", "low", "high", "sd", "median", "niqr"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def summary(values: np.ndarray) -> dict[str, float]:
+    """`mean, low, high` (Student's 95 % interval), `sd, median, niqr` of (N,) values; NaN where one value has none."""
+    n = len(values)
+    low, high = np.percentile(values, [25, 75])
+    sd = float(values.std(ddof=1)) if n > 1 else np.nan
+    half = float(distributions.t.isf(0.025, n - 1)) * sd / np.sqrt(n) if n > 1 else np.nan
+    mean = float(values.mean())
+    # One person has neither an interval nor a spread.
+    spread = 0.7413 * (high - low) if n > 1 else np.nan
+    return {
+        "mean": mean,
+        "low": mean - half,
+        "high": mean + half,
+        "sd": sd,
+        "median": float(np.median(values)),
+        "niqr": spread,
+    }
+
+
+def repeatability(study: StudyData, to_compare: Plan, table: pd.DataFrame) -> pd.DataFrame:
+    """ICC, SEM and minimal detectable change, from the cycles of one visit and from visits.
+
+    Of cycles: "2,1" and "2,k" of all persons (the paper's Table 2) and "1,1" (docs/statistics.md, Which ICC). Of
+    visits, by group: "2,1" with the generalized interval, and "3,1", which leaves out a shift that all persons share.
+    In a group that changes, persons who change differently count as error in both.
+    """
+    rows: list[dict[str, Any]] = []
+
+    def add(name: str, of: str, kind: str, group: str, ratings: Callable[[], Any], interval: str) -> None:
+        found, why = _tried(lambda: icc(ratings(), kind, interval=interval))
+        more = {k: np.nan if found is None else getattr(found, k) for k in ("sem", "mdc90", "mdc95", "n", "k")}
+        rows.append({"name": name, "of": of, "group": group, "kind": kind, **_interval(found), **more, **why})
+
+    for name in to_compare.measures:
+        cycles = cycle_values(study, to_compare, name)
+        for kind in ("2,1", "2,k", "1,1") if len(cycles) else ():
+            add(name, "cycles", kind, "all", lambda c=cycles: ratings_table(c["value"], c["subject"]), "f")
+    for name in (*to_compare.measures, *to_compare.scores):
+        for group in to_compare.groups:
+            own: Any = table[table["group"] == group]
+            wide = own.pivot(index="subject", columns="role", values=name).dropna(how="all").dropna(axis=1, how="all")
+            if len(wide):
+                for kind, interval in (("2,1", "generalized"), ("3,1", "f")):
+                    add(name, "visits", kind, group, lambda w=wide: w.to_numpy(float), interval)
+    columns = [
+        "name",
+        "of",
+        "group",
+        "kind",
+        "value",
+        "low",
+        "high",
+        "sem",
+        "mdc90",
+        "mdc95",
+        "n",
+        "k",
+        "code",
+        "message",
+    ]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def validity(study: StudyData, to_compare: Plan, table: pd.DataFrame) -> pd.DataFrame:
+    """Correlation of each measure with each score at the visit `change_from`: all persons who have both, and the
+    changing group where it is not all of them. Spearman where the score is ordinal, else Pearson (the paper,
+    Statistics)."""
+    ordinal = {
+        score_column(study, i): o
+        for i, o in zip(study.instruments["instrument"], study.instruments["ordinal"], strict=True)
+    }
+    at: Any = table[table["role"] == to_compare.change_from]
+    rows = []
+    for name in to_compare.measures:
+        for score in to_compare.scores:
+            both = at.dropna(subset=[name, score])
+            own = both[both["group"] == to_compare.change_group]
+            parts = {"all": both} if len(own) in (0, len(both)) else {"all": both, to_compare.change_group: own}
+            for persons, part in parts.items():
+                kind = "spearman" if ordinal[score] else "pearson"
+                found, why = _tried(correlation, part[name], part[score], kind)
+                p = np.nan if found is None else found.p
+                rows.append(
+                    {
+                        "name": name,
+                        "score": score,
+                        "persons": persons,
+                        "kind": kind,
+                        **_interval(found),
+                        "p": p,
+                        "n": len(part),
+                        **why,
+                    }
+                )
+    columns = ["name", "score", "persons", "kind", "value", "low", "high", "p", "p_holm", "n", "code", "message"]
+    return _corrected(pd.DataFrame(rows, columns=columns), "persons")
+
+
+def change(to_compare: Plan, table: pd.DataFrame, resamples: int = 10_000) -> pd.DataFrame:
+    """Change of the changing group by measure and score: "mean" (Student's interval), "srm" (jackknife; the paper,
+    Statistics) and "effect_size" (Wilcoxon; the paper, Responsiveness), each over the persons with both visits."""
+    rows = []
+    for name in (*to_compare.measures, *to_compare.scores):
+        both = pairs(table, to_compare, name)
+        pre, post = both["pre"].to_numpy(float), both["post"].to_numpy(float)
+        shared = {"name": name, "n": len(both)}
+        moved, why_moved = _tried(srm, pre, post)
+        mean = summary(post - pre) if moved is not None else {}
+        middle = {"value": mean.get("mean", np.nan), **{k: mean.get(k, np.nan) for k in ("low", "high")}}
+        rows.append({**shared, "statistic": "mean", **middle, "p": np.nan, **why_moved})
+        rows.append(
+            {**shared, "statistic": "srm", **_interval(moved), "p": np.nan if moved is None else moved.p, **why_moved}
+        )
+        tested, why = _tried(wilcoxon, pre, post, n_resamples=resamples)
+        effect = None if tested is None else tested.effect
+        rows.append(
+            {
+                **shared,
+                "statistic": "effect_size",
+                **_interval(effect),
+                "p": np.nan if tested is None else tested.p,
+                **why,
+            }
+        )
+    columns = ["name", "n", "statistic", "value", "low", "high", "p", "p_holm", "code", "message"]
+    return _corrected(pd.DataFrame(rows, columns=columns), "statistic")
+
+
+def group_differences(study: StudyData, to_compare: Plan, table: pd.DataFrame) -> pd.DataFrame:
+    """Each measure between groups, and between neighbouring classes of a score, at the visit `change_from`: the
+    paper's test (Statistics) and Hedges' g."""
+    at: Any = table[table["role"] == to_compare.change_from]
+    kinds = {"group": at["group"]} | score_classes(study, to_compare, at)
+    rows = []
+    for by, labels in kinds.items():
+        names = list(to_compare.groups) if by == "group" else list(labels.cat.categories)
+        others = (
+            [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
+            if by == "group"
+            else list(itertools.pairwise(names))
+        )
+        for name in to_compare.measures:
+            for a, b in others:
+                x, y = (at.loc[labels == v, name].dropna().to_numpy(float) for v in (a, b))
+                if not len(x) or not len(y):
+                    continue
+                test, why = _tried(compare_groups, x, y)
+                size, _ = _tried(hedges_g, x, y)
+                rows.append(
+                    {
+                        "name": name,
+                        "by": by,
+                        "a": a,
+                        "b": b,
+                        "test": "" if test is None else test.name,
+                        "statistic": np.nan if test is None else test.statistic,
+                        "p": np.nan if test is None else test.p,
+                        **{
+                            f"g_{k}" if k != "value" else "g": v
+                            for k, v in _interval(size if test is not None else None).items()
+                        },
+                        "n_a": len(x),
+                        "n_b": len(y),
+                        **why,
+                    }
+                )
+    columns = [
+        "name",
+        "by",
+        "a",
+        "b",
+        "test",
+        "statistic",
+        "p",
+        "p_holm",
+        "g",
+        "g_low",
+        "g_high",
+        "n_a",
+        "n_b",
+        "code",
+        "message",
+    ]
+    return _corrected(pd.DataFrame(rows, columns=columns), "by")
+
+
+def _corrected(tests: pd.DataFrame, family: str) -> pd.DataFrame:
+    """With `p_holm`: p corrected (Holm) for the tests that have the same value in the column `family`."""
+    known: Any = tests[tests["p"].notna()]
+    for _, of_family in known.groupby(family):
+        tests.loc[of_family.index, "p_holm"] = adjust(of_family["p"])
+    return tests
+
+
+def score_classes(study: StudyData, to_compare: Plan, table: Any) -> dict[str, Any]:
+    """Score -> class of each row of a table, in order from the lowest, of the scores that have classes."""
+    found = {}
+    for instrument, text in zip(study.instruments["instrument"], study.instruments["classes"], strict=True):
+        classes, column = classes_of(text), score_column(study, instrument)
+        if len(classes) > 1 and column in to_compare.scores:
+            edges = [v for v, _ in classes]
+            found[column] = pd.cut(table[column], [*edges, np.inf], right=False, labels=[w for _, w in classes])
+    return found
+
+
+def curve_results(study: StudyData, to_compare: Plan, permutations: int = 10_000) -> list[CurveResult]:
+    """Curves of each angle: the changing group before and after (paired), and against every other group before."""
+    found = []
+    for angle in to_compare.angles:
+        curves = mean_curves(study, angle)
+
+        def of(role: str, group: str, curves: pd.DataFrame = curves) -> pd.DataFrame:
+            frame: Any = curves
+            rows = (frame.index.get_level_values("role") == role) & (frame.index.get_level_values("group") == group)
+            return frame[rows].droplevel(["role", "group"])
+
+        start, own = to_compare.change_from, to_compare.change_group
+        before, after = of(start, own), of(to_compare.change_to, own)
+        both = before.index.intersection(after.index)
+        found.append(
+            _compared(
+                angle, "change", after.loc[both], before.loc[both], True, (to_compare.change_to, start), permutations
+            )
+        )
+        for group in to_compare.groups[1:]:
+            other = of(start, group)
+            if len(other):
+                found.append(_compared(angle, f"{own} and {group}", before, other, False, (own, group), permutations))
+    return found
+
+
+def _compared(
+    angle: str,
+    comparison: str,
+    a: pd.DataFrame,
+    b: pd.DataFrame,
+    paired: bool,
+    names: tuple[str, str],
+    permutations: int,
+) -> CurveResult:
+    known_a, known_b = (np.isfinite(x.to_numpy(float)).all(axis=1) for x in (a, b))
+    if paired:
+        known_a = known_b = known_a & known_b
+    x, y = a.to_numpy(float)[known_a], b.to_numpy(float)[known_b]
+    left_out = int((~known_a).sum()) + (0 if paired else int((~known_b).sum()))
+    try:
+        test: CurveTest | PblError = curve_test(x, y, paired=paired, alpha=ALPHA, n_permutations=permutations)
+    except PblError as error:
+        test = error
+    return CurveResult(angle, comparison, test, left_out, x, y, names)

@@ -1,0 +1,205 @@
+"""Everything known of a video file before its pictures are used."""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline import progress
+from pbl_pipeline.names import is_plain
+
+from .container_tags import Tags, read_tags
+from .decode import Decoder, check_file
+from .orientation import Orientation, orientation_of
+from .timing import speed_notes
+from .types import FirstPicture, VideoInfo
+
+
+def sha256_of(path: str | Path) -> str:
+    """SHA-256 of a video file as 64 hex digits, read in pieces.
+
+    Raises
+    ------
+    PblError
+        VIDEO_MISSING, VIDEO_EMPTY.
+    """
+    with check_file(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
+    """Decode `path` once and say what it holds.
+
+    The whole file is decoded, because only that tells which frames there are: edit lists, damaged ends and announced
+    counts differ from it. The frames and stamps are those of `read_frames`. Memory does not grow with the length.
+
+    Raises
+    ------
+    PblError
+        VIDEO_MISSING, VIDEO_EMPTY, VIDEO_NOT_A_VIDEO, VIDEO_TOO_LARGE, VIDEO_NO_FRAMES, VIDEO_TRUNCATED, VIDEO_DAMAGED,
+        VIDEO_TIMESTAMPS.
+    """
+    path = check_file(path)
+    sha256 = sha256_of(path)
+    stamps: list[int] = []
+    turn, pixel_format, width, height = Orientation(), "", 0, 0
+    with Decoder(path, threads, exact=True) as decoder:
+        stream, container = decoder.stream, decoder.container
+        for pts, frame in progress.track(decoder, "reading video", total=decoder.n_announced or None):
+            if not stamps:
+                turn = orientation_of(frame)
+                pixel_format = frame.format.name
+                width, height = turn.size(frame.width, frame.height)
+            stamps.append(pts)
+        ticks = np.asarray(stamps, np.int64) - stamps[0]
+        tick_s = float(decoder.time_base)
+        time_s = ticks * tick_s
+        interval_s, varies = _rate(time_s, tick_s, float(stream.average_rate) if stream.average_rate else None)
+        tags = read_tags(path)
+        metadata = _metadata(decoder, tags)
+        capture_fps = _number(metadata, "com.android.capture.fps", "com.apple.quicktime.capture.fps")
+        notes = decoder.notes + _picture_notes(turn, stream.sample_aspect_ratio)
+        notes += speed_notes(1.0 / interval_s, capture_fps, tags.speeds)
+        return VideoInfo(
+            path=str(path),
+            sha256=sha256,
+            size_bytes=path.stat().st_size,
+            container=_container_name(container.format.name, metadata),
+            codec=stream.codec_context.name,
+            pixel_format=pixel_format,
+            width_px=width,
+            height_px=height,
+            rotation_deg=turn.rotation_deg,
+            time_s=time_s,
+            fps=1.0 / interval_s,
+            duration_s=float(time_s[-1]) + interval_s,
+            n_frames=len(time_s),
+            n_frames_announced=decoder.n_announced,
+            variable_frame_rate=varies,
+            recorded_utc=_recorded_utc(metadata),
+            notes=tuple(notes),
+            capture_fps=capture_fps,
+            **_phone(metadata),
+        )
+
+
+def read_first(path: str | Path) -> FirstPicture:
+    """Size and rotation of a video's first picture, and the phone that recorded it. No more is decoded.
+
+    Raises
+    ------
+    PblError
+        As `probe`.
+    """
+    path = check_file(path)
+    with Decoder(path) as decoder:
+        _, frame = next(iter(decoder))  # without a picture it raises
+        turn = orientation_of(frame)
+        metadata = _metadata(decoder, read_tags(path))
+        width, height = turn.size(frame.width, frame.height)
+        return FirstPicture(str(path), width, height, turn.rotation_deg, **_phone(metadata))
+
+
+def packet_times(path: str | Path) -> np.ndarray:
+    """(n,) time stamps (s) of a video's pictures as its container states them, the first 0. Nothing is decoded: a file
+    with a damaged end or an edit list may decode to other frames (`probe`).
+
+    Raises
+    ------
+    PblError
+        VIDEO_MISSING, VIDEO_EMPTY, VIDEO_NOT_A_VIDEO, VIDEO_TRUNCATED, VIDEO_TOO_LARGE.
+    """
+    path = check_file(path)
+    with Decoder(path) as decoder:
+        stamps = decoder.packet_stamps()
+    return (np.sort(stamps) - min(stamps, default=0)) * float(decoder.time_base)
+
+
+def read_metadata(path: str | Path) -> dict[str, str]:
+    """What a file says beside its pictures (place, phone, times, ...): names in lower case, and texts of one line.
+
+    Raises
+    ------
+    PblError
+        As `probe`.
+    """
+    path = check_file(path)
+    with Decoder(path) as decoder:
+        found = _metadata(decoder, read_tags(path))
+    return {name.lower(): text.strip() for name, text in found.items() if is_plain(text.strip())}
+
+
+def _metadata(decoder: Decoder, tags: Tags) -> dict[str, str]:
+    """Of the stream, the container and its atoms by name; the later ones win."""
+    return dict(decoder.stream.metadata) | dict(decoder.container.metadata) | tags.items
+
+
+def _phone(metadata: Mapping[str, str]) -> dict[str, Any]:
+    return {
+        "make": _first(metadata, "com.apple.quicktime.make", "com.android.manufacturer", "make"),
+        "model": _first(metadata, "com.apple.quicktime.model", "com.android.model", "model"),
+        "lens": _first(metadata, "com.apple.quicktime.camera.lens_model"),
+        "focal_35mm": _number(metadata, "com.apple.quicktime.camera.focal_length.35mm_equivalent"),
+    }
+
+
+def _rate(time_s: np.ndarray, tick_s: float, announced_fps: float | None) -> tuple[float, bool]:
+    """Median interval (s) and whether the intervals vary by more than a tenth of it and more than rounding explains."""
+    if len(time_s) < 2:
+        return (1.0 / announced_fps if announced_fps else float("nan")), False
+    steps = np.diff(time_s)
+    median = float(np.median(steps))
+    # Stamps rounded to whole ticks put up to one tick between equal intervals (MKV: 1 ms).
+    tolerance = max(0.1 * median, 1.001 * tick_s)
+    return median, bool(np.abs(steps - median).max() > tolerance)
+
+
+def _picture_notes(turn: Orientation, pixel_aspect: object) -> list[str]:
+    notes = []
+    if turn.mirrored:
+        notes.append("the file asks for a mirrored picture: left and right are swapped as a player shows it")
+    if not turn.exact:
+        notes.append(f"the rotation is not a multiple of 90 degrees: {turn.rotation_deg} is used")
+    if pixel_aspect not in (None, 0, 1):
+        notes.append(f"pixels are not square ({pixel_aspect}): the picture is used as stored")
+    return notes
+
+
+def _container_name(format_name: str, metadata: Mapping[str, str]) -> str:
+    first = format_name.split(",")[0]
+    if first != "mov":
+        return first
+    return "mov" if metadata.get("major_brand", "").startswith("qt") else "mp4"
+
+
+def _recorded_utc(metadata: Mapping[str, str]) -> str | None:
+    text = _first(metadata, "com.apple.quicktime.creationdate", "creation_time")
+    if text is None:
+        return None
+    try:
+        when = datetime.datetime.fromisoformat(text)
+    except ValueError:
+        return None
+    if when.tzinfo is None:
+        when = when.replace(tzinfo=datetime.UTC)
+    when = when.astimezone(datetime.UTC)
+    # 1904 and 1970 are the zeros of two clocks: a camera that did not know the time.
+    return when.strftime("%Y-%m-%dT%H:%M:%SZ") if when.year > 1990 else None
+
+
+def _first(metadata: Mapping[str, str], *names: str) -> str | None:
+    lower = {key.lower(): value.strip() for key, value in metadata.items() if is_plain(value.strip())}
+    return next((lower[name] for name in names if lower.get(name)), None)
+
+
+def _number(metadata: Mapping[str, str], *names: str) -> float | None:
+    """The positive number that a tag begins with ("27", "27.00mm"); None where there is none."""
+    digits = re.match(r"\d+(\.\d+)?", _first(metadata, *names) or "")
+    value = float(digits[0]) if digits else 0.0
+    return value if value > 0 else None

@@ -1,0 +1,150 @@
+"""Exports of the app Sensor Logger (Kelvin Choi; iOS and Android): `Orientation.csv`, its folder or zip, or JSON.
+
+By its documentation (github.com/tszheichoi/awesome-sensor-logger: README, UNITS, COORDINATES) `time` is UTC in
+nanoseconds since 1970, `seconds_elapsed` counts from the tap on Record, values are in m/s^2, rad/s and uT, and rows may
+be repeated. The quaternion is the system's own (Android's rotation vector, iOS' CMAttitude), both of which turn the
+device's axes into a world with z up. That it does can be seen in each file: the last row of its matrix holds the sine
+of `pitch`, which Android counts the other way. A file in which it does not is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pbl_pipeline import bounded
+
+from .attitude import DEVICE, check_attitude, log_error
+from .phone_log import OWN_CLOCK, QUATERNION, UTC_CLOCK, PhoneLog, Sensor, numbers, read_table, read_text
+
+_ORIENTATION = "Orientation"
+#: Names of its sensors -> ours. "Accelerometer" there is without gravity, which our schema's is with.
+_SENSORS = {
+    "TotalAcceleration": "accelerometer",
+    "Gravity": "gravity",
+    "Gyroscope": "gyroscope",
+    "Magnetometer": "magnetometer",
+}
+#: Repeated rows are left out; more than this fraction, and the stamps are not to be trusted.
+_MOST_REPEATS = 0.1
+#: How far the sine of the stated pitch may lie from the quaternion's.
+_PITCH_TOL = 0.05
+#: Stamps before this (s since 1970; 2015) are of a clock that does not know the date.
+_EARLIEST_UTC_S = 1.42e9
+
+#: The columns that are read of any sensor.
+_COLUMNS = {"time", *QUATERNION, "pitch", "x", "y", "z", "device name", "platform"}
+
+_Rows = Sequence[Mapping[str, Any]]
+
+
+def is_sensor_logger(path: Path) -> bool:
+    """Whether this looks like such an export: a folder, an archive, or a file with its names at the beginning."""
+    if path.is_dir() or path.suffix.lower() == ".zip":
+        return True
+    try:
+        head = bounded.read_start(path, 4096).decode("utf-8-sig", "replace")
+    except OSError:
+        return False
+    first = head.lstrip().split("\n", 1)[0]
+    if head.lstrip()[:1] == "[":
+        return '"sensor"' in head
+    return "seconds_elapsed" in first
+
+
+def read_sensor_logger(path: Path) -> PhoneLog:
+    """Read an export. Raises `PblError` FILE_MISSING, PHONE_LOG."""
+    tables, form = _tables(path)
+    rows = tables(_ORIENTATION)
+    if not rows:
+        raise log_error("no orientation", "Orientation.csv, or rows of the sensor Orientation in the JSON", path)
+    first_ns, time, rows, notes = _time(path, rows)
+    quat = np.stack([numbers(path, rows, name) for name in QUATERNION], axis=1)
+    time, quat = check_attitude(time, quat, path)
+    _check_pitch(path, rows, quat)
+    sensors = {}
+    for name, ours in _SENSORS.items():
+        found = tables(name)
+        if found:
+            start_ns, at, found, more = _time(path, found)
+            xyz = np.stack([numbers(path, found, axis) for axis in "xyz"], axis=1)
+            sensors[ours] = Sensor(at + (start_ns - first_ns) / 1e9, xyz)
+            notes += [f"{name}: {n}" for n in more]
+    about = next(iter(tables("Metadata")), {})
+    device = " ".join(str(about[k]) for k in ("device name", "platform") if about.get(k))
+    start = first_ns / 1e9
+    clock, start = (UTC_CLOCK, start) if start > _EARLIEST_UTC_S else (OWN_CLOCK, None)
+    return PhoneLog(time, quat, DEVICE, None, clock, start, sensors, f"Sensor Logger {form}", device, tuple(notes))
+
+
+def _tables(path: Path) -> tuple[Callable[[str], _Rows], str]:
+    """A function from a sensor's name to its rows (empty where there are none), and the form."""
+    if path.is_dir():
+        return lambda name: _csv(path, _member(path, name)), "folder"
+    if path.suffix.lower() == ".zip":
+        return lambda name: _csv(path, _unzipped(path, name)), "zip"
+    text = read_text(path)
+    if text.lstrip()[:1] == "[":
+        try:
+            content = bounded.parse_json(text)
+        except ValueError as error:
+            raise log_error(f"no JSON ({error})", "a list of rows, as Sensor Logger exports it", path) from error
+        rows = [r for r in content if isinstance(r, dict)]
+        return lambda name: [r for r in rows if r.get("sensor") == name], "JSON"
+    return lambda name: _csv(path, text) if name == _ORIENTATION else [], "CSV"
+
+
+def _csv(path: Path, text: str | None) -> _Rows:
+    return [] if text is None else read_table(path, text, _COLUMNS)[1]
+
+
+def _member(folder: Path, name: str) -> str | None:
+    file = next((f for f in sorted(folder.glob("*.csv")) if f.stem.lower() == name.lower()), None)
+    return None if file is None else read_text(file)
+
+
+def _unzipped(path: Path, name: str) -> str | None:
+    try:
+        with bounded.opened_zip(path) as archive:
+            wanted = f"{name}.csv".lower()
+            member = next((m for m in archive.infolist() if PurePosixPath(m.filename).name.lower() == wanted), None)
+            return (
+                None if member is None else bounded.read_member(archive, member, bounded.MAX_TEXT).decode("utf-8-sig")
+            )
+    except (OSError, ValueError) as error:
+        if isinstance(error, FileNotFoundError):
+            read_text(path)  # says so
+        raise log_error(f"no readable archive ({error})", "the zip that Sensor Logger exports", path) from error
+
+
+def _time(path: Path, rows: _Rows) -> tuple[int, np.ndarray, _Rows, list[str]]:
+    """First stamp (ns), times (s) after it, and the rows they belong to, repeats left out."""
+    try:
+        ns = np.array([int(str(row["time"]).split(".")[0]) for row in rows], np.int64)
+    except (KeyError, ValueError, OverflowError) as error:
+        raise log_error(f"column time: {error}", "nanoseconds since 1970 in each row", path) from error
+    kept = np.concatenate([[True], np.diff(ns) != 0])
+    n = int((~kept).sum())
+    if n > _MOST_REPEATS * len(ns):
+        raise log_error(f"{n} of {len(ns)} stamps repeat the one before", "a stamp of its own for each sample", path)
+    notes = [f"{n} repeated rows were left out"] if n else []
+    rows = [row for row, keep in zip(rows, kept, strict=True) if keep]
+    return int(ns[0]), (ns[kept] - ns[0]) / 1e9, rows, notes
+
+
+def _check_pitch(path: Path, rows: _Rows, quat_wxyz: np.ndarray) -> None:
+    if "pitch" not in rows[0]:
+        return
+    stated = np.abs(np.sin(numbers(path, rows, "pitch")))
+    matrix = Rotation.from_quat(quat_wxyz, scalar_first=True).as_matrix()
+    off = float(np.median(np.abs(np.abs(matrix[:, 2, 1]) - stated)))
+    if off > _PITCH_TOL:
+        raise log_error(
+            f"quaternions whose pitch differs from the column pitch (sines by {off:.2f})",
+            "quaternions that turn the phone's axes into a world with z up",
+            path,
+        )
