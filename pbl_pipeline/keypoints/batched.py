@@ -12,7 +12,7 @@ import numpy as np
 
 from pbl_pipeline.video import Camera, Frame
 
-from .protocol import Look
+from .protocol import Inspection
 from .types import PersonKeypoints
 
 _Item = tuple[Frame, np.ndarray, bool, "Future[PersonKeypoints]"]
@@ -49,10 +49,10 @@ class BatchedInference:
         self._waiting.put(None)
         self._thread.join()
 
-    def submit(self, frame: Frame, roi_px: np.ndarray, look: Look) -> Future[PersonKeypoints]:
+    def submit(self, frame: Frame, roi_px: np.ndarray, inspection: Inspection) -> Future[PersonKeypoints]:
         """Detect in the region `roi_px` (4,) of a frame, in the order of the calls."""
         future: Future[PersonKeypoints] = Future()
-        self._waiting.put((frame, np.array(roi_px, np.float64), look is Look.QUICK, future))
+        self._waiting.put((frame, np.array(roi_px, np.float64), inspection is Inspection.QUICK, future))
         return future
 
     def _work(self) -> None:

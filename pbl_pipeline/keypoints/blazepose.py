@@ -20,7 +20,7 @@ from pbl_pipeline.video import Camera, cut_image
 
 from .crop_geometry import crop_matrix, view_rotation
 from .flips import mirror_of
-from .mirrored_inference import MirrorLooks
+from .mirrored_inference import MirroredInference
 from .params import MARKER_SET, MODEL_SHA256, ROOT_RELATIVE, KeypointParams
 from .types import PersonKeypoints
 
@@ -77,7 +77,7 @@ MIRROR = np.array(mirror_of(NAMES))
 class BlazePoseLandmarks:
     """`KeypointDetector` with BlazePose's 33 points, root-relative (origin between the hips).
 
-    The crop is shown twice, the second time mirrored, and `MirrorLooks` puts the answers together; a quick look is one
+    The crop is shown twice, the second time mirrored, and `MirroredInference` puts the answers together; a quick one is
     of `quick_path`'s network, where one is given, at the crop as it is. The confidence that
     the network states is sigmoid(visibility logit) * sigmoid(presence logit): the point is not hidden; it lies in the
     picture. presence = the network's own pose flag.
@@ -103,7 +103,7 @@ class BlazePoseLandmarks:
         self._model = LiteModel(model_path, sha256, _OUTPUTS, num_threads)
         self._quick = LiteModel(quick_path, MODEL_SHA256, _OUTPUTS, num_threads) if quick_path else self._model
         self.model_sha256 = self._model.sha256
-        self.mirror_looks = MirrorLooks(NAMES, agree_mm, agree_width_mm)
+        self.mirrored_inference = MirroredInference(NAMES, agree_mm, agree_width_mm)
 
     def detect(self, image: np.ndarray, roi_px: np.ndarray, camera: Camera, *, quick: bool = False) -> PersonKeypoints:
         """See `KeypointDetector`. `image` (H, W, 3) uint8 BGR; what lies beyond it is black to the network."""
@@ -123,7 +123,7 @@ class BlazePoseLandmarks:
         if quick:
             return self._look(self._quick, crop, roi_px, camera, mirrored=False)
         own, other = (self.detect_once(crop, roi_px, camera, mirrored=m) for m in (False, True))
-        return self.mirror_looks.averaged(own, other)
+        return self.mirrored_inference.averaged(own, other)
 
     def detect_once(
         self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, mirrored: bool = False

@@ -27,7 +27,7 @@ from .methods import METHODS
 from .params import KeypointParams
 from .passes import ParallelInference, n_workers, two_passes
 from .picture import Picture, PictureMeter
-from .protocol import KeypointDetector, Look, MirrorDetector
+from .protocol import Inspection, KeypointDetector, MirrorDetector
 from .stated_confidence import confidence_curve
 from .types import Keypoints, PersonKeypoints
 
@@ -109,11 +109,11 @@ def _detect_all(
     sharing = one if isinstance(one, MirrorDetector) and _close(time_s[regions.rows], params.share_looks_s) else None
     mirrored = np.arange(len(roi)) % 2 == 1
 
-    def look(row: int) -> Look:
-        return Look.FULL if sharing is None else Look.MIRRORED if mirrored[row] else Look.PLAIN
+    def inspection(row: int) -> Inspection:
+        return Inspection.FULL if sharing is None else Inspection.MIRRORED if mirrored[row] else Inspection.PLAIN
 
     with BatchedInference(one, camera) if batched else ParallelInference(detectors, camera) as inference:
-        seen = two_passes(frames, inference, time_s, regions, look)
+        seen = two_passes(frames, inference, time_s, regions, inspection)
         for row, person in progress.track(seen, "keypoints", total=len(regions.rows)):
             found[row] = person
     n_seen = sum(person is not None for person in found)
@@ -125,7 +125,7 @@ def _detect_all(
             next_step="track the people again in this file",
             key=str(video_path),
         )
-    return sharing.mirror_looks.shared(found, mirrored, time_s, params.min_presence) if sharing else found
+    return sharing.mirrored_inference.shared(found, mirrored, time_s, params.min_presence) if sharing else found
 
 
 def _close(time_s: np.ndarray, most_s: float) -> bool:

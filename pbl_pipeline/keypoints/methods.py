@@ -23,7 +23,7 @@ class RegisteredModels:
 #: A family is a detector: a function from its parameters to a `KeypointDetector`.
 METHODS: Stage[KeypointParams] = Stage("keypoints", "detector", "blazepose-heavy", RegisteredModels())
 METHODS.register("blazepose-33", 2, KeypointParams(), blazepose)
-#: It shares looks, at 24 frames/s and more: each is dear, and its answers of two frames lie close together.
+#: It shares inferences at 24 frames/s and more: each is slow, and its answers for two frames lie close together.
 METHODS.register(
     "blazepose-heavy",
     3,

@@ -2,8 +2,8 @@
 
 Its errors in the two are partly independent, and where it prefers one side of the body the mirrored answer prefers the
 other: their mean is better than either (docs/benchmarks.md). Half their difference changes slowly, so frames that
-follow each other closely can share the two looks: one is seen as it is, the next mirrored, and the half is taken from
-the frames around. That costs one look a frame in place of two.
+follow each other closely can share the two inferences: one is seen as it is, the next mirrored, and the half is taken
+from the frames around. That costs one inference a frame instead of two.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ LEAST_APART, MOST_CROSSED = 0.05, 0.5
 UNDECIDED = 0.5
 #: Over a longer gap nothing is shared.
 _MAX_GAP_S = 0.25
-#: Standard deviation of the Gaussian over time that half the difference is smoothed by where looks are shared.
+#: Standard deviation of the Gaussian over time that half the difference is smoothed by where inferences are shared.
 _SMOOTH_S = 0.15
 #: Weight there of a point whose two answers contradict each other.
 _LEAST_WEIGHT = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
-class MirrorLooks:
+class MirroredInference:
     """Puts the two answers for points `names` together.
 
     confidence = the mean of both, times 1 / (1 + exp((sigma - agree_mm) / agree_width_mm)); sigma is half the 3D
@@ -72,7 +72,7 @@ class MirrorLooks:
         min_presence: float,
     ) -> list[PersonKeypoints | None]:
         """Of frames that were looked at once each, those of `mirrored` (T,) bool in the mirror image. Frames in which
-        nobody was seen take no part; a stretch with fewer than two looks of either kind stays as it is."""
+        nobody was seen take no part; a stretch with fewer than two inferences of either kind stays as it is."""
         out = list(found)
         seen = np.array([i for i, p in enumerate(found) if p is not None and p.presence >= min_presence], int)
         breaks = np.flatnonzero(np.diff(time_s[seen]) > _MAX_GAP_S) + 1

@@ -26,8 +26,8 @@ class KeypointParams:
     track's, and differs from it in size by at most this factor.
     agree_mm, agree_width_mm: how far the answers for the picture and its mirror image may lie apart, see
     `BlazePoseLandmarks`.
-    share_looks_s: frames no further apart than this share the looks at picture and mirror image, every second frame
-    mirrored (`MirrorLooks.shared`); 0: each frame has both.
+    share_looks_s: frames no further apart than this share the inferences of picture and mirror image: every second
+    frame is mirrored (`MirroredInference.shared`); 0: each frame has both.
     lighter_first: the first pass, which only places the crop, takes BlazePose's lighter network.
     sides: where left and right are exchanged back, see `exchange_sides`; None: nowhere.
     min_time_s: a person in view for less cannot be measured.

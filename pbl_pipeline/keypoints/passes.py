@@ -20,7 +20,7 @@ from pbl_pipeline.settings import n_cores
 from pbl_pipeline.video import Camera, Frame
 
 from .crops import Regions
-from .protocol import CropDetector, KeypointDetector, Look, MirrorDetector
+from .protocol import CropDetector, Inspection, KeypointDetector, MirrorDetector
 from .types import PersonKeypoints
 
 #: More detectors than this bring little and cost memory.
@@ -37,7 +37,7 @@ class Inference(Protocol):
 
     n_detectors: int
 
-    def submit(self, frame: Frame, roi_px: np.ndarray, look: Look) -> Future[PersonKeypoints]: ...
+    def submit(self, frame: Frame, roi_px: np.ndarray, inspection: Inspection) -> Future[PersonKeypoints]: ...
 
 
 class ParallelInference:
@@ -57,17 +57,17 @@ class ParallelInference:
     def __exit__(self, *_: object) -> None:
         self._pool.shutdown(cancel_futures=True)
 
-    def submit(self, frame: Frame, roi_px: np.ndarray, look: Look) -> Future[PersonKeypoints]:
+    def submit(self, frame: Frame, roi_px: np.ndarray, inspection: Inspection) -> Future[PersonKeypoints]:
         """Detect in the region `roi_px` (4,) of a frame as soon as a detector is idle, in the order of the calls."""
-        return self._pool.submit(self._detect, frame, roi_px, look)
+        return self._pool.submit(self._detect, frame, roi_px, inspection)
 
-    def _detect(self, frame: Frame, roi_px: np.ndarray, look: Look) -> PersonKeypoints:
-        detector, quick = self._idle.get(), look is Look.QUICK
+    def _detect(self, frame: Frame, roi_px: np.ndarray, inspection: Inspection) -> PersonKeypoints:
+        detector, quick = self._idle.get(), inspection is Inspection.QUICK
         try:
             if isinstance(detector, CropDetector):
                 crop = frame.cut(*detector.crop_of(roi_px))
-                if look in (Look.PLAIN, Look.MIRRORED) and isinstance(detector, MirrorDetector):
-                    return detector.detect_once(crop, roi_px, self._camera, mirrored=look is Look.MIRRORED)
+                if inspection in (Inspection.PLAIN, Inspection.MIRRORED) and isinstance(detector, MirrorDetector):
+                    return detector.detect_once(crop, roi_px, self._camera, mirrored=inspection is Inspection.MIRRORED)
                 return detector.detect_crop(crop, roi_px, self._camera, quick=quick)
             return detector.detect(frame.image, roi_px, self._camera, quick=quick)
         finally:
@@ -79,13 +79,13 @@ def two_passes(
     inference: Inference,
     time_s: np.ndarray,
     regions: Regions,
-    look: Callable[[int], Look] = lambda _: Look.FULL,
+    inspection: Callable[[int], Inspection] = lambda _: Inspection.FULL,
 ) -> Iterator[tuple[int, PersonKeypoints]]:
     """What the second pass found, frame by frame in order.
 
     `frames` are those in which the person is, of the video with stamps `time_s` (T,). The first pass is over those of
     `regions.first`; a frame's region of the second is asked for once all first results up to `regions.reach_s` after
-    it are known. `look`: how the second pass looks at a frame.
+    it are known. `inspection`: how the second pass inspects a frame.
     """
     last_needed = np.searchsorted(time_s, time_s + regions.reach_s, side="right") - 1
     waiting: collections.deque[Frame] = collections.deque()
@@ -96,12 +96,12 @@ def two_passes(
         while early and early[0][0] <= last_needed[frame.index]:
             index, future = early.popleft()
             regions.correct(index, future.result())
-        late.append((frame.index, inference.submit(frame, regions.at(frame.index), look(frame.index))))
+        late.append((frame.index, inference.submit(frame, regions.at(frame.index), inspection(frame.index))))
 
     for frame in frames:
         waiting.append(frame)
         if frame.index in regions.first:
-            early.append((frame.index, inference.submit(frame, regions.track_px[frame.index], Look.QUICK)))
+            early.append((frame.index, inference.submit(frame, regions.track_px[frame.index], Inspection.QUICK)))
         while waiting and last_needed[waiting[0].index] <= frame.index:
             second(waiting.popleft())
         # So many frames may be under way that no detector waits, and no more: each is held in memory.

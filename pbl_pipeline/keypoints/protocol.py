@@ -9,12 +9,12 @@ import numpy as np
 
 from pbl_pipeline.video import Camera
 
-from .mirrored_inference import MirrorLooks
+from .mirrored_inference import MirroredInference
 from .types import PersonKeypoints
 
 
-class Look(enum.Enum):
-    """How a detector looks at a frame: as well as it can; quickly; at the picture alone; at its mirror image alone."""
+class Inspection(enum.Enum):
+    """How a detector inspects a frame: in full; quickly; the picture alone; its mirror image alone."""
 
     FULL = "full"
     QUICK = "quick"
@@ -61,7 +61,7 @@ class CropDetector(Protocol):
 class MirrorDetector(CropDetector, Protocol):
     """A `CropDetector` that looks at a region and at its mirror image."""
 
-    mirror_looks: MirrorLooks
+    mirrored_inference: MirroredInference
 
     def detect_once(
         self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, mirrored: bool = False

@@ -9,9 +9,9 @@ import numpy as np
 from pbl_pipeline.keypoints import METHODS, PersonKeypoints
 from pbl_pipeline.keypoints.blazepose import MIRROR, NAMES
 from pbl_pipeline.keypoints.flips import leg_points
-from pbl_pipeline.keypoints.mirrored_inference import UNDECIDED, MirrorLooks
+from pbl_pipeline.keypoints.mirrored_inference import UNDECIDED, MirroredInference
 
-LOOKS = MirrorLooks(NAMES, 100.0, 20.0)
+LOOKS = MirroredInference(NAMES, 100.0, 20.0)
 REGION = np.array([500.0, 400.0, 300.0, 0.0])
 LEGS = leg_points(NAMES)
 OWN = np.arange(33)
