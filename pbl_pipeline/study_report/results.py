@@ -31,6 +31,15 @@ from .visit_values import INDEX, Plan, at_role, cycle_values, mean_curves, pairs
 
 #: Two-sided level of significance (the paper, Statistics).
 ALPHA = 0.05
+#: Columns of the tables of `StudyResults`.
+_INTERVAL, _WHY = ("value", "low", "high"), ("code", "message")
+COLUMNS = {
+    "by_visit": ["name", "group", "role", "n", "mean", "low", "high", "sd", "median", "niqr"],
+    "repeatability": ["name", "of", "group", "kind", *_INTERVAL, "sem", "mdc90", "mdc95", "n", "k", *_WHY],
+    "validity": ["name", "score", "persons", "kind", *_INTERVAL, "p", "p_holm", "n", *_WHY],
+    "change": ["name", "n", "statistic", *_INTERVAL, "p", "p_holm", *_WHY],
+    "groups": ["name", "by", "a", "b", "test", "statistic", "p", "p_holm", "g", "g_low", "g_high", "n_a", "n_b", *_WHY],
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,40 +71,17 @@ class CurveResult:
 
 @dataclasses.dataclass(frozen=True)
 class StudyResults:
-    """All statistics of a report; every frame is long, `code` and `message` are "" where there is a value.
+    """All statistics of a report; every frame is long, `code` and `message` are "" where there is a value."""
 
-    Attributes
-    ----------
-    plan
-        What was compared.
-    table
-        `visit_table` of the study.
-    flow
-        `group, role, persons, took_place, excluded, counted, reasons`.
-    by_visit
-        `name, group, role, n, mean, low, high, sd, median, niqr`: mean with Student's interval.
-    repeatability
-        `name, of, kind, value, low, high, sem, mdc90, mdc95, n, k`: cycles of one visit, and visits.
-    validity
-        `name, score, persons, kind, value, low, high, p, n`: at the visit `change_from`.
-    change
-        `name, n, mean_pre, mean_post, mean_change, low, high, statistic ...`: one row per name and statistic of change:
-        "mean", "srm", "effect_size".
-    groups
-        `name, a, b, test, statistic, p, g, low, high, n_a, n_b`: groups, and classes of a score, at `change_from`.
-    curves
-        One per angle and comparison.
-    """
-
-    plan: Plan
-    table: pd.DataFrame
-    flow: pd.DataFrame
-    by_visit: pd.DataFrame
-    repeatability: pd.DataFrame
-    validity: pd.DataFrame
-    change: pd.DataFrame
-    groups: pd.DataFrame
-    curves: tuple[CurveResult, ...]
+    plan: Plan  # what was compared
+    table: pd.DataFrame  # `visit_table` of the study
+    flow: pd.DataFrame  # persons and visits by group and role, with the reasons why visits do not count
+    by_visit: pd.DataFrame  # mean with Student's interval
+    repeatability: pd.DataFrame  # of the cycles of one visit, and of visits
+    validity: pd.DataFrame  # correlation with scores at the visit `change_from`
+    change: pd.DataFrame  # a row per name and statistic: "mean", "srm", "effect_size"
+    groups: pd.DataFrame  # groups, and classes of a score, at `change_from`
+    curves: tuple[CurveResult, ...]  # one per angle and comparison
 
 
 def study_results(study: StudyData, to_compare: Plan, permutations: int = 10_000) -> StudyResults:
@@ -162,8 +148,7 @@ def visit_means(table: pd.DataFrame, to_compare: Plan) -> pd.DataFrame:
                 values = at_role(table, role, name, group).to_numpy(float)
                 if len(values):
                     rows.append({"name": name, "group": group, "role": role, "n": len(values), **summary(values)})
-    columns = ["name", "group", "role", "n", "mean", "low", "high", "sd", "median", "niqr"]
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame(rows, columns=COLUMNS["by_visit"])
 
 
 def summary(values: np.ndarray) -> dict[str, float]:
@@ -210,23 +195,7 @@ def repeatability(study: StudyData, to_compare: Plan, table: pd.DataFrame) -> pd
             if len(wide):
                 for kind, interval in (("2,1", "generalized"), ("3,1", "f")):
                     add(name, "visits", kind, group, lambda w=wide: w.to_numpy(float), interval)
-    columns = [
-        "name",
-        "of",
-        "group",
-        "kind",
-        "value",
-        "low",
-        "high",
-        "sem",
-        "mdc90",
-        "mdc95",
-        "n",
-        "k",
-        "code",
-        "message",
-    ]
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame(rows, columns=COLUMNS["repeatability"])
 
 
 def validity(study: StudyData, to_compare: Plan, table: pd.DataFrame) -> pd.DataFrame:
@@ -260,8 +229,7 @@ def validity(study: StudyData, to_compare: Plan, table: pd.DataFrame) -> pd.Data
                         **why,
                     }
                 )
-    columns = ["name", "score", "persons", "kind", "value", "low", "high", "p", "p_holm", "n", "code", "message"]
-    return _corrected(pd.DataFrame(rows, columns=columns), "persons")
+    return _corrected(pd.DataFrame(rows, columns=COLUMNS["validity"]), "persons")
 
 
 def change(to_compare: Plan, table: pd.DataFrame, resamples: int = 10_000) -> pd.DataFrame:
@@ -290,8 +258,7 @@ def change(to_compare: Plan, table: pd.DataFrame, resamples: int = 10_000) -> pd
                 **why,
             }
         )
-    columns = ["name", "n", "statistic", "value", "low", "high", "p", "p_holm", "code", "message"]
-    return _corrected(pd.DataFrame(rows, columns=columns), "statistic")
+    return _corrected(pd.DataFrame(rows, columns=COLUMNS["change"]), "statistic")
 
 
 def group_differences(study: StudyData, to_compare: Plan, table: pd.DataFrame) -> pd.DataFrame:
@@ -332,24 +299,7 @@ def group_differences(study: StudyData, to_compare: Plan, table: pd.DataFrame) -
                         **why,
                     }
                 )
-    columns = [
-        "name",
-        "by",
-        "a",
-        "b",
-        "test",
-        "statistic",
-        "p",
-        "p_holm",
-        "g",
-        "g_low",
-        "g_high",
-        "n_a",
-        "n_b",
-        "code",
-        "message",
-    ]
-    return _corrected(pd.DataFrame(rows, columns=columns), "by")
+    return _corrected(pd.DataFrame(rows, columns=COLUMNS["groups"]), "by")
 
 
 def _corrected(tests: pd.DataFrame, family: str) -> pd.DataFrame:

@@ -1,9 +1,10 @@
 """Calibrations of known phones' main cameras, brought to the size and turn of a recording.
 
 The figures (`data/phone_cameras.json`, made by `research/phone_cameras.py`) hold for the upright portrait picture of
-video of 720 or 2160 lines. Video of 16:9 uses the full width of the sensor's longer side, so a recording of another size is
-taken as the same view scaled by its longer side, and one of another shape as cut (or widened) about the middle along
-the shorter side. How much a phone's own stabilisation crops is not published; it makes the focal length longer.
+video of 720 or 2160 lines. Video of 16:9 uses the full width of the sensor's longer side, so a recording of another
+size is taken as the same view scaled by its longer side, and one of another shape as cut (or widened) about the
+middle along the shorter side. How much a phone's own stabilisation crops is not published; it makes the focal length
+longer.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import METHODS, BlazePoseLandmarks, KeypointParams
 from pbl_pipeline.keypoints.blazepose import MIRROR, NAMES, blazepose
 from pbl_pipeline.keypoints.passes import ParallelInference
-from pbl_pipeline.keypoints.protocol import Look
+from pbl_pipeline.keypoints.protocol import Inspection
 from pbl_pipeline.models import LiteModel, suppress
 from pbl_pipeline.models.tflite_outputs import keep_outputs
 from pbl_pipeline.tracking import BlazePoseDetector
@@ -210,7 +210,7 @@ def test_quick_gives_nearly_the_same_circle(landmarks, frames):
 
 
 def test_which_network_looks(frames):
-    """Of `blazepose-heavy`, the first look at a frame is the lighter network's; each look that counts is its own."""
+    """Of `blazepose-heavy`, the first pass over a frame is the lighter network's; each that counts is its own."""
     for name in ("blazepose_landmarks", "blazepose_landmarks_heavy"):
         asset(name)
     heavy = METHODS["blazepose-heavy"].params
@@ -219,13 +219,14 @@ def test_which_network_looks(frames):
     roi = region(100)
     crop = cut_image(frames[100], *both.crop_of(roi))
 
-    def points(detector: BlazePoseLandmarks, look: Look) -> np.ndarray:
+    def points(detector: BlazePoseLandmarks, inspection: Inspection) -> np.ndarray:
         with ParallelInference([detector], CAMERA) as inference:
-            return inference.submit(Frame(0, 0.0, lambda: frames[100]), roi, look).result().xy_px
+            return inference.submit(Frame(0, 0.0, lambda: frames[100]), roi, inspection).result().xy_px
 
-    np.testing.assert_array_equal(points(both, Look.QUICK), points(light, Look.QUICK))
-    assert np.abs(points(alone, Look.QUICK) - points(light, Look.QUICK)).max() > 1
-    for look in (Look.PLAIN, Look.MIRRORED, Look.FULL):
-        np.testing.assert_array_equal(points(both, look), points(alone, look))
-    np.testing.assert_array_equal(points(both, Look.PLAIN), points(alone, Look.QUICK))
-    np.testing.assert_array_equal(points(both, Look.MIRRORED), both.detect_once(crop, roi, CAMERA, mirrored=True).xy_px)
+    np.testing.assert_array_equal(points(both, Inspection.QUICK), points(light, Inspection.QUICK))
+    assert np.abs(points(alone, Inspection.QUICK) - points(light, Inspection.QUICK)).max() > 1
+    for inspection in (Inspection.PLAIN, Inspection.MIRRORED, Inspection.FULL):
+        np.testing.assert_array_equal(points(both, inspection), points(alone, inspection))
+    np.testing.assert_array_equal(points(both, Inspection.PLAIN), points(alone, Inspection.QUICK))
+    mirrored = both.detect_once(crop, roi, CAMERA, mirrored=True).xy_px
+    np.testing.assert_array_equal(points(both, Inspection.MIRRORED), mirrored)
