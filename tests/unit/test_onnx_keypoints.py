@@ -33,7 +33,7 @@ from pbl_pipeline.keypoints.blazepose import CROP_MARGIN, MIRROR, N_ALL
 from pbl_pipeline.keypoints.blazepose import NAMES as BLAZEPOSE_NAMES
 from pbl_pipeline.keypoints.decode_2d import from_heatmap, from_simcc
 from pbl_pipeline.keypoints.params import MODEL_SHA256 as BLAZEPOSE_SHA256
-from pbl_pipeline.keypoints.protocol import Look
+from pbl_pipeline.keypoints.protocol import Inspection
 from pbl_pipeline.keypoints.root_position import absolute_root
 from pbl_pipeline.keypoints.virtual_camera import crops, look_at
 from pbl_pipeline.models import LiteModel
@@ -440,7 +440,9 @@ def roi(x: float, side: float = 10) -> np.ndarray:
 def test_what_waits_goes_together_in_order_and_quick_looks_apart():
     counts, frame = Counts(), Frame(0, 0.0, lambda: np.zeros((2, 2, 3), np.uint8))
     with BatchedInference(counts, CAMERA) as inference:
-        futures = [inference.submit(frame, roi(x), Look.QUICK if x in (4, 5) else Look.FULL) for x in range(9)]
+        futures = [
+            inference.submit(frame, roi(x), Inspection.QUICK if x in (4, 5) else Inspection.FULL) for x in range(9)
+        ]
         counts.begin.set()
         assert [f.result(10).roi_px[0] for f in futures] == list(range(9))
     assert [x for xs, _ in counts.calls for x in xs] == list(range(9))
@@ -452,14 +454,14 @@ def test_an_error_goes_to_who_asked_and_leaving_drops_what_waits():
     counts, frame = Counts(), Frame(0, 0.0, lambda: np.zeros((2, 2, 3), np.uint8))
     counts.begin.set()
     with BatchedInference(counts, CAMERA) as inference:
-        bad = inference.submit(frame, roi(0, 13), Look.FULL)
+        bad = inference.submit(frame, roi(0, 13), Inspection.FULL)
         with pytest.raises(ValueError, match="13"):
             bad.result(10)
-        assert inference.submit(frame, roi(1), Look.FULL).result(10).roi_px[0] == 1
+        assert inference.submit(frame, roi(1), Inspection.FULL).result(10).roi_px[0] == 1
         with pytest.raises(ValueError, match="torn"):
-            inference.submit(Frame(1, 0.1, torn), roi(2), Look.FULL).result(10)
+            inference.submit(Frame(1, 0.1, torn), roi(2), Inspection.FULL).result(10)
         counts.begin.clear()
-        waiting = [inference.submit(frame, roi(x), Look.FULL) for x in range(50)]
+        waiting = [inference.submit(frame, roi(x), Inspection.FULL) for x in range(50)]
         counts.begin.set()
     assert sum(f.done() for f in waiting) < 50
 
