@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from .run import Row
+from .run import Row, measured
 from .table import Column, mega, number, table
 
 
@@ -43,20 +40,8 @@ def run_detect(
             note(f"measuring {method}".strip())
             label = (str(video) if video else "demo recording at 1080p") + (f", {method}" if method else "")
             spec = {"video": str(path), "person": person, "repeat": repeat, "keypoints": method or None}
-            yield {"label": label} | _measure(spec | {"result": str(folder / f"{method}.json")}, timeout_s)
-
-
-def _measure(spec: dict, timeout_s: float) -> Row:
-    """Return the figures of one case, measured in a separate process."""
-    command = [sys.executable, "-m", "pbl_pipeline.bench.detect_case", json.dumps(spec)]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s)
-    except subprocess.TimeoutExpired:
-        return {"error": f"over {timeout_s:g} s"}
-    result = Path(spec["result"])
-    if not result.exists():
-        return {"error": f"died, exit {done.returncode}", "error_text": done.stderr[-2000:]}
-    return json.loads(result.read_text(encoding="utf-8"))
+            spec["result"] = str(folder / f"{method}.json")
+            yield {"label": label} | measured("pbl_pipeline.bench.detect_case", spec, timeout_s)
 
 
 def detect_text(row: Row) -> str:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -98,12 +98,20 @@ def _stage(program: str, case: Case, folder: Path, cache: Path, root: Path, time
         "stage": stage,
         "started": time.time(),
     }
+    return measured(program, spec, timeout_s, {"JAX_COMPILATION_CACHE_DIR": str(cache)})
+
+
+def measured(program: str, spec: Row, timeout_s: float, variables: Mapping[str, str] = {}) -> Row:
+    """Return what a program measured in a separate process and wrote to the file `spec["result"]`, or `error`.
+
+    `variables`: of its environment, beside those of this process.
+    """
     command = [sys.executable, "-m", program, json.dumps(spec)]
-    env = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache)}
     try:
-        done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=timeout_s)
+        done = subprocess.run(command, env=os.environ | variables, capture_output=True, text=True, timeout=timeout_s)
     except subprocess.TimeoutExpired:
         return {"error": f"over {timeout_s:g} s"}
+    result = Path(spec["result"])
     if result.exists():
         # JSON has no NaN: unknown values are null in the file.
         return json.loads(result.read_text(encoding="utf-8"), parse_constant=lambda _: None)

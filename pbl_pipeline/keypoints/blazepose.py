@@ -134,7 +134,7 @@ class BlazePoseLandmarks:
     def _look(
         self, network: LiteModel, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, mirrored: bool
     ) -> PersonKeypoints:
-        """What a network says of the crop, or of its mirror image, in terms of the picture."""
+        """Return the points that a network finds in the crop, or in its mirror image, in coordinates of the picture."""
         crop = np.multiply(cv2.cvtColor(crop, cv2.COLOR_BGR2RGB), np.float32(1 / 255), dtype=np.float32)
         output = network(np.ascontiguousarray(crop[:, ::-1] if mirrored else crop))
         found = output[N_ALL * 5].reshape(N_ALL, 5).astype(np.float64)

@@ -1,6 +1,6 @@
 """From the axes of a picture's crop to the camera frame.
 
-A network that sees a crop does not know where in the picture it was cut. What it sees is, but for a slight stretch,
+A network that sees a crop does not know where in the picture it was cut. Except for a slight stretch, the crop is
 the picture of a camera that looks straight at the crop's centre and is rolled with the crop. Its 3D points stand in
 that virtual camera's frame. A person at the edge of a wide picture is seen at up to 30 degrees from the optical axis,
 and without this rotation would seem to turn while she walks straight on.

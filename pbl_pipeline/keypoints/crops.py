@@ -47,8 +47,10 @@ def smooth_at(roi: np.ndarray, time_s: np.ndarray, at_s: float, sigma_s: float) 
 def corrected(
     roi: np.ndarray, found: PersonKeypoints, min_presence: float, max_drift: float, max_growth: float
 ) -> np.ndarray:
-    """The region (4,) that the keypoints show, or `roi` (4,) where they show nobody or somebody else: `max_drift` and
-    `max_growth` as in `KeypointParams`."""
+    """Return the region (4,) that the keypoints show, or `roi` (4,) where they show no one or another person.
+
+    `max_drift` and `max_growth` as in `KeypointParams`.
+    """
     if found.presence < min_presence or not np.all(np.isfinite(found.roi_px)):
         return roi
     drift = float(np.hypot(*(found.roi_px[:2] - roi[:2]))) / roi[2]

@@ -3,7 +3,7 @@
 Two passes, because the crop decides the quality: the first, over some of the frames, cuts along the person's track, and
 its keypoints show the true region of interest; the second, over every frame, cuts there, smoothed over time in both
 directions (nothing is live here). The crop never feeds on itself from frame to frame, so it cannot wander off to
-somebody else: where the first pass contradicts the track, the track wins.
+another person: where the first pass contradicts the track, the track wins.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def detect_keypoints(
         raise PblError(
             "SUBJECT_UNKNOWN_PERSON",
             found=f"person {person_id}",
-            expected=f"one of {', '.join(str(p.person_id) for p in tracking.persons) or 'nobody: no person was found'}",
+            expected=f"one of {', '.join(str(p.person_id) for p in tracking.persons) or 'no one: no person was found'}",
             next_step="choose one of the numbers that tracking gave",
             key=str(video_path),
         )
@@ -156,7 +156,7 @@ def _assemble(
     for row, person in enumerate(found):
         if person is None or person.presence < params.min_presence:
             continue
-        # What lies beyond the picture was not seen, whatever the detector extrapolates.
+        # Points beyond the picture were not seen: the detector extrapolates them.
         inside = np.all((person.xy_px >= -0.5) & (person.xy_px <= np.array([width, height]) - 0.5), axis=1)
         xy[row, inside], xyz[row, inside] = person.xy_px[inside], person.xyz_cam_m[inside]
         confidence[row, inside] = np.clip(person.confidence[inside], 0.0, 1.0)

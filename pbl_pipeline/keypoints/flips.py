@@ -10,9 +10,9 @@ that cross in a view from the side are not exchanged: they pass each other at a 
 Lengths play no part, so legs of different length do not mislead it. Of synthetic walkers whose left thigh, shank or
 both were 10, 20 and 30 % shorter (three views, three seeds each, 9,720 frames) no frame was exchanged, and all 2,025
 stretches that were exchanged on purpose came back exactly; with further errors of 6 cm that last 0.2 s, 19 of 1,080
-did not, of walkers with equal legs 18 of 270. What a detector makes of a missing leg or a prosthesis was not seen here.
+did not, of walkers with equal legs 18 of 270. A missing leg or a prosthesis was not in these data.
 
-What this cannot tell: whether the sides are right for the greater part of the track. `check_keypoints` reports that.
+Whether the sides are right for the greater part of the track cannot be told here; `check_keypoints` reports it.
 """
 
 from __future__ import annotations

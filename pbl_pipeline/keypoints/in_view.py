@@ -39,7 +39,7 @@ class Gap:
 
 @dataclasses.dataclass(frozen=True)
 class Visibility:
-    """Who was in view when.
+    """Frames in which the person is in view.
 
     Attributes
     ----------

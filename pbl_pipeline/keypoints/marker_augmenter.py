@@ -5,7 +5,7 @@ of 1176 people to predict where 35 skin markers are, iliac spines among them (Fa
 Enhancement for Markerless Motion Capture", IEEE Trans Biomed Eng 72:2013, doi:10.1101/2024.07.13.603382). It sees the
 points y up, relative to the middle of the hips, over the person's height, then height and mass, all standardised by the
 mean and standard deviation that lie beside it; its markers are relative to the same point and over the same height.
-Which way somebody walks ought not to matter and does, so the answers of several headings are averaged.
+The walking direction should not matter but does, so the predictions for several headings are averaged.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class AugmenterParams:
 @dataclasses.dataclass(frozen=True)
 class AnatomicalMarkers:
     """`names` (35,); `xyz_world_m` (T, 35, 3) z up, NaN where a point was unknown; `height_m`, `mass_kg` as they were
-    used; `assumed`: a sentence for each of them that nobody had stated, or that the network was not made for; `origin`:
+    used; `assumed`: a sentence for each of them that was not stated, or that the network was not made for; `origin`:
     network, licence and hash."""
 
     names: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""What a network says of a picture and of its mirror image, as one answer.
+"""Inference of a picture and of its mirror image, combined into one result.
 
 Its errors in the two are partly independent, and where it prefers one side of the body the mirrored answer prefers the
 other: their mean is better than either (docs/benchmarks.md). Half their difference changes slowly, so frames that
@@ -37,8 +37,8 @@ class MirroredInference:
     """Puts the two answers for points `names` together.
 
     confidence = the mean of both, times 1 / (1 + exp((sigma - agree_mm) / agree_width_mm)); sigma is half the 3D
-    distance in mm between the answers. What a network states of itself stays near 1 where it takes one leg for the
-    other; this factor is small there.
+    distance in mm between the answers. The confidence that a network states stays near 1 where it takes one leg
+    for the other; this factor is small there.
 
     Where the two are one body with left and right exchanged, of the legs or of the rest, the mirrored answer is renamed
     after the other (their mean would be a body without width) and the confidence of these points is halved: which of
@@ -109,8 +109,11 @@ class MirroredInference:
         both: np.ndarray,
         time_s: np.ndarray,
     ) -> list[PersonKeypoints]:
-        """Half the difference in a frame is that of its own answer to the other kind's, interpolated there. Before and
-        after the frames of `both` one kind is not known: there the nearest of them speaks."""
+        """Return the combined results of a stretch.
+
+        Half the difference in a frame is that of its result to the other kind's, interpolated there. Before and after
+        the frames of `both` one kind is not known: the nearest of them is used.
+        """
         plain = _between(people, ~mirrored, time_s)
         crossed = np.zeros((len(people), len(self.names)), bool)
         for i in np.flatnonzero(mirrored & both):

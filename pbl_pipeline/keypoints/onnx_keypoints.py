@@ -51,7 +51,7 @@ class ModelParams:
 class ModelKeypointParams(KeypointParams):
     """Parameters of `detect_keypoints` with a registered model.
 
-    min_presence is 0: no network here says whether somebody is there; who is not, has low confidences. `agree_mm`,
+    min_presence is 0: no network here says whether a person is there; without one, confidences are low. `agree_mm`,
     `confidence_curve` and `sides` were made and measured with BlazePose: the first does nothing here, the others are
     off.
     """
@@ -163,7 +163,7 @@ class OnnxKeypoints:
         confidence = sd_confidence(spread_mm(together), self._params.half_mm, self._params.width_mm)
         root = absolute_root(mean_xyz, mean_xy, confidence, camera, self._params.half_root_m)
         placed = np.asarray(np.isfinite(root).all(axis=1))
-        # A shape that fits nowhere in front of the camera is no person.
+        # A shape that fits nowhere in front of the camera is not a person.
         confidence = np.where(placed[:, None], confidence, 0.0)
         mean_xyz = mean_xyz + root[:, None]
         people = zip(mean_xy, mean_xyz, confidence, rois_px, strict=True)

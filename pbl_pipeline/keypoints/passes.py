@@ -81,7 +81,7 @@ def two_passes(
     regions: Regions,
     inspection: Callable[[int], Inspection] = lambda _: Inspection.FULL,
 ) -> Iterator[tuple[int, PersonKeypoints]]:
-    """What the second pass found, frame by frame in order.
+    """Yield the index of each frame, in order, with the keypoints that the second pass found.
 
     `frames` are those in which the person is, of the video with stamps `time_s` (T,). The first pass is over those of
     `regions.first`; a frame's region of the second is asked for once all first results up to `regions.reach_s` after

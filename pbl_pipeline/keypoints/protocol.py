@@ -1,4 +1,4 @@
-"""What every keypoint detector offers; tables and commands know nothing more of one."""
+"""Interfaces of keypoint detectors; tables and commands use nothing else of a detector."""
 
 from __future__ import annotations
 

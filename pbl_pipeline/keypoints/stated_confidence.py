@@ -1,4 +1,4 @@
-"""What a detector's confidence is worth: curves from what it states to how often the point is where it says.
+"""Calibration of a detector's confidence: curves from the stated value to the probability that a point is right.
 
 A stated confidence is a number between 0 and 1 in a scale of the detector's own. A curve turns it into the probability
 that the point lies within a stated bound of the true one in the picture. Curves are data with a name and a version
@@ -45,7 +45,7 @@ class ConfidenceCurve:
     n : int
         Points that it was fitted to.
     source
-        What it was fitted to, in words.
+        The data that it was fitted to, in words.
     params
         The parameters of the detection that gave these confidences (`KeypointParams` less `confidence_curve`).
     """
@@ -60,7 +60,7 @@ class ConfidenceCurve:
     params: dict
 
     def __call__(self, confidence: np.ndarray) -> np.ndarray:
-        """Probabilities for stated confidences of any shape; 0 for 0, which says that there is no point."""
+        """Return probabilities for stated confidences of any shape; 0 for 0, which means that no point was found."""
         confidence = np.asarray(confidence, float)
         return np.where(confidence > 0, np.interp(confidence, self.stated, self.probability), 0.0)
 

@@ -76,10 +76,10 @@ class Keypoints:
         Phone orientation, camera to world, at its own stamps: both or neither. Brought to unit length, without jumps
         of sign, when made (`check_attitude`); how much of the recording it covers is for the fit to judge.
     origin
-        Which detector and model made them, under which licence and on what; empty where nobody said.
+        Which detector and model made them, under which licence and on what; empty where it is not stated.
     sides_changed : (T, 3) bool or None
         Frames in which left and right of the legs, and of the rest of the body, are not as the detector said but were
-        exchanged, and those in which its body has no width, so that the sides cannot be told; None: nobody looked.
+        exchanged, and those in which its body has no width, so that the sides cannot be told; None: not checked.
     assumed
         Fields that the file did not have, for which a default stands (`load`).
     picture

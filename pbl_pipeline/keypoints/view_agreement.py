@@ -37,7 +37,7 @@ def ray_miss_m(trial: MultiView) -> Float[np.ndarray, " V"]:
     place = np.linalg.solve(a + 1e-9 * np.eye(3), b[..., None])[..., 0]
     to = place[:, :, None] - origin
     miss = np.linalg.norm(np.einsum("tjvab,tjvb->tjva", across, to), axis=-1)
-    # What lies behind a camera is no place that it sees: as far off as it is away.
+    # A camera cannot see a point behind it: its distance counts as the miss.
     behind = np.einsum("tjva,tjva->tjv", to, ray) < 0
     miss = np.where(behind, np.linalg.norm(to, axis=-1), miss)
     counted = seen & twice[..., None]

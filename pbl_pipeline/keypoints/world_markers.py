@@ -68,7 +68,7 @@ class WorldMarkers:
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice or "" in names:
             raise _format_error(
-                f"names that repeat: {', '.join(twice) or '(empty)'}", "a name of its own for each marker"
+                f"names that repeat: {', '.join(twice) or '(empty)'}", "a different name for each marker"
             )
         if not np.isfinite(self.time_s).all():
             raise _format_error("time stamps that are not finite", "seconds")
