@@ -24,8 +24,8 @@ MODULES: dict[str, tuple[str, ...]] = {
     "schemas.origin": (),
     "schemas.reading": (),
     "schemas.rows": ("InputChanged", "one"),
-    "schemas.status": ("pipeline_status",),
-    "schemas.views": (),
+    "schemas.reading.status": ("pipeline_status",),
+    "schemas.reading.frames": (),
 }
 
 

@@ -12,9 +12,9 @@ from pbl_pipeline.names import check_label
 
 from . import fit, gait, gdi, lab, session, video
 from .method_names import with_keys
+from .reading.frames import newest_sets
 from .rows import plain
 from .stored_files import new_folder
-from .views import newest_sets
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib

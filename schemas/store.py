@@ -14,7 +14,7 @@ from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
 from .datajoint_setup import full_path
-from .folders import private_folder
+from .operations.folders import private_folder
 from .operations.secret_files import secret
 
 #: Folder of the bucket under which everything of ours lies; the phones' uploads may have another one beside it.

@@ -26,7 +26,10 @@ import pymysql
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import read_phone_log, sha256_of
 from schemas import video, worker
-from schemas.archive import (
+from schemas.connection import dj
+from schemas.intake import OneCamera, Sensors, VisitRecord, register
+from schemas.intake.uploads import LOG_ENDINGS, Bucket, Folder, StillChanging, Upload, drop_folder, incoming_url
+from schemas.operations.archive import (
     COPIES,
     LOCK,
     REFUSED,
@@ -37,11 +40,8 @@ from schemas.archive import (
     remove_copies,
     save_seen,
 )
-from schemas.codes import check_subject
-from schemas.connection import dj
-from schemas.folders import private_folder, remove_empty, sync_folders
-from schemas.intake import OneCamera, Sensors, Visit, register
-from schemas.intake.uploads import LOG_ENDINGS, Bucket, Folder, StillChanging, Upload, drop_folder, incoming_url
+from schemas.operations.folders import private_folder, remove_empty, sync_folders
+from schemas.subject_codes import check_subject
 
 from .limited import LimitExceeded, limited
 
@@ -267,7 +267,7 @@ def _register(name: PurePosixPath, copies: Sequence[_Copy], archive: Path) -> st
         copy.path = copy.path.replace(to)
     sync_folders(folder, archive)
     sensors = Sensors(attitude=logs[0].path if logs else None)
-    (result,) = register([OneCamera(target, Visit(subject, session), sensors)])
+    (result,) = register([OneCamera(target, VisitRecord(subject, session), sensors)])
     if result.error is not None:
         raise result.error
     if result.status == "registered":

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from schemas.jobs import jobs_of
-from schemas.scope import Scope
+from schemas.reading.scope import Scope
 
 from . import queue, refresh, registry, run_job
 from .batches import run_fits

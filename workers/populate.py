@@ -10,9 +10,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from pbl_pipeline import progress
-from schemas import computed_tables, scope, tracking
+from schemas import computed_tables, tracking
 from schemas.jobs import jobs_of
-from schemas.status import empty_rows
+from schemas.reading import scope
+from schemas.reading.status import empty_rows
 
 from . import queue, refresh, run_job
 from .heartbeat import Silent

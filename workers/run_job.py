@@ -14,8 +14,8 @@ import pymysql
 
 from pbl_pipeline.errors import PblError
 from schemas import connection
-from schemas.coded_errors import error_code, error_message
 from schemas.connection import DuplicateError, IntegrityError, LostConnectionError, inserting
+from schemas.job_errors import error_code, error_message
 from schemas.jobs import keys_of
 from schemas.rows import InputChanged
 from schemas.stored_files import remove_left_over

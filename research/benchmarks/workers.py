@@ -55,12 +55,12 @@ def installation() -> Iterator[Path]:
 
 def recordings(first: int, n: int) -> Iterator[Any]:
     """Numbered recordings, `EACH` of a session, one session of a subject."""
-    from schemas.intake import Visit
+    from schemas.intake import VisitRecord
     from schemas.intake.bulk import archived
 
     for i in range(first, first + n):
         sha256 = hashlib.sha256(str(i).encode()).hexdigest()
-        yield archived(f"/recordings/{i:07d}.mp4", sha256, 1000 + i, Visit(f"S{i // EACH:07d}", "1"))
+        yield archived(f"/recordings/{i:07d}.mp4", sha256, 1000 + i, VisitRecord(f"S{i // EACH:07d}", "1"))
 
 
 def say(what: str, value: float, unit: str, bar: str = "") -> None:
@@ -101,7 +101,7 @@ def scale(videos: int) -> None:
     """Register, look, refresh, work, with as many videos."""
     from schemas import computed_tables, video
     from schemas.intake.bulk import register_many
-    from schemas.status import pipeline_status
+    from schemas.reading.status import pipeline_status
     from workers import refresh
 
     with installation():

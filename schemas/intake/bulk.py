@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..transactions import in_transaction
 from .plans import resolve
-from .records import File, Methods, Visit
+from .records import File, Methods, VisitRecord
 from .registration import check_owner, registered, write
 from .videos import OneCamera
 
@@ -18,7 +18,7 @@ from .videos import OneCamera
 CHUNK = 5000
 
 
-def archived(path: str, sha256: str, size: int, visit: Visit) -> OneCamera:
+def archived(path: str, sha256: str, size: int, visit: VisitRecord) -> OneCamera:
     """Return the record of a video whose SHA-256 and length (bytes) are known; it is not opened."""
     return OneCamera(Path(path), visit, file=File(Path(path), sha256, size))
 

@@ -13,7 +13,14 @@ from .. import fit, video
 from ..jobs import forget_errors
 from ..transactions import in_transaction
 from .calibrations import camera_id_of, camera_row, known_camera
-from .records import File, Methods, Recording, Registered, Visit, usage
+from .records import (
+    File,
+    Methods,
+    Recording,
+    Registered,
+    VisitRecord,
+    usage,
+)
 from .registration import register
 from .sensors import NONE, Sensors, attach, delete_keypoints
 
@@ -29,7 +36,7 @@ class OneCamera(Recording):
     """
 
     path: Path
-    visit: Visit
+    visit: VisitRecord
     sensors: Sensors = dataclasses.field(default_factory=Sensors)
     file: File | None = None
     log: PhoneLog | None = dataclasses.field(default=None, init=False)
@@ -116,7 +123,7 @@ def _camera(camera_file: str | Path, path: Path) -> dict[str, Any] | None:
 
 
 def ingest(
-    paths: Sequence[str | Path], visit: Visit, methods: Methods | None = None, files: Sequence[Sensors] = ()
+    paths: Sequence[str | Path], visit: VisitRecord, methods: Methods | None = None, files: Sequence[Sensors] = ()
 ) -> list[Registered]:
     """Register videos of one visit: `register` for a list of paths. At most one picture of each is decoded.
 

@@ -27,8 +27,8 @@ import pymysql
 from pbl_pipeline import __version__, progress
 from pbl_pipeline.errors import PblError
 from schemas import connection
-from schemas.folders import make_private, private_folder
-from schemas.json_files import write_json
+from schemas.operations.folders import make_private, private_folder
+from schemas.operations.json_files import write_json
 from schemas.store import store_error
 
 from . import backup_files, catalog, dump

@@ -20,13 +20,21 @@ from typing import Any
 
 from pbl_pipeline import progress, settings
 from pbl_pipeline.errors import PblError
-from schemas import archive, connection, fit, lab, session, video, worker
-from schemas.codes import check_subject
+from schemas import (
+    connection,
+    fit,
+    lab,
+    session,
+    video,
+    worker,
+)
 from schemas.datajoint_setup import full_path
-from schemas.folders import remove_empty
-from schemas.json_files import write_json
+from schemas.operations import archive
+from schemas.operations.folders import remove_empty
+from schemas.operations.json_files import write_json
 from schemas.rows import delete_below
 from schemas.store import files_below, purge, store_error
+from schemas.subject_codes import check_subject
 
 from . import catalog
 from .catalog import Column, quote

@@ -13,15 +13,15 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
 
 from .. import fit, gait, gdi, keypoints, session, tracking, video
-from ..archive import plain_name
 from ..chain import before
-from ..coded_errors import error_code, error_found
+from ..decisions.not_usable import unusable
+from ..job_errors import error_code, error_found
 from ..jobs import jobs_of
 from ..method_names import with_keys
+from ..operations.archive import plain_name
 from ..rows import ReadAhead, Rows, inside, row_of, stored_rows
 from ..stored_files import file_ref, stored_file
 from ..studies.slices import chain_of
-from ..usable import unusable
 from .objects import (
     load_choice,
     load_cycles,

@@ -17,10 +17,10 @@ from pbl_pipeline.words import unit_of
 from .. import fit, gait, gdi, lab, session, study, video
 from ..datajoint_setup import dj
 from ..method_names import with_keys
+from ..reading.frames import cycle_rows, frame_of, newest_sets
 from ..rows import inside, utc_now
 from ..stored_files import file_ref, stored_file
 from ..transactions import in_transaction
-from ..views import cycle_rows, frame_of, newest_sets
 
 if TYPE_CHECKING:
     from pbl_pipeline.study import StudyData

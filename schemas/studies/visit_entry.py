@@ -14,7 +14,7 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 
 from .. import session, study
-from ..decide import decisions, record
+from ..decisions.review_decisions import decisions, record
 from ..intake.sheets import Line, Row, Sheet, refused
 from ..transactions import in_transaction
 from .study_sheets import CLEAR, SCORE_COLUMNS, import_rows

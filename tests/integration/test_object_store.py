@@ -13,9 +13,9 @@ import pbl_pipeline.video
 import schemas
 from pbl_pipeline.errors import PblError
 from schemas import connection, store, tracking, video
-from schemas.declare import declare_all
-from schemas.intake import Visit, ingest
+from schemas.intake import VisitRecord, ingest
 from schemas.operations import backup, forget
+from schemas.operations.declare import declare_all
 from schemas.stored_files import file_ref, stored_file
 from tests.rows import remove_all
 from workers.incoming import take_over
@@ -59,7 +59,7 @@ def test_arrays_and_files_go_to_the_bucket_and_come_back(remote: None, tmp_path:
     assert not backend.fs.exists("walks")
     store.check_store(backend, create=True)
     path = chain.small_video(tmp_path, "walk")
-    ingest([path], Visit(subject="P001"))
+    ingest([path], VisitRecord(subject="P001"))
     for table in (video.VideoInfo, tracking.Tracking):
         table.populate()
     stored = sorted(backend.fs.find("walks"))
@@ -88,7 +88,7 @@ def test_arrays_and_files_go_to_the_bucket_and_come_back(remote: None, tmp_path:
 def test_a_backup_and_a_person_who_is_forgotten(remote: None, tmp_path: Path):
     declare_all()
     backend = connection.store_backend()
-    ingest([chain.small_video(tmp_path, "walk")], Visit(subject="P002"))
+    ingest([chain.small_video(tmp_path, "walk")], VisitRecord(subject="P002"))
     for table in (video.VideoInfo, tracking.Tracking):
         table.populate()
     number = video.Video.fetch1("video_id")

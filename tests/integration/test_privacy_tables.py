@@ -16,9 +16,9 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import VideoInfo, probe, sha256_of
 from schemas import jobs, privacy
 from schemas.operations.forget import forget
-from schemas.status import pipeline_status
+from schemas.reading.status import pipeline_status
+from schemas.reading.why import why
 from schemas.stored_files import file_ref, stored_file
-from schemas.why import why
 from tests.rows import register, remove_all
 from tests.videos import constant_rate, numbered_frames, write_video
 from workers.populate import populate

@@ -10,14 +10,15 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.words import UNUSABLE
 
-from . import fit, qc, tracking, usable, video
-from .choose import selection_of
-from .jobs import jobs_of
-from .plan import locked, plan_anew, queues_before_fit
-from .review import Decision
-from .rows import utc_now
-from .transactions import next_id
-from .usable import Unusable
+from .. import fit, qc, tracking, video
+from ..jobs import jobs_of
+from ..plan import locked, plan_anew, queues_before_fit
+from ..review import Decision
+from ..rows import utc_now
+from ..transactions import next_id
+from . import not_usable
+from .candidates import selection_of
+from .not_usable import Unusable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,7 +153,7 @@ def _decide_usable(video_id: int, mark: dict[str, str] | None, by: str, seen: st
     with locked(session_id):
         if seen is not None and usable_state(video_id) != seen:
             raise meanwhile(video_id, "usable")
-        before = usable.unusable([video_id]).get(video_id)
+        before = not_usable.unusable([video_id]).get(video_id)
         if mark is None and before is None:
             return
         # Of several cameras all: their trial is fitted with every view or not at all.
@@ -160,7 +161,7 @@ def _decide_usable(video_id: int, mark: dict[str, str] | None, by: str, seen: st
         (video.NotUsable & views).delete_quick()
         if mark is not None:
             video.NotUsable.insert({**view, **mark, "unusable_created": utc_now()} for view in views)
-        after = usable.unusable([video_id]).get(video_id)
+        after = not_usable.unusable([video_id]).get(video_id)
         reason = after.note if after else ""
         record("usable", by, {}, _said(before), _said(after), reason, video_id=video_id)
         plan_anew(session_id, failed)

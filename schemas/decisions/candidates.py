@@ -1,4 +1,4 @@
-"""A person's choice who is measured: what there is to choose from. `schemas.decide.decide_person` decides."""
+"""Candidates for the measured person of a video. `review_decisions.decide_person` records the choice."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 
-from . import tracking, video
-from .method_rows import stored_key
-from .reading.objects import load_tracking
-from .stored_files import file_ref, stored_file
+from .. import tracking, video
+from ..method_rows import stored_key
+from ..reading.objects import load_tracking
+from ..stored_files import file_ref, stored_file
 
 
 @dataclasses.dataclass(frozen=True)

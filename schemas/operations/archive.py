@@ -18,7 +18,7 @@ from typing import Any
 
 from pbl_pipeline import settings
 
-from .codes import SUBJECT_CODE
+from ..subject_codes import SUBJECT_CODE
 from .folders import private_folder, remove_empty
 from .json_files import write_json
 

@@ -11,10 +11,18 @@ from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from . import computed_tables, connection, keypoints, tracking, usable, video, worker
-from .coded_errors import error_code, error_found, error_next_step
-from .jobs import jobs_of
-from .operations.catalog import quote
+from .. import (
+    computed_tables,
+    connection,
+    keypoints,
+    tracking,
+    video,
+    worker,
+)
+from ..decisions import not_usable
+from ..job_errors import error_code, error_found, error_next_step
+from ..jobs import jobs_of
+from ..operations.catalog import quote
 
 #: Fewer videos than this, and keys are counted that nobody has queued yet.
 SMALL = 5000
@@ -153,7 +161,9 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
     errors = [e for t, s in zip(chain, tables, strict=True) if s.error for e in _errors(t, most)]
     empty = {t.table for t in tables if t.empty}
     waiting = _waiting(most) if any(t.waiting for t in tables) else []
-    marked = [LeftOut(m.video_id, _file_of({"video_id": m.video_id}), m.text, m.by) for m in usable.all_unusable(most)]
+    marked = [
+        LeftOut(m.video_id, _file_of({"video_id": m.video_id}), m.text, m.by) for m in not_usable.all_unusable(most)
+    ]
     return Status(n_videos, tables, errors, _empty(empty, most), waiting, live_workers(), exact, cameras, marked)
 
 

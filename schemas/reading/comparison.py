@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
 
-from . import fit, gait, study, video, views
-from .reading.shown import ShownVisit, shown_visit
+from .. import fit, gait, study, video
+from . import frames
+from .shown import ShownVisit, shown_visit
 from .visit_list import Change, change_since, results_of
 
 if TYPE_CHECKING:
@@ -139,7 +140,7 @@ def _compared(
     before = scores[first.row.session_id] if about is not first else {}
     return Side(
         about=about,
-        curves=views.cycle_curves(about.key or False),
+        curves=frames.cycle_curves(about.key or False),
         cycles=_cycles(about.key) if about.key else (),
         scores={n: _score(v, before.get(n), instruments[n]) for n, v in scores[about.row.session_id].items()},
         change=change,

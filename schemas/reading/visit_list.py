@@ -14,10 +14,19 @@ import datetime
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from . import computed_tables, fit, gdi, qc, session, study, tracking, video
-from .coded_errors import error_code
-from .operations.catalog import quote
-from .rows import number
+from .. import (
+    computed_tables,
+    fit,
+    gdi,
+    qc,
+    session,
+    study,
+    tracking,
+    video,
+)
+from ..job_errors import error_code
+from ..operations.catalog import quote
+from ..rows import number
 from .status import queue_name
 
 #: Visits of a page.

@@ -8,12 +8,20 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 
-from . import fit, gdi, keypoints, lab, review, session, video
-from .datajoint_setup import dj
-from .methods import METHOD_TABLES
-from .rows import inside
-from .usable import unusable
-from .views import frame_of, newest_sets
+from .. import (
+    fit,
+    gdi,
+    keypoints,
+    lab,
+    review,
+    session,
+    video,
+)
+from ..datajoint_setup import dj
+from ..decisions.not_usable import unusable
+from ..methods import METHOD_TABLES
+from ..rows import inside
+from .frames import frame_of, newest_sets
 
 if TYPE_CHECKING:
     import pandas as pd

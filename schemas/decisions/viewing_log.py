@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from . import session, video
-from .review import Viewing
-from .rows import utc_now
-from .transactions import in_transaction, next_id
+from .. import session, video
+from ..review import Viewing
+from ..rows import utc_now
+from ..transactions import in_transaction, next_id
 
 
 def record_viewing(of: str, number: int, what: str, by: str) -> None:
