@@ -19,7 +19,6 @@ MODULES: dict[str, tuple[str, ...]] = {
     "schemas": (),
     "schemas.connection": ("connect", "schema_name"),
     "schemas.intake": (),
-    "schemas.intake.bulk": ("archived", "register_many"),
     "schemas.method_rows": ("insert_methods", "method_columns"),
     "schemas.origin": (),
     "schemas.reading": (),

@@ -281,7 +281,7 @@ def _run(site: Site, minutes: float, supervisors: int, can_fill: bool) -> list[s
 
 
 def _register(first: int) -> int:
-    from schemas.intake.bulk import register_many
+    from research.benchmarks.many_recordings import register_many
 
     register_many(workers.recordings(first, 10 * workers.EACH))
     return first + 10 * workers.EACH

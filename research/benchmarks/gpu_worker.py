@@ -110,8 +110,8 @@ class Walks:
 
 def put_sessions(home: Path, sessions: Sequence[Plan]) -> None:
     """Register the sessions' videos and put the rows of all tables before SessionFit, as detection would leave them."""
+    from research.benchmarks.many_recordings import archived, register_many
     from schemas.intake import Methods, VisitRecord
-    from schemas.intake.bulk import archived, register_many
 
     recordings, trials = [], []
     walks = Walks()

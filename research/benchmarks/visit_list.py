@@ -88,7 +88,7 @@ def median_ms(function: Any, n: int) -> float:
 @click.option("--repeats", default=50, show_default=True)
 def main(visits: int, repeats: int) -> None:
     """Make the visits, ask for pages, print the figures."""
-    from schemas.intake.bulk import register_many
+    from research.benchmarks.many_recordings import register_many
     from schemas.reading.visit_list import Filter, visit_page
 
     with queue.installation():

@@ -30,15 +30,11 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass
 class OneCamera(Recording):
-    """A video of one camera, with the files that its phone or the person's sensors recorded beside it.
-
-    `file`: where its bytes are known, as in an archive; the video is not opened then.
-    """
+    """A video of one camera, with the files that its phone or the person's sensors recorded beside it."""
 
     path: Path
     visit: VisitRecord
     sensors: Sensors = dataclasses.field(default_factory=Sensors)
-    file: File | None = None
     log: PhoneLog | None = dataclasses.field(default=None, init=False)
 
     @property
@@ -50,7 +46,7 @@ class OneCamera(Recording):
         return self.visit.camera_motion or ("handheld" if self.sensors.has_log else "static")
 
     def read(self) -> None:
-        self.files = (self.file or File.of(*self.paths),)  # no picture is decoded
+        self.files = (File.of(*self.paths),)  # no picture is decoded
         self.log = self.sensors.read()
 
     def check_known(self, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -56,7 +56,7 @@ class Side:
     """One of the visits that are compared, with its changes against the reference."""
 
     about: ShownVisit
-    curves: pd.DataFrame  # of `views.cycle_curves`
+    curves: pd.DataFrame  # of `frames.cycle_curves`
     cycles: tuple[Cycle, ...]
     scores: dict[str, Score]
     change: Change | None  # of the index; None for the reference itself

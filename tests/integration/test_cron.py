@@ -14,9 +14,9 @@ from click.testing import CliRunner
 
 import schemas
 from pbl_pipeline.errors import PblError
+from research.benchmarks.many_recordings import archived, register_many
 from schemas import connection, lab, session, tracking, video
 from schemas.intake import VisitRecord, uploads
-from schemas.intake.bulk import archived, register_many
 from schemas.operations.orphans import orphans, remove
 from tests.rows import register
 from workers import incoming

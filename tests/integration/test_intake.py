@@ -9,6 +9,7 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import sha256_of
+from research.benchmarks.many_recordings import archived, register_many
 from schemas import fit, gait, gdi, keypoints, lab, session, tracking, video
 from schemas.intake import (
     LaboratoryMarkers,
@@ -19,7 +20,6 @@ from schemas.intake import (
     ingest,
     register,
 )
-from schemas.intake.bulk import archived, register_many
 from schemas.intake.plans import resolve
 from schemas.intake.recording_sheet import ingest_sheet
 from tests.command import pbl

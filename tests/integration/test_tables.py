@@ -22,6 +22,7 @@ import pbl_pipeline.tracking
 import pbl_pipeline.video
 import schemas
 import workers.populate
+from docs_site import table_map
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import Check
@@ -43,7 +44,6 @@ from schemas.decisions.candidates import candidates, write_sheet
 from schemas.decisions.review_decisions import decide_person
 from schemas.intake import Methods, VisitRecord, ingest
 from schemas.method_rows import resolve_method
-from schemas.operations import table_map
 from schemas.plan import plan_fit_sets
 from schemas.reading import frames
 from schemas.reading.status import pipeline_status
@@ -848,7 +848,7 @@ def test_the_map_is_what_the_database_holds(declared: None):
 
 def test_the_page_of_the_tables_is_up_to_date():
     page = (ROOT / "docs" / "tables.md").read_text()
-    assert page == table_map.table_map(), "run: python -m schemas.operations.table_map > docs/tables.md"
+    assert page == table_map.table_map(), "run: python -m docs_site.table_map > docs/tables.md"
 
 
 def test_methods_are_frozen(declared: None):
