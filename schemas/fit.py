@@ -259,7 +259,7 @@ class SessionFit(dj.Computed):
         views = views_of([int(r["video_id"]) for r in rows]) if of_rig else {}
         files = {r["video_id"]: file_ref(r["keypoints_file" if rows else "markers_file"]) for r in rows or of_markers}
         leads = [r for r in rows or of_markers if not of_rig or views[int(r["video_id"])]]
-        names = trial_names([(r["video_id"], r["video_name"]) for r in leads])
+        names = distinct([Path(r["video_name"]).stem for r in leads], [r["video_id"] for r in leads])
         trials = []
         for r, name in zip(leads, names, strict=True):
             own = views.get(int(r["video_id"]), [])
@@ -474,11 +474,6 @@ def median(values: np.ndarray) -> float | None:
     """Median of the values that are there; None where none is."""
     there = values[np.isfinite(values)]
     return float(np.median(there)) if len(there) else None
-
-
-def trial_names(videos: Sequence[tuple[int, str]]) -> list[str]:
-    """A name for each (video_id, file name): the file's stem, with the number where stems repeat."""
-    return distinct([Path(name).stem for _, name in videos], [number for number, _ in videos])
 
 
 def float32_trial(trial: lib.TrialFit) -> lib.TrialFit:

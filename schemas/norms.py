@@ -139,17 +139,8 @@ def build_norm(
 
 
 def load_norm(norm: str) -> lib.NormativeSet:
-    """The library's set of a key (`name-v2`) or name (its newest version). Raises `PblError` NORM_UNKNOWN."""
-    rows = gdi.NormativeSet.proj("norm_name", "norm_version").to_dicts(order_by="norm_version DESC")
-    found = next((r["norm"] for r in rows if norm in (r["norm"], r["norm_name"])), None)
-    if found is None:
-        raise PblError(
-            "NORM_UNKNOWN",
-            found=f"normative set {norm!r}",
-            expected="one of " + ", ".join(sorted(r["norm"] for r in rows)),
-            next_step="choose one of the names above",
-        )
-    return gdi.norm_of_row(*gdi.norm_ref({"norm": found}))
+    """Return the library's set of a key (`name-v2`) or name (its newest version). Raises `PblError` NORM_UNKNOWN."""
+    return gdi.norm_of_row(*gdi.norm_ref({"norm": gdi.norm_keys(norm)[0]}))
 
 
 def _cycle_keys(people: Sequence[dict], restriction: Any, pace: str) -> list[dict[str, Any]]:

@@ -16,7 +16,7 @@ from schemas.reading.scope import Scope
 
 from . import queue, refresh, registry, run_job
 from .batches import run_fits
-from .heartbeat import Listener
+from .heartbeat import Silent
 from .log import event
 from .queue import Claim
 from .run_job import Outcome
@@ -40,7 +40,7 @@ class Worker:
     """
 
     tables: Sequence[Any]
-    heartbeat: Listener
+    heartbeat: Silent
     stop: threading.Event = dataclasses.field(default_factory=threading.Event)
     report: Callable[[Claim, Outcome | None], None] = lambda *_: None
     batch: int = 1

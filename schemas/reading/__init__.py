@@ -1,8 +1,7 @@
 """Reading the tables: visits and recordings as the library's objects."""
 
+from ..gait import load_cycles, load_events
 from .objects import (
-    load_cycles,
-    load_events,
     load_fit_checks,
     load_keypoints,
     load_metrics,

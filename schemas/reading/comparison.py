@@ -33,15 +33,6 @@ class Cycle:
 
 
 @dataclasses.dataclass(frozen=True)
-class MeasureChange:
-    """What a measure differs by from that of the reference. sure: whether that is more than chance, None where the
-    smallest change that is no chance is not known, as it is for all measures but the index."""
-
-    by: float
-    sure: bool | None = None
-
-
-@dataclasses.dataclass(frozen=True)
 class Score:
     """A clinical score. change: against the reference; important: whether that is at least the minimal important change
     of the instrument, None where none is taken over."""
@@ -60,7 +51,7 @@ class Side:
     cycles: tuple[Cycle, ...]
     scores: dict[str, Score]
     change: Change | None  # of the index; None for the reference itself
-    changes: dict[str, MeasureChange]
+    changes: dict[str, Change]  # of the measures
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,7 +127,7 @@ def _compared(
         for name, (other, _) in first.measures.items():
             mine, _ = about.measures.get(name, (None, ""))
             if mine is not None and other is not None:
-                changes[name] = MeasureChange(mine.mean - other.mean)
+                changes[name] = Change(mine.mean - other.mean, None)
     before = scores[first.row.session_id] if about is not first else {}
     return Side(
         about=about,

@@ -217,12 +217,6 @@ def quality_summary(restriction: Any = True) -> pd.DataFrame:
     return (current_sets() * checks & restriction).to_pandas(order_by="session_id, qc_no").reset_index()
 
 
-def decided_by_hand() -> pd.DataFrame:
-    """Videos whose subject a person chose."""
-    manual = tracking.SubjectOverride * video.Video.proj("video_name", "session_id")
-    return manual.to_pandas(order_by="video_id").reset_index()
-
-
 def validation_frame(restriction: Any = True) -> pd.DataFrame:
     """Errors of the current fits against the current references, one row per trial, reference and joint.
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from .. import fit, gait, gdi, keypoints, tracking, video
 from ..checks import check_values
-from ..rows import Rows, number, row_of, stored_rows
+from ..gait import load_cycles, load_events
+from ..rows import Rows, row_of, stored_rows
 from ..stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -28,8 +29,8 @@ def videos_of(key: Mapping[str, Any], rows: Rows = stored_rows) -> list[int]:
 
 
 def _of(table: Any, key: Mapping[str, Any]) -> dict[str, Any]:
-    """What of a key belongs to a table."""
-    return {name: key[name] for name in table.primary_key if name in key}
+    """Return what of a key belongs to a table."""
+    return {name: key[name] for name in table.primary_key}
 
 
 def load_keypoints(key: Any, rows: Rows = stored_rows) -> Keypoints:
@@ -106,16 +107,6 @@ def load_choice(row: Mapping[str, Any]) -> tracking_lib.SubjectChoice:
     )
 
 
-def load_events(key: Any, rows: Rows = stored_rows) -> lib.GaitEvents:
-    """Return the library's `GaitEvents` that the cycles of a trial were made from: detected or corrected by hand."""
-    return gait.load_events(key, rows)
-
-
-def load_cycles(key: Any, trial: str, rows: Rows = stored_rows) -> tuple[lib.GaitCycle, ...]:
-    """The library's `GaitCycle`s of one row, with their curves."""
-    return tuple(gait.load_cycles(key, trial, rows))
-
-
 def _checks(rows: Sequence[Mapping[str, Any]], prefix: str) -> list[Check]:
     from pbl_pipeline.qc import Check, in_order
 
@@ -142,13 +133,7 @@ def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
     checks = _checks(rows(gdi.SessionGdi.Check, row_key), "gdi")
     index = lib.Gdi(
         status="PASS" if row["session_gdi"] is not None else "EMPTY",
-        reason=row["session_gdi_reason"],
-        left=number(row["session_gdi_left"]),
-        right=number(row["session_gdi_right"]),
-        mean=number(row["session_gdi"]),
-        sd=number(row["session_gdi_sd"]),
-        minimal_change=number(row["session_gdi_minimal_change"]),
-        n=int(row["session_gdi_n"]),
+        **gdi.index_fields(row, "session_gdi"),
         n_left=sum(t.gdi.n_left for t in pooled),
         n_right=sum(t.gdi.n_right for t in pooled),
         norm=norm_name,
@@ -195,7 +180,7 @@ def _trial_metrics(key: Mapping[str, Any], rows: Rows) -> lib.TrialMetrics:
         n_cycles_used=int(counts["n_cycles_used"]),
         n_steps_used=int(row["n_steps_used"]),
     )
-    index, cycles = load_gdi(key, name, rows), load_cycles(of_trial, name, rows)
+    index, cycles = load_gdi(key, name, rows), tuple(load_cycles(of_trial, name, rows))
     reason = events.reason or measures.reason
     return lib.TrialMetrics(
         name=name,
@@ -229,13 +214,7 @@ def load_gdi(key: Any, trial: str, rows: Rows = stored_rows) -> lib.Gdi:
     )
     return lib.Gdi(
         status=row["gdi_status"],
-        reason=row["gdi_reason"],
-        left=number(row["gdi_left"]),
-        right=number(row["gdi_right"]),
-        mean=number(row["gdi"]),
-        sd=number(row["gdi_sd"]),
-        minimal_change=number(row["gdi_minimal_change"]),
-        n=int(row["gdi_n"]),
+        **gdi.index_fields(row, "gdi"),
         n_left=sum(c.side == "left" for c in cycles),
         n_right=sum(c.side == "right" for c in cycles),
         norm=norm_name,

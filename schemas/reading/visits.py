@@ -15,6 +15,7 @@ from pbl_pipeline.names import distinct
 from .. import fit, gait, gdi, keypoints, session, tracking, video
 from ..chain import before
 from ..decisions.not_usable import unusable
+from ..gait import load_cycles
 from ..job_errors import error_code, error_found
 from ..jobs import jobs_of
 from ..method_names import with_keys
@@ -24,7 +25,6 @@ from ..stored_files import file_ref, stored_file
 from ..studies.slices import chain_of
 from .objects import (
     load_choice,
-    load_cycles,
     load_fit_checks,
     load_keypoints,
     load_metrics,
