@@ -1,29 +1,7 @@
 """One configured DataJoint connection, to the server DJ_HOST names or else to the embedded one.
 
-Pattern for a module of tables. Importing it connects to nothing: the schema is bound later.
-
-    from schemas import lab                    # tables that are referred to as lab.Subject
-    from schemas.connection import dj          # DataJoint, imported behind our configuration
-
-    schema = dj.Schema()                       # not bound yet
-
-    @schema
-    class Session(dj.Manual):
-        definition = '''
-        -> lab.Subject
-        session_id : int32
-        ---
-        recorded   : datetime
-        '''
-
-and, once per process, in the order of dependency (`schemas.activate()` does this for all modules):
-
-    from schemas import connection
-    connection.connect()
-    connection.bind("lab", lab.schema)         # schema `pbl_lab`
-    connection.bind("session", session.schema)
-
-Until then the classes exist and can be imported; using one raises DataJoint's "schema is not activated".
+Importing a module of tables connects to nothing: `schemas.activate()` connects and binds the schemas. Until then the
+classes exist and can be imported; using one raises DataJoint's "schema is not activated".
 """
 
 from __future__ import annotations

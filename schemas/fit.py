@@ -267,7 +267,9 @@ class SessionFit(dj.Computed):
                 raise InputChanged("a camera of this set has no keypoints any more")
             refs = [files[v["video_id"]] for v in own] or [files[r["video_id"]]]
             trials.append((r["video_id"], name, r["camera_motion"], refs, _rig(own)))
-        return trials, _marker_table(of_markers), _height_of(key), method_row(FitMethod, key)
+        people = session.Session.proj("subject") * lab.Subject.proj("subject_height")
+        height_m = number(one(people & (FitSet & key).proj("session_id"), "subject_height"))
+        return trials, _marker_table(of_markers), height_m, method_row(FitMethod, key)
 
     @computes
     def make_compute(
@@ -379,12 +381,6 @@ class SessionFit(dj.Computed):
                     }
                 )
         self.Check.insert({**key, **check_row("fit", check)} for check in result.qc)
-
-
-def _height_of(key: Mapping[str, Any]) -> float | None:
-    """The stated body height (m) of the person of a set."""
-    people = session.Session.proj("subject") * lab.Subject.proj("subject_height") & (FitSet & key).proj("session_id")
-    return number(one(people, "subject_height"))
 
 
 def session_of_set(key: Mapping[str, Any]) -> int:

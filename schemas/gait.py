@@ -439,7 +439,10 @@ def events_of(
     key = {k: row[k] for k in GaitEvents.primary_key}
     detected = lib.GaitEvents(
         status=row["events_status"],
-        events=tuple(event_of_row(e) for e in rows(GaitEvents.Event, key)),
+        events=tuple(
+            lib.GaitEvent(*(e[f"event_{k}"] for k in ("time", "side", "kind", "probability", "bout")))
+            for e in rows(GaitEvents.Event, key)
+        ),
         reason=row["events_reason"],
         method=row["events_detector"],
         params_hash=row["events_method_hash"],
@@ -464,19 +467,6 @@ def load_events(key: Mapping[str, Any], rows: Rows = stored_rows) -> lib.GaitEve
     cycles = row_of(GaitCycle, {k: row[k] for k in GaitEvents.primary_key}, rows)
     names = EventCorrection.primary_key
     return events_of(row, None if cycles["correction_no"] is None else {k: cycles[k] for k in names}, rows)
-
-
-def event_of_row(row: Mapping[str, Any]) -> lib.GaitEvent:
-    """The library's `GaitEvent`."""
-    from pbl_pipeline.gait import GaitEvent
-
-    return GaitEvent(
-        float(row["event_time"]),
-        row["event_side"],
-        row["event_kind"],
-        float(row["event_probability"]),
-        int(row["event_bout"]),
-    )
 
 
 def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Curves | None = None) -> lib.GaitCycle:

@@ -130,7 +130,8 @@ class Keypoints(dj.Computed):
         checks = (*check_timing(info), *check_keypoints(found))
         source = None if attitude is None else attitude.source
         camera_id = int(camera["camera_id"]) if camera else None
-        return found, person, detector.hash, model_sha256(detector.params), checks, source, camera_id
+        model = getattr(detector.params, "model_sha256", None)
+        return found, person, detector.hash, model, checks, source, camera_id
 
     def make_insert(
         self,
@@ -183,8 +184,3 @@ def camera_of_row(row: Mapping[str, Any]) -> Camera:
     camera = Camera(matrix, distortion, source, rel_sd)
     size = (int(row["camera_width"]), int(row["camera_height"]))
     return turned_camera(camera, size, row["turn_deg"])
-
-
-def model_sha256(params: Any) -> str | None:
-    """SHA-256 of the landmark model, as the parameters or the pinned asset state it."""
-    return getattr(params, "model_sha256", None)

@@ -123,6 +123,11 @@ def number(value: Any) -> float | None:
     return value if np.isfinite(value) else None
 
 
+def or_nan(value: float | None) -> float:
+    """Return the number of a nullable column; NaN for NULL."""
+    return float("nan") if value is None else float(value)
+
+
 def plain(value: Any) -> Any:
     """Mappings and tuples as dicts and lists of plain numbers: what a json column takes."""
     if isinstance(value, Mapping):

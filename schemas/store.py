@@ -87,7 +87,8 @@ def _bucket_spec() -> dict[str, Any]:
             next_step="pip install 'pbl-pipeline[s3]', or unset PBL_S3_ENDPOINT to keep arrays in a folder",
         )
     spec = {"protocol": "s3", "endpoint": endpoint, "bucket": bucket(), "location": LOCATION, "subfolding": [2, 2]}
-    return {**spec, "secure": endpoint.startswith("https://"), **_login(key, password)}
+    login = {"access_key": key, "secret_key": password} if key and password else {}
+    return {**spec, "secure": endpoint.startswith("https://"), **login}
 
 
 def further_stores(taken: str) -> dict[str, Any]:
@@ -116,10 +117,6 @@ def further_stores(taken: str) -> dict[str, Any]:
             next_step="correct the variable, or unset it",
         )
     return found
-
-
-def _login(key: str | None, password: str | None) -> dict[str, str]:
-    return {"access_key": key, "secret_key": password} if key and password else {}
 
 
 def check_store(backend: Any, create: bool = False) -> None:

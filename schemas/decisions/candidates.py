@@ -38,8 +38,7 @@ def candidates(video_id: int, tracking_method: str | None = None) -> list[Candid
     PblError
         DB_NOT_FOUND for a video that is not registered or not tracked yet, SOLVER_UNKNOWN.
     """
-    key = _key(video_id, tracking_method)
-    name = (video.Video & {"video_id": video_id}).fetch1("video_name")
+    key, name = _key(video_id, tracking_method), video.registered_video(video_id)["video_name"]
     out, found = [], (tracking.Tracking & key).keys()
     for tracked in found:
         persons = sorted(int(p) for p in (tracking.Tracking.Person & tracked).to_arrays("person_id"))
@@ -112,8 +111,7 @@ def write_sheet(about: Candidates, out_path: Path) -> Path:
 
 def _key(video_id: int, tracking_method: str | None) -> dict[str, Any]:
     """Restriction to a registered video and, where named, one tracking method."""
-    if not video.Video & {"video_id": video_id}:
-        raise video.unknown_video(video_id)
+    video.registered_video(video_id)  # raises for an unknown one
     key: dict[str, Any] = {"video_id": video_id}
     if tracking_method is not None:
         key["tracking_method"] = stored_key(tracking.TrackingMethod, tracking_method)

@@ -145,10 +145,7 @@ def take_back(video_id: int, by: str = "", seen: str | None = None) -> None:
 
 
 def _decide_usable(video_id: int, mark: dict[str, str] | None, by: str, seen: str | None) -> None:
-    rows = (video.Video & {"video_id": video_id}).to_dicts()
-    if not rows:
-        raise video.unknown_video(video_id)
-    session_id = int(rows[0]["session_id"])
+    session_id = int(video.registered_video(video_id)["session_id"])
     failed = queues_before_fit()
     with locked(session_id):
         if seen is not None and usable_state(video_id) != seen:

@@ -11,7 +11,7 @@ import numpy as np
 from .. import fit, gait, gdi, keypoints, tracking, video
 from ..checks import check_values
 from ..gait import load_cycles, load_events
-from ..rows import Rows, row_of, stored_rows
+from ..rows import Rows, or_nan, row_of, stored_rows
 from ..stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -95,14 +95,13 @@ def load_choice(row: Mapping[str, Any]) -> tracking_lib.SubjectChoice:
     """The library's `SubjectChoice` of a row."""
     from pbl_pipeline.tracking import SubjectChoice
 
-    nan = float("nan")
     return SubjectChoice(
         status=row["choice_status"],
         person_id=None if row["chosen_person_id"] is None else int(row["chosen_person_id"]),
-        score=nan if row["choice_score"] is None else float(row["choice_score"]),
+        score=or_nan(row["choice_score"]),
         runner_up_id=None if row["runner_up_id"] is None else int(row["runner_up_id"]),
-        runner_up_score=nan if row["runner_up_score"] is None else float(row["runner_up_score"]),
-        scores={int(k): nan if v is None else float(v) for k, v in row["choice_scores"].items()},
+        runner_up_score=or_nan(row["runner_up_score"]),
+        scores={int(k): or_nan(v) for k, v in row["choice_scores"].items()},
         reason=row["choice_reason"],
     )
 

@@ -216,20 +216,20 @@ def queue_name(table: Any) -> tuple[str, str]:
     return str(table.database), "~~" + str(table.table_name).lstrip("_")
 
 
-def _quoted_queue(table: Any) -> str:
-    return quote(*queue_name(table))
+def queues(server: Any) -> set[tuple[str, str]]:
+    """Return schema and name of every queue that the server has."""
+    rows = server.query("SELECT table_schema, table_name FROM information_schema.tables WHERE table_name LIKE '~~%%'")
+    return {(str(schema), str(name)) for schema, name in rows.fetchall()}
 
 
 def queue_counts(server: Any) -> dict[str, dict[str, int]]:
     """Job rows of each computed table by status; none where the queue was never used. Only `server` is asked, so that
     a thread may call it with a connection of its own."""
-    rows = server.query("SELECT table_schema, table_name FROM information_schema.tables WHERE table_name LIKE '~~%%'")
-    there = {(str(schema), str(name)) for schema, name in rows.fetchall()}
-    out = {}
+    there, out = queues(server), {}
     for table in computed_tables():
         out[table.__name__] = dict.fromkeys(("pending", "reserved", "error", "ignore"), 0)
         if queue_name(table) in there:
-            found = server.query(f"SELECT status, COUNT(*) FROM {_quoted_queue(table)} GROUP BY status")  # noqa: S608
+            found = server.query(f"SELECT status, COUNT(*) FROM {quote(*queue_name(table))} GROUP BY status")  # noqa: S608
             out[table.__name__] |= {str(status): int(n) for status, n in found.fetchall()}
     return out
 
@@ -279,7 +279,7 @@ def span(seconds: float | None) -> str:
 
 def _oldest(table: Any, server: Any) -> tuple[float | None, str]:
     """Age (s) of the oldest pending job, and why jobs that were put back wait."""
-    jobs = _quoted_queue(table)
+    jobs = quote(*queue_name(table))
     age = server.query(
         f"SELECT TIMESTAMPDIFF(SECOND, MIN(created_time), CURRENT_TIMESTAMP) FROM {jobs} WHERE status='pending'"  # noqa: S608
     ).fetchone()[0]

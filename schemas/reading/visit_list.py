@@ -27,7 +27,7 @@ from .. import (
 from ..job_errors import error_code
 from ..operations.catalog import quote
 from ..rows import number
-from .status import queue_name
+from .status import queue_name, queues
 
 #: Visits of a page.
 PAGE = 50
@@ -348,7 +348,7 @@ def _failed(column: str = "") -> str:
     """Visits with an error row in any queue, of a usable video or a current set; with that column of it, a row for
     each."""
     parts = []
-    there = _queues()
+    there = queues(session.Session.connection)
     for table in computed_tables():
         if queue_name(table) not in there:
             continue
@@ -367,11 +367,6 @@ def _failed(column: str = "") -> str:
 
 
 _STATES = {"waiting": _waiting, "failed": _failed, "empty": _empty, "unusable": _unusable}
-
-
-def _queues() -> set[tuple[str, str]]:
-    rows = _ask("SELECT table_schema, table_name FROM information_schema.tables WHERE table_name LIKE '~~%%'", [])
-    return {(str(schema), str(name)) for schema, name in rows}
 
 
 # ----------------------------------------------------------------------------------------------------- rows of a page
@@ -402,14 +397,13 @@ def _visit_rows(rows: Sequence[Sequence[Any]]) -> tuple[VisitRow, ...]:
     open_sets = {int(s) for (s,) in _ask(f"{_unfinished()} AND f.session_id IN ({listed})", ids)}
     errors = f"SELECT session_id, error_message FROM ({_failed('error_message')}) x WHERE session_id IN ({listed})"
     failed = {int(s): error_code(message) for s, message in _ask(errors, ids)}
+    sets = {"failed": failed, "waiting": waiting, "empty": empty, "unusable": unusable}
     out = []
     for session_id, subject, label, day, role, *_ in rows:
         i = int(session_id)
         found = results[i]
         computed = bool(found) and i not in open_sets
-        sets = {"failed": failed, "waiting": waiting, "empty": empty, "unusable": unusable}
-        states = [(name, i in found_in) for name, found_in in sets.items()]
-        state = next((name for name, holds in [*states, ("computed", computed)] if holds), "pending")
+        state = next((name for name, visits in sets.items() if i in visits), "computed" if computed else "pending")
         first = found[0] if found else None
         out.append(
             VisitRow(

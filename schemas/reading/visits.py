@@ -203,11 +203,8 @@ def load_recording(video_id: int) -> Recording:
 
     They may be there before the measures are. Raises `PblError` DB_NOT_FOUND for an unknown number.
     """
-    found = stored_rows(video.Video, {"video_id": video_id})
-    if not found:
-        raise video.unknown_video(video_id)
-    key = fit.trial_key(video_id)
-    recording = _recording(found[0], key, stored_rows)
+    row, key = video.registered_video(video_id), fit.trial_key(video_id)
+    recording = _recording(row, key, stored_rows)
     events = None if key is None else gait.newest_events(key)
     if events is None:
         return recording

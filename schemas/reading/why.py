@@ -50,12 +50,7 @@ def why(video_id: int) -> Why:
 
     Raises `PblError` DB_NOT_FOUND for an unknown video.
     """
-    from ..video import unknown_video
-
-    rows = (video.Video & {"video_id": video_id}).to_dicts()
-    if not rows:
-        raise unknown_video(video_id)
-    row = rows[0]
+    row = video.registered_video(video_id)
     # One of several cameras: from the fit on the trial counts, before it every camera.
     trial = fit.trial_of(video_id)
     views = fit.videos_of(trial)

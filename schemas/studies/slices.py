@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label, is_plain
 from pbl_pipeline.words import unit_of
@@ -98,7 +99,7 @@ def freeze(
                 "slice_roles": list(roles),
                 "slice_n": len(rows),
                 "slice_hash": digest,
-                "slice_code_version": _version(),
+                "slice_code_version": code_version()[:64],
                 "slice_created": utc_now(),
             }
         )
@@ -448,12 +449,6 @@ def _text(value: Any) -> str:
 
 def _digest(texts: Any) -> str:
     return hashlib.sha256("\n".join(sorted(texts)).encode()).hexdigest()[:16]
-
-
-def _version() -> str:
-    from pbl_pipeline.code_version import code_version
-
-    return code_version()[:64]
 
 
 def _usage(found: str, expected: str) -> PblError:
