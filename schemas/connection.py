@@ -89,7 +89,7 @@ def another() -> datajoint.Connection:
 
 
 def prefix() -> str:
-    """What the names of the schemas begin with (PBL_DB_PREFIX, default `pbl`)."""
+    """Return the beginning of the schemas' names (PBL_DB_PREFIX, default `pbl`)."""
     return os.environ.get("PBL_DB_PREFIX") or "pbl"
 
 
@@ -171,7 +171,7 @@ def _target(start: bool) -> dict[str, Any]:
 
 
 def _tls() -> bool | dict[str, Any] | None:
-    """How the connection is encrypted: None where the server can, False never, a dict of the driver's always.
+    """Return the encryption of the connection: None where the server can, False never, a dict of the driver's always.
 
     DJ_TLS_CA names the file of the authority that signed the server's certificate: name and certificate are checked
     then. Without it DJ_USE_TLS=1 encrypts, but would not notice another server in between. A bare True is no choice:
@@ -194,7 +194,7 @@ def _tls() -> bool | dict[str, Any] | None:
 
 
 def plain_connection(**options: Any) -> pymysql.Connection[Any]:
-    """A connection of the driver with the login of the tables, beside DataJoint's: for what is no query of a table.
+    """A connection of the driver with the login of the tables, for statements that are not queries of a table.
 
     Raises
     ------

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
 schema = dj.Schema()
 
-#: What stands for the methods before the fit where markers of a laboratory are fitted.
+#: Name in place of the methods before the fit where markers of a laboratory are fitted.
 LABORATORY = "laboratory markers"
-#: What a set holds, and so what is never fitted, pooled or averaged with another: videos of one camera each, trials of
+#: Kinds of sets, which are never fitted, pooled or averaged with one another: videos of one camera each, trials of
 #: several calibrated cameras, marker recordings.
 SINGLE, RIG, MARKERS = "single", "rig", "markers"
 KINDS = (SINGLE, RIG, MARKERS)

@@ -76,7 +76,7 @@ class Keypoints(dj.Computed):
 
     @property
     def key_source(self) -> Any:
-        """Only where somebody is chosen: a video that waits for a choice has no row and no error."""
+        """Only where a person is chosen: a video that waits for a choice has no row and no error."""
         chosen = tracking.SubjectChoice & [{"choice_status": s} for s in tracking.CHOSEN]
         return ((chosen.proj() * KeypointSelection.proj()) & video.VideoInfo) - video.NotUsable
 

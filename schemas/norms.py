@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from pbl_pipeline import gait as lib
     from pbl_pipeline.qc import Check
 
-#: What a set is called: as the shipped ones, and short enough for its column.
+#: Form of a set's name: as the shipped ones, and short enough for its column.
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{1,39}")
-#: What makes one chain of methods: cycles of several chains are not one norm.
+#: Columns of one chain of methods: cycles of several chains are not one norm.
 _CHAIN = ("fit_set_kind", "tracking_method", "keypoint_method", "fit_method", "gait_method")
 
 

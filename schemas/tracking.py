@@ -98,7 +98,7 @@ class Tracking(dj.Computed):
 
     @property
     def key_source(self) -> Any:
-        """Only what a probe could read: a file that is no video has one error row, in VideoInfo."""
+        """Only what a probe could read: a file that is not a video has one error row, in VideoInfo."""
         return (TrackingSelection & video.VideoInfo) - video.NotUsable
 
     def make_fetch(self, key: dict) -> tuple:
@@ -258,7 +258,7 @@ def set_override(key: Mapping[str, Any], person_id: int) -> None:
 
 
 def choose_command(key: Mapping[str, Any], persons: str) -> str:
-    """The command by which somebody decides about the tracking `key`; `persons`: such as "1|2". The method is named
+    """Return the command that decides about the tracking `key`; `persons`: such as "1|2". The method is named
     where the video has several: each numbers people anew."""
     several = len(TrackingSelection & {"video_id": key["video_id"]}) > 1
     return f"pbl choose {key['video_id']} {persons}" + (

@@ -26,7 +26,7 @@ PERIOD_S = 15.0
 
 
 class Silent:
-    """What a worker reports its work to; this one ignores all reports, for a worker without a row of its own."""
+    """Receiver of a worker's reports; this one ignores them, for a worker without a row in `Worker`."""
 
     def doing(self, what: str) -> None:
         """Report the current job."""

@@ -4,7 +4,7 @@ Layout: SUBJECT/SESSION/FILE under the place that `PBL_INCOMING` names. Beside a
 the same name (.csv, .json, .zip; docs/phone_capture.md), which is taken with it. A file is taken when it was the same
 in two runs at least `SETTLED_S` apart. It is copied into the archive and checked there, registered, and only then
 removed from where it came: whatever breaks off in between, the bytes are in at least one place, and the next run goes
-on. What cannot be registered is moved into the folder `_refused` of the archive, with the reason beside it.
+on. A recording that cannot be registered is moved into the folder `_refused` of the archive, with the reason beside it.
 
 Uploads are taken in random order: whatever one of them does to the run, no other waits behind it for ever.
 """
@@ -153,7 +153,7 @@ def _listed(drop: Folder | Bucket, archive: Path, settled_s: float, out: Taken) 
 
 
 def _misplaced(upload: Upload) -> str:
-    """Why something in the drop folder is no recording in its place; "" where it is one, or a log."""
+    """Return why an entry of the drop folder is not a recording in its place; "" where it is one, or a log."""
     name = upload.name
     if any(part.startswith((".", "_")) for part in name.parts):
         return "a name that begins with . or _, as what is still being written has"
@@ -203,7 +203,7 @@ def _take(drop: Folder | Bucket, recording: Upload, logs: list[Upload], archive:
 
 
 def _copy(drop: Folder | Bucket, upload: Upload, archive: Path, end: float) -> _Copy:
-    """Copy into the archive under a name of its own, on disk when this returns.
+    """Copy into the archive under a new name, on disk when this returns.
 
     Raises
     ------

@@ -25,7 +25,7 @@ log = logging.getLogger("pbl.worker")
 
 #: Pause after the first look that found nothing, and the longest; each look that finds nothing doubles it.
 IDLE_S = (0.5, 20.0)
-#: An idle worker looks at all tables when nobody has done so for as long.
+#: An idle worker looks at all tables when no worker has done so for as long.
 REFRESH_EVERY_S = 60.0
 
 

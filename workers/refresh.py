@@ -1,4 +1,4 @@
-"""What became computable: after single jobs, and over all tables."""
+"""Queue what became computable: after single jobs, and over all tables."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from . import queue, recover
 from .queue import Claim
 from .registry import NEW
 
-#: Days in which something from outside counts as recent, and seconds after which somebody looks at everything again.
+#: Days in which something from outside counts as recent, and seconds after which a worker looks at everything again.
 RECENT_DAYS, ALL_EVERY_S = 2, 3600.0
 #: Name of a look at all rows in `worker.Look`.
 ALL = "all"
@@ -25,7 +25,7 @@ FEW = 10_000
 
 @dataclasses.dataclass
 class Refreshed:
-    """What a refresh did: table -> queued jobs; deleted jobs, freed reservations, planned fits, dropped rows."""
+    """Outcome of a refresh: table -> queued jobs; deleted jobs, freed reservations, planned fits, dropped rows."""
 
     queued: Counter[str] = dataclasses.field(default_factory=Counter)
     swept: int = 0
@@ -87,7 +87,7 @@ def refresh(everything: bool | None = None) -> Refreshed | None:
     Parameters
     ----------
     everything
-        Look at all rows; None where it is an hour since somebody did, or where there are few videos.
+        Look at all rows; None where the last such look is an hour ago, or where there are few videos.
 
     Returns
     -------

@@ -89,7 +89,7 @@ _MODULES = {"tracking": tracking, "keypoint": keypoints, "fit": fit, "gait": gai
 
 
 def plan_new_method(table: str, method: str, since: datetime.date | None = None) -> Reprocess:
-    """What selecting a method for everything that went through another method of that table would add.
+    """Return what selecting a method for everything that went through another method of that table would add.
 
     Old rows stay: a method is part of the key. `since`: only videos registered from that day on.
 
@@ -201,7 +201,7 @@ def parse_time(text: str | None) -> datetime.datetime | None:
 
 
 def summary(plan: Reprocess) -> Sequence[str]:
-    """What a plan would do, in words."""
+    """Return what a plan would do, in words."""
     out = []
     if plan.add:
         out.append(f"{len(plan.add)} selections would be added for {plan.table}; nothing is deleted")

@@ -31,7 +31,7 @@ class Candidates:
 
 
 def candidates(video_id: int, tracking_method: str | None = None) -> list[Candidates]:
-    """Who can be chosen in a video, once for each tracking method (or for one of them).
+    """Return the people who can be chosen in a video, once for each tracking method (or for one of them).
 
     Raises
     ------

@@ -83,7 +83,7 @@ def compare(chosen: Sequence[tuple[int, int | None]], reference: tuple[int, int 
     Raises
     ------
     PblError
-        USAGE for fewer than two or more than six, DB_NOT_FOUND for a visit or result that there is not.
+        USAGE for fewer than two or more than six, DB_NOT_FOUND for an unknown visit or result.
     """
     chosen = list(dict.fromkeys(chosen))
     if not FEWEST <= len(chosen) <= MOST:

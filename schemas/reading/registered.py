@@ -47,7 +47,7 @@ def visits(restriction: Any = True) -> pd.DataFrame:
 
 def videos(restriction: Any = True) -> pd.DataFrame:
     """One row per video: whose, what is done at which pace, how many methods made keypoints and fits of it, and why it
-    is not usable ("" where nobody said so)."""
+    is not usable ("" for usable ones)."""
     columns = ("session_id", "video_name", "activity", "camera_motion", "video_created")
     query = video.Video.proj(*columns) * _visits() & restriction
     rows = frame_of(query).sort_values("video_id", ignore_index=True)
@@ -77,7 +77,7 @@ def method_rows(stage: str | None = None) -> pd.DataFrame:
     """One row per method: the stage, its key and short name (which means the newest version), and whether it is the
     stage's default.
 
-    Raises `PblError` SOLVER_UNKNOWN for a stage that there is not.
+    Raises `PblError` SOLVER_UNKNOWN for an unknown stage.
     """
     import pandas as pd
 

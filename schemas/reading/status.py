@@ -24,7 +24,7 @@ from ..job_errors import error_code, error_found, error_next_step
 from ..jobs import jobs_of
 from ..operations.catalog import quote
 
-#: Fewer videos than this, and keys are counted that nobody has queued yet.
+#: With fewer videos than this, keys that are not queued yet are also counted.
 SMALL = 5000
 
 #: Columns that say "ran well, nothing to produce": table -> (status, values, reason or None where a table above says).
@@ -109,7 +109,7 @@ class Waiting:
 
 @dataclasses.dataclass(frozen=True)
 class LeftOut:
-    """A video that somebody marked as not usable."""
+    """A video that is marked as not usable."""
 
     video_id: int
     about: str

@@ -31,7 +31,7 @@ from .status import queue_name, queues
 
 #: Visits of a page.
 PAGE = 50
-#: What is asked of the state of a visit; empty: nobody is in any of its usable videos; unusable: it has none.
+#: States of a visit to filter by. empty: no one is in any of its usable videos; unusable: it has no usable video.
 STATES = ("computed", "pending", "waiting", "failed", "empty", "unusable")
 #: State of a visit in a folder without its measures.
 INCOMPLETE = "incomplete"
@@ -45,7 +45,7 @@ _NO_DAY = "0001-01-01"
 
 @dataclasses.dataclass(frozen=True)
 class Filter:
-    """What is asked for; empty: everything. search: part of a person's code or of a visit's label. `state`: one of
+    """A request for visits; empty: everything. search: part of a person's code or of a visit's label. `state`: one of
     `STATES`, `quality`: one of `OUTCOMES`."""
 
     search: str = ""
@@ -61,7 +61,7 @@ class Filter:
 class Result:
     """Index and checks of the current set of a visit by one chain of methods.
 
-    sd: of the error of the index; minimal_change: smallest change between two such visits that is no chance (90 %).
+    sd: of the error of the index; minimal_change: minimal detectable change between two such visits (90 %).
     outcome: worst check, empty before the checks are computed; worst: its names. corrected: a person corrected events.
     """
 
@@ -230,7 +230,7 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
 def _asked(wanted: Filter) -> tuple[list[str], list[str], list[Any]]:
     """Joins, conditions and their arguments, in this order.
 
-    What is a set of visits is joined as a table of its own: as a condition the server would look it up for each visit.
+    A set of visits is joined as a separate table: as a condition the server would look it up for each visit.
     """
     joins: list[str] = []
     where: list[str] = []
@@ -318,7 +318,7 @@ def _waiting() -> str:
 
 
 def _empty() -> str:
-    """Visits in whose usable videos nobody is."""
+    """Visits without a person in any of their usable videos."""
     videos, chosen = _name(video.Video), _name(tracking.SubjectChoice)
     nobody = f"SELECT t.video_id FROM {chosen} t WHERE t.choice_status = 'NO_PERSON' AND {_is_usable('t')}"
     some = f"SELECT b.session_id FROM {videos} b JOIN ({nobody}) c ON c.video_id = b.video_id"

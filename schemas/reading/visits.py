@@ -82,7 +82,7 @@ def load_visit(restriction: Any, *, measures: bool = True) -> Visit:
     Parameters
     ----------
     restriction
-        What picks one session and, where several methods were used, one chain of methods: a dict such as
+        Restriction to one session and, where several methods were used, one chain of methods: a dict such as
         `{"subject": "P017", "session_label": "2026-03-01", "fit_method": "paper-2025"}`; `fit_set_kind` where it has
         recordings of one camera, of several, or markers.
     measures
