@@ -506,10 +506,15 @@ def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Curves | None = Non
 
 
 def load_cycles(key: Mapping[str, Any], trial: str = "", rows: Rows = stored_rows) -> list[lib.GaitCycle]:
-    """The library's cycles of one row of GaitCycle, with their curves."""
-    with stored_file(GaitCycle(), file_ref(row_of(GaitCycle, key, rows)["curves"])) as path:
+    """Return the library's cycles of one row of GaitCycle, with their curves."""
+    return cycles_of_rows(rows(GaitCycle.Cycle, key), file_ref(row_of(GaitCycle, key, rows)["curves"]), trial)
+
+
+def cycles_of_rows(rows: Sequence[Mapping[str, Any]], ref: Mapping[str, Any], trial: str) -> list[lib.GaitCycle]:
+    """Return the library's cycles of rows of GaitCycle.Cycle, with their curves from the file `ref`."""
+    with stored_file(GaitCycle(), ref) as path:
         curves = load_curves(path)
-    return [cycle_of_row(r, trial, curves.get(int(r["cycle_no"]))) for r in rows(GaitCycle.Cycle, key)]
+    return [cycle_of_row(r, trial, curves.get(int(r["cycle_no"]))) for r in rows]
 
 
 def save_curves(cycles: Sequence[lib.GaitCycle], path: Path) -> None:

@@ -141,9 +141,7 @@ class GDI(dj.Computed):
         from pbl_pipeline.gait import score_gdi
 
         index = methods.stored(**method)
-        with stored_file(self, ref) as path:
-            curves = gait.load_curves(path)
-        cycles = [gait.cycle_of_row(r, name, curves.get(int(r["cycle_no"]))) for r in rows]
+        cycles = gait.cycles_of_rows(rows, ref, name)
         result = score_gdi(cycles, norm_of_row(*norm), index.params, index)
         return result, index.hash, norm[1]
 
@@ -277,17 +275,10 @@ class SessionGdi(dj.Computed):
         params = lib.GaitParams(methods.stored(**events).paramset, model.params)
         pooled = []
         for trial in trials:
-            with stored_file(self, trial["curves"]) as path:
-                curves = gait.load_curves(path)
-            rows = [r for r in cycles if r["video_id"] == trial["video_id"]]
+            name, rows = trial["trial_name"], [r for r in cycles if r["video_id"] == trial["video_id"]]
             detected = trial["events_reason"] if trial["correction_no"] is None else ""
-            pooled.append(
-                lib.TrialCycles(
-                    trial["trial_name"],
-                    detected or trial["measures_reason"],
-                    tuple(gait.cycle_of_row(r, trial["trial_name"], curves.get(int(r["cycle_no"]))) for r in rows),
-                )
-            )
+            own = tuple(gait.cycles_of_rows(rows, trial["curves"], name))
+            pooled.append(lib.TrialCycles(name, detected or trial["measures_reason"], own))
         done = [lib.Condition(*c) for c in conditions]
         return lib.pool_trials(pooled, norm_of_row(*norm), params, model, conditions=done), trials, model.hash, norm[1]
 
