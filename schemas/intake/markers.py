@@ -15,14 +15,7 @@ from pbl_pipeline.names import check_label
 from .. import fit, video
 from ..method_rows import method_row
 from ..stored_files import new_folder
-from .records import (
-    File,
-    Methods,
-    Recording,
-    VisitRecord,
-    check_path,
-    usage,
-)
+from .records import File, Methods, Recording, VisitRecord, check_path, usage
 
 if TYPE_CHECKING:
     from pbl_pipeline.body import MarkerSet

@@ -17,14 +17,7 @@ from ..rows import utc_now
 from ..stored_files import new_folder
 from ..transactions import next_id
 from .calibrations import camera_row
-from .records import (
-    File,
-    Methods,
-    Recording,
-    RefusedFile,
-    VisitRecord,
-    usage,
-)
+from .records import File, Methods, Recording, RefusedFile, VisitRecord, usage
 
 
 @dataclasses.dataclass

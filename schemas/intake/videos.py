@@ -13,14 +13,7 @@ from .. import fit, video
 from ..jobs import forget_errors
 from ..transactions import in_transaction
 from .calibrations import camera_id_of, camera_row, known_camera
-from .records import (
-    File,
-    Methods,
-    Recording,
-    Registered,
-    VisitRecord,
-    usage,
-)
+from .records import File, Methods, Recording, Registered, VisitRecord, usage
 from .registration import register
 from .sensors import NONE, Sensors, attach, delete_keypoints
 

@@ -20,14 +20,7 @@ from typing import Any
 
 from pbl_pipeline import progress, settings
 from pbl_pipeline.errors import PblError
-from schemas import (
-    connection,
-    fit,
-    lab,
-    session,
-    video,
-    worker,
-)
+from schemas import connection, fit, lab, session, video, worker
 from schemas.datajoint_setup import full_path
 from schemas.operations import archive
 from schemas.operations.folders import remove_empty

@@ -6,18 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from .. import (
-    fit,
-    gait,
-    gdi,
-    lab,
-    qc,
-    session,
-    study,
-    tracking,
-    validation,
-    video,
-)
+from .. import fit, gait, gdi, lab, qc, session, study, tracking, validation, video
 from ..datajoint_setup import dj
 from ..stored_files import file_ref, stored_file
 

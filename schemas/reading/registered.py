@@ -8,15 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 
-from .. import (
-    fit,
-    gdi,
-    keypoints,
-    lab,
-    review,
-    session,
-    video,
-)
+from .. import fit, gdi, keypoints, lab, review, session, video
 from ..datajoint_setup import dj
 from ..decisions.not_usable import unusable
 from ..methods import METHOD_TABLES

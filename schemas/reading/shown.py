@@ -10,14 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
-from .. import (
-    fit,
-    gait,
-    gdi,
-    qc,
-    session,
-    video,
-)
+from .. import fit, gait, gdi, qc, session, video
 from ..decisions.not_usable import Unusable, unusable
 from . import registered
 from .visit_list import Result, VisitRow, results_of, visits_of

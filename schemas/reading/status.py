@@ -11,14 +11,7 @@ from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from .. import (
-    computed_tables,
-    connection,
-    keypoints,
-    tracking,
-    video,
-    worker,
-)
+from .. import computed_tables, connection, keypoints, tracking, video, worker
 from ..decisions import not_usable
 from ..job_errors import error_code, error_found, error_next_step
 from ..jobs import jobs_of

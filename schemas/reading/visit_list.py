@@ -14,16 +14,7 @@ import datetime
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from .. import (
-    computed_tables,
-    fit,
-    gdi,
-    qc,
-    session,
-    study,
-    tracking,
-    video,
-)
+from .. import computed_tables, fit, gdi, qc, session, study, tracking, video
 from ..job_errors import error_code
 from ..operations.catalog import quote
 from ..rows import number

@@ -17,15 +17,7 @@ import schemas
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait.events import load_events
 from pbl_pipeline.video import probe
-from schemas import (
-    fit,
-    gait,
-    gdi,
-    keypoints,
-    qc,
-    tracking,
-    video,
-)
+from schemas import fit, gait, gdi, keypoints, qc, tracking, video
 from schemas.reading import frames
 from tests.command import Done, pbl
 from tests.rows import remove_all

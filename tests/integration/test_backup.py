@@ -17,14 +17,7 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import (
-    connection,
-    gait,
-    lab,
-    load_visit,
-    migrations,
-    video,
-)
+from schemas import connection, gait, lab, load_visit, migrations, video
 from schemas.intake import VisitRecord, ingest
 from schemas.operations import backup, backup_files, dump
 from schemas.operations.declare import declare_all

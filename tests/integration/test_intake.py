@@ -11,15 +11,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import sha256_of
 from research.benchmarks.many_recordings import archived, register_many
 from schemas import fit, gait, gdi, keypoints, lab, session, tracking, video
-from schemas.intake import (
-    LaboratoryMarkers,
-    Methods,
-    Recording,
-    SeveralCameras,
-    VisitRecord,
-    ingest,
-    register,
-)
+from schemas.intake import LaboratoryMarkers, Methods, Recording, SeveralCameras, VisitRecord, ingest, register
 from schemas.intake.plans import resolve
 from schemas.intake.recording_sheet import ingest_sheet
 from tests.command import pbl

@@ -15,14 +15,7 @@ from pbl_pipeline.fit import METHODS, fit_session
 from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.synthetic import plain_walk
 from research.walker.views import observe_markers
-from schemas import (
-    fit,
-    gait,
-    gdi,
-    load_visit,
-    norms,
-    video,
-)
+from schemas import fit, gait, gdi, load_visit, norms, video
 from schemas.intake import LaboratoryMarkers, Registered, VisitRecord, ingest, register
 from schemas.operations.forget import forget
 from schemas.reading import frames

@@ -17,17 +17,7 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import (
-    connection,
-    gait,
-    gdi,
-    jobs,
-    lab,
-    migrations,
-    session,
-    stages,
-    video,
-)
+from schemas import connection, gait, gdi, jobs, lab, migrations, session, stages, video
 from schemas.chain import ON_REQUEST
 from schemas.decisions import event_corrections
 from schemas.intake import VisitRecord, ingest

@@ -15,15 +15,7 @@ import pbl_pipeline.gait
 import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GaitMetrics
-from schemas import (
-    fit,
-    gait,
-    gdi,
-    lab,
-    load_visit,
-    norms,
-    session,
-)
+from schemas import fit, gait, gdi, lab, load_visit, norms, session
 from schemas.cli.norm import norm as command
 from schemas.intake import Methods, VisitRecord, ingest
 from schemas.reading import frames

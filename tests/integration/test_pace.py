@@ -11,15 +11,7 @@ import pytest
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GDI_METHODS
 from pbl_pipeline.paramset import Paramset
-from schemas import (
-    fit,
-    gait,
-    gdi,
-    load_visit,
-    norms,
-    session,
-    video,
-)
+from schemas import fit, gait, gdi, load_visit, norms, session, video
 from schemas.intake import Methods, VisitRecord, ingest
 from schemas.intake.conditions import set_condition
 from schemas.method_rows import insert_methods

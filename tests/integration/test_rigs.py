@@ -17,16 +17,7 @@ from pbl_pipeline.fit import fit_session
 from pbl_pipeline.keypoints import Keypoints, MultiView
 from pbl_pipeline.synthetic import NO_NOISE, plain_walk
 from research.walker.views import observe_views
-from schemas import (
-    fit,
-    gait,
-    gdi,
-    jobs,
-    load_visit,
-    norms,
-    validation,
-    video,
-)
+from schemas import fit, gait, gdi, jobs, load_visit, norms, validation, video
 from schemas.decisions.review_decisions import decide_person
 from schemas.intake import SeveralCameras, VisitRecord, ingest, register
 from schemas.job_errors import error_code

@@ -13,14 +13,7 @@ from click.testing import CliRunner
 import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.study import read_study
-from schemas import (
-    fit,
-    gait,
-    gdi,
-    session,
-    study,
-    video,
-)
+from schemas import fit, gait, gdi, session, study, video
 from schemas.cli.study import export, slice_
 from schemas.intake import VisitRecord, ingest
 from schemas.intake.conditions import set_condition

@@ -27,19 +27,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import Check
 from pbl_pipeline.video import Camera
-from schemas import (
-    fit,
-    gait,
-    gdi,
-    keypoints,
-    lab,
-    load_visit,
-    qc,
-    reading,
-    session,
-    tracking,
-    video,
-)
+from schemas import fit, gait, gdi, keypoints, lab, load_visit, qc, reading, session, tracking, video
 from schemas.decisions.candidates import candidates, write_sheet
 from schemas.decisions.review_decisions import decide_person
 from schemas.intake import Methods, VisitRecord, ingest

@@ -14,14 +14,7 @@ import pytest
 
 import pbl_pipeline.gait
 from pbl_pipeline.errors import PblError
-from schemas import (
-    fit,
-    gait,
-    gdi,
-    load_visit,
-    qc,
-    study,
-)
+from schemas import fit, gait, gdi, load_visit, qc, study
 from schemas.decisions import event_corrections, review_decisions
 from schemas.intake import move
 from schemas.operations.forget import forget

@@ -11,16 +11,7 @@ import pytest
 import pbl_pipeline.fit
 import pbl_pipeline.keypoints
 from pbl_pipeline.errors import PblError
-from schemas import (
-    fit,
-    gdi,
-    intake,
-    load_visit,
-    qc,
-    study,
-    tracking,
-    video,
-)
+from schemas import fit, gdi, intake, load_visit, qc, study, tracking, video
 from schemas.decisions import not_usable, review_decisions
 from schemas.intake import LaboratoryMarkers, SeveralCameras, VisitRecord
 from schemas.plan import plan_fit_sets

@@ -15,14 +15,7 @@ from starlette.routing import Route
 from schemas import fit
 from schemas.decisions import review_decisions
 from schemas.operations.server_status import database_status
-from schemas.reading.status import (
-    ErrorRow,
-    Running,
-    Status,
-    pipeline_status,
-    running,
-    span,
-)
+from schemas.reading.status import ErrorRow, Running, Status, pipeline_status, running, span
 from schemas.transactions import in_transaction
 
 from ..requeue import retry
