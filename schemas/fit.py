@@ -140,7 +140,7 @@ class TrialInput(dj.Computed):
         from pbl_pipeline.keypoints import MultiView, ray_miss_m
 
         with ExitStack() as stack:
-            found = _load_trial(self, stack, refs, rig)
+            found = _load_trial(stack, refs, rig)
         used, share = check_trial(found, name, methods.stored(**method))
         miss = number(100 * np.nanmax(ray_miss_m(found))) if isinstance(found, MultiView) else None
         return int(np.sum(used)), float(share), miss, ids, method["sha"]
@@ -324,9 +324,9 @@ class SessionFit(dj.Computed):
         own = None
         with ExitStack() as stack:
             markers = video.NO_CAMERA in motions
-            loaded = [_load_trial(self, stack, r, rig, markers) for r, rig in zip(refs, rigs, strict=True)]
+            loaded = [_load_trial(stack, r, rig, markers) for r, rig in zip(refs, rigs, strict=True)]
             if table is not None:
-                own = load_marker_set(stack.enter_context(stored_file(self, table[1])), name=table[0])
+                own = load_marker_set(stack.enter_context(stored_file(table[1])), name=table[0])
         # The library knows one moving camera; "one of several" on stands is a static one for it.
         motions = ["handheld" if m == "handheld" else "static" for m in motions]
         return SessionInput(loaded, names, motions, own, height_m)
@@ -431,19 +431,17 @@ def _rig(views: Sequence[Mapping[str, Any]]) -> tuple[dict, list[str]] | None:
     return (file_ref(views[0]["rig_file"]), [v["rig_camera"] for v in views]) if views else None
 
 
-def _load_trial(
-    table: Any, stack: ExitStack, refs: Sequence[dict], rig: tuple | None, markers: bool = False
-) -> lib.Trial:
+def _load_trial(stack: ExitStack, refs: Sequence[dict], rig: tuple | None, markers: bool = False) -> lib.Trial:
     """A trial from its files: keypoints of one camera, or of several with their calibration, or markers."""
     from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 
-    paths = [stack.enter_context(stored_file(table, ref)) for ref in refs]
+    paths = [stack.enter_context(stored_file(ref)) for ref in refs]
     if markers:
         return WorldMarkers.load(paths[0])
     views = [Keypoints.load(path) for path in paths]
     if rig is None:
         return views[0]
-    return MultiView.from_calibration(views, stack.enter_context(stored_file(table, rig[0])), rig[1])
+    return MultiView.from_calibration(views, stack.enter_context(stored_file(rig[0])), rig[1])
 
 
 def _marker_table(rows: Sequence[Mapping[str, Any]]) -> tuple[str, dict] | None:

@@ -174,7 +174,7 @@ class GaitEvents(dj.Computed):
         from pbl_pipeline.fit import TrialFit
         from pbl_pipeline.gait import detect_events, feet_from_fit
 
-        with stored_file(self, ref) as path:
+        with stored_file(ref) as path:
             trial = TrialFit.load(path)
         return detect_events(feet_from_fit(trial), methods.stored(**method)), method["sha"]
 
@@ -269,7 +269,7 @@ class GaitCycle(dj.Computed):
         from pbl_pipeline.gait import find_cycles
         from pbl_pipeline.qc import Check
 
-        with stored_file(self, ref) as path:
+        with stored_file(ref) as path:
             trial = TrialFit.load(path)
         cycles = find_cycles(events, trial, fit_checks=[Check(*check) for check in checks])
         return cycles, None if correction is None else correction["correction_no"]
@@ -512,7 +512,7 @@ def load_cycles(key: Mapping[str, Any], trial: str = "", rows: Rows = stored_row
 
 def cycles_of_rows(rows: Sequence[Mapping[str, Any]], ref: Mapping[str, Any], trial: str) -> list[lib.GaitCycle]:
     """Return the library's cycles of rows of GaitCycle.Cycle, with their curves from the file `ref`."""
-    with stored_file(GaitCycle(), ref) as path:
+    with stored_file(ref) as path:
         curves = load_curves(path)
     return [cycle_of_row(r, trial, curves.get(int(r["cycle_no"]))) for r in rows]
 

@@ -425,7 +425,7 @@ def norm_of_row(name: str, sha256: str, ref: Mapping[str, Any] | None = None) ->
     if ref is None:
         norm = load_norm(name)
     else:
-        with stored_file(NormativeSet(), ref) as path:
+        with stored_file(ref) as path:
             norm = load_norm(str(path))
     if norm.sha256 != sha256:
         raise PblError(

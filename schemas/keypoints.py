@@ -115,13 +115,13 @@ class Keypoints(dj.Computed):
 
         path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
         detector = methods.stored(**method)
-        with stored_file(self, times) as stored:
+        with stored_file(times) as stored:
             info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
         attitude = None
         if log is not None:
-            with stored_file(self, log[1]) as stored:
+            with stored_file(log[1]) as stored:
                 attitude = attitude_of(read_phone_log(stored), Path(log[0]), info)
-        with stored_file(self, tracks[0]) as stored:
+        with stored_file(tracks[0]) as stored:
             everybody = tracking.load_tracking(stored, (info.width_px, info.height_px), *tracks[1:])
         view = camera_of_row(camera) if camera else find_camera(info)
         found = detect_keypoints(path, everybody, person, view, params=detector)

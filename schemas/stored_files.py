@@ -61,7 +61,7 @@ def _alive(pid: int) -> bool:
 
 
 @contextmanager
-def stored_file(table: Any, ref: Mapping[str, Any]) -> Iterator[Path]:
+def stored_file(ref: Mapping[str, Any]) -> Iterator[Path]:
     """Path to read an object of the store, from the dict that `file_ref` took from a row. Touches no database.
 
     A store in a folder gives the file itself; a remote one a copy that is removed afterwards.

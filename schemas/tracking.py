@@ -114,7 +114,7 @@ class Tracking(dj.Computed):
 
         path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
         tracker = methods.stored(**method)
-        with stored_file(self, times) as stored:
+        with stored_file(times) as stored:
             info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
         return track_people(path, params=tracker, info=info), tracker.hash
 
@@ -180,13 +180,13 @@ class SubjectChoice(dj.Computed):
         from pbl_pipeline.tracking import carried_choice, choose_subject, contact_sheet_jpeg
 
         chooser = methods.stored(**method)
-        with stored_file(self, ref) as path:
+        with stored_file(ref) as path:
             tracking = load_tracking(path, size, *about)
         if elsewhere is None:
             choice = choose_subject(tracking, params=chooser, override=override)
         else:
             other_tracks, other_about, number_there, other_method = elsewhere
-            with stored_file(self, other_tracks) as path:
+            with stored_file(other_tracks) as path:
                 other = load_tracking(path, size, *other_about)
             choice = carried_choice(other, number_there, other_method, tracking, chooser)
         sheet = None

@@ -92,9 +92,9 @@ class KinematicError(dj.Computed):
         from pbl_pipeline import validation as lib
         from pbl_pipeline.fit import TrialFit
 
-        with stored_file(self, fitted) as path:
+        with stored_file(fitted) as path:
             trial = TrialFit.load(path)
-        with stored_file(self, reference) as path:
+        with stored_file(reference) as path:
             truth = lib.Reference.load(path)
         return (lib.compare(trial, truth),)
 

@@ -92,7 +92,7 @@ def write_sheet(about: Candidates, out_path: Path) -> Path:
     stored = [s for s in (tracking.SubjectChoice & about.key).to_arrays("contact_sheet") if s is not None]
     try:
         if stored and out_path.suffix.lower() != ".png":
-            with stored_file(tracking.SubjectChoice(), file_ref(stored[0])) as path:
+            with stored_file(file_ref(stored[0])) as path:
                 shutil.copyfile(path, out_path)
             return out_path
         path, sha256 = (video.Video & about.key).fetch1("video_path", "video_sha256")

@@ -233,10 +233,10 @@ def validation_curves(frame: pd.DataFrame) -> pd.DataFrame:
     for key, row in _compared():
         if (row.trial, row.detector, row.solver) not in wanted:
             continue
-        with stored_file(fit.SessionFit, file_ref((fit.SessionFit.Trial & key).fetch1("trial_file"))) as path:
+        with stored_file(file_ref((fit.SessionFit.Trial & key).fetch1("trial_file"))) as path:
             trial = TrialFit.load(path)
         references = validation.ReferenceKinematics
-        with stored_file(references, file_ref((references & key).fetch1("reference_file"))) as path:
+        with stored_file(file_ref((references & key).fetch1("reference_file"))) as path:
             truth = lib.Reference.load(path)
         for method in dict.fromkeys(r["gait_method"] for r in (gait.GaitCycle & key).proj().to_dicts()):
             of_method = {**key, "gait_method": method}

@@ -38,7 +38,7 @@ def load_keypoints(key: Any, rows: Rows = stored_rows) -> Keypoints:
     from pbl_pipeline.keypoints import Keypoints
 
     ref = file_ref(row_of(keypoints.Keypoints, _keys(key), rows)["keypoints_file"])
-    with stored_file(keypoints.Keypoints(), ref) as path:
+    with stored_file(ref) as path:
         return Keypoints.load(path)
 
 
@@ -47,7 +47,7 @@ def load_trial_fit(key: Any, rows: Rows = stored_rows) -> TrialFit:
     from pbl_pipeline.fit import TrialFit
 
     ref = file_ref(row_of(fit.SessionFit.Trial, _keys(key), rows)["trial_file"])
-    with stored_file(fit.SessionFit(), ref) as path:
+    with stored_file(ref) as path:
         return TrialFit.load(path)
 
 
@@ -61,7 +61,7 @@ def load_solution(key: Mapping[str, Any], rows: Rows = stored_rows) -> Solution:
     from pbl_pipeline.visit import Solution
 
     row = row_of(fit.SessionFit, key, rows)
-    with stored_file(fit.SessionFit(), file_ref(row["session_file"])) as path, np.load(path, allow_pickle=False) as f:
+    with stored_file(file_ref(row["session_file"])) as path, np.load(path, allow_pickle=False) as f:
         scale, trace = f["scale"], f["loss_trace"]
     return Solution(
         solver=row["solver"],
@@ -87,7 +87,7 @@ def load_tracking(key: Any) -> tracking_lib.Tracking:
     """The library's `Tracking` of one row."""
     row = (tracking.Tracking & key).fetch1()
     size = (video.VideoInfo & {"video_id": row["video_id"]}).fetch1("width", "height")
-    with stored_file(tracking.Tracking(), file_ref(row["tracks"])) as path:
+    with stored_file(file_ref(row["tracks"])) as path:
         return tracking.load_tracking(path, (int(size[0]), int(size[1])), row["detector"], row["tracking_model_sha256"])
 
 

@@ -303,7 +303,7 @@ def _log_of(number: int, points: Mapping[str, Any], rows: Rows) -> tuple[PhoneLo
     stored = rows(video.PhoneAttitude, {"video_id": number})
     if not stored:
         return None
-    with stored_file(video.PhoneAttitude(), file_ref(stored[0]["attitude_file"])) as path:
+    with stored_file(file_ref(stored[0]["attitude_file"])) as path:
         log = read_phone_log(path)
     return log, log_shift_s(log, load_keypoints(points, rows), f"video {number}")
 

@@ -411,7 +411,7 @@ def _curves(rows: Any, about: Mapping[str, Any]) -> Any:
         sides = used[r["fit_set"], number]
         if not sides or not done[number].pooled(pace):
             continue
-        with stored_file(gait.GaitCycle(), file_ref(r["curves"])) as path:
+        with stored_file(file_ref(r["curves"])) as path:
             by_cycle = gait.load_curves(path)
         for n, side in sides.items():
             for angle, curve in by_cycle[n].deg.items():

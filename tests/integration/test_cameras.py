@@ -61,7 +61,7 @@ def sources() -> dict[int, str]:
 
 def matrix_of(video_id: int) -> np.ndarray:
     ref = file_ref((keypoints.Keypoints & {"video_id": video_id}).fetch1("keypoints_file"))
-    with stored_file(keypoints.Keypoints(), ref) as path, np.load(path) as found:
+    with stored_file(ref) as path, np.load(path) as found:
         return found["camera_matrix"]
 
 

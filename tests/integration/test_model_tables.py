@@ -87,7 +87,7 @@ def test_a_registered_model_is_a_method_of_the_tables(tables: None, tmp_path: Pa
     assert not row["root_relative"]
     assert row["keypoints_model_sha256"] == spec.sha256
     assert row["median_confidence"] == pytest.approx(0.95, abs=0.01)
-    with stored_file(keypoints.Keypoints(), file_ref(row["keypoints_file"])) as path:
+    with stored_file(file_ref(row["keypoints_file"])) as path:
         stored = Keypoints.load(path)
     assert np.median(np.linalg.norm(stored.xy_px - xy_px(), axis=2)) < 0.5
     assert "licence: CC0-1.0" in stored.origin

@@ -74,13 +74,13 @@ def test_arrays_and_files_go_to_the_bucket_and_come_back(remote: None, tmp_path:
     assert np.asarray(times).tolist() == pbl_pipeline.video.probe(path).time_s.tolist()
     # <object@>: as a file that is gone afterwards
     ref = file_ref(tracking.Tracking.fetch1("tracks"))
-    with stored_file(tracking.Tracking(), ref) as local:
+    with stored_file(ref) as local:
         found = tracking.load_tracking(local, (1920, 1080), "stand-in", "0" * 64)
     assert not local.exists()
     np.testing.assert_allclose(found.persons[0].box_px, chain.track_people(path).persons[0].box_px, rtol=1e-6)
     # a file that is lost has a code and a next step
     backend.remove(ref["path"])
-    with pytest.raises(PblError, match="the object store has no") as error, stored_file(tracking.Tracking(), ref):
+    with pytest.raises(PblError, match="the object store has no") as error, stored_file(ref):
         pass
     assert error.value.code == "FILE_FORMAT"
 

@@ -80,7 +80,7 @@ def test_copies_lie_in_the_store_with_the_frames_to_look_at(tables, tmp_path: Pa
     assert (row["deidentified_how"], row["deidentified_status"]) == ("pixelate", "REVIEW")
     assert row["deidentified_ranges"] == [{"first": 3, "last": 4, "why": ["held"]}]
     assert (row["deidentified_heads"], row["deidentified_uncertain"]) == (1, 2)
-    with stored_file(privacy.Deidentified(), file_ref(row["deidentified_file"])) as path:
+    with stored_file(file_ref(row["deidentified_file"])) as path:
         assert sha256_of(path) == row["deidentified_sha256"]
         info = probe(path)
     np.testing.assert_allclose(info.time_s, probe(paths[0]).time_s, atol=1 / 90_000)

@@ -37,7 +37,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 def stored_keypoints() -> Keypoints:
     ref = file_ref(keypoints.Keypoints.fetch1("keypoints_file"))
-    with stored_file(keypoints.Keypoints(), ref) as path:
+    with stored_file(ref) as path:
         return Keypoints.load(path)
 
 
@@ -139,7 +139,7 @@ def test_depth_video_and_wearables_are_kept(capture, tmp_path: Path):
     for number, content in ((1, b"left"), (2, b"right")):
         row = (video.WearableImu & {"imu": number}).fetch1()
         assert row["imu_sha256"] == pbl_pipeline.video.sha256_of(left if number == 1 else right)
-        with stored_file(video.WearableImu(), file_ref(row["imu_file"])) as kept:
+        with stored_file(file_ref(row["imu_file"])) as kept:
             assert kept.read_bytes() == content
     assert pbl("ingest", path, "--subject", "P001", "--imu", empty).error_code == "FILE_FORMAT"
     assert pbl("ingest", path, "--subject", "P001", "--imu", tmp_path / "none").error_code == "FILE_MISSING"
