@@ -19,13 +19,12 @@ MODULES: dict[str, tuple[str, ...]] = {
     "schemas": (),
     "schemas.connection": ("connect", "schema_name"),
     "schemas.intake": (),
-    "schemas.intake.bulk": ("archived", "register_many"),
     "schemas.method_rows": ("insert_methods", "method_columns"),
     "schemas.origin": (),
     "schemas.reading": (),
     "schemas.rows": ("InputChanged", "one"),
-    "schemas.status": ("pipeline_status",),
-    "schemas.views": (),
+    "schemas.reading.status": ("pipeline_status",),
+    "schemas.reading.frames": (),
 }
 
 

@@ -23,10 +23,11 @@ def activate(start: bool = False, methods: bool = True) -> None:
     PblError
         What `schemas.connection.connect` raises; DB_MIGRATION for tables of an older version.
     """
-    from . import connection, fit, older, plan
+    from . import connection, fit, plan
+    from .operations import older_tables
 
     connection.connect(start=start)
-    older.refuse_older()
+    older_tables.refuse_older()
     for stage, module in zip(STAGES, modules(), strict=True):
         connection.bind(stage, module.schema)
     fit.SessionFit.plan = staticmethod(plan.plan_fit_sets)

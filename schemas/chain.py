@@ -51,7 +51,7 @@ def computed_tables() -> list[Any]:
     return [cls for cls in tables().values() if issubclass(cls, dj.Computed)]
 
 
-#: Computed tables that have rows only where somebody asked for it: a reference was registered, a setting wants copies.
+#: Computed tables that have rows only where they were asked for: a reference was registered, a setting wants copies.
 ON_REQUEST = ("KinematicError", "Deidentified")
 
 

@@ -1,29 +1,7 @@
 """One configured DataJoint connection, to the server DJ_HOST names or else to the embedded one.
 
-Pattern for a module of tables. Importing it connects to nothing: the schema is bound later.
-
-    from schemas import lab                    # tables that are referred to as lab.Subject
-    from schemas.connection import dj          # DataJoint, imported behind our configuration
-
-    schema = dj.Schema()                       # not bound yet
-
-    @schema
-    class Session(dj.Manual):
-        definition = '''
-        -> lab.Subject
-        session_id : int32
-        ---
-        recorded   : datetime
-        '''
-
-and, once per process, in the order of dependency (`schemas.activate()` does this for all modules):
-
-    from schemas import connection
-    connection.connect()
-    connection.bind("lab", lab.schema)         # schema `pbl_lab`
-    connection.bind("session", session.schema)
-
-Until then the classes exist and can be imported; using one raises DataJoint's "schema is not activated".
+Importing a module of tables connects to nothing: `schemas.activate()` connects and binds the schemas. Until then the
+classes exist and can be imported; using one raises DataJoint's "schema is not activated".
 """
 
 from __future__ import annotations
@@ -111,7 +89,7 @@ def another() -> datajoint.Connection:
 
 
 def prefix() -> str:
-    """What the names of the schemas begin with (PBL_DB_PREFIX, default `pbl`)."""
+    """Return the beginning of the schemas' names (PBL_DB_PREFIX, default `pbl`)."""
     return os.environ.get("PBL_DB_PREFIX") or "pbl"
 
 
@@ -193,7 +171,7 @@ def _target(start: bool) -> dict[str, Any]:
 
 
 def _tls() -> bool | dict[str, Any] | None:
-    """How the connection is encrypted: None where the server can, False never, a dict of the driver's always.
+    """Return the encryption of the connection: None where the server can, False never, a dict of the driver's always.
 
     DJ_TLS_CA names the file of the authority that signed the server's certificate: name and certificate are checked
     then. Without it DJ_USE_TLS=1 encrypts, but would not notice another server in between. A bare True is no choice:
@@ -216,7 +194,7 @@ def _tls() -> bool | dict[str, Any] | None:
 
 
 def plain_connection(**options: Any) -> pymysql.Connection[Any]:
-    """A connection of the driver with the login of the tables, beside DataJoint's: for what is no query of a table.
+    """A connection of the driver with the login of the tables, for statements that are not queries of a table.
 
     Raises
     ------

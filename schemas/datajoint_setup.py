@@ -57,7 +57,7 @@ dj: Any = datajoint
 
 
 # ------------------------------------------------------------------------------------------------------------ MariaDB
-#: What makes CURRENT_TIMESTAMP a time that never goes back in autumn.
+#: Statement that makes CURRENT_TIMESTAMP a time that never goes back in autumn.
 UTC = "SET SESSION time_zone = '+00:00'"
 
 

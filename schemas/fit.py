@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
 schema = dj.Schema()
 
-#: What stands for the methods before the fit where markers of a laboratory are fitted.
+#: Name in place of the methods before the fit where markers of a laboratory are fitted.
 LABORATORY = "laboratory markers"
-#: What a set holds, and so what is never fitted, pooled or averaged with another: videos of one camera each, trials of
+#: Kinds of sets, which are never fitted, pooled or averaged with one another: videos of one camera each, trials of
 #: several calibrated cameras, marker recordings.
 SINGLE, RIG, MARKERS = "single", "rig", "markers"
 KINDS = (SINGLE, RIG, MARKERS)
@@ -140,7 +140,7 @@ class TrialInput(dj.Computed):
         from pbl_pipeline.keypoints import MultiView, ray_miss_m
 
         with ExitStack() as stack:
-            found = _load_trial(self, stack, refs, rig)
+            found = _load_trial(stack, refs, rig)
         used, share = check_trial(found, name, methods.stored(**method))
         miss = number(100 * np.nanmax(ray_miss_m(found))) if isinstance(found, MultiView) else None
         return int(np.sum(used)), float(share), miss, ids, method["sha"]
@@ -259,7 +259,7 @@ class SessionFit(dj.Computed):
         views = views_of([int(r["video_id"]) for r in rows]) if of_rig else {}
         files = {r["video_id"]: file_ref(r["keypoints_file" if rows else "markers_file"]) for r in rows or of_markers}
         leads = [r for r in rows or of_markers if not of_rig or views[int(r["video_id"])]]
-        names = trial_names([(r["video_id"], r["video_name"]) for r in leads])
+        names = distinct([Path(r["video_name"]).stem for r in leads], [r["video_id"] for r in leads])
         trials = []
         for r, name in zip(leads, names, strict=True):
             own = views.get(int(r["video_id"]), [])
@@ -267,7 +267,9 @@ class SessionFit(dj.Computed):
                 raise InputChanged("a camera of this set has no keypoints any more")
             refs = [files[v["video_id"]] for v in own] or [files[r["video_id"]]]
             trials.append((r["video_id"], name, r["camera_motion"], refs, _rig(own)))
-        return trials, _marker_table(of_markers), _height_of(key), method_row(FitMethod, key)
+        people = session.Session.proj("subject") * lab.Subject.proj("subject_height")
+        height_m = number(one(people & (FitSet & key).proj("session_id"), "subject_height"))
+        return trials, _marker_table(of_markers), height_m, method_row(FitMethod, key)
 
     @computes
     def make_compute(
@@ -322,9 +324,9 @@ class SessionFit(dj.Computed):
         own = None
         with ExitStack() as stack:
             markers = video.NO_CAMERA in motions
-            loaded = [_load_trial(self, stack, r, rig, markers) for r, rig in zip(refs, rigs, strict=True)]
+            loaded = [_load_trial(stack, r, rig, markers) for r, rig in zip(refs, rigs, strict=True)]
             if table is not None:
-                own = load_marker_set(stack.enter_context(stored_file(self, table[1])), name=table[0])
+                own = load_marker_set(stack.enter_context(stored_file(table[1])), name=table[0])
         # The library knows one moving camera; "one of several" on stands is a static one for it.
         motions = ["handheld" if m == "handheld" else "static" for m in motions]
         return SessionInput(loaded, names, motions, own, height_m)
@@ -381,12 +383,6 @@ class SessionFit(dj.Computed):
         self.Check.insert({**key, **check_row("fit", check)} for check in result.qc)
 
 
-def _height_of(key: Mapping[str, Any]) -> float | None:
-    """The stated body height (m) of the person of a set."""
-    people = session.Session.proj("subject") * lab.Subject.proj("subject_height") & (FitSet & key).proj("session_id")
-    return number(one(people, "subject_height"))
-
-
 def session_of_set(key: Mapping[str, Any]) -> int:
     """The session of a set, by a key that holds `fit_set`.
 
@@ -435,19 +431,17 @@ def _rig(views: Sequence[Mapping[str, Any]]) -> tuple[dict, list[str]] | None:
     return (file_ref(views[0]["rig_file"]), [v["rig_camera"] for v in views]) if views else None
 
 
-def _load_trial(
-    table: Any, stack: ExitStack, refs: Sequence[dict], rig: tuple | None, markers: bool = False
-) -> lib.Trial:
+def _load_trial(stack: ExitStack, refs: Sequence[dict], rig: tuple | None, markers: bool = False) -> lib.Trial:
     """A trial from its files: keypoints of one camera, or of several with their calibration, or markers."""
     from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 
-    paths = [stack.enter_context(stored_file(table, ref)) for ref in refs]
+    paths = [stack.enter_context(stored_file(ref)) for ref in refs]
     if markers:
         return WorldMarkers.load(paths[0])
     views = [Keypoints.load(path) for path in paths]
     if rig is None:
         return views[0]
-    return MultiView.from_calibration(views, stack.enter_context(stored_file(table, rig[0])), rig[1])
+    return MultiView.from_calibration(views, stack.enter_context(stored_file(rig[0])), rig[1])
 
 
 def _marker_table(rows: Sequence[Mapping[str, Any]]) -> tuple[str, dict] | None:
@@ -474,11 +468,6 @@ def median(values: np.ndarray) -> float | None:
     """Median of the values that are there; None where none is."""
     there = values[np.isfinite(values)]
     return float(np.median(there)) if len(there) else None
-
-
-def trial_names(videos: Sequence[tuple[int, str]]) -> list[str]:
-    """A name for each (video_id, file name): the file's stem, with the number where stems repeat."""
-    return distinct([Path(name).stem for _, name in videos], [number for number, _ in videos])
 
 
 def float32_trial(trial: lib.TrialFit) -> lib.TrialFit:

@@ -174,7 +174,7 @@ class GaitEvents(dj.Computed):
         from pbl_pipeline.fit import TrialFit
         from pbl_pipeline.gait import detect_events, feet_from_fit
 
-        with stored_file(self, ref) as path:
+        with stored_file(ref) as path:
             trial = TrialFit.load(path)
         return detect_events(feet_from_fit(trial), methods.stored(**method)), method["sha"]
 
@@ -269,7 +269,7 @@ class GaitCycle(dj.Computed):
         from pbl_pipeline.gait import find_cycles
         from pbl_pipeline.qc import Check
 
-        with stored_file(self, ref) as path:
+        with stored_file(ref) as path:
             trial = TrialFit.load(path)
         cycles = find_cycles(events, trial, fit_checks=[Check(*check) for check in checks])
         return cycles, None if correction is None else correction["correction_no"]
@@ -439,7 +439,10 @@ def events_of(
     key = {k: row[k] for k in GaitEvents.primary_key}
     detected = lib.GaitEvents(
         status=row["events_status"],
-        events=tuple(event_of_row(e) for e in rows(GaitEvents.Event, key)),
+        events=tuple(
+            lib.GaitEvent(*(e[f"event_{k}"] for k in ("time", "side", "kind", "probability", "bout")))
+            for e in rows(GaitEvents.Event, key)
+        ),
         reason=row["events_reason"],
         method=row["events_detector"],
         params_hash=row["events_method_hash"],
@@ -464,19 +467,6 @@ def load_events(key: Mapping[str, Any], rows: Rows = stored_rows) -> lib.GaitEve
     cycles = row_of(GaitCycle, {k: row[k] for k in GaitEvents.primary_key}, rows)
     names = EventCorrection.primary_key
     return events_of(row, None if cycles["correction_no"] is None else {k: cycles[k] for k in names}, rows)
-
-
-def event_of_row(row: Mapping[str, Any]) -> lib.GaitEvent:
-    """The library's `GaitEvent`."""
-    from pbl_pipeline.gait import GaitEvent
-
-    return GaitEvent(
-        float(row["event_time"]),
-        row["event_side"],
-        row["event_kind"],
-        float(row["event_probability"]),
-        int(row["event_bout"]),
-    )
 
 
 def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Curves | None = None) -> lib.GaitCycle:
@@ -516,10 +506,15 @@ def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Curves | None = Non
 
 
 def load_cycles(key: Mapping[str, Any], trial: str = "", rows: Rows = stored_rows) -> list[lib.GaitCycle]:
-    """The library's cycles of one row of GaitCycle, with their curves."""
-    with stored_file(GaitCycle(), file_ref(row_of(GaitCycle, key, rows)["curves"])) as path:
+    """Return the library's cycles of one row of GaitCycle, with their curves."""
+    return cycles_of_rows(rows(GaitCycle.Cycle, key), file_ref(row_of(GaitCycle, key, rows)["curves"]), trial)
+
+
+def cycles_of_rows(rows: Sequence[Mapping[str, Any]], ref: Mapping[str, Any], trial: str) -> list[lib.GaitCycle]:
+    """Return the library's cycles of rows of GaitCycle.Cycle, with their curves from the file `ref`."""
+    with stored_file(ref) as path:
         curves = load_curves(path)
-    return [cycle_of_row(r, trial, curves.get(int(r["cycle_no"]))) for r in rows(GaitCycle.Cycle, key)]
+    return [cycle_of_row(r, trial, curves.get(int(r["cycle_no"]))) for r in rows]
 
 
 def save_curves(cycles: Sequence[lib.GaitCycle], path: Path) -> None:

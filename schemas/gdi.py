@@ -141,9 +141,7 @@ class GDI(dj.Computed):
         from pbl_pipeline.gait import score_gdi
 
         index = methods.stored(**method)
-        with stored_file(self, ref) as path:
-            curves = gait.load_curves(path)
-        cycles = [gait.cycle_of_row(r, name, curves.get(int(r["cycle_no"]))) for r in rows]
+        cycles = gait.cycles_of_rows(rows, ref, name)
         result = score_gdi(cycles, norm_of_row(*norm), index.params, index)
         return result, index.hash, norm[1]
 
@@ -153,13 +151,7 @@ class GDI(dj.Computed):
                 **key,
                 "session_id": fit.session_of_set(key),
                 "gdi_status": result.status,
-                "gdi_reason": result.reason[:1000],
-                "gdi": number(result.mean),
-                "gdi_left": number(result.left),
-                "gdi_right": number(result.right),
-                "gdi_sd": number(result.sd),
-                "gdi_minimal_change": number(result.minimal_change),
-                "gdi_n": result.n,
+                **index_row(result, "gdi"),
                 **gps_row(result.profile, "gdi"),
                 **origin.row("gdi", method_hash=sha, model_sha256=norm_sha),
             }
@@ -283,17 +275,10 @@ class SessionGdi(dj.Computed):
         params = lib.GaitParams(methods.stored(**events).paramset, model.params)
         pooled = []
         for trial in trials:
-            with stored_file(self, trial["curves"]) as path:
-                curves = gait.load_curves(path)
-            rows = [r for r in cycles if r["video_id"] == trial["video_id"]]
+            name, rows = trial["trial_name"], [r for r in cycles if r["video_id"] == trial["video_id"]]
             detected = trial["events_reason"] if trial["correction_no"] is None else ""
-            pooled.append(
-                lib.TrialCycles(
-                    trial["trial_name"],
-                    detected or trial["measures_reason"],
-                    tuple(gait.cycle_of_row(r, trial["trial_name"], curves.get(int(r["cycle_no"]))) for r in rows),
-                )
-            )
+            own = tuple(gait.cycles_of_rows(rows, trial["curves"], name))
+            pooled.append(lib.TrialCycles(name, detected or trial["measures_reason"], own))
         done = [lib.Condition(*c) for c in conditions]
         return lib.pool_trials(pooled, norm_of_row(*norm), params, model, conditions=done), trials, model.hash, norm[1]
 
@@ -315,13 +300,7 @@ class SessionGdi(dj.Computed):
                 "session_id": fit.session_of_set(key),
                 "session_status": result.status,
                 "session_reason": result.reason[:2000],
-                "session_gdi_reason": index.reason[:1000],
-                "session_gdi": number(index.mean),
-                "session_gdi_left": number(index.left),
-                "session_gdi_right": number(index.right),
-                "session_gdi_sd": number(index.sd),
-                "session_gdi_minimal_change": number(index.minimal_change),
-                "session_gdi_n": index.n,
+                **index_row(index, "session_gdi"),
                 **gps_row(index.profile, "session"),
                 "session_cycles": measures.n_cycles_used,
                 "session_corrected": sum(r["correction_no"] is not None for r in trials),
@@ -335,6 +314,22 @@ class SessionGdi(dj.Computed):
         self.Measure.insert({**key, **row} for row in rows)
         self.Profile.insert({**key, **row} for row in profile_rows(index.profile, "session"))
         self.Check.insert({**key, **check_row("gdi", check)} for check in result.qc)
+
+
+#: End of a column of the index -> field of the library's `Gdi`.
+_INDEX = {"": "mean", "_left": "left", "_right": "right", "_sd": "sd", "_minimal_change": "minimal_change"}
+
+
+def index_row(index: lib.Gdi, prefix: str) -> dict[str, Any]:
+    """Return the columns of the index, `prefix` ("gdi", "session_gdi") that of its mean."""
+    values = {f"{prefix}{end}": number(getattr(index, field)) for end, field in _INDEX.items()}
+    return {**values, f"{prefix}_n": index.n, f"{prefix}_reason": index.reason[:1000]}
+
+
+def index_fields(row: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """Return the fields of the library's `Gdi` that `index_row` wrote."""
+    values: dict[str, Any] = {field: number(row[f"{prefix}{end}"]) for end, field in _INDEX.items()}
+    return {**values, "n": int(row[f"{prefix}_n"]), "reason": row[f"{prefix}_reason"]}
 
 
 def gps_row(profile: lib.MovementProfile | None, prefix: str) -> dict[str, float | None]:
@@ -400,6 +395,23 @@ def norm_row(norm: lib.NormativeSet) -> dict[str, Any]:
     }
 
 
+def norm_keys(name: str) -> list[str]:
+    """Return the keys of the normative sets that a key (`name-v2`) or a name means, the newest version first.
+
+    Raises `PblError` NORM_UNKNOWN.
+    """
+    rows = NormativeSet.proj("norm_name", "norm_version").to_dicts(order_by="norm_version DESC")
+    found = [row["norm"] for row in rows if name in (row["norm"], row["norm_name"])]
+    if found:
+        return found
+    raise PblError(
+        "NORM_UNKNOWN",
+        found=f"normative set {name!r}",
+        expected=f"one of {', '.join(sorted({row['norm_name'] for row in rows}))}",
+        next_step="choose one of the names above (`pbl norm list`)",
+    )
+
+
 def norm_ref(key: Mapping[str, Any]) -> tuple[str, str, dict | None]:
     """What `norm_of_row` takes: name, checksum and, of a set that was built here, its file."""
     name, sha256, stored = one(NormativeSet & key, "norm_name", "norm_sha256", "norm_file")
@@ -413,7 +425,7 @@ def norm_of_row(name: str, sha256: str, ref: Mapping[str, Any] | None = None) ->
     if ref is None:
         norm = load_norm(name)
     else:
-        with stored_file(NormativeSet(), ref) as path:
+        with stored_file(ref) as path:
             norm = load_norm(str(path))
     if norm.sha256 != sha256:
         raise PblError(
@@ -434,16 +446,7 @@ def resolve(model: str | None, norm: str | None) -> dict[str, str]:
 
     method = resolve_method(GdiModel, model or lib.GDI_METHODS.default)
     name, params = (GdiModel & {"gdi_method": method}).fetch1("gdi_method_name", "gdi_params")
-    wanted = norm or params["norm"]
-    rows = NormativeSet.proj("norm_name", "norm_version").to_dicts(order_by="norm_version DESC")
-    found = next((r["norm"] for r in rows if wanted in (r["norm"], r["norm_name"])), None)
-    if found is None:
-        raise PblError(
-            "NORM_UNKNOWN",
-            found=f"normative set {wanted!r}",
-            expected="one of " + ", ".join(r["norm_name"] for r in rows),
-            next_step="choose one of the names above",
-        )
+    found = norm_keys(norm or params["norm"])[0]
     variables = tuple((NormativeSet & {"norm": found}).fetch1("norm_variables"))
     if variables != lib.MODEL_ANGLES.get(name, variables):
         raise PblError(

@@ -10,8 +10,8 @@ import pymysql
 from pbl_pipeline.errors import PblError
 
 from .chain import computed_tables
-from .coded_errors import error_code
 from .datajoint_setup import AccessError
+from .job_errors import error_code
 
 #: Columns that DataJoint's job table lacks, 0 for each new job, and what they count.
 COUNTS = {
@@ -36,7 +36,7 @@ def jobs_of(table: Any) -> Any:
     """The job table of a computed table (class), made once: DataJoint reads every foreign key of the server for it.
 
     It is declared where it is missing, and gets the columns of `COUNTS`; an account that may not declare relies on
-    `schemas.declare.declare_all`. Both end a transaction that is open.
+    `schemas.operations.declare.declare_all`. Both end a transaction that is open.
     """
 
     def declared() -> Any:

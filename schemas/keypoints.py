@@ -76,7 +76,7 @@ class Keypoints(dj.Computed):
 
     @property
     def key_source(self) -> Any:
-        """Only where somebody is chosen: a video that waits for a choice has no row and no error."""
+        """Only where a person is chosen: a video that waits for a choice has no row and no error."""
         chosen = tracking.SubjectChoice & [{"choice_status": s} for s in tracking.CHOSEN]
         return ((chosen.proj() * KeypointSelection.proj()) & video.VideoInfo) - video.NotUsable
 
@@ -115,13 +115,13 @@ class Keypoints(dj.Computed):
 
         path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
         detector = methods.stored(**method)
-        with stored_file(self, times) as stored:
+        with stored_file(times) as stored:
             info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
         attitude = None
         if log is not None:
-            with stored_file(self, log[1]) as stored:
+            with stored_file(log[1]) as stored:
                 attitude = attitude_of(read_phone_log(stored), Path(log[0]), info)
-        with stored_file(self, tracks[0]) as stored:
+        with stored_file(tracks[0]) as stored:
             everybody = tracking.load_tracking(stored, (info.width_px, info.height_px), *tracks[1:])
         view = camera_of_row(camera) if camera else find_camera(info)
         found = detect_keypoints(path, everybody, person, view, params=detector)
@@ -130,7 +130,8 @@ class Keypoints(dj.Computed):
         checks = (*check_timing(info), *check_keypoints(found))
         source = None if attitude is None else attitude.source
         camera_id = int(camera["camera_id"]) if camera else None
-        return found, person, detector.hash, model_sha256(detector.params), checks, source, camera_id
+        model = getattr(detector.params, "model_sha256", None)
+        return found, person, detector.hash, model, checks, source, camera_id
 
     def make_insert(
         self,
@@ -183,8 +184,3 @@ def camera_of_row(row: Mapping[str, Any]) -> Camera:
     camera = Camera(matrix, distortion, source, rel_sd)
     size = (int(row["camera_width"]), int(row["camera_height"]))
     return turned_camera(camera, size, row["turn_deg"])
-
-
-def model_sha256(params: Any) -> str | None:
-    """SHA-256 of the landmark model, as the parameters or the pinned asset state it."""
-    return getattr(params, "model_sha256", None)

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pbl_pipeline.errors import PblError
-
 from . import fit, gait, gdi, keypoints, tracking
 from .method_rows import stored_key
 
@@ -42,16 +40,9 @@ def with_keys(restriction: Mapping[str, Any]) -> dict[str, Any]:
 def keys_named(column: str, name: str) -> list[str]:
     """Keys of the methods (column `fit_method`, ...) or normative sets (`norm`) that a key or a short name means, the
     newest version first. Raises `PblError` SOLVER_UNKNOWN, NORM_UNKNOWN."""
+    if column == "norm":
+        return gdi.norm_keys(name)
     table = _RESULTS[column][0]
     rows = table.proj(f"{column}_name", f"{column}_version").to_dicts(order_by=f"{column}_version DESC")
     found = [row[column] for row in rows if name in (row[column], row[f"{column}_name"])]
-    if found:
-        return found
-    if column != "norm":
-        stored_key(table, name)  # says which there are
-    raise PblError(
-        "NORM_UNKNOWN",
-        found=f"normative set {name!r}",
-        expected=f"one of {', '.join(sorted({row['norm_name'] for row in rows}))}",
-        next_step="choose one of the names above (`pbl norm list`)",
-    )
+    return found or [stored_key(table, name)]  # raises, and names those that there are

@@ -12,17 +12,17 @@ from pbl_pipeline.names import check_label
 
 from . import fit, gait, gdi, lab, session, video
 from .method_names import with_keys
+from .reading.frames import newest_sets
 from .rows import plain
 from .stored_files import new_folder
-from .views import newest_sets
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib
     from pbl_pipeline.qc import Check
 
-#: What a set is called: as the shipped ones, and short enough for its column.
+#: Form of a set's name: as the shipped ones, and short enough for its column.
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{1,39}")
-#: What makes one chain of methods: cycles of several chains are not one norm.
+#: Columns of one chain of methods: cycles of several chains are not one norm.
 _CHAIN = ("fit_set_kind", "tracking_method", "keypoint_method", "fit_method", "gait_method")
 
 
@@ -110,46 +110,36 @@ def build_norm(
         "variance": variance,
         "pace": pace,
     }
-    newest = _newest(name)
-    made: dict[str, Any] = {}
-    # As the newest version first: the same cycles give the same bytes, and then there is nothing to register.
-    for version in ([newest["norm_version"]] if newest else []) + [(newest or {}).get("norm_version", 0) + 1]:
-        norm, checks = lib.norm_from_cycles(
-            cycles,
-            people,
-            name=name,
-            version=version,
-            source=source or f"built here from the cycles of {', '.join([*populations, *subjects])}",
-            variables=lib.NINE_ANGLES if nine_angles else lib.THREE_ANGLES,
-            variance=variance,
-            pooled=_cycles(patients)[0],
-        )
-        made = {"set": norm, "checks": checks, "n_people": len(set(people)), "n_cycles": norm.n}
-        with new_folder() as folder:
-            sha256 = norm.save(folder / "norm.json", digits=None)
-            if newest and sha256 == newest["norm_sha256"]:
-                return BuiltNorm(norm=newest["norm"], new=False, **made)
-            if newest and version == newest["norm_version"]:
-                continue
-            row = gdi.norm_row(dataclasses.replace(norm, sha256=sha256))
-            row |= {"norm_file": folder / "norm.json", "norm_query": plain(query)}
-            gdi.NormativeSet.insert1(row)
-            return BuiltNorm(norm=row["norm"], new=True, **made)
-    raise AssertionError("the last version is always registered")
+    rows = (gdi.NormativeSet & {"norm_name": name}).proj("norm_version", "norm_sha256")
+    newest = next(iter(rows.to_dicts(order_by="norm_version DESC")), None)
+    norm, checks = lib.norm_from_cycles(
+        cycles,
+        people,
+        name=name,
+        version=newest["norm_version"] if newest else 1,
+        source=source or f"built here from the cycles of {', '.join([*populations, *subjects])}",
+        variables=lib.NINE_ANGLES if nine_angles else lib.THREE_ANGLES,
+        variance=variance,
+        pooled=_cycles(patients)[0],
+    )
+    made = {"checks": checks, "n_people": len(set(people)), "n_cycles": norm.n}
+    with new_folder() as folder:
+        file = folder / "norm.json"
+        sha256 = norm.save(file, digits=None)
+        if newest:
+            # As the newest version the same cycles give the same bytes, and then there is nothing to register.
+            if sha256 == newest["norm_sha256"]:
+                return BuiltNorm(norm=newest["norm"], new=False, set=norm, **made)
+            norm = dataclasses.replace(norm, version=norm.version + 1)
+            sha256 = norm.save(file, digits=None)
+        row = gdi.norm_row(dataclasses.replace(norm, sha256=sha256))
+        gdi.NormativeSet.insert1({**row, "norm_file": file, "norm_query": plain(query)})
+        return BuiltNorm(norm=row["norm"], new=True, set=norm, **made)
 
 
 def load_norm(norm: str) -> lib.NormativeSet:
-    """The library's set of a key (`name-v2`) or name (its newest version). Raises `PblError` NORM_UNKNOWN."""
-    rows = gdi.NormativeSet.proj("norm_name", "norm_version").to_dicts(order_by="norm_version DESC")
-    found = next((r["norm"] for r in rows if norm in (r["norm"], r["norm_name"])), None)
-    if found is None:
-        raise PblError(
-            "NORM_UNKNOWN",
-            found=f"normative set {norm!r}",
-            expected="one of " + ", ".join(sorted(r["norm"] for r in rows)),
-            next_step="choose one of the names above",
-        )
-    return gdi.norm_of_row(*gdi.norm_ref({"norm": found}))
+    """Return the library's set of a key (`name-v2`) or name (its newest version). Raises `PblError` NORM_UNKNOWN."""
+    return gdi.norm_of_row(*gdi.norm_ref({"norm": gdi.norm_keys(norm)[0]}))
 
 
 def _cycle_keys(people: Sequence[dict], restriction: Any, pace: str) -> list[dict[str, Any]]:
@@ -174,11 +164,6 @@ def _cycles(keys: Sequence[dict[str, Any]]) -> tuple[list[lib.GaitCycle], list[s
         cycles += found
         people += [key["subject"]] * len(found)
     return cycles, people
-
-
-def _newest(name: str) -> dict[str, Any] | None:
-    rows = (gdi.NormativeSet & {"norm_name": name}).proj("norm_name", "norm_version", "norm_sha256")
-    return next(iter(rows.to_dicts(order_by="norm_version DESC")), None)
 
 
 def _one_chain(keys: Sequence[dict[str, Any]]) -> None:

@@ -13,7 +13,7 @@ from typing import Any, ParamSpec, TypeVarTuple, cast
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 
-from .coded_errors import fitted, internal
+from .job_errors import fitted, internal
 from .rows import utc_now
 
 Arguments = ParamSpec("Arguments")

@@ -18,12 +18,12 @@ from .jobs import jobs_of
 from .method_rows import method_row, resolve_method
 from .rows import utc_now
 
-#: What one fit is for: recordings of one kind of a session, seen through one chain of methods.
+#: Columns of one fit: recordings of one kind of a session, seen through one chain of methods.
 GROUP = ("session_id", "tracking_method", "keypoint_method", "fit_method", "fit_set_kind")
 
 
 def default_fit(keypoint_method: str) -> str:
-    """Key of the fit method that keypoints of this method (a key) get where nobody names one: as `pbl run` chooses.
+    """Return the key of the fit method for keypoints of this method (a key) where none is named: as `pbl run` chooses.
 
     Raises `PblError` MODEL_MISSING, MODEL_INVALID where the method's model is not registered on this machine.
     """
@@ -120,7 +120,7 @@ def _with_unusable() -> Any:
 
 @contextmanager
 def locked(session_id: int) -> Iterator[None]:
-    """A transaction in which nobody else plans this session and every query sees what others have committed.
+    """A transaction in which no other process plans this session and every query sees what others have committed.
 
     Two workers that see different trials ready would otherwise both make their set the current one.
     """
@@ -199,7 +199,7 @@ def _trial_of(row: Mapping[str, Any]) -> int:
 
 
 def _plan_markers(session_id: int) -> list[dict[str, Any]]:
-    """Marker recordings make sets of their own, never with a video: one fit method's, all those of the session.
+    """Marker recordings make separate sets, never with a video: one fit method's, all those of the session.
 
     They were found fit to be used when they were registered, so none is waited for.
     """
@@ -260,7 +260,7 @@ def _measured(row: Mapping[str, Any]) -> str:
 
 
 def _decided(videos: Any, failed: Sequence[Any]) -> Any:
-    """A test of a selection row: True when it will not give keypoints by itself (failed, nobody, must be chosen)."""
+    """Return a test of a selection row: True if it will not give keypoints (failed, no one there, must be chosen)."""
     ids = {int(v) for v in videos.to_arrays("video_id")}
     stopped: list[dict] = []
     for jobs in failed:

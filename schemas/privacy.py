@@ -73,7 +73,7 @@ class Deidentified(dj.Computed):
                 next_step="set it as on the machine that queued the job, then `pbl retry`",
             )
         path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
-        with stored_file(self, times) as stored:
+        with stored_file(times) as stored:
             info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
         folder = lasting_folder()
         done = deidentify(path, Path(folder.name) / "deidentified.mp4", how, info=info)
@@ -136,5 +136,5 @@ def shown(video_id: int) -> Iterator[Path | None]:
         )
     if rows[0]["deidentified_status"] == "NO_HEAD" and how != "skeleton":
         raise nothing_covered(f"video_id={video_id}")
-    with stored_file(Deidentified(), file_ref(rows[0]["deidentified_file"])) as path:
+    with stored_file(file_ref(rows[0]["deidentified_file"])) as path:
         yield path

@@ -93,7 +93,7 @@ class SessionQc(dj.Computed):
 
 
 def _of_set(table: Any, key: dict) -> Any:
-    """What restricts a table of checks to one set of videos. Keypoints do not know the set: they are its members."""
+    """Return the restriction of a table of checks to one set of videos. Keypoints are its members."""
     if table is not keypoints.Keypoints.Check:
         return key
     return [{k: row[k] for k in keypoints.Keypoints.primary_key} for row in (fit.FitSet.Video & key).to_dicts()]

@@ -1,5 +1,4 @@
-"""What people decided and looked at on the review page. Rows are added, never changed; `schemas.decide` and
-`schemas.viewings` write them."""
+"""What people decided and viewed on the review page. Rows are added, never changed; `schemas.decisions` writes them."""
 
 from __future__ import annotations
 

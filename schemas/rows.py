@@ -12,8 +12,8 @@ from pbl_pipeline.errors import PblError
 
 from .datajoint_setup import dj
 
-#: What returns the rows of a table that agree with a key, in the order of the table's own key: `stored_rows` asks the
-#: database each time, `ReadAhead` for many keys at once.
+#: Function that returns the rows of a table that agree with a key, in the order of the table's own key: `stored_rows`
+#: asks the database each time, `ReadAhead` for many keys at once.
 Rows = Callable[[Any, Mapping[str, Any]], list[dict[str, Any]]]
 
 
@@ -123,6 +123,11 @@ def number(value: Any) -> float | None:
     return value if np.isfinite(value) else None
 
 
+def or_nan(value: float | None) -> float:
+    """Return the number of a nullable column; NaN for NULL."""
+    return float("nan") if value is None else float(value)
+
+
 def plain(value: Any) -> Any:
     """Mappings and tuples as dicts and lists of plain numbers: what a json column takes."""
     if isinstance(value, Mapping):
@@ -147,7 +152,7 @@ def counted(deleted: Mapping[str, int]) -> str:
     return ", ".join(f"{n} of {name}" for name, n in deleted.items())
 
 
-#: Times that a cascade is begun anew where somebody inserts below it meanwhile.
+#: Times that a cascade is begun anew where another process inserts below it meanwhile.
 _DELETES = 5
 
 

@@ -14,7 +14,7 @@ from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
 from .datajoint_setup import full_path
-from .folders import private_folder
+from .operations.folders import private_folder
 from .operations.secret_files import secret
 
 #: Folder of the bucket under which everything of ours lies; the phones' uploads may have another one beside it.
@@ -27,7 +27,7 @@ def is_remote() -> bool:
 
 
 def describe() -> str:
-    """Where arrays go, in words, without any secret."""
+    """Return where arrays go, in words, without any secret."""
     if is_remote():
         return f"{os.environ['PBL_S3_ENDPOINT']}, bucket {bucket()}"
     return str(settings.store_dir())
@@ -87,16 +87,17 @@ def _bucket_spec() -> dict[str, Any]:
             next_step="pip install 'pbl-pipeline[s3]', or unset PBL_S3_ENDPOINT to keep arrays in a folder",
         )
     spec = {"protocol": "s3", "endpoint": endpoint, "bucket": bucket(), "location": LOCATION, "subfolding": [2, 2]}
-    return {**spec, "secure": endpoint.startswith("https://"), **_login(key, password)}
+    login = {"access_key": key, "secret_key": password} if key and password else {}
+    return {**spec, "secure": endpoint.startswith("https://"), **login}
 
 
 def further_stores(taken: str) -> dict[str, Any]:
-    """The stores that DJ_STORES describes (JSON, as DataJoint reads it), for tables of a lab's own.
+    """The stores that DJ_STORES describes (JSON, as DataJoint reads it), for a lab's custom tables.
 
     Raises
     ------
     PblError
-        USAGE where it is no JSON object of stores, or describes the store `taken`, which other variables decide.
+        USAGE where it is not a JSON object of stores, or describes the store `taken`, which other variables decide.
     """
     raw = os.environ.get("DJ_STORES")
     if not raw:
@@ -118,10 +119,6 @@ def further_stores(taken: str) -> dict[str, Any]:
     return found
 
 
-def _login(key: str | None, password: str | None) -> dict[str, str]:
-    return {"access_key": key, "secret_key": password} if key and password else {}
-
-
 def check_store(backend: Any, create: bool = False) -> None:
     """Write, read and compare a small object in the store.
 
@@ -137,7 +134,7 @@ def check_store(backend: Any, create: bool = False) -> None:
     PblError
         STORE_UNAVAILABLE with what the store said.
     """
-    # In a bucket always the same object, for a worker's key may not delete; in a folder a file of its own that goes
+    # In a bucket always the same object, for a worker's key may not delete; in a folder a separate file that goes
     # again. Several processes may write that object at once: whoever wrote it, it holds some bytes and their hash.
     name = secrets.token_bytes(16)
     content = name + hashlib.sha256(name).digest()

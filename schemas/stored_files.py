@@ -33,7 +33,7 @@ def new_folder() -> Iterator[Path]:
 
 
 def lasting_folder() -> tempfile.TemporaryDirectory:
-    """Such a folder for a file that is computed now and stored later: gone when nobody holds the object any more."""
+    """Such a folder for a file that is computed now and stored later: gone when the object is not held any more."""
     return tempfile.TemporaryDirectory(prefix=f"{_PREFIX}{os.getpid()}-{_OWN}-")
 
 
@@ -61,7 +61,7 @@ def _alive(pid: int) -> bool:
 
 
 @contextmanager
-def stored_file(table: Any, ref: Mapping[str, Any]) -> Iterator[Path]:
+def stored_file(ref: Mapping[str, Any]) -> Iterator[Path]:
     """Path to read an object of the store, from the dict that `file_ref` took from a row. Touches no database.
 
     A store in a folder gives the file itself; a remote one a copy that is removed afterwards.
@@ -90,7 +90,7 @@ def stored_file(table: Any, ref: Mapping[str, Any]) -> Iterator[Path]:
 
 @contextmanager
 def _readable(path: Path, ref: Mapping[str, Any]) -> Iterator[None]:
-    """What reads a file of the store raises FILE_FORMAT where it is damaged, naming the file."""
+    """Turn errors in reading a file of the store into FILE_FORMAT, which names the file."""
     size = path.stat().st_size
     if ref.get("size") not in (None, size):
         raise _damaged(ref, f"{size} bytes where its row says {ref['size']}")

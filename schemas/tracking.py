@@ -98,7 +98,7 @@ class Tracking(dj.Computed):
 
     @property
     def key_source(self) -> Any:
-        """Only what a probe could read: a file that is no video has one error row, in VideoInfo."""
+        """Only what a probe could read: a file that is not a video has one error row, in VideoInfo."""
         return (TrackingSelection & video.VideoInfo) - video.NotUsable
 
     def make_fetch(self, key: dict) -> tuple:
@@ -114,7 +114,7 @@ class Tracking(dj.Computed):
 
         path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
         tracker = methods.stored(**method)
-        with stored_file(self, times) as stored:
+        with stored_file(times) as stored:
             info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
         return track_people(path, params=tracker, info=info), tracker.hash
 
@@ -180,13 +180,13 @@ class SubjectChoice(dj.Computed):
         from pbl_pipeline.tracking import carried_choice, choose_subject, contact_sheet_jpeg
 
         chooser = methods.stored(**method)
-        with stored_file(self, ref) as path:
+        with stored_file(ref) as path:
             tracking = load_tracking(path, size, *about)
         if elsewhere is None:
             choice = choose_subject(tracking, params=chooser, override=override)
         else:
             other_tracks, other_about, number_there, other_method = elsewhere
-            with stored_file(self, other_tracks) as path:
+            with stored_file(other_tracks) as path:
                 other = load_tracking(path, size, *other_about)
             choice = carried_choice(other, number_there, other_method, tracking, chooser)
         sheet = None
@@ -258,7 +258,7 @@ def set_override(key: Mapping[str, Any], person_id: int) -> None:
 
 
 def choose_command(key: Mapping[str, Any], persons: str) -> str:
-    """The command by which somebody decides about the tracking `key`; `persons`: such as "1|2". The method is named
+    """Return the command that decides about the tracking `key`; `persons`: such as "1|2". The method is named
     where the video has several: each numbers people anew."""
     several = len(TrackingSelection & {"video_id": key["video_id"]}) > 1
     return f"pbl choose {key['video_id']} {persons}" + (

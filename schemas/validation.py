@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from . import fit, session, video  # noqa: F401  definitions refer to session and video
 from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
-from .rows import number, one
+from .rows import number, one, or_nan
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -92,9 +92,9 @@ class KinematicError(dj.Computed):
         from pbl_pipeline import validation as lib
         from pbl_pipeline.fit import TrialFit
 
-        with stored_file(self, fitted) as path:
+        with stored_file(fitted) as path:
             trial = TrialFit.load(path)
-        with stored_file(self, reference) as path:
+        with stored_file(reference) as path:
             truth = lib.Reference.load(path)
         return (lib.compare(trial, truth),)
 
@@ -131,9 +131,14 @@ JOINT_COLUMNS = {
 
 
 def joint_row(error: lib.JointError) -> dict[str, Any]:
-    """A library `JointError` as columns of KinematicError.Joint."""
+    """Return a library `JointError` as columns of KinematicError.Joint."""
     row = {column: getattr(error, field) for field, column in JOINT_COLUMNS.items()}
     return {c: v if c in ("error_joint", "joint_n") else number(v) for c, v in row.items()}
+
+
+def _fields(joint: Mapping[str, Any]) -> dict[str, Any]:
+    values = {field: joint[column] for field, column in JOINT_COLUMNS.items()}
+    return {k: v if k in ("joint", "n") else or_nan(v) for k, v in values.items()}
 
 
 def errors_of_rows(row: Mapping[str, Any], joints: Sequence[Mapping[str, Any]]) -> lib.KinematicErrors:
@@ -151,14 +156,10 @@ def errors_of_rows(row: Mapping[str, Any], joints: Sequence[Mapping[str, Any]]) 
         lag_s=float(row["error_lag"]),
         max_lag_s=float(row["error_max_lag"]),
         n=int(row["error_n"]),
-        joints=tuple(lib.JointError(**{f: _value(j[c]) for f, c in JOINT_COLUMNS.items()}) for j in joints),
-        median_abs_deg=_value(row["error_median_abs"]),
-        rte_m=_value(row["rte"]),
+        joints=tuple(lib.JointError(**_fields(j)) for j in joints),
+        median_abs_deg=or_nan(row["error_median_abs"]),
+        rte_m=or_nan(row["rte"]),
         view={"left": row["error_view_left"], "right": row["error_view_right"]},
-        residual_2d_px=_value(row["trial_residual_2d"]),
-        residual_3d_cm=_value(row["trial_residual_3d"]),
+        residual_2d_px=or_nan(row["trial_residual_2d"]),
+        residual_3d_cm=or_nan(row["trial_residual_3d"]),
     )
-
-
-def _value(value: Any) -> Any:
-    return float("nan") if value is None else value

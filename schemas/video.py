@@ -14,7 +14,7 @@ from pbl_pipeline.words import UNUSABLE
 from . import lab, session  # noqa: F401  the definitions refer to them
 from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
-from .rows import Rows, number, one, row_of, stored_rows
+from .rows import Rows, number, one, or_nan, row_of, stored_rows
 
 if TYPE_CHECKING:
     from pbl_pipeline import video as lib
@@ -244,7 +244,6 @@ def info_of_row(row: Mapping[str, Any], time_s: np.ndarray) -> lib.VideoInfo:
     """The library's `VideoInfo` from a joined row of Video and VideoInfo and the array in `frame_time`."""
     from pbl_pipeline import video as lib
 
-    nan = float("nan")
     return lib.VideoInfo(
         path=row["video_path"],
         sha256=row["video_sha256"],
@@ -256,8 +255,8 @@ def info_of_row(row: Mapping[str, Any], time_s: np.ndarray) -> lib.VideoInfo:
         height_px=int(row["height"]),
         rotation_deg=int(row["rotation"]),
         time_s=time_s,
-        fps=nan if row["fps"] is None else float(row["fps"]),
-        duration_s=nan if row["duration"] is None else float(row["duration"]),
+        fps=or_nan(row["fps"]),
+        duration_s=or_nan(row["duration"]),
         n_frames=int(row["n_frames"]),
         n_frames_announced=int(row["n_frames_announced"]),
         variable_frame_rate=bool(row["variable_frame_rate"]),
@@ -312,20 +311,25 @@ def camera_of(row: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def present_file(video_id: int) -> Path:
-    """The file of a video, if it is there; whether its bytes are still those that were registered is not looked at.
+    """Return the file of a video if it is there; its bytes are not compared with those that were registered.
 
     Raises
     ------
     PblError
         DB_NOT_FOUND, VIDEO_MISSING.
     """
-    paths = (Video & {"video_id": video_id}).to_arrays("video_path")
-    if not len(paths):
-        raise unknown_video(video_id)
-    path = Path(str(paths[0]))
+    path = Path(registered_video(video_id)["video_path"])
     if not path.is_file():
         raise _missing(path, {"video_id": video_id})
     return path
+
+
+def registered_video(video_id: int) -> dict[str, Any]:
+    """Return the row of Video of a number. Raises `PblError` DB_NOT_FOUND for a number that no video has."""
+    rows = (Video & {"video_id": video_id}).to_dicts()
+    if not rows:
+        raise unknown_video(video_id)
+    return rows[0]
 
 
 def unknown_video(video_id: int) -> PblError:

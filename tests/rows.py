@@ -8,13 +8,13 @@ from pathlib import Path
 
 from pbl_pipeline import settings
 from schemas import connection
-from schemas.intake import Visit, ingest
+from schemas.intake import VisitRecord, ingest
 from schemas.operations import catalog, dump
 
 
 def register(*paths: Path, **visit) -> list[int]:
     """Ingest videos that are all new, of P001 where nothing else is said; their `video_id`s."""
-    results = ingest(paths, Visit(subject=visit.pop("subject", "P001"), **visit))
+    results = ingest(paths, VisitRecord(subject=visit.pop("subject", "P001"), **visit))
     assert [r.status for r in results] == ["registered"] * len(paths), results
     return [r.video_id or 0 for r in results]
 

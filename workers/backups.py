@@ -33,7 +33,7 @@ def backup_regularly(root: Path, keep: int, say: Say = lambda _: None) -> Backup
     """Save everything into a new folder of `root`, then remove all but the `keep` newest; None where another process
     is doing this.
 
-    Recordings that the newest one has are linked: they take room once. What an interrupted run left is removed.
+    Recordings that the newest one has are linked: they take room once. The remains of an interrupted run are removed.
 
     Raises
     ------

@@ -12,7 +12,7 @@ import platform
 import secrets
 import threading
 from collections import defaultdict
-from typing import Any, Protocol
+from typing import Any
 
 import pymysql
 
@@ -25,8 +25,8 @@ from schemas.connection import dj
 PERIOD_S = 15.0
 
 
-class Listener(Protocol):
-    """What a worker reports its work to."""
+class Silent:
+    """Receiver of a worker's reports; this one ignores them, for a worker without a row in `Worker`."""
 
     def doing(self, what: str) -> None:
         """Report the current job."""
@@ -35,17 +35,7 @@ class Listener(Protocol):
         """Report finished jobs of a stage and the seconds they took."""
 
 
-class Silent:
-    """Ignores all reports: for a worker without a row of its own."""
-
-    def doing(self, what: str) -> None:
-        """Nothing."""
-
-    def count(self, stage: str, done: int, failed: int, busy_s: float) -> None:
-        """Nothing."""
-
-
-class Heartbeat:
+class Heartbeat(Silent):
     """A context manager that keeps a row of `Worker` up to date.
 
     The thread has its own connection (DataJoint's is not safe between threads). While the database is unavailable beats

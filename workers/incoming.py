@@ -4,7 +4,7 @@ Layout: SUBJECT/SESSION/FILE under the place that `PBL_INCOMING` names. Beside a
 the same name (.csv, .json, .zip; docs/phone_capture.md), which is taken with it. A file is taken when it was the same
 in two runs at least `SETTLED_S` apart. It is copied into the archive and checked there, registered, and only then
 removed from where it came: whatever breaks off in between, the bytes are in at least one place, and the next run goes
-on. What cannot be registered is moved into the folder `_refused` of the archive, with the reason beside it.
+on. A recording that cannot be registered is moved into the folder `_refused` of the archive, with the reason beside it.
 
 Uploads are taken in random order: whatever one of them does to the run, no other waits behind it for ever.
 """
@@ -26,7 +26,10 @@ import pymysql
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import read_phone_log, sha256_of
 from schemas import video, worker
-from schemas.archive import (
+from schemas.connection import dj
+from schemas.intake import OneCamera, Sensors, VisitRecord, register
+from schemas.intake.uploads import LOG_ENDINGS, Bucket, Folder, StillChanging, Upload, drop_folder, incoming_url
+from schemas.operations.archive import (
     COPIES,
     LOCK,
     REFUSED,
@@ -37,11 +40,8 @@ from schemas.archive import (
     remove_copies,
     save_seen,
 )
-from schemas.codes import check_subject
-from schemas.connection import dj
-from schemas.folders import private_folder, remove_empty, sync_folders
-from schemas.intake import OneCamera, Sensors, Visit, register
-from schemas.intake.uploads import LOG_ENDINGS, Bucket, Folder, StillChanging, Upload, drop_folder, incoming_url
+from schemas.operations.folders import private_folder, remove_empty, sync_folders
+from schemas.subject_codes import check_subject
 
 from .limited import LimitExceeded, limited
 
@@ -153,7 +153,7 @@ def _listed(drop: Folder | Bucket, archive: Path, settled_s: float, out: Taken) 
 
 
 def _misplaced(upload: Upload) -> str:
-    """Why something in the drop folder is no recording in its place; "" where it is one, or a log."""
+    """Return why an entry of the drop folder is not a recording in its place; "" where it is one, or a log."""
     name = upload.name
     if any(part.startswith((".", "_")) for part in name.parts):
         return "a name that begins with . or _, as what is still being written has"
@@ -203,7 +203,7 @@ def _take(drop: Folder | Bucket, recording: Upload, logs: list[Upload], archive:
 
 
 def _copy(drop: Folder | Bucket, upload: Upload, archive: Path, end: float) -> _Copy:
-    """Copy into the archive under a name of its own, on disk when this returns.
+    """Copy into the archive under a new name, on disk when this returns.
 
     Raises
     ------
@@ -267,7 +267,7 @@ def _register(name: PurePosixPath, copies: Sequence[_Copy], archive: Path) -> st
         copy.path = copy.path.replace(to)
     sync_folders(folder, archive)
     sensors = Sensors(attitude=logs[0].path if logs else None)
-    (result,) = register([OneCamera(target, Visit(subject, session), sensors)])
+    (result,) = register([OneCamera(target, VisitRecord(subject, session), sensors)])
     if result.error is not None:
         raise result.error
     if result.status == "registered":

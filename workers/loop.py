@@ -12,11 +12,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from schemas.jobs import jobs_of
-from schemas.scope import Scope
+from schemas.reading.scope import Scope
 
 from . import queue, refresh, registry, run_job
 from .batches import run_fits
-from .heartbeat import Listener
+from .heartbeat import Silent
 from .log import event
 from .queue import Claim
 from .run_job import Outcome
@@ -25,7 +25,7 @@ log = logging.getLogger("pbl.worker")
 
 #: Pause after the first look that found nothing, and the longest; each look that finds nothing doubles it.
 IDLE_S = (0.5, 20.0)
-#: An idle worker looks at all tables when nobody has done so for as long.
+#: An idle worker looks at all tables when no worker has done so for as long.
 REFRESH_EVERY_S = 60.0
 
 
@@ -40,7 +40,7 @@ class Worker:
     """
 
     tables: Sequence[Any]
-    heartbeat: Listener
+    heartbeat: Silent
     stop: threading.Event = dataclasses.field(default_factory=threading.Event)
     report: Callable[[Claim, Outcome | None], None] = lambda *_: None
     batch: int = 1

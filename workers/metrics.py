@@ -68,7 +68,7 @@ class _Queues(Collector):
         yield up
 
     def _run(self) -> None:
-        from schemas.status import queue_counts
+        from schemas.reading.status import queue_counts
 
         connection = None
         while True:

@@ -10,9 +10,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from pbl_pipeline import progress
-from schemas import computed_tables, scope, tracking
+from schemas import computed_tables, tracking
 from schemas.jobs import jobs_of
-from schemas.status import empty_rows
+from schemas.reading import scope
+from schemas.reading.status import empty_rows
 
 from . import queue, refresh, run_job
 from .heartbeat import Silent
@@ -27,7 +28,7 @@ COUNT_EVERY_S = 2.0
 
 @dataclasses.dataclass
 class TableRun:
-    """What one run did to one table. errors: code -> how many. empty: rows with a status that says so."""
+    """Outcome of one run for one table. errors: code -> how many. empty: rows with a status that says so."""
 
     table: str
     done: int = 0
@@ -38,7 +39,7 @@ class TableRun:
 
 @dataclasses.dataclass
 class Run:
-    """What one run did. `dropped`: rows deleted because a person chose somebody else. `interrupted`: by a signal."""
+    """Outcome of one run. `dropped`: rows deleted because another person was chosen. `interrupted`: by a signal."""
 
     tables: list[TableRun]
     freed: int = 0
@@ -115,7 +116,7 @@ def _ready(tables: Sequence[Any], limit: int | None) -> int:
 def _counting(
     parts: dict[str, TableRun], tables: Sequence[Any], limit: int | None, update: Callable[..., None]
 ) -> Callable[[Claim, Outcome | None], None]:
-    """What the worker reports of each job: counted by table, and drawn."""
+    """Return the function that counts the worker's jobs by table and draws them."""
     ended, counted = 0, time.monotonic()
 
     def report(job: Claim, outcome: Outcome | None) -> None:

@@ -185,9 +185,9 @@ def _run(task: Task, done: Any, root: Path, stop: threading.Event) -> Path | Non
 
 def _reporting(done: Any, function: Callable[..., object], args: tuple[Any, ...]) -> None:
     """Run in the process: call the function; what `progress.track` counts goes into `done`."""
-    progress.tell(functools.partial(_tell, done))
+
+    def tell(n: int, total: int | None) -> None:
+        done.value = n / total if total else 0.0
+
+    progress.tell(tell)
     function(*args)
-
-
-def _tell(done: Any, n: int, total: int | None) -> None:
-    done.value = n / total if total else 0.0

@@ -111,7 +111,7 @@ def _repeated(connection: Any, statement: Callable[[], int]) -> int:
 
 
 def sweep(table: Any, which: str = "status != 'reserved'") -> int:
-    """Delete jobs that nobody needs any more: done by another route, or no longer asked for; returns how many."""
+    """Delete jobs that are not needed any more: done by another route, or no longer asked for; returns how many."""
     n = 0
     for needless in (table.proj(), dj.Not(keys_of(table).proj())):
         if jobs := jobs_of(table) & which:  # most often there are none
@@ -139,7 +139,7 @@ def claim(table: Any, n: int = 1, where: str | None = None) -> list[Claim]:
     ready = jobs.pending & "scheduled_time <= CURRENT_TIMESTAMP(3)" & (where or True)
     rows = ready.proj("priority", "attempts").to_dicts(order_by="priority, scheduled_time", limit=_SPREAD * n)
     claims: list[Claim] = []
-    # Everybody sees the same candidates: a random order within a priority makes two hands on one job rare.
+    # All workers see the same candidates: a random order within a priority makes two hands on one job rare.
     rows.sort(key=lambda r: (r["priority"], random.random()))  # noqa: S311
     for row in rows:
         key = {k: row[k] for k in jobs.primary_key}
@@ -159,7 +159,7 @@ def finish(job: Claim) -> None:
 
 
 def fail(job: Claim, message: str, stack: str = "") -> bool:
-    """Make an error row of the job; it is tried again only when somebody asks (`pbl retry`). Whether it was ours."""
+    """Make an error row of the job; it is tried again on request only (`pbl retry`). Returns whether it was ours."""
     ours = len(_mine(job)) == 1
     if ours:
         jobs_of(job.table).error(job.key, error_message=message, error_stack=stack or None)
@@ -176,7 +176,7 @@ def put_back(job: Claim, reason: str = "", delay_s: float = 0.0, **counts: int) 
 
 
 def let_go(job: Claim) -> None:
-    """Forget the job: somebody else has it."""
+    """Forget the job: another worker has it."""
     _held.discard((job.table.__name__, job.hash))
 
 
@@ -197,7 +197,7 @@ def reset(jobs: Any, reason: str = "", delay_s: float = 0.0, **counts: int) -> i
 
 
 def reset_to_new(jobs: Any) -> int:
-    """`reset`, and forget earlier attempts: somebody asked for it."""
+    """`reset`, and forget earlier attempts, on request."""
     return reset(jobs, "", 0.0, **dict.fromkeys(COUNTS, 0))
 
 
@@ -218,11 +218,11 @@ def _mine(job: Claim) -> Any:
 
 
 class ReservationLost(Exception):
-    """Somebody else holds the job by now: its result must not be written twice."""
+    """Another worker holds the job by now: its result must not be written twice."""
 
 
 def hold(job: Claim) -> float:
-    """Inside the transaction that inserts: go on only while the reservation is ours, and let nobody else take it;
+    """Inside the transaction that inserts: go on only while the reservation is ours, and let no other worker take it;
     returns when the job was queued (s since 1970).
 
     The job's row is locked until the transaction ends, so a second holder of the same job waits here and then finds

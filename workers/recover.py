@@ -10,7 +10,7 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 from schemas import worker
-from schemas.coded_errors import error_message
+from schemas.job_errors import error_message
 from schemas.jobs import jobs_of
 
 from . import queue

@@ -1,20 +1,21 @@
-"""What became computable: after single jobs, and over all tables."""
+"""Queue what became computable: after single jobs, and over all tables."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 from schemas import chain, fit, review, tracking, video, worker
-from schemas.scope import Scope, of_visit
+from schemas.reading.scope import Scope, of_visit
 from schemas.worker import alone
 
 from . import queue, recover
 from .queue import Claim
 from .registry import NEW
 
-#: Days in which something from outside counts as recent, and seconds after which somebody looks at everything again.
+#: Days in which something from outside counts as recent, and seconds after which a worker looks at everything again.
 RECENT_DAYS, ALL_EVERY_S = 2, 3600.0
 #: Name of a look at all rows in `worker.Look`.
 ALL = "all"
@@ -24,24 +25,18 @@ FEW = 10_000
 
 @dataclasses.dataclass
 class Refreshed:
-    """What a refresh did: table -> queued jobs; deleted jobs, freed reservations, planned fits, dropped rows."""
+    """Outcome of a refresh: table -> queued jobs; deleted jobs, freed reservations, planned fits, dropped rows."""
 
-    queued: dict[str, int] = dataclasses.field(default_factory=dict)
+    queued: Counter[str] = dataclasses.field(default_factory=Counter)
     swept: int = 0
     freed: int = 0
     planned: int = 0
-    dropped: dict[str, int] = dataclasses.field(default_factory=dict)
+    dropped: Counter[str] = dataclasses.field(default_factory=Counter)
 
     def add(self, other: Refreshed) -> None:
-        """Count what another one did too."""
-        self.swept, self.freed, self.planned = (
-            self.swept + other.swept,
-            self.freed + other.freed,
-            self.planned + other.planned,
-        )
-        for mine, more in ((self.queued, other.queued), (self.dropped, other.dropped)):
-            for name, n in more.items():
-                mine[name] = mine.get(name, 0) + n
+        """Also count what another one did."""
+        for field in dataclasses.fields(self):
+            setattr(self, field.name, getattr(self, field.name) + getattr(other, field.name))
 
 
 def after(done: Sequence[Claim], failed: Sequence[Claim] = ()) -> Refreshed:
@@ -55,8 +50,7 @@ def after(done: Sequence[Claim], failed: Sequence[Claim] = ()) -> Refreshed:
                 keys = [c.key for c in of_table if c.priority == priority]
                 if follower is fit.TrialInput:
                     keys = fit.TrialInput.with_trials(keys)
-                n = queue.fill(follower, keys, priority)
-                out.add(Refreshed({follower.__name__: n}))
+                out.queued[follower.__name__] += queue.fill(follower, keys, priority)
         if table in (tracking.SubjectChoice, fit.TrialInput):
             touched += [c.key for c in of_table]
     # A failure before the fit decides that a trial does not take part in it.
@@ -93,7 +87,7 @@ def refresh(everything: bool | None = None) -> Refreshed | None:
     Parameters
     ----------
     everything
-        Look at all rows; None where it is an hour since somebody did, or where there are few videos.
+        Look at all rows; None where the last such look is an hour ago, or where there are few videos.
 
     Returns
     -------
@@ -158,7 +152,7 @@ def _refresh(tables: Sequence[Any], lately: Scope | None) -> Refreshed:
     out = Refreshed()
     for table in tables:
         out.freed += recover.free_dead(table)
-    out.dropped = drop_outdated_choices()
+    out.dropped = Counter(drop_outdated_choices())
     for table in tables:
         if table is fit.SessionFit:
             out.planned = plan(None if lately is None else lately.sessions)

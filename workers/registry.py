@@ -1,4 +1,4 @@
-"""What each computed table needs of a worker: resource class, time limit, how many jobs it takes at once."""
+"""Needs of each computed table: resource class, time limit, how many jobs it takes at once."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NEW, AGAIN = 5, 8
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """What one computed table needs. limit_s: after that a job is ended and becomes an error row. batch: jobs reserved
+    """Needs of one computed table. limit_s: after that a job is ended and becomes an error row. batch: jobs reserved
     at once: 1 where a job takes long, so that none waits behind it while other workers are idle."""
 
     resource: str

@@ -89,7 +89,7 @@ _MODULES = {"tracking": tracking, "keypoint": keypoints, "fit": fit, "gait": gai
 
 
 def plan_new_method(table: str, method: str, since: datetime.date | None = None) -> Reprocess:
-    """What selecting a method for everything that went through another method of that table would add.
+    """Return what selecting a method for everything that went through another method of that table would add.
 
     Old rows stay: a method is part of the key. `since`: only videos registered from that day on.
 
@@ -111,7 +111,7 @@ def plan_new_method(table: str, method: str, since: datetime.date | None = None)
     selection, methods = getattr(module, selection_name), getattr(module, method_name)
     column = f"{prefix}_method"
     chosen = resolve_method(methods, method)
-    rows = selection & (video.Video & _since(since))
+    rows = selection & (video.Video & (True if since is None else f"video_created >= '{since:%Y-%m-%d}'"))
     others = [k for k in rows.primary_key if k != column]
     have = {tuple(r[k] for k in others) for r in (selection & {column: chosen}).proj().to_dicts()}
     # The choice of the subject goes with the tracking: that of this version, not that of the older row.
@@ -179,22 +179,13 @@ def carry_out(plan: Reprocess) -> Iterator[int]:
             if plan.fit_method is not None:
                 plan_fits(part, plan.fit_method)
             yield min(i + 50 * CHUNK, len(plan.add))
-        _queue_at_low_priority(one)
+        # A new plan of fits makes keys computable of the table before it, which plans the sets.
+        queue.fill(table_named("TrialInput") if one is fit.SessionFit else one, None, AGAIN)
     for i in range(0, len(plan.outdated), CHUNK):
         part = plan.outdated[i : i + CHUNK]
         delete_below(one, part)
         queue.fill(one, part, AGAIN)
         yield min(i + CHUNK, len(plan.outdated))
-
-
-def _queue_at_low_priority(table: Any) -> None:
-    """Queue what a new selection made computable: of this table, or of the one that plans its keys."""
-    planned = table.__name__ == "SessionFit"
-    queue.fill(table_named("TrialInput") if planned else table, None, AGAIN)
-
-
-def _since(day: datetime.date | None) -> Any:
-    return True if day is None else f"video_created >= '{day:%Y-%m-%d}'"
 
 
 def parse_time(text: str | None) -> datetime.datetime | None:
@@ -210,7 +201,7 @@ def parse_time(text: str | None) -> datetime.datetime | None:
 
 
 def summary(plan: Reprocess) -> Sequence[str]:
-    """What a plan would do, in words."""
+    """Return what a plan would do, in words."""
     out = []
     if plan.add:
         out.append(f"{len(plan.add)} selections would be added for {plan.table}; nothing is deleted")

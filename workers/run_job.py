@@ -14,8 +14,8 @@ import pymysql
 
 from pbl_pipeline.errors import PblError
 from schemas import connection
-from schemas.coded_errors import error_code, error_message
 from schemas.connection import DuplicateError, IntegrityError, LostConnectionError, inserting
+from schemas.job_errors import error_code, error_message
 from schemas.jobs import keys_of
 from schemas.rows import InputChanged
 from schemas.stored_files import remove_left_over
@@ -23,12 +23,12 @@ from schemas.stored_files import remove_left_over
 from . import queue
 from .queue import Claim, ReservationLost
 
-#: What a job can come to.
+#: Outcomes of a job.
 DONE, ALREADY, LOST, FAILED, LATER = "done", "already there", "somebody else has it", "failed", "later"
 #: Its key is gone: a row above was deleted, or another selection took its place. Its job is deleted, not tried.
 VANISHED = "no longer asked for"
 
-#: What the driver and DataJoint raise for the database itself, and the numbers that say that it is away, or full, or
+#: Exceptions of the driver and DataJoint about the database, and the numbers that say that it is away, or full, or
 #: read-only (the computed result is kept and written later), or that the same statement will do next time.
 DATABASE_ERRORS = (
     LostConnectionError,
@@ -51,7 +51,7 @@ DATABASE_WAIT_S, DATABASE_PAUSE_S = 3600.0, 2.0
 
 @dataclasses.dataclass
 class Outcome:
-    """What became of a job. code: of an error. seconds: all of it, the wait for a database included."""
+    """Outcome of a job. code: of an error. seconds: all of it, the wait for a database included."""
 
     job: Claim
     what: str
@@ -130,7 +130,7 @@ class _Attempt:
     computed: Computed | None = None
 
     def make(self) -> str:
-        """DONE, ALREADY (the row is there) or VANISHED (nobody asks for it any more); raises what goes wrong."""
+        """DONE, ALREADY (the row is there) or VANISHED (it is not asked for any more); raises what goes wrong."""
         table, key = self.job.table(), self.job.key
         if key in table:
             return ALREADY
@@ -148,7 +148,7 @@ class _Attempt:
                 with inserting(table):
                     table.make_insert(dict(key), *self.computed.result)
             except BaseException as error:
-                if not is_gone(error):  # then the job may be somebody else's; who inserts next removes them
+                if not is_gone(error):  # then another worker may have the job; the next insert removes them
                     remove_left_over(table, key, queued_s)
                 raise
         return DONE
@@ -194,7 +194,7 @@ def _settle(job: Claim, error: Exception) -> Outcome:
 
 
 def cause_outside(error: BaseException) -> str | None:
-    """What the file system or the database said where it is the store's or the server's fault and not the job's."""
+    """Return what the file system or the database said where the store or the server is at fault, not the job."""
     if number_of(error) in REPEAT:
         return f"DATABASE: {type(error).__name__}: {error}"
     seen: BaseException | None = error

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from pbl_pipeline import __version__, settings
 from schemas import computed_tables, session, video
-from schemas.archive import archive_dir
-from schemas.status import Status, pipeline_status
+from schemas.operations.archive import archive_dir
+from schemas.reading.status import Status, pipeline_status
 
 
 @dataclasses.dataclass(frozen=True)

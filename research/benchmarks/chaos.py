@@ -253,8 +253,8 @@ def _disks(home: Path, minutes: float) -> Iterator[bool]:
 
 
 def _run(site: Site, minutes: float, supervisors: int, can_fill: bool) -> list[str]:
-    from schemas.declare import declare_all
     from schemas.operations import embedded
+    from schemas.operations.declare import declare_all
 
     embedded.start(folder=embedded.Folder(site.home / "db"))
     declare_all()
@@ -281,7 +281,7 @@ def _run(site: Site, minutes: float, supervisors: int, can_fill: bool) -> list[s
 
 
 def _register(first: int) -> int:
-    from schemas.intake.bulk import register_many
+    from research.benchmarks.many_recordings import register_many
 
     register_many(workers.recordings(first, 10 * workers.EACH))
     return first + 10 * workers.EACH
@@ -303,7 +303,8 @@ def _cron() -> None:
 
 def _status(site: Site, supervisors: int, until: float) -> list[str]:
     """Wait until what `pbl status` says is so: no dead worker, no job in dead hands, the rows that are there."""
-    from schemas import computed_tables, status
+    from schemas import computed_tables
+    from schemas.reading import status
 
     wrong, last, began = ["it was not asked"], list[str](), time.monotonic()
     while wrong and time.monotonic() < until:
@@ -331,7 +332,7 @@ def _status(site: Site, supervisors: int, until: float) -> list[str]:
 
 def _drain(site: Site, supervisors: int, until: float) -> list[str]:
     """Let everything be done, with what `pbl cron` does every night."""
-    from schemas.status import queue_counts
+    from schemas.reading.status import queue_counts
     from schemas.video import Video
     from workers import requeue
 

@@ -110,8 +110,8 @@ class Walks:
 
 def put_sessions(home: Path, sessions: Sequence[Plan]) -> None:
     """Register the sessions' videos and put the rows of all tables before SessionFit, as detection would leave them."""
-    from schemas.intake import Methods, Visit
-    from schemas.intake.bulk import archived, register_many
+    from research.benchmarks.many_recordings import archived, register_many
+    from schemas.intake import Methods, VisitRecord
 
     recordings, trials = [], []
     walks = Walks()
@@ -120,7 +120,7 @@ def put_sessions(home: Path, sessions: Sequence[Plan]) -> None:
             for seconds in session.seconds:
                 number = len(recordings)
                 sha256 = hashlib.sha256(f"{number}".encode()).hexdigest()
-                visit = Visit(f"S{i:05d}", "1", camera_motion=session.camera)
+                visit = VisitRecord(f"S{i:05d}", "1", camera_motion=session.camera)
                 recordings.append(archived(f"/recordings/{number}.mp4", sha256, 1, visit))
                 keypoints = walks.trial(seconds, session.camera, person=i % 2)
                 keypoints.save(Path(name) / f"{number}.npz")

@@ -122,8 +122,8 @@ def main(inputs: int, seed: int) -> None:
     """Make the inputs, put them through, count."""
     import schemas
     from schemas import tracking, video
-    from schemas.coded_errors import error_code
-    from schemas.intake import Sensors, Visit, ingest
+    from schemas.intake import Sensors, VisitRecord, ingest
+    from schemas.job_errors import error_code
     from schemas.jobs import jobs_of
     from workers.process import Options
     from workers.supervisor import Supervisor
@@ -148,7 +148,7 @@ def main(inputs: int, seed: int) -> None:
                 sensors = [Sensors(attitude=log)]
             else:
                 path.write_bytes(KINDS[kind](good, draw))
-            (result,) = ingest([path], Visit(subject="P001", session_label=str(i)), files=sensors)
+            (result,) = ingest([path], VisitRecord(subject="P001", session_label=str(i)), files=sensors)
             if result.error is not None:
                 refused[f"{kind}: refused, {result.error.code}"] += 1
             elif result.video_id is not None:

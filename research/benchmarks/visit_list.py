@@ -57,7 +57,7 @@ def spread(n_visits: int) -> None:
 
 def filters() -> dict[str, Any]:
     """What is measured, by name."""
-    from schemas.visit_list import OUTCOMES, STATES, Filter
+    from schemas.reading.visit_list import OUTCOMES, STATES, Filter
 
     day = datetime.date
     found = {"everything": Filter(), "a person's code": Filter(search="s000123"), "a label": Filter(search="2024-0")}
@@ -88,8 +88,8 @@ def median_ms(function: Any, n: int) -> float:
 @click.option("--repeats", default=50, show_default=True)
 def main(visits: int, repeats: int) -> None:
     """Make the visits, ask for pages, print the figures."""
-    from schemas.intake.bulk import register_many
-    from schemas.visit_list import Filter, visit_page
+    from research.benchmarks.many_recordings import register_many
+    from schemas.reading.visit_list import Filter, visit_page
 
     with queue.installation():
         register_many(list(recordings(visits))[: queue.EACH])

@@ -55,12 +55,12 @@ def installation() -> Iterator[Path]:
 
 def recordings(first: int, n: int) -> Iterator[Any]:
     """Numbered recordings, `EACH` of a session, one session of a subject."""
-    from schemas.intake import Visit
-    from schemas.intake.bulk import archived
+    from research.benchmarks.many_recordings import archived
+    from schemas.intake import VisitRecord
 
     for i in range(first, first + n):
         sha256 = hashlib.sha256(str(i).encode()).hexdigest()
-        yield archived(f"/recordings/{i:07d}.mp4", sha256, 1000 + i, Visit(f"S{i // EACH:07d}", "1"))
+        yield archived(f"/recordings/{i:07d}.mp4", sha256, 1000 + i, VisitRecord(f"S{i // EACH:07d}", "1"))
 
 
 def say(what: str, value: float, unit: str, bar: str = "") -> None:
@@ -99,9 +99,9 @@ def main() -> None:
 @click.option("--videos", default=300_000, show_default=True)
 def scale(videos: int) -> None:
     """Register, look, refresh, work, with as many videos."""
+    from research.benchmarks.many_recordings import register_many
     from schemas import computed_tables, video
-    from schemas.intake.bulk import register_many
-    from schemas.status import pipeline_status
+    from schemas.reading.status import pipeline_status
     from workers import refresh
 
     with installation():
@@ -142,8 +142,8 @@ def scale(videos: int) -> None:
 
 def _cost_per_job(first: int, sessions: int) -> float:
     """Seconds a job of two workers costs beside make_compute, over a whole chain of new sessions."""
+    from research.benchmarks.many_recordings import register_many
     from schemas import computed_tables
-    from schemas.intake.bulk import register_many
 
     before = {t.__name__: _computed(t) for t in computed_tables()}
     register_many(recordings(first, sessions * EACH))
@@ -236,8 +236,8 @@ def _first_set() -> str:
 )
 def speed(keys: int, work_ms: float) -> None:
     """Jobs a second of one table (VideoInfo) by 1 to 4 workers, each key exactly once; what the database could do."""
+    from research.benchmarks.many_recordings import register_many
     from schemas import tracking, video
-    from schemas.intake.bulk import register_many
     from schemas.operations import embedded
     from workers import queue
 
@@ -300,8 +300,8 @@ def _processor_s(pid: int) -> float:
 @click.option("--worked", default=20, show_default=True, help="Sessions whose new fits are computed then.")
 def method(sessions: int, worked: int) -> None:
     """A new parameter set of the fit over fitted sessions: what becomes pending, and that no old row changes."""
+    from research.benchmarks.many_recordings import register_many
     from schemas import computed_tables, fit
-    from schemas.intake.bulk import register_many
     from workers import refresh, requeue
 
     with installation():
@@ -359,7 +359,7 @@ def _contents(table: Any, but: str = "") -> tuple[int, int]:
 @click.option("--jobs", default=500, show_default=True)
 def memory(jobs: int) -> None:
     """Resident memory of one worker, started as in production: after 20 jobs, after all, after as many again."""
-    from schemas.intake.bulk import register_many
+    from research.benchmarks.many_recordings import register_many
     from workers.metrics import Metrics
     from workers.process import Options
     from workers.supervisor import Supervisor

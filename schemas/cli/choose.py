@@ -11,7 +11,7 @@ import click
 from pbl_pipeline.words import UNUSABLE
 
 if TYPE_CHECKING:
-    from schemas.choose import Candidates
+    from schemas.decisions.candidates import Candidates
 
 
 @click.command()
@@ -50,8 +50,8 @@ def choose(
     if note and reason is None:
         raise click.UsageError("--note goes with --not-usable.")
     import schemas
-    from schemas.choose import candidates, write_sheet
-    from schemas.decide import decide_person
+    from schemas.decisions.candidates import candidates, write_sheet
+    from schemas.decisions.review_decisions import decide_person
 
     schemas.activate(methods=False)
     if reason is not None or usable:
@@ -75,7 +75,7 @@ def choose(
 
 
 def _decide_usable(video_id: int, reason: str | None, note: str) -> None:
-    from schemas.decide import mark_not_usable, take_back
+    from schemas.decisions.review_decisions import mark_not_usable, take_back
 
     who = getpass.getuser()
     if reason is None:

@@ -83,8 +83,8 @@ def init() -> None:
     Example: pbl db init
     """
     from schemas import store
-    from schemas.declare import declare_all
     from schemas.operations import catalog
+    from schemas.operations.declare import declare_all
 
     if not _uses_external():
         from schemas.operations import embedded

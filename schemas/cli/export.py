@@ -90,20 +90,12 @@ def export(
         raise _usage("--attitude or --marker-set without FILES", "them with FILES: the tables have the log")
     options = ExportOptions(name, number_trials, not markers_only, allow_failed, overwrite)
     check_export(formats, out, options)
+    named = {"subject": subject, "session_label": label, "fit_method": fit_method, "fit_set_kind": fit_set_kind}
+    wanted = {column: value for column, value in named.items() if value is not None}
     if many:
-        _write_many(
-            {"subject": subject, "fit_method": fit_method, "fit_set_kind": fit_set_kind},
-            slice_name,
-            formats,
-            out,
-            options,
-        )
+        _write_many(wanted, slice_name, formats, out, options)
         return
-    if files:
-        visit = _of_files(files, formats, attitude, marker_set)
-    else:
-        wanted = {"subject": subject, "session_label": label, "fit_method": fit_method, "fit_set_kind": fit_set_kind}
-        visit = _of_tables(wanted, formats)
+    visit = _of_files(files, formats, attitude, marker_set) if files else _of_tables(wanted, formats)
     for path in write_export(visit, formats, out, options):
         click.echo(path)
 
@@ -132,22 +124,17 @@ def _of_files(
     return visit
 
 
-def _of_tables(restriction: dict[str, str | None], formats: tuple[str, ...]) -> Visit:
+def _of_tables(wanted: dict[str, str], formats: tuple[str, ...]) -> Visit:
     import schemas
     from pbl_pipeline.export import GAIT_FORMATS
     from schemas.reading import fitted_visit
 
     schemas.activate(methods=False)
-    wanted = {k: v for k, v in restriction.items() if v is not None}
     return fitted_visit(wanted, gait=bool(GAIT_FORMATS & set(formats)))
 
 
 def _write_many(
-    restriction: dict[str, str | None],
-    slice_name: str | None,
-    formats: tuple[str, ...],
-    out: Path,
-    options: ExportOptions,
+    wanted: dict[str, str], slice_name: str | None, formats: tuple[str, ...], out: Path, options: ExportOptions
 ) -> None:
     """Each visit into its folder; those that cannot be exported are named at the end of their line."""
     import schemas
@@ -156,7 +143,7 @@ def _write_many(
     from schemas.reading import list_fitted, load_visits
 
     schemas.activate(methods=False)
-    visits = list_fitted({k: v for k, v in restriction.items() if v is not None}, slice_name)
+    visits = list_fitted(wanted, slice_name)
     gait = bool(GAIT_FORMATS & set(formats))
     refused = 0
     with progress.bar("export", len(visits), "visit") as update:

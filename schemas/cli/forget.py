@@ -28,7 +28,7 @@ def forget(subject: str, yes: bool, videos: bool) -> None:
     Example: pbl forget P017 --yes --videos
     """
     import schemas
-    from schemas import archive
+    from schemas.operations import archive
     from schemas.operations import forget as lib
 
     schemas.activate(methods=False)

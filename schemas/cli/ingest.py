@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from schemas.intake import Methods, Registered, Sensors, Visit
+    from schemas.intake import Methods, Registered, Sensors, VisitRecord
 
 
 #: Options that name methods -> field of `Methods`.
@@ -206,14 +206,14 @@ def _sheet(sheet: Path, methods: Methods, dry_run: bool) -> None:
 
 def _visits(
     paths: tuple[Path, ...], name_pattern: str | None, stated: dict[str, Any]
-) -> tuple[list[tuple[int, Visit]], list[Registered]]:
+) -> tuple[list[tuple[int, VisitRecord]], list[Registered]]:
     """(position of a file, its visit), and the files whose name does not fit the pattern.
 
     Raises `PblError` USAGE for an invalid pattern; `click.UsageError` where it and an option state the same, or neither
     states the subject.
     """
     from pbl_pipeline.errors import PblError
-    from schemas.intake import Registered, Visit
+    from schemas.intake import Registered, VisitRecord
     from schemas.intake.name_pattern import compiled, read_name
 
     pattern = compiled(name_pattern) if name_pattern is not None else None
@@ -230,7 +230,7 @@ def _visits(
         said: dict[str, Any] = {"session_label" if k == "session" else k: text for k, text in said.items()}
         if "subject" not in said | stated:
             raise click.UsageError("Missing option '--subject' (or a group 'subject' in --name-pattern).")
-        visits.append((i, Visit(**stated, **said)))
+        visits.append((i, VisitRecord(**stated, **said)))
     return visits, refused
 
 

@@ -79,17 +79,19 @@ def looks(as_json: bool, as_csv: bool, **restriction: str | None) -> None:
 @_options(click.option("--stage", metavar="NAME", help="Of this stage, such as keypoint, fit or gait."))
 def methods(as_json: bool, as_csv: bool, stage: str | None) -> None:
     """The methods by stage. Where a method is asked for, its key or its name is taken; a name is its newest version."""
-    from schemas import activate, listing
+    from schemas import activate
+    from schemas.reading import registered
 
     activate()
-    _show(listing.method_rows(stage), as_json, as_csv)
+    _show(registered.method_rows(stage), as_json, as_csv)
 
 
 def _print(what: str, restriction: dict[str, str | None], as_json: bool, as_csv: bool) -> None:
-    from schemas import activate, listing
+    from schemas import activate
+    from schemas.reading import registered
 
     activate(methods=False)
-    _show(getattr(listing, what)({k: v for k, v in restriction.items() if v is not None}), as_json, as_csv)
+    _show(getattr(registered, what)({k: v for k, v in restriction.items() if v is not None}), as_json, as_csv)
 
 
 def _show(rows: pd.DataFrame, as_json: bool, as_csv: bool) -> None:

@@ -19,12 +19,10 @@ def list_sets() -> None:
     """The sets in the database, those that ship with the code among them; without a database those alone."""
     from pbl_pipeline.errors import PblError
     from pbl_pipeline.gait import load_norm, norm_names
+    from schemas import activate, gdi
 
     try:
-        import schemas
-        from schemas import gdi
-
-        schemas.activate()
+        activate()
         rows = gdi.NormativeSet.proj(
             "norm_n", "norm_variables", "norm_components", "norm_angle_model", "norm_query"
         ).to_dicts(order_by="norm_name, norm_version")
@@ -32,17 +30,7 @@ def list_sets() -> None:
         if not error.code.startswith("DB_"):
             raise
         click.echo(f"no database ({error.code}): the sets that ship", err=True)
-        rows = [
-            {
-                "norm": f"{s.name}-v{s.version}",
-                "norm_n": s.n,
-                "norm_variables": s.variables,
-                "norm_components": len(s.components),
-                "norm_angle_model": s.angle_model,
-                "norm_query": None,
-            }
-            for s in map(load_norm, norm_names())
-        ]
+        rows = [{**gdi.norm_row(load_norm(name)), "norm_query": None} for name in norm_names()]
     click.echo(f"{'set':<34}{'vectors':>8}{'angles':>8}{'components':>12}  {'definition':<14}from")
     for r in rows:
         origin = "ships with the code" if r["norm_query"] is None else f"{len(r['norm_query']['subjects'])} people here"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from schemas.status import Status
+    from schemas.reading.status import Status
 
 
 @click.command()
@@ -22,7 +22,7 @@ def status(exact: bool, as_json: bool) -> None:
     Example: pbl status --json > status.json
     """
     import schemas
-    from schemas.status import pipeline_status
+    from schemas.reading.status import pipeline_status
 
     schemas.activate(methods=False)
     state = pipeline_status(exact or None)
@@ -35,7 +35,7 @@ def status(exact: bool, as_json: bool) -> None:
 
 def lines(state: Status) -> list[str]:
     """The printed form."""
-    from schemas.status import span
+    from schemas.reading.status import span
 
     out = [f"{state.videos} videos", ""]
     out.append(

@@ -127,7 +127,7 @@ def _show(frame: pd.DataFrame, where: Sequence[str], out: Path | None, in_databa
     chosen.to_csv(out / "errors.csv", index=False)
     click.echo(f"tables, and the errors they are made from (errors.csv): {out}")
     if in_database:
-        from schemas.views import validation_curves
+        from schemas.reading.frames import validation_curves
 
         curves = validation_curves(chosen)
         n = len(curves[["trial", "cycle"]].drop_duplicates())
@@ -196,7 +196,7 @@ def add(
 
 def _of_database() -> pd.DataFrame:
     import schemas
-    from schemas.views import validation_frame
+    from schemas.reading.frames import validation_frame
 
     schemas.activate(methods=False)
     return validation_frame()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from schemas.why import Step
+    from schemas.reading.why import Step
 
 
 @click.command()
@@ -21,7 +21,7 @@ def why(video_id: int, as_json: bool) -> None:
     Example: pbl why 17
     """
     import schemas
-    from schemas.why import why as look
+    from schemas.reading.why import why as look
 
     schemas.activate(methods=False)
     found = look(video_id)

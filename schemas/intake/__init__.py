@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .markers import LaboratoryMarkers
-from .records import Methods, Recording, Registered, Visit
+from .records import Methods, Recording, Registered, VisitRecord
 from .registration import register
 from .rigs import SeveralCameras
 from .sensors import Sensors
@@ -17,7 +17,7 @@ __all__ = [
     "Registered",
     "Sensors",
     "SeveralCameras",
-    "Visit",
+    "VisitRecord",
     "ingest",
     "register",
 ]

@@ -15,7 +15,7 @@ from pbl_pipeline.names import check_label
 from .. import fit, video
 from ..method_rows import method_row
 from ..stored_files import new_folder
-from .records import File, Methods, Recording, Visit, check_path, usage
+from .records import File, Methods, Recording, VisitRecord, check_path, usage
 
 if TYPE_CHECKING:
     from pbl_pipeline.body import MarkerSet
@@ -31,7 +31,7 @@ class LaboratoryMarkers(Recording):
     """
 
     path: Path
-    visit: Visit
+    visit: VisitRecord
     marker_set: str | None = None  # name of a shipped set, or path of a custom table (.csv); needed for .trc
     up: str = "y"  # vertical axis of .trc files, "y" or "z"
     markers: ClassVar[bool] = True

@@ -14,15 +14,15 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 
 from .. import fit, gait, gdi, keypoints, lab, session, video, worker
-from ..archive import LOCK, archive_dir, folder_of, plain_name
-from ..codes import check_subject
 from ..datajoint_setup import dj
-from ..folders import private_folder, remove_empty, sync_folders
 from ..jobs import forget_errors
+from ..operations.archive import LOCK, archive_dir, folder_of, plain_name
+from ..operations.folders import private_folder, remove_empty, sync_folders
 from ..rows import delete_below
+from ..subject_codes import check_subject
 from ..transactions import in_transaction
 from ..video import unknown_video
-from .records import Visit
+from .records import VisitRecord
 from .rigs import check_same_number
 from .visits import session_ids
 
@@ -107,7 +107,7 @@ def carry_out(plan: Move) -> None:
         again = plan_move(plan.video_id, *plan.after)
         old = int((video.Video & {"video_id": plan.video_id}).fetch1("session_id"))
         delete_below(fit.FitSet, again.sets)
-        (new,) = session_ids([Visit(*plan.after)]).values()
+        (new,) = session_ids([VisitRecord(*plan.after)]).values()
         for number, path in paths.items():
             video.Video.update1({"video_id": number, "session_id": new, "video_path": str(path)})
         points = keypoints.KeypointSelection & of_these

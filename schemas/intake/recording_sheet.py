@@ -8,12 +8,12 @@ from pathlib import Path
 from pbl_pipeline.progress import track
 
 from .. import lab, session
-from ..codes import day_of
 from ..rows import inside
+from ..subject_codes import day_of
 from ..transactions import in_transaction
 from ..video import CAMERA_MOTIONS
 from .plans import resolve
-from .records import Methods, Visit
+from .records import Methods, VisitRecord
 from .registration import check_owner, registered, write
 from .sensors import Sensors
 from .sheets import (
@@ -102,7 +102,7 @@ def _rows(path: Path) -> list[Row]:
     return rows
 
 
-def _visit(row: Row, line: Line, folder: Path) -> Visit | None:
+def _visit(row: Row, line: Line, folder: Path) -> VisitRecord | None:
     """Return the visit that a row states; None where it is refused."""
     with line.about():
         needed(row, "file")
@@ -112,7 +112,7 @@ def _visit(row: Row, line: Line, folder: Path) -> Visit | None:
             raise refused(row.where, f"camera_motion {motion!r}", f"one of {', '.join(CAMERA_MOTIONS)}", "correct it")
         if person is not None and not (person.isdecimal() and 1 <= int(person) < 1000):
             raise refused(row.where, f"person {person!r}", "the number of a person, from 1", "correct it")
-        visit = Visit(
+        visit = VisitRecord(
             subject=needed(row, "subject"),
             session_label=needed(row, "visit"),
             project=cells.get("project"),
@@ -134,7 +134,7 @@ def _visit(row: Row, line: Line, folder: Path) -> Visit | None:
     return None
 
 
-def _check_people(visits: Sequence[Visit | None], lines: Sequence[Line]) -> None:
+def _check_people(visits: Sequence[VisitRecord | None], lines: Sequence[Line]) -> None:
     """Refuse rows that cannot all be true: one label for two days, one person in two groups or under two codes."""
     codes = {visit.subject for visit in visits if visit is not None}
     stored = (session.Session & inside("subject", codes)).to_dicts()
@@ -165,7 +165,7 @@ def _check_people(visits: Sequence[Visit | None], lines: Sequence[Line]) -> None
                     check_same(first.setdefault(of, value), value, what, whose, _ONE_VISIT)
 
 
-def _recording(row: Row, visit: Visit, folder: Path) -> OneCamera:
+def _recording(row: Row, visit: VisitRecord, folder: Path) -> OneCamera:
     log = row.cells.get("attitude")
     return OneCamera(folder / row.cells["file"], visit, Sensors(attitude=folder / log if log else None))
 

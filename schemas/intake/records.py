@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_height, check_label, is_plain
 
-from ..codes import check_subject
 from ..session import UNLABELLED
+from ..subject_codes import check_subject
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Methods:
 
 
 @dataclasses.dataclass(frozen=True)
-class Visit:
+class VisitRecord:
     """What is stated of a recording and its visit. None: the subject's and the visit's columns are left as they are."""
 
     subject: str
@@ -103,7 +103,7 @@ class Recording:
     `register` calls the methods in the order in which they stand here. One that does not apply to a kind does nothing.
     """
 
-    visit: Visit
+    visit: VisitRecord
     files: tuple[File, ...] = ()  # what `read` read
     markers: ClassVar[bool] = False  # whether it goes straight to the fit, without tracking and keypoints
 
@@ -118,7 +118,7 @@ class Recording:
         raise NotImplementedError
 
     def check(self, methods: Methods) -> None:
-        """Raise what `Visit.check` raises, and `PblError` USAGE for what does not apply to this kind of recording."""
+        """Raise what `VisitRecord.check` raises; `PblError` USAGE for what does not apply to this kind of recording."""
         self.visit.check()
 
     def read(self) -> None:

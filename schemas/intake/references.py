@@ -223,7 +223,7 @@ def add_trial(
         )
     (row,) = rows
     said = origin or f"fit of video_id {trial}, set {row['fit_set']}, {row['fit_method']}"
-    with stored_file(fit.SessionFit(), file_ref(row["trial_file"])) as path:
+    with stored_file(file_ref(row["trial_file"])) as path:
         return add_reference(about, path, dataset, origin=said, shift_s=shift_s)
 
 

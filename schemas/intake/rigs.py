@@ -17,7 +17,7 @@ from ..rows import utc_now
 from ..stored_files import new_folder
 from ..transactions import next_id
 from .calibrations import camera_row
-from .records import File, Methods, Recording, RefusedFile, Visit, usage
+from .records import File, Methods, Recording, RefusedFile, VisitRecord, usage
 
 
 @dataclasses.dataclass
@@ -31,7 +31,7 @@ class SeveralCameras(Recording):
 
     videos: Sequence[Path]
     calibration: Path
-    visit: Visit
+    visit: VisitRecord
     motion: ClassVar[str] = video.ONE_OF_SEVERAL  # type: ignore[misc]
     rig: dict[str, Any] = dataclasses.field(default_factory=dict, init=False)  # columns of Rig
     seen_by: list[str] = dataclasses.field(default_factory=list, init=False)  # the camera of each video

@@ -18,7 +18,7 @@ from typing import Any
 from pbl_pipeline.bounded import MAX_ROWS, MIB, opened_zip, read_bytes
 from pbl_pipeline.errors import PblError
 
-from ..codes import folded
+from ..subject_codes import folded
 
 #: Bytes of a sheet, and of all parts of a workbook unpacked.
 _MAX_BYTES, _MAX_UNPACKED = 32 * MIB, 128 * MIB

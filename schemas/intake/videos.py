@@ -13,7 +13,7 @@ from .. import fit, video
 from ..jobs import forget_errors
 from ..transactions import in_transaction
 from .calibrations import camera_id_of, camera_row, known_camera
-from .records import File, Methods, Recording, Registered, Visit, usage
+from .records import File, Methods, Recording, Registered, VisitRecord, usage
 from .registration import register
 from .sensors import NONE, Sensors, attach, delete_keypoints
 
@@ -23,15 +23,11 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass
 class OneCamera(Recording):
-    """A video of one camera, with the files that its phone or the person's sensors recorded beside it.
-
-    `file`: where its bytes are known, as in an archive; the video is not opened then.
-    """
+    """A video of one camera, with the files that its phone or the person's sensors recorded beside it."""
 
     path: Path
-    visit: Visit
+    visit: VisitRecord
     sensors: Sensors = dataclasses.field(default_factory=Sensors)
-    file: File | None = None
     log: PhoneLog | None = dataclasses.field(default=None, init=False)
 
     @property
@@ -43,7 +39,7 @@ class OneCamera(Recording):
         return self.visit.camera_motion or ("handheld" if self.sensors.has_log else "static")
 
     def read(self) -> None:
-        self.files = (self.file or File.of(*self.paths),)  # no picture is decoded
+        self.files = (File.of(*self.paths),)  # no picture is decoded
         self.log = self.sensors.read()
 
     def check_known(self, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -116,7 +112,7 @@ def _camera(camera_file: str | Path, path: Path) -> dict[str, Any] | None:
 
 
 def ingest(
-    paths: Sequence[str | Path], visit: Visit, methods: Methods | None = None, files: Sequence[Sensors] = ()
+    paths: Sequence[str | Path], visit: VisitRecord, methods: Methods | None = None, files: Sequence[Sensors] = ()
 ) -> list[Registered]:
     """Register videos of one visit: `register` for a list of paths. At most one picture of each is decoded.
 

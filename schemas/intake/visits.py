@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from .. import fit, lab, session
-from ..codes import day_of
 from ..rows import counted, delete_below, inside, number, utc_now
+from ..subject_codes import day_of
 from ..transactions import next_id
-from .records import Visit
+from .records import VisitRecord
 
 
-def session_ids(visits: Iterable[Visit]) -> dict[tuple[str, str], int]:
+def session_ids(visits: Iterable[VisitRecord]) -> dict[tuple[str, str], int]:
     """Return the number of the session of each visit, by subject and label; people and sessions are registered where
     they are new, and population, height and date are changed where they are stated. Call it in a transaction.
     """
@@ -42,7 +42,7 @@ def session_ids(visits: Iterable[Visit]) -> dict[tuple[str, str], int]:
     return {key: numbers[key] for key in keys}
 
 
-def add_people(visits: Iterable[Visit]) -> None:
+def add_people(visits: Iterable[VisitRecord]) -> None:
     """Register the people of visits with their projects; change population and height where they are stated."""
     visits = list(visits)
     codes = list(dict.fromkeys(v.subject for v in visits))

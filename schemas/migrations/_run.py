@@ -17,8 +17,8 @@ from pbl_pipeline.errors import PblError
 from schemas import connection
 from schemas.chain import tables
 from schemas.datajoint_setup import dj, read_heading_again
-from schemas.declare import declare_all
 from schemas.operations import catalog
+from schemas.operations.declare import declare_all
 from schemas.rows import utc_now
 from schemas.stages import STAGES, modules
 

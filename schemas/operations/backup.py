@@ -17,7 +17,7 @@ import datetime
 import gzip
 import hashlib
 import json
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -27,8 +27,8 @@ import pymysql
 from pbl_pipeline import __version__, progress
 from pbl_pipeline.errors import PblError
 from schemas import connection
-from schemas.folders import make_private, private_folder
-from schemas.json_files import write_json
+from schemas.operations.folders import make_private, private_folder
+from schemas.operations.json_files import write_json
 from schemas.store import store_error
 
 from . import backup_files, catalog, dump
@@ -91,7 +91,13 @@ def backup(
         with closing(connection.plain_connection(conv={})) as server:
             version = _snapshot(server)
             tables = catalog.tables()
-            _check_some(tables, prefix)
+            if not tables:
+                raise PblError(
+                    "DB_NOT_FOUND",
+                    found=f"no table under {prefix}_*",
+                    expected="a database with tables",
+                    next_step="check PBL_DB_PREFIX and DJ_HOST, or: pbl db init",
+                )
             say(f"Saving {len(tables)} tables of {prefix}_* into {folder}")
             rows, files = _save_tables(server, tables, folder / "database.sql.gz")
             videos = _videos(server, prefix) if with_recordings else []
@@ -367,16 +373,6 @@ def _new_folder(folder: Path) -> None:
             found="a folder with something in it",
             expected="a new or empty folder: no backup is ever written over another",
             next_step="name another folder, such as one with today's date",
-        )
-
-
-def _check_some(tables: Collection[Any], prefix: str) -> None:
-    if not tables:
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=f"no table under {prefix}_*",
-            expected="a database with tables",
-            next_step="check PBL_DB_PREFIX and DJ_HOST, or: pbl db init",
         )
 
 

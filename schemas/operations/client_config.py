@@ -8,8 +8,8 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 from schemas import connection
 from schemas.datajoint_setup import dj
-from schemas.folders import private_folder
-from schemas.json_files import write_json, write_text
+from schemas.operations.folders import private_folder
+from schemas.operations.json_files import write_json, write_text
 
 #: Names that DataJoint looks for, in the working directory and above it.
 CONFIG, SECRETS = "datajoint.json", ".secrets"

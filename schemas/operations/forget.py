@@ -20,13 +20,14 @@ from typing import Any
 
 from pbl_pipeline import progress, settings
 from pbl_pipeline.errors import PblError
-from schemas import archive, connection, fit, lab, session, video, worker
-from schemas.codes import check_subject
+from schemas import connection, fit, lab, session, video, worker
 from schemas.datajoint_setup import full_path
-from schemas.folders import remove_empty
-from schemas.json_files import write_json
+from schemas.operations import archive
+from schemas.operations.folders import remove_empty
+from schemas.operations.json_files import write_json
 from schemas.rows import delete_below
 from schemas.store import files_below, purge, store_error
+from schemas.subject_codes import check_subject
 
 from . import catalog
 from .catalog import Column, quote
@@ -208,7 +209,9 @@ def _find(ids: Ids, earlier: dict[str, Any], recordings: list[str]) -> Found:
         if table.startswith("~~"):
             held = conn.query(f"SELECT host, pid FROM {name} WHERE ({where}) AND status = 'reserved'", args=values)  # noqa: S608
             running += [f"{table.removeprefix('~~')} on {host}, process {pid}" for host, pid in held.fetchall()]
-    files.update(_without_row(ids))
+    # All files in the person's folders: a computation that was killed leaves some without a row.
+    store = connection.store_backend()
+    files.update(path for folder in _folders(ids) for path in files_below(store, folder))
     files.update(path for path in earlier.get("files", []) if path not in files and _exists(path))
     return Found(rows, sorted(files), _videos(ids, earlier), running, recordings)
 
@@ -231,17 +234,11 @@ def _whose(columns: Sequence[Column], ids: Ids) -> tuple[str, tuple]:
     return " OR ".join(parts), tuple(values)
 
 
-def _without_row(ids: Ids) -> list[str]:
-    """Return all files in the person's folders of the store: a computation that was killed leaves some without a row.
+def _folders(ids: Ids) -> list[str]:
+    """Return the person's folders of the store.
 
     A path is `_schema/<schema>/<table>/<key>=<value>/...`, the key in the order of the table.
     """
-    store = connection.store_backend()
-    return [path for folder in _folders(ids) for path in files_below(store, folder)]
-
-
-def _folders(ids: Ids) -> list[str]:
-    """Return the person's folders of the store."""
     root = connection.store_root()
     return [
         f"{root}/{schema}/{table}/{name}={value}"

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from schemas import archive, video
-from schemas.archive import archive_dir
+from schemas import video
 from schemas.intake.uploads import Bucket, Folder, Upload, drop_folder
+from schemas.operations import archive
+from schemas.operations.archive import archive_dir
 from schemas.stored_files import remove_left_folders
 
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from .. import fit, gait, gdi, keypoints, tracking, video
 from ..checks import check_values
-from ..rows import Rows, number, row_of, stored_rows
+from ..gait import load_cycles, load_events
+from ..rows import Rows, or_nan, row_of, stored_rows
 from ..stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -28,8 +29,8 @@ def videos_of(key: Mapping[str, Any], rows: Rows = stored_rows) -> list[int]:
 
 
 def _of(table: Any, key: Mapping[str, Any]) -> dict[str, Any]:
-    """What of a key belongs to a table."""
-    return {name: key[name] for name in table.primary_key if name in key}
+    """Return what of a key belongs to a table."""
+    return {name: key[name] for name in table.primary_key}
 
 
 def load_keypoints(key: Any, rows: Rows = stored_rows) -> Keypoints:
@@ -37,7 +38,7 @@ def load_keypoints(key: Any, rows: Rows = stored_rows) -> Keypoints:
     from pbl_pipeline.keypoints import Keypoints
 
     ref = file_ref(row_of(keypoints.Keypoints, _keys(key), rows)["keypoints_file"])
-    with stored_file(keypoints.Keypoints(), ref) as path:
+    with stored_file(ref) as path:
         return Keypoints.load(path)
 
 
@@ -46,7 +47,7 @@ def load_trial_fit(key: Any, rows: Rows = stored_rows) -> TrialFit:
     from pbl_pipeline.fit import TrialFit
 
     ref = file_ref(row_of(fit.SessionFit.Trial, _keys(key), rows)["trial_file"])
-    with stored_file(fit.SessionFit(), ref) as path:
+    with stored_file(ref) as path:
         return TrialFit.load(path)
 
 
@@ -60,7 +61,7 @@ def load_solution(key: Mapping[str, Any], rows: Rows = stored_rows) -> Solution:
     from pbl_pipeline.visit import Solution
 
     row = row_of(fit.SessionFit, key, rows)
-    with stored_file(fit.SessionFit(), file_ref(row["session_file"])) as path, np.load(path, allow_pickle=False) as f:
+    with stored_file(file_ref(row["session_file"])) as path, np.load(path, allow_pickle=False) as f:
         scale, trace = f["scale"], f["loss_trace"]
     return Solution(
         solver=row["solver"],
@@ -86,7 +87,7 @@ def load_tracking(key: Any) -> tracking_lib.Tracking:
     """The library's `Tracking` of one row."""
     row = (tracking.Tracking & key).fetch1()
     size = (video.VideoInfo & {"video_id": row["video_id"]}).fetch1("width", "height")
-    with stored_file(tracking.Tracking(), file_ref(row["tracks"])) as path:
+    with stored_file(file_ref(row["tracks"])) as path:
         return tracking.load_tracking(path, (int(size[0]), int(size[1])), row["detector"], row["tracking_model_sha256"])
 
 
@@ -94,26 +95,15 @@ def load_choice(row: Mapping[str, Any]) -> tracking_lib.SubjectChoice:
     """The library's `SubjectChoice` of a row."""
     from pbl_pipeline.tracking import SubjectChoice
 
-    nan = float("nan")
     return SubjectChoice(
         status=row["choice_status"],
         person_id=None if row["chosen_person_id"] is None else int(row["chosen_person_id"]),
-        score=nan if row["choice_score"] is None else float(row["choice_score"]),
+        score=or_nan(row["choice_score"]),
         runner_up_id=None if row["runner_up_id"] is None else int(row["runner_up_id"]),
-        runner_up_score=nan if row["runner_up_score"] is None else float(row["runner_up_score"]),
-        scores={int(k): nan if v is None else float(v) for k, v in row["choice_scores"].items()},
+        runner_up_score=or_nan(row["runner_up_score"]),
+        scores={int(k): or_nan(v) for k, v in row["choice_scores"].items()},
         reason=row["choice_reason"],
     )
-
-
-def load_events(key: Any, rows: Rows = stored_rows) -> lib.GaitEvents:
-    """Return the library's `GaitEvents` that the cycles of a trial were made from: detected or corrected by hand."""
-    return gait.load_events(key, rows)
-
-
-def load_cycles(key: Any, trial: str, rows: Rows = stored_rows) -> tuple[lib.GaitCycle, ...]:
-    """The library's `GaitCycle`s of one row, with their curves."""
-    return tuple(gait.load_cycles(key, trial, rows))
 
 
 def _checks(rows: Sequence[Mapping[str, Any]], prefix: str) -> list[Check]:
@@ -142,13 +132,7 @@ def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
     checks = _checks(rows(gdi.SessionGdi.Check, row_key), "gdi")
     index = lib.Gdi(
         status="PASS" if row["session_gdi"] is not None else "EMPTY",
-        reason=row["session_gdi_reason"],
-        left=number(row["session_gdi_left"]),
-        right=number(row["session_gdi_right"]),
-        mean=number(row["session_gdi"]),
-        sd=number(row["session_gdi_sd"]),
-        minimal_change=number(row["session_gdi_minimal_change"]),
-        n=int(row["session_gdi_n"]),
+        **gdi.index_fields(row, "session_gdi"),
         n_left=sum(t.gdi.n_left for t in pooled),
         n_right=sum(t.gdi.n_right for t in pooled),
         norm=norm_name,
@@ -195,7 +179,7 @@ def _trial_metrics(key: Mapping[str, Any], rows: Rows) -> lib.TrialMetrics:
         n_cycles_used=int(counts["n_cycles_used"]),
         n_steps_used=int(row["n_steps_used"]),
     )
-    index, cycles = load_gdi(key, name, rows), load_cycles(of_trial, name, rows)
+    index, cycles = load_gdi(key, name, rows), tuple(load_cycles(of_trial, name, rows))
     reason = events.reason or measures.reason
     return lib.TrialMetrics(
         name=name,
@@ -229,13 +213,7 @@ def load_gdi(key: Any, trial: str, rows: Rows = stored_rows) -> lib.Gdi:
     )
     return lib.Gdi(
         status=row["gdi_status"],
-        reason=row["gdi_reason"],
-        left=number(row["gdi_left"]),
-        right=number(row["gdi_right"]),
-        mean=number(row["gdi"]),
-        sd=number(row["gdi_sd"]),
-        minimal_change=number(row["gdi_minimal_change"]),
-        n=int(row["gdi_n"]),
+        **gdi.index_fields(row, "gdi"),
         n_left=sum(c.side == "left" for c in cycles),
         n_right=sum(c.side == "right" for c in cycles),
         norm=norm_name,

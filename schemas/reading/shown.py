@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
-from .. import fit, gait, gdi, listing, qc, session, video
-from ..usable import Unusable, unusable
-from ..visit_list import Result, VisitRow, results_of, visits_of
-from ..why import why
+from .. import fit, gait, gdi, qc, session, video
+from ..decisions.not_usable import Unusable, unusable
+from . import registered
+from .visit_list import Result, VisitRow, results_of, visits_of
 from .visits import load_recording, load_visit
+from .why import why
 
 if TYPE_CHECKING:
     from pbl_pipeline.gait import Measure
@@ -227,7 +228,7 @@ def _recordings(session_id: int) -> tuple[Recording, ...]:
     from pbl_pipeline.gait import Condition
     from pbl_pipeline.visit import Recording
 
-    rows = listing.videos({"session_id": session_id}).to_dict("records")
+    rows = registered.videos({"session_id": session_id}).to_dict("records")
     marked = unusable(int(row["video_id"]) for row in rows)
     out = []
     for row in rows:

@@ -13,18 +13,18 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
 
 from .. import fit, gait, gdi, keypoints, session, tracking, video
-from ..archive import plain_name
 from ..chain import before
-from ..coded_errors import error_code, error_found
+from ..decisions.not_usable import unusable
+from ..gait import load_cycles
+from ..job_errors import error_code, error_found
 from ..jobs import jobs_of
 from ..method_names import with_keys
+from ..operations.archive import plain_name
 from ..rows import ReadAhead, Rows, inside, row_of, stored_rows
 from ..stored_files import file_ref, stored_file
 from ..studies.slices import chain_of
-from ..usable import unusable
 from .objects import (
     load_choice,
-    load_cycles,
     load_fit_checks,
     load_keypoints,
     load_metrics,
@@ -82,7 +82,7 @@ def load_visit(restriction: Any, *, measures: bool = True) -> Visit:
     Parameters
     ----------
     restriction
-        What picks one session and, where several methods were used, one chain of methods: a dict such as
+        Restriction to one session and, where several methods were used, one chain of methods: a dict such as
         `{"subject": "P017", "session_label": "2026-03-01", "fit_method": "paper-2025"}`; `fit_set_kind` where it has
         recordings of one camera, of several, or markers.
     measures
@@ -203,11 +203,8 @@ def load_recording(video_id: int) -> Recording:
 
     They may be there before the measures are. Raises `PblError` DB_NOT_FOUND for an unknown number.
     """
-    found = stored_rows(video.Video, {"video_id": video_id})
-    if not found:
-        raise video.unknown_video(video_id)
-    key = fit.trial_key(video_id)
-    recording = _recording(found[0], key, stored_rows)
+    row, key = video.registered_video(video_id), fit.trial_key(video_id)
+    recording = _recording(row, key, stored_rows)
     events = None if key is None else gait.newest_events(key)
     if events is None:
         return recording
@@ -306,7 +303,7 @@ def _log_of(number: int, points: Mapping[str, Any], rows: Rows) -> tuple[PhoneLo
     stored = rows(video.PhoneAttitude, {"video_id": number})
     if not stored:
         return None
-    with stored_file(video.PhoneAttitude(), file_ref(stored[0]["attitude_file"])) as path:
+    with stored_file(file_ref(stored[0]["attitude_file"])) as path:
         log = read_phone_log(path)
     return log, log_shift_s(log, load_keypoints(points, rows), f"video {number}")
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label, is_plain
 from pbl_pipeline.words import unit_of
@@ -17,10 +18,10 @@ from pbl_pipeline.words import unit_of
 from .. import fit, gait, gdi, lab, session, study, video
 from ..datajoint_setup import dj
 from ..method_names import with_keys
+from ..reading.frames import cycle_rows, frame_of, newest_sets
 from ..rows import inside, utc_now
 from ..stored_files import file_ref, stored_file
 from ..transactions import in_transaction
-from ..views import cycle_rows, frame_of, newest_sets
 
 if TYPE_CHECKING:
     from pbl_pipeline.study import StudyData
@@ -98,7 +99,7 @@ def freeze(
                 "slice_roles": list(roles),
                 "slice_n": len(rows),
                 "slice_hash": digest,
-                "slice_code_version": _version(),
+                "slice_code_version": code_version()[:64],
                 "slice_created": utc_now(),
             }
         )
@@ -410,7 +411,7 @@ def _curves(rows: Any, about: Mapping[str, Any]) -> Any:
         sides = used[r["fit_set"], number]
         if not sides or not done[number].pooled(pace):
             continue
-        with stored_file(gait.GaitCycle(), file_ref(r["curves"])) as path:
+        with stored_file(file_ref(r["curves"])) as path:
             by_cycle = gait.load_curves(path)
         for n, side in sides.items():
             for angle, curve in by_cycle[n].deg.items():
@@ -448,12 +449,6 @@ def _text(value: Any) -> str:
 
 def _digest(texts: Any) -> str:
     return hashlib.sha256("\n".join(sorted(texts)).encode()).hexdigest()[:16]
-
-
-def _version() -> str:
-    from pbl_pipeline.code_version import code_version
-
-    return code_version()[:64]
 
 
 def _usage(found: str, expected: str) -> PblError:

@@ -15,9 +15,8 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 
 from .. import lab, session, study, video
-from ..codes import check_subject, day_of
 from ..intake.conditions import set_condition
-from ..intake.records import Visit
+from ..intake.records import VisitRecord
 from ..intake.sheets import (
     Imported,
     Line,
@@ -34,6 +33,7 @@ from ..intake.sheets import (
 )
 from ..intake.visits import add_people, session_ids
 from ..rows import inside
+from ..subject_codes import check_subject, day_of
 from ..transactions import in_transaction
 
 #: Column of a sheet -> column of `study.Visit`.
@@ -390,9 +390,9 @@ class _Plan:
     # -------------------------------------------------------------------------------------------------------- applying
     def apply(self) -> None:
         """Write what `_compare` has left. Inside a transaction."""
-        add_people(Visit(code, population=s.values.get("population")) for code, s in self.people.items())
+        add_people(VisitRecord(code, population=s.values.get("population")) for code, s in self.people.items())
         numbers = {key: int(r["session_id"]) for key, r in self.registered.items()} | session_ids(
-            Visit(*key, date=s.values.get("session_date")) for key, s in self.sessions.items()
+            VisitRecord(*key, date=s.values.get("session_date")) for key, s in self.sessions.items()
         )
         blank = {column: _default(column) for column in VISIT_COLUMNS.values()}
         visits = {key: ({"session_id": numbers[key]}, s.values) for key, s in self.visits.items()}

@@ -14,8 +14,8 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 
 from .. import session, study
-from ..decide import decisions, record
-from ..intake.sheets import Line, Row, Sheet, refused
+from ..decisions.review_decisions import decisions, record
+from ..intake.sheets import Row, Sheet, refused
 from ..transactions import in_transaction
 from .study_sheets import CLEAR, SCORE_COLUMNS, import_rows
 
@@ -112,7 +112,7 @@ def _enter(session_id: int, values: Mapping[str, str], by: str, seen: str, reaso
     scores = Sheet("scores", SCORE_COLUMNS, tuple(r for n, r in rows.items() if n != ROLE))
     # Codes that are alike are a question to who registers people, not to who enters a score.
     found = import_rows([s for s in (roles, scores) if s.rows], dry_run=bool(errors), distinct_codes=True)
-    errors |= {line.where: error for line in found.lines if (error := _first(line)) is not None}
+    errors |= {line.where: line.errors[0] for line in found.lines if line.errors}
     if errors:
         return Entered((), errors)
     for name, text in changed.items():
@@ -142,10 +142,6 @@ def _stored(text: str, is_role: bool) -> Any:
     if not text:
         return None
     return text if is_role else float(text)
-
-
-def _first(line: Line) -> PblError | None:
-    return line.errors[0] if line.errors else None
 
 
 def _meanwhile(session_id: int) -> PblError:

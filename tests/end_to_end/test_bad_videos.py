@@ -17,7 +17,8 @@ import schemas
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait.events import load_events
 from pbl_pipeline.video import probe
-from schemas import fit, gait, gdi, keypoints, qc, tracking, video, views
+from schemas import fit, gait, gdi, keypoints, qc, tracking, video
+from schemas.reading import frames
 from tests.command import Done, pbl
 from tests.rows import remove_all
 from tests.videos import constant_rate, numbered_frames, write_video
@@ -134,7 +135,7 @@ def test_standing_is_fitted_and_has_no_gait(status):
     row = (gait.GaitEvents * name).fetch1()
     assert row["events_status"] == "EMPTY"
     assert "no walking" in row["events_reason"]
-    (visit,) = views.session_summary({"session_label": "stands"}).to_dict("records")
+    (visit,) = frames.session_summary({"session_label": "stands"}).to_dict("records")
     assert visit["session_status"] == "EMPTY"
     assert "no walking" in visit["session_reason"]
     assert visit["qc_outcome"] == "EMPTY"

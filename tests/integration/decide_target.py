@@ -10,7 +10,7 @@ from pbl_pipeline.errors import PblError
 
 
 def decide(function: str, arguments: tuple[Any, ...], together: Barrier, answers: Any) -> None:
-    """Call a function of `schemas.decide` when all have come so far; its error's code, or "done", into `answers`."""
+    """Call a function of `schemas.decisions` when all have come so far; its error's code, or "done", into `answers`."""
     import importlib
 
     schemas.activate(methods=False)

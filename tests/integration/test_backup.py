@@ -17,10 +17,11 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection, gait, lab, load_visit, migrations, video, views
-from schemas.declare import declare_all
-from schemas.intake import Visit, ingest
+from schemas import connection, gait, lab, load_visit, migrations, video
+from schemas.intake import VisitRecord, ingest
 from schemas.operations import backup, backup_files, dump
+from schemas.operations.declare import declare_all
+from schemas.reading import frames
 from tests.command import pbl
 from tests.database import installation
 from tests.rows import everything, everything_but_refreshes, remove_all
@@ -40,7 +41,7 @@ def filled(database: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     chain.install(monkeypatch)
     declare_all()
     (tmp_path / "notes.mp4").write_text("not a video")
-    ingest([chain.small_video(tmp_path, "walk"), tmp_path / "notes.mp4"], Visit(subject="P001", project="gait"))
+    ingest([chain.small_video(tmp_path, "walk"), tmp_path / "notes.mp4"], VisitRecord(subject="P001", project="gait"))
     populate()
     lab.Project.update1({"project": "gait", "project_title": TITLE})
     lab.Subject.update1({"subject": "P001", "subject_height": HEIGHT})
@@ -87,7 +88,7 @@ def test_there_and_back(elsewhere: Any, tmp_path: Path, monkeypatch: pytest.Monk
     schemas.activate()
     assert lab.Subject.fetch1("subject_height") == HEIGHT
     assert lab.Project.fetch1("project_title") == TITLE
-    assert views.session_summary()["subject"].tolist() == ["P001"]
+    assert frames.session_summary()["subject"].tolist() == ["P001"]
     results = load_visit({"subject": "P001"})
     assert results.fitted
     assert np.isfinite(results.fitted[0].fit.qpos).any()

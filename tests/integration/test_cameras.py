@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from schemas import fit, keypoints, lab, video
-from schemas.intake import Visit, ingest
+from schemas.intake import VisitRecord, ingest
 from schemas.stored_files import file_ref, stored_file
 from tests.command import pbl
 from tests.integration import chain
@@ -61,7 +61,7 @@ def sources() -> dict[int, str]:
 
 def matrix_of(video_id: int) -> np.ndarray:
     ref = file_ref((keypoints.Keypoints & {"video_id": video_id}).fetch1("keypoints_file"))
-    with stored_file(keypoints.Keypoints(), ref) as path, np.load(path) as found:
+    with stored_file(ref) as path, np.load(path) as found:
         return found["camera_matrix"]
 
 
@@ -155,7 +155,7 @@ def test_another_rate_zoom_or_size_is_another_view(tmp_path: Path):
 
 def test_a_calibration_of_another_phone_is_refused(tmp_path: Path):
     path, file = recording(tmp_path, "pixel", PIXEL), calibration(tmp_path / "camera.json")
-    (result,) = ingest([path], Visit("P001", camera_file=file))
+    (result,) = ingest([path], VisitRecord("P001", camera_file=file))
     assert result.error is not None
     assert (result.error.code, result.status) == ("CAMERA_INVALID", "refused")
     assert not video.Video()

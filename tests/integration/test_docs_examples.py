@@ -19,7 +19,8 @@ from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.study import write_study
 from research.cohort import cohort
-from schemas import gdi, study, views
+from schemas import gdi, study
+from schemas.reading import frames
 from tests import pages
 from tests.command import pbl
 from tests.exported import marked_fit
@@ -71,7 +72,7 @@ def visit(tables: None, tmp_path: Path) -> dict[str, Any]:
     """A visit of one video, computed: its keys."""
     (number,) = register(small_video(tmp_path, "walk"), session_label="2026-03-01")
     populate()
-    return {"video_id": number, "session_id": int(views.session_summary()["session_id"].item())}
+    return {"video_id": number, "session_id": int(frames.session_summary()["session_id"].item())}
 
 
 @pytest.fixture
@@ -116,14 +117,14 @@ def test_results_by_kind_of_recording(visit: dict[str, Any]):
 
 @example("docs/study.md", 3)
 def test_the_phone_against_cameras(visit: dict[str, Any], monkeypatch: pytest.MonkeyPatch, capsys: Any):
-    one, rng = views.session_summary().iloc[0], np.random.default_rng(0)
+    one, rng = frames.session_summary().iloc[0], np.random.default_rng(0)
     index = rng.normal(90, 8, 6)
     rows = [
         {**one, "subject": f"P{i:03}", "fit_set_kind": kind, "session_gdi": index[i] + shift + rng.normal(0, 0.1)}
         for i in range(6)
         for kind, shift in (("single", -3.0), ("rig", 0.0))
     ]
-    monkeypatch.setattr(views, "session_summary", lambda: pd.DataFrame(rows))
+    monkeypatch.setattr(frames, "session_summary", lambda: pd.DataFrame(rows))
     names, _ = run("docs/study.md", 3)
     assert len(names["both"]) == 6
     difference = names["bland_altman"](names["both"]["single"], names["both"]["rig"]).bias.value

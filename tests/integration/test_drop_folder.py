@@ -16,9 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from schemas import archive as layout
 from schemas import connection, lab, session, video, worker
-from schemas.intake import Visit, ingest, uploads
+from schemas.intake import VisitRecord, ingest, uploads
+from schemas.operations import archive as layout
 from schemas.operations import backup, forget
 from schemas.stored_files import new_folder, remove_left_folders
 from tests.command import pbl
@@ -110,7 +110,7 @@ def test_thirty_kinds_of_hostile_entries_between_thirty_good_ones(
 ):
     """The real command: everything good is taken, everything else is named, in at most 1 GiB."""
     before = chain.small_video(tmp_path, "before", n=5)
-    ingest([before], Visit(subject="P099", session_label="first"))
+    ingest([before], VisitRecord(subject="P099", session_label="first"))
     outside = tmp_path / "outside"
     outside.mkdir()
     # The box that ends each is one that players skip.
@@ -311,7 +311,7 @@ def test_what_a_killed_import_left_goes_with_the_next_run_and_with_the_person(
 def test_the_proof_names_what_could_not_be_removed(drop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("PBL_INCOMING", str(drop))
     monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
-    ingest([upload(tmp_path, "walk.mp4")], Visit(subject="P017"))
+    ingest([upload(tmp_path, "walk.mp4")], VisitRecord(subject="P017"))
     (drop / "P017/1/deeper").mkdir(parents=True)
     done = pbl("forget", "P017", "--yes", "--videos")
     assert done.code == 1

@@ -16,7 +16,7 @@ from pbl_pipeline.body import marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit
 from schemas import fit, gait, gdi, session
-from schemas.intake import Methods, Sensors, Visit, ingest
+from schemas.intake import Methods, Sensors, VisitRecord, ingest
 from schemas.reading import fitted_visit, list_fitted, load_visits
 from schemas.reading import visits as reading_visits
 from tests.command import pbl
@@ -44,7 +44,7 @@ def test_a_visit_of_the_tables(tables: None, tmp_path: Path, monkeypatch: pytest
     pd.DataFrame(log).to_csv(tmp_path / "log.csv", index=False)
     paths = [chain.small_video(tmp_path, name) for name in ("Doe1", "Doe2")]
     for path, files in zip(paths, (Sensors(attitude=tmp_path / "log.csv"), Sensors()), strict=True):
-        assert ingest([path], Visit("P001", session_label="2026-03-01"), files=[files])[0].status == "registered"
+        assert ingest([path], VisitRecord("P001", session_label="2026-03-01"), files=[files])[0].status == "registered"
     with pytest.raises(PblError, match="no finished fit"):
         fitted_visit({"subject": "P001"})
     populate()
@@ -140,7 +140,7 @@ def test_visits_that_are_not_there_or_are_ambiguous(tables: None, tmp_path: Path
     assert pbl("export", "--slice", "paper", "--subject", "P001", *out).error_code == "USAGE"
     path = chain.small_video(tmp_path, "walk")
     for method in ("blazepose", "gauss-newton"):
-        ingest([path], Visit("P001"), methods=Methods(fit=method))
+        ingest([path], VisitRecord("P001"), methods=Methods(fit=method))
     populate()
     ambiguous = pbl("export", "--all", *out)
     assert ambiguous.error_code == "USAGE"

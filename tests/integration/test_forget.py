@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from schemas import connection, keypoints, lab, session, video
-from schemas.declare import declare_all
-from schemas.intake import Visit, ingest
+from schemas.intake import VisitRecord, ingest
 from schemas.operations import forget
+from schemas.operations.declare import declare_all
 from tests.command import pbl
 from tests.rows import everything_but_refreshes, register, remove_all
 from workers.populate import populate
@@ -42,7 +42,7 @@ def two(database: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iter
     declare_all()
     shutil.rmtree(Path(connection.store_backend().spec["location"]) / "_schema", ignore_errors=True)
     shared, own = camera(tmp_path, "shared", 900), camera(tmp_path, "own", 905)
-    ingest([chain.small_video(tmp_path, "other")], Visit(subject="P001", camera_file=shared))
+    ingest([chain.small_video(tmp_path, "other")], VisitRecord(subject="P001", camera_file=shared))
     populate()
     rows, files = everything_but_refreshes(), stored()
     videos = [chain.small_video(tmp_path, "walk"), chain.small_video(tmp_path, "waits", people="two alike")]
@@ -111,7 +111,7 @@ def test_nothing_of_the_person_is_left_and_nothing_else_is_touched(
     assert everything_but_refreshes() == rows
     # Where numbers are given anew (a database that was rebuilt), the next person keeps what is theirs.
     lab.Numbered.delete(prompt=False)
-    ingest([chain.small_video(tmp_path, "next")], Visit(subject="P018"))
+    ingest([chain.small_video(tmp_path, "next")], VisitRecord(subject="P018"))
     assert set(video.Video.to_arrays("video_id")) & set(proof["ids"]["video_id"])
     populate()
     theirs, their_files = everything_but_refreshes(), stored()
@@ -144,7 +144,7 @@ def test_broken_off_it_is_repeated_until_done(
     # The rows are gone and somebody else has the numbers by now: still the command knows what to remove, and what not.
     left = stored()
     lab.Numbered.delete(prompt=False)
-    ingest([chain.small_video(tmp_path, "next")], Visit(subject="P018"))
+    ingest([chain.small_video(tmp_path, "next")], VisitRecord(subject="P018"))
     video.VideoInfo.populate()
     theirs = stored() - left
     numbers = json.loads(forget.manifest_path("P017").read_text())["ids"]["video_id"]

@@ -21,10 +21,10 @@ from pbl_pipeline.video import read_phone_log
 from research.benchmarks import mutated_files as files
 from schemas import fit, video
 from schemas.chain import ON_REQUEST
-from schemas.coded_errors import error_next_step
-from schemas.intake import Visit, ingest
+from schemas.intake import VisitRecord, ingest
 from schemas.intake.references import add_reference
-from schemas.report import write_visit
+from schemas.job_errors import error_next_step
+from schemas.reading.report import write_visit
 from tests.command import pbl
 from workers.populate import populate
 
@@ -74,7 +74,7 @@ def test_names_go_through_tables_and_report_as_text(tables: None, tmp_path: Path
     bad = [folder / f"{name}.mp4" for name in REFUSED]
     for path in bad:
         path.write_bytes(os.urandom(64))
-    results = ingest([*paths, *bad], Visit(subject="P001", session_label="</title><script>1</script>"))
+    results = ingest([*paths, *bad], VisitRecord(subject="P001", session_label="</title><script>1</script>"))
     assert [r.status for r in results] == ["registered"] * len(paths) + ["refused"] * len(bad)
     assert sorted(video.Video.to_arrays("video_name")) == sorted(p.name for p in paths)
     for result in results[len(paths) :]:
@@ -113,7 +113,7 @@ def test_names_go_through_tables_and_report_as_text(tables: None, tmp_path: Path
 @pytest.mark.parametrize("field", ["session_label", "project", "activity", "population"])
 def test_labels_hold_no_control_characters(tmp_path: Path, field: str, label: str):
     with pytest.raises(PblError) as error:
-        ingest([tmp_path / "any.mp4"], dataclasses.replace(Visit(subject="P001"), **{field: label}))
+        ingest([tmp_path / "any.mp4"], dataclasses.replace(VisitRecord(subject="P001"), **{field: label}))
     assert error.value.code == "USAGE"
     assert str(error.value).replace("\n", "").isascii()
 

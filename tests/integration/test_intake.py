@@ -9,9 +9,9 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import sha256_of
+from research.benchmarks.many_recordings import archived, register_many
 from schemas import fit, gait, gdi, keypoints, lab, session, tracking, video
-from schemas.intake import LaboratoryMarkers, Methods, Recording, SeveralCameras, Visit, ingest, register
-from schemas.intake.bulk import archived, register_many
+from schemas.intake import LaboratoryMarkers, Methods, Recording, SeveralCameras, VisitRecord, ingest, register
 from schemas.intake.plans import resolve
 from schemas.intake.recording_sheet import ingest_sheet
 from tests.command import pbl
@@ -21,7 +21,7 @@ from . import chain, test_markers, test_rigs
 from .drop import look
 
 #: Registers the files for a visit; returns "registered", "known" or the code of the error.
-Adapter = Callable[[list[Path], Visit], str]
+Adapter = Callable[[list[Path], VisitRecord], str]
 
 
 def said(recordings: Sequence[Recording]) -> str:
@@ -30,17 +30,17 @@ def said(recordings: Sequence[Recording]) -> str:
     return found
 
 
-def by_ingest(paths: list[Path], visit: Visit) -> str:
+def by_ingest(paths: list[Path], visit: VisitRecord) -> str:
     (found,) = {r.error.code if r.error else r.status for r in ingest(paths, visit)}
     return found
 
 
-def by_command(paths: list[Path], visit: Visit) -> str:
+def by_command(paths: list[Path], visit: VisitRecord) -> str:
     done = pbl("ingest", *paths, "--subject", visit.subject, "--session", visit.session_label)
     return done.error_code or ("registered" if " registered (" in done.out else "known")
 
 
-def by_name(paths: list[Path], visit: Visit) -> str:
+def by_name(paths: list[Path], visit: VisitRecord) -> str:
     """The name of a copy states the person."""
     pattern, named = "(?P<subject>.*)=.*", [p.with_name(f"{visit.subject}={p.name}") for p in paths]
     for path, copy in zip(paths, named, strict=True):
@@ -49,7 +49,7 @@ def by_name(paths: list[Path], visit: Visit) -> str:
     return done.error_code or ("registered" if " registered (" in done.out else "known")
 
 
-def by_sheet(paths: list[Path], visit: Visit) -> str:
+def by_sheet(paths: list[Path], visit: VisitRecord) -> str:
     sheet = paths[0].parent / "visits.csv"
     rows = (f"{p.name},{visit.subject},{visit.session_label}" for p in paths)
     sheet.write_text("\n".join(("file,subject,visit", *rows)))
@@ -58,7 +58,7 @@ def by_sheet(paths: list[Path], visit: Visit) -> str:
     return outcome
 
 
-def by_drop_folder(paths: list[Path], visit: Visit) -> str:
+def by_drop_folder(paths: list[Path], visit: VisitRecord) -> str:
     drop, archive = paths[0].parent / "uploads", paths[0].parent / "archive"
     folder = drop / visit.subject / visit.session_label
     folder.mkdir(parents=True, exist_ok=True)
@@ -70,7 +70,7 @@ def by_drop_folder(paths: list[Path], visit: Visit) -> str:
     return outcome
 
 
-def by_archive(paths: list[Path], visit: Visit) -> str:
+def by_archive(paths: list[Path], visit: VisitRecord) -> str:
     try:
         done = register_many(archived(str(p), sha256_of(p), p.stat().st_size, visit) for p in paths)
     except PblError as error:
@@ -78,11 +78,11 @@ def by_archive(paths: list[Path], visit: Visit) -> str:
     return "registered" if done["registered"] else "known"
 
 
-def by_rig(paths: list[Path], visit: Visit) -> str:
+def by_rig(paths: list[Path], visit: VisitRecord) -> str:
     return said([SeveralCameras(paths, paths[0].parent / "rig.toml", visit)])
 
 
-def by_markers(paths: list[Path], visit: Visit) -> str:
+def by_markers(paths: list[Path], visit: VisitRecord) -> str:
     return said([LaboratoryMarkers(p, visit) for p in paths])
 
 
@@ -140,10 +140,10 @@ def expected_plans(of_markers: bool) -> dict[str, set[tuple]]:
 @pytest.mark.parametrize("name", ADAPTERS)
 def test_a_recording_is_registered_once_for_one_person_with_its_plans(tables: None, tmp_path: Path, name: str):
     adapter, make = ADAPTERS[name]
-    paths, visit = make(tmp_path), Visit("P001", "2026-03-01")
+    paths, visit = make(tmp_path), VisitRecord("P001", "2026-03-01")
     # A code that could be a name is refused before anything is written.
     try:
-        refused = adapter(paths, Visit("Jane Doe", "2026-03-01"))
+        refused = adapter(paths, VisitRecord("Jane Doe", "2026-03-01"))
     except PblError as error:
         refused = error.code
     assert refused == "USAGE"
@@ -163,5 +163,5 @@ def test_a_recording_is_registered_once_for_one_person_with_its_plans(tables: No
     assert adapter(paths, visit) == "known"
     assert everything_but_refreshes() == before
     # The same bytes cannot be another person's.
-    assert adapter(paths, Visit("P002", "2026-03-01")) == "VIDEO_DUPLICATE"
+    assert adapter(paths, VisitRecord("P002", "2026-03-01")) == "VIDEO_DUPLICATE"
     assert everything_but_refreshes() == before

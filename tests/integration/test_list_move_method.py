@@ -12,7 +12,7 @@ import pytest
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS
 from schemas import fit, gait, gdi, intake, keypoints, lab, session, video
-from schemas.intake import Methods, SeveralCameras, Visit, ingest
+from schemas.intake import Methods, SeveralCameras, VisitRecord, ingest
 from schemas.intake.move import carry_out, plan_move
 from schemas.method_names import keys_named, with_keys
 from tests.command import pbl
@@ -131,12 +131,12 @@ def test_a_fit_method_for_other_points_is_warned_of(tables, tmp_path):
 
 def test_all_cameras_of_a_trial_move_together(tables, tmp_path):
     toml = test_rigs.calibration(tmp_path / "rig.toml")
-    three = SeveralCameras(test_rigs.rig_videos(tmp_path / "three"), toml, Visit("P001", "2026-03-01"))
+    three = SeveralCameras(test_rigs.rig_videos(tmp_path / "three"), toml, VisitRecord("P001", "2026-03-01"))
     done = intake.register([three])
     numbers = {int(r.video_id or 0) for r in done}
     pair = test_rigs.calibration(tmp_path / "pair.toml", test_rigs.CAMERAS[:2])
     two = test_rigs.rig_videos(tmp_path / "two", "b_", 250, test_rigs.CAMERAS[:2])
-    intake.register([SeveralCameras(two, pair, Visit("P003", "1"))])
+    intake.register([SeveralCameras(two, pair, VisitRecord("P003", "1"))])
     assert pbl("move", max(numbers), "--to", "P003/1", "--yes").error_code == "USAGE"  # two cameras there
     assert pbl("move", max(numbers), "--to", "P002/1", "--yes").code == 0
     moved = video.Video * session.Session.proj("subject") & {"subject": "P002"}
@@ -181,7 +181,7 @@ def test_a_method_from_a_file_is_registered_once_and_used_by_its_name(tables, tm
         file.write_text(json.dumps({"base": METHODS.default, "max_iterations": 8}), encoding="utf-8")
         assert "slow-v2: registered" in pbl("method", "add", file).out
         assert keys_named("fit_method", "slow") == ["slow-v2", "slow-v1"]
-        (result,) = ingest([path], Visit("P002", "2026-03-02"), Methods(fit="slow-v1"))
+        (result,) = ingest([path], VisitRecord("P002", "2026-03-02"), Methods(fit="slow-v1"))
         assert result.status == "updated"
         populate()
         assert {r["fit_method"] for r in fit.SessionFit().to_dicts()} > {"slow-v1"}

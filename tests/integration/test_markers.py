@@ -15,12 +15,13 @@ from pbl_pipeline.fit import METHODS, fit_session
 from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.synthetic import plain_walk
 from research.walker.views import observe_markers
-from schemas import fit, gait, gdi, load_visit, norms, video, views
-from schemas.intake import LaboratoryMarkers, Registered, Visit, ingest, register
+from schemas import fit, gait, gdi, load_visit, norms, video
+from schemas.intake import LaboratoryMarkers, Registered, VisitRecord, ingest, register
 from schemas.operations.forget import forget
+from schemas.reading import frames
+from schemas.reading.why import why
 from schemas.studies import slices
 from schemas.studies.study_sheets import import_sheets
-from schemas.why import why
 from tests.command import pbl
 from tests.inputs import ROWS, trc_text
 from tests.walking_fit import CYCLE_S
@@ -43,7 +44,7 @@ def recording(path: Path, seconds: float = 8.0, marker_set: str = "bml_movi_87")
     return path
 
 
-def ingest_markers(path: Path, visit: Visit, table: Path | None = None) -> Registered:
+def ingest_markers(path: Path, visit: VisitRecord, table: Path | None = None) -> Registered:
     """The outcome for one file."""
     (result,) = register([LaboratoryMarkers(path, visit, None if table is None else str(table))])
     return result
@@ -72,7 +73,7 @@ def test_a_phone_and_a_laboratory_measure_the_same_walk(fitted: None, tmp_path: 
     ids = {r["camera_motion"]: int(r["video_id"]) for r in video.Video().to_dicts()}
     assert video.VideoInfo().to_arrays("video_id").tolist() == [ids["static"]]
     # A set of its own, and an index of its own, whose only cycles are its own.
-    found = {r["fit_method"]: r for r in views.session_summary().to_dict("records")}
+    found = {r["fit_method"]: r for r in frames.session_summary().to_dict("records")}
     assert set(found) == {PHONE, LAB}
     assert len(gdi.SessionGdi()) == 2
     used = {int(r["video_id"]): int(r["n_cycles_used"]) for r in gait.GaitCycle().to_dicts()}
@@ -138,24 +139,24 @@ def test_recordings_of_a_table_of_ones_own(tables: None, tmp_path: Path, monkeyp
     assert seen == [(["w0", "w1"], {WorldMarkers}, "our_lab", names)]
     # The same bytes again: nothing new; another pace and index: added.
     table.write_text(SHIPPED.read_text())
-    again = ingest_markers(first, Visit("P002"), table)
+    again = ingest_markers(first, VisitRecord("P002"), table)
     assert (again.status, again.note.split("; ")[-1]) == ("known", "nothing was inserted")
-    third_row = ingest_markers(third, Visit("P002"), table)
+    third_row = ingest_markers(third, VisitRecord("P002"), table)
     populate()
     assert [len(s[0]) for s in seen] == [2, 3]
     current = fit.FitSelection & {"fit_current": True}
     assert len(fit.FitSet.Video & current) == 3
     assert len(gdi.SessionGdi & current.proj()) == 1
-    fast = ingest_markers(third, Visit("P002", pace="fast"), table)
+    fast = ingest_markers(third, VisitRecord("P002", pace="fast"), table)
     assert (fast.status, fast.video_id) == ("updated", third_row.video_id)
     assert "what pooled it was deleted" in fast.note
     # Another set in the same session, and other uses of the same bytes, are refused.
-    with_other = ingest_markers(recording(tmp_path / "other.npz", 12), Visit("P002"))
+    with_other = ingest_markers(recording(tmp_path / "other.npz", 12), VisitRecord("P002"))
     assert with_other.error is not None
     assert with_other.error.code == "USAGE"
     codes = [
-        ingest_markers(first, Visit("P002")).error,
-        ingest([first], Visit("P002"))[0].error,
+        ingest_markers(first, VisitRecord("P002")).error,
+        ingest([first], VisitRecord("P002"))[0].error,
     ]
     assert [e.code if e else "" for e in codes] == ["USAGE", "USAGE"]
     assert len(video.Video()) == 3

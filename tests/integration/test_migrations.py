@@ -17,10 +17,12 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection, event_corrections, gait, gdi, jobs, lab, migrations, session, stages, video, views
+from schemas import connection, gait, gdi, jobs, lab, migrations, session, stages, video
 from schemas.chain import ON_REQUEST
-from schemas.intake import Visit, ingest
+from schemas.decisions import event_corrections
+from schemas.intake import VisitRecord, ingest
 from schemas.operations import embedded
+from schemas.reading import frames
 from tests.command import pbl
 from tests.database import new_home, remove_home
 from tests.rows import everything, register
@@ -173,11 +175,11 @@ def test_an_older_database_keeps_its_rows_and_works(
     assert migrations.migrate().steps == []
     assert len(migrations.applied()) == OWN
     # A new visit goes through the whole chain beside it.
-    assert views.session_summary()["subject"].tolist() == ["P001"]
-    ingest([chain.small_video(tmp_path, "new")], Visit(subject="P002"))
+    assert frames.session_summary()["subject"].tolist() == ["P001"]
+    ingest([chain.small_video(tmp_path, "new")], VisitRecord(subject="P002"))
     run = populate(_chain())
     assert not {t.table: t.errors for t in run.tables if t.errors}
-    assert set(views.session_summary()["subject"]) == {"P001", "P002"}
+    assert set(frames.session_summary()["subject"]) == {"P001", "P002"}
     assert set(video.Video.to_arrays("video_size")) > {7}
 
 

@@ -20,7 +20,7 @@ from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.video import probe
 from schemas import fit, gait, gdi, keypoints, tracking
-from schemas.intake import Methods, Visit, ingest
+from schemas.intake import Methods, VisitRecord, ingest
 from schemas.method_rows import insert_methods, resolve_method
 from schemas.rows import plain
 from schemas.stored_files import file_ref, stored_file
@@ -70,7 +70,7 @@ def test_a_registered_model_is_a_method_of_the_tables(tables: None, tmp_path: Pa
     camera = tmp_path / "camera.json"
     fields = {"camera_matrix": lens.matrix.tolist(), "distortion": lens.distortion.tolist()}
     camera.write_text(json.dumps(fields | {"image_size_px": [960, 720]}))
-    visit = Visit(subject="P001", camera_file=camera)
+    visit = VisitRecord(subject="P001", camera_file=camera)
     with pytest.raises(PblError) as caught:
         ingest([video], visit, Methods(keypoint="dots-crop3d"))
     assert caught.value.code == "SOLVER_UNKNOWN"
@@ -87,7 +87,7 @@ def test_a_registered_model_is_a_method_of_the_tables(tables: None, tmp_path: Pa
     assert not row["root_relative"]
     assert row["keypoints_model_sha256"] == spec.sha256
     assert row["median_confidence"] == pytest.approx(0.95, abs=0.01)
-    with stored_file(keypoints.Keypoints(), file_ref(row["keypoints_file"])) as path:
+    with stored_file(file_ref(row["keypoints_file"])) as path:
         stored = Keypoints.load(path)
     assert np.median(np.linalg.norm(stored.xy_px - xy_px(), axis=2)) < 0.5
     assert "licence: CC0-1.0" in stored.origin
@@ -144,17 +144,17 @@ def test_the_fit_that_suits_the_points_is_planned(tables: None, tmp_path: Path, 
     for name, (kind, markers) in SEEN_BY.items():
         register_spec(tmp_path / "models", kind, markers, name)
     path = chain.small_video(tmp_path, "walk")
-    notes = [ingest([path], Visit("P001"), Methods(keypoint=name))[0].note for name in SEEN_BY]
+    notes = [ingest([path], VisitRecord("P001"), Methods(keypoint=name))[0].note for name in SEEN_BY]
     assert "FitPlan" in notes[-1]
-    ingest([chain.small_video(tmp_path, "again")], Visit("P001"))
+    ingest([chain.small_video(tmp_path, "again")], VisitRecord("P001"))
     assert plans() == DEFAULT_FITS
     populate()
     assert fitted() == DEFAULT_FITS
     assert len(fit.SessionFit()) == len(DEFAULT_FITS)
     # Who names a fit method means all keypoints of the visit, or those that are named with it.
-    ingest([path], Visit("P001"), Methods(keypoint="few-17", fit="paper-2025"))
+    ingest([path], VisitRecord("P001"), Methods(keypoint="few-17", fit="paper-2025"))
     assert plans() == DEFAULT_FITS | {("few-17-v1", "paper-2025-v2")}
-    ingest([path], Visit("P001"), Methods(fit="markers"))
+    ingest([path], VisitRecord("P001"), Methods(fit="markers"))
     assert {p for p in plans() if p[1] == "markers-v1"} == {(p[0], "markers-v1") for p in DEFAULT_FITS}
 
 
@@ -164,7 +164,7 @@ def test_a_new_keypoint_method_for_all_comes_with_its_fit(
     chain.install(monkeypatch)
     register_spec(tmp_path / "models", "crop3d", "bml_movi_87", "metrabs-87")
     for subject in ("P001", "P002"):
-        ingest([chain.small_video(tmp_path, subject)], Visit(subject))
+        ingest([chain.small_video(tmp_path, subject)], VisitRecord(subject))
     for _ in requeue.carry_out(requeue.plan_new_method("Keypoints", "metrabs-87")):
         pass
     assert plans() == {(HEAVY, BLAZEPOSE), ("metrabs-87-v1", GAUSS_NEWTON)}
@@ -176,7 +176,7 @@ def test_a_new_keypoint_method_for_all_comes_with_its_fit(
 def test_own_parameters_under_a_name_of_their_own(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """As docs/extending.md says: the row names its family, so the tables find its function."""
     chain.install(monkeypatch)
-    ingest([chain.small_video(tmp_path, "walk")], Visit("P001"))
+    ingest([chain.small_video(tmp_path, "walk")], VisitRecord("P001"))
     mine = EVENT_METHODS.make("mine", 1, EventParams(cutoff_hz=4.0))
     insert_methods(gait.GaitEventMethod, [mine])
     assert list(requeue.carry_out(requeue.plan_new_method("GaitEvents", "mine"))) == [1]
@@ -193,7 +193,7 @@ def test_a_method_that_this_version_does_not_know_is_an_error_row(
 ):
     """Rows of a newer version: each stage ends with the code, at once."""
     chain.install(monkeypatch)
-    ingest([chain.small_video(tmp_path, "walk")], Visit("P001"))
+    ingest([chain.small_video(tmp_path, "walk")], VisitRecord("P001"))
     stages = {
         "Tracking": (tracking.TrackingMethod, {"detector": "newer"}),
         "SubjectChoice": (tracking.SubjectMethod, {"family": "newer"}),

@@ -15,9 +15,10 @@ import pbl_pipeline.gait
 import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GaitMetrics
-from schemas import fit, gait, gdi, lab, load_visit, norms, session, views
+from schemas import fit, gait, gdi, lab, load_visit, norms, session
 from schemas.cli.norm import norm as command
-from schemas.intake import Methods, Visit, ingest
+from schemas.intake import Methods, VisitRecord, ingest
+from schemas.reading import frames
 from tests.rows import remove_all
 from workers.populate import populate
 
@@ -33,7 +34,7 @@ def walkers(database: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
         chain.install(patch)
         for i, name in enumerate(("C01", "C02", "C03", "C04", "P01")):
             path = chain.small_video(folder, f"walk{i}", n=340 + i)
-            ingest([path], Visit(name, population="patient" if name == "P01" else "healthy"))
+            ingest([path], VisitRecord(name, population="patient" if name == "P01" else "healthy"))
         populate()
         assert len(gdi.SessionGdi()) == 5
         yield folder
@@ -80,7 +81,7 @@ def _of(population: str):
 def _used_by_a_session(walkers: Path, expected) -> None:
     """A visit that is planned with the built set is scored with it, and its old result stays."""
     old = (gdi.SessionGdi & _sets("P01")).fetch1("session_gdi", "norm")
-    (result,) = ingest([walkers / "walk4.mp4"], Visit("P01"), Methods(norm="our-lab-v1"))
+    (result,) = ingest([walkers / "walk4.mp4"], VisitRecord("P01"), Methods(norm="our-lab-v1"))
     assert result.status == "updated"
     populate()
     rows = {r["norm"]: r for r in (gdi.SessionGdi & _sets("P01")).to_dicts()}
@@ -104,7 +105,7 @@ def _sets(subject: str):
 
 
 def test_nine_angles_in_the_tables(walkers: Path):
-    (result,) = ingest([walkers / "walk0.mp4"], Visit("C01"), Methods(gdi="gillette-2008"))
+    (result,) = ingest([walkers / "walk0.mp4"], VisitRecord("C01"), Methods(gdi="gillette-2008"))
     assert result.status == "updated"
     populate()
     found = (gdi.SessionGdi & _sets("C01") & {"gdi_method": "gillette-2008-v1"}).to_dicts()[0]
@@ -140,7 +141,7 @@ def test_what_cannot_be_built(walkers: Path):
 
 
 def test_curves_beside_the_bands(walkers: Path):
-    frame = views.cycle_curves({"subject": "C02"})
+    frame = frames.cycle_curves({"subject": "C02"})
     assert set(frame["side"]) == {"left", "right"}
     assert set(frame["angle"]) == set(pbl_pipeline.gait.ANGLE_NAMES)
     assert len(frame) == 2 * 9 * 51
@@ -150,7 +151,7 @@ def test_curves_beside_the_bands(walkers: Path):
     assert set(knee["n"]) == {len(cycles)}
     assert set(frame["normal_matched"]) == {"speed"}  # the feet stand, so the speed is known
     assert 50 < float(np.max(np.asarray(knee["normal_mean_deg"]))) < 65
-    assert len(views.cycle_curves({"subject": "nobody"})) == 0
+    assert len(frames.cycle_curves({"subject": "nobody"})) == 0
 
 
 def test_the_command(walkers: Path, tmp_path: Path):

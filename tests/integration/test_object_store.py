@@ -13,9 +13,9 @@ import pbl_pipeline.video
 import schemas
 from pbl_pipeline.errors import PblError
 from schemas import connection, store, tracking, video
-from schemas.declare import declare_all
-from schemas.intake import Visit, ingest
+from schemas.intake import VisitRecord, ingest
 from schemas.operations import backup, forget
+from schemas.operations.declare import declare_all
 from schemas.stored_files import file_ref, stored_file
 from tests.rows import remove_all
 from workers.incoming import take_over
@@ -59,7 +59,7 @@ def test_arrays_and_files_go_to_the_bucket_and_come_back(remote: None, tmp_path:
     assert not backend.fs.exists("walks")
     store.check_store(backend, create=True)
     path = chain.small_video(tmp_path, "walk")
-    ingest([path], Visit(subject="P001"))
+    ingest([path], VisitRecord(subject="P001"))
     for table in (video.VideoInfo, tracking.Tracking):
         table.populate()
     stored = sorted(backend.fs.find("walks"))
@@ -74,13 +74,13 @@ def test_arrays_and_files_go_to_the_bucket_and_come_back(remote: None, tmp_path:
     assert np.asarray(times).tolist() == pbl_pipeline.video.probe(path).time_s.tolist()
     # <object@>: as a file that is gone afterwards
     ref = file_ref(tracking.Tracking.fetch1("tracks"))
-    with stored_file(tracking.Tracking(), ref) as local:
+    with stored_file(ref) as local:
         found = tracking.load_tracking(local, (1920, 1080), "stand-in", "0" * 64)
     assert not local.exists()
     np.testing.assert_allclose(found.persons[0].box_px, chain.track_people(path).persons[0].box_px, rtol=1e-6)
     # a file that is lost has a code and a next step
     backend.remove(ref["path"])
-    with pytest.raises(PblError, match="the object store has no") as error, stored_file(tracking.Tracking(), ref):
+    with pytest.raises(PblError, match="the object store has no") as error, stored_file(ref):
         pass
     assert error.value.code == "FILE_FORMAT"
 
@@ -88,7 +88,7 @@ def test_arrays_and_files_go_to_the_bucket_and_come_back(remote: None, tmp_path:
 def test_a_backup_and_a_person_who_is_forgotten(remote: None, tmp_path: Path):
     declare_all()
     backend = connection.store_backend()
-    ingest([chain.small_video(tmp_path, "walk")], Visit(subject="P002"))
+    ingest([chain.small_video(tmp_path, "walk")], VisitRecord(subject="P002"))
     for table in (video.VideoInfo, tracking.Tracking):
         table.populate()
     number = video.Video.fetch1("video_id")

@@ -17,7 +17,7 @@ import pytest
 import pbl_pipeline.video
 import schemas
 from schemas import connection, fit, session, tracking, video, worker
-from schemas.coded_errors import error_code
+from schemas.job_errors import error_code
 from schemas.jobs import jobs_of
 from schemas.operations.orphans import orphans
 from schemas.stored_files import remove_left_over

@@ -11,10 +11,11 @@ import pytest
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GDI_METHODS
 from pbl_pipeline.paramset import Paramset
-from schemas import fit, gait, gdi, load_visit, norms, session, video, views
-from schemas.intake import Methods, Visit, ingest
+from schemas import fit, gait, gdi, load_visit, norms, session, video
+from schemas.intake import Methods, VisitRecord, ingest
 from schemas.intake.conditions import set_condition
 from schemas.method_rows import insert_methods
+from schemas.reading import frames
 from tests.command import pbl
 from tests.rows import register
 from workers.populate import populate
@@ -38,7 +39,7 @@ def test_only_walking_at_one_pace_is_pooled(tables: None, tmp_path: Path):
     at_fast = {"family": GDI_METHODS.find().name, **GDI_METHODS.find().paramset.params, "pace": "fast"}
     insert_methods(gdi.GdiModel, [GDI_METHODS.of(Paramset("gdi", "fast-walk", 1, at_fast))])
     try:
-        assert ingest([slow], Visit("P001"), Methods(gdi="fast-walk"))[0].status == "updated"
+        assert ingest([slow], VisitRecord("P001"), Methods(gdi="fast-walk"))[0].status == "updated"
         populate()
         used = {r["video_id"]: int(r["n_cycles_used"]) for r in gait.GaitCycle().to_dicts()}
         plain = GDI_METHODS.find().key
@@ -50,11 +51,11 @@ def test_only_walking_at_one_pace_is_pooled(tables: None, tmp_path: Path):
         assert shown.measures is not None
         assert [t.pooled for t in shown.measures.trials] == [True, False, False]
         assert shown.measures.gdi.n == shown.measures.gdi.n_left + shown.measures.gdi.n_right == used[ids["slow"]]
-        curves = views.cycle_curves({"gdi_method": plain})
+        curves = frames.cycle_curves({"gdi_method": plain})
         assert int(curves["n"].to_numpy().max()) <= used[ids["slow"]]
         # What is changed is computed anew, and nothing else is.
         events = gait.GaitEvents().to_arrays("events_computed", order_by="KEY")
-        (result,) = ingest([fast], Visit("P001", pace="self_selected"))
+        (result,) = ingest([fast], VisitRecord("P001", pace="self_selected"))
         assert "pace is self_selected now" in result.note
         assert not len(gdi.SessionGdi())
         populate()

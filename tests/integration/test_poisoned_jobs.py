@@ -13,7 +13,7 @@ import pbl_pipeline.video
 import schemas
 from pbl_pipeline.paramset import Paramset
 from schemas import connection, fit, gait, keypoints, tracking, video
-from schemas.coded_errors import error_code, error_found
+from schemas.job_errors import error_code, error_found
 from schemas.jobs import jobs_of
 from tests.rows import register
 from workers import queue, refresh, requeue, run_job

@@ -16,9 +16,9 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import VideoInfo, probe, sha256_of
 from schemas import jobs, privacy
 from schemas.operations.forget import forget
-from schemas.status import pipeline_status
+from schemas.reading.status import pipeline_status
+from schemas.reading.why import why
 from schemas.stored_files import file_ref, stored_file
-from schemas.why import why
 from tests.rows import register, remove_all
 from tests.videos import constant_rate, numbered_frames, write_video
 from workers.populate import populate
@@ -80,7 +80,7 @@ def test_copies_lie_in_the_store_with_the_frames_to_look_at(tables, tmp_path: Pa
     assert (row["deidentified_how"], row["deidentified_status"]) == ("pixelate", "REVIEW")
     assert row["deidentified_ranges"] == [{"first": 3, "last": 4, "why": ["held"]}]
     assert (row["deidentified_heads"], row["deidentified_uncertain"]) == (1, 2)
-    with stored_file(privacy.Deidentified(), file_ref(row["deidentified_file"])) as path:
+    with stored_file(file_ref(row["deidentified_file"])) as path:
         assert sha256_of(path) == row["deidentified_sha256"]
         info = probe(path)
     np.testing.assert_allclose(info.time_s, probe(paths[0]).time_s, atol=1 / 90_000)

@@ -17,16 +17,17 @@ from pbl_pipeline.fit import fit_session
 from pbl_pipeline.keypoints import Keypoints, MultiView
 from pbl_pipeline.synthetic import NO_NOISE, plain_walk
 from research.walker.views import observe_views
-from schemas import fit, gait, gdi, jobs, load_visit, norms, validation, video, views
-from schemas.coded_errors import error_code
-from schemas.decide import decide_person
-from schemas.intake import SeveralCameras, Visit, ingest, register
+from schemas import fit, gait, gdi, jobs, load_visit, norms, validation, video
+from schemas.decisions.review_decisions import decide_person
+from schemas.intake import SeveralCameras, VisitRecord, ingest, register
+from schemas.job_errors import error_code
 from schemas.operations.forget import forget
 from schemas.plan import fit_set_hash
+from schemas.reading import frames
 from schemas.reading.visits import methods_of
+from schemas.reading.why import why
 from schemas.studies import slices
 from schemas.studies.study_sheets import import_sheets
-from schemas.why import why
 from tests.command import pbl
 from tests.videos import constant_rate, numbered_frames, write_video
 from tests.walking_fit import CYCLE_S
@@ -121,7 +122,7 @@ def test_a_phone_and_three_cameras_measure_the_same_walk(rig: pytest.MonkeyPatch
     assert row["ray_miss"] < 0.1
     assert sorted(fit.TrialInput().to_arrays("video_id").tolist()) == [1, 2]
     # One trial of the rig, with an index of its own, whose only cycles are its own.
-    found = {r["fit_set_kind"]: r for r in views.session_summary().to_dict("records")}
+    found = {r["fit_set_kind"]: r for r in frames.session_summary().to_dict("records")}
     assert set(found) == {"single", "rig"}
     used = {int(r["video_id"]): int(r["n_cycles_used"]) for r in gait.GaitCycle().to_dicts()}
     assert set(used) == {1, 2}
@@ -172,12 +173,12 @@ def test_a_phone_and_three_cameras_measure_the_same_walk(rig: pytest.MonkeyPatch
     joints = {r["error_joint"]: r["joint_median_abs"] for r in validation.KinematicError.Joint().to_dicts()}
     assert abs(error["error_lag"]) < 0.02
     assert joints["knee_flexion_r"] < 2.0
-    assert views.validation_frame()["dataset"].unique().tolist() == ["OURS"]
+    assert frames.validation_frame()["dataset"].unique().tolist() == ["OURS"]
     for wrong, code in ((("--of-trial", 1), "USAGE"), (("--of-trial", 99), "DB_NOT_FOUND")):
         assert pbl("validate", "add", 1, *wrong).error_code == code
     assert pbl("validate", "add", 1).code == 2
     # As docs/study.md says it.
-    wide = views.session_summary().pivot_table("session_gdi", ["subject", "session_label"], "fit_set_kind")
+    wide = frames.session_summary().pivot_table("session_gdi", ["subject", "session_label"], "fit_set_kind")
     assert wide["rig"].tolist() == [found["rig"]["session_gdi"]]
 
 
@@ -193,7 +194,7 @@ def test_people_of_the_cameras(rig: pytest.MonkeyPatch, tmp_path: Path):
     rig.setattr(pbl_pipeline.tracking, "track_people", track_people)
     toml = calibration(tmp_path / "Calib.toml")
     for trial in ("w1.", "w2."):
-        made = register([SeveralCameras(rig_videos(tmp_path, trial), toml, Visit("P001"))])
+        made = register([SeveralCameras(rig_videos(tmp_path, trial), toml, VisitRecord("P001"))])
         assert [r.status for r in made] == ["registered"] * 3, made
     populate()
     assert len(video.Rig()) == 1
@@ -225,7 +226,7 @@ def test_people_of_the_cameras(rig: pytest.MonkeyPatch, tmp_path: Path):
     keys = [{"video_id": 2, "tracking_method": "t", "keypoint_method": "k"}]
     assert fit.TrialInput.with_trials(keys) == [*keys, {**keys[0], "video_id": 1}]
     # The pace of one camera is that of the trial.
-    assert ingest([tmp_path / "w1.cam_02.mp4"], Visit("P001", pace="fast"))[0].status == "updated"
+    assert ingest([tmp_path / "w1.cam_02.mp4"], VisitRecord("P001", pace="fast"))[0].status == "updated"
     assert {c.pace for v, c in video.conditions(True).items() if v < 4} == {"fast"}
     assert len(gdi.SessionGdi()) == 0
     files = {r["rig_file"].path for r in video.Rig().to_dicts()}
@@ -269,13 +270,13 @@ def test_trials_that_cannot_be_are_refused(rig: pytest.MonkeyPatch, tmp_path: Pa
         assert pbl("ingest", one, two, "--rig", toml, "--subject", "P001", *wrong).code == 2
     assert len(video.Video()) == len(video.Rig()) == 0
     # Registered: the same again is known; anything else of these files is refused.
-    assert ingest([three], Visit("P001"))[0].status == "registered"
+    assert ingest([three], VisitRecord("P001"))[0].status == "registered"
     assert codes([one, two, three]) == {"USAGE"}
-    made = register([SeveralCameras([one, two], toml, Visit("P001"))])
+    made = register([SeveralCameras([one, two], toml, VisitRecord("P001"))])
     assert [r.status for r in made] == ["registered"] * 2
     assert codes([two, one, *rig_videos(tmp_path / "more", n=30)[2:]]) == {"USAGE"}
     assert codes(rig_videos(tmp_path / "more", "w.", n=30)) == {"USAGE"}  # three cameras in a session with two
-    (with_camera,) = ingest([one], Visit("P001", camera_file=toml))
+    (with_camera,) = ingest([one], VisitRecord("P001", camera_file=toml))
     assert with_camera.error is not None
     assert with_camera.error.code == "USAGE"
     assert len(video.Video()) == 3

@@ -13,12 +13,13 @@ import yaml
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection, gdi, lab, session, views, worker
+from schemas import connection, gdi, lab, session, worker
 from schemas.chain import ON_REQUEST
 from schemas.datajoint_setup import dj
-from schemas.declare import declare_all
-from schemas.intake import Visit, ingest
+from schemas.intake import VisitRecord, ingest
 from schemas.operations import embedded, roles
+from schemas.operations.declare import declare_all
+from schemas.reading import frames
 from tests.command import pbl
 from tests.rows import remove_all
 from workers import refresh
@@ -74,7 +75,7 @@ def test_a_worker_fills_every_table_and_changes_none(login: Login, tmp_path: Pat
     chain.install(monkeypatch)
     login("worker")
     schemas.activate()
-    ingest([chain.small_video(tmp_path, "walk")], Visit(subject="P001"))
+    ingest([chain.small_video(tmp_path, "walk")], VisitRecord(subject="P001"))
     run = populate()
     assert all(t.done == 1 for t in run.tables if t.table not in ON_REQUEST), run
     assert not any(t.errors for t in run.tables)
@@ -86,7 +87,7 @@ def test_a_worker_fills_every_table_and_changes_none(login: Login, tmp_path: Pat
     assert refused("CREATE USER 'x'@'%' IDENTIFIED BY 'long-enough-1'")
     login("analyst")
     schemas.activate(methods=False)
-    assert views.session_summary()["subject"].tolist() == ["P001"]
+    assert frames.session_summary()["subject"].tolist() == ["P001"]
     assert lab.Subject.to_arrays("subject").tolist() == ["P001"]
     for sql in (
         "INSERT INTO pbl_lab.project (project) VALUES ('x')",
@@ -165,7 +166,7 @@ def test_an_analyst_has_tables_of_a_labs_own_below_ours(
     login("worker")
     schemas.activate()
     for subject in ("P001", "P002"):
-        ingest([chain.small_video(tmp_path, subject)], Visit(subject, "2026-03-01"))
+        ingest([chain.small_video(tmp_path, subject)], VisitRecord(subject, "2026-03-01"))
     populate()
 
     login("maria")
@@ -201,7 +202,7 @@ def test_an_analyst_has_tables_of_a_labs_own_below_ours(
 
     # Who computes a result anew, and who forgets a person, takes the rows below with it.
     login("worker")
-    assert ingest([tmp_path / "P001.mp4"], Visit("P001", "2026-03-01", pace="fast"))[0].status != "failed"
+    assert ingest([tmp_path / "P001.mp4"], VisitRecord("P001", "2026-03-01", pace="fast"))[0].status != "failed"
     assert spreads() == 1
     login("admin")
     forgotten = pbl("forget", "P002", "--yes")

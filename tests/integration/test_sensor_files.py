@@ -11,7 +11,7 @@ import pbl_pipeline.fit
 import pbl_pipeline.video
 from pbl_pipeline.keypoints import Keypoints
 from schemas import fit, keypoints, lab, load_visit, qc, video
-from schemas.intake import Sensors, Visit, ingest
+from schemas.intake import Sensors, VisitRecord, ingest
 from schemas.stored_files import file_ref, stored_file
 from tests.command import pbl
 from tests.integration import chain
@@ -37,7 +37,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 def stored_keypoints() -> Keypoints:
     ref = file_ref(keypoints.Keypoints.fetch1("keypoints_file"))
-    with stored_file(keypoints.Keypoints(), ref) as path:
+    with stored_file(ref) as path:
         return Keypoints.load(path)
 
 
@@ -50,7 +50,7 @@ def test_the_log_reaches_keypoints_and_fit(capture, monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(pbl_pipeline.fit, "fit_session", fit_session)
     path, log = capture
-    (result,) = ingest([path], Visit("P001"), files=[Sensors(attitude=log)])
+    (result,) = ingest([path], VisitRecord("P001"), files=[Sensors(attitude=log)])
     assert result.status == "registered"
     assert "the phone's log of 1200 orientations" in result.note
     assert video.Video.fetch1("camera_motion") == "handheld"
@@ -69,7 +69,7 @@ def test_the_log_reaches_keypoints_and_fit(capture, monkeypatch: pytest.MonkeyPa
     np.testing.assert_array_equal(times, kept.phone_time_s)
     assert motions == ["handheld"]
     # The same log again, as a zip of the same files too, changes nothing.
-    (again,) = ingest([path], Visit("P001"), files=[Sensors(attitude=log)])
+    (again,) = ingest([path], VisitRecord("P001"), files=[Sensors(attitude=log)])
     assert again.status == "known"
     assert len(fit.SessionFit()) == 1
 
@@ -101,12 +101,14 @@ def test_a_log_of_another_time_is_an_error_of_its_video_only(capture, tmp_path: 
     path, _ = capture
     other = film(tmp_path / "other.mov", 60.0, SECONDS)
     short = sensor_logger(tmp_path / "short", 4.0)
-    results = ingest([path, other], Visit("P001"), files=[Sensors(attitude=Path("none")), Sensors(attitude=short)])
+    results = ingest(
+        [path, other], VisitRecord("P001"), files=[Sensors(attitude=Path("none")), Sensors(attitude=short)]
+    )
     assert [r.status for r in results] == ["registered", "registered"]
     assert errors(populate()) == {"Keypoints": {"PHONE_LOG": 1}}
     # The other recording of the visit is measured all the same.
     assert len(fit.SessionFit()) == 1
-    (gone,) = ingest([other], Visit("P001"), files=[Sensors(attitude=Path("none"))])
+    (gone,) = ingest([other], VisitRecord("P001"), files=[Sensors(attitude=Path("none"))])
     assert gone.status == "updated"
     assert not errors(populate(SEEN))
     assert len(keypoints.Keypoints()) == 2
@@ -137,7 +139,7 @@ def test_depth_video_and_wearables_are_kept(capture, tmp_path: Path):
     for number, content in ((1, b"left"), (2, b"right")):
         row = (video.WearableImu & {"imu": number}).fetch1()
         assert row["imu_sha256"] == pbl_pipeline.video.sha256_of(left if number == 1 else right)
-        with stored_file(video.WearableImu(), file_ref(row["imu_file"])) as kept:
+        with stored_file(file_ref(row["imu_file"])) as kept:
             assert kept.read_bytes() == content
     assert pbl("ingest", path, "--subject", "P001", "--imu", empty).error_code == "FILE_FORMAT"
     assert pbl("ingest", path, "--subject", "P001", "--imu", tmp_path / "none").error_code == "FILE_MISSING"
@@ -172,13 +174,13 @@ def test_the_uncertainty_of_a_calibration_is_stored(tmp_path: Path):
         '{"camera_matrix": [[900, 0, 64], [0, 900, 36], [0, 0, 1]], "distortion": [0, 0, 0, 0, 0],'
         ' "image_size_px": [128, 72], "focal_sd_px": 4.5}'
     )
-    ingest([path], Visit("P001", camera_file=camera))
+    ingest([path], VisitRecord("P001", camera_file=camera))
     assert lab.CameraCalibration.fetch1("camera_focal_sd") == pytest.approx(4.5)
     populate(SEEN)
     row = keypoints.Keypoints.fetch1()
     assert row["focal_rel_sd"] == pytest.approx(0.005)
     assert row["camera_source"].startswith("measured: camera.json")
     # The same file again is the same calibration.
-    (again,) = ingest([path], Visit("P001", camera_file=camera))
+    (again,) = ingest([path], VisitRecord("P001", camera_file=camera))
     assert again.status == "known"
     assert len(lab.CameraCalibration()) == 1

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from schemas import fit, gait, gdi, qc
+from schemas.reading.status import pipeline_status
 from schemas.rows import delete_below
-from schemas.status import pipeline_status
 from tests.integration import chain
 from tests.rows import register
 from workers import refresh

@@ -13,10 +13,11 @@ from click.testing import CliRunner
 import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.study import read_study
-from schemas import fit, gait, gdi, session, study, video, views
+from schemas import fit, gait, gdi, session, study, video
 from schemas.cli.study import export, slice_
-from schemas.intake import Visit, ingest
+from schemas.intake import VisitRecord, ingest
 from schemas.intake.conditions import set_condition
+from schemas.reading import frames
 from schemas.studies import slices
 from schemas.studies.study_sheets import import_sheets
 from tests.command import pbl
@@ -47,7 +48,7 @@ def cohort(database: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
             [("P001", "pre", None), ("P001", "pre", "fast"), ("P001", "after", None), ("C001", "pre", None)]
         ):
             path = chain.small_video(folder, f"walk{i}", n=340 + i)
-            ingest([path], Visit(subject, label, pace=pace))
+            ingest([path], VisitRecord(subject, label, pace=pace))
         populate()
         sheet = folder / "visits.csv"
         sheet.write_text(VISITS)
@@ -125,7 +126,7 @@ def test_the_same_frames_again_until_a_row_changes(cohort: Path):
     study.ClinicalScore.update1({**score, "score_value": 11})
     assert slices.changes("second") == []
     # A later video makes another set; the slice keeps its own.
-    (extra,) = ingest([chain.small_video(cohort, "later", n=350)], Visit("P001", "pre"))
+    (extra,) = ingest([chain.small_video(cohort, "later", n=350)], VisitRecord("P001", "pre"))
     populate()
     assert slices.changes("second") == []
     again: Any = slices.study_data("second", curves=False)
@@ -160,14 +161,14 @@ def test_what_cannot_be_frozen(cohort: Path):
 
 
 def test_the_views_of_a_study(cohort: Path):
-    visits: Any = views.visit_frame()
+    visits: Any = frames.visit_frame()
     assert len(visits) == 5
     one = visits[(visits["subject"] == "P001") & (visits["session_label"] == "pre")].iloc[0]
     assert (one["mJOA"], one["TUG"], one["visit_role"], one["population"]) == (11, 14.5, "pre", "patient")
     assert visits["mJOA"].notna().sum() == 3
     assert visits["session_gdi"].notna().sum() == 3
-    assert views.visit_frame({"subject": "P002"})["mJOA"].tolist() == [12]
-    cycles: Any = views.cycle_frame({"subject": "P001", "session_label": "pre"})
+    assert frames.visit_frame({"subject": "P002"})["mJOA"].tolist() == [12]
+    cycles: Any = frames.cycle_frame({"subject": "P001", "session_label": "pre"})
     assert {"fast", "unknown"} <= set(cycles["pace"])
     assert set(cycles["activity"]) == {"walking"}
     assert len(cycles) == sum(

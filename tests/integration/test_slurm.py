@@ -18,7 +18,7 @@ import pytest
 from schemas import tracking, video
 from schemas.operations import embedded
 from schemas.operations.orphans import orphans
-from schemas.status import queue_counts
+from schemas.reading.status import queue_counts
 from tests import slurm
 from tests.rows import register
 

@@ -22,17 +22,19 @@ import pbl_pipeline.tracking
 import pbl_pipeline.video
 import schemas
 import workers.populate
+from docs_site import table_map
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import Check
 from pbl_pipeline.video import Camera
-from schemas import fit, gait, gdi, keypoints, lab, load_visit, qc, reading, session, table_map, tracking, video, views
-from schemas.choose import candidates, write_sheet
-from schemas.decide import decide_person
-from schemas.intake import Methods, Visit, ingest
+from schemas import fit, gait, gdi, keypoints, lab, load_visit, qc, reading, session, tracking, video
+from schemas.decisions.candidates import candidates, write_sheet
+from schemas.decisions.review_decisions import decide_person
+from schemas.intake import Methods, VisitRecord, ingest
 from schemas.method_rows import resolve_method
 from schemas.plan import plan_fit_sets
-from schemas.status import pipeline_status
+from schemas.reading import frames
+from schemas.reading.status import pipeline_status
 from tests.command import pbl
 from tests.rows import register
 from workers.populate import populate
@@ -89,17 +91,17 @@ def test_a_bad_file_leaves_one_error_row_while_the_others_finish(tables: None, t
     assert "Traceback" in row.stack
     _everything_comes_back(good)
     # What the synthetic walker does is what the rows say: a stride of 1.1 s.
-    (visit,) = views.session_summary().to_dict("records")
+    (visit,) = frames.session_summary().to_dict("records")
     assert visit["session_stride_time"] == pytest.approx(1.1, abs=0.01)
     assert visit["session_cadence"] == pytest.approx(120 / 1.1, abs=1.0)
     assert np.isfinite(visit["session_gdi"])
     assert (visit["subject"], visit["session_label"], visit["fit_set_n"]) == ("P001", "2026-03-01", 2)
     assert visit["qc_outcome"] == "WARN"
     assert "residual_3d_cm" in visit["qc_worst"]
-    assert set(views.trial_summary()["trial_orientation"]) == {"assumed: level"}
-    assert len(views.trial_summary()) == 2
-    assert set(views.video_summary()["choice_status"]) == {"CHOSEN"}
-    assert "PASS" not in set(views.quality_summary()["qc_check_outcome"])
+    assert set(frames.trial_summary()["trial_orientation"]) == {"assumed: level"}
+    assert len(frames.trial_summary()) == 2
+    assert set(frames.video_summary()["choice_status"]) == {"CHOSEN"}
+    assert "PASS" not in set(frames.quality_summary()["qc_check_outcome"])
     again = populate()
     assert not again.did_something
     assert set(done(again).values()) == {0}
@@ -247,7 +249,7 @@ def test_a_moved_file_is_computed_without_being_told(tables: None, tmp_path: Pat
     populate(["VideoInfo"])
     moved = first.rename(tmp_path / "moved.mp4")
     assert errors(populate(["Tracking"])) == {"Tracking": {"VIDEO_MISSING": 1}}
-    (result,) = ingest([moved], Visit("P001"))
+    (result,) = ingest([moved], VisitRecord("P001"))
     assert result.status == "moved"
     assert video.Video.fetch1("video_path") == str(moved)
     assert not pipeline_status().errors
@@ -265,7 +267,7 @@ def test_a_registered_video_takes_a_camera_and_further_methods(tables: None, tmp
         '{"camera_matrix": [[900, 0, 64], [0, 900, 36], [0, 0, 1]], "distortion": [0, 0, 0, 0, 0],'
         ' "image_size_px": [128, 72]}'
     )
-    (result,) = ingest([path], Visit("P001", camera_file=camera, activity="running"))
+    (result,) = ingest([path], VisitRecord("P001", camera_file=camera, activity="running"))
     assert (result.status, result.video_id) == ("updated", number)
     assert "1 of" in result.note
     assert "keypoints" in result.note.lower()
@@ -276,11 +278,11 @@ def test_a_registered_video_takes_a_camera_and_further_methods(tables: None, tmp
     assert camera_of(0).matrix[0, 0] == 900
     assert len(qc.SessionQc()) == 1
     # The same camera again changes nothing.
-    (result,) = ingest([path], Visit("P001", camera_file=camera))
+    (result,) = ingest([path], VisitRecord("P001", camera_file=camera))
     assert (result.status, result.note.endswith("nothing was inserted")) == ("known", True)
     names = {r["fit_method_name"] for r in fit.FitMethod.to_dicts()}
     other = sorted(names - {(fit.FitPlan * fit.FitMethod).fetch1("fit_method_name")})[0]
-    (result,) = ingest([path], Visit("P001"), Methods(fit=other))
+    (result,) = ingest([path], VisitRecord("P001"), Methods(fit=other))
     assert result.status == "updated"
     assert f"FitPlan {other}" in result.note
     assert len(fit.FitPlan()) == 2
@@ -291,7 +293,7 @@ def test_a_registered_video_takes_a_camera_and_further_methods(tables: None, tmp
 def test_refused_files_do_not_hold_up_the_others(tables: None, tmp_path: Path):
     (tmp_path / "empty.mp4").touch()
     paths = [tmp_path / "absent.mp4", tmp_path / "empty.mp4", tmp_path, chain.small_video(tmp_path, "walk")]
-    results = ingest(paths, Visit("P001"))
+    results = ingest(paths, VisitRecord("P001"))
     codes = [r.error.code if r.error else r.status for r in results]
     assert codes == ["VIDEO_MISSING", "VIDEO_EMPTY", "VIDEO_MISSING", "registered"]
 
@@ -299,14 +301,14 @@ def test_refused_files_do_not_hold_up_the_others(tables: None, tmp_path: Path):
 @pytest.mark.parametrize("subject", ["Jane Doe", "", "x" * 33, "-p"])
 def test_a_code_that_could_be_a_name_is_refused(tables: None, tmp_path: Path, subject: str):
     with pytest.raises(PblError, match="USAGE"):
-        ingest([tmp_path / "a.mp4"], Visit(subject))
+        ingest([tmp_path / "a.mp4"], VisitRecord(subject))
 
 
 @pytest.mark.parametrize("label", [{"session_label": "s" * 65}, {"project": "p" * 33}, {"activity": "a" * 33}])
 def test_labels_that_do_not_fit_are_refused(tables: None, tmp_path: Path, label: dict):
     path = chain.small_video(tmp_path, "walk")
     with pytest.raises(PblError, match="USAGE"):
-        ingest([path], Visit("P001", **label))
+        ingest([path], VisitRecord("P001", **label))
 
 
 def test_odd_tags_of_a_file_are_cut_not_an_error(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -325,7 +327,7 @@ def test_odd_tags_of_a_file_are_cut_not_an_error(tables: None, tmp_path: Path, m
 
 def test_one_persons_number_for_several_videos_is_refused(tables: None, tmp_path: Path):
     with pytest.raises(PblError, match="USAGE"):
-        ingest([tmp_path / "a.mp4", tmp_path / "b.mp4"], Visit("P001", person=2))
+        ingest([tmp_path / "a.mp4", tmp_path / "b.mp4"], VisitRecord("P001", person=2))
 
 
 def test_a_registered_person_detector_becomes_a_method(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -345,7 +347,7 @@ def test_a_registered_person_detector_becomes_a_method(tables: None, tmp_path: P
     (folder / "model.json").write_text(json.dumps(spec | {"input": {**entry, "colour": "RGB"}}))
     assert resolve_method(tracking.TrackingMethod, "crowd") == "crowd-v2"
     path = chain.small_video(tmp_path, "walk")
-    (row,) = ingest([path], Visit("P001"), Methods(tracking="crowd"))
+    (row,) = ingest([path], VisitRecord("P001"), Methods(tracking="crowd"))
     assert (tracking.TrackingSelection & {"video_id": row.video_id}).fetch1("tracking_method") == "crowd-v2"
     populate(["VideoInfo", "Tracking"])
     assert len(tracking.Tracking & {"video_id": row.video_id, "tracking_method": "crowd-v2"}) == 1
@@ -356,7 +358,7 @@ def test_unknown_methods_are_refused_with_the_names_there_are(tables: None, tmp_
     path = chain.small_video(tmp_path, "walk")
     for methods in (Methods(tracking="x"), Methods(fit="x"), Methods(norm="x")):
         with pytest.raises(PblError, match=r"expected: one of \w+"):
-            ingest([path], Visit("P001"), methods)
+            ingest([path], VisitRecord("P001"), methods)
     assert len(video.Video()) == 0
 
 
@@ -401,8 +403,8 @@ def test_two_alike_wait_for_a_choice_and_the_rest_goes_on(tables: None, tmp_path
     assert len(fit.SessionFit()) == 2
     assert (fit.FitSelection & {"fit_current": True}).keys() != first_fit
     assert len(fit.FitSelection & {"fit_current": True}) == 1
-    assert len(views.session_summary()) == 1
-    assert views.session_summary()["fit_set_n"].tolist() == [2]
+    assert len(frames.session_summary()) == 1
+    assert frames.session_summary()["fit_set_n"].tolist() == [2]
 
 
 def test_the_picture_of_the_people_is_stored_where_somebody_has_to_choose(tables: None, tmp_path: Path):
@@ -834,7 +836,7 @@ def test_the_map_is_what_the_database_holds(declared: None):
 
 def test_the_page_of_the_tables_is_up_to_date():
     page = (ROOT / "docs" / "tables.md").read_text()
-    assert page == table_map.table_map(), "run: python -m schemas.table_map > docs/tables.md"
+    assert page == table_map.table_map(), "run: python -m docs_site.table_map > docs/tables.md"
 
 
 def test_methods_are_frozen(declared: None):

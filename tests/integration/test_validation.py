@@ -17,12 +17,13 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.synthetic import SynthSpec, synthesise
 from pbl_pipeline.validation import Reference, compare, reference_of_fit
-from schemas import lab, validation, video, views
+from schemas import lab, validation, video
 from schemas.chain import is_wanted
 from schemas.cli.validate import validate
-from schemas.intake import Visit, ingest
+from schemas.intake import VisitRecord, ingest
 from schemas.intake.references import add_reference, find_video, read_reference
-from schemas.status import pipeline_status
+from schemas.reading import frames
+from schemas.reading.status import pipeline_status
 from tests.conftest import SHARED
 from tests.rows import everything_but_refreshes, register
 from tests.walking_fit import walking_fit
@@ -66,7 +67,7 @@ def test_a_reference_that_is_added_later_gives_the_errors_that_were_put_in(table
     (number,) = register(first, population="healthy", camera_motion="handheld")
     register(second)
     assert done(populate()) == 0
-    assert views.validation_frame().empty
+    assert frames.validation_frame().empty
     added = add_reference(number, saved(tmp_path, "truth.npz", reference()), dataset="LAB")
     assert (added.status, added.video_id) == ("registered", number)
     run = populate()
@@ -83,7 +84,7 @@ def test_a_reference_that_is_added_later_gives_the_errors_that_were_put_in(table
     assert joints["knee_flexion_l"]["joint_median_abs"] < 0.1
     assert joints["knee_flexion_l"]["joint_correlation"] > 0.999
     assert joints["knee_flexion_l"]["joint_within_90"] is None  # the stand-in states no standard deviation
-    frame = views.validation_frame()
+    frame = frames.validation_frame()
     assert set(frame["dataset"]) == {"LAB"}
     assert set(frame["population"]) == {"healthy"}
     assert set(frame["activity"]) == {"walking"}
@@ -115,11 +116,11 @@ def test_another_file_of_a_source_is_another_row_and_takes_the_place(tables: Non
     assert add_reference(number, old, dataset="OTHER").status == "updated"
     assert not populate().did_something
     assert _knee_bias() == pytest.approx(-KNEE_DEG, abs=0.05)
-    assert set(views.validation_frame()["dataset"]) == {"OTHER"}
+    assert set(frames.validation_frame()["dataset"]) == {"OTHER"}
     # Another instrument does not take the place of the first.
     assert add_reference(number, new, source="several cameras").status == "registered"
     assert done(populate()) == 1
-    assert set(views.validation_frame()["trial"]) == {
+    assert set(frames.validation_frame()["trial"]) == {
         f"{number} walk against optical markers",
         f"{number} walk against several cameras",
     }
@@ -144,7 +145,7 @@ def test_every_result_of_a_person_goes_with_them_and_nothing_of_another(tables: 
 
 
 def _knee_bias() -> float:
-    frame = views.validation_frame()
+    frame = frames.validation_frame()
     (row,) = frame.query("joint == 'knee_flexion' and side == 'r'").to_dict("records")
     return float(row["bias_deg"])
 
@@ -253,7 +254,7 @@ def test_the_command_from_reference_to_tables(tables: None, tmp_path: Path):
         assert word in result.output
     assert {p.suffix for p in (tmp_path / "out").iterdir()} >= {".csv", ".tex", ".html"}
     errors = pd.read_csv(tmp_path / "out" / "errors.csv").fillna({"side": ""})
-    pd.testing.assert_frame_equal(errors, views.validation_frame(), check_dtype=False)
+    pd.testing.assert_frame_equal(errors, frames.validation_frame(), check_dtype=False)
     cells = pd.read_csv(tmp_path / "out" / "summary.csv").to_dict("records")
     rte = {c["column"]: c for c in cells if c["row"] == "RTE (cm)"}
     assert (rte["LAB static"]["n"], rte["MMMC handheld"]["n"]) == (1, 0)
@@ -264,8 +265,8 @@ def test_the_command_from_reference_to_tables(tables: None, tmp_path: Path):
         assert 0 < right.sum() < len(right)
         np.testing.assert_allclose(knee[right], KNEE_DEG, atol=0.3)
         np.testing.assert_allclose(knee[~right], 0.0, atol=0.3)
-    (known,) = ingest([path], Visit("P001", population="patient"))
-    assert (known.status, set(views.validation_frame()["population"])) == ("updated", {"patient"})
+    (known,) = ingest([path], VisitRecord("P001", population="patient"))
+    assert (known.status, set(frames.validation_frame()["population"])) == ("updated", {"patient"})
     assert "None of" in call("--where", "population=healthy").output
     assert call("--where", "shoe=red").exit_code != 0
     assert call("--reference", truth).exit_code == 2

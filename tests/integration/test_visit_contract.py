@@ -34,10 +34,10 @@ from pbl_pipeline.report.page import page_of
 from pbl_pipeline.tracking import Tracking
 from pbl_pipeline.video import VideoInfo, probe
 from pbl_pipeline.visit import Recording, Solution, Visit, load_visit, save_visit
-from schemas import event_corrections
 from schemas import load_visit as load_from_tables
+from schemas.decisions import event_corrections
 from schemas.intake import Methods, ingest
-from schemas.intake import Visit as Whose
+from schemas.intake import VisitRecord as Whose
 from tests.command import pbl
 from tests.exported import with_markers
 from tests.integration import chain, test_markers, test_rigs, web

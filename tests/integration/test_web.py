@@ -12,10 +12,11 @@ from typing import Any
 import pytest
 
 from pbl_pipeline.errors import PblError
-from schemas import gdi, lab, qc, session, study, visit_list
+from schemas import gdi, lab, qc, session, study
+from schemas.reading import visit_list
 from schemas.reading.shown import shown_visit
+from schemas.reading.visit_list import Filter, visit_page
 from schemas.rows import utc_now
-from schemas.visit_list import Filter, visit_page
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register

@@ -13,7 +13,8 @@ import pytest
 import pbl_pipeline.fit
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import compare, gdi, study, views
+from schemas import gdi, study
+from schemas.reading import comparison, frames
 from tests.integration import chain, web
 from tests.integration.chain import small_video
 from tests.rows import register, remove_all
@@ -44,7 +45,7 @@ def visits(database: Path, tmp_path_factory: pytest.TempPathFactory):
         populate()
         register(small_video(folder, "later"), session_label="2026-09-10")
         for number, index in ((1, 80.0), (2, 86.0), (3, 95.0)):
-            key = compare.shown_visit(number).key
+            key = comparison.shown_visit(number).key
             row = {k: key[k] for k in gdi.SessionGdi.primary_key}
             values = {"session_gdi": index, "session_gdi_sd": 3.0, "session_gdi_minimal_change": 5.0 + number}
             gdi.SessionGdi.update1({**row, **values})
@@ -57,7 +58,7 @@ def visits(database: Path, tmp_path_factory: pytest.TempPathFactory):
 
 
 def test_changes_against_the_reference(visits: None):
-    found = compare.compare([(2, None), (1, None), (4, None)])
+    found = comparison.compare([(2, None), (1, None), (4, None)])
     assert [c.about.row.session_id for c in found.compared] == [1, 2, 4]  # by day
     first, second, without = found.compared
     assert (first.change, first.changes) == (None, {})
@@ -75,24 +76,24 @@ def test_changes_against_the_reference(visits: None):
     assert second.scores["mJOA-LE"].change is None  # the reference has none
     assert (without.about.result, without.cycles, without.change) == (None, (), None)
     assert len(without.curves) == 0
-    turned = compare.compare([(1, None), (2, None)], (2, None))
+    turned = comparison.compare([(1, None), (2, None)], (2, None))
     assert turned.reference == 1
     assert turned.compared[0].change is not None
     assert turned.compared[0].change.by == -6.0
     gdi.SessionGdi.update1({k: first.about.key[k] for k in gdi.SessionGdi.primary_key} | {"session_gdi": 79.0})
-    again = compare.compare([(1, None), (2, None)]).compared[1].change
+    again = comparison.compare([(1, None), (2, None)]).compared[1].change
     assert again is not None
     assert (again.by, again.sure) == (7.0, True)
     gdi.SessionGdi.update1({k: first.about.key[k] for k in gdi.SessionGdi.primary_key} | {"session_gdi": 80.0})
 
 
 def test_results_by_other_methods_are_not_judged(visits: None, monkeypatch: pytest.MonkeyPatch):
-    one, other = compare.shown_visit(1).results[0], compare.shown_visit(2).results[0]
-    assert compare.change_since(other, one) == compare.Change(6.0, False)
+    one, other = comparison.shown_visit(1).results[0], comparison.shown_visit(2).results[0]
+    assert comparison.change_since(other, one) == comparison.Change(6.0, False)
     strange = dataclasses.replace(other, methods=("another", *other.methods[1:]))
-    assert compare.change_since(strange, one) == compare.Change(6.0, None)
-    assert compare.change_since(dataclasses.replace(other, minimal_change=None), one) == compare.Change(6.0, None)
-    assert compare.change_since(dataclasses.replace(other, index=None), one) is None
+    assert comparison.change_since(strange, one) == comparison.Change(6.0, None)
+    assert comparison.change_since(dataclasses.replace(other, minimal_change=None), one) == comparison.Change(6.0, None)
+    assert comparison.change_since(dataclasses.replace(other, index=None), one) is None
 
 
 def test_the_interval_of_a_measure_is_students():
@@ -166,8 +167,8 @@ def test_what_cannot_be_compared(visits: None, asked: str, status: int):
 
 
 def test_curves_that_are_drawn_are_those_of_the_tables(visits: None):
-    found = compare.compare([(1, None), (2, None)])
-    frame = views.cycle_curves({"session_id": 1})
+    found = comparison.compare([(1, None), (2, None)])
+    frame = frames.cycle_curves({"session_id": 1})
     drawn = charts_of(found, ["a", "b"])
     knee = next(c for c in drawn if c.title == "Knee flexion")
     own = frame[(frame["angle"] == "knee_flexion") & (frame["side"] == "left")]["mean_deg"]

@@ -10,9 +10,10 @@ from typing import Any
 
 import pytest
 
-from schemas import decide, fit, gdi, qc, tracking
+from schemas import fit, gdi, qc, tracking
+from schemas.decisions import review_decisions
 from schemas.jobs import jobs_of
-from schemas.visit_progress import visit_progress
+from schemas.reading.visit_progress import visit_progress
 from tests.integration import compute_target, web
 from tests.integration.chain import small_video
 from tests.rows import everything_but_refreshes, register
@@ -63,7 +64,11 @@ def ended(browser: Any, session_id: int = 1) -> None:
 
 def mark(browser: Any, number: int) -> None:
     answer = web.post(
-        browser, f"/recordings/{number}/usable", usable="no", reason="helped", seen=decide.usable_state(number)
+        browser,
+        f"/recordings/{number}/usable",
+        usable="no",
+        reason="helped",
+        seen=review_decisions.usable_state(number),
     )
     assert answer.status_code == 303, answer.text
 
@@ -106,7 +111,7 @@ def test_a_visit_waits_for_the_one_before_and_says_so(visits: None, browser: Any
     assert "after another one" in browser.get("/visits/2/progress").text
     assert 'data-busy="yes"' in browser.get("/visits/1/progress").text
     mark(browser, 2)  # decided while it is computed: the last decision counts
-    decide.take_back(1)
+    review_decisions.take_back(1)
     (hold / "hold").unlink()
     ended(browser)
     ended(browser, 2)

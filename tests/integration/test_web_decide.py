@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 
 from pbl_pipeline.errors import PblError
-from schemas import decide, fit, qc, tracking
+from schemas import fit, qc, tracking
 from schemas.datajoint_setup import dj
+from schemas.decisions import review_decisions
 from schemas.operations import forget
 from schemas.reading import shown
 from schemas.review import Decision
@@ -174,7 +175,7 @@ def test_a_warning_is_accepted_with_a_name_until_it_is_computed_anew(warned: dic
     qc.SessionQc.update1({**key, "qc_computed": "2030-01-01 00:00:00"})  # as if computed again
     assert "accepted by" not in browser.get("/visits/1").text
     assert accept(browser, warned).status_code == 409
-    assert len(decide.decisions(1)) == 1  # what was decided stays in the history
+    assert len(review_decisions.decisions(1)) == 1  # what was decided stays in the history
 
 
 def test_only_warnings_can_be_accepted(warned: dict[str, Any]):
@@ -184,13 +185,13 @@ def test_only_warnings_can_be_accepted(warned: dict[str, Any]):
     assert accept(web.client(), warned, result=5).status_code == 404
     qc.SessionQc.Check.update1({**key, "qc_check_outcome": "FAIL"})
     with pytest.raises(PblError, match="asks for attention"):
-        decide.accept_check(key, warned["qc_no"], "A")
+        review_decisions.accept_check(key, warned["qc_no"], "A")
     assert len(Decision()) == 0
 
 
 def test_a_forgotten_person_takes_the_decisions_along(warned: dict[str, Any]):
     accept(web.client(), warned)
-    decide.decide_person(1, int(tracking.SubjectChoice.fetch1("chosen_person_id")), by="A")
+    review_decisions.decide_person(1, int(tracking.SubjectChoice.fetch1("chosen_person_id")), by="A")
     assert len(Decision()) == 2
     assert not forget.forget("P001").left
     assert len(Decision()) == 0

@@ -14,15 +14,16 @@ import pytest
 
 import pbl_pipeline.gait
 from pbl_pipeline.errors import PblError
-from schemas import decide, event_corrections, fit, gait, gdi, load_visit, qc, study
+from schemas import fit, gait, gdi, load_visit, qc, study
+from schemas.decisions import event_corrections, review_decisions
 from schemas.intake import move
 from schemas.operations.forget import forget
 from schemas.reading import list_fitted
 from schemas.reading.shown import shown_recording, shown_visit
+from schemas.reading.visit_list import Filter, visit_page
 from schemas.review import Decision
 from schemas.rows import delete_below
 from schemas.studies import slices
-from schemas.visit_list import Filter, visit_page
 from tests.integration import decide_target, web
 from tests.integration.chain import small_video
 from tests.rows import everything_but_refreshes, register
@@ -173,7 +174,7 @@ def test_corrections_again_and_back_to_the_detected_ones(visit: str):
     assert not populate().did_something
     history = (gait.EventCorrection & {"video_id": 1}).to_arrays("correction_withdrawn", order_by="correction_no")
     assert history.tolist() == [0, 0, 1]
-    told = [(d.before["by"], d.after["by"]) for d in decide.decisions(1)]
+    told = [(d.before["by"], d.after["by"]) for d in review_decisions.decisions(1)]
     assert told == [("hand", "automatic")] * 2 + [("hand", "hand")] + [("automatic", "hand")] * 2
     assert f"by hand, {len(events)} events" in browser.get("/visits/1").text
 
@@ -206,7 +207,7 @@ def test_two_people_correct_at_the_same_moment(visit: str):
     found = event_corrections.shown(1)
     assert found is not None
     calls = [(1, moved(by=d), name, found.state) for d, name in ((0.1, "A. First"), (0.05, "B. Second"))]
-    late, done = decide_target.at_once("schemas.event_corrections.save", *calls)
+    late, done = decide_target.at_once("schemas.decisions.event_corrections.save", *calls)
     assert (done, late[0]) == (("done", ""), "DECIDED_MEANWHILE")
     assert f"{gait.EventCorrection.fetch1('correction_by')} decided for by hand, changed 1" in late[1]
     assert len(Decision()) == 1
@@ -271,7 +272,7 @@ def test_a_decision_waits_for_the_insert_that_reads_what_it_changes(visit: str):
 def test_corrections_are_of_the_person_that_was_measured(visit: str):
     save(1, moved())
     populate()
-    decide.decide_person(1, 2)
+    review_decisions.decide_person(1, 2)
     populate()
     found = event_corrections.shown(1)
     assert found is not None
@@ -279,12 +280,12 @@ def test_corrections_are_of_the_person_that_was_measured(visit: str):
     assert (gait.GaitCycle & {"video_id": 1} & fit.current()).fetch1("correction_no") is None
     page = web.client().get("/recordings/1").text
     assert "corrected for another person" in page
-    decide.decide_person(1, 1)
+    review_decisions.decide_person(1, 1)
     populate()
     assert (gait.GaitCycle & {"video_id": 1} & fit.current()).fetch1("correction_no") == 1
     assert shown_recording(1).recording.cycles  # those of the corrected events
     # The last correction of each person counts: of the other one there was none to take back.
-    decide.decide_person(1, 2)
+    review_decisions.decide_person(1, 2)
     populate()
     found = event_corrections.shown(1)
     assert found is not None

@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 
-from schemas import status, video
+from schemas import video
 from schemas.jobs import jobs_of
+from schemas.reading import status
 from schemas.review import Decision
 from tests.integration import web
 from tests.integration.chain import small_video

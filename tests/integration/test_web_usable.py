@@ -11,14 +11,16 @@ import pytest
 import pbl_pipeline.fit
 import pbl_pipeline.keypoints
 from pbl_pipeline.errors import PblError
-from schemas import decide, fit, gdi, intake, listing, load_visit, qc, study, tracking, usable, video, visit_list
-from schemas.intake import LaboratoryMarkers, SeveralCameras, Visit
+from schemas import fit, gdi, intake, load_visit, qc, study, tracking, video
+from schemas.decisions import not_usable, review_decisions
+from schemas.intake import LaboratoryMarkers, SeveralCameras, VisitRecord
 from schemas.plan import plan_fit_sets
+from schemas.reading import registered, visit_list
 from schemas.reading.shown import shown_visit
+from schemas.reading.visit_list import Filter, visit_page
+from schemas.reading.why import why
 from schemas.review import Decision
 from schemas.studies import slices
-from schemas.visit_list import Filter, visit_page
-from schemas.why import why
 from tests.command import pbl
 from tests.integration import decide_target, test_markers, test_rigs, web
 from tests.integration.chain import small_video
@@ -94,21 +96,24 @@ def test_a_marked_recording_leaves_its_visit_and_comes_back(visit: tuple[int, in
     assert (state(), current()) == ("computed", [[1, 2]])
     assert not populate().did_something
     assert "No decisions about this visit" not in browser.get("/visits/1").text
-    assert [d.after for d in decide.decisions(1)] == [{"usable": "yes"}, {"usable": "no", "why": "interrupted"}]
+    assert [d.after for d in review_decisions.decisions(1)] == [
+        {"usable": "yes"},
+        {"usable": "no", "why": "interrupted"},
+    ]
 
 
 def test_a_visit_without_a_usable_recording_has_no_set(visit: tuple[int, int]):
     for number in visit:
-        decide.mark_not_usable(number, "too_dark")
+        review_decisions.mark_not_usable(number, "too_dark")
     assert (state(), current()) == ("unusable", [])
     assert not populate().did_something
     assert state() == "unusable"
     page = web.client().get("/visits/1").text
     assert "no usable recording" in page
     assert shown_visit(1).results == ()
-    decide.take_back(1)
+    review_decisions.take_back(1)
     assert (state(), current()) == ("pending", [[1]])
-    decide.take_back(1)  # is used already
+    review_decisions.take_back(1)  # is used already
     assert len(Decision()) == 3
 
 
@@ -121,9 +126,9 @@ def test_a_mark_waits_for_nobody_and_nobody_for_it(tables: None, tmp_path: Path)
     lost.unlink()
     populate()
     assert (state(), visit_page(Filter()).visits[0].problem) == ("failed", "VIDEO_MISSING")
-    decide.mark_not_usable(gone, "other", "the file is lost")
+    review_decisions.mark_not_usable(gone, "other", "the file is lost")
     assert state() == "waiting"
-    decide.mark_not_usable(waits, "other_person")
+    review_decisions.mark_not_usable(waits, "other_person")
     assert (state(), current()) == ("computed", [[one]])
     said = pbl("status")
     assert "not usable" in said.out
@@ -133,7 +138,7 @@ def test_a_mark_waits_for_nobody_and_nobody_for_it(tables: None, tmp_path: Path)
     assert "VIDEO_MISSING" not in pbl("status").out
     # A new recording that is not computed yet, and the only computed one is marked: no set until it is decided.
     later = register(small_video(tmp_path, "d"), session_label="2026-01-10")[0]
-    decide.mark_not_usable(one, "duplicate")
+    review_decisions.mark_not_usable(one, "duplicate")
     assert (state(), current()) == ("pending", [])
     populate()
     assert (state(), current()) == ("computed", [[later]])
@@ -141,11 +146,11 @@ def test_a_mark_waits_for_nobody_and_nobody_for_it(tables: None, tmp_path: Path)
 
 def test_nothing_is_computed_of_a_recording_that_was_marked_first(tables: None, tmp_path: Path):
     number = register(small_video(tmp_path, "a"), session_label="2026-01-10")[0]
-    decide.mark_not_usable(number, "not_in_view")
+    review_decisions.mark_not_usable(number, "not_in_view")
     populate()
     assert len(tracking.Tracking()) == 0
     assert state() == "unusable"
-    decide.take_back(number)
+    review_decisions.take_back(number)
     populate()
     assert (state(), current()) == ("computed", [[number]])
 
@@ -158,12 +163,12 @@ def test_a_mark_by_another_route_is_planned_too(visit: tuple[int, int]):
 
 
 def test_two_people_decide_at_the_same_moment(visit: tuple[int, int]):
-    seen = decide.usable_state(1)
+    seen = review_decisions.usable_state(1)
     calls = [(1, reason, "", name, seen) for reason, name in (("helped", "A. First"), ("too_dark", "B. Second"))]
-    late, done = decide_target.at_once("schemas.decide.mark_not_usable", *calls)
+    late, done = decide_target.at_once("schemas.decisions.review_decisions.mark_not_usable", *calls)
     assert done == ("done", "")
     assert late[0] == "DECIDED_MEANWHILE"
-    mark = usable.unusable([1])[1]
+    mark = not_usable.unusable([1])[1]
     assert f"{mark.by} decided for usable no, why {mark.reason}" in late[1]
     assert len(Decision()) == 1
     assert current() == [[2]]
@@ -176,7 +181,7 @@ def test_who_is_late_sees_it_in_the_page(visit: tuple[int, int]):
     late = send(second, 1, form, usable="no", reason="too_dark")
     assert late.status_code == 409
     assert "A. First decided for" in late.text
-    assert usable.unusable([1])[1].reason == "helped"
+    assert not_usable.unusable([1])[1].reason == "helped"
     assert send(first, 1, usable="yes").status_code == 303
     assert send(second, 1, form, usable="no", reason="too_dark").status_code == 409  # it was marked in between
 
@@ -201,9 +206,9 @@ def test_a_forged_form_changes_nothing(visit: tuple[int, int]):
 def test_the_command(visit: tuple[int, int]):
     said = pbl("choose", 1, "--not-usable", "camera_moved", "--note", "fell over")
     assert (said.code, "left out" in said.out) == (0, True)
-    assert usable.unusable([1, 2])[1].text == "the camera was moved, or stood badly (fell over)"
+    assert not_usable.unusable([1, 2])[1].text == "the camera was moved, or stood badly (fell over)"
     assert "not usable: the camera was moved" in pbl("why", 1).out
-    assert list(listing.videos()["not_usable"]) == ["the camera was moved, or stood badly (fell over)", ""]
+    assert list(registered.videos()["not_usable"]) == ["the camera was moved, or stood badly (fell over)", ""]
     assert pbl("choose", 1, "--usable").code == 0
     assert len(video.NotUsable()) == 0
     assert len(Decision()) == 2
@@ -211,7 +216,7 @@ def test_the_command(visit: tuple[int, int]):
     assert pbl("choose", 99, "--not-usable", "helped").error_code == "DB_NOT_FOUND"
     assert pbl("choose", 1, 2, "--usable").code == pbl("choose", 1, "--note", "x").code == 2
     with pytest.raises(PblError, match="no video_id 99"):
-        decide.take_back(99)
+        review_decisions.take_back(99)
 
 
 def test_all_cameras_of_a_trial_are_marked_together(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -220,18 +225,18 @@ def test_all_cameras_of_a_trial_are_marked_together(tables: None, tmp_path: Path
     toml = test_rigs.calibration(tmp_path / "Calib.toml")
     for trial in ("w1.", "w2."):
         made = intake.register(
-            [SeveralCameras(test_rigs.rig_videos(tmp_path, trial), toml, Visit("P001", "2026-01-10"))]
+            [SeveralCameras(test_rigs.rig_videos(tmp_path, trial), toml, VisitRecord("P001", "2026-01-10"))]
         )
         assert [r.status for r in made] == ["registered"] * 3
     populate()
     assert current() == [[1, 2, 3, 4, 5, 6]]
     assert "one of 3 cameras" in web.client().get("/recordings/5").text
-    decide.mark_not_usable(5, "camera_moved", by="A")
+    review_decisions.mark_not_usable(5, "camera_moved", by="A")
     assert sorted(video.NotUsable().to_arrays("video_id")) == [4, 5, 6]
     assert current() == [[1, 2, 3]]
     populate()
     assert state() == "computed"
-    decide.take_back(6, by="B")
+    review_decisions.take_back(6, by="B")
     assert (state(), current()) == ("computed", [[1, 2, 3, 4, 5, 6]])
 
 
@@ -239,13 +244,13 @@ def test_marker_recordings_are_marked_too(tables: None, tmp_path: Path, monkeypa
     monkeypatch.setattr(pbl_pipeline.fit, "fit_session", lambda *given, **_: test_rigs.fit_none(*given))
     number = register(small_video(tmp_path, "walk"), session_label="2026-01-10")[0]
     paths = [test_markers.recording(tmp_path / f"{name}.npz", s) for name, s in (("m1", 7.0), ("m2", 8.0))]
-    made = intake.register([LaboratoryMarkers(p, Visit("P001", "2026-01-10")) for p in paths])
+    made = intake.register([LaboratoryMarkers(p, VisitRecord("P001", "2026-01-10")) for p in paths])
     assert [r.status for r in made] == ["registered"] * 2, made
     populate()
     assert sorted(current()) == [[number], [2, 3]]
-    decide.mark_not_usable(3, "duplicate")
+    review_decisions.mark_not_usable(3, "duplicate")
     assert sorted(current()) == [[number], [2]]
-    decide.mark_not_usable(2, "helped")
+    review_decisions.mark_not_usable(2, "helped")
     assert current() == [[number]]
     assert state() == "computed"
     assert "Is it usable?" in web.client().get("/recordings/2").text
@@ -254,7 +259,7 @@ def test_marker_recordings_are_marked_too(tables: None, tmp_path: Path, monkeypa
 def test_a_frozen_slice_does_not_change(visit: tuple[int, int]):
     study.Visit.insert1({"session_id": 1, "visit_role": "pre"})
     frozen = slices.freeze("before")
-    decide.mark_not_usable(2, "helped")
+    review_decisions.mark_not_usable(2, "helped")
     assert not slices.changes("before")
     populate()
     assert not slices.changes("before")
@@ -276,7 +281,7 @@ def test_from_the_click_to_the_row(visit: tuple[int, int], chromium: Any):
         page.get_by_label("Why (no names)").last.fill("fell over")
         button.click()
         page.get_by_role("button", name="Use it again").wait_for()
-        assert usable.unusable([1])[1].text == "the camera was moved, or stood badly (fell over)"
+        assert not_usable.unusable([1])[1].text == "the camera was moved, or stood badly (fell over)"
         assert Decision.fetch1("decision_by") == "A. First"
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         page.get_by_role("button", name="Use it again").click()

@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 import schemas
-from schemas import connection, status, video
+from schemas import connection, video
 from schemas.jobs import jobs_of
+from schemas.reading import status
 from schemas.worker import alone
 
 

@@ -28,8 +28,8 @@ from schemas import connection, fit, gait, gdi, lab, qc, tracking, video, worker
 from schemas.chain import ON_REQUEST
 from schemas.cli.why import why as why_command
 from schemas.operations import embedded
-from schemas.status import live_workers, pipeline_status, queue_counts
-from schemas.why import why
+from schemas.reading.status import live_workers, pipeline_status, queue_counts
+from schemas.reading.why import why
 from tests.rows import register
 from workers import queue, recover, refresh, registry, requeue, run_job
 from workers.heartbeat import Heartbeat, Silent
@@ -485,7 +485,7 @@ def test_few_and_many_videos_are_counted_alike(tables: None, tmp_path: Path, mon
     assert {t.table: t.error for t in few.tables if t.error} == {"VideoInfo": 1}
     assert {t.table: (t.empty, t.waiting) for t in few.tables if t.empty or t.waiting} == {"SubjectChoice": (1, 1)}
     assert few.cameras == {"guess": done["Keypoints"]}
-    monkeypatch.setattr("schemas.status.SMALL", 0)  # through connections side by side
+    monkeypatch.setattr("schemas.reading.status.SMALL", 0)  # through connections side by side
     many = pipeline_status(exact=False)
     assert [(t.table, t.done, t.empty, t.pending, t.error, t.waiting) for t in many.tables] == [
         (t.table, t.done, t.empty, t.pending, t.error, t.waiting) for t in few.tables

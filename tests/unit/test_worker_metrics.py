@@ -13,7 +13,8 @@ from types import SimpleNamespace
 import pymysql
 import pytest
 
-from schemas import connection, fit, status
+from schemas import connection, fit
+from schemas.reading import status
 from workers import recover
 from workers.metrics import Metrics
 from workers.process import Options

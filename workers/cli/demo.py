@@ -60,10 +60,11 @@ def _fetched() -> dict[str, Path]:
 
 def _run(out: Path) -> None:
     import schemas
-    from schemas import connection, views
-    from schemas.intake import Visit, ingest
+    from schemas import connection
+    from schemas.intake import VisitRecord, ingest
     from schemas.operations import embedded
-    from schemas.report import write_visit
+    from schemas.reading import frames
+    from schemas.reading.report import write_visit
     from workers.cli.populate import summary
     from workers.populate import populate
 
@@ -76,7 +77,7 @@ def _run(out: Path) -> None:
     for name, path in files.items():
         click.echo(f"{name}: {path}")
     _step(3, "ingest")
-    visit = Visit(SUBJECT, SESSION, PROJECT, camera_file=files["demo_camera"])
+    visit = VisitRecord(SUBJECT, SESSION, PROJECT, camera_file=files["demo_camera"])
     for result in ingest([files["demo_video"]], visit):
         if result.error is not None:
             raise result.error
@@ -89,8 +90,8 @@ def _run(out: Path) -> None:
     _step(5, "result")
     here = {"subject": SUBJECT, "session_label": SESSION}
     paths = write_visit(here, out)
-    summary_rows = views.session_summary(here)
-    click.echo(rows_text(summary_rows, views.trial_summary(here)))
+    summary_rows = frames.session_summary(here)
+    click.echo(rows_text(summary_rows, frames.trial_summary(here)))
     click.echo()
     for path in paths:
         click.echo(path)

@@ -29,8 +29,8 @@ from typing import Any, ClassVar
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import one_process
-from schemas.folders import private_folder
-from schemas.json_files import write_json
+from schemas.operations.folders import private_folder
+from schemas.operations.json_files import write_json
 
 from .access import RIGHTS
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from starlette.requests import Request
 
 if TYPE_CHECKING:
-    from schemas.visit_list import Result
+    from schemas.reading.visit_list import Result
 
 #: Largest number of a row: DataJoint's int32.
 LARGEST = 2**31 - 1

@@ -11,7 +11,7 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from pbl_pipeline.errors import PblError
-from schemas.viewings import record_viewing
+from schemas.decisions.viewing_log import record_viewing
 
 from .access import Session
 from .address import LARGEST

@@ -19,7 +19,7 @@ from pbl_pipeline import charts
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, number
-from schemas import compare
+from schemas.reading import comparison
 
 from .address import LARGEST, interval
 from .pages import Pages, as_json, page
@@ -45,7 +45,7 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
     async def show(request: Request) -> Response:
         chosen = [_read(text) for text in request.query_params.getlist("v")[:100]]
         wanted = request.query_params.get("ref", "")
-        found = await tables.ask(compare.compare, chosen, _read(wanted) if wanted else None)
+        found = await tables.ask(comparison.compare, chosen, _read(wanted) if wanted else None)
         names = [_name(c) for c in found.compared]
         cycles = [c.cycles for c in found.compared]
         shown: dict[int, PblError | None] = {}
@@ -78,7 +78,7 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
     return page("/compare", show)
 
 
-def charts_of(found: compare.Comparison, names: Sequence[str]) -> list[Chart]:
+def charts_of(found: comparison.Comparison, names: Sequence[str]) -> list[Chart]:
     """Every angle of which any result has curves, in the order of the report."""
     out = []
     for angle, (title, positive) in (ANGLES | FOOT_ANGLES | PELVIS_ANGLES).items():
@@ -111,7 +111,7 @@ def _norm(frame: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     return (columns[0], columns[1], columns[2]) if np.isfinite(columns[1]).all() else None
 
 
-def _name(one: compare.Side) -> str:
+def _name(one: comparison.Side) -> str:
     """What tells a result from the others, without the person's code."""
     label = one.about.row.label
     if len(one.about.results) < 2 or one.about.result is None:
@@ -119,7 +119,7 @@ def _name(one: compare.Side) -> str:
     return f"{label}, {one.about.result.kind}, {one.about.result.methods[0]}"
 
 
-def _first_cycle(own: Sequence[compare.Cycle], of_all: Sequence[Sequence[compare.Cycle]]) -> int | None:
+def _first_cycle(own: Sequence[comparison.Cycle], of_all: Sequence[Sequence[comparison.Cycle]]) -> int | None:
     """The place of the cycle that is shown at first: in the middle of those of one side, the same side for all."""
     side = max(("right", "left"), key=lambda s: sum(any(c.side == s for c in cycles) for cycles in of_all))
     mine = [i for i, c in enumerate(own) if c.side == side] or list(range(len(own)))
@@ -139,7 +139,7 @@ def _read(text: str) -> tuple[int, int | None]:
     return int(found[1]), None if found[2] is None else int(found[2])
 
 
-def _address(found: compare.Comparison, reference: int) -> str:
+def _address(found: comparison.Comparison, reference: int) -> str:
     """The same comparison with another reference."""
     named = [
         f"{c.about.row.session_id}" + ("" if c.about.shown is None else f".{c.about.shown}") for c in found.compared

@@ -6,7 +6,7 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 
-from schemas.visit_progress import visit_progress
+from schemas.reading.visit_progress import visit_progress
 
 from ..process_queue import ProcessQueue
 from .access import Refused, form_of

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from starlette.requests import Request
 
 from pbl_pipeline.errors import PblError
-from schemas.visit_progress import Progress
+from schemas.reading.visit_progress import Progress
 
 from ..process_queue import ProcessQueue, Task
 

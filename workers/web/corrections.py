@@ -1,4 +1,4 @@
-"""Judge a recording: whether it is usable, and its events by hand. Each decision is a row (`schemas.decide`)."""
+"""Judge a recording: whether it is usable, and its events by hand. Each decision is a row (`schemas.decisions`)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 
 from pbl_pipeline.words import UNUSABLE
-from schemas import decide, event_corrections, fit, usable
+from schemas import fit
+from schemas.decisions import event_corrections, not_usable, review_decisions
 
 from ..refresh import queue_visit_of
 from .access import Refused, Session, form_of
@@ -26,7 +27,7 @@ class Judged:
     """What was decided of a recording, and the state in which the page shows it. views: videos of its trial, which are
     marked together; events: those that count, None where none were searched."""
 
-    mark: usable.Unusable | None
+    mark: not_usable.Unusable | None
     usable_state: str
     views: int
     events: event_corrections.Shown | None
@@ -36,8 +37,8 @@ class Judged:
 def judged(video_id: int) -> Judged:
     """Of a registered recording. Reads tables."""
     views = fit.videos_of(fit.trial_of(video_id))
-    mark = usable.unusable([video_id]).get(video_id)
-    return Judged(mark, decide.usable_state(video_id), len(views), event_corrections.shown(video_id))
+    mark = not_usable.unusable([video_id]).get(video_id)
+    return Judged(mark, review_decisions.usable_state(video_id), len(views), event_corrections.shown(video_id))
 
 
 def routes(tables: Tables) -> list[Route]:
@@ -48,10 +49,10 @@ def routes(tables: Tables) -> list[Route]:
         session: Session = request.state.session
         number, seen = number_of(request), fields.get("seen", "")
         if fields.get("usable") == "yes":
-            await tables.ask(decide.take_back, number, session.name, seen)
+            await tables.ask(review_decisions.take_back, number, session.name, seen)
         elif fields.get("usable") == "no":
             reason, note = fields.get("reason", ""), fields.get("note", "")
-            await tables.ask(decide.mark_not_usable, number, reason, note, session.name, seen)
+            await tables.ask(review_decisions.mark_not_usable, number, reason, note, session.name, seen)
         else:
             raise Refused("form")
         await tables.ask(queue_visit_of, number)

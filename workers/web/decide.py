@@ -1,4 +1,4 @@
-"""Decide: who is measured, and which warnings are accepted. Each decision is a row (`schemas.decide`)."""
+"""Decide: who is measured, and which warnings are accepted. Each decision is a row (`schemas.decisions`)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from starlette.routing import Route
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
-from schemas import choose, decide, video
+from schemas import video
+from schemas.decisions import candidates, review_decisions
 
 from ..refresh import queue_visit_of
 from .access import Refused, Session, form_of
@@ -29,7 +30,7 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
         number = number_of(request)
         chosen = _number(fields.get("person", ""))
         method, seen = fields.get("method", ""), fields.get("seen", "")
-        await tables.ask(decide.decide_person, number, chosen, method, session.name, seen)
+        await tables.ask(review_decisions.decide_person, number, chosen, method, session.name, seen)
         await tables.ask(queue_visit_of, number)
         return RedirectResponse(f"/recordings/{number}", 303)
 
@@ -51,7 +52,7 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
                     key=f"session_id={number}",
                 )
             reason = fields.get("reason", "").strip()
-            decide.accept_check(about.key, _number(fields.get("check", "")), session.name, reason)
+            review_decisions.accept_check(about.key, _number(fields.get("check", "")), session.name, reason)
 
         await tables.ask(write)
         return RedirectResponse(f"/visits/{number}?result={shown}", 303)
@@ -63,11 +64,11 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
         def picture() -> bytes:
             if settings.deidentify_how():
                 raise video.unknown_video(number)
-            found = choose.candidates(number)
+            found = candidates.candidates(number)
             if which >= len(found):
                 raise video.unknown_video(number)
             with tempfile.TemporaryDirectory() as folder:
-                return choose.write_sheet(found[which], Path(folder) / "people.jpg").read_bytes()
+                return candidates.write_sheet(found[which], Path(folder) / "people.jpg").read_bytes()
 
         return Response(await tables.ask(picture), media_type="image/jpeg")
 

@@ -19,8 +19,8 @@ from pbl_pipeline.qc import PASS
 from pbl_pipeline.visit import FIT, METRICS, OVERLAY, REPORT, SESSION, Held, Recording, Visit, load_visit, name_of_fit
 from pbl_pipeline.words import MEASURES
 from schemas.reading.shown import ShownCheck, ShownRecording, ShownVisit, video_facts
-from schemas.visit_list import INCOMPLETE, Page, Result, VisitRow
-from schemas.visit_progress import Progress
+from schemas.reading.visit_list import INCOMPLETE, Page, Result, VisitRow
+from schemas.reading.visit_progress import Progress
 
 from .access import REPORT_POLICY
 from .address import interval, number_of

@@ -12,9 +12,10 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 
-from schemas import decide, fit
+from schemas import fit
+from schemas.decisions import review_decisions
 from schemas.operations.server_status import database_status
-from schemas.status import ErrorRow, Running, Status, pipeline_status, running, span
+from schemas.reading.status import ErrorRow, Running, Status, pipeline_status, running, span
 from schemas.transactions import in_transaction
 
 from ..requeue import retry
@@ -92,7 +93,7 @@ def _retry(table: str, code: str, key: dict[str, Any] | None, by: str) -> int:
         n = sum(retry(code, table, key=key).values())
         if n:
             about = {"table": table, "code": code, **({"key": key} if key else {})}
-            decide.record("retry", by, about, {"errors": n}, {"errors": 0}, "", **_whose(key or {}))
+            review_decisions.record("retry", by, about, {"errors": n}, {"errors": 0}, "", **_whose(key or {}))
         return n
 
     return in_transaction(work)

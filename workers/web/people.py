@@ -11,7 +11,8 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from schemas import choose, reading, video
+from schemas import reading, video
+from schemas.decisions import candidates
 
 from .address import number_of
 from .pages import Pages
@@ -28,7 +29,7 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
         number, asked = number_of(request), request.query_params.get("method", "0")
 
         def load() -> Tracking:
-            found = choose.candidates(number)
+            found = candidates.candidates(number)
             if not asked.isdecimal() or len(asked) > 3 or int(asked) >= len(found):
                 raise video.unknown_video(number)
             return reading.load_tracking(found[int(asked)].key)

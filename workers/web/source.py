@@ -8,9 +8,9 @@ from typing import Any, Protocol
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.visit import Visit
-from schemas import choose, decide
+from schemas.decisions import candidates, review_decisions
 from schemas.reading import shown
-from schemas.visit_progress import Progress, visit_progress
+from schemas.reading.visit_progress import Progress, visit_progress
 
 from .corrections import Judged, judged
 from .videos import Videos
@@ -43,7 +43,7 @@ class Source(Protocol):
         """Return a computed visit. Raises `PblError` DB_NOT_FOUND where it has no result."""
         ...
 
-    def people(self, about: shown.ShownRecording) -> tuple[Sequence[choose.Candidates], list[str]]:
+    def people(self, about: shown.ShownRecording) -> tuple[Sequence[candidates.Candidates], list[str]]:
         """Return who can be chosen, by tracking method, and the state in which that is shown."""
         ...
 
@@ -83,15 +83,15 @@ class TablesSource:
         assert about.visit is not None
         return about.visit
 
-    def people(self, about: shown.ShownRecording) -> tuple[Sequence[choose.Candidates], list[str]]:
+    def people(self, about: shown.ShownRecording) -> tuple[Sequence[candidates.Candidates], list[str]]:
         """None before people are searched."""
         try:
-            found = choose.candidates(about.number)
+            found = candidates.candidates(about.number)
         except PblError as error:
             if error.code != "DB_NOT_FOUND":
                 raise
             return [], []
-        return found, [decide.person_state(about.number, c.key["tracking_method"]) for c in found]
+        return found, [review_decisions.person_state(about.number, c.key["tracking_method"]) for c in found]
 
     def judged(self, number: int) -> Judged:
         return judged(number)
@@ -104,7 +104,7 @@ class TablesSource:
 
         number = about.row.session_id
         return {
-            "decisions": decide.decisions(number),
-            "accepted": decide.accepted(about.key) if about.key else {},
+            "decisions": review_decisions.decisions(number),
+            "accepted": review_decisions.accepted(about.key) if about.key else {},
             "entry": entry(number),
         }

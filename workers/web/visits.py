@@ -12,7 +12,7 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 
-from schemas import visit_list
+from schemas.reading import visit_list
 
 from .access import Session, form_of
 from .address import LARGEST, interval, number_of, shown_of

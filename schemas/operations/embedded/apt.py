@@ -40,27 +40,17 @@ def install(say: Say) -> str | None:
     return _run([*command, "update"])[0] or _run(add)[0]
 
 
-def unpack(folder: Path, say: Say, apt_options: Sequence[str] = ()) -> str | None:
+def unpack(folder: Path, say: Say) -> str | None:
     """Download the packages, with the libraries the system lacks, and unpack them into `folder`. Needs no root.
 
-    Parameters
-    ----------
-    folder
-        Becomes the root of the unpacked tree (`folder/usr/sbin/mariadbd`).
-    apt_options
-        Further `-o` options of apt, e.g. another package status in a test.
-
-    Returns
-    -------
-    str | None
-        None when done, else why not.
+    `folder` becomes the root of the unpacked tree (`folder/usr/sbin/mariadbd`). Returns None when done, else why not.
     """
     work = folder.with_name(folder.name + ".tmp")
     try:
         shutil.rmtree(work, ignore_errors=True)
         (work / "lists" / "partial").mkdir(parents=True)
         (work / "archives" / "partial").mkdir(parents=True)
-        failure = _download_and_unpack(work, say, apt_options)
+        failure = _download_and_unpack(work, say)
         if failure is None:
             shutil.rmtree(folder, ignore_errors=True)
             (work / "root").rename(folder)
@@ -71,20 +61,19 @@ def unpack(folder: Path, say: Say, apt_options: Sequence[str] = ()) -> str | Non
         shutil.rmtree(work, ignore_errors=True)
 
 
-def _download_and_unpack(work: Path, say: Say, apt_options: Sequence[str]) -> str | None:
+def _download_and_unpack(work: Path, say: Say) -> str | None:
     # The system's package lists are used as they are; where they are missing, own ones are fetched beside them.
-    own_lists = ["-o", f"Dir::State::Lists={work / 'lists'}", "-o", f"Dir::Cache={work}", "-o", "Debug::NoLocking=1"]
-    failure = _download(work, say, apt_options)
+    own_lists = ("-o", f"Dir::State::Lists={work / 'lists'}", "-o", f"Dir::Cache={work}", "-o", "Debug::NoLocking=1")
+    failure = _download(work, say)
     if failure is not None:
         say("  fetching a package list of our own")
-        options = [*apt_options, *own_lists]
-        failure = _run(["apt-get", *options, "-q", "update"])[0] or _download(work, say, options)
+        failure = _run(["apt-get", *own_lists, "-q", "update"])[0] or _download(work, say, own_lists)
     for package in sorted((work / "archives").glob("*.deb")):
         failure = failure or _run(["dpkg", "-x", str(package), str(work / "root")])[0]
     return failure
 
 
-def _download(work: Path, say: Say, options: Sequence[str]) -> str | None:
+def _download(work: Path, say: Say, options: Sequence[str] = ()) -> str | None:
     """Download what an installation would add: our packages and the libraries that the system lacks."""
     failure, said = _run(["apt-get", *options, "-s", "-q", "install", "--no-install-recommends", *PACKAGES])
     if failure is not None:

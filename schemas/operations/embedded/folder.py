@@ -13,7 +13,7 @@ from typing import Any
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import one_process
-from schemas.json_files import write_json
+from schemas.operations.json_files import write_json
 
 from .account import Account, check_enterable
 

@@ -35,7 +35,7 @@ def make_private(path: Path) -> None:
     """Make a folder 0700, and by default 0600 and 0700 what is made in it later.
 
     A default access control list, which takes the umask's place, does the latter on the file systems of Linux that
-    have them; on others the folder's own mode keeps everybody else out.
+    have them; on others the folder's own mode keeps all others out.
     """
     path.chmod(0o700)
     if hasattr(os, "setxattr"):

@@ -12,7 +12,7 @@ SUBJECT_CODE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
 
 
 def check_subject(code: str, next_step: str, key: object = None) -> None:
-    """Raise USAGE for what is no pseudonymous code; `next_step` and `key` are those of the error."""
+    """Raise USAGE for a text that is not a pseudonymous code; `next_step` and `key` are those of the error."""
     if not SUBJECT_CODE.fullmatch(code):
         raise PblError(
             "USAGE",

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
 
-from . import fit, gait, video
-from .decide import meanwhile, record
-from .plan import locked
-from .reading.objects import load_trial_fit
-from .review import Decision
-from .rows import delete_below, utc_now
+from .. import fit, gait, video
+from ..plan import locked
+from ..reading.objects import load_trial_fit
+from ..review import Decision
+from ..rows import delete_below, utc_now
+from .review_decisions import meanwhile, record
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib

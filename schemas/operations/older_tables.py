@@ -7,9 +7,9 @@ import re
 from pbl_pipeline import __version__
 from pbl_pipeline.errors import PblError
 
-from . import connection
-from .chain import tables
-from .operations import catalog
+from .. import connection
+from ..chain import tables
+from . import catalog
 
 #: A line of a definition that makes a column of the table's own: its name.
 _OWN = re.compile(r"^\s*([a-z]\w*)\s*[:=]", re.MULTILINE)

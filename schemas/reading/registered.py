@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 
-from . import fit, gdi, keypoints, lab, review, session, video
-from .datajoint_setup import dj
-from .methods import METHOD_TABLES
-from .rows import inside
-from .usable import unusable
-from .views import frame_of, newest_sets
+from .. import fit, gdi, keypoints, lab, review, session, video
+from ..datajoint_setup import dj
+from ..decisions.not_usable import unusable
+from ..methods import METHOD_TABLES
+from ..rows import inside
+from .frames import frame_of, newest_sets
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -39,7 +39,7 @@ def visits(restriction: Any = True) -> pd.DataFrame:
 
 def videos(restriction: Any = True) -> pd.DataFrame:
     """One row per video: whose, what is done at which pace, how many methods made keypoints and fits of it, and why it
-    is not usable ("" where nobody said so)."""
+    is not usable ("" for usable ones)."""
     columns = ("session_id", "video_name", "activity", "camera_motion", "video_created")
     query = video.Video.proj(*columns) * _visits() & restriction
     rows = frame_of(query).sort_values("video_id", ignore_index=True)
@@ -69,7 +69,7 @@ def method_rows(stage: str | None = None) -> pd.DataFrame:
     """One row per method: the stage, its key and short name (which means the newest version), and whether it is the
     stage's default.
 
-    Raises `PblError` SOLVER_UNKNOWN for a stage that there is not.
+    Raises `PblError` SOLVER_UNKNOWN for an unknown stage.
     """
     import pandas as pd
 

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
 
-from . import fit, gait, study, video, views
-from .reading.shown import ShownVisit, shown_visit
+from .. import fit, gait, study, video
+from . import frames
+from .shown import ShownVisit, shown_visit
 from .visit_list import Change, change_since, results_of
 
 if TYPE_CHECKING:
@@ -32,15 +33,6 @@ class Cycle:
 
 
 @dataclasses.dataclass(frozen=True)
-class MeasureChange:
-    """What a measure differs by from that of the reference. sure: whether that is more than chance, None where the
-    smallest change that is no chance is not known, as it is for all measures but the index."""
-
-    by: float
-    sure: bool | None = None
-
-
-@dataclasses.dataclass(frozen=True)
 class Score:
     """A clinical score. change: against the reference; important: whether that is at least the minimal important change
     of the instrument, None where none is taken over."""
@@ -55,11 +47,11 @@ class Side:
     """One of the visits that are compared, with its changes against the reference."""
 
     about: ShownVisit
-    curves: pd.DataFrame  # of `views.cycle_curves`
+    curves: pd.DataFrame  # of `frames.cycle_curves`
     cycles: tuple[Cycle, ...]
     scores: dict[str, Score]
     change: Change | None  # of the index; None for the reference itself
-    changes: dict[str, MeasureChange]
+    changes: dict[str, Change]  # of the measures
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +83,7 @@ def compare(chosen: Sequence[tuple[int, int | None]], reference: tuple[int, int 
     Raises
     ------
     PblError
-        USAGE for fewer than two or more than six, DB_NOT_FOUND for a visit or result that there is not.
+        USAGE for fewer than two or more than six, DB_NOT_FOUND for an unknown visit or result.
     """
     chosen = list(dict.fromkeys(chosen))
     if not FEWEST <= len(chosen) <= MOST:
@@ -135,11 +127,11 @@ def _compared(
         for name, (other, _) in first.measures.items():
             mine, _ = about.measures.get(name, (None, ""))
             if mine is not None and other is not None:
-                changes[name] = MeasureChange(mine.mean - other.mean)
+                changes[name] = Change(mine.mean - other.mean, None)
     before = scores[first.row.session_id] if about is not first else {}
     return Side(
         about=about,
-        curves=views.cycle_curves(about.key or False),
+        curves=frames.cycle_curves(about.key or False),
         cycles=_cycles(about.key) if about.key else (),
         scores={n: _score(v, before.get(n), instruments[n]) for n, v in scores[about.row.session_id].items()},
         change=change,

@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from . import fit, gait, gdi, lab, qc, session, study, tracking, validation, video
-from .datajoint_setup import dj
-from .stored_files import file_ref, stored_file
+from .. import fit, gait, gdi, lab, qc, session, study, tracking, validation, video
+from ..datajoint_setup import dj
+from ..stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -206,12 +206,6 @@ def quality_summary(restriction: Any = True) -> pd.DataFrame:
     return (current_sets() * checks & restriction).to_pandas(order_by="session_id, qc_no").reset_index()
 
 
-def decided_by_hand() -> pd.DataFrame:
-    """Videos whose subject a person chose."""
-    manual = tracking.SubjectOverride * video.Video.proj("video_name", "session_id")
-    return manual.to_pandas(order_by="video_id").reset_index()
-
-
 def validation_frame(restriction: Any = True) -> pd.DataFrame:
     """Errors of the current fits against the current references, one row per trial, reference and joint.
 
@@ -239,10 +233,10 @@ def validation_curves(frame: pd.DataFrame) -> pd.DataFrame:
     for key, row in _compared():
         if (row.trial, row.detector, row.solver) not in wanted:
             continue
-        with stored_file(fit.SessionFit, file_ref((fit.SessionFit.Trial & key).fetch1("trial_file"))) as path:
+        with stored_file(file_ref((fit.SessionFit.Trial & key).fetch1("trial_file"))) as path:
             trial = TrialFit.load(path)
         references = validation.ReferenceKinematics
-        with stored_file(references, file_ref((references & key).fetch1("reference_file"))) as path:
+        with stored_file(file_ref((references & key).fetch1("reference_file"))) as path:
             truth = lib.Reference.load(path)
         for method in dict.fromkeys(r["gait_method"] for r in (gait.GaitCycle & key).proj().to_dicts()):
             of_method = {**key, "gait_method": method}

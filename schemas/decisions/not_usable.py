@@ -1,4 +1,4 @@
-"""Recordings that a person marked as not usable, and why; `schemas.decide` marks them."""
+"""Recordings that a person marked as not usable, and why; `review_decisions` marks them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from pbl_pipeline.words import UNUSABLE
 
-from . import video
+from .. import video
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,10 +2,10 @@
 
     SUBJECT/SESSION/HASH-FILE    registered recordings, with the logs beside them
     _refused/SUBJECT/HASH-FILE   what could not be registered, with its reason in HASH-FILE.txt
-    .incoming/SUBJECT/           copies that are being made; what lies there while nobody imports was left by a kill
+    .incoming/SUBJECT/           copies that are being made; while no import runs, the remains of a killed one
     .incoming/seen.json          what lay in the drop folder when it was last listed
 
-SUBJECT is `_` for what was uploaded under a name that is no code.
+SUBJECT is `_` for what was uploaded under a name that is not a code.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 
 from pbl_pipeline import settings
 
-from .codes import SUBJECT_CODE
+from ..subject_codes import SUBJECT_CODE
 from .folders import private_folder, remove_empty
 from .json_files import write_json
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from . import fit, video
+from .. import fit, video
 
 
 @dataclasses.dataclass(frozen=True)

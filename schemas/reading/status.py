@@ -11,12 +11,13 @@ from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from . import computed_tables, connection, keypoints, tracking, usable, video, worker
-from .coded_errors import error_code, error_found, error_next_step
-from .jobs import jobs_of
-from .operations.catalog import quote
+from .. import computed_tables, connection, keypoints, tracking, video, worker
+from ..decisions import not_usable
+from ..job_errors import error_code, error_found, error_next_step
+from ..jobs import jobs_of
+from ..operations.catalog import quote
 
-#: Fewer videos than this, and keys are counted that nobody has queued yet.
+#: With fewer videos than this, keys that are not queued yet are also counted.
 SMALL = 5000
 
 #: Columns that say "ran well, nothing to produce": table -> (status, values, reason or None where a table above says).
@@ -101,7 +102,7 @@ class Waiting:
 
 @dataclasses.dataclass(frozen=True)
 class LeftOut:
-    """A video that somebody marked as not usable."""
+    """A video that is marked as not usable."""
 
     video_id: int
     about: str
@@ -153,7 +154,9 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
     errors = [e for t, s in zip(chain, tables, strict=True) if s.error for e in _errors(t, most)]
     empty = {t.table for t in tables if t.empty}
     waiting = _waiting(most) if any(t.waiting for t in tables) else []
-    marked = [LeftOut(m.video_id, _file_of({"video_id": m.video_id}), m.text, m.by) for m in usable.all_unusable(most)]
+    marked = [
+        LeftOut(m.video_id, _file_of({"video_id": m.video_id}), m.text, m.by) for m in not_usable.all_unusable(most)
+    ]
     return Status(n_videos, tables, errors, _empty(empty, most), waiting, live_workers(), exact, cameras, marked)
 
 
@@ -206,20 +209,20 @@ def queue_name(table: Any) -> tuple[str, str]:
     return str(table.database), "~~" + str(table.table_name).lstrip("_")
 
 
-def _quoted_queue(table: Any) -> str:
-    return quote(*queue_name(table))
+def queues(server: Any) -> set[tuple[str, str]]:
+    """Return schema and name of every queue that the server has."""
+    rows = server.query("SELECT table_schema, table_name FROM information_schema.tables WHERE table_name LIKE '~~%%'")
+    return {(str(schema), str(name)) for schema, name in rows.fetchall()}
 
 
 def queue_counts(server: Any) -> dict[str, dict[str, int]]:
     """Job rows of each computed table by status; none where the queue was never used. Only `server` is asked, so that
     a thread may call it with a connection of its own."""
-    rows = server.query("SELECT table_schema, table_name FROM information_schema.tables WHERE table_name LIKE '~~%%'")
-    there = {(str(schema), str(name)) for schema, name in rows.fetchall()}
-    out = {}
+    there, out = queues(server), {}
     for table in computed_tables():
         out[table.__name__] = dict.fromkeys(("pending", "reserved", "error", "ignore"), 0)
         if queue_name(table) in there:
-            found = server.query(f"SELECT status, COUNT(*) FROM {_quoted_queue(table)} GROUP BY status")  # noqa: S608
+            found = server.query(f"SELECT status, COUNT(*) FROM {quote(*queue_name(table))} GROUP BY status")  # noqa: S608
             out[table.__name__] |= {str(status): int(n) for status, n in found.fetchall()}
     return out
 
@@ -269,7 +272,7 @@ def span(seconds: float | None) -> str:
 
 def _oldest(table: Any, server: Any) -> tuple[float | None, str]:
     """Age (s) of the oldest pending job, and why jobs that were put back wait."""
-    jobs = _quoted_queue(table)
+    jobs = quote(*queue_name(table))
     age = server.query(
         f"SELECT TIMESTAMPDIFF(SECOND, MIN(created_time), CURRENT_TIMESTAMP) FROM {jobs} WHERE status='pending'"  # noqa: S608
     ).fetchone()[0]

@@ -15,7 +15,7 @@ _LIMITS = {"found": 600, "expected": 350, "next_step": 600, "key": 250}
 
 
 def fitted(error: PblError, key: Mapping[str, Any]) -> PblError:
-    """The same error, cut to fit the job's error row; without a key of its own it gets the job's."""
+    """Return the same error, cut to fit the job's error row, with the job's key where it has none."""
     about = error.key if error.key is not None else ", ".join(f"{k}={v}" for k, v in key.items())
     return PblError(
         error.code,
@@ -43,7 +43,7 @@ def _cut(text: str, limit: int) -> str:
 
 
 def error_message(error: BaseException, table: str, key: Mapping[str, Any]) -> str:
-    """What an error row says of an error, always with a code."""
+    """Return the message of an error row, always with a code."""
     coded = fitted(error, key) if isinstance(error, PblError) else internal(error, table, key)
     return f"PblError: {coded}"
 
@@ -64,7 +64,7 @@ def error_next_step(message: str) -> str:
 
 
 def error_found(message: str) -> str:
-    """What an error row's message found; the message itself when it is not a coded one."""
+    """Return what an error row's message states as found; the message itself when it is not a coded one."""
     for line in message.splitlines():
         if line.strip().startswith("found:"):
             return line.strip().removeprefix("found:").strip()

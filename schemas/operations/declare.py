@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 
-from . import connection, store
-from ._activate import activate
-from .chain import computed_tables
-from .jobs import jobs_of
+from .. import connection, store
+from .._activate import activate
+from ..chain import computed_tables
+from ..jobs import jobs_of
 
 
 def declare_all() -> None:

@@ -1,4 +1,4 @@
-"""A person's choice who is measured: what there is to choose from. `schemas.decide.decide_person` decides."""
+"""Candidates for the measured person of a video. `review_decisions.decide_person` records the choice."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 
-from . import tracking, video
-from .method_rows import stored_key
-from .reading.objects import load_tracking
-from .stored_files import file_ref, stored_file
+from .. import tracking, video
+from ..method_rows import stored_key
+from ..reading.objects import load_tracking
+from ..stored_files import file_ref, stored_file
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,15 +31,14 @@ class Candidates:
 
 
 def candidates(video_id: int, tracking_method: str | None = None) -> list[Candidates]:
-    """Who can be chosen in a video, once for each tracking method (or for one of them).
+    """Return the people who can be chosen in a video, once for each tracking method (or for one of them).
 
     Raises
     ------
     PblError
         DB_NOT_FOUND for a video that is not registered or not tracked yet, SOLVER_UNKNOWN.
     """
-    key = _key(video_id, tracking_method)
-    name = (video.Video & {"video_id": video_id}).fetch1("video_name")
+    key, name = _key(video_id, tracking_method), video.registered_video(video_id)["video_name"]
     out, found = [], (tracking.Tracking & key).keys()
     for tracked in found:
         persons = sorted(int(p) for p in (tracking.Tracking.Person & tracked).to_arrays("person_id"))
@@ -93,7 +92,7 @@ def write_sheet(about: Candidates, out_path: Path) -> Path:
     stored = [s for s in (tracking.SubjectChoice & about.key).to_arrays("contact_sheet") if s is not None]
     try:
         if stored and out_path.suffix.lower() != ".png":
-            with stored_file(tracking.SubjectChoice(), file_ref(stored[0])) as path:
+            with stored_file(file_ref(stored[0])) as path:
                 shutil.copyfile(path, out_path)
             return out_path
         path, sha256 = (video.Video & about.key).fetch1("video_path", "video_sha256")
@@ -112,8 +111,7 @@ def write_sheet(about: Candidates, out_path: Path) -> Path:
 
 def _key(video_id: int, tracking_method: str | None) -> dict[str, Any]:
     """Restriction to a registered video and, where named, one tracking method."""
-    if not video.Video & {"video_id": video_id}:
-        raise video.unknown_video(video_id)
+    video.registered_video(video_id)  # raises for an unknown one
     key: dict[str, Any] = {"video_id": video_id}
     if tracking_method is not None:
         key["tracking_method"] = stored_key(tracking.TrackingMethod, tracking_method)

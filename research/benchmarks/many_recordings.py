@@ -1,4 +1,4 @@
-"""Registration of very many recordings whose bytes are known, such as an archive."""
+"""Registration of very many recordings whose bytes are stated, for measurements of large databases."""
 
 from __future__ import annotations
 
@@ -8,19 +8,21 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 
-from ..transactions import in_transaction
-from .plans import resolve
-from .records import File, Methods, Visit
-from .registration import check_owner, registered, write
-from .videos import OneCamera
+from schemas.intake.plans import resolve
+from schemas.intake.records import File, Methods, VisitRecord
+from schemas.intake.registration import check_owner, registered, write
+from schemas.intake.videos import OneCamera
+from schemas.transactions import in_transaction
 
 #: Recordings in one transaction.
 CHUNK = 5000
 
 
-def archived(path: str, sha256: str, size: int, visit: Visit) -> OneCamera:
+def archived(path: str, sha256: str, size: int, visit: VisitRecord) -> OneCamera:
     """Return the record of a video whose SHA-256 and length (bytes) are known; it is not opened."""
-    return OneCamera(Path(path), visit, file=File(Path(path), sha256, size))
+    one = OneCamera(Path(path), visit)
+    one.files = (File(Path(path), sha256, size),)
+    return one
 
 
 def register_many(recordings: Iterable[OneCamera], methods: Methods | None = None) -> Counter[str]:
@@ -41,7 +43,6 @@ def register_many(recordings: Iterable[OneCamera], methods: Methods | None = Non
     for chunk in _chunks(recordings):
         for one in chunk:
             one.visit.check(one.path)
-            one.read()
         new = in_transaction(functools.partial(_write_new, chunk, chosen))
         out += Counter(registered=new, known=len(chunk) - new)
     return out

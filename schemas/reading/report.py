@@ -7,8 +7,8 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import privacy
-from .reading.visits import fitted_visit
+from .. import privacy
+from .visits import fitted_visit
 
 if TYPE_CHECKING:
     from pbl_pipeline.visit import Visit

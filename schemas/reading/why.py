@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from . import computed_tables, fit, tracking, video
-from .chain import ON_REQUEST, before
-from .coded_errors import error_code, error_found, error_next_step
-from .jobs import jobs_of
+from .. import computed_tables, fit, tracking, video
+from ..chain import ON_REQUEST, before
+from ..decisions.not_usable import unusable
+from ..job_errors import error_code, error_found, error_next_step
+from ..jobs import jobs_of
 from .status import EMPTY_COLUMNS
-from .usable import unusable
 
 _TAKE_BACK = "no fit uses it; `pbl choose {} --usable` takes that back"
 DONE, EMPTY, PENDING, RUNNING, ERROR, NOT_YET = "done", "empty", "pending", "being computed", "error", "not yet"
@@ -50,12 +50,7 @@ def why(video_id: int) -> Why:
 
     Raises `PblError` DB_NOT_FOUND for an unknown video.
     """
-    from .video import unknown_video
-
-    rows = (video.Video & {"video_id": video_id}).to_dicts()
-    if not rows:
-        raise unknown_video(video_id)
-    row = rows[0]
+    row = video.registered_video(video_id)
     # One of several cameras: from the fit on the trial counts, before it every camera.
     trial = fit.trial_of(video_id)
     views = fit.videos_of(trial)

@@ -10,14 +10,15 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.words import UNUSABLE
 
-from . import fit, qc, tracking, usable, video
-from .choose import selection_of
-from .jobs import jobs_of
-from .plan import locked, plan_anew, queues_before_fit
-from .review import Decision
-from .rows import utc_now
-from .transactions import next_id
-from .usable import Unusable
+from .. import fit, qc, tracking, video
+from ..jobs import jobs_of
+from ..plan import locked, plan_anew, queues_before_fit
+from ..review import Decision
+from ..rows import utc_now
+from ..transactions import next_id
+from . import not_usable
+from .candidates import selection_of
+from .not_usable import Unusable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,14 +37,14 @@ class Decided:
 
 
 def decisions(session_id: int) -> tuple[Decided, ...]:
-    """What was decided about a visit and its videos, the last first."""
+    """Return the decisions about a visit and its videos, the last first."""
     videos = [{"video_id": int(v)} for v in (video.Video & {"session_id": session_id}).to_arrays("video_id")]
     rows = (Decision & [{"session_id": session_id}, *videos]).to_dicts(order_by="decision_id DESC")
     return tuple(_decided(row) for row in rows)
 
 
 def person_state(video_id: int, tracking_method: str) -> str:
-    """What is shown of the choice in a video: another text after each decision, also one by `pbl choose`."""
+    """Return a text for the state of the choice in a video that each decision changes, also one by `pbl choose`."""
     key = {"video_id": video_id, "tracking_method": tracking_method}
     of_person = Decision & {"video_id": video_id, "decision_what": "person"}
     last = max((int(n) for n in of_person.to_arrays("decision_id")), default=0)
@@ -55,14 +56,14 @@ def person_state(video_id: int, tracking_method: str) -> str:
 def decide_person(
     video_id: int, person: int, tracking_method: str | None = None, by: str = "", seen: str | None = None
 ) -> dict[str, int]:
-    """Measure `person` of a video: write the override, delete what was computed for somebody else, add a Decision.
+    """Measure `person` of a video: write the override, delete what was computed for another person, add a Decision.
 
     All in one transaction. An error row of the choice (a number that did not exist) becomes pending again.
 
     Parameters
     ----------
     tracking_method
-        Whose number it is; needed where several methods track the video.
+        Tracking in which the person has this number; needed where several methods track the video.
     by
         Name of who decides.
     seen
@@ -94,7 +95,7 @@ def decide_person(
 
 
 def usable_state(video_id: int) -> str:
-    """What is shown of the mark of a recording: another text after each decision."""
+    """Return a text for the mark of a recording that each decision changes."""
     last = (Decision & {"video_id": video_id, "decision_what": "usable"}).to_arrays("decision_id")
     marked = (video.NotUsable & {"video_id": video_id}).to_dicts()
     return f"{max(map(int, last), default=0)}-{marked[0]['unusable_reason'] if marked else ''}"
@@ -119,7 +120,7 @@ def mark_not_usable(video_id: int, reason: str, note: str = "", by: str = "", se
     Raises
     ------
     PblError
-        USAGE for a reason that there is not, or "other" without words; DB_NOT_FOUND for an unknown recording;
+        USAGE for an unknown reason, or "other" without words; DB_NOT_FOUND for an unknown recording;
         DECIDED_MEANWHILE where `seen` is another state than the tables'.
     """
     note = " ".join(note.split())[:500]
@@ -144,15 +145,12 @@ def take_back(video_id: int, by: str = "", seen: str | None = None) -> None:
 
 
 def _decide_usable(video_id: int, mark: dict[str, str] | None, by: str, seen: str | None) -> None:
-    rows = (video.Video & {"video_id": video_id}).to_dicts()
-    if not rows:
-        raise video.unknown_video(video_id)
-    session_id = int(rows[0]["session_id"])
+    session_id = int(video.registered_video(video_id)["session_id"])
     failed = queues_before_fit()
     with locked(session_id):
         if seen is not None and usable_state(video_id) != seen:
             raise meanwhile(video_id, "usable")
-        before = usable.unusable([video_id]).get(video_id)
+        before = not_usable.unusable([video_id]).get(video_id)
         if mark is None and before is None:
             return
         # Of several cameras all: their trial is fitted with every view or not at all.
@@ -160,7 +158,7 @@ def _decide_usable(video_id: int, mark: dict[str, str] | None, by: str, seen: st
         (video.NotUsable & views).delete_quick()
         if mark is not None:
             video.NotUsable.insert({**view, **mark, "unusable_created": utc_now()} for view in views)
-        after = usable.unusable([video_id]).get(video_id)
+        after = not_usable.unusable([video_id]).get(video_id)
         reason = after.note if after else ""
         record("usable", by, {}, _said(before), _said(after), reason, video_id=video_id)
         plan_anew(session_id, failed)

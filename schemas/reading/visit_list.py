@@ -14,15 +14,15 @@ import datetime
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from . import computed_tables, fit, gdi, qc, session, study, tracking, video
-from .coded_errors import error_code
-from .operations.catalog import quote
-from .rows import number
-from .status import queue_name
+from .. import computed_tables, fit, gdi, qc, session, study, tracking, video
+from ..job_errors import error_code
+from ..operations.catalog import quote
+from ..rows import number
+from .status import queue_name, queues
 
 #: Visits of a page.
 PAGE = 50
-#: What is asked of the state of a visit; empty: nobody is in any of its usable videos; unusable: it has none.
+#: States of a visit to filter by. empty: no one is in any of its usable videos; unusable: it has no usable video.
 STATES = ("computed", "pending", "waiting", "failed", "empty", "unusable")
 #: State of a visit in a folder without its measures.
 INCOMPLETE = "incomplete"
@@ -36,7 +36,7 @@ _NO_DAY = "0001-01-01"
 
 @dataclasses.dataclass(frozen=True)
 class Filter:
-    """What is asked for; empty: everything. search: part of a person's code or of a visit's label. `state`: one of
+    """A request for visits; empty: everything. search: part of a person's code or of a visit's label. `state`: one of
     `STATES`, `quality`: one of `OUTCOMES`."""
 
     search: str = ""
@@ -52,7 +52,7 @@ class Filter:
 class Result:
     """Index and checks of the current set of a visit by one chain of methods.
 
-    sd: of the error of the index; minimal_change: smallest change between two such visits that is no chance (90 %).
+    sd: of the error of the index; minimal_change: minimal detectable change between two such visits (90 %).
     outcome: worst check, empty before the checks are computed; worst: its names. corrected: a person corrected events.
     """
 
@@ -221,7 +221,7 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
 def _asked(wanted: Filter) -> tuple[list[str], list[str], list[Any]]:
     """Joins, conditions and their arguments, in this order.
 
-    What is a set of visits is joined as a table of its own: as a condition the server would look it up for each visit.
+    A set of visits is joined as a separate table: as a condition the server would look it up for each visit.
     """
     joins: list[str] = []
     where: list[str] = []
@@ -309,7 +309,7 @@ def _waiting() -> str:
 
 
 def _empty() -> str:
-    """Visits in whose usable videos nobody is."""
+    """Visits without a person in any of their usable videos."""
     videos, chosen = _name(video.Video), _name(tracking.SubjectChoice)
     nobody = f"SELECT t.video_id FROM {chosen} t WHERE t.choice_status = 'NO_PERSON' AND {_is_usable('t')}"
     some = f"SELECT b.session_id FROM {videos} b JOIN ({nobody}) c ON c.video_id = b.video_id"
@@ -339,7 +339,7 @@ def _failed(column: str = "") -> str:
     """Visits with an error row in any queue, of a usable video or a current set; with that column of it, a row for
     each."""
     parts = []
-    there = _queues()
+    there = queues(session.Session.connection)
     for table in computed_tables():
         if queue_name(table) not in there:
             continue
@@ -358,11 +358,6 @@ def _failed(column: str = "") -> str:
 
 
 _STATES = {"waiting": _waiting, "failed": _failed, "empty": _empty, "unusable": _unusable}
-
-
-def _queues() -> set[tuple[str, str]]:
-    rows = _ask("SELECT table_schema, table_name FROM information_schema.tables WHERE table_name LIKE '~~%%'", [])
-    return {(str(schema), str(name)) for schema, name in rows}
 
 
 # ----------------------------------------------------------------------------------------------------- rows of a page
@@ -393,14 +388,13 @@ def _visit_rows(rows: Sequence[Sequence[Any]]) -> tuple[VisitRow, ...]:
     open_sets = {int(s) for (s,) in _ask(f"{_unfinished()} AND f.session_id IN ({listed})", ids)}
     errors = f"SELECT session_id, error_message FROM ({_failed('error_message')}) x WHERE session_id IN ({listed})"
     failed = {int(s): error_code(message) for s, message in _ask(errors, ids)}
+    sets = {"failed": failed, "waiting": waiting, "empty": empty, "unusable": unusable}
     out = []
     for session_id, subject, label, day, role, *_ in rows:
         i = int(session_id)
         found = results[i]
         computed = bool(found) and i not in open_sets
-        sets = {"failed": failed, "waiting": waiting, "empty": empty, "unusable": unusable}
-        states = [(name, i in found_in) for name, found_in in sets.items()]
-        state = next((name for name, holds in [*states, ("computed", computed)] if holds), "pending")
+        state = next((name for name, visits in sets.items() if i in visits), "computed" if computed else "pending")
         first = found[0] if found else None
         out.append(
             VisitRow(

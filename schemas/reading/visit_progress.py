@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 
-from . import computed_tables
-from .coded_errors import error_code, error_found, error_next_step
-from .operations.catalog import quote
+from .. import computed_tables
+from ..job_errors import error_code, error_found, error_next_step
+from ..operations.catalog import quote
+from ..video import Video
 from .scope import of_visit
 from .status import queue_counts, queue_name
-from .video import Video
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from . import session, video
-from .review import Viewing
-from .rows import utc_now
-from .transactions import in_transaction, next_id
+from .. import session, video
+from ..review import Viewing
+from ..rows import utc_now
+from ..transactions import in_transaction, next_id
 
 
 def record_viewing(of: str, number: int, what: str, by: str) -> None:
@@ -16,9 +16,9 @@ def record_viewing(of: str, number: int, what: str, by: str) -> None:
     of, number
         "video_id" or "session_id", and which.
     what
-        What of it is looked at, such as "video" or "report".
+        Part of it that is viewed, such as "video" or "report".
     by
-        Name of who looks.
+        Name of the viewer.
     """
     table = {"video_id": video.Video, "session_id": session.Session}[of]
     if not table & {of: number}:

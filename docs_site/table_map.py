@@ -1,4 +1,4 @@
-"""The map of all tables, made from their definitions: `python -m schemas.table_map > docs/tables.md`."""
+"""The map of all tables, made from their definitions: `python -m docs_site.table_map > docs/tables.md`."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import re
 import sys
 from typing import Any
 
-from .chain import references, renamed, tables
-from .datajoint_setup import dj
-from .stages import STAGES, modules
+from schemas.chain import references, renamed, tables
+from schemas.datajoint_setup import dj
+from schemas.stages import STAGES, modules
 
 _ORIGIN = ("code_version", "method_hash", "model_sha256", "host", "seconds", "computed")
 _KINDS = {dj.Manual: "manual", dj.Lookup: "lookup", dj.Computed: "computed", dj.Part: "part"}
@@ -67,8 +67,8 @@ def table_map() -> str:
     lines = [
         "# Tables",
         "",
-        "Made by `python -m schemas.table_map > docs/tables.md`; do not edit. Each section is a schema of the server,",
-        "`pbl_<section>`. Boxes are filled by people and `pbl ingest`, slanted boxes hold methods, round ones",
+        "Made by `python -m docs_site.table_map > docs/tables.md`; do not edit. Each section is a schema of the",
+        "server, `pbl_<section>`. Boxes are filled by people and `pbl ingest`, slanted boxes hold methods, round ones",
         "`pbl populate` computes.",
         "",
         "```mermaid",
