@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from pbl_pipeline import __version__
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 
 from . import connection
@@ -28,7 +28,7 @@ def refuse_older() -> None:
         raise PblError(
             "DB_MIGRATION",
             found=f"tables of an older version, without {', '.join(missing[:4])}{more}",
-            expected=f"tables as pbl-pipeline {__version__} defines them",
+            expected=f"tables as pbl-pipeline {code_version()} defines them",
             next_step="`pbl db migrate --dry-run` says what will be done, `pbl db migrate` does it; of a database of a "
             "development version it says that no migration does: set PBL_HOME to a new folder, ingest the videos again",
         )

@@ -8,7 +8,8 @@ import html
 import shutil
 from pathlib import Path
 
-from pbl_pipeline import __version__, settings
+from pbl_pipeline import settings
+from pbl_pipeline.code_version import code_version
 from schemas import computed_tables, session, video
 from schemas.archive import archive_dir
 from schemas.status import Status, pipeline_status
@@ -101,7 +102,7 @@ def as_html(found: Summary) -> str:
     title = f"PBL, {found.until:%Y-%m-%d}"
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{style}</style>'
-        f"<h1>{title}</h1><table>{lines}</table><p>pbl-pipeline {html.escape(__version__)}</p></html>\n"
+        f"<h1>{title}</h1><table>{lines}</table><p>pbl-pipeline {html.escape(code_version())}</p></html>\n"
     )
 
 

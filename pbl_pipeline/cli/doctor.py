@@ -17,7 +17,8 @@ from pathlib import Path
 
 import click
 
-from pbl_pipeline import __version__, assets, settings
+from pbl_pipeline import assets, settings
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 
 OK, NOTE, MISSING = "ok", "note", "missing"
@@ -92,7 +93,7 @@ def _fetch_missing() -> dict[str, PblError]:
 
 def _python() -> Finding:
     what = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {os.cpu_count()} cores"
-    return Finding("Python", OK, f"{what}; pbl-pipeline {__version__}")
+    return Finding("Python", OK, f"{what}; pbl-pipeline {code_version()}")
 
 
 def _packages() -> Iterator[Finding]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import pymysql
 
-from pbl_pipeline import __version__
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from schemas import connection
 from schemas.chain import tables
@@ -133,7 +133,7 @@ def _refuse_newer() -> None:
     if newer:
         raise _error(
             f"migration {newer[-1].number:04d} ({newer[-1].name}) of pbl-pipeline {newer[-1].version} was applied",
-            f"a database that pbl-pipeline {__version__} knows",
+            f"a database that pbl-pipeline {code_version()} knows",
             f"use the pbl-pipeline that applied it ({newer[-1].version}) or a newer one",
         )
 
@@ -207,7 +207,7 @@ def _record(cursor: Any, table: str, migration: Migration, statements: list[str]
     )
     cursor.execute(
         f"INSERT INTO {table} (number, name, code_version, applied, statements) VALUES (%s, %s, %s, %s, %s)",  # noqa: S608
-        (migration.number, migration.name, __version__, utc_now(), ";\n".join(statements)),
+        (migration.number, migration.name, code_version(), utc_now(), ";\n".join(statements)),
     )
 
 

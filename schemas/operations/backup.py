@@ -24,7 +24,8 @@ from typing import Any
 
 import pymysql
 
-from pbl_pipeline import __version__, progress
+from pbl_pipeline import progress
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from schemas import connection
 from schemas.folders import make_private, private_folder
@@ -113,7 +114,7 @@ def backup(
     listings = [f"{part}.sha256" for part in PARTS if (folder / f"{part}.sha256").exists()]
     manifest = {
         "format": FORMAT,
-        "pbl_pipeline": __version__,
+        "pbl_pipeline": code_version(),
         "created": created,
         "server": version,
         "prefix": prefix,
