@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pymysql
 
 from pbl_pipeline.errors import PblError
 
-from .datajoint_setup import dj
+from .datajoint_setup import REPEAT, dj
 
 #: What returns the rows of a table that agree with a key, in the order of the table's own key: `stored_rows` asks the
 #: database each time, `ReadAhead` for many keys at once.
@@ -147,7 +148,7 @@ def counted(deleted: Mapping[str, int]) -> str:
     return ", ".join(f"{n} of {name}" for name, n in deleted.items())
 
 
-#: Times that a cascade is begun anew where somebody inserts below it meanwhile.
+#: Times that a cascade is begun anew where another process inserts below it, or holds its locks, meanwhile.
 _DELETES = 5
 
 
@@ -165,6 +166,10 @@ def delete_below(table: Any, keys: Sequence[Mapping[str, Any]]) -> dict[str, int
         try:
             target.delete(prompt=False, part_integrity="cascade")
             break
+        except pymysql.err.OperationalError as error:
+            # In a transaction that is open who opened it begins again (`schemas.transactions.repeated`).
+            if attempt == _DELETES - 1 or error.args[0] not in REPEAT or target.connection.in_transaction:
+                raise
         except dj.DataJointError as error:
             # A worker inserted a row below one that is deleted, after its table's turn; the row above is locked now.
             if attempt == _DELETES - 1 or not str(error).startswith("Delete blocked"):

@@ -13,6 +13,7 @@ from typing import Any
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
+from .coded_errors import store_full
 from .datajoint_setup import full_path
 from .folders import private_folder
 from .operations.secret_files import secret
@@ -135,7 +136,7 @@ def check_store(backend: Any, create: bool = False) -> None:
     Raises
     ------
     PblError
-        STORE_UNAVAILABLE with what the store said.
+        STORE_UNAVAILABLE with what the store said, STORE_FULL.
     """
     # In a bucket always the same object, for a worker's key may not delete; in a folder a file of its own that goes
     # again. Several processes may write that object at once: whoever wrote it, it holds some bytes and their hash.
@@ -161,7 +162,7 @@ def files_below(backend: Any, folder: str = "") -> dict[str, dict[str, Any]]:
     Raises
     ------
     PblError
-        STORE_UNAVAILABLE with what the store said.
+        STORE_UNAVAILABLE with what the store said, STORE_FULL.
     """
     try:
         base = full_path(backend, "")
@@ -178,7 +179,7 @@ def purge(fs: Any, folder: str) -> None:
     Raises
     ------
     PblError
-        STORE_UNAVAILABLE with what the store said.
+        STORE_UNAVAILABLE with what the store said, STORE_FULL.
     """
     name, _, path = folder.partition("/")
     where = {"Bucket": name, "Prefix": f"{path.strip('/')}/"}
@@ -202,6 +203,8 @@ def _kept(fs: Any, where: dict[str, str]) -> list[tuple[str, dict[str, str]]]:
 
 def store_error(error: BaseException) -> PblError:
     """The coded error for a store that does not do what it is asked. The clients' messages hold no secret."""
+    if (full := store_full(error)) is not None:
+        return full.about(describe())
     return PblError(
         "STORE_UNAVAILABLE",
         key=describe(),

@@ -16,6 +16,7 @@ import datajoint
 import pytest
 
 import schemas
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from schemas import connection, event_corrections, gait, gdi, jobs, lab, migrations, session, stages, video, views
 from schemas.chain import ON_REQUEST
@@ -24,6 +25,7 @@ from schemas.operations import embedded
 from tests.command import pbl
 from tests.database import new_home, remove_home
 from tests.rows import everything, register
+from workers import heartbeat, loop
 from workers.populate import populate
 
 from . import chain
@@ -32,6 +34,8 @@ pytestmark = pytest.mark.database
 
 #: Number of the first migration that is not the package's own.
 OWN = len(migrations.available()) + 1
+#: Databases of before 0.2.0 recorded no migrations when their tables were new.
+NOT_RECORDED = "DROP TABLE pbl_lab.`~migrations`"
 #: A column that may not be null, for a table that has rows: added, filled with what is true of them, then closed.
 SIZES = '''
 """The size of a video's file, which older versions did not record."""
@@ -100,6 +104,7 @@ def _make_older(add: Callable[[str, str], None]) -> None:
         kinds = "ENUM('person','check') NOT NULL COMMENT ':enum(''person'',''check''):who is measured'"
         cursor.execute(f"ALTER TABLE pbl_review.decision MODIFY COLUMN decision_what {kinds}")
         cursor.execute("ALTER TABLE pbl_fit.__session_fit DROP COLUMN fit_height")
+        cursor.execute(NOT_RECORDED)
     add(f"{OWN:04}_sizes", SIZES)
 
 
@@ -208,6 +213,7 @@ def test_results_from_before_they_had_their_session_get_it(
             cursor.execute(f"ALTER TABLE {table} DROP FOREIGN KEY `{key}`, DROP COLUMN session_id")
             schema, name = table.split(".")
             cursor.execute(f"DELETE FROM {schema}.`~lineage` WHERE table_name = %s", (name,))
+        cursor.execute(NOT_RECORDED)
     empty()
     dry = migrations.migrate(dry_run=True)
     assert (len(dict(dry.steps)["0001 session_of_results"]), dry.open) == (4 * len(WITHOUT_SESSION), [])
@@ -270,6 +276,7 @@ def _with_methods_by_hand() -> None:
         for table, column in (("gait.__spatiotemporal", "stance"), ("gdi.__session_gdi", "session_stance")):
             cursor.execute(f"UPDATE pbl_{table} SET {column} = 1.5 WHERE gait_method = %s", (method,))
         cursor.execute("UPDATE pbl_gdi.__g_d_i__cycle SET cycle_z = 1.5 WHERE gait_method = %s", (method,))
+        cursor.execute(NOT_RECORDED)
 
 
 @pytest.mark.parametrize("killed_before", [None, 4, 60])
@@ -323,14 +330,14 @@ def test_commands_over_tables_of_an_older_version_name_the_migration(older: None
     before = everything()
     refused = pbl(*command)
     assert (refused.code, refused.err.split(":")[0]) == (1, "DB_MIGRATION")
-    for part in ("without video.video_size, __session_fit.fit_height", "pbl db migrate --dry-run"):
+    for part in ("0003 height_of_fits", "video.video_size, __session_fit.fit_height", "pbl db migrate --dry-run"):
         assert part in refused.err, refused.err
     assert everything() == before
     migrations.migrate()
     assert pbl("list", "videos").code == 0
 
 
-def test_what_no_migration_removes_is_named(empty: Callable[[], None]):
+def test_what_no_migration_removes_is_named(empty: Callable[[], None], add: Callable[[str, str], None]):
     schemas.activate()
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute("ALTER TABLE pbl_video.video DROP COLUMN video_size")
@@ -351,9 +358,13 @@ def test_what_no_migration_removes_is_named(empty: Callable[[], None]):
     }
     for part in ("ADD `video_size` bigint", "MODIFY `subject_height` double", "varchar(200)", "`forgotten`", "indexes"):
         assert any(part in n for n in named), part
-    with pytest.raises(PblError, match="video_size") as error:
-        migrations.migrate()
-    assert error.value.code == "DB_MIGRATION"
+    # Refused before the first statement, also of a migration that could be applied; one difference a line.
+    add(f"{OWN:04}_wanted", 'def statements(conn):\n    return ["CREATE TABLE pbl_lab.wanted (a INT PRIMARY KEY)"]\n')
+    refused = pbl("db", "migrate")
+    assert (refused.code, refused.error_code) == (1, "DB_MIGRATION")
+    assert [line[4:] for line in refused.err.splitlines() if line.startswith("    ")] == named
+    assert "pbl_lab.wanted" not in everything()
+    assert [a.number for a in migrations.applied()] == [*range(1, OWN)]
     # Nothing was altered by itself.
     assert _named() == named
 
@@ -403,15 +414,55 @@ def test_migrations_without_a_gap(add: Callable[[str, str], None]):
         migrations.available()
 
 
-def test_a_database_of_a_newer_version_is_left_alone(older: None):
-    migrations.migrate()
+STARTS = (
+    ("status",), ("populate",), ("worker", "--once"), ("web", "--port", "0"), ("db", "config"), ("db", "init"),
+    ("db", "migrate"), ("db", "migrate", "--dry-run"), ("list", "videos"), ("cron", "refresh"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("number", "name"), [(999, "x"), (1, "another_of_this_number")])
+def test_a_database_of_a_newer_version_is_left_alone(
+    empty: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, name: str
+):
+    monkeypatch.chdir(tmp_path)
+    schemas.activate()
+    assert [(a.number, a.name) for a in migrations.applied()] == [(m.number, m.name) for m in migrations.available()]
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute(
-            "INSERT INTO pbl_lab.`~migrations` (number, name, code_version, applied) VALUES (999, 'x', '9.9', NOW())"
+            "INSERT INTO pbl_lab.`~migrations` (number, name, code_version, applied)"
+            " VALUES (%s, %s, '9.9+gabc', NOW())",
+            (number, name),
         )
-    with pytest.raises(PblError, match=r"pbl-pipeline 9\.9") as error:
-        migrations.migrate(dry_run=True)
+    before = everything()
+    for command in STARTS:
+        empty()
+        refused = pbl(*command)
+        assert (refused.code, refused.error_code) == (1, "DB_MIGRATION"), command
+        for part in (f"{number:04} {name}", "9.9+gabc", code_version()):
+            assert part in refused.err, command
+    assert everything() == before
+    assert not list(tmp_path.iterdir())
+    # Also a worker that runs while the tables are migrated stops at its next look.
+    empty()
+    schemas.stages.modules()
+    with pytest.raises(PblError, match=r"9\.9") as error:
+        loop.Worker((), heartbeat.Silent()).run(once=True)
     assert error.value.code == "DB_MIGRATION"
+
+
+def test_a_database_that_lacks_a_migration_is_refused_although_no_column_is_missing(empty: Callable[[], None]):
+    schemas.activate()
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        cursor.execute("DELETE FROM pbl_lab.`~migrations` WHERE number = %s", (OWN - 1,))
+    last = migrations.available()[-1]
+    for command in STARTS:
+        if command[:2] != ("db", "migrate"):
+            empty()
+            refused = pbl(*command)
+            assert (refused.code, refused.error_code) == (1, "DB_MIGRATION"), command
+            assert f"without migration {last.title}" in refused.err
+    assert migrations.migrate().steps == [(last.title, [])]
+    assert pbl("status").code == 0
 
 
 def test_one_process_migrates_at_a_time(database: Path):
