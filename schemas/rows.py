@@ -112,8 +112,9 @@ class ReadAhead:
 
 
 def utc_now() -> datetime.datetime:
-    """Now in UTC, whole seconds, without zone: what a datetime column takes."""
-    return datetime.datetime.now(datetime.UTC).replace(tzinfo=None, microsecond=0)
+    """Now in UTC by the clock of the database server, whole seconds, without zone: what a datetime column takes. One
+    clock for every row, whatever those of the machines say."""
+    return dj.conn().query("SELECT UTC_TIMESTAMP()").fetchone()[0]
 
 
 def number(value: Any) -> float | None:

@@ -12,6 +12,7 @@ from pbl_pipeline import settings
 from pbl_pipeline.code_version import code_version
 from schemas import computed_tables, session, video
 from schemas.archive import archive_dir
+from schemas.rows import utc_now
 from schemas.status import Status, pipeline_status
 
 
@@ -31,7 +32,7 @@ class Summary:
 
 def make_summary(hours: float = 24.0) -> Summary:
     """Count the last hours."""
-    until = datetime.datetime.now(datetime.UTC).replace(tzinfo=None, microsecond=0)
+    until = utc_now()
     since = until - datetime.timedelta(hours=hours)
     text = f"'{since:%Y-%m-%d %H:%M:%S}'"
     done = {}

@@ -21,6 +21,7 @@ import schemas
 from schemas import connection, decide, fit, lab, review, session, tracking, video, worker
 from schemas.coded_errors import error_code, of_server
 from schemas.jobs import jobs_of
+from schemas.operations import catalog
 from schemas.operations.orphans import orphans
 from schemas.store import store_error
 from schemas.stored_files import remove_left_over
@@ -307,6 +308,25 @@ def test_jobs_do_not_wait_for_a_clock_that_was_set_back(tmp_path: Path):
         assert work(video.VideoInfo).done == 1
     finally:
         connection.connect().query("SET SESSION timestamp = DEFAULT")
+
+
+def test_every_row_has_the_time_of_the_servers_clock(tmp_path: Path):
+    """The server's clock stands in 2001 for this connection; a machine's own clock is in no row."""
+    connection.connect().query("SET SESSION timestamp = 1000000000")
+    try:
+        (one, two) = register(chain.small_video(tmp_path, "walk"), chain.small_video(tmp_path, "again"))
+        decide.mark_not_usable(two, "other", "dark", by="A. First")
+        assert work().failed == 0
+        decide.decide_person(one, 1, by="A. First")
+    finally:
+        connection.connect().query("SET SESSION timestamp = DEFAULT")
+    times = {}
+    for (schema, table), columns in catalog.tables().items():
+        for column in (c.name for c in columns if c.type == "datetime" and not table.startswith(("#", "~"))):
+            found = connection.connect().query(f"SELECT `{column}` FROM `{schema}`.`{table}`").fetchall()
+            times |= {f"{table}.{column}": {str(t)[:10] for (t,) in found if t is not None}} if found else {}
+    assert {"video.video_created", "__session_gdi.session_gdi_computed", "decision.decision_at"} <= set(times)
+    assert {t for found in times.values() for t in found} == {"2001-09-09"}, times
 
 
 def test_no_hour_comes_twice_in_autumn():
