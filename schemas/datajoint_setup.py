@@ -44,6 +44,7 @@ __all__ = [
     "IntegrityError",
     "LostConnectionError",
     "MissingTableError",
+    "RightMissing",
     "backend_of",
     "build_object_path",
     "datajoint",
@@ -72,10 +73,11 @@ _OF_WORKERS = ("SELECT", "INSERT", "UPDATE", "DELETE")
 
 
 class RightMissing(AccessError, PblError):
-    """DB_REFUSED for a statement that the account may not execute; names the account that may."""
+    """DB_REFUSED for a statement that the account may not execute; names the account that may. role: end of its name,
+    where it is not the least that may execute this statement."""
 
-    def __init__(self, found: str) -> None:
-        role = "worker" if found.startswith(_OF_WORKERS) else "owner"
+    def __init__(self, found: str, role: str = "") -> None:
+        role = role or ("worker" if found.startswith(_OF_WORKERS) else "owner")
         account = f"{os.environ.get('PBL_DB_PREFIX') or 'pbl'}_{role}"
         PblError.__init__(
             self,

@@ -20,6 +20,7 @@ import click
 from pbl_pipeline import assets, settings
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.resources import cores
 
 OK, NOTE, MISSING = "ok", "note", "missing"
 
@@ -92,7 +93,7 @@ def _fetch_missing() -> dict[str, PblError]:
 
 
 def _python() -> Finding:
-    what = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {os.cpu_count()} cores"
+    what = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {cores()} cores"
     return Finding("Python", OK, f"{what}; pbl-pipeline {code_version()}")
 
 

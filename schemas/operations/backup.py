@@ -30,7 +30,7 @@ from pbl_pipeline.errors import PblError
 from schemas import connection
 from schemas.folders import make_private, private_folder
 from schemas.json_files import write_json
-from schemas.store import store_error
+from schemas.store import check_store, store_error
 
 from . import backup_files, catalog, dump
 from .backup_files import PARTS, listed, safe_path, sha256_of, unwritable
@@ -194,7 +194,7 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
         than the backup's, or when a file of the store has other bytes than the backup's; STORE_UNAVAILABLE.
     """
     manifest = check(folder, say)
-    connection.connect()
+    connection.connect(start=True)  # a new place has no server yet
     prefix = connection.prefix()
     if prefix != manifest["prefix"]:
         raise _refused(
@@ -206,6 +206,7 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
         with closing(connection.plain_connection()) as server, server.cursor() as cursor:
             _make_room(cursor, prefix, again)
             if manifest["store"]:
+                check_store(connection.store_backend(), create=True)
                 say(f"Bringing {manifest['n_files']} files back")
                 _restore_files(folder)
             say(f"Bringing {len(manifest['rows'])} tables back")

@@ -325,6 +325,54 @@ def test_corrections_by_a_method_become_rows(
     assert {t.table: t.done for t in populate(_chain()).tables if t.done}["SessionGdi"] == 1
 
 
+@pytest.mark.parametrize("killed_before", [None, 5])
+def test_tracking_without_the_video_info_that_it_read_goes(
+    empty: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_before: int | None
+):
+    chain.install(monkeypatch)
+    schemas.activate()
+    (one,) = register(chain.small_video(tmp_path, "a"), session_label="2026-03-01")
+    register(chain.small_video(tmp_path, "b"), session_label="2026-06-01")
+    populate(_chain())
+    new = everything()
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        cursor.execute(
+            "SELECT constraint_name FROM information_schema.key_column_usage WHERE table_schema = 'pbl_tracking'"
+            " AND table_name = '__tracking' AND referenced_table_name = '__video_info'"
+        )
+        ((key,),) = cursor.fetchall()
+        cursor.execute(f"ALTER TABLE pbl_tracking.__tracking DROP FOREIGN KEY `{key}`")
+        cursor.execute("DELETE FROM pbl_video.__video_info WHERE video_id = %s", (one,))
+        cursor.execute("DELETE FROM pbl_lab.`~migrations` WHERE number = 5")
+    empty()
+    dry = migrations.migrate(dry_run=True)
+    statements = dict(dry.steps)["0005 tracking_of_videos_that_were_read"]
+    assert (statements[0], len(statements) > 20, dry.open) == ("START TRANSACTION", True, [])
+
+    class Killed(BaseException):
+        pass
+
+    done: list[str] = []
+
+    def say(line: str) -> None:
+        done.append(line)
+        if len(done) == killed_before:
+            raise Killed
+
+    with contextlib.suppress(Killed):
+        migrations.migrate(say=say)
+    assert (len(done) == len(statements)) == (killed_before is None)
+    migrations.migrate()
+    after = everything()
+    left = {t: len(rows) for t, rows in after.items() if t.split(".")[1].startswith("__") or "fit_set" in t}
+    assert left == {t: len(new[t]) // 2 for t in left}
+    assert set(map(str, video.VideoInfo.to_arrays("video_id"))) == {str(one + 1)}
+    assert migrations.migrate().steps == []
+    # What was asked for is computed again.
+    assert not {t.table: t.errors for t in populate(_chain()).tables if t.errors}
+    assert {t: len(rows) for t, rows in everything().items() if t in left} == {t: len(new[t]) for t in left}
+
+
 @pytest.mark.parametrize("command", [("populate",), ("list", "videos"), ("worker", "--once"), ("db", "init")])
 def test_commands_over_tables_of_an_older_version_name_the_migration(older: None, command: tuple[str, ...]):
     before = everything()
