@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import click
 
 from workers.registry import FIT, GROUPS
@@ -11,15 +13,14 @@ from workers.registry import FIT, GROUPS
 CORES_EACH, MEMORY_EACH = 2, 4 * 2**30
 
 
-class Processes(click.IntRange):
+class Processes(click.ParamType):
     """A number of processes, or `auto`."""
 
-    def __init__(self) -> None:
-        super().__init__(1, 256)
+    name = "number|auto"
 
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
         """Return the number, or "auto"."""
-        return "auto" if value == "auto" else super().convert(value, param, ctx)
+        return "auto" if value == "auto" else click.IntRange(1, 256).convert(value, param, ctx)
 
 
 @click.command()
