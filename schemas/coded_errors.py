@@ -11,7 +11,7 @@ from pbl_pipeline.errors import CODES, PblError
 
 from .datajoint_setup import AWAY, FULL, REPEAT, LostConnectionError
 
-#: What stores of objects say where they are full: MinIO, quotas.
+#: Words of object stores for "full": MinIO, quotas.
 _BUCKET_FULL = re.compile(r"StorageFull|QuotaExceeded|minimum free drive threshold")
 #: A code at the beginning of a message, behind the name of the exception where DataJoint writes one.
 _CODE = re.compile(r"(?:\w+: )?([A-Z_0-9]+):")

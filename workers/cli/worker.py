@@ -8,7 +8,7 @@ import click
 
 from workers.registry import FIT, GROUPS
 
-#: What a process of `--processes auto` gets: more cores bring one recording little, and its memory is what a long
+#: Share of a process of `--processes auto`: more cores bring one recording little, and its memory is what a long
 #: recording takes (bytes).
 CORES_EACH, MEMORY_EACH = 2, 4 * 2**30
 
