@@ -3,9 +3,5 @@
 Nothing here knows a database: the tables in `schemas` call these functions, never the other way round.
 """
 
-from importlib.metadata import PackageNotFoundError, version
-
-try:
-    __version__ = version("pbl-pipeline")
-except PackageNotFoundError:  # a source tree on sys.path without installation
-    __version__ = "0.0.0+not-installed"
+#: Stated here only: pyproject.toml reads it. `code_version` adds the commit.
+__version__ = "0.2.0"

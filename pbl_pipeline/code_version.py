@@ -1,4 +1,4 @@
-"""Which code computed a result: the version and the commit, such as `0.1.0+g8589a11c2f4e`."""
+"""Which code computed a result: the version and the commit, such as `0.2.0+g8589a11c2f4e`."""
 
 from __future__ import annotations
 

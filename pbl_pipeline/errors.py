@@ -65,6 +65,7 @@ CODES: dict[str, str] = {
     "DB_MIGRATION": "the tables on the server are not as this version of the code declares them",
     "INPUT_CHANGED": "rows that a computation reads are gone, or changed each time it ran",
     "STORE_UNAVAILABLE": "the object store of the arrays cannot be reached, or refuses",
+    "STORE_FULL": "the store of the arrays has no room left",
     "BACKUP_INVALID": "a backup is incomplete or was changed",
     "TIME_LIMIT": "a job took longer than a worker gives it and was ended",
     "WORKER_CRASH": "a job took its worker's process down more than once",

@@ -15,7 +15,7 @@ import pkgutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Generic, Protocol, TypeVar
 
-from pbl_pipeline import __version__
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import Paramset
 
@@ -51,7 +51,7 @@ def stored(*, stage: str, name: str, version: int, params: Mapping[str, Any], sh
         raise PblError(
             "SOLVER_UNKNOWN",
             found=f"{stage} method {method.key} with hash {sha}, whose parameters hash to {method.hash}",
-            expected=f"{type(method.params).__name__} of pbl-pipeline {__version__}, as they were stored",
+            expected=f"{type(method.params).__name__} of pbl-pipeline {code_version()}, as they were stored",
             next_step="use the version of pbl-pipeline that wrote the method, or select a newer one; if somebody "
             "edited the row, restore the method table from the backup",
             key=method.key,
@@ -224,7 +224,7 @@ class Stage(Mapping[str, Method[P]]):
         except (TypeError, ValueError) as error:
             raise self._unknown(
                 f"{paramset.key}, whose parameters this version does not understand: {error}",
-                f"parameters of {family.params.__name__} of pbl-pipeline {__version__}",
+                f"parameters of {family.params.__name__} of pbl-pipeline {code_version()}",
                 "use the version of pbl-pipeline that wrote the method, or select a newer one",
             ) from error
         return self._method(paramset.name, paramset.version, params, family)

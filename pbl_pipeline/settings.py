@@ -16,6 +16,8 @@ DEIDENTIFY = ("blur", "pixelate", "skeleton")
 VARIABLES: dict[str, str] = {
     "PBL_CACHE": "folder for fetched models, demo files and compiled programs (default: the user's cache folder)",
     "PBL_HOME": "folder for the embedded database and its object store (default: the user's data folder)",
+    "PBL_CORES": "cores that a process uses (default: those that it is bound to or its container may use; `pbl worker` "
+    "sets each process's share)",
     "PBL_OFFLINE": "1: never fetch anything, fail with the remedy instead",
     "PBL_DB_PREFIX": "prefix of the database schema names (default: pbl)",
     "PBL_MODELS": "folder of the registered keypoint models (default: models/ in PBL_HOME)",
@@ -82,11 +84,6 @@ def deidentify_how() -> str:
 def audit_looks() -> bool:
     """True where each look at a recording in the review page has to leave a row."""
     return os.environ.get("PBL_AUDIT_LOOKS", "") not in ("", "0")
-
-
-def n_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def offline() -> bool:

@@ -21,13 +21,12 @@ def activate(start: bool = False, methods: bool = True) -> None:
     Raises
     ------
     PblError
-        What `schemas.connection.connect` raises; DB_MIGRATION for tables of an older version.
+        What `schemas.connection.connect` raises; DB_MIGRATION for tables of another version, older or newer.
     """
-    from . import connection, fit, plan
-    from .operations import older_tables
+    from . import connection, fit, plan, tables_version
 
     connection.connect(start=start)
-    older_tables.refuse_older()
+    tables_version.check_version()
     for stage, module in zip(STAGES, modules(), strict=True):
         connection.bind(stage, module.schema)
     fit.SessionFit.plan = staticmethod(plan.plan_fit_sets)

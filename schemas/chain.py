@@ -68,12 +68,12 @@ def before(table: Any) -> tuple[Any, ...]:
 
 
 def needs(table: Any) -> list[Any]:
-    """The computed tables of which a row can make a key of this one computable: those that its foreign keys name, and
-    those that its `key_source` looks at beside them (its attribute `waits_for`)."""
+    """The computed tables that this one reads: those that its foreign keys name, and those of its parts. A row of them
+    can make a key of this one computable, and takes what was computed from it along when it is deleted."""
     found = tables()
     name = next(n for n, cls in found.items() if cls is table)
-    masters = [found[".".join(target.split(".")[:2])] for target in references(name, table)]
-    wanted = {*masters, *getattr(table, "waits_for", ())}
+    parts = [n for n in found if n == name or n.startswith(f"{name}.")]
+    wanted = {found[".".join(target.split(".")[:2])] for n in parts for target in references(n, found[n])} - {table}
     return [t for t in computed_tables() if t in wanted]
 
 

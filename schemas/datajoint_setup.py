@@ -32,7 +32,7 @@ with warnings.catch_warnings():
             next_step="correct the variable, or unset it",
         ) from error
 from datajoint.adapters import ADAPTERS, MySQLAdapter
-from datajoint.errors import AccessError, DuplicateError, IntegrityError, LostConnectionError
+from datajoint.errors import AccessError, DuplicateError, IntegrityError, LostConnectionError, MissingTableError
 from datajoint.hash_registry import get_store_backend
 from datajoint.storage import StorageBackend, build_object_path
 from pymysql.converters import escape_string
@@ -43,6 +43,8 @@ __all__ = [
     "DuplicateError",
     "IntegrityError",
     "LostConnectionError",
+    "MissingTableError",
+    "RightMissing",
     "backend_of",
     "build_object_path",
     "datajoint",
@@ -59,6 +61,32 @@ dj: Any = datajoint
 # ------------------------------------------------------------------------------------------------------------ MariaDB
 #: Statement that makes CURRENT_TIMESTAMP a time that never goes back in autumn.
 UTC = "SET SESSION time_zone = '+00:00'"
+
+
+#: The server's numbers of errors that a repetition mends: row changed since it was read, lock wait, deadlock.
+REPEAT = (1020, 1205, 1213)
+#: Those that say that the server cannot be reached, and that it is full or read-only.
+AWAY = (0, 1040, 1053, 1927, 2002, 2003, 2006, 2013, 2055, 4031)
+FULL = (3, 1021, 1026, 1030, 1114, 1290, 1836)
+#: Rights that accounts of workers have (`schemas.operations.roles`), as the server names them when it refuses.
+_OF_WORKERS = ("SELECT", "INSERT", "UPDATE", "DELETE")
+
+
+class RightMissing(AccessError, PblError):
+    """DB_REFUSED for a statement that the account may not execute; names the account that may. role: end of its name,
+    where it is not the least that may execute this statement."""
+
+    def __init__(self, found: str, role: str = "") -> None:
+        role = role or ("worker" if found.startswith(_OF_WORKERS) else "owner")
+        account = f"{os.environ.get('PBL_DB_PREFIX') or 'pbl'}_{role}"
+        PblError.__init__(
+            self,
+            "DB_REFUSED",
+            found=found,
+            expected=f"an account that may do this, such as {account}",
+            next_step=f"repeat it with DJ_USER={account} and its password (DJ_PASS or DJ_PASS_FILE); `pbl db roles` "
+            "makes that account",
+        )
 
 
 class MySQLOrMariaDB(MySQLAdapter):
@@ -78,6 +106,11 @@ class MySQLOrMariaDB(MySQLAdapter):
                 cursor.execute("SET SESSION sql_mode = REPLACE(@@SESSION.sql_mode, 'ONLY_FULL_GROUP_BY', '')")
                 connection.encoders = {**connection.encoders, dict: _json_literal}
         return connection
+
+    def translate_error(self, error: Exception, query: str = "") -> Exception:
+        """DataJoint's error; of a right that is missing one with a code."""
+        translated = super().translate_error(error, query)
+        return RightMissing(str(error.args[-1])) if isinstance(translated, AccessError) else translated
 
 
 def _json_literal(value: dict[str, Any], _mapping: object = None) -> str:

@@ -225,8 +225,6 @@ class SessionGdi(dj.Computed):
         {check_columns("gdi")}
         """
 
-    waits_for = (GDI, gait.Spatiotemporal)
-
     @property
     def key_source(self) -> Any:
         """Sets all of whose trials have their cycles, measures and index: the rows that the visit pools."""

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import re
 from collections.abc import Mapping
 from typing import Any
 
 from pbl_pipeline.errors import CODES, PblError
 
+from .datajoint_setup import AWAY, FULL, REPEAT, LostConnectionError
+
+#: Words of object stores for "full": MinIO, quotas.
+_BUCKET_FULL = re.compile(r"StorageFull|QuotaExceeded|minimum free drive threshold")
 #: A code at the beginning of a message, behind the name of the exception where DataJoint writes one.
 _CODE = re.compile(r"(?:\w+: )?([A-Z_0-9]+):")
 #: Longest texts that keep a whole coded error within the 2047 characters of a job's error_message.
@@ -26,8 +31,50 @@ def fitted(error: PblError, key: Mapping[str, Any]) -> PblError:
     )
 
 
+def store_full(error: BaseException) -> PblError | None:
+    """STORE_FULL where an error says that the store has no room, or came from one that does."""
+    seen: BaseException | None = error
+    while seen is not None:
+        if getattr(seen, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or _BUCKET_FULL.search(str(seen)):
+            return PblError(
+                "STORE_FULL",
+                found=_cut(f"{type(seen).__name__}: {seen}", _LIMITS["found"]),
+                expected="room for arrays and temporary files",
+                next_step="free space, or give the store's disk or bucket more; jobs that met it go on by themselves",
+            )
+        seen = seen.__cause__ or seen.__context__
+    return None
+
+
+def of_server(error: Exception) -> PblError:
+    """The coded error for what the driver or DataJoint raised of the database itself: DB_NOT_RUNNING only where it
+    cannot be reached, else DB_REFUSED with the server's number and text."""
+    first, text = (error.args[0], error.args[-1]) if error.args else (0, type(error).__name__)
+    number = first if isinstance(first, int) else 0
+    if isinstance(error, LostConnectionError) or number in AWAY:
+        return PblError(
+            "DB_NOT_RUNNING",
+            found=f"the database went away while it was asked ({text})",
+            expected="an answer",
+            next_step="try again; if that fails: `pbl db status`, `pbl db start`",
+        )
+    steps = {
+        REPEAT: "try again: another one held what this needed for too long",
+        FULL: "free space on the server's disk, or end its read-only mode; nothing was written",
+    }
+    return PblError(
+        "DB_REFUSED",
+        found=f"error {number} of the server: {text}",
+        expected="a statement that the server executes; nothing was written",
+        next_step=next((said for numbers, said in steps.items() if number in numbers), "report it with the whole text"),
+    )
+
+
 def internal(error: BaseException, table: str, key: Mapping[str, Any]) -> PblError:
-    """INTERNAL for an error without a code: a table never shows a bare traceback as its message."""
+    """INTERNAL for an error without a code (STORE_FULL where the store is full): a table never shows a bare traceback
+    as its message."""
+    if (full := store_full(error)) is not None:
+        return fitted(full, key)
     about = f"{table} " + ", ".join(f"{k}={v}" for k, v in key.items())
     return PblError(
         "INTERNAL",

@@ -78,7 +78,7 @@ class Keypoints(dj.Computed):
     def key_source(self) -> Any:
         """Only where a person is chosen: a video that waits for a choice has no row and no error."""
         chosen = tracking.SubjectChoice & [{"choice_status": s} for s in tracking.CHOSEN]
-        return ((chosen.proj() * KeypointSelection.proj()) & video.VideoInfo) - video.NotUsable
+        return chosen.proj() * KeypointSelection.proj() - video.NotUsable
 
     def make_fetch(self, key: dict) -> tuple:
         probed = one(video.Video * video.VideoInfo & key)

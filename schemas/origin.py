@@ -38,27 +38,28 @@ def origin_columns(prefix: str) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Origin:
-    """Version, host, duration and time of one computation."""
+    """Version, host, duration and end of one computation. ended: by `time.monotonic`."""
 
     code_version: str
     host: str
     seconds: float
-    computed: datetime.datetime
+    ended: float
 
     @classmethod
     def now(cls, seconds: float) -> Origin:
         """Of a computation that ended now, here, and took `seconds`."""
-        return cls(code_version(), platform.node()[:64], round(seconds, 3), utc_now())
+        return cls(code_version(), platform.node()[:64], round(seconds, 3), time.monotonic())
 
     def row(self, prefix: str, *, method_hash: str | None = None, model_sha256: str | None = None) -> dict[str, Any]:
-        """Values of `origin_columns(prefix)`."""
+        """Values of `origin_columns(prefix)`, the time by the server's clock."""
+        computed = utc_now() - datetime.timedelta(seconds=round(time.monotonic() - self.ended))
         return {
             f"{prefix}_code_version": self.code_version,
             f"{prefix}_method_hash": method_hash,
             f"{prefix}_model_sha256": model_sha256,
             f"{prefix}_host": self.host,
             f"{prefix}_seconds": self.seconds,
-            f"{prefix}_computed": self.computed,
+            f"{prefix}_computed": computed,
         }
 
 

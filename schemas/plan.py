@@ -17,6 +17,7 @@ from .datajoint_setup import dj
 from .jobs import jobs_of
 from .method_rows import method_row, resolve_method
 from .rows import utc_now
+from .transactions import repeated
 
 #: Columns of one fit: recordings of one kind of a session, seen through one chain of methods.
 GROUP = ("session_id", "tracking_method", "keypoint_method", "fit_method", "fit_set_kind")
@@ -93,9 +94,14 @@ def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]
     failed = queues_before_fit()
     made = []
     for session_id in to_plan:
-        with locked(session_id):
-            made += plan_anew(session_id, failed)
+        made += _plan_alone(session_id, failed)
     return made
+
+
+@repeated
+def _plan_alone(session_id: int, failed: Sequence[Any]) -> list[dict[str, Any]]:
+    with locked(session_id):
+        return plan_anew(session_id, failed)
 
 
 def queues_before_fit() -> list[Any]:

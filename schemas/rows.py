@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pymysql
 
 from pbl_pipeline.errors import PblError
 
-from .datajoint_setup import dj
+from .datajoint_setup import REPEAT, dj
 
 #: Function that returns the rows of a table that agree with a key, in the order of the table's own key: `stored_rows`
 #: asks the database each time, `ReadAhead` for many keys at once.
@@ -111,8 +112,9 @@ class ReadAhead:
 
 
 def utc_now() -> datetime.datetime:
-    """Now in UTC, whole seconds, without zone: what a datetime column takes."""
-    return datetime.datetime.now(datetime.UTC).replace(tzinfo=None, microsecond=0)
+    """Now in UTC by the clock of the database server, whole seconds, without zone: what a datetime column takes. One
+    clock for every row, whatever those of the machines say."""
+    return dj.conn().query("SELECT UTC_TIMESTAMP()").fetchone()[0]
 
 
 def number(value: Any) -> float | None:
@@ -152,7 +154,7 @@ def counted(deleted: Mapping[str, int]) -> str:
     return ", ".join(f"{n} of {name}" for name, n in deleted.items())
 
 
-#: Times that a cascade is begun anew where another process inserts below it meanwhile.
+#: Times that a cascade is begun anew where another process inserts below it, or holds its locks, meanwhile.
 _DELETES = 5
 
 
@@ -170,6 +172,10 @@ def delete_below(table: Any, keys: Sequence[Mapping[str, Any]]) -> dict[str, int
         try:
             target.delete(prompt=False, part_integrity="cascade")
             break
+        except pymysql.err.OperationalError as error:
+            # In a transaction that is open who opened it begins again (`schemas.transactions.repeated`).
+            if attempt == _DELETES - 1 or error.args[0] not in REPEAT or target.connection.in_transaction:
+                raise
         except dj.DataJointError as error:
             # A worker inserted a row below one that is deleted, after its table's turn; the row above is locked now.
             if attempt == _DELETES - 1 or not str(error).startswith("Delete blocked"):

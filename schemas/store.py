@@ -14,6 +14,7 @@ from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
 from .datajoint_setup import full_path
+from .job_errors import store_full
 from .operations.folders import private_folder
 from .operations.secret_files import secret
 
@@ -132,7 +133,7 @@ def check_store(backend: Any, create: bool = False) -> None:
     Raises
     ------
     PblError
-        STORE_UNAVAILABLE with what the store said.
+        STORE_UNAVAILABLE with what the store said, STORE_FULL.
     """
     # In a bucket always the same object, for a worker's key may not delete; in a folder a separate file that goes
     # again. Several processes may write that object at once: whoever wrote it, it holds some bytes and their hash.
@@ -158,7 +159,7 @@ def files_below(backend: Any, folder: str = "") -> dict[str, dict[str, Any]]:
     Raises
     ------
     PblError
-        STORE_UNAVAILABLE with what the store said.
+        STORE_UNAVAILABLE with what the store said, STORE_FULL.
     """
     try:
         base = full_path(backend, "")
@@ -175,7 +176,7 @@ def purge(fs: Any, folder: str) -> None:
     Raises
     ------
     PblError
-        STORE_UNAVAILABLE with what the store said.
+        STORE_UNAVAILABLE with what the store said, STORE_FULL.
     """
     name, _, path = folder.partition("/")
     where = {"Bucket": name, "Prefix": f"{path.strip('/')}/"}
@@ -199,6 +200,8 @@ def _kept(fs: Any, where: dict[str, str]) -> list[tuple[str, dict[str, str]]]:
 
 def store_error(error: BaseException) -> PblError:
     """The coded error for a store that does not do what it is asked. The clients' messages hold no secret."""
+    if (full := store_full(error)) is not None:
+        return full.about(describe())
     return PblError(
         "STORE_UNAVAILABLE",
         key=describe(),

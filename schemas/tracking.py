@@ -71,6 +71,7 @@ class SubjectOverride(dj.Manual):
 class Tracking(dj.Computed):
     definition = f"""
     # everybody in the video, numbered in order of appearance
+    -> video.VideoInfo
     -> TrackingSelection
     ---
     n_persons       : int16
@@ -94,12 +95,10 @@ class Tracking(dj.Computed):
         box_height      : float64              # (px) median height of the box
         """
 
-    waits_for = (video.VideoInfo,)
-
     @property
     def key_source(self) -> Any:
         """Only what a probe could read: a file that is not a video has one error row, in VideoInfo."""
-        return (TrackingSelection & video.VideoInfo) - video.NotUsable
+        return TrackingSelection.proj() * video.VideoInfo.proj() - video.NotUsable
 
     def make_fetch(self, key: dict) -> tuple:
         method = method_row(TrackingMethod, key)
@@ -163,7 +162,7 @@ class SubjectChoice(dj.Computed):
 
     @property
     def key_source(self) -> Any:
-        return (Tracking & video.VideoInfo) - video.NotUsable
+        return Tracking - video.NotUsable
 
     @computes
     def make_compute(

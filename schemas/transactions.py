@@ -1,18 +1,46 @@
-"""Transactions that are run again where two processes insert the same, and numbers that are given once."""
+"""Transactions that are run again where another process was in the way, and numbers that are given once."""
 
 from __future__ import annotations
 
+import functools
+import random
+import time
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
+
+import pymysql
 
 from . import lab
-from .datajoint_setup import DuplicateError, dj
+from .datajoint_setup import REPEAT, DuplicateError, dj
 
 T = TypeVar("T")
+Arguments = ParamSpec("Arguments")
 
 _ATTEMPTS = 20
+#: Longest pause before a transaction is begun again (s): random, so that two do not meet again.
+_PAUSE_S = 0.1
 
 
+def repeated(work: Callable[Arguments, T]) -> Callable[Arguments, T]:
+    """Decorator of a function that is one transaction: begin it again where the server broke it off for another one's
+    sake (deadlock, lock wait). Inside a transaction that is open the error goes on up to the one who opened it."""
+
+    @functools.wraps(work)
+    def wrapper(*arguments: Arguments.args, **named: Arguments.kwargs) -> T:
+        for attempt in range(_ATTEMPTS):
+            try:
+                return work(*arguments, **named)
+            except pymysql.err.OperationalError as error:
+                inside = lab.schema.connection is not None and lab.schema.connection.in_transaction
+                if error.args[0] not in REPEAT or inside or attempt == _ATTEMPTS - 1:
+                    raise
+                time.sleep(random.uniform(0.0, _PAUSE_S))  # noqa: S311
+        raise AssertionError("unreachable")
+
+    return wrapper
+
+
+@repeated
 def in_transaction(work: Callable[[], T], until: Callable[[], bool] = lambda: False) -> T:
     """Run `work` in a transaction; again where another process inserted the same at that moment, unless `until` holds
     then."""

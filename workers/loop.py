@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from schemas import tables_version
 from schemas.jobs import jobs_of
 from schemas.reading.scope import Scope
 
@@ -166,6 +167,7 @@ class Worker:
             return None if any(len(jobs) for jobs in held) else False
         if time.monotonic() - self._refreshed < REFRESH_EVERY_S and self._refreshed > 0:
             return False
+        tables_version.refuse_newer()  # migrated while this worker ran: it ends, and its successor does not start
         self.heartbeat.doing("looks at all tables")
         found = refresh.refresh(self._everything)
         if found is None:

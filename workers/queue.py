@@ -18,18 +18,14 @@ import random
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-import pymysql
-
 from pbl_pipeline.errors import PblError
 from schemas import chain
 from schemas.connection import dj
 from schemas.jobs import COUNTS, jobs_of, keys_of
+from schemas.transactions import repeated
 
 from .registry import NEW
 
-#: Error numbers of the server that a repetition mends: deadlock, lock wait.
-_AGAIN = (1205, 1213)
-_ATTEMPTS = 8
 #: Candidates looked at for each job that is wanted: others look at the same ones.
 _SPREAD = 4
 #: The longest that a job which was put back waits (s).
@@ -93,21 +89,16 @@ def fill(
     # IGNORE: another process may queue the same key between the two halves of the statement. Nothing in it comes from
     # outside: names are DataJoint's own, quoted by its adapter.
     statement = f"INSERT IGNORE INTO {jobs.full_table_name} ({names}) SELECT {values} FROM ({todo.make_sql()}) AS todo"  # noqa: S608
-    return _repeated(table.connection, lambda: int(table.connection.query(statement).rowcount))
+    return _alone(table.connection, lambda: int(table.connection.query(statement).rowcount))
 
 
-def _repeated(connection: Any, statement: Callable[[], int]) -> int:
+@repeated
+def _alone(connection: Any, statement: Callable[[], int]) -> int:
     """Run one statement that reads much and writes little: without locks on what it reads, again after a deadlock.
     Returns how many rows it changed."""
-    for attempt in range(_ATTEMPTS):
-        try:
-            connection.query("SET TRANSACTION ISOLATION LEVEL READ COMMITTED")
-            with connection.transaction:
-                return statement()
-        except pymysql.err.OperationalError as error:
-            if error.args[0] not in _AGAIN or attempt == _ATTEMPTS - 1:
-                raise
-    raise AssertionError("unreachable")
+    connection.query("SET TRANSACTION ISOLATION LEVEL READ COMMITTED")
+    with connection.transaction:
+        return statement()
 
 
 def sweep(table: Any, which: str = "status != 'reserved'") -> int:
@@ -116,7 +107,7 @@ def sweep(table: Any, which: str = "status != 'reserved'") -> int:
     for needless in (table.proj(), dj.Not(keys_of(table).proj())):
         if jobs := jobs_of(table) & which:  # most often there are none
             gone = jobs.restrict(needless, semantic_check=False)
-            n += int(_repeated(table.connection, functools.partial(gone.delete_quick, get_count=True)))
+            n += int(_alone(table.connection, functools.partial(gone.delete_quick, get_count=True)))
     return n
 
 

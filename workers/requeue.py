@@ -12,7 +12,7 @@ from schemas import computed_tables, fit, gait, gdi, keypoints, tracking, video
 from schemas.connection import dj
 from schemas.intake import Methods
 from schemas.intake.plans import resolve as resolve_ingest
-from schemas.jobs import jobs_of
+from schemas.jobs import jobs_of, keys_of
 from schemas.method_names import keys_named
 from schemas.method_rows import resolve_method
 from schemas.plan import default_fit, plan_fits, unsuited
@@ -67,13 +67,15 @@ def _of_video(table: Any, video_id: int) -> list[dict[str, Any]]:
 @dataclasses.dataclass(frozen=True)
 class Reprocess:
     """What is to be done again. `add`: selections of a method, which is fitted by `fit_method` where it is one of the
-    keypoints; `outdated`: keys whose results are deleted."""
+    keypoints; `outdated`: keys whose results are deleted; `unasked`: number of those that are not computed again now,
+    because the recording is marked as not usable, or another selection took their place."""
 
     table: str
     add: list[dict[str, Any]]
     outdated: list[dict[str, Any]]
     below: dict[str, int]
     fit_method: str | None = None
+    unasked: int = 0
 
 
 #: Where a method is selected: table -> (prefix of its columns, selection, method table).
@@ -152,7 +154,8 @@ def plan_again(
     if keys and len(keys) <= 10 * CHUNK:
         counts = dj.Diagram.cascade(one & keys, part_integrity="cascade").counts()
         below = {n: c for n, c in counts.items() if c}
-    return Reprocess(one.__name__, [], keys, below)
+    unasked = len(keys) - len(keys_of(one) & keys) if keys else 0
+    return Reprocess(one.__name__, [], keys, below, unasked=unasked)
 
 
 def _named(columns: Sequence[str], name: str) -> list[tuple[str, str]]:
@@ -210,4 +213,6 @@ def summary(plan: Reprocess) -> Sequence[str]:
     if plan.outdated:
         out.append(f"{len(plan.outdated)} rows of {plan.table} would be deleted and computed again")
         out += [f"  with it: {n} rows of {name}" for name, n in plan.below.items()]
+        if plan.unasked:
+            out.append(f"  {plan.unasked} of them only when they are asked for again (recordings marked as not usable)")
     return out or [f"nothing of {plan.table} is to be done again"]

@@ -15,6 +15,7 @@ import pymysql
 from pbl_pipeline.errors import PblError
 from schemas import connection
 from schemas.connection import DuplicateError, IntegrityError, LostConnectionError, inserting
+from schemas.datajoint_setup import AWAY, FULL, REPEAT
 from schemas.job_errors import error_code, error_message
 from schemas.jobs import keys_of
 from schemas.rows import InputChanged
@@ -28,17 +29,15 @@ DONE, ALREADY, LOST, FAILED, LATER = "done", "already there", "somebody else has
 #: Its key is gone: a row above was deleted, or another selection took its place. Its job is deleted, not tried.
 VANISHED = "no longer asked for"
 
-#: Exceptions of the driver and DataJoint about the database, and the numbers that say that it is away, or full, or
-#: read-only (the computed result is kept and written later), or that the same statement will do next time.
+#: Exceptions of the driver and DataJoint about the database: where it is away, full or read-only the computed result is
+#: kept and written later; at most `REPEATS` times the same statement is tried again at once.
 DATABASE_ERRORS = (
     LostConnectionError,
     pymysql.err.OperationalError,
     pymysql.err.InterfaceError,
     pymysql.err.InternalError,
 )
-AWAY = (0, 1040, 1053, 1927, 2002, 2003, 2006, 2013, 2055, 4031)
-FULL = (3, 1021, 1026, 1030, 1114, 1290, 1836)
-REPEAT, REPEATS = (1020, 1205, 1213), 10
+REPEATS = 10
 #: Attempts of a job whose inputs are gone or changed, and how long it waits after each but the last (s).
 ATTEMPTS, RETRY_S = 3, (1.0, 30.0)
 #: Errors of the file system that say nothing about the job: store full, read-only, away.
@@ -197,6 +196,8 @@ def cause_outside(error: BaseException) -> str | None:
     """Return what the file system or the database said where the store or the server is at fault, not the job."""
     if number_of(error) in REPEAT:
         return f"DATABASE: {type(error).__name__}: {error}"
+    if isinstance(error, PblError) and error.code == "STORE_FULL":  # `schemas.origin.computes` gave it its code
+        return f"STORE: {error.found}"
     seen: BaseException | None = error
     while seen is not None:
         if isinstance(seen, OSError) and seen.errno in STORE_GONE and not isinstance(error, PblError):

@@ -8,10 +8,12 @@ import html
 import shutil
 from pathlib import Path
 
-from pbl_pipeline import __version__, settings
+from pbl_pipeline import settings
+from pbl_pipeline.code_version import code_version
 from schemas import computed_tables, session, video
 from schemas.operations.archive import archive_dir
 from schemas.reading.status import Status, pipeline_status
+from schemas.rows import utc_now
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +32,7 @@ class Summary:
 
 def make_summary(hours: float = 24.0) -> Summary:
     """Count the last hours."""
-    until = datetime.datetime.now(datetime.UTC).replace(tzinfo=None, microsecond=0)
+    until = utc_now()
     since = until - datetime.timedelta(hours=hours)
     text = f"'{since:%Y-%m-%d %H:%M:%S}'"
     done = {}
@@ -101,7 +103,7 @@ def as_html(found: Summary) -> str:
     title = f"PBL, {found.until:%Y-%m-%d}"
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{style}</style>'
-        f"<h1>{title}</h1><table>{lines}</table><p>pbl-pipeline {html.escape(__version__)}</p></html>\n"
+        f"<h1>{title}</h1><table>{lines}</table><p>pbl-pipeline {html.escape(code_version())}</p></html>\n"
     )
 
 

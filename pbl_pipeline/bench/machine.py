@@ -6,12 +6,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from pbl_pipeline.settings import n_cores
+from pbl_pipeline.resources import cores
 
 
 def machine() -> dict[str, Any]:
     """Device and processor as this process saw them."""
-    out: dict[str, Any] = {"cores": n_cores()}
+    out: dict[str, Any] = {"cores": cores()}
     if "jax" in sys.modules:
         import jax
 

@@ -109,13 +109,13 @@ def detect(
 
 def keep(benchmark: str, rows: Iterable[Row], path: Path | None) -> list[Row]:
     """Gather the rows of a benchmark and write them to `path` after each one: a run of hours may be interrupted."""
-    from pbl_pipeline import __version__
+    from pbl_pipeline.code_version import code_version
 
     begun = datetime.now(UTC).isoformat(timespec="seconds")
     kept: list[Row] = []
     for row in rows:
         kept.append(row)
         if path is not None:
-            content = {"benchmark": benchmark, "version": __version__, "time_utc": begun, "rows": kept}
+            content = {"benchmark": benchmark, "version": code_version(), "time_utc": begun, "rows": kept}
             path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     return kept

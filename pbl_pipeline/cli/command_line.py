@@ -11,7 +11,8 @@ from pathlib import Path
 
 import click
 
-from pbl_pipeline import __version__, progress
+from pbl_pipeline import progress
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 
 #: Exit codes: 0 done, 1 a coded error, 2 wrong usage (click's own), 130 interrupted.
@@ -63,8 +64,18 @@ class ByTask(Commands):
                     formatter.write_dl(rows)
 
 
+def _print_version(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
+    """Print version and commit; git is asked only here."""
+    if asked and not ctx.resilient_parsing:
+        click.echo(f"pbl, version {code_version()}")
+        ctx.exit()
+
+
 @click.group(cls=ByTask, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(__version__, prog_name="pbl")
+@click.option(
+    "--version", is_flag=True, is_eager=True, expose_value=False, callback=_print_version,
+    help="Show the version and exit.",
+)  # fmt: skip
 @click.option("--quiet", is_flag=True, help="No progress bars.")
 @click.option("--debug", is_flag=True, help="Print the traceback of an error, too.")
 def cli(quiet: bool, debug: bool) -> None:

@@ -17,8 +17,10 @@ from pathlib import Path
 
 import click
 
-from pbl_pipeline import __version__, assets, settings
+from pbl_pipeline import assets, settings
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.resources import cores
 
 OK, NOTE, MISSING = "ok", "note", "missing"
 
@@ -91,8 +93,8 @@ def _fetch_missing() -> dict[str, PblError]:
 
 
 def _python() -> Finding:
-    what = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {os.cpu_count()} cores"
-    return Finding("Python", OK, f"{what}; pbl-pipeline {__version__}")
+    what = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {cores()} cores"
+    return Finding("Python", OK, f"{what}; pbl-pipeline {code_version()}")
 
 
 def _packages() -> Iterator[Finding]:

@@ -16,7 +16,7 @@ from typing import Protocol
 
 import numpy as np
 
-from pbl_pipeline.settings import n_cores
+from pbl_pipeline.resources import cores
 from pbl_pipeline.video import Camera, Frame
 
 from .crops import Regions
@@ -29,7 +29,7 @@ _MAX_WORKERS = 8
 
 def n_workers() -> int:
     """Detectors to run side by side: the cores this process may use, at most 8."""
-    return min(n_cores(), _MAX_WORKERS)
+    return min(cores(), _MAX_WORKERS)
 
 
 class Inference(Protocol):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.settings import n_cores
+from pbl_pipeline.resources import cores
 
 from .devices import asked_device, device_of, providers_for, unavailable
 from .spec import GRAPH_FILE, SPEC_FILE, WITHOUT_POINTS, ModelSpec, load_spec, model_invalid
@@ -46,7 +46,7 @@ class OnnxModel:
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = n_cores()
+        options.intra_op_num_threads = cores()
         options.log_severity_level = 4  # what it would print is raised below
         try:
             self._session = onnxruntime.InferenceSession(data, options, providers=providers)

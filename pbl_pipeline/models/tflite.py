@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.resources import cores
 
 from .notices import without_notice
 from .tflite_outputs import keep_outputs
@@ -50,7 +51,7 @@ class LiteModel:
         if outputs is not None:
             content = keep_outputs(content, outputs)
         with without_notice(b"XNNPACK delegate"):
-            self._interpreter = Interpreter(model_content=content, num_threads=num_threads)
+            self._interpreter = Interpreter(model_content=content, num_threads=min(num_threads, cores()))
             self._interpreter.allocate_tensors()
         self._input = self._interpreter.get_input_details()[0]["index"]
         self._outputs = self._interpreter.get_output_details()

@@ -7,7 +7,7 @@ from pathlib import PurePath
 
 import numpy as np
 
-import pbl_pipeline
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.gait import (
     GILLETTE_MODEL,
     Gdi,
@@ -62,7 +62,7 @@ def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str,
         "key_time": _figures.legend("left", "right", "stance"),
         "notes": _notes(visit, norm),
         "origin": _origin(visit, recordings, norm),
-        "footer": f"Made by the PBL pipeline {pbl_pipeline.__version__}. Research software: not a medical device, "
+        "footer": f"Made by the PBL pipeline {code_version()}. Research software: not a medical device, "
         "and no diagnosis. Everything on this page is contained in it; nothing is loaded from elsewhere.",
     }
     if metrics is not None and not empty:
@@ -393,7 +393,7 @@ def _origin(visit: Visit, recordings: Sequence[Recording], norm: NormativeSet | 
         groups.append({"name": "Gait measures", "rows": rows})
     if visit.methods:
         groups.append({"name": "Methods", "rows": [(k, v, False) for k, v in visit.methods.items()]})
-    software = {"pbl-pipeline": pbl_pipeline.__version__}
+    software = {"pbl-pipeline": code_version()}
     software |= {f"keypoints of {r.name}": r.keypoints.origin for r in recordings if r.keypoints and r.keypoints.origin}
     groups.append({"name": "Software", "rows": [(k, v, False) for k, v in software.items()]})
     return groups

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 import jinja2
 
-import pbl_pipeline
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.latex import tex_escape
 
 from .paper import paper_figures
@@ -87,7 +87,7 @@ def html(tables: Mapping[str, Table]) -> str:
     return template.render(
         tables=list(tables.values()),
         source=paper_figures()["source"],
-        version=pbl_pipeline.__version__,
+        version=code_version(),
         has_values=_has_values,
     )
 

@@ -19,7 +19,7 @@ from av.error import FFmpegError
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.memory import return_large_blocks
-from pbl_pipeline.settings import n_cores
+from pbl_pipeline.resources import cores
 
 from .container_structure import family, missing_end
 
@@ -77,7 +77,7 @@ def check_file(path: str | Path) -> Path:
 
 def decode_threads() -> int:
     """Threads for decoding: the cores this process may use, at most 8 (more brings nothing and costs memory)."""
-    return min(n_cores(), 8)
+    return min(cores(), 8)
 
 
 class Decoder:

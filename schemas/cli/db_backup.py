@@ -47,14 +47,15 @@ def _say_left(saved: Backup) -> None:
 @click.option("--check", "only_check", is_flag=True, help="Compare the backup with its checksums; change nothing.")
 @click.option("--again", is_flag=True, help="After an interrupted restore: remove what it left and start again.")
 def restore(folder: Path, only_check: bool, again: bool) -> None:
-    """Bring a backup back into an empty database and its store.
+    """Bring a backup back into an empty database and its store. An embedded database that is not running, or not there
+    yet, is started.
 
     Never over another: where tables exist it refuses. Checksums are compared before anything is written, row counts
     after.
 
     \b
     Example: pbl db restore --check /backup/2026-03-01
-    Example: PBL_HOME=/srv/pbl-new pbl db start && PBL_HOME=/srv/pbl-new pbl db restore /backup/2026-03-01
+    Example: PBL_HOME=/srv/pbl-new pbl db restore /backup/2026-03-01
     """
     from schemas.operations import backup
 

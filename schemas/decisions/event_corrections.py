@@ -14,6 +14,7 @@ from ..plan import locked
 from ..reading.objects import load_trial_fit
 from ..review import Decision
 from ..rows import delete_below, utc_now
+from ..transactions import repeated
 from .review_decisions import meanwhile, record
 
 if TYPE_CHECKING:
@@ -134,6 +135,7 @@ def take_back(video_id: int, by: str, seen: str) -> dict[str, int]:
     return _decide(_must_be_shown(video_id), None, by, seen)
 
 
+@repeated
 def _decide(before: Shown, events: tuple[Event, ...] | None, by: str, seen: str) -> dict[str, int]:
     trial = int(before.key["video_id"])
     with locked(int((video.Video & {"video_id": trial}).fetch1("session_id"))):

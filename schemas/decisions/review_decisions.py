@@ -15,7 +15,7 @@ from ..jobs import jobs_of
 from ..plan import locked, plan_anew, queues_before_fit
 from ..review import Decision
 from ..rows import utc_now
-from ..transactions import next_id
+from ..transactions import next_id, repeated
 from . import not_usable
 from .candidates import selection_of
 from .not_usable import Unusable
@@ -53,6 +53,7 @@ def person_state(video_id: int, tracking_method: str) -> str:
     return f"{last}-{by_hand[0] if len(by_hand) else ''}-{chosen[0] if len(chosen) else ''}"
 
 
+@repeated
 def decide_person(
     video_id: int, person: int, tracking_method: str | None = None, by: str = "", seen: str | None = None
 ) -> dict[str, int]:
@@ -144,6 +145,7 @@ def take_back(video_id: int, by: str = "", seen: str | None = None) -> None:
     _decide_usable(video_id, None, by, seen)
 
 
+@repeated
 def _decide_usable(video_id: int, mark: dict[str, str] | None, by: str, seen: str | None) -> None:
     session_id = int(video.registered_video(video_id)["session_id"])
     failed = queues_before_fit()
@@ -168,6 +170,7 @@ def _said(mark: Unusable | None) -> dict[str, str]:
     return {"usable": "yes"} if mark is None else {"usable": "no", "why": mark.reason}
 
 
+@repeated
 def accept_check(key: Mapping[str, Any], number: int, by: str, reason: str = "") -> None:
     """Accept a check of a visit that asks for attention, with one's name; nothing is computed anew.
 

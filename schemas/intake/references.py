@@ -17,6 +17,7 @@ from pbl_pipeline.paramset import canonical_json
 from .. import fit, validation, video
 from ..rows import utc_now
 from ..stored_files import file_ref, new_folder, stored_file
+from ..transactions import repeated
 
 if TYPE_CHECKING:
     from pbl_pipeline import validation as lib
@@ -109,6 +110,7 @@ def _read_npz(path: Path) -> lib.Reference:
     return lib.reference_of_fit(fitted, "optical markers" if by_markers else "several cameras")
 
 
+@repeated
 def add_reference(
     about: int | str | Path,
     path: str | Path,

@@ -10,6 +10,8 @@ DataJoint before the migrations run. The table `~migrations` in the schema `lab`
 applied, when, by which version, with which statements.
 """
 
-from ._run import Applied, Migration, Outcome, applied, available, migrate
+from schemas.tables_version import Applied, applied
+
+from ._run import Migration, Outcome, available, migrate
 
 __all__ = ["Applied", "Migration", "Outcome", "applied", "available", "migrate"]

@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import pkgutil
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import Any
 
 import pymysql
 
-from pbl_pipeline import __version__
 from pbl_pipeline.errors import PblError
 from schemas import connection
 from schemas.chain import tables
 from schemas.datajoint_setup import dj, read_heading_again
 from schemas.operations import catalog
 from schemas.operations.declare import declare_all
-from schemas.rows import utc_now
 from schemas.stages import STAGES, modules
+from schemas.tables_version import applied, numbered, record, refuse_newer, title
 
 from ._differences import differences
 
-_NAME = re.compile(r"(\d{4})_(\w+)")
 Say = Callable[[str], None]
 
 
@@ -36,15 +32,10 @@ class Migration:
     name: str
     statements: Callable[[Any], list[str]]
 
-
-@dataclasses.dataclass(frozen=True)
-class Applied:
-    """A row of the table `~migrations`."""
-
-    number: int
-    name: str
-    version: str
-    when: str
+    @property
+    def title(self) -> str:
+        """Number and name."""
+        return title(self.number, self.name)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,33 +48,9 @@ class Outcome:
 
 
 def available() -> list[Migration]:
-    """All migrations, in the order of their numbers.
-
-    Raises
-    ------
-    ValueError
-        A number that is missing or used twice: a mistake in the code.
-    """
-    found, package = [], importlib.import_module("schemas.migrations")
-    for module in pkgutil.iter_modules(package.__path__):
-        match = _NAME.fullmatch(module.name)
-        if match:
-            loaded = importlib.import_module(f"{package.__name__}.{module.name}")
-            found.append(Migration(int(match[1]), match[2], loaded.statements))
-    found.sort(key=lambda m: m.number)
-    if [m.number for m in found] != list(range(1, len(found) + 1)):
-        raise ValueError(f"migrations must be numbered 1, 2, 3 ...: {[m.number for m in found]}")
-    return found
-
-
-def applied() -> list[Applied]:
-    """The migrations that this database has seen; empty for one from before there were any."""
-    conn = connection.connect()
-    lab = connection.schema_name("lab")
-    if (lab, "~migrations") not in catalog.tables():
-        return []
-    rows = conn.query(f"SELECT number, name, code_version, applied FROM `{lab}`.`~migrations` ORDER BY id")  # noqa: S608
-    return [Applied(int(r[0]), r[1], r[2], str(r[3])) for r in rows.fetchall()]
+    """Return all migrations, in the order of their numbers. Raises ValueError as `tables_version.numbered`."""
+    loaded = ((n, name, importlib.import_module(f"schemas.migrations.{n:04d}_{name}")) for n, name in numbered())
+    return [Migration(n, name, module.statements) for n, name, module in loaded]
 
 
 def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
@@ -101,41 +68,27 @@ def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
     Raises
     ------
     PblError
-        DB_MIGRATION when differences remain that no migration removes (what could be done is done then), when the
+        DB_MIGRATION when the plan leaves differences that no migration removes (before anything is done), when the
         database has seen a newer version of the code, or when another process is migrating it; DB_REFUSED when the
         account may not alter tables.
     """
-    _refuse_newer()
+    refuse_newer()
     if dry_run:
         return _plan()
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute("SELECT GET_LOCK(%s, 5)", (f"{connection.prefix()}_migrate",))
         if (cursor.fetchone() or (0,))[0] != 1:
             raise _error("another process is migrating this database", "one at a time", "wait until it has ended")
+        if left := _plan().open:
+            raise _differs(left)
         created = _bind(create=True)
         steps = _apply(cursor, say)
     if any(statements for _, statements in steps):
         _reread()
-    left = [d.text() for d in differences()]
-    if left:
-        raise _error(
-            f"{len(left)} differences that no migration removes: {'; '.join(left[:8])}",
-            "tables as this version defines them",
-            "they need a migration: see docs/deployment.md, section Upgrade",
-        )
+    if left := [d.text() for d in differences()]:
+        raise _differs(left)
     declare_all()
     return Outcome(steps, created, [])
-
-
-def _refuse_newer() -> None:
-    numbers = {m.number for m in available()}
-    newer = [a for a in applied() if a.number not in numbers]
-    if newer:
-        raise _error(
-            f"migration {newer[-1].number:04d} ({newer[-1].name}) of pbl-pipeline {newer[-1].version} was applied",
-            f"a database that pbl-pipeline {__version__} knows",
-            f"use the pbl-pipeline that applied it ({newer[-1].version}) or a newer one",
-        )
 
 
 def _bind(create: bool) -> list[str]:
@@ -168,7 +121,7 @@ def _reread() -> None:
 def _plan() -> Outcome:
     conn, created = connection.connect(), _bind(create=False)
     done = {a.number for a in applied()}
-    steps = [(_title(m), m.statements(conn)) for m in available() if m.number not in done]
+    steps = [(m.title, m.statements(conn)) for m in available() if m.number not in done]
     planned = " ".join(s for _, statements in steps for s in statements)
     # What a planned statement changes, and what refers to a table that is still to be created, is compared afterwards.
     left = [d.text() for d in differences() if d.table not in planned and (d.known or not created)]
@@ -176,7 +129,7 @@ def _plan() -> Outcome:
 
 
 def _apply(cursor: Any, say: Say) -> list[tuple[str, list[str]]]:
-    conn, table = connection.connect(), f"`{connection.schema_name('lab')}`.`~migrations`"
+    conn = connection.connect()
     done = {a.number for a in applied()}
     steps = []
     for migration in available():
@@ -190,29 +143,24 @@ def _apply(cursor: Any, say: Say) -> list[tuple[str, list[str]]]:
             except pymysql.err.Error as error:
                 raise PblError(
                     "DB_REFUSED",
-                    key=f"{_title(migration)}: {statement[:200]}",
+                    key=f"{migration.title}: {statement[:200]}",
                     found=str(error.args[-1]),
                     expected="an account that may alter the tables, and tables that nobody uses at the moment",
                     next_step="stop the workers, use the account pbl_owner (pbl db roles), then repeat: it goes on",
                 ) from error
-        _record(cursor, table, migration, statements)
-        steps.append((_title(migration), statements))
+        record(cursor.execute, migration.number, migration.name, statements)
+        steps.append((migration.title, statements))
     return steps
 
 
-def _record(cursor: Any, table: str, migration: Migration, statements: list[str]) -> None:
-    cursor.execute(
-        f"CREATE TABLE IF NOT EXISTS {table} (id INT NOT NULL AUTO_INCREMENT PRIMARY KEY, number INT NOT NULL, "
-        "name VARCHAR(64) NOT NULL, code_version VARCHAR(32) NOT NULL, applied DATETIME NOT NULL, statements LONGTEXT)"
+def _differs(left: Sequence[str]) -> PblError:
+    """DB_MIGRATION, which names one difference a line."""
+    lines = "".join(f"\n    {line}" for line in left)
+    return _error(
+        f"{len(left)} differences that no migration removes:{lines}",
+        "tables as this version defines them",
+        "they need a migration: see docs/deployment.md, section Upgrade",
     )
-    cursor.execute(
-        f"INSERT INTO {table} (number, name, code_version, applied, statements) VALUES (%s, %s, %s, %s, %s)",  # noqa: S608
-        (migration.number, migration.name, __version__, utc_now(), ";\n".join(statements)),
-    )
-
-
-def _title(migration: Migration) -> str:
-    return f"{migration.number:04d} {migration.name}"
 
 
 def _error(found: str, expected: str, next_step: str) -> PblError:

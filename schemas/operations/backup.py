@@ -24,12 +24,13 @@ from typing import Any
 
 import pymysql
 
-from pbl_pipeline import __version__, progress
+from pbl_pipeline import progress
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from schemas import connection
 from schemas.operations.folders import make_private, private_folder
 from schemas.operations.json_files import write_json
-from schemas.store import store_error
+from schemas.store import check_store, store_error
 
 from . import backup_files, catalog, dump
 from .backup_files import PARTS, listed, safe_path, sha256_of, unwritable
@@ -119,7 +120,7 @@ def backup(
     listings = [f"{part}.sha256" for part in PARTS if (folder / f"{part}.sha256").exists()]
     manifest = {
         "format": FORMAT,
-        "pbl_pipeline": __version__,
+        "pbl_pipeline": code_version(),
         "created": created,
         "server": version,
         "prefix": prefix,
@@ -199,7 +200,7 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
         than the backup's, or when a file of the store has other bytes than the backup's; STORE_UNAVAILABLE.
     """
     manifest = check(folder, say)
-    connection.connect()
+    connection.connect(start=True)  # a new place has no server yet
     prefix = connection.prefix()
     if prefix != manifest["prefix"]:
         raise _refused(
@@ -211,6 +212,7 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
         with closing(connection.plain_connection()) as server, server.cursor() as cursor:
             _make_room(cursor, prefix, again)
             if manifest["store"]:
+                check_store(connection.store_backend(), create=True)
                 say(f"Bringing {manifest['n_files']} files back")
                 _restore_files(folder)
             say(f"Bringing {len(manifest['rows'])} tables back")

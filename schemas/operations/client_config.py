@@ -10,6 +10,7 @@ from schemas import connection
 from schemas.datajoint_setup import dj
 from schemas.operations.folders import private_folder
 from schemas.operations.json_files import write_json, write_text
+from schemas.tables_version import refuse_other_version
 
 #: Names that DataJoint looks for, in the working directory and above it.
 CONFIG, SECRETS = "datajoint.json", ".secrets"
@@ -33,9 +34,11 @@ def write_config(folder: Path, overwrite: bool = False) -> list[Path]:
     Raises
     ------
     PblError
-        FILE_UNWRITABLE: it exists already, or cannot be written; what `connection.connect` raises.
+        FILE_UNWRITABLE: it exists already, or cannot be written; DB_MIGRATION for tables of another version;
+        what `connection.connect` raises.
     """
     connection.connect()
+    refuse_other_version()
     config, here = dj.config, folder / CONFIG
     if not overwrite and (here.exists() or (folder / SECRETS).exists()):
         raise _unwritable(here, "it is there already", "pass --overwrite to replace it and .secrets/, or another --out")

@@ -21,7 +21,7 @@ from typing import Any
 from pbl_pipeline import progress, settings
 from pbl_pipeline.errors import PblError
 from schemas import connection, fit, lab, session, video, worker
-from schemas.datajoint_setup import full_path
+from schemas.datajoint_setup import RightMissing, full_path
 from schemas.operations import archive
 from schemas.operations.folders import remove_empty
 from schemas.operations.json_files import write_json
@@ -112,19 +112,23 @@ def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> For
     Raises
     ------
     PblError
-        DB_NOT_FOUND; DB_REFUSED while a worker computes something of this person or uploads are taken over;
+        DB_NOT_FOUND; DB_REFUSED while a worker computes something of this person or uploads are taken over, or without
+        the right to delete;
         STORE_UNAVAILABLE.
     """
-    with worker.alone(archive.LOCK, connection.connect()) as obtained:
-        if not obtained:
-            raise PblError(
-                "DB_REFUSED",
-                key=subject,
-                found="`pbl cron import` is running",
-                expected="no import, so that no recording appears after it was deleted",
-                next_step="repeat this when it has ended",
-            )
-        return _forget(subject, videos, say)
+    try:
+        with worker.alone(archive.LOCK, connection.connect()) as obtained:
+            if not obtained:
+                raise PblError(
+                    "DB_REFUSED",
+                    key=subject,
+                    found="`pbl cron import` is running",
+                    expected="no import, so that no recording appears after it was deleted",
+                    next_step="repeat this when it has ended",
+                )
+            return _forget(subject, videos, say)
+    except RightMissing as error:  # the account that may also remove the files of the store
+        raise RightMissing(error.found, "owner") from error
 
 
 def _forget(subject: str, videos: bool, say: Say) -> Forgotten:

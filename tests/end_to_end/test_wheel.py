@@ -54,7 +54,8 @@ def test_it_is_declared_for_the_pythons_that_were_tried(wheel):
 
 def test_the_installed_script_is_the_wheels(installed, tmp_path):
     done = run([installed / "bin" / "pbl", "--version"], tmp_path, PYTHONPATH=str(installed))
-    assert done.stdout == f"pbl, version {pbl_pipeline.__version__}\n", done.stderr
+    said = rf"pbl, version {re.escape(pbl_pipeline.__version__)}\+g[0-9a-f]{{12}}(\.dirty)?\n"
+    assert re.fullmatch(said, done.stdout), done.stdout + done.stderr
     where = "import pbl_pipeline, schemas, workers\nfor m in (pbl_pipeline, schemas, workers): print(m.__file__)"
     done = run([sys.executable, "-c", where], tmp_path, PYTHONPATH=str(installed))
     assert [Path(line).is_relative_to(installed) for line in done.stdout.splitlines()] == [True] * 3, done.stderr

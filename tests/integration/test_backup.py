@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gzip
 import json
+import shutil
 import subprocess
 import sys
 import threading
@@ -19,7 +20,7 @@ import schemas
 from pbl_pipeline.errors import PblError
 from schemas import connection, gait, lab, load_visit, migrations, video
 from schemas.intake import VisitRecord, ingest
-from schemas.operations import backup, backup_files, dump
+from schemas.operations import backup, backup_files, dump, embedded
 from schemas.operations.declare import declare_all
 from schemas.reading import frames
 from tests.command import pbl
@@ -103,7 +104,9 @@ def test_there_and_back(elsewhere: Any, tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_a_backup_of_an_older_version_is_restored_and_migrated(database: Path):
     """Made at commit 2e66321: one visit through the stand-ins of the chain, the tables alone."""
-    with installation():
+    with installation() as home:
+        embedded.stop()
+        shutil.rmtree(home / "db")  # a new place: no server is there yet
         found = backup.restore(Path(__file__).parent / "backup_of_2e66321")
         assert (sum(found.rows.values()), len(found.rows)) == (493, 110)
         migrations.migrate()

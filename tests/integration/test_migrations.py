@@ -16,6 +16,7 @@ import datajoint
 import pytest
 
 import schemas
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from schemas import connection, gait, gdi, jobs, lab, migrations, session, stages, video
 from schemas.chain import ON_REQUEST
@@ -26,6 +27,7 @@ from schemas.reading import frames
 from tests.command import pbl
 from tests.database import new_home, remove_home
 from tests.rows import everything, register
+from workers import heartbeat, loop
 from workers.populate import populate
 
 from . import chain
@@ -34,6 +36,8 @@ pytestmark = pytest.mark.database
 
 #: Number of the first migration that is not the package's own.
 OWN = len(migrations.available()) + 1
+#: Databases of before 0.2.0 recorded no migrations when their tables were new.
+NOT_RECORDED = "DROP TABLE pbl_lab.`~migrations`"
 #: A column that may not be null, for a table that has rows: added, filled with what is true of them, then closed.
 SIZES = '''
 """The size of a video's file, which older versions did not record."""
@@ -102,6 +106,7 @@ def _make_older(add: Callable[[str, str], None]) -> None:
         kinds = "ENUM('person','check') NOT NULL COMMENT ':enum(''person'',''check''):who is measured'"
         cursor.execute(f"ALTER TABLE pbl_review.decision MODIFY COLUMN decision_what {kinds}")
         cursor.execute("ALTER TABLE pbl_fit.__session_fit DROP COLUMN fit_height")
+        cursor.execute(NOT_RECORDED)
     add(f"{OWN:04}_sizes", SIZES)
 
 
@@ -210,6 +215,7 @@ def test_results_from_before_they_had_their_session_get_it(
             cursor.execute(f"ALTER TABLE {table} DROP FOREIGN KEY `{key}`, DROP COLUMN session_id")
             schema, name = table.split(".")
             cursor.execute(f"DELETE FROM {schema}.`~lineage` WHERE table_name = %s", (name,))
+        cursor.execute(NOT_RECORDED)
     empty()
     dry = migrations.migrate(dry_run=True)
     assert (len(dict(dry.steps)["0001 session_of_results"]), dry.open) == (4 * len(WITHOUT_SESSION), [])
@@ -272,6 +278,7 @@ def _with_methods_by_hand() -> None:
         for table, column in (("gait.__spatiotemporal", "stance"), ("gdi.__session_gdi", "session_stance")):
             cursor.execute(f"UPDATE pbl_{table} SET {column} = 1.5 WHERE gait_method = %s", (method,))
         cursor.execute("UPDATE pbl_gdi.__g_d_i__cycle SET cycle_z = 1.5 WHERE gait_method = %s", (method,))
+        cursor.execute(NOT_RECORDED)
 
 
 @pytest.mark.parametrize("killed_before", [None, 4, 60])
@@ -320,19 +327,67 @@ def test_corrections_by_a_method_become_rows(
     assert {t.table: t.done for t in populate(_chain()).tables if t.done}["SessionGdi"] == 1
 
 
+@pytest.mark.parametrize("killed_before", [None, 5])
+def test_tracking_without_the_video_info_that_it_read_goes(
+    empty: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_before: int | None
+):
+    chain.install(monkeypatch)
+    schemas.activate()
+    (one,) = register(chain.small_video(tmp_path, "a"), session_label="2026-03-01")
+    register(chain.small_video(tmp_path, "b"), session_label="2026-06-01")
+    populate(_chain())
+    new = everything()
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        cursor.execute(
+            "SELECT constraint_name FROM information_schema.key_column_usage WHERE table_schema = 'pbl_tracking'"
+            " AND table_name = '__tracking' AND referenced_table_name = '__video_info'"
+        )
+        ((key,),) = cursor.fetchall()
+        cursor.execute(f"ALTER TABLE pbl_tracking.__tracking DROP FOREIGN KEY `{key}`")
+        cursor.execute("DELETE FROM pbl_video.__video_info WHERE video_id = %s", (one,))
+        cursor.execute("DELETE FROM pbl_lab.`~migrations` WHERE number = 5")
+    empty()
+    dry = migrations.migrate(dry_run=True)
+    statements = dict(dry.steps)["0005 tracking_of_videos_that_were_read"]
+    assert (statements[0], len(statements) > 20, dry.open) == ("START TRANSACTION", True, [])
+
+    class Killed(BaseException):
+        pass
+
+    done: list[str] = []
+
+    def say(line: str) -> None:
+        done.append(line)
+        if len(done) == killed_before:
+            raise Killed
+
+    with contextlib.suppress(Killed):
+        migrations.migrate(say=say)
+    assert (len(done) == len(statements)) == (killed_before is None)
+    migrations.migrate()
+    after = everything()
+    left = {t: len(rows) for t, rows in after.items() if t.split(".")[1].startswith("__") or "fit_set" in t}
+    assert left == {t: len(new[t]) // 2 for t in left}
+    assert set(map(str, video.VideoInfo.to_arrays("video_id"))) == {str(one + 1)}
+    assert migrations.migrate().steps == []
+    # What was asked for is computed again.
+    assert not {t.table: t.errors for t in populate(_chain()).tables if t.errors}
+    assert {t: len(rows) for t, rows in everything().items() if t in left} == {t: len(new[t]) for t in left}
+
+
 @pytest.mark.parametrize("command", [("populate",), ("list", "videos"), ("worker", "--once"), ("db", "init")])
 def test_commands_over_tables_of_an_older_version_name_the_migration(older: None, command: tuple[str, ...]):
     before = everything()
     refused = pbl(*command)
     assert (refused.code, refused.err.split(":")[0]) == (1, "DB_MIGRATION")
-    for part in ("without video.video_size, __session_fit.fit_height", "pbl db migrate --dry-run"):
+    for part in ("0003 height_of_fits", "video.video_size, __session_fit.fit_height", "pbl db migrate --dry-run"):
         assert part in refused.err, refused.err
     assert everything() == before
     migrations.migrate()
     assert pbl("list", "videos").code == 0
 
 
-def test_what_no_migration_removes_is_named(empty: Callable[[], None]):
+def test_what_no_migration_removes_is_named(empty: Callable[[], None], add: Callable[[str, str], None]):
     schemas.activate()
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute("ALTER TABLE pbl_video.video DROP COLUMN video_size")
@@ -353,9 +408,13 @@ def test_what_no_migration_removes_is_named(empty: Callable[[], None]):
     }
     for part in ("ADD `video_size` bigint", "MODIFY `subject_height` double", "varchar(200)", "`forgotten`", "indexes"):
         assert any(part in n for n in named), part
-    with pytest.raises(PblError, match="video_size") as error:
-        migrations.migrate()
-    assert error.value.code == "DB_MIGRATION"
+    # Refused before the first statement, also of a migration that could be applied; one difference a line.
+    add(f"{OWN:04}_wanted", 'def statements(conn):\n    return ["CREATE TABLE pbl_lab.wanted (a INT PRIMARY KEY)"]\n')
+    refused = pbl("db", "migrate")
+    assert (refused.code, refused.error_code) == (1, "DB_MIGRATION")
+    assert [line[4:] for line in refused.err.splitlines() if line.startswith("    ")] == named
+    assert "pbl_lab.wanted" not in everything()
+    assert [a.number for a in migrations.applied()] == [*range(1, OWN)]
     # Nothing was altered by itself.
     assert _named() == named
 
@@ -405,15 +464,55 @@ def test_migrations_without_a_gap(add: Callable[[str, str], None]):
         migrations.available()
 
 
-def test_a_database_of_a_newer_version_is_left_alone(older: None):
-    migrations.migrate()
+STARTS = (
+    ("status",), ("populate",), ("worker", "--once"), ("web", "--port", "0"), ("db", "config"), ("db", "init"),
+    ("db", "migrate"), ("db", "migrate", "--dry-run"), ("list", "videos"), ("cron", "refresh"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("number", "name"), [(999, "x"), (1, "another_of_this_number")])
+def test_a_database_of_a_newer_version_is_left_alone(
+    empty: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, name: str
+):
+    monkeypatch.chdir(tmp_path)
+    schemas.activate()
+    assert [(a.number, a.name) for a in migrations.applied()] == [(m.number, m.name) for m in migrations.available()]
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute(
-            "INSERT INTO pbl_lab.`~migrations` (number, name, code_version, applied) VALUES (999, 'x', '9.9', NOW())"
+            "INSERT INTO pbl_lab.`~migrations` (number, name, code_version, applied)"
+            " VALUES (%s, %s, '9.9+gabc', NOW())",
+            (number, name),
         )
-    with pytest.raises(PblError, match=r"pbl-pipeline 9\.9") as error:
-        migrations.migrate(dry_run=True)
+    before = everything()
+    for command in STARTS:
+        empty()
+        refused = pbl(*command)
+        assert (refused.code, refused.error_code) == (1, "DB_MIGRATION"), command
+        for part in (f"{number:04} {name}", "9.9+gabc", code_version()):
+            assert part in refused.err, command
+    assert everything() == before
+    assert not list(tmp_path.iterdir())
+    # Also a worker that runs while the tables are migrated stops at its next look.
+    empty()
+    schemas.stages.modules()
+    with pytest.raises(PblError, match=r"9\.9") as error:
+        loop.Worker((), heartbeat.Silent()).run(once=True)
     assert error.value.code == "DB_MIGRATION"
+
+
+def test_a_database_that_lacks_a_migration_is_refused_although_no_column_is_missing(empty: Callable[[], None]):
+    schemas.activate()
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        cursor.execute("DELETE FROM pbl_lab.`~migrations` WHERE number = %s", (OWN - 1,))
+    last = migrations.available()[-1]
+    for command in STARTS:
+        if command[:2] != ("db", "migrate"):
+            empty()
+            refused = pbl(*command)
+            assert (refused.code, refused.error_code) == (1, "DB_MIGRATION"), command
+            assert f"without migration {last.title}" in refused.err
+    assert migrations.migrate().steps == [(last.title, [])]
+    assert pbl("status").code == 0
 
 
 def test_one_process_migrates_at_a_time(database: Path):

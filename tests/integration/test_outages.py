@@ -8,6 +8,8 @@ import errno
 import os
 import shutil
 import subprocess
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +18,13 @@ import pytest
 
 import pbl_pipeline.video
 import schemas
-from schemas import connection, fit, session, tracking, video, worker
-from schemas.job_errors import error_code
+from schemas import connection, fit, lab, review, session, tracking, video, worker
+from schemas.decisions import review_decisions
+from schemas.job_errors import error_code, of_server
 from schemas.jobs import jobs_of
+from schemas.operations import catalog
 from schemas.operations.orphans import orphans
+from schemas.store import store_error
 from schemas.stored_files import remove_left_over
 from tests.rows import register
 from workers import queue, recover, refresh, run_job
@@ -97,6 +102,69 @@ def test_a_deadlock_that_does_not_end_puts_the_job_back(tmp_path: Path, monkeypa
     assert "Deadlock" in video.VideoInfo.jobs.fetch1("error_message")
 
 
+@pytest.mark.parametrize("number", [1205, 1213])
+def test_a_decision_that_meets_a_deadlock_is_made_once(tmp_path: Path, monkeypatch, number: int):
+    (one,) = register(chain.small_video(tmp_path, "walk"))
+    broken_off = pymysql.err.OperationalError(number, "try restarting transaction")
+    tried = failing(monkeypatch, review_decisions, "record", broken_off, broken_off)
+    review_decisions.mark_not_usable(one, "other", "dark", by="A. First")
+    assert len(tried) == 3
+    assert (len(video.NotUsable()), len(review.Decision())) == (1, 1)
+    failing(monkeypatch, review_decisions, "record", pymysql.err.OperationalError(1366, "Incorrect value"))
+    with pytest.raises(pymysql.err.OperationalError):  # another error is not tried again
+        review_decisions.take_back(one, by="A. First")
+    assert len(video.NotUsable()) == 1
+
+
+def test_two_decisions_that_lock_each_other_out_are_both_made(tmp_path: Path, monkeypatch):
+    """A deadlock of the server's own: another connection holds the row that the decision locks second, and asks for the
+    one that it locked first."""
+    one, two = register(chain.small_video(tmp_path, "a"), chain.small_video(tmp_path, "b"))
+    other, real, waiting = connection.plain_connection(), review_decisions.record, []
+    videos, sessions = video.Video.full_table_name, session.Session.full_table_name
+
+    def record(*args, **options):
+        if not waiting:
+            cursor = other.cursor()
+            other.begin()
+            cursor.execute(f"UPDATE {videos} SET video_size = video_size + 1 WHERE video_id = {two}")
+            # It has more to undo, so the server breaks the decision off.
+            rows = [(f"X{i}", "unknown", "2026-01-01") for i in range(300)]
+            columns = "subject, population, subject_created"
+            cursor.executemany(f"INSERT INTO {lab.Subject.full_table_name} ({columns}) VALUES (%s, %s, %s)", rows)
+            waiting.append(threading.Thread(target=cursor.execute, args=(f"SELECT * FROM {sessions} FOR UPDATE",)))
+            waiting[0].start()
+            time.sleep(0.5)
+            try:
+                connection.connect().query(f"SELECT * FROM {videos} WHERE video_id = {two} FOR UPDATE")
+                pytest.fail("the server broke the other one off")
+            finally:
+                waiting[0].join()
+                other.rollback()
+        return real(*args, **options)
+
+    monkeypatch.setattr(review_decisions, "record", record)
+    review_decisions.mark_not_usable(one, "other", "dark", by="A. First")
+    assert len(waiting) == 1
+    assert (len(video.NotUsable()), len(review.Decision())) == (1, 1)
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (pymysql.err.OperationalError(2013, "Lost connection"), "DB_NOT_RUNNING"),
+        (pymysql.err.OperationalError(1213, "Deadlock found"), "DB_REFUSED"),
+        (FULL, "DB_REFUSED"),
+        (pymysql.err.DataError(1406, "Data too long"), "DB_REFUSED"),
+    ],
+)
+def test_only_a_database_that_is_away_is_an_outage(error: Exception, code: str):
+    said = of_server(error)
+    assert said.code == code
+    assert str(error.args[-1]) in said.found
+    assert code == "DB_NOT_RUNNING" or str(error.args[0]) in said.found
+
+
 def test_a_deadlock_while_jobs_are_swept_is_tried_again(tmp_path: Path, monkeypatch):
     register(chain.small_video(tmp_path, "walk"))
     refresh.refresh()
@@ -155,8 +223,23 @@ def test_a_full_store_keeps_no_half_a_file(tmp_path: Path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_bytes", full)
-        assert run_job.run(job).what == run_job.LATER
+        outcome = run_job.run(job)
+    assert (outcome.what, outcome.code) == (run_job.LATER, "STORE_FULL")
     assert left_in_the_store(video.VideoInfo) == []
+
+
+def test_a_full_disk_while_a_job_computes_puts_it_back_too(tmp_path: Path, monkeypatch):
+    job = first_job(tmp_path)
+    failing(monkeypatch, pbl_pipeline.video, "probe", OSError(errno.ENOSPC, "No space left on device"))
+    outcome = run_job.run(job)
+    assert (outcome.what, outcome.code) == (run_job.LATER, "STORE_FULL")
+    assert video.VideoInfo.jobs.fetch1("status") == "pending"
+
+
+def test_a_bucket_without_room_has_its_code():
+    refused = OSError(errno.EIO, "An error occurred (XMinioStorageFull) when calling the PutObject operation")
+    assert store_error(refused).code == "STORE_FULL"
+    assert store_error(OSError(errno.EIO, "no route to host")).code == "STORE_UNAVAILABLE"
 
 
 class Killed(BaseException):
@@ -226,6 +309,25 @@ def test_jobs_do_not_wait_for_a_clock_that_was_set_back(tmp_path: Path):
         assert work(video.VideoInfo).done == 1
     finally:
         connection.connect().query("SET SESSION timestamp = DEFAULT")
+
+
+def test_every_row_has_the_time_of_the_servers_clock(tmp_path: Path):
+    """The server's clock stands in 2001 for this connection; a machine's own clock is in no row."""
+    connection.connect().query("SET SESSION timestamp = 1000000000")
+    try:
+        (one, two) = register(chain.small_video(tmp_path, "walk"), chain.small_video(tmp_path, "again"))
+        review_decisions.mark_not_usable(two, "other", "dark", by="A. First")
+        assert work().failed == 0
+        review_decisions.decide_person(one, 1, by="A. First")
+    finally:
+        connection.connect().query("SET SESSION timestamp = DEFAULT")
+    times = {}
+    for (schema, table), columns in catalog.tables().items():
+        for column in (c.name for c in columns if c.type == "datetime" and not table.startswith(("#", "~"))):
+            found = connection.connect().query(f"SELECT `{column}` FROM `{schema}`.`{table}`").fetchall()
+            times |= {f"{table}.{column}": {str(t)[:10] for (t,) in found if t is not None}} if found else {}
+    assert {"video.video_created", "__session_gdi.session_gdi_computed", "decision.decision_at"} <= set(times)
+    assert {t for found in times.values() for t in found} == {"2001-09-09"}, times
 
 
 def test_no_hour_comes_twice_in_autumn():

@@ -13,7 +13,7 @@ import yaml
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection, gdi, lab, session, worker
+from schemas import connection, gdi, lab, session, video, worker
 from schemas.chain import ON_REQUEST
 from schemas.datajoint_setup import dj
 from schemas.intake import VisitRecord, ingest
@@ -22,7 +22,7 @@ from schemas.operations.declare import declare_all
 from schemas.reading import frames
 from tests.command import pbl
 from tests.rows import remove_all
-from workers import refresh
+from workers import queue, refresh, run_job
 from workers.populate import populate
 
 from . import chain
@@ -105,6 +105,41 @@ def test_a_worker_fills_every_table_and_changes_none(login: Login, tmp_path: Pat
     assert not refused("DROP DATABASE pbl_more")
     assert refused("CREATE DATABASE elsewhere")
     assert refused("CREATE USER 'x'@'%' IDENTIFIED BY 'long-enough-1'")
+
+
+@pytest.mark.parametrize(
+    ("command", "account"),
+    [
+        (("retry",), "pbl_worker"),
+        (("choose", "1", "--not-usable", "other", "--note", "dark"), "pbl_worker"),
+        (("reprocess", "--table", "VideoInfo", "--yes"), "pbl_worker"),
+        (("populate",), "pbl_worker"),
+        (("forget", "P001", "--yes"), "pbl_owner"),
+        (("db", "init"), "pbl_owner"),
+    ],
+)
+def test_without_the_right_the_account_that_has_it_is_named(
+    login: Login, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...], account: str
+):
+    login("worker")
+    schemas.activate()
+    ingest([chain.small_video(tmp_path, "walk")], VisitRecord(subject="P001"))
+    refresh.refresh()
+    (job,) = queue.claim(video.VideoInfo, 1)
+    if command[0] == "reprocess":
+        assert run_job.run(job).what == run_job.DONE
+    else:
+        queue.fail(job, "PblError: VIDEO_MISSING: gone")
+    if command[0] == "db":
+        monkeypatch.setenv("PBL_DB_PREFIX", "pbl_other")  # no schema of this prefix is there
+        account = "pbl_other_owner"
+    else:
+        login("analyst")
+    done = pbl(*command)
+    assert (done.code, done.error_code) == (1, "DB_REFUSED"), done.err
+    assert f"DJ_USER={account} " in done.err
+    assert "denied" in done.err
+    assert "Traceback" not in done.err
 
 
 def test_an_analyst_cannot_hold_what_a_refresh_needs(login: Login):

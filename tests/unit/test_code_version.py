@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from pbl_pipeline import __version__, code_version
 from pbl_pipeline.code_version import built_commit, checked_out_commit
+from tests.command import pbl
 
 
 def git(root: Path, *arguments: str) -> str:
@@ -63,6 +66,24 @@ def test_the_wheel_says_its_commit_first(tmp_path: Path, monkeypatch: pytest.Mon
     assert version() == f"{__version__}+g0123456789ab"
     file.unlink()
     assert version() == __version__
+
+
+def test_the_version_is_stated_once_and_shown_with_its_commit():
+    root = Path(__file__).parents[2]
+    stated = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))
+    assert "version" not in stated["project"]
+    assert stated["project"]["dynamic"] == ["version"]
+    assert stated["tool"]["hatch"]["version"]["path"] == "pbl_pipeline/__init__.py"
+    shown = pbl("--version")
+    assert (shown.code, shown.out) == (0, f"pbl, version {code_version.code_version()}\n")
+    # Whoever shows a version shows it with its commit: nothing else reads the bare one.
+    bare = {
+        str(path.relative_to(root))
+        for package in code_version.PACKAGES
+        for path in (root / package).rglob("*.py")
+        if re.search(r"(?<![.\w])__version__|pbl_pipeline\.__version__", path.read_text(encoding="utf-8"))
+    }
+    assert bare == {"pbl_pipeline/__init__.py", "pbl_pipeline/code_version.py"}
 
 
 def test_it_fits_its_column():

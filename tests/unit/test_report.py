@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import pbl_pipeline
 from pbl_pipeline.body import load_body
 from pbl_pipeline.charts import cycle_chart, mean_curve, nice_ticks
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.fit import SessionFit, TrialFit
 from pbl_pipeline.gait import GaitMetrics, gait_metrics, load_norm
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, PASS, WARN, Check
@@ -202,7 +202,7 @@ def test_page_shows_the_measures(visit: Visit, measured: GaitMetrics, tmp_path: 
         "walk.mp4",
         "Acme Phone 9",
         measured.params_hash,
-        f"pbl-pipeline {pbl_pipeline.__version__}",
+        f"pbl-pipeline {code_version()}",
         "Keypoints blazepose-v2",
         "not the original",
         "Kalman smoother",

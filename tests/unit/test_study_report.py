@@ -17,6 +17,7 @@ import pytest
 from click.testing import CliRunner
 
 from pbl_pipeline.cli.study import study as command
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.stats import correlation, icc, srm
 from pbl_pipeline.study import StudyData, read_study, write_study
@@ -170,7 +171,7 @@ def test_the_files_of_a_report(written):
     for path in (out / "figures").glob("*.svg"):
         root = ET.parse(path).getroot()
         words = " ".join(t.text or "" for t in root.iter("{http://www.w3.org/2000/svg}text"))
-        for said in ("synthetic spine cohort", "80 persons", "no video", "PBL pipeline 0.1.0"):
+        for said in ("synthetic spine cohort", "80 persons", "no video", f"PBL pipeline {code_version()}"):
             assert said in words, path.name
         assert "nan" not in path.read_text().lower()
         assert path.with_suffix(".pdf").read_bytes().startswith(b"%PDF-1.")

@@ -2,9 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import click
 
 from workers.registry import FIT, GROUPS
+
+#: Share of a process of `--processes auto`: more cores bring one recording little, and its memory is what a long
+#: recording takes (bytes).
+CORES_EACH, MEMORY_EACH = 2, 4 * 2**30
+
+
+class Processes(click.ParamType):
+    """A number of processes, or `auto`."""
+
+    name = "number|auto"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
+        """Return the number, or "auto"."""
+        return "auto" if value == "auto" else click.IntRange(1, 256).convert(value, param, ctx)
 
 
 @click.command()
@@ -16,8 +32,9 @@ from workers.registry import FIT, GROUPS
     help="What this machine serves: cpu is everything but the fit, gpu the fit.",
 )
 @click.option(
-    "--processes", type=click.IntRange(1, 256),
-    help="Working processes (default: one for each GPU where the fit is served, else 1).",
+    "--processes", type=Processes(),
+    help="Working processes, which divide the cores among them; auto: as many as cores and memory allow (2 cores and "
+    "4 GB each; with GPUs one for each). Default: one for each GPU where the fit is served, else 1.",
 )  # fmt: skip
 @click.option(
     "--batch",
@@ -39,7 +56,7 @@ from workers.registry import FIT, GROUPS
 @click.option("--no-selftest", is_flag=True, help="Skip the known jobs that each process does first.")
 def worker(
     resource: str,
-    processes: int | None,
+    processes: int | str | None,
     batch: int | None,
     once: bool,
     max_jobs: int | None,
@@ -56,10 +73,11 @@ def worker(
     JSON lines on stderr.
 
     \b
-    Example: pbl worker
+    Example: pbl worker --processes auto
     Example: pbl worker --resource gpu --batch 32 --metrics-port 9108
     """
     import schemas
+    from pbl_pipeline.resources import cores, divide_cores, memory_bytes
     from schemas import connection
     from workers.devices import given_gpus
     from workers.log import to_stderr
@@ -69,9 +87,13 @@ def worker(
     schemas.activate(methods=False)  # a wrong address or login is reported here, not by a process that is started again
     to_stderr()
     gpus = given_gpus() if FIT in GROUPS[resource] else ()
+    if processes == "auto":
+        processes = len(gpus) or max(1, min(cores() // CORES_EACH, memory_bytes() // MEMORY_EACH))
+    n = int(processes or len(gpus) or 1)
+    divide_cores(n)
     options = Options(
         resource=resource,
-        processes=processes or len(gpus) or 1,
+        processes=n,
         # Among so many sessions are enough of one size to be solved together.
         batch=batch or (128 if gpus else 1),
         gpus=gpus,

@@ -218,14 +218,21 @@ def _opened_by_links(where: Where, port: int, options: Options, visit: int | Non
 
 @contextlib.contextmanager
 def database() -> Iterator[None]:
-    """The embedded database, started where it is used and not running, and stopped again then."""
-    from schemas import connection
+    """The embedded database, started where it is used and not running, and stopped again then. Tables of another
+    version are refused; of a database that is away the pages say so, until it answers."""
+    from schemas import connection, tables_version
     from schemas.operations import embedded
 
     started = connection.external() is None and not embedded.status().running
     if started:
         embedded.start(say=click.echo)
     try:
+        try:
+            connection.connect()
+            tables_version.refuse_other_version()
+        except PblError as error:
+            if error.code != "DB_NOT_RUNNING":
+                raise
         yield
     finally:
         if started:

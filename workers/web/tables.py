@@ -9,8 +9,6 @@ from typing import Any, Protocol, TypeVar
 
 import pymysql
 
-from pbl_pipeline.errors import PblError
-
 T = TypeVar("T")
 
 
@@ -43,34 +41,31 @@ class Tables:
         Raises
         ------
         PblError
-            What the function raises; DB_NOT_RUNNING, DB_REFUSED where the database is away.
+            What the function raises; DB_NOT_RUNNING where the database is away, DB_REFUSED with the server's words
+            for its other errors, STORE_FULL.
         """
         return await asyncio.get_running_loop().run_in_executor(self._thread, self._answer, question, args)
 
     def _answer(self, question: Callable[..., T], args: tuple[Any, ...]) -> T:
         import schemas
-        from schemas import connection
+        from schemas import connection, tables_version
+        from schemas.job_errors import of_server, store_full
 
         if not self._declared:
             schemas.activate(methods=False)
             self._declared = True
         else:
             connection.connect()  # a server that was started again is found again
+            tables_version.refuse_newer()  # migrated while the page was served
         try:
             return question(*args)
-        except (pymysql.err.OperationalError, connection.LostConnectionError) as error:
-            raise gone(error) from error
+        except (pymysql.err.Error, connection.LostConnectionError) as error:
+            raise of_server(error) from error
+        except OSError as error:
+            if (full := store_full(error)) is not None:
+                raise full from error
+            raise
 
     def close(self) -> None:
         """Wait for the question that is being asked, take no more."""
         self._thread.shutdown(cancel_futures=True)
-
-
-def gone(error: Exception) -> PblError:
-    """DB_NOT_RUNNING for a connection that was lost while a question was asked."""
-    return PblError(
-        "DB_NOT_RUNNING",
-        found=f"the database went away while it was asked ({error.args[-1] if error.args else type(error).__name__})",
-        expected="an answer",
-        next_step="load the page again; if that fails: `pbl db status`, `pbl db start`",
-    )

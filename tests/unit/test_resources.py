@@ -1,0 +1,127 @@
+"""Cores and memory: those of the machine, less what a container or batch system withholds; divided by the processes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pbl_pipeline import resources
+from schemas.operations.embedded import process
+from tests.command import pbl
+from workers import supervisor
+from workers.process import Options
+
+GB = 2**30
+
+
+def groups(folder: Path, patch: pytest.MonkeyPatch, own: str, files: dict[str, str]) -> None:
+    """A tree of control groups as the kernel shows it."""
+    patch.setattr(resources, "_GROUPS", folder)
+    (folder / "own").write_text(own)
+    patch.setattr(resources, "_OWN", folder / "own")
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text + "\n")
+
+
+@pytest.fixture
+def sixteen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that is bound to 16 cores of a machine with 64 GB."""
+    for name in (resources.CORES, *resources._THREADS):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(16)))
+    monkeypatch.setattr(os, "sysconf", {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 16 * 2**20}.__getitem__)
+
+
+@pytest.mark.parametrize(
+    ("own", "files", "expected"),
+    [
+        ("0::/", {}, (16, 64 * GB)),
+        ("0::/", {"cpu.max": "max 100000", "memory.max": "max"}, (16, 64 * GB)),
+        ("0::/", {"cpu.max": "250000 100000", "memory.max": str(8 * GB)}, (2, 8 * GB)),  # a container
+        ("0::/", {"cpu.max": "50000 100000"}, (1, 64 * GB)),
+        ("0::/slice/job", {"slice/cpu.max": "400000 100000", "slice/job/cpu.max": "max 100000"}, (4, 64 * GB)),
+        ("0::/slice/job", {"slice/memory.max": str(GB), "slice/job/memory.max": str(2 * GB)}, (16, GB)),
+        (
+            "4:memory:/docker/a\n3:cpu,cpuacct:/docker/a",
+            {
+                "cpu/docker/a/cpu.cfs_quota_us": "300000",
+                "cpu/docker/a/cpu.cfs_period_us": "100000",
+                "cpu/cpu.cfs_quota_us": "-1",
+                "cpu/cpu.cfs_period_us": "100000",
+                "memory/docker/a/memory.limit_in_bytes": str(4 * GB),
+            },
+            (3, 4 * GB),
+        ),
+    ],
+)
+def test_limits_of_control_groups_count(sixteen, tmp_path: Path, monkeypatch, own: str, files: dict, expected: tuple):
+    groups(tmp_path, monkeypatch, own, files)
+    assert (resources.cores(), resources.memory_bytes()) == expected
+
+
+def test_what_is_stated_counts_but_never_more_than_there_is(sixteen, tmp_path: Path, monkeypatch):
+    groups(tmp_path, monkeypatch, "0::/", {"cpu.max": "400000 100000"})
+    for stated, expected in (("3", 3), ("64", 4), ("0", 1), ("many", 4)):
+        monkeypatch.setenv(resources.CORES, stated)
+        assert resources.cores() == expected
+
+
+@pytest.mark.parametrize(
+    ("asked", "processes", "share"), [((), 1, "16"), (("--processes", "5"), 5, "3"), (("--processes", "auto"), 8, "2")]
+)
+def test_a_worker_divides_the_cores_by_its_processes(
+    sixteen, tmp_path: Path, monkeypatch, asked: tuple, processes: int, share: str
+):
+    groups(tmp_path, monkeypatch, "0::/", {})
+    monkeypatch.setattr("schemas.activate", lambda **_: None)
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")  # who sets it means it
+    found: list[Options] = []
+    monkeypatch.setattr(supervisor.Supervisor, "run", lambda self: found.append(self.options) or 0)
+    monkeypatch.setattr("workers.devices.given_gpus", tuple)
+    with monkeypatch.context() as patch:
+        for name in ("NPROC", "OPENBLAS_NUM_THREADS", resources.CORES):
+            patch.setenv(name, "x")
+            patch.delenv(name)
+        assert pbl("worker", *asked).code == 0
+        assert [o.processes for o in found] == [processes]
+        left = {name: os.environ[name] for name in (resources.CORES, *resources._THREADS)}
+    assert left == {resources.CORES: share, "OMP_NUM_THREADS": "7", "OPENBLAS_NUM_THREADS": share, "NPROC": share}
+
+
+def test_little_memory_means_fewer_processes(sixteen, tmp_path: Path, monkeypatch):
+    groups(tmp_path, monkeypatch, "0::/", {"memory.max": str(13 * GB)})
+    monkeypatch.setattr("schemas.activate", lambda **_: None)
+    monkeypatch.setattr("workers.devices.given_gpus", tuple)
+    monkeypatch.setattr("pbl_pipeline.resources.divide_cores", lambda _: None)
+    found: list[Options] = []
+    monkeypatch.setattr(supervisor.Supervisor, "run", lambda self: found.append(self.options) or 0)
+    assert pbl("worker", "--processes", "auto").code == 0
+    assert [o.processes for o in found] == [3]
+    assert pbl("worker", "--processes", "many").code == 2
+
+
+def test_the_numerical_library_keeps_to_its_share():
+    """XLA makes a thread for each core it may use; with a share of one core it makes one."""
+    program = (
+        "import os, jax.numpy as j; x = j.ones((300, 300)); (x @ x).block_until_ready()\n"
+        "names = [open(f'/proc/self/task/{t}/comm').read() for t in os.listdir('/proc/self/task')]\n"
+        "print(sum('XLAEigen' in name for name in names))"
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        for name in (resources.CORES, *resources._THREADS):
+            patch.setenv(name, "x")
+            patch.delenv(name)
+        resources.divide_cores(1000)
+        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "1"
+
+
+@pytest.mark.parametrize(("limit", "expected"), [(GB, 256), (16 * GB, 2048), (64 * GB, 8192)])
+def test_the_database_is_sized_to_the_machine(sixteen, tmp_path: Path, monkeypatch, limit: int, expected: int):
+    groups(tmp_path, monkeypatch, "0::/", {"memory.max": str(limit)})
+    assert process.buffer_pool_mb() == expected
