@@ -383,7 +383,7 @@ def test_only_the_proxy_is_answered_and_believed(known: Accounts):
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     """A page that waits for half a second."""
-    monkeypatch.setattr(connections, "HEAD_S", 0.5)
+    monkeypatch.setattr(connections, "REQUEST_S", 0.5)
     monkeypatch.setattr(connections, "TAKE_S", 0.5)
 
     async def large(scope: Any, receive: Any, send: Any) -> None:

@@ -9,10 +9,10 @@ import math
 
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
-from starlette.routing import Route
 
 from .access import HOURS, Cookie, Sessions, form_of, read_form
 from .accounts import Accounts, Attempts
+from .address import OPEN, Address, whole_number
 from .pages import Pages
 
 log = logging.getLogger(__name__)
@@ -31,7 +31,7 @@ class WayIn:
     attempts: Attempts
 
 
-def routes(pages: Pages, way: WayIn, used: object = None) -> list[Route]:
+def routes(pages: Pages, way: WayIn, used: object = None) -> list[Address]:
     """The addresses of this part. `used`: called after a link was used."""
     turn = asyncio.Semaphore(AT_ONCE)
     waiting = 0
@@ -48,7 +48,7 @@ def routes(pages: Pages, way: WayIn, used: object = None) -> list[Route]:
         if value is None:
             return pages.refused(request, "session")
         to = request.query_params.get("to", "")
-        response = opened(request, value, to if to.startswith("/visits/") and to[8:].isdecimal() else "/")
+        response = opened(request, value, to if to.startswith("/visits/") and whole_number(to[8:]) else "/")
         if callable(used):
             used()
         return response
@@ -82,14 +82,14 @@ def routes(pages: Pages, way: WayIn, used: object = None) -> list[Route]:
         return opened(request, way.sessions.open(account.name, account.roles, account.changed), "/")
 
     async def leave(request: Request) -> Response:
-        await form_of(request, "")
+        await form_of(request)
         way.sessions.leave(way.cookie.of(request))
         response = RedirectResponse("/", 303)
         way.cookie.forget(response)
         return response
 
     if way.accounts is None:
-        entries = [Route("/enter", by_link)]
+        entries = [Address("/enter", by_link, OPEN)]
     else:
-        entries = [Route("/enter", ask), Route("/enter", sign_in, methods=["POST"])]
-    return [*entries, Route("/leave", leave, methods=["POST"])]
+        entries = [Address("/enter", ask, OPEN), Address("/enter", sign_in, OPEN, methods=["POST"])]
+    return [*entries, Address("/leave", leave, "", methods=["POST"])]
