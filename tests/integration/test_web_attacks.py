@@ -127,6 +127,23 @@ def test_forms_full_of_nonsense_are_refused(one_visit: None, text: str):
     assert rows() == before
 
 
+@pytest.mark.parametrize("text", ["\u202egnp.exe", "a\u2066b", "\u200fx", "P\u200b1", "\x1b[2J", "a\x00b", "\ufeffx"])
+def test_texts_that_read_otherwise_than_they_are_get_into_no_row(one_visit: None, text: str):
+    browser = web.client("reviewer,operator")
+    token, before = web.token(browser), rows()
+    for path, fields in (
+        ("/recordings/1/usable", {"usable": "no", "reason": "other", "note": text}),
+        ("/visits/1/enter", {"value:role": text, "reason": text}),
+        ("/visits/1/accept", {"result": "0", "check": "0", "reason": text}),
+        ("/visits", {"search": text}),
+        ("/visits", {text: "x"}),
+    ):
+        answer = browser.post(path, data={"token": token, **fields}, follow_redirects=False)
+        assert answer.status_code == 400, (path, answer.status_code)
+        assert text not in answer.text
+    assert rows() == before
+
+
 @pytest.fixture
 def hostile(tables: None, tmp_path: Path) -> Iterator[None]:
     """Names, labels, roles, notes, instruments and errors that are written to run: visits 1 and 2 with videos."""

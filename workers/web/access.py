@@ -20,6 +20,8 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from pbl_pipeline.names import check_label
+
 #: Hours after which a session ends, whatever was done in it; and where people sign in, hours without a request.
 HOURS, IDLE_HOURS = 12.0, 1.0
 #: What a role may do: a reader looks at visits and recordings, a reviewer also decides and enters; an operator sees
@@ -273,12 +275,17 @@ async def form_of(request: Request) -> Mapping[str, str]:
     ------
     Refused
         Another token or none, a body that is too long, broken off or no form.
+    PblError
+        USAGE for a text with control characters or such as nobody sees.
     """
     session: Session | None = request.state.session
     fields = await read_form(request)
     sent = fields.pop("token", "") or request.headers.get("x-token", "")
     if session is None or not hmac.compare_digest(sent.encode(), session.token.encode()):
         raise Refused("token")
+    for name, text in fields.items():
+        one_line = re.sub(r"[\r\n\t]", " ", name + text)  # as a text that is pasted may have them
+        check_label(f"field {ascii(name)[:80]}", one_line, BODY_BYTES)
     return fields
 
 

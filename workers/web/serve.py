@@ -17,6 +17,7 @@ import uvicorn
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import check_label
 
 from .access import Sessions
 from .accounts import Accounts
@@ -130,10 +131,11 @@ def serve(
     Raises
     ------
     PblError
-        What `Where.check` raises; WEB_ACCOUNT where people sign in and there are no accounts; WEB_PORT where the
-        port is taken.
+        What `Where.check` raises; USAGE for a name that cannot be printed, and for a folder that more than this
+        machine may see; WEB_ACCOUNT where people sign in and there are no accounts; WEB_PORT where the port is taken.
     """
     where.check()
+    check_label("--name", name, 64)
     if folder is not None and settings.audit_looks():
         raise PblError(
             "USAGE",

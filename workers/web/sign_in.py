@@ -17,8 +17,9 @@ from .pages import Pages
 
 log = logging.getLogger(__name__)
 
-#: Passwords that are compared at a time (each takes 128 MiB), and that may wait for it.
-AT_ONCE, WAITING = 2, 20
+#: Passwords that are compared at a time (each takes 128 MiB). As many may wait for it as there are connections: a limit
+#: of those would let a flood of wrong ones refuse the right one.
+AT_ONCE = 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +35,6 @@ class WayIn:
 def routes(pages: Pages, way: WayIn, used: object = None) -> list[Address]:
     """The addresses of this part. `used`: called after a link was used."""
     turn = asyncio.Semaphore(AT_ONCE)
-    waiting = 0
 
     def opened(request: Request, value: str, to: str) -> Response:
         # The browser never chooses its session, and the one that it had ends.
@@ -57,23 +57,18 @@ def routes(pages: Pages, way: WayIn, used: object = None) -> list[Address]:
         return pages.show(request, "sign_in.html", problem="", wait=0)
 
     async def sign_in(request: Request) -> Response:
-        nonlocal waiting
         assert way.accounts is not None
         fields = await read_form(request)
         name, password = fields.get("name", "").strip(), fields.get("password", "")
         address = request.client.host if request.client else ""
         wait = way.attempts.wait_s(name, address)
-        if wait > 0 or waiting >= WAITING:
-            seconds = max(1, math.ceil(wait))
+        if wait > 0:
+            seconds = math.ceil(wait)
             headers = {"retry-after": str(seconds)}
             return pages.show(request, "sign_in.html", 429, headers, problem="sign_in.wait", wait=seconds)
         way.attempts.failed(name, address)
-        waiting += 1
-        try:
-            async with turn:
-                account = await asyncio.to_thread(way.accounts.check, name, password)
-        finally:
-            waiting -= 1
+        async with turn:
+            account = await asyncio.to_thread(way.accounts.check, name, password)
         if account is None:
             # No name: people write their password into the wrong field.
             log.warning("a failed sign-in from %s", address)
