@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import signal
 import socket
 import ssl
 import subprocess
@@ -417,6 +418,36 @@ def test_only_the_proxy_is_answered_and_believed(known: Accounts):
         with running(tell, where) as port, socket.create_connection(("127.0.0.1", port)) as client:
             asked(client, more=forged)
         assert seen[-1] == expected
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_page_that_is_ended_stops_the_database_that_it_started(tmp_path: Path, number: signal.Signals):
+    script = """
+import contextlib, sys
+from workers.web import Where, serve
+@contextlib.contextmanager
+def database():
+    try:
+        yield
+    finally:
+        print("stopped", flush=True)
+sys.modules["workers.web.serve"].database = database
+serve(Where(port=0))
+"""
+    page = subprocess.Popen([sys.executable, "-u", "-c", script], stdout=subprocess.PIPE, text=True)
+    try:
+        assert page.stdout is not None
+        port = int(re.findall(r":(\d+)/enter", page.stdout.readline())[0])
+        for _ in range(600):  # it listens soon after the link is printed
+            with contextlib.suppress(ConnectionError), socket.create_connection(("127.0.0.1", port)) as client:
+                assert b"400" in asked(client, host="nothing")
+                break
+            time.sleep(0.1)
+        page.send_signal(number)
+        assert "stopped" in page.communicate(timeout=60)[0]
+        assert page.returncode == 0
+    finally:
+        page.kill()
 
 
 # -------------------------------------------------------------------------------------------------------- slow clients

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import ipaddress
 import logging
+import signal
 import socket
 import ssl
 import threading
@@ -172,6 +173,7 @@ def serve(
     click.echo("The page ends with Ctrl-C.")
     logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
     threading.Thread(target=_warm, daemon=True).start()
+    signal.signal(signal.SIGTERM, _end)  # uvicorn raises the signal again when it has ended, and the database ends too
     needed = database() if folder is None else contextlib.nullcontext()
     with needed, contextlib.closing(listening), contextlib.suppress(KeyboardInterrupt):
         uvicorn.Server(config(app, where)).run(sockets=[listening])
@@ -232,6 +234,10 @@ def database() -> Iterator[None]:
     finally:
         if started:
             embedded.stop(say=click.echo)
+
+
+def _end(*_: object) -> None:
+    raise SystemExit(0)
 
 
 def _warm() -> None:
