@@ -9,7 +9,7 @@ from unicodedata import category
 
 from pbl_pipeline.errors import PblError
 
-#: Control characters, formatting characters that nobody sees (U+202E turns the direction of what follows), halves of
+#: Control characters, invisible formatting characters (U+202E reverses what follows), halves of
 #: letters (bytes that are not text), separators of lines and paragraphs.
 _ODD = ("Cc", "Cf", "Cs", "Zl", "Zp")
 #: Formatting characters that words need: joiners of Persian, Hindi and of combined emoji.

@@ -240,7 +240,7 @@ def test_a_form_that_never_ends_keeps_no_connection(
     with running(app, Where()) as port, head_sent(port, "POST /visits HTTP/1.1", cookie, size) as slow:
         _, seconds = dripped(slow, b"1\r\na\r\n" if drip and size.startswith("Transfer") else drip)
         assert seconds < 3
-    assert "Traceback" not in caplog.text  # a client that goes is no error of the program
+    assert "Traceback" not in caplog.text  # a client that leaves is not an error of the program
 
 
 @pytest.mark.parametrize("drip", [b"a", b"a" * 60_000, b""])

@@ -276,7 +276,7 @@ async def form_of(request: Request) -> Mapping[str, str]:
     Refused
         Another token or none, a body that is too long, broken off or no form.
     PblError
-        USAGE for a text with control characters or such as nobody sees.
+        USAGE for a text with control or invisible characters.
     """
     session: Session | None = request.state.session
     fields = await read_form(request)

@@ -1,4 +1,4 @@
-"""Addresses of the page: each states the right that it needs, and what of a person is looked at who opens it."""
+"""Addresses of the page: each declares the right that it needs, and the look at a person that opening it is."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .access import Refused, Session
 if TYPE_CHECKING:
     from schemas.visit_list import Result
 
-#: Right of an address that anybody may open; the others are those of `access.RIGHTS`, and "" for any session.
+#: Right of an address that is open without a session; the others are those of `access.RIGHTS`, and "" for any session.
 OPEN = "open"
 #: Ending of the address of a page as JSON.
 JSON = ".json"
@@ -26,7 +26,7 @@ class Address(Route):
     """An address of the page, which answers those who have its right.
 
     right
-        Of `access.RIGHTS`; "" for any session, `OPEN` for anybody.
+        Of `access.RIGHTS`; "" for any session, `OPEN` without one.
     look
         What is looked at of the recording (`{video_id:int}` in the path) or visit (`{session_id:int}`), such as
         "video": a row of `schemas.review.Viewing` before it is shown. Empty where no person is looked at.
@@ -66,12 +66,12 @@ def number_of(request: Request) -> int:
 
 
 def whole_number(text: str) -> int | None:
-    """Return the number that a form or query names, None for what is none or has more than nine digits."""
+    """Return the number that a form or query names, None if it is not in its shortest form or has over nine digits."""
     return int(text) if _NUMBER.fullmatch(text) else None
 
 
 def shown_of(request: Request) -> int:
-    """Return which result of a visit is asked for; -1, which none has, for what is no number."""
+    """Return which result of a visit is asked for; -1, which none has, if that is not a number."""
     asked = whole_number(request.query_params.get("result", "0"))
     return -1 if asked is None else asked
 

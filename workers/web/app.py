@@ -51,7 +51,7 @@ log = logging.getLogger(__name__)
 
 #: Status of an answer by the code of its error; 409 for the others: what the tables hold does not allow it now.
 STATUS = {"DB_NOT_FOUND": 404, "VIDEO_MISSING": 404, "USAGE": 400, "DB_NOT_RUNNING": 503, "DB_REFUSED": 503}
-#: What a browser may keep of `vendor/`, whose file names carry their versions.
+#: Cache header of `vendor/`: its file names carry their versions.
 _KEEP = "public, max-age=31536000, immutable"
 
 
