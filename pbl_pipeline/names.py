@@ -9,13 +9,16 @@ from unicodedata import category
 
 from pbl_pipeline.errors import PblError
 
-#: Control characters, halves of letters (bytes that are no text), and what ends a line or paragraph.
-_ODD = ("Cc", "Cs", "Zl", "Zp")
+#: Control characters, invisible formatting characters (U+202E reverses what follows), halves of
+#: letters (bytes that are not text), separators of lines and paragraphs.
+_ODD = ("Cc", "Cf", "Cs", "Zl", "Zp")
+#: Formatting characters that words need: joiners of Persian, Hindi and of combined emoji.
+_JOINERS = "\u200c\u200d"
 
 
 def is_plain(text: str) -> bool:
-    """Whether a text is one line that can be stored and printed."""
-    return not any(category(c) in _ODD for c in text)
+    """Return whether a text is one line that can be stored and that reads as it is printed."""
+    return not any(category(c) in _ODD and c not in _JOINERS for c in text)
 
 
 def check_label(what: str, text: str, longest: int, least: int = 0) -> None:
@@ -29,7 +32,7 @@ def check_label(what: str, text: str, longest: int, least: int = 0) -> None:
     raise PblError(
         "USAGE",
         found=f"{what} of {len(text)} characters" if plain else f"{what} {ascii(text)[:80]}",
-        expected=f"{least} to {longest} characters" if plain else "one line without control characters",
+        expected=f"{least} to {longest} characters" if plain else "one line without control or invisible characters",
         next_step="choose another one",
     )
 

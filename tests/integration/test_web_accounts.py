@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import signal
 import socket
 import ssl
 import subprocess
@@ -233,13 +234,17 @@ def test_who_guesses_waits_twice_as_long_each_time():
         attempts.failed("A", "192.0.2.1")
         waits.append(attempts.wait_s("A", "192.0.2.1"))
     assert waits == [0, 0, 1, 2, 4, 8, 16, 32, 60, 60, 60, 60]
-    assert attempts.wait_s("A", "198.51.100.1") == 60  # the account, from wherever
+    assert attempts.wait_s("A", "198.51.100.1") == 0  # an address that never failed
+    for n in range(3):
+        assert attempts.wait_s("A", "198.51.100.2") == 0
+        attempts.failed("B" if n else "A", "198.51.100.2")
+    assert attempts.wait_s("A", "198.51.100.2") == 60  # one that guesses shares the wait of the account
     assert attempts.wait_s("B", "198.51.100.1") == 0
     for i in range(30):  # many accounts from one address
         attempts.failed(f"person{i}", "192.0.2.1")
     assert attempts.wait_s("B", "192.0.2.1") == 900
     attempts.succeeded("A", "192.0.2.1")
-    assert attempts.wait_s("A", "198.51.100.1") == 0
+    assert attempts.wait_s("A", "198.51.100.2") == 0
     assert attempts.wait_s("B", "192.0.2.1") == 900  # an account of one's own does not clear the address
     now[0] += Attempts.FORGOTTEN_S + 901
     attempts.failed("B", "192.0.2.1")
@@ -266,6 +271,42 @@ def test_the_page_refuses_before_it_compares(known: Accounts, monkeypatch: pytes
     assert late.status_code == 429
     assert int(late.headers["retry-after"]) >= 1
     assert "Try again in" in late.text
+
+
+def test_a_flood_of_wrong_passwords_does_not_keep_the_right_one_out(known: Accounts, monkeypatch: pytest.MonkeyPatch):
+    """Wrong passwords of many addresses for one account, at once and before; then the right one from another."""
+    check = Accounts.check
+    monkeypatch.setattr(Accounts, "check", lambda *a: time.sleep(0.05) or check(*a))
+    where = Where("127.0.0.1", behind_proxy="127.0.0.1", hostnames=("gait.example",))
+    app = create_app(Options(hosts=where.names, accounts=known, secure=True))
+
+    def send(connection: socket.socket, address: str, password: str) -> None:
+        body = f"name=A&password={password}"
+        form = f"Content-Type: application/x-www-form-urlencoded\r\nContent-Length: {len(body)}"
+        lines = ["POST /enter HTTP/1.1", "Host: gait.example", f"X-Forwarded-For: {address}", form, "", body]
+        connection.sendall("\r\n".join(lines).encode())
+
+    with running(app, where) as port, contextlib.ExitStack() as stack:
+        flood = [stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(90)]
+        for i, connection in enumerate(flood):
+            send(connection, f"198.51.100.{i // 3}", "wrong-password-words")
+        time.sleep(0.3)
+        with socket.create_connection(("127.0.0.1", port), timeout=30) as right:
+            send(right, "192.0.2.7", WORDS.replace(" ", "+"))
+            assert b"HTTP/1.1 303" in right.recv(65536)
+        answers = [connection.recv(65536).split(b" ")[1] for connection in flood]
+    assert answers.count(b"401") == 90
+
+
+def test_the_language_is_chosen_over_tls_alone(known: Accounts, tables: None):
+    client = browser(known)
+    sign_in(client)
+    token = re.findall(r'name="token" value="([^"]+)"', client.get("/visits").text)[0]
+    for language, expected in (("de", "de"), ("xx; Domain=evil", "en"), ("", "en")):
+        fields = {"token": token, "language": language}
+        cookie = client.post("/language", data=fields, follow_redirects=False).headers["set-cookie"].lower()
+        assert cookie.startswith(f"pbl_language={expected};")
+        assert all(part in cookie for part in ("secure", "httponly", "samesite=strict", "path=/"))
 
 
 def test_an_unknown_name_takes_as_long_as_a_known_one(known: Accounts, monkeypatch: pytest.MonkeyPatch):
@@ -379,11 +420,41 @@ def test_only_the_proxy_is_answered_and_believed(known: Accounts):
         assert seen[-1] == expected
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_page_that_is_ended_stops_the_database_that_it_started(tmp_path: Path, number: signal.Signals):
+    script = """
+import contextlib, sys
+from workers.web import Where, serve
+@contextlib.contextmanager
+def database():
+    try:
+        yield
+    finally:
+        print("stopped", flush=True)
+sys.modules["workers.web.serve"].database = database
+serve(Where(port=0))
+"""
+    page = subprocess.Popen([sys.executable, "-u", "-c", script], stdout=subprocess.PIPE, text=True)
+    try:
+        assert page.stdout is not None
+        port = int(re.findall(r":(\d+)/enter", page.stdout.readline())[0])
+        for _ in range(600):  # it listens soon after the link is printed
+            with contextlib.suppress(ConnectionError), socket.create_connection(("127.0.0.1", port)) as client:
+                assert b"400" in asked(client, host="nothing")
+                break
+            time.sleep(0.1)
+        page.send_signal(number)
+        assert "stopped" in page.communicate(timeout=60)[0]
+        assert page.returncode == 0
+    finally:
+        page.kill()
+
+
 # -------------------------------------------------------------------------------------------------------- slow clients
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     """A page that waits for half a second."""
-    monkeypatch.setattr(connections, "HEAD_S", 0.5)
+    monkeypatch.setattr(connections, "REQUEST_S", 0.5)
     monkeypatch.setattr(connections, "TAKE_S", 0.5)
 
     async def large(scope: Any, receive: Any, send: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import socket
 import time
@@ -19,12 +20,12 @@ from tests.integration.chain import small_video
 from tests.integration.test_web_accounts import running
 from tests.rows import everything, register
 from workers.populate import populate
-from workers.web import Options, Where, access, create_app
+from workers.web import Options, Where, connections, create_app
 
 #: What a page must never run, whatever it stands in.
 EVIL = '"><img src=x onerror=alert(1)><script>document.title="pwned"</script>'
 #: Addresses that anybody may open, and that any session may.
-OPEN, ANY_ROLE = {"/", "/enter"}, {"/leave", "/language"}
+OPEN, ANY_ROLE = {"/", "/enter", "/static/1", "/vendor/1"}, {"/leave", "/language"}
 #: Forms that change nothing but what the sender sees.
 HARMLESS = {"/leave", "/language", "/visits"}
 
@@ -126,6 +127,23 @@ def test_forms_full_of_nonsense_are_refused(one_visit: None, text: str):
     assert rows() == before
 
 
+@pytest.mark.parametrize("text", ["\u202egnp.exe", "a\u2066b", "\u200fx", "P\u200b1", "\x1b[2J", "a\x00b", "\ufeffx"])
+def test_texts_that_read_otherwise_than_they_are_get_into_no_row(one_visit: None, text: str):
+    browser = web.client("reviewer,operator")
+    token, before = web.token(browser), rows()
+    for path, fields in (
+        ("/recordings/1/usable", {"usable": "no", "reason": "other", "note": text}),
+        ("/visits/1/enter", {"value:role": text, "reason": text}),
+        ("/visits/1/accept", {"result": "0", "check": "0", "reason": text}),
+        ("/visits", {"search": text}),
+        ("/visits", {text: "x"}),
+    ):
+        answer = browser.post(path, data={"token": token, **fields}, follow_redirects=False)
+        assert answer.status_code == 400, (path, answer.status_code)
+        assert text not in answer.text
+    assert rows() == before
+
+
 @pytest.fixture
 def hostile(tables: None, tmp_path: Path) -> Iterator[None]:
     """Names, labels, roles, notes, instruments and errors that are written to run: visits 1 and 2 with videos."""
@@ -182,25 +200,89 @@ def test_no_name_runs_in_a_browser(hostile: None, chromium: Any):
         assert asked == []
 
 
-def test_a_form_that_never_ends_is_given_up(one_visit: None, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(access, "BODY_S", 0.5)
+@contextlib.contextmanager
+def head_sent(port: int, line: str, cookie: str = "", more: str = "Content-Length: 5000") -> Iterator[socket.socket]:
+    """A connection over which the head of a request went, whose body is still to come."""
+    lines = [line, f"Host: 127.0.0.1:{port}", f"Cookie: pbl_session={cookie}", more,
+             "Content-Type: application/x-www-form-urlencoded", "", ""]  # fmt: skip
+    with socket.create_connection(("127.0.0.1", port)) as slow:
+        slow.sendall("\r\n".join(lines).encode())
+        yield slow
+
+
+def dripped(slow: socket.socket, drip: bytes, longest_s: float = 8.0) -> tuple[bytes, float]:
+    """What is answered while bytes are sent now and then, and the seconds until the other side closed."""
+    start, answer = time.monotonic(), b""
+    slow.settimeout(0.05)
+    while time.monotonic() - start < longest_s:
+        try:
+            if drip:
+                slow.sendall(drip)
+            part = slow.recv(65536)
+        except TimeoutError:
+            continue
+        except ConnectionError:
+            break
+        answer += part
+        if not part and not drip:  # who still sends notices it by an error
+            break
+    return answer, time.monotonic() - start
+
+
+@pytest.mark.parametrize("drip", [b"a", b""])
+@pytest.mark.parametrize("size", ["Content-Length: 5000", "Transfer-Encoding: chunked"])
+def test_a_form_that_never_ends_keeps_no_connection(
+    one_visit: None, drip: bytes, size: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    monkeypatch.setattr(connections, "REQUEST_S", 0.5)
     app = create_app(Options())
-    link = app.state.sessions.new_link("A", "reviewer")
-    cookie = app.state.sessions.enter(link)
-    with running(app, Where()) as port, socket.create_connection(("127.0.0.1", port)) as slow:
-        head = ["POST /visits HTTP/1.1", f"Host: 127.0.0.1:{port}", f"Cookie: pbl_session={cookie}",
-                "Content-Type: application/x-www-form-urlencoded", "Content-Length: 5000", "", ""]  # fmt: skip
-        slow.sendall("\r\n".join(head).encode())
-        start, answer = time.monotonic(), b""
-        slow.settimeout(0.05)
-        while time.monotonic() - start < 5 and not answer:
-            try:
-                slow.sendall(b"a")
-                answer = slow.recv(65536)
-            except TimeoutError:
-                continue
-        assert answer.startswith(b"HTTP/1.1 413")
-        assert time.monotonic() - start < 3
+    cookie = app.state.sessions.enter(app.state.sessions.new_link("A", "reviewer"))
+    with running(app, Where()) as port, head_sent(port, "POST /visits HTTP/1.1", cookie, size) as slow:
+        _, seconds = dripped(slow, b"1\r\na\r\n" if drip and size.startswith("Transfer") else drip)
+        assert seconds < 3
+    assert "Traceback" not in caplog.text  # a client that leaves is not an error of the program
+
+
+@pytest.mark.parametrize("drip", [b"a", b"a" * 60_000, b""])
+@pytest.mark.parametrize(
+    ("line", "status"),
+    [
+        ("GET / HTTP/1.1", b"401"),
+        ("GET /visits HTTP/1.1", b"401"),
+        ("POST /visits HTTP/1.1", b"401"),
+        ("GET /static/page.css HTTP/1.1", b"200"),
+        ("GET /operate%0a HTTP/1.1", b"404"),
+    ],
+)
+def test_a_body_that_nobody_reads_keeps_no_connection(one_visit: None, line: str, status: bytes, drip: bytes):
+    """The answer comes, and with its end the connection is closed, long before the limit of a request."""
+    with running(create_app(Options()), Where()) as port:
+        with head_sent(port, line, more="Content-Length: 100000000") as slow:
+            answer, seconds = dripped(slow, drip)
+        assert answer.split(b" ")[1] == status
+        assert seconds < 5
+        assert connections.REQUEST_S > 5
+
+
+def test_a_form_that_comes_in_pieces_and_requests_in_one_are_answered(one_visit: None):
+    app = create_app(Options())
+    cookie = app.state.sessions.enter(app.state.sessions.new_link("A", "reviewer"))
+    session = app.state.sessions.find(cookie)
+    body = f"token={session.token}&role=pre".encode()
+    with running(app, Where()) as port:
+        with head_sent(port, "POST /visits HTTP/1.1", cookie, f"Content-Length: {len(body)}") as slow:
+            for i in range(len(body)):
+                slow.sendall(body[i : i + 1])
+                time.sleep(0.02)
+            slow.settimeout(5)
+            assert b"location: /visits?role=pre" in slow.recv(65536)
+            slow.sendall(f"GET /visits HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: pbl_session={cookie}\r\n\r\n".encode())
+            assert b" 200 " in slow.recv(65536)  # the connection is kept
+        two = f"GET /static/page.css HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n"
+        with socket.create_connection(("127.0.0.1", port)) as both:
+            both.sendall((two + two.replace("\r\n\r\n", "\r\nConnection: close\r\n\r\n")).encode())
+            both.settimeout(5)
+            assert b"".join(iter(lambda: both.recv(65536), b"")).count(b"HTTP/1.1 200") == 2
 
 
 @pytest.mark.parametrize("host", ["two", "none", "port only", "absolute"])

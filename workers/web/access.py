@@ -1,6 +1,6 @@
 """Who may open a page: one-time links, sessions, the token of each form, and the headers of every answer.
 
-A request passes `Gate` before any page sees it. What a page does later can rely on `request.state.session`.
+A request passes `Gate`, which finds its session, and then the right of its address (`address.Address`).
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import hmac
+import re
 import secrets
 import time
 from collections.abc import Callable, Mapping
@@ -15,9 +16,11 @@ from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from pbl_pipeline.names import check_label
 
 #: Hours after which a session ends, whatever was done in it; and where people sign in, hours without a request.
 HOURS, IDLE_HOURS = 12.0, 1.0
@@ -28,10 +31,10 @@ RIGHTS: dict[str, frozenset[str]] = {
     "reviewer": frozenset({"look", "decide"}),
     "operator": frozenset({"operate"}),
 }
-#: The right that an address needs by how it begins; "": any session has it. Every other needs "look".
-_NEEDS = (("/operate", "operate"), ("/leave", ""), ("/language", ""))
-#: Longest body of a form (byte), and seconds in which it has to be here.
-BODY_BYTES, BODY_S = 65_536, 10.0
+#: Longest body of a form (byte).
+BODY_BYTES = 65_536
+#: Addresses that the page can have: no character that would have to be escaped, numbers of rows in their shortest form.
+_PATH = re.compile(r"/|(?:/(?:[A-Za-z_][A-Za-z0-9._-]*|[1-9][0-9]{0,8}(?:\.json)?))+")
 #: Searches that a session remembers.
 _SEARCHES = 200
 
@@ -52,8 +55,6 @@ CONTENT_POLICY = "; ".join(
 )
 #: Of a report, which is one file with its own style and no script.
 REPORT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
-#: What a browser keeps: files whose names carry their versions.
-KEPT = "/vendor/"
 HEADERS = {
     "content-security-policy": CONTENT_POLICY,
     "x-content-type-options": "nosniff",
@@ -196,13 +197,11 @@ def _hashed(secret: str) -> str:
 
 
 class Gate:
-    """Lets a request through to the pages when it has a session, and sets the headers of every answer.
+    """Finds the session of each request, refuses what no page answers, and sets the headers of every answer. The right
+    that an address needs is its own (`address.Address`).
 
     refuse
-        Makes the answer for a request that may not pass, from its reason: "host", "session", "token".
-    open_paths
-        Paths that need no session, or their beginnings where they end with "/": the way in, and the files of the page
-        itself, which say nothing.
+        Makes the answer for a request that may not pass, from its reason: "host", "address", "token".
     """
 
     def __init__(
@@ -211,10 +210,9 @@ class Gate:
         sessions: Sessions,
         hosts: frozenset[str],
         refuse: Callable[[Request, str], Any],
-        open_paths: tuple[str, ...],
         cookie: Cookie,
     ) -> None:
-        self._app, self._sessions, self._hosts, self._refuse, self._open = app, sessions, hosts, refuse, open_paths
+        self._app, self._sessions, self._hosts, self._refuse = app, sessions, hosts, refuse
         self._cookie = cookie
         self._headers = {**HEADERS, **(_BY_TLS if cookie.secure else {})}
 
@@ -224,13 +222,9 @@ class Gate:
                 await self._app(scope, receive, send)
             return
 
-        kept = scope["path"].startswith(KEPT)
-
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
-                if kept and message["status"] == 200:
-                    headers["cache-control"] = "public, max-age=31536000, immutable"
                 for name, value in self._headers.items():
                     headers.setdefault(name, value)
             await send(message)
@@ -244,24 +238,14 @@ class Gate:
 
     def _reason(self, request: Request) -> str:
         headers = request.headers
+        request.state.session = None
         # Another name that leads to 127.0.0.1 (DNS rebinding) would make a page of its own one of this server.
         if len(headers.getlist("host")) != 1 or host_of(headers["host"]) not in self._hosts:
             return "host"
-        session = self._sessions.find(self._cookie.of(request))
-        request.state.session = session
-        if request.method not in ("GET", "HEAD") and not _from_here(headers):
-            return "token"
-        path = request.scope["path"]  # as the routes see it
-        if path == "/" or any(path.startswith(p) if p.endswith("/") else path == p for p in self._open):
-            return ""
-        if session is None:
-            return "session"
-        return "" if session.may(right_for(path)) else "right"
-
-
-def right_for(path: str) -> str:
-    """The right of `RIGHTS` that an address needs, "" for one that every session may open."""
-    return next((right for begin, right in _NEEDS if path == begin or path.startswith(f"{begin}/")), "look")
+        request.state.session = self._sessions.find(self._cookie.of(request))
+        if not _PATH.fullmatch(request.scope["path"]):
+            return "address"
+        return "" if request.method in ("GET", "HEAD") or _from_here(headers) else "token"
 
 
 def host_of(header: str) -> str:
@@ -281,42 +265,42 @@ def _from_here(headers: Headers) -> bool:
 
 
 class Refused(Exception):
-    """A form that may not be accepted: "token", "right", "size" or "form"."""
+    """A request that may not be answered: "session", "right", "token", "size" or "form"."""
 
 
-async def form_of(request: Request, right: str) -> Mapping[str, str]:
-    """The fields of a form whose sender has a right and whose token is that of her session.
+async def form_of(request: Request) -> Mapping[str, str]:
+    """The fields of a form whose token is that of its sender's session.
 
     Raises
     ------
     Refused
-        Another token or none, no such right, a body that is too long, too slow or no form.
+        Another token or none, a body that is too long, broken off or no form.
+    PblError
+        USAGE for a text with control or invisible characters.
     """
     session: Session | None = request.state.session
     fields = await read_form(request)
     sent = fields.pop("token", "") or request.headers.get("x-token", "")
     if session is None or not hmac.compare_digest(sent.encode(), session.token.encode()):
         raise Refused("token")
-    if not session.may(right):
-        raise Refused("right")
+    for name, text in fields.items():
+        one_line = re.sub(r"[\r\n\t]", " ", name + text)  # as a text that is pasted may have them
+        check_label(f"field {ascii(name)[:80]}", one_line, BODY_BYTES)
     return fields
 
 
 async def read_form(request: Request) -> dict[str, str]:
-    """The fields of a form, whoever sent it. Raises `Refused` for a body that is too long, too slow or no form."""
-    import asyncio
-
+    """The fields of a form, whoever sent it. Raises `Refused` for a body that is too long, broken off or no form."""
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/x-www-form-urlencoded":
         raise Refused("form")
     body = bytearray()
     try:
-        async with asyncio.timeout(BODY_S):
-            async for piece in request.stream():
-                body += piece
-                if len(body) > BODY_BYTES:
-                    raise Refused("size")
-    except TimeoutError:
-        raise Refused("size") from None
+        async for piece in request.stream():
+            body += piece
+            if len(body) > BODY_BYTES:
+                raise Refused("size")
+    except ClientDisconnect:
+        raise Refused("form") from None
     try:
         return dict(parse_qsl(body.decode(), keep_blank_values=True, max_num_fields=100))
     except ValueError:

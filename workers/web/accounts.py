@@ -193,9 +193,10 @@ class _Failures:
 
 
 class Attempts:
-    """Slows down who guesses: after some failures of an account or an address the next attempt has to wait, each time
-    twice as long. Nobody is locked out for ever: an account waits for a minute at most, an address for a quarter of an
-    hour, and an hour without a failure clears them.
+    """Slows down guessing: after some failures of an account or an address the next attempt has to wait, each time
+    twice as long: an account for a minute at most, an address for a quarter of an hour. An hour without a failure
+    clears them. The wait of an account holds for addresses that failed as often themselves: guesses from elsewhere do
+    not lock its owner out.
     """
 
     #: By kind: failures that cost nothing, and the longest wait (s).
@@ -209,7 +210,10 @@ class Attempts:
 
     def wait_s(self, account: str, address: str) -> float:
         """Seconds until an attempt of an account from an address may be made; 0: now."""
-        return max(self._wait(key) for key in self._keys(account, address))
+        of_account, of_address = self._keys(account, address)
+        found, now = self._failures.get(of_address), self._clock()
+        guessed = found is not None and found.n >= self.LIMITS["account"][0] and now - found.last < self.FORGOTTEN_S
+        return max(self._wait(of_address), self._wait(of_account) if guessed else 0.0)
 
     def failed(self, account: str, address: str) -> None:
         """Count a failure. An attempt counts as one before its password is compared: many at once get no more tries."""

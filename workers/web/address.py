@@ -1,32 +1,83 @@
-"""Numbers in addresses, and an interval as pages show it."""
+"""Addresses of the page: each declares the right that it needs, and the look at a person that opening it is."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import re
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 from starlette.requests import Request
+from starlette.routing import Route
+from starlette.types import Receive, Scope, Send
+
+from .access import Refused, Session
 
 if TYPE_CHECKING:
     from schemas.reading.visit_list import Result
 
-#: Largest number of a row: DataJoint's int32.
-LARGEST = 2**31 - 1
+#: Right of an address that is open without a session; the others are those of `access.RIGHTS`, and "" for any session.
+OPEN = "open"
+#: Ending of the address of a page as JSON.
+JSON = ".json"
+_NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
+
+
+class Address(Route):
+    """An address of the page, which answers those who have its right.
+
+    right
+        Of `access.RIGHTS`; "" for any session, `OPEN` without one.
+    look
+        What is looked at of the recording (`{video_id:int}` in the path) or visit (`{session_id:int}`), such as
+        "video": a row of `schemas.review.Viewing` before it is shown. Empty where no person is looked at.
+    """
+
+    def __init__(
+        self, path: str, answer: Callable[..., Any], right: str, *, look: str = "", methods: Sequence[str] = ("GET",)
+    ) -> None:
+        super().__init__(path, answer, methods=methods)
+        self.right, self.look = right, look
+
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request. Raises `Refused` for a sender without the right, `PblError` for a look without its row."""
+        request = Request(scope)
+        session: Session | None = request.state.session
+        if self.right != OPEN:
+            if session is None:
+                raise Refused("session")
+            if not session.may(self.right):
+                raise Refused("right")
+            looks = request.app.state.looks
+            if self.look and looks is not None and scope["method"] in (self.methods or ()):
+                ((of, number),) = request.path_params.items()
+                await looks.record(session, of, number, self.look)
+        await super().handle(scope, receive, send)
+
+
+def page(path: str, answer: Callable[..., Any], right: str, *, look: str = "") -> list[Address]:
+    """Return the addresses of a page: as JSON of its values, and as HTML."""
+    return [Address(path + JSON, answer, right, look=look), Address(path, answer, right, look=look)]
 
 
 def number_of(request: Request) -> int:
-    """The number in the address; one that no row can have becomes 0, which none has."""
-    number = int(request.path_params["number"])
-    return number if number <= LARGEST else 0
+    """Return the number in the address."""
+    (number,) = request.path_params.values()
+    return number
+
+
+def whole_number(text: str) -> int | None:
+    """Return the number that a form or query names, None if it is not in its shortest form or has over nine digits."""
+    return int(text) if _NUMBER.fullmatch(text) else None
 
 
 def shown_of(request: Request) -> int:
-    """Which result of a visit is asked for; one that none can be becomes `LARGEST`, which none has."""
-    asked = request.query_params.get("result", "0")
-    return int(asked) if asked.isdecimal() and len(asked) < 4 else LARGEST
+    """Return which result of a visit is asked for; -1, which none has, if that is not a number."""
+    asked = whole_number(request.query_params.get("result", "0"))
+    return -1 if asked is None else asked
 
 
 def interval(result: Result) -> str:
-    """ "78 to 87" as numbers; empty where the error of the index is not known."""
+    """Return the 90 % interval of an index as numbers, "78 to 87"; empty where its error is not known."""
     from pbl_pipeline.gait import interval_90
 
     bounds = interval_90(result.index, result.sd)

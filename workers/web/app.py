@@ -14,8 +14,8 @@ from starlette.middleware import Middleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
-from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
+from starlette.types import Receive, Scope, Send
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
@@ -36,9 +36,11 @@ from . import (
     recordings,
     reports,
     sign_in,
+    texts,
     visits,
 )
 from .accounts import Accounts, Attempts
+from .address import OPEN, Address
 from .computing import Target, compute_visit
 from .pages import Pages
 from .source import Source, TablesSource
@@ -49,8 +51,8 @@ log = logging.getLogger(__name__)
 
 #: Status of an answer by the code of its error; 409 for the others: what the tables hold does not allow it now.
 STATUS = {"DB_NOT_FOUND": 404, "VIDEO_MISSING": 404, "USAGE": 400, "DB_NOT_RUNNING": 503, "DB_REFUSED": 503}
-#: Longest address (characters).
-_ADDRESS = 2000
+#: Cache header of `vendor/`: its file names carry their versions.
+_KEEP = "public, max-age=31536000, immutable"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +81,6 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
     way = sign_in.WayIn(sessions, access.Cookie(options.secure), accounts, Attempts())
     pages, tables, videos, making = Pages(accounts is not None), Tables(), Videos(), ProcessQueue(most=20, kept=8)
     computing = ProcessQueue(most=50, kept=50)
-    files = Path(__file__).parent
 
     @contextlib.asynccontextmanager
     async def life(app: Starlette) -> AsyncIterator[None]:
@@ -98,17 +99,21 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
         return pages.refused(request, "session") if session is None else RedirectResponse(session.home, 303)
 
     async def language(request: Request) -> Response:
-        fields = await access.form_of(request, "")
+        fields = await access.form_of(request)
         response = RedirectResponse(recordings.own_address(fields.get("back", "")), 303)
-        response.set_cookie("pbl_language", fields.get("language", "")[:2], path="/", httponly=True, samesite="strict")
+        chosen = texts.language_of(fields.get("language"), "")
+        response.set_cookie("pbl_language", chosen, httponly=True, samesite="strict", secure=options.secure)
         return response
+
+    async def unknown(scope: Scope, receive: Receive, send: Send) -> None:
+        raise access.Refused("session") if Request(scope).state.session is None else HTTPException(404)
 
     async def refused(request: Request, error: Exception) -> Response:
         return pages.refused(request, str(error))
 
     async def coded(request: Request, error: Exception) -> Response:
         assert isinstance(error, PblError)
-        return failed(request, error)
+        return pages.error(request, error, STATUS.get(error.code, 409))
 
     async def missing(request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)
@@ -117,10 +122,6 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
     async def unforeseen(request: Request, error: Exception) -> Response:
         return pages.unforeseen(request)
 
-    def failed(request: Request, error: PblError) -> Response:
-        return pages.error(request, error, STATUS.get(error.code, 409))
-
-    looks = []
     asks: Asks
     source: Source
     if options.folder is not None:
@@ -128,7 +129,6 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
         parts = folder.routes(pages, asks, options.folder)
     else:
         asks, source = tables, TablesSource(videos)
-        looks = [Middleware(audit.Looks, tables=tables, failed=failed)] if settings.audit_looks() else []
         parts = [
             *visits.list_routes(pages, tables),
             *decide.routes(pages, tables),
@@ -145,15 +145,16 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
         *recordings.routes(pages, asks, source),
         *export.routes(asks, source),
     ]
+    routes: list[Address] = [
+        Address("/", home, OPEN),
+        *sign_in.routes(pages, way, link_used),
+        Address("/language", language, "", methods=["POST"]),
+        *parts,
+        _files("static", "no-store"),
+        _files("vendor", _KEEP),
+    ]
     app = Starlette(
-        routes=[
-            Route("/", home),
-            *sign_in.routes(pages, way, link_used),
-            Route("/language", language, methods=["POST"]),
-            *parts,
-            Mount("/static", StaticFiles(directory=files / "static")),
-            Mount("/vendor", StaticFiles(directory=files / "vendor")),
-        ],
+        routes=routes,
         exception_handlers={
             access.Refused: refused,
             PblError: coded,
@@ -166,14 +167,26 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
                 sessions=sessions,
                 hosts=options.hosts,
                 refuse=pages.refused,
-                open_paths=("/enter", "/static/", "/vendor/"),
                 cookie=way.cookie,
             ),
-            *looks,
             Middleware(GZipMiddleware, minimum_size=1000),
         ],
         lifespan=life,
     )
     app.state.sessions, app.state.way_in = sessions, way
     app.state.computing = computing
+    app.state.looks = audit.Looks(tables) if settings.audit_looks() and options.folder is None else None
+    app.router.default, app.router.redirect_slashes = unknown, False
     return app
+
+
+def _files(folder: str, kept: str) -> Address:
+    """The files of a folder beside this module. `kept`: what browsers are told about keeping them."""
+    files = StaticFiles(directory=Path(__file__).parent / folder)
+
+    async def file(request: Request) -> Response:
+        response = await files.get_response(request.path_params["file"], request.scope)
+        response.headers["cache-control"] = kept
+        return response
+
+    return Address(f"/{folder}/{{file}}", file, OPEN)

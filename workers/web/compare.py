@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import re
 from collections.abc import Sequence
 from typing import Any
 from urllib.parse import urlencode
@@ -13,7 +12,6 @@ import numpy as np
 from markupsafe import Markup
 from starlette.requests import Request
 from starlette.responses import Response
-from starlette.routing import Route
 
 from pbl_pipeline import charts
 from pbl_pipeline.code_version import code_version
@@ -21,13 +19,11 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, number
 from schemas.reading import comparison
 
-from .address import LARGEST, interval
-from .pages import Pages, as_json, page
+from .address import Address, interval, page, whole_number
+from .pages import Pages, as_json
 from .plain_values import plain
 from .tables import Tables
 from .videos import Videos
-
-_ONE = re.compile(r"(\d{1,10})(?:\.(\d{1,3}))?")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +35,7 @@ class Chart:
     sides: dict[str, Markup]
 
 
-def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
+def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
     """The addresses of this part."""
 
     async def show(request: Request) -> Response:
@@ -75,7 +71,7 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Route]:
             version=code_version(),
         )
 
-    return page("/compare", show)
+    return page("/compare", show, "look")
 
 
 def charts_of(found: comparison.Comparison, names: Sequence[str]) -> list[Chart]:
@@ -133,10 +129,11 @@ def _bounds(limits: tuple[float, float] | None, decimals: int) -> str:
 
 def _read(text: str) -> tuple[int, int | None]:
     """A visit, and which of its results, as an address names it; 0, which no visit has, for anything else."""
-    found = _ONE.fullmatch(text)
-    if found is None or int(found[1]) > LARGEST:
+    visit, point, result = text.partition(".")
+    numbers = whole_number(visit), whole_number(result) if point else None
+    if numbers[0] is None or (point and numbers[1] is None):
         return 0, None
-    return int(found[1]), None if found[2] is None else int(found[2])
+    return numbers[0], numbers[1]
 
 
 def _address(found: comparison.Comparison, reference: int) -> str:

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
-from starlette.routing import Route
 
 from schemas.reading.visit_progress import visit_progress
 
 from ..process_queue import ProcessQueue
 from .access import Refused, form_of
-from .address import number_of
+from .address import Address, number_of
 from .computing import Target, begin, told
 from .pages import Pages
 from .recordings import own_address
 from .tables import Tables
 
 
-def routes(pages: Pages, tables: Tables, computing: ProcessQueue, target: Target) -> list[Route]:
+def routes(pages: Pages, tables: Tables, computing: ProcessQueue, target: Target) -> list[Address]:
     """The addresses of this part."""
 
     async def compute(request: Request) -> Response:
-        fields = await form_of(request, "decide")
+        fields = await form_of(request)
         number = number_of(request)
         if fields.get("again") not in ("yes", "no"):
             raise Refused("form")
@@ -35,8 +34,8 @@ def routes(pages: Pages, tables: Tables, computing: ProcessQueue, target: Target
         return pages.show(request, "progress.html", told=told(request, await tables.ask(visit_progress, number)))
 
     return [
-        Route("/visits/{number:int}/compute", compute, methods=["POST"]),
-        Route("/visits/{number:int}/progress", progress),
+        Address("/visits/{session_id:int}/compute", compute, "decide", methods=["POST"]),
+        Address("/visits/{session_id:int}/progress", progress, "look", look="progress"),
     ]
 
 

@@ -1,4 +1,4 @@
-"""Connections to the page: who sends a request too slowly, or does not take the answer, does not keep one of them."""
+"""Connections to the page: clients that send a request too slowly or do not take the answer keep none of them."""
 
 from __future__ import annotations
 
@@ -9,22 +9,26 @@ from typing import Any
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-#: Seconds in which the head of a request has to be here, and in which some of an answer has to be taken: a browser
-#: that plays a video stops reading when it has enough, and asks again for the rest.
-HEAD_S, TAKE_S = 10.0, 120.0
+#: Seconds in which a whole request, head and body, has to be here, counted from its first byte (the first also from the
+#: connection); and in which some of an answer has to be taken: a browser that plays a video stops reading when it has
+#: enough, and asks again for the rest.
+REQUEST_S, TAKE_S = 10.0, 120.0
+#: Seconds that a client has to take an answer that ended before its request did: a connection that is closed with
+#: bytes unread may lose the answer.
+LINGER_S = 1.0
 
 
 class Connection(H11Protocol):
-    """uvicorn's protocol with these two limits, at most `per_address` connections of one address (None: any number),
-    and none but from `only_from` where that is set: a proxy in front."""
+    """uvicorn's protocol with these limits, at most `per_address` connections of one address (None: any number), and
+    none but from `only_from` where that is set: a proxy in front."""
 
     per_address: int | None = None
     only_from: IPv4Network | IPv6Network | None = None
 
     def __init__(self, *args: Any, **more: Any) -> None:
         super().__init__(*args, **more)
-        self._head: asyncio.TimerHandle | None = None
-        self._taken: asyncio.TimerHandle | None = None
+        self._timers: dict[str, asyncio.TimerHandle] = {}
+        self._over = False  # the answer ended before the request: what still comes is not read
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for a request."""
@@ -36,35 +40,53 @@ class Connection(H11Protocol):
         if self.per_address and sum(c.client[0] == self.client[0] for c in mine) > self.per_address:  # type: ignore[index]
             transport.abort()
             return
-        self._head = self.loop.call_later(HEAD_S, transport.abort)
+        self._abort_after("request", REQUEST_S)
 
     def data_received(self, data: bytes) -> None:
-        """The wait ends with a whole head, and begins again with the first byte of the next."""
-        super().data_received(data)
-        if self.conn.their_state is not h11.IDLE:
-            self._end("_head")
-        elif self._head is None and not self.transport.is_closing():
-            self._head = self.loop.call_later(HEAD_S, self.transport.abort)
+        """Read more of a request, whose time ends when all of it is here."""
+        if not self._over:
+            super().data_received(data)
+            self._time_request()
+
+    def on_response_complete(self) -> None:
+        """Close the connection where the answer ended before the request; else go on with the next."""
+        self._over = self.conn.their_state is h11.SEND_BODY
+        super().on_response_complete()
+        if self._over and not self.transport.is_closing():
+            self._unset_keepalive_if_required()
+            if self.transport.can_write_eof():
+                self.transport.write_eof()
+            self._abort_after("request", LINGER_S)
+        elif self.conn.their_state is h11.SEND_BODY:  # of the next request, which came along with this one
+            self._time_request()
 
     def pause_writing(self) -> None:
         """The client takes nothing at the moment."""
         super().pause_writing()  # type: ignore[misc]
-        self._end("_taken")
-        self._taken = self.loop.call_later(TAKE_S, self.transport.abort)
+        self._abort_after("answer", TAKE_S)
 
     def resume_writing(self) -> None:
         """It took something."""
         super().resume_writing()  # type: ignore[misc]
-        self._end("_taken")
+        self._end("answer")
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Nothing is waited for any more."""
-        self._end("_head")
-        self._end("_taken")
+        self._end("request")
+        self._end("answer")
         super().connection_lost(exc)
 
+    def _time_request(self) -> None:
+        if self.conn.their_state not in (h11.IDLE, h11.SEND_BODY):
+            self._end("request")
+        elif "request" not in self._timers and not self.transport.is_closing():
+            self._abort_after("request", REQUEST_S)
+
+    def _abort_after(self, name: str, seconds: float) -> None:
+        self._end(name)
+        self._timers[name] = self.loop.call_later(seconds, self.transport.abort)
+
     def _end(self, name: str) -> None:
-        timer = getattr(self, name)
+        timer = self._timers.pop(name, None)
         if timer is not None:
             timer.cancel()
-            setattr(self, name, None)

@@ -7,7 +7,6 @@ import re
 
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
-from starlette.routing import Route
 
 from pbl_pipeline.words import UNUSABLE
 from schemas import fit
@@ -15,7 +14,7 @@ from schemas.decisions import event_corrections, not_usable, review_decisions
 
 from ..refresh import queue_visit_of
 from .access import Refused, Session, form_of
-from .address import number_of
+from .address import Address, number_of
 from .tables import Tables
 
 _EVENT = re.compile(r"(\d{1,5}(?:\.\d{1,6})?)([lr])([du])", re.ASCII)
@@ -41,11 +40,11 @@ def judged(video_id: int) -> Judged:
     return Judged(mark, review_decisions.usable_state(video_id), len(views), event_corrections.shown(video_id))
 
 
-def routes(tables: Tables) -> list[Route]:
+def routes(tables: Tables) -> list[Address]:
     """The addresses of this part."""
 
     async def usable_or_not(request: Request) -> Response:
-        fields = await form_of(request, "decide")
+        fields = await form_of(request)
         session: Session = request.state.session
         number, seen = number_of(request), fields.get("seen", "")
         if fields.get("usable") == "yes":
@@ -59,7 +58,7 @@ def routes(tables: Tables) -> list[Route]:
         return RedirectResponse(f"/recordings/{number}", 303)
 
     async def events(request: Request) -> Response:
-        fields = await form_of(request, "decide")
+        fields = await form_of(request)
         session: Session = request.state.session
         number, seen = number_of(request), fields.get("seen", "")
         if fields.get("back") == "automatic":
@@ -71,8 +70,8 @@ def routes(tables: Tables) -> list[Route]:
         return RedirectResponse(f"/recordings/{number}", 303)
 
     return [
-        Route("/recordings/{number:int}/usable", usable_or_not, methods=["POST"]),
-        Route("/recordings/{number:int}/events", events, methods=["POST"]),
+        Address("/recordings/{video_id:int}/usable", usable_or_not, "decide", methods=["POST"]),
+        Address("/recordings/{video_id:int}/events", events, "decide", methods=["POST"]),
     ]
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
-from starlette.routing import Route
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
@@ -16,16 +15,16 @@ from schemas.decisions import candidates, review_decisions
 
 from ..refresh import queue_visit_of
 from .access import Refused, Session, form_of
-from .address import LARGEST, number_of
+from .address import Address, number_of, whole_number
 from .pages import Pages
 from .tables import Tables
 
 
-def routes(pages: Pages, tables: Tables) -> list[Route]:
+def routes(pages: Pages, tables: Tables) -> list[Address]:
     """The addresses of this part."""
 
     async def person(request: Request) -> Response:
-        fields = await form_of(request, "decide")
+        fields = await form_of(request)
         session: Session = request.state.session
         number = number_of(request)
         chosen = _number(fields.get("person", ""))
@@ -37,7 +36,7 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
     async def accept(request: Request) -> Response:
         from schemas.reading.shown import shown_visit
 
-        fields = await form_of(request, "decide")
+        fields = await form_of(request)
         session: Session = request.state.session
         number, shown = number_of(request), _number(fields.get("result", ""))
 
@@ -73,13 +72,14 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
         return Response(await tables.ask(picture), media_type="image/jpeg")
 
     return [
-        Route("/recordings/{number:int}/person", person, methods=["POST"]),
-        Route("/recordings/{number:int}/people", people),
-        Route("/visits/{number:int}/accept", accept, methods=["POST"]),
+        Address("/recordings/{video_id:int}/person", person, "decide", methods=["POST"]),
+        Address("/recordings/{video_id:int}/people", people, "look", look="people"),
+        Address("/visits/{session_id:int}/accept", accept, "decide", methods=["POST"]),
     ]
 
 
 def _number(text: str) -> int:
-    if not text.isdecimal() or len(text) > 9 or int(text) > LARGEST:
+    number = whole_number(text)
+    if number is None:
         raise Refused("form")
-    return int(text)
+    return number

@@ -6,13 +6,12 @@ from collections.abc import Mapping
 
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
-from starlette.routing import Route
 
 from pbl_pipeline.errors import PblError
 from schemas.studies import visit_entry as enter
 
 from .access import Session, form_of
-from .address import number_of
+from .address import Address, number_of
 from .pages import Pages
 from .tables import Tables
 
@@ -20,7 +19,7 @@ from .tables import Tables
 _FIELD = "value:"
 
 
-def routes(pages: Pages, tables: Tables) -> list[Route]:
+def routes(pages: Pages, tables: Tables) -> list[Address]:
     """The addresses of this part."""
 
     def page(
@@ -41,7 +40,7 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
         return page(request, await tables.ask(enter.entry, number_of(request)), {}, {})
 
     async def send(request: Request) -> Response:
-        fields = await form_of(request, "decide")
+        fields = await form_of(request)
         session: Session = request.state.session
         number = number_of(request)
         values = {name.removeprefix(_FIELD): text for name, text in fields.items() if name.startswith(_FIELD)}
@@ -52,6 +51,6 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
         return RedirectResponse(f"/visits/{number}#entered", 303)
 
     return [
-        Route("/visits/{number:int}/enter", form),
-        Route("/visits/{number:int}/enter", send, methods=["POST"]),
+        Address("/visits/{session_id:int}/enter", form, "look"),
+        Address("/visits/{session_id:int}/enter", send, "decide", methods=["POST"]),
     ]

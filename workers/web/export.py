@@ -10,11 +10,10 @@ from pathlib import Path
 from starlette.background import BackgroundTask
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response
-from starlette.routing import Route
 
 from pbl_pipeline.visit import Visit
 
-from .address import number_of, shown_of
+from .address import Address, number_of, shown_of
 from .source import Source
 from .tables import Asks
 
@@ -22,7 +21,7 @@ from .tables import Asks
 FORMATS = ("csv", "trc", "mot")
 
 
-def routes(asks: Asks, source: Source) -> list[Route]:
+def routes(asks: Asks, source: Source) -> list[Address]:
     """Return the addresses of this part."""
 
     async def export(request: Request) -> Response:
@@ -33,7 +32,7 @@ def routes(asks: Asks, source: Source) -> list[Route]:
 
         return await archive_of(await asks.ask(load), f"visit_{number}.zip")
 
-    return [Route("/visits/{number:int}/export", export)]
+    return [Address("/visits/{session_id:int}/export", export, "look", look="export")]
 
 
 async def archive_of(visit: Visit, name: str) -> Response:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response
-from starlette.routing import Route
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
@@ -23,9 +22,9 @@ from schemas.reading.visit_list import INCOMPLETE, Page, Result, VisitRow
 from schemas.reading.visit_progress import Progress
 
 from .access import REPORT_POLICY
-from .address import interval, number_of
+from .address import Address, interval, number_of, page
 from .corrections import Judged
-from .pages import Pages, page
+from .pages import Pages
 from .tables import Asks
 
 if TYPE_CHECKING:
@@ -230,7 +229,7 @@ class ResultsFolder:
         )
 
 
-def routes(pages: Pages, files: Asks, folder: ResultsFolder) -> list[Route]:
+def routes(pages: Pages, files: Asks, folder: ResultsFolder) -> list[Address]:
     """Return the addresses that a folder answers in its own way: the list, and files that are there already."""
 
     async def visits(request: Request) -> Response:
@@ -255,9 +254,9 @@ def routes(pages: Pages, files: Asks, folder: ResultsFolder) -> list[Route]:
         return FileResponse(await files.ask(folder.overlay, number_of(request)), media_type="video/mp4")
 
     return [
-        *page("/visits", visits),
-        Route("/visits/{number:int}/report", report),
-        Route("/recordings/{number:int}/overlay", overlay),
+        *page("/visits", visits, "look"),
+        Address("/visits/{session_id:int}/report", report, "look", look="report"),
+        Address("/recordings/{video_id:int}/overlay", overlay, "look", look="overlay"),
     ]
 
 

@@ -10,7 +10,6 @@ from typing import Any
 
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
-from starlette.routing import Route
 
 from schemas import fit
 from schemas.decisions import review_decisions
@@ -21,6 +20,7 @@ from schemas.transactions import in_transaction
 from ..requeue import retry
 from ..summary import disks
 from .access import Refused, Session, form_of
+from .address import Address, whole_number
 from .pages import Pages
 from .tables import Tables
 
@@ -37,12 +37,11 @@ class Group:
     errors: tuple[ErrorRow, ...]
 
 
-def routes(pages: Pages, tables: Tables) -> list[Route]:
+def routes(pages: Pages, tables: Tables) -> list[Address]:
     """The addresses of this part."""
 
     async def show(request: Request) -> Response:
         state, jobs, server, free = await tables.ask(_state)
-        retried = request.query_params.get("retried", "")
         return pages.show(
             request,
             "operate.html",
@@ -52,14 +51,14 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
             disks=free,
             groups=groups_of(state.errors),
             n_errors=sum(t.error for t in state.tables),
-            retried=int(retried) if retried.isdecimal() and len(retried) < 9 else None,
+            retried=whole_number(request.query_params.get("retried", "")),
             now=f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M:%S}",
             span=span,
             key_text=lambda key: json.dumps(key, default=str),
         )
 
     async def again(request: Request) -> Response:
-        fields = await form_of(request, "operate")
+        fields = await form_of(request)
         session: Session = request.state.session
         table, code, key = fields.get("table", ""), fields.get("code", ""), _key(fields.get("key", ""))
         if not table or not code:
@@ -68,8 +67,8 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
         return RedirectResponse(f"/operate?retried={n}", 303)
 
     return [
-        Route("/operate", show),
-        Route("/operate/retry", again, methods=["POST"]),
+        Address("/operate", show, "operate"),
+        Address("/operate/retry", again, "operate", methods=["POST"]),
     ]
 
 

@@ -3,36 +3,29 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jinja2
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
-from starlette.routing import Route
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.words import ANGLES, MEASURES, check_words, number, significant
 
 from . import texts
 from .access import HEADERS, HOURS, Session
+from .address import JSON
 from .plain_values import plain
 
-#: Ending of the address of a page as JSON.
-JSON = ".json"
 #: Status of the answer to a request that may not pass, by its reason.
 _REFUSED = {"session": 401, "host": 400, "token": 403, "right": 403, "size": 413, "form": 415}
 
 
-def page(path: str, answer: Callable[..., Any], **options: Any) -> list[Route]:
-    """Return the addresses of a page: as HTML, and as JSON of the same values."""
-    return [Route(path + JSON, answer), Route(path, answer, **options)]
-
-
 def as_json(request: Request) -> bool:
     """Return whether the page is asked for as JSON."""
-    return request.url.path.endswith(JSON)
+    return request.scope["path"].endswith(JSON)
 
 
 class Pages:
@@ -76,13 +69,15 @@ class Pages:
             language=language,
             other_language=next(name for name in texts.LANGUAGES if name != language),
             session=session,
-            path=request.url.path,
+            path=request.scope["path"],
             **values,
         )
         return HTMLResponse(page, status, dict(headers or {}))
 
     def refused(self, request: Request, reason: str) -> Response:
         """The answer to a request that may not pass."""
+        if reason == "address":
+            return self.missing(request, 404)
         name = "enter.title" if reason == "session" else f"enter.{reason}_title"
         text = "enter.text" if reason == "session" else f"enter.{reason}"
         if as_json(request):
@@ -95,7 +90,7 @@ class Pages:
         """The answer that a coded error makes: what is known and what to do."""
         return self.show(request, "error.html", status, error=error)
 
-    def missing(self, request: Request, status: int, headers: Mapping[str, str] | None) -> Response:
+    def missing(self, request: Request, status: int, headers: Mapping[str, str] | None = None) -> Response:
         """The answer for an address that there is not."""
         if as_json(request):
             return self.error(request, _not_there(), status)

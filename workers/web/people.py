@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from starlette.requests import Request
 from starlette.responses import Response
-from starlette.routing import Route
 
 from schemas import reading, video
 from schemas.decisions import candidates
 
-from .address import number_of
+from .address import Address, number_of, whole_number
 from .pages import Pages
 from .tables import Tables
 
@@ -22,22 +21,22 @@ if TYPE_CHECKING:
     from pbl_pipeline.tracking import Tracking
 
 
-def routes(pages: Pages, tables: Tables) -> list[Route]:
+def routes(pages: Pages, tables: Tables) -> list[Address]:
     """The addresses of this part."""
 
     async def boxes(request: Request) -> Response:
-        number, asked = number_of(request), request.query_params.get("method", "0")
+        number, which = number_of(request), whole_number(request.query_params.get("method", "0"))
 
         def load() -> Tracking:
             found = candidates.candidates(number)
-            if not asked.isdecimal() or len(asked) > 3 or int(asked) >= len(found):
+            if which is None or which >= len(found):
                 raise video.unknown_video(number)
-            return reading.load_tracking(found[int(asked)].key)
+            return reading.load_tracking(found[which].key)
 
         tracked = await tables.ask(load)
         return Response(await asyncio.to_thread(boxes_json, tracked), media_type="application/json")
 
-    return [Route("/recordings/{number:int}/boxes", boxes)]
+    return [Address("/recordings/{video_id:int}/boxes", boxes, "look", look="boxes")]
 
 
 def boxes_json(tracked: Tracking) -> bytes:

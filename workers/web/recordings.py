@@ -9,26 +9,25 @@ from collections.abc import Hashable
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response
-from starlette.routing import Route
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.visit import Recording
 
-from .address import number_of
+from .address import Address, number_of, page
 from .computing import told as told_of
 from .movement import Movement
-from .pages import Pages, page
+from .pages import Pages
 from .source import Source
 from .tables import Asks
 
 #: Recordings whose movement is kept in memory at a time: some hundred kB each.
 _KEPT = 8
-_OWN = re.compile(r"/(visits|recordings)(/\d{1,10}(/enter)?)?|/operate")
+_OWN = re.compile(r"/(visits|recordings)(/[0-9]{1,9}(/enter)?)?|/operate")
 #: How browsers call a file by its ending; others are offered as MP4, and a browser that cannot play one says so.
 _KINDS = {".webm": "video/webm", ".mkv": "video/x-matroska", ".mov": "video/mp4", ".mp4": "video/mp4"}
 
 
-def routes(pages: Pages, asks: Asks, source: Source) -> list[Route]:
+def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
     """Return the addresses of this part."""
 
     async def recording(request: Request) -> Response:
@@ -84,11 +83,11 @@ def routes(pages: Pages, asks: Asks, source: Source) -> list[Route]:
         return Response((await prepared(request)).points, media_type="application/octet-stream")
 
     return [
-        *page("/recordings/{number:int}", recording),
-        Route("/recordings/{number:int}/video", video),
-        Route("/recordings/{number:int}/movement", movement),
-        Route("/recordings/{number:int}/body", body),
-        Route("/recordings/{number:int}/points", points),
+        *page("/recordings/{video_id:int}", recording, "look", look="page"),
+        Address("/recordings/{video_id:int}/video", video, "look", look="video"),
+        Address("/recordings/{video_id:int}/movement", movement, "look", look="movement"),
+        Address("/recordings/{video_id:int}/body", body, "look", look="body"),
+        Address("/recordings/{video_id:int}/points", points, "look", look="points"),
     ]
 
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response
-from starlette.routing import Route
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
@@ -19,7 +18,7 @@ from schemas.reading import shown as reading
 
 from ..process_queue import ProcessQueue, Task, Work
 from .access import REPORT_POLICY
-from .address import number_of, shown_of
+from .address import Address, number_of, shown_of
 from .pages import Pages
 from .tables import Tables
 
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
 SECONDS, N_BYTES = 3600.0, 8 * 2**30
 
 
-def routes(pages: Pages, tables: Tables, making: ProcessQueue) -> list[Route]:
+def routes(pages: Pages, tables: Tables, making: ProcessQueue) -> list[Address]:
     """The addresses of this part."""
 
     async def work_of(request: Request, key: Callable[..., Any], load: Callable[..., Task], *args: int) -> Work:
@@ -73,11 +72,11 @@ def routes(pages: Pages, tables: Tables, making: ProcessQueue) -> list[Route]:
         return state(making.find(await tables.ask(report_key, number_of(request), shown_of(request))))
 
     return [
-        Route("/recordings/{number:int}/overlay", overlay),
-        Route("/recordings/{number:int}/overlay/file", overlay_file),
-        Route("/recordings/{number:int}/overlay/state", overlay_state),
-        Route("/visits/{number:int}/report", report),
-        Route("/visits/{number:int}/report/state", report_state),
+        Address("/recordings/{video_id:int}/overlay", overlay, "look", look="overlay"),
+        Address("/recordings/{video_id:int}/overlay/file", overlay_file, "look", look="overlay"),
+        Address("/recordings/{video_id:int}/overlay/state", overlay_state, "look", look="overlay"),
+        Address("/visits/{session_id:int}/report", report, "look", look="report"),
+        Address("/visits/{session_id:int}/report/state", report_state, "look", look="report"),
     ]
 
 

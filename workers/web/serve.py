@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import ipaddress
 import logging
+import signal
 import socket
 import ssl
 import threading
@@ -17,6 +18,7 @@ import uvicorn
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import check_label
 
 from .access import Sessions
 from .accounts import Accounts
@@ -130,10 +132,11 @@ def serve(
     Raises
     ------
     PblError
-        What `Where.check` raises; WEB_ACCOUNT where people sign in and there are no accounts; WEB_PORT where the
-        port is taken.
+        What `Where.check` raises; USAGE for a name that cannot be printed, and for a folder that more than this
+        machine may see; WEB_ACCOUNT where people sign in and there are no accounts; WEB_PORT where the port is taken.
     """
     where.check()
+    check_label("--name", name, 64)
     if folder is not None and settings.audit_looks():
         raise PblError(
             "USAGE",
@@ -170,6 +173,7 @@ def serve(
     click.echo("The page ends with Ctrl-C.")
     logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
     threading.Thread(target=_warm, daemon=True).start()
+    signal.signal(signal.SIGTERM, _end)  # uvicorn raises the signal again when it has ended, and the database ends too
     needed = database() if folder is None else contextlib.nullcontext()
     with needed, contextlib.closing(listening), contextlib.suppress(KeyboardInterrupt):
         uvicorn.Server(config(app, where)).run(sockets=[listening])
@@ -237,6 +241,10 @@ def database() -> Iterator[None]:
     finally:
         if started:
             embedded.stop(say=click.echo)
+
+
+def _end(*_: object) -> None:
+    raise SystemExit(0)
 
 
 def _warm() -> None:

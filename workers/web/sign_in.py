@@ -9,16 +9,17 @@ import math
 
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
-from starlette.routing import Route
 
 from .access import HOURS, Cookie, Sessions, form_of, read_form
 from .accounts import Accounts, Attempts
+from .address import OPEN, Address, whole_number
 from .pages import Pages
 
 log = logging.getLogger(__name__)
 
-#: Passwords that are compared at a time (each takes 128 MiB), and that may wait for it.
-AT_ONCE, WAITING = 2, 20
+#: Passwords that are compared at a time (each takes 128 MiB). As many may wait for it as there are connections: a limit
+#: of those would let a flood of wrong ones refuse the right one.
+AT_ONCE = 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,10 +32,9 @@ class WayIn:
     attempts: Attempts
 
 
-def routes(pages: Pages, way: WayIn, used: object = None) -> list[Route]:
+def routes(pages: Pages, way: WayIn, used: object = None) -> list[Address]:
     """The addresses of this part. `used`: called after a link was used."""
     turn = asyncio.Semaphore(AT_ONCE)
-    waiting = 0
 
     def opened(request: Request, value: str, to: str) -> Response:
         # The browser never chooses its session, and the one that it had ends.
@@ -48,7 +48,7 @@ def routes(pages: Pages, way: WayIn, used: object = None) -> list[Route]:
         if value is None:
             return pages.refused(request, "session")
         to = request.query_params.get("to", "")
-        response = opened(request, value, to if to.startswith("/visits/") and to[8:].isdecimal() else "/")
+        response = opened(request, value, to if to.startswith("/visits/") and whole_number(to[8:]) else "/")
         if callable(used):
             used()
         return response
@@ -57,23 +57,18 @@ def routes(pages: Pages, way: WayIn, used: object = None) -> list[Route]:
         return pages.show(request, "sign_in.html", problem="", wait=0)
 
     async def sign_in(request: Request) -> Response:
-        nonlocal waiting
         assert way.accounts is not None
         fields = await read_form(request)
         name, password = fields.get("name", "").strip(), fields.get("password", "")
         address = request.client.host if request.client else ""
         wait = way.attempts.wait_s(name, address)
-        if wait > 0 or waiting >= WAITING:
-            seconds = max(1, math.ceil(wait))
+        if wait > 0:
+            seconds = math.ceil(wait)
             headers = {"retry-after": str(seconds)}
             return pages.show(request, "sign_in.html", 429, headers, problem="sign_in.wait", wait=seconds)
         way.attempts.failed(name, address)
-        waiting += 1
-        try:
-            async with turn:
-                account = await asyncio.to_thread(way.accounts.check, name, password)
-        finally:
-            waiting -= 1
+        async with turn:
+            account = await asyncio.to_thread(way.accounts.check, name, password)
         if account is None:
             # No name: people write their password into the wrong field.
             log.warning("a failed sign-in from %s", address)
@@ -82,14 +77,14 @@ def routes(pages: Pages, way: WayIn, used: object = None) -> list[Route]:
         return opened(request, way.sessions.open(account.name, account.roles, account.changed), "/")
 
     async def leave(request: Request) -> Response:
-        await form_of(request, "")
+        await form_of(request)
         way.sessions.leave(way.cookie.of(request))
         response = RedirectResponse("/", 303)
         way.cookie.forget(response)
         return response
 
     if way.accounts is None:
-        entries = [Route("/enter", by_link)]
+        entries = [Address("/enter", by_link, OPEN)]
     else:
-        entries = [Route("/enter", ask), Route("/enter", sign_in, methods=["POST"])]
-    return [*entries, Route("/leave", leave, methods=["POST"])]
+        entries = [Address("/enter", ask, OPEN), Address("/enter", sign_in, OPEN, methods=["POST"])]
+    return [*entries, Address("/leave", leave, "", methods=["POST"])]

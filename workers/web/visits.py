@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 import datetime
-import re
 from collections.abc import Mapping
 from typing import Any
 from urllib.parse import urlencode
 
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
-from starlette.routing import Route
 
 from schemas.reading import visit_list
 
 from .access import Session, form_of
-from .address import LARGEST, interval, number_of, shown_of
+from .address import Address, interval, number_of, page, shown_of, whole_number
 from .computing import told as told_of
-from .pages import Pages, as_json, page
+from .pages import Pages, as_json
 from .plain_values import plain
 from .source import Source
 from .tables import Asks, Tables
 
-_AFTER = re.compile(r"(\d{4}-\d{2}-\d{2})~(\d{1,10})")
 _FIELDS = ("cohort", "role", "quality", "state", "first_day", "last_day")
 
 
-def routes(pages: Pages, asks: Asks, source: Source) -> list[Route]:
+def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
     """Return the address of a visit, which tables and folder have."""
 
     async def visit(request: Request) -> Response:
@@ -37,16 +34,13 @@ def routes(pages: Pages, asks: Asks, source: Source) -> list[Route]:
             values = await asks.ask(plain, values)
         return pages.show(request, "visit.html", interval=interval, **values)
 
-    return page("/visits/{number:int}", visit)
+    return page("/visits/{session_id:int}", visit, "look")
 
 
-def list_routes(pages: Pages, tables: Tables) -> list[Route]:
+def list_routes(pages: Pages, tables: Tables) -> list[Address]:
     """Return the address of the list of the tables' visits."""
 
     async def visits(request: Request) -> Response:
-        if request.method == "POST":
-            fields = await form_of(request, "look")
-            return RedirectResponse(_address(request.state.session, fields), 303)
         session: Session = request.state.session
         asked = dict(request.query_params)
         wanted, bad = _filter(asked, session)
@@ -70,7 +64,10 @@ def list_routes(pages: Pages, tables: Tables) -> list[Route]:
             interval=interval,
         )
 
-    return page("/visits", visits, methods=["GET", "POST"])
+    async def search(request: Request) -> Response:
+        return RedirectResponse(_address(request.state.session, await form_of(request)), 303)
+
+    return [*page("/visits", visits, "look"), Address("/visits", search, "look", methods=["POST"])]
 
 
 def _address(session: Session, fields: Mapping[str, str]) -> str:
@@ -91,12 +88,10 @@ def _filter(asked: Mapping[str, str], session: Session) -> tuple[visit_list.Filt
         bad = bad or (bool(asked.get(name)) and name not in values)
     for name in ("first_day", "last_day"):
         if asked.get(name):
-            try:
-                values[name] = datetime.date.fromisoformat(asked[name])
-            except ValueError:
-                bad = True
-    if (number := asked.get("q", "")).isdecimal() and len(number) < 9:
-        values["search"] = session.search_text(int(number))
+            values[name] = _day(asked[name])
+            bad = bad or values[name] is None
+    if (number := whole_number(asked.get("q", ""))) is not None:
+        values["search"] = session.search_text(number)
         bad = bad or not values["search"]
     for name in ("cohort", "role"):
         values[name] = asked.get(name, "")[:64]
@@ -104,11 +99,14 @@ def _filter(asked: Mapping[str, str], session: Session) -> tuple[visit_list.Filt
 
 
 def _after(text: str) -> tuple[str, int] | None:
-    found = _AFTER.fullmatch(text)
-    if not found or int(found[2]) > LARGEST:
-        return None
+    day, _, visit = text.partition("~")
+    number = whole_number(visit)
+    return None if number is None or _day(day) is None else (day, number)
+
+
+def _day(text: str) -> datetime.date | None:
+    """A day as pages write it, None for what is none."""
     try:
-        datetime.date.fromisoformat(found[1])
+        return datetime.date.fromisoformat(text) if len(text) == len("2026-01-10") else None
     except ValueError:
         return None
-    return found[1], int(found[2])

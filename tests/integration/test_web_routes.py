@@ -1,0 +1,180 @@
+"""Right and look of every address, in each spelling that the page may take for it: by the page's own list of routes."""
+
+from __future__ import annotations
+
+import re
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import quote
+
+import pytest
+from starlette.routing import Route
+from starlette.testclient import TestClient
+
+from schemas.review import Viewing
+from tests.integration import web
+from tests.integration.chain import small_video
+from tests.integration.test_web_accounts import running
+from tests.rows import register, remove_all
+from workers.populate import populate
+from workers.web import Options, Where, audit, create_app
+
+#: Each address with 1 for its number: the roles that may open it ("*": anybody, "+": whoever is signed in) and what of
+#: a person is looked at. An address that is new belongs in here.
+LOOK, DECIDE, OPERATE = "reader reviewer", "reviewer", "operator"
+EXPECTED = {
+    "GET /": ("*", ""),
+    "GET /enter": ("*", ""),
+    "POST /leave": ("+", ""),
+    "POST /language": ("+", ""),
+    "GET /static/1": ("*", ""),
+    "GET /vendor/1": ("*", ""),
+    "GET /visits": (LOOK, ""),
+    "GET /visits.json": (LOOK, ""),
+    "POST /visits": (LOOK, ""),
+    "GET /visits/1": (LOOK, ""),
+    "GET /visits/1.json": (LOOK, ""),
+    "GET /visits/1/enter": (LOOK, ""),
+    "GET /visits/1/progress": (LOOK, "progress"),
+    "GET /visits/1/report": (LOOK, "report"),
+    "GET /visits/1/report/state": (LOOK, "report"),
+    "GET /visits/1/export": (LOOK, "export"),
+    "GET /compare": (LOOK, ""),
+    "GET /compare.json": (LOOK, ""),
+    "GET /recordings/1": (LOOK, "page"),
+    "GET /recordings/1.json": (LOOK, "page"),
+    "GET /recordings/1/video": (LOOK, "video"),
+    "GET /recordings/1/movement": (LOOK, "movement"),
+    "GET /recordings/1/body": (LOOK, "body"),
+    "GET /recordings/1/points": (LOOK, "points"),
+    "GET /recordings/1/people": (LOOK, "people"),
+    "GET /recordings/1/boxes": (LOOK, "boxes"),
+    "GET /recordings/1/overlay": (LOOK, "overlay"),
+    "GET /recordings/1/overlay/file": (LOOK, "overlay"),
+    "GET /recordings/1/overlay/state": (LOOK, "overlay"),
+    "POST /visits/1/enter": (DECIDE, ""),
+    "POST /visits/1/accept": (DECIDE, ""),
+    "POST /visits/1/compute": (DECIDE, ""),
+    "POST /recordings/1/person": (DECIDE, ""),
+    "POST /recordings/1/usable": (DECIDE, ""),
+    "POST /recordings/1/events": (DECIDE, ""),
+    "GET /operate": (OPERATE, ""),
+    "POST /operate/retry": (OPERATE, ""),
+}
+ROLES = ("reader", "reviewer", "operator")
+
+
+def spellings(path: str) -> list[str]:
+    """Ways to write an address that a reader of paths may take for the same, without the address itself."""
+    ends = ("%0a", "%0d", "%00", "%09", "%20", "%0a/", "/", "//", "/.", "/%2e", "%2f", ";", "%3f", "%23", "%e2%80%ae",
+            "%ff", ".json%0a", "/..;/x", "%85", "%e2%80%a8")  # fmt: skip
+    found = [path + end for end in ends]
+    found += ["/" + path, "/." + path, "/x/.." + path, "/%2e" + path, path.upper(), "/%0a" + path[1:]]
+    found += ["/" + "".join(f"%{ord(c):02x}" for c in path[1:])]
+    for number in ("01", "0" * 13 + "1", "0" * 4499 + "1", "+1", "%2b1", "-1", "1e0", "1.0", "1_0", "%201", "1%0a",
+                   "1%00", quote("\u0661"), quote("\uff11"), quote("\u00b9"), "0x1", "1;"):  # fmt: skip
+        found.append(re.sub(r"(?<=/)1(?=/|\.|$)", number, path))
+    return sorted({f for f in found if f != path})
+
+
+@pytest.fixture(scope="module")
+def one_visit(database: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Visit 1 with recording 1, computed; and each look is to leave a row."""
+    import schemas
+    from tests.integration import chain
+
+    with pytest.MonkeyPatch.context() as patch:
+        schemas.activate()
+        remove_all()
+        chain.install(patch)
+        patch.setenv("PBL_AUDIT_LOOKS", "1")
+        patch.setattr(audit, "AGAIN_S", 0.0)
+        register(small_video(tmp_path_factory.mktemp("routes"), "walk"), session_label="2026-01-10")
+        populate()
+        yield
+        remove_all()
+
+
+@pytest.fixture(scope="module")
+def browsers(one_visit: None) -> dict[str, TestClient]:
+    return {role: web.client(role) for role in ROLES}
+
+
+def looks() -> list[tuple[str, int | None, int | None]]:
+    return [(r["viewing_what"], r["video_id"], r["session_id"]) for r in Viewing().to_dicts(order_by="viewing_id")]
+
+
+def test_every_address_is_expected_here():
+    found = {
+        f"{method} {re.sub(r'{[^}]*}', '1', route.path)}"
+        for route in create_app(Options()).routes
+        if isinstance(route, Route)
+        for method in route.methods or ()
+        if method != "HEAD"
+    }
+    assert found == set(EXPECTED)
+
+
+def test_each_address_opens_for_its_roles_and_leaves_its_row(browsers: dict[str, TestClient]):
+    stranger = web.client(signed_in=False)
+    for name, (allowed, look) in EXPECTED.items():
+        method, path = name.split()
+        if name == "GET /enter":  # says 401 itself where a link is no way in
+            continue
+        if path != "/":  # shows the way in
+            assert (stranger.request(method, path).status_code == 401) == (allowed != "*"), name
+        of = (1, None) if "recordings" in path else (None, 1)
+        for role, browser in browsers.items():
+            Viewing().delete_quick()
+            status = browser.request(method, path, follow_redirects=False).status_code
+            if role in allowed or allowed in "*+":
+                assert status in ((200, 303, 400, 404, 409) if method == "GET" else (415,)), (name, role, status)
+                assert looks() == ([(look, *of)] if look else []), (name, role)
+            else:
+                assert status == 403, (name, role)
+                assert looks() == [], (name, role)
+
+
+@pytest.mark.parametrize("name", [n for n in EXPECTED if n.startswith("GET") and EXPECTED[n][0] != "*"])
+def test_no_spelling_of_an_address_passes_its_right_or_its_row(browsers: dict[str, TestClient], name: str):
+    """What is answered is answered to those who may, with its row; what is none of our addresses is not answered."""
+    path, (allowed, look) = name.split()[1], EXPECTED[name]
+    Viewing().delete_quick()
+    for spelled in spellings(path):
+        for role, browser in browsers.items():
+            status = browser.get(web.BASE + spelled, follow_redirects=False).status_code
+            assert status in (200, 303, 400, 403, 404, 409), (spelled, role, status)
+            if status not in (403, 404):
+                assert role in allowed, (spelled, role, status)
+                assert bool(looks()) == bool(look), (spelled, role, status)
+                Viewing().delete_quick()
+    assert looks() == []
+
+
+def test_addresses_that_no_browser_sends(one_visit: None):
+    """By a socket: a client of HTTP would put them right."""
+    app = create_app(Options())
+    cookie = app.state.sessions.enter(app.state.sessions.new_link("A", "reader"))
+    with running(app, Where()) as port:
+        for target in ("/operate%0a", "/operate%", "/operate%0", "/./operate", "//operate", "/operate#", "/operate\t",
+                       "http://127.0.0.1/operate%0a", "*", "/visits/../operate", "/visits/" + "1" * 4500):  # fmt: skip
+            lines = [f"GET {target} HTTP/1.1", f"Host: 127.0.0.1:{port}", f"Cookie: pbl_session={cookie}"]
+            with socket.create_connection(("127.0.0.1", port), timeout=5) as sent:
+                sent.sendall("\r\n".join([*lines, "Connection: close", "", ""]).encode())
+                answer = b"".join(iter(lambda: sent.recv(65536), b""))
+            assert answer.split(b" ")[1] in (b"400", b"403", b"404"), (target, answer[:100])
+            assert b"Queues" not in answer
+
+
+def test_an_address_that_belongs_to_no_page_is_refused_by_default(one_visit: None):
+    for path in ("/nothing", "/visits/1/nothing", "/recordings", "/static", "/docs", "/openapi.json"):
+        assert web.client(signed_in=False).get(path).status_code == 401, path
+        for role in ROLES:
+            assert web.client(role).get(path).status_code == 404, (path, role)
+        for method in ("PUT", "DELETE", "OPTIONS", "TRACE", "PROPFIND", "CONNECT"):
+            for known in (path, "/visits", "/recordings/1/video"):
+                answer = web.client().request(method, known)
+                assert answer.status_code in (403, 404, 405), (method, known)
+                assert web.client(signed_in=False).request(method, known).status_code in (401, 403), (method, known)
+    assert looks() == []
