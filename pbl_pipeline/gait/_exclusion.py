@@ -10,9 +10,9 @@ class Exclusion:
     """Reasons against a cycle; none where it is used.
 
     `first_step`, `last_step`: it touches the first or last step of its walking bout. `length_ratio`: its length over
-    the typical stride's, where that is odd and the feet do not show one stride; `length_unproven`: they are not known, so
-    that it may be one. `curve_distance_deg`: how far its curves are from the median curves of the
-    `n_curves` cycles of its side, where that is far. `failed_checks`: checks of the fit that FAIL.
+    the typical stride's, where that is odd and the feet do not show one stride; `length_unproven`: they are not known,
+    so that it may be one. `curve_distance_deg`: how far its curves are from the median curves of the `n_curves` cycles
+    of its side, where that is far. `failed_checks`: checks of the fit that FAIL.
     """
 
     first_step: bool = False

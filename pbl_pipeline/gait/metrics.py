@@ -352,8 +352,8 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
 def _odd_lengths(cycles: Sequence[GaitCycle]) -> str:
     if any(c.exclusion.length_unproven for c in cycles):
         return (
-            "a step was missed, or the person slowed down or paused; no feet show which: left out of the measures, which "
-            "have no spread for it. Look at the events"
+            "a step was missed, or the person slowed down or paused; no feet show which: left out of the measures, "
+            "which have no spread for it. Look at the events"
         )
     return "a step was missed or invented: left out of the measures, see the overlay"
 
