@@ -244,10 +244,9 @@ def summary(walked: Sequence[Walked]) -> str:
 
 
 def double_support_error(speed: float, seed: int, method: str) -> tuple[float, Truth]:
-    """Error of the double support (% of the cycle) of one person's exact motion, NaN without a measure, and the truth."""
-    seconds = max(7.0, 4.0 / speed)
-    spec = SynthSpec("walk", seed, noise="none", seconds=seconds, speed_m_per_s=speed, ground="treadmill", fps=100.0)
-    truth = synthesise(spec).truth
+    """Error of the double support (% of the cycle) of one person's exact motion, NaN without a measure; the truth."""
+    how = {"noise": "none", "ground": "treadmill", "fps": 100.0, "seconds": max(7.0, 4.0 / speed)}
+    truth = synthesise(SynthSpec("walk", seed, speed_m_per_s=speed, **how)).truth
     found = detect_events(feet_of_truth(truth, truth.markers_world_m), method)
     got, true = (spatiotemporal(find_cycles(e))["double_support_percent"] for e in (found, truth.events))
     return (float("nan") if got is None or true is None else got.mean - true.mean), truth

@@ -80,7 +80,7 @@ def turn_deg_per_stride(grid: Grid, phases: Phases) -> Float[np.ndarray, " N"]:
     turned = np.sum(phases.z[1:] * np.conj(phases.z[:-1]), axis=1)
     turned = np.append(turned, turned[-1:]) if len(turned) else np.zeros(len(grid.time_s), complex)
     frames = round(GRID_HZ)
-    mean = uniform_filter1d(turned.real, frames) + 1j * uniform_filter1d(turned.imag, frames)
+    mean = uniform_filter1d(np.real(turned), frames) + 1j * uniform_filter1d(np.imag(turned), frames)
     shortest, longest = _STRIDE_S
     rate = np.where(np.abs(mean) > 1e-6, np.angle(mean) * GRID_HZ / (2 * np.pi), 2 / (shortest + longest))
     half = 0.5 * np.clip(1 / np.maximum(rate, 1e-6), shortest, longest)
