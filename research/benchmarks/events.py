@@ -49,7 +49,7 @@ from research.paths import SHARED
 NEAR_S = 0.1
 #: Walking speeds (m/s) of the part `slow`, and its people.
 SPEEDS = (0.3, 0.5, 0.8, 1.1, 1.4)
-DESIGN, HELD_OUT = range(900, 912), range(1900, 1912)
+DESIGN, HELD_OUT = (*range(7), *range(900, 912)), tuple(range(1900, 1912))
 VIEWS = ("frontal", "oblique", "sagittal", "follow")
 KINDS: dict[str, tuple[Impairment, ...]] = {"healthy": (), **{n: (Impairment(n, 0.7),) for n in IMPAIRMENTS}}
 
@@ -266,7 +266,7 @@ def foot_speed(feet: FootTrajectories, events: Sequence[GaitEvent], belt_m_per_s
 
 
 def slow(method: str, say=click.echo) -> dict[str, float]:
-    """Root mean square (% of the cycle) of the error of the double support over all speeds, of each set of people."""
+    """Root mean square (% of the cycle) of the double support's error at the worst speed, of each set of people."""
     lab = []
     for walk in lab_walks():
         assert walk.feet is not None
@@ -296,8 +296,8 @@ def slow(method: str, say=click.echo) -> dict[str, float]:
                 f"{np.nanmean(e):+.1f}, worst {e[np.nanargmax(np.abs(e))]:+.1f} % of the cycle; labels: heel at "
                 f"contact {heel:.2f} of the walking speed, toe at toe-off {toe:.2f}"
             )
-        rms[name] = _rms(np.concatenate(every))
-        say(f"double support, {name}, all speeds: rms {rms[name]:.2f} % of the cycle")
+        rms[name] = max(_rms(e) for e in every)
+        say(f"double support, {name}, all speeds: rms {_rms(np.concatenate(every)):.2f} % of the cycle")
     return rms
 
 
@@ -371,7 +371,9 @@ def main(parts: Sequence[str], methods: Sequence[str], seeds: int) -> None:
             click.echo(method)
             rms = slow(method)
             if method == default:
-                bars += [(f"double support, {name}: rms 2 %", value <= 2.0) for name, value in rms.items()]
+                bars += [
+                    (f"double support, {name}: rms 2 % at every speed", value <= 2.0) for name, value in rms.items()
+                ]
     if "chain" in parts:
         walked = chain(methods, seeds).get(default)
         if walked:
