@@ -34,8 +34,7 @@ def solved_sequence(seed: int) -> Sequence:
     for name in rng.choice(names, n, replace=False):
         side = str(rng.choice(["right", "left"])) if name in ("stiff_knee", "drop_foot", "weakness") else ""
         impairments.append(synthetic.Impairment(str(name), float(rng.uniform(0.1, 1.0)), side))
-    # Slow walks as often as fast ones: evenly from 0.3 m/s on, or the person's own speed.
-    speed = float(rng.uniform(0.3, 1.9)) if rng.random() < 0.7 else None
+    speed = float(np.clip(rng.normal(1.15, 0.4), 0.35, 2.2)) if rng.random() < 0.7 else None
     spec = synthetic.SynthSpec(
         task=task,
         seed=seed,
