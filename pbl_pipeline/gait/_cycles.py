@@ -18,7 +18,7 @@ from .events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents
 from .ground import cycle_lengths, is_metric, where_feet_stand, why_no_lengths
 from .motion import BodyPoses, FootTrajectories, feet_from_fit, trial_poses
 from .normative import BODY_ANGLES
-from .outliers import without_odd_curves, without_odd_lengths
+from .outliers import without_missed_steps, without_odd_curves
 from .types import NO_POSITIONS, GaitCycle, Lengths
 
 if TYPE_CHECKING:
@@ -53,9 +53,9 @@ def find_cycles(
     `keep_ends` uses them all the same: for a recording that begins and ends while the person walks, such as a
     laboratory's, where the first step in view is not the first step of the walk.
 
-    A cycle longer than 1.35 times the median stride of its bout, or shorter than its inverse, is not used
-    either: a step that was not detected makes one long cycle of each side, which would pass as a slow stride. Nor is
-    one whose curves are far from the others' (`_outliers.py`).
+    A cycle longer than 1.35 times the median stride of its bout, or shorter than its inverse, is not used either
+    unless the feet pass each other in it as in one stride: a pair of steps that was not detected would pass as a slow
+    stride, and a slow stride belongs to the spread. Nor is one whose curves are far from the others' (`outliers.py`).
 
     `series` and `feet` stand for the fit's angles and feet where there is none (a laboratory's recording; positions in
     metres in a world that stands still).
@@ -113,7 +113,7 @@ def find_cycles(
             )
             cycles.append(cycle)
             slides.append(slide)
-    cycles = without_odd_curves(without_odd_lengths(where_feet_stand(cycles, slides)))
+    cycles = without_odd_curves(without_missed_steps(where_feet_stand(cycles, slides), feet))
     if checks := failed(fit_checks):
         cycles = [dataclasses.replace(c, exclusion=Exclusion(failed_checks=checks)) for c in cycles]
     cycles.sort(key=lambda c: c.start_s)

@@ -10,13 +10,15 @@ class Exclusion:
     """Reasons against a cycle; none where it is used.
 
     `first_step`, `last_step`: it touches the first or last step of its walking bout. `length_ratio`: its length over
-    the typical stride's, where that is odd. `curve_distance_deg`: how far its curves are from the median curves of the
-    `n_curves` cycles of its side, where that is far. `failed_checks`: checks of the fit that FAIL.
+    the typical stride's, where that is odd and the feet do not show one stride; `length_unproven`: they are not known,
+    so that it may be one. `curve_distance_deg`: how far its curves are from the median curves of the `n_curves` cycles
+    of its side, where that is far. `failed_checks`: checks of the fit that FAIL.
     """
 
     first_step: bool = False
     last_step: bool = False
     length_ratio: float | None = None
+    length_unproven: bool = False
     curve_distance_deg: float | None = None
     n_curves: int | None = None
     failed_checks: tuple[str, ...] = ()
@@ -33,7 +35,8 @@ class Exclusion:
         reasons = ["first step of the bout"] if self.first_step else []
         reasons += ["last step of the bout"] if self.last_step else []
         if self.length_ratio is not None:
-            reasons.append(f"{self.length_ratio:.2f} times the typical stride")
+            unproven = ", without feet that show whether a step was missed" if self.length_unproven else ""
+            reasons.append(f"{self.length_ratio:.2f} times the typical stride{unproven}")
         if self.curve_distance_deg is not None:
             reasons.append(f"{self.curve_distance_deg:.0f} deg from the median curves of {self.n_curves} cycles")
         return " and ".join(reasons)

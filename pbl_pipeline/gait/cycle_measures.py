@@ -40,6 +40,8 @@ SIDED = (
     "single_support_percent",
     "step_length_m",
 )
+#: Key of `Spatiotemporal.reasons` that says why the measures have no spread.
+SPREAD = "spread"
 NO_WIDTH = "one camera does not tell it: on synthetic walkers it comes out up to 4 cm too wide"
 
 
@@ -85,7 +87,8 @@ class Measure:
 class Spatiotemporal:
     """Measures by name (`MEASURES`); None where one cannot be trusted, with the reason in `reasons`.
 
-    `n_cycles_found` and `n_cycles_used` count before and after the exclusions of `find_cycles`.
+    `reasons["spread"]`, where it is there, says why no measure has a spread. `n_cycles_found` and `n_cycles_used` count
+    before and after the exclusions of `find_cycles`.
     """
 
     status: str
@@ -110,6 +113,9 @@ def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
     of this side; a step that is part of two cycles counts once. Lengths are those of `cycle_lengths`, speed is stride
     length by stride time.
 
+    A cycle of odd length that may be a true stride (`Exclusion.length_unproven`) leaves every measure without sd,
+    variability and CV, as without it the spread would be too small.
+
     Status EMPTY with a reason where no cycle is used.
     """
     used = [c for c in cycles if c.used]
@@ -132,6 +138,13 @@ def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
     for name in LENGTHS:
         if measures[name] is None:
             reasons[name] = _no_length(name, used)
+    if unproven := sum(c.exclusion.length_unproven for c in cycles):
+        reasons[SPREAD] = (
+            f"{unproven} cycles of odd length were left out, and no feet show whether they are slow strides or hold a "
+            "missed step"
+        )
+        none = {"sd": None, "variability": None, "cv_percent": None}
+        measures = {name: m and dataclasses.replace(m, **none) for name, m in measures.items()}
     return Spatiotemporal("PASS", "", measures, reasons, len(cycles), len(used), len(steps))
 
 

@@ -279,7 +279,7 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
         WARN if odd else PASS,
         float(odd),
         0.0,
-        "a step was missed or invented, or the person paused: left out of the measures, see the overlay" if odd else "",
+        _odd_lengths(cycles) if odd else "",
     )
     unlike = sum(c.odd_curves for c in cycles)
     curves = Check(
@@ -347,6 +347,15 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
             )
         )
     return tuple(checks)
+
+
+def _odd_lengths(cycles: Sequence[GaitCycle]) -> str:
+    if any(c.exclusion.length_unproven for c in cycles):
+        return (
+            "a step was missed, or the person slowed down or paused; no feet show which: left out of the measures, "
+            "which have no spread for it. Look at the events"
+        )
+    return "a step was missed or invented: left out of the measures, see the overlay"
 
 
 def _short(gdi: Gdi) -> str:

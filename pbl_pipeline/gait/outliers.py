@@ -1,4 +1,4 @@
-"""Cycles that are not like the others: of an odd length, or with curves far from the rest."""
+"""Cycles that are not one stride, or whose curves are far from the others'."""
 
 from __future__ import annotations
 
@@ -8,11 +8,18 @@ from typing import Any
 
 import numpy as np
 
+from .motion import FootTrajectories
 from .types import GaitCycle
 
-#: A stride longer than this times the typical one holds a step that was missed (at least half a stride more) or a
-#: pause; one shorter than its inverse an event that is none. Strides of one walk vary by a few percent, in ataxia ten.
+#: A stride longer than this times the typical one may hold a step that was missed, one shorter than its inverse an
+#: event that is none: the feet decide. Strides of one walk vary by a few percent, in ataxia ten.
 STRIDE_RATIO = 1.35
+#: The feet pass each other this often in a stride; in one that hides a missed pair of steps twice as often.
+_PASSES = 2
+#: A pass counts where the feet come this far beyond the middle of their range, in fractions of the range.
+_BEYOND = 0.2
+#: Fraction of a cycle's frames in which both feet must be seen to count passes.
+_SEEN = 0.8
 #: Fewest cycles of a bout for a typical stride of its own; shorter bouts are compared with the whole trial.
 _OWN_MEDIAN = 5
 
@@ -26,15 +33,41 @@ MIN_CURVES = 5
 CURVE_SD, CURVE_MIN_DEG = 6.0, 8.0
 
 
-def without_odd_lengths(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
-    """The cycles, those of an odd length marked as not used with the reason."""
+def without_missed_steps(cycles: Sequence[GaitCycle], feet: FootTrajectories | None = None) -> list[GaitCycle]:
+    """Return the cycles, those of an odd length that are not one stride marked as not used.
+
+    A cycle beyond `STRIDE_RATIO` times the typical stride (the median of its bout, or of the trial where the bout is
+    short) is a stride all the same if the feet pass each other as often as in one (`foot_passes`): it is used, and
+    its length counts in every spread. Where the feet are not known the cycle is left out as `length_unproven`, and
+    `spatiotemporal` returns no spread.
+    """
     out = []
     for c in cycles:
         own = [o.stride_time_s for o in cycles if o.bout == c.bout]
         typical = np.median(own if len(own) >= _OWN_MEDIAN else [o.stride_time_s for o in cycles])
         ratio = float(c.stride_time_s / typical)
-        out.append(c if 1 / STRIDE_RATIO <= ratio <= STRIDE_RATIO else not_used(c, length_ratio=ratio))
+        if not 1 / STRIDE_RATIO <= ratio <= STRIDE_RATIO:
+            passes = None if feet is None else foot_passes(feet, c.start_s, c.end_s)
+            if passes != _PASSES:
+                c = not_used(c, length_ratio=ratio, length_unproven=passes is None)
+        out.append(c)
     return out
+
+
+def foot_passes(feet: FootTrajectories, start_s: float, end_s: float) -> int | None:
+    """Return how often the feet pass each other from `start_s` to `end_s`; None where they are hardly seen.
+
+    Counted about the middle of the range of the heels' distance along the heading, so that a foot that is always
+    placed behind the other one passes it as well.
+    """
+    inside = (feet.time_s >= start_s) & (feet.time_s <= end_s)
+    apart = np.sum((feet.heel_m[inside, 0] - feet.heel_m[inside, 1]) * feet.forward[inside], axis=1)
+    seen = apart[np.isfinite(apart)]
+    if len(seen) < max(4, _SEEN * len(apart)):
+        return None
+    low, high = np.percentile(seen, [5, 95])
+    side = np.sign(np.where(np.abs(seen - 0.5 * (low + high)) > _BEYOND * (high - low), seen - 0.5 * (low + high), 0.0))
+    return int(np.count_nonzero(np.diff(side[side != 0])))
 
 
 def without_odd_curves(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:

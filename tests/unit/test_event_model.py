@@ -21,11 +21,12 @@ from pbl_pipeline.gait import (
     feet_from_markers,
     find_cycles,
 )
-from pbl_pipeline.gait.events import METHODS
+from pbl_pipeline.gait.events import METHODS, WalkingParams
 from pbl_pipeline.gait.events.network.predict import load, model_path
 from pbl_pipeline.gait.events.phase import double_support_s
 from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.synthetic import Impairment, SynthSpec, Truth, synthesise
+from research.benchmarks.turns import circle, eight, turns_deg
 from research.corpus.true_fit import fit_of_qpos
 from research.events._gaits import curve_foot_off, gait_angles
 from research.events._leg import leg_points
@@ -355,7 +356,26 @@ def test_the_weights_are_those_that_the_method_names():
     about = load(params.model)[1]
     assert about["train"]["seed"] == 0
     assert about["reliability"]["expected_error"] < 0.01
-    assert METHODS.find("phase-transformer-v1") == method
+    assert METHODS.find("phase-transformer-v2") == method
+
+
+def test_rows_of_the_first_version_stand():
+    """Its turns are judged by time; its hash is the one that stored rows name."""
+    params = dataclasses.replace(METHODS.find().params, walking=WalkingParams())
+    assert METHODS.make("phase-transformer", 1, params).hash.startswith("9f9ad11a864dcb24")
+
+
+def test_what_counts_as_turning_does_not_follow_the_speed():
+    """By time a slow walker kept strides that turn by 60 degrees, and a fast one lost those of 50."""
+    limit = METHODS.find().params.walking.max_turn_deg_per_stride
+    for speed in (0.35, 1.6):
+        assert len(turns_deg(circle(speed, 60.0, strides=8)[0], limit)) <= 2
+        assert len(turns_deg(circle(speed, 15.0, strides=8)[0], limit)) >= 12
+    feet, heading = eight(0.35, 1, strides=20)
+    kept = turns_deg(feet, limit, heading)
+    assert len(kept)
+    assert kept.max() < 30.0
+    assert turns_deg(feet, 0.0, heading).max() > 60.0
 
 
 def test_other_weights_are_refused():

@@ -15,7 +15,7 @@ from pbl_pipeline.gait.events.network.features import N_FEATURES, features, head
 from pbl_pipeline.gait.events.network.predict import GRID_HZ, Grid, Phases, on_grid
 from pbl_pipeline.gait.events.network.transformer import Architecture, PhaseTransformer, load_model, save_model
 from pbl_pipeline.gait.events.phase_filter import crossings, smooth_phases
-from pbl_pipeline.gait.events.walking import turning_deg_per_s, walking_stretches
+from pbl_pipeline.gait.events.walking import turn_deg_per_stride, turning_deg_per_s, walking_stretches
 from research.events._augment import SOURCE, WINDOW, augment
 from research.events._calibrate import _wraps, fit_logistic, probability, reliability
 from research.events._corpus import UNIT_M, load, pack, save
@@ -211,6 +211,30 @@ def test_feet_that_do_not_pass_each_other_do_not_walk():
 def test_turning_is_positive_to_the_left():
     turn = np.radians(40.0) * np.arange(200) / GRID_HZ
     np.testing.assert_allclose(turning_deg_per_s(a_grid(200, np.zeros(200), turn))[20:-20], 40.0, atol=0.5)
+
+
+def test_turn_of_a_stride_by_hand():
+    """40 deg/s is 80 deg of a stride at 0.5 strides a second, 32 at 1.25; also at the ends."""
+    n = 400
+    turn = np.radians(40.0) * np.arange(n) / GRID_HZ
+    for strides_hz, wanted in ((0.5, 80.0), (1.25, 32.0)):
+        phase = 2 * np.pi * strides_hz * np.arange(n) / GRID_HZ
+        phases = Phases(np.exp(1j * (phase[:, None] - np.arange(4))), np.ones(n), np.ones(n, bool))
+        np.testing.assert_allclose(turn_deg_per_stride(a_grid(n, np.zeros(n), turn), phases), wanted, rtol=0.05)
+        np.testing.assert_allclose(turn_deg_per_stride(a_grid(n, np.zeros(n)), phases), 0.0, atol=1e-6)
+
+
+def test_a_bend_ends_a_slow_walk_and_not_a_fast_one():
+    """40 deg/s for three seconds."""
+    n = 600
+    turn = np.radians(40.0) * np.clip(np.arange(n) / GRID_HZ - 4.5, 0, 3)
+    swing = 0.6 * np.sin(2 * np.pi * np.arange(n) / GRID_HZ)
+    for strides_hz, stretches in ((0.5, 2), (1.6, 1)):
+        phase = 2 * np.pi * strides_hz * np.arange(n) / GRID_HZ
+        phases = Phases(np.exp(1j * (phase[:, None] - np.arange(4))), np.ones(n), np.ones(n, bool))
+        found = walking_stretches(a_grid(n, swing, turn), phases, WalkingParams(max_turn_deg_per_stride=30.0))
+        assert len(found) == stretches
+        assert len(walking_stretches(a_grid(n, swing, turn), phases, WalkingParams())) == 1  # version 1: by time
 
 
 # --- network

@@ -7,6 +7,8 @@ import pytest
 
 from pbl_pipeline.gait import (
     AngleSeries,
+    FootTrajectories,
+    GaitCycle,
     Measure,
     Spatiotemporal,
     cycle_checks,
@@ -15,6 +17,7 @@ from pbl_pipeline.gait import (
     spatiotemporal,
 )
 from pbl_pipeline.gait.events import GaitEvent
+from pbl_pipeline.gait.outliers import foot_passes
 
 
 def walk(downs: list[tuple[float, str]], double_support_s: dict[str, float], bout: int = 0) -> list[GaitEvent]:
@@ -172,22 +175,84 @@ def steps(times: list[float]) -> list[GaitEvent]:
     return walk([(t, "left" if k % 2 == 0 else "right") for k, t in enumerate(times)], {"left": 0.11, "right": 0.11})
 
 
-def test_a_missed_step_does_not_pass_as_a_long_stride():
-    # Twelve steps of 0.55 s (stride 1.10 s); between the sixth and the seventh foot down one step more goes by unseen.
-    times = [0.55 * k + (0.55 if k >= 6 else 0.0) for k in range(13)]
-    cycles = find_cycles(steps(times))
+#: Twelve steps of 0.55 s (stride 1.10 s); the seventh comes one step later than it should.
+LATE_STEP = [0.55 * k + (0.55 if k >= 6 else 0.0) for k in range(13)]
+
+
+def walking_feet(downs: list[float]) -> FootTrajectories:
+    """Feet of which one is furthest ahead at each of `downs`, left and right in turn."""
+    time = np.arange(downs[0], downs[-1], 1 / 60)
+    apart = np.cos(np.pi * np.interp(time, downs, np.arange(len(downs))))
+    heel = np.zeros((len(time), 2, 3))
+    heel[:, 0, 0], heel[:, 1, 0] = 0.3 * apart, -0.3 * apart
+    ahead = np.tile([1.0, 0.0, 0.0], (len(time), 1))
+    return FootTrajectories(
+        time, heel, heel, np.tile([0, 0, 0.9], (len(time), 1)), ahead, np.array([0, 0, 1.0]), heel[:, :, 0], "markers"
+    )
+
+
+def cycles_with_feet(events: list[GaitEvent], feet: FootTrajectories) -> tuple[GaitCycle, ...]:
+    curves = AngleSeries(feet.time_s, {"hip_flexion": feet.time_s}, {"hip_flexion": feet.time_s})
+    return find_cycles(events, series=curves, feet=feet)
+
+
+def test_a_long_stride_that_may_hold_a_missed_step_leaves_no_spread():
+    cycles = find_cycles(steps(LATE_STEP))
     assert [round(c.stride_time_s, 2) for c in cycles if c.odd_length] == [1.65, 1.65]
-    assert {c.excluded for c in cycles if c.odd_length} == {"1.50 times the typical stride"}
+    wanted = "1.50 times the typical stride, without feet that show whether a step was missed"
+    assert {c.excluded for c in cycles if c.odd_length} == {wanted}
     result = spatiotemporal(cycles)
     assert (result.n_cycles_found, result.n_cycles_used) == (11, 7)
-    stride = of(result, "stride_time_s")
-    assert stride.mean == pytest.approx(1.10)
-    assert stride.sd == pytest.approx(0.0, abs=1e-9)
+    assert of(result, "stride_time_s").mean == pytest.approx(1.10)
     assert of(result, "cadence_steps_per_min").mean == pytest.approx(60 / 0.55)
     assert of(result, "step_time_s").mean == pytest.approx(0.55)
+    for name in ("stride_time_s", "cadence_steps_per_min", "double_support_percent"):
+        measure = of(result, name)
+        assert (measure.sd, measure.variability, measure.cv_percent, measure.interval) == (None, None, None, None)
+    assert "2 cycles of odd length" in result.reasons["spread"]
     (check,) = (c for c in cycle_checks(result, cycles) if c.check == "cycles_of_odd_length")
     assert (check.outcome, check.value) == ("WARN", 2.0)
-    assert check.advice
+    assert "no spread" in check.advice
+
+
+def test_a_true_long_stride_is_used_and_counts_in_the_spread():
+    """The feet swing once in it: the person was slow."""
+    cycles = cycles_with_feet(steps(LATE_STEP), walking_feet(LATE_STEP))
+    assert not any(c.odd_length for c in cycles)
+    result = spatiotemporal(cycles)
+    assert result.n_cycles_used == 9
+    stride = of(result, "stride_time_s")
+    by_side = [[c.stride_time_s for c in cycles if c.used and c.side == side] for side in ("left", "right")]
+    assert stride.variability == pytest.approx(np.sqrt(np.mean([np.var(x, ddof=1) for x in by_side])))
+    assert stride.variability is not None
+    assert stride.variability > 0.2
+    assert "spread" not in result.reasons
+
+
+def test_a_missed_pair_of_steps_does_not_pass_as_a_long_stride():
+    """The feet swing on where no event was found: the cycles are left out, and the spread of the others stands."""
+    true = [0.55 * k for k in range(15)]
+    cycles = cycles_with_feet(steps(true[:6] + true[8:]), walking_feet(true))
+    assert [round(c.stride_time_s, 2) for c in cycles if c.odd_length] == [2.2, 2.2]
+    assert {c.excluded for c in cycles if c.odd_length} == {"2.00 times the typical stride"}
+    result = spatiotemporal(cycles)
+    stride = of(result, "stride_time_s")
+    assert (stride.mean, stride.sd) == pytest.approx((1.10, 0.0), abs=1e-9)
+    (check,) = (c for c in cycle_checks(result, cycles) if c.check == "cycles_of_odd_length")
+    assert (check.value, check.advice.startswith("a step was missed or invented")) == (2.0, True)
+
+
+@pytest.mark.parametrize("behind_m", [0.0, 0.5])
+def test_feet_pass_each_other_twice_in_a_stride(behind_m: float):
+    """Also where one foot is always placed behind the other; None where they are not seen."""
+    feet = walking_feet([0.55 * k for k in range(13)])
+    feet.heel_m[:, 1, 0] -= behind_m
+    rng = np.random.default_rng(0)
+    feet.heel_m[:] += 0.01 * rng.standard_normal(feet.heel_m.shape)
+    assert [foot_passes(feet, 0.55 * k, 0.55 * (k + 2)) for k in range(10)] == [2] * 10
+    assert [foot_passes(feet, 0.55 * k, 0.55 * (k + 4)) for k in range(8)] == [4] * 8
+    feet.heel_m[40:80] = np.nan
+    assert foot_passes(feet, 0.55, 1.65) is None
 
 
 def test_strides_that_vary_as_in_disease_are_all_used():

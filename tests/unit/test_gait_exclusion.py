@@ -20,6 +20,10 @@ def cycle(exclusion: Exclusion) -> GaitCycle:
             Exclusion(last_step=True, length_ratio=1.5),
             "last step of the bout and 1.50 times the typical stride",
         ),
+        (
+            Exclusion(length_ratio=1.4, length_unproven=True),
+            "1.40 times the typical stride, without feet that show whether a step was missed",
+        ),
         (Exclusion(curve_distance_deg=24.6, n_curves=8), "25 deg from the median curves of 8 cycles"),
         (Exclusion(first_step=True, failed_checks=("scale", "jumps")), "the fit failed its check scale, jumps"),
     ],

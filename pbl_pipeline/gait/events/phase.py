@@ -17,7 +17,7 @@ from ._preconditions import check_preconditions, input_error
 from .network.predict import GRID_HZ, check_model, load, predict
 from .phase_filter import FilterParams, SmoothPhases, crossings, smooth_phases
 from .types import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents, heading_check, no_events
-from .walking import WalkingParams, reach_leg, swing_leg, turning_deg_per_s, walking_stretches
+from .walking import WalkingParams, reach_leg, swing_leg, turns, walking_stretches
 
 #: Order of the model's phases.
 PHASE_ORDER = ((LEFT, FOOT_DOWN), (RIGHT, FOOT_UP), (RIGHT, FOOT_DOWN), (LEFT, FOOT_UP))
@@ -83,7 +83,7 @@ def detect_by_phase(feet: FootTrajectories, method: Method[PhaseParams]) -> Gait
     if not bouts:
         reason, advice = _why_not(grid, phases, len(stretches), half_seen, p)
         return no_events(method.name, method.hash, feet.source, reason, advice)
-    turning = float(np.mean(np.abs(turning_deg_per_s(grid)) > p.walking.max_turn_deg_per_s))
+    turning = float(np.mean(turns(grid, phases, p.walking)))
     return GaitEvents(
         status=PASS,
         events=tuple(sorted(events, key=lambda e: (e.time_s, e.bout))),

@@ -5,14 +5,18 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.ndimage import uniform_filter1d
 
+from pbl_pipeline.paramset import later
 from pbl_pipeline.runs import runs
 
 from ._preconditions import seated
 from .network.features import GRID_HZ
 from .network.predict import Grid, Phases
+
+#: Shortest and longest stride of a walk (s): 120 and 30 strides a minute at most and least.
+_STRIDE_S = (0.6, 3.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,8 +29,11 @@ class WalkingParams:
         Shorter stretches do not count; shorter pauses do not end one.
     max_gap_s
         Longer gaps in view end a stretch.
+    max_turn_deg_per_stride
+        A heading that changes by more within a stride is turning, not walking on: it ends a stretch. 0: not asked.
     max_turn_deg_per_s
-        Faster changes of the heading are turning, not walking on: they end a stretch.
+        The same by time, asked where `max_turn_deg_per_stride` is 0 (version 1): it keeps slow walkers' turns and loses
+        fast walkers' bends.
     min_swing_leg
         The ankles pass each other by at least this much along the heading (leg lengths).
     """
@@ -38,6 +45,7 @@ class WalkingParams:
     max_gap_s: float = 0.3
     max_turn_deg_per_s: float = 50.0
     min_swing_leg: float = 0.15
+    max_turn_deg_per_stride: float = later(0.0)
 
 
 def walking_stretches(grid: Grid, phases: Phases, params: WalkingParams) -> list[tuple[int, int]]:
@@ -49,11 +57,38 @@ def walking_stretches(grid: Grid, phases: Phases, params: WalkingParams) -> list
     walks = _without_short(walks, False, round(params.pause_s * GRID_HZ))
     unseen = _without_short(~phases.seen, True, round(params.max_gap_s * GRID_HZ))
     walks = (walks | ~phases.seen) & ~unseen
-    walks &= ~(np.abs(turning_deg_per_s(grid)) > params.max_turn_deg_per_s)
+    walks &= ~turns(grid, phases, params)
     walks &= ~_without_short(seated(grid), True, round(params.pause_s * GRID_HZ))
     walks = _without_short(walks, True, round(params.shortest_s * GRID_HZ))
     swing = swing_leg(grid)
     return [(run.start, run.stop - 1) for run in runs(walks) if reach_leg(swing[run]) >= params.min_swing_leg]
+
+
+def turns(grid: Grid, phases: Phases, params: WalkingParams) -> Bool[np.ndarray, " N"]:
+    """Whether the person turns instead of walking on, of each frame."""
+    if params.max_turn_deg_per_stride:
+        return np.abs(turn_deg_per_stride(grid, phases)) > params.max_turn_deg_per_stride
+    return np.abs(turning_deg_per_s(grid)) > params.max_turn_deg_per_s
+
+
+def turn_deg_per_stride(grid: Grid, phases: Phases) -> Float[np.ndarray, " N"]:
+    """Change of the heading to the left (deg) over the stride about each frame.
+
+    A stride lasts a turn of the phases at their mean rate within half a second, between `_STRIDE_S`; its middle value
+    where no phase is seen. Where it reaches beyond the recording, the part inside is extrapolated.
+    """
+    turned = np.sum(phases.z[1:] * np.conj(phases.z[:-1]), axis=1)
+    turned = np.append(turned, turned[-1:]) if len(turned) else np.zeros(len(grid.time_s), complex)
+    frames = round(GRID_HZ)
+    mean = uniform_filter1d(np.real(turned), frames) + 1j * uniform_filter1d(np.imag(turned), frames)
+    shortest, longest = _STRIDE_S
+    rate = np.where(np.abs(mean) > 1e-6, np.angle(mean) * GRID_HZ / (2 * np.pi), 2 / (shortest + longest))
+    half = 0.5 * np.clip(1 / np.maximum(rate, 1e-6), shortest, longest)
+    heading = np.cumsum(turning_deg_per_s(grid)) / GRID_HZ
+    time = grid.time_s
+    first, last = np.maximum(time - half, time[0]), np.minimum(time + half, time[-1])
+    change = np.interp(last, time, heading) - np.interp(first, time, heading)
+    return change * 2 * half / np.maximum(last - first, 1 / GRID_HZ)
 
 
 def turning_deg_per_s(grid: Grid) -> Float[np.ndarray, " N"]:
