@@ -49,7 +49,7 @@ from research.paths import SHARED
 NEAR_S = 0.1
 #: Walking speeds (m/s) of the part `slow`, and its people.
 SPEEDS = (0.3, 0.5, 0.8, 1.1, 1.4)
-PEOPLE = {"looked at": range(900, 912), "of the review": range(7), "held out": range(1900, 1912)}
+PEOPLE = {"looked at": range(900, 912), "seeds 0 to 6": range(7), "held out": range(1900, 1912)}
 VIEWS = ("frontal", "oblique", "sagittal", "follow")
 KINDS: dict[str, tuple[Impairment, ...]] = {"healthy": (), **{n: (Impairment(n, 0.7),) for n in IMPAIRMENTS}}
 
