@@ -17,7 +17,20 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection, event_corrections, gait, gdi, jobs, lab, migrations, session, stages, video, views
+from schemas import (
+    connection,
+    event_corrections,
+    gait,
+    gdi,
+    jobs,
+    lab,
+    migrations,
+    session,
+    stages,
+    validation,
+    video,
+    views,
+)
 from schemas.chain import ON_REQUEST
 from schemas.intake import Visit, ingest
 from schemas.operations import embedded
@@ -233,18 +246,20 @@ def test_results_from_before_they_had_their_session_get_it(
     assert migrations.migrate().steps == []
 
 
-def test_instruments_of_before_get_their_changes_by_value(empty: Callable[[], None]):
+def test_instruments_and_errors_of_before_get_their_columns(empty: Callable[[], None]):
     schemas.activate()
     new = everything()["pbl_study.#clinical_instrument"]
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         table = "pbl_study.`#clinical_instrument`"
         cursor.execute(f"ALTER TABLE {table} DROP COLUMN minimal_change_classes")
+        cursor.execute("ALTER TABLE pbl_validation.__kinematic_error__joint DROP COLUMN joint_normal_p")
         for name, columns in SHIPPED_BEFORE.items():
             for column, value in columns.items():
                 cursor.execute(f"UPDATE {table} SET {column} = %s WHERE instrument = %s", (value, name))
     empty()
     migrations.migrate()
     assert everything()["pbl_study.#clinical_instrument"] == new
+    assert "joint_normal_p" in validation.KinematicError.Joint.heading.names
     assert migrations.migrate().steps == []
 
 
