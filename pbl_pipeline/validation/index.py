@@ -10,7 +10,7 @@ import pandas as pd
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.stats import bland_altman, correlation
 
-from .paper import paper_cells, paper_where
+from .paper import paper_cells
 from .table import Cell, Table
 
 #: Columns of the indices: of a visit by one kind of recordings (`kind`: single, rig, markers) against a norm that was
@@ -19,7 +19,6 @@ INDEX_COLUMNS = ("subject", "session_label", "session_id", "kind", "method", "no
 #: Columns of the pairs: the index of one camera and of several, of one visit.
 PAIR_COLUMNS = ("subject", "session_label", "single", "rig", "single_norm", "rig_norm")
 _ROW = "GDI of one camera against several"
-_PAPER_ROW = "GDI of one camera against several (r)"
 
 
 def index_pairs(indices: pd.DataFrame) -> pd.DataFrame:
@@ -67,9 +66,8 @@ def index_agreement(pairs: pd.DataFrame) -> Table:
     """
     one, several = (pairs[k].to_numpy(float) for k in ("single", "rig"))
     r, agreement, n = correlation(one, several), bland_altman(one, several), len(pairs)
-    paper = next(iter(paper_cells("curves").get(_PAPER_ROW, {}).values()), "")
     values = {
-        "r": Cell(r.value, n=n, paper=paper),
+        "r": Cell(r.value, n=n, paper=paper_cells("index_agreement")[_ROW]["r"]),
         "r, low": Cell(r.low, n=n),
         "r, high": Cell(r.high, n=n),
         "bias": Cell(agreement.bias.value, n=n),
@@ -83,10 +81,7 @@ def index_agreement(pairs: pd.DataFrame) -> Table:
     return Table(
         "index_agreement",
         "Index of one camera against several, each with a norm of its own kind",
-        (_ROW,),
-        tuple(values),
         {(_ROW, column): cell for column, cell in values.items()},
-        paper_where("curves"),
         f"{n} visits of {persons} persons. Norms: {norms[0]} (one camera), {norms[1]} (several). Bias: one camera "
         "minus several; limits of agreement hold 95 % of the visits. r with its 95 % interval, which is too narrow "
         "where a person has several visits.",
