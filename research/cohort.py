@@ -131,7 +131,7 @@ SCORES = {
     "10MWT": Score("m/s", 1.0, 0.25, 0.01, 0, np.nan, 0.8, 0.25, False, 0.1, f"{MIC}Perera 2006"),
     "BBS": Score(
         "points", 44, 7, 1, 0, 56, 0.6, 0.2, True, np.nan, "Berg 1992",
-        "0 high fall risk; 21 medium fall risk; 41 low fall risk",
+        "0 high fall risk; 41 fall risk; 51 low fall risk",
     ),
 }  # fmt: skip
 #: Part of a score's own variance (what does not go with the index) that belongs to the person.

@@ -67,7 +67,8 @@ class ClinicalInstrument(dj.Lookup):
     ordinal               : bool               # ranks (Spearman) and no measure (Pearson)
     minimal_change=null   : float64            # in the unit (see instrument_unit): minimal important change, null where none is taken over
     minimal_change_source='' : varchar(255)    # who found it, in whom
-    instrument_classes='' : varchar(255)       # classes by lowest value, such as: 0 high risk; 21 medium risk; 41 low risk
+    instrument_classes='' : varchar(255)       # classes by lowest value, such as: 0 high risk; 41 at risk; 51 low risk
+    minimal_change_classes='' : varchar(255)   # minimal_change by lowest value before, such as: 0 3; 12 2; 15 1; empty: at all values
     """  # noqa: E501
     contents = INSTRUMENTS
 

@@ -72,6 +72,7 @@ class KinematicError(dj.Computed):
         joint_rms=null        : float64        # (deg) root of its mean square
         joint_correlation=null: float64        # (-1..1) null where one of the two does not move
         joint_within_90=null  : float64        # (0..1) share of frames inside the fit's 90 percent interval, or null
+        joint_normal_p=null   : float64        # (0..1) p of Shapiro-Wilk of the errors of the frames, or null
         """
 
     @property
@@ -127,6 +128,7 @@ JOINT_COLUMNS = {
     "rms_deg": "joint_rms",
     "correlation": "joint_correlation",
     "within_90": "joint_within_90",
+    "normal_p": "joint_normal_p",
 }
 
 

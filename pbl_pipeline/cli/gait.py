@@ -19,7 +19,7 @@ Example: pbl gait lab/walk1.c3d lab/walk2.c3d --out lab/metrics.json"""
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="metrics.json to write.")
 @click.option(
     "--index",
-    help="pbl-2025-three-angles (default of fits) or gillette-2008 (nine angles; default of C3D files).",
+    help="pbl-2025-three-angles (default of fits), paper-2025, or gillette-2008 (nine angles; default of C3D files).",
 )
 @click.option("--norm", help="Normative set of the index: a name, or a .json file (`pbl norm list`).")
 @click.option("--method", default="phase-transformer", show_default=True, help=METHOD_HELP)

@@ -22,10 +22,11 @@ from pbl_pipeline.visit import Visit
 
 from .c3d import check_frames, write_c3d
 from .columns import Table, dictionary, write_csv, write_parquet
+from .ground import on_floor
 from .keypoints_csv import write_keypoints_csv
 from .mot import write_mot
 from .osim import write_osim
-from .provenance import origin_of, summary
+from .provenance import one_line, origin_of, summary
 from .trc import write_trc
 from .trial import ExportTrial, wanted_markers, with_body_points
 from .visit_tables import session_tables
@@ -42,6 +43,8 @@ FORMATS: Mapping[str, str] = {
 }
 #: Formats that need events, cycles and measures.
 GAIT_FORMATS = frozenset({"c3d", "csv", "parquet"})
+#: Formats with heights, which count from the floor.
+_WITH_GROUND = frozenset({"trc", "mot", "osim", "c3d"})
 #: Formats whose readers take ASCII in names only, and not in every system's paths.
 _ASCII = ("trc", "mot", "osim", "c3d")
 #: What OpenSim refuses in the name of a component.
@@ -119,14 +122,19 @@ def write_export(visit: Visit, formats: Sequence[str], out: Path, options: Expor
     if options.number_trials:
         trials = tuple(dataclasses.replace(t, name=f"trial_{i}") for i, t in enumerate(trials, 1))
     _check_visit(trials, visit.fit_checks, formats, options)
-    body, paths, about = load_body(), [], {}
+    body, paths, about, grounds = load_body(), [], {}, {}
     for trial in trials:
         origin = origin_of(trial, body)
         if bad := failed(visit.fit_checks):
             origin["failed_checks"] = ", ".join(bad)
         about[trial.name] = {**origin, **summary(trial)}
         folder = out / trial.name
-        for ending, write in _writers(trial, formats, origin, options).items():
+        standing, headers = trial, origin
+        if _WITH_GROUND & set(formats):
+            standing, ground = on_floor(trial)
+            headers = {**origin, "ground": one_line(ground)}
+            grounds[trial.name] = {"ground": ground}
+        for ending, write in _writers(standing, formats, headers, options).items():
             folder.mkdir(parents=True, exist_ok=True)
             paths.append(_written(folder / f"{trial.name}{ending}", write))
     out.mkdir(parents=True, exist_ok=True)
@@ -136,7 +144,7 @@ def write_export(visit: Visit, formats: Sequence[str], out: Path, options: Expor
         "exported": datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
         "formats": list(formats),
         "axes_and_units": "docs/export.md",
-        "trials": about,
+        "trials": {name: {**of_trial, **grounds.get(name, {})} for name, of_trial in about.items()},
         "files": sorted(p.relative_to(out).as_posix() for p in paths),
     }
     text = json.dumps(content, indent=2, allow_nan=False) + "\n"

@@ -14,7 +14,7 @@ from pbl_pipeline.methods import Method, Stage
 from pbl_pipeline.paramset import Paramset, later
 from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
 
-from ._condition import SELF_SELECTED
+from ._condition import ANY_PACE, SELF_SELECTED
 from ._profile import MovementProfile, movement_profile, variable_scores
 from .events import LEFT, RIGHT
 from .normative import (
@@ -78,6 +78,9 @@ Z90 = 1.6449
 MOST_LONGER = 2.0
 #: The paper's index, and the original one (Schwartz & Rozumalski 2008).
 GDI_MODEL, GILLETTE_MODEL = "pbl-2025-three-angles", "gillette-2008"
+#: The index of three angles by the paper's own recipe: the mean of the indices of all steps of a session, nothing taken
+#: back. Its components are those of norm and patients together in a set of `norm_from_cycles(pooled=...)`.
+PAPER_INDEX = "paper-2025"
 #: Angles that an index is made of.
 MODEL_ANGLES: dict[str, tuple[str, ...]] = {GDI_MODEL: THREE_ANGLES, GILLETTE_MODEL: NINE_ANGLES}
 #: Version 1 of the index of three angles had the norm `gillette-166-three-angles`; version 2 is the mean of the indices
@@ -93,7 +96,12 @@ GDI_METHODS.register(
     "pbl_pipeline.gait:score_gdi",
 )
 GDI_METHODS.register(GILLETTE_MODEL, 1, GdiParams(norm="gillette-166-nine-angles"), "pbl_pipeline.gait:score_gdi")
-_NAMES = {GDI_MODEL: "GDI of three angles", GILLETTE_MODEL: "GDI (Schwartz & Rozumalski 2008)"}
+GDI_METHODS.register(PAPER_INDEX, 1, GdiParams(average="cycles", pace=ANY_PACE))
+_NAMES = {
+    GDI_MODEL: "GDI of three angles",
+    PAPER_INDEX: "GDI of three angles, the paper's recipe",
+    GILLETTE_MODEL: "GDI (Schwartz & Rozumalski 2008)",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -434,7 +442,8 @@ def _checks(
 
 
 def _convention(angle_models: set[str], norm: NormativeSet) -> Check:
-    """Whether the angles of cycles and norm mean the same."""
+    """Whether the angles of cycles and norm mean the same. The default norm, which is mapped, passes: the description
+    of the index says so once."""
     advice = ""
     if len(angle_models) > 1:
         advice = "cycles of several ways of measuring are mixed: score those of the laboratory and of the video apart"
@@ -444,7 +453,7 @@ def _convention(angle_models: set[str], norm: NormativeSet) -> Check:
             f"({next(iter(angle_models))}): pelvis tilt and hip flexion differ by a constant. Compare sessions with "
             "each other, do not read a single value against 100, or take a norm of the same definition"
         )
-    elif norm.mapped_from:
+    elif norm.mapped_from and norm.name != DEFAULT_NORM:
         advice = (
             "the norm was measured with a laboratory's marker model and mapped to the fitted body's angles by a "
             "constant; what else differs (hip joint centres, age, a person's own pelvis) is in the index. Changes "

@@ -70,7 +70,8 @@ def norm_from_cycles(
         percent=at,
         source=source,
         licence=licence,
-        convention=f"{len(known)} gait cycles of {len(counts)} people, angles of {model}, degrees",
+        convention=f"{len(known)} gait cycles of {len(counts)} people, angles of {model}, degrees"
+        + (f"; components of these and {len(others)} cycles of patients" if others else ""),
         curves=_bands([c for c, _ in known], percent),
         variance=variance,
         n_components=n_components,

@@ -15,7 +15,7 @@ from pbl_pipeline.qc import EMPTY, OUTCOMES, PASS, WARN, Check, in_session, wors
 
 from ._condition import Condition
 from ._cycles import find_cycles
-from ._gdi import GDI_METHODS, GDI_MODEL, GILLETTE_MODEL, Gdi, GdiParams, norm_of, params_of, score_gdi
+from ._gdi import GDI_METHODS, GDI_MODEL, GILLETTE_MODEL, PAPER_INDEX, Gdi, GdiParams, norm_of, params_of, score_gdi
 from .cycle_measures import MEASURES, Spatiotemporal, far_leg_of, spatiotemporal
 from .events import METHODS, GaitEvents, detect_events
 from .laboratory import LabTrial
@@ -359,7 +359,8 @@ def _odd_lengths(cycles: Sequence[GaitCycle]) -> str:
 
 
 def _short(gdi: Gdi) -> str:
-    return {GDI_MODEL: "GDI of three angles", GILLETTE_MODEL: "GDI of nine angles"}.get(gdi.model, gdi.model)
+    short = {GDI_MODEL: "GDI of three angles", PAPER_INDEX: "GDI, paper's recipe", GILLETTE_MODEL: "GDI of nine angles"}
+    return short.get(gdi.model, gdi.model)
 
 
 def _cell(value: float | None, width: int = 9) -> str:

@@ -362,6 +362,11 @@ def _notes(visit: Visit, norm: NormativeSet | None) -> list[str]:
     )
     if norm is not None:
         notes.append(f"The index compares with the set {norm.name} (n = {norm.n}): {norm.convention}.")
+        if norm.mapped_from:
+            notes[-1] += (
+                " What a constant does not map (hip joint centres, age, a person's own pelvis) is in the index: "
+                "changes between visits hold better than a single value against 100."
+            )
     return notes
 
 

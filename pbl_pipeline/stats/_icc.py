@@ -18,6 +18,8 @@ ICC_KINDS = ("1,1", "2,1", "3,1", "1,k", "2,k", "3,k")
 ICC_INTERVALS = ("f", "generalized")
 #: Draws of the mean squares for "generalized": another seed changes its limits by some 0.003.
 _DRAWS = 50_000
+#: A variance below this part of the mean squares is zero.
+_ROUNDING = 1e-12
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,11 +106,18 @@ def icc(ratings: Any, kind: str, confidence: float = 0.95, interval: str = "f", 
         88:899-905; compared by Ionan et al. 2014, BMC Med Res Methodol 14:121). For kinds 2 with few raters whose means
         differ: there "f" holds the truth in as few as 80 % of studies (docs/statistics.md).
 
+    Returns
+    -------
+    Icc
+        With low <= value <= high <= 1. A value is negative where subjects differ less than error alone would make them;
+        `low` of a mean of k is -inf where the ratings put no lower bound on it.
+
     Raises
     ------
     PblError
         STATS_INPUT: unknown kind, another shape, infinite values, fewer than two subjects or raters, all ratings equal,
-        a subject or rater without any rating, no subject with two ratings.
+        a subject or rater without any rating, no subject with two ratings; no variance of which subjects could have a
+        share; for the mean of k ratings also means of the subjects that differ so little that it is not defined.
     """
     one_of(kind, ICC_KINDS, "kind")
     one_of(interval, ICC_INTERVALS, "interval")
@@ -118,13 +127,27 @@ def icc(ratings: Any, kind: str, confidence: float = 0.95, interval: str = "f", 
     ms = mean_squares(table, model)
     subjects = (ms.subjects - ms.error) / ms.k
     noise = ms.error + (ms.raters - ms.error) / ms.n
-    value = subjects / (subjects + noise) if subjects + noise > 0 else 0.0
+    total = subjects + noise
+    if total <= _ROUNDING * (ms.subjects + ms.raters + ms.error):
+        raise refuse(
+            "ratings without any variance between subjects",
+            "subjects that differ",
+            "check the column; another kind has a value where raters differ",
+        )
+    value = subjects / total
     tail = (1 - confidence) / 2
     low, high = _limits(ms, value, model, tail) if interval == "f" else _drawn_limits(ms, model, tail, seed)
+    # Limits of the F distribution exclude the value for a confidence below about 0.5, drawn ones where it is negative.
+    low, high = min(low, value), min(max(high, value), 1.0)
     if kind.endswith("k"):
-        # The reliability of a mean of k ratings from that of one (Spearman & Brown).
-        value, low, high = (ms.k * r / (1 + (ms.k - 1) * r) for r in (value, low, high))
+        value, low, high = (_of_mean(r, ms.k) for r in (value, low, high))
         noise /= ms.k
+        if not np.isfinite(value):
+            raise refuse(
+                "means of the subjects that differ less than the error of their ratings alone would make them",
+                "subjects that differ",
+                f"report kind {kind[0]},1: the reliability of a mean of k ratings is not defined here",
+            )
     return Icc(
         value=float(value),
         low=float(low),
@@ -138,6 +161,12 @@ def icc(ratings: Any, kind: str, confidence: float = 0.95, interval: str = "f", 
     )
 
 
+def _of_mean(r: float, k: float) -> float:
+    """Reliability of a mean of k ratings from that of one (Spearman & Brown); -inf where it has no lower bound."""
+    scale = 1 + (k - 1) * r
+    return k * r / scale if scale > _ROUNDING else -np.inf
+
+
 def _limits(ms: MeanSquares, value: float, model: int, tail: float) -> tuple[float, float]:
     """Limits of the reliability of one rating, from the F distribution."""
     if model == 2:
@@ -146,6 +175,8 @@ def _limits(ms: MeanSquares, value: float, model: int, tail: float) -> tuple[flo
         parts = np.array([weight_raters * ms.raters, weight_error * ms.error])
         spread = (parts**2 / (ms.df_raters, ms.df_error)).sum()
         df = parts.sum() ** 2 / spread if spread > 0 else ms.df_error
+        # A negative reliability weighs the raters negatively; of a sum of variances the degrees are never fewer.
+        df = max(df, min(ms.df_raters, ms.df_error))
         noise = ms.k * ms.raters + (ms.k * ms.n - ms.k - ms.n) * ms.error
         lower, upper = stats.f.isf(tail, ms.df_subjects, df), stats.f.isf(tail, df, ms.df_subjects)
         return (

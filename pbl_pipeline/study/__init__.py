@@ -3,7 +3,7 @@
 from .frame_columns import CURVE_PERCENT, CURVE_POINTS, FRAMES, KEYS, SIDES, Column
 from .study_folder import content_hash, data_dictionary, read_study, write_study
 from .subject_codes import deidentified
-from .types import FIRST_ROLES, StudyData, StudyDescription, classes_of
+from .types import FIRST_ROLES, StudyData, StudyDescription, classes_of, minimal_change_at
 
 __all__ = [
     "CURVE_PERCENT",
@@ -19,6 +19,7 @@ __all__ = [
     "content_hash",
     "data_dictionary",
     "deidentified",
+    "minimal_change_at",
     "read_study",
     "write_study",
 ]

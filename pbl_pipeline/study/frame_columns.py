@@ -14,12 +14,14 @@ CURVE_POINTS = tuple(f"p{i}" for i in range(101))
 
 @dataclasses.dataclass(frozen=True)
 class Column:
-    """A column. `kind`: "label" (text, never empty), "text", "number" (empty: unknown), "flag" (true or false)."""
+    """A column. `kind`: "label" (text, never empty), "text", "number" (empty: unknown), "flag" (true or false).
+    `optional`: a study that lacks it has empty texts there."""
 
     name: str
     kind: str
     unit: str
     meaning: str
+    optional: bool = False
 
 
 _VISIT = (
@@ -63,7 +65,8 @@ FRAMES: dict[str, tuple[Column, ...]] = {
         Column("ordinal", "flag", "", "whether its steps are ranks (Spearman) or a continuous measure (Pearson)"),
         Column("mic", "number", "unit", "minimal important change, positive; empty: none published"),
         Column("source", "text", "", "of range and minimal important change"),
-        Column("classes", "text", "", "classes by lowest value, such as: 0 high risk; 21 medium risk; 41 low risk"),
+        Column("classes", "text", "", "classes by lowest value, such as: 0 high risk; 41 at risk; 51 low risk"),
+        Column("mic_classes", "text", "", "mic by lowest value before, such as: 0 3; 12 2; 15 1; empty: mic", True),
     ),
     "cycles": (
         *_VISIT,

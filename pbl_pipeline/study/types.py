@@ -128,6 +128,7 @@ def typed(name: str, frame: pd.DataFrame) -> pd.DataFrame:
     columns, frame = FRAMES[name], frame.reset_index(drop=True)
     if not len(frame) and not len(frame.columns):
         frame = pd.DataFrame({c.name: [] for c in columns})
+    frame = frame.assign(**{c.name: "" for c in columns if c.optional and c.name not in frame})
     if absent := [c.name for c in columns if c.name not in frame]:
         raise invalid(name, f"no column {', '.join(absent[:5])}", "the columns of docs/study.md", "add them")
     more = [c for c in frame.columns if c not in {k.name for k in columns}]
@@ -223,6 +224,8 @@ def _check_scores(scores: Any, instruments: Any) -> None:
         )
     for text in table["classes"]:
         classes_of(text)
+    for text in table["mic_classes"]:
+        minimal_change_at(0.0, None, text)
     low, high = (scores["instrument"].map(table[c]).astype(float) for c in ("low", "high"))
     if (outside := (scores["value"] < low) | (scores["value"] > high)).any():
         row = scores[outside].iloc[0]
@@ -248,6 +251,33 @@ def classes_of(text: str) -> list[tuple[float, str]]:
     if [v for v, _ in found] != sorted({v for v, _ in found}):
         raise invalid("instruments", f"classes {text!r}", "lowest values that increase", "put them in order")
     return found
+
+
+def minimal_change_at(before: float, change: float | None, classes: str) -> float | None:
+    """Minimal important change of a score that was `before`, in its unit; None where none is taken over.
+
+    Parameters
+    ----------
+    change
+        The one of all values, where there is one.
+    classes
+        Changes by the lowest value before, such as "0 3; 12 2; 15 1", which then hold instead of `change`; or "".
+
+    Raises
+    ------
+    PblError
+        STUDY_INVALID: `classes` that are not positive numbers by values in order.
+    """
+    for lowest, text in classes_of(classes):
+        try:
+            least = float(text)
+        except ValueError:
+            least = np.nan
+        if not least > 0:
+            raise invalid("instruments", f"minimal change {text!r}", "such as: 0 3; 12 2; 15 1", "correct it")
+        if before >= lowest:
+            change = least
+    return change
 
 
 def _row(frame: Any, where: Any, key: tuple[str, ...]) -> str:

@@ -4,6 +4,7 @@ from .align import align_path, best_lag
 from .compare import JointError, KinematicErrors, compare, compare_angles
 from .curves import CURVE_COLUMNS, cycle_curves, save_curves
 from .frame import COLUMNS, TrialErrors, error_frame
+from .index import INDEX_COLUMNS, index_agreement, index_pairs
 from .joints import JOINTS_CLIP, JOINTS_OPENCAP, JOINTS_PAPER
 from .paper import paper_figures
 from .paper_tables import paper_tables
@@ -27,6 +28,7 @@ __all__ = [
     "COLUMNS",
     "CONVENTIONS",
     "CURVE_COLUMNS",
+    "INDEX_COLUMNS",
     "JOINTS_CLIP",
     "JOINTS_OPENCAP",
     "JOINTS_PAPER",
@@ -47,6 +49,8 @@ __all__ = [
     "fit_angles",
     "fit_angles_sd",
     "html",
+    "index_agreement",
+    "index_pairs",
     "latex",
     "median_niqr",
     "niqr",

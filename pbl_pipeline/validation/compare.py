@@ -17,6 +17,7 @@ from .joints import JOINTS_OPENCAP, JOINTS_PAPER
 from .reference import Reference
 from .rotations import pelvis_angles_deg, pelvis_rotations
 from .sources import fit_angles, fit_angles_sd
+from .statistics import normality_p
 from .view import MIXED, view_of_fit
 
 
@@ -27,6 +28,7 @@ class JointError:
     n: frames with both values. median_abs_deg, mean_abs_deg: of |error|. bias_deg: mean error. sd_deg: sd of the error
     (ddof 0), which is its rms without the constant part. rms_deg: bias and sd together. correlation: Pearson's, NaN
     where one of the two does not move. within_90: fraction of the frames inside 1.645 sd of the fit, NaN without sd.
+    normal_p: p of the Shapiro-Wilk test of the errors of the frames, NaN for fewer than three or errors all the same.
     """
 
     joint: str
@@ -38,6 +40,7 @@ class JointError:
     rms_deg: float
     correlation: float
     within_90: float
+    normal_p: float = float("nan")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -213,6 +216,7 @@ def _joint_error(
         rms_deg=float(np.sqrt(np.mean(error**2))),
         correlation=_correlation(theirs[known] + error, theirs[known]),
         within_90=inside,
+        normal_p=normality_p(error),
     )
 
 

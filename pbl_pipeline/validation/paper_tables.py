@@ -16,10 +16,12 @@ from pbl_pipeline.errors import PblError
 from .frame import COLUMNS, KEY
 from .joints import JOINTS_OPENCAP, JOINTS_PAPER, ROWS_PAPER, split_side
 from .paper import paper_cells
-from .statistics import median_niqr, niqr
+from .statistics import median_niqr, niqr, normality_p
 from .table import Cell, Table
 from .view import BACK, CONTRALATERAL, FRONT, IPSILATERAL, LATERAL, MIXED
 
+#: Level of significance (the paper, Statistics).
+ALPHA = 0.05
 MEDIAN, MEAN, RTE = "Median Absolute Error (deg)", "Mean Absolute Error (deg)", "RTE (cm)"
 KNOWN, TRIALS = "Joints compared", "All"
 _POPULATIONS = ("control", "neurological", "LLPU", "pediatric")
@@ -50,8 +52,9 @@ def paper_tables(frame: pd.DataFrame) -> dict[str, Table]:
     """Return the tables of the paper's results on accuracy, filled from the rows of `error_frame`.
 
     Name -> table: `summary`, `joints_by_dataset`, `joints_by_population`, `by_population`, `by_activity`, `by_view`,
-    `view_tests`, `residuals`, and of our own `joint_measures` and `by_method`. Values are medians over trials (nIQR)
-    unless the title says otherwise; n is the number of trials. An empty frame gives tables of empty cells.
+    `view_tests`, `residuals`, `normality`, and of our own `joint_measures` and `by_method`. Values are medians over
+    trials (nIQR) unless the title says otherwise; n is the number of trials. An empty frame gives tables of empty
+    cells.
 
     Raises `PblError` REFERENCE_INPUT where the frame lacks columns.
     """
@@ -74,6 +77,7 @@ def paper_tables(frame: pd.DataFrame) -> dict[str, Table]:
         _by_view(rows),
         _view_tests(rows[rows["n"] > 0]),
         _residuals(trials),
+        _normality(rows[rows["n"] > 0], trials),
         _measures(rows),
         _by_method(trials),
     ]
@@ -202,6 +206,28 @@ def _residuals(trials: Any) -> Table:
         cells,
         "Two continuous variables: Pearson. n: trials; fewer than three give no correlation.",
         {"p": 4},
+    )
+
+
+def _normality(measured: Any, trials: Any) -> Table:
+    cells = {}
+    within, across = "trials rejected (share)", "between trials, p"
+    for label, joint in ROWS_PAPER.items():
+        part = measured[measured["joint"] == joint]
+        tested = part.dropna(subset=["normal_p"])
+        rejected = float((tested["normal_p"] < ALPHA).mean()) if len(tested) else math.nan
+        cells[label, within] = Cell(rejected, n=tested["comparison"].nunique())
+        cells[label, across] = Cell(normality_p(part["median_abs_deg"]), n=part["comparison"].nunique())
+    medians = trials["median_deg"].dropna()
+    cells[TRIALS, within], cells[TRIALS, across] = Cell(), Cell(normality_p(medians), n=len(medians))
+    return _table(
+        "normality",
+        "Are the errors normally distributed? Shapiro-Wilk within trials and between trials",
+        cells,
+        "Within: of the errors of the frames of a trial, the share of the trials (and sides) in which p is below 0.05. "
+        "Between: of the median absolute errors of the trials (and sides). The paper finds neither normal (Accuracy "
+        "Evaluation), hence medians. Neighbouring frames are alike, so p within a trial is too small.",
+        {across: 4},
     )
 
 

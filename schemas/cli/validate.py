@@ -136,6 +136,38 @@ def _show(frame: pd.DataFrame, where: Sequence[str], out: Path | None, in_databa
         click.echo(f"{n} gait cycles of fit and reference in pairs" + (f": {out / 'curves.npz'}" if n else ""))
 
 
+@validate.command(epilog="Example: pbl validate index --where method=paper-2025-v1 --out agreement")
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write CSV, LaTeX and HTML there.")
+@click.option(
+    "--where", multiple=True, metavar="COLUMN=VALUE", help="Only these rows, such as method=paper-2025-v1; repeatable."
+)
+def index(out: Path | None, where: tuple[str, ...]) -> None:
+    """Compare the index of one camera with that of several cameras, of visits that have both.
+
+    Each is taken against a norm of the same kind: `pbl norm build NAME --kind single` and `--kind rig`, and both norms
+    named when the visits are ingested. The paper's figure stands beside.
+    """
+    import schemas
+    from pbl_pipeline.files import check_out_folder
+    from pbl_pipeline.validation import index_agreement, index_pairs, print_tables, write_tables
+    from schemas.reading.frames import index_frame
+
+    if out is not None:
+        check_out_folder(out)
+    schemas.activate(methods=False)
+    pairs = index_pairs(select(index_frame(), where))
+    if pairs.empty:
+        click.echo("No visit has an index of one camera and one of several, each against a norm of the same kind.")
+        click.echo("next: pbl norm build NAME --kind single, pbl norm build NAME --kind rig, then ingest with --norm")
+        return
+    made = {"index_agreement": index_agreement(pairs)}
+    print_tables(made)
+    if out is not None:
+        write_tables(made, out)
+        pairs.to_csv(out / "pairs.csv", index=False)
+        click.echo(f"table, and the pairs that it is made from (pairs.csv): {out}")
+
+
 @validate.command()
 @click.argument("video")
 @click.option(

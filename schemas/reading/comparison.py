@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.study import minimal_change_at
 
 from .. import fit, gait, study, video
 from . import frames
@@ -35,7 +36,7 @@ class Cycle:
 @dataclasses.dataclass(frozen=True)
 class Score:
     """A clinical score. change: against the reference; important: whether that is at least the minimal important change
-    of the instrument, None where none is taken over."""
+    of the instrument for a score like that of the reference, None where none is taken over."""
 
     value: float
     change: float | None
@@ -149,7 +150,7 @@ def _scores(ids: set[int]) -> dict[int, dict[str, float]]:
 def _score(value: float, before: float | None, instrument: dict[str, Any]) -> Score:
     if before is None:
         return Score(value, None, None)
-    least = instrument["minimal_change"]
+    least = minimal_change_at(before, instrument["minimal_change"], instrument["minimal_change_classes"])
     return Score(value, value - before, None if least is None else abs(value - before) >= least)
 
 

@@ -122,6 +122,28 @@ def frame_of(query: Any) -> Any:
     return pd.DataFrame(list(query.cursor().fetchall()), columns=list(query.heading.names))
 
 
+def index_frame() -> pd.DataFrame:
+    """One row per visit, kind of recordings, method and norm of the index, with the columns of
+    `pbl_pipeline.validation.INDEX_COLUMNS`: `norm_kind` is the kind whose cycles the norm was built from."""
+    import pandas as pd
+
+    from pbl_pipeline.validation import INDEX_COLUMNS
+
+    found = current_sets() * gdi.SessionGdi.proj("session_gdi") * gdi.NormativeSet.proj("norm_query")
+    rows = found.to_dicts(order_by="session_id")
+    renamed = [
+        {
+            **row,
+            "kind": row["fit_set_kind"],
+            "method": row["gdi_method"],
+            "norm_kind": ((row["norm_query"] or {}).get("methods") or {}).get("fit_set_kind", ""),
+            "index": row["session_gdi"],
+        }
+        for row in rows
+    ]
+    return pd.DataFrame(renamed, columns=list(INDEX_COLUMNS))
+
+
 def cycle_frame(restriction: Any = True, chain: Any = True) -> pd.DataFrame:
     """One row per gait cycle that is used, with its index: of the current fits of the visits of `restriction`, as for
     `visit_frame`. Times in s, lengths in m; `activity` and `pace` say what is done in its video ("unknown" where it is

@@ -315,13 +315,14 @@ def _frames(rows: Any, about: Mapping[str, Any]) -> dict[str, Any]:
             "instrument_high": "high",
             "minimal_change": "mic",
             "instrument_classes": "classes",
+            "minimal_change_classes": "mic_classes",
         }
     )
     sources = [
         "; ".join(filter(None, (a, f"minimal important change: {b}" if b else "")))[:200]
         for a, b in zip(instruments["instrument_source"], instruments["minimal_change_source"], strict=True)
     ]
-    wanted = ["instrument", "unit", "low", "high", "higher_is_better", "ordinal", "mic", "classes"]
+    wanted = ["instrument", "unit", "low", "high", "higher_is_better", "ordinal", "mic", "classes", "mic_classes"]
     cycles = cycle_rows(fit.FitSelection.proj() * fit.FitSet.proj("session_id") & of_sets, chain)
     return {
         "visits": visits,

@@ -18,7 +18,7 @@ import pytest
 import schemas
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
-from schemas import connection, gait, gdi, jobs, lab, migrations, session, stages, video
+from schemas import connection, gait, gdi, jobs, lab, migrations, session, stages, validation, video
 from schemas.chain import ON_REQUEST
 from schemas.decisions import event_corrections
 from schemas.intake import VisitRecord, ingest
@@ -188,6 +188,19 @@ def test_an_older_database_keeps_its_rows_and_works(
     assert set(video.Video.to_arrays("video_size")) > {7}
 
 
+#: What shipped of instruments before migration 0006.
+SHIPPED_BEFORE = {
+    "mJOA": {
+        "minimal_change_source": "ROC analysis, degenerative cervical myelopathy 12 months after surgery, depends on "
+        "severity: Tetreault et al. 2015, Spine 40:1653-1659"
+    },
+    "BBS": {
+        "instrument_source": "the scale: Berg et al. 1992, Can J Public Health 83 Suppl 2:S7-11",
+        "instrument_classes": "0 high risk; 21 medium risk; 41 low risk",
+    },
+    "mRS": {"instrument_source": "the scale: van Swieten et al. 1988, Stroke 19:604-607", "instrument_high": 6},
+}
+
 #: The tables of results as they were before migration 0001.
 WITHOUT_SESSION = [
     *(f"pbl_{t}" for t in ("fit.__session_fit", "gait.__gait_events", "gait.__gait_cycle", "gait.__spatiotemporal")),
@@ -225,6 +238,24 @@ def test_results_from_before_they_had_their_session_get_it(
     assert changed == set()
     assert len(gdi.SessionGdi * session.Session) == len(session.Session()) == 2
     assert len(gait.Spatiotemporal * session.Session * video.Video) == 2
+    assert migrations.migrate().steps == []
+
+
+def test_instruments_and_errors_of_before_get_their_columns(empty: Callable[[], None]):
+    schemas.activate()
+    new = everything()["pbl_study.#clinical_instrument"]
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        table = "pbl_study.`#clinical_instrument`"
+        cursor.execute(f"ALTER TABLE {table} DROP COLUMN minimal_change_classes")
+        cursor.execute("ALTER TABLE pbl_validation.__kinematic_error__joint DROP COLUMN joint_normal_p")
+        for name, columns in SHIPPED_BEFORE.items():
+            for column, value in columns.items():
+                cursor.execute(f"UPDATE {table} SET {column} = %s WHERE instrument = %s", (value, name))
+        cursor.execute(NOT_RECORDED)
+    empty()
+    migrations.migrate()
+    assert everything()["pbl_study.#clinical_instrument"] == new
+    assert "joint_normal_p" in validation.KinematicError.Joint.heading.names
     assert migrations.migrate().steps == []
 
 

@@ -19,6 +19,7 @@ from schemas import fit, gait, gdi, lab, load_visit, norms, session
 from schemas.cli.norm import norm as command
 from schemas.intake import Methods, VisitRecord, ingest
 from schemas.reading import frames
+from tests.command import pbl
 from tests.rows import remove_all
 from workers.populate import populate
 
@@ -92,6 +93,12 @@ def _used_by_a_session(walkers: Path, expected) -> None:
     assert rows["our-lab-v1"]["session_gdi"] == pytest.approx(scored.mean, abs=1e-3)
     checks = gdi.SessionGdi.Check & _sets("P01") & {"norm": "our-lab-v1", "gdi_check": "norm_convention"}
     assert checks.fetch1("gdi_check_outcome") == "PASS"
+    indices = frames.index_frame()
+    kinds = dict(zip(indices["norm"], indices["norm_kind"], strict=True))
+    assert (kinds["our-lab-v1"], kinds[old[1]]) == ("single", "")
+    of_visit = indices[(indices["norm"] == "our-lab-v1") & (indices["subject"] == "P01")]
+    assert of_visit["index"].tolist() == [pytest.approx(scored.mean, abs=1e-3)]
+    assert "No visit has an index of one camera and one of several" in pbl("validate", "index").out
 
 
 def metrics_of(restriction: dict[str, str]) -> GaitMetrics:

@@ -13,6 +13,7 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.study import classes_of, minimal_change_at
 from schemas import lab, session, study
 from schemas.operations import forget
 from schemas.rows import utc_now
@@ -96,6 +97,22 @@ def test_the_instruments_that_ship():
         assert row["instrument_low"] < row["instrument_high"]
         assert bool(row["minimal_change"]) == bool(row["minimal_change_source"]), row["instrument"]
         assert all(len(row[k]) <= 255 for k in ("instrument_source", "minimal_change_source", "instrument_classes"))
+
+
+def test_instruments_are_those_of_the_paper_and_of_their_sources():
+    """The paper (Datasets): a BBS of 50 and below is a fall risk, of 40 and below a high one."""
+    shipped = {row["instrument"]: row for row in study.ClinicalInstrument.contents}
+    classes = classes_of(shipped["BBS"]["instrument_classes"])
+    risk = {value: [word for lowest, word in classes if value >= lowest][-1] for value in (40, 41, 45, 50, 51, 56)}
+    assert (risk[40], risk[41], risk[45], risk[50]) == ("high fall risk", *["fall risk"] * 3)
+    assert risk[51] == risk[56] == "low fall risk"
+    assert shipped["mRS"]["instrument_high"] == 5  # 6 is dead
+    mjoa = shipped["mJOA"]
+    least = [
+        minimal_change_at(v, mjoa["minimal_change"], mjoa["minimal_change_classes"]) for v in (0, 11, 12, 14, 15, 17)
+    ]
+    assert least == [3, 3, 2, 2, 1, 1]  # severe, moderate, mild (Tetreault et al. 2015)
+    assert minimal_change_at(44, shipped["BBS"]["minimal_change"], "") is None
 
 
 def test_a_forgotten_person_leaves_her_cohort_to_the_others(two_people: None):

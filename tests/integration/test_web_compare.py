@@ -87,6 +87,12 @@ def test_changes_against_the_reference(visits: None):
     gdi.SessionGdi.update1({k: first.about.key[k] for k in gdi.SessionGdi.primary_key} | {"session_gdi": 80.0})
 
 
+@pytest.mark.parametrize(("before", "after", "important"), [(10, 12, False), (12, 14, True), (15, 16, True)])
+def test_the_important_change_of_mjoa_depends_on_the_score_before(visits: None, before, after, important):
+    (instrument,) = (study.ClinicalInstrument & {"instrument": "mJOA"}).to_dicts()
+    assert comparison._score(after, before, instrument) == comparison.Score(after, after - before, important)
+
+
 def test_results_by_other_methods_are_not_judged(visits: None, monkeypatch: pytest.MonkeyPatch):
     one, other = comparison.shown_visit(1).results[0], comparison.shown_visit(2).results[0]
     assert comparison.change_since(other, one) == comparison.Change(6.0, False)

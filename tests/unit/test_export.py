@@ -31,7 +31,7 @@ from pbl_pipeline.visit import Held, Recording, Visit, save_visit, visit_of_fits
 from tests.command import pbl
 from tests.exported import marked_fit, with_markers
 from tests.unit.visits import solution_of
-from tests.walking_fit import foot_events
+from tests.walking_fit import foot_events, walking_fit
 
 SCALAR = ("scope", "trial", "measure", "statistic")
 
@@ -238,6 +238,71 @@ def test_every_joint_is_one_with_opensims_name_and_the_mjcfs_limits(out):
     for joint in joints.values():  # no two axes in line, else OpenSim refuses the joint
         axes = [np.array(str(a.findtext("axis")).split(), float) for a in joint.iter("TransformAxis")][:3]
         assert abs(np.linalg.det(axes)) > 0.5
+
+
+# --------------------------------------------------------------------------------------------------------------- floor
+@pytest.fixture(scope="module")
+def walk() -> TrialFit:
+    """A walk on a level floor that a camera 1.15 m above it films: heights of the fit count from the camera."""
+    body = load_body()
+    names = pbl_pipeline.body.marker_set("blazepose_33").names
+    return with_markers(walking_fit(body.joint_names, body.sha256, marker_names=names, n_frames=120))
+
+
+def _heights(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Height (m) of the pelvis in the MOT, and of the lowest of the calcanei and the toes' joints in the TRC."""
+    pelvis = reference_of_mot(folder / "walk.mot").pelvis_m
+    assert pelvis is not None
+    seen = WorldMarkers.from_trc(folder / "walk.trc", "blazepose_33")
+    feet = [seen.names.index(f"{b}_{s}_o") for b in ("calcn", "toes") for s in "lr"]
+    return pelvis[:, 2], seen.xyz_world_m[:, feet, 2].min(axis=1)
+
+
+def test_the_floor_is_at_0_where_it_was_found(walk, tmp_path):
+    qpos = walk.qpos.copy()
+    # A vertical that is off: the floor seems to rise by 8 cm over 4.8 m.
+    qpos[:, walk.joint_names.index("pelvis_ty")] += 0.02 * walk.time_s
+    fit = with_markers(dataclasses.replace(walk, qpos=qpos))
+    folder = written(Recording.of("walk", fit), tmp_path / "a", "trc", "mot", "osim")
+    pelvis, lowest = _heights(folder)
+    assert pelvis.mean() == pytest.approx(0.95, abs=0.03)
+    assert np.quantile(np.abs(lowest), 0.95) < 0.03
+    knee = walk.qpos[:, walk.joint_names.index("knee_angle_r")]
+    found = np.abs(reference_of_mot(folder / "walk.mot").angles_deg["knee_flexion_r"])
+    np.testing.assert_allclose(found, np.degrees(np.abs(knee)), atol=1e-4)
+    names, xyz = opensim_kinematics(folder / "walk.osim", folder / "walk.mot")
+    seen = WorldMarkers.from_trc(folder / "walk.trc", "blazepose_33")
+    own = [names.index(n) for n in seen.names]
+    np.testing.assert_allclose(xyz[:, own] @ Y_UP_TO_Z_UP.T, seen.xyz_world_m, atol=1e-5)
+    ground = "height 0 is the floor under the person, from the lowest sole"
+    assert f"ground={ground}" in (folder / "walk.mot").read_text()
+    assert f"ground: {ground}" in (folder / "walk.osim").read_text()
+    assert json.loads((tmp_path / "a" / "export.json").read_text())["trials"]["walk"]["ground"] == ground
+
+
+def test_the_floor_of_a_c3d_is_at_0(walk, tmp_path):
+    ezc3d = pytest.importorskip("ezc3d")
+    file = ezc3d.c3d(str(written(Recording.of("walk", walk), tmp_path / "a", "c3d") / "walk.c3d"))
+    heels = [walk.marker_names.index(f"{s}_heel") for s in ("left", "right")]
+    assert np.abs(file["data"]["points"][2, heels].min(axis=0)).mean() < 60  # mm: the marker is above the sole
+    assert file["parameters"]["PBL"]["GROUND"]["value"][0].startswith("height 0 is the floor")
+
+
+@pytest.mark.parametrize("what", ["stairs", "jumps", "laboratory"])
+def test_what_0_is_where_no_floor_was_found(walk, what, tmp_path):
+    qpos, up = walk.qpos.copy(), walk.joint_names.index("pelvis_ty")
+    if what == "stairs":
+        qpos[:, up] += 0.3 * walk.time_s
+    if what == "jumps":
+        qpos[:, up] += 0.2 * np.abs(np.sin(6 * walk.time_s))
+    source = "measured: calibration" if what == "laboratory" else walk.orientation_source
+    fit = with_markers(dataclasses.replace(walk, qpos=qpos, orientation_source=source))
+    folder = written(Recording.of("walk", fit), tmp_path / "a", "trc", "mot")
+    poses = trial_poses(fit)
+    pelvis, _ = _heights(folder)
+    np.testing.assert_allclose(pelvis, poses.position_m[:, poses.index("pelvis"), 2], atol=1e-5)
+    said = "laboratory's" if what == "laboratory" else "no floor was found"
+    assert said in next(line for line in (folder / "walk.mot").read_text().splitlines() if line.startswith("ground="))
 
 
 # ----------------------------------------------------------------------------------------------------------------- c3d

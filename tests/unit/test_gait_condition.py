@@ -69,7 +69,7 @@ def test_no_trial_of_that_pace_says_which_there_are(trials: list):
         assert "'self_selected' (there are: tug; walking, fast)" in reason
 
 
-@pytest.mark.parametrize("family", list(GDI_METHODS))
+@pytest.mark.parametrize("family", list(GDI_METHODS.families))
 def test_a_method_of_ones_own_at_another_pace(trials: list, family: str):
     """Its row is read back, scores with the angles of its family, and its hash is the row's."""
     params = {"family": family, **GDI_METHODS[family].paramset.params, "pace": "any"}

@@ -14,6 +14,7 @@ from pbl_pipeline.gait import (
     GDI_METHODS,
     GILLETTE_MODEL,
     NINE_ANGLES,
+    PAPER_INDEX,
     PLUG_IN_GAIT,
     THREE_ANGLES,
     GaitCycle,
@@ -27,7 +28,7 @@ from pbl_pipeline.gait import (
     variable_scores,
 )
 from research.norms import BUILDERS
-from tests.unit.test_gait_gdi import ABOUT, PERCENT, toy_vectors
+from tests.unit.test_gait_gdi import ABOUT, PERCENT, cycle, toy_vectors
 
 NINE = "gillette-166-nine-angles"
 
@@ -179,7 +180,7 @@ def test_index_and_norm_must_fit_together():
         ((PLUG_IN_GAIT, PLUG_IN_GAIT), NINE, "PASS"),
         ((BODY_ANGLES, BODY_ANGLES), NINE, "WARN"),
         ((BODY_ANGLES, BODY_ANGLES), "gillette-166-three-angles", "WARN"),
-        ((BODY_ANGLES, BODY_ANGLES), "gillette-166-body-angles", "WARN"),
+        ((BODY_ANGLES, BODY_ANGLES), "gillette-166-body-angles", "PASS"),  # the usual: described with the index
         ((PLUG_IN_GAIT, BODY_ANGLES), NINE, "WARN"),
     ],
 )
@@ -189,6 +190,14 @@ def test_mixed_conventions_warn(models, norm, outcome):
     check = next(c for c in score_gdi(cycles, norm).qc if c.check == "norm_convention")
     assert check.outcome == outcome
     assert bool(check.advice) == (outcome == "WARN")
+
+
+def test_another_norm_that_was_mapped_warns():
+    mapped = fit_norm(toy_vectors(), variables=THREE_ANGLES, percent=PERCENT, angle_model=BODY_ANGLES, **ABOUT)
+    mapped = dataclasses.replace(mapped, mapped_from=PLUG_IN_GAIT)
+    cycles = [nine_cycle(load_norm(NINE).mean_deg + 3, s, BODY_ANGLES) for s in ("left", "right")]
+    check = next(c for c in score_gdi(cycles, mapped).qc if c.check == "norm_convention")
+    assert (check.outcome, "mapped" in check.advice) == ("WARN", True)
 
 
 def test_a_norm_of_the_bodys_own_cycles_passes():
@@ -227,8 +236,36 @@ def test_pooled_components_come_from_patients_too():
     np.testing.assert_allclose(pooled.explained_variance, values[: len(pooled.components)])
 
 
+def test_the_papers_index_is_the_mean_over_all_steps_with_nothing_taken_back():
+    """The paper, Gait Deviation Index: components of norm and patients together, index of every step, their mean."""
+    g = np.random.default_rng(1)
+    norm_curves, patients = toy_vectors(), toy_vectors(60, seed=5) + 8.0
+    norm = make(norm_curves, pooled=patients)
+    walked = patients[:7] + g.normal(0, 2, (7, 150))
+    sd = {v: np.full(51, 5.0) for v in THREE_ANGLES}
+    cycles = [cycle(v, "right" if i < 5 else "left", number=i, curves_sd=sd) for i, v in enumerate(walked)]
+    found = score_gdi(cycles, norm, model=PAPER_INDEX)
+    both = np.vstack([norm_curves, patients])
+    values, vectors = np.linalg.eigh(np.cov(both.T))
+    k = 1 + int(np.searchsorted(np.cumsum(values[::-1]) / values.sum(), 0.95))
+    components = vectors[:, ::-1][:, :k].T
+    middle = norm_curves.mean(axis=0)
+    ln = [np.log(np.linalg.norm((x - middle) @ components.T, axis=1)) for x in (norm_curves, walked)]
+    expected = 100 - 10 * (ln[1] - ln[0].mean()) / ln[0].std(ddof=1)
+    assert found.mean == pytest.approx(expected.mean(), abs=1e-6)
+    assert found.right == pytest.approx(expected[:5].mean(), abs=1e-6)
+    assert found.model == PAPER_INDEX
+    assert GDI_METHODS[PAPER_INDEX].hash != found.params_hash  # the set's name is part of it
+    # The default corrects for the angles' errors and averages curves.
+    assert score_gdi(cycles, norm).mean != pytest.approx(found.mean, abs=0.5)
+
+
 def test_paramsets():
-    assert {name: p.version for name, p in GDI_METHODS.items()} == {"pbl-2025-three-angles": 5, GILLETTE_MODEL: 1}
+    assert {name: p.version for name, p in GDI_METHODS.items()} == {
+        "pbl-2025-three-angles": 5,
+        GILLETTE_MODEL: 1,
+        PAPER_INDEX: 1,
+    }
     # A row of version 1 is understood as it was.
     old = score_gdi([], "gillette-166-three-angles", GdiParams(), "pbl-2025-three-angles", 1)
     assert (

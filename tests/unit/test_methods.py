@@ -36,6 +36,7 @@ SHIPPED = {
     ("gait", "oconnor-2007", 2): "818ff933a9a6365a",
     ("gdi", "pbl-2025-three-angles", 5): "47eb3c8645e19a7f",
     ("gdi", "gillette-2008", 1): "a68829dd8731dde1",
+    ("gdi", "paper-2025", 1): "a51bf145c1179652",
 }
 EVERY = [m for name in methods.STAGES for m in of_stage(name).values()]
 

@@ -110,6 +110,57 @@ def test_perfect_agreement_and_none():
     assert icc(opposite, "1,1").value == pytest.approx(-1)
 
 
+def test_limits_enclose_the_value_of_any_table():
+    """Unreliable, small and tied tables: low <= value <= high <= 1 of every kind, or the coded error."""
+    g = np.random.default_rng(3)
+    n_values, codes = dict.fromkeys(ICC_KINDS, 0), set()
+    for i in range(200):
+        shape = g.integers(2, 8), g.integers(2, 5)
+        table = g.integers(0, 4, shape).astype(float) if i % 2 else g.normal(size=shape)
+        if i % 5 == 0:
+            table[g.uniform(size=shape) < 0.2] = np.nan
+        for kind in ICC_KINDS:
+            for confidence in (0.95, 0.3):
+                try:
+                    found = icc(table, kind, confidence)
+                except PblError as error:
+                    codes.add(error.code)
+                    continue
+                assert found.low <= found.value <= found.high <= 1, (kind, table)
+                n_values[kind] += 1
+    assert min(n_values.values()) > 300, n_values
+    assert codes == {"STATS_INPUT"}
+    drawn = icc(g.normal(size=(6, 3)), "2,1", interval="generalized")
+    assert drawn.low <= drawn.value <= drawn.high <= 1
+
+
+def test_limits_of_unreliable_tables_do_not_cross():
+    """Of 6 x 3 ratings without any reliability."""
+    g = np.random.default_rng(0)
+    n_values = 0
+    for _ in range(100):
+        try:
+            found = icc(g.normal(size=(6, 3)), "2,k")
+        except PblError:
+            continue
+        assert found.low < found.value < found.high <= 1
+        n_values += 1
+    assert n_values > 80
+
+
+@pytest.mark.parametrize("kind", ["1,k", "2,k", "3,k"])
+def test_a_mean_without_any_reliability_is_refused(kind):
+    with pytest.raises(PblError, match="STATS_INPUT"):
+        icc([[1, 2], [2, 1]], kind)
+
+
+def test_subjects_without_any_variance():
+    alike = [[1.0, 2.0], [1.0, 2.0], [1.0, 2.0]]
+    assert icc(alike, "2,1").value == pytest.approx(0)
+    with pytest.raises(PblError, match="STATS_INPUT"):
+        icc(alike, "3,1")
+
+
 def test_drawn_interval_is_near_that_of_f_for_the_published_table():
     for kind in ICC_KINDS:
         by_f, drawn = icc(TABLE, kind), icc(TABLE, kind, interval="generalized")

@@ -23,6 +23,7 @@ from pbl_pipeline.study import (
     content_hash,
     data_dictionary,
     deidentified,
+    minimal_change_at,
     read_study,
     write_study,
 )
@@ -205,6 +206,18 @@ def test_the_index_of_a_frame_does_not_matter():
     study = small_study()
     halves = pd.concat([study.scores.iloc[:3], study.scores.iloc[3:].reset_index(drop=True)])
     pd.testing.assert_frame_equal(dataclasses.replace(study, scores=halves).scores, study.scores)
+
+
+def test_minimal_changes_by_the_score_before():
+    study = small_study()
+    assert [minimal_change_at(v, 2.0, "0 3; 12 2; 15 1") for v in (0.0, 11.9, 12.0, 18.0)] == [3, 3, 2, 1]
+    assert minimal_change_at(-1.0, 2.0, "0 3") == 2  # below the first value
+    assert (minimal_change_at(5.0, 2.0, ""), minimal_change_at(5.0, None, "")) == (2, None)
+    table = study.instruments.drop(columns="mic_classes")
+    assert (dataclasses.replace(study, instruments=table).instruments["mic_classes"] == "").all()
+    for text in ("0 three", "0 -1", "12 2; 0 3"):
+        with pytest.raises(PblError, match="STUDY_INVALID"):
+            dataclasses.replace(study, instruments=table.assign(mic_classes=text))
 
 
 def test_classes():

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
@@ -106,6 +107,15 @@ def test_known_noise():
     assert error.bias_deg == pytest.approx(1 + noise.mean())
     assert error.within_90 == pytest.approx(np.mean(np.abs(noise + 1) <= 1.645 * 2))
     assert 0.7 < error.within_90 < 0.95
+
+
+def test_normality_of_the_errors_of_the_frames():
+    g = np.random.default_rng(2)
+    normal, skewed = g.normal(0, 2.0, TIME.size), g.exponential(2.0, TIME.size)
+    found = [_knee(WAVE + e, max_lag_s=0.0).normal_p for e in (normal, skewed)]
+    assert found == pytest.approx([stats.shapiro(e).pvalue for e in (normal, skewed)], rel=1e-6)
+    assert found[0] > 0.05 > found[1]
+    assert np.isnan(_knee(WAVE + 1.0).normal_p)  # a constant is no distribution
 
 
 def test_intervals_count_only_where_there_is_an_sd():

@@ -20,6 +20,7 @@ from pbl_pipeline.gait.events import GaitEvent
 from pbl_pipeline.validation import (
     COLUMNS,
     CURVE_COLUMNS,
+    INDEX_COLUMNS,
     JointError,
     KinematicErrors,
     Table,
@@ -27,6 +28,8 @@ from pbl_pipeline.validation import (
     cycle_curves,
     error_frame,
     html,
+    index_agreement,
+    index_pairs,
     latex,
     median_niqr,
     paper_figures,
@@ -204,6 +207,58 @@ def test_views_and_their_test():
     assert test.cell(knee, "p").value == pytest.approx(1 / 924)  # all of 6 below all of 6: 1 of 12 over 6 orders
     assert (test.cell(knee, "p").n, test.cell(knee, "p").paper) == (12, "<0.005")
     assert test.cell(test.rows[0], "p").n == 0
+
+
+def test_normality_of_both_levels():
+    """Within: a share of trials; between: scipy's p of the trials' medians."""
+    g = np.random.default_rng(0)
+    medians = g.lognormal(1, 1, 30)
+    rows = [_trial(f"t{i}", {"knee_flexion_r": m}, median=m) for i, m in enumerate(medians)]
+    p = [0.001] * 12 + [0.5] * 15 + [float("nan")] * 3
+    rows = [
+        replace(r, errors=replace(r.errors, joints=tuple(replace(j, normal_p=v) for j in r.errors.joints)))
+        for r, v in zip(rows, p, strict=True)
+    ]
+    table = paper_tables(error_frame(rows))["normality"]
+    within, between = table.columns
+    assert table.cell("Knee Flexion", within).value == pytest.approx(12 / 27)
+    assert table.cell("Knee Flexion", within).n == 27
+    for row in ("Knee Flexion", "All"):
+        assert table.cell(row, between).value == pytest.approx(stats.shapiro(medians).pvalue)
+        assert table.cell(row, between).value < 0.05
+    assert table.cell("Hip Flexion", between).n == 0
+
+
+def _indices(n: int, seed: int = 0) -> pd.DataFrame:
+    g = np.random.default_rng(seed)
+    true = g.normal(85, 10, n)
+    rows = []
+    for i, value in enumerate(true):
+        about = {"subject": f"P{i // 2:02}", "session_label": f"visit {i}", "session_id": i, "method": "paper-2025-v1"}
+        for kind, sd in (("single", 5.0), ("rig", 1.0)):
+            rows.append(
+                {**about, "kind": kind, "norm": f"our-{kind}-v1", "norm_kind": kind, "index": g.normal(value, sd)}
+            )
+            rows.append({**about, "kind": kind, "norm": "gillette-166-body-angles-v1", "norm_kind": "", "index": 0.0})
+    return pd.DataFrame(rows, columns=list(INDEX_COLUMNS))
+
+
+def test_the_index_of_one_camera_against_several():
+    frame = _indices(40)
+    frame = frame[~((frame["session_id"] == 3) & (frame["kind"] == "rig"))]  # a visit with one kind alone
+    pairs = index_pairs(frame)
+    assert len(pairs) == 39
+    assert set(pairs["single_norm"]) == {"our-single-v1"}
+    table = index_agreement(pairs)
+    (row,) = table.rows
+    assert table.cell(row, "r").value == pytest.approx(np.corrcoef(pairs["single"], pairs["rig"])[0, 1])
+    assert table.cell(row, "r").paper == "0.85"
+    assert table.cell(row, "bias").value == pytest.approx((pairs["single"] - pairs["rig"]).mean())
+    assert "39 visits of 20 persons" in table.note
+    twice = pd.concat([frame, frame.assign(method="pbl-2025-three-angles-v5")])
+    with pytest.raises(PblError, match="several indices"):
+        index_pairs(twice)
+    assert index_pairs(frame.assign(norm_kind="")).empty
 
 
 def test_a_joint_never_compared_is_no_value():
