@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
+from pbl_pipeline.temporary import new_folder
 
 from . import fit, gait, gdi, lab, session, video
 from .method_names import with_keys
 from .rows import plain
-from .stored_files import new_folder
 from .views import newest_sets
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import click
 
-from pbl_pipeline import __version__, progress
+from pbl_pipeline import __version__, progress, temporary
 from pbl_pipeline.errors import PblError
 
 #: Exit codes: 0 done, 1 a coded error, 2 wrong usage (click's own), 130 interrupted.
@@ -73,6 +73,7 @@ def cli(quiet: bool, debug: bool) -> None:
     Example: pbl run walk.mp4 --out results
     """
     progress.enable(not quiet)
+    temporary.sweep()
 
 
 def main() -> None:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
-
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.temporary import new_folder
 from schemas import choose, decide, video
 
 from ..refresh import queue_visit_of
@@ -66,8 +64,8 @@ def routes(pages: Pages, tables: Tables) -> list[Route]:
             found = choose.candidates(number)
             if which >= len(found):
                 raise video.unknown_video(number)
-            with tempfile.TemporaryDirectory() as folder:
-                return choose.write_sheet(found[which], Path(folder) / "people.jpg").read_bytes()
+            with new_folder() as folder:
+                return choose.write_sheet(found[which], folder / "people.jpg").read_bytes()
 
         return Response(await tables.ask(picture), media_type="image/jpeg")
 
