@@ -34,6 +34,8 @@ MIB = 1 << 20
 MAX_TEXT = 32 * MIB
 #: Rows of a table: 83 minutes at 100 Hz. A row of one letter takes a hundred times its bytes.
 MAX_ROWS = 500_000
+#: Columns of a table, as many as a sheet of a workbook can have; and its cells, empty ones included.
+MAX_COLUMNS, MAX_CELLS = 16_384, 2_000_000
 #: From the first to the last time stamp of a recording (s): what lies between them is put on even grids.
 MAX_SECONDS = 3600.0
 #: Bytes of a TOML file: its reader takes the square of a name's length.
@@ -137,6 +139,14 @@ def count_rows(n: int) -> None:
     """Refuse a table of more than `MAX_ROWS` rows."""
     if n > MAX_ROWS:
         raise ValueError(f"more than {MAX_ROWS:,} rows")
+
+
+def count_cells(n: int, columns: int = 0) -> None:
+    """Refuse a table of more than `MAX_CELLS` cells or `MAX_COLUMNS` columns."""
+    if columns > MAX_COLUMNS:
+        raise ValueError(f"more than {MAX_COLUMNS:,} columns")
+    if n > MAX_CELLS:
+        raise ValueError(f"more than {MAX_CELLS:,} cells")
 
 
 @contextlib.contextmanager

@@ -24,6 +24,7 @@ from pathlib import Path, PurePosixPath
 import pymysql
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.limited import LimitExceeded, limited
 from pbl_pipeline.video import read_phone_log, sha256_of
 from schemas import video, worker
 from schemas.archive import (
@@ -42,8 +43,6 @@ from schemas.connection import dj
 from schemas.folders import private_folder, remove_empty, sync_folders
 from schemas.intake import OneCamera, Sensors, Visit, register
 from schemas.intake.uploads import LOG_ENDINGS, Bucket, Folder, StillChanging, Upload, drop_folder, incoming_url
-
-from .limited import LimitExceeded, limited
 
 #: Seconds in which a file must not have changed.
 SETTLED_S = 60.0

@@ -23,9 +23,8 @@ from typing import Any
 
 from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.limited import LimitExceeded, limited
 from pbl_pipeline.temporary import new_folder
-
-from .limited import LimitExceeded, limited
 
 log = logging.getLogger(__name__)
 
