@@ -12,6 +12,7 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 from starlette.routing import Route
 
+from pbl_pipeline.bounded import parse_json
 from schemas import decide, fit
 from schemas.operations.server_status import database_status
 from schemas.status import ErrorRow, Running, Status, pipeline_status, running, span
@@ -110,7 +111,7 @@ def _key(text: str) -> dict[str, Any] | None:
     if not text:
         return None
     try:
-        found = json.loads(text)
+        found = parse_json(text)
     except ValueError:
         raise Refused("form") from None
     named = isinstance(found, dict) and all(
