@@ -9,13 +9,16 @@ from unicodedata import category
 
 from pbl_pipeline.errors import PblError
 
-#: Control characters, halves of letters (bytes that are no text), and what ends a line or paragraph.
-_ODD = ("Cc", "Cs", "Zl", "Zp")
+#: Control characters, those of format (which turn the direction of writing, as U+202E, or have no width), halves of
+#: letters (bytes that are no text), and what ends a line or paragraph.
+_ODD = ("Cc", "Cf", "Cs", "Zl", "Zp")
+#: Letters and marks that show nothing.
+_BLANK = "\u034f\u115f\u1160\u17b4\u17b5\u2800\u3164\uffa0"
 
 
 def is_plain(text: str) -> bool:
-    """Whether a text is one line that can be stored and printed."""
-    return not any(category(c) in _ODD for c in text)
+    """Return whether a text is one line that shows all that it holds, in its order."""
+    return not any(category(c) in _ODD or c in _BLANK for c in text)
 
 
 def check_label(what: str, text: str, longest: int, least: int = 0) -> None:
@@ -29,7 +32,9 @@ def check_label(what: str, text: str, longest: int, least: int = 0) -> None:
     raise PblError(
         "USAGE",
         found=f"{what} of {len(text)} characters" if plain else f"{what} {ascii(text)[:80]}",
-        expected=f"{least} to {longest} characters" if plain else "one line without control characters",
+        expected=f"{least} to {longest} characters"
+        if plain
+        else "one line without control characters and such that are not seen",
         next_step="choose another one",
     )
 
