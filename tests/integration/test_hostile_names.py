@@ -17,12 +17,13 @@ import pbl_pipeline.pipeline
 import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import load_npz
-from pbl_pipeline.video import read_phone_log
+from pbl_pipeline.video import load_camera, read_phone_log
 from research.benchmarks import mutated_files as files
 from schemas import fit, video
 from schemas.chain import ON_REQUEST
 from schemas.coded_errors import error_next_step
 from schemas.intake import Visit, ingest
+from schemas.intake.calibrations import camera_row
 from schemas.intake.references import add_reference
 from schemas.report import write_visit
 from tests.command import pbl
@@ -129,6 +130,13 @@ def test_so_are_those_of_references(field: str, tmp_path: Path):
         with pytest.raises(PblError) as error:
             add_reference("a.mp4", tmp_path / "a.mot", **{field: label})  # type: ignore[arg-type]
         assert error.value.code == "USAGE"
+
+
+def test_so_is_the_name_of_a_calibration(tmp_path: Path):
+    path = tmp_path / "camera\u202e4pm.json"
+    files.camera(path)
+    with pytest.raises(PblError, match="USAGE"):
+        camera_row(load_camera(path, files.SIZE_PX), files.SIZE_PX)
 
 
 def test_a_log_of_a_phone_with_a_hostile_name(tmp_path: Path):
