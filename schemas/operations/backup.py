@@ -152,7 +152,7 @@ def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
     except FileNotFoundError as error:
         found = "no manifest.json: this is not a backup, or an interrupted one"
         raise _invalid(folder, found, "manifest.json, written last") from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise _invalid(
             folder, f"manifest.json cannot be read ({error})", "the manifest that pbl db backup wrote"
         ) from error

@@ -341,6 +341,7 @@ def test_a_million_columns(tmp_path: Path):
         {"sha256": None},
         {"n_files": "x"},
         {"n_files": None},
+        {"n_files": float("inf")},
         {"rows": ...},
         {"prefix": ...},
         {"format": None},
