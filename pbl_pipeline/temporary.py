@@ -11,13 +11,15 @@ import os
 import secrets
 import shutil
 import tempfile
+import time
 from pathlib import Path
 
 #: How the names begin; the number of the process follows, then its own word, because a container that is started again
 #: has processes of the same numbers.
 _PREFIX, _OWN = "pbl-tmp-", secrets.token_hex(4)
-#: Names that earlier versions gave.
-_EARLIER = ("pbl-files-", "pbl-web-")
+#: Names that earlier versions gave. Those of the page have no number: they go when nothing changed in them for so long
+#: (s).
+_EARLIER, _UNCHANGED_S = ("pbl-files-", "pbl-web-"), 86_400.0
 
 
 class TemporaryFolder(tempfile.TemporaryDirectory[str]):
@@ -48,8 +50,7 @@ def new_folder(beside: Path | None = None) -> TemporaryFolder:
 
 
 def sweep(beside: Path | None = None) -> list[Path]:
-    """Remove the folders of processes that have ended; return those that this account may not remove, and those of
-    earlier versions whose process is not known."""
+    """Remove the folders of processes that have ended; return those that this account may not remove."""
     left = []
     with contextlib.suppress(OSError), os.scandir(tempfile.gettempdir() if beside is None else beside) as entries:
         for path in [Path(e.path) for e in entries if not e.is_symlink()]:
@@ -58,13 +59,19 @@ def sweep(beside: Path | None = None) -> list[Path]:
             if prefix is None:
                 continue
             pid, own, *_ = [*name.removeprefix(prefix).split("-"), ""]
-            if pid.isdecimal() and not _used(int(pid), own):
-                shutil.rmtree(path, ignore_errors=True)
-            elif pid.isdecimal() or prefix == _PREFIX:
+            if _used(int(pid), own) if pid.isdecimal() else prefix == _PREFIX or not _unchanged(path):
                 continue
+            shutil.rmtree(path, ignore_errors=True)
             if path.exists():
                 left.append(path)
     return left
+
+
+def _unchanged(path: Path) -> bool:
+    try:
+        return time.time() - path.stat().st_mtime > _UNCHANGED_S
+    except OSError:
+        return False
 
 
 def _used(pid: int, own: str) -> bool:

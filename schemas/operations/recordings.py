@@ -86,4 +86,4 @@ def delete_left_over(subject: str) -> list[str]:
     others = {name: about for name, about in seen.items() if not name.startswith(f"{subject}/")}
     if others != seen:
         archive.save_seen(archive_dir(), others)
-    return [f"{path}, perhaps of a process that was killed" for path in temporary.sweep()]
+    return [f"{path}, of a process that was killed" for path in temporary.sweep()]

@@ -48,8 +48,10 @@ def test_what_is_not_ours_or_in_use_stays(folder: Path, tmp_path_factory: pytest
         (folder / name).mkdir()
     for name in ("pbl-tmp-999999999-abc-1", f"pbl-tmp-{os.getpid()}-abc", "pbl-files-999999999-a", "pbl-web-abcdefgh"):
         (folder / name).mkdir()
-    # Earlier versions of the page gave no number: whether it runs cannot be known, and `pbl forget` reports it.
-    assert temporary.sweep() == [folder / "pbl-web-abcdefgh"]
+    # Earlier versions of the page gave no number: whether it runs cannot be known.
+    (folder / "pbl-web-older").mkdir()
+    os.utime(folder / "pbl-web-older", (0, 0))
+    assert not temporary.sweep()
     left = {"pbl-tmp-999999999-abc", "pbl-tmp-x-abc", "other-999999999-abc", f"pbl-tmp-{os.getppid()}-abc"}
     assert {p.name for p in folder.iterdir()} == left | {"pbl-web-abcdefgh"}
     assert elsewhere.is_dir()
