@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from pbl_pipeline.csv_cells import frame_to_csv, quoted, unquoted, unquoted_frame
-from pbl_pipeline.export._columns import Column, Labels, Table, write_csv
+from pbl_pipeline.export.columns import Column, Labels, Table, write_csv
 from tests.command import pbl
 
 FORMULAS = ["=1+1", "+cmd|' /C calc'!A0", "-2+3", "@SUM(A1)", "\t=1", "\r=1", "\uff1d1+1", "'=1", "''-x"]
@@ -65,7 +65,7 @@ def test_no_table_is_written_past_it():
     allowed = {
         "pbl_pipeline/csv_cells.py",
         "pbl_pipeline/gait/events/types.py",
-        "pbl_pipeline/export/_keypoints_csv.py",
+        "pbl_pipeline/export/keypoints_csv.py",
     }
     found = {
         str(path.relative_to(root))
