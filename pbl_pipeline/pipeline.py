@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from pbl_pipeline.names import check_height, check_label, distinct
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
 from pbl_pipeline.report import Picture, write_report
+from pbl_pipeline.temporary import new_folder
 from pbl_pipeline.tracking import METHODS as TRACKING_METHODS
 from pbl_pipeline.tracking import TrackingParams, choose_subject, require_subject, track_people
 from pbl_pipeline.video import attitude_of, find_camera, probe, read_phone_log, sha256_of
@@ -156,11 +156,9 @@ def write_visit_report(path: Path, visit: Visit, title: str = "Gait report") -> 
 @contextlib.contextmanager
 def _as_shown(visit: Visit) -> Iterator[Visit]:
     """Yield the visit with the recordings whose pictures may be shown."""
-    with tempfile.TemporaryDirectory() as folder:
+    with new_folder() as folder:
         recordings = tuple(
-            dataclasses.replace(r, shown=r.shown or to_show(r.path, Path(folder), r.video))
-            if r.fitted and r.path
-            else r
+            dataclasses.replace(r, shown=r.shown or to_show(r.path, folder, r.video)) if r.fitted and r.path else r
             for r in visit.recordings
         )
         yield dataclasses.replace(visit, recordings=recordings)

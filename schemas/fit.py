@@ -14,6 +14,7 @@ import numpy as np
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
+from pbl_pipeline.temporary import new_folder
 
 from . import keypoints, lab, session, video
 from .checks import check_columns, check_row, check_values
@@ -21,7 +22,7 @@ from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .rows import InputChanged, number, one
-from .stored_files import file_ref, new_folder, stored_file
+from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import fit as lib

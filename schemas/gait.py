@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pbl_pipeline import methods
+from pbl_pipeline.temporary import new_folder
 
 from . import fit, keypoints, session, video  # noqa: F401  a definition refers to video
 from .checks import check_columns, check_row, check_values
@@ -16,7 +17,7 @@ from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .rows import Rows, number, one, row_of, stored_rows
-from .stored_files import file_ref, new_folder, stored_file
+from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib

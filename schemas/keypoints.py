@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbl_pipeline import methods
+from pbl_pipeline.temporary import new_folder
 
 from . import tracking, video
 from .checks import check_columns, check_row
@@ -16,7 +17,7 @@ from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .rows import number, one
-from .stored_files import file_ref, new_folder, stored_file
+from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import keypoints as lib

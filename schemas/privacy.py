@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,12 +11,13 @@ import numpy as np
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.temporary import TemporaryFolder, new_folder
 
 from . import video
 from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
 from .rows import one
-from .stored_files import file_ref, lasting_folder, stored_file
+from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import deidentify as lib
@@ -60,7 +60,7 @@ class Deidentified(dj.Computed):
     @computes
     def make_compute(
         self, key: dict, probed: Mapping[str, Any], times: dict
-    ) -> tuple[lib.Deidentified, tempfile.TemporaryDirectory, str]:
+    ) -> tuple[lib.Deidentified, TemporaryFolder, str]:
         from pbl_pipeline.deidentify import deidentify
         from pbl_pipeline.video import sha256_of
 
@@ -75,20 +75,20 @@ class Deidentified(dj.Computed):
         path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
         with stored_file(times) as stored:
             info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
-        folder = lasting_folder()
-        done = deidentify(path, Path(folder.name) / "deidentified.mp4", how, info=info)
+        folder = new_folder()
+        done = deidentify(path, folder.path / "deidentified.mp4", how, info=info)
         return done, folder, sha256_of(done.path)
 
     def make_insert(
         self,
         key: dict,
         done: lib.Deidentified,
-        folder: tempfile.TemporaryDirectory,
+        folder: TemporaryFolder,
         sha256: str,
         origin: Origin,
     ) -> None:
         # The folder goes with the object: an insert that meets a deadlock is tried again.
-        assert Path(folder.name).is_dir()
+        assert folder.path.is_dir()
         self.insert1(
             {
                 **key,

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import glob
-import os
-import secrets
-import shutil
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -16,48 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.temporary import new_folder
 
 from . import connection
 from .datajoint_setup import backend_of, build_object_path, full_path
-
-#: How the names of temporary folders begin; the number of the process follows, then its own word, because a container
-#: that is started again has processes of the same numbers.
-_PREFIX, _OWN = "pbl-files-", secrets.token_hex(4)
-
-
-@contextmanager
-def new_folder() -> Iterator[Path]:
-    """A folder for a file that is about to enter the object store or was taken from it; gone afterwards."""
-    with tempfile.TemporaryDirectory(prefix=f"{_PREFIX}{os.getpid()}-{_OWN}-") as folder:
-        yield Path(folder)
-
-
-def lasting_folder() -> tempfile.TemporaryDirectory:
-    """Such a folder for a file that is computed now and stored later: gone when the object is not held any more."""
-    return tempfile.TemporaryDirectory(prefix=f"{_PREFIX}{os.getpid()}-{_OWN}-")
-
-
-def remove_left_folders() -> list[Path]:
-    """Remove such folders of processes that were killed; returns those that this account may not remove."""
-    left = []
-    for path in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
-        pid, own, *_ = [*path.name.removeprefix(_PREFIX).split("-"), ""]
-        used = own == _OWN if pid == str(os.getpid()) else not pid.isdecimal() or _alive(int(pid))
-        if not used and not path.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
-            if path.exists():
-                left.append(path)
-    return left
-
-
-def _alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:  # another account's
-        pass
-    return True
 
 
 @contextmanager

@@ -24,6 +24,7 @@ from pathlib import Path, PurePosixPath
 import pymysql
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.limited import LimitExceeded, limited
 from pbl_pipeline.video import read_phone_log, sha256_of
 from schemas import video, worker
 from schemas.connection import dj
@@ -42,8 +43,6 @@ from schemas.operations.archive import (
 )
 from schemas.operations.folders import private_folder, remove_empty, sync_folders
 from schemas.subject_codes import check_subject
-
-from .limited import LimitExceeded, limited
 
 #: Seconds in which a file must not have changed.
 SETTLED_S = 60.0

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
+from pbl_pipeline import temporary
 from pbl_pipeline.errors import PblError
 
 from . import registry, run_job
@@ -57,7 +58,6 @@ def work(options: Options, pipe: Connection) -> None:
         # Without this JAX reserves most of a GPU's memory for the first of several processes that share it.
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     import schemas
-    from schemas import stored_files
 
     from . import heartbeat, loop, selftest
 
@@ -80,7 +80,7 @@ def work(options: Options, pipe: Connection) -> None:
         event(log, logging.CRITICAL, "cannot start", code=error.code, text=error.text())
         raise SystemExit(1) from error
     to_stderr()  # connecting set DataJoint's own level
-    stored_files.remove_left_folders()  # of processes that were killed here
+    temporary.sweep()  # of processes that were killed here
     tables = registry.tables_of(options.resource)
     if options.selftest:
         try:

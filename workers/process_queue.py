@@ -13,8 +13,8 @@ import functools
 import logging
 import math
 import multiprocessing
+import secrets
 import shutil
-import tempfile
 import threading
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -23,8 +23,8 @@ from typing import Any
 
 from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
-
-from .limited import LimitExceeded, limited
+from pbl_pipeline.limited import LimitExceeded, limited
+from pbl_pipeline.temporary import new_folder
 
 log = logging.getLogger(__name__)
 
@@ -90,7 +90,7 @@ class ProcessQueue:
 
     def __init__(self, most: int, kept: int) -> None:
         self._most, self._kept = most, kept
-        self._folder = tempfile.TemporaryDirectory(prefix="pbl-web-")
+        self._folder = new_folder()
         self._works: collections.OrderedDict[Hashable, Work] = collections.OrderedDict()
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="process queue")
         self._lock, self._stop = threading.Lock(), threading.Event()
@@ -141,7 +141,7 @@ class ProcessQueue:
         self._folder.cleanup()
 
     def _submit(self, task: Task, done: Any) -> Future[Path | None]:
-        future = self._thread.submit(_run, task, done, Path(self._folder.name), self._stop)
+        future = self._thread.submit(_run, task, done, self._folder.path, self._stop)
         future.add_done_callback(lambda _: task.open_files.close())
         return future
 
@@ -161,7 +161,8 @@ def _run(task: Task, done: Any, root: Path, stop: threading.Event) -> Path | Non
     PblError
         The error that the function raised, `task.broken`, or INTERNAL for any other exception.
     """
-    folder = Path(tempfile.mkdtemp(dir=root))
+    folder = root / secrets.token_hex(8)
+    folder.mkdir()
     part = folder / f"part-{task.file}"
     args = (part, *task.args) if task.file else task.args
     limits = {"seconds": task.seconds, "n_bytes": task.n_bytes, "end_s": task.end_s}

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+
+from pbl_pipeline.temporary import new_folder
 
 from .run import Row, measured
 from .table import Column, mega, number, table
@@ -26,8 +27,7 @@ def run_detect(
     """
     from .clip import demo_clip
 
-    with tempfile.TemporaryDirectory(prefix="pbl-bench-") as name:
-        folder = Path(name)
+    with new_folder() as folder:
         if video is None:
             note("making a clip of 1920x1080 from the demo recording")
             path = demo_clip(folder / "demo1080.mp4")

@@ -8,13 +8,13 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.temporary import new_folder
 
 from .cases import Case, Data
 
@@ -45,8 +45,7 @@ def run_cases(
     PblError
         INTERNAL: the data could not be made.
     """
-    with tempfile.TemporaryDirectory(prefix="pbl-bench-") as name:
-        root = Path(name)
+    with new_folder() as root:
         for number, case in enumerate(cases):
             note(f"{number + 1}/{len(cases)} {case.label}")
             folder = _data_folder(root, case.data, programs.data)

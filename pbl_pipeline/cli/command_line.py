@@ -11,7 +11,7 @@ from pathlib import Path
 
 import click
 
-from pbl_pipeline import progress
+from pbl_pipeline import progress, temporary
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 
@@ -84,6 +84,7 @@ def cli(quiet: bool, debug: bool) -> None:
     Example: pbl run walk.mp4 --out results
     """
     progress.enable(not quiet)
+    temporary.sweep()
 
 
 def main() -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from pbl_pipeline.csv_cells import quoted
 from pbl_pipeline.extras import needed
 
 from .text import lines, number_cells, text_cells
@@ -158,4 +159,5 @@ def _cells(kind: str, columns: Sequence[Column]) -> list[np.ndarray]:
 
 
 def _quoted(text: str) -> str:
+    text = quoted(text)
     return f'"{text.replace(chr(34), chr(34) * 2)}"' if any(c in text for c in ',"\n\r') else text

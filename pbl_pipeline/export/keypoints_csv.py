@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pbl_pipeline.csv_cells import quoted
 from pbl_pipeline.errors import PblError
 
 from .text import lines, number_cells
@@ -33,7 +34,7 @@ def write_keypoints_csv(trial: ExportTrial, path: Path) -> None:
     scorer = f"pbl_{points.marker_set}"
     head = [
         ["scorer", *[scorer] * (3 * j)],
-        ["bodyparts", *(name for name in points.names for _ in range(3))],
+        ["bodyparts", *(quoted(name) for name in points.names for _ in range(3))],
         ["coords", *["x", "y", "likelihood"] * j],
     ]
     table = np.concatenate([points.xy_px, points.confidence[..., None]], axis=2).reshape(n, 3 * j)

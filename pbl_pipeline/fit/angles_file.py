@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from pbl_pipeline.body import angle_of, joint_angles
+from pbl_pipeline.csv_cells import frame_to_csv
 from pbl_pipeline.errors import PblError
 
 from .results import TrialFit
@@ -48,5 +49,5 @@ def write_angles_csv(fit: TrialFit, path: str | Path) -> Path:
     """Write `angles_table(fit)` as CSV (UTF-8, comma, point, six decimals, empty cells for NaN); returns the path."""
     path = Path(path)
     # Adding zero turns the -0.0 of a straight knee into 0.0.
-    (angles_table(fit) + 0.0).to_csv(path, index=False, float_format="%.6f", lineterminator="\n")
+    path.write_bytes(frame_to_csv(angles_table(fit) + 0.0, "%.6f").encode())
     return path

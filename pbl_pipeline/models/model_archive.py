@@ -6,7 +6,6 @@ import contextlib
 import hashlib
 import http.client
 import tarfile
-import tempfile
 import urllib.error
 import urllib.request
 import zipfile
@@ -17,6 +16,7 @@ from typing import IO
 from pbl_pipeline import progress, settings
 from pbl_pipeline.bounded import DAMAGED, opened_zip
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.temporary import new_folder
 
 from .spec import GRAPH_FILE, SPEC_FILE, model_invalid
 
@@ -43,10 +43,10 @@ def unpacked(source: str | Path, sha256: str | None) -> Iterator[Path]:
             next_step="pass --sha256",
             key=text,
         )
-    with tempfile.TemporaryDirectory(prefix="pbl-model-") as temporary:
-        archive = _download(text, Path(temporary)) if address else Path(source)
+    with new_folder() as temporary:
+        archive = _download(text, temporary) if address else Path(source)
         _check(archive, sha256, text)
-        folder = Path(temporary) / "model"
+        folder = temporary / "model"
         folder.mkdir()
         _extract(archive, folder, text)
         yield folder

@@ -10,12 +10,12 @@ import contextlib
 import dataclasses
 import os
 import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.temporary import new_folder
 
 from .model_archive import unpacked
 from .onnx_model import OnnxModel, check_graph_file
@@ -151,9 +151,6 @@ def _same(folder: Path, spec: ModelSpec) -> bool:
 @contextlib.contextmanager
 def _scratch(beside: Path) -> Iterator[Path]:
     """A folder on the same disk, so that the finished one appears whole or not at all."""
-    folder = Path(tempfile.mkdtemp(dir=beside, prefix=".new-"))
-    folder.chmod(0o755)  # readable for the account a worker runs under
-    try:
+    with new_folder(beside) as folder:
+        folder.chmod(0o755)  # readable for the account a worker runs under
         yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)

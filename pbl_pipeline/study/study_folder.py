@@ -13,6 +13,7 @@ from typing import Any
 import pandas as pd
 
 from pbl_pipeline.bounded import MAX_ROWS, MIB, read_bytes, read_json
+from pbl_pipeline.csv_cells import frame_to_csv, unquoted_frame
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_out_folder
 from pbl_pipeline.paramset import structured
@@ -50,7 +51,7 @@ def write_study(study: StudyData, folder: str | Path) -> list[Path]:
         **{k: dict(v) if isinstance(v, Mapping) else v for k, v in vars(study.description).items()},
         "files": {name: _sha256(data) for name, data in contents.items()},
     }
-    contents[_DICTIONARY] = _to_csv(data_dictionary(study)).encode()
+    contents[_DICTIONARY] = frame_to_csv(data_dictionary(study), "%.8g").encode()
     contents[_SCRIPT] = (Path(__file__).with_name("templates") / "make_report.py.txt").read_bytes()
     contents[_ABOUT] = (json.dumps(about, indent=1, ensure_ascii=False) + "\n").encode()
     paths = []
@@ -133,11 +134,7 @@ def content_hash(study: StudyData) -> str:
 
 def _csv(name: str, frame: Any) -> bytes:
     flags = {c.name: frame[c.name].map({True: "true", False: "false"}) for c in FRAMES[name] if c.kind == "flag"}
-    return _to_csv(frame.assign(**flags), _DIGITS.get(name, "%.8g")).encode()
-
-
-def _to_csv(frame: Any, digits: str = "%.8g") -> str:
-    return frame.to_csv(index=False, float_format=digits, lineterminator="\n")
+    return frame_to_csv(frame.assign(**flags), _DIGITS.get(name, "%.8g")).encode()
 
 
 def _about(path: Path) -> dict[str, Any]:
@@ -168,9 +165,10 @@ def _frame(path: Path, name: str, data: bytes) -> pd.DataFrame:
             raise ValueError(f"more than {MAX_ROWS:,} rows")
         if len(data.split(b"\n", 1)[0]) > _MAX_HEADER:
             raise ValueError("a header that is too long")
-        return pd.read_csv(
+        read = pd.read_csv(
             io.BytesIO(data), dtype=texts, keep_default_na=False, na_values=[""], encoding="utf-8-sig", low_memory=False
         )
+        return unquoted_frame(read)
     except (ValueError, OverflowError) as error:  # pandas' ParserError and UnicodeDecodeError are ValueErrors
         raise _format(path, f"{error}"[:200], "a CSV file as docs/study.md describes it", "copy it again") from error
 

@@ -11,6 +11,7 @@ import jinja2
 import pandas as pd
 
 from pbl_pipeline.code_version import code_version
+from pbl_pipeline.csv_cells import frame_to_csv
 from pbl_pipeline.files import check_out_folder
 from pbl_pipeline.stats import CurveTest, Estimate
 from pbl_pipeline.study import StudyData, content_hash
@@ -73,7 +74,7 @@ def write_study_report(
             paths[-1].write_bytes(figure.pdf(footer))
     for name, frame in _frames(results).items():
         paths.append(folder / "tables" / f"{name}.csv")
-        frame.to_csv(paths[-1], index=False, float_format="%.8g", lineterminator="\n")
+        paths[-1].write_bytes(frame_to_csv(frame, "%.8g").encode())
     for table in tables.values():
         paths.append(folder / "tables" / f"{table.name}.tex")
         paths[-1].write_text(table.latex(". ".join(footer)), encoding="utf-8")

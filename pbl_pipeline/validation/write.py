@@ -10,6 +10,7 @@ import click
 import jinja2
 
 from pbl_pipeline.code_version import code_version
+from pbl_pipeline.csv_cells import frame_to_csv
 from pbl_pipeline.latex import tex_escape
 
 from .paper import paper_figures
@@ -26,7 +27,7 @@ def write_tables(tables: Mapping[str, Table], folder: str | Path) -> list[Path]:
     paths = []
     for table in tables.values():
         csv, tex = folder / f"{table.name}.csv", folder / f"{table.name}.tex"
-        table.frame().to_csv(csv, index=False, lineterminator="\n")
+        csv.write_bytes(frame_to_csv(table.frame()).encode())
         tex.write_text(latex(table), encoding="utf-8")
         paths += [csv, tex]
     page = folder / "index.html"

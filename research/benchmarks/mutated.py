@@ -17,6 +17,7 @@ import io
 import json
 import multiprocessing
 import random
+import re
 import shutil
 import struct
 import tempfile
@@ -41,6 +42,11 @@ LONGEST_S, MOST_MIB = 60.0, 1024.0
 _CELLS = (
     *("nan", "inf", "-inf", "-1", "0", "1e308", "-1e308", "1e400", "9" * 400, "1.5.2", "", "x", "\x00", "\x1b[2J"),
     *("\u202e", "1,1", "\t", '"', "0x7f", "__import__('os')", "\ud7ff", "4611686018427387904", "1e-320", "[", "true"),
+)
+#: What stands for a value or an attribute in XML.
+_XML_VALUES = (
+    *("XFD1048576", "XFD499999", "A0", "ZZZZZZ1", "A99999999999", "-1", "1e400", "9" * 400, "nan", "", "x", "n", "s"),
+    *("str", "b", "d", "e", "inlineStr", "0", "4294967296", "true", "\u202e", "&a;", "&#0;", "&amp;", "../../x", "1:1"),
 )
 #: What stands for a value in JSON.
 _VALUES: tuple[Callable[[], Any], ...] = (
@@ -198,6 +204,25 @@ def _text(between: str) -> Callable[[bytes, random.Random], bytes]:
     return change
 
 
+def _xml(data: bytes, draw: random.Random) -> bytes:
+    """Elements and values of XML replaced, left out, repeated, exchanged; sometimes a document type."""
+    text = data.decode()
+    for _ in range(draw.choice([1, 1, 2, 4])):
+        tags = list(re.finditer(r"<[^<>]*>", text))
+        values = list(re.finditer(r'(?<==")[^"<>]*(?=")|(?<=>)[^<>]+(?=<)', text))
+        what = draw.randrange(5)
+        if what <= 1 and values:
+            at = draw.choice(values)
+            text = text[: at.start()] + draw.choice(_XML_VALUES) + text[at.end() :]
+        elif tags:
+            at, other = draw.choice(tags), draw.choice(tags)
+            new = {2: "", 3: at.group() * draw.choice([2, 50, 5000]), 4: other.group()}.get(what, at.group())
+            text = text[: at.start()] + new + text[at.end() :]
+    if draw.random() < 0.05:
+        text = f'<!DOCTYPE x [<!ENTITY a "{"a" * 99}">]>{text}'
+    return text.encode("utf-8", "surrogatepass")
+
+
 def _json(data: bytes, draw: random.Random) -> bytes:
     return json.dumps(of_json(json.loads(data), draw)).encode()
 
@@ -226,13 +251,15 @@ def _npz(data: bytes, draw: random.Random) -> bytes:
     return out.getvalue()
 
 
-def _zip(change: Callable[[bytes, random.Random], bytes]) -> Callable[[bytes, random.Random], bytes]:
+def _zip(
+    change: Callable[[bytes, random.Random], bytes], share: float = 0.4
+) -> Callable[[bytes, random.Random], bytes]:
     def changed(data: bytes, draw: random.Random) -> bytes:
         out = io.BytesIO()
         with zipfile.ZipFile(io.BytesIO(data)) as before, zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as after:
             for member in before.infolist():
                 content = before.read(member)
-                after.writestr(member.filename, change(content, draw) if draw.random() < 0.4 else content)
+                after.writestr(member.filename, change(content, draw) if draw.random() < share else content)
         return out.getvalue()
 
     return changed
@@ -275,6 +302,13 @@ def kinds() -> list[Kind]:
         Kind("markers.csv", m.marker_set, m.use_marker_set, _text(",")),
         Kind("params.json", m.params, m.use_params, _json),
         Kind("norm.json", m.norm, m.use_norm, _signed_json),
+        Kind("study.xlsx", m.workbook, m.use_sheets, _zip(_xml, 0.1)),
+        Kind("visits.csv", m.sheet, m.use_sheets, _text(",")),
+        Kind("semicolons.csv", m.sheet, m.use_sheets, _text(";")),
+        Kind("study.visits.csv", m.study_visits, m.use_study, _text(",")),
+        Kind("study.scores.csv", m.study_scores, m.use_study, _text(",")),
+        Kind("study.json", m.study_about, m.use_study, _json),
+        Kind("manifest.json", m.manifest, m.use_manifest, _json),
         Kind("session.json", m.session, m.use_session, _json),
         Kind("model.json", m.model, m.use_model, _json),
     ]
@@ -353,7 +387,7 @@ def apart(name: str, seeds: Sequence[int]) -> list[Outcome]:
     while len(found) < len(seeds):
         folder = Path(tempfile.mkdtemp(prefix="mutated-"))
         ours, theirs = context.Pipe(duplex=False)
-        process = context.Process(target=_child, args=(name, seeds[len(found) :], folder, theirs), daemon=True)
+        process = context.Process(target=_child, args=(name, seeds[len(found) :], folder, theirs))
         process.start()
         theirs.close()
         room = 10 * LONGEST_S  # the first waits for the libraries

@@ -383,3 +383,112 @@ def use_model(path: Path) -> None:
     folder.mkdir(exist_ok=True)
     (folder / "model.json").write_bytes(path.read_bytes())
     load_spec(folder)
+
+
+# --------------------------------------------------------------------------------------------- sheets, studies, backups
+ROWS = [
+    ["subject", "visit", "date", "role", "mJOA", "TUG", "note"],
+    *(
+        [f"P{i:03}", "pre", f"2026-01-{i + 1:02}", "pre", 12 + i % 5, 9.25, "a, b" if i % 3 else None]
+        for i in range(20)
+    ),
+]
+
+
+def workbook(path: Path) -> None:
+    import datetime
+
+    from openpyxl import Workbook
+
+    made = Workbook()
+    page = made.active
+    assert page is not None
+    for row in ROWS:
+        page.append([datetime.date.fromisoformat(c) if str(c).startswith("2026-") else c for c in row])
+    made.create_sheet("scores").append(["subject", "visit"])
+    made.save(path)
+
+
+def sheet(path: Path) -> None:
+    import csv
+
+    with path.open("w", newline="") as file:
+        csv.writer(file, delimiter=";" if "semi" in path.name else ",", lineterminator="\n").writerows(ROWS)
+
+
+def use_sheets(path: Path) -> None:
+    """In this process, whose memory is measured; the commands read a workbook in another one with limits."""
+    from unittest import mock
+
+    from pbl_pipeline.errors import PblError
+    from schemas.intake import sheets
+
+    def here(function: Any, *args: Any, **_: object) -> object:
+        return function(*args)
+
+    with mock.patch.object(sheets, "limited", here):
+        found = sheets.read_sheets(path)
+    for page in found:
+        page.plain_names()
+        for row in page.rows:
+            for column in row.cells:
+                for read in (sheets.date_of, lambda r, c: sheets.number_of(r, c, r.cells[c])):
+                    try:
+                        read(row, column)
+                    except PblError as error:
+                        error.text().encode()
+
+
+def _study_file(path: Path, name: str) -> None:
+    from pbl_pipeline.study import write_study
+    from tests.unit.test_study_folder import small_study
+
+    folder = path.parent / "sound-study"
+    write_study(small_study(), folder)
+    about = json.loads((folder / "study.json").read_text())
+    del about["files"]
+    (folder / "study.json").write_text(json.dumps(about))
+    path.write_bytes((folder / name).read_bytes())
+
+
+def study_visits(path: Path) -> None:
+    _study_file(path, "visits.csv")
+
+
+def study_scores(path: Path) -> None:
+    _study_file(path, "scores.csv")
+
+
+def study_about(path: Path) -> None:
+    _study_file(path, "study.json")
+
+
+def use_study(path: Path) -> None:
+    import shutil
+
+    from pbl_pipeline.study import content_hash, data_dictionary, deidentified, read_study, write_study
+
+    folder = path.parent / "study"
+    shutil.copytree(path.parent / "sound-study", folder, dirs_exist_ok=True)
+    name = path.name.removeprefix("sound-").removeprefix("study.") if path.suffix == ".csv" else "study.json"
+    (folder / name).write_bytes(path.read_bytes())
+    study = read_study(folder)
+    content_hash(study)
+    data_dictionary(study)
+    write_study(deidentified(study)[0], path.parent / "again")
+
+
+def manifest(path: Path) -> None:
+    from schemas.operations import backup
+
+    content = {"format": backup.FORMAT, "created": "2026-01-01", "server": "x", "prefix": "pbl", "rows": {"a": 1}}
+    path.write_text(json.dumps(content | {"store": True, "n_files": 0, "n_bytes": 0, "sha256": {}}))
+
+
+def use_manifest(path: Path) -> None:
+    from schemas.operations import backup
+
+    folder = path.parent / "backup"
+    folder.mkdir(exist_ok=True)
+    (folder / "manifest.json").write_bytes(path.read_bytes())
+    backup.check(folder)

@@ -11,7 +11,7 @@ points are detected once and kept in the temporary folder (`--fresh` detects ane
 intrinsics are a guess, as they are for most users. Prints one table per clip: mean and median absolute error in degrees
 per angle and side (the paper's figures are medians), and the same for what two published systems made of the clip (they
 see the same pixels). Both clips were in sight when the weights of `blazepose` were chosen: they are tuned on, not held
-out, for ours; for the two systems they are held out as far as is known. "in 90 %" is the
+out, for ours; whether the two systems were trained or tuned on them is not known to us. "in 90 %" is the
 share of the samples in our 90 % intervals, the mean over the angles. Exit code 1 where the first paramset misses a
 bar: 8.0 deg, knee correlation 0.93, 75 % in the intervals, each on each clip.
 """

@@ -212,22 +212,19 @@ def _visits(
     Raises `PblError` USAGE for an invalid pattern; `click.UsageError` where it and an option state the same, or neither
     states the subject.
     """
-    from pbl_pipeline.errors import PblError
+    from pbl_pipeline.name_pattern import read_names, unfit
     from schemas.intake import Registered, VisitRecord
-    from schemas.intake.name_pattern import compiled, read_name
 
-    pattern = compiled(name_pattern) if name_pattern is not None else None
+    groups, names = ((), [{}] * len(paths)) if name_pattern is None else read_names(name_pattern, paths)
     options = {option.removesuffix("_label") for option in stated}
-    if pattern is not None and (twice := sorted(set(pattern.groupindex) & options)):
+    if twice := sorted(set(groups) & options):
         raise click.UsageError(f"--{twice[0]} and the name pattern state the same: leave one out.")
     visits, refused = [], []
-    for i, path in enumerate(paths):
-        try:
-            said = read_name(pattern, path) if pattern is not None else {}
-        except PblError as error:
-            refused.append(Registered(path, "refused", error=error))
+    for i, (path, name) in enumerate(zip(paths, names, strict=True)):
+        if name is None:
+            refused.append(Registered(path, "refused", error=unfit(name_pattern or "", path)))
             continue
-        said: dict[str, Any] = {"session_label" if k == "session" else k: text for k, text in said.items()}
+        said: dict[str, Any] = {"session_label" if k == "session" else k: text for k, text in name.items()}
         if "subject" not in said | stated:
             raise click.UsageError("Missing option '--subject' (or a group 'subject' in --name-pattern).")
         visits.append((i, VisitRecord(**stated, **said)))

@@ -100,7 +100,9 @@ def _show(rows: pd.DataFrame, as_json: bool, as_csv: bool) -> None:
     if as_json:
         click.echo(rows.to_json(orient="records", date_format="iso", indent=1))
     elif as_csv:
-        click.echo(rows.to_csv(index=False, lineterminator="\n"), nl=False)
+        from pbl_pipeline.csv_cells import frame_to_csv
+
+        click.echo(frame_to_csv(rows), nl=False)
     elif rows.empty:
         click.echo("none")
     else:

@@ -100,13 +100,14 @@ def export(name: str, out: Path, key: Path | None, keep_codes: bool, no_curves: 
 
     `pbl study report DIR` makes figures and tables of it, without a database.
     """
+    from pbl_pipeline.csv_cells import frame_to_csv
     from pbl_pipeline.study import deidentified, write_study
 
     data = load_slice(name, curves=not no_curves)
     if not keep_codes:
         data, codes = deidentified(data)
         if key is not None:
-            _write_key(key, codes.to_csv(index=False))
+            _write_key(key, frame_to_csv(codes))
     paths = write_study(data, out)
     click.echo(f"{data.n_subjects} persons, {data.n_visits} visits: {len(paths)} files in {out}")
 

@@ -113,6 +113,7 @@ def tables(
 
 def _show(frame: pd.DataFrame, where: Sequence[str], out: Path | None, in_database: bool) -> None:
     """Print the tables of the rows that `where` leaves, and write them where a folder is given."""
+    from pbl_pipeline.csv_cells import frame_to_csv
     from pbl_pipeline.validation import paper_tables, print_tables, save_curves, write_tables
 
     chosen = select(frame, where)
@@ -124,7 +125,7 @@ def _show(frame: pd.DataFrame, where: Sequence[str], out: Path | None, in_databa
     if out is None:
         return
     write_tables(made, out)
-    chosen.to_csv(out / "errors.csv", index=False)
+    (out / "errors.csv").write_bytes(frame_to_csv(chosen).encode())
     click.echo(f"tables, and the errors they are made from (errors.csv): {out}")
     if in_database:
         from schemas.reading.frames import validation_curves

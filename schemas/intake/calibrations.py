@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import check_label
 from pbl_pipeline.paramset import canonical_json
 
 from .. import keypoints, lab, video
@@ -30,7 +31,9 @@ if TYPE_CHECKING:
 
 
 def camera_row(camera: Camera, size_px: tuple[int, int]) -> dict[str, Any]:
-    """The library's `Camera` of upright pictures (width, height) as a row of CameraCalibration, without its number."""
+    """Return the library's `Camera` of upright pictures (width, height) as a row of CameraCalibration, without its
+    number. Raises `PblError` USAGE for the name of a file or camera with control characters."""
+    check_label("name of the calibration", camera.source, 1000)
     row = {
         "camera_width": size_px[0],
         "camera_height": size_px[1],

@@ -11,10 +11,10 @@ import numpy as np
 
 from pbl_pipeline import methods as library_methods
 from pbl_pipeline.names import check_label
+from pbl_pipeline.temporary import new_folder
 
 from .. import fit, video
 from ..method_rows import method_row
-from ..stored_files import new_folder
 from .records import File, Methods, Recording, VisitRecord, check_path, usage
 
 if TYPE_CHECKING:

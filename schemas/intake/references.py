@@ -13,10 +13,11 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import fields_of
 from pbl_pipeline.names import check_label
 from pbl_pipeline.paramset import canonical_json
+from pbl_pipeline.temporary import new_folder
 
 from .. import fit, validation, video
 from ..rows import utc_now
-from ..stored_files import file_ref, new_folder, stored_file
+from ..stored_files import file_ref, stored_file
 from ..transactions import repeated
 
 if TYPE_CHECKING:

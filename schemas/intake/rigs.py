@@ -10,11 +10,11 @@ from typing import Any, ClassVar
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
+from pbl_pipeline.temporary import new_folder
 
 from .. import video
 from ..datajoint_setup import dj
 from ..rows import utc_now
-from ..stored_files import new_folder
 from ..transactions import next_id
 from .calibrations import camera_row
 from .records import File, Methods, Recording, RefusedFile, VisitRecord, usage

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.temporary import new_folder
 
 from .. import keypoints, video
 from ..rows import counted, delete_below, utc_now
-from ..stored_files import new_folder
 
 if TYPE_CHECKING:
     from pbl_pipeline.video import PhoneLog

@@ -9,19 +9,17 @@ import datetime
 import io
 import math
 import re
-import zipfile
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from pbl_pipeline.bounded import MAX_ROWS, MIB, opened_zip, read_bytes
+from pbl_pipeline.bounded import MAX_TEXT, count_cells, count_rows, read_bytes
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.limited import LimitExceeded, limited
+from pbl_pipeline.workbook import READ_BYTES, READ_S, read_workbook
 
 from ..subject_codes import folded
-
-#: Bytes of a sheet, and of all parts of a workbook unpacked.
-_MAX_BYTES, _MAX_UNPACKED = 32 * MIB, 128 * MIB
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +96,7 @@ def read_sheets(path: Path) -> list[Sheet]:
         )
     try:
         tables = _workbook(path) if path.suffix.lower() in (".xlsx", ".xlsm") else [(path.name, _csv(path))]
-    except (ValueError, OSError, KeyError, zipfile.BadZipFile, csv.Error) as error:
+    except (ValueError, OSError, csv.Error) as error:
         raise refused(str(path), f"{error}"[:200], "a sheet as CSV in UTF-8 or as .xlsx", "save it anew") from error
     found = [_sheet(name, list(cells)) for name, cells in tables]
     return [sheet for sheet in found if sheet is not None]
@@ -161,65 +159,23 @@ def number_of(row: Row, column: str, text: str) -> float:
 
 
 def _csv(path: Path) -> list[list[str]]:
-    text = read_bytes(path, _MAX_BYTES).decode("utf-8-sig")
-    if text.count("\n") > MAX_ROWS:
-        raise ValueError(f"more than {MAX_ROWS:,} rows")
+    text = read_bytes(path, MAX_TEXT).decode("utf-8-sig")
     first = text.split("\n", 1)[0]
     between = max(",;\t", key=first.count)
+    n_rows = text.count("\n")
+    count_rows(n_rows)
+    count_cells(n_rows + text.count(between), first.count(between))
     return list(csv.reader(io.StringIO(text), delimiter=between, strict=True))
 
 
 def _workbook(path: Path) -> list[tuple[str, list[list[str]]]]:
-    from openpyxl import load_workbook
-    from openpyxl.utils.exceptions import InvalidFileException
-
-    data = read_bytes(path, _MAX_BYTES)
-    with opened_zip(path) as archive:
-        if sum(m.file_size for m in archive.infolist()) > _MAX_UNPACKED:
-            raise ValueError(f"more than {_MAX_UNPACKED // MIB} MiB unpacked")
+    """Raises ValueError, OSError, and the `PblError` of a workbook that hides values."""
     try:
-        book = load_workbook(io.BytesIO(data))
-    except InvalidFileException as error:
-        raise ValueError(str(error)) from error
-    sheets = book.worksheets
-    several = sum(s.max_row > 1 or s.cell(1, 1).value is not None for s in sheets) > 1
-    return [(f"{path.name}, sheet {s.title}" if several else path.name, list(_cells(s, path))) for s in sheets]
-
-
-def _cells(sheet: Any, path: Path) -> Iterator[list[str]]:
-    where = f"{path.name}, sheet {sheet.title}"
-    if merged := [str(m) for m in sheet.merged_cells.ranges]:
-        raise refused(
-            where,
-            f"merged cells {', '.join(merged[:5])}",
-            "one value in one cell",
-            "unmerge them and repeat the value in every row it is meant for",
-        )
-    if sheet.max_row > MAX_ROWS:
-        raise ValueError(f"more than {MAX_ROWS:,} rows")
-    for row in sheet.iter_rows():
-        for cell in row:
-            if cell.data_type in ("f", "e"):
-                what = "a formula" if cell.data_type == "f" else f"the error {cell.value}"
-                raise refused(
-                    f"{where}, cell {cell.coordinate}",
-                    what,
-                    "a value",
-                    "copy the column and paste it as values, so that what is imported is what you see",
-                )
-        yield [_text(cell.value) for cell in row]
-
-
-def _text(value: Any) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, datetime.datetime) and value.time() == datetime.time():
-        return value.date().isoformat()
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float) and value.is_integer():
-        return str(int(value))
-    return value.isoformat() if isinstance(value, datetime.date) else str(value)
+        sheets = limited(read_workbook, path, seconds=READ_S, n_bytes=READ_BYTES, returns=True)
+    except LimitExceeded as error:
+        raise ValueError(f"a workbook that takes too much to read: {error}") from error
+    several = sum(bool(rows) for _, rows in sheets) > 1
+    return [(f"{path.name}, sheet {title}" if several else path.name, rows) for title, rows in sheets]
 
 
 def _sheet(name: str, lines: list[list[str]]) -> Sheet | None:
@@ -230,7 +186,7 @@ def _sheet(name: str, lines: list[list[str]]) -> Sheet | None:
     _, header = numbered[0]
     while header and not header[-1]:
         header = header[:-1]
-    if wrong := sorted({c for c in header if not c or header.count(c) > 1}):
+    if wrong := sorted(c for c, n in Counter(header).items() if not c or n > 1):
         what = f"column {wrong[0]!r} twice" if wrong[0] else "a column without a name"
         raise refused(name, what, "a header row that names each column once", "name the columns")
     rows = []

@@ -16,7 +16,6 @@ import dataclasses
 import datetime
 import gzip
 import hashlib
-import json
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -25,6 +24,7 @@ from typing import Any
 import pymysql
 
 from pbl_pipeline import progress
+from pbl_pipeline.bounded import read_json
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from schemas import connection
@@ -148,15 +148,18 @@ def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
         BACKUP_INVALID, which names the missing or changed files.
     """
     try:
-        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
-        parts = manifest["sha256"]
+        manifest = read_json(folder / "manifest.json")
+        parts = dict(manifest["sha256"])
         manifest.setdefault("n_recordings", 0)  # a backup from before they were saved
         if manifest["format"] != FORMAT:
             raise _invalid(folder, f"format {manifest['format']}", f"format {FORMAT}")
+        expected = int(manifest["n_files"]) + int(manifest["n_recordings"])
+        if absent := {"created", "prefix", "rows", "store", "n_bytes"} - set(manifest):
+            raise KeyError(*absent)
     except FileNotFoundError as error:
         found = "no manifest.json: this is not a backup, or an interrupted one"
         raise _invalid(folder, found, "manifest.json, written last") from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise _invalid(
             folder, f"manifest.json cannot be read ({error})", "the manifest that pbl db backup wrote"
         ) from error
@@ -172,7 +175,6 @@ def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
             if not file.is_file() or sha256_of(file) != sha:
                 wrong.append(f"{part}/{path}")
             update(1)
-    expected = manifest["n_files"] + manifest["n_recordings"]
     if wrong or len(files) != expected:
         found = f"{len(wrong)} files are missing or were changed: {', '.join(wrong[:5])}"
         raise _invalid(

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from pbl_pipeline import temporary
 from schemas import video
 from schemas.intake.uploads import Bucket, Folder, Upload, drop_folder
 from schemas.operations import archive
 from schemas.operations.archive import archive_dir
-from schemas.stored_files import remove_left_folders
 
 
 def delete_registered(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict[str, str]]:
@@ -87,4 +87,4 @@ def delete_left_over(subject: str) -> list[str]:
     others = {name: about for name, about in seen.items() if not name.startswith(f"{subject}/")}
     if others != seen:
         archive.save_seen(archive_dir(), others)
-    return [f"{path}, of a process that was killed" for path in remove_left_folders()]
+    return [f"{path}, of a process that was killed" for path in temporary.sweep()]

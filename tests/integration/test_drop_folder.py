@@ -16,11 +16,11 @@ from pathlib import Path
 
 import pytest
 
+from pbl_pipeline import temporary
 from schemas import connection, lab, session, video, worker
 from schemas.intake import VisitRecord, ingest, uploads
 from schemas.operations import archive as layout
 from schemas.operations import backup, forget
-from schemas.stored_files import new_folder, remove_left_folders
 from tests.command import pbl
 from workers import incoming
 
@@ -282,10 +282,10 @@ def test_what_a_killed_import_left_goes_with_the_next_run_and_with_the_person(
     left = kill()
     ended = subprocess.Popen(["true"])
     ended.wait()
-    (tmp_path / f"pbl-files-{ended.pid}-abc").mkdir()
-    (tmp_path / f"pbl-files-{ended.pid}-abc" / "keypoints.npz").write_bytes(b"a person")
+    (tmp_path / f"pbl-tmp-{ended.pid}-abc").mkdir()
+    (tmp_path / f"pbl-tmp-{ended.pid}-abc" / "keypoints.npz").write_bytes(b"a person")
     # A container that was started again has a process of the number that left this one.
-    (tmp_path / f"pbl-files-{os.getpid()}-abc").mkdir()
+    (tmp_path / f"pbl-tmp-{os.getpid()}-abc").mkdir()
     dry = pbl("forget", "P017", "--videos")
     assert dry.code == 0, dry.err
     for name in (left.name, "empty.mp4", "walk.mp4"):
@@ -298,9 +298,9 @@ def test_what_a_killed_import_left_goes_with_the_next_run_and_with_the_person(
     done = pbl("forget", "P017", "--yes", "--videos")
     assert done.code == 0, done.err + done.out
     assert "and no recording" in done.out
-    with new_folder() as used:
-        assert not remove_left_folders()
-        assert [p.name for p in tmp_path.glob("pbl-files-*")] == [used.name]
+    with temporary.new_folder() as used:
+        assert not temporary.sweep()
+        assert [p.name for p in tmp_path.glob("pbl-tmp-*")] == [used.name]
     assert f"the archive {archive}, the drop folder: {drop}" in done.out
     assert not [p for p in [*drop.rglob("*"), *archive.rglob("*")] if "P017" in str(p.relative_to(tmp_path))]
     assert "P017" not in (archive / ".incoming" / "seen.json").read_text()

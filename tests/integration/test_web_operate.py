@@ -81,6 +81,7 @@ def test_errors_with_code_words_and_next_step_are_tried_again(three_gone: list[i
         ({"table": "VideoInfo", "code": "OTHER_CODE"}, 303),
         ({"table": "VideoInfo", "code": "VIDEO_MISSING", "key": "{"}, 415),
         ({"table": "VideoInfo", "code": "VIDEO_MISSING", "key": "[1]"}, 415),
+        ({"table": "VideoInfo", "code": "VIDEO_MISSING", "key": '{"a":' * 2000}, 415),
         ({"table": "VideoInfo", "code": "VIDEO_MISSING", "key": '{"video_id": [1, 2]}'}, 415),
         ({"table": "VideoInfo", "code": "VIDEO_MISSING", "key": '{"status": "error"}'}, 303),
         ({"table": "VideoInfo", "code": "VIDEO_MISSING", "key": '{"video_id": "1 OR 1=1"}'}, 303),

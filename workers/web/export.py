@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import tempfile
 import zipfile
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from starlette.background import BackgroundTask
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 
+from pbl_pipeline.temporary import new_folder
 from pbl_pipeline.visit import Visit
 
 from .address import Address, number_of, shown_of
@@ -37,14 +37,14 @@ def routes(asks: Asks, source: Source) -> list[Address]:
 
 async def archive_of(visit: Visit, name: str) -> Response:
     """A visit's movement as an archive of that name, in the formats of `FORMATS`."""
-    folder = tempfile.TemporaryDirectory()
+    folder = new_folder()
 
     def write() -> Path:
         from pbl_pipeline.export import ExportOptions, write_export
 
         # As a reviewer sees it: what failed a check says so in its files.
         options = ExportOptions(number_trials=True, allow_failed=True)
-        out, archive = Path(folder.name) / "files", Path(folder.name) / "visit.zip"
+        out, archive = folder.path / "files", folder.path / "visit.zip"
         paths = write_export(visit, FORMATS, out, options)
         with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
             for path in paths:

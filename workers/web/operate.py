@@ -11,6 +11,7 @@ from typing import Any
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
+from pbl_pipeline.bounded import parse_json
 from schemas import fit
 from schemas.decisions import review_decisions
 from schemas.operations.server_status import database_status
@@ -110,7 +111,7 @@ def _key(text: str) -> dict[str, Any] | None:
     if not text:
         return None
     try:
-        found = json.loads(text)
+        found = parse_json(text)
     except ValueError:
         raise Refused("form") from None
     named = isinstance(found, dict) and all(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import multiprocessing
+import os
 import threading
 import time
 import traceback
@@ -22,10 +23,12 @@ def limited(
     *args: Any,
     seconds: float = math.inf,
     n_bytes: int | None = None,
+    returns: bool = False,
     stop: threading.Event | None = None,
     end_s: float = 0.0,
-) -> None:
-    """Call a function for what it raises; its result is dropped.
+) -> Any:
+    """Call a function for what it raises, or for its result. A script that calls this keeps what it does under
+    `if __name__ == "__main__":`.
 
     Parameters
     ----------
@@ -35,6 +38,8 @@ def limited(
         Time it may take, the start of the process (about a second) included.
     n_bytes
         Memory the process may allocate in addition to what its imports take; None: any amount.
+    returns
+        Return the result, which can be pickled, instead of None.
     stop
         Ends the process when it is set.
     end_s
@@ -47,7 +52,7 @@ def limited(
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_call, args=(theirs, n_bytes, function, args), daemon=True)
+    process = context.Process(target=_call, args=(theirs, n_bytes, seconds, returns, function, args), daemon=True)
     process.start()
     theirs.close()
     try:
@@ -61,7 +66,7 @@ def limited(
             if time.monotonic() >= end:
                 raise LimitExceeded(f"more than {seconds:g} s")
         try:
-            error = ours.recv()
+            error, result = ours.recv()
         except EOFError:
             process.join(5.0)
             raise LimitExceeded(f"its process ended with code {process.exitcode}") from None
@@ -74,18 +79,38 @@ def limited(
         raise LimitExceeded(f"more than {limit} of memory")
     if error is not None:
         raise error
+    return result
 
 
-def _call(pipe: Connection, n_bytes: int | None, function: Callable[..., object], args: tuple) -> None:
+def _call(
+    pipe: Connection,
+    n_bytes: int | None,
+    seconds: float,
+    returns: bool,
+    function: Callable[..., object],
+    args: tuple,
+) -> None:
     if n_bytes is not None:
         _limit_memory(n_bytes)
+    if math.isfinite(seconds):
+        _limit_time(seconds)
     try:
-        function(*args)
+        result = function(*args)
+        pipe.send((None, result if returns else None))
     except Exception as error:  # noqa: BLE001  raised where the function was called
         error.add_note(traceback.format_exc())
-        pipe.send(error)
-    else:
-        pipe.send(None)
+        pipe.send((error, None))
+
+
+def _limit_time(seconds: float) -> None:
+    """End the process where its caller was killed and cannot."""
+    try:
+        import resource
+
+        most = math.ceil(seconds) * max(1, os.cpu_count() or 1)  # of all threads together
+        resource.setrlimit(resource.RLIMIT_CPU, (most, most))
+    except (ImportError, OSError, ValueError):
+        pass
 
 
 def _limit_memory(n_bytes: int) -> None:
