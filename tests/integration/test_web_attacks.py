@@ -166,8 +166,6 @@ def test_names_are_text_on_every_page(hostile: None):
         assert not re.search(r"<style|\sstyle=|<script(?![^>]*\ssrc=\"/)", page.text), path
 
 
-@pytest.mark.needs_extra
-@pytest.mark.slow
 def test_no_name_runs_in_a_browser(hostile: None, chromium: Any):
     with web.shown(chromium, name=EVIL[:60]) as page:
         asked: list[str] = []

@@ -13,8 +13,6 @@ from tests.integration.chain import N_FRAMES, small_video
 from tests.rows import register
 from workers.populate import populate
 
-pytestmark = [pytest.mark.needs_extra, pytest.mark.slow]
-
 #: In the page: while the video plays, the number in each shown picture (`numbered_frames`: its grey is 8 times the
 #: number modulo 30) and the frame of the body that is drawn then.
 WATCH = """

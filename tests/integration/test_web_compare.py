@@ -176,8 +176,6 @@ def test_curves_that_are_drawn_are_those_of_the_tables(visits: None):
     assert knee.sides["left"].count("fill-opacity") == 2  # a band each
 
 
-@pytest.mark.needs_extra
-@pytest.mark.slow
 def test_videos_in_step_in_a_browser(visits: None, chromium: Any):
     with web.shown(chromium) as page:
         page.get_by_role("link", name="2026-01-10").first.click()

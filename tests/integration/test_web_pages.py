@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,6 @@ from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register, remove_all
 from workers.populate import populate
-
-pytestmark = [pytest.mark.needs_extra, pytest.mark.slow]
 
 #: What a page of each kind needs until everything on it is there.
 PAGES = {
@@ -80,8 +79,7 @@ def visits(chromium: Any, database: Path, tmp_path_factory: pytest.TempPathFacto
 @pytest.fixture(scope="module")
 def axe() -> str:
     """axe-core as a script."""
-    package = pytest.importorskip("axe_playwright_python", reason="pip install -e .[browser]")
-    return (Path(package.__file__).parent / "axe.min.js").read_text("utf-8")
+    return (files("axe_playwright_python") / "axe.min.js").read_text("utf-8")
 
 
 def go(page: Any, kind: str) -> None:

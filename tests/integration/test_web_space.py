@@ -13,8 +13,6 @@ from tests.integration.chain import small_video
 from tests.rows import register, remove_all
 from workers.populate import populate
 
-pytestmark = [pytest.mark.needs_extra, pytest.mark.slow]
-
 #: Byte of everything but the video that a recording's page may load, as it comes over the line.
 WEIGHT = 400_000
 
