@@ -220,7 +220,7 @@ def test_videos_in_step_in_a_browser(visits: None, chromium: Any):
 
 def _until(page: Any, holds: str) -> None:
     """Wait until an expression holds. Playwright's own wait evaluates texts in the page, which its policy forbids."""
-    for _ in range(100):
+    for _ in range(1200):
         if page.evaluate(holds):
             return
         page.wait_for_timeout(50)

@@ -58,7 +58,9 @@ def test_the_body_that_is_sent_is_that_of_the_fit(looked_at):
     body = browser.get(f"/recordings/{walk}/movement").json()["body"]
     key = fit.trial_key(walk)
     assert key is not None
-    track = body_track(reading.load_recording(walk).fit)
+    fitted = reading.load_recording(walk).fit
+    assert fitted is not None
+    track = body_track(fitted)
     low, high = np.frombuffer(browser.get(f"/recordings/{walk}/body").content, np.uint8).reshape(2, -1, N_FRAMES)
     again = (low.astype(np.uint16) | high.astype(np.uint16) << 8).astype(np.int16).astype(np.int64)
     changes = np.concatenate([again[:, :1], np.cumsum(again[:, 1:], axis=1)], axis=1)
@@ -77,6 +79,8 @@ def test_curves_events_and_what_is_uncertain(looked_at):
     key = fit.trial_key(walk)
     assert key is not None
     about = reading.load_recording(walk)
+    assert about.fit is not None
+    assert about.events is not None
     assert len(found["time"]) == N_FRAMES
     knee = next(c for c in found["curves"] if c["name"] == "Knee flexion")
     np.testing.assert_allclose(knee["left"]["value"], leg_angles(about.fit)["left"]["knee_flexion"], atol=0.006)

@@ -34,7 +34,7 @@ def walk(chromium: Any, database: Path, tmp_path_factory: pytest.TempPathFactory
 
 def changed(page: Any, before: bytes) -> bytes:
     """The 3D picture once it is another one."""
-    for _ in range(50):
+    for _ in range(1200):
         now = page.locator(".space-view").screenshot()
         if now != before:
             return now

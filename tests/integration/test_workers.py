@@ -365,8 +365,8 @@ def test_a_job_beyond_its_time_limit_is_ended(tables, tmp_path: Path, quick: Non
 
 
 def test_sigterm_lets_the_job_in_hand_end_or_puts_it_back(tables, tmp_path: Path, quick: None):
-    for grace_s, done in ((20.0, 1), (0.0, 0)):
-        (path,) = videos(tmp_path, f"slow{int(grace_s)}")
+    for name, grace_s, done in (("slow", 120.0, 1), ("hangs", 0.0, 0)):
+        (path,) = videos(tmp_path, name)
         register(path, session_label=path.stem)
         boss = Supervisor(Options(resource="decode", selftest=False, grace_s=grace_s), target=worker_target.work)
         timer = threading.Thread(target=_stop_when_begun, args=(boss, Path(f"{path}.begun")))
@@ -375,7 +375,7 @@ def test_sigterm_lets_the_job_in_hand_end_or_puts_it_back(tables, tmp_path: Path
         assert boss.run() == 0
         timer.join()
         assert len(video.VideoInfo()) == done
-        assert time.monotonic() - start < 30.0
+        assert time.monotonic() - start < 120.0
         if done:
             lab.Subject.delete(prompt=False, part_integrity="cascade")
     assert jobs_left() == {"VideoInfo": {"pending": 1}}
@@ -413,7 +413,7 @@ def test_the_heartbeat_says_what_is_done(tables: None, monkeypatch):
     with Heartbeat("cpu") as beats:
         beats.doing("VideoInfo video_id=3")
         beats.count("VideoInfo", 2, 1, 0.5)
-        until = time.monotonic() + 30
+        until = time.monotonic() + 120
         while not (alive := [w["worker_doing"] for w in live_workers()])[0] and time.monotonic() < until:
             time.sleep(0.05)
         assert alive == ["VideoInfo video_id=3"]

@@ -203,7 +203,7 @@ def test_the_script_of_a_folder_makes_the_same_tables(written):
     script, out = written / "data" / "make_report.py", written / "again"
     root = Path(__file__).resolve().parents[2]
     done = subprocess.run(
-        [sys.executable, "-c", code, script, out], cwd=root, capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", code, script, out], cwd=root, capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 0, done.stderr[-2000:]
     for path in (written / "out" / "tables").glob("*.csv"):
