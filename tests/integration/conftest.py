@@ -27,6 +27,23 @@ def tables(declared: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     remove_all()
 
 
+@pytest.fixture(scope="module")
+def module_patch() -> Iterator[pytest.MonkeyPatch]:
+    """What a module of tests replaces, put back at its end."""
+    with pytest.MonkeyPatch.context() as patch:
+        yield patch
+
+
+@pytest.fixture(scope="module")
+def module_tables(
+    declared: None, module_patch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Path]:
+    """`tables` of a whole module, which fills them once; yields a folder for its videos."""
+    chain.install(module_patch)
+    yield tmp_path_factory.mktemp("videos")
+    remove_all()
+
+
 @pytest.fixture
 def drop(tables: None, tmp_path: Path) -> Path:
     """An empty drop folder."""

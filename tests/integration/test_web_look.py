@@ -17,22 +17,13 @@ from workers.web.movement import METRE_STEPS, TURN_STEPS
 
 
 @pytest.fixture(scope="module")
-def looked_at(database: Path, tmp_path_factory: pytest.TempPathFactory):
+def looked_at(module_tables: Path):
     """Videos 1 (fitted) and 2 (nobody in it), and the file of 1."""
-    import schemas
-    from tests.integration import chain
-    from tests.rows import remove_all
-
-    with pytest.MonkeyPatch.context() as patch:
-        schemas.activate()
-        chain.install(patch)
-        folder = tmp_path_factory.mktemp("look")
-        path = small_video(folder, "walk")
-        ids = register(path, session_label="2026-01-10")
-        ids += register(small_video(folder, "none", people="nobody"), session_label="2026-02-10")
-        populate()
-        yield path, *ids
-        remove_all()
+    path = small_video(module_tables, "walk")
+    ids = register(path, session_label="2026-01-10")
+    ids += register(small_video(module_tables, "none", people="nobody"), session_label="2026-02-10")
+    populate()
+    return path, *ids
 
 
 def test_a_page_of_a_recording(looked_at):

@@ -161,6 +161,7 @@ def test_curves_with_unknown_points_are_left_out_and_counted(study, results):
     assert np.isfinite(change.a).all()
 
 
+@pytest.mark.slow
 def test_the_files_of_a_report(written):
     out = written / "out"
     page = (out / "report.html").read_text()
@@ -194,6 +195,7 @@ def test_the_files_of_a_report(written):
     assert float(found[0]["low"]) < made.INDEX.srm < float(found[0]["high"])
 
 
+@pytest.mark.slow
 def test_the_script_of_a_folder_makes_the_same_tables(written):
     """In a process that cannot import the tables of the database."""
     code = (
