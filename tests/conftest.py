@@ -83,9 +83,8 @@ def database(nothing_of_the_developer: None) -> Iterator[Path]:
 @pytest.fixture(scope="session")
 def chromium() -> Iterator[Any]:
     """The Chromium of the machine, without windows."""
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=_CHROMIUM, args=["--no-sandbox"])
         yield browser
         browser.close()

@@ -31,9 +31,11 @@ def work(options: Options, pipe: Connection) -> None:
         name = Path(path).stem
         if "kills" in name:
             os.kill(os.getpid(), signal.SIGKILL)
-        if "hangs" in name or "slow" in name:
+        if "hangs" in name:
+            time.sleep(3600)
+        if "slow" in name:
             _note(path, "begun")
-            time.sleep(3600 if "hangs" in name else 3.0)
+            time.sleep(3.0)
         return real(path)
 
     patch.setattr(pbl_pipeline.video, "probe", probe)
