@@ -25,7 +25,7 @@ test: $(READY)  ## the tests
 	$(PYTEST)
 
 test-fast: $(READY) ## the tests that take a minute and a half: no database, no fit, no network over a video
-	$(PYTEST) -m "not slow and not database and not needs_extra"
+	$(PYTEST) tests -m "not slow and not database and not browser and not needs_extra"
 
 lint: $(READY)  ## style, formatting and types
 	$(BIN)/ruff check .

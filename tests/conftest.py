@@ -8,8 +8,11 @@ into an empty cache on purpose). Set PBL_CACHE to try a cold start. The database
 
 from __future__ import annotations
 
+import importlib.util
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -18,13 +21,38 @@ from tests.database import installation, leave_nothing_of_the_developer
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
+#: How to have what the browser tests need, "" on a machine that has it.
+_CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+_NO_BROWSER = " and ".join(
+    how
+    for how, there in (
+        ("apt-get install chromium", _CHROMIUM),
+        ("pip install -e .[browser]", importlib.util.find_spec("playwright")),
+    )
+    if not there
+)
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """The marker `database` follows from the fixture of that name; `machine` runs only where it is asked for."""
+    """The markers `database` and `browser` follow from the fixtures; `machine` runs only where it is asked for."""
     for item in items:
-        if "database" in getattr(item, "fixturenames", ()):
+        names = getattr(item, "fixturenames", ())
+        if "database" in names:
             item.add_marker(pytest.mark.database)
+        if "chromium" in names:
+            item.add_marker(pytest.mark.browser)
+            if _NO_BROWSER:
+                item.add_marker(pytest.mark.skip(reason=f"browser: {_NO_BROWSER}"))
         if item.get_closest_marker("machine") and "machine" not in config.option.markexpr:
             item.add_marker(pytest.mark.skip(reason="takes minutes and starts services: pytest -m machine"))
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Say in one line that the browser tests were left out, and how to have them."""
+    skipped = terminalreporter.stats.get("skipped", ())
+    n_left_out = sum(f"browser: {_NO_BROWSER}" in str(report.longrepr) for report in skipped)
+    if _NO_BROWSER and n_left_out:
+        terminalreporter.write_line(f"LEFT OUT: {n_left_out} tests of pages in a browser; to run them: {_NO_BROWSER}")
 
 
 @pytest.fixture(scope="session")
@@ -50,3 +78,13 @@ def database(nothing_of_the_developer: None) -> Iterator[Path]:
     """The embedded server, running, with PBL_HOME set to its folder for the whole session; yields that folder."""
     with installation() as home:
         yield home
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Any]:
+    """The Chromium of the machine, without windows."""
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=_CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()

@@ -38,7 +38,11 @@ def leave_nothing_of_the_developer(patch: pytest.MonkeyPatch) -> None:
 
 @contextlib.contextmanager
 def installation() -> Iterator[Path]:
-    """A running embedded server with its store, and PBL_HOME set to its folder, which is yielded and removed after."""
+    """A running embedded server with its store, and PBL_HOME set to its folder, which is yielded and removed after.
+
+    It leaves it to the system when a commit is on the disk: a test outlives no power cut. What a killed server keeps is
+    tested on servers with the settings of users (test_embedded_db.py).
+    """
     home = new_home()
     end = functools.partial(remove_home, home)
     atexit.register(end)  # also when what uses it breaks off
@@ -46,7 +50,10 @@ def installation() -> Iterator[Path]:
         leave_nothing_of_the_developer(patch)
         patch.setenv("PBL_HOME", str(home))
         try:
-            embedded.start(folder=embedded.Folder(home / "db"))
+            folder = embedded.Folder(home / "db")
+            embedded.start(folder=folder)
+            with embedded.admin(folder) as connection, connection.cursor() as cursor:
+                cursor.execute("SET GLOBAL innodb_flush_log_at_trx_commit = 2")
             yield home
         finally:
             end()

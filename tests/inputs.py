@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pbl_pipeline.keypoints import Keypoints, WorldMarkers
-from pbl_pipeline.video import Camera, CameraPose
+from pbl_pipeline.video import Camera, CameraPose, VideoInfo
 
 T, J = 5, 3
 NAMES = ("A", "B", "C")
@@ -48,6 +48,33 @@ def keypoints(**changes) -> Keypoints:
         "box_px": np.full((T, 4), np.nan),
     }
     return Keypoints(**{**values, **changes})
+
+
+def video_info(**changes) -> VideoInfo:
+    """Facts of a video of three frames, filmed upright, whose container names no camera."""
+    values: dict = {
+        "path": "v.mov",
+        "sha256": "0" * 64,
+        "size_bytes": 1,
+        "container": "mov",
+        "codec": "h264",
+        "pixel_format": "yuv420p",
+        "width_px": 720,
+        "height_px": 1280,
+        "rotation_deg": 90,
+        "time_s": np.arange(3) / 30,
+        "fps": 30.0,
+        "duration_s": 0.1,
+        "n_frames": 3,
+        "n_frames_announced": 3,
+        "variable_frame_rate": False,
+        "recorded_utc": None,
+        "make": None,
+        "model": None,
+    }
+    if "time_s" in changes:
+        values |= dict.fromkeys(("n_frames", "n_frames_announced"), len(changes["time_s"]))
+    return VideoInfo(**{**values, **changes})
 
 
 def changed(array: np.ndarray, value: float) -> np.ndarray:

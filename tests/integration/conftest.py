@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -29,22 +27,26 @@ def tables(declared: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     remove_all()
 
 
+@pytest.fixture(scope="module")
+def module_patch() -> Iterator[pytest.MonkeyPatch]:
+    """What a module of tests replaces, put back at its end."""
+    with pytest.MonkeyPatch.context() as patch:
+        yield patch
+
+
+@pytest.fixture(scope="module")
+def module_tables(
+    declared: None, module_patch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Path]:
+    """`tables` of a whole module, which fills them once; yields a folder for its videos."""
+    chain.install(module_patch)
+    yield tmp_path_factory.mktemp("videos")
+    remove_all()
+
+
 @pytest.fixture
 def drop(tables: None, tmp_path: Path) -> Path:
     """An empty drop folder."""
     folder = tmp_path / "uploads"
     folder.mkdir()
     return folder
-
-
-@pytest.fixture(scope="session")
-def chromium() -> Iterator[Any]:
-    """A Chromium of the machine, without windows. Skips where there is none."""
-    sync_api = pytest.importorskip("playwright.sync_api", reason="pip install -e .[browser]")
-    program = shutil.which("chromium") or shutil.which("google-chrome")
-    if program is None:
-        pytest.skip("no Chromium on this machine: apt-get install chromium")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        yield browser
-        browser.close()

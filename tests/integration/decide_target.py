@@ -33,8 +33,8 @@ def at_once(function: str, *calls: tuple[Any, ...]) -> list[tuple[str, str]]:
     processes = [context.Process(target=decide, args=(function, c, together, answers)) for c in calls]
     for process in processes:
         process.start()
-    found = sorted(answers.get(timeout=90) for _ in processes)
+    found = sorted(answers.get(timeout=300) for _ in processes)
     for process in processes:
-        process.join(30)
+        process.join(120)
         assert process.exitcode == 0
     return found

@@ -91,8 +91,8 @@ def test_there_and_back(elsewhere: Any, tmp_path: Path, monkeypatch: pytest.Monk
     assert lab.Project.fetch1("project_title") == TITLE
     assert frames.session_summary()["subject"].tolist() == ["P001"]
     results = load_visit({"subject": "P001"})
-    assert results.fitted
-    assert np.isfinite(results.fitted[0].fit.qpos).any()
+    fits = [r.fit for r in results.fitted if r.fit is not None]
+    assert np.isfinite(fits[0].qpos).any()
     kept = everything_but_refreshes()
     assert not populate().did_something
     # Never over another.

@@ -46,7 +46,7 @@ def jobs() -> dict[str, int]:
 
 
 def test_two_batches_are_computed_at_a_time_and_each_session_once(sessions):
-    together, sizes = threading.Barrier(2, timeout=30), []
+    together, sizes = threading.Barrier(2, timeout=120), []
 
     def solve(n: int) -> None:
         sizes.append(n)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import schemas
 from schemas import fit, gdi, lab, session, video
 from schemas.chain import ON_REQUEST
 from schemas.datajoint_setup import dj
-from tests.rows import register, remove_all
+from tests.rows import register
 from workers.populate import populate
 
 from . import chain
@@ -21,18 +20,13 @@ VISITS, VIDEOS = 4, 8
 
 
 @pytest.fixture(scope="module")
-def visits(declared: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def visits(module_tables: Path) -> None:
     """Two people with two visits each of two videos each, computed."""
-    folder: Path = tmp_path_factory.mktemp("videos")
-    with pytest.MonkeyPatch.context() as patch:
-        chain.install(patch)
-        for person in ("P001", "P002"):
-            for label in ("2026-03-01", "2026-06-01"):
-                paths = [chain.small_video(folder, f"{person}-{label}-{i}") for i in range(2)]
-                register(*paths, subject=person, session_label=label)
-        populate()
-    yield
-    remove_all()
+    for person in ("P001", "P002"):
+        for label in ("2026-03-01", "2026-06-01"):
+            paths = [chain.small_video(module_tables, f"{person}-{label}-{i}") for i in range(2)]
+            register(*paths, subject=person, session_label=label)
+    populate()
 
 
 def _computed() -> list[Any]:

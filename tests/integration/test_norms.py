@@ -12,7 +12,6 @@ import pytest
 from click.testing import CliRunner
 
 import pbl_pipeline.gait
-import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GaitMetrics
 from schemas import fit, gait, gdi, lab, load_visit, norms, session
@@ -27,18 +26,14 @@ from . import chain
 
 
 @pytest.fixture(scope="module")
-def walkers(database: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def walkers(module_tables: Path) -> Iterator[Path]:
     """Four healthy people and a patient, through the whole chain with stand-ins for the slow stages."""
-    schemas.activate()
-    folder = tmp_path_factory.mktemp("walkers")
-    with pytest.MonkeyPatch.context() as patch:
-        chain.install(patch)
-        for i, name in enumerate(("C01", "C02", "C03", "C04", "P01")):
-            path = chain.small_video(folder, f"walk{i}", n=340 + i)
-            ingest([path], VisitRecord(name, population="patient" if name == "P01" else "healthy"))
-        populate()
-        assert len(gdi.SessionGdi()) == 5
-        yield folder
+    for i, name in enumerate(("C01", "C02", "C03", "C04", "P01")):
+        path = chain.small_video(module_tables, f"walk{i}", n=340 + i)
+        ingest([path], VisitRecord(name, population="patient" if name == "P01" else "healthy"))
+    populate()
+    assert len(gdi.SessionGdi()) == 5
+    yield module_tables
     remove_all()
     (gdi.NormativeSet & "norm_query IS NOT NULL").delete(prompt=False)
 

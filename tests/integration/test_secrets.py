@@ -104,7 +104,7 @@ print("cipher", connection.connect().query("SHOW SESSION STATUS LIKE 'Ssl_cipher
 
 def in_new_process(code: str) -> subprocess.CompletedProcess[str]:
     """DataJoint keeps one connection per process: each way of connecting gets one of its own."""
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False)
 
 
 # ----------------------------------------------------------------------------------------------------------- TLS
@@ -182,7 +182,7 @@ def test_no_secret_is_printed_or_logged(database: Path, use: Use, tmp_path: Path
         )
     for child in running:  # beside each other
         with child:
-            said += child.communicate(timeout=120)[0]
+            said += child.communicate(timeout=300)[0]
     assert "DB_REFUSED" in said
     assert "STORE_UNAVAILABLE" in said
     for file in (p for p in tmp_path.rglob("*") if p.is_file() and p not in (wrong, s3)):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.study import read_study
 from schemas import fit, gait, gdi, session, study, video
@@ -21,7 +19,6 @@ from schemas.reading import frames
 from schemas.studies import slices
 from schemas.studies.study_sheets import import_sheets
 from tests.command import pbl
-from tests.rows import remove_all
 from workers.populate import populate
 
 from . import chain
@@ -37,25 +34,19 @@ X001,,,,,patient,dcm,,no,declined,,
 
 
 @pytest.fixture(scope="module")
-def cohort(database: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def cohort(module_tables: Path) -> Path:
     """Three visits through the whole chain, one of them with a fast trial too; one visit without a video; an excluded
     person."""
-    schemas.activate()
-    folder = tmp_path_factory.mktemp("cohort")
-    with pytest.MonkeyPatch.context() as patch:
-        chain.install(patch)
-        for i, (subject, label, pace) in enumerate(
-            [("P001", "pre", None), ("P001", "pre", "fast"), ("P001", "after", None), ("C001", "pre", None)]
-        ):
-            path = chain.small_video(folder, f"walk{i}", n=340 + i)
-            ingest([path], VisitRecord(subject, label, pace=pace))
-        populate()
-        sheet = folder / "visits.csv"
-        sheet.write_text(VISITS)
-        assert import_sheets([sheet]).done
-        slices.freeze("first", "dcm", event="surgery", note="Two clinics.")
-        yield folder
-    remove_all()
+    for i, (subject, label, pace) in enumerate(
+        [("P001", "pre", None), ("P001", "pre", "fast"), ("P001", "after", None), ("C001", "pre", None)]
+    ):
+        ingest([chain.small_video(module_tables, f"walk{i}", n=340 + i)], VisitRecord(subject, label, pace=pace))
+    populate()
+    sheet = module_tables / "visits.csv"
+    sheet.write_text(VISITS)
+    assert import_sheets([sheet]).done
+    slices.freeze("first", "dcm", event="surgery", note="Two clinics.")
+    return module_tables
 
 
 def of(frame: Any, subject: str, visit: str) -> Any:

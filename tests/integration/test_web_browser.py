@@ -13,8 +13,6 @@ from tests.integration.chain import N_FRAMES, small_video
 from tests.rows import register
 from workers.populate import populate
 
-pytestmark = [pytest.mark.needs_extra, pytest.mark.slow]
-
 #: In the page: while the video plays, the number in each shown picture (`numbered_frames`: its grey is 8 times the
 #: number modulo 30) and the frame of the body that is drawn then.
 WATCH = """
@@ -98,7 +96,7 @@ def test_from_the_link_to_a_frame_of_the_body(page: Any):
 def settled(page: Any) -> int:
     """The frame that picture, body and 3D view show once nothing moves any more; they are the same one."""
     last: dict[str, int] = {}
-    for _ in range(60):
+    for _ in range(1000):
         found = page.evaluate(SHOWN)
         if found == last and found["picture"] == found["body"] % 30:
             assert found["body"] == found["space"] == found["strip"], found
@@ -127,7 +125,11 @@ def test_picture_body_and_3d_view_show_one_frame_at_pause_step_and_seek(page: An
         page.locator("#speed").select_option(speed)
         before = settled(page)
         page.get_by_role("button", name="Play").click()
-        page.wait_for_timeout(700)
+        page.wait_for_selector(f"canvas.body:not([data-frame='{before}'])")
+        for _ in range(1000):
+            if int(page.locator("canvas.body").get_attribute("data-frame")) > before + 3:
+                break
+            page.wait_for_timeout(30)
         page.get_by_role("button", name="Pause").click()
         assert settled(page) > before + 3
     page.get_by_label("Points").check()

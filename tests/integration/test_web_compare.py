@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 
 import pbl_pipeline.fit
-import schemas
 from pbl_pipeline.errors import PblError
 from schemas import gdi, study
 from schemas.reading import comparison, frames
 from tests.integration import chain, web
 from tests.integration.chain import small_video
-from tests.rows import register, remove_all
+from tests.rows import register
 from workers.populate import populate
 from workers.web.compare import charts_of
 
@@ -26,35 +25,29 @@ LESS = 0.8
 
 
 @pytest.fixture(scope="module")
-def visits(database: Path, tmp_path_factory: pytest.TempPathFactory):
+def visits(module_tables: Path, module_patch: pytest.MonkeyPatch) -> None:
     """Visits 1 and 2 of P001, the second with smaller angles, 3 of P002, and 4 of P001 without a result."""
-    with pytest.MonkeyPatch.context() as patch:
-        schemas.activate()
-        chain.install(patch)
 
-        def smaller(trials: Any, names: Any, *args: Any, **more: Any):
-            found = chain.fit_session(trials, names, *args, **more)
-            by = LESS if "2026-04-10" in names[0] else 1.0
-            fits = (dataclasses.replace(t, qpos=np.hstack([t.qpos[:, :6], by * t.qpos[:, 6:]])) for t in found.trials)
-            return dataclasses.replace(found, trials=tuple(fits))
+    def smaller(trials: Any, names: Any, *args: Any, **more: Any):
+        found = chain.fit_session(trials, names, *args, **more)
+        by = LESS if "2026-04-10" in names[0] else 1.0
+        fits = (dataclasses.replace(t, qpos=np.hstack([t.qpos[:, :6], by * t.qpos[:, 6:]])) for t in found.trials)
+        return dataclasses.replace(found, trials=tuple(fits))
 
-        patch.setattr(pbl_pipeline.fit, "fit_session", smaller)
-        folder = tmp_path_factory.mktemp("compare")
-        for subject, day in (("P001", "2026-01-10"), ("P001", "2026-04-10"), ("P002", "2026-02-01")):
-            register(small_video(folder, f"walk {day}"), subject=subject, session_label=day)
-        populate()
-        register(small_video(folder, "later"), session_label="2026-09-10")
-        for number, index in ((1, 80.0), (2, 86.0), (3, 95.0)):
-            key = comparison.shown_visit(number).key
-            row = {k: key[k] for k in gdi.SessionGdi.primary_key}
-            values = {"session_gdi": index, "session_gdi_sd": 3.0, "session_gdi_minimal_change": 5.0 + number}
-            gdi.SessionGdi.update1({**row, **values})
-        study.ClinicalScore.insert(
-            {"session_id": i, "instrument": n, "score_value": v}
-            for i, n, v in ((1, "mJOA", 12), (2, "mJOA", 15), (1, "BBS", 44), (2, "mJOA-LE", 4))
-        )
-        yield
-        remove_all()
+    module_patch.setattr(pbl_pipeline.fit, "fit_session", smaller)
+    for subject, day in (("P001", "2026-01-10"), ("P001", "2026-04-10"), ("P002", "2026-02-01")):
+        register(small_video(module_tables, f"walk {day}"), subject=subject, session_label=day)
+    populate()
+    register(small_video(module_tables, "later"), session_label="2026-09-10")
+    for number, index in ((1, 80.0), (2, 86.0), (3, 95.0)):
+        key = comparison.shown_visit(number).key
+        row = {k: key[k] for k in gdi.SessionGdi.primary_key}
+        values = {"session_gdi": index, "session_gdi_sd": 3.0, "session_gdi_minimal_change": 5.0 + number}
+        gdi.SessionGdi.update1({**row, **values})
+    study.ClinicalScore.insert(
+        {"session_id": i, "instrument": n, "score_value": v}
+        for i, n, v in ((1, "mJOA", 12), (2, "mJOA", 15), (1, "BBS", 44), (2, "mJOA-LE", 4))
+    )
 
 
 def test_changes_against_the_reference(visits: None):
@@ -183,8 +176,6 @@ def test_curves_that_are_drawn_are_those_of_the_tables(visits: None):
     assert knee.sides["left"].count("fill-opacity") == 2  # a band each
 
 
-@pytest.mark.needs_extra
-@pytest.mark.slow
 def test_videos_in_step_in_a_browser(visits: None, chromium: Any):
     with web.shown(chromium) as page:
         page.get_by_role("link", name="2026-01-10").first.click()
@@ -229,7 +220,7 @@ def test_videos_in_step_in_a_browser(visits: None, chromium: Any):
 
 def _until(page: Any, holds: str) -> None:
     """Wait until an expression holds. Playwright's own wait evaluates texts in the page, which its policy forbids."""
-    for _ in range(100):
+    for _ in range(1200):
         if page.evaluate(holds):
             return
         page.wait_for_timeout(50)

@@ -184,8 +184,6 @@ def test_who_may_not_and_what_is_not_there(visits: None, browser: Any):
     assert state(browser, 1) == ""
 
 
-@pytest.mark.needs_extra
-@pytest.mark.slow
 def test_from_the_button_to_the_result(visits: None, chromium: Any, hold: Path):
     mark(web.client(), 2)
     (hold / "hold").touch()

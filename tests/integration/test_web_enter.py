@@ -127,8 +127,6 @@ def test_a_value_that_an_import_wrote_out_of_range_does_not_block_the_others(two
     assert enter(1, {"mJOA": "99", "BBS": "12"}, "A", entry(1).seen).changed == ("BBS",)
 
 
-@pytest.mark.needs_extra
-@pytest.mark.slow
 def test_from_the_click_to_the_row_in_a_browser(two_visits: None, chromium: Any):
     with web.shown(chromium) as page:
         page.goto("/visits/1")

@@ -320,8 +320,6 @@ def test_trend_slices_move_and_forget(visit: str, tmp_path: Path):
     assert len(gait.EventCorrection()) == len(gait.EventCorrection.Event()) == 0
 
 
-@pytest.mark.needs_extra
-@pytest.mark.slow
 def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str):
     before = event_corrections.shown(1)
     assert before is not None

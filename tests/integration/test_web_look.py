@@ -17,22 +17,13 @@ from workers.web.movement import METRE_STEPS, TURN_STEPS
 
 
 @pytest.fixture(scope="module")
-def looked_at(database: Path, tmp_path_factory: pytest.TempPathFactory):
+def looked_at(module_tables: Path):
     """Videos 1 (fitted) and 2 (nobody in it), and the file of 1."""
-    import schemas
-    from tests.integration import chain
-    from tests.rows import remove_all
-
-    with pytest.MonkeyPatch.context() as patch:
-        schemas.activate()
-        chain.install(patch)
-        folder = tmp_path_factory.mktemp("look")
-        path = small_video(folder, "walk")
-        ids = register(path, session_label="2026-01-10")
-        ids += register(small_video(folder, "none", people="nobody"), session_label="2026-02-10")
-        populate()
-        yield path, *ids
-        remove_all()
+    path = small_video(module_tables, "walk")
+    ids = register(path, session_label="2026-01-10")
+    ids += register(small_video(module_tables, "none", people="nobody"), session_label="2026-02-10")
+    populate()
+    return path, *ids
 
 
 def test_a_page_of_a_recording(looked_at):
@@ -58,7 +49,9 @@ def test_the_body_that_is_sent_is_that_of_the_fit(looked_at):
     body = browser.get(f"/recordings/{walk}/movement").json()["body"]
     key = fit.trial_key(walk)
     assert key is not None
-    track = body_track(reading.load_recording(walk).fit)
+    fitted = reading.load_recording(walk).fit
+    assert fitted is not None
+    track = body_track(fitted)
     low, high = np.frombuffer(browser.get(f"/recordings/{walk}/body").content, np.uint8).reshape(2, -1, N_FRAMES)
     again = (low.astype(np.uint16) | high.astype(np.uint16) << 8).astype(np.int16).astype(np.int64)
     changes = np.concatenate([again[:, :1], np.cumsum(again[:, 1:], axis=1)], axis=1)
@@ -77,6 +70,8 @@ def test_curves_events_and_what_is_uncertain(looked_at):
     key = fit.trial_key(walk)
     assert key is not None
     about = reading.load_recording(walk)
+    assert about.fit is not None
+    assert about.events is not None
     assert len(found["time"]) == N_FRAMES
     knee = next(c for c in found["curves"] if c["name"] == "Knee flexion")
     np.testing.assert_allclose(knee["left"]["value"], leg_angles(about.fit)["left"]["knee_flexion"], atol=0.006)

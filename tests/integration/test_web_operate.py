@@ -128,8 +128,6 @@ def test_what_is_being_computed_by_whom_since_when(three_gone: list[int]):
     assert f'href="/recordings/{three_gone[0]}"' not in page  # an operator does not look
 
 
-@pytest.mark.needs_extra
-@pytest.mark.slow
 def test_from_the_click_to_the_queue_in_a_browser(three_gone: list[int], chromium: Any):
     with web.shown(chromium, role="operator") as page:
         page.wait_for_url("**/operate")

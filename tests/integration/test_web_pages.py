@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +10,8 @@ import pytest
 
 from tests.integration import web
 from tests.integration.chain import small_video
-from tests.rows import register, remove_all
+from tests.rows import register
 from workers.populate import populate
-
-pytestmark = [pytest.mark.needs_extra, pytest.mark.slow]
 
 #: What a page of each kind needs until everything on it is there.
 PAGES = {
@@ -60,28 +58,19 @@ LAYOUT = """
 
 
 @pytest.fixture(scope="module")
-def visits(chromium: Any, database: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def visits(chromium: Any, module_tables: Path) -> None:
     """Video 1 with a fit, 2 in which somebody has to be chosen, 3 with nobody; a long label among the visits."""
-    import schemas
-    from tests.integration import chain
-
-    with pytest.MonkeyPatch.context() as patch:
-        schemas.activate()
-        chain.install(patch)
-        folder = tmp_path_factory.mktemp("pages")
-        register(small_video(folder, "walk"), session_label="2026-01-10")
-        register(small_video(folder, "two", people="two alike"), session_label="after the second operation, left knee")
-        register(small_video(folder, "none", people="nobody"), subject="P002", session_label="2026-02-10")
-        populate()
-        yield
-        remove_all()
+    walk, two = small_video(module_tables, "walk"), small_video(module_tables, "two", people="two alike")
+    register(walk, session_label="2026-01-10")
+    register(two, session_label="after the second operation, left knee")
+    register(small_video(module_tables, "none", people="nobody"), subject="P002", session_label="2026-02-10")
+    populate()
 
 
 @pytest.fixture(scope="module")
 def axe() -> str:
     """axe-core as a script."""
-    package = pytest.importorskip("axe_playwright_python", reason="pip install -e .[browser]")
-    return (Path(package.__file__).parent / "axe.min.js").read_text("utf-8")
+    return (files("axe_playwright_python") / "axe.min.js").read_text("utf-8")
 
 
 def go(page: Any, kind: str) -> None:

@@ -58,8 +58,6 @@ def test_boxes_are_those_of_the_tracking(two_alike: int):
     assert web.client(signed_in=False).get(f"/recordings/{two_alike}/boxes").status_code == 401
 
 
-@pytest.mark.needs_extra
-@pytest.mark.slow
 @pytest.mark.parametrize("way", ["click", "key", "tab"])
 def test_from_a_click_on_a_person_to_the_row(chromium: Any, two_alike: int, way: str):
     with web.shown(chromium, name="A. First") as page:
@@ -87,8 +85,6 @@ def test_from_a_click_on_a_person_to_the_row(chromium: Any, two_alike: int, way:
     assert (row["decision_by"], row["decision_after"]) == ("A. First", {"person": 2})
 
 
-@pytest.mark.needs_extra
-@pytest.mark.slow
 def test_another_person_is_chosen_only_where_that_is_asked_for(chromium: Any, seen: None, tmp_path: Path):
     number = register(small_video(tmp_path, "walk"), session_label="2026-01-10")[0]
     populate()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,33 +9,24 @@ import pytest
 
 from tests.integration import web
 from tests.integration.chain import small_video
-from tests.rows import register, remove_all
+from tests.rows import register
 from workers.populate import populate
-
-pytestmark = [pytest.mark.needs_extra, pytest.mark.slow]
 
 #: Byte of everything but the video that a recording's page may load, as it comes over the line.
 WEIGHT = 400_000
 
 
 @pytest.fixture(scope="module")
-def walk(chromium: Any, database: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+def walk(chromium: Any, module_tables: Path) -> int:
     """A fitted recording of 30 s."""
-    import schemas
-    from tests.integration import chain
-
-    with pytest.MonkeyPatch.context() as patch:
-        schemas.activate()
-        chain.install(patch)
-        number = register(small_video(tmp_path_factory.mktemp("space"), "walk", 900), session_label="2026-01-10")[0]
-        populate()
-        yield number
-        remove_all()
+    number = register(small_video(module_tables, "walk", 900), session_label="2026-01-10")[0]
+    populate()
+    return number
 
 
 def changed(page: Any, before: bytes) -> bytes:
     """The 3D picture once it is another one."""
-    for _ in range(50):
+    for _ in range(1200):
         now = page.locator(".space-view").screenshot()
         if now != before:
             return now

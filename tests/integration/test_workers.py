@@ -329,7 +329,7 @@ def test_a_worker_that_is_told_to_end_at_once_puts_back_all_it_holds(tables, tmp
 def supervise(**options) -> int:
     """A worker as it runs in production, behind stand-ins."""
     boss = Supervisor(Options(once=True, selftest=False, **options), target=worker_target.work)
-    watchdog = threading.Timer(180, boss.stop)  # one that never ends fails, too
+    watchdog = threading.Timer(1200, boss.stop)  # one that never ends fails, too
     watchdog.start()
     try:
         return boss.run()
@@ -355,17 +355,17 @@ def test_a_job_that_kills_its_process_becomes_an_error_and_the_others_are_done(t
 
 def test_a_job_beyond_its_time_limit_is_ended(tables, tmp_path: Path, quick: None):
     ids = register(*videos(tmp_path, "walk1", "hangs", "walk2"))
-    factor = 3.0 / registry.stage_of("VideoInfo").limit_s
+    factor = 10.0 / registry.stage_of("VideoInfo").limit_s
     assert supervise(resource="decode", limit_factor=factor) == 0
     (error,) = pipeline_status().errors
     assert (error.code, error.about) == ("TIME_LIMIT", "hangs.mp4")
-    assert "time limit of 3 s" in error.found
+    assert "time limit of 10 s" in error.found
     assert sorted(video.VideoInfo.to_arrays("video_id")) == [ids[0], ids[2]]
     assert jobs_left()["VideoInfo"] == {"error": 1}
 
 
 def test_sigterm_lets_the_job_in_hand_end_or_puts_it_back(tables, tmp_path: Path, quick: None):
-    for grace_s, done in ((20.0, 1), (0.0, 0)):
+    for grace_s, done in ((120.0, 1), (0.0, 0)):
         (path,) = videos(tmp_path, f"slow{int(grace_s)}")
         register(path, session_label=path.stem)
         boss = Supervisor(Options(resource="decode", selftest=False, grace_s=grace_s), target=worker_target.work)
@@ -375,7 +375,7 @@ def test_sigterm_lets_the_job_in_hand_end_or_puts_it_back(tables, tmp_path: Path
         assert boss.run() == 0
         timer.join()
         assert len(video.VideoInfo()) == done
-        assert time.monotonic() - start < 30.0
+        assert time.monotonic() - start < 120.0
         if done:
             lab.Subject.delete(prompt=False, part_integrity="cascade")
     assert jobs_left() == {"VideoInfo": {"pending": 1}}
@@ -413,7 +413,7 @@ def test_the_heartbeat_says_what_is_done(tables: None, monkeypatch):
     with Heartbeat("cpu") as beats:
         beats.doing("VideoInfo video_id=3")
         beats.count("VideoInfo", 2, 1, 0.5)
-        until = time.monotonic() + 30
+        until = time.monotonic() + 120
         while not (alive := [w["worker_doing"] for w in live_workers()])[0] and time.monotonic() < until:
             time.sleep(0.05)
         assert alive == ["VideoInfo video_id=3"]

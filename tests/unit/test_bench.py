@@ -11,16 +11,12 @@ import time
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from scipy.spatial.transform import Rotation
 
 from pbl_pipeline import bench
 from pbl_pipeline.bench import Case, Data, case, data
 from pbl_pipeline.bench.accuracy import MAIN_JOINTS, PAPER_JOINTS, joint_errors_deg, mean_over, summary
 from pbl_pipeline.body import load_body
 from pbl_pipeline.cli.bench import bench as command
-from research.benchmarks import fit as comparison
-from research.benchmarks import fit_data
-from research.benchmarks.fit_case import accuracy_of, camera_error_deg
 
 NAMES = load_body().joint_names
 
@@ -31,15 +27,6 @@ NAMES = load_body().joint_names
 def test_the_cases_are_trials_by_batch():
     cases = bench.fit_cases("gauss-newton", (1, 10), (1, 16, 64), 3, 2)
     assert [(c.data.n_trials, c.batch) for c in cases] == [(n, b) for n in (1, 10) for b in (1, 16, 64)]
-    assert all(c.data.n_sessions == (c.batch if c.batch > 1 else 3) for c in cases)
-    assert len({c.label for c in cases}) == len(cases)
-
-
-def test_the_cases_of_the_comparison_are_solver_by_trials_by_camera_by_batch():
-    methods = list(comparison.METHOD_OF.values())
-    cases = comparison.speed_cases(methods, (1, 10), fit_data.MOTIONS, (1, 16, 64), 3, 3)
-    assert len(cases) == 2 * 2 * 3 + 2 * 2
-    assert {c.batch for c in cases if c.method == "paper-2025"} == {1}
     assert all(c.data.n_sessions == (c.batch if c.batch > 1 else 3) for c in cases)
     assert len({c.label for c in cases}) == len(cases)
 
@@ -62,37 +49,9 @@ def test_options_choose_the_cases(options, n, monkeypatch, tmp_path):
     assert len(asked) == n
 
 
-@pytest.mark.parametrize(
-    ("options", "n"),
-    [
-        (["--quick"], 4),
-        (["--solver", "gauss-newton", "--trials", "1", "--batch", "1,64", "--motion", "handheld"], 2),
-        (["--long"], 2),
-        (["--long", "--solver", "all", "--motion", "handheld"], 2),
-    ],
-)
-def test_options_choose_the_cases_of_the_comparison(options, n, monkeypatch):
-    asked = []
-
-    def run_cases(cases, timeout_s, note, programs):
-        asked.extend(cases)
-        return [compared(row())]
-
-    monkeypatch.setattr(comparison, "run_cases", run_cases)
-    done = CliRunner().invoke(comparison.main, options)
-    assert done.exit_code == 0, done.output
-    assert len(asked) == n
-
-
 @pytest.mark.parametrize("options", [["--trials", "one"], ["--batch", "0"], ["--seeds", "0"]])
 def test_wrong_options_are_refused(options):
     assert CliRunner().invoke(command, ["fit", *options]).exit_code == 2
-
-
-def test_batches_of_the_paper_solver_alone_are_no_benchmark():
-    done = CliRunner().invoke(comparison.main, ["--solver", "implicit-adam", "--batch", "16"])
-    assert done.exit_code == 2
-    assert "gauss-newton" in done.output
 
 
 def test_the_process_that_starts_others_imports_no_jax():
@@ -120,17 +79,6 @@ def test_data_are_written_and_read_again(tmp_path):
     assert what.key != dataclasses.replace(what, n_trials=1).key
 
 
-def test_data_of_the_comparison_have_a_camera(tmp_path):
-    what = fit_data.WalkerData(n_trials=1, n_sessions=1, n_frames=60, motion="handheld", short_side_px=720)
-    fit_data.write(tmp_path, what)
-    (session,) = data.sessions(tmp_path)
-    (keypoints,) = data.read_keypoints(session)
-    assert keypoints.image_size_px == (720, 1280)
-    assert data.read_truth(session, "R_nc")[0].shape == (60, 3, 3)
-    assert float(data.read_truth(session, "clock_offset_s")[0]) == 0.04
-    assert what.key != dataclasses.replace(what, motion="static").key
-
-
 # --- the measures
 
 
@@ -147,15 +95,6 @@ def test_joint_error_is_the_median_of_a_trial_then_the_mean_over_joints():
     assert mean_over(errors, MAIN_JOINTS) == pytest.approx(2.5 / 13)
     assert mean_over(errors, PAPER_JOINTS) == pytest.approx((2.5 + 3) / 22)
     assert np.isnan(joint_errors_deg(fitted * np.nan, truth, NAMES)["knee_angle_r"])
-
-
-def test_camera_error_is_the_median_angle():
-    true = Rotation.from_euler("z", np.linspace(0, 1, 5)[:, None])
-    off = Rotation.from_euler("x", np.deg2rad([0, 1, 2, 3, 170])[:, None])
-    quat = (true * off).as_quat(scalar_first=True)
-    quat[0] = np.nan
-    assert camera_error_deg(quat, true.as_matrix()) == pytest.approx(2.5)
-    assert camera_error_deg(-quat[1:4], true.as_matrix()[1:4]) == pytest.approx(2)  # q and -q are one rotation
 
 
 def test_the_mean_over_trials_leaves_out_what_is_unknown():
@@ -175,12 +114,6 @@ def row(method="gauss-newton", batch=1, **more):
     return {**out, "device": "cpu", "cores": 2, "jax": "0", **more}
 
 
-def compared(of, motion="handheld"):
-    """The row as the comparison of solvers has it."""
-    data = dataclasses.asdict(fit_data.WalkerData(motion=motion))
-    return {**of, "data": data, "paper_loss": 9.0, "accuracy": {**of["accuracy"], "camera_deg": 0.5, "clock_ms": 1.0}}
-
-
 def test_the_table_shows_every_row_and_the_code_of_one_that_failed():
     failed = {**row("paper-2025"), "error": "FIT_DIVERGED", "error_text": "FIT_DIVERGED: why"}
     failed = {k: v for k, v in failed.items() if k not in ("accuracy", "warm_seconds")}
@@ -192,16 +125,6 @@ def test_the_table_shows_every_row_and_the_code_of_one_that_failed():
     assert "FIT_DIVERGED: why" in text
     assert "2.000" in lines[2]
     assert "32.00" in lines[3]  # sessions a second
-
-
-def test_the_table_of_the_comparison_has_the_camera_of_a_held_phone_only():
-    rows = [compared(row()), compared(row("paper-2025"), "static"), compared(row("some/adam-500.json"))]
-    text = comparison.text(rows)
-    held, still, short = text.splitlines()[2:5]
-    assert held.split()[-3:] == ["0.50", "1.0", "9.00"]
-    assert still.split()[-3:] == ["-", "-", "9.00"]
-    assert short.startswith("adam-500 ")
-    assert "the paper's objective" in text
 
 
 # --- real runs
@@ -223,31 +146,6 @@ def test_a_case_is_measured(tmp_path):
     assert 0 < got["accuracy"]["main_deg"] < 6
     assert "error" not in got
     assert case.machine()["cores"] >= 1
-
-
-@pytest.mark.slow
-def test_a_batch_of_the_comparison_is_measured_and_compared_with_the_sessions_alone(tmp_path):
-    fit_data.write(tmp_path, fit_data.WalkerData(n_frames=64, n_sessions=2, motion="handheld"))
-    how = {"method": "gauss-newton", "batch": 2, "repeat": 1, "camera_motion": "handheld", "judge": accuracy_of}
-    got = case.measure(tmp_path, "warm", time.time(), **how)
-    assert got["n_sessions"] == 2
-    assert got["batch_difference_rad"] < 1e-3
-    assert got["accuracy"]["camera_deg"] < 5
-    assert got["accuracy"]["clock_ms"] < 40
-    assert 1 < got["paper_loss"] < 100
-
-
-@pytest.mark.slow
-def test_fewer_steps_are_another_method_of_its_own_process(tmp_path):
-    """Twenty frames are under a second: the fit refuses them."""
-    short = comparison.shorter(tmp_path, 20)
-    (got,) = bench.run_cases([Case(short, Data(n_frames=20, n_sessions=1), repeat=1)], 120.0)
-    assert got["label"].startswith("adam-20, ")
-    assert got["error"] == "FIT_INPUT"
-    assert got["cold_seconds"] is None
-    assert got["start_seconds"] is None
-    assert "FIT_INPUT" in bench.fit_text([got])
-    json.dumps(got, allow_nan=False)
 
 
 @pytest.mark.slow

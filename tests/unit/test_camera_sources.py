@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.keypoints import Keypoints
-from pbl_pipeline.video import CAMERA_KINDS, Camera, VideoInfo, check_timing, find_camera, probe, read_frames
+from pbl_pipeline.video import CAMERA_KINDS, Camera, check_timing, find_camera, probe, read_frames
 from pbl_pipeline.video.camera import reaches_corners
 from pbl_pipeline.video.container_tags import read_tags
 from pbl_pipeline.video.presets import preset_camera, presets, quarter_turn
 from research.phone_cameras import build
-from tests.inputs import keypoints
+from tests.inputs import keypoints, video_info
 from tests.quicktime import edit_list, insert, meta
 from tests.videos import constant_rate, numbered_frames, write_video
 
@@ -27,30 +27,6 @@ APPLE = {
 }
 LENS = "com.apple.quicktime.camera.lens_model"
 FOCAL = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
-
-
-def video(**changes) -> VideoInfo:
-    values: dict = {
-        "path": "v.mov",
-        "sha256": "0" * 64,
-        "size_bytes": 1,
-        "container": "mov",
-        "codec": "h264",
-        "pixel_format": "yuv420p",
-        "width_px": 720,
-        "height_px": 1280,
-        "rotation_deg": 90,
-        "time_s": constant_rate(3),
-        "fps": 30.0,
-        "duration_s": 0.1,
-        "n_frames": 3,
-        "n_frames_announced": 3,
-        "variable_frame_rate": False,
-        "recorded_utc": None,
-        "make": None,
-        "model": None,
-    }
-    return VideoInfo(**{**values, **changes})
 
 
 def small(path, **options):
@@ -141,7 +117,7 @@ def test_the_order_of_sources(tmp_path):
     file = tmp_path / "camera.json"
     content = {"camera_matrix": [[940, 0, 360], [0, 942, 640], [0, 0, 1]], "distortion": [0] * 5}
     file.write_text(json.dumps(content | {"image_size_px": [720, 1280], "focal_sd_px": 4.705}))
-    full = video(model="iPhone 13", focal_35mm=27.0)
+    full = video_info(model="iPhone 13", focal_35mm=27.0)
     given = find_camera(full, file)
     assert given.source.startswith("file: camera.json, focal length within 0.5 % (sd)")
     assert given.focal_rel_sd == pytest.approx(0.005)
@@ -149,28 +125,31 @@ def test_the_order_of_sources(tmp_path):
     assert find_camera(dataclasses.replace(full, focal_35mm=None)).source.startswith(
         "preset: main camera of the iPhone"
     )
-    assert find_camera(video()).source.startswith("guess: ")
-    spread = [find_camera(v).focal_rel_sd for v in (full, video(model="iPhone 13"), video())]
+    assert find_camera(video_info()).source.startswith("guess: ")
+    spread = [find_camera(v).focal_rel_sd for v in (full, video_info(model="iPhone 13"), video_info())]
     assert sorted(spread) == spread
     assert spread[0] > given.focal_rel_sd
 
 
 def test_focal_length_from_film():
-    camera = find_camera(video(focal_35mm=36.0, width_px=1600, height_px=1200))
+    camera = find_camera(video_info(focal_35mm=36.0, width_px=1600, height_px=1200))
     # 36 mm along 36 mm of film is as long as the picture; along the diagonals (43.267 mm, 2000 px) it is 1664 px.
     assert camera.focal_px == pytest.approx(np.sqrt(1600 * 2000 * 36 / 43.2666), rel=1e-4)
     assert not camera.distortion.any()
-    assert find_camera(video(focal_35mm=3000.0)).source.startswith("guess")
+    assert find_camera(video_info(focal_35mm=3000.0)).source.startswith("guess")
 
 
 def test_film_and_published_calibration_agree_on_one_phone():
-    film, known = find_camera(video(model="iPhone 13", focal_35mm=27.0)), find_camera(video(model="iPhone 13"))
+    film, known = (
+        find_camera(video_info(model="iPhone 13", focal_35mm=27.0)),
+        find_camera(video_info(model="iPhone 13")),
+    )
     assert film.focal_px == pytest.approx(known.focal_px, rel=film.focal_rel_sd)
     np.testing.assert_array_equal(film.distortion, known.distortion)
     assert "distortion of that model" in film.source
     # Zoomed, or another lens of that phone: nothing is known of its distortion.
     for other in (13.0, 54.0):
-        camera = find_camera(video(model="iPhone 13", focal_35mm=other))
+        camera = find_camera(video_info(model="iPhone 13", focal_35mm=other))
         assert not camera.distortion.any()
         assert "no distortion" in camera.source
 
@@ -180,7 +159,7 @@ def test_presets_are_those_published(shared_data):
     assert build(published) == presets()
     for key, entry in published.items():
         height, width = (int(row[0]) for row in entry["imageSize"])
-        camera = preset_camera(video(model=key.split("/")[0], width_px=width, height_px=height))
+        camera = preset_camera(video_info(model=key.split("/")[0], width_px=width, height_px=height))
         assert camera is not None
         np.testing.assert_allclose(camera.matrix, entry["intrinsicMat"], atol=1e-3)
         np.testing.assert_allclose(camera.distortion, entry["distortion"][0], atol=1e-6)
@@ -188,7 +167,10 @@ def test_presets_are_those_published(shared_data):
 
 @pytest.mark.parametrize("name", ["iPhone 11", "iphone12,1", " iPhone  11 "])
 def test_a_preset_by_name_or_identifier(name):
-    small_one, large = preset_camera(video(model=name)), preset_camera(video(model=name, width_px=2160, height_px=3840))
+    small_one, large = (
+        preset_camera(video_info(model=name)),
+        preset_camera(video_info(model=name, width_px=2160, height_px=3840)),
+    )
     assert small_one is not None
     assert large is not None
     # Of this phone both formats are published, and differ.
@@ -209,28 +191,28 @@ def test_a_preset_by_name_or_identifier(name):
     ],
 )
 def test_no_preset(model, lens):
-    assert preset_camera(video(model=model, lens=lens)) is None
-    assert find_camera(video(model=model, lens=lens)).source.startswith("guess")
+    assert preset_camera(video_info(model=model, lens=lens)) is None
+    assert find_camera(video_info(model=model, lens=lens)).source.startswith("guess")
 
 
 def test_a_preset_scales_and_turns_with_the_recording():
-    portrait = preset_camera(video(model="iPhone 11"))
+    portrait = preset_camera(video_info(model="iPhone 11"))
     assert portrait is not None
     points = np.array([[0.3, -0.2, 2.0], [-0.4, 0.6, 2.5], [0.1, 0.9, 3.0]])
     seen = _project(points, portrait)
     # 1080p portrait: the same view, 1.5 times as many pixels.
-    larger = preset_camera(video(model="iPhone 11", width_px=1080, height_px=1920))
+    larger = preset_camera(video_info(model="iPhone 11", width_px=1080, height_px=1920))
     assert larger is not None
     np.testing.assert_allclose(_project(points, larger) + 0.5, 1.5 * (seen + 0.5), atol=1e-6)
     # The phone turned counter-clockwise (flag 0): right in the portrait picture is up, so (x, y) -> (y, W - 1 - x).
-    level = preset_camera(video(model="iPhone 11", width_px=1280, height_px=720, rotation_deg=0))
+    level = preset_camera(video_info(model="iPhone 11", width_px=1280, height_px=720, rotation_deg=0))
     assert level is not None
     np.testing.assert_allclose(
         _project(points @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), level),
         np.stack([seen[:, 1], 719 - seen[:, 0]], 1),
         atol=1e-6,
     )
-    on_its_head = preset_camera(video(model="iPhone 11", width_px=1280, height_px=720, rotation_deg=180))
+    on_its_head = preset_camera(video_info(model="iPhone 11", width_px=1280, height_px=720, rotation_deg=180))
     assert on_its_head is not None
     np.testing.assert_allclose(
         _project(points @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]]), on_its_head),
@@ -238,12 +220,12 @@ def test_a_preset_scales_and_turns_with_the_recording():
         atol=1e-6,
     )
     # Upright, the phone on its head (flag 270): half a turn.
-    upside_down = preset_camera(video(model="iPhone 11", rotation_deg=270))
+    upside_down = preset_camera(video_info(model="iPhone 11", rotation_deg=270))
     assert upside_down is not None
     np.testing.assert_allclose(_project(points * [-1, -1, 1], upside_down), [719, 1279] - seen, atol=1e-6)
     # Copies whose pictures were turned: the shape tells more than the flag.
     for size, flag, same in (((720, 1280), 0, portrait), ((1280, 720), 90, level)):
-        copy = preset_camera(video(model="iPhone 11", width_px=size[0], height_px=size[1], rotation_deg=flag))
+        copy = preset_camera(video_info(model="iPhone 11", width_px=size[0], height_px=size[1], rotation_deg=flag))
         assert copy is not None
         np.testing.assert_array_equal(copy.matrix, same.matrix)
 
@@ -260,7 +242,7 @@ def test_four_quarter_turns_are_none():
 def test_every_preset_holds_over_the_whole_picture():
     for model in presets()["names"]:
         for width, height, turned in ((720, 1280, 90), (1920, 1080, 0), (1440, 1080, 180)):
-            camera = preset_camera(video(model=model, width_px=width, height_px=height, rotation_deg=turned))
+            camera = preset_camera(video_info(model=model, width_px=width, height_px=height, rotation_deg=turned))
             assert camera is not None
             assert reaches_corners(camera.matrix, camera.distortion, (width, height))
 

@@ -22,7 +22,6 @@ from pbl_pipeline.deidentify import (
     cover,
     covered_picture,
     deidentify,
-    find_heads,
     ranges,
     sidecar_of,
 )
@@ -32,8 +31,7 @@ from pbl_pipeline.deidentify.types import BODY, DISAGREE, HELD, KEYPOINTS, NONE
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import BlazePoseLandmarks, Keypoints
 from pbl_pipeline.tracking import PersonTrack
-from pbl_pipeline.video import Camera, probe, read_frames, read_metadata, write_h264
-from research.heads.coverage import HeadCoverage, LocatedClip, LocatedHead, frame_coverage, head_coverage, located_clips
+from pbl_pipeline.video import Camera, probe, read_frames, read_metadata
 from tests.command import pbl
 from tests.unit.test_blazepose import asset
 from tests.videos import constant_rate, numbered_frames, write_video
@@ -378,52 +376,3 @@ def test_a_video_without_a_head_is_written_and_says_so(tmp_path):
 
 
 # --- how much is covered
-
-
-def test_coverage_by_hand():
-    """A box of 20 px: wholly inside the circle, half inside, outside; and one that is hardly in the picture."""
-    boxes = np.array([[90, 90, 110, 110], [125, 90, 145, 110], [300, 90, 320, 110], [-18, 90, 2, 110.0]])
-    located = LocatedHead("a", False, np.arange(4), boxes)
-    heads = heads_of(4, SIZE, a_head([(100, 100, 35)] * 4))
-    heads.heads[0].source[1] = HELD
-    (found,) = head_coverage(LocatedClip("c", "c.mp4", False, (located,)), heads)
-    assert found.frames.tolist() == [0, 1, 2]
-    assert found.fraction == pytest.approx([1, 0.5, 0], abs=0.03)
-    assert found.certain.tolist() == [True, False, True]
-    assert frame_coverage([found]) == (3, 1, 1)
-    other = HeadCoverage("c", "b", np.array([0, 9]), np.array([0.2, 1.0]), np.array([True, True]))
-    assert frame_coverage([found, other]) == (4, 1, 2)
-
-
-def test_located_heads_are_boxes_of_heads():
-    clips = located_clips()
-    assert {c.name for c in clips if not c.tune} == {"walk", "STS", "cam01", "cam04"}
-    for head in (h for c in clips for h in c.heads):
-        size = head.boxes_px[:, 2:] - head.boxes_px[:, :2]
-        assert (np.diff(head.frames) > 0).all()
-        assert ((size > 20) & (size < 170)).all()
-    sts = next(c for c in clips if c.name == "STS").heads[0].boxes()
-    np.testing.assert_allclose(sts[5], sts[0] + (sts[15] - sts[0]) / 3)
-
-
-@pytest.mark.slow
-def test_the_heads_of_two_real_people_are_covered(tmp_path):
-    """Some frames of the demo: one walks in the foreground, one stands on a wall behind."""
-    video = asset("demo_video")
-    asset("face_detector")
-    first, n = 94, 12
-    times = constant_rate(n)
-    frames = ((t, f.image) for t, f in zip(times, read_frames(video, start=first, stop=first + n), strict=True))
-    cut = tmp_path / "cut.mp4"
-    write_h264(cut, frames, (1768, 994), times, 18)
-    heads = find_heads(cut)
-    clip = next(c for c in located_clips() if c.name == "demo")
-    shifted = tuple(
-        dataclasses.replace(h, frames=np.array(list(at)), boxes_px=np.array(list(at.values())), interpolate=False)
-        for h in clip.heads
-        if (at := {t - first: box for t, box in h.boxes().items() if first <= t < first + n})
-    )
-    found = head_coverage(dataclasses.replace(clip, heads=shifted), heads)
-    assert {f.who: len(f.frames) for f in found} == {"walker": n, "man on the wall": 1}
-    assert all(f.covered.all() for f in found)
-    assert len(heads.heads) <= 4

@@ -227,11 +227,11 @@ def test_the_cron_loop_goes_by_the_clock_and_on_after_a_job_that_fails(tmp_path:
     environment = {"PATH": f"{tmp_path}:/usr/bin:/bin", "PBL_CRON_TICK_S": "0.02"}
     loop = subprocess.Popen(["sh", DEPLOY / "cron-loop.sh"], env=environment, stderr=subprocess.PIPE, text=True)
     ran = tmp_path / "ran"
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 120
     while not (ran.exists() and "summary" in ran.read_text()) and time.monotonic() < deadline:
         time.sleep(0.05)
     loop.send_signal(signal.SIGTERM)
-    _, said = loop.communicate(timeout=10)
+    _, said = loop.communicate(timeout=120)
     assert loop.returncode == 0
     names = ran.read_text().split()
     upto = names[: names.index("summary") + 1]
@@ -260,7 +260,7 @@ def test_the_slurm_script_ends_its_worker_in_order(tmp_path: Path):
     assert (host, words[:-1]) == ("db.example", ["worker", "--resource", "gpu", "--processes", "auto", "--grace"])
     assert float(words[-1]) + LAST_S < SLURM_KILL_WAIT_S
     job.send_signal(signal.SIGTERM)
-    said, _ = job.communicate(timeout=10)
+    said, _ = job.communicate(timeout=120)
     assert said == "ended\n"
     assert job.returncode == 5
 

@@ -49,7 +49,7 @@ def test_the_installed_command(tmp_path):
     env = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
     env |= {"PBL_CACHE": str(tmp_path / "cache"), "PBL_HOME": str(tmp_path / "home"), "PBL_OFFLINE": "1"}
     start = [sys.executable, "-c", "from pbl_pipeline.cli import main; main()", "doctor"]
-    done = subprocess.run(start, env=env, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(start, env=env, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 1, done.stderr
     assert f"on: {tmp_path / 'cache' / 'jax'}" in done.stdout
     assert "Traceback" not in done.stderr

@@ -24,7 +24,6 @@ from pbl_pipeline.gait import (
     score_gdi,
 )
 from pbl_pipeline.gait.normative.norm import _checksum, _to_json
-from research.norms import build_gillette, gillette_vectors
 
 PERCENT = np.linspace(0, 98, 50)
 ABOUT = {"name": "toy", "version": 1, "source": "made up", "licence": "none", "convention": "none"}
@@ -349,19 +348,6 @@ def test_the_set_that_ships():
     np.testing.assert_allclose(np.concatenate([hip[:50], adduction[:50], knee[:50]]), norm.mean_deg, atol=1e-5)
 
 
-def test_the_set_is_what_the_command_builds(shared_data):
-    source = shared_data / "real" / "gdi_gillette" / "GDI_Calc_Fast_Data.mat"
-    shipped, built = load_norm("gillette-166-three-angles"), build_gillette(source)
-    assert shipped.source_sha256 == built.source_sha256
-    np.testing.assert_allclose(shipped.mean_deg, built.mean_deg, rtol=1e-6)
-    np.testing.assert_allclose(shipped.components, built.components, atol=1e-6)
-    vectors = gillette_vectors(source).reshape(166, 9, 51)[:, [3, 4, 6], :50].reshape(166, 150)
-    scores = shipped.index(vectors)
-    assert scores.mean() == pytest.approx(100, abs=1e-3)
-    assert scores.std(ddof=1) == pytest.approx(10, abs=1e-3)
-    np.testing.assert_allclose(scores, index_another_way(vectors, vectors), atol=1e-3)
-
-
 def test_the_arithmetic_reproduces_the_original_index(shared_data, toy):
     """With the published 15 features of nine angles in place of our components: the known log distance."""
     data = loadmat(shared_data / "real" / "gdi_gillette" / "GDI_Calc_Fast_Data.mat")
@@ -370,10 +356,3 @@ def test_the_arithmetic_reproduces_the_original_index(shared_data, toy):
     distance = original.log_distance(vectors)
     assert distance.mean() == pytest.approx(4.694223, abs=1e-6)
     assert distance.std(ddof=1) == pytest.approx(0.297627, abs=1e-6)
-
-
-def test_not_a_gillette_file(tmp_path):
-    path = tmp_path / "x.mat"
-    path.write_bytes(b"nothing")
-    with pytest.raises(PblError, match="NORM_INVALID"):
-        build_gillette(path)

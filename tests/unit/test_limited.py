@@ -13,7 +13,7 @@ from pbl_pipeline.limited import LimitExceeded, limited
 @pytest.mark.parametrize(
     ("function", "argument", "said"),
     [
-        (time.sleep, 60.0, "more than 3 s"),
+        (time.sleep, 600.0, "more than 3 s"),
         (bytearray, 2**31, "more than 256 MiB of memory"),
         (os._exit, 3, "ended with code 3"),
     ],
@@ -22,8 +22,8 @@ from pbl_pipeline.limited import LimitExceeded, limited
 def test_what_takes_too_much_is_ended(function, argument, said: str):
     begun = time.monotonic()
     with pytest.raises(LimitExceeded, match=said):
-        limited(function, argument, seconds=3.0 if function is time.sleep else 60.0, n_bytes=2**28)
-    assert time.monotonic() - begun < 30.0
+        limited(function, argument, seconds=3.0 if function is time.sleep else 300.0, n_bytes=2**28)
+    assert time.monotonic() - begun < 300.0
 
 
 def test_what_is_raised_there_is_raised_here():

@@ -25,7 +25,7 @@ with without_notice(b"known words"):
 
 
 def said(program: str) -> str:
-    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120).stderr
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300).stderr
 
 
 def test_all_else_is_written_also_where_the_block_fails():

@@ -22,9 +22,9 @@ from pbl_pipeline.video import (
     read_first,
     turned_camera,
 )
+from tests.inputs import video_info as probed
 from tests.quicktime import insert, meta
 from tests.unit.test_camera_sources import small
-from tests.unit.test_camera_sources import video as probed
 from tests.videos import constant_rate, numbered_frames, write_video
 
 CAMERA = Camera(

@@ -17,8 +17,8 @@ from pbl_pipeline.video import Attitude, load_attitude, probe, read_phone_log
 from pbl_pipeline.video.attitude import held_deg
 from pbl_pipeline.video.clock import match_pictures
 from tests.inputs import csv_log
+from tests.inputs import video_info as video
 from tests.phone_film import EPOCH_NS, as_json, as_zip, device_quat, film, hand, sensor_logger
-from tests.unit.test_camera_sources import video
 from tests.walker import observe
 
 BEGIN_S, SECONDS = 3.25, 6.0

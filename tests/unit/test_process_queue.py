@@ -25,8 +25,9 @@ def refuse(path: Path) -> None:
     raise PblError("VIDEO_DAMAGED", found="x", expected="y", next_step="z", key=1)
 
 
-def sleep(path: Path) -> None:
+def sleep(path: Path, begun: Path) -> None:
     path.write_text("half")
+    begun.touch()
     time.sleep(600)
 
 
@@ -74,14 +75,17 @@ def test_a_half_written_file_is_never_there():
     assert not again.path.exists()
 
 
-def test_the_page_ends_while_something_is_made():
+def test_the_page_ends_while_something_is_made(tmp_path: Path):
     making, opened = ProcessQueue(most=2, kept=2), Opened()
-    work = making.begin("a", opened.task(sleep))
+    work = making.begin("a", opened.task(sleep, tmp_path / "begun"))
     waits = making.begin("b", opened.task(write, "x"))
-    time.sleep(1.0)
+    until = time.monotonic() + 60
+    while not (tmp_path / "begun").exists():
+        assert time.monotonic() < until
+        time.sleep(0.05)
     begun = time.monotonic()
     making.close()
-    assert time.monotonic() - begun < 5.0
+    assert time.monotonic() - begun < 60.0  # it sleeps for ten minutes
     assert work.path is None
     assert waits.path is None
     assert opened.closed == 2

@@ -22,6 +22,7 @@ from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.video import VideoInfo
 from pbl_pipeline.visit import Recording, Solution, Visit
 from pbl_pipeline.words import number, significant
+from tests.inputs import video_info
 from tests.walking_fit import walking_fit
 
 N, FPS = 200, 30.0
@@ -70,23 +71,16 @@ class Page(HTMLParser):
 
 
 def _video(name: str = "walk.mp4") -> VideoInfo:
-    time = np.arange(N) / FPS
-    return VideoInfo(
+    return video_info(
         path=f"/somewhere/secret/{name}",
         sha256="ab" * 32,
         size_bytes=3_456_789,
         container="mp4",
-        codec="h264",
-        pixel_format="yuv420p",
         width_px=640,
         height_px=360,
         rotation_deg=0,
-        time_s=time,
-        fps=FPS,
+        time_s=np.arange(N) / FPS,
         duration_s=N / FPS,
-        n_frames=N,
-        n_frames_announced=N,
-        variable_frame_rate=False,
         recorded_utc="2026-11-20T10:00:00Z",
         make="Acme",
         model="Phone 9",

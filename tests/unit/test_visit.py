@@ -39,6 +39,7 @@ from pbl_pipeline.video import Camera, VideoInfo
 from pbl_pipeline.visit import Recording, Visit, load_visit, save_visit, visit_of_fits
 from tests.command import pbl
 from tests.exported import marked_fit
+from tests.inputs import video_info
 from tests.same_visit import ROUNDED, as_stored, assert_same, assert_same_exports, assert_same_text, fields, leaves
 from tests.unit.visits import solution_of
 from tests.walking_fit import walking_fit
@@ -85,25 +86,17 @@ def keypoints_of(fit: TrialFit) -> Keypoints:
 
 
 def video_of(name: str, time_s: np.ndarray) -> VideoInfo:
-    return VideoInfo(
+    return video_info(
         path=f"/somewhere/secret/{name}.mp4",
         sha256="ab" * 32,
         size_bytes=3_456_789,
         container="mp4",
-        codec="h264",
-        pixel_format="yuv420p",
         width_px=640,
         height_px=360,
-        rotation_deg=90,
         time_s=time_s,
-        fps=FPS,
         duration_s=float("nan"),
-        n_frames=len(time_s),
-        n_frames_announced=len(time_s),
-        variable_frame_rate=False,
         recorded_utc="2026-03-01T10:00:00Z",
         make="Acme",
-        model=None,
         notes=("two stamps repeat",),
         capture_fps=240.0,  # slow motion: a check that FAILs, of the recording
     )

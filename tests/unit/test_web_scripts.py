@@ -83,6 +83,7 @@ def test_scripts_of_the_page(tmp_path: Path):
         shutil.copy(file, tmp_path)
     (tmp_path / "package.json").write_text('{"type": "module"}')
     sent = Movement.of(found)
+    assert found.fit is not None
     (tmp_path / "movement.json").write_bytes(sent.movement)
     (tmp_path / "body.bin").write_bytes(sent.body)
     (tmp_path / "expected.json").write_text(json.dumps(discs_of(found.fit)))
@@ -91,7 +92,7 @@ def test_scripts_of_the_page(tmp_path: Path):
     (tmp_path / "points.json").write_text(json.dumps(seen))
     (tmp_path / "root.json").write_text(json.dumps(np.nan_to_num(body_track(found.fit).root_m).tolist()))
     files = sorted(p.name for p in tmp_path.glob("*.test.mjs"))
-    done = subprocess.run(["node", "--test", *files], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(["node", "--test", *files], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
     assert "# pass 0" not in done.stdout
 

@@ -1,7 +1,7 @@
 """The export script of docs/metrabs.md, with a randomly initialised network that has MeTRAbs' interface.
 
 torch is no dependency of the project: without it these tests skip. To run them, install torch, onnx and onnxscript
-beside the project and `pytest -m needs_extra tests/integration/test_export_metrabs.py`.
+beside the project and `pytest -m needs_extra research/tests/test_export_metrabs.py`.
 """
 
 from __future__ import annotations
