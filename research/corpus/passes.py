@@ -99,7 +99,7 @@ def _curves(cycles: Sequence) -> dict[str, np.ndarray]:
 
 def _measures(cycles: Sequence) -> np.ndarray:
     found = spatiotemporal(cycles).measures
-    return np.array([np.nan if found.get(m) is None else found[m].mean for m in MEASURES], np.float32)
+    return np.array([np.nan if (m := found.get(name)) is None else m.mean for name in MEASURES], np.float32)
 
 
 def row_of(case: Case, trial: TrialFit) -> dict[str, Any]:

@@ -245,7 +245,7 @@ def _indices(n: int, seed: int = 0) -> pd.DataFrame:
 
 def test_the_index_of_one_camera_against_several():
     frame = _indices(40)
-    frame = frame[~((frame["session_id"] == 3) & (frame["kind"] == "rig"))]  # a visit with one kind alone
+    frame = frame.loc[~((frame["session_id"] == 3) & (frame["kind"] == "rig"))]  # a visit with one kind alone
     pairs = index_pairs(frame)
     assert len(pairs) == 39
     assert set(pairs["single_norm"]) == {"our-single-v1"}
