@@ -149,6 +149,7 @@ def index(out: Path | None, where: tuple[str, ...]) -> None:
     named when the visits are ingested. The paper's figure stands beside.
     """
     import schemas
+    from pbl_pipeline.csv_cells import frame_to_csv
     from pbl_pipeline.files import check_out_folder
     from pbl_pipeline.validation import index_agreement, index_pairs, print_tables, write_tables
     from schemas.reading.frames import index_frame
@@ -165,7 +166,7 @@ def index(out: Path | None, where: tuple[str, ...]) -> None:
     print_tables(made)
     if out is not None:
         write_tables(made, out)
-        pairs.to_csv(out / "pairs.csv", index=False)
+        (out / "pairs.csv").write_bytes(frame_to_csv(pairs).encode())
         click.echo(f"table, and the pairs that it is made from (pairs.csv): {out}")
 
 
