@@ -119,7 +119,7 @@ def test_hostile_workbooks(tmp_path: Path, what: str):
     assert peak.grown_mib < 640
     with guarded() as peak, contextlib.suppress(PblError, ValueError):  # what its process takes
         read_workbook(path)
-    assert peak.mib < 1024
+    assert peak.grown_mib < 768  # and 256 MiB of a process that has read nothing: a gibibyte, whatever ran here before
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ def test_the_largest_csv_takes_less_than_a_gibibyte(tmp_path: Path):
     with guarded() as peak:
         (sheet,) = read_sheets(tmp_path / "a.csv")
     assert len(sheet.rows) == 1990
-    assert peak.mib < 1024
+    assert peak.grown_mib < 768  # and 256 MiB of a process that has read nothing: a gibibyte, whatever ran here before
 
 
 # ------------------------------------------------------------------------------------------------------ names of files
