@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
-
-import numpy as np
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import methods
 from pbl_pipeline.temporary import new_folder
@@ -21,6 +18,7 @@ from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib
+    from pbl_pipeline.gait.curves_file import Curves
 
 schema = dj.Schema()
 
@@ -276,6 +274,8 @@ class GaitCycle(dj.Computed):
         return cycles, None if correction is None else correction["correction_no"]
 
     def make_insert(self, key: dict, cycles: Sequence[lib.GaitCycle], correction: int | None, origin: Origin) -> None:
+        from pbl_pipeline.gait.curves_file import save_curves
+
         with new_folder() as folder:
             save_curves(cycles, folder / "curves.npz")
             self.insert1(
@@ -496,6 +496,7 @@ def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Curves | None = Non
         curves_missing=row["curves_missing"],
         curves_sd=dict(curves.sd_deg if curves else {}),
         far_leg=row["cycle_far_leg"] or "",
+        error_model=curves.error_model if curves else "",
         lengths=lib.Lengths(
             number(row["cycle_stride_length"]),
             number(row["cycle_step_length"]),
@@ -513,48 +514,8 @@ def load_cycles(key: Mapping[str, Any], trial: str = "", rows: Rows = stored_row
 
 def cycles_of_rows(rows: Sequence[Mapping[str, Any]], ref: Mapping[str, Any], trial: str) -> list[lib.GaitCycle]:
     """Return the library's cycles of rows of GaitCycle.Cycle, with their curves from the file `ref`."""
+    from pbl_pipeline.gait.curves_file import load_curves
+
     with stored_file(ref) as path:
         curves = load_curves(path)
     return [cycle_of_row(r, trial, curves.get(int(r["cycle_no"]))) for r in rows]
-
-
-def save_curves(cycles: Sequence[lib.GaitCycle], path: Path) -> None:
-    """Write the curves of all cycles and their sd to one npz; what a cycle has not is NaN."""
-    from pbl_pipeline.gait import REPORT_PERCENT
-
-    percent = np.asarray(REPORT_PERCENT, np.float32)
-    names = sorted({name for c in cycles for name in c.curves})
-    unknown = np.full(len(percent), np.nan, np.float32)
-
-    def table(of: Callable[[lib.GaitCycle], Mapping[str, np.ndarray]]) -> np.ndarray:
-        rows = [[of(c).get(name, unknown) for name in names] for c in cycles]
-        return np.asarray(rows, np.float32).reshape(len(cycles), len(names), len(percent))
-
-    np.savez_compressed(
-        path,
-        cycle_no=np.asarray([c.number for c in cycles], np.int16),
-        names=np.asarray(names, dtype=str),
-        percent=percent,
-        curve=table(lambda c: c.curves),
-        curve_sd=table(lambda c: c.curves_sd),
-    )
-
-
-class Curves(NamedTuple):
-    """Curves of one cycle and their standard deviations by name, each (P,) degrees; those that are known."""
-
-    deg: dict[str, np.ndarray]
-    sd_deg: dict[str, np.ndarray]
-
-
-def load_curves(path: Path) -> dict[int, Curves]:
-    """Curves by cycle number; cycles without curves have none."""
-    with np.load(path, allow_pickle=False) as f:
-        data = {k: f[k] for k in f.files}
-    names = [str(name) for name in data["names"]]
-
-    def known(rows: np.ndarray) -> dict[str, np.ndarray]:
-        return {name: curve for name, curve in zip(names, rows, strict=True) if np.isfinite(curve).all()}
-
-    sd = data.get("curve_sd", np.full_like(data["curve"], np.nan))  # rows of before it was kept
-    return {int(n): Curves(known(a), known(b)) for n, a, b in zip(data["cycle_no"], data["curve"], sd, strict=True)}

@@ -23,7 +23,9 @@ from ._gdi import (
     GdiParams,
     gdi_vector,
     interval_90,
+    intervals_with_one_more,
     score_gdi,
+    worth_of_one_more,
 )
 from ._own_norm import norm_from_cycles
 from ._profile import MovementProfile, movement_profile, variable_scores
@@ -143,6 +145,7 @@ __all__ = [
     "gait_metrics",
     "gdi_vector",
     "interval_90",
+    "intervals_with_one_more",
     "leg_angles",
     "leg_angles_sd",
     "leg_length_m",
@@ -162,4 +165,5 @@ __all__ = [
     "spatiotemporal",
     "trial_poses",
     "variable_scores",
+    "worth_of_one_more",
 ]

@@ -16,6 +16,7 @@ from ._camera_side import far_leg, mostly
 from ._exclusion import Exclusion
 from .events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents
 from .ground import cycle_lengths, is_metric, where_feet_stand, why_no_lengths
+from .measurement import model_of_fit
 from .motion import BodyPoses, FootTrajectories, feet_from_fit, trial_poses
 from .normative import BODY_ANGLES
 from .outliers import without_missed_steps, without_odd_curves
@@ -65,11 +66,13 @@ def find_cycles(
     found = events.events if isinstance(events, GaitEvents) else tuple(events)
     name = trial or (fit.name if fit is not None else "")
     no_lengths, metric, stated, far = "" if feet is not None else NO_POSITIONS, True, False, None
+    errors = ""
     if fit is not None:
         poses = poses or trial_poses(fit)
         series, feet = angle_series(fit, poses), feet_from_fit(fit, poses)
         no_lengths, metric, far = why_no_lengths(fit), is_metric(fit), far_leg(fit, poses)
         stated = bool(np.isfinite(fit.height_m))
+        errors = "" if metric else model_of_fit(fit.params_hash)
     cycles, slides = [], []
     for bout in sorted({e.bout for e in found}):
         inside = sorted((e for e in found if e.bout == bout), key=lambda e: e.time_s)
@@ -110,6 +113,7 @@ def find_cycles(
                 lengths=lengths,
                 angle_model=series.angle_model if series is not None else BODY_ANGLES,
                 far_leg="" if fit is None or far is None else mostly(_during(far, fit.time_s, start, end)),
+                error_model=errors if curves_sd else "",
             )
             cycles.append(cycle)
             slides.append(slide)

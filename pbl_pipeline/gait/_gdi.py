@@ -17,6 +17,7 @@ from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
 from ._condition import ANY_PACE, SELF_SELECTED
 from ._profile import MovementProfile, movement_profile, variable_scores
 from .events import LEFT, RIGHT
+from .measurement import MeasurementModel, Pass, estimate, expected_index, load_model, with_one_more
 from .normative import (
     DEFAULT_NORM,
     NINE_ANGLES,
@@ -24,6 +25,7 @@ from .normative import (
     NormativeSet,
     check_degrees,
     load_norm,
+    norm_names,
 )
 from .types import GaitCycle
 
@@ -56,7 +58,8 @@ class GdiParams:
     average
         What is averaged over cycles: their indices ("cycles", the paper's way) or, of each side, their curves
         ("curves"). What differs by chance from cycle to cycle adds to the distance of each cycle from the norm, and so
-        lowers a mean of indices, most of all near 100.
+        lowers a mean of indices, most of all near 100. "passes": the index expected from all passes together by the
+        measured model of their error (`gait/measurement.py`); as "curves" where these cycles or this norm have none.
     """
 
     norm: str = DEFAULT_NORM
@@ -88,11 +91,12 @@ MODEL_ANGLES: dict[str, tuple[str, ...]] = {GDI_MODEL: THREE_ANGLES, GILLETTE_MO
 #: correlation of the sides' lasting errors on the tuning persons of `research.corpus`: hip flexion 0.5 to 0.8, knee 0
 #: to 0.4, adduction -0.9 to 0.2. `lengthening` is the one of 0, 0.05, 0.1 ... with which the index and its change
 #: between two visits err least with 33 points on these persons (the sum of both mean squares); version 4 had 0.2.
+#: Version 6 takes the measured model of the error where there is one; these constants serve where there is none.
 GDI_METHODS: Stage[GdiParams] = Stage("gdi", "family", GDI_MODEL)
 GDI_METHODS.register(
     GDI_MODEL,
-    5,
-    GdiParams(average="curves", lasting=0.5, both_sides=0.25, lengthening=0.05),
+    6,
+    GdiParams(average="passes", lasting=0.5, both_sides=0.25, lengthening=0.05),
     "pbl_pipeline.gait:score_gdi",
 )
 GDI_METHODS.register(GILLETTE_MODEL, 1, GdiParams(norm="gillette-166-nine-angles"), "pbl_pipeline.gait:score_gdi")
@@ -229,10 +233,16 @@ def score_gdi(
     reason = "" if enough else _too_few(cycles, n_left, n_right, params)
     left, right, mean, profile, sd, minimal_change = None, None, None, None, None, None
     if enough:
-        parts = _parts(usable, vectors, basis, params)
-        left, right = (_weighted([p for p in parts if p.side == side]) for side in (LEFT, RIGHT))
-        mean = _weighted(parts)
-        sd, minimal_change = _errors(parts, params)
+        if (model_of_error := _model_of_error(usable, basis, params)) is not None:
+            passes = _passes(usable, vectors, basis)
+            expected = expected_index(estimate(model_of_error, passes), basis, model_of_error.widening)
+            left, right, mean, sd = expected.left, expected.right, expected.mean, expected.sd
+            minimal_change = _minimal_change(expected.sd_anew)
+        else:
+            parts = _parts(usable, vectors, basis, params)
+            left, right = (_weighted([p for p in parts if p.side == side]) for side in (LEFT, RIGHT))
+            mean = _weighted(parts)
+            sd, minimal_change = _errors(parts, params)
         scores = variable_scores(np.array(vectors), basis)
         sides = np.array([c.side for c in usable])
         profile = movement_profile({s: scores[sides == s] for s in (LEFT, RIGHT)}, basis)
@@ -272,6 +282,59 @@ def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 3)
 
 
+def worth_of_one_more(cycles: Sequence[GaitCycle], index: Gdi) -> str:
+    """What one more pass would bring, from where it brings most; empty where that is not known."""
+    after = intervals_with_one_more(cycles, index)
+    if not after or index.sd is None:
+        return ""
+    best = min(after, key=lambda side: after[side])
+    where = {LEFT: "from the left side", RIGHT: "from the right side"}.get(best, "from the front or back")
+    return (
+        f"another pass filmed {where} would narrow the index's 90 % interval from +-{Z90 * index.sd:.0f} to "
+        f"+-{after[best]:.0f}"
+    )
+
+
+def intervals_with_one_more(cycles: Sequence[GaitCycle], index: Gdi) -> dict[str, float]:
+    """Half the 90 % interval that the index of `cycles` would have after one more pass, by the side from which it is
+    filmed ("left", "right", or "" for front and back); empty where the model of the error is not known."""
+    method = GDI_METHODS.get(index.model)
+    basis = load_norm(index.norm) if index.norm in norm_names() else None
+    usable = [c for c in cycles if c.used and c.curves]
+    if index.mean is None or method is None or basis is None or len(usable) != index.n:  # other cycles than its own
+        return {}
+    model = _model_of_error(usable, basis, method.params)
+    if model is None:
+        return {}
+    passes = _passes(usable, [gdi_vector(c, basis) for c in usable], basis)
+    filmed_from = {LEFT: RIGHT, RIGHT: LEFT, "": ""}  # the leg that is behind
+    return {filmed_from[k]: Z90 * sd for k, sd in with_one_more(model, passes, basis).items()}
+
+
+def _model_of_error(cycles: Sequence[GaitCycle], norm: NormativeSet, params: GdiParams) -> MeasurementModel | None:
+    """The measured model that all cycles have, with this norm's components."""
+    names = {c.error_model for c in cycles}
+    if params.average != "passes" or len(names) != 1 or "" in names:
+        return None
+    model = load_model(names.pop())
+    return model if model.norm == norm.name else None
+
+
+def _passes(cycles: Sequence[GaitCycle], vectors: Sequence[np.ndarray], norm: NormativeSet) -> list[Pass]:
+    """The cycles by trial and view, as scores of the mean curves of each side."""
+    keys = [(c.trial, c.far_leg) for c in cycles]
+    scores = (np.array(vectors) - norm.mean_deg) @ norm.components.T
+    unseen = np.full(len(norm.components), np.nan)
+    out = []
+    for key in dict.fromkeys(keys):
+        own = [
+            np.array([k == key and c.side == side for k, c in zip(keys, cycles, strict=True)]) for side in (LEFT, RIGHT)
+        ]
+        left, right = (scores[o].mean(axis=0) if o.any() else unseen for o in own)
+        out.append(Pass((left, right), (int(own[0].sum()), int(own[1].sum())), key[1]))
+    return out
+
+
 class _Part(NamedTuple):
     """What an index is the weighted mean of: one cycle, or the mean curves of one side.
 
@@ -307,7 +370,7 @@ def _parts(
         change = _changes(gdi, middle, slope, each, longer, norm) if known else None
         return _Part(sides[own][0], weight, gdi, change, _of_mean((x[own] - middle) @ slope))
 
-    if params.average == "curves":
+    if params.average != "cycles":
         seen = [side for side in (LEFT, RIGHT) if side in sides]
         return [part(sides == side, 1.0 / len(seen)) for side in seen]
     one, n = np.arange(len(x)), len(x)
@@ -350,8 +413,6 @@ def _errors(parts: Sequence[_Part], params: GdiParams) -> tuple[float | None, fl
     all cycles of a side, and partly on both sides, of an angle; what differs from cycle to cycle is in the cycles'
     spread.
     """
-    from pbl_pipeline.stats import minimal_detectable_change  # loads pandas, which every command would wait for
-
     changes = np.array([p.weight * p.change for p in parts if p.change is not None])
     if len(changes) < len(parts):
         return None, None
@@ -361,7 +422,13 @@ def _errors(parts: Sequence[_Part], params: GdiParams) -> tuple[float | None, fl
     fit = params.lasting * (params.both_sides * alike + (1.0 - params.both_sides) * apart)
     walk = sum(p.weight**2 * p.chance for p in parts)
     anew = float(np.sqrt((1.0 - params.repeated) * fit + walk))
-    return float(np.sqrt(fit + walk)), minimal_detectable_change(anew, 0.9)
+    return float(np.sqrt(fit + walk)), _minimal_change(anew)
+
+
+def _minimal_change(sd_anew: float) -> float:
+    from pbl_pipeline.stats import minimal_detectable_change  # loads pandas, which every command would wait for
+
+    return minimal_detectable_change(sd_anew, 0.9)
 
 
 def gdi_vector(cycle: GaitCycle, norm: NormativeSet) -> np.ndarray:

@@ -15,10 +15,12 @@ from ._cycles import REPORT_PERCENT, GaitCycle
 
 
 class Curves(NamedTuple):
-    """Known curves of one cycle and their standard deviations by name, each (P,) degrees."""
+    """Known curves of one cycle and their standard deviations by name, each (P,) degrees, and the name of the model of
+    their error (`GaitCycle.error_model`)."""
 
     deg: dict[str, np.ndarray]
     sd_deg: dict[str, np.ndarray]
+    error_model: str = ""
 
 
 def save_curves(cycles: Sequence[GaitCycle], path: Path) -> None:
@@ -38,12 +40,13 @@ def save_curves(cycles: Sequence[GaitCycle], path: Path) -> None:
         percent=percent,
         curve=table(lambda c: c.curves),
         curve_sd=table(lambda c: c.curves_sd),
+        error_model=np.asarray([c.error_model for c in cycles], dtype=str),
     )
 
 
 def load_curves(path: Path) -> dict[int, Curves]:
     """Return the curves by cycle number. Raises `PblError` FILE_MISSING, FILE_FORMAT."""
-    data = load_npz(path, ("cycle_no", "names", "curve", "curve_sd"))
+    data = load_npz(path, ("cycle_no", "names", "curve", "curve_sd", "error_model"))
     if missing := {"cycle_no", "names", "curve"} - data.keys():
         raise PblError(
             "FILE_FORMAT",
@@ -58,7 +61,10 @@ def load_curves(path: Path) -> dict[int, Curves]:
     shape = (data["cycle_no"].size, len(names), None)
     check_numbers(path, {"curve": curves, "curve_sd": sd}, {"curve": shape, "curve_sd": shape})
 
+    errors = texts_of(path, data, "error_model") if "error_model" in data else [""] * shape[0]  # since version 0.2
+
     def known(rows: np.ndarray) -> dict[str, np.ndarray]:
         return {name: curve for name, curve in zip(names, rows, strict=True) if np.isfinite(curve).all()}
 
-    return {int(n): Curves(known(a), known(b)) for n, a, b in zip(data["cycle_no"].ravel(), curves, sd, strict=True)}
+    rows = zip(data["cycle_no"].ravel(), curves, sd, errors, strict=True)
+    return {int(n): Curves(known(a), known(b), error) for n, a, b, error in rows}

@@ -15,7 +15,18 @@ from pbl_pipeline.qc import EMPTY, OUTCOMES, PASS, WARN, Check, in_session, wors
 
 from ._condition import Condition
 from ._cycles import find_cycles
-from ._gdi import GDI_METHODS, GDI_MODEL, GILLETTE_MODEL, PAPER_INDEX, Gdi, GdiParams, norm_of, params_of, score_gdi
+from ._gdi import (
+    GDI_METHODS,
+    GDI_MODEL,
+    GILLETTE_MODEL,
+    PAPER_INDEX,
+    Gdi,
+    GdiParams,
+    norm_of,
+    params_of,
+    score_gdi,
+    worth_of_one_more,
+)
 from .cycle_measures import MEASURES, Spatiotemporal, far_leg_of, spatiotemporal
 from .events import METHODS, GaitEvents, detect_events
 from .laboratory import LabTrial
@@ -62,7 +73,7 @@ class TrialMetrics(TrialCycles):
         events = {**found, "walking_s": [list(bout) for bout in found["walking_s"]]}
         events["qc"] = [c.to_dict() for c in self.events.qc]
         cycles = [
-            {k: v for k, v in dataclasses.asdict(c).items() if k not in ("trial", "curves", "curves_sd")}
+            {k: v for k, v in dataclasses.asdict(c).items() if k not in ("trial", "curves", "curves_sd", "error_model")}
             for c in self.cycles
         ]
         more = {"pooled": self.pooled, "events": events, "gait_cycles": cycles}
@@ -142,6 +153,8 @@ class GaitMetrics(SessionMetrics):
         if g.interval is not None:
             low, high = g.interval
             lines.append(f"{'its 90 % interval':<24}{low:>9.1f} to {high:.1f}, minimal change {g.minimal_change:.1f}")
+            if more := worth_of_one_more(self.cycles, g):
+                lines.append(more)
         if g.profile is not None and g.profile.gps is not None:
             p = g.profile
             lines.append(f"{'GPS (deg)':<24}{_cell(p.gps_left)}{_cell(p.gps_right)}{_cell(p.gps)}")

@@ -103,7 +103,8 @@ def _bout(time_s: float, bouts: Sequence[tuple[float, float]]) -> int:
 
 def _cycle(content: Mapping[str, Any], trial: str, curves: Mapping[int, Curves]) -> GaitCycle:
     known = curves.get(int(content["number"]), Curves({}, {}))
-    return structured({**content, "trial": trial, "curves": known.deg, "curves_sd": known.sd_deg}, GaitCycle)
+    of_file = {"curves": known.deg, "curves_sd": known.sd_deg, "error_model": known.error_model}
+    return structured({**content, "trial": trial, **of_file}, GaitCycle)
 
 
 def _spatiotemporal(content: Mapping[str, Any], n_steps: int = 0) -> Spatiotemporal:

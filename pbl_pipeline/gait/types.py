@@ -43,7 +43,8 @@ class GaitCycle:
     no fit or frames are missing (`curves_missing` says which); `curves_sd` maps them to their standard deviation (deg),
     where it is known. `angle_model` says how the angles are defined.
     `lengths` are those on the floor, None with the reason where they are not known. `far_leg`: "left" or "right" where
-    one camera saw that leg behind the other, else empty.
+    one camera saw that leg behind the other, else empty. `error_model`: the measured model of the error of such
+    curves (`measurement.model_names`), empty where there is none.
     """
 
     trial: str
@@ -62,6 +63,7 @@ class GaitCycle:
     lengths: Lengths = dataclasses.field(default_factory=lambda: Lengths(missing=NO_POSITIONS))
     angle_model: str = BODY_ANGLES
     far_leg: str = ""
+    error_model: str = ""
 
     @property
     def used(self) -> bool:

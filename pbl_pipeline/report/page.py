@@ -10,6 +10,7 @@ import numpy as np
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.gait import (
     GILLETTE_MODEL,
+    GaitCycle,
     Gdi,
     Measure,
     NormalBands,
@@ -19,6 +20,7 @@ from pbl_pipeline.gait import (
     load_norm,
     norm_names,
     normal_bands,
+    worth_of_one_more,
 )
 from pbl_pipeline.keypoints import confidence_text, visibility
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, OUTCOMES, PASS, WARN, Check, in_session
@@ -80,7 +82,7 @@ def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str,
         bands = _bands(visit)
         page["cycle_charts"] = _figures.cycle_charts(cycles, bands)
         page["cycles_note"] = _cycles_note(bands, far_leg_of(cycles))
-        page["index"] = _index(metrics.gdi)
+        page["index"] = _index(metrics.gdi, metrics.cycles)
     return page
 
 
@@ -219,7 +221,7 @@ def _gdi_sd(gdi: Gdi) -> float | None:
     return float(np.std(values, ddof=1)) if len(values) > 1 else None
 
 
-def _index(gdi: Gdi) -> dict:
+def _index(gdi: Gdi, cycles: Sequence[GaitCycle]) -> dict:
     values = {side: [c.gdi for c in gdi.cycles if c.side == side] for side in ("left", "right")}
     if gdi.mean is None:
         text = f"Not known: {gdi.reason}"
@@ -230,6 +232,8 @@ def _index(gdi: Gdi) -> dict:
         )
         if interval := _interval(gdi):
             text += f"; {interval}: less between two visits filmed alike may be chance"
+        if more := worth_of_one_more(cycles, gdi):
+            text += f"; {more}"
     which = (
         "This is the original Gait Deviation Index of nine angles."
         if gdi.model == GILLETTE_MODEL

@@ -396,6 +396,7 @@ def _curves(rows: Any, about: Mapping[str, Any]) -> Any:
     """Mean curve of the used cycles that each visit pools, per side and angle, at 0, 1, ..., 100 %."""
     import pandas as pd
 
+    from pbl_pipeline.gait.curves_file import load_curves
     from pbl_pipeline.study import CURVE_PERCENT, CURVE_POINTS
 
     of = rows.loc[rows["fit_set"] != ""].set_index("fit_set")
@@ -413,7 +414,7 @@ def _curves(rows: Any, about: Mapping[str, Any]) -> Any:
         if not sides or not done[number].pooled(pace):
             continue
         with stored_file(file_ref(r["curves"])) as path:
-            by_cycle = gait.load_curves(path)
+            by_cycle = load_curves(path)
         for n, side in sides.items():
             for angle, curve in by_cycle[n].deg.items():
                 found[r["fit_set"], side, angle].append(curve)

@@ -1,0 +1,211 @@
+"""What fitted passes show of how a person walks, with its error: the measurement model of the index.
+
+A pass p in view v shows the scores y of a person's mean curves, of both sides in the components of a normative set:
+
+    y_p = m + b_v + G_v (s - m) + person + view + pass_p
+
+s are the true scores, m their mean over people; b_v and G_v what detector and fit make of them (a prior draws postures
+together, so G is not 1); `person` is the same in all passes of a person, `view` in all of one view, `pass_p` is drawn
+anew. All terms are normal; their covariances are variance components of walks whose truth is known, on persons who are
+not held out (`research.corpus.measurement`; docs/measures.md). Of several passes, s is estimated at once: the mean and
+covariance of a normal posterior (Rasmussen & Williams 2006, Gaussian Processes for Machine Learning, eq. A.6).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Iterable, Sequence
+from importlib import resources
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from pbl_pipeline.bounded import parse_json
+
+from .events import LEFT, RIGHT
+from .normative import NormativeSet
+
+#: Draws of the scores for an expected index, and of two visits' errors for the index's own error.
+N_DRAWS, N_VISITS = 512, 64
+_FOLDER = resources.files("pbl_pipeline.gait").joinpath("measurement_models")
+
+
+class Pass(NamedTuple):
+    """Scores (K,) of the mean curves of the left and the right side, NaN where a side has no cycle, the number of
+    cycles of each, and the leg behind the other (`GaitCycle.far_leg`), which tells the view."""
+
+    scores: tuple[Float[np.ndarray, " K"], Float[np.ndarray, " K"]]
+    n_cycles: tuple[int, int]
+    far_leg: str
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """Terms of one view for the scores of both sides, left before right: `bias` (2K,), `gain` (2K, 2K), and the
+    covariances (2K, 2K) of what a view and what a pass adds."""
+
+    bias: np.ndarray
+    gain: np.ndarray
+    view: np.ndarray
+    anew: np.ndarray
+
+    def mirrored(self) -> View:
+        """The same view of a mirrored person."""
+        turn = np.roll(np.arange(len(self.bias)), len(self.bias) // 2)
+        both = np.ix_(turn, turn)
+        return View(self.bias[turn], self.gain[both], self.view[both], self.anew[both])
+
+
+@dataclasses.dataclass(frozen=True)
+class MeasurementModel:
+    """A measured model.
+
+    Attributes
+    ----------
+    name, norm
+        Its own and that of the normative set whose components the scores belong to.
+    fits
+        Hashes of the fit parameters that it was measured with.
+    mean, spread
+        Mean (2K,) and covariance (2K, 2K) of people's true scores.
+    person
+        Covariance (2K, 2K) of the error that all passes of a person share.
+    views
+        By `GaitCycle.far_leg`: "left", "right", or "" where neither leg is behind the other (front, back).
+    cycle, n_cycles
+        Covariance (K, K) of a cycle's scores about the mean of its side, and how many cycles of a side the passes had.
+    widening
+        Factor of the index's standard deviation with which 90 % intervals of persons left out held 90 %.
+    """
+
+    name: str
+    norm: str
+    fits: tuple[str, ...]
+    mean: np.ndarray
+    spread: np.ndarray
+    person: np.ndarray
+    views: dict[str, View]
+    cycle: np.ndarray
+    n_cycles: float
+    widening: float
+
+
+class Posterior(NamedTuple):
+    """Mean (2K,) and covariance (2K, 2K) of the scores, and the covariance that errors of passes drawn anew give the
+    mean."""
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    anew: np.ndarray
+
+
+class ExpectedIndex(NamedTuple):
+    """Expectation of the index of each side and of their mean over the scores' error, the standard deviation of the
+    mean, and that which passes drawn anew give it."""
+
+    left: float
+    right: float
+    mean: float
+    sd: float
+    sd_anew: float
+
+
+def model_names() -> tuple[str, ...]:
+    """The models that ship."""
+    return tuple(sorted(f.name.removesuffix(".json") for f in _FOLDER.iterdir() if f.name.endswith(".json")))
+
+
+@functools.cache
+def load_model(name: str) -> MeasurementModel:
+    """A model that ships, by its name."""
+    data = parse_json(_FOLDER.joinpath(name + ".json").read_text(encoding="utf-8"))
+    views = {k: View(**{n: np.array(v) for n, v in view.items()}) for k, view in data.pop("views").items()}
+    arrays = {n: np.array(data.pop(n)) for n in ("mean", "spread", "person", "cycle")}
+    about = {k: v for k, v in data.items() if k != "made_by"}
+    views[RIGHT] = views[LEFT].mirrored()
+    return MeasurementModel(**about | arrays | {"fits": tuple(data["fits"])}, views=views)
+
+
+def model_of_fit(params_hash: str) -> str:
+    """The name of the model that was measured with a fit's parameters, empty where there is none."""
+    return next((name for name in model_names() if params_hash in load_model(name).fits), "")
+
+
+def estimate(model: MeasurementModel, passes: Sequence[Pass]) -> Posterior:
+    """The scores of a person from all passes of a visit together. At least one pass has a side."""
+    size = len(model.mean)
+    views = [model.views[p.far_leg] for p in passes]
+    scores = np.concatenate([np.concatenate(p.scores) for p in passes])
+    gain = np.vstack([v.gain for v in views])
+    expected = np.concatenate([model.mean + v.bias - v.gain @ model.mean for v in views])
+    anew = _blocks(v.anew + _fewer_cycles(model, p) for v, p in zip(views, passes, strict=True))
+    error = anew + np.tile(model.person, (len(passes), len(passes)))
+    for far_leg, view in model.views.items():
+        same = np.repeat([p.far_leg == far_leg for p in passes], size)
+        error += np.tile(view.view, (len(passes), len(passes))) * np.outer(same, same)
+    seen = np.isfinite(scores)
+    gain, off, error, anew = gain[seen], (scores - expected)[seen], error[np.ix_(seen, seen)], anew[np.ix_(seen, seen)]
+    known = np.linalg.inv(model.spread)
+    weighed = np.linalg.solve(error, gain)
+    covariance = np.linalg.inv(gain.T @ weighed + known)
+    filtered = covariance @ weighed.T
+    mean = filtered @ off + covariance @ known @ model.mean
+    return Posterior(mean, covariance, filtered @ anew @ filtered.T)
+
+
+def expected_index(posterior: Posterior, norm: NormativeSet, widening: float = 1.0) -> ExpectedIndex:
+    """The index of scores that are known with an error: its expectation, not the index of the expected scores, because
+    an error of any direction lengthens a short distance from the norm."""
+    # The same draws at each call, and each with its opposite: an index changes only with its scores.
+    half = np.random.default_rng(0).standard_normal((N_DRAWS // 2, len(posterior.mean)))
+    spread = np.concatenate([half, -half]) @ _root(posterior.covariance).T
+    sides = _index(posterior.mean + spread, norm)
+    visits = np.random.default_rng(1).standard_normal((N_VISITS // 2, len(posterior.mean)))
+    visits = np.concatenate([visits, -visits]) @ _root(posterior.anew).T
+    anew = _index(posterior.mean + visits[:, None] + spread[None, ::4], norm).mean(axis=(1, 2))
+    left, right = sides.mean(axis=0)
+    return ExpectedIndex(
+        float(left),
+        float(right),
+        float(sides.mean()),
+        widening * float(sides.mean(axis=1).std()),
+        float(anew.std()),
+    )
+
+
+def with_one_more(model: MeasurementModel, passes: Sequence[Pass], norm: NormativeSet) -> dict[str, float]:
+    """The standard deviation that the index would have after a further pass, by the leg that is behind in it: that of
+    scores as estimated now, with the covariance that such passes leave."""
+    now, unseen = estimate(model, passes), np.zeros(len(model.mean) // 2)
+    out = {}
+    for far_leg in model.views:
+        typical = Pass((unseen, unseen), (round(model.n_cycles),) * 2, far_leg)
+        then = now._replace(covariance=estimate(model, [*passes, typical]).covariance)
+        out[far_leg] = expected_index(then, norm, model.widening).sd
+    return out
+
+
+def _fewer_cycles(model: MeasurementModel, seen: Pass) -> np.ndarray:
+    """Covariance (2K, 2K) that a pass of fewer cycles than the measured ones has beside theirs."""
+    more = [max(0.0, 1.0 / max(n, 1) - 1.0 / model.n_cycles) for n in seen.n_cycles]
+    return _blocks(m * model.cycle for m in more)
+
+
+def _index(scores: np.ndarray, norm: NormativeSet) -> np.ndarray:
+    """(..., 2) of scores (..., 2K)."""
+    distance = np.linalg.norm(scores.reshape(*scores.shape[:-1], 2, -1), axis=-1)
+    return 100.0 - 10.0 * (np.log(distance) - norm.ln_mean) / norm.ln_sd
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """A matrix whose product with its transpose is a covariance, singular ones too."""
+    values, vectors = np.linalg.eigh(covariance)
+    return vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+
+
+def _blocks(parts: Iterable[np.ndarray]) -> np.ndarray:
+    from scipy.linalg import block_diag
+
+    return block_diag(*parts)

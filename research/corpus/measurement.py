@@ -1,0 +1,329 @@
+"""`python -m research.corpus.measurement`: the measurement model of the index from passes whose truth is known.
+
+The passes are those of `research.corpus.passes`. Everything is estimated on the persons who are not held out, and
+judged on those who are.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import pandas as pd
+
+from pbl_pipeline.fit import METHODS
+from pbl_pipeline.gait import Z90, load_norm
+from pbl_pipeline.gait.events import LEFT, RIGHT
+from pbl_pipeline.gait.measurement import MeasurementModel, Pass, View, estimate, expected_index
+from pbl_pipeline.gait.normative import DEFAULT_NORM, NormativeSet
+from research.corpus.passes import ANGLES, STEP_DEG
+from research.corpus.walks import HEALTHY
+
+#: The leg behind the other, by view of the corpus.
+FAR_LEG = {"sagittal": RIGHT, "sagittal_right": LEFT, "frontal": "", "rear": "", "oblique": ""}
+MIRRORED = {"sagittal": "sagittal_right", "sagittal_right": "sagittal"}
+OTHER = {LEFT: RIGHT, RIGHT: LEFT, "": ""}
+#: How much a gain is drawn towards 1 (deg^2 of the scores' variance): of 30, 100 and 300, the one with the least mean
+#: square error of one pass of tuning persons who were left out in turn.
+RIDGE = 300.0
+#: Least variance (deg^2) of a pass' error in any direction.
+LEAST = 1.0
+#: Passes of one visit that make a session: how many of each view.
+SESSIONS: dict[str, dict[str, int]] = {
+    "left": {"sagittal": 1},
+    "right": {"sagittal_right": 1},
+    "front": {"frontal": 1},
+    "back": {"rear": 1},
+    "obliquely": {"oblique": 1},
+    "both sides": {"sagittal": 1, "sagittal_right": 1},
+    "both sides twice": {"sagittal": 2, "sagittal_right": 2},
+    "sides, front, back": {"sagittal": 1, "sagittal_right": 1, "frontal": 1, "rear": 1},
+}
+#: Groups of persons who are left out in turn.
+FOLDS = 5
+
+
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """A pass: whose, its scores (2, K) and the true ones, how many cycles each side has."""
+
+    person: str
+    held_out: bool
+    source: str
+    condition: str
+    severity: float
+    view: str
+    visit: int
+    scores: np.ndarray
+    true: np.ndarray
+    n_cycles: tuple[int, int]
+    within: np.ndarray  # (K, K) sum of squares of the cycles' scores about their side's mean
+
+    @property
+    def walk(self) -> tuple[str, str, float]:
+        return self.person, self.condition, self.severity
+
+    def mirrored(self) -> Seen:
+        """The same pass of the mirrored person."""
+        return dataclasses.replace(
+            self,
+            view=MIRRORED.get(self.view, self.view),
+            scores=self.scores[::-1],
+            true=self.true[::-1],
+            n_cycles=self.n_cycles[::-1],
+        )
+
+    def as_pass(self) -> Pass:
+        return Pass((self.scores[0], self.scores[1]), self.n_cycles, FAR_LEG[self.view])
+
+
+def read_passes(folder: Path, norm: NormativeSet, events: str = "detected") -> list[Seen]:
+    """The passes of `passes-*.npz` that have cycles of both sides, with `events` "detected" or "known"."""
+    out = []
+    for path in sorted(folder.glob("*.npz")):
+        with np.load(path, allow_pickle=False) as file:
+            data = dict(file)
+        columns = zip(_scores(data, events, norm), _scores(data, "true", norm), strict=True)
+        for i, (found, true) in enumerate(columns):
+            if min(map(len, found)) == 0 or min(map(len, true)) == 0:
+                continue
+            off = np.concatenate([side - side.mean(axis=0) for side in found])
+            out.append(
+                Seen(
+                    str(data["person"][i]),
+                    bool(data["held_out"][i]),
+                    str(data["source"][i]),
+                    str(data["condition"][i]),
+                    float(data["severity"][i]),
+                    str(data["view"][i]),
+                    int(data["visit"][i]),
+                    np.array([side.mean(axis=0) for side in found]),
+                    np.array([side.mean(axis=0) for side in true]),
+                    (len(found[0]), len(found[1])),
+                    off.T @ off,
+                )
+            )
+    return out
+
+
+def _scores(data: dict[str, np.ndarray], kind: str, norm: NormativeSet) -> Iterator[list[np.ndarray]]:
+    """Of each pass, the scores (N, K) of the cycles of the left and of the right side."""
+    percent = np.linspace(0.0, 100.0, 51)
+    curves = data[f"{kind}_curves"] * STEP_DEG
+    at = np.array([np.concatenate([np.interp(norm.percent, percent, a) for a in c]) for c in curves])
+    scores = (at.reshape(-1, len(ANGLES) * len(norm.percent)) - norm.mean_deg) @ norm.components.T
+    ends = np.cumsum(data[f"{kind}_curves_n"])
+    for part, right in zip(np.split(scores, ends[:-1]), np.split(data[f"{kind}_right"], ends[:-1]), strict=True):
+        yield [part[~right], part[right]]
+
+
+def fit_model(seen: Sequence[Seen], norm: NormativeSet, fits: Sequence[str], widening: float = 1.0) -> MeasurementModel:
+    """Bias and gain of each view by ridge regression of the error on the true scores, and the rest's variance
+    components by the means of products of two passes of a walk: of different views `person`; of one view at two visits
+    `person` and `view`; of a pass with itself all. Mirrored passes count as well: left and right are alike."""
+    both = [*seen, *(s.mirrored() for s in seen)]
+    true = np.array([s.true.ravel() for s in both])
+    mean, spread = true.mean(axis=0), np.cov(true.T)
+    terms: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    for far_leg in ("", LEFT):
+        own = [s for s in both if FAR_LEG[s.view] == far_leg]
+        off = np.array([s.true.ravel() for s in own]) - mean
+        error = np.array([(s.scores - s.true).ravel() for s in own])
+        about = error.mean(axis=0)
+        slope = np.linalg.solve(off.T @ off + RIDGE * len(off) * np.eye(len(mean)), off.T @ (error - about))
+        terms[far_leg] = about - slope.T @ off.mean(axis=0), slope.T
+    half = len(mean) // 2
+    terms[RIGHT] = np.roll(terms[LEFT][0], half), np.roll(terms[LEFT][1], (half, half), axis=(0, 1))
+    by_walk: dict[tuple, list[tuple[Seen, np.ndarray]]] = {}
+    for i, s in enumerate(both):
+        bias, slope = terms[FAR_LEG[s.view]]
+        rest = (s.scores - s.true).ravel() - bias - slope @ (s.true.ravel() - mean)
+        by_walk.setdefault((s.walk, i >= len(seen)), []).append((s, rest))
+    products: dict[tuple[str, str], list[np.ndarray]] = {}
+    for group in by_walk.values():
+        for (a, x), (b, y) in itertools.combinations(group, 2):
+            if a.view != b.view:
+                products.setdefault(("person", ""), []).append(_symmetric(x, y))
+            elif a.visit != b.visit:
+                products.setdefault(("view", FAR_LEG[a.view]), []).append(_symmetric(x, y))
+        for s, x in group:
+            products.setdefault(("all", FAR_LEG[s.view]), []).append(np.outer(x, x))
+    person = _positive(np.mean(products["person", ""], axis=0))
+    views = {}
+    for far_leg in ("", LEFT):
+        bias, slope = terms[far_leg]
+        view = _positive(np.mean(products["view", far_leg], axis=0) - person)
+        anew = _positive(np.mean(products["all", far_leg], axis=0) - person - view) + LEAST * np.eye(len(mean))
+        views[far_leg] = View(bias, np.eye(len(mean)) + slope, view, anew)
+    freedom = sum(sum(s.n_cycles) - 2 for s in seen)
+    return MeasurementModel(
+        "blazepose-33",
+        norm.name,
+        tuple(fits),
+        mean,
+        spread,
+        person,
+        views | {RIGHT: views[LEFT].mirrored()},
+        np.sum([s.within for s in seen], axis=0) / freedom,
+        float(np.median([n for s in seen for n in s.n_cycles])),
+        widening,
+    )
+
+
+def _symmetric(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    product = np.outer(x, y)
+    return (product + product.T) / 2
+
+
+def _positive(matrix: np.ndarray) -> np.ndarray:
+    """The nearest covariance."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return (vectors * np.maximum(values, 0.0)) @ vectors.T
+
+
+def sessions_of(seen: Iterable[Seen]) -> Iterator[tuple[str, int, list[Seen]]]:
+    """The sessions that passes of one visit make: kind, visit, passes."""
+    visits: dict[tuple, dict[str, list[Seen]]] = {}
+    for s in seen:
+        visits.setdefault((s.walk, s.visit), {}).setdefault(s.view, []).append(s)
+    for (_, visit), views in visits.items():
+        for kind, wanted in SESSIONS.items():
+            for first in range(2 if max(wanted.values()) == 1 else 1):
+                passes = [views.get(v, [])[first : first + n] for v, n in wanted.items()]
+                if all(len(p) == n for p, n in zip(passes, wanted.values(), strict=True)):
+                    yield kind, visit, [s for p in passes for s in p]
+
+
+def judged(seen: Iterable[Seen], model: MeasurementModel, norm: NormativeSet) -> pd.DataFrame:
+    """A row per session: whose, the true index, the found one with its errors, and that of the plain mean curves."""
+    rows = []
+    for kind, visit, passes in sessions_of(seen):
+        found = expected_index(estimate(model, [s.as_pass() for s in passes]), norm, model.widening)
+        plain, true = (np.mean([getattr(s, n) for s in passes], axis=0) for n in ("scores", "true"))
+        first = passes[0]
+        rows.append(
+            {
+                "kind": kind,
+                "passes": len(passes),
+                **{n: getattr(first, n) for n in ("person", "held_out", "source", "condition", "severity")},
+                "visit": visit,
+                "true": _index(true, norm),
+                "plain": _index(plain, norm),
+                "found": found.mean,
+                "sd": found.sd,
+                "sd_anew": found.sd_anew,
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _index(scores: np.ndarray, norm: NormativeSet) -> float:
+    return float(np.mean(100.0 - 10.0 * (np.log(np.linalg.norm(scores, axis=1)) - norm.ln_mean) / norm.ln_sd))
+
+
+def error_table(frame: pd.DataFrame) -> pd.DataFrame:
+    """Per kind of session: bias, sd and rms of the error, of the plain mean curves beside it; the fraction of 90 %
+    intervals that hold the truth; the fraction of pairs of visits without a change that lie within the minimal one."""
+    rows: list[dict[str, Any]] = []
+    groups = [("one pass, any view", frame[frame["passes"] == 1]), *frame.groupby("kind", sort=False)]
+    for name, group in groups:
+        off, plain = group["found"] - group["true"], group["plain"] - group["true"]
+        keys = ["kind", "person", "condition", "severity"]
+        visits: Any = group.groupby([*keys, "visit"])[["found", "sd_anew"]].first().unstack("visit").dropna()
+        apart = (visits["found"][0] - visits["found"][1]).abs()
+        least = Z90 * np.sqrt(visits["sd_anew"][0] ** 2 + visits["sd_anew"][1] ** 2)
+        rows.append(
+            {
+                "session": name,
+                "n": len(group),
+                "bias": off.mean(),
+                "sd": off.std(),
+                "rms": float(np.sqrt((off**2).mean())),
+                "plain bias": plain.mean(),
+                "plain sd": plain.std(),
+                "recorded bias": off[group["source"] == "recorded"].mean(),
+                "mean sd": group["sd"].mean(),
+                "in 90 %": (off.abs() <= Z90 * group["sd"]).mean(),
+                "unchanged within": (apart <= least).mean(),
+                "minimal change": least.mean(),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def change_table(frame: pd.DataFrame) -> pd.DataFrame:
+    """Of the true change of synthetic people between healthy and the severest impairment, the fraction that is found,
+    by impairment and kind of session; impairments that change the index by less than 3 points in the mean are left
+    out."""
+    keys = ["kind", "person"]
+    own = frame[frame["source"] == "synthetic"]
+    healthy: Any = own[own["condition"].isin(["", HEALTHY])].groupby(keys)[["found", "plain", "true"]].mean()
+    severe = own[own["severity"] == own["severity"].max()]
+    change: Any = severe.groupby(["condition", *keys])[["found", "plain", "true"]].mean() - healthy
+    total: Any = change.dropna().groupby(["kind", "condition"]).mean()
+    total = total[total["true"].abs() >= 3.0]
+    return pd.DataFrame({"found": total["found"] / total["true"], "plain": total["plain"] / total["true"]}).unstack(
+        "kind"
+    )
+
+
+def widening_of(seen: Sequence[Seen], norm: NormativeSet) -> float:
+    """The factor of the sd with which 90 % of the intervals of tuning persons hold the truth who are left out in turn
+    (one pass, and both sides)."""
+    people = sorted({s.person for s in seen})
+    ratios = []
+    for fold in range(FOLDS):
+        out = set(people[fold::FOLDS])
+        model = fit_model([s for s in seen if s.person not in out], norm, ())
+        frame = judged([s for s in seen if s.person in out], model, norm)
+        ratios.append((frame["found"] - frame["true"]).abs() / frame["sd"])
+    return round(float(np.quantile(pd.concat(ratios), 0.9)) / Z90, 2)
+
+
+def write_model(model: MeasurementModel, path: Path, made_by: str) -> None:
+    """Write a model as the library reads it, to four digits."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            return json.loads(json.dumps(value.tolist()), parse_float=lambda t: float(f"{float(t):.4g}"))
+        if dataclasses.is_dataclass(value):
+            return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return value
+
+    content = {f.name: plain(getattr(model, f.name)) for f in dataclasses.fields(model)}
+    content["views"] = {k: plain(v) for k, v in model.views.items() if k != RIGHT}
+    path.write_text(json.dumps({"made_by": made_by, **content}, separators=(",", ":")) + "\n", encoding="utf-8")
+
+
+@click.command(epilog="Example: python -m research.corpus.measurement passes --write model.json")
+@click.argument("folder", type=click.Path(path_type=Path, exists=True))
+@click.option("--norm", default=DEFAULT_NORM, show_default=True, help="Normative set.")
+@click.option("--fit", default="blazepose", show_default=True, help="Method the passes were fitted with.")
+@click.option("--write", type=click.Path(path_type=Path), help="Write the model there.")
+def main(folder: Path, norm: str, fit: str, write: Path | None) -> None:
+    """Estimate the model of the passes in FOLDER on the tuning persons, and print its errors on those held out."""
+    basis, method = load_norm(norm), METHODS[fit]
+    seen = read_passes(folder, basis)
+    tuning = [s for s in seen if not s.held_out]
+    held = [s for s in seen if s.held_out]
+    model = fit_model(tuning, basis, [method.hash], widening_of(tuning, basis))
+    people = [len({s.person for s in part}) for part in (tuning, held)]
+    click.echo(f"{len(tuning)} passes of {people[0]} tuning persons, {len(held)} of {people[1]} held out; {method.key}")
+    click.echo(f"widening {model.widening}")
+    for title, part in (("held out", held), ("tuning", tuning)):
+        frame = judged(part, model, basis)
+        click.echo(f"\n{title}: error of the index\n{error_table(frame).to_string(index=False, float_format='%.2f')}")
+        click.echo(f"\n{title}: of a true change is found\n{change_table(frame).to_string(float_format='%.2f')}")
+    if write is not None:
+        write_model(model, write, f"python -m research.corpus.measurement, {method.key}, {people[0]} persons")
+        click.echo(f"\n{write}")
+
+
+if __name__ == "__main__":
+    main()

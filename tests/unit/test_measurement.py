@@ -1,0 +1,218 @@
+"""The measurement model against closed forms, and the index that score_gdi makes of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+from scipy.stats import norm as normal
+
+from pbl_pipeline.fit import METHODS, default_fit
+from pbl_pipeline.gait import (
+    GDI_METHODS,
+    GDI_MODEL,
+    THREE_ANGLES,
+    Z90,
+    GaitCycle,
+    intervals_with_one_more,
+    load_norm,
+    score_gdi,
+)
+from pbl_pipeline.gait.curves_file import load_curves, save_curves
+from pbl_pipeline.gait.measurement import (
+    MeasurementModel,
+    Pass,
+    Posterior,
+    View,
+    estimate,
+    expected_index,
+    load_model,
+    model_names,
+    model_of_fit,
+    with_one_more,
+)
+
+K = 2
+NORM = load_norm()
+
+
+def toy_model(spread: float = 4.0, person: float = 0.5, view: float = 0.3, anew: float = 1.0) -> MeasurementModel:
+    """Two scores a side whose errors are independent: each is a closed form of its own."""
+    one = np.eye(2 * K)
+    seen = View(np.full(2 * K, 0.7), one, view * one, anew * one)
+    views = {"": seen, "left": seen, "right": seen}
+    return MeasurementModel(
+        "toy", "toy", (), np.full(2 * K, 3.0), spread * one, person * one, views, np.eye(K), 5.0, 1.0
+    )
+
+
+def toy_pass(value: float, far_leg: str = "left", n: int = 5) -> Pass:
+    return Pass((np.full(K, value), np.full(K, value)), (n, n), far_leg)
+
+
+@pytest.mark.parametrize("n", [1, 2, 4])
+def test_passes_of_one_view_share_its_error_and_the_persons(n):
+    """The mean of n passes errs by person + view + pass / n; of people of variance 4 a share 4 / (4 + that) counts."""
+    found = estimate(toy_model(), [toy_pass(5.7 + i) for i in range(n)])
+    error = 0.5 + 0.3 + 1.0 / n
+    share = 4.0 / (4.0 + error)
+    expected = 3.0 + share * (np.mean([5.7 + i for i in range(n)]) - 0.7 - 3.0)
+    np.testing.assert_allclose(found.mean, expected)
+    np.testing.assert_allclose(found.covariance, (1 - share) * 4.0 * np.eye(2 * K), atol=1e-12)
+    np.testing.assert_allclose(found.anew, share**2 * 1.0 / n * np.eye(2 * K), atol=1e-12)
+
+
+def test_passes_of_two_views_halve_the_error_of_a_view():
+    found = estimate(toy_model(), [toy_pass(5.0, "left"), toy_pass(5.0, "right")])
+    error = 0.5 + (0.3 + 1.0) / 2
+    np.testing.assert_allclose(found.covariance, 4.0 * error / (4.0 + error) * np.eye(2 * K), atol=1e-12)
+
+
+def test_fewer_cycles_than_measured_add_their_chance():
+    found = estimate(toy_model(), [toy_pass(5.0, n=1)])
+    error = 0.5 + 0.3 + 1.0 + (1.0 - 1.0 / 5.0)
+    np.testing.assert_allclose(found.covariance, 4.0 * error / (4.0 + error) * np.eye(2 * K), atol=1e-12)
+
+
+def test_a_side_that_was_not_seen_stays_as_people_are():
+    seen = Pass((np.full(K, 5.0), np.full(K, np.nan)), (5, 0), "left")
+    found = estimate(toy_model(), [seen])
+    np.testing.assert_allclose(found.mean[K:], 3.0)
+    np.testing.assert_allclose(np.diag(found.covariance)[K:], 4.0)
+
+
+def test_a_gain_is_undone():
+    model = toy_model(spread=1e6, person=0.0, view=0.0)
+    half = dataclasses.replace(model.views["left"], gain=0.5 * np.eye(2 * K))
+    found = estimate(dataclasses.replace(model, views=model.views | {"left": half}), [toy_pass(3.7 + 1.0)])
+    np.testing.assert_allclose(found.mean, 3.0 + 2.0, rtol=1e-4)
+
+
+def test_scores_without_an_error_have_their_own_index():
+    scores = np.random.default_rng(2).normal(0, 20, 2 * len(NORM.components))
+    none = np.zeros((len(scores), len(scores)))
+    found = expected_index(Posterior(scores, none, none), NORM)
+    vectors = scores.reshape(2, -1) @ NORM.components + NORM.mean_deg
+    assert (found.left, found.right) == pytest.approx(NORM.index(vectors))
+    assert found.mean == pytest.approx(np.mean(NORM.index(vectors)))
+    assert (found.sd, found.sd_anew) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+def test_the_expected_index_is_the_mean_over_the_error():
+    """Against 200,000 other draws."""
+    rng = np.random.default_rng(5)
+    size = 2 * len(NORM.components)
+    mean, root = rng.normal(0, 15, size), 8.0 * np.eye(size)
+    found = expected_index(Posterior(mean, root @ root.T, 0 * root), NORM)
+    draws = (mean + rng.standard_normal((200_000, size)) @ root.T).reshape(-1, 2, size // 2)
+    index = 100 - 10 * (np.log(np.linalg.norm(draws, axis=-1)) - NORM.ln_mean) / NORM.ln_sd
+    assert found.mean == pytest.approx(index.mean(), abs=0.1)
+    assert found.sd == pytest.approx(index.mean(axis=1).std(), rel=0.1)
+
+
+@pytest.mark.parametrize("name", model_names())
+def test_a_model_that_ships_is_one_of_covariances_and_mirrored(name):
+    model = load_model(name)
+    assert model.norm == NORM.name
+    for matrix in (model.spread, model.person, *(m for v in model.views.values() for m in (v.view, v.anew))):
+        np.testing.assert_allclose(matrix, matrix.T, atol=0.02 * np.abs(matrix).max())
+        assert np.linalg.eigvalsh(matrix).min() > -0.01 * np.abs(matrix).max()
+    half = len(model.mean) // 2
+    np.testing.assert_array_equal(model.views["right"].bias, np.roll(model.views["left"].bias, half))
+    np.testing.assert_array_equal(model.views["right"].mirrored().gain, model.views["left"].gain)
+    assert 1.0 <= model.widening < 1.5
+
+
+def test_the_default_fit_of_a_phone_has_a_measured_model():
+    """Another version of the fit errs otherwise: measure it (`python -m research.corpus.passes`, `.measurement`)."""
+    assert model_of_fit(METHODS[default_fit(("blazepose_33", True))].hash) == "blazepose-33"
+    assert model_of_fit("another") == ""
+
+
+def walk(rng: np.random.Generator, far_leg: str, trial: str = "a", model: str = "blazepose-33") -> list[GaitCycle]:
+    """Five cycles of each side about a fixed deviation from the norm."""
+    true = NORM.mean_deg + 12.0 * NORM.components[0] + 5.0 * NORM.components[1]
+    cycles = []
+    for i in range(10):
+        curves = np.split(true + rng.normal(0, 1.0, len(true)), 3)
+        deg = {n: np.append(v, v[0]) for n, v in zip(THREE_ANGLES, curves, strict=True)}
+        sd = {n: np.full(51, 6.0) for n in deg}
+        cycles.append(
+            GaitCycle(
+                trial, i, 0, ("left", "right")[i % 2], 0.0, 0.1, 0.5, 0.6, 1.0,
+                curves=deg, curves_sd=sd, far_leg=far_leg, error_model=model,
+            )
+        )  # fmt: skip
+    return cycles
+
+
+def test_the_interval_shrinks_with_passes_and_differs_by_view():
+    rng = np.random.default_rng(1)
+    side, front = score_gdi(walk(rng, "left")), score_gdi(walk(rng, ""))
+    both = score_gdi(walk(rng, "left", "a") + walk(rng, "right", "b"))
+    four = score_gdi([c for i, leg in enumerate(["left", "right"] * 2) for c in walk(rng, leg, f"{i}")])
+    assert four.sd < both.sd < side.sd < front.sd
+    assert four.minimal_change < both.minimal_change < side.minimal_change
+    assert both.mean == pytest.approx(np.mean([both.left, both.right]), abs=0.01)
+
+
+def test_left_and_right_are_alike():
+    cycles = walk(np.random.default_rng(1), "left")
+    other = {"left": "right", "right": "left"}
+    mirrored = [dataclasses.replace(c, side=other[c.side], far_leg=other[c.far_leg]) for c in cycles]
+    one, two = score_gdi(cycles), score_gdi(mirrored)
+    # The draws are not mirrored with them.
+    assert (one.left, one.right) == pytest.approx((two.right, two.left), abs=0.5)
+
+
+def test_what_one_more_pass_brings_is_what_it_brought():
+    rng = np.random.default_rng(1)
+    cycles = walk(rng, "left")
+    index = score_gdi(cycles)
+    after = intervals_with_one_more(cycles, index)
+    then = score_gdi(cycles + walk(rng, "right", "b"))  # filmed from the left
+    assert after["left"] == pytest.approx(Z90 * then.sd, rel=0.1)
+    assert all(half < Z90 * index.sd for half in after.values())
+    assert intervals_with_one_more(cycles[:-2], index) == {}
+    other = walk(rng, "left", model="")
+    assert intervals_with_one_more(other, score_gdi(other)) == {}
+
+
+def test_without_a_measured_model_the_curves_are_averaged():
+    rng = np.random.default_rng(1)
+    cycles = walk(rng, "left", model="")
+    plain = score_gdi(cycles, params=dataclasses.replace(GDI_METHODS[GDI_MODEL].params, average="curves"))
+    assert (plain.mean, plain.sd) == (score_gdi(cycles).mean, score_gdi(cycles).sd)
+    mixed = cycles[:5] + walk(rng, "left")[5:]
+    assert score_gdi(mixed).sd == score_gdi([dataclasses.replace(c, error_model="") for c in mixed]).sd
+
+
+def test_the_model_of_the_error_lies_with_the_curves(tmp_path):
+    cycles = walk(np.random.default_rng(1), "left")
+    save_curves(cycles, tmp_path / "w.cycles.npz")
+    assert {c.error_model for c in load_curves(tmp_path / "w.cycles.npz").values()} == {"blazepose-33"}
+
+
+def test_the_interval_holds_nine_of_ten_of_the_models_own_people():
+    """Scores and passes drawn from the model itself: the interval before widening is that of the model."""
+    model = dataclasses.replace(load_model("blazepose-33"), widening=1.0)
+    rng = np.random.default_rng(4)
+    inside, n, far = 0, 300, ["left", "right"]
+    draw = functools.partial(rng.multivariate_normal, method="eigh", check_valid="ignore")  # of rounded covariances
+    for _ in range(n):
+        true = draw(model.mean, model.spread)
+        person = draw(0 * model.mean, model.person)
+        passes = []
+        for leg in far:
+            view = model.views[leg]
+            y = model.mean + view.bias + view.gain @ (true - model.mean) + person
+            y = y + draw(0 * y, view.view + view.anew)
+            passes.append(Pass((y[:9], y[9:]), (round(model.n_cycles),) * 2, leg))
+        found = expected_index(estimate(model, passes), NORM)
+        distance = np.linalg.norm(true.reshape(2, -1), axis=1)
+        index = np.mean(100 - 10 * (np.log(distance) - NORM.ln_mean) / NORM.ln_sd)
+        inside += abs(index - found.mean) <= normal.isf(0.05) * found.sd
+    assert inside / n == pytest.approx(0.9, abs=0.05)
+    assert with_one_more(model, passes, NORM)["left"] < expected_index(estimate(model, passes), NORM).sd
