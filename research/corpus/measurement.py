@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from pbl_pipeline.fit import METHODS
-from pbl_pipeline.gait import Z90, load_norm
+from pbl_pipeline.gait import MEASURES, Z90, load_norm
 from pbl_pipeline.gait.events import LEFT, RIGHT
 from pbl_pipeline.gait.measurement import MeasurementModel, Pass, View, estimate, expected_index
 from pbl_pipeline.gait.normative import DEFAULT_NORM, NormativeSet
@@ -64,6 +64,7 @@ class Seen:
     true: np.ndarray
     n_cycles: tuple[int, int]
     within: np.ndarray  # (K, K) sum of squares of the cycles' scores about their side's mean
+    measures: np.ndarray  # (2, M) of `gait.MEASURES`, found and true
 
     @property
     def walk(self) -> tuple[str, str, float]:
@@ -107,6 +108,7 @@ def read_passes(folder: Path, norm: NormativeSet, events: str = "detected") -> l
                     np.array([side.mean(axis=0) for side in true]),
                     (len(found[0]), len(found[1])),
                     off.T @ off,
+                    np.array([data["measures"][i], data["true_measures"][i]]),
                 )
             )
     return out
@@ -273,6 +275,28 @@ def change_table(frame: pd.DataFrame) -> pd.DataFrame:
     )
 
 
+def measure_errors(seen: Sequence[Seen]) -> pd.DataFrame:
+    """Error of each gait measure of one pass: bias and sd in its unit, and the sd of what two passes of one walk at one
+    visit in one view have in common, by where they were filmed from."""
+    rows = []
+    for title, views in (("sides", ("sagittal", "sagittal_right")), ("front, back", ("frontal", "rear"))):
+        own = [s for s in seen if s.view in views]
+        off = np.array([s.measures[0] - s.measures[1] for s in own])
+        by_walk: dict[tuple, list[np.ndarray]] = {}
+        for s, o in zip(own, off, strict=True):
+            by_walk.setdefault((s.walk, s.view, s.visit), []).append(o)
+        pairs = np.array([p for p in by_walk.values() if len(p) == 2]) - np.nanmean(off, axis=0)
+        common = np.sqrt(np.maximum(np.nanmean(pairs[:, 0] * pairs[:, 1], axis=0), 0))
+        for k, name in enumerate(MEASURES):
+            if np.isfinite(off[:, k]).sum() > 10:
+                values = off[:, k]
+                rows.append(
+                    {"measure": name, "from": title, "n": int(np.isfinite(values).sum()), "bias": np.nanmean(values),
+                     "sd": np.nanstd(values), "in common": common[k]}
+                )  # fmt: skip
+    return pd.DataFrame(rows)
+
+
 def widening_of(seen: Sequence[Seen], norm: NormativeSet) -> float:
     """The factor of the sd with which 90 % of the intervals of tuning persons hold the truth who are left out in turn
     (one pass, and both sides)."""
@@ -319,6 +343,7 @@ def main(folder: Path, norm: str, fit: str, write: Path | None) -> None:
     for title, part in (("held out", held), ("tuning", tuning)):
         frame = judged(part, model, basis)
         click.echo(f"\n{title}: error of the index\n{error_table(frame).to_string(index=False, float_format='%.2f')}")
+        click.echo(f"\n{title}: gait measures\n{measure_errors(part).to_string(index=False, float_format='%.3f')}")
         click.echo(f"\n{title}: of a true change is found\n{change_table(frame).to_string(float_format='%.2f')}")
     if write is not None:
         write_model(model, write, f"python -m research.corpus.measurement, {method.key}, {people[0]} persons")
