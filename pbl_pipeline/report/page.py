@@ -223,6 +223,7 @@ def _gdi_sd(gdi: Gdi) -> float | None:
 
 def _index(gdi: Gdi, cycles: Sequence[GaitCycle]) -> dict:
     values = {side: [c.gdi for c in gdi.cycles if c.side == side] for side in ("left", "right")}
+    fitted = ""
     if gdi.mean is None:
         text = f"Not known: {gdi.reason}"
     else:
@@ -234,6 +235,7 @@ def _index(gdi: Gdi, cycles: Sequence[GaitCycle]) -> dict:
             text += f"; {interval}: less between two visits filmed alike may be chance"
         if more := worth_of_one_more(cycles, gdi):
             text += f"; {more}"
+            fitted = " as it was fitted, without the correction for the view that the values above have"
     which = (
         "This is the original Gait Deviation Index of nine angles."
         if gdi.model == GILLETTE_MODEL
@@ -244,7 +246,7 @@ def _index(gdi: Gdi, cycles: Sequence[GaitCycle]) -> dict:
         "title": gdi.title,
         "svg": _figures.index_chart(values, gdi.title),
         "sentence": sentence(text),
-        "note": "Each dot is one gait cycle, the bar the mean of its side; the grey area is within one standard "
+        "note": f"Each dot is one gait cycle{fitted}, the bar the mean of its side; the grey area is within one standard "
         f"deviation of the norm. {which}",
         "profile": _profile(gdi),
     }
