@@ -246,8 +246,8 @@ def _index(gdi: Gdi, cycles: Sequence[GaitCycle]) -> dict:
         "title": gdi.title,
         "svg": _figures.index_chart(values, gdi.title),
         "sentence": sentence(text),
-        "note": f"Each dot is one gait cycle{fitted}, the bar the mean of its side; the grey area is within one standard "
-        f"deviation of the norm. {which}",
+        "note": f"Each dot is one gait cycle{fitted}, the bar the mean of its side; the grey area is within one "
+        f"standard deviation of the norm. {which}",
         "profile": _profile(gdi),
     }
 
