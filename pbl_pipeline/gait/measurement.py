@@ -17,7 +17,7 @@ import dataclasses
 import functools
 from collections.abc import Iterable, Sequence
 from importlib import resources
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -82,7 +82,7 @@ class MeasurementModel:
 
     name: str
     norm: str
-    fits: tuple[str, ...]
+    fits: Sequence[str]
     mean: np.ndarray
     spread: np.ndarray
     person: np.ndarray
@@ -120,12 +120,12 @@ def model_names() -> tuple[str, ...]:
 @functools.cache
 def load_model(name: str) -> MeasurementModel:
     """A model that ships, by its name."""
-    data = parse_json(_FOLDER.joinpath(name + ".json").read_text(encoding="utf-8"))
+    data: dict[str, Any] = parse_json(_FOLDER.joinpath(name + ".json").read_text(encoding="utf-8"))
+    del data["made_by"]
     views = {k: View(**{n: np.array(v) for n, v in view.items()}) for k, view in data.pop("views").items()}
-    arrays = {n: np.array(data.pop(n)) for n in ("mean", "spread", "person", "cycle")}
-    about = {k: v for k, v in data.items() if k != "made_by"}
     views[RIGHT] = views[LEFT].mirrored()
-    return MeasurementModel(**about | arrays | {"fits": tuple(data["fits"])}, views=views)
+    arrays: dict[str, Any] = {n: np.array(data.pop(n)) for n in ("mean", "spread", "person", "cycle")}
+    return MeasurementModel(**data, **arrays, views=views)
 
 
 def model_of_fit(params_hash: str) -> str:
@@ -179,9 +179,10 @@ def with_one_more(model: MeasurementModel, passes: Sequence[Pass], norm: Normati
     """The standard deviation that the index would have after a further pass, by the leg that is behind in it: that of
     scores as estimated now, with the covariance that such passes leave."""
     now, unseen = estimate(model, passes), np.zeros(len(model.mean) // 2)
+    cycles = round(model.n_cycles)
     out = {}
     for far_leg in model.views:
-        typical = Pass((unseen, unseen), (round(model.n_cycles),) * 2, far_leg)
+        typical = Pass((unseen, unseen), (cycles, cycles), far_leg)
         then = now._replace(covariance=estimate(model, [*passes, typical]).covariance)
         out[far_leg] = expected_index(then, norm, model.widening).sd
     return out
@@ -208,4 +209,4 @@ def _root(covariance: np.ndarray) -> np.ndarray:
 def _blocks(parts: Iterable[np.ndarray]) -> np.ndarray:
     from scipy.linalg import block_diag
 
-    return block_diag(*parts)
+    return np.asarray(block_diag(*parts))

@@ -264,15 +264,14 @@ def change_table(frame: pd.DataFrame) -> pd.DataFrame:
     by impairment and kind of session; impairments that change the index by less than 3 points in the mean are left
     out."""
     keys = ["kind", "person"]
-    own = frame[frame["source"] == "synthetic"]
+    own: Any = frame[frame["source"] == "synthetic"]
     healthy: Any = own[own["condition"].isin(["", HEALTHY])].groupby(keys)[["found", "plain", "true"]].mean()
-    severe = own[own["severity"] == own["severity"].max()]
+    severe: Any = own[own["severity"] == own["severity"].max()]
     change: Any = severe.groupby(["condition", *keys])[["found", "plain", "true"]].mean() - healthy
     total: Any = change.dropna().groupby(["kind", "condition"]).mean()
     total = total[total["true"].abs() >= 3.0]
-    return pd.DataFrame({"found": total["found"] / total["true"], "plain": total["plain"] / total["true"]}).unstack(
-        "kind"
-    )
+    share: Any = pd.DataFrame({n: total[n] / total["true"] for n in ("found", "plain")})
+    return share.unstack("kind")
 
 
 def measure_errors(seen: Sequence[Seen]) -> pd.DataFrame:

@@ -16,6 +16,7 @@ from pbl_pipeline.gait import (
     THREE_ANGLES,
     Z90,
     GaitCycle,
+    Gdi,
     intervals_with_one_more,
     load_norm,
     score_gdi,
@@ -131,6 +132,12 @@ def test_the_default_fit_of_a_phone_has_a_measured_model():
     assert model_of_fit("another") == ""
 
 
+def errors(index: Gdi) -> tuple[float, float]:
+    """Its standard deviation and its minimal change."""
+    assert index.sd is not None and index.minimal_change is not None
+    return index.sd, index.minimal_change
+
+
 def walk(rng: np.random.Generator, far_leg: str, trial: str = "a", model: str = "blazepose-33") -> list[GaitCycle]:
     """Five cycles of each side about a fixed deviation from the norm."""
     true = NORM.mean_deg + 12.0 * NORM.components[0] + 5.0 * NORM.components[1]
@@ -153,9 +160,9 @@ def test_the_interval_shrinks_with_passes_and_differs_by_view():
     side, front = score_gdi(walk(rng, "left")), score_gdi(walk(rng, ""))
     both = score_gdi(walk(rng, "left", "a") + walk(rng, "right", "b"))
     four = score_gdi([c for i, leg in enumerate(["left", "right"] * 2) for c in walk(rng, leg, f"{i}")])
-    assert four.sd < both.sd < side.sd < front.sd
-    assert four.minimal_change < both.minimal_change < side.minimal_change
-    assert both.mean == pytest.approx(np.mean([both.left, both.right]), abs=0.01)
+    sd, least = zip(*(errors(g) for g in (four, both, side, front)), strict=True)
+    assert sd == tuple(sorted(sd))
+    assert least[:3] == tuple(sorted(least[:3]))
 
 
 def test_left_and_right_are_alike():
@@ -173,8 +180,8 @@ def test_what_one_more_pass_brings_is_what_it_brought():
     index = score_gdi(cycles)
     after = intervals_with_one_more(cycles, index)
     then = score_gdi(cycles + walk(rng, "right", "b"))  # filmed from the left
-    assert after["left"] == pytest.approx(Z90 * then.sd, rel=0.1)
-    assert all(half < Z90 * index.sd for half in after.values())
+    assert after["left"] == pytest.approx(Z90 * errors(then)[0], rel=0.1)
+    assert all(half < Z90 * errors(index)[0] for half in after.values())
     assert intervals_with_one_more(cycles[:-2], index) == {}
     other = walk(rng, "left", model="")
     assert intervals_with_one_more(other, score_gdi(other)) == {}
@@ -199,17 +206,18 @@ def test_the_interval_holds_nine_of_ten_of_the_models_own_people():
     """Scores and passes drawn from the model itself: the interval before widening is that of the model."""
     model = dataclasses.replace(load_model("blazepose-33"), widening=1.0)
     rng = np.random.default_rng(4)
-    inside, n, far = 0, 300, ["left", "right"]
+    inside, n, far, cycles = 0, 300, ["left", "right"], round(model.n_cycles)
+    passes: list[Pass] = []
     draw = functools.partial(rng.multivariate_normal, method="eigh", check_valid="ignore")  # of rounded covariances
     for _ in range(n):
         true = draw(model.mean, model.spread)
         person = draw(0 * model.mean, model.person)
-        passes = []
+        passes.clear()
         for leg in far:
             view = model.views[leg]
             y = model.mean + view.bias + view.gain @ (true - model.mean) + person
             y = y + draw(0 * y, view.view + view.anew)
-            passes.append(Pass((y[:9], y[9:]), (round(model.n_cycles),) * 2, leg))
+            passes.append(Pass((y[:9], y[9:]), (cycles, cycles), leg))
         found = expected_index(estimate(model, passes), NORM)
         distance = np.linalg.norm(true.reshape(2, -1), axis=1)
         index = np.mean(100 - 10 * (np.log(distance) - NORM.ln_mean) / NORM.ln_sd)
