@@ -14,6 +14,11 @@ from pathlib import Path
 import pytest
 
 from schemas.operations import embedded
+from tests import mysql
+
+
+#: For tests of what the embedded server alone has.
+embedded_only = pytest.mark.skipif(mysql.chosen(), reason="a test of the embedded database, not of the server's kind")
 
 
 def new_home() -> Path:
@@ -37,17 +42,33 @@ def leave_nothing_of_the_developer(patch: pytest.MonkeyPatch) -> None:
 
 
 @contextlib.contextmanager
+def server(home: Path) -> Iterator[dict[str, str]]:
+    """Start the database of a home; yields the variables with which `pbl` uses it. MySQL is ended after, the embedded
+    server with its home (`remove_home`)."""
+    if mysql.chosen():
+        with mysql.running(home / "db") as started:
+            yield {"PBL_HOME": str(home), **started.environment}
+    else:
+        embedded.start(folder=embedded.Folder(home / "db"))
+        yield {"PBL_HOME": str(home)}
+
+
+@contextlib.contextmanager
 def installation() -> Iterator[Path]:
-    """A running embedded server with its store, and PBL_HOME set to its folder, which is yielded and removed after."""
+    """A running server with its store, and PBL_HOME set to its folder, which is yielded and removed after.
+
+    The embedded one; a MySQL server where PBL_TEST_DATABASE asks for that (`tests.mysql`).
+    """
     home = new_home()
     end = functools.partial(remove_home, home)
     atexit.register(end)  # also when what uses it breaks off
     with pytest.MonkeyPatch.context() as patch:
         leave_nothing_of_the_developer(patch)
-        patch.setenv("PBL_HOME", str(home))
         try:
-            embedded.start(folder=embedded.Folder(home / "db"))
-            yield home
+            with server(home) as variables:
+                for name, value in variables.items():
+                    patch.setenv(name, value)
+                yield home
         finally:
             end()
             atexit.unregister(end)
