@@ -13,6 +13,8 @@ from schemas.json_files import write_json, write_text
 
 #: Names that DataJoint looks for, in the working directory and above it.
 CONFIG, SECRETS = "datajoint.json", ".secrets"
+#: What makes `A.aggr(B)` work for plain DataJoint on MariaDB: its configuration has no place for it.
+AGGREGATE = """dj.conn().query("SET SESSION sql_mode = REPLACE(@@SESSION.sql_mode, 'ONLY_FULL_GROUP_BY', '')")"""
 #: Attributes of a store that are secret.
 _SECRET = ("access_key", "secret_key", "account_key", "connection_string", "token", "password")
 
