@@ -128,7 +128,7 @@ def joins() -> list[str]:
         "from schemas import gdi, session",
         "",
         'chosen = gdi.GDI & (session.Session & {"subject": "P001"})',
-        '(gdi.GDI & chosen.keys()).delete(part_integrity="cascade")  # asks first; prompt=False does not',
+        '(gdi.GDI & chosen.keys()).delete(part_integrity="cascade", prompt=False)  # without prompt=False it asks first',
         "```",
         "",
         "**A drawing of the tables.** `dj.Diagram(gdi.SessionGdi) - 2` draws itself in a notebook, and `.save(\"tables.svg\")` writes a file, where Graphviz",
