@@ -285,7 +285,7 @@ def _run(site: Site, minutes: float, supervisors: int, can_fill: bool) -> list[s
         site.keep_bosses(supervisors)
         time.sleep(site.draw.uniform(0.5, 4.0))
         if site.mysql is not None:
-            site.start_server()  # MySQL ends by itself where its log meets a full disk; the embedded server waits
+            site.start_server()  # in case it ended by itself
         site.draw.choices([f for _, f in weights], [w for w, _ in weights])[0]()
         with contextlib.suppress(Exception):  # as a person and cron would: again later
             if time.monotonic() - refreshed > 5.0:
