@@ -16,7 +16,6 @@ import pytest
 from schemas.operations import embedded
 from tests import mysql
 
-
 #: For tests of what the embedded server alone has.
 embedded_only = pytest.mark.skipif(mysql.chosen(), reason="a test of the embedded database, not of the server's kind")
 

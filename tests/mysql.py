@@ -146,9 +146,7 @@ class Server:
 
     def connection(self) -> pymysql.Connection:
         """A connection as root."""
-        return pymysql.connect(
-            host="127.0.0.1", port=self.port, user="root", password=self.password, autocommit=True
-        )
+        return pymysql.connect(host="127.0.0.1", port=self.port, user="root", password=self.password, autocommit=True)
 
     @property
     def pid(self) -> int:

@@ -6,7 +6,7 @@ from typing import Any
 
 
 def work(gate: Any, said: Any) -> None:
-    """Wait for the others at `gate`, take jobs of VideoInfo one by one until none is left; put their videos in `said`."""
+    """Wait for the others at `gate`, take jobs of VideoInfo one by one until none is left; put them in `said`."""
     import schemas
     from schemas import video
     from workers import queue, run_job

@@ -86,6 +86,7 @@ def test_two_results_with_the_video_between_them_are_of_one_visit(visits: None):
     for first, second in itertools.combinations(_computed(), 2):
         pair = _key(first) * _key(video.Video) * _key(second)
         assert len(pair) == VIDEOS, (first.__name__, second.__name__)
+    assert len(gdi.SessionGdi.Measure.proj() * _key(gdi.SessionGdi)) == len(gdi.SessionGdi.Measure())
     for first, second in EVERY_PAIR:
         assert len(first() * second()) == len(first()) * len(second())
 
@@ -101,7 +102,7 @@ def test_a_delete_behind_a_restricted_restriction_is_datajoints_own_error(visits
     """docs/datajoint_delete.md. Where this fails DataJoint has mended it: the page and the way around can go."""
     one = session.Session & {"subject": "P001", "session_label": "2026-06-01"}
     for chosen in (gdi.GDI & one, video.VideoInfo & (video.Video & one)):
-        with pytest.raises(DataJointError, match="Attribute `(pbl_)?[a-z]+` is not found in query"):
+        with pytest.raises(DataJointError, match=r"Attribute `(pbl_)?[a-z]+` is not found in query"):
             chosen.delete(prompt=False)
         assert len(chosen) == 2
 

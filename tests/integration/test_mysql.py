@@ -82,7 +82,6 @@ def test_the_tests_of_tables_pass_on_mysql(root: Path, name: str):
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(file)]
     done = subprocess.run(command, env=_environment(root), cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-5000:]
-    print(name, done.stdout.splitlines()[-1])
 
 
 def _values(rows: dict[str, list[tuple]]) -> dict[str, list[tuple]]:
