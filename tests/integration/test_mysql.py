@@ -1,4 +1,4 @@
-"""The tables on a real MySQL, fetched and started in a folder of its own: 30 minutes on two cores.
+"""The tables on a real MySQL, fetched and started in a folder of its own: 20 minutes on two cores.
 
     pytest -m machine tests/integration/test_mysql.py
 
@@ -33,7 +33,7 @@ from workers.populate import populate
 from . import chain, contention
 
 ROOT = Path(__file__).resolve().parents[2]
-#: Files of tests that pass on MySQL as they are: the chain and views, joins, accounts, backup, migrations, the queue.
+#: Files of tests that pass on MySQL as they are: the chain and views, joins, accounts, backup, migrations.
 FILES = (
     "test_tables.py",
     "test_joins.py",
@@ -42,10 +42,6 @@ FILES = (
     "test_backup.py",
     "test_migrations.py",
     "test_catalog.py",
-    "test_forget.py",
-    "test_outages.py",
-    "test_poisoned_jobs.py",
-    "test_session_gdi.py",
 )
 
 pytestmark = pytest.mark.machine
