@@ -14,6 +14,38 @@ _ORIGIN = ("code_version", "method_hash", "model_sha256", "host", "seconds", "co
 _KINDS = {dj.Manual: "manual", dj.Lookup: "lookup", dj.Computed: "computed", dj.Part: "part"}
 _SHAPES = {"manual": ('["', '"]'), "lookup": ('[/"', '"/]'), "computed": ('(["', '"])')}
 
+#: A natural join pairs every row with every row where two tables have no column in common that tells visits apart.
+_JOINS = """\
+## Joins
+
+A natural join (`A * B`) pairs rows by the columns that both have. Where these do not tell one visit from another, such as the name of a
+method, it pairs **every visit with every other** and raises nothing: `fit.TrialInput * fit.SessionFit` of 4 visits with 2 videos each has 32 rows
+instead of 8, and `lab.Subject * gdi.SessionGdi` has each person with everybody's visits. Count the rows (`len(A * B)`).
+
+| rows | tables | safe chain |
+|---|---|---|
+| know their visit (`session_id`) | @VISIT@ | `T * session.Session * lab.Subject` |
+| know their video only | @VIDEO@ | `T * video.Video * session.Session * lab.Subject` |
+| two of these | any `A` and `B` | `A * video.Video * B`: a row of each video; two that know their visit: `A * B` |
+| of a part | `SessionGdi.Measure`, `GDI.Cycle`, ... | through its table: `gdi.SessionGdi.Measure * gdi.SessionGdi.proj('session_id')` |
+| of a person | `lab.Subject` | never without `session.Session` between it and results |
+
+**Deleting results of chosen visits.** DataJoint 2.3.5 cannot delete from a table that is restricted by another query with a restriction:
+`(gdi.GDI & (session.Session & {...})).delete()` ends with "Attribute `pbl_session` is not found in query" and deletes nothing
+([datajoint_delete.md](datajoint_delete.md)). Restrict by the keys instead, and let results of the whole visit go along:
+
+```python
+from schemas import gdi, session
+
+chosen = gdi.GDI & (session.Session & {"subject": "P001"})
+(gdi.GDI & chosen.keys()).delete(part_integrity="cascade", prompt=False)  # without prompt=False it asks first
+```
+
+**A drawing of the tables.** `dj.Diagram(gdi.SessionGdi) - 2` draws itself in a notebook; `.make_svg()` and `.save("tables.svg")` need the program Graphviz
+(`apt-get install graphviz`, `brew install graphviz`) and `pip install ipython`, which notebooks bring. `.save("tables.mmd")` needs neither: it writes
+Mermaid, as the picture above.
+"""  # noqa: E501
+
 
 def kind(cls: Any) -> str:
     """manual, lookup, computed or part."""
@@ -77,6 +109,8 @@ def table_map() -> str:
         "",
         "*origin* stands for the columns that say where a computed row comes from: `<prefix>_code_version`,",
         "`_method_hash`, `_model_sha256`, `_host`, `_seconds` (s), `_computed` (UTC).",
+        "",
+        *joins(),
     ]
     stage = ""
     for name, cls in tables().items():
@@ -96,6 +130,19 @@ def table_map() -> str:
         if origin:
             lines.append("| *origin* | | |")
     return "\n".join(lines) + "\n"
+
+
+def joins() -> list[str]:
+    """Return the section of the joins that give each row its own visit, line by line."""
+    computed = {name: cls for name, cls in tables().items() if issubclass(cls, dj.Computed)}
+    of_visit = [name for name, cls in computed.items() if "session.Session" in references(name, cls)]
+    of_video = [name for name in computed if name not in of_visit]
+    text = _JOINS.replace("@VISIT@", _names(of_visit)).replace("@VIDEO@", _names(of_video))
+    return text.splitlines()
+
+
+def _names(found: list[str]) -> str:
+    return ", ".join(f"`{name}`" for name in found)
 
 
 def _refers_to(name: str, cls: Any) -> list[str]:

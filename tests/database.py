@@ -14,6 +14,10 @@ from pathlib import Path
 import pytest
 
 from schemas.operations import embedded
+from tests import mysql
+
+#: For tests of what the embedded server alone has.
+embedded_only = pytest.mark.skipif(mysql.chosen(), reason="a test of the embedded database, not of the server's kind")
 
 
 def new_home() -> Path:
@@ -37,24 +41,38 @@ def leave_nothing_of_the_developer(patch: pytest.MonkeyPatch) -> None:
 
 
 @contextlib.contextmanager
-def installation() -> Iterator[Path]:
-    """A running embedded server with its store, and PBL_HOME set to its folder, which is yielded and removed after.
+def server(home: Path) -> Iterator[dict[str, str]]:
+    """Start the database of a home; yields the variables with which `pbl` uses it. MySQL is ended after, the embedded
+    server with its home (`remove_home`)."""
+    if mysql.chosen():
+        with mysql.running(home / "db") as started:
+            yield {"PBL_HOME": str(home), **started.environment}
+    else:
+        embedded.start(folder=embedded.Folder(home / "db"))
+        yield {"PBL_HOME": str(home)}
 
-    It leaves it to the system when a commit is on the disk: a test outlives no power cut. What a killed server keeps is
-    tested on servers with the settings of users (test_embedded_db.py).
+
+@contextlib.contextmanager
+def installation() -> Iterator[Path]:
+    """A running server with its store, and PBL_HOME set to its folder, which is yielded and removed after.
+
+    The embedded one; a MySQL server where PBL_TEST_DATABASE asks for that (`tests.mysql`). The embedded one leaves it
+    to the system when a commit is on the disk: a test outlives no power cut. What a killed server keeps is tested on
+    servers with the settings of users (test_embedded_db.py).
     """
     home = new_home()
     end = functools.partial(remove_home, home)
     atexit.register(end)  # also when what uses it breaks off
     with pytest.MonkeyPatch.context() as patch:
         leave_nothing_of_the_developer(patch)
-        patch.setenv("PBL_HOME", str(home))
         try:
-            folder = embedded.Folder(home / "db")
-            embedded.start(folder=folder)
-            with embedded.admin(folder) as connection, connection.cursor() as cursor:
-                cursor.execute("SET GLOBAL innodb_flush_log_at_trx_commit = 2")
-            yield home
+            with server(home) as variables:
+                for name, value in variables.items():
+                    patch.setenv(name, value)
+                if not mysql.chosen():
+                    with embedded.admin(embedded.Folder(home / "db")) as connection, connection.cursor() as cursor:
+                        cursor.execute("SET GLOBAL innodb_flush_log_at_trx_commit = 2")
+                yield home
         finally:
             end()
             atexit.unregister(end)

@@ -1,6 +1,7 @@
 """Workers, supervisors, the database and the disks fail at random while recordings come in: what is left afterwards.
 
-    python -m research.benchmarks.chaos --minutes 20 --seed 1     # as root, who may mount two small disks
+    python -m research.benchmarks.chaos --minutes 20 --seed 1             # as root, who may mount two small disks
+    python -m research.benchmarks.chaos --minutes 10 --database mysql     # on Debian's MySQL (tests/mysql.py)
 
 Faults, one every few seconds: kill -9 of working processes, of supervisors, and of the database inside an insert,
 before or after its statement; pauses of processes for longer than it takes until they count as dead, and of the
@@ -30,7 +31,7 @@ import click
 import pytest
 
 from research.benchmarks import worker_standins, workers
-from tests import database
+from tests import database, mysql
 from tests.integration import chain
 from workers.process import Options
 
@@ -99,6 +100,7 @@ class Site:
 
     home: Path
     draw: random.Random
+    mysql: mysql.Server | None = None  # the database, where it is not the embedded one
     bosses: list[Any] = dataclasses.field(default_factory=list)
     done: Counter[str] = dataclasses.field(default_factory=Counter)
 
@@ -107,7 +109,18 @@ class Site:
         """Process number of the database."""
         from schemas.operations import embedded
 
+        if self.mysql is not None:
+            return self.mysql.pid
         return int(embedded.Folder(self.home / "db").state()["pid"])
+
+    def start_server(self) -> None:
+        """Start the database where it does not run, as systemd would."""
+        from schemas.operations import embedded
+
+        if self.mysql is not None:
+            self.mysql.start()
+        else:
+            embedded.start(folder=embedded.Folder(self.home / "db"))
 
     def keep_bosses(self, n: int) -> None:
         """Start the supervisors that are missing, as systemd would."""
@@ -155,16 +168,17 @@ class Site:
 
     def kill_server(self) -> None:
         """Inside an insert, where one begins within some seconds."""
-        from schemas.operations import embedded
-
         inserts, until = Path(os.environ[INSERTS]), time.monotonic() + 10.0
         while not (inside := any(inserts.iterdir())) and time.monotonic() < until:
             time.sleep(0.002)
         time.sleep(self.draw.uniform(0, 0.05))
-        os.kill(self.server, signal.SIGKILL)
+        if self.mysql is not None:
+            self.mysql.kill()
+        else:
+            os.kill(self.server, signal.SIGKILL)
         self.done["database killed" + (" inside an insert" if inside else "")] += 1
         time.sleep(self.draw.uniform(0.2, 3.0))
-        embedded.start(folder=embedded.Folder(self.home / "db"))
+        self.start_server()
 
     def fill(self, disk: str) -> None:
         """No byte is left on a disk for some seconds."""
@@ -209,7 +223,8 @@ def _faults(site: Site, can_fill: bool) -> list[tuple[float, Any]]:
 @click.option("--minutes", default=20.0, show_default=True)
 @click.option("--seed", default=0, show_default=True)
 @click.option("--supervisors", default=3, show_default=True)
-def main(minutes: float, seed: int, supervisors: int) -> None:
+@click.option("--database", "kind", type=click.Choice(["embedded", "mysql"]), default="embedded", show_default=True)
+def main(minutes: float, seed: int, supervisors: int, kind: str) -> None:
     """Let things fail for some minutes, then count."""
     home = database.new_home()
     with _disks(home, minutes) as can_fill, pytest.MonkeyPatch.context() as patch:
@@ -223,6 +238,10 @@ def main(minutes: float, seed: int, supervisors: int) -> None:
         patch.setenv(worker_standins.SLEEP, "0.1")
         _pass_for_a_machine()
         site = Site(home, random.Random(seed))
+        if kind == "mysql":
+            site.mysql = mysql.start(home / "db")
+            for name, value in site.mysql.environment.items():
+                patch.setenv(name, value)
         try:
             wrong = _run(site, minutes, supervisors, can_fill)
         finally:
@@ -230,6 +249,8 @@ def main(minutes: float, seed: int, supervisors: int) -> None:
             database.remove_home(home / "nothing")
             from schemas.operations import embedded
 
+            if site.mysql is not None:
+                site.mysql.stop()
             embedded.stop(folder=embedded.Folder(home / "db"))
     for line in wrong:
         click.echo(f"WRONG: {line}")
@@ -253,10 +274,9 @@ def _disks(home: Path, minutes: float) -> Iterator[bool]:
 
 
 def _run(site: Site, minutes: float, supervisors: int, can_fill: bool) -> list[str]:
-    from schemas.operations import embedded
     from schemas.operations.declare import declare_all
 
-    embedded.start(folder=embedded.Folder(site.home / "db"))
+    site.start_server()
     declare_all()
     registered = _register(0)
     until, weights = time.monotonic() + 60 * minutes, _faults(site, can_fill)
@@ -264,6 +284,8 @@ def _run(site: Site, minutes: float, supervisors: int, can_fill: bool) -> list[s
     while time.monotonic() < until:
         site.keep_bosses(supervisors)
         time.sleep(site.draw.uniform(0.5, 4.0))
+        if site.mysql is not None:
+            site.start_server()  # in case it ended by itself
         site.draw.choices([f for _, f in weights], [w for w, _ in weights])[0]()
         with contextlib.suppress(Exception):  # as a person and cron would: again later
             if time.monotonic() - refreshed > 5.0:

@@ -37,6 +37,7 @@ def install(patch: pytest.MonkeyPatch) -> None:
         return dataclasses.replace(probe(recorded), path=str(path))
 
     patch.setattr(pbl_pipeline.video, "probe", given)
+    patch.setattr(chain, "probe", lambda _: probe(recorded))
     patch.setattr(schemas.video, "registered_file", lambda path, sha256, key: Path(path))
 
 

@@ -24,9 +24,12 @@ def config(out: Path, overwrite: bool) -> None:
 
     Example: pbl db config --out notebooks
     """
-    from schemas.operations.client_config import is_mariadb, write_config
+    from schemas.operations.client_config import AGGREGATE, is_mariadb, write_config
 
     for path in write_config(out, overwrite):
         click.echo(path)
     if is_mariadb():
-        click.echo("The server is MariaDB, where A.aggr(B) of DataJoint fails: import schemas before datajoint.")
+        click.echo(
+            "The server is MariaDB, where A.aggr(B) of plain DataJoint fails (error 1055). After each connect:\n"
+            f"{AGGREGATE}"
+        )

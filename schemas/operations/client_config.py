@@ -14,6 +14,8 @@ from schemas.tables_version import refuse_other_version
 
 #: Names that DataJoint looks for, in the working directory and above it.
 CONFIG, SECRETS = "datajoint.json", ".secrets"
+#: What makes `A.aggr(B)` work for plain DataJoint on MariaDB: its configuration has no place for it.
+AGGREGATE = """dj.conn().query("SET SESSION sql_mode = REPLACE(@@SESSION.sql_mode, 'ONLY_FULL_GROUP_BY', '')")"""
 #: Attributes of a store that are secret.
 _SECRET = ("access_key", "secret_key", "account_key", "connection_string", "token", "password")
 

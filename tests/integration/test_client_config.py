@@ -16,6 +16,7 @@ import schemas
 from pbl_pipeline.errors import PblError
 from schemas import connection
 from schemas.datajoint_setup import dj
+from schemas.operations import client_config
 from schemas.store import further_stores
 from tests.command import pbl
 
@@ -24,6 +25,14 @@ PLAIN = """
 import sys
 import datajoint as dj
 own = dj.VirtualModule("own", "pbl_tried")
+counted = own.Tried.aggr(own.Below, "curve", n="count(*)")
+if repair := sys.argv[1]:
+    try:
+        counted.to_dicts()
+    except Exception as error:
+        print("without it:", error.args[0])
+    exec(repair)
+print("aggregated", counted.to_arrays("n").tolist())
 print(own.Tried().fetch1("curve").load().tolist(), dj.config.safemode, dj.config.stores["far"]["secret_key"])
 assert not [n for n in sys.modules if n.split(".")[0] in ("schemas", "pbl_pipeline")]
 own.Tried().delete()
@@ -53,6 +62,14 @@ def tried(stores: None):
 
     table = schema(Tried)
     table.insert1({"tried": 1, "curve": np.arange(3.0)})
+
+    class Below(dj.Manual):
+        definition = """
+        -> Tried
+        below : int32
+        """
+
+    schema(Below, context={"Tried": Tried}).insert([(1, 1), (1, 2)])
     yield table
     schema.drop(prompt=False)
     connection.configure()
@@ -75,7 +92,7 @@ def test_plain_datajoint_connects_with_what_is_written(tried, tmp_path):
     below.mkdir()
     env = {k: v for k, v in os.environ.items() if not k.startswith(("DJ_", "PBL_", "PYTHONPATH"))}
     asked = subprocess.run(
-        [sys.executable, "-P", "-c", PLAIN],
+        [sys.executable, "-P", "-c", PLAIN, client_config.AGGREGATE if client_config.is_mariadb() else ""],
         cwd=below,
         env=env,
         capture_output=True,
@@ -84,6 +101,9 @@ def test_plain_datajoint_connects_with_what_is_written(tried, tmp_path):
         check=False,
     )
     assert "[0.0, 1.0, 2.0] True s3cret" in asked.stdout, asked.stderr
+    assert "aggregated [2]" in asked.stdout
+    assert ("without it: 1055" in asked.stdout) == client_config.is_mariadb()
+    assert (client_config.AGGREGATE in done.out) == client_config.is_mariadb()
     assert "Commit deletes?" in asked.stdout  # safemode asks a person, who says no
     assert len(tried()) == 1
 

@@ -19,7 +19,7 @@ from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.study import write_study
 from research.cohort import cohort
-from schemas import gdi, study
+from schemas import gait, gdi, study
 from schemas.reading import frames
 from tests import pages
 from tests.command import pbl
@@ -86,6 +86,15 @@ def without_its_method(tables: None) -> Iterator[None]:
 def test_a_row_per_visit(visit: dict[str, Any]):
     _, (_, summary) = run("README.md", 0)
     assert summary["subject"].tolist() == ["P001"]
+
+
+@example("docs/tables.md", 0)
+def test_results_of_chosen_visits_are_deleted_by_their_keys(visit: dict[str, Any]):
+    """With the visit's own index, which was computed from them; every other result stays."""
+    cycles = len(gait.GaitCycle())
+    run("docs/tables.md", 0)
+    assert (len(gdi.GDI()), len(gdi.SessionGdi())) == (0, 0)
+    assert len(gait.GaitCycle()) == cycles > 0
 
 
 @example("README.md", 1)

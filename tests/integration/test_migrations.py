@@ -22,10 +22,9 @@ from schemas import connection, gait, gdi, jobs, lab, migrations, session, stage
 from schemas.chain import ON_REQUEST
 from schemas.decisions import event_corrections
 from schemas.intake import VisitRecord, ingest
-from schemas.operations import embedded
 from schemas.reading import frames
 from tests.command import pbl
-from tests.database import new_home, remove_home
+from tests.database import new_home, remove_home, server
 from tests.rows import everything, register
 from workers import heartbeat, loop
 from workers.populate import populate
@@ -65,20 +64,21 @@ def statements(conn):
 
 
 @pytest.fixture(scope="module")
-def home() -> Iterator[Path]:
-    """A server of its own, in use only where `empty` or `older` says so."""
+def home() -> Iterator[dict[str, str]]:
+    """The variables of a server of its own, in use only where `empty` or `older` says so."""
     path = new_home()
-    embedded.start(folder=embedded.Folder(path / "db"))
-    yield path
+    with server(path) as variables:
+        yield variables
     remove_home(path)
 
 
 @pytest.fixture
-def empty(home: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
+def empty(home: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
     """The server of its own without any table. Calling it forgets what the classes know of the server, as in a new
     process."""
     with monkeypatch.context() as patch:
-        patch.setenv("PBL_HOME", str(home))
+        for name, value in home.items():
+            patch.setenv(name, value)
         patch.setattr(connection, "_current", None)
         patch.setattr(datajoint.instance, "_singleton_connection", None)
         _unbind(patch)

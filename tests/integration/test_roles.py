@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import stat
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -17,7 +18,7 @@ from schemas import connection, gdi, lab, session, video, worker
 from schemas.chain import ON_REQUEST
 from schemas.datajoint_setup import dj
 from schemas.intake import VisitRecord, ingest
-from schemas.operations import embedded, roles
+from schemas.operations import roles
 from schemas.operations.declare import declare_all
 from schemas.reading import frames
 from tests.command import pbl
@@ -29,6 +30,9 @@ from . import chain
 
 Login = Callable[[str], None]
 
+#: The accounts as the embedded server's are, also on another one.
+ROLES = ("db", "roles", "--from", "127.0.0.1")
+LOGIN = ("HOST", "PORT", "USER", "PASS", "PASS_FILE")
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -36,19 +40,26 @@ ROOT = Path(__file__).resolve().parents[2]
 def secrets(database: Path, tmp_path: Path) -> Path:
     """The three accounts, with their password files."""
     declare_all()
-    done = pbl("db", "roles", "--secrets", tmp_path / "secrets")
+    done = pbl(*ROLES, "--secrets", tmp_path / "secrets")
     assert done.code == 0, done.err
     return tmp_path / "secrets"
 
 
 @pytest.fixture
-def login(secrets: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Login]:
+def server_before(database: Path) -> dict[str, str]:
+    """The login before a role is taken: nothing for the embedded server, else that of the server's administrator."""
+    return {name: value for name, value in os.environ.items() if name.startswith("DJ_") and name[3:] in LOGIN}
+
+
+@pytest.fixture
+def login(secrets: Path, server_before: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Login]:
     """Go on as the account of a role, in this process, as a worker does that is told so by its environment."""
-    port = embedded.Folder.default().state()["port"]
+    port = connection.connect().conn_info["port"]
     with monkeypatch.context() as patch:
 
         def become(role: str) -> None:
             user = roles.default_account(role, "127.0.0.1").user if role in roles.ROLES else role
+            patch.delenv("DJ_PASS", raising=False)
             for name, value in (("HOST", "127.0.0.1"), ("PORT", port), ("USER", user), ("PASS_FILE", secrets / user)):
                 patch.setenv(f"DJ_{name}", str(value))
             connection.connect()
@@ -177,24 +188,28 @@ def test_it_can_be_repeated_and_takes_excess_rights_back(secrets: Path, login: L
     assert set(before) == {"pbl_owner", "pbl_worker", "pbl_analyst"}
     assert {stat.S_IMODE(p.stat().st_mode) for p in secrets.iterdir()} == {0o600}
     roles._run([rf"GRANT ALL PRIVILEGES ON `pbl\_%`.* TO {analyst.name}"])
-    done = pbl("db", "roles", "--secrets", secrets)
+    done = pbl(*ROLES, "--secrets", secrets)
     assert done.code == 0, done.err
     assert {p.name: p.read_text() for p in secrets.iterdir()} == before
     assert not any(password in done.out + done.err for password in before.values())
     login("analyst")
     assert refused("DELETE FROM pbl_lab.subject")
     # An analyst cannot make accounts, and is told who can; the password in the statement is not repeated.
-    denied = pbl("db", "roles", "--secrets", secrets)
+    denied = pbl(*ROLES, "--secrets", secrets)
     assert denied.error_code == "DB_REFUSED"
     assert "DJ_USER=root" in denied.err
     assert not any(password in denied.out + denied.err for password in before.values())
 
 
 def test_an_analyst_has_tables_of_a_labs_own_below_ours(
-    login: Login, secrets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    login: Login,
+    secrets: Path,
+    server_before: dict[str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ):
     chain.install(monkeypatch)
-    own = ("db", "roles", "--role", "analyst", "--user", "maria", "--schema", "mylab", "--secrets", secrets)
+    own = (*ROLES, "--role", "analyst", "--user", "maria", "--schema", "mylab", "--secrets", secrets)
     done = pbl(*own)
     assert done.code == 0, done.err
     assert "maria from 127.0.0.1: select, show view on pbl_*, all on pbl_mylab" in done.out
@@ -246,9 +261,10 @@ def test_an_analyst_has_tables_of_a_labs_own_below_ours(
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute("DROP DATABASE pbl_mylab")
     with monkeypatch.context() as as_before:
-        as_before.delenv("DJ_HOST")
-        as_before.delenv("DJ_USER")
-        as_before.delenv("DJ_PASS_FILE")
+        for name in LOGIN:
+            as_before.delenv(f"DJ_{name}", raising=False)
+        for name, value in server_before.items():
+            as_before.setenv(name, value)
         roles.drop(roles.Account("analyst", "maria", "127.0.0.1"))
 
 
@@ -260,11 +276,11 @@ def test_schemas_that_an_analyst_cannot_have(name: str):
 
 
 def test_another_account_of_a_role_and_its_end(secrets: Path):
-    assert pbl("db", "roles", "--role", "analyst", "--user", "maria", "--secrets", secrets).code == 0
-    names = "SELECT User FROM mysql.global_priv WHERE User = 'maria'"
+    assert pbl(*ROLES, "--role", "analyst", "--user", "maria", "--secrets", secrets).code == 0
+    names = "SELECT User FROM mysql.user WHERE User = 'maria'"
     with closing(roles._server_admin()) as server, server.cursor() as cursor:
         assert cursor.execute(names) == 1
-    assert pbl("db", "roles", "--role", "analyst", "--user", "maria", "--drop").code == 0
+    assert pbl(*ROLES, "--role", "analyst", "--user", "maria", "--drop").code == 0
     with closing(roles._server_admin()) as server, server.cursor() as cursor:
         assert cursor.execute(names) == 0
 
@@ -277,7 +293,7 @@ def test_accounts_that_the_server_needs_are_left_alone(user: str):
 
 
 def test_the_dry_run_prints_what_would_be_done_and_no_password(database: Path, tmp_path: Path):
-    done = pbl("db", "roles", "--dry-run", "--require-tls", "--secrets", tmp_path / "secrets")
+    done = pbl(*ROLES, "--dry-run", "--require-tls", "--secrets", tmp_path / "secrets")
     assert done.code == 0
     assert not (tmp_path / "secrets").exists()
     assert done.out.count("REQUIRE SSL") == 3

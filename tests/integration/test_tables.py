@@ -36,6 +36,7 @@ from schemas.plan import plan_fit_sets
 from schemas.reading import frames
 from schemas.reading.status import pipeline_status
 from tests.command import pbl
+from tests.database import embedded_only
 from tests.rows import register
 from workers.populate import populate
 
@@ -854,6 +855,7 @@ def test_methods_are_frozen(declared: None):
 
 
 # ----------------------------------------------------------------------------------------------------- commands
+@embedded_only
 def test_the_demo_stops_when_it_is_interrupted(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from pbl_pipeline import assets
     from workers.cli.demo import demo

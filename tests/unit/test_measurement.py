@@ -134,7 +134,8 @@ def test_the_default_fit_of_a_phone_has_a_measured_model():
 
 def errors(index: Gdi) -> tuple[float, float]:
     """Its standard deviation and its minimal change."""
-    assert index.sd is not None and index.minimal_change is not None
+    assert index.sd is not None
+    assert index.minimal_change is not None
     return index.sd, index.minimal_change
 
 

@@ -1,0 +1,20 @@
+"""A process that takes jobs from the same queue as others at the same time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def work(gate: Any, said: Any) -> None:
+    """Wait for the others at `gate`, take jobs of VideoInfo one by one until none is left; put them in `said`."""
+    import schemas
+    from schemas import video
+    from workers import queue, run_job
+
+    schemas.activate(methods=False)
+    gate.wait(240)
+    done: list[int] = []
+    while jobs := queue.claim(video.VideoInfo, 1):
+        assert run_job.run(jobs[0]).what == run_job.DONE
+        done.append(int(jobs[0].key["video_id"]))
+    said.put(done)
