@@ -283,7 +283,7 @@ def _rounded(value: float | None) -> float | None:
 
 
 def worth_of_one_more(cycles: Sequence[GaitCycle], index: Gdi) -> str:
-    """What one more pass would bring, from where it brings most; empty where that is not known."""
+    """Return a sentence on the view from which one more pass narrows the interval most; empty if it is not known."""
     after = intervals_with_one_more(cycles, index)
     if not after or index.sd is None:
         return ""
@@ -296,7 +296,7 @@ def worth_of_one_more(cycles: Sequence[GaitCycle], index: Gdi) -> str:
 
 
 def intervals_with_one_more(cycles: Sequence[GaitCycle], index: Gdi) -> dict[str, float]:
-    """Half the 90 % interval that the index of `cycles` would have after one more pass, by the side from which it is
+    """Return half the 90 % interval that the index of `cycles` would have after one more pass, by the side from which it is
     filmed ("left", "right", or "" for front and back); empty where the model of the error is not known."""
     method = GDI_METHODS.get(index.model)
     basis = load_norm(index.norm) if index.norm in norm_names() else None
@@ -312,7 +312,7 @@ def intervals_with_one_more(cycles: Sequence[GaitCycle], index: Gdi) -> dict[str
 
 
 def _model_of_error(cycles: Sequence[GaitCycle], norm: NormativeSet, params: GdiParams) -> MeasurementModel | None:
-    """The measured model that all cycles have, with this norm's components."""
+    """Return the measured model that all cycles have, with this norm's components."""
     names = {c.error_model for c in cycles}
     if params.average != "passes" or len(names) != 1 or "" in names:
         return None

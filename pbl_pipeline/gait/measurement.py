@@ -1,4 +1,4 @@
-"""What fitted passes show of how a person walks, with its error: the measurement model of the index.
+"""Measurement model of the index: the scores of a person from fitted passes, with their error.
 
 A pass p in view v shows the scores y of a person's mean curves, of both sides in the components of a normative set:
 
@@ -113,13 +113,13 @@ class ExpectedIndex(NamedTuple):
 
 
 def model_names() -> tuple[str, ...]:
-    """The models that ship."""
+    """Return the names of the models that ship."""
     return tuple(sorted(f.name.removesuffix(".json") for f in _FOLDER.iterdir() if f.name.endswith(".json")))
 
 
 @functools.cache
 def load_model(name: str) -> MeasurementModel:
-    """A model that ships, by its name."""
+    """Return a model that ships, by its name."""
     data: dict[str, Any] = parse_json(_FOLDER.joinpath(name + ".json").read_text(encoding="utf-8"))
     del data["made_by"]
     views = {k: View(**{n: np.array(v) for n, v in view.items()}) for k, view in data.pop("views").items()}
@@ -129,12 +129,12 @@ def load_model(name: str) -> MeasurementModel:
 
 
 def model_of_fit(params_hash: str) -> str:
-    """The name of the model that was measured with a fit's parameters, empty where there is none."""
+    """Return the name of the model that was measured with a fit's parameters; empty if there is none."""
     return next((name for name in model_names() if params_hash in load_model(name).fits), "")
 
 
 def estimate(model: MeasurementModel, passes: Sequence[Pass]) -> Posterior:
-    """The scores of a person from all passes of a visit together. At least one pass has a side."""
+    """Estimate the scores of a person from all passes of a visit together. At least one pass has cycles of a side."""
     size = len(model.mean)
     views = [model.views[p.far_leg] for p in passes]
     scores = np.concatenate([np.concatenate(p.scores) for p in passes])
@@ -156,7 +156,7 @@ def estimate(model: MeasurementModel, passes: Sequence[Pass]) -> Posterior:
 
 
 def expected_index(posterior: Posterior, norm: NormativeSet, widening: float = 1.0) -> ExpectedIndex:
-    """The index of scores that are known with an error: its expectation, not the index of the expected scores, because
+    """Return the index of scores that are known with an error: its expectation, not the index of the expected scores, because
     an error of any direction lengthens a short distance from the norm."""
     # The same draws at each call, and each with its opposite: an index changes only with its scores.
     half = np.random.default_rng(0).standard_normal((N_DRAWS // 2, len(posterior.mean)))
@@ -176,7 +176,7 @@ def expected_index(posterior: Posterior, norm: NormativeSet, widening: float = 1
 
 
 def with_one_more(model: MeasurementModel, passes: Sequence[Pass], norm: NormativeSet) -> dict[str, float]:
-    """The standard deviation that the index would have after a further pass, by the leg that is behind in it: that of
+    """Return the standard deviation that the index would have after one more pass, by the leg that is behind in it: that of
     scores as estimated now, with the covariance that such passes leave."""
     now, unseen = estimate(model, passes), np.zeros(len(model.mean) // 2)
     cycles = round(model.n_cycles)
