@@ -156,8 +156,8 @@ def estimate(model: MeasurementModel, passes: Sequence[Pass]) -> Posterior:
 
 
 def expected_index(posterior: Posterior, norm: NormativeSet, widening: float = 1.0) -> ExpectedIndex:
-    """Return the index of scores that are known with an error: its expectation, not the index of the expected scores, because
-    an error of any direction lengthens a short distance from the norm."""
+    """Return the index of scores that are known with an error: its expectation, not the index of the expected scores,
+    because an error of any direction lengthens a short distance from the norm."""
     # The same draws at each call, and each with its opposite: an index changes only with its scores.
     half = np.random.default_rng(0).standard_normal((N_DRAWS // 2, len(posterior.mean)))
     spread = np.concatenate([half, -half]) @ _root(posterior.covariance).T
@@ -176,8 +176,8 @@ def expected_index(posterior: Posterior, norm: NormativeSet, widening: float = 1
 
 
 def with_one_more(model: MeasurementModel, passes: Sequence[Pass], norm: NormativeSet) -> dict[str, float]:
-    """Return the standard deviation that the index would have after one more pass, by the leg that is behind in it: that of
-    scores as estimated now, with the covariance that such passes leave."""
+    """Return the standard deviation that the index would have after one more pass, by the leg that is behind in it:
+    that of scores as estimated now, with the covariance that such passes leave."""
     now, unseen = estimate(model, passes), np.zeros(len(model.mean) // 2)
     cycles = round(model.n_cycles)
     out = {}
