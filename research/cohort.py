@@ -116,9 +116,10 @@ class Score:
     classes: str = ""
 
     def of(self, latent: np.ndarray) -> np.ndarray:
-        """The scores of standard normal values."""
+        """Return the scores of standard normal values, as the decimals that a file holds."""
         high = np.inf if np.isnan(self.high) else self.high
-        return np.clip(np.round((self.mean + self.sd * latent) / self.step) * self.step, self.low, high)
+        scores = np.round((self.mean + self.sd * latent) / self.step) * self.step
+        return np.clip(np.round(scores, 6), self.low, high)
 
 
 MIC = "minimal important change: "

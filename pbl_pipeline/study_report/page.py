@@ -30,7 +30,7 @@ from .figures import (
     draw_scatter,
 )
 from .page_tables import PageTable, all_tables, number, p_text, short_of, title_of, unit_of
-from .results import StudyResults, score_classes, study_results
+from .results import StudyResults, reason, score_classes, study_results
 from .visit_values import INDEX, pairs, plan, score_column
 
 PAGE = "report.html"
@@ -46,9 +46,9 @@ def write_study_report(
 ) -> list[Path]:
     """Write `report.html`, `figures/*.svg` and `*.pdf`, `tables/*.csv` and `*.tex`; returns the paths, the page first.
 
-    The page asks for nothing from elsewhere. Statistics that the values do not support are a code with its reason.
-    `change_from`, `change_to` (roles) and `change_group` take precedence over those of the study's description. Without
-    `pdf` the figures are SVG alone, in a third of the time.
+    The page asks for nothing from elsewhere. Where the values do not support a statistic, the reason stands instead;
+    the CSV tables have its code as well. `change_from`, `change_to` (roles) and `change_group` take precedence over
+    those of the study's description. Without `pdf` the figures are SVG alone, in a third of the time.
 
     Raises
     ------
@@ -199,7 +199,7 @@ def _correlations(results: StudyResults, measure: str, score: str) -> str:
     words = []
     for r in frame[(frame["name"] == measure) & (frame["score"] == score)].to_dict("records"):
         limits = f"{number(r['low'], 2)} to {number(r['high'], 2)}"
-        found = r["code"] or f"{r['kind'].capitalize()} r = {number(r['value'], 2)} ({limits})"
+        found = r["message"] or f"{r['kind'].capitalize()} r = {number(r['value'], 2)} ({limits})"
         words.append(f"{r['persons']} (n {r['n']}): {found}")
     return "; ".join(words)
 
@@ -208,7 +208,7 @@ def _tests(results: StudyResults, measure: str, by: str) -> str:
     """The tests of a measure between groups, in words."""
     frame: Any = results.groups
     rows = frame[(frame["name"] == measure) & (frame["by"] == by)].to_dict("records")
-    words = [f"{r['a']} and {r['b']}: " + (r["code"] or f"{r['test']}, p = {p_text(r['p'])}") for r in rows]
+    words = [f"{r['a']} and {r['b']}: " + (r["message"] or f"{r['test']}, p = {p_text(r['p'])}") for r in rows]
     return "; ".join(words) or "one group only"
 
 
@@ -254,7 +254,7 @@ def _paired_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]
         if not len(both):
             continue
         row = frame[(frame["name"] == name) & (frame["statistic"] == "effect_size")].iloc[0]
-        test = row["code"] or f"Wilcoxon p = {p_text(row['p'])}, r = {number(row['value'], 2)}"
+        test = row["message"] or f"Wilcoxon p = {p_text(row['p'])}, r = {number(row['value'], 2)}"
         drawing = draw_pairs(both, (plan.change_from, plan.change_to), unit_of(study, name))
         yield Figure(
             _file("paired", name), title_of(study, name), f"{plan.change_group}, n {len(both)}; {test}", drawing
@@ -273,7 +273,7 @@ def _curve_figures(study: StudyData, results: StudyResults, comparison: str) -> 
             spans = ", ".join(f"{x.first:.0f} to {x.last:.0f} %" for x in c.test.phases)
             test = f"differ at {spans}" if spans else f"differ nowhere (p = {p_text(c.test.p_value)})"
         else:
-            test = c.test.code
+            test = reason(c.test)
         n = f"n {len(c.a)}" if of_change else f"n {len(c.a)}, {len(c.b)}"
         left = f"; {c.left_out} left out for unknown points" if c.left_out else ""
         prefix, letter = ("curves", "") if of_change else ("5A", "A  ")

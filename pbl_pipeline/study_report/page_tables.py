@@ -13,11 +13,12 @@ from pbl_pipeline.latex import tex_escape
 from pbl_pipeline.study import StudyData
 from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES
 
-from .results import ALPHA, StudyResults
+from .results import ALPHA, StudyResults, reason
 from .visit_values import INDEX, score_column
 
 GAIT, SCORES = "Gait measures", "Clinical scores"
 _MINUS = "\N{MINUS SIGN}"
+_NONE = "\N{EN DASH}"
 _STARS = "* p < 0.05, not corrected for the number of tests"
 #: Of a table that shows it.
 _HOLM = "p, Holm: corrected for those"
@@ -36,7 +37,7 @@ class PageTable:
     body
         Texts; its columns may have two levels.
     messages
-        Why cells with a code have no number: (code with its mark, text).
+        Why cells without a number have none: (mark of the cells, text).
     """
 
     name: str
@@ -73,14 +74,15 @@ class PageTable:
 
 
 class _Marks:
-    """Codes of a table's cells, each message once."""
+    """Reasons why cells of a table have no number, each once."""
 
     def __init__(self) -> None:
         self.found: dict[str, str] = {}
 
-    def __call__(self, code: str, message: str) -> str:
-        mark = self.found.setdefault(f"{code}: {message}", chr(ord("a") + len(self.found) % 26))
-        return f"{code} ({mark})"
+    def __call__(self, message: str) -> str:
+        """Return the text of a cell that has no number for this reason."""
+        mark = self.found.setdefault(message, chr(ord("a") + len(self.found) % 26))
+        return f"{_NONE} ({mark})"
 
     def messages(self) -> tuple[tuple[str, str], ...]:
         return tuple((mark, text) for text, mark in self.found.items())
@@ -146,7 +148,7 @@ def p_text(p: float) -> str:
 def estimate(row: Any, marks: _Marks, digits: int = 2, star: bool = False) -> str:
     """`0.84 (0.81 to 0.86)` of a row with `value, low, high, p, code, message`, with a star where p < 0.05."""
     if row["code"]:
-        return marks(row["code"], row["message"])
+        return marks(row["message"])
     limits = f"({number(row['low'], digits)} to {number(row['high'], digits)})"
     shown = limits if math.isfinite(row["low"]) else "(no interval)"
     return f"{number(row['value'], digits)} {shown}{'*' if star and row['p'] < ALPHA else ''}"
@@ -190,26 +192,25 @@ def flow(results: StudyResults) -> PageTable:
 def table2(results: StudyResults) -> PageTable:
     """The paper's Table 2: repeatability over cycles, correlation with the scores, effect size of change."""
     plan, marks = results.plan, _Marks()
-    none = "\N{EN DASH}"
     rows = []
     for kind, names in ((SCORES, plan.scores), (GAIT, plan.measures)):
         for i, name in enumerate(names):
             row: dict[Any, str] = {("", ""): "" if i else kind, (" ", "Measure"): short_of(name)}
             for icc_kind, head in (("2,1", "ICC2"), ("2,k", "ICC2k")):
                 found = _one(results.repeatability, name=name, of="cycles", kind=icc_kind)
-                row["Repeatability", head] = none if found is None else estimate(found, marks)
+                row["Repeatability", head] = _NONE if found is None else estimate(found, marks)
             for score in plan.scores:
                 found = _one(results.validity, name=name, score=score, persons="all")
-                text = none
+                text = _NONE
                 if found is not None:
                     text = (
-                        marks(found["code"], found["message"])
+                        marks(found["message"])
                         if found["code"]
                         else f"{number(found['value'], 2)}{'*' if found['p'] < ALPHA else ''}"
                     )
                 row["Validity", f"r {short_of(score)}"] = text
             found = _one(results.change, name=name, statistic="effect_size")
-            row["Responsiveness", "Effect size"] = none if found is None else estimate(found, marks, star=True)
+            row["Responsiveness", "Effect size"] = _NONE if found is None else estimate(found, marks, star=True)
             rows.append(row)
     body = pd.DataFrame(rows)
     body.columns = pd.MultiIndex.from_tuples(list(body.columns))
@@ -378,7 +379,7 @@ def phases(results: StudyResults) -> PageTable:
             rows.append(
                 {
                     **row,
-                    "Phase (% of cycle)": marks(error.code, f"{error.found}; expected {error.expected}"),
+                    "Phase (% of cycle)": marks(reason(error)),
                     "Largest difference (deg)": "",
                     "p": "",
                 }

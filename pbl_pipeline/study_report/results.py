@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -105,7 +106,13 @@ def _tried(function: Callable[..., Any], *values: Any, **options: Any) -> tuple[
     try:
         return function(*values, **options), {"code": "", "message": ""}
     except PblError as error:
-        return None, {"code": error.code, "message": f"{error.found}; expected {error.expected}"}
+        return None, {"code": error.code, "message": reason(error)}
+
+
+def reason(error: PblError) -> str:
+    """Return why a statistic has no value; too few values, one per person, as the number of persons that it needs."""
+    least = re.fullmatch(r"at least (\d+)(?: subjects)?", error.expected)
+    return f"at least {least[1]} persons needed" if least else f"{error.found}; expected {error.expected}"
 
 
 def _interval(found: Estimate | None) -> dict[str, float]:

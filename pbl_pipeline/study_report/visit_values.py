@@ -43,14 +43,15 @@ class Plan:
 def visit_table(study: StudyData) -> pd.DataFrame:
     """One row per visit that counts: `subject, visit, role, days, group`, then a column per measure and score.
 
-    A measure is that of both sides where the study has it, else the mean of left and right. What a visit lacks is NaN.
+    A measure is that of both sides where the study has it, else the mean of left and right; the index is that of the
+    visits alone, whatever the measures say of its sides. What a visit lacks is NaN.
     A score that is named like a measure has " (score)" behind its name.
     """
     visits: Any = study.visits[study.visits["included"]]
     table = visits[[*_KEY, "role", "days", "group", INDEX]]
     if visits[INDEX].isna().all():
         table = table.drop(columns=INDEX)
-    measures: Any = study.measures
+    measures: Any = study.measures[study.measures["measure"] != INDEX]
     sided = measures[measures["side"] != "both"].groupby([*_KEY, "measure"], sort=False)["value"]
     both = measures[measures["side"] == "both"].set_index([*_KEY, "measure"])["value"]
     # Of one leg alone there is no mean of both.

@@ -10,7 +10,8 @@ import pytest
 from click.testing import CliRunner
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.study import read_study
+from pbl_pipeline.study import read_study, write_study
+from pbl_pipeline.study_report import all_tables, plan, study_results
 from schemas import fit, gait, gdi, session, study, video
 from schemas.cli.study import export, slice_
 from schemas.intake import VisitRecord, ingest
@@ -103,6 +104,19 @@ def test_a_slice_as_frames(cohort: Path):
     absent = "1 of 4 people of the cohort have none of these visits (1 excluded: declined)."
     assert found.description.note == f"Two clinics. {absent}"
     assert found.description.methods["fit_method"] == fit.SessionFit().to_dicts()[0]["fit_method"]
+
+
+def test_a_slice_and_its_folder_make_the_same_report(cohort: Path, tmp_path: Path):
+    found = slices.study_data("first")
+    assert ((found.measures["measure"] == "gdi") & (found.measures["side"] == "left")).any()
+    write_study(found, tmp_path)
+    of_tables, of_folder = (study_results(s, plan(s), permutations=100) for s in (found, read_study(tmp_path)))
+    assert of_tables.plan.measures[0] == "gdi"
+    assert not [m for m in of_tables.plan.measures if m.startswith(("gdi ", "gdi_"))]
+    assert of_tables.table["gdi"].to_list() == found.visits.loc[found.visits["included"], "gdi"].to_list()
+    assert of_folder.plan == of_tables.plan
+    for name, table in all_tables(found, of_tables).items():
+        assert table.body.equals(all_tables(found, of_folder)[name].body)
 
 
 def test_the_same_frames_again_until_a_row_changes(cohort: Path):

@@ -147,6 +147,34 @@ def test_a_measure_of_one_leg_alone_is_no_measure_of_both(study):
     assert table["stance_percent"].dropna().to_list() == [62.0]
 
 
+def test_the_index_is_one_measure_whatever_is_known_of_its_sides(study, results, tmp_path):
+    """A slice of the tables has the index of each side among its measures; so has a folder written from it."""
+    visits = study.visits[["subject", "visit", "n_cycles"]]
+    sides = [
+        visits.assign(side=side, measure="gdi", value=study.visits["gdi"] + shift, sd=np.nan, unit="")
+        for side, shift in (("left", -2.0), ("right", 2.0))
+    ]
+    of_tables = dataclasses.replace(study, measures=pd.concat([study.measures, *sides], ignore_index=True))
+    write_study(of_tables, tmp_path)
+    for other in (of_tables, read_study(tmp_path)):
+        assert plan(other) == results.plan
+        found = study_results(other, plan(other), permutations=1000)
+        for name in ("table", "flow", "by_visit", "repeatability", "validity", "change", "groups"):
+            pd.testing.assert_frame_equal(getattr(found, name), getattr(results, name), check_dtype=False)
+        for name, table in all_tables(other, found).items():
+            pd.testing.assert_frame_equal(table.body, all_tables(study, results)[name].body)
+
+
+def test_too_few_persons_are_said_once_below_a_table():
+    less = one_person(made.cohort(1, 26, 8))
+    tables = all_tables(less, study_results(less, plan(less), permutations=200))
+    assert tables["srm"].messages == (("a", "at least 3 persons needed"),)
+    assert {text for _, text in tables["repeatability"].messages} == {"at least 2 persons needed"}
+    assert set(tables["srm"].body["SRM"]) == {"\N{EN DASH} (a)"}
+    for table in tables.values():
+        assert "STATS_INPUT" not in table.body.to_string() + table.latex("")
+
+
 def test_curves_with_unknown_points_are_left_out_and_counted(study, results):
     curves = mean_curves(study, "knee_flexion")
     unknown = (
@@ -168,7 +196,7 @@ def test_the_files_of_a_report(written):
     out = written / "out"
     page = (out / "report.html").read_text()
     assert not re.findall(r"(?:src|href)=\"(?!#|data:image/svg)", page)
-    assert "STATS_INPUT" not in page
+    assert '<ul class="why">' not in page
     assert "nan" not in re.sub(r"<[^>]*>", " ", page).lower().split()
     for path in (out / "figures").glob("*.svg"):
         root = ET.parse(path).getroot()
@@ -278,12 +306,16 @@ def test_what_is_not_defined_is_a_code_and_never_a_number(change):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("change", CHANGES)
-def test_a_page_shows_what_is_not_defined_as_a_code(change, tmp_path):
+def test_a_page_says_once_per_table_why_something_is_not_defined(change, tmp_path):
     less = change(made.cohort(1, 26, 8))
     coded = number_of_codes(study_results(less, plan(less), permutations=200))
     write_study_report(less, tmp_path, pdf=False)
     page = (tmp_path / "report.html").read_text()
-    assert ("STATS_INPUT" in page) == (coded > 0)
+    assert "STATS_INPUT" not in page
+    assert ('<ul class="why">' in page) == (coded > 0)
+    for table in page.split("<table>")[1:]:
+        reasons = re.findall(r"<li>\(\w\) (.*?)</li>", table)
+        assert len(reasons) == len(set(reasons))
     assert " nan" not in re.sub(r"<[^>]*>", " ", page).lower()
     assert "nan" not in "".join(p.read_text().lower() for p in tmp_path.glob("figures/*.svg"))
 
