@@ -19,7 +19,8 @@ from ..stored_files import file_ref, stored_file
 class Candidates:
     """One tracked video: the persons with their scores, best first, and what was decided so far.
 
-    status "TRACKED" stands for a choice that is not computed yet; `key` is that of the tracking.
+    status "TRACKED" stands for a choice that is not computed yet; `chosen` is then the person of a decision that waits
+    to be computed. `key` is that of the tracking.
     """
 
     key: dict[str, Any]
@@ -44,7 +45,9 @@ def candidates(video_id: int, tracking_method: str | None = None) -> list[Candid
         persons = sorted(int(p) for p in (tracking.Tracking.Person & tracked).to_arrays("person_id"))
         rows = (tracking.SubjectChoice & tracked).to_dicts()
         if not rows:
-            out.append(Candidates(dict(tracked), name, "TRACKED", None, "", dict.fromkeys(persons)))
+            decided = (tracking.SubjectOverride & tracked).to_arrays("override_person_id")
+            chosen = int(decided[0]) if len(decided) else None
+            out.append(Candidates(dict(tracked), name, "TRACKED", chosen, "", dict.fromkeys(persons)))
             continue
         scores = {int(k): v for k, v in rows[0]["choice_scores"].items()}
         ranked = sorted(persons, key=lambda p: -(scores.get(p) or 0.0))

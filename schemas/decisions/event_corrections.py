@@ -86,7 +86,8 @@ def shown(video_id: int) -> Shown | None:
 def save(video_id: int, events: Sequence[tuple[float, str, str]], by: str, seen: str) -> dict[str, int]:
     """Write the events of a trial as a person set them, with a row of Decision: one transaction.
 
-    The detected events stay, and so do earlier corrections. Cycles, measures and indices that were computed from other
+    The detected events stay, and so do earlier corrections. Events that are the detected ones again are no correction:
+    the last one is withdrawn, as by `take_back`. Cycles, measures and indices that were computed from other
     events of this trial are deleted and pending again.
 
     Parameters
@@ -124,7 +125,8 @@ def save(video_id: int, events: Sequence[tuple[float, str, str]], by: str, seen:
             next_step="change one, then save",
             key=f"video_id={video_id}",
         )
-    return _decide(before, found, by, seen)
+    detected = sorted(e[:3] for e in before.detected)
+    return _decide(before, None if sorted(e[:3] for e in found) == detected else found, by, seen)
 
 
 def take_back(video_id: int, by: str, seen: str) -> dict[str, int]:

@@ -35,6 +35,24 @@ class Decided:
     reason: str
     video_id: int | None
 
+    @property
+    def moves(self) -> list[tuple[str, str, float | None, float | None]]:
+        """Gait events that a decision changed: side, kind, time (s) before (None: added) and after (None: removed).
+
+        Of a side and kind, times are matched in order where as many are gone as are new.
+        """
+        if "events" not in self.before or "events" not in self.after:
+            return []
+        was, now = ({(s, k, t) for t, s, k in about["events"]} for about in (self.before, self.after))
+        out: list[tuple[str, str, float | None, float | None]] = []
+        for side, kind in sorted({e[:2] for e in was ^ now}):
+            gone, new = (sorted(t for s, k, t in only if (s, k) == (side, kind)) for only in (was - now, now - was))
+            if len(gone) == len(new):
+                out += [(side, kind, a, b) for a, b in zip(gone, new, strict=True)]
+            else:
+                out += [(side, kind, t, None) for t in gone] + [(side, kind, None, t) for t in new]
+        return out
+
 
 def decisions(session_id: int) -> tuple[Decided, ...]:
     """Return the decisions about a visit and its videos, the last first."""

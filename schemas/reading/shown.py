@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from pbl_pipeline.visit import Recording, Visit
 
 
+#: Why a recording that waits to be computed has no fit.
+NOT_COMPUTED = "not computed yet"
+
+
 @dataclasses.dataclass(frozen=True)
 class ShownCheck:
     """A check of a visit."""
@@ -89,6 +93,12 @@ class ShownRecording:
         )
 
 
+def _problem(video_id: int) -> str:
+    """Return why a recording has no fit, without the state of the queues where it only waits to be computed."""
+    found = why(video_id)
+    return NOT_COMPUTED if found.waits else found.verdict
+
+
 def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
     """Return a visit by its number; `shown`: which of its results.
 
@@ -152,7 +162,7 @@ def shown_recording(video_id: int) -> ShownRecording:
     named = (visits & {"video_id": video_id}).fetch1()
     lead = fit.trial_of(video_id)
     if not recording.fitted:
-        recording = dataclasses.replace(recording, problem=why(video_id).verdict)
+        recording = dataclasses.replace(recording, problem=_problem(video_id))
     return ShownRecording(
         recording=recording,
         number=video_id,
@@ -233,7 +243,7 @@ def _recordings(session_id: int) -> tuple[Recording, ...]:
     out = []
     for row in rows:
         number = int(row["video_id"])
-        problem = "" if row["fits"] or number in marked else why(number).verdict
+        problem = "" if row["fits"] or number in marked else _problem(number)
         condition = Condition(row["activity"], row["pace"] or "")
         out.append(Recording(row["video_name"], condition=condition, problem=problem, number=number))
     return tuple(out)

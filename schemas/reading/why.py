@@ -40,6 +40,13 @@ class Why:
     steps: list[Step]
     verdict: str
 
+    @property
+    def waits(self) -> bool:
+        """Whether it waits for a worker alone, not for another video, a choice, another try or a mark taken back."""
+        left = [s for s in self.steps if s.what != DONE]
+        stops = any(s.next_step or s.what in (ERROR, EMPTY) for s in left) or bool(unusable([self.video_id]))
+        return bool(left) and not stops and (left[0].table, left[0].what) != ("SessionFit", NOT_YET)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
         return dataclasses.asdict(self)

@@ -75,6 +75,21 @@ def test_two_people_decide_at_once_and_the_second_sees_it(two_alike: int):
     ]
 
 
+def test_a_person_who_was_chosen_is_shown_before_it_is_computed(two_alike: int):
+    browser = web.client()
+    assert "No one is chosen yet" in browser.get(f"/recordings/{two_alike}").text
+    assert send(browser, two_alike, form_of(browser, two_alike), 1).status_code == 303
+    page, visit = browser.get(f"/recordings/{two_alike}").text, browser.get("/visits/1").text
+    assert "No one is chosen yet" not in page
+    assert "Person 1 is measured" in page
+    # What waits is said without the tables' and queues' own words.
+    for told in (page, visit):
+        assert "not computed yet" in told
+        assert not re.search(r"SubjectChoice|priority|not queued|pbl worker", told)
+    browser.cookies.set("pbl_language", "de")
+    assert "noch nicht berechnet" in browser.get("/visits/1").text
+
+
 def test_a_choice_on_the_command_line_is_seen_too(two_alike: int):
     browser = web.client()
     form = form_of(browser, two_alike)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import re
@@ -139,6 +140,33 @@ def test_corrected_events_count_instead_of_the_detected_ones(visit: str, monkeyp
     trials = json.loads(archive.read(name))["trials"].values()
     assert [t["event_method"] for t in trials] == [f"{visit}, corrected by hand", visit]
     assert not populate().did_something
+
+
+def test_the_history_says_which_event_was_moved_and_by_how_much(visit: str):
+    time, side, kind = moved(by=0.0)[6]
+    save(1, moved(by=0.1))
+    (decided,) = review_decisions.decisions(1)
+    assert decided.moves == [(side, kind, pytest.approx(time, abs=1e-4), pytest.approx(time + 0.1, abs=1e-4))]
+    event = f"{side.capitalize()}, {'initial contact' if kind == 'foot_down' else 'toe-off'}"
+    assert f"{event} {time:.2f} s, moved by +0.10 s" in web.client().get("/visits/1").text
+    events = moved(by=0.0)
+    saved = dataclasses.replace(decided, before={"events": events}, after={"events": events[1:]})
+    assert saved.moves == [(*events[0][1:], events[0][0], None)]
+
+
+def test_moving_an_event_back_leaves_nothing_set_by_hand(visit: str):
+    before = pooled()
+    detected = moved(by=0.0)
+    save(1, moved(by=0.1))
+    save(1, detected)
+    counting = event_corrections.shown(1)
+    assert counting is not None
+    assert counting.hand is None
+    assert not counting.stale
+    assert "events corrected by" not in web.client().get("/recordings/1").text
+    populate()
+    assert pooled() == before
+    assert not qc.SessionQc.Check & {"qc_check": "events_by_hand"}
 
 
 def test_corrections_again_and_back_to_the_detected_ones(visit: str):
