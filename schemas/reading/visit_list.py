@@ -15,9 +15,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from .. import computed_tables, fit, gdi, qc, session, study, tracking, video
+from ..datajoint_setup import dj
 from ..job_errors import error_code
 from ..operations.catalog import quote
-from ..rows import number
+from ..review import Decision
+from ..rows import inside, number
 from .status import queue_name, queues
 
 #: Visits of a page.
@@ -27,9 +29,10 @@ STATES = ("computed", "pending", "waiting", "failed", "empty", "unusable")
 #: State of a visit in a folder without its measures.
 INCOMPLETE = "incomplete"
 #: Outcomes of the checks that can be asked for.
-OUTCOMES = ("PASS", "WARN", "EMPTY", "NEEDS_CHOICE", "FAIL")
+OUTCOMES = ("PASS", "WARN", "EMPTY", "NEEDS_CHOICE", "FAIL", "ACCEPTED")
 #: Checks (q) of measures (g).
-_SAME_RESULT = " AND ".join(f"q.{k} = g.{k}" for k in ("fit_set", "fit_method", "gait_method", "gdi_method", "norm"))
+_RESULT = ("fit_set", "fit_method", "gait_method", "gdi_method", "norm")
+_SAME_RESULT = " AND ".join(f"q.{k} = g.{k}" for k in _RESULT)
 #: Stands for the day of a visit without one: before all others.
 _NO_DAY = "0001-01-01"
 
@@ -53,7 +56,8 @@ class Result:
     """Index and checks of the current set of a visit by one chain of methods.
 
     sd: of the error of the index; minimal_change: minimal detectable change between two such visits (90 %).
-    outcome: worst check, empty before the checks are computed; worst: its names. corrected: a person corrected events.
+    outcome: worst check, empty before the checks are computed, ACCEPTED where a person accepted every one that asked
+    for attention; worst: the names of those that nobody accepted. corrected: a person corrected events.
     """
 
     kind: str
@@ -185,8 +189,10 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
     if not ids:
         return found
     order = {fit.SINGLE: 0, fit.RIG: 1, fit.MARKERS: 2}
+    open_checks = _open_checks(ids)
     rows = _ask(
-        "SELECT f.session_id, f.fit_set_kind, g.fit_method, g.gait_method, g.gdi_method, g.norm, g.session_status,"
+        "SELECT f.session_id, g.fit_set, f.fit_set_kind, g.fit_method, g.gait_method, g.gdi_method, g.norm,"
+        " g.session_status,"
         " g.session_reason, g.session_gdi_reason, g.session_gdi, g.session_gdi_sd, g.session_gdi_minimal_change,"
         " g.session_corrected, COALESCE(q.qc_outcome, ''), COALESCE(q.qc_worst, '')"
         f" FROM {_name(fit.FitSet)} f"
@@ -196,9 +202,11 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
         f" WHERE f.session_id IN ({_places(ids)}) ORDER BY g.session_gdi_computed DESC",
         ids,
     )
-    for session_id, kind, *four, status, why, no_index, index, sd, change, corrected, outcome, worst in rows:
+    for session_id, fit_set, kind, *four, status, why, no_index, index, sd, change, corrected, outcome, worst in rows:
         methods = (str(four[0]), str(four[1]), str(four[2]), str(four[3]))
         names = tuple(n for n in str(worst).split(", ") if n)
+        if outcome == "WARN" and (left := open_checks.get((str(fit_set), *methods))) is not None:
+            names, outcome = tuple(n for n in names if n in left), "WARN" if left else "ACCEPTED"
         reason = str(why or no_index or "")
         found[int(session_id)].append(
             Result(
@@ -215,6 +223,32 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
             )
         )
     return {i: sorted(r, key=lambda one: order.get(one.kind, 9)) for i, r in found.items()}
+
+
+def _open_checks(sessions: Iterable[int]) -> dict[tuple[str, ...], set[str]]:
+    """Checks that ask for attention and that nobody accepted, by the key of a result of these visits of which somebody
+    accepted one since it was computed."""
+    accepted: dict[tuple[str, ...], set[int]] = {}
+    for row in (Decision & inside("session_id", sessions) & {"decision_what": "check"}).to_dicts():
+        about = row["decision_about"]
+        of = tuple(str(about[k]) for k in (*_RESULT, "computed"))
+        accepted.setdefault(of, set()).add(int(about["qc_no"]))
+    found: dict[tuple[str, ...], set[str]] = {}
+    for of, numbers in accepted.items():
+        key = {**dict(zip(_RESULT, of, strict=False)), "qc_computed": of[-1]}
+        checks = qc.SessionQc.Check * qc.SessionQc.proj("qc_computed") & key & {"qc_check_outcome": "WARN"}
+        rows = checks.to_dicts()
+        if rows:
+            found[of[:-1]] = {r["qc_check"] for r in rows if int(r["qc_no"]) not in numbers}
+    return found
+
+
+def _settled() -> set[int]:
+    """Visits in which a person accepted every check that asked for attention."""
+    asked = dj.U("session_id") & (Decision & {"decision_what": "check"} & "session_id IS NOT NULL")
+    found = results_of(int(i) for i in asked.to_arrays("session_id"))
+    outcomes = {i: {r.outcome for r in results} for i, results in found.items()}
+    return {i for i, of in outcomes.items() if "ACCEPTED" in of and "WARN" not in of}
 
 
 # --------------------------------------------------------------------------------------------------------- the filter
@@ -254,7 +288,13 @@ def _asked(wanted: Filter) -> tuple[list[str], list[str], list[Any]]:
     if wanted.last_day:
         add("s.session_date <= %s", wanted.last_day)
     if wanted.quality:
-        only("j", f"{_judged()} WHERE q.qc_outcome = %s", wanted.quality)
+        only("j", f"{_judged()} WHERE q.qc_outcome = %s", "WARN" if wanted.quality == "ACCEPTED" else wanted.quality)
+        if wanted.quality in ("WARN", "ACCEPTED"):
+            settled = _settled()
+            if wanted.quality == "WARN":
+                outside(settled)
+            else:
+                add(f"s.session_id IN ({_places(list(settled))})" if settled else "FALSE", *settled)
     if wanted.state in ("computed", "pending"):
         # Asked for first: as a part of the question the server would answer them for each visit.
         questions = (_waiting(), _failed(), _empty(), _unusable())

@@ -15,7 +15,7 @@ from schemas import fit, qc, tracking
 from schemas.datajoint_setup import dj
 from schemas.decisions import review_decisions
 from schemas.operations import forget
-from schemas.reading import shown
+from schemas.reading import shown, visit_list
 from schemas.review import Decision
 from schemas.rows import delete_below
 from tests.command import pbl
@@ -191,6 +191,32 @@ def test_a_warning_is_accepted_with_a_name_until_it_is_computed_anew(warned: dic
     assert "accepted by" not in browser.get("/visits/1").text
     assert accept(browser, warned).status_code == 409
     assert len(review_decisions.decisions(1)) == 1  # what was decided stays in the history
+
+
+def test_what_was_accepted_is_no_longer_open(warned: dict[str, Any]):
+    browser = web.client(name="A. First")
+
+    def listed(quality: str) -> int:
+        return len(visit_list.visit_page(visit_list.Filter(quality=quality)).visits)
+
+    key = {k: warned[k] for k in qc.SessionQc.primary_key}
+    open_checks = (qc.SessionQc.Check & key & {"qc_check_outcome": "WARN"}).to_dicts()
+    assert (listed("WARN"), listed("ACCEPTED")) == (1, 0)
+    for i, check in enumerate(open_checks):
+        (result,) = visit_list.results_of([1])[1]
+        assert (result.outcome, len(result.worst)) == ("WARN", len(open_checks) - i)
+        assert accept(browser, check | {"qc_computed": warned["qc_computed"]}).status_code == 303
+        assert check["qc_check"] not in visit_list.results_of([1])[1][0].worst
+    (result,) = visit_list.results_of([1])[1]
+    assert (result.outcome, result.worst) == ("ACCEPTED", ())
+    assert (listed("WARN"), listed("ACCEPTED")) == (0, 1)
+    page = browser.get("/visits").text
+    assert '<span class="outcome ACCEPTED">accepted</span>' in page
+    assert '<span class="outcome WARN">' not in page
+    browser.cookies.set("pbl_language", "de")
+    assert '<span class="outcome ACCEPTED">angenommen</span>' in browser.get("/visits").text
+    qc.SessionQc.update1({**key, "qc_computed": "2030-01-01 00:00:00"})  # as if computed again
+    assert (listed("WARN"), listed("ACCEPTED")) == (1, 0)
 
 
 def test_only_warnings_can_be_accepted(warned: dict[str, Any]):
