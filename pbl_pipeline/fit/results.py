@@ -6,9 +6,8 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import SCALE_NAMES, load_body, stature_m
+from pbl_pipeline.body import SCALE_NAMES
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_numbers, load_npz, picture_size, text_of, texts_of
 from pbl_pipeline.qc import Check
@@ -55,21 +54,6 @@ class TrialFit:
     loss: float
     seconds: float
     height_m: float = float("nan")
-
-    @property
-    def residual_2d_share(self) -> float:
-        """Median 2D residual as a fraction of the person's height in the picture, which is the same at any size of it;
-        NaN where there is no camera. (The height is that of the standing body at its distance along the camera's axis.)
-        For people to read: the check divides by the extent of the points, which a body placed wrongly does not change.
-        """
-        placed = np.isfinite(self.markers_world_m).all(axis=2)
-        seen = np.isfinite(self.residual_2d_px).any(axis=1) & placed.any(axis=-1)
-        if not seen.any():
-            return float("nan")
-        away = np.nanmean(self.markers_world_m[seen], axis=1) - self.camera_position_m
-        axis = Rotation.from_quat(self.phone_quat_wxyz[seen], scalar_first=True).apply([0.0, 0.0, 1.0])
-        height_px = self.camera.focal_px * stature_m(load_body(), self.scale) / np.sum(away * axis, axis=1)
-        return float(np.nanmedian(self.residual_2d_px[seen] / height_px[:, None]))
 
     def save(self, path: str | Path) -> None:
         """Write `<name>.fit.npz`."""

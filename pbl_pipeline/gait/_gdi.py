@@ -473,7 +473,8 @@ def _too_few(cycles: Sequence[GaitCycle], n_left: int, n_right: int, params: Gdi
     if failed := next((c.excluded for c in cycles if c.fit_failed), ""):
         return failed
     text = (
-        f"the GDI needs {params.min_cycles_per_side} complete gait cycles with curves on each side; this recording has "
+        f"the GDI needs {2 * params.min_cycles_per_side} complete gait cycles with curves, "
+        f"{params.min_cycles_per_side} or more on each side; this recording has "
         f"{n_left} left and {n_right} right ones of {len(cycles)} cycles in all"
     )
     missing = sorted({c.curves_missing for c in cycles if c.used and c.curves_missing})

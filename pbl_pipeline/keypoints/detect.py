@@ -62,9 +62,12 @@ def detect_keypoints(
         )
     in_view = time_in_view_s(track, tracking.time_s)
     if in_view < params.min_time_s:
+        lasts = float(tracking.time_s[-1] - tracking.time_s[0]) if len(tracking.time_s) else 0.0
         raise PblError(
             "TRACK_TOO_SHORT",
-            found=f"person {person_id} is in view for {in_view:.2f} s",
+            found=f"the whole video lasts {lasts:.2f} s"
+            if lasts < params.min_time_s
+            else f"person {person_id} is in view for {in_view:.2f} s",
             expected=f"{params.min_time_s:g} s or more; a gait cycle takes about 1.1 s and three or more are wanted",
             next_step="film again so that the whole body stays in the picture for several steps, or choose another "
             "person",

@@ -283,11 +283,9 @@ def _trial(t: Recording, pictures: Sequence[Picture]) -> dict:
         where = ", ".join(f"{number(a, 1)} to {number(b, 1)} s" for a, b in spans[:4])
         texts.append(f"The body is fitted from {where}" if spans else "The body is fitted in no frame")
         if np.isfinite(t.fit.residual_2d_px).any():
-            px, share = float(np.nanmedian(t.fit.residual_2d_px)), 100 * t.fit.residual_2d_share
-            away = [f"{number(px, 1)} px ({number(share, 1)} % of the person's height)"]
-            if np.isfinite(t.fit.residual_3d_m).any():
-                away.append(f"{number(100 * float(np.nanmedian(t.fit.residual_3d_m)), 1)} cm")
-            texts.append(f"It lies {' and '.join(away)} (median) from the detected points")
+            # Share of the height and distance in space are in the checks, over the points that the fit counts.
+            px = number(float(np.nanmedian(t.fit.residual_2d_px)), 1)
+            texts.append(f"It lies {px} px (median) from the points detected in the picture")
     if m is not None and m.reason:
         texts.append(f"No gait measures: {m.reason}")
     if t.problem:

@@ -32,6 +32,22 @@ def family(path: Path) -> str | None:
     return None
 
 
+#: First bytes of photos, and brands of photos in boxes (ISO/IEC 23008-12, AV1 Image File Format).
+_PHOTO_HEADS = {b"\xff\xd8\xff": "JPEG", b"\x89PNG": "PNG", b"II*\x00": "TIFF", b"MM\x00*": "TIFF"}
+_PHOTO_BRANDS = {b"heic": "HEIC", b"heix": "HEIC", b"heim": "HEIC", b"heis": "HEIC", b"mif1": "HEIF", b"avif": "AVIF"}
+
+
+def photo_format(path: Path) -> str | None:
+    """Return the format of a photo ("HEIC", "JPEG", ...) by the first bytes of a file, None for what is no photo."""
+    with path.open("rb") as file:
+        head = file.read(12)
+    if head[4:8] == b"ftyp":
+        return _PHOTO_BRANDS.get(head[8:12])
+    if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
+        return "WebP"
+    return next((name for first, name in _PHOTO_HEADS.items() if head.startswith(first)), None)
+
+
 def missing_end(path: Path) -> str | None:
     """One sentence on what the file lacks at its end, or None when its lengths add up (or it has none)."""
     size = path.stat().st_size

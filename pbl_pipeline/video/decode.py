@@ -21,7 +21,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.memory import return_large_blocks
 from pbl_pipeline.resources import cores
 
-from .container_structure import family, missing_end
+from .container_structure import family, missing_end, photo_format
 
 #: Containers that phones, cameras and converters write. Pictures, texts and playlists (which could name other files)
 #: are not videos even where FFmpeg would open them.
@@ -348,6 +348,15 @@ def _words(error: BaseException) -> str:
 
 
 def _open(path: Path) -> InputContainer:
+    photo = photo_format(path)
+    if photo is not None:
+        raise PblError(
+            "VIDEO_NOT_A_VIDEO",
+            found=f"a photo ({photo})",
+            expected=_EXPECTED,
+            next_step="film the person walking; of a Live Photo, share the video",
+            key=path,
+        )
     try:
         return av.open(str(path), options=_OPTIONS, metadata_errors="replace")
     except FFMPEG_ERRORS as error:

@@ -250,6 +250,9 @@ def test_too_few_cycles_give_none_with_a_reason(toy, n_left):
     result = score_gdi([cycle(toy.mean_deg + 1.0, number=i) for i in range(n_left)], toy)
     assert (result.status, result.mean, result.left) == ("EMPTY", None, None)
     assert f"{n_left} left and 0 right" in result.reason
+    # The reason asks for as many cycles as the check does.
+    (check,) = [c for c in result.qc if c.check == "gdi_cycles"]
+    assert f"needs {check.threshold:g} complete gait cycles with curves, 1 or more on each side" in result.reason
     none = dict.fromkeys(("left", "right", "mean", "sd", "minimal_change", "interval"))
     counted = {"n": n_left, "n_left": n_left, "n_right": 0, "norm": "toy", "params_hash": result.params_hash}
     assert result.to_dict() == {**none, **counted, "cycles": [dataclasses.asdict(c) for c in result.cycles]}

@@ -264,7 +264,20 @@ def test_under_a_second_in_view_is_too_short(case):
     with pytest.raises(PblError) as error:
         detect_keypoints(video, Tracking(tracking.time_s, (200, 100), (short,), "test", ""), 1, CAMERA, None, Cross())
     assert error.value.code == "TRACK_TOO_SHORT"
-    assert "0.50 s" in error.value.found
+    assert error.value.found == "person 1 is in view for 0.50 s"
+
+
+def test_a_clip_under_a_second_is_named_as_one(case):
+    video, tracking = case
+    person = tracking.persons[0]
+    first = slice(0, 30)
+    short = PersonTrack(1, *(getattr(person, f)[first] for f in ("box_px", "roi_px", "score", "observed")))
+    clip = Tracking(tracking.time_s[first], (200, 100), (short,), "test", "")
+    with pytest.raises(PblError) as error:
+        detect_keypoints(video, clip, 1, CAMERA, None, Cross())
+    lasts = tracking.time_s[29] - tracking.time_s[0]
+    assert lasts < 1.0
+    assert (error.value.code, error.value.found) == ("TRACK_TOO_SHORT", f"the whole video lasts {lasts:.2f} s")
 
 
 def test_unknown_person_detector_and_changed_video(case, tmp_path):

@@ -205,6 +205,14 @@ def test_page_shows_the_measures(visit: Visit, measured: GaitMetrics, tmp_path: 
     assert "/somewhere/secret" not in page.text  # a file's name is provenance, a folder of the laboratory is not
 
 
+def test_residuals_of_one_name_stand_once(visit: Visit, tmp_path: Path) -> None:
+    """Share of the height and distance in space are those of the checks, which the text does not compute otherwise."""
+    text = _page(visit, tmp_path).text
+    assert re.search(r"It lies [\d.]+ px \(median\) from the points detected in the picture", text)
+    assert not re.search(r"[\d.]+ cm \(median\)|% of the person's height", text)
+    assert "Residual 3D (cm)" in text
+
+
 def test_gdi_is_always_named_with_its_three_angles(visit: Visit, tmp_path: Path) -> None:
     text = _page(visit, tmp_path).text
     matches = list(re.finditer(r"\bGDI\b", text))

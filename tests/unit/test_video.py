@@ -299,6 +299,32 @@ def test_not_a_video(tmp_path):
         assert code_of(path) == "VIDEO_NOT_A_VIDEO"
 
 
+@pytest.mark.parametrize(
+    ("head", "name"),
+    [
+        (b"\0\0\0\x18ftypheic", "HEIC"),
+        (b"\0\0\0\x18ftypmif1", "HEIF"),
+        (b"\xff\xd8\xff\xe0", "JPEG"),
+        (b"RIFF\0\0\0\0WEBP", "WebP"),
+    ],
+)
+def test_a_photo_is_named_as_one(tmp_path, head, name):
+    photo = tmp_path / "IMG_0001.mov"
+    photo.write_bytes(head + bytes(1000))
+    for read in (probe, packet_times):
+        with pytest.raises(PblError) as error:
+            read(photo)
+        assert (error.value.code, error.value.found) == ("VIDEO_NOT_A_VIDEO", f"a photo ({name})")
+
+
+def test_a_photo_that_decodes_is_still_no_video(tmp_path):
+    for name, suffix in (("JPEG", ".jpg"), ("PNG", ".png"), ("TIFF", ".tiff")):
+        cv2.imwrite(str(tmp_path / f"p{suffix}"), np.zeros((64, 64, 3), np.uint8))
+        with pytest.raises(PblError) as error:
+            probe(tmp_path / f"p{suffix}")
+        assert (error.value.code, error.value.found) == ("VIDEO_NOT_A_VIDEO", f"a photo ({name})")
+
+
 def test_not_one_frame_decodes(tmp_path):
     path = write_video(
         tmp_path / "v.mp4", noise_frames(10), constant_rate(10), container_options={"movflags": "+faststart"}
