@@ -50,6 +50,8 @@ PELVIS_ANGLES: dict[str, tuple[str, str]] = {
 #: So does the direction of the foot.
 FOOT_ANGLES: dict[str, tuple[str, str]] = {"foot_progression": ("Foot direction", "toes in +")}
 
+#: Why a recording that waits to be computed has no fit.
+NOT_COMPUTED = "not computed yet"
 #: Why a recording is not usable, by one word; "other" asks for words of one's own.
 UNUSABLE: dict[str, str] = {
     "not_in_view": "the person is not in view, or only in part",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.words import NOT_COMPUTED
 
 from .. import fit, gait, gdi, qc, session, video
 from ..decisions.not_usable import Unusable, unusable
@@ -21,10 +22,6 @@ if TYPE_CHECKING:
     from pbl_pipeline.gait import Measure
     from pbl_pipeline.qc import Check
     from pbl_pipeline.visit import Recording, Visit
-
-
-#: Why a recording that waits to be computed has no fit.
-NOT_COMPUTED = "not computed yet"
 
 
 @dataclasses.dataclass(frozen=True)
