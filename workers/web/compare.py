@@ -28,11 +28,13 @@ from .videos import Videos
 
 @dataclasses.dataclass(frozen=True)
 class Chart:
-    """Curves of one angle. sides: "left" and "right" with their pictures."""
+    """Curves of one angle. sides: "left" and "right" with their pictures; far: by side the places of the results in
+    which that leg was behind the other."""
 
     title: str
     positive: str
     sides: dict[str, Markup]
+    far: dict[str, list[int]]
 
 
 def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
@@ -78,7 +80,7 @@ def charts_of(found: comparison.Comparison, names: Sequence[str]) -> list[Chart]
     """Every angle of which any result has curves, in the order of the report."""
     out = []
     for angle, (title, positive) in (ANGLES | FOOT_ANGLES | PELVIS_ANGLES).items():
-        sides = {}
+        sides, far = {}, {}
         for side in ("left", "right"):
             frames: list[Any] = [
                 c.curves[(c.curves["angle"] == angle) & (c.curves["side"] == side)] for c in found.compared
@@ -88,17 +90,19 @@ def charts_of(found: comparison.Comparison, names: Sequence[str]) -> list[Chart]
                 continue
             of_reference = frames[found.reference] if len(frames[found.reference]) else first
             curves = [(f["mean_deg"].to_numpy(float), f["sd_deg"].to_numpy(float)) if len(f) else None for f in frames]
-            means = [
-                f"{name} {number(float(c[0].min()), 0)} to {number(float(c[0].max()), 0)}\N{DEGREE SIGN}"
-                for name, c in zip(names, curves, strict=True)
-                if c is not None
-            ]
+            far[side] = [i for i, c in enumerate(found.compared) if c.far_leg == side and len(frames[i])]
+            means = []
+            for i, (name, c) in enumerate(zip(names, curves, strict=True)):
+                if c is not None:
+                    uncertain = " (less certain, the leg behind the other)" if i in far[side] else ""
+                    low, high = number(float(c[0].min()), 0), number(float(c[0].max()), 0)
+                    means.append(f"{name} {low} to {high}\N{DEGREE SIGN}{uncertain}")
             label = f"{title}, {side} leg, in degrees over the gait cycle in percent. Mean curves: {'; '.join(means)}."
             sides[side] = charts.compare_chart(
-                label, first["percent"].to_numpy(float), curves, _norm(of_reference), found.reference
+                label, first["percent"].to_numpy(float), curves, _norm(of_reference), found.reference, far[side]
             )
         if sides:
-            out.append(Chart(title, positive, sides))
+            out.append(Chart(title, positive, sides, far))
     return out
 
 
