@@ -7,8 +7,9 @@ import math
 from collections import Counter
 from collections.abc import Iterable
 
-#: A view counts where it is that of this fraction of the cycles of a recording: a turn at the end is not a view.
-VIEW_SHARE = 0.25
+#: A side counts as a view from this fraction of the cycles of a recording on (a turn at the end is not a view), front
+#: or back from the other: a pass along the camera begins and ends obliquely.
+SIDE_SHARE, FRONT_SHARE = 0.25, 0.5
 #: The view from the front or the back, in which neither leg is behind the other.
 FRONT_OR_BACK = "front_or_back"
 VIEW = "view"
@@ -83,7 +84,11 @@ def views_of(cycles: Iterable[tuple[str | int, str]]) -> tuple[str, ...]:
     of_recording: Counter[str | int] = Counter()
     for (recording, _), n in counts.items():
         of_recording[recording] += n
-    enough = {far for (recording, far), n in counts.items() if n >= VIEW_SHARE * of_recording[recording]}
+    enough = {
+        far
+        for (recording, far), n in counts.items()
+        if n >= (SIDE_SHARE if far else FRONT_SHARE) * of_recording[recording]
+    }
     return known(_VIEWS.get(far, FRONT_OR_BACK) for far in enough)
 
 

@@ -80,6 +80,7 @@ def test_what_is_not_known_is_not_compared():
 def test_views_of_a_visit():
     one_pass = [("a", "right")] * 7 + [("a", "")]  # turned at the end
     assert views_of(one_pass) == ("left",)
+    assert views_of([("a", "right")] * 4 + [("a", "")] * 3) == ("left",)  # oblique at first and at last
     assert views_of([*one_pass, ("b", "left")]) == ("left", "right")
     assert views_of([("a", "right"), ("a", "left")] * 4) == ("left", "right")  # there and back in one recording
     assert views_of([("a", "")] * 5) == ("front_or_back",)

@@ -62,6 +62,7 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
             names=names,
             keys=[charts.series_key(i) for i in range(len(names))],
             measures=[n for n in MEASURES if any(n in c.about.measures for c in found.compared)],
+            of_cycles=[n for n in MEASURES if any(_interval(c, n) is not None for c in found.compared)],
             charts=charts_of(found, names),
             plot=charts.CYCLE_PLOT,
             first_cycle=[_first_cycle(c, cycles) for c in cycles],
@@ -109,6 +110,12 @@ def charts_of(found: comparison.Comparison, names: Sequence[str]) -> list[Chart]
 def _norm(frame: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     columns = tuple(frame[c].to_numpy(float) for c in ("percent", "normal_mean_deg", "normal_sd_deg"))
     return (columns[0], columns[1], columns[2]) if np.isfinite(columns[1]).all() else None
+
+
+def _interval(one: comparison.Side, name: str) -> tuple[float, float] | None:
+    """The interval of a measure, which is that of the spread of its cycles alone; None where it has none."""
+    value, _ = one.about.measures.get(name, (None, ""))
+    return None if value is None else value.interval
 
 
 def _name(one: comparison.Side) -> str:
