@@ -90,11 +90,15 @@ class Change:
 
 @dataclasses.dataclass(frozen=True)
 class Trend:
-    """Change of the index against the visit before of the same person, by the same chain of methods."""
+    """Change of the index against the visit before of the same person, by the same chain of methods; sure, least and
+    differs as in `Change`."""
 
     session_id: int
     day: datetime.date | None
-    change: Change
+    change: float
+    sure: bool | None
+    least: float | None = None
+    differs: tuple[Difference, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,7 +183,7 @@ def change_since(result: Result, before: Result) -> Change | None:
 
 
 def not_alike(result: Result, before: Result) -> tuple[Difference, ...]:
-    """What of two results was not made or filmed alike; all but another view leaves a change without a verdict."""
+    """Return what of two results was not made or filmed alike: all but the view leaves a change without a verdict."""
     found = []
     if (result.kind, result.methods) != (before.kind, before.methods):
         found.append(Difference("methods"))
@@ -473,7 +477,7 @@ def _trend(
             if (other.kind, other.methods) == (result.kind, result.methods):
                 change = change_since(result, other)
                 if change is not None:
-                    return Trend(session_id, before, change)
+                    return Trend(session_id, before, change.by, change.sure, change.least, change.differs)
     return None
 
 

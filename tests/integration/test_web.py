@@ -89,7 +89,7 @@ def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Pa
     rows = {v.subject + str(v.day): v for v in visit_page(Filter()).visits}
     later, before = rows["P0012026-04-10"], rows["P0012026-01-10"]
     assert later.trend is not None
-    assert (later.trend.session_id, later.trend.change) == (before.session_id, visit_list.Change(10.0, True, 7.0))
+    assert (later.trend.session_id, later.trend.change, later.trend.sure) == (before.session_id, 10.0, True)
     assert before.trend is None
     assert (later.state, later.videos, later.more) == ("computed", 1, 0)
     assert later.result is not None
