@@ -23,14 +23,14 @@ _DASH = {"right": "none", "left": "7 3"}  # sides differ in print without colour
 _CYCLE_SIZE, _CYCLE_MARGIN = (280, 200), (36, 8, 8, 22)
 #: The plot of `compare_chart` in its view box: left, top, right and bottom; from left to right it is 0 to 100 %.
 CYCLE_PLOT = (_CYCLE_MARGIN[0], _CYCLE_MARGIN[1], _CYCLE_SIZE[0] - _CYCLE_MARGIN[2], _CYCLE_SIZE[1] - _CYCLE_MARGIN[3])
-#: Colour and dash of lines that are compared (Okabe and Ito): they differ for every colour vision and in grey.
+#: Colour and dash of lines that are compared. They differ in grey, too, and none is that of a side (`SIDE_COLOUR`).
 SERIES = (
     ("#22262b", "none"),
-    ("#d55e00", "7 3"),
-    ("#0072b2", "2 2.5"),
-    ("#009e73", "9 3 2 3"),
-    ("#b4588f", "5 2"),
-    ("#b07800", "12 4"),
+    ("#00835f", "7 3"),
+    ("#b4588f", "2 2.5"),
+    ("#878f97", "9 3 2 3"),
+    ("#7a1f4b", "5 2"),
+    ("#7d8b00", "12 4"),
 )
 
 
@@ -194,6 +194,7 @@ def compare_chart(
     curves: Sequence[tuple[np.ndarray, np.ndarray] | None],
     norm: tuple[np.ndarray, np.ndarray, np.ndarray] | None,
     reference: int = 0,
+    faint: Sequence[int] = (),
 ) -> Markup:
     """One joint angle of one side over the gait cycle, of several visits: mean curves with bands of one sd.
 
@@ -208,14 +209,17 @@ def compare_chart(
         percent (Q,), mean (Q,), sd (Q,) in degrees; None where there is none.
     reference
         Place of the curve that is drawn thicker.
+    faint
+        Places of the curves that are less certain.
     """
     drawn = [(*SERIES[i], i, *c) for i, c in enumerate(curves) if c is not None]
     axes = _cycle_axes([edge for *_, mean, sd in drawn for edge in (mean, mean - sd, mean + sd)], norm)
-    for colour, _, _, mean, sd in drawn:
+    opacity = [0.4 if i in faint else 1.0 for i in range(len(curves))]
+    for colour, _, i, mean, sd in drawn:
         if np.isfinite(sd).all():
-            axes.band(percent, mean - sd, mean + sd, colour, 0.14)
+            axes.band(percent, mean - sd, mean + sd, colour, 0.14 * opacity[i])
     for colour, dash, i, mean, _ in drawn:
-        axes.curve(percent, mean, colour, 2.6 if i == reference else 1.8, 1.0, dash)
+        axes.curve(percent, mean, colour, 2.6 if i == reference else 1.8, opacity[i], dash)
     return axes.svg(label)
 
 

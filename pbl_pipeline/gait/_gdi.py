@@ -296,8 +296,8 @@ def worth_of_one_more(cycles: Sequence[GaitCycle], index: Gdi) -> str:
 
 
 def intervals_with_one_more(cycles: Sequence[GaitCycle], index: Gdi) -> dict[str, float]:
-    """Return half the 90 % interval that the index of `cycles` would have after one more pass, by the side from which it
-    is filmed ("left", "right", or "" for front and back); empty where the model of the error is not known."""
+    """Return half the 90 % interval that the index of `cycles` would have after one more pass, by the side from which
+    it is filmed ("left", "right", or "" for front and back); empty where the model of the error is not known."""
     method = GDI_METHODS.get(index.model)
     basis = load_norm(index.norm) if index.norm in norm_names() else None
     usable = [c for c in cycles if c.used and c.curves]

@@ -22,9 +22,10 @@ from pbl_pipeline.stats import CurveTest, Estimate
 from .results import CurveResult, summary
 
 #: Colours that differ also for the colour-blind (Okabe & Ito): the changing group, the others in order.
-GROUP_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
-BEFORE, AFTER = "#0072b2", "#d55e00"
-_INK, _LINE, _PERSON, _PHASE = "#2a2e33", "#b9bfc5", "#8a939c", "#f4d9a8"
+# Orange and blue are those of the sides (`render.SIDE_COLOUR`) and of nothing else.
+GROUP_COLOURS = ("#00835f", "#b4588f", "#22262b", "#7d8b00", "#7a1f4b", "#878f97")
+BEFORE, AFTER = "#22262b", "#00835f"
+_INK, _LINE, _PERSON, _PHASE = "#2a2e33", "#b9bfc5", "#8a939c", "#e9e6a8"
 _SIZE, _NARROW = (4.9, 3.3), (3.5, 3.2)
 #: Text stays text in both formats, "$" is a character like others, and the same figure has the same bytes.
 _STYLE: dict[Any, Any] = {

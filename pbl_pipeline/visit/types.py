@@ -13,8 +13,9 @@ import numpy as np
 from pbl_pipeline.body import MarkerSet
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.filming import Filming, height_word, known, picture_class, views_of
 from pbl_pipeline.fit import SessionFit, TrialFit
-from pbl_pipeline.gait import Condition, GaitCycle, GaitEvents, GaitMetrics, TrialMetrics
+from pbl_pipeline.gait import Condition, GaitCycle, GaitEvents, GaitMetrics, TrialMetrics, far_leg_of
 from pbl_pipeline.keypoints import Keypoints, check_keypoints, log_shift_s
 from pbl_pipeline.qc import WARN, Check
 from pbl_pipeline.tracking import SubjectChoice
@@ -213,6 +214,22 @@ class Visit:
         if self.measures is None or self.measures.before:
             return self.measures
         return self.measures.with_checks(self.checks)
+
+    @property
+    def filming(self) -> Filming:
+        """How the pooled recordings were filmed; aid and orthosis are stated in tables alone. Loads the fits; raises as
+        `Recording.fit`."""
+        pooled = [r for r in self.fitted if r.measured is not None and r.measured.pooled]
+        fits = [r.fit for r in pooled if r.fit is not None]
+        one_camera = self.kind == "single"
+        return Filming(
+            views=views_of((r.name, c.far_leg) for r in pooled for c in r.cycles if c.used) if one_camera else (),
+            paces=known(r.condition.pool for r in pooled),
+            height=known(height_word(f.height_m) for f in fits),
+            cameras=known(f.camera.kind for f in fits) if one_camera else (),
+            pictures=known(picture_class(*f.image_size_px) for f in fits) if one_camera else (),
+            far_leg=far_leg_of([c for r in pooled for c in r.cycles]),
+        )
 
     @property
     def title(self) -> str:

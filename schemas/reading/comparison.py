@@ -8,12 +8,13 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.filming import Difference
 from pbl_pipeline.study import minimal_change_at
 
 from .. import fit, gait, study, video
 from . import frames
 from .shown import ShownVisit, shown_visit
-from .visit_list import Change, change_since, results_of
+from .visit_list import Change, change_since, not_alike, results_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -52,7 +53,14 @@ class Side:
     cycles: tuple[Cycle, ...]
     scores: dict[str, Score]
     change: Change | None  # of the index; None for the reference itself
-    changes: dict[str, Change]  # of the measures
+    changes: dict[str, Change]  # of the measures: of none is the whole error known, so none has a verdict
+    differs: tuple[Difference, ...]  # what was not made or filmed like the reference
+
+    @property
+    def far_leg(self) -> str:
+        """The leg whose curves are less certain, as one camera saw it behind the other; empty where there is none."""
+        filming = None if self.about.result is None else self.about.result.filming
+        return "" if filming is None else filming.far_leg
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,14 +129,14 @@ def compare(chosen: Sequence[tuple[int, int | None]], reference: tuple[int, int 
 def _compared(
     about: ShownVisit, first: ShownVisit, scores: dict[int, dict[str, float]], instruments: dict[str, dict[str, Any]]
 ) -> Side:
-    change, changes = None, {}
+    change, changes, differs = None, {}, ()
     if about is not first:
         if about.result is not None and first.result is not None:
-            change = change_since(about.result, first.result)
+            change, differs = change_since(about.result, first.result), not_alike(about.result, first.result)
         for name, (other, _) in first.measures.items():
             mine, _ = about.measures.get(name, (None, ""))
             if mine is not None and other is not None:
-                changes[name] = Change(mine.mean - other.mean, None)
+                changes[name] = Change(mine.mean - other.mean, None, None, (*differs, Difference("error")))
     before = scores[first.row.session_id] if about is not first else {}
     return Side(
         about=about,
@@ -137,6 +145,7 @@ def _compared(
         scores={n: _score(v, before.get(n), instruments[n]) for n, v in scores[about.row.session_id].items()},
         change=change,
         changes=changes,
+        differs=differs,
     )
 
 

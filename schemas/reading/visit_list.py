@@ -11,15 +11,23 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
+
+from pbl_pipeline.filming import VIEW, Difference, Filming, differences
 
 from .. import computed_tables, fit, gdi, qc, session, study, tracking, video
 from ..datajoint_setup import dj
 from ..job_errors import error_code
 from ..operations.catalog import quote
+<<<<<<< HEAD
 from ..review import Decision
 from ..rows import inside, number
+=======
+from ..rows import number
+from .filming import filming_of
+>>>>>>> compare
 from .status import queue_name, queues
 
 #: Visits of a page.
@@ -70,26 +78,35 @@ class Result:
     outcome: str
     worst: tuple[str, ...]
     corrected: bool = False
+    filming: Filming | None = None  # how it was filmed; None where it was not looked up
+
+
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """Change of a value against that of another result.
+
+    sure: whether it is at least `least`, None where it cannot be judged. differs: why it cannot, with what is not alike
+    in the two results: "methods", "corrected" (events), "error" (not known), or what `filming.differences` finds; with
+    a verdict it is at most the view, by which `least` is that of visits filmed from other sides.
+    """
+
+    by: float
+    sure: bool | None
+    least: float | None = None
+    differs: tuple[Difference, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
 class Trend:
-    """The index against the visit before of the same person, by the same chain of methods. sure: the change is at least
-    the larger of the two minimal changes; None where these are not known."""
+    """Change of the index against the visit before of the same person, by the same chain of methods; sure, least and
+    differs as in `Change`."""
 
     session_id: int
     day: datetime.date | None
     change: float
     sure: bool | None
-
-
-@dataclasses.dataclass(frozen=True)
-class Change:
-    """Of an index against another one. sure: it is at least the larger of the two minimal changes; None where these are
-    not known, or another chain of methods made the other one."""
-
-    by: float
-    sure: bool | None
+    least: float | None = None
+    differs: tuple[Difference, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,14 +174,45 @@ def visit_page(wanted: Filter, after: tuple[str, int] | None = None, size: int =
 
 
 def change_since(result: Result, before: Result) -> Change | None:
-    """The change of the index from one result to another; None where one of them has no index."""
+    """The change of the index from one result to another; None where one of them has no index.
+
+    Filmed alike, a change is more than chance from the larger of the two minimal changes on. Filmed from other sides,
+    the errors of the two views do not cancel: from Z90 sqrt(sd1^2 + sd2^2) on, of the sds of their whole errors.
+    """
     if result.index is None or before.index is None:
         return None
-    change = result.index - before.index
-    least = [m for m in (result.minimal_change, before.minimal_change) if m is not None]
-    same = (result.kind, result.methods, result.corrected) == (before.kind, before.methods, before.corrected)
-    comparable = len(least) == 2 and same
-    return Change(change, abs(change) >= max(least) if comparable else None)
+    by, differs = result.index - before.index, not_alike(result, before)
+    if any(d.what != VIEW for d in differs):
+        return Change(by, None, None, differs)
+    least = _least(result, before, other_view=bool(differs))
+    if least is None:
+        return Change(by, None, None, (*differs, Difference("error")))
+    return Change(by, abs(by) >= least, least, differs)
+
+
+def not_alike(result: Result, before: Result) -> tuple[Difference, ...]:
+    """Return what of two results was not made or filmed alike: all but the view leaves a change without a verdict."""
+    found = []
+    if (result.kind, result.methods) != (before.kind, before.methods):
+        found.append(Difference("methods"))
+    if result.corrected != before.corrected:
+        found.append(Difference("corrected"))
+    if result.filming is not None and before.filming is not None:
+        found += differences(result.filming, before.filming)
+    return tuple(found)
+
+
+def _least(result: Result, before: Result, other_view: bool) -> float | None:
+    """The least change of the index that is more than chance; None where an error is not known."""
+    from pbl_pipeline.gait import Z90
+
+    if other_view:
+        if result.sd is None or before.sd is None:
+            return None
+        return Z90 * math.hypot(result.sd, before.sd)
+    if result.minimal_change is None or before.minimal_change is None:
+        return None
+    return max(result.minimal_change, before.minimal_change)
 
 
 def visits_of(subject: str) -> tuple[VisitRow, ...]:
@@ -191,10 +239,16 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
     order = {fit.SINGLE: 0, fit.RIG: 1, fit.MARKERS: 2}
     open_checks = _open_checks(ids)
     rows = _ask(
+<<<<<<< HEAD
         "SELECT f.session_id, g.fit_set, f.fit_set_kind, g.fit_method, g.gait_method, g.gdi_method, g.norm,"
         " g.session_status,"
         " g.session_reason, g.session_gdi_reason, g.session_gdi, g.session_gdi_sd, g.session_gdi_minimal_change,"
         " g.session_corrected, COALESCE(q.qc_outcome, ''), COALESCE(q.qc_worst, '')"
+=======
+        "SELECT f.session_id, f.fit_set, f.fit_set_kind, g.fit_method, g.gait_method, g.gdi_method, g.norm,"
+        " g.session_status, g.session_reason, g.session_gdi_reason, g.session_gdi, g.session_gdi_sd,"
+        " g.session_gdi_minimal_change, g.session_corrected, COALESCE(q.qc_outcome, ''), COALESCE(q.qc_worst, '')"
+>>>>>>> compare
         f" FROM {_name(fit.FitSet)} f"
         f" JOIN {_name(fit.FitSelection)} c ON c.fit_set = f.fit_set AND c.fit_current = 1"
         f" JOIN {_name(gdi.SessionGdi)} g ON g.fit_set = c.fit_set AND g.fit_method = c.fit_method"
@@ -202,24 +256,35 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
         f" WHERE f.session_id IN ({_places(ids)}) ORDER BY g.session_gdi_computed DESC",
         ids,
     )
+<<<<<<< HEAD
     for session_id, fit_set, kind, *four, status, why, no_index, index, sd, change, corrected, outcome, worst in rows:
         methods = (str(four[0]), str(four[1]), str(four[2]), str(four[3]))
         names = tuple(n for n in str(worst).split(", ") if n)
         if outcome == "WARN" and (left := open_checks.get((str(fit_set), *methods))) is not None:
             names, outcome = tuple(n for n in names if n in left), "WARN" if left else "ACCEPTED"
         reason = str(why or no_index or "")
+=======
+    names = ("session_id", "fit_set", "fit_set_kind", "fit_method", "gait_method", "gdi_method", "norm")
+    filmed = filming_of([dict(zip(names, row, strict=False)) for row in rows])
+    for row, filming in zip(rows, filmed, strict=True):
+        session_id, _, kind, *four = row[:7]
+        status, why, no_index, index, sd, change, corrected, outcome, worst = row[7:]
+        methods = (str(four[0]), str(four[1]), str(four[2]), str(four[3]))
+        checks = tuple(n for n in str(worst).split(", ") if n)
+>>>>>>> compare
         found[int(session_id)].append(
             Result(
                 str(kind),
                 methods,
                 str(status),
-                reason,
+                str(why or no_index or ""),
                 number(index),
                 number(sd),
                 number(change),
                 str(outcome),
-                names,
+                checks,
                 bool(corrected),
+                filming,
             )
         )
     return {i: sorted(r, key=lambda one: order.get(one.kind, 9)) for i, r in found.items()}
@@ -465,12 +530,11 @@ def _trend(
     for before, session_id in sorted(of_person, reverse=True):
         if before >= day:
             continue
-        # Corrected events against detected ones: `change_since` does not judge such a change.
         for other in results[session_id]:
             if (other.kind, other.methods) == (result.kind, result.methods):
                 change = change_since(result, other)
                 if change is not None:
-                    return Trend(session_id, before, change.by, change.sure)
+                    return Trend(session_id, before, change.by, change.sure, change.least, change.differs)
     return None
 
 

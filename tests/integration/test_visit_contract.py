@@ -315,6 +315,7 @@ def common_of_visit(page: dict[str, Any], kind: str) -> dict[str, Any]:
         "fit": {k: v for k, v in visit.items() if k != "seconds"},
         "metrics": metrics,
         "kind": facts["kind"],
+        "filming": page["results"][page["shown"]]["filming"],
     }
     if kind != "single":
         for name in ("qc", "qc_before_gait", "outcome"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ import pytest
 
 import pbl_pipeline.fit
 from pbl_pipeline.errors import PblError
-from schemas import gdi, study
+from pbl_pipeline.filming import Difference
+from schemas import fit, gait, gdi, study
 from schemas.reading import comparison, frames
 from tests.integration import chain, web
 from tests.integration.chain import small_video
@@ -88,11 +90,99 @@ def test_the_important_change_of_mjoa_depends_on_the_score_before(visits: None, 
 
 def test_results_by_other_methods_are_not_judged(visits: None, monkeypatch: pytest.MonkeyPatch):
     one, other = comparison.shown_visit(1).results[0], comparison.shown_visit(2).results[0]
-    assert comparison.change_since(other, one) == comparison.Change(6.0, False)
+    assert comparison.change_since(other, one) == comparison.Change(6.0, False, 7.0)
     strange = dataclasses.replace(other, methods=("another", *other.methods[1:]))
-    assert comparison.change_since(strange, one) == comparison.Change(6.0, None)
-    assert comparison.change_since(dataclasses.replace(other, minimal_change=None), one) == comparison.Change(6.0, None)
+    reasons = (Difference("methods"),)
+    assert comparison.change_since(strange, one) == comparison.Change(6.0, None, differs=reasons)
+    unknown = comparison.Change(6.0, None, differs=(Difference("error"),))
+    assert comparison.change_since(dataclasses.replace(other, minimal_change=None), one) == unknown
     assert comparison.change_since(dataclasses.replace(other, index=None), one) is None
+
+
+@pytest.fixture
+def from_other_sides(visits: None) -> Iterator[None]:
+    """The first visit seen from the left, the second from the right."""
+    rows = {n: (gait.GaitCycle.Cycle & comparison.shown_visit(n).key).keys() for n in (1, 2)}
+    for number, far in ((1, "right"), (2, "left")):
+        for row in rows[number]:
+            gait.GaitCycle.Cycle.update1({**row, "cycle_far_leg": far})
+    yield
+    for row in rows[1] + rows[2]:
+        gait.GaitCycle.Cycle.update1({**row, "cycle_far_leg": None})
+
+
+def test_visits_filmed_from_other_sides(from_other_sides: None):
+    found = comparison.compare([(1, None), (2, None)])
+    change = found.compared[1].change
+    assert change is not None
+    assert change.least == pytest.approx(1.645 * np.hypot(3, 3), abs=0.01)
+    assert change.differs == (Difference("view", ("right",), ("left",)),)
+    assert change.sure is False
+    assert [c.far_leg for c in found.compared] == ["right", "left"]
+    knee = next(c for c in charts_of(found, ["a", "b"]) if c.title == "Knee flexion")
+    assert knee.far == {"left": [1], "right": [0]}
+    lines = [
+        [float(o) for o in re.findall(r'<polyline[^>]*opacity="([\d.]+)"', str(knee.sides[s]))] for s in knee.sides
+    ]
+    assert lines == [[1.0, 0.4], [0.4, 1.0]]
+    page = web.client().get("/compare?v=1&v=2").text
+    assert "filmed from other sides (right, before: left)" in page
+    assert "compare neither a side nor its curves" in page
+    assert page.count("2026-01-10 faint: this leg was behind the other") == 9  # under each curve, in print as well
+    assert "more than chance</b>" not in page
+    german = web.client().get("/compare?v=1&v=2", headers={"accept-language": "de"}).text
+    assert "von anderen Seiten gefilmt (rechts, zuvor: links)" in german
+
+
+def test_a_visit_with_an_aid_is_not_judged(visits: None):
+    study.Visit.insert1({"session_id": 2, "visit_role": "3_months", "assistive_device": "Cane & <b>"})
+    try:
+        change = comparison.compare([(1, None), (2, None)]).compared[1].change
+        assert change is not None
+        assert (change.sure, [d.what for d in change.differs]) == (None, ["aid"])
+        page = web.client().get("/compare?v=1&v=2").text
+        assert "+6.0: change cannot be judged: other walking aid (cane &amp; &lt;b&gt;, before: none)" in page
+        assert "can change the values as much as the person did" in page
+        visit = web.client().get("/visits/2").text
+        assert "+6.0 since 2026-01-10: cannot be judged: other walking aid" in visit
+        assert (
+            "Änderung nicht zu beurteilen: andere Gehhilfe (cane"
+            in web.client().get("/compare?v=1&v=2", headers={"accept-language": "de"}).text
+        )
+    finally:
+        (study.Visit & {"session_id": 2}).delete(prompt=False)
+
+
+def test_a_visit_with_a_stated_height_is_not_judged(visits: None):
+    key = {k: comparison.shown_visit(2).key[k] for k in fit.SessionFit.primary_key}
+    before = (fit.SessionFit & key).fetch1("fit_height")
+    fit.SessionFit.update1({**key, "fit_height": 1.7})
+    try:
+        change = comparison.compare([(1, None), (2, None)]).compared[1].change
+        assert change is not None
+        assert (change.sure, change.differs) == (None, (Difference("height", ("stated",), ("not_stated",)),))
+    finally:
+        fit.SessionFit.update1({**key, "fit_height": before})
+
+
+def test_measures_say_that_their_interval_is_the_spread_of_cycles(visits: None):
+    page = web.client().get("/compare?v=1&v=2").text
+    found = comparison.compare([(1, None), (2, None)]).compared[1]
+    assert (
+        page.count("interval: spread of the cycles only")
+        == sum(m is not None for m, _ in found.about.measures.values())
+        > 10
+    )
+    assert page.count(": change cannot be judged</span>") == len(found.changes) > 0
+
+
+def test_tables_and_a_visit_from_them_know_the_same_filming(visits: None):
+    about = comparison.shown_visit(1)
+    assert about.result is not None
+    assert about.visit is not None
+    assert about.result.filming == about.visit.filming
+    assert about.result.filming.cameras
+    assert about.result.filming.pictures
 
 
 def test_the_interval_of_a_measure_is_students():
@@ -213,7 +303,7 @@ def test_videos_in_step_in_a_browser(visits: None, chromium: Any):
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         # For the record: what is printed has curves and no buttons or videos.
         page.emulate_media(media="print")
-        assert page.locator(".charts svg").first.is_visible()
+        assert page.locator(".charts figure > svg").first.is_visible()
         assert not page.locator(".together").is_visible()
         assert not page.locator(".top").is_visible()
 

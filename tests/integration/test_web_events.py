@@ -335,6 +335,7 @@ def test_trend_slices_move_and_forget(visit: str, tmp_path: Path):
     assert (row.result.corrected, row.more) == (True, 0) if row.result else False
     assert row.trend is not None
     assert (row.trend.session_id, row.trend.sure) == (1, None)
+    assert [d.what for d in row.trend.differs] == ["corrected"]
     # A slice says which of its visits have other measures since.
     assert slices.changes("before") == ["visit 2026-04-10 of P001 has other rows"]
     slices.freeze("after")

@@ -72,6 +72,7 @@ def test_a_folder_is_found_looked_at_and_taken_along(results):
     assert first.count("files are missing") == 2  # and so do those without measures
     visit = browser.get("/visits/1").text
     assert "Cadence" in visit
+    assert "film the next visit alike: " in " ".join(visit.split())
     assert 'href="/recordings/1"' in visit
     assert browser.get("/visits/1/report").headers["content-security-policy"].startswith("sandbox")
     recording = browser.get("/recordings/1").text

@@ -28,11 +28,13 @@ from .videos import Videos
 
 @dataclasses.dataclass(frozen=True)
 class Chart:
-    """Curves of one angle. sides: "left" and "right" with their pictures."""
+    """Curves of one angle. sides: "left" and "right" with their pictures; far: by side the places of the results in
+    which that leg was behind the other."""
 
     title: str
     positive: str
     sides: dict[str, Markup]
+    far: dict[str, list[int]]
 
 
 def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
@@ -60,6 +62,7 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
             names=names,
             keys=[charts.series_key(i) for i in range(len(names))],
             measures=[n for n in MEASURES if any(n in c.about.measures for c in found.compared)],
+            of_cycles=[n for n in MEASURES if any(_interval(c, n) is not None for c in found.compared)],
             charts=charts_of(found, names),
             plot=charts.CYCLE_PLOT,
             first_cycle=[_first_cycle(c, cycles) for c in cycles],
@@ -78,7 +81,7 @@ def charts_of(found: comparison.Comparison, names: Sequence[str]) -> list[Chart]
     """Every angle of which any result has curves, in the order of the report."""
     out = []
     for angle, (title, positive) in (ANGLES | FOOT_ANGLES | PELVIS_ANGLES).items():
-        sides = {}
+        sides, far = {}, {}
         for side in ("left", "right"):
             frames: list[Any] = [
                 c.curves[(c.curves["angle"] == angle) & (c.curves["side"] == side)] for c in found.compared
@@ -88,23 +91,31 @@ def charts_of(found: comparison.Comparison, names: Sequence[str]) -> list[Chart]
                 continue
             of_reference = frames[found.reference] if len(frames[found.reference]) else first
             curves = [(f["mean_deg"].to_numpy(float), f["sd_deg"].to_numpy(float)) if len(f) else None for f in frames]
-            means = [
-                f"{name} {number(float(c[0].min()), 0)} to {number(float(c[0].max()), 0)}\N{DEGREE SIGN}"
-                for name, c in zip(names, curves, strict=True)
-                if c is not None
-            ]
+            far[side] = [i for i, c in enumerate(found.compared) if c.far_leg == side and len(frames[i])]
+            means = []
+            for i, (name, c) in enumerate(zip(names, curves, strict=True)):
+                if c is not None:
+                    uncertain = " (less certain, the leg behind the other)" if i in far[side] else ""
+                    low, high = number(float(c[0].min()), 0), number(float(c[0].max()), 0)
+                    means.append(f"{name} {low} to {high}\N{DEGREE SIGN}{uncertain}")
             label = f"{title}, {side} leg, in degrees over the gait cycle in percent. Mean curves: {'; '.join(means)}."
             sides[side] = charts.compare_chart(
-                label, first["percent"].to_numpy(float), curves, _norm(of_reference), found.reference
+                label, first["percent"].to_numpy(float), curves, _norm(of_reference), found.reference, far[side]
             )
         if sides:
-            out.append(Chart(title, positive, sides))
+            out.append(Chart(title, positive, sides, far))
     return out
 
 
 def _norm(frame: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     columns = tuple(frame[c].to_numpy(float) for c in ("percent", "normal_mean_deg", "normal_sd_deg"))
     return (columns[0], columns[1], columns[2]) if np.isfinite(columns[1]).all() else None
+
+
+def _interval(one: comparison.Side, name: str) -> tuple[float, float] | None:
+    """The interval of a measure, which is that of the spread of its cycles alone; None where it has none."""
+    value, _ = one.about.measures.get(name, (None, ""))
+    return None if value is None else value.interval
 
 
 def _name(one: comparison.Side) -> str:

@@ -97,7 +97,7 @@ class ResultsFolder:
             load_visit=Held(visit),
             measures=_measures(visit),
             lacks=visit.lacks,
-            results=() if row.result is None else (row.result,),
+            results=() if row.result is None else (dataclasses.replace(row.result, filming=visit.filming),),
             shown=None if row.result is None else 0,
             checks=tuple(ShownCheck(i, check, None) for i, check in enumerate(checks, 1)),
         )

@@ -101,7 +101,7 @@ function median(values) {
 function lines() {
   const made = [], plot = /** @type {HTMLElement|null} */ (document.querySelector(".charts"))?.dataset.plot ?? "0 0 0 0";
   const [left, top, right, bottom] = plot.split(" ");
-  for (const svg of document.querySelectorAll(".charts svg")) {
+  for (const svg of document.querySelectorAll(".charts figure > svg")) {
     const line = document.createElementNS("http://www.w3.org/2000/svg", "line");
     line.setAttribute("class", "phase-line");
     line.setAttribute("y1", top); line.setAttribute("y2", bottom);

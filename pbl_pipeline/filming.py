@@ -1,0 +1,102 @@
+"""How the walks of a visit were filmed, and whether two visits were filmed alike: only such can be compared."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import Counter
+from collections.abc import Iterable
+
+#: A side counts as a view from this fraction of the cycles of a recording on (a turn at the end is not a view), front
+#: or back from the other: a pass along the camera begins and ends obliquely.
+SIDE_SHARE, FRONT_SHARE = 0.25, 0.5
+#: The view from the front or the back, in which neither leg is behind the other.
+FRONT_OR_BACK = "front_or_back"
+VIEW = "view"
+#: What `differences` compares, in its order.
+WHAT = ("aid", "orthosis", "pace", "height", "camera", "picture", VIEW)
+#: Lowest number of pixels of the shorter side of a picture, and what such pictures are called.
+_PICTURES = ((1400, "2160p"), (900, "1080p"), (600, "720p"), (0, "480p"))
+_VIEWS = {"right": "left", "left": "right"}  # the camera is on the other side of the leg that is behind
+
+
+@dataclasses.dataclass(frozen=True)
+class Filming:
+    """How the pooled walks of a visit were filmed. Each is sorted, and empty where it is not known.
+
+    views: sides from which one camera saw the person, "left", "right" and `FRONT_OR_BACK`; aid, orthosis: as stated of
+    the visit, none where nothing is; paces: of the walks; height: whether the body height was stated ("stated" or
+    "not_stated"); cameras: kinds of sources of the intrinsics (`video.CAMERA_KINDS`); pictures: classes of the size of
+    the picture, such as "1080p"; far_leg: the leg behind the other in most cycles (`gait.far_leg_of`).
+    """
+
+    views: tuple[str, ...] = ()
+    aid: tuple[str, ...] = ()
+    orthosis: tuple[str, ...] = ()
+    paces: tuple[str, ...] = ()
+    height: tuple[str, ...] = ()
+    cameras: tuple[str, ...] = ()
+    pictures: tuple[str, ...] = ()
+    far_leg: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """What was not alike in two visits, one of `WHAT`, with its values now and before."""
+
+    what: str
+    now: tuple[str, ...] = ()
+    before: tuple[str, ...] = ()
+
+
+def differences(now: Filming, before: Filming) -> tuple[Difference, ...]:
+    """Return what was not alike when two visits were filmed. What is not known of one of them is not compared, but an
+    aid or orthosis that is stated of one visit alone differs."""
+    pairs = zip(WHAT, _compared(now), _compared(before), strict=True)
+    return tuple(
+        Difference(what, a, b) for what, a, b in pairs if a != b and ((a and b) or what in ("aid", "orthosis"))
+    )
+
+
+def stated(text: str) -> tuple[str, ...]:
+    """Return an aid or orthosis as stated of a visit; empty for none."""
+    word = " ".join(text.split()).lower()
+    return () if word in ("", "no", "none") else (word,)
+
+
+def height_word(height_m: float | None) -> str:
+    """Return the word of `Filming.height` for the body height that the fit was told (m); None or NaN for none."""
+    return "not_stated" if height_m is None or math.isnan(height_m) else "stated"
+
+
+def picture_class(width_px: float, height_px: float) -> str:
+    """Return the class of the size of a picture, such as "1080p", by its shorter side; empty where it is not known."""
+    shorter = min(width_px, height_px)
+    return next(name for lowest, name in _PICTURES if shorter >= lowest) if shorter > 0 else ""
+
+
+def views_of(cycles: Iterable[tuple[str | int, str]]) -> tuple[str, ...]:
+    """Return the sides from which a person was seen.
+
+    cycles: recording and `GaitCycle.far_leg` of each used cycle.
+    """
+    counts = Counter(cycles)
+    of_recording: Counter[str | int] = Counter()
+    for (recording, _), n in counts.items():
+        of_recording[recording] += n
+    enough = {
+        far
+        for (recording, far), n in counts.items()
+        if n >= (SIDE_SHARE if far else FRONT_SHARE) * of_recording[recording]
+    }
+    return known(_VIEWS.get(far, FRONT_OR_BACK) for far in enough)
+
+
+def known(words: Iterable[str]) -> tuple[str, ...]:
+    """Return the words that are not empty, each once and sorted."""
+    return tuple(sorted({w for w in words if w}))
+
+
+def _compared(filming: Filming) -> tuple[tuple[str, ...], ...]:
+    f = filming
+    return f.aid, f.orthosis, f.paces, f.height, f.cameras, f.pictures, f.views

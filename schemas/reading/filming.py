@@ -1,0 +1,67 @@
+"""How the walks of results were filmed, from the rows of their recordings: a few queries for many visits."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.filming import Filming, height_word, known, picture_class, stated, views_of
+
+from .. import fit, gait, gdi, keypoints, study, video
+from ..rows import number
+
+
+def filming_of(results: Sequence[Mapping[str, Any]]) -> list[Filming]:
+    """Return how each result was filmed, in their order.
+
+    results: rows with session_id, fit_set, fit_set_kind, fit_method, gait_method and gdi_method.
+    """
+    if not results:
+        return []
+    from pbl_pipeline.gait import mostly
+
+    of_visit = [{"session_id": r["session_id"]} for r in {r["session_id"]: r for r in results}.values()]
+    sets = [{"fit_set": name} for name in {r["fit_set"] for r in results}]
+    used = gait.GaitCycle.Cycle & sets & {"cycle_used": True}
+    cycles = defaultdict(list)
+    for row in used.proj("cycle_far_leg").to_dicts():
+        cycles[row["fit_set"], row["fit_method"], row["gait_method"]].append(
+            (int(row["video_id"]), row["cycle_far_leg"] or "")
+        )
+    heights = {
+        (r["fit_set"], r["fit_method"]): number(r["fit_height"])
+        for r in (fit.SessionFit & sets).proj("fit_height").to_dicts()
+    }
+    filmed = fit.FitSet.Video * keypoints.Keypoints.proj("camera_kind") * video.VideoInfo.proj("width", "height")
+    recordings = defaultdict(list)
+    for row in (filmed & sets).to_dicts():
+        recordings[row["fit_set"]].append(row)
+    done = video.conditions((fit.FitSet.Video & sets).proj())
+    members = defaultdict(list)
+    for row in (fit.FitSet.Video & sets).proj().to_dicts():
+        members[row["fit_set"]].append(int(row["video_id"]))
+    visits = {int(r["session_id"]): r for r in (study.Visit & of_visit).to_dicts()}
+    paces = {name: gdi.pace_of(name) for name in {r["gdi_method"] for r in results}}
+    out = []
+    for r in results:
+        pace, one_camera = paces[r["gdi_method"]], r["fit_set_kind"] == fit.SINGLE
+        pooled = {v for v in members[r["fit_set"]] if done[v].pooled(pace)}
+        own = [c for c in cycles[r["fit_set"], r["fit_method"], r["gait_method"]] if c[0] in pooled]
+        about = [v for v in recordings[r["fit_set"]] if int(v["video_id"]) in pooled] if one_camera else []
+        visit = visits.get(int(r["session_id"]), {"assistive_device": "", "orthosis": ""})
+        out.append(
+            Filming(
+                views=views_of(own) if one_camera else (),
+                aid=stated(visit["assistive_device"]),
+                orthosis=stated(visit["orthosis"]),
+                paces=known(done[v].pool for v in pooled),
+                height=(height_word(heights[r["fit_set"], r["fit_method"]]),),
+                cameras=known(v["camera_kind"] for v in about),
+                pictures=known(picture_class(v["width"], v["height"]) for v in about),
+                far_leg=mostly(np.array([far for _, far in own])),
+            )
+        )
+    return out
