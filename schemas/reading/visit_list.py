@@ -21,13 +21,9 @@ from .. import computed_tables, fit, gdi, qc, session, study, tracking, video
 from ..datajoint_setup import dj
 from ..job_errors import error_code
 from ..operations.catalog import quote
-<<<<<<< HEAD
 from ..review import Decision
 from ..rows import inside, number
-=======
-from ..rows import number
 from .filming import filming_of
->>>>>>> compare
 from .status import queue_name, queues
 
 #: Visits of a page.
@@ -239,16 +235,9 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
     order = {fit.SINGLE: 0, fit.RIG: 1, fit.MARKERS: 2}
     open_checks = _open_checks(ids)
     rows = _ask(
-<<<<<<< HEAD
-        "SELECT f.session_id, g.fit_set, f.fit_set_kind, g.fit_method, g.gait_method, g.gdi_method, g.norm,"
-        " g.session_status,"
-        " g.session_reason, g.session_gdi_reason, g.session_gdi, g.session_gdi_sd, g.session_gdi_minimal_change,"
-        " g.session_corrected, COALESCE(q.qc_outcome, ''), COALESCE(q.qc_worst, '')"
-=======
         "SELECT f.session_id, f.fit_set, f.fit_set_kind, g.fit_method, g.gait_method, g.gdi_method, g.norm,"
         " g.session_status, g.session_reason, g.session_gdi_reason, g.session_gdi, g.session_gdi_sd,"
         " g.session_gdi_minimal_change, g.session_corrected, COALESCE(q.qc_outcome, ''), COALESCE(q.qc_worst, '')"
->>>>>>> compare
         f" FROM {_name(fit.FitSet)} f"
         f" JOIN {_name(fit.FitSelection)} c ON c.fit_set = f.fit_set AND c.fit_current = 1"
         f" JOIN {_name(gdi.SessionGdi)} g ON g.fit_set = c.fit_set AND g.fit_method = c.fit_method"
@@ -256,22 +245,15 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
         f" WHERE f.session_id IN ({_places(ids)}) ORDER BY g.session_gdi_computed DESC",
         ids,
     )
-<<<<<<< HEAD
-    for session_id, fit_set, kind, *four, status, why, no_index, index, sd, change, corrected, outcome, worst in rows:
-        methods = (str(four[0]), str(four[1]), str(four[2]), str(four[3]))
-        names = tuple(n for n in str(worst).split(", ") if n)
-        if outcome == "WARN" and (left := open_checks.get((str(fit_set), *methods))) is not None:
-            names, outcome = tuple(n for n in names if n in left), "WARN" if left else "ACCEPTED"
-        reason = str(why or no_index or "")
-=======
     names = ("session_id", "fit_set", "fit_set_kind", "fit_method", "gait_method", "gdi_method", "norm")
     filmed = filming_of([dict(zip(names, row, strict=False)) for row in rows])
     for row, filming in zip(rows, filmed, strict=True):
-        session_id, _, kind, *four = row[:7]
+        session_id, fit_set, kind, *four = row[:7]
         status, why, no_index, index, sd, change, corrected, outcome, worst = row[7:]
         methods = (str(four[0]), str(four[1]), str(four[2]), str(four[3]))
         checks = tuple(n for n in str(worst).split(", ") if n)
->>>>>>> compare
+        if outcome == "WARN" and (left := open_checks.get((str(fit_set), *methods))) is not None:
+            checks, outcome = tuple(n for n in checks if n in left), "WARN" if left else "ACCEPTED"
         found[int(session_id)].append(
             Result(
                 str(kind),
