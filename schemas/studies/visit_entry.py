@@ -15,7 +15,7 @@ from pbl_pipeline.errors import PblError
 
 from .. import session, study
 from ..decisions.review_decisions import decisions, record
-from ..intake.sheets import Row, Sheet, refused
+from ..intake.sheets import Row, Sheet, refused, with_point
 from ..transactions import in_transaction
 from .study_sheets import CLEAR, SCORE_COLUMNS, import_rows
 
@@ -98,6 +98,7 @@ def _enter(session_id: int, values: Mapping[str, str], by: str, seen: str, reaso
     if now.seen != seen:
         raise _meanwhile(session_id)
     given = {name: text.strip()[:200] for name, text in values.items()}
+    given = {name: text if name == ROLE else with_point(text) for name, text in given.items()}
     changed = {name: text for name, text in given.items() if not _same(text, now.values[name])}
     errors: dict[str, PblError] = {}
     if changed.get(ROLE) == "":

@@ -40,21 +40,21 @@ def score(number: int, name: str) -> float | None:
 
 def test_each_change_is_a_row_with_what_was_before(two_visits: None):
     browser = web.client(name="A. First")
-    answer = send(browser, 1, mJOA="13.5", BBS="44", role="baseline", reason="read from the <i>chart")
+    answer = send(browser, 1, mJOA="13", TUG="9,5", BBS="44", role="baseline", reason="read from the <i>chart")
     assert (answer.status_code, answer.headers["location"]) == (303, "/visits/1#entered")
-    assert (score(1, "mJOA"), score(1, "BBS")) == (13.5, 44)
+    assert (score(1, "mJOA"), score(1, "BBS"), score(1, "TUG")) == (13, 44, 9.5)
     assert (study.Visit & {"session_id": 1}).fetch1("visit_role", "visit_note") == ("baseline", "uses a cane")
     rows = {(r["decision_what"], r["decision_about"].get("instrument")): r for r in Decision().to_dicts()}
     told = {k: (r["decision_before"]["value"], r["decision_after"]["value"]) for k, r in rows.items()}
-    expected = {("score", "mJOA"): (12.0, 13.5), ("score", "BBS"): (None, 44.0), ("role", None): ("pre", "baseline")}
-    assert told == expected
+    scores = {"mJOA": (12.0, 13.0), "BBS": (None, 44.0), "TUG": (None, 9.5)}
+    assert told == {**{("score", n): v for n, v in scores.items()}, ("role", None): ("pre", "baseline")}
     assert {(r["decision_by"], r["session_id"]) for r in rows.values()} == {("A. First", 1)}
     page = browser.get("/visits/1").text
     assert "clinical score mJOA: read from the &lt;i&gt;chart" in page
-    assert re.search(r"mJOA 13\.5 <span[^>]*>points", page)
+    assert re.search(r"TUG 9\.5 <span[^>]*>s<", page)
     # What is as it was changes nothing; an empty field removes.
-    assert send(browser, 1, mJOA="13.50", BBS="", role="baseline").status_code == 303
-    assert (score(1, "BBS"), len(Decision())) == (None, 4)
+    assert send(browser, 1, mJOA="13.0", TUG="9,50", BBS="", role="baseline").status_code == 303
+    assert (score(1, "BBS"), len(Decision())) == (None, 5)
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,10 @@ def test_each_change_is_a_row_with_what_was_before(two_visits: None):
         ({"mJOA": "19"}, "SCORE_RANGE", "at least 0 and at most 18"),
         ({"mJOA": "-1"}, "SCORE_RANGE", "at least 0"),
         ({"mJOA": "nan"}, "SHEET_FORMAT", "a number with a decimal point"),
-        ({"mJOA": "12,5"}, "SHEET_FORMAT", "a number with a decimal point"),
+        ({"mJOA": "12,5"}, "SCORE_RANGE", "a whole number"),
+        ({"mJOA": "12.5"}, "SCORE_RANGE", "a whole number"),
+        ({"mJOA-LE": "3", "mJOA": "2"}, "SHEET_CONFLICT", "the sum of its parts"),
+        ({"TUG": "1,234"}, "SHEET_FORMAT", "a number with a decimal point"),
         ({"mJOA": "1_2"}, "SHEET_FORMAT", "a number"),
         ({"mJOA": "<script>"}, "SHEET_FORMAT", "&lt;script&gt;"),
         ({"role": "6 Weeks"}, "SHEET_FORMAT", "small letters"),
