@@ -47,7 +47,8 @@ def _add(row: Row, by: str) -> dict[str, PblError]:
         line = Line(field)
         with line.about():
             made[field] = _value(row, field)
-        errors |= {field: error for error in line.errors}
+        if line.errors:
+            errors[field] = line.errors[0]
     low, high = (made.get(f"instrument_{end}") for end in ("low", "high"))
     if low is not None and high is not None and low >= high:
         expected = f"more than the lowest value, {low:g}"

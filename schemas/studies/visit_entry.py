@@ -54,11 +54,16 @@ def entry(session_id: int) -> Entry:
     roles = (study.Visit & {"session_id": session_id}).to_arrays("visit_role")
     scores = (study.ClinicalScore & {"session_id": session_id}).to_dicts()
     stored = {r["instrument"]: f"{r['score_value']:.12g}" for r in scores}
-    instruments = {r["instrument"]: r for r in study.ClinicalInstrument().to_dicts(order_by="instrument")}
-    values = {ROLE: str(roles[0]) if len(roles) else "", **{n: stored.get(n, "") for n in instruments}}
+    known = instruments()
+    values = {ROLE: str(roles[0]) if len(roles) else "", **{n: stored.get(n, "") for n in known}}
     text = json.dumps([session_id, values], sort_keys=True)
     seen = hashlib.sha256(text.encode()).hexdigest()[:16]
-    return Entry(session_id, rows[0]["subject"], rows[0]["session_label"], values, instruments, seen)
+    return Entry(session_id, rows[0]["subject"], rows[0]["session_label"], values, known, seen)
+
+
+def instruments() -> dict[str, dict[str, Any]]:
+    """Return the rows of ClinicalInstrument by name."""
+    return {r["instrument"]: r for r in study.ClinicalInstrument().to_dicts(order_by="instrument")}
 
 
 def enter(session_id: int, values: Mapping[str, str], by: str, seen: str, reason: str = "") -> Entered:

@@ -14,7 +14,7 @@ import pytest
 import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.study import classes_of, minimal_change_at
-from schemas import lab, session, study
+from schemas import lab, methods, session, study
 from schemas.operations import forget
 from schemas.rows import utc_now
 from tests.rows import remove_all

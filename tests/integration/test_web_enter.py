@@ -6,8 +6,10 @@ import re
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 
 from schemas import lab, session, study
+from schemas.cli.study import instrument
 from schemas.review import Decision
 from schemas.rows import utc_now
 from schemas.studies.visit_entry import enter, entry
@@ -128,6 +130,55 @@ def test_a_value_that_an_import_wrote_out_of_range_does_not_block_the_others(two
     table = study.ClinicalScore.full_table_name
     study.ClinicalScore.connection.query(f"UPDATE {table} SET score_value = 99")
     assert enter(1, {"mJOA": "99", "BBS": "12"}, "A", entry(1).seen).changed == ("BBS",)
+
+
+OWN = {"instrument": "FAC", "instrument_name": "Functional Ambulation Categories", "instrument_unit": "points",
+       "instrument_low": "0", "instrument_high": "5", "higher_is_better": "yes", "ordinal": "yes"}  # fmt: skip
+
+
+@pytest.fixture
+def own(two_visits: None):
+    yield
+    (study.ClinicalScore & {"instrument": "FAC"}).delete(prompt=False)
+    (study.ClinicalInstrument & {"instrument": "FAC"}).delete(prompt=False)
+
+
+def test_an_instrument_of_ones_own_is_added_and_entered(own: None):
+    browser = web.client(name="A. First")
+    assert web.post(browser, "/instruments", **OWN).status_code == 303
+    assert "Functional Ambulation Categories" in browser.get("/instruments").text
+    assert send(browser, 1, FAC="2.5").status_code == 200
+    assert send(browser, 1, FAC="3").status_code == 303
+    assert score(1, "FAC") == 3
+    added = (Decision & {"decision_what": "instrument"}).to_dicts()
+    assert [(r["decision_by"], r["decision_after"]["instrument_high"]) for r in added] == [("A. First", 5)]
+    again = web.post(browser, "/instruments", **{**OWN, "instrument": "fac"}).text
+    assert "a name that no instrument and no column of a sheet has" in again
+
+
+def test_every_wrong_field_of_an_instrument_is_said_and_nothing_is_added(own: None):
+    browser, before = web.client(), everything()
+    wrong = {"instrument": "Role", "instrument_name": "", "instrument_unit": "x" * 17, "instrument_low": "1,234",
+             "instrument_high": "much", "minimal_change": "-1", "higher_is_better": "", "ordinal": "maybe"}  # fmt: skip
+    answer = web.post(browser, "/instruments", **wrong)
+    assert answer.status_code == 200
+    assert answer.text.count("aria-invalid") == len(wrong)
+    more = {"instrument_low": "6", "minimal_change": "1"}
+    said = web.post(browser, "/instruments", **{**OWN, **more}).text
+    assert said.count("aria-invalid") == 2
+    assert "more than the lowest value, 6" in said
+    assert "who found it, in whom" in said
+    assert web.post(web.client(role="reader"), "/instruments", **OWN).status_code == 403
+    assert "Add a score" not in web.client(role="reader").get("/instruments").text
+    assert everything() == before
+
+
+def test_the_command_adds_an_instrument(own: None):
+    words = ["FAC", "--title", "Categories", "--unit", "points", "--better", "higher", "--low", "0"]
+    assert CliRunner().invoke(instrument, ["add", *words, "--high", "-1"]).exit_code == 1
+    assert CliRunner().invoke(instrument, ["add", *words, "--high", "5", "--ordinal"]).output == "FAC: added\n"
+    row = (study.ClinicalInstrument & {"instrument": "FAC"}).fetch1()
+    assert (row["instrument_high"], row["ordinal"], row["higher_is_better"]) == (5, 1, 1)
 
 
 def test_from_the_click_to_the_row_in_a_browser(two_visits: None, chromium: Any):
