@@ -196,3 +196,21 @@ def test_from_the_click_to_the_row_in_a_browser(two_visits: None, chromium: Any)
         page.wait_for_url("**/visits/1#entered")
     assert score(1, "BBS") == 50
     assert {r["decision_what"] for r in Decision().to_dicts()} == {"role", "score"}
+
+
+@pytest.mark.parametrize(("language", "saved"), [("de", "Sichern"), ("en", "Save")])
+def test_an_instrument_is_added_in_a_browser(own: None, chromium: Any, language: str, saved: str):
+    with web.shown(chromium, locale=language) as page:
+        page.goto("/visits/1/enter")
+        page.locator('a[href="/instruments"]').click()
+        for field, text in OWN.items():
+            one = page.locator(f"#{field}")
+            one.select_option(text) if text in ("yes", "no") else one.fill("" if field == "instrument_unit" else text)
+        page.get_by_role("button", name=saved).click()
+        page.get_by_role("alert").wait_for()
+        assert "SHEET_FORMAT" in page.locator(".problem").inner_text()
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        page.locator("#instrument_unit").fill("points")
+        page.get_by_role("button", name=saved).click()
+        page.get_by_text("Functional Ambulation Categories").wait_for()
+    assert len(study.ClinicalInstrument & {"instrument": "FAC"}) == 1
