@@ -82,4 +82,6 @@ def _value(row: Row, field: str) -> Any:
         taken |= {str(name).lower() for name in study.ClinicalInstrument().to_arrays("instrument")}
         if text.lower() in taken or text.lower().replace(" ", "_") in taken:
             raise refused(field, repr(text), "a name that no instrument and no column of a sheet has", "choose another")
+    if field == "instrument_unit" and text.lower() == "punkte":
+        return "points"  # the word by which whole numbers are asked for (`study.check_score`)
     return text

@@ -210,7 +210,7 @@ def test_an_instrument_is_added_in_a_browser(own: None, chromium: Any, language:
         page.get_by_role("alert").wait_for()
         assert "SHEET_FORMAT" in page.locator(".problem").inner_text()
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-        page.locator("#instrument_unit").fill("points")
+        page.locator("#instrument_unit").fill("Punkte" if language == "de" else "points")
         page.get_by_role("button", name=saved).click()
         page.get_by_text("Functional Ambulation Categories").wait_for()
-    assert len(study.ClinicalInstrument & {"instrument": "FAC"}) == 1
+    assert (study.ClinicalInstrument & {"instrument": "FAC"}).fetch1("instrument_unit") == "points"
