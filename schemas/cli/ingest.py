@@ -50,7 +50,7 @@ _METHODS = {
     "--template",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Write an empty sheet (.csv, .xlsx) for --sheet, with all its columns, and do no more.",
+    help="Write an empty sheet (.csv, .xlsx) for --sheet, with all its columns; nothing else is done.",
 )
 @click.option("--dry-run", is_flag=True, help="With --sheet: read all, change nothing, say what would happen.")
 @click.option("--subject", metavar="CODE", help="Pseudonymous code of the person, never a name.")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     "--template",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Write an empty sheet (.csv, .xlsx) of visits with all its columns and scores, and do no more.",
+    help="Write an empty sheet (.csv, .xlsx) of visits with all its columns and scores; nothing else is done.",
 )
 @click.option("--dry-run", is_flag=True, help="Change nothing; say row by row what would happen.")
 @click.option("--distinct-codes", is_flag=True, help="Codes such as P1 and P001 are different people.")

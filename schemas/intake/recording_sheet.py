@@ -136,7 +136,7 @@ def _visit(row: Row, line: Line, folder: Path) -> VisitRecord | None:
 
 
 def _blank(row: Row, folder: Path) -> VisitRecord:
-    """A visit of nobody, with the calibration that a row names."""
+    """A placeholder visit with the calibration that a row names."""
     return VisitRecord("X", camera_file=folder / row.cells["camera"] if "camera" in row.cells else None)
 
 

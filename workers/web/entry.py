@@ -1,4 +1,4 @@
-"""Enter: the role of a visit, its clinical scores, and instruments of one's own. Each change is a row of Decision."""
+"""Enter: the role of a visit, its clinical scores, and custom instruments. Each change is a row of Decision."""
 
 from __future__ import annotations
 
