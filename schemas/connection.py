@@ -39,7 +39,8 @@ def connect(start: bool = False) -> datajoint.Connection:
     Parameters
     ----------
     start
-        Start the embedded server when it is not running (never done when DJ_HOST names a server).
+        Start the embedded server when it is not running (never done when DJ_HOST names a server). After `pbl demo`
+        has stopped it, any connection does.
 
     Raises
     ------
@@ -163,9 +164,9 @@ def _target(start: bool) -> dict[str, Any]:
             "use_tls": _tls(),
             "embedded": False,
         }
-    if start:
-        embedded.start()
     folder = Folder.default()
+    if start or embedded.starts_on_demand(folder):
+        embedded.start()
     login = {"host": HOST, "user": APP_USER, "password": folder.credentials().app_password}
     return {**login, "port": int(folder.state().get("port") or 0), "use_tls": False, "embedded": True}
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pbl_pipeline import methods
 
-from . import fit, gait, gdi, keypoints, tracking
+from . import fit, gait, gdi, keypoints, study, tracking
+from .instruments import INSTRUMENTS
 from .method_rows import insert_methods
 
 #: Every table of methods, in the order of the chain.
@@ -24,6 +25,8 @@ def insert_all() -> None:
 
     for table in METHOD_TABLES:
         insert_methods(table, methods.of_stage(table.stage).values())
+    # DataJoint compares only the numbers of rows: a laboratory's own instruments would hide those that are new here.
+    study.ClinicalInstrument.insert(INSTRUMENTS, skip_duplicates=True)
     _body()
     for name in norm_names():
         _norm(name)

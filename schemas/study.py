@@ -131,19 +131,23 @@ def check_scores(rows: Iterable[Mapping[str, Any]]) -> None:
 
 
 def check_score(value: Any, instrument: Mapping[str, Any], key: object = None) -> None:
-    """Raise `PblError` SCORE_RANGE for a value that a row of ClinicalInstrument does not allow."""
+    """Raise `PblError` SCORE_RANGE for a value that a row of ClinicalInstrument does not allow: outside its range, or a
+    fraction of an ordinal score in points."""
     low, high = (instrument[f"instrument_{k}"] for k in ("low", "high"))
     try:
         number = float(value)
     except (TypeError, ValueError):
         number = math.nan
-    if math.isfinite(number) and (low is None or number >= low) and (high is None or number <= high):
+    whole = bool(instrument["ordinal"]) and instrument["instrument_unit"] == "points"
+    inside = math.isfinite(number) and (low is None or number >= low) and (high is None or number <= high)
+    if inside and (number.is_integer() or not whole):
         return
+    kind = "a whole number" if whole else "a number"
     bounds = " and ".join(f"at {w} {b:g}" for w, b in (("least", low), ("most", high)) if b is not None)
     raise PblError(
         "SCORE_RANGE",
         found=f"{instrument['instrument']} of {value!r}",
-        expected=f"a number{' of ' if bounds else ''}{bounds} {instrument['instrument_unit']}".rstrip(),
+        expected=f"{kind}{' of ' if bounds else ''}{bounds} {instrument['instrument_unit']}".rstrip(),
         next_step="correct the score at its source; leave out one that was not taken. The ranges are the rows of "
         "ClinicalInstrument",
         key=key,

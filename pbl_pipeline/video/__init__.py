@@ -9,7 +9,7 @@ from .camera import check_lens, guess_camera, load_camera, scaled_matrix, undist
 from .camera_pose import CameraPose, load_camera_poses
 from .camera_source import find_camera
 from .cut_region import cut_image
-from .file_facts import packet_times, probe, read_first, read_metadata, sha256_of
+from .file_facts import packet_times, probe, read_first, read_metadata, recorded_utc, sha256_of
 from .frames import read_frames
 from .h264 import write_h264
 from .lens_calibration import (
@@ -65,6 +65,7 @@ __all__ = [
     "read_frames",
     "read_metadata",
     "read_phone_log",
+    "recorded_utc",
     "scaled_matrix",
     "sha256_of",
     "turned_camera",

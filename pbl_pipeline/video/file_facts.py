@@ -135,6 +135,17 @@ def read_metadata(path: str | Path) -> dict[str, str]:
     return {name.lower(): text.strip() for name, text in found.items() if is_plain(text.strip())}
 
 
+def recorded_utc(path: str | Path) -> str | None:
+    """Return when a file says that it was recorded (YYYY-MM-DDTHH:MM:SSZ); None where it does not. Nothing is decoded.
+
+    Raises
+    ------
+    PblError
+        As `probe`.
+    """
+    return _recorded_utc(read_metadata(path))
+
+
 def _metadata(decoder: Decoder, tags: Tags) -> dict[str, str]:
     """Of the stream, the container and its atoms by name; the later ones win."""
     return dict(decoder.stream.metadata) | dict(decoder.container.metadata) | tags.items

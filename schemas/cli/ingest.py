@@ -46,6 +46,12 @@ _METHODS = {
     metavar="FILE",
     help="Instead of VIDEOS: a sheet (.csv, .xlsx) with a row for each, of any people and visits (docs/files.md).",
 )
+@click.option(
+    "--template",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write an empty sheet (.csv, .xlsx) for --sheet, with all its columns; nothing else is done.",
+)
 @click.option("--dry-run", is_flag=True, help="With --sheet: read all, change nothing, say what would happen.")
 @click.option("--subject", metavar="CODE", help="Pseudonymous code of the person, never a name.")
 @click.option(
@@ -104,6 +110,7 @@ _METHODS = {
 def ingest(
     videos: tuple[Path, ...],
     sheet: Path | None,
+    template: Path | None,
     dry_run: bool,
     markers: tuple[Path, ...],
     marker_set: str | None,
@@ -130,6 +137,7 @@ def ingest(
     Example: pbl ingest walk.mov --subject P018 --attitude 2026-03-01_09-15-30.zip
     Example: pbl ingest *.mp4 --session 2026-03-01 --name-pattern '(?P<subject>[^_]+)_(?P<pace>[^_]+)_.*'
     Example: pbl ingest cam_01.mp4 cam_02.mp4 cam_03.mp4 --rig Calib.toml --subject P017 --session 2026-03-01
+    Example: pbl ingest --template visits.xlsx
     Example: pbl ingest --sheet visits.csv --dry-run
     Example: pbl ingest --markers walk1.trc --marker-set our_lab.csv --subject P017 --session 2026-03-01
     """
@@ -137,6 +145,13 @@ def ingest(
     from schemas.intake import LaboratoryMarkers, Methods, OneCamera, SeveralCameras, register
     from schemas.intake.videos import check_person
 
+    if template is not None:
+        from schemas.intake.recording_sheet import COLUMNS, NEEDED
+        from schemas.intake.sheets import write_template
+
+        write_template(template, COLUMNS)
+        click.echo(f"written: {template}; a row for each video, {', '.join(NEEDED)} are needed (docs/files.md)")
+        return
     methods = Methods(**{field: stated.pop(option) for option, field in _METHODS.items()})
     stated = {option: value for option, value in stated.items() if value is not None}
     if sheet is not None:
@@ -194,6 +209,8 @@ def _sheet(sheet: Path, methods: Methods, dry_run: bool) -> None:
     for line in found.lines:
         for error in line.errors:
             click.echo(error.text(), err=True)
+        for text in line.doubts:
+            click.echo(f"warning: {line.where}: {text}", err=True)
         for text in filter(None, (*line.changes, line.kept)):
             click.echo(f"{line.where}: {text}")
     wrong = sum(bool(line.errors) for line in found.lines)

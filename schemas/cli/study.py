@@ -15,21 +15,37 @@ if TYPE_CHECKING:
 
 @click.command(
     "import",
-    epilog="\b\nExample: pbl study import visits.csv scores.csv --dry-run\nExample: pbl study import study.xlsx",
+    epilog="\b\nExample: pbl study import --template visits.xlsx\n"
+    "Example: pbl study import visits.csv scores.csv --dry-run\nExample: pbl study import study.xlsx",
 )
-@click.argument("sheets", nargs=-1, required=True, type=click.Path(path_type=Path, readable=False))
+@click.argument("sheets", nargs=-1, type=click.Path(path_type=Path, readable=False))
+@click.option(
+    "--template",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write an empty sheet (.csv, .xlsx) of visits with all its columns and scores; nothing else is done.",
+)
 @click.option("--dry-run", is_flag=True, help="Change nothing; say row by row what would happen.")
 @click.option("--distinct-codes", is_flag=True, help="Codes such as P1 and P001 are different people.")
-def import_(sheets: tuple[Path, ...], dry_run: bool, distinct_codes: bool) -> None:
+def import_(sheets: tuple[Path, ...], template: Path | None, dry_run: bool, distinct_codes: bool) -> None:
     """Visits, clinical scores, cohorts, and activity and pace of videos from SHEETS (.csv, .xlsx).
 
     docs/files.md lists the columns. Rows that are stored already change nothing. Either all rows of all sheets are
     imported or none: exit code 1 where one is refused.
     """
     import schemas
-    from schemas.studies.study_sheets import import_sheets
+    from schemas import study
+    from schemas.intake.sheets import write_template
+    from schemas.studies.study_sheets import COLUMNS, import_sheets
 
+    if not sheets and template is None:
+        raise click.UsageError("Missing argument 'SHEETS...' (or --template FILE).")
     schemas.activate()
+    if template is not None:
+        instruments = map(str, study.ClinicalInstrument().to_arrays("instrument"))
+        write_template(template, (*COLUMNS, *instruments))
+        click.echo(f"written: {template}; remove the columns that you do not need (docs/files.md)")
+        return
     found = import_sheets(sheets, dry_run, distinct_codes)
     changed = [line for line in found.lines if line.changes]
     for line in changed:
@@ -110,6 +126,44 @@ def export(name: str, out: Path, key: Path | None, keep_codes: bool, no_curves: 
             _write_key(key, frame_to_csv(codes))
     paths = write_study(data, out)
     click.echo(f"{data.n_subjects} persons, {data.n_visits} visits: {len(paths)} files in {out}")
+
+
+@click.group()
+def instrument() -> None:
+    """Clinical scores of your own, beside those that ship."""
+
+
+@instrument.command(
+    epilog="Example: pbl study instrument add FAC --title 'Functional Ambulation Categories' --unit points --low 0 "
+    "--high 5 --better higher --ordinal"
+)
+@click.argument("name")
+@click.option("--title", required=True, metavar="TEXT", help="Full name.")
+@click.option("--unit", required=True, metavar="UNIT", help="Of its values; an ordinal score in points is whole.")
+@click.option("--low", default="", metavar="VALUE", help="A lower value is refused.")
+@click.option("--high", default="", metavar="VALUE", help="A higher value is refused.")
+@click.option("--source", default="", metavar="TEXT", help="Source of the scale.")
+@click.option("--better", type=click.Choice(["higher", "lower"]), required=True, help="Which values are better.")
+@click.option("--ordinal", is_flag=True, help="Its values are ranks.")
+@click.option("--minimal-change", default="", metavar="VALUE", help="Minimal important change.")
+@click.option("--change-source", default="", metavar="TEXT", help="Who found the minimal important change, in whom.")
+def add(name: str, better: str, ordinal: bool, **stated: str) -> None:
+    """Add the instrument NAME, which is then a column of sheets and a field of the web page."""
+    import getpass
+
+    import schemas
+    from schemas.studies.own_instruments import add_instrument
+
+    columns = {"title": "instrument_name", "change_source": "minimal_change_source", "minimal_change": "minimal_change"}
+    values = {columns.get(option, f"instrument_{option}"): text for option, text in stated.items()}
+    values |= {"higher_is_better": "yes" if better == "higher" else "no", "ordinal": "yes" if ordinal else "no"}
+    schemas.activate()
+    errors = add_instrument({"instrument": name, **values}, getpass.getuser())
+    for error in errors.values():
+        click.echo(error.text(), err=True)
+    if errors:
+        raise click.exceptions.Exit(1)
+    click.echo(f"{name}: added")
 
 
 def load_slice(name: str, curves: bool = True) -> StudyData:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.progress import track
+from pbl_pipeline.video import recorded_utc
 
 from .. import lab, session
 from ..rows import inside
@@ -60,11 +65,15 @@ def ingest_sheet(sheet: Path, methods: Methods | None = None, dry_run: bool = Fa
     new: list[tuple[Row, Line, OneCamera]] = []
     seen: dict[str, str] = {}
     for row, line, visit in track(list(zip(rows, lines, visits, strict=True)), "reading", unit="file"):
-        if visit is None or line.errors:
+        if "file" not in row.cells:
             continue
-        with line.about():
-            one = _recording(row, visit, sheet.absolute().parent)
+        with line.about():  # the file also of a row that is refused: all that is wrong is found at once
+            one = _recording(row, visit or _blank(row, sheet.absolute().parent), sheet.absolute().parent)
             one.read()
+            if visit is None or line.errors:
+                one.complete(chosen)
+                continue
+            _check_day(one, line)
             sha256, file = one.files[0].sha256, row.cells["file"]
             if (first := seen.setdefault(sha256, row.where)) != row.where:
                 raise conflict(f"the same bytes as in {first}", "each recording once", "remove one of the rows")
@@ -96,42 +105,66 @@ def _rows(path: Path) -> list[Row]:
                 f"{', '.join(NEEDED)}, and any of {', '.join(COLUMNS[len(NEEDED) :])}",
                 "rename or remove columns; clinical scores and roles of visits go into a sheet of `pbl study import`",
             )
-        rows += [Row(row.where, {names[c]: text for c, text in row.cells.items()}) for row in sheet.rows]
+        rows += [replace(row, cells={names[c]: text for c, text in row.cells.items()}) for row in sheet.rows]
     if not rows:
         raise refused(str(path), "no rows", "a row for each video", "write them below the header")
     return rows
 
 
 def _visit(row: Row, line: Line, folder: Path) -> VisitRecord | None:
-    """Return the visit that a row states; None where it is refused."""
+    """Return the visit that a row states; None where it is refused, with an error for each cell that is wrong."""
+    if row.error is not None:
+        line.errors.append(row.error)
+        return None
+    visit = _blank(row, folder)
+    for column in dict.fromkeys((*NEEDED, *row.cells)):
+        with line.about():
+            text = needed(row, column)
+            if column not in ("file", "camera", "attitude"):
+                field = "session_label" if column == "visit" else column
+                replace(_blank(row, folder), **{field: (value := _value(row, column, text))}).check()
+                visit = replace(visit, **{field: value})
+    if line.errors:
+        return None
     with line.about():
-        needed(row, "file")
-        cells = row.cells
-        motion, person = cells.get("camera_motion"), cells.get("person")
-        if motion is not None and motion not in CAMERA_MOTIONS:
-            raise refused(row.where, f"camera_motion {motion!r}", f"one of {', '.join(CAMERA_MOTIONS)}", "correct it")
-        if person is not None and not (person.isdecimal() and 1 <= int(person) < 1000):
-            raise refused(row.where, f"person {person!r}", "the number of a person, from 1", "correct it")
-        visit = VisitRecord(
-            subject=needed(row, "subject"),
-            session_label=needed(row, "visit"),
-            project=cells.get("project"),
-            camera_file=folder / cells["camera"] if "camera" in cells else None,
-            camera_motion=motion,
-            activity=cells.get("activity"),
-            person=None if person is None else int(person),
-            population=cells.get("population"),
-            pace=cells.get("pace"),
-            height_m=number_of(row, "height_m", cells["height_m"]) if "height_m" in cells else None,
-            date=date_of(row, "date") if "date" in cells else None,
-        )
-        visit.check()
         day = day_of(visit.session_label)
         if visit.date is not None and day not in (None, visit.date):
             found = f"date {visit.date} of the visit {visit.session_label}"
             raise conflict(found, f"{day}, which its label says", "correct one of them")
         return visit
     return None
+
+
+def _blank(row: Row, folder: Path) -> VisitRecord:
+    """A placeholder visit with the calibration that a row names."""
+    return VisitRecord("X", camera_file=folder / row.cells["camera"] if "camera" in row.cells else None)
+
+
+def _value(row: Row, column: str, text: str) -> Any:
+    """Return the value of a cell. Raises `PblError` SHEET_FORMAT."""
+    if column == "camera_motion" and text not in CAMERA_MOTIONS:
+        raise refused(row.where, f"camera_motion {text!r}", f"one of {', '.join(CAMERA_MOTIONS)}", "correct it")
+    if column == "person":
+        if not (text.isdecimal() and 1 <= int(text) < 1000):
+            raise refused(row.where, f"person {text!r}", "the number of a person, from 1", "correct it")
+        return int(text)
+    if column == "height_m":
+        return number_of(row, column, text)
+    return date_of(row, column) if column == "date" else text
+
+
+def _check_day(one: OneCamera, line: Line) -> None:
+    """Note a doubt where the file was recorded on another day than its visit, in every time zone."""
+    visit = one.visit
+    day = visit.date or day_of(visit.session_label)
+    try:
+        said = recorded_utc(one.files[0].path) if day else None
+    except PblError:  # what is wrong with the video stands in the table of the stage that meets it
+        return
+    if day and said:
+        at = datetime.datetime.fromisoformat(said)
+        if not (at - datetime.timedelta(hours=12)).date() <= day <= (at + datetime.timedelta(hours=14)).date():
+            line.doubts.append(f"{one.files[0].path.name} says that it was recorded on {at.date()}, its visit is {day}")
 
 
 def _check_people(visits: Sequence[VisitRecord | None], lines: Sequence[Line]) -> None:

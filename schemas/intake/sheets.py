@@ -10,7 +10,7 @@ import io
 import math
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ class Row:
 
     where: str  # for errors
     cells: dict[str, str]  # those that are not empty, by column
+    error: PblError | None = None  # of the row as a whole
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +51,7 @@ class Line:
     where: str
     changes: list[str] = dataclasses.field(default_factory=list)  # in words; none: it is stored already
     errors: list[PblError] = dataclasses.field(default_factory=list)  # why it is refused
+    doubts: list[str] = dataclasses.field(default_factory=list)  # in words; the row is not refused for them
     kept: str = ""  # what is stored already, in words
 
     @contextlib.contextmanager
@@ -83,8 +85,8 @@ def read_sheets(path: Path) -> list[Sheet]:
     Raises
     ------
     PblError
-        FILE_MISSING; SHEET_FORMAT: no header, a column twice or without a name, cells beside the header's columns,
-        merged cells, formulas, error values, no such file format.
+        FILE_MISSING; SHEET_FORMAT: no header, a column twice or without a name, merged cells, formulas, error values,
+        no such file format. Cells beside the header's columns are an error of their row.
     """
     if not path.is_file():
         raise PblError(
@@ -137,15 +139,17 @@ def needed(row: Row, column: str) -> str:
 
 
 def date_of(row: Row, column: str) -> datetime.date:
-    """The day in a cell. Raises `PblError` SHEET_FORMAT for what is not written YYYY-MM-DD."""
+    """The day in a cell. Raises `PblError` SHEET_FORMAT for what is written neither YYYY-MM-DD nor D.M.YYYY."""
     text = row.cells[column]
+    if match := re.fullmatch(r"(\d\d?)\.(\d\d?)\.(\d{4})", text):
+        text = f"{match[3]}-{int(match[2]):02}-{int(match[1]):02}"
     if re.fullmatch(r"\d{4}-\d\d-\d\d", text):
         with contextlib.suppress(ValueError):
             return datetime.date.fromisoformat(text)
     raise refused(
         row.where,
-        f"{column} {text!r}",
-        "a day as YYYY-MM-DD, such as 2026-03-09, or a date cell of a workbook",
+        f"{column} {row.cells[column]!r}",
+        "a day as YYYY-MM-DD, such as 2026-03-09, or as 9.3.2026, or a date cell of a workbook",
         "write it so: 03/09 is another day in other countries",
     )
 
@@ -153,9 +157,39 @@ def date_of(row: Row, column: str) -> datetime.date:
 def number_of(row: Row, column: str, text: str) -> float:
     """The number that `text`, the cell of a row in a column, is. Raises `PblError` SHEET_FORMAT for what is none."""
     with contextlib.suppress(ValueError):
-        if math.isfinite(value := float(text)) and "_" not in text:
+        if math.isfinite(value := float(with_point(text))) and "_" not in text:
             return value
-    raise refused(row.where, f"{column} {text!r}", "a number with a decimal point", "correct it, or leave it empty")
+    expected = "a number with a decimal point, or with a comma that cannot divide thousands"
+    raise refused(row.where, f"{column} {text!r}", expected, "correct it, or leave it empty")
+
+
+def with_point(text: str) -> str:
+    """Return a number with a decimal comma with a point; as it is where the comma could divide thousands (1,234)."""
+    decimal = re.fullmatch(r"[+-]?\d+,\d+", text) and not re.fullmatch(r"[+-]?[1-9]\d{0,2},\d{3}", text)
+    return text.replace(",", ".") if decimal else text
+
+
+def write_template(path: Path, columns: Sequence[str]) -> None:
+    """Write an empty sheet (.csv or .xlsx) with these columns. Raises `PblError` FILE_UNWRITABLE, also for a file that
+    exists."""
+    try:
+        with path.open("xb") as out:
+            if path.suffix.lower() == ".xlsx":
+                from openpyxl import Workbook
+
+                book = Workbook()
+                book.worksheets[0].append(list(columns))
+                book.save(out)
+            else:
+                out.write((",".join(columns) + "\n").encode())
+    except OSError as error:
+        raise PblError(
+            "FILE_UNWRITABLE",
+            found=error.strerror or str(error),
+            expected="a file, .csv or .xlsx, that does not exist yet",
+            next_step="pass another path",
+            key=path,
+        ) from error
 
 
 def _csv(path: Path) -> list[list[str]]:
@@ -192,8 +226,9 @@ def _sheet(name: str, lines: list[list[str]]) -> Sheet | None:
     rows = []
     for number, line in numbered[1:]:
         where = f"{name}, row {number}"
+        error = None
         if any(line[len(header) :]):
             found = f"{len(line)} cells under {len(header)} columns"
-            raise refused(where, found, "no cell beside the columns", "remove them, or quote a text with commas")
-        rows.append(Row(where, {c: v for c, v in zip(header, line, strict=False) if v}))
+            error = refused(where, found, "no cell beside the columns", "remove them, or quote a text with commas")
+        rows.append(Row(where, {c: v for c, v in zip(header, line, strict=False) if v}, error))
     return Sheet(name, tuple(header), tuple(rows))

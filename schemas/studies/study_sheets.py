@@ -15,6 +15,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 
 from .. import lab, session, study, video
+from ..instruments import disagreement
 from ..intake.conditions import set_condition
 from ..intake.records import VisitRecord
 from ..intake.sheets import (
@@ -54,7 +55,15 @@ SCORE_COLUMNS = ("subject", "visit", "instrument", "value")
 TRIAL_COLUMNS = ("video", "subject", "visit", "activity", "pace")
 #: A cell that removes what is stored; an empty one leaves it.
 CLEAR = "-"
-_LONGEST = {"note": 1000, "reason": 255, "intervention": 64, "assistive_device": 64, "orthosis": 64}
+_LONGEST = {
+    "visit": 64,
+    "record": 255,
+    "note": 1000,
+    "reason": 255,
+    "intervention": 64,
+    "assistive_device": 64,
+    "orthosis": 64,
+}
 _YES, _NO = ("yes", "true", "1", "in"), ("no", "false", "0", "out")
 
 
@@ -117,6 +126,7 @@ class _Plan:
         if not distinct_codes:
             self._check_codes()
         self._check_times()
+        self._check_scores()
         self._compare()
 
     # ------------------------------------------------------------------------------------------------------- reading
@@ -124,6 +134,7 @@ class _Plan:
         return self.lines.setdefault(row.where, Line(row.where))
 
     def _read(self, sheet: Sheet) -> None:
+        """Read the rows of a sheet; unknown columns and wrong cells are errors, and the rest is read all the same."""
         names = {name: column for column, name in sheet.plain_names().items()}
         kind = TRIAL_COLUMNS if "video" in names else SCORE_COLUMNS if "instrument" in names else COLUMNS
         known = {names[c]: c for c in kind if c in names}
@@ -131,30 +142,65 @@ class _Plan:
         unknown = [c for c in sheet.columns if c not in known and c not in wide]
         if unknown:
             scores = f"; or a clinical score: {', '.join(self.instruments)}" if kind is COLUMNS else ""
-            raise refused(
+            error = refused(
                 sheet.name,
                 f"unknown column {', '.join(map(repr, unknown[:5]))}",
                 f"columns of {', '.join(kind)}{scores}",
-                "rename or remove it; a score of your own is a row of ClinicalInstrument first",
+                "rename or remove it; a score of your own first: pbl study instrument add",
             )
+            self.lines[sheet.name] = Line(sheet.name, errors=[error])
         read = {TRIAL_COLUMNS: self._trial, SCORE_COLUMNS: self._long_score, COLUMNS: self._visit}[kind]
         for row in sheet.rows:
-            cells = {known.get(c, c): v for c, v in row.cells.items()}
-            with self._line(row).about():
-                read(Row(row.where, cells))
+            line = self._line(row)
+            if row.error is not None:
+                line.errors.append(row.error)
+                continue
+            cells = {known.get(c, c): v for c, v in row.cells.items() if c not in unknown}
+            wrong = self._wrong_cells(Row(row.where, cells), line, kind)
+            if wrong and (kind is not COLUMNS or wrong & {"subject", "visit", "cohort"}):
+                continue
+            with line.about():
+                read(Row(row.where, {c: v for c, v in cells.items() if c not in wrong}))
+
+    def _wrong_cells(self, row: Row, line: Line, kind: tuple[str, ...]) -> set[str]:
+        """Return the columns of a row whose cells are wrong by themselves, or empty and needed; each is an error."""
+        wrong = set()
+        for column in dict.fromkeys((*(SCORE_COLUMNS if kind is SCORE_COLUMNS else ()), *row.cells)):
+            before = len(line.errors)
+            with line.about():
+                self._check_cell(row, column, needed(row, column), kind)
+            if len(line.errors) > before:
+                wrong.add(column)
+        return wrong
+
+    def _check_cell(self, row: Row, column: str, text: str, kind: tuple[str, ...]) -> None:
+        if kind is TRIAL_COLUMNS or column == "instrument":
+            return
+        if column == "subject":
+            check_subject(text, "write the code of the person")
+        elif column == "value":
+            if (name := row.cells.get("instrument", "")) in self.instruments:
+                self._number(row, name, text)
+        elif column in self.instruments:
+            self._number(row, column, text)
+        elif column in VISIT_COLUMNS:
+            _visit_value(row, column)
+        elif column == "included":
+            _flag(row, column)
+        elif column in _DATED:
+            _day(row, column)
+        else:
+            check_label(column, text, _LONGEST.get(column, 32))
 
     def _person(self, row: Row) -> str:
         code = needed(row, "subject")
-        check_subject(code, "write the code of the person")
         stated = self.people.setdefault(code, _Stated(row, {}))
         if population := row.cells.get("population"):
-            check_label("population", population, 32)
             check_same(stated.values.setdefault("population", population), population, "population", code)
         return code
 
     def _session(self, row: Row, code: str) -> tuple[str, str]:
         label = needed(row, "visit")
-        check_label("visit", label, 64, 1)
         stated = self.sessions.setdefault((code, label), _Stated(row, {}))
         day = day_of(label)
         if "date" in row.cells:
@@ -195,15 +241,12 @@ class _Plan:
             if len(mine) > 1:
                 raise conflict(f"{len(mine)} records of {code}", "one record for a person", "correct code or record")
         if "birth_date" in row.cells:
-            text = row.cells["birth_date"]
-            day = (
-                datetime.date(int(text), 7, 1) if re.fullmatch(r"(18|19|20)\d\d", text) else date_of(row, "birth_date")
-            )
+            day = _day(row, "birth_date")
+            text = str(day.year) if len(row.cells["birth_date"]) == 4 else day.isoformat()
             check_same(self.births.setdefault(code, (text, day))[0], text, "birth date", code)
 
     def _member(self, row: Row, code: str) -> None:
         cohort = needed(row, "cohort")
-        check_label("cohort", cohort, 32, 1)
         stated = self.members.setdefault((cohort, code), _Stated(row, {}))
         for column, name in MEMBER_COLUMNS.items():
             if column not in row.cells:
@@ -211,8 +254,6 @@ class _Plan:
             value: Any = row.cells[column]
             if column == "included":
                 value = _flag(row, column)
-            else:
-                check_label(column, value, _LONGEST.get(column, 32))
             check_same(stated.values.setdefault(name, value), value, f"{column} in {cohort}", code)
 
     def _long_score(self, row: Row) -> None:
@@ -225,11 +266,9 @@ class _Plan:
                 row.where,
                 f"instrument {name!r}",
                 f"one of {', '.join(self.instruments)}",
-                "correct the name, or insert your own into ClinicalInstrument first",
+                "correct the name, or add your own first: pbl study instrument add",
             )
-        value: float | str = CLEAR
-        if text != CLEAR:
-            study.check_score(value := number_of(row, name, text), self.instruments[name], row.where)
+        value = self._number(row, name, text)
         if (other := self.scores.get((*key, name))) is not None:
             raise conflict(
                 f"{name} of {key[0]}, {key[1]} also in {other.row.where}",
@@ -237,6 +276,13 @@ class _Plan:
                 "remove one, or correct the label of its visit",
             )
         self.scores[(*key, name)] = _Stated(row, {"score_value": value})
+
+    def _number(self, row: Row, name: str, text: str) -> float | str:
+        """The value of a score, which its instrument allows; CLEAR as it is."""
+        if text != CLEAR:
+            study.check_score(value := number_of(row, name, text), self.instruments[name], row.where)
+            return value
+        return CLEAR
 
     def _trial(self, row: Row) -> None:
         values = {k: row.cells[k] for k in ("activity", "pace") if k in row.cells}
@@ -284,7 +330,9 @@ class _Plan:
             with self._line(stated.row).about():
                 self._age(key)
         for key, stated in self.visits.items():
-            with self._line(stated.row).about():
+            with self._line(stated.row).about() as line:
+                if line.errors:  # the role may be what is wrong
+                    continue
                 visits = by_person[key[0]]
                 self._days(key, stated, visits[key[1]])
                 self._order(key, visits)
@@ -346,6 +394,20 @@ class _Plan:
                 "roles in the order of their dates",
                 "correct role or date",
             )
+
+    def _check_scores(self) -> None:
+        """Refuse scores that contradict others of the visit: a total against its parts, a speed against its time."""
+        by_visit: dict[tuple[str, str], dict[str, float]] = defaultdict(dict)
+        for (code, label, name), row in self.stored_scores.items():
+            by_visit[code, label][name] = row["score_value"]
+        for (code, label, name), stated in self.scores.items():
+            by_visit[code, label][name] = stated.values["score_value"]
+        for key in dict.fromkeys(k[:2] for k in self.scores):
+            wrong = disagreement({n: v for n, v in by_visit[key].items() if v != CLEAR})
+            stated = [self.scores[(*key, n)] for n in wrong[0] if (*key, n) in self.scores] if wrong else []
+            if wrong and stated:
+                with self._line(stated[0].row).about():
+                    raise conflict(f"{wrong[1]} of {', '.join(key)}", wrong[2], "correct the score that is wrong")
 
     # ------------------------------------------------------------------------------------------------------ comparison
     def _compare(self) -> None:
@@ -433,6 +495,14 @@ def _column(key: Any, column: str) -> str:
 
 def _default(column: str) -> Any:
     return None if column in ("visit_days", "visit_age", "intervention_date", "score_value") else ""
+
+
+def _day(row: Row, column: str) -> datetime.date:
+    """The day in a cell; of a birth date that is only a year its middle."""
+    text = row.cells[column]
+    if column == "birth_date" and re.fullmatch(r"(18|19|20)\d\d", text):
+        return datetime.date(int(text), 7, 1)
+    return date_of(row, column)
 
 
 def _flag(row: Row, column: str) -> bool:

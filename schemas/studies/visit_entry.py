@@ -15,7 +15,7 @@ from pbl_pipeline.errors import PblError
 
 from .. import session, study
 from ..decisions.review_decisions import decisions, record
-from ..intake.sheets import Row, Sheet, refused
+from ..intake.sheets import Row, Sheet, refused, with_point
 from ..transactions import in_transaction
 from .study_sheets import CLEAR, SCORE_COLUMNS, import_rows
 
@@ -54,11 +54,16 @@ def entry(session_id: int) -> Entry:
     roles = (study.Visit & {"session_id": session_id}).to_arrays("visit_role")
     scores = (study.ClinicalScore & {"session_id": session_id}).to_dicts()
     stored = {r["instrument"]: f"{r['score_value']:.12g}" for r in scores}
-    instruments = {r["instrument"]: r for r in study.ClinicalInstrument().to_dicts(order_by="instrument")}
-    values = {ROLE: str(roles[0]) if len(roles) else "", **{n: stored.get(n, "") for n in instruments}}
+    known = instruments()
+    values = {ROLE: str(roles[0]) if len(roles) else "", **{n: stored.get(n, "") for n in known}}
     text = json.dumps([session_id, values], sort_keys=True)
     seen = hashlib.sha256(text.encode()).hexdigest()[:16]
-    return Entry(session_id, rows[0]["subject"], rows[0]["session_label"], values, instruments, seen)
+    return Entry(session_id, rows[0]["subject"], rows[0]["session_label"], values, known, seen)
+
+
+def instruments() -> dict[str, dict[str, Any]]:
+    """Return the rows of ClinicalInstrument by name."""
+    return {r["instrument"]: r for r in study.ClinicalInstrument().to_dicts(order_by="instrument")}
 
 
 def enter(session_id: int, values: Mapping[str, str], by: str, seen: str, reason: str = "") -> Entered:
@@ -98,6 +103,7 @@ def _enter(session_id: int, values: Mapping[str, str], by: str, seen: str, reaso
     if now.seen != seen:
         raise _meanwhile(session_id)
     given = {name: text.strip()[:200] for name, text in values.items()}
+    given = {name: text if name == ROLE else with_point(text) for name, text in given.items()}
     changed = {name: text for name, text in given.items() if not _same(text, now.values[name])}
     errors: dict[str, PblError] = {}
     if changed.get(ROLE) == "":

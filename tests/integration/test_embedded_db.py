@@ -110,6 +110,19 @@ def test_start_and_stop_can_be_repeated(home: Path):
     assert third.pid != first.pid
 
 
+def test_after_the_demo_any_command_starts_the_server_and_after_a_stop_none(home: Path):
+    embedded.start(folder=folder(home))
+    embedded.stop(folder=folder(home), on_demand=True)
+    assert servers_of(home) == []
+    assert not embedded.status(folder(home)).running  # a look does not start it
+    done = pbl(home, "list", "subjects")
+    assert done.returncode == 0, done.stderr
+    assert len(servers_of(home)) == 1
+    embedded.stop(folder=folder(home))
+    assert "DB_NOT_RUNNING" in pbl(home, "list", "subjects").stderr
+    assert servers_of(home) == []
+
+
 def test_kill_9_loses_no_committed_row(home: Path):
     embedded.start(folder=folder(home))
     with login(home) as connection:

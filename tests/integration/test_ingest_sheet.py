@@ -5,11 +5,13 @@ from __future__ import annotations
 import datetime
 from pathlib import Path
 
+import av
 import pytest
 
 from schemas import lab, session, video
 from schemas.intake import videos
-from schemas.intake.recording_sheet import ingest_sheet
+from schemas.intake.recording_sheet import COLUMNS, ingest_sheet
+from schemas.intake.sheets import read_sheets
 from tests.command import pbl
 from tests.rows import everything
 
@@ -113,6 +115,61 @@ def test_one_bad_row_and_nothing_is_registered(tables, recordings, row, code, wo
         assert words in done.err
         assert "not registered" in done.out
     assert everything() == before
+
+
+def test_all_errors_of_all_rows_at_once(tables, recordings):
+    rows = (
+        "nobody.mp4,Anna Meier,1,03/02/2026,,,,flying,,,1.7 m",
+        "empty.mp4,P003,,,,,,,,,",
+        "three.mp4,P003,1,,,,no.toml,,,,172",
+        ",,,2.13.2026,,,,,,,",
+        "one.mp4,P004,1,,,,,,,,1,72",
+    )
+    before = everything()
+    done = pbl("ingest", "--sheet", sheet(recordings, *rows, name="bad.csv"))
+    said = [line.split(":")[0] for line in done.err.splitlines() if line.split(":")[0].replace("_", "").isupper()]
+    assert sorted(said) == sorted(
+        ["USAGE", "SHEET_FORMAT", "SHEET_FORMAT", "SHEET_FORMAT", "VIDEO_MISSING"]
+        + ["SHEET_FORMAT", "VIDEO_EMPTY"]
+        + ["FIT_INPUT", "CAMERA_INVALID"]
+        + ["SHEET_FORMAT"] * 4
+        + ["SHEET_FORMAT"]
+    )
+    assert all(f"bad.csv, row {n}" in done.err for n in range(2, 7))
+    assert "12 cells under 11 columns" in done.err
+    assert "0 videos not registered, 0 known, 5 rows refused" in done.out
+    assert everything() == before
+
+
+def test_days_and_decimals_in_the_german_form(tables, recordings):
+    path = sheet(recordings, "one.mp4;P001;1;9.3.2026;1,72", header="file;subject;visit;date;height_m", name="de.csv")
+    assert pbl("ingest", "--sheet", path).code == 0
+    assert session.Session().fetch1("session_date") == datetime.date(2026, 3, 9)
+    assert lab.Subject().fetch1("subject_height") == 1.72
+
+
+def test_the_files_own_day_against_the_visits(tables, recordings):
+    video_file = recordings / "dated.mp4"
+    with av.open(str(recordings / "one.mp4")) as old, av.open(str(video_file), "w") as new:
+        new.metadata["creation_time"] = "2026-03-09T20:00:00Z"
+        stream = new.add_stream_from_template(old.streams.video[0])
+        for packet in old.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                new.mux(packet)
+    for day, doubted in (("2026-03-09", False), ("2026-03-10", False), ("2026-03-08", True), ("2025-03-09", True)):
+        path = sheet(recordings, f"dated.mp4,P001,{day}", header="file,subject,visit", name="days.csv")
+        done = pbl("ingest", "--sheet", path, "--dry-run")
+        assert done.code == 0, done.err
+        assert ("dated.mp4 says that it was recorded on 2026-03-09" in done.err) == doubted
+
+
+def test_the_template_is_a_sheet(tmp_path):
+    for name in ("new.csv", "new.xlsx"):
+        assert pbl("ingest", "--template", tmp_path / name).code == 0
+        (made,) = read_sheets(tmp_path / name)
+        assert made.columns == COLUMNS
+        assert pbl("ingest", "--template", tmp_path / name).error_code == "FILE_UNWRITABLE"
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,12 @@ HEAD = "subject,visit,date,role,intervention_date,birth_date,record,mJOA\n"
         ("P001,a,2026-01-01,pre,,2026-05-01,,\n", "SHEET_CONFLICT", "before the birth"),
         ("P001,a,1950-01-01,pre,,1960,,\n", "SHEET_CONFLICT", "before the birth"),
         ("P001,a,2026-01-01,pre,,,,19\n", "SCORE_RANGE", "at most 18"),
-        ('P001,a,2026-01-01,pre,,,,"12,5"\n', "SHEET_FORMAT", "decimal point"),
+        ("P001,a,2026-01-01,pre,,,,12.5\n", "SCORE_RANGE", "a whole number"),
+        ('P001,a,2026-01-01,pre,,,,"12,5"\n', "SCORE_RANGE", "a whole number"),
+        ('P001,a,2026-01-01,pre,,,,"1,234"\n', "SHEET_FORMAT", "decimal point"),
+        ("P001,a,9.13.2026,pre,,,,\n", "SHEET_FORMAT", "'9.13.2026'"),
+        ("P001,a,9.3.26,pre,,,,\n", "SHEET_FORMAT", "YYYY-MM-DD"),
+        ("P001,a,2026-01-01,pre,,,,12,5\n", "SHEET_FORMAT", "quote a text with commas"),
         ("P001,a,2026-01-01,pre,,,,\nP001,a,2026-01-01,pre,,,,\n", "SHEET_CONFLICT", "also in visits.csv, row 2"),
         ("P001,a,2026-05-01,pre,,,,\nP001,b,2026-01-01,6_weeks,,,,\n", "SHEET_CONFLICT", "order of their dates"),
         ("P001,a,2026-05-01,pre,2026-04-01,,,\n", "SHEET_CONFLICT", "before the intervention"),
@@ -214,7 +219,6 @@ def test_workbooks_that_hide_values(tmp_path: Path, change, words: str):
     [
         ("a.csv", b"subject,visit,subject\n", "twice"),
         ("a.csv", b"subject,,visit\nP,1,2\n", "without a name"),
-        ("a.csv", b"subject,visit\nP001,a,b\n", "3 cells under 2 columns"),
         ("a.csv", b"subject,visit\n\xff\xfe\n", "UTF-8"),
         ("a.csv", b'subject,visit\n"P001,a\n', "CSV"),
         ("a.xlsx", b"subject,visit\n", "zip"),
@@ -229,11 +233,81 @@ def test_files_that_are_no_sheet(tmp_path: Path, name: str, content: bytes, word
 
 
 def test_columns_that_are_unknown(empty: None, tmp_path: Path):
-    with pytest.raises(PblError, match="SHEET_FORMAT") as error:
-        run(sheet(tmp_path, "subject,visit,mJOAA\nP001,a,3\n"))
-    assert "'mJOAA'" in error.value.found
+    found = run(sheet(tmp_path, "subject,visit,mJOAA,mJOA\nP001,a,3,44\n"))
+    assert [e.code for e in found.errors] == ["SHEET_FORMAT", "SCORE_RANGE"]
+    assert "'mJOAA'" in found.errors[0].found
+    assert not found.done
     with pytest.raises(PblError, match="FILE_MISSING"):
         run(tmp_path / "absent.csv")
+
+
+def test_all_errors_of_all_rows_at_once(empty: None, tmp_path: Path):
+    wrong = "Ann Smith,a,03/04/2026,Pre Op,30.2.2026,1950-13-01,,44\nP002,,,pre,,,,\nP003,a,,pre,,,,x\n"
+    found = run(
+        sheet(tmp_path, HEAD + wrong), sheet(tmp_path, "subject,visit,instrument,value\n,,,\n,,TUG,0\n", "b.csv")
+    )
+    assert not found.done
+    said = {(str(e.key).split(":")[0], e.code, e.found.split(" ")[0]) for e in found.errors}
+    first = "visits.csv, row 2"
+    assert said == {
+        (first, "USAGE", "subject"),
+        *((first, "SHEET_FORMAT", column) for column in ("date", "role", "intervention_date", "birth_date")),
+        (first, "SCORE_RANGE", "mJOA"),
+        ("visits.csv, row 3", "SHEET_FORMAT", "no"),
+        ("visits.csv, row 4", "SHEET_FORMAT", "mJOA"),
+        ("b.csv, row 3", "SHEET_FORMAT", "no"),
+        ("b.csv, row 3", "SCORE_RANGE", "TUG"),
+    }
+    assert [e.found for e in found.errors if str(e.key).startswith("b.csv")][:2] == ["no subject", "no visit"]
+    assert not len(lab.Subject())
+
+
+def test_days_and_decimals_in_the_german_form(empty: None, tmp_path: Path):
+    text = "subject;visit;date;role;birth_date;TUG\nP001;a;9.3.2026;pre;01.05.1950;9,25\n"
+    text += "P001;b;2026-06-01;6_weeks;1950-05-01;-\n"
+    done = run(sheet(tmp_path, text))
+    assert done.done, done.errors
+    assert stored()["P001", "a"]["session_date"] == datetime.date(2026, 3, 9)
+    assert study.ClinicalScore().to_arrays("score_value").tolist() == [9.25]
+    assert not any(line.changes for line in run(sheet(tmp_path, text)).lines)
+
+
+@pytest.mark.parametrize(
+    ("scores", "words"),
+    [
+        ({"mJOA": 12, "mJOA-UE": 3, "mJOA-LE": 5, "mJOA-S": 2, "mJOA-B": 3}, "mJOA 13, the sum of its parts"),
+        ({"mJOA": 13, "mJOA-UE": 3, "mJOA-LE": 5, "mJOA-S": 2, "mJOA-B": 3}, ""),
+        ({"mJOA": 4, "mJOA-LE": 5}, "mJOA 5 to 16"),
+        ({"mJOA": 16, "mJOA-LE": 5}, ""),
+        ({"10MWT_s": 8, "10MWT_m_per_s": 1}, "1.25 m/s, or 0.75"),
+        ({"10MWT_s": 8, "10MWT_m_per_s": 1.25}, ""),
+        ({"10MWT_s": 8, "10MWT_m_per_s": 0.75}, ""),
+    ],
+)
+def test_scores_that_contradict_each_other(empty: None, tmp_path: Path, scores: dict[str, float], words: str):
+    """In one sheet, and the last of them against those that are stored."""
+    head = "subject,visit,instrument,value\n"
+    rows = [f"P001,a,{name},{value}\n" for name, value in scores.items()]
+    together = run(sheet(tmp_path, head + "".join(rows)), dry_run=True)
+    assert run(sheet(tmp_path, head + "".join(rows[:-1]))).done
+    later = run(sheet(tmp_path, head + rows[-1]))
+    for found in (together, later):
+        assert [e.code for e in found.errors] == (["SHEET_CONFLICT"] if words else [])
+        assert words in "".join(e.expected for e in found.errors)
+    assert later.done == (not words)
+
+
+def test_the_template_is_a_sheet(empty: None, tmp_path: Path):
+    for name in ("new.csv", "new.xlsx"):
+        path = tmp_path / name
+        assert CliRunner().invoke(import_, ["--template", str(path)]).exit_code == 0
+        (made,) = sheets.read_sheets(path)
+        assert set(made.columns) == {*study_sheets.COLUMNS, *study.ClinicalInstrument().to_arrays("instrument")}
+        assert run(path).done
+        again = CliRunner().invoke(import_, ["--template", str(path)])
+        assert isinstance(again.exception, PblError)
+        assert again.exception.code == "FILE_UNWRITABLE"
+    assert CliRunner().invoke(import_, []).exit_code == 2
 
 
 def test_the_command_says_row_by_row(empty: None, tmp_path: Path):

@@ -14,7 +14,7 @@ import pytest
 import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.study import classes_of, minimal_change_at
-from schemas import lab, session, study
+from schemas import lab, methods, session, study
 from schemas.operations import forget
 from schemas.rows import utc_now
 from tests.rows import remove_all
@@ -81,15 +81,15 @@ def test_mistakes_of_the_call_are_datajoints_own_errors(two_people: None):
 
 
 def test_an_instrument_of_ones_own(two_people: None):
-    own = {"instrument": "NDI", "instrument_name": "Neck Disability Index", "instrument_unit": "percent"}
+    own = {"instrument": "own", "instrument_name": "a scale", "instrument_unit": "percent"}
     try:
         study.ClinicalInstrument.insert1({**own, "instrument_low": 0, "higher_is_better": False, "ordinal": True})
-        study.ClinicalScore.insert1({"session_id": 1, "instrument": "NDI", "score_value": 1e6})
+        study.ClinicalScore.insert1({"session_id": 1, "instrument": "own", "score_value": 1e6})
         with pytest.raises(PblError, match="at least 0 percent"):
-            study.ClinicalScore.insert1({"session_id": 2, "instrument": "NDI", "score_value": -1})
+            study.ClinicalScore.insert1({"session_id": 2, "instrument": "own", "score_value": -1})
     finally:
-        (study.ClinicalScore & {"instrument": "NDI"}).delete(prompt=False)
-        (study.ClinicalInstrument & {"instrument": "NDI"}).delete(prompt=False)
+        (study.ClinicalScore & {"instrument": "own"}).delete(prompt=False)
+        (study.ClinicalInstrument & {"instrument": "own"}).delete(prompt=False)
 
 
 def test_the_instruments_that_ship():
@@ -97,6 +97,31 @@ def test_the_instruments_that_ship():
         assert row["instrument_low"] < row["instrument_high"]
         assert bool(row["minimal_change"]) == bool(row["minimal_change_source"]), row["instrument"]
         assert all(len(row[k]) <= 255 for k in ("instrument_source", "minimal_change_source", "instrument_classes"))
+
+
+def test_new_shipped_instruments_come_beside_those_of_ones_own(two_people: None):
+    """DataJoint inserts contents only where they are more than the rows."""
+    shipped = study.ClinicalInstrument.contents
+    (study.ClinicalInstrument & {"instrument": "NDI"}).delete(prompt=False)
+    own = {**shipped[0], "instrument": "own"}
+    study.ClinicalInstrument.insert1(own)
+    methods.insert_all()
+    assert set(study.ClinicalInstrument().to_arrays("instrument")) == {"own", *(r["instrument"] for r in shipped)}
+    (study.ClinicalInstrument & {"instrument": "own"}).delete(prompt=False)
+
+
+def test_disability_and_quality_of_life_are_those_of_their_sources():
+    """Fairbank & Pynsent 2000: 21 % is moderate, 41 % severe; Vernon & Mior 1991: 35 of 50 complete; Ostelo 2008."""
+    shipped = {row["instrument"]: row for row in study.ClinicalInstrument.contents}
+    odi, ndi = shipped["ODI"], shipped["NDI"]
+    assert [c.split()[0] for c in odi["instrument_classes"].split("; ")] == ["0", "21", "41", "61", "81"]
+    assert [c.split()[0] for c in ndi["instrument_classes"].split("; ")] == ["0", "5", "15", "25", "35"]
+    assert (odi["minimal_change"], shipped["VAS"]["minimal_change"], odi["instrument_high"]) == (10, 15, 100)
+    for name, value in (("ODI", 22.2), ("VAS", 47.5), ("EQ-5D-5L", -0.661), ("EQ-VAS", 80), ("NDI", 50)):
+        study.check_score(value, shipped[name])
+    for name, value in (("NDI", 12.5), ("EQ-5D-5L", 1.1), ("EQ-VAS", 80.5), ("mRS", 2.5), ("ODI", 101)):
+        with pytest.raises(PblError, match="SCORE_RANGE"):
+            study.check_score(value, shipped[name])
 
 
 def test_instruments_are_those_of_the_paper_and_of_their_sources():

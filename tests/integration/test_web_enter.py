@@ -6,8 +6,10 @@ import re
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 
 from schemas import lab, session, study
+from schemas.cli.study import instrument
 from schemas.review import Decision
 from schemas.rows import utc_now
 from schemas.studies.visit_entry import enter, entry
@@ -40,21 +42,21 @@ def score(number: int, name: str) -> float | None:
 
 def test_each_change_is_a_row_with_what_was_before(two_visits: None):
     browser = web.client(name="A. First")
-    answer = send(browser, 1, mJOA="13.5", BBS="44", role="baseline", reason="read from the <i>chart")
+    answer = send(browser, 1, mJOA="13", TUG="9,5", BBS="44", role="baseline", reason="read from the <i>chart")
     assert (answer.status_code, answer.headers["location"]) == (303, "/visits/1#entered")
-    assert (score(1, "mJOA"), score(1, "BBS")) == (13.5, 44)
+    assert (score(1, "mJOA"), score(1, "BBS"), score(1, "TUG")) == (13, 44, 9.5)
     assert (study.Visit & {"session_id": 1}).fetch1("visit_role", "visit_note") == ("baseline", "uses a cane")
     rows = {(r["decision_what"], r["decision_about"].get("instrument")): r for r in Decision().to_dicts()}
     told = {k: (r["decision_before"]["value"], r["decision_after"]["value"]) for k, r in rows.items()}
-    expected = {("score", "mJOA"): (12.0, 13.5), ("score", "BBS"): (None, 44.0), ("role", None): ("pre", "baseline")}
-    assert told == expected
+    scores = {"mJOA": (12.0, 13.0), "BBS": (None, 44.0), "TUG": (None, 9.5)}
+    assert told == {**{("score", n): v for n, v in scores.items()}, ("role", None): ("pre", "baseline")}
     assert {(r["decision_by"], r["session_id"]) for r in rows.values()} == {("A. First", 1)}
     page = browser.get("/visits/1").text
     assert "clinical score mJOA: read from the &lt;i&gt;chart" in page
-    assert re.search(r"mJOA 13\.5 <span[^>]*>points", page)
+    assert re.search(r"TUG 9\.5 <span[^>]*>s<", page)
     # What is as it was changes nothing; an empty field removes.
-    assert send(browser, 1, mJOA="13.50", BBS="", role="baseline").status_code == 303
-    assert (score(1, "BBS"), len(Decision())) == (None, 4)
+    assert send(browser, 1, mJOA="13.0", TUG="9,50", BBS="", role="baseline").status_code == 303
+    assert (score(1, "BBS"), len(Decision())) == (None, 5)
 
 
 @pytest.mark.parametrize(
@@ -63,7 +65,10 @@ def test_each_change_is_a_row_with_what_was_before(two_visits: None):
         ({"mJOA": "19"}, "SCORE_RANGE", "at least 0 and at most 18"),
         ({"mJOA": "-1"}, "SCORE_RANGE", "at least 0"),
         ({"mJOA": "nan"}, "SHEET_FORMAT", "a number with a decimal point"),
-        ({"mJOA": "12,5"}, "SHEET_FORMAT", "a number with a decimal point"),
+        ({"mJOA": "12,5"}, "SCORE_RANGE", "a whole number"),
+        ({"mJOA": "12.5"}, "SCORE_RANGE", "a whole number"),
+        ({"mJOA-LE": "3", "mJOA": "2"}, "SHEET_CONFLICT", "the sum of its parts"),
+        ({"TUG": "1,234"}, "SHEET_FORMAT", "a number with a decimal point"),
         ({"mJOA": "1_2"}, "SHEET_FORMAT", "a number"),
         ({"mJOA": "<script>"}, "SHEET_FORMAT", "&lt;script&gt;"),
         ({"role": "6 Weeks"}, "SHEET_FORMAT", "small letters"),
@@ -127,6 +132,55 @@ def test_a_value_that_an_import_wrote_out_of_range_does_not_block_the_others(two
     assert enter(1, {"mJOA": "99", "BBS": "12"}, "A", entry(1).seen).changed == ("BBS",)
 
 
+OWN = {"instrument": "FAC", "instrument_name": "Functional Ambulation Categories", "instrument_unit": "points",
+       "instrument_low": "0", "instrument_high": "5", "higher_is_better": "yes", "ordinal": "yes"}  # fmt: skip
+
+
+@pytest.fixture
+def own(two_visits: None):
+    yield
+    (study.ClinicalScore & {"instrument": "FAC"}).delete(prompt=False)
+    (study.ClinicalInstrument & {"instrument": "FAC"}).delete(prompt=False)
+
+
+def test_an_instrument_of_ones_own_is_added_and_entered(own: None):
+    browser = web.client(name="A. First")
+    assert web.post(browser, "/instruments", **OWN).status_code == 303
+    assert "Functional Ambulation Categories" in browser.get("/instruments").text
+    assert send(browser, 1, FAC="2.5").status_code == 200
+    assert send(browser, 1, FAC="3").status_code == 303
+    assert score(1, "FAC") == 3
+    added = (Decision & {"decision_what": "instrument"}).to_dicts()
+    assert [(r["decision_by"], r["decision_after"]["instrument_high"]) for r in added] == [("A. First", 5)]
+    again = web.post(browser, "/instruments", **{**OWN, "instrument": "fac"}).text
+    assert "a name that no instrument and no column of a sheet has" in again
+
+
+def test_every_wrong_field_of_an_instrument_is_said_and_nothing_is_added(own: None):
+    browser, before = web.client(), everything()
+    wrong = {"instrument": "Role", "instrument_name": "", "instrument_unit": "x" * 17, "instrument_low": "1,234",
+             "instrument_high": "much", "minimal_change": "-1", "higher_is_better": "", "ordinal": "maybe"}  # fmt: skip
+    answer = web.post(browser, "/instruments", **wrong)
+    assert answer.status_code == 200
+    assert answer.text.count("aria-invalid") == len(wrong)
+    more = {"instrument_low": "6", "minimal_change": "1"}
+    said = web.post(browser, "/instruments", **{**OWN, **more}).text
+    assert said.count("aria-invalid") == 2
+    assert "more than the lowest value, 6" in said
+    assert "who found it, in whom" in said
+    assert web.post(web.client(role="reader"), "/instruments", **OWN).status_code == 403
+    assert "Add a score" not in web.client(role="reader").get("/instruments").text
+    assert everything() == before
+
+
+def test_the_command_adds_an_instrument(own: None):
+    words = ["FAC", "--title", "Categories", "--unit", "points", "--better", "higher", "--low", "0"]
+    assert CliRunner().invoke(instrument, ["add", *words, "--high", "-1"]).exit_code == 1
+    assert CliRunner().invoke(instrument, ["add", *words, "--high", "5", "--ordinal"]).output == "FAC: added\n"
+    row = (study.ClinicalInstrument & {"instrument": "FAC"}).fetch1()
+    assert (row["instrument_high"], row["ordinal"], row["higher_is_better"]) == (5, 1, 1)
+
+
 def test_from_the_click_to_the_row_in_a_browser(two_visits: None, chromium: Any):
     with web.shown(chromium) as page:
         page.goto("/visits/1")
@@ -142,3 +196,21 @@ def test_from_the_click_to_the_row_in_a_browser(two_visits: None, chromium: Any)
         page.wait_for_url("**/visits/1#entered")
     assert score(1, "BBS") == 50
     assert {r["decision_what"] for r in Decision().to_dicts()} == {"role", "score"}
+
+
+@pytest.mark.parametrize(("language", "saved"), [("de", "Sichern"), ("en", "Save")])
+def test_an_instrument_is_added_in_a_browser(own: None, chromium: Any, language: str, saved: str):
+    with web.shown(chromium, locale=language) as page:
+        page.goto("/visits/1/enter")
+        page.locator('a[href="/instruments"]').click()
+        for field, text in OWN.items():
+            one = page.locator(f"#{field}")
+            one.select_option(text) if text in ("yes", "no") else one.fill("" if field == "instrument_unit" else text)
+        page.get_by_role("button", name=saved).click()
+        page.get_by_role("alert").wait_for()
+        assert "SHEET_FORMAT" in page.locator(".problem").inner_text()
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        page.locator("#instrument_unit").fill("Punkte" if language == "de" else "points")
+        page.get_by_role("button", name=saved).click()
+        page.get_by_text("Functional Ambulation Categories").wait_for()
+    assert (study.ClinicalInstrument & {"instrument": "FAC"}).fetch1("instrument_unit") == "points"

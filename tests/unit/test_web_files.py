@@ -35,7 +35,7 @@ def test_every_text_that_a_page_names_is_in_the_catalogue():
 
 #: Groups and texts that are named by a value: a state, an outcome, a reason, a filter, an event.
 _BY_VALUE = re.compile(
-    r"(role|state|quality|trend|enter|decided)\.|visits\.(cohort|role|quality|state)|recording\.foot_"
+    r"(role|state|quality|trend|enter|decided|instruments)\.|visits\.(cohort|role|quality|state)|recording\.foot_"
     r"|operate\.(done|empty|pending|reserved|error|waiting|oldest|per_hour|left)$"
     r"|unusable\.|usable\.(yes|no)|byhand\.(automatic|hand)|differs\.|filmed\."
 )

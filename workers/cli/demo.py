@@ -22,7 +22,7 @@ def demo(context: click.Context, out: Path, no_database: bool) -> None:
     """Set up what the default needs, put the demo recording through every table, show the rows and write the report.
 
     Safe to repeat: what is there already is not computed again. The database is stopped at the end if it was not
-    running before.
+    running before; the next command that needs it starts it again.
     """
     if no_database:
         from pbl_pipeline.cli.run import run
@@ -47,7 +47,7 @@ def demo(context: click.Context, out: Path, no_database: bool) -> None:
         _run(out)
     finally:
         if not was_running:
-            embedded.stop(say=click.echo)
+            embedded.stop(say=click.echo, on_demand=True)
     click.echo(f"done in {time.monotonic() - begin:.0f} s")
 
 
@@ -96,7 +96,7 @@ def _run(out: Path) -> None:
     for path in paths:
         click.echo(path)
     visit = int(summary_rows["session_id"].iloc[0])
-    click.echo("look further: `pbl db start`, `pbl status`, and docs/tables.md for the tables")
+    click.echo("look further: `pbl status`, `pbl list`, and docs/tables.md for the tables")
     click.echo(f"open this visit in a browser: pbl web --visit {visit}")
 
 

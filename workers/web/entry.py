@@ -1,4 +1,4 @@
-"""Enter: the role of a visit and its clinical scores. Each change is a row (`schemas.studies.visit_entry`)."""
+"""Enter: the role of a visit, its clinical scores, and custom instruments. Each change is a row of Decision."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
 from pbl_pipeline.errors import PblError
+from schemas.studies import own_instruments
 from schemas.studies import visit_entry as enter
 
 from .access import Session, form_of
@@ -50,7 +51,35 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
             return page(request, await tables.ask(enter.entry, number), values, done.errors)
         return RedirectResponse(f"/visits/{number}#entered", 303)
 
+    async def instruments(request: Request) -> Response:
+        return await instrument_page(request, {}, {})
+
+    async def add_instrument(request: Request) -> Response:
+        fields = await form_of(request)
+        session: Session = request.state.session
+        errors = await tables.ask(own_instruments.add_instrument, fields, session.name)
+        if errors:
+            return await instrument_page(request, fields, errors)
+        return RedirectResponse("/instruments", 303)
+
+    async def instrument_page(request: Request, values: Mapping[str, str], errors: Mapping[str, PblError]) -> Response:
+        rows = await tables.ask(enter.instruments)
+        fields = (*own_instruments.TEXTS, *own_instruments.NUMBERS, *own_instruments.FLAGS)
+        known = {name: values.get(name, "") for name in fields}
+        return pages.show(
+            request,
+            "instruments.html",
+            instruments=rows,
+            values=known,
+            errors=errors,
+            texts=own_instruments.TEXTS,
+            numbers=own_instruments.NUMBERS,
+            flags=own_instruments.FLAGS,
+        )
+
     return [
+        Address("/instruments", instruments, "look"),
+        Address("/instruments", add_instrument, "decide", methods=["POST"]),
         Address("/visits/{session_id:int}/enter", form, "look"),
         Address("/visits/{session_id:int}/enter", send, "decide", methods=["POST"]),
     ]

@@ -9,7 +9,7 @@ from .binaries import Binaries, find_server, get_server
 from .folder import ADMIN_USER, APP_USER, Credentials, Folder
 from .port import HOST
 from .process import admin
-from .server import Status, allow_prefix, not_running, start, status, stop
+from .server import Status, allow_prefix, not_running, start, starts_on_demand, status, stop
 
 __all__ = [
     "ADMIN_USER",
@@ -25,6 +25,7 @@ __all__ = [
     "get_server",
     "not_running",
     "start",
+    "starts_on_demand",
     "status",
     "stop",
 ]

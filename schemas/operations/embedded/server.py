@@ -79,8 +79,13 @@ def start(say: Say = silent, folder: Folder | None = None) -> Status:
     return now
 
 
-def stop(say: Say = silent, folder: Folder | None = None) -> bool:
+def stop(say: Say = silent, folder: Folder | None = None, on_demand: bool = False) -> bool:
     """End the server and wait for it. Safe to call when none runs.
+
+    Parameters
+    ----------
+    on_demand
+        The next connection starts it again (`starts_on_demand`), until it is stopped without this.
 
     Returns
     -------
@@ -97,6 +102,7 @@ def stop(say: Say = silent, folder: Folder | None = None) -> bool:
         say(f"The database is not running: there is none in {folder.path}")
         return False
     with folder.locked():
+        folder.write_state(on_demand=on_demand)
         pid = running_pid(folder)
         if pid is None:
             say("The database is not running.")
@@ -121,6 +127,11 @@ def stop(say: Say = silent, folder: Folder | None = None) -> bool:
         folder.write_state(pid=None)
     say("The database is stopped.")
     return True
+
+
+def starts_on_demand(folder: Folder) -> bool:
+    """Whether the server does not run and was stopped so that the next connection starts it."""
+    return bool(folder.state().get("on_demand")) and running_pid(folder) is None
 
 
 def status(folder: Folder | None = None) -> Status:
