@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pbl_pipeline import methods
+from pbl_pipeline.errors import PblError
 
 from . import fit, gait, gdi, keypoints, study, tracking
 from .instruments import INSTRUMENTS
@@ -25,11 +26,25 @@ def insert_all() -> None:
 
     for table in METHOD_TABLES:
         insert_methods(table, methods.of_stage(table.stage).values())
-    # DataJoint compares only the numbers of rows: a laboratory's own instruments would hide those that are new here.
-    study.ClinicalInstrument.insert(INSTRUMENTS, skip_duplicates=True)
+    add_instruments()
     _body()
     for name in norm_names():
         _norm(name)
+
+
+def add_instruments() -> None:
+    """Insert the clinical instruments that ship and are not there, as far as the account may.
+
+    They are not the table's `contents`: DataJoint would insert these while it binds tables of an older version, before
+    they are migrated, and compares only the numbers of rows, so that a laboratory's own would hide new ones.
+    """
+    there = set(study.ClinicalInstrument().to_arrays("instrument"))
+    if lacking := [row for row in INSTRUMENTS if row["instrument"] not in there]:
+        try:
+            study.ClinicalInstrument.insert(lacking, skip_duplicates=True)
+        except PblError as error:
+            if error.code != "DB_REFUSED":
+                raise
 
 
 def _body() -> None:

@@ -11,7 +11,6 @@ from pbl_pipeline.errors import PblError
 
 from . import fit, gait, gdi, keypoints, lab, session, tracking  # noqa: F401  the definitions refer to them
 from .datajoint_setup import dj
-from .instruments import INSTRUMENTS
 
 schema = dj.Schema()
 
@@ -70,7 +69,6 @@ class ClinicalInstrument(dj.Lookup):
     instrument_classes='' : varchar(255)       # classes by lowest value, such as: 0 high risk; 41 at risk; 51 low risk
     minimal_change_classes='' : varchar(255)   # minimal_change by lowest value before, such as: 0 3; 12 2; 15 1; empty: at all values
     """  # noqa: E501
-    contents = INSTRUMENTS
 
 
 @schema

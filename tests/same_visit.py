@@ -124,8 +124,9 @@ def assert_same_exports(visit: Visit, loaded: Visit, formats: list[str], tmp_pat
             import ezc3d
 
             a, b = (ezc3d.c3d(str(p)) for p in (one, other))
+            mm = FLOAT32_MM if float32 else 0.0
             for kind in ("points", "rotations", "analogs"):
-                np.testing.assert_allclose(a["data"][kind], b["data"][kind], err_msg=one.name, rtol=rtol, atol=atol)
+                np.testing.assert_allclose(a["data"][kind], b["data"][kind], err_msg=one.name, rtol=rtol, atol=mm)
             events = [f["parameters"]["EVENT"] for f in (a, b)]
             assert events[0].keys() == events[1].keys()
             if "TIMES" in events[0]:

@@ -15,6 +15,7 @@ import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.study import classes_of, minimal_change_at
 from schemas import lab, methods, session, study
+from schemas.instruments import INSTRUMENTS
 from schemas.operations import forget
 from schemas.rows import utc_now
 from tests.rows import remove_all
@@ -93,15 +94,15 @@ def test_an_instrument_of_ones_own(two_people: None):
 
 
 def test_the_instruments_that_ship():
-    for row in study.ClinicalInstrument.contents:
+    for row in INSTRUMENTS:
         assert row["instrument_low"] < row["instrument_high"]
         assert bool(row["minimal_change"]) == bool(row["minimal_change_source"]), row["instrument"]
         assert all(len(row[k]) <= 255 for k in ("instrument_source", "minimal_change_source", "instrument_classes"))
 
 
 def test_new_shipped_instruments_come_beside_those_of_ones_own(two_people: None):
-    """DataJoint inserts contents only where they are more than the rows."""
-    shipped = study.ClinicalInstrument.contents
+    """Their number does not matter."""
+    shipped = INSTRUMENTS
     (study.ClinicalInstrument & {"instrument": "NDI"}).delete(prompt=False)
     own = {**shipped[0], "instrument": "own"}
     study.ClinicalInstrument.insert1(own)
@@ -112,7 +113,7 @@ def test_new_shipped_instruments_come_beside_those_of_ones_own(two_people: None)
 
 def test_disability_and_quality_of_life_are_those_of_their_sources():
     """Fairbank & Pynsent 2000: 21 % is moderate, 41 % severe; Vernon & Mior 1991: 35 of 50 complete; Ostelo 2008."""
-    shipped = {row["instrument"]: row for row in study.ClinicalInstrument.contents}
+    shipped = {row["instrument"]: row for row in INSTRUMENTS}
     odi, ndi = shipped["ODI"], shipped["NDI"]
     assert [c.split()[0] for c in odi["instrument_classes"].split("; ")] == ["0", "21", "41", "61", "81"]
     assert [c.split()[0] for c in ndi["instrument_classes"].split("; ")] == ["0", "5", "15", "25", "35"]
@@ -126,7 +127,7 @@ def test_disability_and_quality_of_life_are_those_of_their_sources():
 
 def test_instruments_are_those_of_the_paper_and_of_their_sources():
     """The paper (Datasets): a BBS of 50 and below is a fall risk, of 40 and below a high one."""
-    shipped = {row["instrument"]: row for row in study.ClinicalInstrument.contents}
+    shipped = {row["instrument"]: row for row in INSTRUMENTS}
     classes = classes_of(shipped["BBS"]["instrument_classes"])
     risk = {value: [word for lowest, word in classes if value >= lowest][-1] for value in (40, 41, 45, 50, 51, 56)}
     assert (risk[40], risk[41], risk[45], risk[50]) == ("high fall risk", *["fall risk"] * 3)

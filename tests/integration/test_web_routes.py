@@ -41,6 +41,8 @@ EXPECTED = {
     "GET /visits/1/report/state": (LOOK, "report"),
     "GET /visits/1/export": (LOOK, "export"),
     "GET /compare": (LOOK, ""),
+    "GET /instruments": (LOOK, ""),
+    "POST /instruments": (DECIDE, ""),
     "GET /compare.json": (LOOK, ""),
     "GET /recordings/1": (LOOK, "page"),
     "GET /recordings/1.json": (LOOK, "page"),
