@@ -9,7 +9,9 @@ into an empty cache on purpose). Set PBL_CACHE to try a cold start. The database
 from __future__ import annotations
 
 import importlib.util
+import os
 import shutil
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -55,6 +57,10 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
         terminalreporter.write_line(f"LEFT OUT: {n_left_out} tests of pages in a browser; to run them: {_NO_BROWSER}")
 
 
+#: The home of the session's database while it runs.
+_IN_USE: list[Path] = []
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The development recordings beside the project; tests that need them skip where they are absent."""
@@ -77,7 +83,17 @@ def nothing_of_the_developer(tmp_path_factory: pytest.TempPathFactory) -> Iterat
 def database(nothing_of_the_developer: None) -> Iterator[Path]:
     """The embedded server, running, with PBL_HOME set to its folder for the whole session; yields that folder."""
     with installation() as home:
+        _IN_USE.append(home)
         yield home
+        _IN_USE.clear()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def the_database_of_the_session() -> None:
+    """Point PBL_HOME at the session's database again if a module before has left another there, and say so."""
+    if _IN_USE and os.environ.get("PBL_HOME") != str(_IN_USE[0]):
+        warnings.warn(f"a module before left PBL_HOME at {os.environ.get('PBL_HOME')}", stacklevel=1)
+        os.environ["PBL_HOME"] = str(_IN_USE[0])
 
 
 @pytest.fixture(scope="session")
