@@ -9,7 +9,7 @@ from pbl_pipeline.fit.priors import learned_poses
 from research.corpus.motions import read_motions
 from research.corpus.walks import is_held_out
 from research.poses import JOINTS, MIDDLE, learn, mirrored
-from tests.conftest import SHARED
+from tests import SHARED
 
 MOTIONS = SHARED / "real" / "motions"
 

@@ -24,7 +24,7 @@ from schemas.intake import VisitRecord, ingest
 from schemas.intake.references import add_reference, find_video, read_reference
 from schemas.reading import frames
 from schemas.reading.status import pipeline_status
-from tests.conftest import SHARED
+from tests import SHARED
 from tests.rows import everything_but_refreshes, register
 from tests.walking_fit import walking_fit
 from workers.populate import populate

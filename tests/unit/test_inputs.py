@@ -20,7 +20,7 @@ from pbl_pipeline.keypoints import (
     ray_miss_m,
 )
 from pbl_pipeline.video import Camera, CameraPose, load_camera, load_camera_poses
-from tests.conftest import SHARED
+from tests import SHARED
 from tests.inputs import CALIBRATION, LENS, NAMES, POSE, ROWS, J, T, changed, keypoints, markers, trc_text
 
 

@@ -39,7 +39,7 @@ from pbl_pipeline.validation import (
     save_curves,
     write_tables,
 )
-from tests.conftest import SHARED
+from tests import SHARED
 from tests.walking_fit import foot_events, walking_fit
 
 PAPER = SHARED.parent / "paper" / "pbl_paper.tex.txt"

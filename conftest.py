@@ -1,4 +1,6 @@
-"""Shared fixtures: the development data, a private database, and no trace of the developer's own.
+"""Fixtures of `tests` and `research/tests`: the development data, a private database, and no trace of the developer's
+own. They stand at the root because each has to exist once: a second copy of `nothing_of_the_developer` would point
+PBL_HOME away from a database that runs.
 
 Tests use the user's cache (PBL_CACHE) like every command does: assets are checked against their SHA-256 at each use and
 compiled programs are found by what was compiled, so neither can carry a result from one run to the next, and fetching
@@ -9,19 +11,15 @@ into an empty cache on purpose). Set PBL_CACHE to try a cold start. The database
 from __future__ import annotations
 
 import importlib.util
-import os
 import shutil
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests import SHARED
 from tests.database import installation, leave_nothing_of_the_developer
-
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
-
 
 #: How to have what the browser tests need, "" on a machine that has it.
 _CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -57,10 +55,6 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
         terminalreporter.write_line(f"LEFT OUT: {n_left_out} tests of pages in a browser; to run them: {_NO_BROWSER}")
 
 
-#: The home of the session's database while it runs.
-_IN_USE: list[Path] = []
-
-
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The development recordings beside the project; tests that need them skip where they are absent."""
@@ -83,17 +77,7 @@ def nothing_of_the_developer(tmp_path_factory: pytest.TempPathFactory) -> Iterat
 def database(nothing_of_the_developer: None) -> Iterator[Path]:
     """The embedded server, running, with PBL_HOME set to its folder for the whole session; yields that folder."""
     with installation() as home:
-        _IN_USE.append(home)
         yield home
-        _IN_USE.clear()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def the_database_of_the_session() -> None:
-    """Point PBL_HOME at the session's database again if a module before has left another there, and say so."""
-    if _IN_USE and os.environ.get("PBL_HOME") != str(_IN_USE[0]):
-        warnings.warn(f"a module before left PBL_HOME at {os.environ.get('PBL_HOME')}", stacklevel=1)
-        os.environ["PBL_HOME"] = str(_IN_USE[0])
 
 
 @pytest.fixture(scope="session")
