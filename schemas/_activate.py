@@ -30,9 +30,12 @@ def activate(start: bool = False, methods: bool = True) -> None:
     for stage, module in zip(STAGES, modules(), strict=True):
         connection.bind(stage, module.schema)
     fit.SessionFit.plan = staticmethod(plan.plan_fit_sets)
+    if connection.prefix() in _methods_done:
+        return
     from .methods import add_instruments, insert_all
 
-    add_instruments()
-    if methods and connection.prefix() not in _methods_done:
+    if methods:
         insert_all()
         _methods_done.add(connection.prefix())
+    else:
+        add_instruments()

@@ -323,7 +323,7 @@ def _model_of_error(cycles: Sequence[GaitCycle], norm: NormativeSet, params: Gdi
 def _passes(cycles: Sequence[GaitCycle], vectors: Sequence[np.ndarray], norm: NormativeSet) -> list[Pass]:
     """The cycles by trial and view, as scores of the mean curves of each side."""
     keys = [(c.trial, c.far_leg) for c in cycles]
-    scores = (np.array(vectors) - norm.mean_deg) @ norm.components.T
+    scores = norm.scores(np.array(vectors))
     unseen = np.full(len(norm.components), np.nan)
     out = []
     for key in dict.fromkeys(keys):

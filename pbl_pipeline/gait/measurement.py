@@ -128,6 +128,7 @@ def load_model(name: str) -> MeasurementModel:
     return MeasurementModel(**data, **arrays, views=views)
 
 
+@functools.cache
 def model_of_fit(params_hash: str) -> str:
     """Return the name of the model that was measured with a fit's parameters; empty if there is none."""
     return next((name for name in model_names() if params_hash in load_model(name).fits), "")
@@ -196,8 +197,7 @@ def _fewer_cycles(model: MeasurementModel, seen: Pass) -> np.ndarray:
 
 def _index(scores: np.ndarray, norm: NormativeSet) -> np.ndarray:
     """(..., 2) of scores (..., 2K)."""
-    distance = np.linalg.norm(scores.reshape(*scores.shape[:-1], 2, -1), axis=-1)
-    return 100.0 - 10.0 * (np.log(distance) - norm.ln_mean) / norm.ln_sd
+    return norm.index_of_scores(scores.reshape(*scores.shape[:-1], 2, -1))
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:

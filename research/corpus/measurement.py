@@ -119,7 +119,7 @@ def _scores(data: dict[str, np.ndarray], kind: str, norm: NormativeSet) -> Itera
     percent = np.linspace(0.0, 100.0, 51)
     curves = data[f"{kind}_curves"] * STEP_DEG
     at = np.array([np.concatenate([np.interp(norm.percent, percent, a) for a in c]) for c in curves])
-    scores = (at.reshape(-1, len(ANGLES) * len(norm.percent)) - norm.mean_deg) @ norm.components.T
+    scores = norm.scores(at.reshape(-1, len(ANGLES) * len(norm.percent)))
     ends = np.cumsum(data[f"{kind}_curves_n"])
     for part, right in zip(np.split(scores, ends[:-1]), np.split(data[f"{kind}_right"], ends[:-1]), strict=True):
         yield [part[~right], part[right]]
@@ -215,18 +215,14 @@ def judged(seen: Iterable[Seen], model: MeasurementModel, norm: NormativeSet) ->
                 "passes": len(passes),
                 **{n: getattr(first, n) for n in ("person", "held_out", "source", "condition", "severity")},
                 "visit": visit,
-                "true": _index(true, norm),
-                "plain": _index(plain, norm),
+                "true": norm.index_of_scores(true).mean(),
+                "plain": norm.index_of_scores(plain).mean(),
                 "found": found.mean,
                 "sd": found.sd,
                 "sd_anew": found.sd_anew,
             }
         )
     return pd.DataFrame(rows)
-
-
-def _index(scores: np.ndarray, norm: NormativeSet) -> float:
-    return float(np.mean(100.0 - 10.0 * (np.log(np.linalg.norm(scores, axis=1)) - norm.ln_mean) / norm.ln_sd))
 
 
 def error_table(frame: pd.DataFrame) -> pd.DataFrame:

@@ -80,13 +80,19 @@ class NormativeSet:
 
     def log_distance(self, vectors: np.ndarray) -> np.ndarray:
         """ln of the Euclidean distance of the component scores of (N, V * P) vectors to the normative mean."""
-        scores = (np.atleast_2d(vectors) - self.mean_deg) @ self.components.T
-        # A vector equal to the mean has no logarithm; a millionth of a degree is far below any real distance.
-        return np.log(np.maximum(np.linalg.norm(scores, axis=1), 1e-6))
+        return _log_length(self.scores(np.atleast_2d(vectors)))
+
+    def scores(self, vectors: np.ndarray) -> np.ndarray:
+        """Return the component scores (..., K) of (..., V * P) vectors (deg)."""
+        return (vectors - self.mean_deg) @ self.components.T
 
     def index(self, vectors: np.ndarray) -> np.ndarray:
         """100 - 10 z of (N, V * P) vectors: 100 is the normative mean, 10 one normative standard deviation."""
-        return 100.0 - 10.0 * (self.log_distance(vectors) - self.ln_mean) / self.ln_sd
+        return self.index_of_scores(self.scores(np.atleast_2d(vectors)))
+
+    def index_of_scores(self, scores: np.ndarray) -> np.ndarray:
+        """Return the index (...) of component scores (..., K)."""
+        return 100.0 - 10.0 * (_log_length(scores) - self.ln_mean) / self.ln_sd
 
     def save(self, path: str | Path, digits: int | None = 7) -> str:
         """Write the set as JSON with the checksum of what was written, and return that (SHA-256).
@@ -187,6 +193,11 @@ def _vectors(vectors: np.ndarray, variables: Sequence[str], percent: np.ndarray)
 def norm_names() -> tuple[str, ...]:
     """Names of the sets that ship."""
     return tuple(sorted(f.name.removesuffix(".json") for f in _FOLDER.iterdir() if f.name.endswith(".json")))
+
+
+def _log_length(scores: np.ndarray) -> np.ndarray:
+    # A vector equal to the mean has no logarithm; a millionth of a degree is far below any real distance.
+    return np.log(np.maximum(np.linalg.norm(scores, axis=-1), 1e-6))
 
 
 def load_norm(name: str = DEFAULT_NORM) -> NormativeSet:
