@@ -20,7 +20,7 @@ _JOINS = """\
 
 A natural join (`A * B`) pairs rows by the columns that both have. Where these do not tell one visit from another, such as the name of a
 method, it pairs **every visit with every other** and raises nothing: `fit.TrialInput * fit.SessionFit` of 4 visits with 2 videos each has 32 rows
-instead of 8, and `lab.Subject * gdi.SessionGdi` has each person with everybody's visits. Count the rows (`len(A * B)`).
+instead of 8, and `lab.Subject * gdi.SessionGdi` has each person with the visits of all people. Count the rows (`len(A * B)`).
 
 | rows | tables | safe chain |
 |---|---|---|
