@@ -477,9 +477,9 @@ def impatient(monkeypatch: pytest.MonkeyPatch, given_up: threading.Event) -> Ite
         yield port
 
 
-def _is_closed(connection: socket.socket, drip: bytes) -> bool:
+def _is_closed(connection: socket.socket, drip: bytes, within_s: float = 60.0) -> bool:
     """Whether the other side closes, while it is sent a byte now and then."""
-    until = time.monotonic() + 60
+    until = time.monotonic() + within_s
     connection.settimeout(0.05)
     while time.monotonic() < until:
         try:
@@ -544,6 +544,61 @@ def test_one_address_does_not_take_all_connections(impatient: int, monkeypatch: 
         held[0].settimeout(0.05)
         with pytest.raises(TimeoutError):
             held[0].recv(1)
+
+
+@pytest.mark.parametrize("asks", [b"", b"GET /hang HTTP/1.1\r\nHost: x\r\n\r\n"])
+def test_a_few_addresses_keep_no_one_out(monkeypatch: pytest.MonkeyPatch, asks: bytes):
+    """Two addresses that hold every connection, waiting or being answered, lose one to a third; a third loses none."""
+    monkeypatch.setattr(sys.modules[config.__module__], "_OF_ONE", 4)
+    monkeypatch.setattr(sys.modules[config.__module__], "_CONNECTIONS", 8)
+
+    async def page(scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] != "http":
+            return
+        if scope["path"] == "/hang":
+            await receive()
+            await receive()  # until the client leaves
+            return
+        await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"0")]})
+        await send({"type": "http.response.body", "body": b""})
+
+    def connected(stack: contextlib.ExitStack, address: str) -> socket.socket:
+        made = stack.enter_context(socket.create_connection(("127.0.0.1", port), source_address=(address, 0)))
+        made.settimeout(10)
+        return made
+
+    with running(page, Where()) as port, contextlib.ExitStack() as stack:
+        patient = connected(stack, "127.0.0.9")
+        patient.sendall(b"GET /hang HTTP/1.1\r\nHost: x\r\n\r\n")
+        held = [connected(stack, address) for _ in range(4) for address in ("127.0.0.2", "127.0.0.3")]
+        for one in held:
+            with contextlib.suppress(ConnectionError):
+                one.sendall(asks)
+        for i in range(3):
+            with contextlib.ExitStack() as short:
+                assert b" 200 " in asked(connected(short, f"127.0.0.{4 + i}"))[:20]
+        closed = sum(_is_closed(one, b"", 0.2) for one in held)
+        assert 1 <= closed <= 4, closed
+        assert not _is_closed(patient, b"", 0.2)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("192.0.2.1", "192.0.2.1", True),
+        ("192.0.2.1", "192.0.2.2", False),
+        ("2001:db8:0:1::1", "2001:db8:0:1:ffff::1", True),
+        ("2001:db8:0:1::1", "2001:db8:0:2::1", False),
+        ("::ffff:192.0.2.1", "::ffff:192.0.2.2", False),  # a page on all addresses hears IPv4 so
+        ("::ffff:192.0.2.1", "192.0.2.1", True),
+    ],
+)
+def test_who_counts_as_one_address(one: str, other: str, same: bool):
+    assert (connections.customer(one) == connections.customer(other)) == same
+    attempts = Attempts(lambda: 0.0)
+    for i in range(20):
+        attempts.failed(f"n{i}", one)
+    assert (attempts.wait_s("B", other) > 0) == same
 
 
 def test_no_name_of_a_person_gets_into_a_path_or_a_log(known: Accounts, tables: None, caplog: pytest.LogCaptureFixture):

@@ -22,7 +22,6 @@ import secrets
 import time
 import unicodedata
 from collections.abc import Callable, Iterator, Sequence
-from ipaddress import IPv6Address, ip_address
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -33,6 +32,7 @@ from schemas.operations.folders import private_folder
 from schemas.operations.json_files import write_json
 
 from .access import RIGHTS
+from .connections import customer
 
 #: Cost of scrypt: 2^17 blocks of 8 x 128 byte, one after the other. A guess takes 128 MiB and some tenths of a second
 #: (OWASP Password Storage Cheat Sheet). scrypt is the memory-hard hash of Python's own library.
@@ -244,7 +244,5 @@ class Attempts:
     @staticmethod
     def _keys(account: str, address: str) -> tuple[tuple[str, str], tuple[str, str]]:
         with contextlib.suppress(ValueError):
-            at = ip_address(address)
-            if isinstance(at, IPv6Address):  # one customer has a whole /64
-                address = str(IPv6Address(int(at) >> 64 << 64))
+            address = customer(address)
         return ("account", hashlib.sha256(account.encode(errors="replace")).hexdigest()), ("address", address)

@@ -1,9 +1,10 @@
-"""Connections to the page: clients that send a request too slowly or do not take the answer keep none of them."""
+"""Connections to the page: slow clients keep none of them, and those who hold the most make room for others."""
 
 from __future__ import annotations
 
 import asyncio
-from ipaddress import IPv4Network, IPv6Network, ip_address
+from collections import Counter
+from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address
 from typing import Any
 
 import h11
@@ -18,9 +19,27 @@ REQUEST_S, TAKE_S = 10.0, 120.0
 LINGER_S = 1.0
 
 
+def customer(address: str) -> str:
+    """Return the IPv4 address, also of one written as IPv6; of IPv6 the /64 network, all of which one customer has.
+
+    Raises
+    ------
+    ValueError
+        The text is not an address.
+    """
+    at = ip_address(address)
+    if isinstance(at, IPv6Address):
+        return str(at.ipv4_mapped or IPv6Address(int(at) >> 64 << 64))
+    return address
+
+
 class Connection(H11Protocol):
-    """uvicorn's protocol with these limits, at most `per_address` connections of one address (None: any number), and
-    none but from `only_from` where that is set: a proxy in front."""
+    """uvicorn's protocol with these limits, at most `per_address` connections of one address or IPv6 network (None: any
+    number), and none but from `only_from` where that is set: a proxy in front.
+
+    When all connections are taken, a new one closes one of the address that holds the most, so that a few addresses
+    cannot keep others out. Behind a proxy all have its address, and the proxy has to limit them.
+    """
 
     per_address: int | None = None
     only_from: IPv4Network | IPv6Network | None = None
@@ -29,6 +48,8 @@ class Connection(H11Protocol):
         super().__init__(*args, **more)
         self._timers: dict[str, asyncio.TimerHandle] = {}
         self._over = False  # the answer ended before the request: what still comes is not read
+        self._made_at = self.loop.time()
+        self._customer = ""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for a request."""
@@ -36,10 +57,14 @@ class Connection(H11Protocol):
         if self.only_from is not None and not (self.client and ip_address(self.client[0]) in self.only_from):
             transport.abort()
             return
-        mine = [c for c in self.connections if isinstance(c, H11Protocol) and c.client and self.client]
-        if self.per_address and sum(c.client[0] == self.client[0] for c in mine) > self.per_address:  # type: ignore[index]
-            transport.abort()
-            return
+        if self.per_address is not None:
+            self._customer = customer(self.client[0]) if self.client else ""
+            others = [c for c in self.connections if isinstance(c, Connection) and c is not self]
+            if sum(c._customer == self._customer for c in others) >= self.per_address:
+                transport.abort()
+                return
+            if self.limit_concurrency is not None and len(others) >= self.limit_concurrency - 1:
+                self._make_room(others)
         self._abort_after("request", REQUEST_S)
 
     def data_received(self, data: bytes) -> None:
@@ -75,6 +100,19 @@ class Connection(H11Protocol):
         self._end("request")
         self._end("answer")
         super().connection_lost(exc)
+
+    def _make_room(self, others: list[Connection]) -> None:
+        """Close a connection of the address that has the most: rather one that waits for its client than one that is
+        being answered, and of these the oldest."""
+        ((most, _),) = Counter(c._customer for c in others).most_common(1)
+        closed = min((c for c in others if c._customer == most), key=lambda c: (not c._waits, c._made_at))
+        self.connections.discard(closed)  # it stops counting now, not when it is closed
+        closed.transport.abort()
+
+    @property
+    def _waits(self) -> bool:
+        """Whether the next step is the client's: to send a request, or to take an answer."""
+        return bool(self._timers) or self.cycle is None or self.cycle.response_complete
 
     def _time_request(self) -> None:
         if self.conn.their_state not in (h11.IDLE, h11.SEND_BODY):
