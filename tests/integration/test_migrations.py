@@ -6,7 +6,6 @@ Beside the package's own migrations the tests write some into a folder that the 
 from __future__ import annotations
 
 import contextlib
-import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -29,14 +28,12 @@ from tests.rows import everything, register
 from workers import heartbeat, loop
 from workers.populate import populate
 
-from . import chain
+from . import chain, older_tables
 
 pytestmark = pytest.mark.database
 
 #: Number of the first migration that is not the package's own.
 OWN = len(migrations.available()) + 1
-#: Databases of before 0.2.0 recorded no migrations when their tables were new.
-NOT_RECORDED = "DROP TABLE pbl_lab.`~migrations`"
 #: A column that may not be null, for a table that has rows: added, filled with what is true of them, then closed.
 SIZES = '''
 """The size of a video's file, which older versions did not record."""
@@ -103,10 +100,9 @@ def _make_older(add: Callable[[str, str], None]) -> None:
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute("ALTER TABLE pbl_video.video DROP COLUMN video_size")
         cursor.execute("DROP DATABASE pbl_validation")
-        kinds = "ENUM('person','check') NOT NULL COMMENT ':enum(''person'',''check''):who is measured'"
-        cursor.execute(f"ALTER TABLE pbl_review.decision MODIFY COLUMN decision_what {kinds}")
-        cursor.execute("ALTER TABLE pbl_fit.__session_fit DROP COLUMN fit_height")
-        cursor.execute(NOT_RECORDED)
+        older_tables.undo_0003(cursor)
+        older_tables.undo_0002(cursor)
+        cursor.execute(older_tables.NOT_RECORDED)
     add(f"{OWN:04}_sizes", SIZES)
 
 
@@ -188,26 +184,6 @@ def test_an_older_database_keeps_its_rows_and_works(
     assert set(video.Video.to_arrays("video_size")) > {7}
 
 
-#: What shipped of instruments before migration 0006.
-SHIPPED_BEFORE = {
-    "mJOA": {
-        "minimal_change_source": "ROC analysis, degenerative cervical myelopathy 12 months after surgery, depends on "
-        "severity: Tetreault et al. 2015, Spine 40:1653-1659"
-    },
-    "BBS": {
-        "instrument_source": "the scale: Berg et al. 1992, Can J Public Health 83 Suppl 2:S7-11",
-        "instrument_classes": "0 high risk; 21 medium risk; 41 low risk",
-    },
-    "mRS": {"instrument_source": "the scale: van Swieten et al. 1988, Stroke 19:604-607", "instrument_high": 6},
-}
-
-#: The tables of results as they were before migration 0001.
-WITHOUT_SESSION = [
-    *(f"pbl_{t}" for t in ("fit.__session_fit", "gait.__gait_events", "gait.__gait_cycle", "gait.__spatiotemporal")),
-    *(f"pbl_{t}" for t in ("gdi.__g_d_i", "gdi.__session_gdi", "qc.__session_qc", "validation.__kinematic_error")),
-]
-
-
 def test_results_from_before_they_had_their_session_get_it(
     empty: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -218,20 +194,11 @@ def test_results_from_before_they_had_their_session_get_it(
     assert not {t.table: t.errors for t in populate(_chain()).tables if t.errors}
     new = everything()
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-        for table in WITHOUT_SESSION:
-            cursor.execute(
-                "SELECT constraint_name FROM information_schema.key_column_usage WHERE CONCAT(table_schema, '.', "
-                "table_name) = %s AND column_name = 'session_id' AND referenced_table_name IS NOT NULL",
-                (table,),
-            )
-            ((key,),) = cursor.fetchall()
-            cursor.execute(f"ALTER TABLE {table} DROP FOREIGN KEY `{key}`, DROP COLUMN session_id")
-            schema, name = table.split(".")
-            cursor.execute(f"DELETE FROM {schema}.`~lineage` WHERE table_name = %s", (name,))
-        cursor.execute(NOT_RECORDED)
+        older_tables.undo_0001(cursor)
+        cursor.execute(older_tables.NOT_RECORDED)
     empty()
     dry = migrations.migrate(dry_run=True)
-    assert (len(dict(dry.steps)["0001 session_of_results"]), dry.open) == (4 * len(WITHOUT_SESSION), [])
+    assert (len(dict(dry.steps)["0001 session_of_results"]), dry.open) == (4 * len(older_tables.WITHOUT_SESSION), [])
     migrations.migrate()
     after = everything()
     changed = {t for t in new if after[t] != new[t] and not t.split(".")[1].startswith("~")}
@@ -245,71 +212,14 @@ def test_instruments_and_errors_of_before_get_their_columns(empty: Callable[[], 
     schemas.activate()
     new = everything()["pbl_study.#clinical_instrument"]
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-        table = "pbl_study.`#clinical_instrument`"
-        cursor.execute(f"ALTER TABLE {table} DROP COLUMN minimal_change_classes")
-        cursor.execute("ALTER TABLE pbl_validation.__kinematic_error__joint DROP COLUMN joint_normal_p")
-        for name, columns in SHIPPED_BEFORE.items():
-            for column, value in columns.items():
-                cursor.execute(f"UPDATE {table} SET {column} = %s WHERE instrument = %s", (value, name))
-        cursor.execute(NOT_RECORDED)
+        older_tables.undo_0007(cursor)
+        older_tables.undo_0006(cursor)
+        cursor.execute(older_tables.NOT_RECORDED)
     empty()
     migrations.migrate()
     assert everything()["pbl_study.#clinical_instrument"] == new
     assert "joint_normal_p" in validation.KinematicError.Joint.heading.names
     assert migrations.migrate().steps == []
-
-
-#: The tables of corrections before migration 0004.
-HAND_EVENTS = (
-    "CREATE TABLE pbl_gait.hand_events (video_id INT NOT NULL PRIMARY KEY, hand_from VARCHAR(48) NOT NULL,"
-    " hand_changed SMALLINT NOT NULL, hand_tracking VARCHAR(48), hand_person SMALLINT, hand_by VARCHAR(64) NOT NULL,"
-    " hand_at DATETIME NOT NULL, FOREIGN KEY (video_id) REFERENCES pbl_video.video (video_id) ON UPDATE CASCADE,"
-    " FOREIGN KEY (hand_from) REFERENCES pbl_gait.`#gait_event_method` (gait_method) ON UPDATE CASCADE)",
-    "CREATE TABLE pbl_gait.hand_events__event (video_id INT NOT NULL, hand_no SMALLINT NOT NULL,"
-    " hand_time DOUBLE NOT NULL, hand_side ENUM('left','right') NOT NULL,"
-    " hand_kind ENUM('foot_down','foot_up') NOT NULL, hand_probability DOUBLE, PRIMARY KEY (video_id, hand_no),"
-    " FOREIGN KEY (video_id) REFERENCES pbl_gait.hand_events (video_id) ON UPDATE CASCADE)",
-    "INSERT INTO pbl_gait.hand_events SELECT video_id, gait_method, correction_changed, correction_tracking,"
-    " correction_person, correction_by, correction_at FROM pbl_gait.event_correction",
-    "INSERT INTO pbl_gait.hand_events__event SELECT video_id, corrected_no, corrected_time, corrected_side,"
-    " corrected_kind, corrected_probability FROM pbl_gait.event_correction__event",
-)
-
-
-def _with_methods_by_hand() -> None:
-    """A corrected event as it was before migration 0004: results by hand beside those of the detected events."""
-    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-        cursor.execute("SELECT gait_method FROM pbl_gait.event_correction")
-        ((method,),) = cursor.fetchall()
-        cursor.execute("SET foreign_key_checks = 0")
-        for statement in HAND_EVENTS:
-            cursor.execute(statement)
-        cursor.execute(
-            "INSERT INTO pbl_gait.`#gait_event_method` VALUES ('by-hand-v1', 'by-hand', 1, %s, 'f8f1e2d3c4b5a697')",
-            (json.dumps({"automatic": method, "automatic_hash": "0" * 16}),),
-        )
-        cursor.execute("INSERT INTO pbl_gait.gait_plan SELECT session_id, 'by-hand-v1' FROM pbl_gait.gait_plan")
-        cursor.execute(
-            "ALTER TABLE pbl_gait.__gait_cycle DROP FOREIGN KEY __gait_cycle_ibfk_3, DROP COLUMN correction_no"
-        )
-        cursor.execute("ALTER TABLE pbl_gdi.__session_gdi DROP COLUMN session_corrected")
-        cursor.execute(
-            "DROP TABLE pbl_gdi.__session_gdi__trial, pbl_gait.event_correction__event, pbl_gait.event_correction"
-        )
-        cursor.execute(
-            "SELECT CONCAT(table_schema, '.', table_name), GROUP_CONCAT(column_name ORDER BY ordinal_position)"
-            " FROM information_schema.columns WHERE table_schema IN ('pbl_gait', 'pbl_gdi', 'pbl_qc')"
-            " AND table_name LIKE '\\_\\_%%' GROUP BY 1 HAVING SUM(column_name = 'gait_method')"
-        )
-        for table, columns in cursor.fetchall():
-            by_hand = columns.replace("gait_method", "'by-hand-v1'")
-            cursor.execute(f"INSERT INTO {table} SELECT {by_hand} FROM {table}")
-        cursor.execute("UPDATE pbl_gait.__gait_events SET events_detector = 'by-hand' WHERE gait_method = 'by-hand-v1'")
-        # Those of the detected events have other numbers.
-        for table, column in (("gait.__spatiotemporal", "stance"), ("gdi.__session_gdi", "session_stance")):
-            cursor.execute(f"UPDATE pbl_{table} SET {column} = 1.5 WHERE gait_method = %s", (method,))
-        cursor.execute("UPDATE pbl_gdi.__g_d_i__cycle SET cycle_z = 1.5 WHERE gait_method = %s", (method,))
-        cursor.execute(NOT_RECORDED)
 
 
 @pytest.mark.parametrize("killed_before", [None, 4, 60])
@@ -326,7 +236,9 @@ def test_corrections_by_a_method_become_rows(
     event_corrections.save(1, [(time + 0.02, side, kind), *(e[:3] for e in others)], "A. First", found.state)
     assert not {t.table: t.errors for t in populate(_chain()).tables if t.errors}
     new = everything()
-    _with_methods_by_hand()
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        older_tables.undo_0004(cursor)
+        cursor.execute(older_tables.NOT_RECORDED)
     empty()
     assert len(everything()["pbl_gdi.__session_gdi"]) == 2
     refused = pbl("populate")
@@ -369,13 +281,7 @@ def test_tracking_without_the_video_info_that_it_read_goes(
     populate(_chain())
     new = everything()
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-        cursor.execute(
-            "SELECT constraint_name FROM information_schema.key_column_usage WHERE table_schema = 'pbl_tracking'"
-            " AND table_name = '__tracking' AND referenced_table_name = '__video_info'"
-        )
-        ((key,),) = cursor.fetchall()
-        cursor.execute(f"ALTER TABLE pbl_tracking.__tracking DROP FOREIGN KEY `{key}`")
-        cursor.execute("DELETE FROM pbl_video.__video_info WHERE video_id = %s", (one,))
+        older_tables.undo_0005(cursor, one)
         cursor.execute("DELETE FROM pbl_lab.`~migrations` WHERE number = 5")
     empty()
     dry = migrations.migrate(dry_run=True)
