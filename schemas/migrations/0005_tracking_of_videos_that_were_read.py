@@ -30,6 +30,7 @@ def statements(conn: Any) -> list[str]:
     keys = [dict(zip(("video_id", "tracking_method"), row, strict=True)) for row in left.fetchall()]
     deletes = []
     if keys:
+        conn.dependencies.load(force=True)  # tables that this upgrade has just created are among those below
         cascade = dj.Diagram.cascade(dj.FreeTable(conn, table) & keys, part_integrity="cascade")
         deletes = [f"DELETE FROM {t.full_table_name}{t.where_clause()}" for t in reversed(cascade) if len(t)]  # noqa: S608
         deletes = ["START TRANSACTION", *deletes, "COMMIT"]
