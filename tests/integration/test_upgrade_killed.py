@@ -12,6 +12,7 @@ import subprocess
 import sys
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -25,19 +26,19 @@ pytestmark = [pytest.mark.machine, pytest.mark.database, embedded_only]
 
 #: Statements at which the upgrade is killed; the longest time (s) from the statement's begin to the kill.
 KILLS, LATEST_S = 20, 0.03
-#: What an upgrade has noted of itself: DataJoint's log, and when a migration was applied.
+#: Tables with the times of an upgrade: DataJoint's log, and when a migration was applied.
 NOTES = ("~log", "~migrations")
 
 
 def target(*words: object) -> subprocess.CompletedProcess[str]:
-    """Run the target as a process of its own."""
+    """Run the target in a separate process."""
     command = [sys.executable, "-m", "tests.integration.upgrade_target", *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
 
 
-def state() -> dict[str, object]:
+def state() -> dict[str, Any]:
     """Every row of every table, every column and every foreign key; the migrations by name."""
-    rows: dict[str, object] = {t: r for t, r in everything().items() if t.split(".")[1] not in NOTES}
+    rows: dict[str, Any] = {t: r for t, r in everything().items() if t.split(".")[1] not in NOTES}
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute(
             "SELECT table_schema, table_name, column_name, column_type, is_nullable, column_default, column_key,"

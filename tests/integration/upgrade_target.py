@@ -1,4 +1,4 @@
-"""What a process of the upgrade test does: `build FOLDER` makes an old database, `migrate [N SECONDS]` upgrades it.
+"""A process of the upgrade test: `build FOLDER` makes an old database, `migrate [N SECONDS]` upgrades it.
 
 With a statement's number N the process kills itself so many seconds after it has begun that statement, counted over all
 migrations: before the server has it, while it works, or when it is done.
@@ -88,5 +88,7 @@ if __name__ == "__main__":
     command, *more = sys.argv[1:]
     if command == "build":
         build(Path(more[0]))
+    elif more:
+        migrate(int(more[0]), float(more[1]))
     else:
-        migrate(*(number(word) for number, word in zip((int, float), more, strict=False)))
+        migrate()
