@@ -51,9 +51,13 @@ def statements(conn: Any) -> list[str]:
             f"ALTER TABLE {table} MODIFY COLUMN instrument_classes VARCHAR(255) NOT NULL DEFAULT ''"
             f" COMMENT '{classes}', ADD COLUMN minimal_change_classes VARCHAR(255) NOT NULL DEFAULT ''"
             f" COMMENT '{changes}' AFTER instrument_classes",
-            f"UPDATE {table} SET minimal_change_classes = '{new['mJOA']['minimal_change_classes']}'"
-            " WHERE instrument = 'mJOA' AND minimal_change = 2",
         ]
+    of_mjoa = "instrument = 'mJOA' AND minimal_change = 2"
+    unfilled = f"SELECT 1 FROM {table} WHERE {of_mjoa} AND minimal_change_classes = ''"
+    if out or conn.query(unfilled).fetchone() is not None:  # also after a run that ended between the two statements
+        out.append(
+            f"UPDATE {table} SET minimal_change_classes = '{new['mJOA']['minimal_change_classes']}' WHERE {of_mjoa}"
+        )
     for name, columns in _SHIPPED.items():
         for column, value in columns.items():
             where = f"instrument = '{name}' AND {column} = '{value}'"

@@ -208,7 +208,8 @@ def test_results_from_before_they_had_their_session_get_it(
     assert migrations.migrate().steps == []
 
 
-def test_instruments_and_errors_of_before_get_their_columns(empty: Callable[[], None]):
+@pytest.mark.parametrize("killed_before", [None, 1, 2, 3])
+def test_instruments_and_errors_of_before_get_their_columns(empty: Callable[[], None], killed_before: int | None):
     schemas.activate()
     new = everything()["pbl_study.#clinical_instrument"]
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
@@ -216,6 +217,19 @@ def test_instruments_and_errors_of_before_get_their_columns(empty: Callable[[], 
         older_tables.undo_0006(cursor)
         cursor.execute(older_tables.NOT_RECORDED)
     empty()
+
+    class Killed(BaseException):
+        pass
+
+    done: list[str] = []
+
+    def say(line: str) -> None:
+        done.append(line)
+        if len(done) == killed_before:
+            raise Killed
+
+    with contextlib.suppress(Killed):
+        migrations.migrate(say=say)
     migrations.migrate()
     assert everything()["pbl_study.#clinical_instrument"] == new
     assert "joint_normal_p" in validation.KinematicError.Joint.heading.names
