@@ -83,8 +83,7 @@ def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
             raise _differs(left)
         created = _bind(create=True)
         steps = _apply(cursor, say)
-    if any(statements for _, statements in steps):
-        _reread()
+    _reread()  # also where nothing was left to do: an earlier run may have ended before it came to this
     if left := [d.text() for d in differences()]:
         raise _differs(left)
     declare_all()
