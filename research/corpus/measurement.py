@@ -16,11 +16,22 @@ from typing import Any
 import click
 import numpy as np
 import pandas as pd
+from scipy.stats import norm as normal
 
 from pbl_pipeline.fit import METHODS
 from pbl_pipeline.gait import MEASURES, Z90, load_norm
+from pbl_pipeline.gait.change import IMPORTANT_CHANGE, change_sd, chances
 from pbl_pipeline.gait.events import LEFT, RIGHT
-from pbl_pipeline.gait.measurement import MeasurementModel, Pass, View, estimate, expected_index
+from pbl_pipeline.gait.events import METHODS as EVENT_METHODS
+from pbl_pipeline.gait.measurement import (
+    MeasureError,
+    MeasurementModel,
+    Pass,
+    View,
+    estimate,
+    expected_index,
+    measure_error,
+)
 from pbl_pipeline.gait.normative import DEFAULT_NORM, NormativeSet
 from research.corpus.passes import ANGLES, STEP_DEG
 from research.corpus.walks import HEALTHY
@@ -175,7 +186,33 @@ def fit_model(seen: Sequence[Seen], norm: NormativeSet, fits: Sequence[str], wid
         np.sum([s.within for s in seen], axis=0) / freedom,
         float(np.median([n for s in seen for n in s.n_cycles])),
         widening,
+        EVENT_METHODS.find().paramset.hash,
+        float(np.median([sum(s.n_cycles) for s in seen])),
+        {far_leg: parts_of_errors([s for s in seen if (FAR_LEG[s.view] != "") == (far_leg != "")]) for far_leg in ("", LEFT)},
     )
+
+
+def parts_of_errors(seen: Sequence[Seen]) -> dict[str, MeasureError]:
+    """The parts of each measure's error: means of products of the errors of two passes of a walk in one view. Where no
+    walk has the measure at two visits (lengths need a phone that stands), the bias alone lasts."""
+    by_walk: dict[tuple, list[tuple[int, np.ndarray]]] = {}
+    for s in seen:
+        by_walk.setdefault((s.walk, s.view), []).append((s.visit, s.measures[0] - s.measures[1]))
+    all_ = np.array([e for group in by_walk.values() for _, e in group])
+    pairs: dict[bool, list[np.ndarray]] = {True: [], False: []}
+    for group in by_walk.values():
+        for (i, x), (j, y) in itertools.combinations(group, 2):
+            pairs[i == j].append(x * y)
+    out = {}
+    for k, name in enumerate(MEASURES):
+        errors, same, other = (v[np.isfinite(v)] for v in (all_[:, k], *(np.array(pairs[b])[:, k] for b in (True, False))))
+        if len(errors) < 10 or not len(same):
+            continue
+        lasting = max(float(other.mean()), 0.0) if len(other) else float(errors.mean()) ** 2
+        visit = max(float(same.mean()) - lasting, 0.0)
+        anew = max(float((errors**2).mean()) - lasting - visit, 0.0)
+        out[name] = MeasureError(*(float(np.sqrt(v)) for v in (lasting, visit, anew)))
+    return out
 
 
 def _symmetric(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -270,6 +307,116 @@ def change_table(frame: pd.DataFrame) -> pd.DataFrame:
     return share.unstack("kind")
 
 
+def change_pairs(frame: pd.DataFrame) -> pd.DataFrame:
+    """Each walk of a person at the first visit with each of theirs at the second, by the same kind of session, or one
+    from the left and one from the front: found and true change, and the standard deviations that are known of it."""
+    keys = ["kind", "person", "condition", "severity", "visit"]
+    one: Any = frame.groupby(keys).first().reset_index()
+    rows = []
+    for _, own in one.groupby("person"):
+        for a, b in itertools.product(*(own[own["visit"] == v].to_dict("records") for v in (0, 1))):
+            same_view = a["kind"] == b["kind"]
+            if not same_view and (a["kind"], b["kind"]) != ("left", "front"):
+                continue
+            whole = a["sd"], b["sd"]
+            least = Z90 * np.sqrt(2.0) * np.array([a["sd_anew"], b["sd_anew"]])
+            by = b["found"] - a["found"]
+            rows.append(
+                {
+                    "kind": a["kind"] if same_view else "left, then front",
+                    "unchanged": (a["condition"], a["severity"]) == (b["condition"], b["severity"]),
+                    "found": by,
+                    "true": b["true"] - a["true"],
+                    "anew": np.hypot(a["sd_anew"], b["sd_anew"]) if same_view else np.hypot(*whole),
+                    "whole": np.hypot(*whole),
+                    "sd": change_sd((least[0], least[1]), whole) if same_view else float(np.hypot(*whole)),
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def remains_table(pairs: pd.DataFrame) -> pd.DataFrame:
+    """Logarithmic loss of both probabilities by how much of what two visits have in common does not cancel
+    (`gait.change.REMAINS`), over pairs that were filmed alike and that changed."""
+    own = pairs[(pairs["kind"] != "left, then front") & ~pairs["unchanged"]]
+    rows = []
+    for share in np.arange(0.0, 1.01, 0.1):
+        sd = np.sqrt(own["anew"] ** 2 + share * (own["whole"] ** 2 - own["anew"] ** 2))
+        losses = {}
+        for limit in (0.0, IMPORTANT_CHANGE):
+            p = np.clip(normal.cdf((own["found"] - limit) / sd), 1e-9, 1 - 1e-9)
+            losses[f"beyond {limit:.0f}"] = -np.log(np.where(own["true"] > limit, p, 1 - p)).mean()
+        rows.append({"remains": share, **losses, "sum": sum(losses.values())})
+    return pd.DataFrame(rows)
+
+
+def probability_table(pairs: pd.DataFrame) -> pd.DataFrame:
+    """Of pairs that changed, how often the true change goes the way of the found one, and by `IMPORTANT_CHANGE`, beside
+    the mean probability that was stated, by stated probability."""
+    own = pairs[~pairs["unchanged"] & (pairs["true"].abs() > 0.01)]
+    said = np.array([chances(by, sd, IMPORTANT_CHANGE) for by, sd in zip(own["found"], own["sd"], strict=True)], float)
+    true = own["true"] * np.sign(own["found"])
+    rows = []
+    for (low, high), (title, p, real) in itertools.product(
+        itertools.pairwise((0.0, 0.05, 0.2, 0.5, 0.65, 0.8, 0.9, 0.95, 0.99, 1.001)),
+        (("real", said[:, 0], true > 0), ("important", said[:, 1], true > IMPORTANT_CHANGE)),
+    ):
+        inside = (p >= low) & (p < high)
+        if inside.any():
+            stated, found = p[inside].mean(), real[inside].mean()
+            rows.append({"of": title, "from": low, "to": min(high, 1.0), "n": inside.sum(), "stated": stated, "found": found})
+    return pd.DataFrame(rows).sort_values("of", kind="stable", ascending=False)
+
+
+def probability_errors(pairs: pd.DataFrame) -> pd.DataFrame:
+    """By kind of session: of unchanged pairs how many are called real with at least 0.95 (either way: at most 0.1), and
+    of changed ones the Brier score of each probability."""
+    rows = []
+    for kind, own in [("all", pairs), *pairs.groupby("kind", sort=False)]:
+        said = np.array([chances(by, sd, IMPORTANT_CHANGE) for by, sd in zip(own["found"], own["sd"], strict=True)], float)
+        true, moved = own["true"] * np.sign(own["found"]), ~own["unchanged"]
+        rows.append(
+            {
+                "session": kind,
+                "unchanged": int(own["unchanged"].sum()),
+                "called real": (said[own["unchanged"], 0] >= 0.95).mean(),
+                "changed": int(moved.sum()),
+                "Brier, real": ((said[:, 0] - (true > 0)) ** 2)[moved].mean(),
+                "Brier, important": ((said[:, 1] - (true > IMPORTANT_CHANGE)) ** 2)[moved].mean(),
+                "in 90 %": ((own["found"] - own["true"]).abs() <= Z90 * own["sd"])[moved].mean(),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def stated_errors(seen: Sequence[Seen], model: MeasurementModel) -> pd.DataFrame:
+    """What the stated errors of the gait measures of one pass hold: 90 % intervals, and pairs of two visits in one view
+    within the minimal detectable change."""
+    rows = []
+    for title, far_leg in (("sides", LEFT), ("front, back", "")):
+        own = [s for s in seen if (FAR_LEG[s.view] != "") == (far_leg != "")]
+        for k, name in enumerate(MEASURES):
+            held, within, sds = [], [], []
+            visits: dict[tuple, dict[int, tuple[float, float]]] = {}
+            for s in own:
+                stated, off = measure_error(model, name, {far_leg: sum(s.n_cycles)}), s.measures[0, k] - s.measures[1, k]
+                if stated is None or not np.isfinite(off):
+                    continue
+                held.append(abs(off) <= Z90 * stated[0])
+                sds.append(stated[0])
+                visits.setdefault((s.walk, s.view), {})[s.visit] = off, stated[1]
+            for pair in visits.values():
+                if len(pair) == 2:
+                    (x, a), (y, b) = pair[0], pair[1]
+                    within.append(abs(x - y) <= Z90 * np.sqrt(2.0) * max(a, b))
+            if held:
+                rows.append(
+                    {"measure": name, "from": title, "n": len(held), "mean sd": np.mean(sds), "in 90 %": np.mean(held),
+                     "unchanged within": np.mean(within) if within else np.nan}
+                )  # fmt: skip
+    return pd.DataFrame(rows)
+
+
 def measure_errors(seen: Sequence[Seen]) -> pd.DataFrame:
     """Error of each gait measure of one pass: bias and sd in its unit, and the sd of what two passes of one walk at one
     visit in one view have in common, by where they were filmed from."""
@@ -311,6 +458,10 @@ def write_model(model: MeasurementModel, path: Path, made_by: str) -> None:
     def plain(value: Any) -> Any:
         if isinstance(value, np.ndarray):
             return json.loads(json.dumps(value.tolist()), parse_float=lambda t: float(f"{float(t):.4g}"))
+        if isinstance(value, dict):
+            return {k: plain(v) for k, v in value.items()}
+        if isinstance(value, tuple) and hasattr(value, "_fields"):
+            return [float(f"{v:.4g}") for v in value]
         if dataclasses.is_dataclass(value):
             return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return value
@@ -339,6 +490,14 @@ def main(folder: Path, norm: str, fit: str, write: Path | None) -> None:
         frame = judged(part, model, basis)
         click.echo(f"\n{title}: error of the index\n{error_table(frame).to_string(index=False, float_format='%.2f')}")
         click.echo(f"\n{title}: gait measures\n{measure_errors(part).to_string(index=False, float_format='%.3f')}")
+        click.echo(f"\n{title}: stated\n{stated_errors(part, model).to_string(index=False, float_format='%.3f')}")
+        pairs = change_pairs(frame)
+        for what, table in (
+            ("which part of what visits have in common remains", remains_table(pairs)),
+            ("probability of a change, as stated and as found", probability_table(pairs)),
+            ("probability of a change, by session", probability_errors(pairs)),
+        ):
+            click.echo(f"\n{title}: {what}\n{table.to_string(index=False, float_format='%.3f')}")
         click.echo(f"\n{title}: of a true change is found\n{change_table(frame).to_string(float_format='%.2f')}")
     if write is not None:
         write_model(model, write, f"python -m research.corpus.measurement, {method.key}, {people[0]} persons")
