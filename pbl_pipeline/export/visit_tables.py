@@ -56,6 +56,8 @@ _STATISTICS = {
     "variability": "standard deviation within a side",
     "cv_percent": "variability in percent of the mean",
     "asymmetry_percent": "100 (right - left) / mean of both",
+    "error_sd": "standard deviation of the error of the mean",
+    "minimal_change": "minimal detectable change (90 %) between two visits filmed alike",
 }
 _TRIAL = "name of the trial"
 
@@ -276,7 +278,7 @@ def _measures_long(parts: Sequence[_Part]) -> Table:
 
 def _measures_wide(parts: Sequence[_Part]) -> Table:
     rows = [{(m, s): v for m, s, v, _ in _values(part)} for part in parts]
-    wanted = [(m, s) for m in MEASURES for s in ("mean", "left", "right", "sd", "n")]
+    wanted = [(m, s) for m in MEASURES for s in ("mean", "left", "right", "sd", "n", "error_sd", "minimal_change")]
     wanted += [("gdi", s) for s in ("mean", "left", "right", "sd", "minimal_change", "n")]
     wanted += [("gps_deg", s) for s in ("mean", "left", "right")]
     columns = _scope([(scope, trial) for scope, trial, *_ in parts])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ._gdi import Z90
+from .cycle_measures import Z90
 
 #: Change of the index that matters: half a standard deviation of healthy people, of which 10 points are one. A
 #: convention (Norman, Sloan & Wyrwich 2003, Medical Care 41:582-592), not measured with patients.

@@ -10,6 +10,7 @@ import numpy as np
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.gait import (
     GILLETTE_MODEL,
+    Z90,
     GaitCycle,
     Gdi,
     Measure,
@@ -201,10 +202,16 @@ def _measure_row(key: str, m: Measure | None, reason: str) -> dict:
         "mean": number(m.mean, decimals),
         "sd": number(m.sd, _sd_decimals(decimals)),
         "n": m.n,
+        "error": _error(m.error_sd, decimals),
         "cv": number(m.cv_percent, 1),
         "asymmetry": number(m.asymmetry_percent, 1),
         "unit": unit,
     }
+
+
+def _error(sd: float | None, decimals: int) -> str:
+    """Half the 90 % interval of a value; empty where its error is not known."""
+    return "" if sd is None else f"\N{PLUS-MINUS SIGN}{number(Z90 * sd, decimals)}"
 
 
 def _gdi_row(gdi: Gdi) -> dict:
@@ -212,7 +219,13 @@ def _gdi_row(gdi: Gdi) -> dict:
         return {"name": gdi.title, "known": False, "reason": gdi.reason}
     values = {"left": number(gdi.left, 1), "right": number(gdi.right, 1), "mean": number(gdi.mean, 1)}
     unit = "100 = norm, 10 = 1 sd"
-    more = {"sd": number(_gdi_sd(gdi), 1), "n": gdi.n, "cv": number(None, 1), "asymmetry": number(None, 1)}
+    more = {
+        "sd": number(_gdi_sd(gdi), 1),
+        "n": gdi.n,
+        "error": _error(gdi.sd, 1),
+        "cv": number(None, 1),
+        "asymmetry": number(None, 1),
+    }
     return {"name": gdi.title, "known": True, **values, **more, "unit": unit}
 
 

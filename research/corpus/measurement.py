@@ -20,7 +20,7 @@ from scipy.stats import norm as normal
 
 from pbl_pipeline.fit import METHODS
 from pbl_pipeline.gait import MEASURES, Z90, load_norm
-from pbl_pipeline.gait.change import IMPORTANT_CHANGE, change_sd, chances
+from pbl_pipeline.gait.change import IMPORTANT_CHANGE, chances, change_sd
 from pbl_pipeline.gait.events import LEFT, RIGHT
 from pbl_pipeline.gait.events import METHODS as EVENT_METHODS
 from pbl_pipeline.gait.measurement import (
@@ -188,7 +188,10 @@ def fit_model(seen: Sequence[Seen], norm: NormativeSet, fits: Sequence[str], wid
         widening,
         EVENT_METHODS.find().paramset.hash,
         float(np.median([sum(s.n_cycles) for s in seen])),
-        {far_leg: parts_of_errors([s for s in seen if (FAR_LEG[s.view] != "") == (far_leg != "")]) for far_leg in ("", LEFT)},
+        {
+            far_leg: parts_of_errors([s for s in seen if (FAR_LEG[s.view] != "") == (far_leg != "")])
+            for far_leg in ("", LEFT)
+        },
     )
 
 
@@ -205,7 +208,9 @@ def parts_of_errors(seen: Sequence[Seen]) -> dict[str, MeasureError]:
             pairs[i == j].append(x * y)
     out = {}
     for k, name in enumerate(MEASURES):
-        errors, same, other = (v[np.isfinite(v)] for v in (all_[:, k], *(np.array(pairs[b])[:, k] for b in (True, False))))
+        errors, same, other = (
+            v[np.isfinite(v)] for v in (all_[:, k], *(np.array(pairs[b])[:, k] for b in (True, False)))
+        )
         if len(errors) < 10 or not len(same):
             continue
         lasting = max(float(other.mean()), 0.0) if len(other) else float(errors.mean()) ** 2
@@ -350,11 +355,16 @@ def remains_table(pairs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def _stated(pairs: pd.DataFrame) -> np.ndarray:
+    """Both probabilities of each change, (N, 2)."""
+    return np.array([chances(by, sd, IMPORTANT_CHANGE) for by, sd in zip(pairs["found"], pairs["sd"], strict=True)])
+
+
 def probability_table(pairs: pd.DataFrame) -> pd.DataFrame:
     """Of pairs that changed, how often the true change goes the way of the found one, and by `IMPORTANT_CHANGE`, beside
     the mean probability that was stated, by stated probability."""
     own = pairs[~pairs["unchanged"] & (pairs["true"].abs() > 0.01)]
-    said = np.array([chances(by, sd, IMPORTANT_CHANGE) for by, sd in zip(own["found"], own["sd"], strict=True)], float)
+    said = _stated(own)
     true = own["true"] * np.sign(own["found"])
     rows = []
     for (low, high), (title, p, real) in itertools.product(
@@ -364,7 +374,9 @@ def probability_table(pairs: pd.DataFrame) -> pd.DataFrame:
         inside = (p >= low) & (p < high)
         if inside.any():
             stated, found = p[inside].mean(), real[inside].mean()
-            rows.append({"of": title, "from": low, "to": min(high, 1.0), "n": inside.sum(), "stated": stated, "found": found})
+            rows.append(
+                {"of": title, "from": low, "to": min(high, 1.0), "n": inside.sum(), "stated": stated, "found": found}
+            )
     return pd.DataFrame(rows).sort_values("of", kind="stable", ascending=False)
 
 
@@ -373,7 +385,9 @@ def probability_errors(pairs: pd.DataFrame) -> pd.DataFrame:
     of changed ones the Brier score of each probability."""
     rows = []
     for kind, own in [("all", pairs), *pairs.groupby("kind", sort=False)]:
-        said = np.array([chances(by, sd, IMPORTANT_CHANGE) for by, sd in zip(own["found"], own["sd"], strict=True)], float)
+        said = np.array(
+            [chances(by, sd, IMPORTANT_CHANGE) for by, sd in zip(own["found"], own["sd"], strict=True)], float
+        )
         true, moved = own["true"] * np.sign(own["found"]), ~own["unchanged"]
         rows.append(
             {
@@ -399,7 +413,10 @@ def stated_errors(seen: Sequence[Seen], model: MeasurementModel) -> pd.DataFrame
             held, within, sds = [], [], []
             visits: dict[tuple, dict[int, tuple[float, float]]] = {}
             for s in own:
-                stated, off = measure_error(model, name, {far_leg: sum(s.n_cycles)}), s.measures[0, k] - s.measures[1, k]
+                stated, off = (
+                    measure_error(model, name, {far_leg: sum(s.n_cycles)}),
+                    s.measures[0, k] - s.measures[1, k],
+                )
                 if stated is None or not np.isfinite(off):
                     continue
                 held.append(abs(off) <= Z90 * stated[0])
