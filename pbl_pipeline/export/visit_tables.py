@@ -84,7 +84,7 @@ def _angles_wide(trial: ExportTrial) -> Table:
     frame = angles_table(trial.fit)
     columns = _time(trial)
     for joint, values in zip(frame.columns[1:], frame.to_numpy().T[1:] + 0.0, strict=True):
-        unit, text = ("m" if joint in SLIDES else "deg"), JOINT_SIGNS.get(_sided(joint)[0], "")
+        unit, text = ("m" if joint in SLIDES else "deg"), joint_sign(joint)
         columns.append(Column(f"{joint}_{unit}", values, unit, f"positive: {text}"))
     return Table("angles_wide", tuple(columns))
 
@@ -124,6 +124,11 @@ def _sided(joint: str) -> tuple[str, str]:
     """ "hip_flexion_r" -> ("hip_flexion", "right"); joints without a side -> (name, "")."""
     base, _, end = joint.rpartition("_")
     return (base, _SIDES[end]) if end in _SIDES else (joint, "")
+
+
+def joint_sign(joint: str) -> str:
+    """Return the direction in which a joint value grows."""
+    return JOINT_SIGNS.get(_sided(joint)[0], "")
 
 
 def _repeated(texts: Sequence[str], n: int) -> Labels:

@@ -180,7 +180,7 @@ def test_measures_say_that_their_interval_is_the_spread_of_cycles(visits: None):
     assert page.count(": not comparable: its error is not known") == len(found.changes) > 0
 
 
-def test_measures_with_an_error_have_a_probability_in_page_json_and_list(visits: None, capsys: Any):
+def test_measures_with_an_error_have_a_probability_in_page_json_and_list(visits: None):
     rows = gdi.SessionGdi.Measure & {"session_measure": "cadence_steps_per_min"}
     keys = [k for k in rows.keys() if k["fit_set"] in {comparison.shown_visit(n).key["fit_set"] for n in (1, 2)}]  # noqa: SIM118
     for key in keys:
@@ -194,7 +194,7 @@ def test_measures_with_an_error_have_a_probability_in_page_json_and_list(visits:
         page = web.client().get("/compare?v=1&v=2").text
         assert "true rise with" in page
         assert "by at least 5 with" in page
-        data = web.client().get("/compare?v=1&v=2", headers={"accept": "application/json"}).json()
+        data = web.client().get("/compare.json?v=1&v=2").json()
         assert data["found"]["compared"][1]["change"]["real"] == pytest.approx(found.change.real)
         listed = registered.changes({"subject": "P001"}).set_index("measure")
         assert listed.loc["gdi", "real"] == round(found.change.real, 3)
