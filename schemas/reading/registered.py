@@ -85,7 +85,7 @@ def changes(restriction: Any = True) -> pd.DataFrame:
 def _measures(sessions: Any) -> dict[tuple, dict[str, Any]]:
     """The library's measures of the results of visits, by visit, kind of recordings and methods."""
     chain = ("session_id", "fit_set_kind", *gdi.SessionGdi.primary_key[1:])
-    query = gdi.SessionGdi.Measure * gdi.SessionGdi.proj("session_id") * fit.FitSet.proj("fit_set_kind") * newest_sets()
+    query = gdi.SessionGdi.Measure * newest_sets()
     out: dict[tuple, dict[str, Any]] = {}
     for row in (query & inside("session_id", sessions.unique())).to_dicts():
         of_visit = out.setdefault(tuple(row[k] for k in chain), {})
