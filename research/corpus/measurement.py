@@ -456,17 +456,29 @@ def measure_errors(seen: Sequence[Seen]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def widening_of(seen: Sequence[Seen], norm: NormativeSet) -> float:
-    """The factor of the sd with which 90 % of the intervals of tuning persons hold the truth who are left out in turn
-    (one pass, and both sides)."""
+def left_out_in_turn(seen: Sequence[Seen], norm: NormativeSet) -> pd.DataFrame:
+    """Sessions of tuning persons, each judged by a model of the others (`judged`), with the error by its sd."""
     people = sorted({s.person for s in seen})
-    ratios = []
+    frames = []
     for fold in range(FOLDS):
         out = set(people[fold::FOLDS])
         model = fit_model([s for s in seen if s.person not in out], norm, ())
         frame = judged([s for s in seen if s.person in out], model, norm)
-        ratios.append((frame["found"] - frame["true"]).abs() / frame["sd"])
-    return round(float(np.quantile(pd.concat(ratios), 0.9)) / Z90, 2)
+        frames.append(frame.assign(ratio=(frame["found"] - frame["true"]).abs() / frame["sd"]))
+    return pd.concat(frames)
+
+
+def widening_of(judged_out: pd.DataFrame) -> float:
+    """The factor of the sd with which 90 % of the intervals of persons left out in turn hold the truth."""
+    return round(float(np.quantile(judged_out["ratio"], 0.9)) / Z90, 2)
+
+
+def coverage_by_chance(judged_out: pd.DataFrame, widening: float, persons: int) -> tuple[np.ndarray, np.ndarray]:
+    """How often the 90 % intervals of each person left out hold the truth, in order; and the 5th, 50th and 95th
+    percentile of the mean of so many persons drawn from them."""
+    held = judged_out.assign(ok=judged_out["ratio"] <= widening * Z90).groupby("person")["ok"].mean().to_numpy()
+    means = np.random.default_rng(0).choice(held, (5000, persons)).mean(axis=1)
+    return np.sort(held), np.quantile(means, [0.05, 0.5, 0.95])
 
 
 def write_model(model: MeasurementModel, path: Path, made_by: str) -> None:
@@ -499,10 +511,17 @@ def main(folder: Path, norm: str, fit: str, write: Path | None) -> None:
     seen = read_passes(folder, basis)
     tuning = [s for s in seen if not s.held_out]
     held = [s for s in seen if s.held_out]
-    model = fit_model(tuning, basis, [method.hash], widening_of(tuning, basis))
+    out = left_out_in_turn(tuning, basis)
+    model = fit_model(tuning, basis, [method.hash], widening_of(out))
     people = [len({s.person for s in part}) for part in (tuning, held)]
     click.echo(f"{len(tuning)} passes of {people[0]} tuning persons, {len(held)} of {people[1]} held out; {method.key}")
-    click.echo(f"widening {model.widening}")
+    by_person, drawn = coverage_by_chance(out, model.widening, people[1])
+    factors = out.groupby("kind")["ratio"].quantile(0.9) / Z90
+    click.echo(f"widening {model.widening}; by session: " + ", ".join(f"{k} {f:.2f}" for k, f in factors.items()))
+    click.echo(f"90 % intervals of tuning persons left out in turn hold {np.round(by_person, 2).tolist()}")
+    click.echo(
+        f"of {people[1]} persons drawn from these: {drawn[1]:.2f} (90 % of draws: {drawn[0]:.2f} to {drawn[2]:.2f})"
+    )
     for title, part in (("held out", held), ("tuning", tuning)):
         frame = judged(part, model, basis)
         click.echo(f"\n{title}: error of the index\n{error_table(frame).to_string(index=False, float_format='%.2f')}")

@@ -55,6 +55,12 @@ def values_by(old: str, new: str) -> tuple[list[pd.DataFrame], pd.DataFrame]:
     return sides, touched(visits[visits["old"] | visits["new"]])
 
 
+def default_methods() -> dict[str, tuple[str, str, str]]:
+    """Stage, name and key of the default method of this version, by the column of SessionGdi."""
+    known = {column: methods.of_stage(stage) for column, stage in COLUMNS.items()}
+    return {column: (stage.name, stage.default, stage[stage.default].key) for column, stage in known.items()}
+
+
 def changed_defaults() -> list[str]:
     """Return a sentence for each default method of this version of which visits have results by another version alone,
     with the command that shows what the change does. Plain SQL: the tables need not be bound."""
@@ -62,14 +68,12 @@ def changed_defaults() -> list[str]:
     named = "SELECT 1 FROM information_schema.tables WHERE table_schema = %s AND table_name = '__session_gdi'"
     there = query(named, args=(schema,)).fetchone()
     out = []
-    for column, stage in COLUMNS.items() if there else ():
-        known = methods.of_stage(stage)
-        default = known[known.default]
+    for column, (stage, name, default) in default_methods().items() if there else ():
         counted = f"SELECT {column}, COUNT(DISTINCT session_id) FROM `{schema}`.`__session_gdi` GROUP BY {column}"  # noqa: S608
         for key, n in sorted(query(counted).fetchall()):
-            if key != default.key and key.rpartition("-v")[0] == default.name:
+            if key != default and key.rpartition("-v")[0] == name:
                 out.append(
-                    f"The default {stage} method is {default.key}; {n} visits have results by {key}. "
-                    f"pbl validate bridge {key} {default.key} --tables shows the shift once some have both."
+                    f"The default {stage} method is {default}; {n} visits have results by {key}. "
+                    f"pbl validate bridge {key} {default} --tables shows the shift once some have both."
                 )
     return out
