@@ -76,6 +76,7 @@ class Seen:
     n_cycles: tuple[int, int]
     within: np.ndarray  # (K, K) sum of squares of the cycles' scores about their side's mean
     measures: np.ndarray  # (2, M) of `gait.MEASURES`, found and true
+    angles: np.ndarray  # (2, 2, 3, 2) deg: found and true, left and right, `ANGLES`, mean and range of the mean curve
 
     @property
     def walk(self) -> tuple[str, str, float]:
@@ -85,6 +86,7 @@ class Seen:
         """The same pass of the mirrored person."""
         return dataclasses.replace(
             self,
+            angles=self.angles[:, ::-1],
             view=MIRRORED.get(self.view, self.view),
             scores=self.scores[::-1],
             true=self.true[::-1],
@@ -102,6 +104,7 @@ def read_passes(folder: Path, norm: NormativeSet, events: str = "detected") -> l
         with np.load(path, allow_pickle=False) as file:
             data = dict(file)
         columns = zip(_scores(data, events, norm), _scores(data, "true", norm), strict=True)
+        angles = list(zip(_angles(data, events), _angles(data, "true"), strict=True))
         for i, (found, true) in enumerate(columns):
             if min(map(len, found)) == 0 or min(map(len, true)) == 0:
                 continue
@@ -120,6 +123,7 @@ def read_passes(folder: Path, norm: NormativeSet, events: str = "detected") -> l
                     (len(found[0]), len(found[1])),
                     off.T @ off,
                     np.array([data["measures"][i], data["true_measures"][i]]),
+                    np.array(angles[i]),
                 )
             )
     return out
@@ -134,6 +138,16 @@ def _scores(data: dict[str, np.ndarray], kind: str, norm: NormativeSet) -> Itera
     ends = np.cumsum(data[f"{kind}_curves_n"])
     for part, right in zip(np.split(scores, ends[:-1]), np.split(data[f"{kind}_right"], ends[:-1]), strict=True):
         yield [part[~right], part[right]]
+
+
+def _angles(data: dict[str, np.ndarray], kind: str) -> Iterator[np.ndarray]:
+    """Of each pass (2, 3, 2) deg: of the mean curve of the left and the right side, each angle's mean and range; NaN
+    where a side has no cycle."""
+    ends = np.cumsum(data[f"{kind}_curves_n"])[:-1]
+    parts = zip(np.split(data[f"{kind}_curves"] * STEP_DEG, ends), np.split(data[f"{kind}_right"], ends), strict=True)
+    for curves, right in parts:
+        means = [curves[own].mean(axis=0) if own.any() else np.full((3, 51), np.nan) for own in (~right, right)]
+        yield np.array([np.stack([m.mean(axis=1), np.ptp(m, axis=1)], axis=1) for m in means])
 
 
 def fit_model(seen: Sequence[Seen], norm: NormativeSet, fits: Sequence[str], widening: float = 1.0) -> MeasurementModel:
@@ -434,6 +448,28 @@ def stated_errors(seen: Sequence[Seen], model: MeasurementModel) -> pd.DataFrame
     return pd.DataFrame(rows)
 
 
+def angle_errors(seen: Sequence[Seen]) -> pd.DataFrame:
+    """Error (deg) of mean and range of each angle's mean curve, of one pass: bias and sd of the leg near to the camera
+    and of the one behind it, or of both from front and back."""
+    rows = []
+    far = {title: [s for s in seen if FAR_LEG[s.view] == leg] for title, leg in ((RIGHT, RIGHT), (LEFT, LEFT))}
+    errors = {n: np.array([s.angles[0] - s.angles[1] for s in own]) for n, own in far.items()}
+    other = np.array([s.angles[0] - s.angles[1] for s in seen if s.view in ("frontal", "rear")])
+    groups = {
+        "sides, near leg": np.concatenate([errors[RIGHT][:, 0], errors[LEFT][:, 1]]),
+        "sides, far leg": np.concatenate([errors[RIGHT][:, 1], errors[LEFT][:, 0]]),
+        "front, back": other.reshape(-1, *other.shape[2:]),
+    }
+    for title, off in groups.items():
+        for k, angle in enumerate(ANGLES):
+            for j, what in enumerate(("mean", "range")):
+                own = off[:, k, j]
+                rows.append(
+                    {"angle": angle, "of": what, "from": title, "n": len(own), "bias": own.mean(), "sd": own.std()}
+                )
+    return pd.DataFrame(rows)
+
+
 def measure_errors(seen: Sequence[Seen]) -> pd.DataFrame:
     """Error of each gait measure of one pass: bias and sd in its unit, and the sd of what two passes of one walk at one
     visit in one view have in common, by where they were filmed from."""
@@ -526,6 +562,7 @@ def main(folder: Path, norm: str, fit: str, write: Path | None) -> None:
         frame = judged(part, model, basis)
         click.echo(f"\n{title}: error of the index\n{error_table(frame).to_string(index=False, float_format='%.2f')}")
         click.echo(f"\n{title}: gait measures\n{measure_errors(part).to_string(index=False, float_format='%.3f')}")
+        click.echo(f"\n{title}: angles\n{angle_errors(part).to_string(index=False, float_format='%.1f')}")
         click.echo(f"\n{title}: stated\n{stated_errors(part, model).to_string(index=False, float_format='%.3f')}")
         pairs = change_pairs(frame)
         for what, table in (
