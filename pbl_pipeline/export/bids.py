@@ -120,7 +120,7 @@ def check_labels(root: Path, labels: Labels, overwrite: bool) -> None:
 
 def _of_data_set(participants: Sequence[str]) -> dict[str, bytes]:
     software = {"Name": "pbl-pipeline", "Version": code_version()}
-    about = {"Name": "Movement fitted to video", "BIDSVersion": BIDS_VERSION, "DatasetType": "raw"}
+    about: dict[str, Any] = {"Name": "Movement fitted to video", "BIDSVersion": BIDS_VERSION, "DatasetType": "raw"}
     about["GeneratedBy"] = [software]
     readme = (
         "Joint angles and marker positions of a body model that was fitted to videos by pbl-pipeline.\n"

@@ -57,7 +57,7 @@ def _design(study: StudyData, results: StudyResults) -> Iterator[tuple[str, str]
     groups = counted.groupby("group")
     yield "Persons who count", "; ".join(f"{g}: {own['subject'].nunique()}" for g, own in groups)
     yield "Visits that count", "; ".join(f"{g}: {len(own)}" for g, own in groups)
-    ages = pd.to_numeric(counted.drop_duplicates("subject")["age"], errors="coerce") if "age" in counted else None
+    ages: Any = pd.to_numeric(counted.drop_duplicates("subject")["age"], errors="coerce") if "age" in counted else None
     known = None if ages is None else ages.dropna()
     yield "Age at the first visit", _spread(known, "years")
     days = counted.groupby("subject")["days"].agg(["min", "max", "count"])
@@ -66,7 +66,8 @@ def _design(study: StudyData, results: StudyResults) -> Iterator[tuple[str, str]
 
 
 def _measurement(study: StudyData) -> Iterator[tuple[str, str]]:
-    given, counted = study.description, study.visits[study.visits["included"]]
+    given, visits = study.description, study.visits
+    counted: Any = visits[visits["included"]]
     yield "Methods", "; ".join(f"{stage} {method}" for stage, method in given.methods.items()) or _NOT_STATED
     yield "Versions", f"values by {given.code_version or 'unknown code'}; report by PBL pipeline {code_version()}"
     yield "Data", f"slice {given.name or 'none'} {given.hash}".strip() + f", content {content_hash(study)}"
@@ -81,17 +82,19 @@ def _measurement(study: StudyData) -> Iterator[tuple[str, str]]:
 def _excluded(study: StudyData, results: StudyResults) -> Iterator[tuple[str, str]]:
     visits: Any = study.visits
     if VIDEOS in visits:
-        total, out = (int(pd.to_numeric(visits[c], errors="coerce").sum()) for c in (VIDEOS, LEFT_OUT))
+        counts: Any = visits[[VIDEOS, LEFT_OUT]].apply(pd.to_numeric, errors="coerce").sum()
+        total, left_out = map(int, counts)
         reasons: Counter[str] = Counter()
         for text in visits[WHY_LEFT_OUT].fillna("").astype(str):
             for reason, n in re.findall(r"(?:^|; )(.+?) \((\d+)\)(?=;|$)", text):
                 reasons[reason] += int(n)
-        yield "Videos left out", _share(out, total) + _reasons(reasons)
+        yield "Videos left out", _share(left_out, total) + _reasons(reasons)
     else:
         yield "Videos left out", _NOT_STATED
     out = visits[~visits["included"]]
     yield "Visits left out", _share(len(out), len(visits)) + _reasons(Counter(out["reason"]))
-    without = int(results.flow["without_index"].sum())
+    flow: Any = results.flow
+    without = int(flow["without_index"].sum())
     yield "Visits that count without an index", _share(without, int(visits["included"].sum()))
 
 

@@ -369,7 +369,7 @@ def remains_table(pairs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _stated(pairs: pd.DataFrame) -> np.ndarray:
+def _stated(pairs: Any) -> np.ndarray:
     """Both probabilities of each change, (N, 2)."""
     return np.array([chances(by, sd, IMPORTANT_CHANGE) for by, sd in zip(pairs["found"], pairs["sd"], strict=True)])
 
@@ -512,7 +512,8 @@ def widening_of(judged_out: pd.DataFrame) -> float:
 def coverage_by_chance(judged_out: pd.DataFrame, widening: float, persons: int) -> tuple[np.ndarray, np.ndarray]:
     """How often the 90 % intervals of each person left out hold the truth, in order; and the 5th, 50th and 95th
     percentile of the mean of so many persons drawn from them."""
-    held = judged_out.assign(ok=judged_out["ratio"] <= widening * Z90).groupby("person")["ok"].mean().to_numpy()
+    rows: Any = judged_out.assign(ok=judged_out["ratio"] <= widening * Z90)
+    held = rows.groupby("person")["ok"].mean().to_numpy()
     means = np.random.default_rng(0).choice(held, (5000, persons)).mean(axis=1)
     return np.sort(held), np.quantile(means, [0.05, 0.5, 0.95])
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -55,7 +57,7 @@ def test_the_near_leg_is_told_from_the_far_one():
         angles = np.zeros((2, 2, 3, 2))
         angles[0, near, 2, 1] = 5.0  # range of the knee
         seen.append(made(0, view, 0, none, angles))
-    table = angle_errors(seen).set_index(["from", "angle", "of"])["bias"]
+    table: Any = angle_errors(seen).set_index(["from", "angle", "of"])["bias"]
     assert table["sides, near leg", "knee_flexion", "range"] == 5.0
     assert table["sides, far leg", "knee_flexion", "range"] == 0.0
     assert table["front, back", "knee_flexion", "range"] == 2.5

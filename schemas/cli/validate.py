@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -217,7 +217,7 @@ def bridge(old: str, new: str | None, in_tables: bool, keep: Path | None, out: P
     made = {"bridge": bridge_table(pairs, (old, str(new)))}
     print_tables(made)
     if comparisons is not None:
-        across = comparisons[comparisons["what"] == "across"]
+        across: Any = comparisons[comparisons["what"] == "across"]
         click.echo(f"{len(across)} successive visits of a person are compared across the change and cannot be judged:")
         for row in across.head(20).to_dict("records"):
             click.echo(f"  {row['subject']}: {row['before']} by {old}, {row['visit']} by {new}, or the other way round")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -32,7 +33,7 @@ def test_the_shift_is_that_of_the_rows(visits: None, tmp_path: Path):
     done = pbl("validate", "bridge", OLD, NEW, "--tables", "--out", tmp_path)
     assert done.code == 0, done.err
     assert "0 successive visits of a person are compared across the change" in done.out
-    pairs = pd.read_csv(tmp_path / "pairs.csv")
+    pairs: Any = pd.read_csv(tmp_path / "pairs.csv")
     stance = pairs[pairs["measure"] == "stance_percent"].sort_values("visit")
     rows = gdi.SessionGdi.Measure * gdi.SessionGdi.proj("session_id") & {"session_measure": "stance_percent"}
     by = {

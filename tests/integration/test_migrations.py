@@ -248,6 +248,8 @@ def test_instruments_and_errors_of_before_get_their_columns(empty: Callable[[], 
         table = "pbl_study.`#clinical_instrument`"
         cursor.execute(f"ALTER TABLE {table} DROP COLUMN minimal_change_classes")
         cursor.execute("ALTER TABLE pbl_validation.__kinematic_error__joint DROP COLUMN joint_normal_p")
+        for column in ("session_measure_error", "session_measure_minimal_change"):
+            cursor.execute(f"ALTER TABLE pbl_gdi.__session_gdi__measure DROP COLUMN {column}")
         for name, columns in SHIPPED_BEFORE.items():
             for column, value in columns.items():
                 cursor.execute(f"UPDATE {table} SET {column} = %s WHERE instrument = %s", (value, name))
@@ -256,6 +258,7 @@ def test_instruments_and_errors_of_before_get_their_columns(empty: Callable[[], 
     migrations.migrate()
     assert everything()["pbl_study.#clinical_instrument"] == new
     assert "joint_normal_p" in validation.KinematicError.Joint.heading.names
+    assert gdi.SessionGdi.Measure.heading.names[-2:] == ["session_measure_error", "session_measure_minimal_change"]
     assert migrations.migrate().steps == []
 
 

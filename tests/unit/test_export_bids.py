@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -83,7 +84,7 @@ def test_the_names_of_the_files(dataset: Path):
 
 def test_channels_hold_the_fit_and_its_standard_deviations(dataset: Path, fit: TrialFit):
     stem = dataset / "sub-P001/ses-20260301/motion/sub-P001_ses-20260301_task-walking_tracksys-video_run-1"
-    channels = pd.read_csv(f"{stem}_channels.tsv", sep="\t", keep_default_na=False)
+    channels: Any = pd.read_csv(f"{stem}_channels.tsv", sep="\t", keep_default_na=False)
     values = pd.read_csv(f"{stem}_motion.tsv", sep="\t", header=None, names=channels["name"], na_values="n/a")
     assert len(values) == len(fit.time_s)
     np.testing.assert_allclose(values["time"], fit.time_s, atol=1e-6)

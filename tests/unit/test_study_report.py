@@ -111,7 +111,7 @@ def test_the_statement_counts_what_was_left_out_and_gives_icc_and_sem(study, res
         "Statistics",
         "Reliability and error",
     ]
-    items = found.set_index("Item")["Statement"]
+    items = dict(zip(found["Item"], found["Statement"], strict=True))
     n = len(visits)
     share = f"5 of {2 * n} ({500 / (2 * n):.0f} %)"
     assert items["Videos left out"] == f"{share}; too dark or blurred (4); the walk (again) (1)"
@@ -125,7 +125,8 @@ def test_the_statement_counts_what_was_left_out_and_gives_icc_and_sem(study, res
     assert f"ICC {icc_['value']:.2f} (" in text
     assert f"minimal detectable change {icc_['mdc95']:.1f}" in text
     assert f"SEM {icc_['sem']:.{2 if icc_['sem'] < 1 else 1 if icc_['sem'] >= 10 else 2}f}" in text
-    plain = statement(study, results).body.set_index("Item")["Statement"]
+    body = statement(study, results).body
+    plain = dict(zip(body["Item"], body["Statement"], strict=True))
     assert plain["Videos left out"] == "not stated"
     assert "Filmed from" not in plain
 
