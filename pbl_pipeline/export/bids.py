@@ -95,7 +95,7 @@ def bids_files(
 
 
 def known_participants(root: Path) -> list[str]:
-    """Return the labels of the participants that a data set has; none where there is no data set."""
+    """Return the labels of the participants that a data set has; empty if it does not exist yet."""
     path = root / "participants.tsv"
     rows = path.read_text(encoding="utf-8").splitlines()[1:] if path.exists() else []
     return [row.split("\t")[0].removeprefix("sub-") for row in rows]

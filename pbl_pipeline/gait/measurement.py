@@ -199,7 +199,7 @@ def measure_error(model: MeasurementModel, name: str, cycles: Mapping[str, int])
     """Return the standard deviation of the error of a gait measure, and of the part that is anew at another visit, both
     in its unit; None if it was not measured in a view.
 
-    cycles: number of used cycles of both sides by the leg behind the other. What lasts counts as the same in all views.
+    cycles: number of used cycles of both sides by the leg behind the other. The lasting part is the same in all views.
     """
     total, lasting, anew = sum(cycles.values()), 0.0, 0.0
     for far_leg, n in cycles.items():

@@ -1,4 +1,4 @@
-"""What a change of version or method does to index and measures: the same recordings by both, in pairs."""
+"""Shift of index and measures by a change of version or method: the same recordings by both, in pairs."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ BRIDGE_SET: Mapping[str, SynthSpec] = {
 
 def refit_bridge_set(name: str, folder: Path, done: Callable[[], object] = lambda: None) -> None:
     """Fit and measure the recordings of `BRIDGE_SET` by the default methods but one, and write each visit into a
-    folder of its own below `folder`, which another version can then be compared with.
+    separate folder below `folder`, which another version can then be compared with.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def _method(name: str, stages: Mapping[str, Stage[Any]]) -> tuple[str, Method[An
     known = [m.key for methods in stages.values() for m in methods.values()]
     raise PblError(
         "SOLVER_UNKNOWN",
-        found=f"{name!r}, which is no folder and no method",
+        found=f"{name!r}, neither a folder nor a method",
         expected=f"a folder of visits, or one of {', '.join(known)}",
         next_step="an older version of a method is in an older version of pbl: run the command there with --keep, and "
         "name the folder here",

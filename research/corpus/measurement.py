@@ -418,8 +418,8 @@ def probability_errors(pairs: pd.DataFrame) -> pd.DataFrame:
 
 
 def stated_errors(seen: Sequence[Seen], model: MeasurementModel) -> pd.DataFrame:
-    """What the stated errors of the gait measures of one pass hold: 90 % intervals, and pairs of two visits in one view
-    within the minimal detectable change."""
+    """Coverage of the stated errors of the gait measures of one pass: the fraction of 90 % intervals that hold the
+    truth, and of pairs of two visits in one view within the minimal detectable change."""
     rows = []
     for title, far_leg in (("sides", LEFT), ("front, back", "")):
         own = [s for s in seen if (FAR_LEG[s.view] != "") == (far_leg != "")]

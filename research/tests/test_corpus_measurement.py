@@ -1,4 +1,4 @@
-"""What the measurement model is estimated from: parts of errors, angles, and pairs of visits, of made passes."""
+"""Parts of errors, angles and pairs of visits, from which the measurement model is estimated, of made passes."""
 
 from __future__ import annotations
 

@@ -195,8 +195,8 @@ def test_measures_with_an_error_have_a_probability_in_page_json_and_list(visits:
         assert index is not None
         assert index.important is not None
         page = web.client().get("/compare?v=1&v=2").text
-        assert "true rise with" in page
-        assert "by at least 5 with" in page
+        assert "probability of a true rise: " in page
+        assert "by at least 5: " in page
         data = web.client().get("/compare.json?v=1&v=2").json()
         assert data["found"]["compared"][1]["change"]["real"] == pytest.approx(index.real)
         listed: Any = registered.changes({"subject": "P001"}).set_index("measure")
