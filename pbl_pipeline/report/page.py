@@ -77,8 +77,8 @@ def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str,
         page["measures_note"] = (
             f"{plural(values.n_cycles_used, 'gait cycle')} used of {values.n_cycles_found} found: the first and the "
             "last step of each walk are left out, and cycles unlike the others in length or curves. SD over all values "
-            "of both sides, n counts them; CV is the spread within a side in percent of the mean; asymmetry is right "
-            "minus left in percent of their mean."
+            "of both sides, n counts them; 90 % is half the interval of Both, of its whole error; CV is the spread "
+            "within a side in percent of the mean; asymmetry is right minus left in percent of their mean."
         )
         bands = _bands(visit)
         page["cycle_charts"] = _figures.cycle_charts(cycles, bands)
@@ -202,7 +202,7 @@ def _measure_row(key: str, m: Measure | None, reason: str) -> dict:
         "mean": number(m.mean, decimals),
         "sd": number(m.sd, _sd_decimals(decimals)),
         "n": m.n,
-        "error": _error(m.error_sd, decimals),
+        "error": _error(m.error_sd, _sd_decimals(decimals)),
         "cv": number(m.cv_percent, 1),
         "asymmetry": number(m.asymmetry_percent, 1),
         "unit": unit,

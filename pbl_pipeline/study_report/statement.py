@@ -123,7 +123,9 @@ def _statistics(results: StudyResults) -> Iterator[tuple[str, str]]:
 def _errors(study: StudyData, results: StudyResults) -> Iterator[tuple[str, str]]:
     frame: Any = results.repeatability
     important = {
-        score_column(study, i): float(m) for i, m in study.instruments[["instrument", "mic"]].to_numpy() if m == m
+        score_column(study, i): f"{classes} (by value before)" if classes else f"{m:g}"
+        for i, m, classes in study.instruments[["instrument", "mic", "mic_classes"]].to_numpy()
+        if classes or m == m
     }
     for r in frame[frame["kind"] == "2,1"].to_dict("records"):
         item = f"{title_of(study, r['name'])}, {r['of']}, {r['group']}"
@@ -135,7 +137,7 @@ def _errors(study: StudyData, results: StudyResults) -> Iterator[tuple[str, str]
         text += f"SEM {number(r['sem'], digits)}; minimal detectable change {number(r['mdc95'], digits)} (95 %)"
         text += f"; n {r['n']:.0f}, k {r['k']:.1f}"
         if r["of"] == "visits" and r["name"] in important:
-            text += f"; minimal important change {important[r['name']]:g}"
+            text += f"; minimal important change {important[r['name']]}"
         yield item, text
     sd: Any = study.visits.loc[study.visits["included"], "gdi_sd"].dropna()
     if len(sd):
