@@ -209,7 +209,7 @@ class SessionGdi(dj.Computed):
 
     class Measure(dj.Part):
         definition = f"""
-        # every measure with both sides, its spread and its error
+        # every measure with both sides and its spread
         {gait.measure_columns("session_measure")}
         session_measure_error=null : float64   # in the unit (see session_measure): standard deviation of the error of the mean
         session_measure_minimal_change=null : float64  # in the unit (see session_measure): minimal detectable change (90 percent)
