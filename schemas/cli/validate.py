@@ -221,7 +221,7 @@ def bridge(old: str, new: str | None, in_tables: bool, keep: Path | None, out: P
         click.echo(f"{len(across)} successive visits of a person are compared across the change and cannot be judged:")
         for row in across.head(20).to_dict("records"):
             click.echo(f"  {row['subject']}: {row['before']} by {old}, {row['visit']} by {new}, or the other way round")
-        click.echo(f"{(comparisons['what'] == 'old').sum()} more have only {old} in common (`pbl reprocess` adds {new})")
+        click.echo(f"{(comparisons['what'] == 'old').sum()} more have only {old} in common (pbl reprocess adds {new})")
     if out is not None:
         write_tables(made, out)
         (out / "pairs.csv").write_bytes(frame_to_csv(pairs).encode())
