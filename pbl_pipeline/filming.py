@@ -48,6 +48,10 @@ class Difference:
     now: tuple[str, ...] = ()
     before: tuple[str, ...] = ()
 
+    def __str__(self) -> str:
+        values = f" ({', '.join(self.now) or 'none'}, before: {', '.join(self.before) or 'none'})"
+        return self.what + (values if self.now or self.before else "")
+
 
 def differences(now: Filming, before: Filming) -> tuple[Difference, ...]:
     """Return what was not alike when two visits were filmed. What is not known of one of them is not compared, but an

@@ -409,6 +409,8 @@ def measure_of_row(row: Mapping[str, Any], prefix: str) -> lib.Measure | None:
     if row[f"{prefix}_mean"] is None:
         return None
     values: dict[str, Any] = {k: number(row[f"{prefix}_{column}"]) for column, k in _MEASURE_PARTS}
+    of_visit = {"error": "error_sd", "minimal_change": "minimal_change"}  # columns that measures of a trial lack
+    values |= {k: number(row.get(f"{prefix}_{column}")) for column, k in of_visit.items()}
     return Measure(**values, n=int(row[f"{prefix}_n"]))
 
 

@@ -113,8 +113,9 @@ def assert_same_exports(visit: Visit, loaded: Visit, formats: list[str], tmp_pat
     files = [write_export(v, formats, o, options) for v, o in zip((visit, loaded), out, strict=True)]
     assert [p.relative_to(out[0]) for p in files[0]] == [p.relative_to(out[1]) for p in files[1]]
     for one, other in zip(*files, strict=True):
-        if one.parent == out[0] and one.suffix == ".csv":
-            tables = [pd.read_csv(p, keep_default_na=False, na_values=[""]) for p in (one, other)]
+        if (one.parent == out[0] and one.suffix == ".csv") or one.name.endswith("_events.tsv"):
+            between = "," if one.suffix == ".csv" else "\t"
+            tables = [pd.read_csv(p, sep=between, keep_default_na=False, na_values=[""]) for p in (one, other)]
             pd.testing.assert_frame_equal(tables[0], tables[1], rtol=0, atol=5.1e-4, obj=one.name)
         elif one.suffix == ".parquet":
             pd.testing.assert_frame_equal(

@@ -33,7 +33,8 @@ class ExportTrial:
     name: of its folder and files. fit: its movement. markers: where the fit's markers are on the body, None where the
     table is not at hand. keypoints, measured (events, cycles, measures), log (of the phone that filmed): None where
     they are not known. log_shift_s: added to the log's times it gives the video's. methods: name of a stage to the
-    method that made it, in words. fitted_with: version and commit of the software that fitted it, where that is known.
+    method that made it, in words. activity: as stated of the recording. fitted_with: version and commit of the software
+    that fitted it, where that is known.
     """
 
     name: str
@@ -45,6 +46,7 @@ class ExportTrial:
     log_shift_s: float = 0.0
     methods: Mapping[str, str] = dataclasses.field(default_factory=dict)
     fitted_with: str = ""
+    activity: str = ""
 
     @classmethod
     def of(cls, recording: Recording, visit: Visit) -> ExportTrial:
@@ -60,6 +62,7 @@ class ExportTrial:
             log=log,
             log_shift_s=shift,
             methods=visit.methods,
+            activity=recording.condition.activity,
             fitted_with="" if visit.solution is None else visit.solution.software,
         )
 

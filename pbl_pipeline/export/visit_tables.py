@@ -56,6 +56,8 @@ _STATISTICS = {
     "variability": "standard deviation within a side",
     "cv_percent": "variability in percent of the mean",
     "asymmetry_percent": "100 (right - left) / mean of both",
+    "error_sd": "standard deviation of the error of the mean",
+    "minimal_change": "minimal detectable change (90 %) between two visits filmed alike",
 }
 _TRIAL = "name of the trial"
 
@@ -82,7 +84,7 @@ def _angles_wide(trial: ExportTrial) -> Table:
     frame = angles_table(trial.fit)
     columns = _time(trial)
     for joint, values in zip(frame.columns[1:], frame.to_numpy().T[1:] + 0.0, strict=True):
-        unit, text = ("m" if joint in SLIDES else "deg"), JOINT_SIGNS.get(_sided(joint)[0], "")
+        unit, text = ("m" if joint in SLIDES else "deg"), joint_sign(joint)
         columns.append(Column(f"{joint}_{unit}", values, unit, f"positive: {text}"))
     return Table("angles_wide", tuple(columns))
 
@@ -122,6 +124,11 @@ def _sided(joint: str) -> tuple[str, str]:
     """ "hip_flexion_r" -> ("hip_flexion", "right"); joints without a side -> (name, "")."""
     base, _, end = joint.rpartition("_")
     return (base, _SIDES[end]) if end in _SIDES else (joint, "")
+
+
+def joint_sign(joint: str) -> str:
+    """Return the direction in which a joint value grows."""
+    return JOINT_SIGNS.get(_sided(joint)[0], "")
 
 
 def _repeated(texts: Sequence[str], n: int) -> Labels:
@@ -276,7 +283,7 @@ def _measures_long(parts: Sequence[_Part]) -> Table:
 
 def _measures_wide(parts: Sequence[_Part]) -> Table:
     rows = [{(m, s): v for m, s, v, _ in _values(part)} for part in parts]
-    wanted = [(m, s) for m in MEASURES for s in ("mean", "left", "right", "sd", "n")]
+    wanted = [(m, s) for m in MEASURES for s in ("mean", "left", "right", "sd", "n", "error_sd", "minimal_change")]
     wanted += [("gdi", s) for s in ("mean", "left", "right", "sd", "minimal_change", "n")]
     wanted += [("gps_deg", s) for s in ("mean", "left", "right")]
     columns = _scope([(scope, trial) for scope, trial, *_ in parts])

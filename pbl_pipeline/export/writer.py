@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from pbl_pipeline.names import check_label
 from pbl_pipeline.qc import Check, failed
 from pbl_pipeline.visit import Visit
 
+from .bids import Labels, bids_files, check_labels, known_participants
 from .c3d import check_frames, write_c3d
 from .columns import Table, dictionary, write_csv, write_parquet
 from .ground import on_floor
@@ -40,9 +42,10 @@ FORMATS: Mapping[str, str] = {
     "dlc": ".dlc.csv",
     "csv": "",
     "parquet": "",
+    "bids": "",
 }
 #: Formats that need events, cycles and measures.
-GAIT_FORMATS = frozenset({"c3d", "csv", "parquet"})
+GAIT_FORMATS = frozenset({"c3d", "csv", "parquet", "bids"})
 #: Formats with heights, which count from the floor.
 _WITH_GROUND = frozenset({"trc", "mot", "osim", "c3d"})
 #: Formats whose readers take ASCII in names only, and not in every system's paths.
@@ -58,7 +61,8 @@ class ExportOptions:
 
     name: written into headers (C3D's subject, titles); empty: nothing that identifies a person. number_trials: call the
     trials trial_1, trial_2, ... in place of their recordings' names. body_points: three further markers on every body
-    in `.trc` and `.osim`. allow_failed: also a fit with a check that failed. overwrite: into a folder with files.
+    in `.trc` and `.osim`. allow_failed: also a fit with a check that failed. overwrite: into a folder with files. bids:
+    folder of the data set and labels of the visit for `bids`; None: one of the visit alone, in the folder `bids`.
     """
 
     name: str = ""
@@ -66,6 +70,7 @@ class ExportOptions:
     body_points: bool = True
     allow_failed: bool = False
     overwrite: bool = False
+    bids: tuple[Path, Labels] | None = None
 
 
 def check_export(formats: Sequence[str], out: Path, options: ExportOptions) -> None:
@@ -122,11 +127,15 @@ def write_export(visit: Visit, formats: Sequence[str], out: Path, options: Expor
     if options.number_trials:
         trials = tuple(dataclasses.replace(t, name=f"trial_{i}") for i, t in enumerate(trials, 1))
     _check_visit(trials, visit.fit_checks, formats, options)
-    body, paths, about, grounds = load_body(), [], {}, {}
+    root, labels = options.bids or (out / "bids", Labels.of(options.name or "01", ""))
+    if "bids" in formats:
+        check_labels(root, labels, options.overwrite)
+    body, paths, about, grounds, origins = load_body(), [], {}, {}, {}
     for trial in trials:
         origin = origin_of(trial, body)
         if bad := failed(visit.fit_checks):
             origin["failed_checks"] = ", ".join(bad)
+        origins[trial.name] = origin
         about[trial.name] = {**origin, **summary(trial)}
         folder = out / trial.name
         standing, headers = trial, origin
@@ -139,13 +148,18 @@ def write_export(visit: Visit, formats: Sequence[str], out: Path, options: Expor
             paths.append(_written(folder / f"{trial.name}{ending}", write))
     out.mkdir(parents=True, exist_ok=True)
     paths += _write_tables(trials, visit.measures, formats, out, _common(about))
+    if "bids" in formats:
+        for name, data in bids_files(trials, origins, labels, known_participants(root)).items():
+            path = root / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            paths.append(_written(path, lambda part, data=data: part.write_bytes(data)))
     content = {
         "software": f"pbl-pipeline {code_version()}",
         "exported": datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
         "formats": list(formats),
         "axes_and_units": "docs/export.md",
         "trials": {name: {**of_trial, **grounds.get(name, {})} for name, of_trial in about.items()},
-        "files": sorted(p.relative_to(out).as_posix() for p in paths),
+        "files": sorted(Path(os.path.relpath(p, out)).as_posix() for p in paths),
     }
     text = json.dumps(content, indent=2, allow_nan=False) + "\n"
     return [*paths, _written(out / "export.json", lambda path: path.write_text(text, encoding="utf-8"))]

@@ -17,7 +17,6 @@ from ._gdi import (
     GILLETTE_MODEL,
     MODEL_ANGLES,
     PAPER_INDEX,
-    Z90,
     Gdi,
     GdiCycle,
     GdiParams,
@@ -29,7 +28,8 @@ from ._gdi import (
 )
 from ._own_norm import norm_from_cycles
 from ._profile import MovementProfile, movement_profile, variable_scores
-from .cycle_measures import MEASURES, Measure, Spatiotemporal, cycle_measures, far_leg_of, spatiotemporal
+from .change import IMPORTANT_CHANGE, Chances, chances, change_sd
+from .cycle_measures import MEASURES, Z90, Measure, Spatiotemporal, cycle_measures, far_leg_of, spatiotemporal
 from .events import METHODS as EVENT_METHODS
 from .events import (
     EventParams,
@@ -89,6 +89,7 @@ __all__ = [
     "GDI_METHODS",
     "GDI_MODEL",
     "GILLETTE_MODEL",
+    "IMPORTANT_CHANGE",
     "LEG_ANGLES",
     "MEASURES",
     "MODEL_ANGLES",
@@ -104,6 +105,7 @@ __all__ = [
     "Z90",
     "AngleSeries",
     "BodyPoses",
+    "Chances",
     "Condition",
     "EventParams",
     "Exclusion",
@@ -129,6 +131,8 @@ __all__ = [
     "angle_series",
     "apply_correction",
     "camera_side",
+    "chances",
+    "change_sd",
     "check_correction",
     "curve_frame",
     "cycle_checks",

@@ -16,6 +16,7 @@ from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
 
 from ._condition import ANY_PACE, SELF_SELECTED
 from ._profile import MovementProfile, movement_profile, variable_scores
+from .cycle_measures import Z90
 from .events import LEFT, RIGHT
 from .measurement import MeasurementModel, Pass, estimate, expected_index, load_model, with_one_more
 from .normative import (
@@ -74,8 +75,6 @@ class GdiParams:
     lengthening: float = later(0.0)
 
 
-#: A 90 % interval of a normal error, in standard deviations.
-Z90 = 1.6449
 #: Errors count as at most so many times the squared distance that was found, which makes an index 15 points higher: of
 #: a fit that is less sure than that, more would be a guess.
 MOST_LONGER = 2.0
@@ -237,7 +236,7 @@ def score_gdi(
             passes = _passes(usable, vectors, basis)
             expected = expected_index(estimate(model_of_error, passes), basis, model_of_error.widening)
             left, right, mean, sd = expected.left, expected.right, expected.mean, expected.sd
-            minimal_change = _minimal_change(expected.sd_anew)
+            minimal_change = minimal_change_of(expected.sd_anew)
         else:
             parts = _parts(usable, vectors, basis, params)
             left, right = (_weighted([p for p in parts if p.side == side]) for side in (LEFT, RIGHT))
@@ -422,10 +421,11 @@ def _errors(parts: Sequence[_Part], params: GdiParams) -> tuple[float | None, fl
     fit = params.lasting * (params.both_sides * alike + (1.0 - params.both_sides) * apart)
     walk = sum(p.weight**2 * p.chance for p in parts)
     anew = float(np.sqrt((1.0 - params.repeated) * fit + walk))
-    return float(np.sqrt(fit + walk)), _minimal_change(anew)
+    return float(np.sqrt(fit + walk)), minimal_change_of(anew)
 
 
-def _minimal_change(sd_anew: float) -> float:
+def minimal_change_of(sd_anew: float) -> float:
+    """Return the minimal detectable change (90 %) between two visits, whose errors that are anew have an sd each."""
     from pbl_pipeline.stats import minimal_detectable_change  # loads pandas, which every command would wait for
 
     return minimal_detectable_change(sd_anew, 0.9)

@@ -11,6 +11,8 @@ from ._camera_side import mostly
 from .events import LEFT, RIGHT
 from .types import GaitCycle
 
+#: A 90 % interval of a normal error, in standard deviations.
+Z90 = 1.6449
 #: Measures in the order of metrics.json; the unit is in the name.
 MEASURES: tuple[str, ...] = (
     "cadence_steps_per_min",
@@ -53,6 +55,9 @@ class Measure:
     an asymmetry does not touch; None with fewer than two values of a side. `cv_percent` is that in percent of the mean.
     `asymmetry_percent` is 100 (right - left) / ((right + left) / 2), None for measures that are not `SIDED` and where
     one camera saw the same leg behind the other in most cycles (`far_leg_of`).
+    `error_sd` is the standard deviation of the error of `mean`: of what camera, detector and fit do, as measured, and
+    of the chance of n values; `minimal_change` the minimal detectable change (90 %) between two visits filmed alike.
+    None where the error was not measured.
     """
 
     left: float | None
@@ -63,17 +68,22 @@ class Measure:
     variability: float | None = None
     cv_percent: float | None = None
     asymmetry_percent: float | None = None
+    error_sd: float | None = None
+    minimal_change: float | None = None
 
     def to_dict(self) -> dict:
         return {k: round(v, 4) if isinstance(v, float) else v for k, v in dataclasses.asdict(self).items()}
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """90 % interval of the mean over repetitions, mean +- t sd / sqrt(n) by Student's t, as far as the values vary
-        from cycle to cycle: what camera, detector and fit do to all of them alike is not in it.
+        """90 % interval of the mean: of its whole error where that was measured (`error_sd`). Else over repetitions,
+        mean +- t sd / sqrt(n) by Student's t, as far as the values vary from cycle to cycle: what camera, detector and
+        fit do to all of them alike is not in it.
 
         The sd is `variability` where it is known (n - 2 degrees of freedom), else `sd` (n - 1); None without either.
         """
+        if self.error_sd is not None:
+            return self.mean - Z90 * self.error_sd, self.mean + Z90 * self.error_sd
         from scipy.stats import t  # takes longer to import than most commands run
 
         sd, freedom = (self.variability, self.n - 2) if self.variability is not None else (self.sd, self.n - 1)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from typing import Any, NamedTuple
 
@@ -58,6 +58,15 @@ class View:
         return View(self.bias[turn], self.gain[both], self.view[both], self.anew[both])
 
 
+class MeasureError(NamedTuple):
+    """Root mean squares, in its unit, of the parts of a gait measure's error: `lasting` at all visits of a person
+    (with the bias), `visit` in all passes of one visit, `anew` in each pass."""
+
+    lasting: float
+    visit: float
+    anew: float
+
+
 @dataclasses.dataclass(frozen=True)
 class MeasurementModel:
     """A measured model.
@@ -78,6 +87,12 @@ class MeasurementModel:
         Covariance (K, K) of a cycle's scores about the mean of its side, and how many cycles of a side the passes had.
     widening
         Factor of the index's standard deviation with which 90 % intervals of persons left out held 90 %.
+    events
+        Hash of the event method that the gait measures were found with.
+    pass_cycles
+        Cycles of both sides of one pass, of which the gait measures are means.
+    measures
+        Errors of the gait measures, by view (far leg "left" or "", mirrored views alike) and measure.
     """
 
     name: str
@@ -90,6 +105,9 @@ class MeasurementModel:
     cycle: np.ndarray
     n_cycles: float
     widening: float
+    events: str
+    pass_cycles: float
+    measures: Mapping[str, Mapping[str, MeasureError]]
 
 
 class Posterior(NamedTuple):
@@ -124,8 +142,9 @@ def load_model(name: str) -> MeasurementModel:
     del data["made_by"]
     views = {k: View(**{n: np.array(v) for n, v in view.items()}) for k, view in data.pop("views").items()}
     views[RIGHT] = views[LEFT].mirrored()
+    errors = {k: {n: MeasureError(*e) for n, e in view.items()} for k, view in data.pop("measures").items()}
     arrays: dict[str, Any] = {n: np.array(data.pop(n)) for n in ("mean", "spread", "person", "cycle")}
-    return MeasurementModel(**data, **arrays, views=views)
+    return MeasurementModel(**data, **arrays, views=views, measures=errors)
 
 
 @functools.cache
@@ -174,6 +193,22 @@ def expected_index(posterior: Posterior, norm: NormativeSet, widening: float = 1
         widening * float(sides.mean(axis=1).std()),
         float(anew.std()),
     )
+
+
+def measure_error(model: MeasurementModel, name: str, cycles: Mapping[str, int]) -> tuple[float, float] | None:
+    """Return the standard deviation of the error of a gait measure, and of the part that is anew at another visit, both
+    in its unit; None if it was not measured in a view.
+
+    cycles: number of used cycles of both sides by the leg behind the other. The lasting part is the same in all views.
+    """
+    total, lasting, anew = sum(cycles.values()), 0.0, 0.0
+    for far_leg, n in cycles.items():
+        error = model.measures[LEFT if far_leg else ""].get(name)
+        if error is None:
+            return None
+        lasting += n / total * error.lasting
+        anew += (n / total) ** 2 * (error.visit**2 + error.anew**2 * model.pass_cycles / n)
+    return float(np.sqrt(lasting**2 + anew)), float(np.sqrt(anew))
 
 
 def with_one_more(model: MeasurementModel, passes: Sequence[Pass], norm: NormativeSet) -> dict[str, float]:

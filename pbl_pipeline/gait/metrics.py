@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,14 +24,16 @@ from ._gdi import (
     PAPER_INDEX,
     Gdi,
     GdiParams,
+    minimal_change_of,
     norm_of,
     params_of,
     score_gdi,
     worth_of_one_more,
 )
-from .cycle_measures import MEASURES, Spatiotemporal, far_leg_of, spatiotemporal
+from .cycle_measures import LENGTHS, MEASURES, Z90, Spatiotemporal, far_leg_of, spatiotemporal
 from .events import METHODS, GaitEvents, detect_events
 from .laboratory import LabTrial
+from .measurement import load_model, measure_error
 from .motion import BodyPoses, feet_from_fit, trial_poses
 from .normative import NormativeSet
 from .types import GaitCycle
@@ -141,13 +145,15 @@ class GaitMetrics(SessionMetrics):
     def table(self) -> str:
         """The session's measures as text for a terminal."""
         lines = [f"{self.status}: {self.reason}"] if self.reason else []
-        lines.append(f"{'measure':<24}{'left':>9}{'right':>9}{'mean':>9}{'sd':>8}{'n':>5}")
+        lines.append(f"{'measure':<24}{'left':>9}{'right':>9}{'mean':>9}{'sd':>8}{'n':>5}{'+- 90 %':>9}")
         for name in MEASURES:
             m = self.spatiotemporal[name]
             if m is None:
                 lines.append(f"{name:<24}{'-':>9}{'-':>9}{'-':>9}{'-':>8}{'-':>5}  {self.spatiotemporal.reasons[name]}")
             else:
-                lines.append(f"{name:<24}{_cell(m.left)}{_cell(m.right)}{_cell(m.mean)}{_cell(m.sd, 8)}{m.n:>5}")
+                error = "" if m.error_sd is None else _cell(Z90 * m.error_sd)
+                row = f"{name:<24}{_cell(m.left)}{_cell(m.right)}{_cell(m.mean)}{_cell(m.sd, 8)}{m.n:>5}{error}"
+                lines.append(row)
         g = self.gdi
         lines.append(f"{_short(g):<24}{_cell(g.left)}{_cell(g.right)}{_cell(g.mean)}{'':>8}{g.n:>5}  {g.reason}")
         if g.interval is not None:
@@ -229,7 +235,8 @@ def pool_trials(
     pooled = [t for t, c in zip(trials, given, strict=True) if c.pooled(params.gdi.pace)]
     cycles = [c for t in pooled for c in t.cycles]
     # Two trials may carry one name; their cycles are told apart by it.
-    measures, gdi = spatiotemporal(_distinct(pooled)), score_gdi(cycles, norm, params.gdi, model, version)
+    measures = with_errors(spatiotemporal(_distinct(pooled)), cycles, params.events)
+    gdi = score_gdi(cycles, norm, params.gdi, model, version)
     status = PASS if measures.status == PASS else EMPTY
     reason = "" if status == PASS else "; ".join(dict.fromkeys(f"{t.name}: {t.reason}" for t in pooled))
     if not pooled:
@@ -245,6 +252,26 @@ def pool_trials(
         qc=(*cycle_checks(measures, cycles), *gdi.qc),
         params_hash=Paramset.of("gait", "gait-metrics", 1, params).hash,
     )
+
+
+def with_errors(measures: Spatiotemporal, cycles: Sequence[GaitCycle], events: Paramset) -> Spatiotemporal:
+    """Return the measures of a session with the error of each, where one was measured for all its used cycles (fit and
+    event method; lengths in metres that the detector assumes)."""
+    used = [c for c in cycles if c.used]
+    names = {c.error_model for c in used}
+    if len(names) != 1 or "" in names or (model := load_model(names.pop())).events != events.hash:
+        return measures
+    metric = any(c.lengths.metric for c in used)
+    views = Counter(c.far_leg for c in used)
+    found = dict(measures.measures)
+    for name, m in found.items():
+        error = measure_error(model, name, views)
+        if m is None or error is None or (metric and name in LENGTHS):
+            continue
+        chance = 0.0 if m.variability is None else m.variability / math.sqrt(m.n)
+        sd, anew = (math.hypot(e, chance) for e in error)
+        found[name] = dataclasses.replace(m, error_sd=sd, minimal_change=minimal_change_of(anew))
+    return dataclasses.replace(measures, measures=found)
 
 
 def _trial(

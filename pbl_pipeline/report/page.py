@@ -10,6 +10,7 @@ import numpy as np
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.gait import (
     GILLETTE_MODEL,
+    Z90,
     GaitCycle,
     Gdi,
     Measure,
@@ -76,8 +77,8 @@ def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str,
         page["measures_note"] = (
             f"{plural(values.n_cycles_used, 'gait cycle')} used of {values.n_cycles_found} found: the first and the "
             "last step of each walk are left out, and cycles unlike the others in length or curves. SD over all values "
-            "of both sides, n counts them; CV is the spread within a side in percent of the mean; asymmetry is right "
-            "minus left in percent of their mean."
+            "of both sides, n counts them; 90 % is half the interval of Both, of its whole error; CV is the spread "
+            "within a side in percent of the mean; asymmetry is right minus left in percent of their mean."
         )
         bands = _bands(visit)
         page["cycle_charts"] = _figures.cycle_charts(cycles, bands)
@@ -201,10 +202,16 @@ def _measure_row(key: str, m: Measure | None, reason: str) -> dict:
         "mean": number(m.mean, decimals),
         "sd": number(m.sd, _sd_decimals(decimals)),
         "n": m.n,
+        "error": _error(m.error_sd, _sd_decimals(decimals)),
         "cv": number(m.cv_percent, 1),
         "asymmetry": number(m.asymmetry_percent, 1),
         "unit": unit,
     }
+
+
+def _error(sd: float | None, decimals: int) -> str:
+    """Half the 90 % interval of a value; empty where its error is not known."""
+    return "" if sd is None else f"\N{PLUS-MINUS SIGN}{number(Z90 * sd, decimals)}"
 
 
 def _gdi_row(gdi: Gdi) -> dict:
@@ -212,7 +219,13 @@ def _gdi_row(gdi: Gdi) -> dict:
         return {"name": gdi.title, "known": False, "reason": gdi.reason}
     values = {"left": number(gdi.left, 1), "right": number(gdi.right, 1), "mean": number(gdi.mean, 1)}
     unit = "100 = norm, 10 = 1 sd"
-    more = {"sd": number(_gdi_sd(gdi), 1), "n": gdi.n, "cv": number(None, 1), "asymmetry": number(None, 1)}
+    more = {
+        "sd": number(_gdi_sd(gdi), 1),
+        "n": gdi.n,
+        "error": _error(gdi.sd, 1),
+        "cv": number(None, 1),
+        "asymmetry": number(None, 1),
+    }
     return {"name": gdi.title, "known": True, **values, **more, "unit": unit}
 
 

@@ -31,6 +31,7 @@ from .figures import (
 )
 from .page_tables import PageTable, all_tables, number, p_text, short_of, title_of, unit_of
 from .results import StudyResults, reason, score_classes, study_results
+from .statement import statement
 from .visit_values import INDEX, pairs, plan, score_column
 
 PAGE = "report.html"
@@ -59,6 +60,8 @@ def write_study_report(
     check_out_folder(folder)
     results = study_results(study, plan(study, change_from, change_to, change_group))
     tables, sections = all_tables(study, results), _sections(study, results)
+    stated = statement(study, results)
+    tables[stated.name] = stated
     head = _head(study, results)
     source = f"Slice {head['slice']}; {head['n']}; values by {head['made_by']}; methods: {head['methods']}"
     footer = [source, f"Report by PBL pipeline {code_version()}; content {head['content']}"]
@@ -75,6 +78,8 @@ def write_study_report(
     for name, frame in _frames(results).items():
         paths.append(folder / "tables" / f"{name}.csv")
         paths[-1].write_bytes(frame_to_csv(frame, "%.8g").encode())
+    paths.append(folder / "tables" / f"{stated.name}.csv")
+    paths[-1].write_bytes(frame_to_csv(stated.body).encode())
     for table in tables.values():
         paths.append(folder / "tables" / f"{table.name}.tex")
         paths[-1].write_text(table.latex(". ".join(footer)), encoding="utf-8")

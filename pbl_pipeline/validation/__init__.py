@@ -1,6 +1,7 @@
 """How far a fit is from a reference: errors per joint, the paper's tables, paired curves (docs/validation.md)."""
 
 from .align import align_path, best_lag
+from .bridge import bridge_pairs, bridge_table, folder_values, refit_bridge_set, touched
 from .compare import JointError, KinematicErrors, compare, compare_angles
 from .curves import CURVE_COLUMNS, cycle_curves, save_curves
 from .frame import COLUMNS, TrialErrors, error_frame
@@ -42,12 +43,15 @@ __all__ = [
     "align_path",
     "best_lag",
     "body_rotation_angles",
+    "bridge_pairs",
+    "bridge_table",
     "compare",
     "compare_angles",
     "cycle_curves",
     "error_frame",
     "fit_angles",
     "fit_angles_sd",
+    "folder_values",
     "html",
     "index_agreement",
     "index_pairs",
@@ -61,7 +65,9 @@ __all__ = [
     "reference_of_fit",
     "reference_of_mot",
     "reference_of_qpos",
+    "refit_bridge_set",
     "save_curves",
+    "touched",
     "view_classes",
     "write_tables",
 ]

@@ -16,11 +16,22 @@ from typing import Any
 import click
 import numpy as np
 import pandas as pd
+from scipy.stats import norm as normal
 
 from pbl_pipeline.fit import METHODS
 from pbl_pipeline.gait import MEASURES, Z90, load_norm
+from pbl_pipeline.gait.change import IMPORTANT_CHANGE, chances, change_sd
 from pbl_pipeline.gait.events import LEFT, RIGHT
-from pbl_pipeline.gait.measurement import MeasurementModel, Pass, View, estimate, expected_index
+from pbl_pipeline.gait.events import METHODS as EVENT_METHODS
+from pbl_pipeline.gait.measurement import (
+    MeasureError,
+    MeasurementModel,
+    Pass,
+    View,
+    estimate,
+    expected_index,
+    measure_error,
+)
 from pbl_pipeline.gait.normative import DEFAULT_NORM, NormativeSet
 from research.corpus.passes import ANGLES, STEP_DEG
 from research.corpus.walks import HEALTHY
@@ -65,6 +76,7 @@ class Seen:
     n_cycles: tuple[int, int]
     within: np.ndarray  # (K, K) sum of squares of the cycles' scores about their side's mean
     measures: np.ndarray  # (2, M) of `gait.MEASURES`, found and true
+    angles: np.ndarray  # (2, 2, 3, 2) deg: found and true, left and right, `ANGLES`, mean and range of the mean curve
 
     @property
     def walk(self) -> tuple[str, str, float]:
@@ -74,6 +86,7 @@ class Seen:
         """The same pass of the mirrored person."""
         return dataclasses.replace(
             self,
+            angles=self.angles[:, ::-1],
             view=MIRRORED.get(self.view, self.view),
             scores=self.scores[::-1],
             true=self.true[::-1],
@@ -91,6 +104,7 @@ def read_passes(folder: Path, norm: NormativeSet, events: str = "detected") -> l
         with np.load(path, allow_pickle=False) as file:
             data = dict(file)
         columns = zip(_scores(data, events, norm), _scores(data, "true", norm), strict=True)
+        angles = list(zip(_angles(data, events), _angles(data, "true"), strict=True))
         for i, (found, true) in enumerate(columns):
             if min(map(len, found)) == 0 or min(map(len, true)) == 0:
                 continue
@@ -109,6 +123,7 @@ def read_passes(folder: Path, norm: NormativeSet, events: str = "detected") -> l
                     (len(found[0]), len(found[1])),
                     off.T @ off,
                     np.array([data["measures"][i], data["true_measures"][i]]),
+                    np.array(angles[i]),
                 )
             )
     return out
@@ -123,6 +138,16 @@ def _scores(data: dict[str, np.ndarray], kind: str, norm: NormativeSet) -> Itera
     ends = np.cumsum(data[f"{kind}_curves_n"])
     for part, right in zip(np.split(scores, ends[:-1]), np.split(data[f"{kind}_right"], ends[:-1]), strict=True):
         yield [part[~right], part[right]]
+
+
+def _angles(data: dict[str, np.ndarray], kind: str) -> Iterator[np.ndarray]:
+    """Of each pass (2, 3, 2) deg: of the mean curve of the left and the right side, each angle's mean and range; NaN
+    where a side has no cycle."""
+    ends = np.cumsum(data[f"{kind}_curves_n"])[:-1]
+    parts = zip(np.split(data[f"{kind}_curves"] * STEP_DEG, ends), np.split(data[f"{kind}_right"], ends), strict=True)
+    for curves, right in parts:
+        means = [curves[own].mean(axis=0) if own.any() else np.full((3, 51), np.nan) for own in (~right, right)]
+        yield np.array([np.stack([m.mean(axis=1), np.ptp(m, axis=1)], axis=1) for m in means])
 
 
 def fit_model(seen: Sequence[Seen], norm: NormativeSet, fits: Sequence[str], widening: float = 1.0) -> MeasurementModel:
@@ -175,7 +200,38 @@ def fit_model(seen: Sequence[Seen], norm: NormativeSet, fits: Sequence[str], wid
         np.sum([s.within for s in seen], axis=0) / freedom,
         float(np.median([n for s in seen for n in s.n_cycles])),
         widening,
+        EVENT_METHODS.find().paramset.hash,
+        float(np.median([sum(s.n_cycles) for s in seen])),
+        {
+            far_leg: parts_of_errors([s for s in seen if (FAR_LEG[s.view] != "") == (far_leg != "")])
+            for far_leg in ("", LEFT)
+        },
     )
+
+
+def parts_of_errors(seen: Sequence[Seen]) -> dict[str, MeasureError]:
+    """The parts of each measure's error: means of products of the errors of two passes of a walk in one view. Where no
+    walk has the measure at two visits (lengths need a phone that stands), the bias alone lasts."""
+    by_walk: dict[tuple, list[tuple[int, np.ndarray]]] = {}
+    for s in seen:
+        by_walk.setdefault((s.walk, s.view), []).append((s.visit, s.measures[0] - s.measures[1]))
+    all_ = np.array([e for group in by_walk.values() for _, e in group])
+    pairs: dict[bool, list[np.ndarray]] = {True: [], False: []}
+    for group in by_walk.values():
+        for (i, x), (j, y) in itertools.combinations(group, 2):
+            pairs[i == j].append(x * y)
+    out = {}
+    for k, name in enumerate(MEASURES):
+        errors, same, other = (
+            v[np.isfinite(v)] for v in (all_[:, k], *(np.array(pairs[b])[:, k] for b in (True, False)))
+        )
+        if len(errors) < 10 or not len(same):
+            continue
+        lasting = max(float(other.mean()), 0.0) if len(other) else float(errors.mean()) ** 2
+        visit = max(float(same.mean()) - lasting, 0.0)
+        anew = max(float((errors**2).mean()) - lasting - visit, 0.0)
+        out[name] = MeasureError(*(float(np.sqrt(v)) for v in (lasting, visit, anew)))
+    return out
 
 
 def _symmetric(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -270,6 +326,150 @@ def change_table(frame: pd.DataFrame) -> pd.DataFrame:
     return share.unstack("kind")
 
 
+def change_pairs(frame: pd.DataFrame) -> pd.DataFrame:
+    """Each walk of a person at the first visit with each of theirs at the second, by the same kind of session, or one
+    from the left and one from the front: found and true change, and the standard deviations that are known of it."""
+    keys = ["kind", "person", "condition", "severity", "visit"]
+    one: Any = frame.groupby(keys).first().reset_index()
+    rows = []
+    for _, own in one.groupby("person"):
+        for a, b in itertools.product(*(own[own["visit"] == v].to_dict("records") for v in (0, 1))):
+            same_view = a["kind"] == b["kind"]
+            if not same_view and (a["kind"], b["kind"]) != ("left", "front"):
+                continue
+            whole = a["sd"], b["sd"]
+            least = Z90 * np.sqrt(2.0) * np.array([a["sd_anew"], b["sd_anew"]])
+            by = b["found"] - a["found"]
+            rows.append(
+                {
+                    "kind": a["kind"] if same_view else "left, then front",
+                    "unchanged": (a["condition"], a["severity"]) == (b["condition"], b["severity"]),
+                    "found": by,
+                    "true": b["true"] - a["true"],
+                    "anew": np.hypot(a["sd_anew"], b["sd_anew"]) if same_view else np.hypot(*whole),
+                    "whole": np.hypot(*whole),
+                    "sd": change_sd((least[0], least[1]), whole) if same_view else float(np.hypot(*whole)),
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def remains_table(pairs: pd.DataFrame) -> pd.DataFrame:
+    """Logarithmic loss of both probabilities by how much of what two visits have in common does not cancel
+    (`gait.change.REMAINS`), over pairs that were filmed alike and that changed."""
+    own = pairs[(pairs["kind"] != "left, then front") & ~pairs["unchanged"]]
+    rows = []
+    for share in np.arange(0.0, 1.01, 0.1):
+        sd = np.sqrt(own["anew"] ** 2 + share * (own["whole"] ** 2 - own["anew"] ** 2))
+        losses = {}
+        for limit in (0.0, IMPORTANT_CHANGE):
+            p = np.clip(normal.cdf((own["found"] - limit) / sd), 1e-9, 1 - 1e-9)
+            losses[f"beyond {limit:.0f}"] = -np.log(np.where(own["true"] > limit, p, 1 - p)).mean()
+        rows.append({"remains": share, **losses, "sum": sum(losses.values())})
+    return pd.DataFrame(rows)
+
+
+def _stated(pairs: Any) -> np.ndarray:
+    """Both probabilities of each change, (N, 2)."""
+    return np.array([chances(by, sd, IMPORTANT_CHANGE) for by, sd in zip(pairs["found"], pairs["sd"], strict=True)])
+
+
+def probability_table(pairs: pd.DataFrame) -> pd.DataFrame:
+    """Of pairs that changed, how often the true change goes the way of the found one, and by `IMPORTANT_CHANGE`, beside
+    the mean probability that was stated, by stated probability."""
+    own = pairs[~pairs["unchanged"] & (pairs["true"].abs() > 0.01)]
+    said = _stated(own)
+    true = own["true"] * np.sign(own["found"])
+    rows = []
+    for (low, high), (title, p, real) in itertools.product(
+        itertools.pairwise((0.0, 0.05, 0.2, 0.5, 0.65, 0.8, 0.9, 0.95, 0.99, 1.001)),
+        (("real", said[:, 0], true > 0), ("important", said[:, 1], true > IMPORTANT_CHANGE)),
+    ):
+        inside = (p >= low) & (p < high)
+        if inside.any():
+            stated, found = p[inside].mean(), real[inside].mean()
+            rows.append(
+                {"of": title, "from": low, "to": min(high, 1.0), "n": inside.sum(), "stated": stated, "found": found}
+            )
+    return pd.DataFrame(rows).sort_values("of", kind="stable", ascending=False)
+
+
+def probability_errors(pairs: pd.DataFrame) -> pd.DataFrame:
+    """By kind of session: of unchanged pairs how many are called real with at least 0.95 (either way: at most 0.1), and
+    of changed ones the Brier score of each probability."""
+    rows = []
+    for kind, own in [("all", pairs), *pairs.groupby("kind", sort=False)]:
+        said = np.array(
+            [chances(by, sd, IMPORTANT_CHANGE) for by, sd in zip(own["found"], own["sd"], strict=True)], float
+        )
+        true, moved = own["true"] * np.sign(own["found"]), ~own["unchanged"]
+        rows.append(
+            {
+                "session": kind,
+                "unchanged": int(own["unchanged"].sum()),
+                "called real": (said[own["unchanged"], 0] >= 0.95).mean(),
+                "changed": int(moved.sum()),
+                "Brier, real": ((said[:, 0] - (true > 0)) ** 2)[moved].mean(),
+                "Brier, important": ((said[:, 1] - (true > IMPORTANT_CHANGE)) ** 2)[moved].mean(),
+                "in 90 %": ((own["found"] - own["true"]).abs() <= Z90 * own["sd"])[moved].mean(),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def stated_errors(seen: Sequence[Seen], model: MeasurementModel) -> pd.DataFrame:
+    """Coverage of the stated errors of the gait measures of one pass: the fraction of 90 % intervals that hold the
+    truth, and of pairs of two visits in one view within the minimal detectable change."""
+    rows = []
+    for title, far_leg in (("sides", LEFT), ("front, back", "")):
+        own = [s for s in seen if (FAR_LEG[s.view] != "") == (far_leg != "")]
+        for k, name in enumerate(MEASURES):
+            held, within, sds = [], [], []
+            visits: dict[tuple, dict[int, tuple[float, float]]] = {}
+            for s in own:
+                stated, off = (
+                    measure_error(model, name, {far_leg: sum(s.n_cycles)}),
+                    s.measures[0, k] - s.measures[1, k],
+                )
+                if stated is None or not np.isfinite(off):
+                    continue
+                held.append(abs(off) <= Z90 * stated[0])
+                sds.append(stated[0])
+                visits.setdefault((s.walk, s.view), {})[s.visit] = off, stated[1]
+            for pair in visits.values():
+                if len(pair) == 2:
+                    (x, a), (y, b) = pair[0], pair[1]
+                    within.append(abs(x - y) <= Z90 * np.sqrt(2.0) * max(a, b))
+            if held:
+                rows.append(
+                    {"measure": name, "from": title, "n": len(held), "mean sd": np.mean(sds), "in 90 %": np.mean(held),
+                     "unchanged within": np.mean(within) if within else np.nan}
+                )  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def angle_errors(seen: Sequence[Seen]) -> pd.DataFrame:
+    """Error (deg) of mean and range of each angle's mean curve, of one pass: bias and sd of the leg near to the camera
+    and of the one behind it, or of both from front and back."""
+    rows = []
+    far = {title: [s for s in seen if FAR_LEG[s.view] == leg] for title, leg in ((RIGHT, RIGHT), (LEFT, LEFT))}
+    errors = {n: np.array([s.angles[0] - s.angles[1] for s in own]) for n, own in far.items()}
+    other = np.array([s.angles[0] - s.angles[1] for s in seen if s.view in ("frontal", "rear")])
+    groups = {
+        "sides, near leg": np.concatenate([errors[RIGHT][:, 0], errors[LEFT][:, 1]]),
+        "sides, far leg": np.concatenate([errors[RIGHT][:, 1], errors[LEFT][:, 0]]),
+        "front, back": other.reshape(-1, *other.shape[2:]),
+    }
+    for title, off in groups.items():
+        for k, angle in enumerate(ANGLES):
+            for j, what in enumerate(("mean", "range")):
+                own = off[:, k, j]
+                rows.append(
+                    {"angle": angle, "of": what, "from": title, "n": len(own), "bias": own.mean(), "sd": own.std()}
+                )
+    return pd.DataFrame(rows)
+
+
 def measure_errors(seen: Sequence[Seen]) -> pd.DataFrame:
     """Error of each gait measure of one pass: bias and sd in its unit, and the sd of what two passes of one walk at one
     visit in one view have in common, by where they were filmed from."""
@@ -292,17 +492,30 @@ def measure_errors(seen: Sequence[Seen]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def widening_of(seen: Sequence[Seen], norm: NormativeSet) -> float:
-    """The factor of the sd with which 90 % of the intervals of tuning persons hold the truth who are left out in turn
-    (one pass, and both sides)."""
+def left_out_in_turn(seen: Sequence[Seen], norm: NormativeSet) -> pd.DataFrame:
+    """Sessions of tuning persons, each judged by a model of the others (`judged`), with the error by its sd."""
     people = sorted({s.person for s in seen})
-    ratios = []
+    frames = []
     for fold in range(FOLDS):
         out = set(people[fold::FOLDS])
         model = fit_model([s for s in seen if s.person not in out], norm, ())
         frame = judged([s for s in seen if s.person in out], model, norm)
-        ratios.append((frame["found"] - frame["true"]).abs() / frame["sd"])
-    return round(float(np.quantile(pd.concat(ratios), 0.9)) / Z90, 2)
+        frames.append(frame.assign(ratio=(frame["found"] - frame["true"]).abs() / frame["sd"]))
+    return pd.concat(frames)
+
+
+def widening_of(judged_out: pd.DataFrame) -> float:
+    """The factor of the sd with which 90 % of the intervals of persons left out in turn hold the truth."""
+    return round(float(np.quantile(judged_out["ratio"], 0.9)) / Z90, 2)
+
+
+def coverage_by_chance(judged_out: pd.DataFrame, widening: float, persons: int) -> tuple[np.ndarray, np.ndarray]:
+    """How often the 90 % intervals of each person left out hold the truth, in order; and the 5th, 50th and 95th
+    percentile of the mean of so many persons drawn from them."""
+    rows: Any = judged_out.assign(ok=judged_out["ratio"] <= widening * Z90)
+    held = rows.groupby("person")["ok"].mean().to_numpy()
+    means = np.random.default_rng(0).choice(held, (5000, persons)).mean(axis=1)
+    return np.sort(held), np.quantile(means, [0.05, 0.5, 0.95])
 
 
 def write_model(model: MeasurementModel, path: Path, made_by: str) -> None:
@@ -311,6 +524,10 @@ def write_model(model: MeasurementModel, path: Path, made_by: str) -> None:
     def plain(value: Any) -> Any:
         if isinstance(value, np.ndarray):
             return json.loads(json.dumps(value.tolist()), parse_float=lambda t: float(f"{float(t):.4g}"))
+        if isinstance(value, dict):
+            return {k: plain(v) for k, v in value.items()}
+        if isinstance(value, tuple) and hasattr(value, "_fields"):
+            return [float(f"{v:.4g}") for v in value]
         if dataclasses.is_dataclass(value):
             return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return value
@@ -331,14 +548,30 @@ def main(folder: Path, norm: str, fit: str, write: Path | None) -> None:
     seen = read_passes(folder, basis)
     tuning = [s for s in seen if not s.held_out]
     held = [s for s in seen if s.held_out]
-    model = fit_model(tuning, basis, [method.hash], widening_of(tuning, basis))
+    out = left_out_in_turn(tuning, basis)
+    model = fit_model(tuning, basis, [method.hash], widening_of(out))
     people = [len({s.person for s in part}) for part in (tuning, held)]
     click.echo(f"{len(tuning)} passes of {people[0]} tuning persons, {len(held)} of {people[1]} held out; {method.key}")
-    click.echo(f"widening {model.widening}")
+    by_person, drawn = coverage_by_chance(out, model.widening, people[1])
+    factors = out.groupby("kind")["ratio"].quantile(0.9) / Z90
+    click.echo(f"widening {model.widening}; by session: " + ", ".join(f"{k} {f:.2f}" for k, f in factors.items()))
+    click.echo(f"90 % intervals of tuning persons left out in turn hold {np.round(by_person, 2).tolist()}")
+    click.echo(
+        f"of {people[1]} persons drawn from these: {drawn[1]:.2f} (90 % of draws: {drawn[0]:.2f} to {drawn[2]:.2f})"
+    )
     for title, part in (("held out", held), ("tuning", tuning)):
         frame = judged(part, model, basis)
         click.echo(f"\n{title}: error of the index\n{error_table(frame).to_string(index=False, float_format='%.2f')}")
         click.echo(f"\n{title}: gait measures\n{measure_errors(part).to_string(index=False, float_format='%.3f')}")
+        click.echo(f"\n{title}: angles\n{angle_errors(part).to_string(index=False, float_format='%.1f')}")
+        click.echo(f"\n{title}: stated\n{stated_errors(part, model).to_string(index=False, float_format='%.3f')}")
+        pairs = change_pairs(frame)
+        for what, table in (
+            ("which part of what visits have in common remains", remains_table(pairs)),
+            ("probability of a change, as stated and as found", probability_table(pairs)),
+            ("probability of a change, by session", probability_errors(pairs)),
+        ):
+            click.echo(f"\n{title}: {what}\n{table.to_string(index=False, float_format='%.3f')}")
         click.echo(f"\n{title}: of a true change is found\n{change_table(frame).to_string(float_format='%.2f')}")
     if write is not None:
         write_model(model, write, f"python -m research.corpus.measurement, {method.key}, {people[0]} persons")

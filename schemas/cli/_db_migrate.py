@@ -18,6 +18,7 @@ def migrate(dry_run: bool) -> None:
     Example: pbl db backup /backup/before && pbl db migrate
     """
     from schemas import migrations
+    from schemas.reading.bridge import changed_defaults
 
     known = migrations.applied()
     click.echo(f"{len(known)} migrations applied so far" + (f", last {known[-1].when} UTC" if known else ""))
@@ -32,5 +33,7 @@ def migrate(dry_run: bool) -> None:
         click.echo(f"  needs its own migration: {line}")
     if outcome.open:
         raise click.exceptions.Exit(1)
+    for line in changed_defaults():
+        click.echo(line)
     done = not outcome.created and not any(s for _, s in outcome.steps)
     click.echo("The tables are as this version defines them." if done or not dry_run else "Nothing was changed.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,7 +30,7 @@ Example: pbl export --slice paper --to parquet --out paper_visits"""
     multiple=True,
     required=True,
     metavar="FORMAT",
-    help="trc, mot, osim, c3d, dlc, csv or parquet; once for each.",
+    help="trc, mot, osim, c3d, dlc, csv, parquet or bids; once for each.",
 )
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder; one below it for each trial.")
 @click.option("--subject", help="Code of the subject, in place of FILES: from the tables.")
@@ -68,7 +69,7 @@ def export(
     allow_failed: bool,
     overwrite: bool,
 ) -> None:
-    """Write the trials of one visit, or of many, for OpenSim, Visual3D, Mokka, R, pandas or movement.
+    """Write the trials of one visit, or of many, for OpenSim, Visual3D, Mokka, R, pandas, movement or as Motion-BIDS.
 
     FILES are fits (fit.npz) of `pbl fit` or `pbl run`, with their keypoints.npz and session.json beside them. Axes,
     units and signs of each format: docs/export.md. c3d and parquet need the extra `export`. With --all and --slice each
@@ -139,7 +140,7 @@ def _write_many(
     """Each visit into its folder; those that cannot be exported are named at the end of their line."""
     import schemas
     from pbl_pipeline import progress
-    from pbl_pipeline.export import GAIT_FORMATS, write_export
+    from pbl_pipeline.export import GAIT_FORMATS, Labels, write_export
     from schemas.reading import list_fitted, load_visits
 
     schemas.activate(methods=False)
@@ -151,7 +152,9 @@ def _write_many(
             try:
                 if isinstance(visit, PblError):
                     raise visit
-                write_export(visit, formats, out / row["folder"], options)
+                labels = Labels.of(row["subject"], row["session_label"])
+                own = dataclasses.replace(options, bids=(out / "bids", labels))
+                write_export(visit, formats, out / row["folder"], own)
             except PblError as error:
                 refused += 1
                 click.echo(f"{row['folder']}: {error.code}: {error.found}. Next: {error.next_step}", err=True)

@@ -54,6 +54,16 @@ def visits(as_json: bool, as_csv: bool, **restriction: str | None) -> None:
     _print("visits", restriction, as_json, as_csv)
 
 
+@list_.command(epilog="Example: pbl list changes --subject P017")
+@_options(*_PEOPLE)
+def changes(as_json: bool, as_csv: bool, **restriction: str | None) -> None:
+    """The changes of index and measures between a visit and the one before, and the probability that each is real.
+
+    Where two visits were not filmed alike, `not_comparable` says why.
+    """
+    _print("changes", restriction, as_json, as_csv)
+
+
 @list_.command(epilog="Example: pbl list videos --subject P017 --session 2026-03-01 --json")
 @_options(*_VISITS, click.option("--activity", help="Of this activity, such as walking."))
 def videos(as_json: bool, as_csv: bool, **restriction: str | None) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -168,6 +168,80 @@ def index(out: Path | None, where: tuple[str, ...]) -> None:
         write_tables(made, out)
         (out / "pairs.csv").write_bytes(frame_to_csv(pairs).encode())
         click.echo(f"table, and the pairs that it is made from (pairs.csv): {out}")
+
+
+@validate.command(
+    epilog="\b\nExample: pbl validate bridge blazepose gauss-newton --keep bridge\n"
+    "Example: pbl validate bridge of_0.2/blazepose-v7 blazepose\n"
+    "Example: pbl validate bridge pbl-2025-three-angles-v5 pbl-2025-three-angles-v6 --tables"
+)
+@click.argument("old")
+@click.argument("new", required=False)
+@click.option("--tables", "in_tables", is_flag=True, help="Results of the tables by two methods, in place of refits.")
+@click.option("--keep", type=click.Path(path_type=Path), metavar="DIR", help="Keep what is refitted, in DIR/METHOD.")
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write CSV, LaTeX and HTML there.")
+def bridge(old: str, new: str | None, in_tables: bool, keep: Path | None, out: Path | None) -> None:
+    """Shift of index and measures from OLD to NEW, with intervals, on the same recordings.
+
+    Each is a method of the fit, the events or the index, by which a frozen set of ten synthetic walks is refitted, or a
+    folder of visits: of `pbl run`, or what --keep wrote with another version of pbl. With OLD alone and --keep that set
+    is only refitted. With --tables both are methods, and every visit that has results by both counts; the comparisons
+    between visits that the change touches are listed.
+    """
+    import tempfile
+
+    from pbl_pipeline.csv_cells import frame_to_csv
+    from pbl_pipeline.files import check_out_folder
+    from pbl_pipeline.validation import bridge_pairs, bridge_table, print_tables, write_tables
+
+    if new is None and (keep is None or in_tables):
+        raise click.UsageError("Missing argument 'NEW' (or --keep DIR, which refits by OLD alone).")
+    if in_tables and keep is not None:
+        raise click.UsageError("--keep with --tables: nothing is refitted")
+    for folder in (keep, out):
+        if folder is not None:
+            check_out_folder(folder)
+    comparisons = None
+    if in_tables:
+        import schemas
+        from schemas.reading.bridge import values_by
+
+        schemas.activate(methods=False)
+        values, comparisons = values_by(old, str(new))
+    else:
+        with tempfile.TemporaryDirectory() as spare:
+            values = [_bridge_values(name, keep or Path(spare)) for name in (old, new) if name is not None]
+        if new is None:
+            return
+    pairs = bridge_pairs(values[0], values[1])
+    made = {"bridge": bridge_table(pairs, (old, str(new)))}
+    print_tables(made)
+    if comparisons is not None:
+        across: Any = comparisons[comparisons["what"] == "across"]
+        click.echo(f"{len(across)} successive visits of a person are compared across the change and cannot be judged:")
+        for row in across.head(20).to_dict("records"):
+            click.echo(f"  {row['subject']}: {row['before']} by {old}, {row['visit']} by {new}, or the other way round")
+        click.echo(f"{(comparisons['what'] == 'old').sum()} more have only {old} in common (pbl reprocess adds {new})")
+    if out is not None:
+        write_tables(made, out)
+        (out / "pairs.csv").write_bytes(frame_to_csv(pairs).encode())
+        if comparisons is not None:
+            (out / "comparisons.csv").write_bytes(frame_to_csv(comparisons).encode())
+        click.echo(f"table, and the pairs that it is made from (pairs.csv): {out}")
+
+
+def _bridge_values(name: str, keep: Path) -> pd.DataFrame:
+    """Values of a folder, or of the frozen set refitted by a method into a folder below `keep`."""
+    from pbl_pipeline import progress
+    from pbl_pipeline.validation import folder_values, refit_bridge_set
+    from pbl_pipeline.validation.bridge import BRIDGE_SET
+
+    folder = Path(name)
+    if not folder.is_dir():
+        folder = keep / name
+        with progress.bar(name, len(BRIDGE_SET), "walk") as update:
+            refit_bridge_set(name, folder, update)
+    return folder_values(folder)
 
 
 @validate.command()

@@ -14,7 +14,7 @@ from pbl_pipeline.study import minimal_change_at
 from .. import fit, gait, study, video
 from . import frames
 from .shown import ShownVisit, shown_visit
-from .visit_list import Change, change_since, not_alike, results_of
+from .visit_list import Change, change_since, judged, not_alike, results_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -53,7 +53,7 @@ class Side:
     cycles: tuple[Cycle, ...]
     scores: dict[str, Score]
     change: Change | None  # of the index; None for the reference itself
-    changes: dict[str, Change]  # of the measures: of none is the whole error known, so none has a verdict
+    changes: dict[str, Change]  # of the measures
     differs: tuple[Difference, ...]  # what was not made or filmed like the reference
 
     @property
@@ -136,7 +136,8 @@ def _compared(
         for name, (other, _) in first.measures.items():
             mine, _ = about.measures.get(name, (None, ""))
             if mine is not None and other is not None:
-                changes[name] = Change(mine.mean - other.mean, None, None, (*differs, Difference("error")))
+                errors = [(m.error_sd, m.minimal_change) for m in (mine, other)]
+                changes[name] = judged(mine.mean - other.mean, errors, differs)
     before = scores[first.row.session_id] if about is not first else {}
     return Side(
         about=about,

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 
-from .. import fit, gdi, keypoints, lab, review, session, video
+from .. import fit, gait, gdi, keypoints, lab, review, session, video
 from ..datajoint_setup import dj
 from ..decisions.not_usable import unusable
 from ..methods import METHOD_TABLES
 from ..rows import inside
 from .frames import frame_of, newest_sets
+from .visit_list import change_since, judged, not_alike, results_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,6 +37,61 @@ def visits(restriction: Any = True) -> pd.DataFrame:
     recorded = dj.U("session_id").aggr(video.Video.proj("session_id"), videos="count(*)")
     results = dj.U("session_id").aggr(gdi.SessionGdi.proj() * newest_sets(), results="count(*)")
     return _counted(rows, "session_id", recorded, results)
+
+
+def changes(restriction: Any = True) -> pd.DataFrame:
+    """One row per visit with a result by the chain of methods of the visit before of the person, and measure ("gdi":
+    the index): its change, the smallest that is more than chance, and the probabilities that it is real and important;
+    or why the two cannot be compared (docs/measures.md)."""
+    import pandas as pd
+
+    found = visits(restriction).sort_values(["subject", "session_date", "session_id"])
+    results = results_of(found["session_id"])
+    measures = _measures(found["session_id"])
+    out: list[dict[str, Any]] = []
+    for _, own in found.groupby("subject", sort=False):
+        rows = [r for r in own.to_dict("records") if results[r["session_id"]]]
+        for before, now in itertools.pairwise(rows):
+            for result in results[now["session_id"]]:
+                chain = result.kind, *result.methods
+                same = [r for r in results[before["session_id"]] if (r.kind, *r.methods) == chain]
+                if not same:
+                    continue
+                differs, other = not_alike(result, same[0]), measures.get((before["session_id"], *chain), {})
+                judgements = {"gdi": change_since(result, same[0])}
+                for name, mine in measures.get((now["session_id"], *chain), {}).items():
+                    if (old := other.get(name)) is not None:
+                        errors = [(m.error_sd, m.minimal_change) for m in (mine, old)]
+                        judgements[name] = judged(mine.mean - old.mean, errors, differs)
+                about = {"subject": now["subject"], "visit": now["session_label"], "before": before["session_label"]}
+                out += [
+                    {
+                        **about,
+                        "measure": name,
+                        "change": round(c.by, 3),
+                        "least": None if c.least is None else round(c.least, 3),
+                        "real": None if c.real is None else round(c.real, 3),
+                        "important": None if c.important is None else round(c.important, 3),
+                        "not_comparable": "" if c.sure is not None else "; ".join(map(str, c.differs)),
+                        "fit": result.methods[0],
+                    }
+                    for name, c in judgements.items()
+                    if c is not None
+                ]
+    columns = ["subject", "visit", "before", "measure", "change", "least", "real", "important", "not_comparable", "fit"]
+    return pd.DataFrame(out, columns=columns)
+
+
+def _measures(sessions: Any) -> dict[tuple, dict[str, Any]]:
+    """The library's measures of the results of visits, by visit, kind of recordings and methods."""
+    chain = ("session_id", "fit_set_kind", *gdi.SessionGdi.primary_key[1:])
+    query = gdi.SessionGdi.Measure * newest_sets()
+    out: dict[tuple, dict[str, Any]] = {}
+    for row in (query & inside("session_id", sessions.unique())).to_dicts():
+        of_visit = out.setdefault(tuple(row[k] for k in chain), {})
+        if (measure := gait.measure_of_row(row, "session_measure")) is not None:
+            of_visit[row["session_measure"]] = measure
+    return out
 
 
 def videos(restriction: Any = True) -> pd.DataFrame:

@@ -81,15 +81,19 @@ class Result:
 class Change:
     """Change of a value against that of another result.
 
-    sure: whether it is at least `least`, None where it cannot be judged. differs: why it cannot, with what is not alike
-    in the two results: "methods", "corrected" (events), "error" (not known), or what `filming.differences` finds; with
-    a verdict it is at most the view, by which `least` is that of visits filmed from other sides.
+    real: probability that the true change goes the same way; important: that it does by at least the minimal important
+    change, None where there is none for the value. Both are None where the change cannot be judged. sure: whether it is
+    at least `least`, None where it cannot be judged. differs: why it cannot, with what is not alike in the two results:
+    "methods", "corrected" (events), "error" (not known), or what `filming.differences` finds; with a verdict it is at
+    most the view, by which `least` is that of visits filmed from other sides.
     """
 
     by: float
     sure: bool | None
     least: float | None = None
     differs: tuple[Difference, ...] = ()
+    real: float | None = None
+    important: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,15 +179,45 @@ def change_since(result: Result, before: Result) -> Change | None:
     Filmed alike, a change is more than chance from the larger of the two minimal changes on. Filmed from other sides,
     the errors of the two views do not cancel: from Z90 sqrt(sd1^2 + sd2^2) on, of the sds of their whole errors.
     """
+    from pbl_pipeline.gait import IMPORTANT_CHANGE
+
     if result.index is None or before.index is None:
         return None
-    by, differs = result.index - before.index, not_alike(result, before)
+    errors = [(r.sd, r.minimal_change) for r in (result, before)]
+    return judged(result.index - before.index, errors, not_alike(result, before), IMPORTANT_CHANGE)
+
+
+def judged(
+    by: float,
+    errors: Sequence[tuple[float | None, float | None]],
+    differs: tuple[Difference, ...],
+    important: float | None = None,
+) -> Change:
+    """Judge a change.
+
+    Parameters
+    ----------
+    by
+        The change.
+    errors
+        Standard deviation of the error, and minimal detectable change, of both values; None where one is not known.
+    differs
+        What was not alike (`not_alike`).
+    important
+        Minimal important change; None where there is none.
+    """
+    from pbl_pipeline.gait import Z90, chances, change_sd
+
     if any(d.what != VIEW for d in differs):
         return Change(by, None, None, differs)
-    least = _least(result, before, other_view=bool(differs))
-    if least is None:
+    known = [(sd, least) for sd, least in errors if sd is not None and least is not None]
+    if len(known) < len(errors):
         return Change(by, None, None, (*differs, Difference("error")))
-    return Change(by, abs(by) >= least, least, differs)
+    (sd_1, sd_2), (least_1, least_2) = zip(*known, strict=True)
+    # From other sides the errors of the two views do not cancel.
+    sd = math.hypot(sd_1, sd_2) if differs else change_sd((least_1, least_2), (sd_1, sd_2))
+    least = Z90 * sd if differs else max(least_1, least_2)
+    return Change(by, abs(by) >= least, least, differs, *chances(by, sd, important))
 
 
 def not_alike(result: Result, before: Result) -> tuple[Difference, ...]:
@@ -196,19 +230,6 @@ def not_alike(result: Result, before: Result) -> tuple[Difference, ...]:
     if result.filming is not None and before.filming is not None:
         found += differences(result.filming, before.filming)
     return tuple(found)
-
-
-def _least(result: Result, before: Result, other_view: bool) -> float | None:
-    """The least change of the index that is more than chance; None where an error is not known."""
-    from pbl_pipeline.gait import Z90
-
-    if other_view:
-        if result.sd is None or before.sd is None:
-            return None
-        return Z90 * math.hypot(result.sd, before.sd)
-    if result.minimal_change is None or before.minimal_change is None:
-        return None
-    return max(result.minimal_change, before.minimal_change)
 
 
 def visits_of(subject: str) -> tuple[VisitRow, ...]:

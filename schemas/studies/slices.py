@@ -12,12 +12,15 @@ import numpy as np
 
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.filming import Filming
 from pbl_pipeline.names import check_label, is_plain
-from pbl_pipeline.words import unit_of
+from pbl_pipeline.words import UNUSABLE, unit_of
 
 from .. import fit, gait, gdi, lab, session, study, video
 from ..datajoint_setup import dj
+from ..decisions.not_usable import unusable
 from ..method_names import with_keys
+from ..reading.filming import filming_of
 from ..reading.frames import cycle_rows, frame_of, newest_sets
 from ..rows import inside, utc_now
 from ..stored_files import file_ref, stored_file
@@ -135,6 +138,7 @@ def study_data(name: str, curves: bool = True) -> StudyData:
     about = _about(name)
     rows = _frozen(about)
     frames = _frames(rows, about)
+    frames["visits"] = frames["visits"].merge(_recordings(rows, about), how="left", on=["subject", "visit"])
     if curves:
         frames["curves"] = _curves(rows, about)
     description = StudyDescription(
@@ -146,6 +150,38 @@ def study_data(name: str, curves: bool = True) -> StudyData:
         note=about["slice_note"],
     )
     return StudyData(**frames, description=description)
+
+
+def _recordings(rows: Any, about: Mapping[str, Any]) -> Any:
+    """Of each visit, how what was pooled was filmed, and how many videos it has and how many are marked as not usable,
+    with the reasons. No part of the frozen hash."""
+    import pandas as pd
+
+    chain = {k: about[k] for k in ("fit_set_kind", "fit_method", "gait_method", "gdi_method")}
+    with_set = rows[rows["fit_set"] != ""]
+    results = [
+        {**chain, "session_id": int(r["session_id"]), "fit_set": r["fit_set"]} for r in with_set.to_dict("records")
+    ]
+    filmed = dict(zip(with_set["session_id"], filming_of(results), strict=True))
+    own = frame_of(video.Video.proj("session_id") & inside("session_id", map(int, rows["session_id"])))
+    marked = {n: UNUSABLE[mark.reason] for n, mark in unusable(own["video_id"]).items()}
+    out = []
+    for row in rows.to_dict("records"):
+        videos = own.loc[own["session_id"] == row["session_id"], "video_id"]
+        reasons = Counter(marked[v] for v in videos if v in marked)
+        how = filmed.get(row["session_id"], Filming())
+        parts = {"views": how.views, "cameras": how.cameras, "pictures": how.pictures, "height": how.height}
+        out.append(
+            {
+                "subject": row["subject"],
+                "visit": row["visit"],
+                **{name: ", ".join(words) for name, words in parts.items()},
+                "videos": len(videos),
+                "videos_left_out": reasons.total(),
+                "videos_left_out_why": "; ".join(f"{reason} ({n})" for reason, n in reasons.items()),
+            }
+        )
+    return pd.DataFrame(out)
 
 
 def chain_of(name: str) -> tuple[dict[str, str], list[str]]:

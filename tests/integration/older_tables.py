@@ -130,3 +130,9 @@ def undo_0006(cursor: Any) -> None:
 def undo_0007(cursor: Any) -> None:
     """Forget whether errors are normally distributed."""
     cursor.execute("ALTER TABLE pbl_validation.__kinematic_error__joint DROP COLUMN joint_normal_p")
+
+
+def undo_0008(cursor: Any) -> None:
+    """Forget the errors of a visit's measures."""
+    for column in ("session_measure_error", "session_measure_minimal_change"):
+        cursor.execute(f"ALTER TABLE pbl_gdi.__session_gdi__measure DROP COLUMN {column}")

@@ -213,6 +213,7 @@ def test_instruments_and_errors_of_before_get_their_columns(empty: Callable[[], 
     schemas.activate()
     new = everything()["pbl_study.#clinical_instrument"]
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        older_tables.undo_0008(cursor)
         older_tables.undo_0007(cursor)
         older_tables.undo_0006(cursor)
         cursor.execute(older_tables.NOT_RECORDED)
@@ -233,6 +234,7 @@ def test_instruments_and_errors_of_before_get_their_columns(empty: Callable[[], 
     migrations.migrate()
     assert everything()["pbl_study.#clinical_instrument"] == new
     assert "joint_normal_p" in validation.KinematicError.Joint.heading.names
+    assert gdi.SessionGdi.Measure.heading.names[-2:] == ["session_measure_error", "session_measure_minimal_change"]
     assert migrations.migrate().steps == []
 
 

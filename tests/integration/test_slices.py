@@ -56,6 +56,9 @@ def of(frame: Any, subject: str, visit: str) -> Any:
 
 def test_a_slice_as_frames(cohort: Path):
     found: Any = slices.study_data("first")
+    filmed: Any = of(found.visits, "P001", "pre").iloc[0]
+    assert (filmed["videos"], filmed["videos_left_out"], filmed["height"]) == (2, 0, "not_stated")
+    assert filmed["cameras"]
     told = found.visits[["subject", "visit", "role", "days", "group", "included", "reason"]]
     assert [tuple(None if v != v else v for v in r) for r in told.itertuples(index=False)] == [
         ("C001", "pre", "baseline", None, "healthy", False, "moved away"),

@@ -14,8 +14,9 @@ import pytest
 import pbl_pipeline.fit
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.filming import Difference
+from pbl_pipeline.gait import IMPORTANT_CHANGE, chances, change_sd
 from schemas import fit, gait, gdi, study
-from schemas.reading import comparison, frames
+from schemas.reading import comparison, frames, registered
 from tests.integration import chain, web
 from tests.integration.chain import small_video
 from tests.rows import register
@@ -59,6 +60,8 @@ def test_changes_against_the_reference(visits: None):
     assert (first.change, first.changes) == (None, {})
     assert second.change is not None
     assert (second.change.by, second.change.sure) == (6.0, False)  # the larger of 6 and 7 is not reached
+    sd = change_sd((6.0, 7.0), (3.0, 3.0))
+    assert (second.change.real, second.change.important) == chances(6.0, sd, IMPORTANT_CHANGE)
     knee = lambda c: c.curves[(c.curves["angle"] == "knee_flexion") & (c.curves["side"] == "left")]["mean_deg"]  # noqa: E731
     np.testing.assert_allclose(knee(second), LESS * knee(first), atol=0.7)
     name = "stride_time_s"
@@ -90,7 +93,8 @@ def test_the_important_change_of_mjoa_depends_on_the_score_before(visits: None, 
 
 def test_results_by_other_methods_are_not_judged(visits: None, monkeypatch: pytest.MonkeyPatch):
     one, other = comparison.shown_visit(1).results[0], comparison.shown_visit(2).results[0]
-    assert comparison.change_since(other, one) == comparison.Change(6.0, False, 7.0)
+    said = chances(6.0, change_sd((7.0, 6.0), (3.0, 3.0)), IMPORTANT_CHANGE)
+    assert comparison.change_since(other, one) == comparison.Change(6.0, False, 7.0, (), *said)
     strange = dataclasses.replace(other, methods=("another", *other.methods[1:]))
     reasons = (Difference("methods"),)
     assert comparison.change_since(strange, one) == comparison.Change(6.0, None, differs=reasons)
@@ -141,12 +145,12 @@ def test_a_visit_with_an_aid_is_not_judged(visits: None):
         assert change is not None
         assert (change.sure, [d.what for d in change.differs]) == (None, ["aid"])
         page = web.client().get("/compare?v=1&v=2").text
-        assert "+6.0: change cannot be judged: other walking aid (cane &amp; &lt;b&gt;, before: none)" in page
+        assert "+6.0: not comparable: other walking aid (cane &amp; &lt;b&gt;, before: none)" in page
         assert "can change the values as much as the person did" in page
         visit = web.client().get("/visits/2").text
         assert "+6.0 since 2026-01-10: cannot be judged: other walking aid" in visit
         assert (
-            "Änderung nicht zu beurteilen: andere Gehhilfe (cane"
+            "nicht vergleichbar: andere Gehhilfe (cane"
             in web.client().get("/compare?v=1&v=2", headers={"accept-language": "de"}).text
         )
     finally:
@@ -173,7 +177,39 @@ def test_measures_say_that_their_interval_is_the_spread_of_cycles(visits: None):
         == sum(m is not None for m, _ in found.about.measures.values())
         > 10
     )
-    assert page.count(": change cannot be judged</span>") == len(found.changes) > 0
+    assert page.count(": not comparable: its error is not known") == len(found.changes) > 0
+
+
+def test_measures_with_an_error_have_a_probability_in_page_json_and_list(visits: None):
+    rows = gdi.SessionGdi.Measure & {"session_measure": "cadence_steps_per_min"}
+    keys = [k for k in rows.keys() if k["fit_set"] in {comparison.shown_visit(n).key["fit_set"] for n in (1, 2)}]  # noqa: SIM118
+    for key in keys:
+        gdi.SessionGdi.Measure.update1({**key, "session_measure_error": 0.3, "session_measure_minimal_change": 0.5})
+    try:
+        found = comparison.compare([(1, None), (2, None)]).compared[1]
+        change = found.changes["cadence_steps_per_min"]
+        sd = change_sd((0.5, 0.5), (0.3, 0.3))
+        assert change.real == chances(change.by, sd).real
+        assert (change.important, change.least) == (None, 0.5)
+        index = found.change
+        assert index is not None
+        assert index.important is not None
+        page = web.client().get("/compare?v=1&v=2").text
+        assert "probability of a true rise: " in page
+        assert "by at least 5: " in page
+        data = web.client().get("/compare.json?v=1&v=2").json()
+        assert data["found"]["compared"][1]["change"]["real"] == pytest.approx(index.real)
+        listed: Any = registered.changes({"subject": "P001"}).set_index("measure")
+        assert listed.loc["gdi", "real"] == pytest.approx(index.real, abs=5e-4)
+        assert listed.loc["gdi", "important"] == pytest.approx(index.important, abs=5e-4)
+        assert listed.loc["cadence_steps_per_min", "least"] == 0.5
+        assert listed.loc["stance_percent", "not_comparable"] == "error"
+        assert registered.changes({"subject": "P002"}).empty  # one visit
+    finally:
+        for key in keys:
+            gdi.SessionGdi.Measure.update1(
+                {**key, "session_measure_error": None, "session_measure_minimal_change": None}
+            )
 
 
 def test_tables_and_a_visit_from_them_know_the_same_filming(visits: None):

@@ -11,18 +11,25 @@ from scipy.stats import norm as normal
 
 from pbl_pipeline.fit import METHODS, default_fit
 from pbl_pipeline.gait import (
+    EVENT_METHODS,
     GDI_METHODS,
     GDI_MODEL,
     THREE_ANGLES,
     Z90,
     GaitCycle,
     Gdi,
+    Lengths,
+    Spatiotemporal,
+    chances,
+    change_sd,
     intervals_with_one_more,
     load_norm,
     score_gdi,
+    spatiotemporal,
 )
 from pbl_pipeline.gait.curves_file import load_curves, save_curves
 from pbl_pipeline.gait.measurement import (
+    MeasureError,
     MeasurementModel,
     Pass,
     Posterior,
@@ -30,13 +37,19 @@ from pbl_pipeline.gait.measurement import (
     estimate,
     expected_index,
     load_model,
+    measure_error,
     model_names,
     model_of_fit,
     with_one_more,
 )
+from pbl_pipeline.gait.metrics import with_errors
 
 K = 2
 NORM = load_norm()
+
+
+#: Of the measures, by view.
+ERRORS = {"left": {"stance_percent": MeasureError(3.0, 2.0, 1.0)}, "": {"stance_percent": MeasureError(1.0, 0.0, 4.0)}}
 
 
 def toy_model(spread: float = 4.0, person: float = 0.5, view: float = 0.3, anew: float = 1.0) -> MeasurementModel:
@@ -45,7 +58,19 @@ def toy_model(spread: float = 4.0, person: float = 0.5, view: float = 0.3, anew:
     seen = View(np.full(2 * K, 0.7), one, view * one, anew * one)
     views = {"": seen, "left": seen, "right": seen}
     return MeasurementModel(
-        "toy", "toy", (), np.full(2 * K, 3.0), spread * one, person * one, views, np.eye(K), 5.0, 1.0
+        "toy",
+        "toy",
+        (),
+        np.full(2 * K, 3.0),
+        spread * one,
+        person * one,
+        views,
+        np.eye(K),
+        5.0,
+        1.0,
+        "events",
+        8.0,
+        ERRORS,
     )
 
 
@@ -225,3 +250,73 @@ def test_the_interval_holds_nine_of_ten_of_the_models_own_people():
         inside += abs(index - found.mean) <= normal.isf(0.05) * found.sd
     assert inside / n == pytest.approx(0.9, abs=0.05)
     assert with_one_more(model, passes, NORM)["left"] < expected_index(estimate(model, passes), NORM).sd
+
+
+@pytest.mark.parametrize(
+    ("cycles", "sd", "anew"),
+    [
+        ({"left": 8}, np.sqrt(9 + 4 + 1), np.sqrt(4 + 1)),
+        ({"right": 8}, np.sqrt(9 + 4 + 1), np.sqrt(4 + 1)),  # a mirrored view errs alike
+        ({"left": 32}, np.sqrt(9 + 4 + 0.25), np.sqrt(4 + 0.25)),
+        ({"": 2}, np.sqrt(1 + 64), 8.0),
+        # Half of each: what lasts is the same in both, what is anew is not.
+        ({"left": 8, "": 8}, np.sqrt(2.0**2 + 0.25 * (5 + 16)), np.sqrt(0.25 * (5 + 16))),
+    ],
+)
+def test_the_error_of_a_measure_by_view_and_number_of_cycles(cycles, sd, anew):
+    assert measure_error(toy_model(), "stance_percent", cycles) == pytest.approx((sd, anew))
+    assert measure_error(toy_model(), "step_width_m", cycles) is None
+
+
+@pytest.mark.parametrize("by", [-7.0, 7.0])
+def test_probabilities_of_a_change_are_those_of_a_normal_error(by):
+    assert change_sd((Z90 * np.sqrt(2.0) * 3.0,) * 2, (3.0, 3.0)) == pytest.approx(np.sqrt(18.0))  # all is anew
+    sd = change_sd((Z90 * np.sqrt(2.0) * 3.0,) * 2, (5.0, 5.0))
+    assert sd == pytest.approx(np.sqrt(18.0 + 0.3 * (50.0 - 18.0)))
+    found = chances(by, sd, 5.0)
+    assert found.real == pytest.approx(normal.cdf(7.0 / sd))
+    assert found.important == pytest.approx(normal.cdf(2.0 / sd))
+    assert chances(by, sd).important is None
+
+
+def measured(far_leg: str = "right", error_model: str = "blazepose-33", metric: bool = False) -> Spatiotemporal:
+    lengths = Lengths(1.2, 0.6, None, "", metric)
+    about = {"lengths": lengths, "far_leg": far_leg, "error_model": error_model}
+    sides = ("left", "right")
+    cycles = [
+        GaitCycle("t", i, 0, sides[i % 2], i, i + 0.1, i + 0.5, i + 0.6, i + 1.0 + 0.01 * (i % 4), **about)
+        for i in range(8)
+    ]
+    return with_errors(spatiotemporal(cycles), cycles, EVENT_METHODS.find().paramset)
+
+
+def error_sd(found: Spatiotemporal, name: str) -> float | None:
+    measure = found[name]
+    assert measure is not None
+    return measure.error_sd
+
+
+def test_measures_of_a_visit_state_their_error():
+    model, found = load_model("blazepose-33"), measured()
+    stance = found["stance_percent"]
+    assert stance is not None
+    assert stance.variability is not None
+    assert stance.error_sd is not None
+    error = measure_error(model, "stance_percent", {"right": 8})
+    assert error is not None
+    sd, anew = error
+    chance = stance.variability / np.sqrt(8)
+    assert stance.error_sd == pytest.approx(np.hypot(sd, chance))
+    assert stance.minimal_change == pytest.approx(Z90 * np.sqrt(2) * np.hypot(anew, chance), rel=1e-4)
+    assert stance.interval == pytest.approx((stance.mean - Z90 * stance.error_sd, stance.mean + Z90 * stance.error_sd))
+    assert error_sd(found, "speed_m_per_s") == pytest.approx(0.08, abs=0.02)
+
+
+def test_measures_without_a_measured_error_state_none():
+    assert error_sd(measured(error_model=""), "stance_percent") is None
+    stated = measured(metric=True)
+    assert error_sd(stated, "speed_m_per_s") is None  # the metres are not the detector's
+    assert error_sd(stated, "cadence_steps_per_min") is not None
+    cycles = [GaitCycle("t", 0, 0, "left", 0, 0.1, 0.5, 0.6, 1.0, error_model="blazepose-33")]
+    zeni = EVENT_METHODS.find("zeni-2008").paramset
+    assert error_sd(with_errors(spatiotemporal(cycles), cycles, zeni), "stance_percent") is None

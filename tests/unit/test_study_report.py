@@ -32,6 +32,7 @@ from pbl_pipeline.study_report import (
     visit_table,
     write_study_report,
 )
+from pbl_pipeline.study_report.statement import statement
 from research import cohort as made
 
 
@@ -96,6 +97,47 @@ def test_correlation_is_spearman_for_ordinal_scores_only(study, results):
     assert (found["value"], found["p"], found["n"]) == pytest.approx((expected.value, expected.p, len(both)))
     assert set(results.validity.loc[results.validity["score"] == "10MWT", "kind"]) == {"pearson"}
     assert row(results.validity, name="gdi", score="10MWT", persons=made.PATIENTS)["n"] == len(first)
+
+
+def test_the_statement_counts_what_was_left_out_and_gives_icc_and_sem(study, results):
+    visits = study.visits.assign(views="left, right", videos=2, videos_left_out=0, videos_left_out_why="")
+    visits.loc[:2, ["videos_left_out", "videos_left_out_why"]] = [1, "too dark or blurred (1)"]
+    visits.loc[3, ["videos_left_out", "videos_left_out_why"]] = [2, "too dark or blurred (1); the walk (again) (1)"]
+    found = statement(dataclasses.replace(study, visits=visits), results).body
+    assert list(dict.fromkeys(found["Section"])) == [
+        "Design",
+        "Measurement",
+        "Recordings and visits",
+        "Statistics",
+        "Reliability and error",
+    ]
+    items = dict(zip(found["Item"], found["Statement"], strict=True))
+    n = len(visits)
+    share = f"5 of {2 * n} ({500 / (2 * n):.0f} %)"
+    assert items["Videos left out"] == f"{share}; too dark or blurred (4); the walk (again) (1)"
+    assert items["Filmed from"] == f"left, right: {int(visits['included'].sum())}"
+    out = visits[~visits["included"]]
+    assert items["Visits left out"].startswith(f"{len(out)} of {n} (")
+    for reason in set(out["reason"]):
+        assert f"{reason} ({int((out['reason'] == reason).sum())})" in items["Visits left out"]
+    icc_ = row(results.repeatability, name="gdi", of="visits", group=made.PATIENTS, kind="2,1")
+    text = items[f"GDI, visits, {made.PATIENTS}"]
+    assert f"ICC {icc_['value']:.2f} (" in text
+    assert f"minimal detectable change {icc_['mdc95']:.1f}" in text
+    assert f"SEM {icc_['sem']:.{2 if icc_['sem'] < 1 else 1 if icc_['sem'] >= 10 else 2}f}" in text
+    body = statement(study, results).body
+    plain = dict(zip(body["Item"], body["Statement"], strict=True))
+    assert plain["Videos left out"] == "not stated"
+    assert "Filmed from" not in plain
+
+
+def test_the_statement_is_page_csv_and_latex(written):
+    page = (written / "out" / "report.html").read_text()
+    assert 'id="statement"' in page
+    table = pd.read_csv(written / "out" / "tables" / "statement.csv")
+    assert list(table.columns) == ["Section", "Item", "Statement"]
+    assert all(item.replace("&", "&amp;") in page for item in table["Item"])
+    assert r"\label{tab:study_statement}" in (written / "out" / "tables" / "statement.tex").read_text()
 
 
 def test_p_is_corrected_within_its_family(results):

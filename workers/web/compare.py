@@ -41,6 +41,8 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
     """The addresses of this part."""
 
     async def show(request: Request) -> Response:
+        from pbl_pipeline.gait import IMPORTANT_CHANGE
+
         chosen = [_read(text) for text in request.query_params.getlist("v")[:100]]
         wanted = request.query_params.get("ref", "")
         found = await tables.ask(comparison.compare, chosen, _read(wanted) if wanted else None)
@@ -70,6 +72,8 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
             as_reference=[_address(found, i) for i in range(len(names))],
             interval=interval,
             bounds=_bounds,
+            percent=lambda p: number(100.0 * min(p, 0.99), 0),
+            least_important=IMPORTANT_CHANGE,
             now=f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M} UTC",
             version=code_version(),
         )
@@ -113,9 +117,9 @@ def _norm(frame: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
 
 
 def _interval(one: comparison.Side, name: str) -> tuple[float, float] | None:
-    """The interval of a measure, which is that of the spread of its cycles alone; None where it has none."""
+    """The interval of a measure if it is that of the spread of its cycles alone; None where it has none."""
     value, _ = one.about.measures.get(name, (None, ""))
-    return None if value is None else value.interval
+    return None if value is None or value.error_sd is not None else value.interval
 
 
 def _name(one: comparison.Side) -> str:

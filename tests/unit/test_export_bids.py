@@ -1,0 +1,149 @@
+"""Motion-BIDS: what the files hold, and what the official validator says of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.export import ExportOptions, Labels, write_export
+from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.gait import Condition, gait_metrics
+from pbl_pipeline.visit import Recording, Visit
+from tests.exported import marked_fit
+
+_PATH = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+_VALIDATOR = shutil.which("bids-validator-deno", path=_PATH)
+
+
+@pytest.fixture(scope="module")
+def fit() -> TrialFit:
+    """A walk of which two frames have no pose."""
+    fit = marked_fit()
+    qpos = fit.qpos.copy()
+    qpos[3:5] = np.nan
+    return dataclasses.replace(fit, qpos=qpos)
+
+
+@pytest.fixture(scope="module")
+def visit(fit: TrialFit) -> Visit:
+    """Two walks and a recording of which nothing was stated."""
+    names = {"walk one": Condition("walking"), "walk2": Condition("walking"), "other": Condition()}
+    trials = [Recording.of(n, dataclasses.replace(fit, name=n), condition=c) for n, c in names.items()]
+    metrics = gait_metrics([r.fit for r in trials if r.fit is not None])
+    return Visit(tuple(r.with_measured(m) for r, m in zip(trials, metrics.trials, strict=True)), measures=metrics)
+
+
+@pytest.fixture(scope="module")
+def dataset(visit: Visit, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two visits of one person and one of another."""
+    root = tmp_path_factory.mktemp("bids")
+    for subject, label in (("P-001", "2026-03-01"), ("P-001", "2026-06-01"), ("P_002", "2026-03-01")):
+        options = ExportOptions(bids=(root / "bids", Labels.of(subject, label)))
+        write_export(visit, ["bids"], root / subject / label, options)
+    return root / "bids"
+
+
+def test_the_names_of_the_files(dataset: Path):
+    found = sorted(p.relative_to(dataset).as_posix() for p in dataset.rglob("*") if p.is_file())
+    of_visit = [
+        "task-unknown_events.json",
+        "task-unknown_events.tsv",
+        "task-unknown_tracksys-video_channels.json",
+        "task-unknown_tracksys-video_channels.tsv",
+        "task-unknown_tracksys-video_motion.json",
+        "task-unknown_tracksys-video_motion.tsv",
+    ]
+    of_visit += [
+        f"task-walking{system}_run-{run}_{end}"
+        for run in (1, 2)
+        for system, end in (
+            ("", "events.json"),
+            ("", "events.tsv"),
+            ("_tracksys-video", "channels.json"),
+            ("_tracksys-video", "channels.tsv"),
+            ("_tracksys-video", "motion.json"),
+            ("_tracksys-video", "motion.tsv"),
+        )
+    ]
+    visits = (("P001", "20260301"), ("P001", "20260601"), ("P002", "20260301"))
+    expected = [f"sub-{s}/ses-{v}/motion/sub-{s}_ses-{v}_{name}" for s, v in visits for name in of_visit]
+    assert found == sorted([*expected, "README.md", "dataset_description.json", "participants.tsv"])
+    assert (dataset / "participants.tsv").read_text() == "participant_id\nsub-P001\nsub-P002\n"
+
+
+def test_channels_hold_the_fit_and_its_standard_deviations(dataset: Path, fit: TrialFit):
+    stem = dataset / "sub-P001/ses-20260301/motion/sub-P001_ses-20260301_task-walking_tracksys-video_run-1"
+    channels: Any = pd.read_csv(f"{stem}_channels.tsv", sep="\t", keep_default_na=False)
+    values = pd.read_csv(f"{stem}_motion.tsv", sep="\t", header=None, names=channels["name"], na_values="n/a")
+    assert len(values) == len(fit.time_s)
+    np.testing.assert_allclose(values["time"], fit.time_s, atol=1e-6)
+    hip = list(fit.joint_names).index("hip_flexion_r")
+    np.testing.assert_allclose(values["hip_flexion_r"], np.degrees(fit.qpos[:, hip]), atol=1e-5)
+    known = np.isfinite(fit.qpos).all(axis=1)
+    sd = np.where(known, np.degrees(fit.qpos_sd[:, hip]), np.nan)
+    np.testing.assert_allclose(values["hip_flexion_r_sd"], sd, atol=1e-5)
+    assert values["hip_flexion_r"].isna().tolist() == (~known).tolist()
+    first = fit.marker_names[0]
+    np.testing.assert_allclose(values[[f"{first}_{a}" for a in "xyz"]], fit.markers_world_m[:, 0], atol=1e-6)
+    row = channels.set_index("name").loc["hip_flexion_r_sd"]
+    assert (row["type"], row["units"], row["tracked_point"]) == ("MISC", "deg", "hip_flexion_r")
+    assert channels.set_index("name").loc["pelvis_tx", ["type", "component", "units"]].tolist() == ["POS", "x", "m"]
+    about = json.loads(Path(f"{stem}_motion.json").read_text())
+    assert about["TaskName"] == "walking"
+    counts = [v for k, v in about.items() if k.endswith("ChannelCount") and not k.startswith("Motion")]
+    assert about["MotionChannelCount"] == len(channels) == sum(counts)
+    assert about["SamplingFrequency"] == pytest.approx(1.0 / np.median(np.diff(fit.time_s)), abs=1e-5)
+
+
+def test_events_are_those_of_the_gait(dataset: Path, visit: Visit):
+    path = dataset / "sub-P002/ses-20260301/motion/sub-P002_ses-20260301_task-walking_run-1_events.tsv"
+    found = pd.read_csv(path, sep="\t")
+    measured = visit.recordings[0].measured
+    assert measured is not None
+    events = sorted(measured.events.events, key=lambda e: e.time_s)
+    assert len(events) > 4
+    np.testing.assert_allclose(found["onset"], [e.time_s for e in events], atol=1e-6)
+    assert found["trial_type"].tolist() == [f"{e.side}_{e.event}" for e in events]
+
+
+def test_a_visit_of_its_own_is_in_the_folder_bids(visit: Visit, tmp_path: Path):
+    write_export(visit, ["bids"], tmp_path / "out", ExportOptions())
+    assert (tmp_path / "out/bids/sub-01/motion").is_dir()
+    listed = json.loads((tmp_path / "out/export.json").read_text())["files"]
+    assert "bids/dataset_description.json" in listed
+
+
+@pytest.mark.parametrize(("subject", "label"), [("P001", "20260301"), ("---", "a")])
+def test_labels_that_are_alike_or_empty_are_refused(visit: Visit, dataset: Path, tmp_path: Path, subject, label):
+    before = sorted(dataset.rglob("*"))
+    with pytest.raises(PblError) as refused:
+        write_export(visit, ["bids"], tmp_path / "new", ExportOptions(bids=(dataset, Labels.of(subject, label))))
+    assert refused.value.code == "EXPORT_INPUT"
+    assert sorted(dataset.rglob("*")) == before
+
+
+@pytest.mark.needs_extra
+@pytest.mark.skipif(_VALIDATOR is None, reason="bids-validator-deno is not installed")
+def test_the_official_validator_finds_no_error(dataset: Path):
+    assert _VALIDATOR is not None
+    done = subprocess.run([_VALIDATOR, str(dataset), "--format", "json"], capture_output=True, text=True, check=False)
+    issues = json.loads(done.stdout)["issues"]["issues"]
+    assert [i for i in issues if i["severity"] == "error"] == []
+    assert done.returncode == 0
+    # It does find what is wrong.
+    broken = dataset.parent / "broken"
+    shutil.copytree(dataset, broken)
+    for path in broken.rglob("*_channels.tsv"):
+        path.write_text(path.read_text().replace("JNTANG", "ANGLE"))
+    assert subprocess.run([_VALIDATOR, str(broken)], capture_output=True, check=False).returncode != 0
