@@ -11,7 +11,7 @@ import dataclasses
 import mujoco
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import make_interp_spline
+from scipy.interpolate import CubicSpline, make_interp_spline
 
 from pbl_pipeline.body import PELVIS_TURNS, SLIDES, Body
 from pbl_pipeline.gait.events.signal import uniform_segments
@@ -41,8 +41,9 @@ class Dynamics:
     """What a motion needs, per kilogram of the person, at N times; world frame, z up.
 
     force_n, moment_nm (N, 3): of everything outside the body, gravity excepted; the moment is about the world's origin
-    (N/kg, Nm/kg). centre_m, centre_velocity (N, 3): of mass. generalised (N, Q): what each joint value would need if that
-    force acted on the pelvis (Nm/kg, N/kg). axis, anchor_m (N, Q, 3): of each joint. xpos (N, B, 3), xmat (N, B, 3, 3).
+    (N/kg, Nm/kg). centre_m, centre_velocity (N, 3): of mass. generalised (N, Q): what each joint value would need if
+    that force acted on the pelvis (Nm/kg, N/kg). axis, anchor_m (N, Q, 3): of each joint. xpos (N, B, 3), xmat (N, B,
+    3, 3).
     """
 
     force_n: np.ndarray
@@ -60,8 +61,8 @@ def smooth_motion(time_s: np.ndarray, qpos: Float[np.ndarray, "T Q"], cutoff_hz:
     """Return the motion with its derivatives, one for each stretch without long gaps; none where all are too short.
 
     Joint values are put on a grid of `GRID_HZ` and low-passed there and back (`uniform_segments`, order 4, -3 dB at
-    `cutoff_hz`); the derivatives are those of the quintic spline through the result. `time_s` (T,); rows of `qpos` that are
-    not finite are gaps.
+    `cutoff_hz`); the derivatives are those of the quintic spline through the result. `time_s` (T,); rows of `qpos` that
+    are not finite are gaps.
     """
     segments = uniform_segments(
         np.asarray(time_s, float),
@@ -71,6 +72,7 @@ def smooth_motion(time_s: np.ndarray, qpos: Float[np.ndarray, "T Q"], cutoff_hz:
         filter_order=4,
         max_gap_s=MAX_GAP_S,
         min_segment_s=MIN_SEGMENT_S,
+        interpolator=CubicSpline,  # a monotone one has kinks where it is flat
     )
     motions = []
     for s in segments:

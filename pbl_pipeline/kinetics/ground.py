@@ -1,25 +1,25 @@
 """Each foot's share of the ground reaction, and where it acts.
 
-What the motion tells well is the vertical force of both feet together. Its second derivatives tell the horizontal force less
-well and the moment badly, so that the centre of pressure of one foot would be off by 5 cm. Three things that are known of
-walking tell more, each measured on force plates (`python -m research.benchmarks.kinetics`):
+What the motion tells well is the vertical force of both feet together. Its second derivatives tell the horizontal force
+less well and the moment badly, so that the centre of pressure of one foot would be off by 5 cm. Three things that are
+known of walking tell more, each measured on force plates (`python -m research.benchmarks.kinetics`):
 
 - the centre of pressure goes from heel to toes in a usual way over the time that the foot stands (`PROGRESS`), and lies
   under the forefoot where the heel is off the floor;
-- each force points from there nearly at the centre of mass: past it by what turns the body (`TURNING` of that is believed).
-  The centre of mass is moved by a constant of the recording, so that the horizontal forces have the mean that the change of
-  velocity asks for;
-- while both feet stand, the vertical force of the one behind falls as `trailing_share` (from the motion alone it cannot be
-  told: two feet and the body are a closed loop).
+- each force points from there nearly at the centre of mass: past it by what turns the body. The centre of mass is moved
+  by a constant of the recording, so that the horizontal forces have the mean that the change of velocity asks for;
+- while both feet stand, the vertical force of the one behind falls as `trailing_share` (from the motion alone it cannot
+  be told: two feet and the body are a closed loop).
 
-The horizontal force is `BELIEVED` times that of the accelerations and the rest of this. What feet on a floor then do not
-carry stays as the residual.
+The horizontal force is `BELIEVED` times that of the accelerations and the rest of this. What feet on a floor then do
+not carry stays as the residual.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
@@ -31,8 +31,8 @@ from .dynamics import GRAVITY, Dynamics
 
 #: Points of a sole in the frames of calcaneus and toes (m, unscaled): below the heel, the ball and the tip of the toes.
 _HEEL_M, _BALL_M, _TIP_M = (-0.015, -0.016, 0.0), (0.19, -0.016, 0.0), (0.06, -0.012, 0.0)
-#: Phase of a foot's stance (0 to 1), centre of pressure then from heel (0) to tip (1) and across (towards the outside), in
-#: lengths of the sole: means over 12 steps of the six tuning children of the benchmark.
+#: Phase of a foot's stance (0 to 1), centre of pressure then from heel (0) to tip (1) and across (towards the outside),
+#: in lengths of the sole: means over 12 steps of the six tuning children of the benchmark.
 PROGRESS = np.array(
     [
         (0.0, 0.12, -0.03),
@@ -48,8 +48,20 @@ PROGRESS = np.array(
 #: Where the centre of pressure is at least while the heel is off the floor, and the heights of the heel (lengths of the
 #: sole) between which that begins to hold.
 _FOREFOOT, _HEEL_OFF = 0.65, (0.1, 0.2)
-#: How much of the body's turning and of the horizontal accelerations is believed: both chosen on the tuning children.
-TURNING, BELIEVED = 0.5, 0.4
+#: Share of the vertical force under the foot behind at 0, 10, ..., 100 % of double support: means over the same
+#: children.
+TRAILING = (0.90, 0.71, 0.59, 0.51, 0.42, 0.34, 0.26, 0.18, 0.12, 0.07, 0.04)
+#: How much of the horizontal accelerations is believed: chosen on the same children.
+BELIEVED = 0.3
+#: What low-passed motion lacks of the sharp change of force at each initial contact: added to the vertical force at
+#: 0, 4, ..., 100 % of a step (from one foot's initial contact to the other's), in ranges of that force over the step.
+#: Means over the same children.
+# fmt: off
+TRANSIENT = np.array([
+    -0.26, 0.21, 0.14, -0.10, -0.12, -0.01, 0.09, 0.12, 0.10, 0.06, 0.01, -0.01, -0.01,
+    -0.00, 0.01, 0.01, -0.00, -0.01, -0.01, -0.01, 0.02, 0.04, 0.02, -0.06, -0.21, -0.26,
+])
+# fmt: on
 #: Largest horizontal against vertical force.
 FRICTION = 0.8
 
@@ -58,9 +70,9 @@ FRICTION = 0.8
 class GroundReaction:
     """Of [left, right] at N times, per kilogram, world frame (z up); NaN where contact is not known.
 
-    contact (N, 2): 1 on the floor, 0 in the air. force_n (N, 2, 3), 0 in the air; centre_m (N, 2, 3): of pressure, NaN in the
-    air. residual_n, residual_nm (N, 3): of what the motion needs, the force and the moment about the centre of mass that no
-    foot carries.
+    contact (N, 2): 1 on the floor, 0 in the air. force_n (N, 2, 3), 0 in the air; centre_m (N, 2, 3): of pressure, NaN
+    in the air. residual_n, residual_nm (N, 3): of what the motion needs, the force and the moment about the centre of
+    mass that no foot carries.
     """
 
     contact: np.ndarray
@@ -72,8 +84,8 @@ class GroundReaction:
 
 @dataclasses.dataclass(frozen=True)
 class _Sole:
-    """A foot on the floor over N times: the heel's place (N, 2) and height over the floor (N,), unit axis from heel to tip
-    (N, 2), length, and the height of the floor (N,)."""
+    """A foot on the floor over N times: the heel's place (N, 2) and height over the floor (N,), unit axis from heel to
+    tip (N, 2), length, and the height of the floor (N,)."""
 
     heel: np.ndarray
     lifted: np.ndarray
@@ -82,7 +94,8 @@ class _Sole:
     floor: np.ndarray
 
     def point(self, s: np.ndarray, left: np.ndarray) -> np.ndarray:
-        """Return the points (N, 3) of the floor at these places along the sole and to the left of its axis, in lengths."""
+        """Return the points (N, 3) of the floor at these places along the sole and to the left of its axis, in
+        lengths."""
         normal = np.stack([-self.along[:, 1], self.along[:, 0]], axis=1)
         xy = self.heel + self.length * (s[:, None] * self.along + left[:, None] * normal)
         return np.column_stack([xy, self.floor])
@@ -91,8 +104,8 @@ class _Sole:
 def contact_of(time_s: np.ndarray, events: Sequence[GaitEvent]) -> Float[np.ndarray, "N 2"]:
     """Return 1 where [left, right] is on the floor, 0 where it is in the air, NaN where the events do not tell.
 
-    A foot's state is known between two events of a bout that follow each other (foot down, foot up); before its first event
-    it is the other one, from the first event of the bout on, and after its last likewise.
+    A foot's state is known between two events of a bout that follow each other (foot down, foot up); before its first
+    event it is the other one, from the first event of the bout on, and after its last likewise.
     """
     contact = np.full((len(time_s), 2), np.nan)
     for bout in sorted({e.bout for e in events}):
@@ -111,12 +124,12 @@ def contact_of(time_s: np.ndarray, events: Sequence[GaitEvent]) -> Float[np.ndar
 
 def ground_reaction(body: Body, scale: np.ndarray, d: Dynamics, contact: Float[np.ndarray, "N 2"]) -> GroundReaction:
     """Return each foot's ground reaction of the motion `d`. `contact` (N, 2): `contact_of` its times."""
-    known = np.isfinite(contact).all(axis=1)
+    known = np.all(np.isfinite(contact), axis=1)
     stands = (contact == 1) & known[:, None]
     centre = np.stack([_pressure(body, scale, d, contact[:, k], k) for k in (0, 1)], axis=1)
-    vertical = _shares(stands) * np.maximum(d.force_n[:, 2], 0.0)[:, None]
+    vertical = _shares(stands) * np.maximum(d.force_n[:, 2] + _transient(d.force_n[:, 2], stands), 0.0)[:, None]
     turns = d.moment_nm - np.cross(d.centre_m, d.force_n)
-    past = TURNING * np.stack([-turns[:, 1], turns[:, 0]], axis=1) / np.maximum(d.force_n[:, 2:], 0.1 * GRAVITY)
+    past = np.stack([-turns[:, 1], turns[:, 0]], axis=1) / np.maximum(d.force_n[:, 2:], 0.1 * GRAVITY)
     level = _towards(d, centre, vertical, past, stands)
     level += _mean_shift(body, d, level, vertical, stands.any(axis=1))
     share = vertical / np.maximum(vertical.sum(axis=1, keepdims=True), 1e-9)
@@ -133,13 +146,24 @@ def ground_reaction(body: Body, scale: np.ndarray, d: Dynamics, contact: Float[n
 
 def trailing_share(phase: np.ndarray) -> np.ndarray:
     """Return the share of the vertical force that the foot behind carries at the phase (0 to 1) of double support."""
-    return (1.0 - np.asarray(phase)) ** 1.5
+    return np.interp(phase, np.linspace(0.0, 1.0, len(TRAILING)), TRAILING)
+
+
+def _transient(vertical: np.ndarray, stands: np.ndarray) -> np.ndarray:
+    """Return `TRANSIENT` over each step that is seen from one initial contact to the next, 0 elsewhere."""
+    lands = np.flatnonzero((stands[1:] & ~stands[:-1]).any(axis=1) & stands[:-1].any(axis=1)) + 1
+    out = np.zeros(len(vertical))
+    for a, b in pairwise(lands):
+        if stands[a:b].any(axis=1).all():
+            phase = np.arange(b - a) / (b - a)
+            out[a:b] = np.ptp(vertical[a:b]) * np.interp(phase, np.linspace(0.0, 1.0, len(TRANSIENT)), TRANSIENT)
+    return out
 
 
 def _shares(stands: np.ndarray) -> np.ndarray:
     """Return the share (N, 2) of the vertical force of each foot; 0 where none stands."""
     share = stands.astype(float)
-    for first, last in _runs(stands.all(axis=1)):
+    for first, last in _runs(np.all(stands, axis=1)):
         # Behind is the foot that stood alone before; where that was not seen, the one that does not stand alone after.
         if first > 0 and stands[first - 1].any():
             behind = int(stands[first - 1, 1])
@@ -173,10 +197,13 @@ def _mean_shift(body: Body, d: Dynamics, level: np.ndarray, vertical: np.ndarray
 
 
 def _pressure(body: Body, scale: np.ndarray, d: Dynamics, contact: np.ndarray, k: int) -> np.ndarray:
-    """Return the centre of pressure (N, 3) of foot `k` [left, right] as `PROGRESS` has it; NaN where it does not stand."""
+    """Return the centre of pressure (N, 3) of foot `k` [left, right] as `PROGRESS` has it; NaN where it does not
+    stand."""
     sole = _sole(body, scale, d, contact, "lr"[k])
     runs = _runs(contact == 1)
-    whole = [b - a + 1 for a, b in runs if a > 0 and b + 1 < len(contact) and np.isfinite(contact[[a - 1, b + 1]]).all()]
+    whole = [
+        b - a + 1 for a, b in runs if a > 0 and b + 1 < len(contact) and np.isfinite(contact[[a - 1, b + 1]]).all()
+    ]
     place = np.full((len(contact), 2), np.nan)
     for first, last in runs:
         n = last + 1 - first

@@ -1,8 +1,8 @@
 """Masses, centres of mass and moments of inertia of the fitted body, per kilogram of the person.
 
-De Leva 1996, J Biomech 29:1223-1230, table 4 (Zatsiorsky's scans of young adults, referred to joint centres), the mean of
-women and men, because the chain does not ask for the sex. Lengths are those of the scaled body. Feet and hands have de
-Leva's masses; how these are spread over their bodies is that of the model (Hamner, Seth & Delp 2010).
+De Leva 1996, J Biomech 29:1223-1230, table 4 (Zatsiorsky's scans of young adults, referred to joint centres), the mean
+of women and men, because the chain does not ask for the sex. Lengths are those of the scaled body. Feet and hands have
+de Leva's masses; how these are spread over their bodies is that of the model (Hamner, Seth & Delp 2010).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from pbl_pipeline.body import Body
 
 
 class _Segment(NamedTuple):
-    """Mean of women and men: mass (fraction of the body's), centre of mass from the upper end, and radii of gyration about
-    the sagittal (forward), longitudinal and transverse axis (fractions of the length)."""
+    """Mean of women and men: mass (fraction of the body's), centre of mass from the upper end, and radii of gyration
+    about the sagittal (forward), longitudinal and transverse axis (fractions of the length)."""
 
     mass: float
     centre: float
@@ -40,8 +40,8 @@ _FOREARM = _mean((0.0138, 0.4559, 0.261, 0.257, 0.094), (0.0162, 0.4574, 0.276, 
 _THIGH = _mean((0.1478, 0.3612, 0.369, 0.364, 0.162), (0.1416, 0.4095, 0.329, 0.329, 0.149))
 _SHANK = _mean((0.0481, 0.4352, 0.267, 0.263, 0.092), (0.0433, 0.4395, 0.251, 0.246, 0.102))
 _HAND_MASS, _FOOT_MASS = 0.5 * (0.0056 + 0.0061), 0.5 * (0.0129 + 0.0137)
-#: Ends of the parts of the trunk on the line from the middle of the hips (0) to that of the shoulders (1): navel, xiphoid
-#: process, suprasternal notch; lengths of the same paper, mean of women and men.
+#: Ends of the parts of the trunk on the line from the middle of the hips (0) to that of the shoulders (1): navel,
+#: xiphoid process, suprasternal notch; lengths of the same paper, mean of women and men.
 _NAVEL, _XIPHOID, _NOTCH = 0.324, 0.739, 1.048
 #: Top of the head above the origin of the body `head`, which lies between the angles of the jaw (m, unscaled).
 _VERTEX_M = 0.197
