@@ -44,12 +44,14 @@ def gait(
     FILES are fits (fit.npz of `pbl fit`), or a laboratory's recordings (C3D with the nine angles of Plug-in Gait).
     Measures that cannot be trusted are null with a reason. Whether a fit lies on the person stands in the session.json
     that `pbl fit` wrote beside it: without that it is not known. Where metrics.json is written beside the fits, their
-    events.csv and cycles.npz are too: they belong together.
+    events.csv and cycles.npz and the kinetics are too: they belong together.
     """
     from pbl_pipeline import progress
     from pbl_pipeline.files import check_out_file
     from pbl_pipeline.gait import EVENT_METHODS, GDI_METHODS, GILLETTE_MODEL, GaitParams, gait_metrics, read_lab_trial
-    from pbl_pipeline.visit import save_beside, visit_of_fits
+    from pbl_pipeline.kinetics import METHODS as KINETICS_METHODS
+    from pbl_pipeline.kinetics import visit_kinetics
+    from pbl_pipeline.visit import load_kinetics, save_beside, save_kinetics, visit_of_fits
 
     check_out_file(out)
     laboratory = [is_c3d(path) for path in files]
@@ -72,6 +74,10 @@ def gait(
         of_fit = visit.fit_checks
         metrics = gait_metrics(fits, norm, params, of_fit, model=index).with_checks(of_fit)
         save_beside(metrics.trials, files, out)
+        if all(path.resolve().parent == out.resolve().parent for path in files):
+            known = load_kinetics(out.parent, [])
+            mass = None if known is None else known.mass_kg
+            save_kinetics(visit_kinetics(fits, metrics.trials, KINETICS_METHODS.find(), mass_kg=mass), out.parent)
     metrics.save(out)
     click.echo(metrics.table())
     click.echo(f"written: {out}")

@@ -51,16 +51,17 @@ class KineticsParams:
 
     cutoff_hz: float = 6.0
     samples: int = 20
-    lasting: float = 0.5
-    memory_s: float = 0.12
+    lasting: float = 0.95
+    memory_s: float = 0.2
 
 
 @dataclasses.dataclass(frozen=True)
 class KineticMeasure:
     """Means over the used cycles of each side and over both sides, with their standard deviations (None: not known).
 
-    The error is that of the fit, by sampling, and that of the method, by force plates; `interval` is the 90 % interval
-    of `mean`. `asymmetry_percent` is 100 (right - left) / ((right + left) / 2), None for what is no measure of one leg.
+    The error is that of the fit, by sampling, that of the method, by force plates, and of one camera what its fit loses
+    in any walk, by synthetic walkers; `interval` is the 90 % interval of `mean`. `asymmetry_percent` is 100 (right -
+    left) / ((right + left) / 2), None for what is no measure of one leg.
     """
 
     left: float | None
