@@ -88,11 +88,15 @@ def main(markers: str, first: int, people: int) -> None:
                 value, truth = getattr(measure, side), getattr(true.measures.get(name), side, None)
                 if value is not None and truth is not None:
                     errors.setdefault(name, []).append((truth, value - truth, getattr(measure, f"sd_{side}")))
-    click.echo(f"{markers}: vertical force {np.mean(rms):.1f} % BW (bar {BARS[markers]:g}), {len(rms)} of {people}
-    walkers") click.echo(f"{'':42}{'true':>9}{'mean':>9}{'rms':>9}{'sd':>9}{'held':>7}") for name, rows in
-    errors.items(): truth, error, sd = np.array(rows).T held = np.mean(np.abs(error) < WIDTH_SD * sd) cells =
-    (truth.mean(), error.mean(), np.sqrt(np.mean(error**2)), sd.mean()) click.echo(f"{name:42}" + "".join(f"{c:9.3f}"
-    for c in cells) + f"{100 * held:6.0f}%") sys.exit(int(not rms or np.mean(rms) > BARS[markers]))
+    mean, n = float(np.mean(rms)), len(rms)
+    click.echo(f"{markers}: vertical force {mean:.1f} % BW (bar {BARS[markers]:g}), {n} of {people} walkers")
+    click.echo(f"{'':42}{'true':>9}{'mean':>9}{'rms':>9}{'sd':>9}{'held':>7}")
+    for name, rows in errors.items():
+        truth, error, sd = np.array(rows).T
+        held = np.mean(np.abs(error) < WIDTH_SD * sd)
+        cells = (truth.mean(), error.mean(), np.sqrt(np.mean(error**2)), sd.mean())
+        click.echo(f"{name:42}" + "".join(f"{c:9.3f}" for c in cells) + f"{100 * held:6.0f}%")
+    sys.exit(int(not rms or mean > BARS[markers]))
 
 
 if __name__ == "__main__":
