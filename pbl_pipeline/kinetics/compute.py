@@ -117,7 +117,7 @@ def visit_kinetics(
         residual_bw=_residual(pooled),
         method=method.key,
         params_hash=method.hash,
-        trials=trials,
+        trials=tuple(dataclasses.replace(t, samples=None) for t in trials),
         qc=_checks(pooled, measures, fits),
     )
 

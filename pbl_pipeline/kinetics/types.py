@@ -82,7 +82,8 @@ class KineticMeasure:
     def to_dict(self) -> dict[str, Any]:
         """Return the measure for JSON."""
         own = {k: round(v, 4) if isinstance(v, float) else v for k, v in dataclasses.asdict(self).items()}
-        return {**own, "interval": None if self.interval is None else [round(v, 4) for v in self.interval]}
+        interval = KineticMeasure(**own).interval
+        return {**own, "interval": None if interval is None else [round(v, 4) for v in interval]}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,10 +15,10 @@ _SIDES = ("left", "right")
 #: The section is folded where the 90 % interval of the loading peak reaches further than this from it (body weights).
 _UNSURE_BW = 0.10
 _NOTE = (
-    "From the motion alone, by Newton's and Euler's laws: no force was measured. Per body weight (BW) and per kilogram. "
-    "Joint moments are internal, those of the person's own muscles and ligaments; at the knee flexion counts as "
-    "positive, so extensors show as negative. While both feet stand, and for where under the sole the force acts, the "
-    "usual course of walking is taken. In brackets the 90 % interval. Thin lines are single cycles, thick ones their mean."
+    "From the motion alone, by the laws of Newton and Euler: no force was measured. Per body weight (BW) and kilogram. "
+    "Joint moments are internal, those of the person's own muscles and ligaments; at the knee flexion is positive, so "
+    "extensors show as negative. While both feet stand, and for where under the sole the force acts, the usual course "
+    "of walking is taken. In brackets the 90 % interval. Thin lines are single cycles, thick ones their mean."
 )
 
 
