@@ -144,7 +144,7 @@ def read_walk(path: Path) -> Walk:
     origins = 1e-3 * numbers["FORCE_PLATFORM:ORIGIN"].reshape(-1, 3)
     mean = analog.mean(axis=2)  # over the samples of a frame
     plates = tuple(_plate(mean[:, 6 * k : 6 * k + 6] / mass, corners[k], origins[k]) for k in range(len(corners)))
-    _check(path, plates)
+    check_plates(path, plates)
     return Walk(
         path.name.split("_")[1].removesuffix(".c3d.gz"),
         WorldMarkers(time, table.names, table.name, metres, seen.astype(float)),
@@ -164,7 +164,8 @@ def _plate(channels: np.ndarray, corners: np.ndarray, origin: np.ndarray) -> Pla
     return Plate(force, moment + np.cross(corners.mean(axis=0) + axes @ origin, force))
 
 
-def _check(path: Path, plates: tuple[Plate, ...]) -> None:
+def check_plates(path: Path, plates: tuple[Plate, ...]) -> None:
+    """Raise `PblError` FILE_FORMAT where the forces of loaded plates are not those of a person's weight."""
     for k, plate in enumerate(plates, 1):
         loaded = np.abs(plate.force[:, 2]) > 0.3 * GRAVITY
         mean = float(plate.force[loaded, 2].mean() / GRAVITY) if loaded.any() else 0.0

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from scipy.interpolate import make_interp_spline
 
 from pbl_pipeline.body import SCALE_NAMES, load_body, stature_m
+from pbl_pipeline.cli.gait import gait as gait_command
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import GaitEvent, gait_metrics
 from pbl_pipeline.kinetics import (
@@ -28,7 +32,10 @@ from pbl_pipeline.kinetics import (
     visit_kinetics,
 )
 from pbl_pipeline.kinetics.ground import PROGRESS, TRANSIENT
+from pbl_pipeline.names import check_mass
+from pbl_pipeline.report import write_report
 from pbl_pipeline.synthetic import SynthSpec, synthesise
+from pbl_pipeline.visit import Recording, Visit, load_kinetics, save_kinetics
 from tests.walking_fit import walking_fit
 
 BODY = load_body()
@@ -350,3 +357,46 @@ def test_mujoco_is_asked_without_joint_limits() -> None:
     limit = BODY.joint_range_rad[knee, 1]
     below, above = (dynamics_of(still(knee_angle_r=limit + x)).generalised[0, knee] for x in (-1e-4, 1e-4))
     assert below == pytest.approx(above, abs=1e-3)
+
+
+@pytest.mark.parametrize("mass_kg", [0.07, 4.0, 700.0, float("nan")])
+def test_a_mass_that_no_person_has_is_refused(mass_kg: float) -> None:
+    with pytest.raises(PblError) as error:
+        check_mass(mass_kg)
+    assert error.value.code == "FIT_INPUT"
+    check_mass(None)
+    check_mass(68.5)
+
+
+def test_pbl_gait_writes_kinetics_beside_the_fits_and_keeps_the_mass(walk: TrialFit, tmp_path: Path) -> None:
+    walk.save(tmp_path / "walk.fit.npz")
+    save_kinetics(dataclasses.replace(kinetics_of(walk, mass_kg=70.0), trials=()), tmp_path)
+    done = CliRunner().invoke(gait_command, [str(tmp_path / "walk.fit.npz"), "--out", str(tmp_path / "metrics.json")])
+    assert done.exit_code == 0, done.output
+    found = load_kinetics(tmp_path, ["walk"])
+    assert found is not None
+    assert found.mass_kg == 70.0
+    assert found.measures.keys() == kinetics_of(walk).measures.keys()
+    series = found.trials[0].series
+    assert series is not None
+    assert series.force_bw.shape == (len(series.time_s), 2, 3)
+
+
+def test_kinetics_of_other_recordings_are_refused(walk: TrialFit, tmp_path: Path) -> None:
+    save_kinetics(kinetics_of(walk), tmp_path)
+    with pytest.raises(PblError) as error:
+        load_kinetics(tmp_path, ["another"])
+    assert error.value.code == "FILE_FORMAT"
+    assert load_kinetics(tmp_path / "empty", ["walk"]) is None
+
+
+def test_the_report_shows_forces_with_intervals_and_newtons(walk: TrialFit, tmp_path: Path) -> None:
+    gait = gait_metrics([walk])
+    visit = Visit((Recording.of("walk", walk),)).with_measures(gait)
+    visit = dataclasses.replace(visit, kinetics=visit_kinetics([walk], gait.trials, METHODS.find(), mass_kg=70.0))
+    page = write_report(tmp_path / "report.html", visit).read_text()
+    assert "Forces and joint moments" in page
+    assert "1 BW is 686 N" in page
+    assert "Not known: one camera sees too little" in page
+    nothing = dataclasses.replace(visit, kinetics=visit_kinetics([walk], gait.trials, METHODS.find(), aid="walker"))
+    assert "No forces: a walking aid" in write_report(tmp_path / "aid.html", nothing).read_text()
