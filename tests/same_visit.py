@@ -19,10 +19,11 @@ from pbl_pipeline.qc import Check
 from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.visit import Recording, Solution, Visit
 
-#: What the rounding in the files of a visit changes at most, by the class that holds the number: metrics.json rounds a
-#: measure to 4 decimals, index and profile to 3, kinetics.json to 4 and those of a cycle to 5; events.csv times to 4 and probabilities to 3; session.json seconds to
-#: 3, scale and loss to 5. Curves, keypoints and boxes of people are stored as float32, from which the tables compute
-#: the index, checks and the choice of the person. Everything else comes back as it was.
+#: What the rounding in the files of a visit changes at most, by the class that holds the number: metrics.json and
+#: kinetics.json round a measure to 4 decimals (of a cycle to 5), index and profile to 3; events.csv times to 4 and
+#: probabilities to 3; session.json seconds to 3, scale and loss to 5. Curves, keypoints and boxes of people are stored
+#: as float32, from which the tables compute the index, checks and the choice of the person. Everything else comes back
+#: as it was.
 ROUNDED = {
     Measure: 5.1e-5,
     KineticMeasure: 5.1e-5,

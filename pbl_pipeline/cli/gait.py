@@ -8,6 +8,8 @@ import click
 
 from pbl_pipeline.errors import PblError
 
+from .options import MASS
+
 METHOD_HELP = "Event method, such as phase-transformer, zeni-2008 or oconnor-2007."
 _EPILOG = """\b
 Example: pbl gait out/walk1.fit.npz out/walk2.fit.npz --out out/metrics.json
@@ -31,6 +33,7 @@ Example: pbl gait lab/walk1.c3d lab/walk2.c3d --out lab/metrics.json"""
     help="events.csv of `pbl events` for C3D files, once for each in their order (default: the labels in the file, "
     "else by --method).",
 )
+@MASS
 def gait(
     files: tuple[Path, ...],
     out: Path,
@@ -38,6 +41,7 @@ def gait(
     norm: str | None,
     method: str,
     event_files: tuple[Path, ...],
+    mass_kg: float | None,
 ) -> None:
     """Events, cycles, spatiotemporal measures and GDI of one session.
 
@@ -51,9 +55,11 @@ def gait(
     from pbl_pipeline.gait import EVENT_METHODS, GDI_METHODS, GILLETTE_MODEL, GaitParams, gait_metrics, read_lab_trial
     from pbl_pipeline.kinetics import METHODS as KINETICS_METHODS
     from pbl_pipeline.kinetics import visit_kinetics
+    from pbl_pipeline.names import check_mass
     from pbl_pipeline.visit import load_kinetics, save_beside, save_kinetics, visit_of_fits
 
     check_out_file(out)
+    check_mass(mass_kg)
     laboratory = [is_c3d(path) for path in files]
     if any(laboratory) and not all(laboratory):
         raise _usage("fits and C3D files together", "one kind of file in a session")
@@ -76,7 +82,7 @@ def gait(
         save_beside(metrics.trials, files, out)
         if all(path.resolve().parent == out.resolve().parent for path in files):
             known = load_kinetics(out.parent, [])
-            mass = None if known is None else known.mass_kg
+            mass = mass_kg if mass_kg is not None or known is None else known.mass_kg
             save_kinetics(visit_kinetics(fits, metrics.trials, KINETICS_METHODS.find(), mass_kg=mass), out.parent)
     metrics.save(out)
     click.echo(metrics.table())
