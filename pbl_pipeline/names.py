@@ -60,7 +60,7 @@ MASS_KG = (5.0, 400.0)
 
 
 def check_mass(mass_kg: float | None) -> None:
-    """Raise `PblError` FIT_INPUT for a number that is no mass of a person in kilograms."""
+    """Raise `PblError` FIT_INPUT unless it is the mass of a person in kilograms."""
     if mass_kg is not None and not MASS_KG[0] <= mass_kg <= MASS_KG[1]:
         raise PblError(
             "FIT_INPUT",

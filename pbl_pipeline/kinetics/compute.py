@@ -68,6 +68,8 @@ REASONS = {
 }
 #: Root mean square of the residual force beyond which a check warns (body weights).
 MAX_RESIDUAL_BW = 0.15
+#: An asymmetry that is less certain than this is left out (percent).
+MAX_ASYMMETRY_SD = 30.0
 #: Words of an aid that carries no weight.
 _NO_AID = ("", "none", "no", "unknown")
 #: Why measures that one camera tells too badly are absent (docs/kinetics.md has the errors).
@@ -260,9 +262,10 @@ def _measure(
     asymmetry = asymmetry_sd = None
     left, right = mean["left"], mean["right"]
     if name in _SIDED and left is not None and right is not None and abs(middle) > 1e-9:
-        asymmetry = 100.0 * (right - left) / abs(middle)
         of_difference = sd([varies["right"], varies["left"]], [1.0, -1.0])
-        asymmetry_sd = None if of_difference is None else 100.0 * of_difference / abs(middle)
+        if of_difference is None or 100.0 * of_difference / abs(middle) <= MAX_ASYMMETRY_SD:
+            asymmetry = 100.0 * (right - left) / abs(middle)
+            asymmetry_sd = None if of_difference is None else 100.0 * of_difference / abs(middle)
     return KineticMeasure(
         left=left,
         right=right,

@@ -38,7 +38,7 @@ class Motion:
 
 @dataclasses.dataclass(frozen=True)
 class Dynamics:
-    """What a motion needs, per kilogram of the person, at N times; world frame, z up.
+    """Forces that a motion needs, per kilogram of the person, at N times; world frame, z up.
 
     force_n, moment_nm (N, 3): of everything outside the body, gravity excepted; the moment is about the world's origin
     (N/kg, Nm/kg). centre_m, centre_velocity (N, 3): of mass. generalised (N, Q): what each joint value would need if

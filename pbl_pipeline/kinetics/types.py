@@ -1,4 +1,4 @@
-"""What the stage returns: curves and measures of gait cycles, and the measures of a visit with their intervals."""
+"""Results of the stage: curves and measures of gait cycles, and the measures of a visit with their intervals."""
 
 from __future__ import annotations
 
@@ -61,7 +61,8 @@ class KineticMeasure:
 
     The error is that of the fit, by sampling, that of the method, by force plates, and of one camera what its fit loses
     in any walk, by synthetic walkers; `interval` is the 90 % interval of `mean`. `asymmetry_percent` is 100 (right -
-    left) / ((right + left) / 2), None for what is no measure of one leg.
+    left) / ((right + left) / 2), None for what is not a
+    measure of one leg and where its standard deviation is more than `compute.MAX_ASYMMETRY_SD`.
     """
 
     left: float | None
@@ -82,7 +83,7 @@ class KineticMeasure:
     def to_dict(self) -> dict[str, Any]:
         """Return the measure for JSON."""
         own = {k: round(v, 4) if isinstance(v, float) else v for k, v in dataclasses.asdict(self).items()}
-        interval = KineticMeasure(**own).interval
+        interval = dataclasses.replace(self, **own).interval
         return {**own, "interval": None if interval is None else [round(v, 4) for v in interval]}
 
 

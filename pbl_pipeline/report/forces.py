@@ -7,11 +7,14 @@ import numpy as np
 from pbl_pipeline import charts
 from pbl_pipeline.kinetics import KineticMeasure, Kinetics
 from pbl_pipeline.kinetics.types import WIDTH_SD
+from pbl_pipeline.qc import PASS
 from pbl_pipeline.report.words import plural, sentence
 from pbl_pipeline.visit import Visit
 from pbl_pipeline.words import KINETICS, KINETICS_CURVES, number
 
 _SIDES = ("left", "right")
+#: Smallest range of a chart by unit.
+_LEAST = {"BW": 0.2, "Nm/kg": 0.5, "W/kg": 1.0}
 #: The section is folded where the 90 % interval of the loading peak reaches further than this from it (body weights).
 _UNSURE_BW = 0.10
 _NOTE = (
@@ -35,12 +38,13 @@ def forces_section(visit: Visit) -> dict | None:
     in_newtons = "" if weight is None else f" 1 BW is {number(9.80665 * weight, 0)} N."
     residual = kinetics.residual_bw
     left_over = "" if residual is None else f" Carried by no foot: {number(100 * residual, 1)} % of the weight."
+    doubts = [c for c in kinetics.qc if c.outcome != PASS]
     return {
         "reason": "",
-        "open": sure,
+        "open": sure and not doubts,
         "rows": [_row(name, kinetics.measures.get(name), kinetics.reasons.get(name, ""), weight) for name in KINETICS],
         "charts": _charts(kinetics),
-        "note": _NOTE + in_newtons + left_over,
+        "note": " ".join([_NOTE + in_newtons + left_over, *(sentence(c.advice) for c in doubts)]),
     }
 
 
@@ -69,15 +73,17 @@ def _row(name: str, measure: KineticMeasure | None, reason: str, mass_kg: float 
 
 
 def _charts(kinetics: Kinetics) -> list[dict]:
-    """Return one chart for each curve that cycles have."""
+    """Return one chart for each curve that cycles have; of hip and knee only where their measures are known."""
+    shown = ("force_", "ankle_") if "knee_extension_moment_peak_nm_per_kg" in kinetics.reasons else ("",)
     cycles = [c for t in kinetics.trials for c in t.cycles if c.used and c.curves]
     drawn = []
     for name, (title, unit) in KINETICS_CURVES.items():
         by_side = {s: [c.curves[name] for c in cycles if c.side == s and name in c.curves] for s in _SIDES}
         known = [curve for curves in by_side.values() for curve in curves]
-        if not known:
+        if not known or not name.startswith(shown):
             continue
         label = f"{title} in {unit} over the gait cycle in percent, of {plural(len(known), 'cycle')}."
         percent = np.linspace(0.0, 100.0, len(known[0]))
-        drawn.append({"name": title, "note": unit, "svg": charts.cycle_chart(label, percent, by_side, {}, None)})
+        chart = charts.cycle_chart(label, percent, by_side, {}, None, unit="", least=_LEAST[unit])
+        drawn.append({"name": title, "note": unit, "svg": chart})
     return drawn

@@ -41,7 +41,7 @@ def walked(seed: int, markers: str) -> tuple[Synthetic, TrialFit, Kinetics, Tria
     made = synthesise(spec)
     points, method = made.keypoints, METHODS.find()
     height = stature_m(load_body(), made.truth.scale)
-    chosen = default_fit([(points.marker_set, points.root_relative)])
+    chosen = default_fit((points.marker_set, points.root_relative))
     session = fit_session([points], [f"seed{seed}"], chosen, "static", height_m=height)
     fit = session.trials[0]
     exact = dataclasses.replace(

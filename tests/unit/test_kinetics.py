@@ -237,7 +237,7 @@ def test_moments_of_standing_on_one_leg_by_hand() -> None:
     inertia = segment_inertia(BODY, ONE)
     ankle = d.xpos[at, BODY.body_names.index("talus_r")]
     axis = d.axis[at, BODY.joint_names.index("ankle_angle_r")]
-    # What the foot needs against its weight and the ground: the moments of both about the joint, turned round.
+    # The joint balances the moments of the foot's weight and of the ground about it.
     outside = np.cross(ground.centre_m[at, 1] - ankle, ground.force_n[at, 1])
     for name in ("talus_r", "calcn_r", "toes_r"):
         b = BODY.body_names.index(name)
