@@ -156,7 +156,7 @@ def cycle_chart(
     unit: str = "\N{DEGREE SIGN}",
     least: float = 20.0,
 ) -> Markup:
-    """A curve, such as a joint angle, over the gait cycle: each cycle thin, the mean of a side thick, the norm as a band.
+    """A curve, such as a joint angle, over the gait cycle: each cycle thin, the mean of a side thick, the norm a band.
 
     Parameters
     ----------
