@@ -41,7 +41,7 @@ class Dynamics:
     """Forces that a motion needs, per kilogram of the person, at N times; world frame, z up.
 
     force_n, moment_nm (N, 3): of everything outside the body, gravity excepted; the moment is about the world's origin
-    (N/kg, Nm/kg). centre_m, centre_velocity (N, 3): of mass. generalised (N, Q): what each joint value would need if
+    (N/kg, Nm/kg). centre_m (N, 3): of mass. generalised (N, Q): what each joint value would need if
     that force acted on the pelvis (Nm/kg, N/kg). axis, anchor_m (N, Q, 3): of each joint. xpos (N, B, 3), xmat (N, B,
     3, 3).
     """
@@ -49,7 +49,6 @@ class Dynamics:
     force_n: np.ndarray
     moment_nm: np.ndarray
     centre_m: np.ndarray
-    centre_velocity: np.ndarray
     generalised: np.ndarray
     axis: np.ndarray
     anchor_m: np.ndarray
@@ -87,14 +86,13 @@ def inverse_dynamics(body: Body, scale: Float[np.ndarray, " S"], inertia: Inerti
     data = mujoco.MjData(model)
     n, q, b = len(motion.time_s), model.nv, model.nbody - 1
     generalised, axis, anchor = np.empty((n, q)), np.empty((n, q, 3)), np.empty((n, q, 3))
-    centre, velocity = np.empty((n, 3)), np.empty((n, 3))
+    centre = np.empty((n, 3))
     xpos, xmat = np.empty((n, b, 3)), np.empty((n, b, 3, 3))
     for i in range(n):
         data.qpos[:], data.qvel[:], data.qacc[:] = motion.qpos[i], motion.qvel[i], motion.qacc[i]
         mujoco.mj_inverse(model, data)
-        mujoco.mj_subtreeVel(model, data)
         generalised[i], axis[i], anchor[i] = data.qfrc_inverse, data.xaxis, data.xanchor
-        centre[i], velocity[i] = data.subtree_com[0], data.subtree_linvel[0]
+        centre[i] = data.subtree_com[0]
         xpos[i], xmat[i] = data.xpos[1:], data.xmat[1:].reshape(-1, 3, 3)
     slides = [body.joint_names.index(name) for name in SLIDES]
     turns = [body.joint_names.index(name) for name in PELVIS_TURNS]
@@ -102,7 +100,7 @@ def inverse_dynamics(body: Body, scale: Float[np.ndarray, " S"], inertia: Inerti
     force = np.linalg.solve(axis[:, slides], generalised[:, slides, None])[..., 0]
     about = np.linalg.solve(axis[:, turns], generalised[:, turns, None])[..., 0]
     moment = about + np.cross(xpos[:, 0], force)
-    return Dynamics(force, moment, centre, velocity, generalised, axis, anchor, xpos, xmat)
+    return Dynamics(force, moment, centre, generalised, axis, anchor, xpos, xmat)
 
 
 def _dynamic_model(body: Body, scale: np.ndarray, inertia: Inertia) -> mujoco.MjModel:

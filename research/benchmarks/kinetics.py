@@ -240,7 +240,7 @@ def _step(
         centre,
         moment[:, side],
         true * np.array([angle_of(j)[1] for j in JOINTS]),
-        float(np.sign(d.centre_velocity[:, 1].mean())),
+        float(np.sign(d.centre_m[-1, 1] - d.centre_m[0, 1])),
         *both,
     )
 
