@@ -153,8 +153,10 @@ def cycle_chart(
     foot_off_percent: Mapping[str, float],
     norm: tuple[np.ndarray, np.ndarray, np.ndarray] | None,
     faint: str = "",
+    unit: str = "\N{DEGREE SIGN}",
+    least: float = 20.0,
 ) -> Markup:
-    """One joint angle over the gait cycle: each cycle thin, the mean of a side thick, the norm as a grey band.
+    """A curve, such as a joint angle, over the gait cycle: each cycle thin, the mean of a side thick, the norm a band.
 
     Parameters
     ----------
@@ -168,9 +170,11 @@ def cycle_chart(
         percent (Q,), mean (Q,), sd (Q,) in degrees; None where there is none.
     faint
         The side whose curves are less certain.
+    unit, least
+        Behind the uppermost number of the axis; the smallest range that the axis has.
     """
     opacity = {side: 0.4 if side == faint else 1.0 for side in cycles}
-    axes = _cycle_axes([c for curves in cycles.values() for c in curves], norm)
+    axes = _cycle_axes([c for curves in cycles.values() for c in curves], norm, unit, least)
     if norm is not None:
         axes.curve(norm[0], norm[1], "#9aa3ad", 1.2)
     for side, curves in cycles.items():
@@ -223,14 +227,19 @@ def compare_chart(
     return axes.svg(label)
 
 
-def _cycle_axes(values: Sequence[np.ndarray], norm: tuple[np.ndarray, np.ndarray, np.ndarray] | None) -> Axes:
-    """Return the plot area of an angle (deg) over the gait cycle (%) with room for `values` and the norm's band."""
+def _cycle_axes(
+    values: Sequence[np.ndarray],
+    norm: tuple[np.ndarray, np.ndarray, np.ndarray] | None,
+    unit: str = "\N{DEGREE SIGN}",
+    least: float = 20.0,
+) -> Axes:
+    """Return the plot area of a curve over the gait cycle (%) with room for `values` and the norm's band."""
     edges = [] if norm is None else [norm[1] - norm[2], norm[1] + norm[2]]
-    ticks = nice_ticks(*_extent([*values, *edges], least=20.0))
+    ticks = nice_ticks(*_extent([*values, *edges], least=least))
     axes = Axes(_CYCLE_SIZE, (0, 100), (ticks[0], ticks[-1]), margin=_CYCLE_MARGIN)
     if norm is not None:
         axes.band(norm[0], edges[0], edges[1])
-    axes.grid([0, 25, 50, 75, 100], ticks, "\N{NO-BREAK SPACE}%", "\N{DEGREE SIGN}")
+    axes.grid([0, 25, 50, 75, 100], ticks, "\N{NO-BREAK SPACE}%", unit)
     return axes
 
 

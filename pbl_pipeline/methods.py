@@ -30,6 +30,7 @@ STAGES = {
     "fit": "pbl_pipeline.fit:METHODS",
     "gait": "pbl_pipeline.gait.events:METHODS",
     "gdi": "pbl_pipeline.gait:GDI_METHODS",
+    "kinetics": "pbl_pipeline.kinetics:METHODS",
 }
 
 

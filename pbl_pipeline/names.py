@@ -55,6 +55,21 @@ def distinct(stems: Sequence[str], numbers: Sequence[int]) -> list[str]:
     return names
 
 
+#: Masses (kg) of people, with room to spare.
+MASS_KG = (5.0, 400.0)
+
+
+def check_mass(mass_kg: float | None) -> None:
+    """Raise `PblError` FIT_INPUT unless it is the mass of a person in kilograms."""
+    if mass_kg is not None and not MASS_KG[0] <= mass_kg <= MASS_KG[1]:
+        raise PblError(
+            "FIT_INPUT",
+            found=f"a body mass of {mass_kg:g} kg",
+            expected=f"kilograms, {MASS_KG[0]:g} to {MASS_KG[1]:g}",
+            next_step="state the mass in kilograms, such as 68.5, or leave it out",
+        )
+
+
 #: Heights (m) of people, the smallest walking child and the tallest adult with room to spare.
 HEIGHT_M = (0.5, 2.6)
 

@@ -15,8 +15,10 @@ from pbl_pipeline.fit import TrialFit, check_trial, default_fit, fit_session
 from pbl_pipeline.gait import DEFAULT_NORM, GaitParams, gait_metrics, load_norm
 from pbl_pipeline.keypoints import METHODS as KEYPOINT_METHODS
 from pbl_pipeline.keypoints import KeypointParams, detect_keypoints
+from pbl_pipeline.kinetics import METHODS as KINETICS_METHODS
+from pbl_pipeline.kinetics import visit_kinetics
 from pbl_pipeline.methods import Method
-from pbl_pipeline.names import check_height, check_label, distinct
+from pbl_pipeline.names import check_height, check_label, check_mass, distinct
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
 from pbl_pipeline.report import Picture, write_report
@@ -39,6 +41,7 @@ def run_visit(
     keypoints: Method[KeypointParams] | None = None,
     people: Method[TrackingParams] | None = None,
     height_m: float | None = None,
+    mass_kg: float | None = None,
 ) -> tuple[Visit, Mapping[str, PblError]]:
     """Compute a visit from its videos. Returns it with the errors of the videos that were left out, by their names.
 
@@ -47,7 +50,8 @@ def run_visit(
 
     `paramset` is the method of the fit; None: the one that suits the keypoints (`fit.default_fit`). `attitude_files`
     holds a sensor log of the phone for each path, or nothing; one that does not belong to its video leaves that out.
-    `camera_motion` None stands for "handheld" where there are logs, else "static". `height_m`: as in `fit_session`.
+    `camera_motion` None stands for "handheld" where there are logs, else "static". `height_m`: as in `fit_session`;
+    `mass_kg`: as in `visit_kinetics`.
 
     Raises
     ------
@@ -61,6 +65,7 @@ def run_visit(
     method = FIT_METHODS.find(paramset or default_fit(keypoints.params.points()))
     load_norm(norm or DEFAULT_NORM)
     check_height(height_m)
+    check_mass(mass_kg)
     logs = [(file, read_phone_log(file)) for file in attitude_files] or [None] * len(paths)
     camera_motion = camera_motion or ("handheld" if attitude_files else "static")
     found: list[Recording] = []
@@ -100,17 +105,21 @@ def run_visit(
     left_out = [r for r in found if r.problem]
     methods = {"Tracking": people.key, "Keypoints": keypoints.key, "Fit": method.key}
     visit = Visit((*fitted, *left_out), Solution.of(fit), fit.qc, methods=methods)
-    return measured(visit, norm=norm), problems
+    return measured(visit, norm=norm, mass_kg=mass_kg), problems
 
 
-def measured(visit: Visit, gait: GaitParams | None = None, norm: str | None = None) -> Visit:
-    """Return a fitted visit with its gait measures, by the default methods where none are given.
+def measured(
+    visit: Visit, gait: GaitParams | None = None, norm: str | None = None, mass_kg: float | None = None
+) -> Visit:
+    """Return a fitted visit with its gait measures and its kinetics, by the default methods where none are given.
 
     Raises what `gait_metrics` raises.
     """
     fits = [dataclasses.replace(r.fit, name=r.name) for r in visit.fitted if r.fit is not None]
     conditions = [r.condition for r in visit.fitted]
-    return visit.with_measures(gait_metrics(fits, norm, gait, fit_checks=visit.fit_checks, conditions=conditions))
+    measures = gait_metrics(fits, norm, gait, fit_checks=visit.fit_checks, conditions=conditions)
+    kinetics = visit_kinetics(fits, measures.trials, KINETICS_METHODS.find(), mass_kg=mass_kg)
+    return dataclasses.replace(visit.with_measures(measures), kinetics=kinetics)
 
 
 def write_results(out: Path, visit: Visit, title: str = "Gait report") -> list[Path]:

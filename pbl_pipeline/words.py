@@ -7,6 +7,11 @@ import math
 
 #: Ends of the names of measures and their units, longer ones before those that they end with.
 _UNITS = (
+    ("_nm_per_kg", "Nm/kg"),
+    ("_w_per_kg", "W/kg"),
+    ("_j_per_kg", "J/kg"),
+    ("_bw_s", "BW s"),
+    ("_bw", "BW"),
     ("_steps_per_min", "steps/min"),
     ("_m_per_s", "m/s"),
     ("_percent", "%"),
@@ -31,6 +36,34 @@ MEASURES: dict[str, tuple[str, str, int]] = {
     "stride_length_m": ("Stride length", "m", 2),
     "step_length_m": ("Step length", "m", 2),
     "step_width_m": ("Step width", "m", 2),
+}
+
+#: Measures of forces and moments: key of kinetics.json -> name, unit, decimals.
+KINETICS: dict[str, tuple[str, str, int]] = {
+    "vertical_peak_loading_bw": ("Vertical force, peak of loading", "BW", 2),
+    "vertical_peak_push_off_bw": ("Vertical force, peak of push-off", "BW", 2),
+    "vertical_impulse_bw_s": ("Vertical impulse", "BW s", 2),
+    "braking_impulse_bw_s": ("Braking impulse", "BW s", 3),
+    "propulsion_impulse_bw_s": ("Propulsion impulse", "BW s", 3),
+    "knee_extension_moment_peak_nm_per_kg": ("Knee extension moment, peak", "Nm/kg", 2),
+    "knee_adduction_moment_peak_nm_per_kg": ("Knee adduction moment, peak (external)", "Nm/kg", 2),
+    "ankle_push_off_power_w_per_kg": ("Ankle push-off power, peak", "W/kg", 1),
+    "hip_work_j_per_kg": ("Work of the hip in stance", "J/kg", 2),
+    "knee_work_j_per_kg": ("Work of the knee in stance", "J/kg", 2),
+    "ankle_work_j_per_kg": ("Work of the ankle in stance", "J/kg", 2),
+    "centre_of_mass_excursion_m": ("Vertical excursion of the centre of mass", "m", 3),
+}
+#: Curves of forces and moments that people read: our name -> heading, unit.
+KINETICS_CURVES: dict[str, tuple[str, str]] = {
+    "force_vertical_bw": ("Vertical force", "BW"),
+    "force_forward_bw": ("Forward force", "BW"),
+    "force_medial_bw": ("Inward force", "BW"),
+    "hip_flexion_moment_nm_per_kg": ("Hip flexion moment", "Nm/kg"),
+    "knee_flexion_moment_nm_per_kg": ("Knee flexion moment", "Nm/kg"),
+    "ankle_angle_moment_nm_per_kg": ("Ankle dorsiflexion moment", "Nm/kg"),
+    "hip_flexion_power_w_per_kg": ("Hip power", "W/kg"),
+    "knee_flexion_power_w_per_kg": ("Knee power", "W/kg"),
+    "ankle_angle_power_w_per_kg": ("Ankle power", "W/kg"),
 }
 
 #: Joint angles: our name -> heading, and what positive means where the heading does not say it.

@@ -14,16 +14,20 @@ import pytest
 
 from pbl_pipeline.export import ExportOptions, write_export
 from pbl_pipeline.gait import GaitEvent, Gdi, GdiCycle, Measure, MovementProfile
+from pbl_pipeline.kinetics import CycleKinetics, KineticMeasure
 from pbl_pipeline.qc import Check
 from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.visit import Recording, Solution, Visit
 
-#: What the rounding in the files of a visit changes at most, by the class that holds the number: metrics.json rounds a
-#: measure to 4 decimals, index and profile to 3; events.csv times to 4 and probabilities to 3; session.json seconds to
-#: 3, scale and loss to 5. Curves, keypoints and boxes of people are stored as float32, from which the tables compute
-#: the index, checks and the choice of the person. Everything else comes back as it was.
+#: What the rounding in the files of a visit changes at most, by the class that holds the number: metrics.json and
+#: kinetics.json round a measure to 4 decimals (of a cycle to 5), index and profile to 3; events.csv times to 4 and
+#: probabilities to 3; session.json seconds to 3, scale and loss to 5. Curves, keypoints and boxes of people are stored
+#: as float32, from which the tables compute the index, checks and the choice of the person. Everything else comes back
+#: as it was.
 ROUNDED = {
     Measure: 5.1e-5,
+    KineticMeasure: 5.1e-5,
+    CycleKinetics: 5.1e-6,
     Gdi: 5.1e-4,
     MovementProfile: 5.1e-4,
     GaitEvent: 5.1e-4,

@@ -8,6 +8,8 @@ import click
 
 from pbl_pipeline.errors import PblError
 
+from .options import MASS
+
 METHOD_HELP = "Event method, such as phase-transformer, zeni-2008 or oconnor-2007."
 _EPILOG = """\b
 Example: pbl gait out/walk1.fit.npz out/walk2.fit.npz --out out/metrics.json
@@ -31,6 +33,7 @@ Example: pbl gait lab/walk1.c3d lab/walk2.c3d --out lab/metrics.json"""
     help="events.csv of `pbl events` for C3D files, once for each in their order (default: the labels in the file, "
     "else by --method).",
 )
+@MASS
 def gait(
     files: tuple[Path, ...],
     out: Path,
@@ -38,20 +41,25 @@ def gait(
     norm: str | None,
     method: str,
     event_files: tuple[Path, ...],
+    mass_kg: float | None,
 ) -> None:
     """Events, cycles, spatiotemporal measures and GDI of one session.
 
     FILES are fits (fit.npz of `pbl fit`), or a laboratory's recordings (C3D with the nine angles of Plug-in Gait).
     Measures that cannot be trusted are null with a reason. Whether a fit lies on the person stands in the session.json
     that `pbl fit` wrote beside it: without that it is not known. Where metrics.json is written beside the fits, their
-    events.csv and cycles.npz are too: they belong together.
+    events.csv and cycles.npz and the kinetics are too: they belong together.
     """
     from pbl_pipeline import progress
     from pbl_pipeline.files import check_out_file
     from pbl_pipeline.gait import EVENT_METHODS, GDI_METHODS, GILLETTE_MODEL, GaitParams, gait_metrics, read_lab_trial
-    from pbl_pipeline.visit import save_beside, visit_of_fits
+    from pbl_pipeline.kinetics import METHODS as KINETICS_METHODS
+    from pbl_pipeline.kinetics import visit_kinetics
+    from pbl_pipeline.names import check_mass
+    from pbl_pipeline.visit import load_kinetics, save_beside, save_kinetics, visit_of_fits
 
     check_out_file(out)
+    check_mass(mass_kg)
     laboratory = [is_c3d(path) for path in files]
     if any(laboratory) and not all(laboratory):
         raise _usage("fits and C3D files together", "one kind of file in a session")
@@ -72,6 +80,10 @@ def gait(
         of_fit = visit.fit_checks
         metrics = gait_metrics(fits, norm, params, of_fit, model=index).with_checks(of_fit)
         save_beside(metrics.trials, files, out)
+        if all(path.resolve().parent == out.resolve().parent for path in files):
+            known = load_kinetics(out.parent, [])
+            mass = mass_kg if mass_kg is not None or known is None else known.mass_kg
+            save_kinetics(visit_kinetics(fits, metrics.trials, KINETICS_METHODS.find(), mass_kg=mass), out.parent)
     metrics.save(out)
     click.echo(metrics.table())
     click.echo(f"written: {out}")

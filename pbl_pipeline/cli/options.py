@@ -27,6 +27,9 @@ CAMERA_MOTION_HELP = "Default: handheld where the phone's orientation is known, 
 HEIGHT = click.option(
     "--height-m", type=float, help="Measured body height, such as 1.72: lengths and speeds become those of it."
 )
+MASS = click.option(
+    "--mass-kg", type=float, help="Measured body mass, such as 68.5: forces can then be shown in newtons."
+)
 
 KEYPOINTS = click.option(
     "--keypoints",

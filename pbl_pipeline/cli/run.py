@@ -14,6 +14,7 @@ from .options import (
     DEVICE,
     HEIGHT,
     KEYPOINTS,
+    MASS,
     PEOPLE,
     Person,
     fit_paramset,
@@ -47,6 +48,7 @@ from .options import (
 @click.option("--params", help="Name of a paramset, or a JSON file with changes to one (docs/files.md).")
 @click.option("--norm", help="Normative set of the GDI.")
 @HEIGHT
+@MASS
 @click.option("--subject", default="-", help="Code of the subject on the report; never a name.")
 def run(
     videos: tuple[Path, ...],
@@ -62,13 +64,14 @@ def run(
     params: str | None,
     norm: str | None,
     height_m: float | None,
+    mass_kg: float | None,
     subject: str,
 ) -> None:
     """Put VIDEOS, the trials of one session, through the whole chain.
 
-    Writes report.html, metrics.json, session.json, and per trial the keypoints, the fit, the angles, the events and a
-    video with the body drawn over it. A video that cannot be used is named and left out; the others go on, and the exit
-    code is 1.
+    Writes report.html, metrics.json, kinetics.json, session.json, and per trial the keypoints, the fit, the angles, the
+    events, the forces and a video with the body drawn over it. A video that cannot be used is named and left out; the
+    others go on, and the exit code is 1.
     """
     from pbl_pipeline.errors import PblError
     from pbl_pipeline.files import check_out_folder
@@ -94,7 +97,7 @@ def run(
     method, finder = keypoint_method(keypoints, device), tracking_method(people)
     paramset = fit_paramset(solver, params, [method.params.points()])
     visit, problems = run_visit(
-        videos, out, camera, person, paramset, camera_motion, norm, attitude, method, finder, height_m
+        videos, out, camera, person, paramset, camera_motion, norm, attitude, method, finder, height_m, mass_kg
     )
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
     visit = dataclasses.replace(visit, subject=subject, label=f"computed {today}")

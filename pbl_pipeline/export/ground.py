@@ -67,3 +67,9 @@ def on_floor(trial: ExportTrial) -> tuple[ExportTrial, str]:
     markers[..., 2] -= floor[:, None]
     lowered = dataclasses.replace(fit, qpos=qpos, markers_world_m=markers)
     return dataclasses.replace(trial, fit=lowered), "height 0 is the floor under the person, from the lowest sole"
+
+
+def taken_off(trial: ExportTrial, standing: ExportTrial) -> np.ndarray:
+    """Return (T,) what `on_floor` took off the heights of the frames (m), NaN without a pose."""
+    column = trial.fit.joint_names.index(_VERTICAL)
+    return np.asarray(trial.fit.qpos, float)[:, column] - np.asarray(standing.fit.qpos, float)[:, column]

@@ -23,6 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import SLIDES, Y_UP_TO_Z_UP, Body, load_body
+from pbl_pipeline.kinetics import Inertia, segment_inertia
 
 from .trial import ExportTrial, site_positions, wanted_markers
 
@@ -48,8 +49,9 @@ _FREE_RAD, _FREE_M = 2 * np.pi, 100.0
 def write_osim(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: str = "pbl_body") -> None:
     """Write the scaled body with the fitted markers as an OpenSim 4 model.
 
-    Lengths are scaled as the fit scales them. Masses are the unscaled body's, because a fit does not know the person's
-    mass: centres of mass move with the scale, inertias with its square.
+    Lengths are scaled as the fit scales them. Masses, centres and inertias are those of the forces (`kinetics.Inertia`)
+    where the person's mass is known. Else masses are the unscaled body's, centres move with the scale, inertias with
+    its square.
 
     Raises
     ------
@@ -61,6 +63,8 @@ def write_osim(trial: ExportTrial, path: Path, origin: Mapping[str, str], title:
     body, fit = load_body(), trial.fit
     markers = wanted_markers(trial)
     own = np.asarray(fit.scale, float)[body.scale_index]
+    known = None if trial.mass_kg is None else (trial.mass_kg, segment_inertia(body, np.asarray(fit.scale, float)))
+    bodies = (_body(body, i, own[i], known) for i in range(len(body.body_names)))
     root = ET.Element("OpenSimDocument", Version="40000")
     model = ET.SubElement(root, "Model", name=title)
     _text(model, "credits", "; ".join(f"{k}: {v}" for k, v in origin.items()))
@@ -68,7 +72,7 @@ def write_osim(trial: ExportTrial, path: Path, origin: Mapping[str, str], title:
     _text(model, "length_units", "meters")
     _text(model, "force_units", "N")
     _text(model, "gravity", "0 -9.80665 0")
-    _objects(model, "BodySet", "bodyset", (_body(body, i, own[i]) for i in range(len(body.body_names))))
+    _objects(model, "BodySet", "bodyset", bodies)
     _objects(model, "JointSet", "jointset", (_joint(body, i, own) for i in range(len(body.body_names))))
     places = site_positions(markers, fit, body.scale_index)
     _objects(model, "MarkerSet", "markerset", map(_marker, markers.names, markers.body_names, places))
@@ -90,15 +94,18 @@ def pelvis_rest_m(body: Body) -> dict[str, float]:
     return {n: float(axis @ rest) for n, axis in axes.items()}
 
 
-def _body(body: Body, index: int, scale: float) -> ET.Element:
+def _body(body: Body, index: int, scale: float, known: tuple[float, Inertia] | None) -> ET.Element:
     model, number = body.mj_model, index + 1
     element = ET.Element("Body", name=body.body_names[index])
     shapes = [_shape(model, g, scale, _turns(body)[g]) for g in range(model.ngeom) if model.geom_bodyid[g] == number]
     components = ET.SubElement(element, "components")
     components.extend(shapes)
-    inertia = scale**2 * _inertias(body)[index]
-    _text(element, "mass", _number(model.body_mass[number]))
-    _text(element, "mass_center", _vector(scale * model.body_ipos[number]))
+    mass, centre, inertia = model.body_mass[number], scale * model.body_ipos[number], scale**2 * _inertias(body)[index]
+    if known is not None:
+        kg, own = known
+        mass, centre, inertia = kg * own.mass[index], own.centre_m[index], kg * np.diag(own.moment_m2[index])
+    _text(element, "mass", _number(mass))
+    _text(element, "mass_center", _vector(centre))
     _text(element, "inertia", _vector([*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]))
     return element
 

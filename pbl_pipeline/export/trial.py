@@ -15,6 +15,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import BodyPoses, TrialMetrics, trial_poses
 from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.kinetics import TrialKinetics
 from pbl_pipeline.video import PhoneLog
 from pbl_pipeline.visit import Recording, Visit
 
@@ -34,7 +35,7 @@ class ExportTrial:
     table is not at hand. keypoints, measured (events, cycles, measures), log (of the phone that filmed): None where
     they are not known. log_shift_s: added to the log's times it gives the video's. methods: name of a stage to the
     method that made it, in words. activity: as stated of the recording. fitted_with: version and commit of the software
-    that fitted it, where that is known.
+    that fitted it, where that is known. kinetics, mass_kg: its forces and the person's mass, None where they are not known.
     """
 
     name: str
@@ -47,12 +48,15 @@ class ExportTrial:
     methods: Mapping[str, str] = dataclasses.field(default_factory=dict)
     fitted_with: str = ""
     activity: str = ""
+    kinetics: TrialKinetics | None = None
+    mass_kg: float | None = None
 
     @classmethod
     def of(cls, recording: Recording, visit: Visit) -> ExportTrial:
         """Return a fitted recording of a visit as it is exported. Raises what loading its arrays raises."""
         assert recording.fit is not None
         log, shift = recording.log or (None, 0.0)
+        forces = () if visit.kinetics is None else visit.kinetics.trials
         return cls(
             name=recording.name,
             fit=recording.fit,
@@ -64,6 +68,8 @@ class ExportTrial:
             methods=visit.methods,
             activity=recording.condition.activity,
             fitted_with="" if visit.solution is None else visit.solution.software,
+            kinetics=next((t for t in forces if t.name == recording.name), None),
+            mass_kg=None if visit.kinetics is None else visit.kinetics.mass_kg,
         )
 
     @functools.cached_property

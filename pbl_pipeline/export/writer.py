@@ -24,7 +24,8 @@ from pbl_pipeline.visit import Visit
 from .bids import Labels, bids_files, check_labels, known_participants
 from .c3d import check_frames, write_c3d
 from .columns import Table, dictionary, write_csv, write_parquet
-from .ground import on_floor
+from .forces import check_forces, write_forces
+from .ground import on_floor, taken_off
 from .keypoints_csv import write_keypoints_csv
 from .mot import write_mot
 from .osim import write_osim
@@ -37,6 +38,7 @@ from .visit_tables import session_tables
 FORMATS: Mapping[str, str] = {
     "trc": ".trc",
     "mot": ".mot",
+    "forces": ".forces.mot",
     "osim": ".osim",
     "c3d": ".c3d",
     "dlc": ".dlc.csv",
@@ -45,11 +47,11 @@ FORMATS: Mapping[str, str] = {
     "bids": "",
 }
 #: Formats that need events, cycles and measures.
-GAIT_FORMATS = frozenset({"c3d", "csv", "parquet", "bids"})
+GAIT_FORMATS = frozenset({"forces", "c3d", "csv", "parquet", "bids"})
 #: Formats with heights, which count from the floor.
-_WITH_GROUND = frozenset({"trc", "mot", "osim", "c3d"})
+_WITH_GROUND = frozenset({"trc", "mot", "forces", "osim", "c3d"})
 #: Formats whose readers take ASCII in names only, and not in every system's paths.
-_ASCII = ("trc", "mot", "osim", "c3d")
+_ASCII = ("trc", "mot", "forces", "osim", "c3d")
 #: What OpenSim refuses in the name of a component.
 _NOT_IN_OPENSIM = frozenset(" \t/\\*+")
 _LONGEST_NAME = 64
@@ -143,7 +145,7 @@ def write_export(visit: Visit, formats: Sequence[str], out: Path, options: Expor
             standing, ground = on_floor(trial)
             headers = {**origin, "ground": one_line(ground)}
             grounds[trial.name] = {"ground": ground}
-        for ending, write in _writers(standing, formats, headers, options).items():
+        for ending, write in _writers(standing, formats, headers, options, taken_off(trial, standing)).items():
             folder.mkdir(parents=True, exist_ok=True)
             paths.append(_written(folder / f"{trial.name}{ending}", write))
     out.mkdir(parents=True, exist_ok=True)
@@ -166,14 +168,19 @@ def write_export(visit: Visit, formats: Sequence[str], out: Path, options: Expor
 
 
 def _writers(
-    trial: ExportTrial, formats: Sequence[str], origin: Mapping[str, str], options: ExportOptions
+    trial: ExportTrial,
+    formats: Sequence[str],
+    origin: Mapping[str, str],
+    options: ExportOptions,
+    floor: np.ndarray,
 ) -> dict[str, Callable[[Path], object]]:
-    """Ending of a file to what writes it, of one trial."""
+    """Ending of a file to what writes it, of one trial; `floor` (T,): what was taken off its heights."""
     name = options.name
     full = with_body_points(trial) if options.body_points and {"trc", "osim"} & set(formats) else trial
     every: dict[str, Callable[[Path], object]] = {
         "trc": lambda path: write_trc(full, path, name or "markers"),
         "mot": lambda path: write_mot(trial, path, origin, name or "coordinates"),
+        "forces": lambda path: write_forces(trial, path, origin, name or "forces", floor),
         "osim": lambda path: write_osim(full, path, origin, name or "pbl_body"),
         "c3d": lambda path: write_c3d(trial, path, origin, name),
         "dlc": lambda path: write_keypoints_csv(trial, path),
@@ -263,6 +270,8 @@ def _check_trial(trial: ExportTrial, formats: Sequence[str], body_points: bool) 
         raise _input("a fit without one marker", "fitted markers in at least some frames", "fit again with pbl fit")
     if "osim" in formats or ("trc" in formats and body_points):
         wanted_markers(trial)
+    if "forces" in formats:
+        check_forces(trial)
     if "c3d" in formats:
         check_frames(trial)
     if GAIT_FORMATS & set(formats) and trial.measured is not None:

@@ -38,7 +38,7 @@ def write_report(
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     template = environment.from_string(folder.joinpath("report.html").read_text(encoding="utf-8"))
     css = Markup(folder.joinpath("report.css").read_text(encoding="utf-8"))  # noqa: S704  our own file
-    page = {"tiles": [], "measures": [], "cycle_charts": [], "index": None} | page_of(
+    page = {"tiles": [], "measures": [], "cycle_charts": [], "index": None, "forces": None} | page_of(
         visit, pictures or {}, title, norm
     )
     part = path.with_name(f"{path.name}.part{os.getpid()}")

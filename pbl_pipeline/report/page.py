@@ -26,6 +26,7 @@ from pbl_pipeline.gait import (
 from pbl_pipeline.keypoints import confidence_text, visibility
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, OUTCOMES, PASS, WARN, Check, in_session
 from pbl_pipeline.report import _figures
+from pbl_pipeline.report.forces import forces_section
 from pbl_pipeline.report.types import Picture
 from pbl_pipeline.report.words import (
     HEADLINES,
@@ -84,6 +85,7 @@ def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str,
         page["cycle_charts"] = _figures.cycle_charts(cycles, bands)
         page["cycles_note"] = _cycles_note(bands, far_leg_of(cycles))
         page["index"] = _index(metrics.gdi, metrics.cycles)
+        page["forces"] = forces_section(visit)
     return page
 
 

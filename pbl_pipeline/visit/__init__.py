@@ -6,14 +6,17 @@ the tables. Report, overlay, exports and web pages take a `Visit` and compute no
 
 from .files import (
     FIT,
+    KINETICS,
     METRICS,
     OVERLAY,
     REPORT,
     SESSION,
+    load_kinetics,
     load_visit,
     name_of_fit,
     recording_facts,
     save_beside,
+    save_kinetics,
     save_visit,
     visit_facts,
     visit_of_fits,
@@ -22,6 +25,7 @@ from .types import Held, Recording, Solution, Visit, stage_checks
 
 __all__ = [
     "FIT",
+    "KINETICS",
     "METRICS",
     "OVERLAY",
     "REPORT",
@@ -30,10 +34,12 @@ __all__ = [
     "Recording",
     "Solution",
     "Visit",
+    "load_kinetics",
     "load_visit",
     "name_of_fit",
     "recording_facts",
     "save_beside",
+    "save_kinetics",
     "save_visit",
     "stage_checks",
     "visit_facts",

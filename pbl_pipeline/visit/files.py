@@ -23,6 +23,8 @@ from pbl_pipeline.gait import Condition, GaitEvent, TrialMetrics, load_events
 from pbl_pipeline.gait.curves_file import Curves, load_curves, save_curves
 from pbl_pipeline.gait.metrics_file import metrics_of
 from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.kinetics import Kinetics
+from pbl_pipeline.kinetics.kinetics_file import kinetics_of, load_arrays, save_arrays, save_content
 from pbl_pipeline.names import distinct
 from pbl_pipeline.paramset import structured
 from pbl_pipeline.qc import WARN, Check
@@ -32,14 +34,15 @@ from pbl_pipeline.video import VideoInfo
 from .types import Held, Recording, Solution, Visit
 
 #: Files of a visit. `overlay.mp4` and `report.html` are drawn by `pipeline.write_results`.
-SESSION, METRICS, REPORT = "session.json", "metrics.json", "report.html"
+SESSION, METRICS, REPORT, KINETICS = "session.json", "metrics.json", "report.html", "kinetics.json"
 #: Files of a recording, after its name and a dot.
-KEYPOINTS, FIT, ANGLES, EVENTS, CYCLES, OVERLAY = (
+KEYPOINTS, FIT, ANGLES, EVENTS, CYCLES, FORCES, OVERLAY = (
     "keypoints.npz",
     "fit.npz",
     "angles.csv",
     "events.csv",
     "cycles.npz",
+    "kinetics.npz",
     "overlay.mp4",
 )
 _AGAIN = "`pbl run` again"
@@ -50,7 +53,7 @@ def save_visit(visit: Visit, folder: Path) -> list[Path]:
     """Write the visit into a folder and return the paths (docs/files.md).
 
     For each fitted recording `<name>.keypoints.npz`, `.fit.npz`, `.angles.csv`, `.events.csv`, `.cycles.npz`; for
-    the visit `metrics.json` and, last, `session.json`.
+    the visit `metrics.json` and, last, `session.json`; with kinetics also `kinetics.json` and `<name>.kinetics.npz`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
@@ -59,8 +62,21 @@ def save_visit(visit: Visit, folder: Path) -> list[Path]:
     if (judged := visit.judged) is not None:
         judged.save(folder / METRICS)
         paths.append(folder / METRICS)
+    if visit.kinetics is not None:
+        paths += save_kinetics(visit.kinetics, folder)
     (folder / SESSION).write_text(json.dumps(visit_facts(visit), indent=2, allow_nan=False) + "\n", encoding="utf-8")
     return [*paths, folder / SESSION]
+
+
+def save_kinetics(kinetics: Kinetics, folder: Path) -> list[Path]:
+    """Write `<name>.kinetics.npz` of each trial that has forces, then `kinetics.json`, and return the paths."""
+    paths = []
+    for trial in kinetics.trials:
+        if trial.series is not None:
+            paths.append(_file(folder, trial.name, FORCES))
+            save_arrays(trial, paths[-1])
+    save_content(kinetics, folder / KINETICS)
+    return [*paths, folder / KINETICS]
 
 
 def visit_facts(visit: Visit) -> dict[str, Any]:
@@ -370,4 +386,22 @@ def _with_stored_measures(visit: Visit, folder: Path) -> Visit:
         if other := [c.check for c in visit.fit_checks if c not in measures.before]:
             raise ValueError(f"measures of another fit, whose check {other[0]} is not the same")
     measures = dataclasses.replace(measures, trials=tuple(by_name[r.name] for r in visit.fitted))
-    return dataclasses.replace(visit.with_measures(measures), lacks=tuple(lacks))
+    visit = dataclasses.replace(visit.with_measures(measures), lacks=tuple(lacks))
+    return dataclasses.replace(visit, kinetics=load_kinetics(folder, [r.name for r in visit.fitted]))
+
+
+def load_kinetics(folder: Path, names: Sequence[str]) -> Kinetics | None:
+    """Return the kinetics of the fitted recordings `names`; None where the folder has none (files of version 0.2).
+
+    Raises `PblError` FILE_FORMAT where they are those of other recordings.
+    """
+    if not (folder / KINETICS).is_file():
+        return None
+    files = {name: _file(folder, name, FORCES) for name in names}
+    content = _read(folder / KINETICS, _MEASURE)
+    with _coded(folder / KINETICS, _MEASURE):
+        found = kinetics_of(content, {n: load_arrays(f) for n, f in files.items() if f.is_file()})
+        by_name = {t.name: t for t in found.trials}
+        if not set(by_name) >= set(names):
+            raise ValueError(f"kinetics of {', '.join(by_name) or 'no trial'}")
+    return dataclasses.replace(found, trials=tuple(by_name[n] for n in names))

@@ -17,6 +17,7 @@ from pbl_pipeline.filming import Filming, height_word, known, picture_class, vie
 from pbl_pipeline.fit import SessionFit, TrialFit
 from pbl_pipeline.gait import Condition, GaitCycle, GaitEvents, GaitMetrics, TrialMetrics, far_leg_of
 from pbl_pipeline.keypoints import Keypoints, check_keypoints, log_shift_s
+from pbl_pipeline.kinetics import Kinetics
 from pbl_pipeline.qc import WARN, Check
 from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.video import PhoneLog, VideoInfo, check_timing, read_phone_log
@@ -169,6 +170,8 @@ class Visit:
         "single" (recordings of one camera), "rig" (several cameras) or "markers" (a laboratory's).
     methods
         Name of a stage up to the fit to the method that computed it, in words; those of the gait are in `measures`.
+    kinetics
+        Forces and joint moments of the fitted recordings, None where they were not computed.
     lacks
         What its files lack, in sentences: those of an older version, or of a run that was ended.
     key
@@ -185,6 +188,7 @@ class Visit:
     kind: str = "single"
     methods: Mapping[str, str] = dataclasses.field(default_factory=dict)
     lacks: tuple[str, ...] = ()
+    kinetics: Kinetics | None = None
     key: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     @property

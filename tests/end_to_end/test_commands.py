@@ -195,8 +195,8 @@ def test_run_of_the_installed_wheel_does_the_same_in_one(installed, fitted, fold
     out = tmp_path / "Měření, früh"  # a letter that the encoding of the output lacks
     done = pbl("run", folder / "walking.mp4", "--out", out, "--subject", "P017", packages=installed)
     assert done.code == 0, done.err
-    ends = ("keypoints.npz", "fit.npz", "angles.csv", "events.csv", "cycles.npz", "overlay.mp4")
-    written = {"report.html", "metrics.json", "session.json", *(f"walking.{end}" for end in ends)}
+    ends = ("keypoints.npz", "fit.npz", "angles.csv", "events.csv", "cycles.npz", "kinetics.npz", "overlay.mp4")
+    written = {"report.html", "metrics.json", "kinetics.json", "session.json", *(f"walking.{end}" for end in ends)}
     assert {p.name for p in out.iterdir()} == written
     assert all(_shown(out / name) in done.out for name in written)
     assert "P017" in (out / "report.html").read_text()

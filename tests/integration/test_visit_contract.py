@@ -58,7 +58,10 @@ class Both:
 
     @functools.cached_property
     def of_files(self) -> Visit:
-        return load_visit(self.folder)
+        found = load_visit(self.folder)
+        assert found.kinetics is not None or found.measures is None
+        # The tables have no kinetics yet (docs/kinetics.md, Limits): compared is everything else.
+        return dataclasses.replace(found, kinetics=None)
 
     @functools.cached_property
     def of_tables(self) -> Visit:
@@ -270,7 +273,7 @@ def test_the_report_is_the_same(both: Both) -> None:
 
 
 def test_exports_are_the_same(both: Both, tmp_path: Path) -> None:
-    formats = [f for f in FORMATS if not (f == "dlc" and both.kind != "single")]
+    formats = [f for f in FORMATS if f != "forces" and not (f == "dlc" and both.kind != "single")]
     for package, wanted in (("ezc3d", "c3d"), ("pyarrow", "parquet")):
         if importlib.util.find_spec(package) is None:
             formats.remove(wanted)

@@ -33,6 +33,8 @@ from tests.exported import marked_fit, with_markers
 from tests.unit.visits import solution_of
 from tests.walking_fit import foot_events, walking_fit
 
+#: Forces need a mass and kinetics: tests/unit/test_export_forces.py.
+ALL = [f for f in FORMATS if f != "forces"]
 SCALAR = ("scope", "trial", "measure", "statistic")
 
 
@@ -77,7 +79,7 @@ def trial(fit: TrialFit, keypoints: Keypoints, metrics: GaitMetrics) -> Recordin
 def out(trial: Recording, metrics: GaitMetrics, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One export of everything."""
     folder = tmp_path_factory.mktemp("export") / "visit"
-    write_export(Visit((trial,), measures=metrics), list(FORMATS), folder)
+    write_export(Visit((trial,), measures=metrics), ALL, folder)
     return folder
 
 
@@ -585,7 +587,7 @@ def test_an_export_says_what_made_it(out):
 
 def test_nobody_is_named_unless_asked(trial, metrics, tmp_path):
     named = dataclasses.replace(trial, name="Doe-Jane", load_fit=Held(dataclasses.replace(trial.fit, name="Doe-Jane")))
-    write_export(Visit((named,), measures=metrics), list(FORMATS), tmp_path / "a", ExportOptions(number_trials=True))
+    write_export(Visit((named,), measures=metrics), ALL, tmp_path / "a", ExportOptions(number_trials=True))
     files = [p for p in (tmp_path / "a").rglob("*") if p.is_file()]
     assert len(files) > 10
     assert [p.name for p in files if b"Doe" in p.read_bytes() or "Doe" in str(p.relative_to(tmp_path))] == []

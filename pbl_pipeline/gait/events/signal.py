@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -27,8 +29,10 @@ def uniform_segments(
     filter_order: int,
     max_gap_s: float,
     min_segment_s: float,
+    interpolator: Callable[..., Any] = PchipInterpolator,
 ) -> list[Segment]:
-    """Split (T, C) `values` at gaps, interpolate (monotone cubic) onto a uniform grid and low-pass without lag.
+    """Split (T, C) `values` at gaps, interpolate onto a uniform grid (monotone cubic, or scipy's `interpolator`) and
+    low-pass without lag.
 
     A gap is a time of more than `max_gap_s` between frames in which every value is finite. The filter is a
     Butterworth run forward and backward: `filter_order` counts both passes, and its cut-off is corrected so that
@@ -49,7 +53,7 @@ def uniform_segments(
         if len(run) < 4 or t[-1] - t[0] < min_segment_s:
             continue
         grid = t[0] + np.arange(int(np.floor((t[-1] - t[0]) * grid_hz + 1e-9)) + 1) / grid_hz
-        raw = PchipInterpolator(t, values[run], axis=0)(grid)
+        raw = interpolator(t, values[run], axis=0)(grid)
         pad = min(len(grid) - 1, int(grid_hz / 2))
         smooth = sosfiltfilt(sos, raw, axis=0, padlen=pad)
         segments.append(Segment(grid, smooth, (int(run[0]), int(run[-1]))))

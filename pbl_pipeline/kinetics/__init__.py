@@ -1,0 +1,47 @@
+"""Ground reactions, joint moments and powers from the fitted motion, with their error (docs/kinetics.md)."""
+
+from .compute import REASONS, trial_kinetics, visit_kinetics
+from .dynamics import GRAVITY, Dynamics, Motion, inverse_dynamics, smooth_motion
+from .ground import GroundReaction, contact_of, ground_reaction
+from .inertia import Inertia, segment_inertia
+from .joints import JOINTS, MOMENTS, generalised_without, leg_moments
+from .methods import METHODS
+from .types import (
+    CURVES,
+    MEASURES,
+    CycleKinetics,
+    KineticMeasure,
+    Kinetics,
+    KineticsParams,
+    Series,
+    TrialKinetics,
+)
+
+__all__ = [
+    "CURVES",
+    "GRAVITY",
+    "JOINTS",
+    "MEASURES",
+    "METHODS",
+    "MOMENTS",
+    "REASONS",
+    "CycleKinetics",
+    "Dynamics",
+    "GroundReaction",
+    "Inertia",
+    "KineticMeasure",
+    "Kinetics",
+    "KineticsParams",
+    "Motion",
+    "Series",
+    "TrialKinetics",
+    "contact_of",
+    "generalised_without",
+    "ground_reaction",
+    "inverse_dynamics",
+    "leg_moments",
+    "segment_inertia",
+    "smooth_motion",
+    "trial_kinetics",
+    "visit_kinetics",
+]

@@ -1,0 +1,309 @@
+"""The kinetics of a visit: from its fits, events and cycles to forces, moments and their measures with intervals."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from pbl_pipeline.body import Body, load_body
+from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.gait import GaitEvent, TrialMetrics
+from pbl_pipeline.gait.ground import FOLLOWS, SLIDES, is_metric, why_no_lengths
+from pbl_pipeline.methods import Method
+from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
+
+from .dynamics import GRAVITY, Dynamics, Motion, inverse_dynamics, smooth_motion
+from .ground import GroundReaction, contact_of, ground_reaction
+from .inertia import Inertia, segment_inertia
+from .joints import knee_adduction, leg_moments
+from .measures import cycle_table, split_table
+from .types import (
+    MEASURES,
+    CycleKinetics,
+    KineticMeasure,
+    Kinetics,
+    KineticsParams,
+    Series,
+    TrialKinetics,
+)
+
+#: What the method itself gets wrong of a measure of one leg (root mean square), from force plates: the tuning children
+#: of `python -m research.benchmarks.kinetics`, whose motion is known from markers.
+METHOD_SD: Mapping[str, float] = {
+    "vertical_peak_loading_bw": 0.08,
+    "vertical_peak_push_off_bw": 0.07,
+    "vertical_impulse_bw_s": 0.013,
+    "braking_impulse_bw_s": 0.005,
+    "propulsion_impulse_bw_s": 0.004,
+    "knee_extension_moment_peak_nm_per_kg": 0.22,
+    "knee_adduction_moment_peak_nm_per_kg": 0.055,
+    "ankle_push_off_power_w_per_kg": 0.87,
+    "hip_work_j_per_kg": 0.12,
+    "knee_work_j_per_kg": 0.04,
+    "ankle_work_j_per_kg": 0.105,
+    "centre_of_mass_excursion_m": 0.002,
+}
+#: What the fit of one camera loses of a measure in any walk, the same on both sides (root mean square over eight
+#: synthetic walkers: `python -m research.benchmarks.kinetics_phone --first 0`).
+ONE_CAMERA_SD: Mapping[str, float] = {
+    "vertical_peak_loading_bw": 0.08,
+    "vertical_peak_push_off_bw": 0.15,
+    "vertical_impulse_bw_s": 0.004,
+    "braking_impulse_bw_s": 0.009,
+    "propulsion_impulse_bw_s": 0.005,
+    "ankle_push_off_power_w_per_kg": 1.1,
+    "centre_of_mass_excursion_m": 0.003,
+}
+#: Why there are no forces, by code.
+REASONS = {
+    "NO_CYCLES": "no gait cycle is used",
+    "MOVING_CAMERA": FOLLOWS,
+    "TREADMILL": SLIDES,
+    "VERTICAL_UNKNOWN": "the tilt of the camera is not known: a level one may be off by more than 5 deg",
+    "TOO_SHORT": "no stretch of a second without gaps",
+    "AID": "a walking aid may carry a part of the weight",
+}
+#: Root mean square of the residual force beyond which a check warns (body weights).
+MAX_RESIDUAL_BW = 0.15
+#: An asymmetry that is less certain than this is left out (percent).
+MAX_ASYMMETRY_SD = 30.0
+#: Words of an aid that carries no weight.
+_NO_AID = ("", "none", "no", "unknown")
+#: Why measures that one camera tells too badly are absent (docs/kinetics.md has the errors).
+_NOT_BY_ONE_CAMERA = {
+    "knee_adduction_moment_peak_nm_per_kg": "one camera sees too little of the distances across the leg",
+    **dict.fromkeys(
+        (
+            "knee_extension_moment_peak_nm_per_kg",
+            "hip_work_j_per_kg",
+            "knee_work_j_per_kg",
+            "ankle_work_j_per_kg",
+        ),
+        "the error of one camera is as large as the value",
+    ),
+}
+_SIDED = tuple(n for n in MEASURES if n != "centre_of_mass_excursion_m")
+
+
+def visit_kinetics(
+    fits: Sequence[TrialFit],
+    gait: Sequence[TrialMetrics],
+    method: Method[KineticsParams],
+    *,
+    mass_kg: float | None = None,
+    aid: str = "",
+) -> Kinetics:
+    """Return the kinetics of a visit's trials, `gait` being what was measured of each of `fits`.
+
+    `mass_kg`: the person's mass, kept with the result. `aid`: the walking aid as it was stated; with one that may carry
+    weight there are no forces.
+    """
+    trials = tuple(trial_kinetics(f, g, method.params, aid=aid) for f, g in zip(fits, gait, strict=True))
+    pooled = [t for t, g in zip(trials, gait, strict=True) if g.pooled and t.series is not None]
+    measures, reasons = _pool(pooled, one_camera=not all(is_metric(f) for f in fits))
+    first = next((t for t in trials if t.code), None)
+    code = "" if measures else (first.code if first is not None else "NO_CYCLES")
+    reason = "" if measures else (first.reason if first is not None else REASONS["NO_CYCLES"])
+    if not measures:
+        reasons = dict.fromkeys(map(str, MEASURES), reason)
+    return Kinetics(
+        status=PASS if measures else EMPTY,
+        code=code,
+        reason=reason,
+        measures=measures,
+        reasons=reasons,
+        mass_kg=mass_kg,
+        residual_bw=_residual(pooled),
+        method=method.key,
+        params_hash=method.hash,
+        trials=tuple(dataclasses.replace(t, samples=None) for t in trials),
+        qc=_checks(pooled, measures, fits),
+    )
+
+
+def trial_kinetics(fit: TrialFit, gait: TrialMetrics, params: KineticsParams, *, aid: str = "") -> TrialKinetics:
+    """Return the kinetics of one trial; EMPTY with a code of `REASONS` where there can be none."""
+    used = [c for c in gait.cycles if c.used]
+    code = _code_against(fit, gait, aid)
+    if code:
+        return TrialKinetics(fit.name, EMPTY, code, REASONS[code])
+    body = load_body()
+    inertia = segment_inertia(body, fit.scale)
+    qpos = np.asarray(fit.qpos, float)
+    series = trial_series(body, fit, inertia, qpos, gait.events.events, params.cutoff_hz)
+    if series is None:
+        return TrialKinetics(fit.name, EMPTY, "TOO_SHORT", REASONS["TOO_SHORT"])
+    table = cycle_table(series, gait.cycles)
+    drawn = [
+        cycle_table(s, gait.cycles)
+        for noise in _noise(fit, params)
+        if (s := trial_series(body, fit, inertia, qpos + noise, gait.events.events, params.cutoff_hz)) is not None
+    ]
+    samples = np.array(drawn) if drawn else None
+    sd = np.full_like(table, np.nan) if samples is None else samples.std(axis=0, ddof=1)
+    cycles = []
+    for c, row, row_sd in zip(gait.cycles, table, sd, strict=True):
+        curves, measures = split_table(row)
+        missing = "" if measures else "contact or motion is not known over the whole stance"
+        cycles.append(CycleKinetics(c.number, c.side, c.used, curves, split_table(row_sd)[0], measures, missing))
+    if not used or not any(c.measures for c in cycles if c.used):
+        return TrialKinetics(fit.name, EMPTY, "NO_CYCLES", REASONS["NO_CYCLES"], tuple(cycles), series)
+    n = len(MEASURES)
+    return TrialKinetics(fit.name, PASS, "", "", tuple(cycles), series, None if samples is None else samples[:, :, -n:])
+
+
+def _code_against(fit: TrialFit, gait: TrialMetrics, aid: str) -> str:
+    if aid.strip().lower() not in _NO_AID:
+        return "AID"
+    if why_no_lengths(fit):
+        return "MOVING_CAMERA"
+    if any(c.lengths.missing == SLIDES for c in gait.cycles):
+        return "TREADMILL"
+    if fit.orientation_source == "assumed: level":
+        return "VERTICAL_UNKNOWN"
+    return "" if any(c.used for c in gait.cycles) else "NO_CYCLES"
+
+
+def trial_series(
+    body: Body, fit: TrialFit, inertia: Inertia, qpos: np.ndarray, events: Sequence[GaitEvent], cutoff_hz: float
+) -> Series | None:
+    """Return forces and moments over time of a trial's motion `qpos` (T, Q); None where no stretch is long enough."""
+    parts = []
+    for motion in smooth_motion(fit.time_s, qpos, cutoff_hz):
+        d = inverse_dynamics(body, fit.scale, inertia, motion)
+        parts.append(series_of(body, motion, d, ground_reaction(body, fit.scale, d, contact_of(motion.time_s, events))))
+    if not parts:
+        return None
+    names = [f.name for f in dataclasses.fields(Series)]
+    return Series(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
+
+
+def series_of(body: Body, motion: Motion, d: Dynamics, ground: GroundReaction) -> Series:
+    """Return forces and moments over time of a motion on this ground reaction."""
+    moment, power = leg_moments(body, d, ground, motion)
+    ahead = d.xmat[:, body.body_names.index("pelvis"), :2, 0]
+    return Series(
+        time_s=motion.time_s,
+        force_bw=ground.force_n / GRAVITY,
+        centre_m=ground.centre_m,
+        moment_nm_per_kg=moment,
+        power_w_per_kg=power,
+        residual_bw=ground.residual_n / GRAVITY,
+        residual_nm_per_kg=ground.residual_nm,
+        centre_of_mass_m=d.centre_m,
+        ahead=ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9),
+        knee_adduction_nm_per_kg=knee_adduction(body, d, ground),
+    )
+
+
+def _noise(fit: TrialFit, params: KineticsParams) -> list[np.ndarray]:
+    """Return `samples` errors of the joint values, as large as the fit states; none where it states none.
+
+    A fraction of the variance is the same in all frames, the rest a Gaussian process with a memory.
+    """
+    sd = np.asarray(fit.qpos_sd, float)
+    if not np.isfinite(sd).any():
+        return []
+    sd = np.nan_to_num(sd)
+    rng = np.random.default_rng(39)
+    width = params.memory_s / max(float(np.median(np.diff(fit.time_s))), 1e-3)
+    gain = np.sqrt(2.0 * np.sqrt(np.pi) * width)
+    drawn = []
+    for _ in range(params.samples):
+        varies = gain * gaussian_filter1d(rng.standard_normal(sd.shape), width, axis=0, mode="wrap")
+        stays = rng.standard_normal(sd.shape[1])
+        drawn.append(sd * (np.sqrt(params.lasting) * stays + np.sqrt(1.0 - params.lasting) * varies))
+    return drawn
+
+
+def _pool(trials: Sequence[TrialKinetics], *, one_camera: bool) -> tuple[dict[str, KineticMeasure], dict[str, str]]:
+    """Return the measures over all used cycles, and why others are absent."""
+    measures: dict[str, KineticMeasure] = {}
+    reasons: dict[str, str] = {}
+    for j, name in enumerate(MEASURES):
+        if one_camera and name in _NOT_BY_ONE_CAMERA:
+            reasons[name] = _NOT_BY_ONE_CAMERA[name]
+            continue
+        values: dict[str, list[float]] = {"left": [], "right": []}
+        drawn: dict[str, list[np.ndarray]] = {"left": [], "right": []}
+        for trial in trials:
+            for i, cycle in enumerate(trial.cycles):
+                if cycle.used and name in cycle.measures:
+                    values[cycle.side].append(cycle.measures[name])
+                    if trial.samples is not None:
+                        drawn[cycle.side].append(trial.samples[:, i, j])
+        if not values["left"] and not values["right"]:
+            reasons[name] = "no used cycle whose stance is known as a whole"
+            continue
+        measures[name] = _measure(name, values, drawn, ONE_CAMERA_SD.get(name, 0.0) if one_camera else 0.0)
+    return measures, reasons
+
+
+def _measure(
+    name: str, values: Mapping[str, list[float]], drawn: Mapping[str, list[np.ndarray]], of_camera: float
+) -> KineticMeasure:
+    """Return means and standard deviations. The method errs on each side by itself, one camera on both alike."""
+    mean = {s: float(np.mean(v)) if v else None for s, v in values.items()}
+    varies = {s: np.nanmean(d, axis=0) if d and len(d) == len(values[s]) else None for s, d in drawn.items()}
+    known = [s for s in ("left", "right") if mean[s] is not None]
+
+    def sd(parts: Sequence[np.ndarray | None], weights: Sequence[float]) -> float | None:
+        if any(p is None for p in parts):
+            return None
+        together = np.sum([w * p for w, p in zip(weights, parts, strict=True) if p is not None], axis=0)
+        own = METHOD_SD[name] ** 2 * np.sum(np.square(weights)) + (of_camera * np.sum(weights)) ** 2
+        return float(np.sqrt(np.var(together, ddof=1) + own))
+
+    both = [mean[s] for s in known]
+    middle = float(np.mean([m for m in both if m is not None]))
+    asymmetry = asymmetry_sd = None
+    left, right = mean["left"], mean["right"]
+    if name in _SIDED and left is not None and right is not None and abs(middle) > 1e-9:
+        of_difference = sd([varies["right"], varies["left"]], [1.0, -1.0])
+        if of_difference is None or 100.0 * of_difference / abs(middle) <= MAX_ASYMMETRY_SD:
+            asymmetry = 100.0 * (right - left) / abs(middle)
+            asymmetry_sd = None if of_difference is None else 100.0 * of_difference / abs(middle)
+    return KineticMeasure(
+        left=left,
+        right=right,
+        mean=middle,
+        sd_left=sd([varies["left"]], [1.0]),
+        sd_right=sd([varies["right"]], [1.0]),
+        sd=sd([varies[s] for s in known], [1.0 / len(known)] * len(known)),
+        n=sum(len(v) for v in values.values()),
+        asymmetry_percent=asymmetry,
+        asymmetry_sd=asymmetry_sd,
+    )
+
+
+def _residual(trials: Sequence[TrialKinetics]) -> float | None:
+    """Return the root mean square of the force that no foot carries, in body weights."""
+    squares = [np.sum(t.series.residual_bw**2, axis=1) for t in trials if t.series is not None]
+    known = np.concatenate(squares) if squares else np.empty(0)
+    known = known[np.isfinite(known)]
+    return float(np.sqrt(known.mean())) if len(known) else None
+
+
+def _checks(
+    trials: Sequence[TrialKinetics], measures: Mapping[str, KineticMeasure], fits: Sequence[TrialFit]
+) -> tuple[Check, ...]:
+    if not measures:
+        return ()
+    residual = _residual(trials) or 0.0
+    small = residual <= MAX_RESIDUAL_BW
+    unexplained = "much of the force that the motion needs is carried by no foot: look at the events and at the fit"
+    sized = all(is_metric(f) or np.isfinite(f.height_m) for f in fits)
+    assumed = "accelerations are scaled by an assumed body size: state the measured height (--height-m)"
+    return (
+        Check(
+            "kinetics_residual",
+            PASS if small else WARN,
+            round(residual, 4),
+            MAX_RESIDUAL_BW,
+            "" if small else unexplained,
+        ),
+        Check("kinetics_scale", PASS if sized else WARN, None, None, "" if sized else assumed),
+    )

@@ -1,0 +1,119 @@
+"""Motion with its derivatives, and the force that it needs: Newton and Euler over all bodies, by C MuJoCo."""
+
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline, make_interp_spline
+
+from pbl_pipeline.body import PELVIS_TURNS, SLIDES, Body
+from pbl_pipeline.gait.events.signal import uniform_segments
+
+from .inertia import Inertia
+
+#: Standard gravity (m/s^2); a force of 1 body weight is this per kilogram.
+GRAVITY = 9.80665
+#: Rate of the uniform grid of all curves in time.
+GRID_HZ = 100.0
+#: Longer gaps between frames split the motion; shorter stretches cannot be differentiated.
+MAX_GAP_S, MIN_SEGMENT_S = 0.15, 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion:
+    """Joint values and their derivatives on a uniform grid: time_s (N,); qpos, qvel, qacc (N, Q) in rad, m, s."""
+
+    time_s: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    qacc: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Dynamics:
+    """Forces that a motion needs, per kilogram of the person, at N times; world frame, z up.
+
+    force_n, moment_nm (N, 3): of everything outside the body, gravity excepted; the moment is about the world's origin
+    (N/kg, Nm/kg). centre_m (N, 3): of mass. generalised (N, Q): what each joint value would need if
+    that force acted on the pelvis (Nm/kg, N/kg). axis, anchor_m (N, Q, 3): of each joint. xpos (N, B, 3), xmat (N, B,
+    3, 3).
+    """
+
+    force_n: np.ndarray
+    moment_nm: np.ndarray
+    centre_m: np.ndarray
+    generalised: np.ndarray
+    axis: np.ndarray
+    anchor_m: np.ndarray
+    xpos: np.ndarray
+    xmat: np.ndarray
+
+
+def smooth_motion(time_s: np.ndarray, qpos: Float[np.ndarray, "T Q"], cutoff_hz: float) -> list[Motion]:
+    """Return the motion with its derivatives, one for each stretch without long gaps; none where all are too short.
+
+    Joint values are put on a grid of `GRID_HZ` and low-passed there and back (`uniform_segments`, order 4, -3 dB at
+    `cutoff_hz`); the derivatives are those of the quintic spline through the result. `time_s` (T,); rows of `qpos` that
+    are not finite are gaps.
+    """
+    segments = uniform_segments(
+        np.asarray(time_s, float),
+        np.asarray(qpos, float),
+        grid_hz=GRID_HZ,
+        cutoff_hz=cutoff_hz,
+        filter_order=4,
+        max_gap_s=MAX_GAP_S,
+        min_segment_s=MIN_SEGMENT_S,
+        interpolator=CubicSpline,  # a monotone one has kinks where it is flat
+    )
+    motions = []
+    for s in segments:
+        spline = make_interp_spline(s.time_s, s.values, k=5)
+        motions.append(Motion(s.time_s, s.values, spline.derivative(1)(s.time_s), spline.derivative(2)(s.time_s)))
+    return motions
+
+
+def inverse_dynamics(body: Body, scale: Float[np.ndarray, " S"], inertia: Inertia, motion: Motion) -> Dynamics:
+    """Return the force that a motion needs (`mj_inverse` in each frame, without contacts and joint limits)."""
+    model = _dynamic_model(body, np.asarray(scale, np.float64), inertia)
+    data = mujoco.MjData(model)
+    n, q, b = len(motion.time_s), model.nv, model.nbody - 1
+    generalised, axis, anchor = np.empty((n, q)), np.empty((n, q, 3)), np.empty((n, q, 3))
+    centre = np.empty((n, 3))
+    xpos, xmat = np.empty((n, b, 3)), np.empty((n, b, 3, 3))
+    for i in range(n):
+        data.qpos[:], data.qvel[:], data.qacc[:] = motion.qpos[i], motion.qvel[i], motion.qacc[i]
+        mujoco.mj_inverse(model, data)
+        generalised[i], axis[i], anchor[i] = data.qfrc_inverse, data.xaxis, data.xanchor
+        centre[i] = data.subtree_com[0]
+        xpos[i], xmat[i] = data.xpos[1:], data.xmat[1:].reshape(-1, 3, 3)
+    slides = [body.joint_names.index(name) for name in SLIDES]
+    turns = [body.joint_names.index(name) for name in PELVIS_TURNS]
+    # Along each slide acts the force's share, about each turn that of the moment about the pelvis.
+    force = np.linalg.solve(axis[:, slides], generalised[:, slides, None])[..., 0]
+    about = np.linalg.solve(axis[:, turns], generalised[:, turns, None])[..., 0]
+    moment = about + np.cross(xpos[:, 0], force)
+    return Dynamics(force, moment, centre, generalised, axis, anchor, xpos, xmat)
+
+
+def _dynamic_model(body: Body, scale: np.ndarray, inertia: Inertia) -> mujoco.MjModel:
+    """Return the scaled body with its inertia, free of contacts and joint limits."""
+    own = scale[body.scale_index]
+    model = copy.copy(body.mj_model)
+    model.body_pos[2:] *= own[body.parent_index[1:], None]
+    model.body_mass[1:], model.body_ipos[1:], model.body_inertia[1:] = (
+        inertia.mass,
+        inertia.centre_m,
+        inertia.moment_m2,
+    )
+    model.body_iquat[1:] = (1.0, 0.0, 0.0, 0.0)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model

@@ -1,0 +1,240 @@
+"""Each foot's share of the ground reaction, and where it acts.
+
+What the motion tells well is the vertical force of both feet together. Its second derivatives tell the horizontal force
+less well and the moment badly, so that the centre of pressure of one foot would be off by 5 cm. Three things that are
+known of walking tell more, each measured on force plates (`python -m research.benchmarks.kinetics`):
+
+- the centre of pressure goes from heel to toes in a usual way over the time that the foot stands (`PROGRESS`), and lies
+  under the forefoot where the heel is off the floor;
+- each force points from there nearly at the centre of mass: past it by what turns the body. The centre of mass is moved
+  by a constant of the recording, so that the horizontal forces have the mean that the change of velocity asks for;
+- while both feet stand, the vertical force of the one behind falls as `trailing_share` (from the motion alone it cannot
+  be told: two feet and the body are a closed loop).
+
+The horizontal force is `BELIEVED` times that of the accelerations and the rest of this. What feet on a floor then do
+not carry stays as the residual.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float
+
+from pbl_pipeline.body import Body
+from pbl_pipeline.gait.events import FOOT_DOWN, SIDES, GaitEvent
+
+from .dynamics import GRAVITY, Dynamics
+
+#: Points of a sole in the frames of calcaneus and toes (m, unscaled): below the heel, the ball and the tip of the toes.
+_HEEL_M, _BALL_M, _TIP_M = (-0.015, -0.016, 0.0), (0.19, -0.016, 0.0), (0.06, -0.012, 0.0)
+#: Phase of a foot's stance (0 to 1), centre of pressure then from heel (0) to tip (1) and across (towards the outside),
+#: in lengths of the sole: means over 12 steps of the six tuning children of the benchmark.
+PROGRESS = np.array(
+    [
+        (0.0, 0.12, -0.03),
+        (0.1, 0.24, -0.03),
+        (0.2, 0.34, -0.03),
+        (0.35, 0.52, -0.02),
+        (0.5, 0.70, -0.02),
+        (0.6, 0.77, -0.03),
+        (0.8, 0.86, -0.07),
+        (1.0, 0.99, -0.10),
+    ]
+)
+#: Where the centre of pressure is at least while the heel is off the floor, and the heights of the heel (lengths of the
+#: sole) between which that begins to hold.
+_FOREFOOT, _HEEL_OFF = 0.65, (0.1, 0.2)
+#: Share of the vertical force under the foot behind at 0, 10, ..., 100 % of double support: means over the same
+#: children.
+TRAILING = (0.90, 0.71, 0.59, 0.51, 0.42, 0.34, 0.26, 0.18, 0.12, 0.07, 0.04)
+#: How much of the horizontal accelerations is believed: chosen on the same children.
+BELIEVED = 0.3
+#: What low-passed motion lacks of the sharp change of force at each initial contact: added to the vertical force at
+#: 0, 4, ..., 100 % of a step (from one foot's initial contact to the other's), in ranges of that force over the step.
+#: Means over the same children.
+# fmt: off
+TRANSIENT = np.array([
+    -0.26, 0.21, 0.14, -0.10, -0.12, -0.01, 0.09, 0.12, 0.10, 0.06, 0.01, -0.01, -0.01,
+    -0.00, 0.01, 0.01, -0.00, -0.01, -0.01, -0.01, 0.02, 0.04, 0.02, -0.06, -0.21, -0.26,
+])
+# fmt: on
+#: Largest horizontal against vertical force.
+FRICTION = 0.8
+
+
+@dataclasses.dataclass(frozen=True)
+class GroundReaction:
+    """Of [left, right] at N times, per kilogram, world frame (z up); NaN where contact is not known.
+
+    contact (N, 2): 1 on the floor, 0 in the air. force_n (N, 2, 3), 0 in the air; centre_m (N, 2, 3): of pressure, NaN
+    in the air. residual_n, residual_nm (N, 3): of what the motion needs, the force and the moment about the centre of
+    mass that no foot carries.
+    """
+
+    contact: np.ndarray
+    force_n: np.ndarray
+    centre_m: np.ndarray
+    residual_n: np.ndarray
+    residual_nm: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class _Sole:
+    """A foot on the floor over N times: the heel's place (N, 2) and height over the floor (N,), unit axis from heel to
+    tip (N, 2), length, and the height of the floor (N,)."""
+
+    heel: np.ndarray
+    lifted: np.ndarray
+    along: np.ndarray
+    length: float
+    floor: np.ndarray
+
+    def point(self, s: np.ndarray, left: np.ndarray) -> np.ndarray:
+        """Return the points (N, 3) of the floor at these places along the sole and to the left of its axis, in
+        lengths."""
+        normal = np.stack([-self.along[:, 1], self.along[:, 0]], axis=1)
+        xy = self.heel + self.length * (s[:, None] * self.along + left[:, None] * normal)
+        return np.column_stack([xy, self.floor])
+
+
+def contact_of(time_s: np.ndarray, events: Sequence[GaitEvent]) -> Float[np.ndarray, "N 2"]:
+    """Return 1 where [left, right] is on the floor, 0 where it is in the air, NaN where the events do not tell.
+
+    A foot's state is known between two events of a bout that follow each other (foot down, foot up); before its first
+    event it is the other one, from the first event of the bout on, and after its last likewise.
+    """
+    contact = np.full((len(time_s), 2), np.nan)
+    for bout in sorted({e.bout for e in events}):
+        inside = sorted((e for e in events if e.bout == bout), key=lambda e: e.time_s)
+        start, end = inside[0].time_s, inside[-1].time_s
+        for k, side in enumerate(SIDES):
+            own = [e for e in inside if e.side == side]
+            for a, b in zip([None, *own], [*own, None], strict=True):
+                known = a is None or b is None or a.event != b.event
+                on = (a.event == FOOT_DOWN) if a is not None else (b is not None and b.event != FOOT_DOWN)
+                if known and own:
+                    at = (time_s >= (start if a is None else a.time_s)) & (time_s < (end if b is None else b.time_s))
+                    contact[at, k] = float(on)
+    return contact
+
+
+def ground_reaction(body: Body, scale: np.ndarray, d: Dynamics, contact: Float[np.ndarray, "N 2"]) -> GroundReaction:
+    """Return each foot's ground reaction of the motion `d`. `contact` (N, 2): `contact_of` its times."""
+    known = np.all(np.isfinite(contact), axis=1)
+    stands = (contact == 1) & known[:, None]
+    centre = np.stack([_pressure(body, scale, d, contact[:, k], k) for k in (0, 1)], axis=1)
+    vertical = _shares(stands) * np.maximum(d.force_n[:, 2] + _transient(d.force_n[:, 2], stands), 0.0)[:, None]
+    turns = d.moment_nm - np.cross(d.centre_m, d.force_n)
+    past = np.stack([-turns[:, 1], turns[:, 0]], axis=1) / np.maximum(d.force_n[:, 2:], 0.1 * GRAVITY)
+    level = _towards(d, centre, vertical, past, stands)
+    level += _mean_shift(body, d, level, vertical, stands.any(axis=1))
+    share = vertical / np.maximum(vertical.sum(axis=1, keepdims=True), 1e-9)
+    level += BELIEVED * share[..., None] * (d.force_n[:, None, :2] - level.sum(axis=1, keepdims=True))
+    size = np.linalg.norm(level, axis=-1)
+    level *= np.minimum(1.0, FRICTION * vertical / np.maximum(size, 1e-9))[..., None]
+    force = np.concatenate([level, vertical[..., None]], axis=-1)
+    force[~known] = np.nan
+    centre[~stands] = np.nan
+    left = d.force_n - force.sum(axis=1)
+    moment = d.moment_nm - np.cross(np.nan_to_num(centre), force).sum(axis=1) - np.cross(d.centre_m, left)
+    return GroundReaction(np.where(known[:, None], contact, np.nan), force, centre, left, moment)
+
+
+def trailing_share(phase: np.ndarray) -> np.ndarray:
+    """Return the share of the vertical force that the foot behind carries at the phase (0 to 1) of double support."""
+    return np.interp(phase, np.linspace(0.0, 1.0, len(TRAILING)), TRAILING)
+
+
+def _transient(vertical: np.ndarray, stands: np.ndarray) -> np.ndarray:
+    """Return `TRANSIENT` over each step that is seen from one initial contact to the next, 0 elsewhere."""
+    lands = np.flatnonzero((stands[1:] & ~stands[:-1]).any(axis=1) & stands[:-1].any(axis=1)) + 1
+    out = np.zeros(len(vertical))
+    for a, b in pairwise(lands):
+        if stands[a:b].any(axis=1).all():
+            phase = np.arange(b - a) / (b - a)
+            out[a:b] = np.ptp(vertical[a:b]) * np.interp(phase, np.linspace(0.0, 1.0, len(TRANSIENT)), TRANSIENT)
+    return out
+
+
+def _shares(stands: np.ndarray) -> np.ndarray:
+    """Return the share (N, 2) of the vertical force of each foot; 0 where none stands."""
+    share = stands.astype(float)
+    for first, last in _runs(np.all(stands, axis=1)):
+        # Behind is the foot that stood alone before; where that was not seen, the one that does not stand alone after.
+        if first > 0 and stands[first - 1].any():
+            behind = int(stands[first - 1, 1])
+        elif last + 1 < len(stands) and stands[last + 1].any():
+            behind = int(stands[last + 1, 0])
+        else:
+            share[first : last + 1] = 0.5
+            continue
+        falls = trailing_share((np.arange(last + 1 - first) + 0.5) / (last + 1 - first))
+        share[first : last + 1, behind], share[first : last + 1, 1 - behind] = falls, 1.0 - falls
+    return share
+
+
+def _towards(d: Dynamics, centre: np.ndarray, vertical: np.ndarray, past: np.ndarray, stands: np.ndarray) -> np.ndarray:
+    """Return horizontal forces (N, 2, 2) that point from each centre of pressure at the centre of mass, and past it."""
+    lever = d.centre_m[:, None] - centre
+    level = vertical[..., None] * (lever[..., :2] + past[:, None]) / np.maximum(lever[..., 2:], 0.1)
+    return np.where(stands[..., None], level, 0.0)
+
+
+def _mean_shift(body: Body, d: Dynamics, level: np.ndarray, vertical: np.ndarray, use: np.ndarray) -> np.ndarray:
+    """Return what to add to `level` (N, 2, 2) so that its sum has the mean of the motion's force forward and aside."""
+    if not use.any():
+        return np.zeros_like(level)
+    ahead = d.xmat[:, body.body_names.index("pelvis"), :2, 0]
+    ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+    axes = np.stack([ahead, np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)], axis=1)  # (N, 2, 2): forward, left
+    missing = np.einsum("nij,nj->ni", axes, d.force_n[:, :2] - level.sum(axis=1))[use].mean(axis=0)
+    per_vertical = missing / vertical.sum(axis=1)[use].mean()
+    return vertical[..., None] * np.einsum("nij,i->nj", axes, per_vertical)[:, None]
+
+
+def _pressure(body: Body, scale: np.ndarray, d: Dynamics, contact: np.ndarray, k: int) -> np.ndarray:
+    """Return the centre of pressure (N, 3) of foot `k` [left, right] as `PROGRESS` has it; NaN where it does not
+    stand."""
+    sole = _sole(body, scale, d, contact, "lr"[k])
+    runs = _runs(contact == 1)
+    whole = [
+        b - a + 1 for a, b in runs if a > 0 and b + 1 < len(contact) and np.isfinite(contact[[a - 1, b + 1]]).all()
+    ]
+    place = np.full((len(contact), 2), np.nan)
+    for first, last in runs:
+        n = last + 1 - first
+        began = first > 0 and np.isfinite(contact[first - 1])
+        ended = last + 1 < len(contact) and np.isfinite(contact[last + 1])
+        # Of a stance that is seen in part, the other part is as long as in the others.
+        full = n if (began and ended) or not whole else max(n, int(np.median(whole)))
+        phase = (np.arange(n) + 0.5 + (0 if began else full - n)) / full
+        for i in (0, 1):
+            place[first : last + 1, i] = np.interp(phase, PROGRESS[:, 0], PROGRESS[:, i + 1])
+    forefoot = _FOREFOOT * np.clip(np.interp(sole.lifted / sole.length, _HEEL_OFF, (0.0, 1.0)), 0.0, 1.0)
+    return sole.point(np.maximum(place[:, 0], forefoot), place[:, 1] * (1 if k == 0 else -1))
+
+
+def _sole(body: Body, scale: np.ndarray, d: Dynamics, contact: np.ndarray, side: str) -> _Sole:
+    calcn, toes = (body.body_names.index(f"{name}_{side}") for name in ("calcn", "toes"))
+    own = float(np.asarray(scale)[body.scale_index[calcn]])
+    heel, ball = (d.xpos[:, calcn] + d.xmat[:, calcn] @ (own * np.array(p)) for p in (_HEEL_M, _BALL_M))
+    tip = d.xpos[:, toes] + d.xmat[:, toes] @ (own * np.array(_TIP_M))
+    axis = (tip - heel)[:, :2]
+    length = own * float(np.linalg.norm(np.array(_TIP_M) + body.mj_model.body_pos[toes + 1] - _HEEL_M))
+    lowest = np.minimum(np.minimum(heel[:, 2], ball[:, 2]), tip[:, 2])
+    floor = np.full(len(heel), np.nan)
+    for first, last in _runs(contact == 1):
+        floor[first : last + 1] = np.median(lowest[first : last + 1])
+    along = axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-9)
+    # A foot on its toes is as long as ever: its tip stays where it is.
+    return _Sole(tip[:, :2] - length * along, heel[:, 2] - floor, along, length, floor)
+
+
+def _runs(on: np.ndarray) -> list[tuple[int, int]]:
+    """Return first and last index of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int)))
+    return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -1,0 +1,153 @@
+"""Kinetics as files: `kinetics.json` of a visit and `<name>.kinetics.npz` of each trial (docs/files.md)."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.files import check_numbers, load_npz, texts_of
+from pbl_pipeline.gait import REPORT_PERCENT
+from pbl_pipeline.paramset import structured
+from pbl_pipeline.qc import Check
+
+from .joints import MOMENTS
+from .types import CURVES, CycleKinetics, KineticMeasure, Kinetics, Series, TrialKinetics
+
+_SERIES = tuple(f.name for f in dataclasses.fields(Series))
+_OF_CYCLES = ("cycle_no", "names", "percent", "curve", "curve_sd")
+
+
+def content_of(kinetics: Kinetics) -> dict[str, Any]:
+    """Return the content of kinetics.json."""
+    own = ("status", "code", "reason", "mass_kg", "residual_bw", "method", "params_hash")
+    return {
+        **{name: getattr(kinetics, name) for name in own},
+        "measures": {name: m.to_dict() for name, m in kinetics.measures.items()},
+        "reasons": dict(kinetics.reasons),
+        "qc": [c.to_dict() for c in kinetics.qc],
+        "trials": [
+            {
+                "name": t.name,
+                "status": t.status,
+                "code": t.code,
+                "reason": t.reason,
+                "cycles": [
+                    {
+                        "number": c.number,
+                        "side": c.side,
+                        "used": c.used,
+                        "measures": {name: round(v, 5) for name, v in c.measures.items()},
+                        "missing": c.missing,
+                    }
+                    for c in t.cycles
+                ],
+            }
+            for t in kinetics.trials
+        ],
+    }
+
+
+def save_content(kinetics: Kinetics, path: Path) -> None:
+    """Write kinetics.json."""
+    path.write_text(json.dumps(content_of(kinetics), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def kinetics_of(content: Mapping[str, Any], arrays: Mapping[str, tuple[Series | None, Sequence[Mapping]]]) -> Kinetics:
+    """Return the kinetics of a kinetics.json. `arrays`: by trial, what `load_arrays` returned.
+
+    Raises KeyError, TypeError, ValueError, AttributeError where the content is not that of a kinetics.json.
+    """
+    measures = {}
+    for name, told in content["measures"].items():
+        measures[str(name)] = structured({k: v for k, v in told.items() if k != "interval"}, KineticMeasure)
+    trials = []
+    for t in content["trials"]:
+        series, curves = arrays.get(t["name"], (None, ()))
+        of_cycle = {int(c["number"]): c for c in curves}
+        cycles = tuple(
+            CycleKinetics(
+                number=int(c["number"]),
+                side=str(c["side"]),
+                used=bool(c["used"]),
+                curves=of_cycle.get(int(c["number"]), {}).get("curves", {}),
+                curves_sd=of_cycle.get(int(c["number"]), {}).get("curves_sd", {}),
+                measures={str(k): float(v) for k, v in c["measures"].items()},
+                missing=str(c["missing"]),
+            )
+            for c in t["cycles"]
+        )
+        trials.append(TrialKinetics(str(t["name"]), str(t["status"]), str(t["code"]), str(t["reason"]), cycles, series))
+    numbers = {k: None if content[k] is None else float(content[k]) for k in ("mass_kg", "residual_bw")}
+    return Kinetics(
+        status=str(content["status"]),
+        code=str(content["code"]),
+        reason=str(content["reason"]),
+        measures=measures,
+        reasons={str(k): str(v) for k, v in content["reasons"].items()},
+        **numbers,
+        method=str(content["method"]),
+        params_hash=str(content["params_hash"]),
+        trials=tuple(trials),
+        qc=tuple(structured(c, Check) for c in content["qc"]),
+    )
+
+
+def save_arrays(trial: TrialKinetics, path: Path) -> None:
+    """Write a trial's forces and moments over time, and its cycles' curves, to one .npz (float32, time_s float64)."""
+    unknown = np.full(len(REPORT_PERCENT), np.nan)
+    tables = {
+        name: [[of(c).get(n, unknown) for n in CURVES] for c in trial.cycles]
+        for name, of in (("curve", lambda c: c.curves), ("curve_sd", lambda c: c.curves_sd))
+    }
+    shape = (len(trial.cycles), len(CURVES), len(REPORT_PERCENT))
+    over_time = {}
+    if trial.series is not None:
+        over_time = {n: np.asarray(getattr(trial.series, n), float if n == "time_s" else np.float32) for n in _SERIES}
+    np.savez_compressed(
+        path,
+        allow_pickle=False,
+        cycle_no=np.asarray([c.number for c in trial.cycles], np.int16),
+        names=np.asarray(CURVES, dtype=str),
+        percent=np.asarray(REPORT_PERCENT, np.float32),
+        **{name: np.asarray(rows, np.float32).reshape(shape) for name, rows in tables.items()},
+        **over_time,
+    )
+
+
+def load_arrays(path: Path) -> tuple[Series | None, list[dict[str, Any]]]:
+    """Return forces and moments over time, and of each cycle `number`, `curves` and `curves_sd`.
+
+    Raises `PblError` FILE_MISSING, FILE_FORMAT.
+    """
+    data = load_npz(path, [*_SERIES, *_OF_CYCLES])
+    n, names = data["cycle_no"].size, texts_of(path, data, "names")
+    curves = {k: (n, len(names), None) for k in ("curve", "curve_sd")}
+    check_numbers(path, data, curves)
+    series = None
+    if set(_SERIES) <= data.keys():
+        t, j = data["time_s"].size, len(MOMENTS)
+        shapes: dict[str, tuple[int | None, ...]] = {
+            "time_s": (t,),
+            "force_bw": (t, 2, 3),
+            "centre_m": (t, 2, 3),
+            "moment_nm_per_kg": (t, 2, j),
+            "power_w_per_kg": (t, 2, j),
+            "residual_bw": (t, 3),
+            "residual_nm_per_kg": (t, 3),
+            "centre_of_mass_m": (t, 3),
+            "ahead": (t, 2),
+            "knee_adduction_nm_per_kg": (t, 2),
+        }
+        check_numbers(path, data, shapes)
+        series = Series(**{name: np.asarray(data[name], float) for name in _SERIES})
+
+    def known(rows: np.ndarray) -> dict[str, np.ndarray]:
+        return {name: row for name, row in zip(names, rows, strict=True) if np.isfinite(row).all()}
+
+    rows = zip(data["cycle_no"].ravel(), data["curve"], data["curve_sd"], strict=True)
+    return series, [{"number": int(i), "curves": known(a), "curves_sd": known(b)} for i, a, b in rows]

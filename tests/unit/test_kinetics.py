@@ -1,0 +1,402 @@
+"""Forces and moments against closed forms, the motion's own momentum, and what must not be computed."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.interpolate import make_interp_spline
+
+from pbl_pipeline.body import SCALE_NAMES, load_body, stature_m
+from pbl_pipeline.cli.gait import gait as gait_command
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.gait import GaitEvent, gait_metrics
+from pbl_pipeline.kinetics import (
+    GRAVITY,
+    JOINTS,
+    MEASURES,
+    METHODS,
+    MOMENTS,
+    Dynamics,
+    Motion,
+    contact_of,
+    ground_reaction,
+    inverse_dynamics,
+    leg_moments,
+    segment_inertia,
+    smooth_motion,
+    visit_kinetics,
+)
+from pbl_pipeline.kinetics.ground import PROGRESS, TRANSIENT
+from pbl_pipeline.names import check_mass
+from pbl_pipeline.report import write_report
+from pbl_pipeline.synthetic import SynthSpec, synthesise
+from pbl_pipeline.visit import Recording, Visit, load_kinetics, save_kinetics
+from tests.walking_fit import walking_fit
+
+BODY = load_body()
+ONE = np.ones(8)
+SCALE = np.array([0.9, 0.95, 0.85, 0.9, 0.86, 0.91, 0.88, 0.87])
+
+
+def still(n: int = 5, **joints: float) -> Motion:
+    """A motion that rests in one pose."""
+    qpos = np.zeros((n, len(BODY.joint_names)))
+    for name, value in joints.items():
+        qpos[:, BODY.joint_names.index(name)] = value
+    return Motion(np.arange(n) / 100, qpos, np.zeros_like(qpos), np.zeros_like(qpos))
+
+
+def dynamics_of(motion: Motion, scale: np.ndarray = ONE) -> Dynamics:
+    return inverse_dynamics(BODY, scale, segment_inertia(BODY, scale), motion)
+
+
+# ------------------------------------------------------------------------------------------------------------- inertia
+def test_the_masses_are_those_of_the_paper() -> None:
+    found = segment_inertia(BODY, SCALE)
+    assert found.mass.sum() == pytest.approx(1.0, abs=1e-12)
+    names = BODY.body_names
+    # Mean of women and men (de Leva 1996, table 4), before the sum is brought to 1 (women's and men's add to 1.0000).
+    assert found.mass[names.index("femur_l")] == pytest.approx(0.5 * (0.1478 + 0.1416), abs=2e-4)
+    assert found.mass[names.index("tibia_r")] == pytest.approx(0.5 * (0.0481 + 0.0433), abs=2e-4)
+    trunk = found.mass[[names.index("pelvis"), names.index("torso")]].sum()
+    assert trunk == pytest.approx(0.5 * (0.4257 + 0.4346), abs=5e-4)
+    feet = [names.index(f"{n}_l") for n in ("talus", "calcn", "toes")]
+    assert found.mass[feet].sum() == pytest.approx(0.5 * (0.0129 + 0.0137), abs=1e-4)
+
+
+def test_the_thigh_scales_with_its_length() -> None:
+    thigh = BODY.body_names.index("femur_r")
+    longer = ONE.copy()
+    longer[SCALE_NAMES.index("right_thigh")] = 1.2
+    plain, long = segment_inertia(BODY, ONE), segment_inertia(BODY, longer)
+    assert long.centre_m[thigh] == pytest.approx(1.2 * plain.centre_m[thigh])
+    assert long.moment_m2[thigh] == pytest.approx(1.44 * plain.moment_m2[thigh])
+    length = np.linalg.norm(BODY.mj_model.body_pos[BODY.body_names.index("tibia_r") + 1])
+    assert plain.centre_m[thigh, 1] == pytest.approx(-0.5 * (0.3612 + 0.4095) * length, rel=1e-4)
+
+
+def test_a_standing_body_has_its_centre_of_mass_where_people_have_it() -> None:
+    centre = dynamics_of(still()).centre_m[0, 2]
+    feet = dynamics_of(still()).xpos[0, BODY.body_names.index("calcn_l"), 2]
+    # 55 to 59 % of the height above the floor (Hay, The Biomechanics of Sports Techniques).
+    assert 0.54 < (centre - feet) / stature_m(BODY, ONE) < 0.60
+
+
+# ------------------------------------------------------------------------------------------------------------ dynamics
+def test_standing_needs_the_weight_through_the_centre_of_mass() -> None:
+    d = dynamics_of(still(), SCALE)
+    assert d.force_n == pytest.approx(np.tile([0, 0, GRAVITY], (5, 1)), abs=1e-6)
+    assert d.moment_nm == pytest.approx(np.cross(d.centre_m, d.force_n), abs=1e-6)
+
+
+def test_a_falling_body_needs_nothing() -> None:
+    motion = still(hip_flexion_l=0.4, lumbar_bending=0.2)
+    motion.qacc[:, BODY.joint_names.index("pelvis_ty")] = -GRAVITY
+    d = dynamics_of(motion)
+    assert d.force_n == pytest.approx(np.zeros((5, 3)), abs=1e-6)
+    assert d.generalised == pytest.approx(np.zeros_like(d.generalised), abs=1e-6)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.5, 1.1])
+def test_a_swinging_shank_is_a_pendulum(angle: float) -> None:
+    # The thigh hangs upright and rests; shank and foot swing about the knee as one body.
+    knee = BODY.joint_names.index("knee_angle_r")
+    motion = still(knee_angle_r=-angle)
+    motion.qvel[:, knee], motion.qacc[:, knee] = 1.7, -4.2
+    d = dynamics_of(motion)
+    inertia = segment_inertia(BODY, ONE)
+    parts = [BODY.body_names.index(f"{n}_r") for n in ("tibia", "talus", "calcn", "toes")]
+    anchor, axis = d.anchor_m[0, knee], d.axis[0, knee]
+    moment_of_inertia = weight = 0.0
+    for b in parts:
+        lever = d.xpos[0, b] + d.xmat[0, b] @ inertia.centre_m[b] - anchor
+        across = lever - (lever @ axis) * axis
+        turned = d.xmat[0, b].T @ axis
+        moment_of_inertia += turned @ (inertia.moment_m2[b] * turned) + inertia.mass[b] * across @ across
+        weight += np.cross(lever, [0, 0, -GRAVITY * inertia.mass[b]]) @ axis
+    assert d.generalised[0, knee] == pytest.approx(moment_of_inertia * -4.2 - weight, abs=1e-6)
+
+
+def test_the_force_is_the_change_of_momentum_of_a_walker() -> None:
+    truth = synthesise(SynthSpec(seed=3, seconds=4, fps=100, noise="none")).truth
+    motion = smooth_motion(truth.time_s, truth.qpos, 6.0)[0]
+    inertia = segment_inertia(BODY, truth.scale)
+    d = inverse_dynamics(BODY, truth.scale, inertia, motion)
+    centres = d.xpos + np.einsum("nbij,bj->nbi", d.xmat, inertia.centre_m)
+    centre = np.einsum("b,nbi->ni", inertia.mass, centres)
+    change = make_interp_spline(motion.time_s, centre, k=5).derivative(2)(motion.time_s) + np.array([0, 0, GRAVITY])
+    inside = slice(10, -10)
+    assert np.abs(change - d.force_n)[inside].max() < 0.01 * GRAVITY
+
+
+def test_derivatives_are_those_of_a_known_motion() -> None:
+    time = np.arange(300) / 60
+    qpos = np.zeros((300, 40))
+    qpos[:, 7] = 0.3 * np.sin(2 * np.pi * 1.0 * time)
+    motion = smooth_motion(time, qpos, 20.0)[0]
+    inside = (motion.time_s > 0.5) & (motion.time_s < 4.0)
+    expected = -0.3 * (2 * np.pi) ** 2 * np.sin(2 * np.pi * motion.time_s)
+    assert motion.qacc[inside, 7] == pytest.approx(expected[inside], abs=0.01 * 0.3 * (2 * np.pi) ** 2)
+
+
+def test_a_gap_splits_the_motion_and_a_short_one_is_none() -> None:
+    time = np.arange(400) / 100
+    qpos = np.zeros((400, 40))
+    qpos[180:230] = np.nan
+    assert [len(m.time_s) for m in smooth_motion(time, qpos, 6.0)] == [180, 170]
+    assert smooth_motion(time[:80], qpos[:80], 6.0) == []
+
+
+# -------------------------------------------------------------------------------------------------------------- ground
+def event(time_s: float, side: str, kind: str) -> GaitEvent:
+    return GaitEvent(time_s, side, f"foot_{kind}", 1.0)
+
+
+def test_contact_follows_the_events_and_is_unknown_elsewhere() -> None:
+    events = [
+        event(0.10, "left", "down"),
+        event(0.20, "right", "up"),
+        event(0.50, "right", "down"),
+        event(0.60, "left", "up"),
+    ]
+    contact = contact_of(np.array([0.05, 0.15, 0.3, 0.55, 0.7]), events)
+    assert np.isnan(contact[[0, 4]]).all()
+    assert contact[1:4].tolist() == [[1, 1], [1, 0], [1, 1]]
+    # An event is missing: between two initial contacts of a side its state is not known.
+    twice = contact_of(np.array([0.3]), [event(0.1, "left", "down"), event(0.5, "left", "down")])
+    assert np.isnan(twice[0, 0])
+
+
+def test_on_one_foot_that_foot_carries_everything() -> None:
+    motion = still(n=50)
+    d = dynamics_of(motion)
+    ground = ground_reaction(BODY, ONE, d, np.tile([0.0, 1.0], (50, 1)))
+    assert ground.force_n[:, 1, 2] == pytest.approx(np.full(50, GRAVITY))
+    assert not ground.force_n[:, 0].any()
+    assert np.isnan(ground.centre_m[:, 0]).all()
+    assert ground.residual_n[:, 2] == pytest.approx(np.zeros(50), abs=1e-9)
+
+
+def test_on_both_feet_the_forces_add_up_and_change_over() -> None:
+    n = 60
+    contact = np.ones((n, 2))
+    contact[:20, 0] = 0  # right alone, both, left alone
+    contact[40:, 1] = 0
+    ground = ground_reaction(BODY, ONE, dynamics_of(still(n=n)), contact)
+    assert ground.force_n[:, :, 2].sum(axis=1) == pytest.approx(np.full(n, GRAVITY), abs=1e-9)
+    behind = ground.force_n[20:40, 1, 2]
+    assert (np.diff(behind) < 0).all()
+    assert behind[0] > 0.8 * GRAVITY > 0.1 * GRAVITY > behind[-1]
+
+
+def test_unknown_contact_has_no_force() -> None:
+    contact = np.ones((30, 2))
+    contact[10:20, 0] = np.nan
+    ground = ground_reaction(BODY, ONE, dynamics_of(still(n=30)), contact)
+    assert np.isnan(ground.force_n[10:20]).all()
+    assert np.isfinite(ground.force_n[:10]).all()
+    assert np.isnan(ground.residual_n[10:20]).all()
+
+
+def test_the_centre_of_pressure_stays_under_the_sole() -> None:
+    n = 100
+    contact = np.zeros((n, 2))
+    contact[:, 0] = 1
+    contact[[0, -1], 0] = 0
+    contact[[0, -1], 1] = 1
+    d = dynamics_of(still(n=n))
+    ground = ground_reaction(BODY, ONE, d, contact)
+    heel = d.xpos[50, BODY.body_names.index("calcn_l")]
+    along = ground.centre_m[1:-1, 0] - heel
+    assert -0.03 < along[0, 0] < 0.06
+    assert 0.22 < along[-1, 0] < 0.27
+    assert (np.diff(along[:, 0]) > -1e-9).all()
+    assert np.abs(along[:, 1]).max() < 0.04
+    assert PROGRESS[:, 1].min() >= 0
+    assert PROGRESS[:, 1].max() <= 1
+
+
+def test_what_is_added_at_initial_contact_takes_no_weight() -> None:
+    assert abs(TRANSIENT[:-1].mean()) < 0.01
+    assert TRANSIENT[0] == TRANSIENT[-1]
+
+
+# -------------------------------------------------------------------------------------------------------------- joints
+def test_moments_of_standing_on_one_leg_by_hand() -> None:
+    n = 50
+    motion = still(n=n)
+    d = dynamics_of(motion)
+    ground = ground_reaction(BODY, ONE, d, np.tile([0.0, 1.0], (n, 1)))
+    moment, power = leg_moments(BODY, d, ground, motion)
+    at = 25
+    inertia = segment_inertia(BODY, ONE)
+    ankle = d.xpos[at, BODY.body_names.index("talus_r")]
+    axis = d.axis[at, BODY.joint_names.index("ankle_angle_r")]
+    # The joint balances the moments of the foot's weight and of the ground about it.
+    outside = np.cross(ground.centre_m[at, 1] - ankle, ground.force_n[at, 1])
+    for name in ("talus_r", "calcn_r", "toes_r"):
+        b = BODY.body_names.index(name)
+        lever = d.xpos[at, b] + d.xmat[at, b] @ inertia.centre_m[b] - ankle
+        outside = outside + np.cross(lever, [0, 0, -GRAVITY * inertia.mass[b]])
+    assert moment[at, 1, MOMENTS.index("ankle_angle")] == pytest.approx(-outside @ axis, abs=1e-9)
+    assert not power.any()
+
+
+def test_the_knee_has_the_sign_of_flexion() -> None:
+    # Crouching on one leg: the knee is held by its extensors, so its flexing moment is negative.
+    motion = still(n=50, hip_flexion_r=0.9, knee_angle_r=-1.4, ankle_angle_r=0.4)
+    d = dynamics_of(motion)
+    ground = ground_reaction(BODY, ONE, d, np.tile([0.0, 1.0], (50, 1)))
+    moment, _ = leg_moments(BODY, d, ground, motion)
+    assert MOMENTS[JOINTS.index("knee_angle")] == "knee_flexion"
+    assert moment[25, 1, MOMENTS.index("knee_flexion")] < -0.2
+
+
+# -------------------------------------------------------------------------------------------------------------- visits
+@pytest.fixture(scope="module")
+def walk() -> TrialFit:
+    """A walk whose vertical is measured, with errors of the joint values."""
+    fit = walking_fit(BODY.joint_names, BODY.sha256, n_frames=240, start_m=(6.0, -4.5, -0.2))
+    sd = np.full_like(fit.qpos, 0.01)
+    return dataclasses.replace(fit, orientation_source="measured: phone", qpos_sd=sd, height_m=1.8)
+
+
+def kinetics_of(fit: TrialFit, **kwargs):
+    method = METHODS.find()
+    gait = gait_metrics([fit])
+    return visit_kinetics([fit], gait.trials, method, **kwargs)
+
+
+def test_a_walk_has_measures_with_intervals(walk: TrialFit) -> None:
+    found = kinetics_of(walk, mass_kg=70.0)
+    assert found.status == "PASS"
+    assert found.mass_kg == 70.0
+    peak = found.measures["vertical_peak_loading_bw"]
+    assert 0.9 < peak.mean < 1.6
+    assert peak.interval is not None
+    assert peak.interval[0] < peak.mean < peak.interval[1]
+    impulse = found.measures["vertical_impulse_bw_s"]
+    # Over a stride both feet carry the weight: half a stride each.
+    assert impulse.mean == pytest.approx(0.55, abs=0.05)
+    assert found.measures["braking_impulse_bw_s"].mean < 0 < found.measures["propulsion_impulse_bw_s"].mean
+    assert found.residual_bw is not None
+    assert found.residual_bw < 0.2
+    cycle = next(c for c in found.trials[0].cycles if c.used)
+    assert cycle.curves["force_vertical_bw"].shape == (51,)
+    assert (cycle.curves_sd["force_vertical_bw"] > 0).any()
+
+
+def test_the_result_is_the_same_every_time_and_needs_no_mass(walk: TrialFit) -> None:
+    first, second = kinetics_of(walk), kinetics_of(walk, mass_kg=90.0)
+    assert first.measures == second.measures
+
+
+def test_one_camera_tells_no_moment_across_the_knee(walk: TrialFit) -> None:
+    found = kinetics_of(walk)
+    assert "knee_adduction_moment_peak_nm_per_kg" not in found.measures
+    assert "one camera" in found.reasons["knee_adduction_moment_peak_nm_per_kg"]
+    metric = kinetics_of(dataclasses.replace(walk, orientation_source="measured: calibration"))
+    assert "knee_adduction_moment_peak_nm_per_kg" in metric.measures
+
+
+def test_a_fit_without_errors_has_no_intervals(walk: TrialFit) -> None:
+    found = kinetics_of(dataclasses.replace(walk, qpos_sd=np.full_like(walk.qpos, np.nan)))
+    assert found.measures["vertical_peak_loading_bw"].interval is None
+
+
+@pytest.mark.parametrize(
+    ("change", "aid", "code"),
+    [
+        ({"orientation_source": "assumed: level"}, "", "VERTICAL_UNKNOWN"),
+        ({"camera_motion": "handheld"}, "", "MOVING_CAMERA"),
+        ({}, "cane", "AID"),
+    ],
+)
+def test_what_cannot_have_forces_says_why(walk: TrialFit, change: dict, aid: str, code: str) -> None:
+    found = kinetics_of(dataclasses.replace(walk, **change), aid=aid)
+    assert (found.status, found.code) == ("EMPTY", code)
+    assert found.measures == {}
+    assert set(found.reasons) == set(MEASURES)
+
+
+def test_a_treadmill_has_no_forces(walk: TrialFit) -> None:
+    still_standing = walk.qpos.copy()
+    tz = BODY.joint_names.index("pelvis_tx")
+    still_standing[:, [tz, tz + 1]] = still_standing[0, [tz, tz + 1]]
+    found = kinetics_of(dataclasses.replace(walk, qpos=still_standing))
+    assert found.status == "EMPTY"
+    assert found.code in ("TREADMILL", "NO_CYCLES")
+
+
+def test_standing_has_no_forces() -> None:
+    fit = walking_fit(BODY.joint_names, BODY.sha256, walks=False)
+    found = kinetics_of(dataclasses.replace(fit, orientation_source="measured: phone"))
+    assert (found.status, found.code) == ("EMPTY", "NO_CYCLES")
+
+
+def test_lost_frames_in_a_stance_leave_that_cycle_out(walk: TrialFit) -> None:
+    gait = gait_metrics([walk])
+    used = [c for c in gait.trials[0].cycles if c.used]
+    lost = walk.qpos.copy()
+    middle = used[0].start_s + 0.3
+    lost[(walk.time_s > middle) & (walk.time_s < middle + 0.25)] = np.nan
+    found = visit_kinetics([dataclasses.replace(walk, qpos=lost)], gait.trials, METHODS.find())
+    cycle = next(c for c in found.trials[0].cycles if c.number == used[0].number)
+    assert not cycle.measures
+    assert cycle.missing
+
+
+def test_mujoco_is_asked_without_joint_limits() -> None:
+    # A knee beyond its limit: no constraint force may enter the inverse dynamics.
+    knee = BODY.joint_names.index("knee_angle_r")
+    limit = BODY.joint_range_rad[knee, 1]
+    below, above = (dynamics_of(still(knee_angle_r=limit + x)).generalised[0, knee] for x in (-1e-4, 1e-4))
+    assert below == pytest.approx(above, abs=1e-3)
+
+
+@pytest.mark.parametrize("mass_kg", [0.07, 4.0, 700.0, float("nan")])
+def test_a_mass_that_no_person_has_is_refused(mass_kg: float) -> None:
+    with pytest.raises(PblError) as error:
+        check_mass(mass_kg)
+    assert error.value.code == "FIT_INPUT"
+    check_mass(None)
+    check_mass(68.5)
+
+
+def test_pbl_gait_writes_kinetics_beside_the_fits_and_keeps_the_mass(walk: TrialFit, tmp_path: Path) -> None:
+    walk.save(tmp_path / "walk.fit.npz")
+    save_kinetics(dataclasses.replace(kinetics_of(walk, mass_kg=70.0), trials=()), tmp_path)
+    done = CliRunner().invoke(gait_command, [str(tmp_path / "walk.fit.npz"), "--out", str(tmp_path / "metrics.json")])
+    assert done.exit_code == 0, done.output
+    found = load_kinetics(tmp_path, ["walk"])
+    assert found is not None
+    assert found.mass_kg == 70.0
+    assert found.measures.keys() == kinetics_of(walk).measures.keys()
+    series = found.trials[0].series
+    assert series is not None
+    assert series.force_bw.shape == (len(series.time_s), 2, 3)
+
+
+def test_kinetics_of_other_recordings_are_refused(walk: TrialFit, tmp_path: Path) -> None:
+    save_kinetics(kinetics_of(walk), tmp_path)
+    with pytest.raises(PblError) as error:
+        load_kinetics(tmp_path, ["another"])
+    assert error.value.code == "FILE_FORMAT"
+    assert load_kinetics(tmp_path / "empty", ["walk"]) is None
+
+
+def test_the_report_shows_forces_with_intervals_and_newtons(walk: TrialFit, tmp_path: Path) -> None:
+    gait = gait_metrics([walk])
+    visit = Visit((Recording.of("walk", walk),)).with_measures(gait)
+    visit = dataclasses.replace(visit, kinetics=visit_kinetics([walk], gait.trials, METHODS.find(), mass_kg=70.0))
+    page = write_report(tmp_path / "report.html", visit).read_text()
+    assert "Forces and joint moments" in page
+    assert "1 BW is 686 N" in page
+    assert "Not known: one camera sees too little" in page
+    nothing = dataclasses.replace(visit, kinetics=visit_kinetics([walk], gait.trials, METHODS.find(), aid="walker"))
+    assert "No forces: a walking aid" in write_report(tmp_path / "aid.html", nothing).read_text()
