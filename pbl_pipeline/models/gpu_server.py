@@ -22,6 +22,8 @@ from typing import Any
 
 import numpy as np
 
+from pbl_pipeline.errors import PblError
+
 from .network import NetworkSpec, read_network
 from .tflite import LiteModel
 
@@ -197,7 +199,7 @@ class Server:
                     if spec not in self._served:
                         self._served[spec] = _Served(Program(spec, self._any_device, self._batch))
             except Exception as error:  # noqa: BLE001 - whoever asked lets LiteRT compute and says why
-                lines = str(error).strip().splitlines()
+                lines = [error.short()] if isinstance(error, PblError) else str(error).strip().splitlines()
                 connection.send_bytes(json.dumps({"error": lines[0] if lines else type(error).__name__}).encode())
                 return
             served = self._served[spec]
